@@ -1,0 +1,105 @@
+"""What can be wrong with what a user gives us.
+
+    SplatliftError                 every error that is the user's to mend
+    ├── InvalidInput               a file or value is malformed      -> exit 2, HTTP 422
+    │   ├── InvalidSplats
+    │   ├── InvalidCameras
+    │   ├── InvalidFeatures
+    │   ├── InvalidLift
+    │   ├── InvalidSettings
+    │   └── InvalidQuery           (an unknown word, a view that is not there)
+    ├── NotFound                   a named thing does not exist      -> exit 2, HTTP 404
+    └── Unavailable                a capability is missing here      -> exit 2, HTTP 422 (weights, encoders)
+
+Every error names the argument, what was expected and what came, and says what to try next.
+"""
+
+from __future__ import annotations
+
+
+class SplatliftError(Exception):
+    """An error whose message is written for the user.
+
+    Args:
+        argument: the argument, file or field at fault, as the user knows it.
+        expected: what would have been right.
+        got: what came instead.
+        hint: what to try next; empty when the first three say it all.
+    """
+
+    kind = "error"  # stable slug: the last part of the problem type in HTTP answers
+
+    def __init__(self, argument: str, *, expected: str, got: str, hint: str = "") -> None:
+        self.argument = argument
+        self.expected = expected
+        self.got = got
+        self.hint = hint
+        super().__init__(argument, expected, got, hint)
+
+    def __str__(self) -> str:
+        """One line: ``argument: expected ..., got ...; hint``."""
+        line = f"{self.argument}: expected {self.expected}, got {self.got}"
+        line = f"{line}; {self.hint}" if self.hint else line
+        return " ".join(line.split())
+
+    def __reduce__(self) -> tuple[object, tuple[object, ...]]:
+        # Errors cross process borders (jobs run in a child); keyword-only arguments need help there.
+        return _rebuild, (type(self), self.argument, self.expected, self.got, self.hint)
+
+
+def _rebuild(cls: type[SplatliftError], argument: str, expected: str, got: str, hint: str) -> SplatliftError:
+    return cls(argument, expected=expected, got=got, hint=hint)
+
+
+class InvalidInput(SplatliftError):
+    """A file or a value is malformed."""
+
+    kind = "invalid-input"
+
+
+class InvalidSplats(InvalidInput):
+    """A splat file or its content is malformed."""
+
+    kind = "invalid-splats"
+
+
+class InvalidCameras(InvalidInput):
+    """A camera file or its content is malformed or not supported."""
+
+    kind = "invalid-cameras"
+
+
+class InvalidFeatures(InvalidInput):
+    """A feature pack or its content is malformed, or does not fit the scene."""
+
+    kind = "invalid-features"
+
+
+class InvalidLift(InvalidInput):
+    """A lift file is malformed, or what it was made from moved or changed."""
+
+    kind = "invalid-lift"
+
+
+class InvalidSettings(InvalidInput):
+    """A setting has an unknown name or a value out of range."""
+
+    kind = "invalid-settings"
+
+
+class InvalidQuery(InvalidInput):
+    """A query cannot be answered as asked."""
+
+    kind = "invalid-query"
+
+
+class NotFound(SplatliftError):
+    """A named thing does not exist."""
+
+    kind = "not-found"
+
+
+class Unavailable(SplatliftError):
+    """A capability is missing on this machine: weights, an encoder, a device."""
+
+    kind = "unavailable"

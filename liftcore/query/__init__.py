@@ -1,0 +1,1 @@
+"""Words to splats: text encoders, scores, thresholds, attention maps and masks."""

@@ -1,0 +1,53 @@
+"""What a raster backend offers: the four uses of A, one view at a time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from liftcore.observe.observation import Observation
+    from liftcore.scene.cameras import Camera
+
+
+@dataclass(frozen=True)
+class Walk:
+    """How a ray walks through the splats, front to back."""
+
+    gain: float = 1.0  # lambda: alpha~ = sigmoid(lambda theta)
+    alpha_cap: float = 0.99  # the largest alpha of a splat on a ray
+    transmittance_stop: float = 1e-4  # exclusive: the splat that would bring T to it or below adds nothing
+
+
+@dataclass(frozen=True)
+class RegionWeights:
+    """``W = A^p^T S`` of one view, sparse by rows of the splats that it saw, and ``A^T 1``."""
+
+    splats: Tensor  # [n] i32 ascending, the splats with a row
+    row_starts: Tensor  # [n + 1] i64, CSR row pointers
+    columns: Tensor  # [nnz] i32 ascending in a row, rows of the codebook
+    weights: Tensor  # [nnz] f32, sums over rays of w^p times the reading S
+    evidence_splats: Tensor  # [m] i32 ascending, the splats that any ray met, labelled or not
+    evidence: Tensor  # [m] f32, sum of plain weights w (gain 1, power 1), each ray once
+
+
+class Raster(Protocol):
+    """A for one scene. Every product is deterministic to the bit, whatever the number of threads."""
+
+    def region_weights(self, camera: Camera, observation: Observation, walk: Walk, power: int) -> RegionWeights:
+        """``A^p^T S`` of a view (power 1 or 2) and the evidence of plain weights."""
+        ...
+
+    def render(self, camera: Camera, values: Tensor, walk: Walk) -> Tensor:
+        """``A X``: values [P, F] f32 -> [H, W, F] f32, background zero, not divided by the row sum."""
+        ...
+
+    def row_sums(self, camera: Camera, walk: Walk) -> Tensor:
+        """``A 1``: [H, W] f32 (Property 2)."""
+        ...
+
+    def top_weights(self, camera: Camera, walk: Walk, count: int) -> tuple[Tensor, Tensor]:
+        """The largest weights of every ray, descending: ids [H, W, count] i32 (-1 = none), weights f32."""
+        ...

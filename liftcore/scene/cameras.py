@@ -1,0 +1,97 @@
+"""Pinhole cameras with known poses, validated once."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from liftcore.errors import InvalidCameras, NotFound
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+MAX_SIDE = 32_768  # pixels; larger images are a broken header, not a photo
+
+
+@dataclass(frozen=True)
+class Camera:
+    """One undistorted pinhole view. OpenCV axes (x right, y down, z forward), pixel centres at +0.5."""
+
+    name: str  # the image's name without its extension; pairs the view with its features
+    width: int  # pixels
+    height: int  # pixels
+    fx: float  # pixels
+    fy: float  # pixels
+    cx: float  # pixels, from the left edge of the first pixel
+    cy: float  # pixels, from the top edge of the first pixel
+    world_to_camera: np.ndarray  # [4, 4] f64, rigid
+
+    def __post_init__(self) -> None:
+        pose = np.array(self.world_to_camera, dtype=np.float64)
+        pose.setflags(write=False)
+        object.__setattr__(self, "world_to_camera", pose)
+        if not (0 < self.width <= MAX_SIDE and 0 < self.height <= MAX_SIDE):
+            self._refuse("size", f"width and height in 1..{MAX_SIDE}", f"{self.width}x{self.height}")
+        intrinsics = (self.fx, self.fy, self.cx, self.cy)
+        if not all(math.isfinite(value) for value in intrinsics) or self.fx <= 0 or self.fy <= 0:
+            self._refuse("intrinsics", "finite fx, fy, cx, cy with positive focal lengths", str(intrinsics))
+        if pose.shape != (4, 4) or not np.isfinite(pose).all():
+            self._refuse("pose", "a finite 4x4 matrix", f"shape {list(pose.shape)}")
+        rotation = pose[:3, :3]
+        error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+        if error > 1e-3 or np.linalg.det(rotation) < 0:
+            self._refuse("pose", "a proper rotation", f"a matrix off by {error:.2g}")
+
+    def _refuse(self, part: str, expected: str, got: str) -> None:
+        raise InvalidCameras(f"camera {self.name!r} {part}", expected=expected, got=got)
+
+    @property
+    def centre(self) -> np.ndarray:
+        """[3] f64, the camera's centre in the world frame."""
+        return -self.world_to_camera[:3, :3].T @ self.world_to_camera[:3, 3]
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """The views of a scene, in file order, looked up by name."""
+
+    views: tuple[Camera, ...]
+
+    def __post_init__(self) -> None:
+        if not self.views:
+            raise InvalidCameras("cameras", expected="at least one view", got="none")
+        seen: set[str] = set()
+        for camera in self.views:
+            if camera.name in seen:
+                raise InvalidCameras("cameras", expected="one view a name", got=f"{camera.name!r} twice")
+            seen.add(camera.name)
+
+    @property
+    def by_name(self) -> Mapping[str, Camera]:
+        """Name -> camera."""
+        return {camera.name: camera for camera in self.views}
+
+    def get(self, name: str) -> Camera:
+        """The view of that name.
+
+        Raises:
+            NotFound: no view has it; the error names the nearest ones.
+        """
+        found = self.by_name.get(name)
+        if found is None:
+            from rapidfuzz import process
+
+            near = [match[0] for match in process.extract(name, list(self.by_name), limit=3)]
+            raise NotFound(
+                "view", expected="the name of a camera", got=repr(name), hint=f"nearest: {', '.join(near)}"
+            )
+        return found
+
+    def __len__(self) -> int:
+        return len(self.views)
+
+    def __iter__(self) -> Iterator[Camera]:
+        return iter(self.views)
