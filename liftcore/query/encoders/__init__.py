@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 ENCODER_SPECS = (
     "table:FILE.safetensors",
     "minilm",
-    "open_clip:MODEL[/PRETRAINED_TAG]",
+    "open_clip:MODEL/PRETRAINED_TAG",
     "open_clip:MODEL@WEIGHTS_FILE",
 )
 
@@ -46,8 +46,8 @@ def open_encoder(spec: str) -> TextEncoder:
     """Open a text encoder by its specification.
 
     Args:
-        spec: ``table:FILE`` or a path ending in ``.safetensors`` (precomputed embeddings); ``minilm`` (a small
-            sentence encoder, offline); ``open_clip:MODEL/TAG`` or ``open_clip:MODEL@FILE``.
+        spec: ``table:FILE`` or a path ending in ``.safetensors`` (precomputed embeddings); ``minilm`` (a
+            small sentence encoder, offline); ``open_clip:MODEL/TAG`` or ``open_clip:MODEL@FILE``.
 
     Raises:
         InvalidQuery: the specification is none of these, or a table is malformed.

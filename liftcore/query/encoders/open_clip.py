@@ -95,7 +95,7 @@ def _from_tag(label: str, model_name: str, tag: str) -> tuple[Any, Any]:
             label,
             expected="weights: a tag or a file",
             got="none",
-            hint=f"write open_clip:{model_name}/TAG or open_clip:{model_name}@FILE; tags: {', '.join(tags) or 'none'}",
+            hint=f"open_clip:{model_name}/TAG or open_clip:{model_name}@FILE; tags: {', '.join(tags) or 'none'}",
         )
     if tag not in tags:
         raise InvalidQuery(label, expected=f"one of the tags {', '.join(tags) or '(none)'}", got=repr(tag))
@@ -153,7 +153,7 @@ def _library() -> Any:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """open_clip logs to the root logger and warns of activations: what matters reaches the user as an error."""
+    """open_clip logs to the root logger and warns of activations: what matters is raised as an error."""
     before = logging.root.manager.disable
     logging.disable(logging.ERROR)
     try:

@@ -67,12 +67,12 @@ class TableEncoder:
             raise InvalidQuery(name, expected="a file", got=f"nothing at {path}")
         try:
             with safe_open(str(path), framework="pt") as handle:
-                if "embeddings" not in handle.keys():
-                    raise InvalidQuery(name, expected="a tensor named embeddings", got="a file without it")
                 embeddings = handle.get_tensor("embeddings")
                 words = json.loads((handle.metadata() or {}).get("words", "null"))
         except (SafetensorError, OSError, json.JSONDecodeError) as error:
-            raise InvalidQuery(name, expected="a safetensors file with words", got=str(error)) from None
+            raise InvalidQuery(
+                name, expected="a safetensors file with embeddings and words", got=str(error)
+            ) from None
         if not isinstance(words, list) or not all(isinstance(word, str) for word in words):
             raise InvalidQuery(name, expected="metadata words, a JSON list of strings", got="none")
         if embeddings.dtype not in (torch.float16, torch.float32):
