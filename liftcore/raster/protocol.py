@@ -33,6 +33,15 @@ class RegionWeights:
     evidence: Tensor  # [m] f32, sum of plain weights w (gain 1, power 1), each ray once
 
 
+@dataclass(frozen=True)
+class RayRows:
+    """Rows of A for single rays, sparse."""
+
+    row_starts: Tensor  # [n + 1] i64, CSR row pointers
+    splats: Tensor  # [nnz] i32, near to far
+    weights: Tensor  # [nnz] f32
+
+
 class Raster(Protocol):
     """A for one scene. Every product is deterministic to the bit, whatever the number of threads."""
 
@@ -50,4 +59,8 @@ class Raster(Protocol):
 
     def top_weights(self, camera: Camera, walk: Walk, count: int) -> tuple[Tensor, Tensor]:
         """The largest weights of every ray, descending: ids [H, W, count] i32 (-1 = none), weights f32."""
+        ...
+
+    def ray_rows(self, camera: Camera, pixels: Tensor, walk: Walk) -> RayRows:
+        """Rows of A for the rays of pixels [n, 2] i32 (x, y)."""
         ...

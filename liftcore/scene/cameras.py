@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 MAX_SIDE = 32_768  # pixels; larger images are a broken header, not a photo
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Camera:
     """One undistorted pinhole view. OpenCV axes (x right, y down, z forward), pixel centres at +0.5."""
 

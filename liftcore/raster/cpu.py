@@ -1,0 +1,204 @@
+"""The CPU backend: A on two cores or on sixty, the same to the bit.
+
+Work is cut into a fixed number of shares, each with places of its own to write to; threads only decide who does
+which share. The compiled kernels release the interpreter lock.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import OrderedDict
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from liftcore.errors import InvalidInput, Unavailable
+from liftcore.raster.constants import TILE
+from liftcore.raster.depth_order import depth_order
+from liftcore.raster.projection import RECORD, axes_of, opacities, project_gaussians, view_of
+from liftcore.raster.protocol import RayRows, RegionWeights, Walk
+from liftcore.raster.readings import reading_of
+from liftcore.raster.region_weights import count_entries, group_entries, merge_rows, split_evidence, weigh_tiles
+from liftcore.raster.rendering import render_tiles, top_tiles, trace_rays
+from liftcore.raster.tiles import count_tiles, fill_tiles, tile_places
+from liftcore.raster.walk import Frame
+from liftcore.scene.splats import Kernel
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from torch import Tensor
+
+    from liftcore.observe.observation import Observation
+    from liftcore.scene.cameras import Camera
+    from liftcore.scene.splats import Splats
+
+SPLAT_SHARES = 8  # shares of the projection, the binning and the merge
+TILE_SHARES = 48  # shares of the blending; more of them even out crowded tiles
+RENDER_CHANNELS = 32  # channels a pass of the render, so that a tile's sums stay in the cache
+
+
+
+class CpuRaster:
+    """A for one scene of 3D Gaussians (``liftcore.raster.protocol.Raster``).
+
+    Args:
+        splats: the scene.
+        threads: how many threads work; None takes the cores that this process may use. The number changes no bit.
+
+    Raises:
+        Unavailable: the kernel of the splats is not implemented here yet.
+    """
+
+    def __init__(self, splats: Splats, threads: int | None = None) -> None:
+        if splats.kernel is not Kernel.GAUSSIAN_3D:
+            raise Unavailable(
+                "splats",
+                expected="3D Gaussian splats (kernel 3dgs)",
+                got=f"kernel {splats.kernel}",
+                hint="2DGS and DBS files are read and inspected; lifting them is not implemented yet",
+            )
+        self.splats = splats
+        self.threads = threads or len(os.sched_getaffinity(0))
+        self._pool = ThreadPoolExecutor(self.threads)
+        self._means = np.ascontiguousarray(splats.means.numpy())
+        self._axes = axes_of(splats)
+        self._opacities: dict[float, np.ndarray] = {}
+        self._records = np.empty((splats.count, RECORD))
+        self._depths = np.empty(splats.count, np.float32)
+        self._frames: OrderedDict[tuple[Camera, Walk], Frame] = OrderedDict()
+
+    def region_weights(self, camera: Camera, observation: Observation, walk: Walk, power: int) -> RegionWeights:
+        """``A^p^T S`` of a view and the evidence of plain weights. See the protocol."""
+        if power not in (1, 2):
+            raise InvalidInput("power", expected="1 or 2", got=str(power))
+        frame = self._frame(camera, walk)
+        reading = reading_of(observation, camera.width, camera.height)
+        with_plain = walk.gain != 1.0
+        entries = self._over_tiles(
+            frame, lambda first, last: weigh_tiles(first, last, frame, reading, power, with_plain)
+        )
+        return self._merge(frame, entries, reading.codebook_rows)
+
+    def render(self, camera: Camera, values: Tensor, walk: Walk) -> Tensor:
+        """``A X``: values [P, C] f32 -> [H, W, C] f32. See the protocol."""
+        if values.ndim != 2 or values.shape[0] != self.splats.count:
+            raise InvalidInput(
+                "values", expected=f"one row for each of {self.splats.count} splats", got=f"{list(values.shape)}"
+            )
+        frame = self._frame(camera, walk)
+        channels = values.shape[1]
+        image = np.zeros((camera.height, camera.width, channels), np.float32)
+        for begin in range(0, channels, RENDER_CHANNELS):
+            end = min(begin + RENDER_CHANNELS, channels)
+            block = np.ascontiguousarray(values[:, begin:end].to(torch.float32).numpy())
+            target = np.zeros((camera.height, camera.width, end - begin), np.float32)
+            self._over_tiles(
+                frame, lambda first, last, block=block, target=target: render_tiles(first, last, frame, block, target)
+            )
+            image[:, :, begin:end] = target
+        return torch.from_numpy(image)
+
+    def row_sums(self, camera: Camera, walk: Walk) -> Tensor:
+        """``A 1``: [H, W] f32."""
+        return self.render(camera, torch.ones(self.splats.count, 1), walk)[:, :, 0]
+
+    def top_weights(self, camera: Camera, walk: Walk, count: int) -> tuple[Tensor, Tensor]:
+        """The largest weights of every ray, descending. See the protocol."""
+        frame = self._frame(camera, walk)
+        ids = np.full((camera.height, camera.width, count), -1, np.int32)
+        weights = np.zeros((camera.height, camera.width, count), np.float32)
+        self._over_tiles(frame, lambda first, last: top_tiles(first, last, frame, ids, weights))
+        return torch.from_numpy(ids), torch.from_numpy(weights)
+
+    def ray_rows(self, camera: Camera, pixels: Tensor, walk: Walk) -> RayRows:
+        """Rows of A for single pixels [n, 2] (x, y). See the protocol."""
+        frame = self._frame(camera, walk)
+        starts, splats, weights = trace_rays(frame, np.ascontiguousarray(pixels.to(torch.int32).numpy()))
+        return RayRows(torch.from_numpy(starts), torch.from_numpy(splats), torch.from_numpy(weights))
+
+    def _frame(self, camera: Camera, walk: Walk) -> Frame:
+        """The view projected and binned; the last one is kept."""
+        key = (camera, walk)
+        frame = self._frames.pop(key, None)
+        if frame is None:
+            self._frames.clear()  # before, so that one frame's memory is the most ever held
+            frame = self._bin(camera, walk, *self._project(camera, walk))
+        self._frames[key] = frame
+        return frame
+
+    def _project(self, camera: Camera, walk: Walk) -> tuple[np.ndarray, np.ndarray]:
+        """Fill the records; give the splat of every record [P] i32 and the depth order [n] i32."""
+        ids = np.full(self.splats.count, -1, np.int32)
+        view = view_of(camera)
+        opacity, plain = self._opacity(walk.gain), self._opacity(1.0)
+        arrays = (self._means, self._axes, opacity, plain, view, self._records, self._depths, ids)
+        bounds = _shares(self.splats.count, SPLAT_SHARES)
+        counts = self._map(lambda first, last: project_gaussians(first, last, *arrays), bounds)
+        used = [np.arange(first, first + count, dtype=np.int32) for (first, _), count in zip(bounds, counts, strict=True)]
+        places = np.concatenate(used) if used else np.empty(0, np.int32)
+        return ids, depth_order(self._depths[places].view(np.uint32), places)
+
+    def _bin(self, camera: Camera, walk: Walk, ids: np.ndarray, order: np.ndarray) -> Frame:
+        columns, rows = -(-camera.width // TILE), -(-camera.height // TILE)
+        bounds = _shares(order.shape[0], SPLAT_SHARES)
+        counts = np.zeros((len(bounds), rows * columns), np.int64)
+        shares = [(order[first:last], k) for k, (first, last) in enumerate(bounds)]
+        self._map(lambda part, k: count_tiles(part, self._records, rows, columns, counts[k]), shares)
+        starts, cursors = tile_places(counts)
+        items = np.empty(starts[-1], np.int32)
+        self._map(lambda part, k: fill_tiles(part, self._records, rows, columns, cursors[k], items), shares)
+        return Frame(
+            self._records, ids, starts, items, columns, rows, camera.width, camera.height,
+            walk.alpha_cap, walk.transmittance_stop,
+        )  # fmt: skip
+
+    def _merge(self, frame: Frame, entries: list, codebook_rows: int) -> RegionWeights:
+        """Entries of all tile shares -> one row a splat."""
+        count = self.splats.count
+        starts = np.zeros(count + 1, np.int64)
+        for places, _, _ in entries:
+            count_entries(places, starts[1:])
+        np.cumsum(starts, out=starts)
+        columns = np.empty(starts[-1], np.int32)
+        weights = np.empty(starts[-1], np.float32)
+        cursors = starts[:-1].copy()
+        for share in entries:
+            group_entries(*share, cursors, columns, weights)
+        kept = np.zeros(count, np.int64)
+        self._map(
+            lambda first, last: merge_rows(first, last, starts, columns, weights, kept), _shares(count, SPLAT_SHARES)
+        )
+        rows, total = int((kept > 0).sum()), int(kept.sum())
+        out = (
+            np.empty(rows, np.int32), np.empty(rows + 1, np.int64), np.empty(total, np.int32),
+            np.empty(total, np.float32), np.empty(rows, np.int32), np.empty(rows, np.float32),
+        )  # fmt: skip
+        used, nonzero, met = split_evidence(starts, kept, columns, weights, codebook_rows, frame.ids, out)
+        ends = (used, used + 1, nonzero, nonzero, met, met)
+        return RegionWeights(*(torch.from_numpy(part[:end]) for part, end in zip(out, ends, strict=True)))
+
+    def _opacity(self, gain: float) -> np.ndarray:
+        if gain not in self._opacities:
+            self._opacities[gain] = opacities(self.splats, gain)
+        return self._opacities[gain]
+
+    def _over_tiles(self, frame: Frame, work: Callable) -> list:
+        """Run ``work(first, last)`` over tile shares of about equal length in list items."""
+        tiles = frame.columns * frame.rows
+        marks = np.linspace(0, frame.starts[-1], TILE_SHARES + 1)
+        edges = np.unique(np.concatenate([[0], np.searchsorted(frame.starts, marks[1:-1]), [tiles]]))
+        return self._map(work, [(int(a), int(b)) for a, b in zip(edges[:-1], edges[1:], strict=True)])
+
+    def _map(self, work: Callable, shares: list) -> list:
+        if self.threads == 1:
+            return [work(*share) for share in shares]
+        return list(self._pool.map(lambda share: work(*share), shares))
+
+
+def _shares(total: int, count: int) -> list[tuple[int, int]]:
+    """``count`` ranges that cover ``total`` items."""
+    edges = [total * k // count for k in range(count + 1)]
+    return list(zip(edges[:-1], edges[1:], strict=True))

@@ -1,0 +1,237 @@
+"""S, tile by tile: which slots each half row of pixels reads, and how much.
+
+Both kinds of observation become the same list of taps. A region map's slots are the distinct label tuples of the
+tile (a ray's labels on all levels), its factors zeros and ones; a grid's slots are the cells that the tile's
+pixels read, its factors the bilinear weights. The pixel loop adds ``weights * factors`` into slots and knows
+neither labels nor channels; slots are expanded to codebook rows once a splat is done with the tile.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numba import njit
+
+from liftcore.observe.observation import FeatureGrid, Observation, RegionMap
+from liftcore.raster.constants import TILE
+from liftcore.raster.lanes import LANES
+from liftcore.raster.walk import HALVES
+
+MAX_SLOTS = 4 * TILE * TILE  # every pixel reads four cells of its own at worst
+MAX_TAPS = HALVES * 4 * LANES  # every lane of a half row reads four cells of its own at worst
+NO_SLOT = -1
+
+
+class Reading(NamedTuple):
+    """S of one view as the compiled code takes it. Exactly one of the two kinds is in use."""
+
+    is_grid: bool
+    levels: int  # codebook rows a slot expands to: L of a region map, 1 of a grid
+    labels: np.ndarray  # [L, h, w] i32, region map (else empty)
+    label_x: np.ndarray  # [W] i32, the label column of a pixel column (else empty)
+    label_y: np.ndarray  # [H] i32
+    cell_x: np.ndarray  # [W] i32, the left grid column of a pixel column (else empty)
+    cell_y: np.ndarray  # [H] i32
+    share_x: np.ndarray  # [W] f32, the right column's share
+    share_y: np.ndarray  # [H] f32
+    grid_width: int
+    codebook_rows: int  # M; column M of W is the evidence of all rays
+
+
+class TileTaps(NamedTuple):
+    """The taps of one tile."""
+
+    starts: np.ndarray  # [33] i32, each half row's taps
+    slots: np.ndarray  # [MAX_TAPS] i32
+    whole: np.ndarray  # [MAX_TAPS] u8, 1 = all factors are one
+    factors: np.ndarray  # [MAX_TAPS * 8] f32
+    slot_columns: np.ndarray  # [MAX_SLOTS, levels] i32, local columns of a slot, -1 none
+    columns: np.ndarray  # [MAX_SLOTS * levels] i32, codebook rows of the tile's local columns
+    sizes: np.ndarray  # [2] i32, slots and local columns in use
+
+
+def reading_of(observation: Observation, width: int, height: int) -> Reading:
+    """S of an observation for an image of ``width`` x ``height`` pixels."""
+    no_ints = np.empty(0, np.int32)
+    no_floats = np.empty(0, np.float32)
+    if isinstance(observation, RegionMap):
+        labels = np.ascontiguousarray(observation.labels.to(torch.int32).numpy())
+        levels, rows, columns = labels.shape
+        return Reading(
+            False, levels, labels, _nearest(width, columns), _nearest(height, rows),
+            no_ints, no_ints, no_floats, no_floats, 0, observation.codebook.shape[0],
+        )  # fmt: skip
+    rows, columns = observation.grid.shape[:2]
+    cell_x, share_x = _taps(width, columns)
+    cell_y, share_y = _taps(height, rows)
+    no_labels = np.empty((0, 0, 0), np.int32)
+    return Reading(
+        True, 1, no_labels, no_ints, no_ints, cell_x, cell_y, share_x, share_y, columns, rows * columns
+    )
+
+
+def _nearest(pixels: int, cells: int) -> np.ndarray:
+    """[pixels] i32: floor((p + 0.5) cells / pixels), in whole numbers."""
+    return ((2 * np.arange(pixels, dtype=np.int64) + 1) * cells // (2 * pixels)).astype(np.int32)
+
+
+def _taps(pixels: int, cells: int) -> tuple[np.ndarray, np.ndarray]:
+    """The left cell and the right cell's share of every pixel, half-pixel centres, clamped borders."""
+    position = ((np.arange(pixels) + 0.5) * cells / pixels - 0.5).clip(0, cells - 1)
+    left = np.minimum(np.floor(position), max(cells - 2, 0)).astype(np.int32)
+    return left, (position - left).astype(np.float32)
+
+
+def observation_size(observation: FeatureGrid | RegionMap) -> tuple[int, int]:
+    """Rows and columns of the label map or the grid."""
+    shape = observation.labels.shape[1:] if isinstance(observation, RegionMap) else observation.grid.shape[:2]
+    return int(shape[0]), int(shape[1])
+
+
+@njit(nogil=True, cache=True)
+def new_taps(levels):
+    """Room for one tile's taps."""
+    return TileTaps(
+        np.zeros(HALVES + 1, np.int32),
+        np.zeros(MAX_TAPS, np.int32),
+        np.zeros(MAX_TAPS, np.uint8),
+        np.zeros(MAX_TAPS * LANES, np.float32),
+        np.zeros((MAX_SLOTS, levels), np.int32),
+        np.zeros(MAX_SLOTS * levels, np.int32),
+        np.zeros(2, np.int32),
+    )
+
+
+@njit(nogil=True, cache=True)
+def read_tile(taps, reading, frame, tile):
+    """Fill ``taps`` with what the tile's pixels read."""
+    x0 = (tile % frame.columns) * TILE
+    y0 = (tile // frame.columns) * TILE
+    taps.sizes[:] = 0
+    if reading.is_grid:
+        _read_grid(taps, reading, frame, x0, y0)
+    else:
+        _read_regions(taps, reading, frame, x0, y0)
+
+
+@njit(nogil=True, cache=True)
+def _local_column(taps, column):
+    """The tile's local number of a codebook row, new or known."""
+    known = taps.sizes[1]
+    for k in range(known - 1, -1, -1):
+        if taps.columns[k] == column:
+            return k
+    taps.columns[known] = column
+    taps.sizes[1] = known + 1
+    return known
+
+
+@njit(nogil=True, cache=True)
+def _slot_of_labels(taps, reading, tuples, y, x):
+    """The slot of the label tuple at label pixel (y, x); NO_SLOT when no level labels it."""
+    levels = reading.levels
+    labelled = False
+    for level in range(levels):
+        labelled |= reading.labels[level, y, x] >= 0
+    if not labelled:
+        return NO_SLOT
+    known = taps.sizes[0]
+    for slot in range(known - 1, -1, -1):
+        same = True
+        for level in range(levels):
+            same &= tuples[slot, level] == reading.labels[level, y, x]
+        if same:
+            return slot
+    for level in range(levels):
+        label = reading.labels[level, y, x]
+        tuples[known, level] = label
+        taps.slot_columns[known, level] = _local_column(taps, label) if label >= 0 else NO_SLOT
+    taps.sizes[0] = known + 1
+    return known
+
+
+@njit(nogil=True, cache=True)
+def _read_regions(taps, reading, frame, x0, y0):
+    tuples = np.empty((TILE * TILE, reading.levels), np.int32)
+    slots = np.empty(LANES, np.int32)
+    count = 0
+    for half in range(HALVES):
+        taps.starts[half] = count
+        y = y0 + half // 2
+        left = x0 + (half % 2) * LANES
+        if y >= frame.height or left >= frame.width:
+            continue
+        last_x = last_y = -1
+        for lane in range(LANES):
+            # Pixels outside the image carry no light; they may read what their neighbour reads.
+            label_x = reading.label_x[min(left + lane, frame.width - 1)]
+            label_y = reading.label_y[y]
+            if lane > 0 and label_x == last_x and label_y == last_y:
+                slots[lane] = slots[lane - 1]
+            else:
+                slots[lane] = _slot_of_labels(taps, reading, tuples, label_y, label_x)
+            last_x, last_y = label_x, label_y
+        first_tap = count
+        for lane in range(LANES):
+            if slots[lane] == NO_SLOT:
+                continue
+            tap = first_tap
+            while tap < count and taps.slots[tap] != slots[lane]:
+                tap += 1
+            if tap == count:
+                taps.slots[tap] = slots[lane]
+                taps.factors[tap * LANES : tap * LANES + LANES] = 0
+                count += 1
+            taps.factors[tap * LANES + lane] = 1
+        whole = count == first_tap + 1 and taps.factors[first_tap * LANES : count * LANES].min() > 0
+        taps.whole[first_tap:count] = whole
+    taps.starts[HALVES] = count
+
+
+@njit(nogil=True, cache=True)
+def _read_grid(taps, reading, frame, x0, y0):
+    known = np.empty(MAX_SLOTS, np.int32)  # the grid cell of each slot
+    count = 0
+    for half in range(HALVES):
+        taps.starts[half] = count
+        y = y0 + half // 2
+        left = x0 + (half % 2) * LANES
+        if y >= frame.height or left >= frame.width:
+            continue
+        first_tap = count
+        for lane in range(LANES):
+            x = min(left + lane, frame.width - 1)
+            for corner in range(4):
+                right, below = corner % 2, corner // 2
+                share_x = reading.share_x[x] if right else 1 - reading.share_x[x]
+                share_y = reading.share_y[y] if below else 1 - reading.share_y[y]
+                if share_x == 0 or share_y == 0:
+                    continue
+                cell = (reading.cell_y[y] + below) * reading.grid_width + reading.cell_x[x] + right
+                slot = _slot_of_cell(taps, known, cell)
+                tap = first_tap
+                while tap < count and taps.slots[tap] != slot:
+                    tap += 1
+                if tap == count:
+                    taps.slots[tap] = slot
+                    taps.whole[tap] = 0
+                    taps.factors[tap * LANES : tap * LANES + LANES] = 0
+                    count += 1
+                taps.factors[tap * LANES + lane] += share_x * share_y
+    taps.starts[HALVES] = count
+
+
+@njit(nogil=True, cache=True)
+def _slot_of_cell(taps, known, cell):
+    slots = taps.sizes[0]
+    for slot in range(slots - 1, -1, -1):
+        if known[slot] == cell:
+            return slot
+    known[slots] = cell
+    taps.columns[slots] = cell
+    taps.slot_columns[slots, 0] = slots
+    taps.sizes[0] = slots + 1
+    taps.sizes[1] = slots + 1
+    return slots

@@ -1,0 +1,149 @@
+"""``A X`` and what else is read off the rays: images, row sums, the largest weights, whole rows of A."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from liftcore.raster.constants import ALPHA_FLOOR, TILE
+from liftcore.raster.lanes import LANES, add_scaled_lanes
+from liftcore.raster.projection import KX, KY, MX, MY, OPACITY, SLOPE
+from liftcore.raster.walk import (
+    CHECK_EVERY,
+    blend,
+    look,
+    new_rays,
+    row_centre,
+    row_range,
+    start_rays,
+    touches,
+)
+
+PIXELS = TILE * TILE
+
+
+@njit(nogil=True, cache=True)
+def render_tiles(first, last, frame, values, image):
+    """Composite ``values`` [P, C] f32 over tiles ``first..last`` into ``image`` [H, W, C] f32."""
+    channels = values.shape[1]
+    rays = new_rays()
+    sums = np.zeros(channels * PIXELS, np.float32)
+    limits = (np.float32(frame.cap), np.float32(frame.stop))
+    for tile in range(first, last):
+        if frame.starts[tile] == frame.starts[tile + 1]:
+            continue
+        x0 = (tile % frame.columns) * TILE
+        y0 = (tile // frame.columns) * TILE
+        start_rays(rays, frame, tile)
+        for step in range(frame.starts[tile], frame.starts[tile + 1]):
+            if (step - frame.starts[tile]) % CHECK_EVERY == 0 and not look(rays):
+                break
+            place = frame.items[step]
+            record = frame.records[place]
+            splat = frame.ids[place]
+            top, bottom = row_range(record, float(y0))
+            for row in range(top, bottom + 1):
+                centre, base = row_centre(record, row, float(x0), float(y0))
+                for side in range(2):
+                    half = 2 * row + side
+                    if not rays.alive[half] or not touches(record, centre, base, side):
+                        continue
+                    blend(rays, record, centre, base, half, limits)
+                    offset = half * LANES
+                    for channel in range(channels):
+                        target = channel * PIXELS + offset
+                        add_scaled_lanes(sums, target, rays.weights, offset, values[splat, channel])
+        for y in range(min(TILE, frame.height - y0)):
+            for x in range(min(TILE, frame.width - x0)):
+                for channel in range(channels):
+                    image[y0 + y, x0 + x, channel] = sums[channel * PIXELS + y * TILE + x]
+        sums[:] = 0
+
+
+@njit(nogil=True, cache=True)
+def top_tiles(first, last, frame, ids, weights):
+    """The largest weights of every ray of tiles ``first..last``, descending.
+
+    Args:
+        ids: [H, W, K] i32, filled with -1 before. weights: [H, W, K] f32, filled with 0 before.
+    """
+    count = ids.shape[2]
+    rays = new_rays()
+    limits = (np.float32(frame.cap), np.float32(frame.stop))
+    for tile in range(first, last):
+        x0 = (tile % frame.columns) * TILE
+        y0 = (tile // frame.columns) * TILE
+        start_rays(rays, frame, tile)
+        for step in range(frame.starts[tile], frame.starts[tile + 1]):
+            if (step - frame.starts[tile]) % CHECK_EVERY == 0 and not look(rays):
+                break
+            place = frame.items[step]
+            record = frame.records[place]
+            splat = frame.ids[place]
+            top, bottom = row_range(record, float(y0))
+            for row in range(top, bottom + 1):
+                centre, base = row_centre(record, row, float(x0), float(y0))
+                for side in range(2):
+                    half = 2 * row + side
+                    if not rays.alive[half] or not touches(record, centre, base, side):
+                        continue
+                    blend(rays, record, centre, base, half, limits)
+                    for lane in range(LANES):
+                        weight = rays.weights[half * LANES + lane]
+                        if weight <= 0:
+                            continue
+                        y, x = y0 + row, x0 + side * LANES + lane
+                        k = count
+                        while k > 0 and weights[y, x, k - 1] < weight:
+                            if k < count:
+                                weights[y, x, k] = weights[y, x, k - 1]
+                                ids[y, x, k] = ids[y, x, k - 1]
+                            k -= 1
+                        if k < count:
+                            weights[y, x, k] = weight
+                            ids[y, x, k] = splat
+
+
+@njit(nogil=True, cache=True)
+def trace_rays(frame, pixels):
+    """Rows of A for single pixels, one ray at a time, in float64.
+
+    Args:
+        pixels: [n, 2] i32, x and y.
+
+    Returns:
+        row_starts [n + 1] i64, splats [nnz] i32 near to far, weights [nnz] f32.
+    """
+    row_starts = np.zeros(pixels.shape[0] + 1, np.int64)
+    splats = np.empty(1 << 12, np.int32)
+    weights = np.empty(1 << 12, np.float32)
+    count = 0
+    for i in range(pixels.shape[0]):
+        x, y = pixels[i, 0], pixels[i, 1]
+        tile = (y // TILE) * frame.columns + x // TILE
+        light = 1.0
+        for step in range(frame.starts[tile], frame.starts[tile + 1]):
+            place = frame.items[step]
+            record = frame.records[place]
+            dy = y + 0.5 - record[MY]
+            dx = x + 0.5 - record[MX] - record[SLOPE] * dy
+            exponent = record[KX] * dx * dx + record[KY] * dy * dy
+            alpha = min(frame.cap, record[OPACITY] * math.pow(2.0, -exponent))
+            if alpha < ALPHA_FLOOR:
+                continue
+            after = light * (1 - alpha)
+            if after <= frame.stop:
+                break
+            if count == splats.shape[0]:
+                splats = np.concatenate((splats, np.empty_like(splats)))
+                weights = np.concatenate((weights, np.empty_like(weights)))
+            splats[count] = frame.ids[place]
+            weights[count] = alpha * light
+            light = after
+            count += 1
+        row_starts[i + 1] = count
+    return row_starts, splats[:count], weights[:count]
+
+

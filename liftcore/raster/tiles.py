@@ -1,0 +1,88 @@
+"""Which splats touch which tile: a counting sort of the depth order into 16 x 16 pixel tiles.
+
+The depth order is cut into a fixed number of shares; each share counts, a prefix sum gives every (tile, share)
+its place, and each share writes there. No two threads write the same place and the order inside a tile is the
+depth order, so the result does not depend on the number of threads.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from liftcore.raster.constants import TILE
+from liftcore.raster.projection import EXTENT_X, EXTENT_Y, KX, KY, LEAN, MX, MY, REACH, SLOPE
+
+
+@njit(nogil=True, cache=True, inline="always")
+def _tile_rows(record, rows):
+    """First and last tile row whose pixel centres the footprint can reach."""
+    top = math.floor((math.ceil(record[MY] - record[EXTENT_Y] - 0.5)) / TILE)
+    bottom = math.floor((math.floor(record[MY] + record[EXTENT_Y] - 0.5)) / TILE)
+    return max(0.0, top), min(rows - 1.0, bottom)
+
+
+@njit(nogil=True, cache=True, inline="always")
+def _edge(record, dy, side):
+    """x of the footprint's left (-1) or right (+1) edge at dy, relative to its centre."""
+    room = max(0.0, record[REACH] - record[KY] * dy * dy)
+    return record[SLOPE] * dy + side * math.sqrt(room / record[KX])
+
+
+@njit(nogil=True, cache=True, inline="always")
+def _tile_columns(record, tile_row, columns):
+    """First and last tile column that the footprint touches between a tile row's first and last pixel centres."""
+    low = max(tile_row * TILE + 0.5 - record[MY], -record[EXTENT_Y])
+    high = min(tile_row * TILE + TILE - 0.5 - record[MY], record[EXTENT_Y])
+    if low > high:
+        return 0.0, -1.0
+    lean = record[LEAN]
+    right = record[EXTENT_X] if low <= lean <= high else _edge(record, low if lean < low else high, 1.0)
+    left = -record[EXTENT_X] if low <= -lean <= high else _edge(record, low if -lean < low else high, -1.0)
+    first = math.floor(math.ceil(record[MX] + left - 0.5) / TILE)
+    last = math.floor(math.floor(record[MX] + right - 0.5) / TILE)
+    return max(0.0, first), min(columns - 1.0, last)
+
+
+@njit(nogil=True, cache=True)
+def count_tiles(order, records, rows, columns, counts):
+    """Add to ``counts`` [rows * columns] i64 how many of ``order``'s footprints touch each tile."""
+    for place in order:
+        record = records[place]
+        top, bottom = _tile_rows(record, rows)
+        for tile_row in range(int(top), int(bottom) + 1):
+            first, last = _tile_columns(record, tile_row, columns)
+            for column in range(int(first), int(last) + 1):
+                counts[tile_row * columns + column] += 1
+
+
+@njit(nogil=True, cache=True)
+def fill_tiles(order, records, rows, columns, cursors, items):
+    """Write ``order``'s places into ``items`` [n] i32 from each tile's cursor on."""
+    for place in order:
+        record = records[place]
+        top, bottom = _tile_rows(record, rows)
+        for tile_row in range(int(top), int(bottom) + 1):
+            first, last = _tile_columns(record, tile_row, columns)
+            for column in range(int(first), int(last) + 1):
+                tile = tile_row * columns + column
+                items[cursors[tile]] = place
+                cursors[tile] += 1
+
+
+def tile_places(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where every share writes.
+
+    Args:
+        counts: [shares, tiles] i64.
+
+    Returns:
+        starts [tiles + 1] i64 of each tile's list, cursors [shares, tiles] i64 of each share inside it.
+    """
+    by_tile = counts.T  # a tile's list holds the shares in depth order
+    ends = np.cumsum(by_tile.ravel()).reshape(by_tile.shape)
+    cursors = np.ascontiguousarray((ends - by_tile).T)
+    starts = np.concatenate([[0], ends[:, -1]]).astype(np.int64)
+    return starts, cursors
