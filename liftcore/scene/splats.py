@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
+SH_ROWS = (1, 4, 9, 16, 25)  # (degree + 1)^2
+
+
 class Kernel(StrEnum):
     """The footprint that a splat leaves on a ray."""
 
@@ -28,8 +31,8 @@ class Kernel(StrEnum):
 class Splats:
     """P trained splats. Scales are logs and opacities logits, as in the files; the raster activates them.
 
-    ``layout`` and ``extras`` keep what the file had beyond the model (normals, SAGA's ``mask``), so that
-    writing gives back what was read.
+    ``layout``, ``extras`` and ``header`` keep what the file had beyond the model (normals, SAGA's ``mask``,
+    comments), so that writing gives back what was read.
     """
 
     means: Tensor  # [P, 3] f32, world frame, scene units
@@ -42,6 +45,7 @@ class Splats:
     sb_params: Tensor | None = None  # [P, S, 6] f32, DBS only: spherical beta lobes (r g b theta phi beta)
     extras: Mapping[str, Tensor] = field(default_factory=dict)  # name -> [P], columns we do not model
     layout: tuple[str, ...] = ()  # the file's property names in order; () = the kernel's usual layout
+    header: tuple[str, ...] = ()  # the file's header lines verbatim; () = made from the layout
 
     def __post_init__(self) -> None:
         count = self.means.shape[0]
@@ -54,15 +58,22 @@ class Splats:
             "log_scales": (self.log_scales, (count, scales)),
             "opacity_logits": (self.opacity_logits, (count,)),
             "beta": (self.beta, (count,)),
-            "sh": (self.sh, (count, self.sh.shape[1], 3) if self.sh is not None and self.sh.ndim == 3 else ()),
+            "sh": (
+                self.sh,
+                (count, self.sh.shape[1], 3) if self.sh is not None and self.sh.ndim == 3 else (),
+            ),
             "sb_params": (
                 self.sb_params,
-                (count, self.sb_params.shape[1], 6) if self.sb_params is not None and self.sb_params.ndim == 3 else (),
+                (count, self.sb_params.shape[1], 6)
+                if self.sb_params is not None and self.sb_params.ndim == 3
+                else (),
             ),
         }
         for name, (tensor, shape) in shapes.items():
             if tensor is not None:
                 _check_column(name, tensor, shape)
+        if self.sh is not None and self.sh.shape[1] not in SH_ROWS:
+            raise InvalidSplats("sh", expected=f"{SH_ROWS} rows (degree 0..4)", got=str(self.sh.shape[1]))
         if (self.kernel is Kernel.BETA) != (self.beta is not None):
             raise InvalidSplats(
                 "beta",

@@ -1,0 +1,17 @@
+"""What all tests share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+SHARED_DATA = Path(__file__).parents[2] / "shared" / "data"
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """The folder of real scenes beside the repository; tests that need it say so when it is not there."""
+    if not SHARED_DATA.is_dir():
+        pytest.skip(f"shared data not found: {SHARED_DATA}")
+    return SHARED_DATA

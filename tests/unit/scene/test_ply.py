@@ -1,0 +1,283 @@
+"""Splat files: every dialect is read, written back to the byte, or refused in one line."""
+
+from __future__ import annotations
+
+import tracemalloc
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+import torch
+
+from liftcore.errors import InvalidSplats
+from liftcore.scene.ply import read_splats, write_splats
+from liftcore.scene.splats import Kernel, Splats
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+ROTATION = [f"rot_{i}" for i in range(4)]
+SCALES = [f"scale_{i}" for i in range(3)]
+INRIA = [*"xyz", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", *SCALES, *ROTATION]
+LOBES = [f"sb_params_{i}" for i in range(12)]
+DIALECTS = {
+    "inria degree 0": INRIA,
+    "inria degree 3": [*INRIA[:9], *(f"f_rest_{i}" for i in range(45)), *INRIA[9:]],
+    "gsplat": [*"xyz", *INRIA[6:]],
+    "saga": [*"xyz", "mask", *INRIA[3:]],
+    "2dgs": [name for name in INRIA if name != "scale_2"],
+    "dbs": [*INRIA[:6], "sh0_0", "sh0_1", "sh0_2", *LOBES, "opacity", "beta", *SCALES, *ROTATION],
+    "no colour": [*"xyz", "opacity", *SCALES, *ROTATION],
+}
+KERNELS = {"2dgs": Kernel.GAUSSIAN_2D, "dbs": Kernel.BETA}
+
+
+def ply_bytes(names: list[str], count: int = 5, types: dict[str, str] | None = None, head: str = "") -> bytes:
+    """Seeded numbers; ``types`` gives columns other types than float, ``head`` more header lines."""
+    types = types or {}
+    codes = {"float": "f4", "double": "f8", "uchar": "u1", "ushort": "u2", "int": "i4"}
+    dtype = np.dtype([(name, "<" + codes[types.get(name, "float")]) for name in names])
+    rows = np.zeros(count, dtype)
+    generator = np.random.default_rng(0)
+    for name in names:
+        rows[name] = (
+            generator.normal(size=count) if types.get(name, "float")[-1] in "te" else np.arange(count)
+        )
+    lines = [f"property {types.get(name, 'float')} {name}" for name in names]
+    header = "\n".join(["ply", "format binary_little_endian 1.0", f"{head}element vertex {count}", *lines])
+    return header.encode() + b"\nend_header\n" + rows.tobytes()
+
+
+def with_ply(tmp_path: Path, content: bytes) -> Path:
+    path = tmp_path / "splats.ply"
+    path.write_bytes(content)
+    return path
+
+
+@pytest.mark.parametrize("dialect", DIALECTS)
+def test_every_dialect_is_written_back_to_the_byte(dialect: str, tmp_path: Path) -> None:
+    path = with_ply(tmp_path, ply_bytes(DIALECTS[dialect]))
+    splats = read_splats(path)
+    assert splats.kernel is KERNELS.get(dialect, Kernel.GAUSSIAN_3D)
+    write_splats(splats, tmp_path / "again.ply")
+    assert (tmp_path / "again.ply").read_bytes() == path.read_bytes()
+
+
+def test_foreign_columns_and_comments_survive_in_their_own_type(tmp_path: Path) -> None:
+    names = [*INRIA, "mask", "object", "time", "part"]
+    types = {"mask": "uchar", "object": "int", "time": "double", "part": "ushort"}
+    path = with_ply(tmp_path, ply_bytes(names, types=types, head="comment trained somewhere\nobj_info a b\n"))
+    splats = read_splats(path)
+    kinds = [splats.extras[name].dtype for name in types]
+    assert kinds == [torch.uint8, torch.int32, torch.float64, torch.uint16]
+    write_splats(splats, tmp_path / "again.ply")
+    assert (tmp_path / "again.ply").read_bytes() == path.read_bytes()
+
+
+def test_carriage_returns_in_a_header_survive(tmp_path: Path) -> None:
+    head, rows = ply_bytes(INRIA).split(b"end_header\n", maxsplit=1)
+    content = (head + b"end_header\n").replace(b"\n", b"\r\n") + rows
+    write_splats(read_splats(with_ply(tmp_path, content)), tmp_path / "again.ply")
+    assert (tmp_path / "again.ply").read_bytes() == content
+
+
+def test_columns_reach_their_places_in_the_model(tmp_path: Path) -> None:
+    content = ply_bytes(DIALECTS["inria degree 3"])
+    splats = read_splats(with_ply(tmp_path, content))
+    names = DIALECTS["inria degree 3"]
+    table = np.frombuffer(content[-5 * 4 * len(names) :], "<f4").reshape(5, len(names))
+    column = {name: torch.from_numpy(table[:, i].copy()) for i, name in enumerate(names)}
+    assert splats.sh is not None
+    assert splats.sh_degree == 3
+    assert torch.equal(splats.means[:, 1], column["y"])
+    assert torch.equal(splats.quats[:, 0], column["rot_0"])
+    assert torch.equal(splats.sh[:, 0, 2], column["f_dc_2"])
+    assert torch.equal(splats.sh[:, 1, 0], column["f_rest_0"])  # channel-major: red first
+    assert torch.equal(splats.sh[:, 1, 1], column["f_rest_15"])
+    assert torch.equal(splats.sh[:, 15, 2], column["f_rest_44"])
+
+
+def test_beta_lobes_are_stored_channel_major(tmp_path: Path) -> None:
+    content = ply_bytes(DIALECTS["dbs"])
+    splats = read_splats(with_ply(tmp_path, content))
+    assert splats.sb_params is not None
+    assert splats.beta is not None
+    assert splats.sb_params.shape == (5, 2, 6)
+    names = DIALECTS["dbs"]
+    table = np.frombuffer(content[-5 * 4 * len(names) :], "<f4").reshape(5, len(names))
+    for i in range(12):
+        lobe, channel = i % 2, i // 2
+        expected = table[:, names.index(f"sb_params_{i}")]
+        assert np.array_equal(splats.sb_params[:, lobe, channel].numpy(), expected)
+
+
+def test_double_columns_are_cast(tmp_path: Path) -> None:
+    types = dict.fromkeys(INRIA, "double")
+    splats = read_splats(with_ply(tmp_path, ply_bytes(INRIA, types=types)))
+    assert splats.means.dtype == torch.float32
+    write_splats(splats, tmp_path / "again.ply")
+    again = read_splats(tmp_path / "again.ply")
+    assert torch.equal(again.means, splats.means)
+
+
+def test_double_beyond_float32_is_refused(tmp_path: Path) -> None:
+    types = {"x": "double"}
+    content = bytearray(ply_bytes(INRIA, types=types))
+    row = 8 + 4 * (len(INRIA) - 1)
+    content[-row : -row + 8] = np.float64(1e300).tobytes()
+    with pytest.raises(InvalidSplats, match=r"means: expected finite values.*first in splat 4"):
+        read_splats(with_ply(tmp_path, bytes(content)))
+
+
+def test_forced_kernel_overrules_the_properties(tmp_path: Path) -> None:
+    path = with_ply(tmp_path, ply_bytes(DIALECTS["dbs"]))
+    splats = read_splats(path, Kernel.GAUSSIAN_3D)
+    assert splats.kernel is Kernel.GAUSSIAN_3D
+    assert splats.beta is None
+    assert "beta" in splats.extras
+    flat = read_splats(with_ply(tmp_path, ply_bytes(INRIA)), Kernel.GAUSSIAN_2D)
+    assert flat.log_scales.shape == (5, 2)
+    with pytest.raises(InvalidSplats, match=r"'scale_2' of a 3dgs splat.*nearest dialect is 2DGS"):
+        read_splats(with_ply(tmp_path, ply_bytes(DIALECTS["2dgs"])), Kernel.GAUSSIAN_3D)
+
+
+def test_subset_keeps_its_header_with_the_new_count(tmp_path: Path) -> None:
+    splats = read_splats(with_ply(tmp_path, ply_bytes(INRIA, head="comment kept\n")))
+    extras = {name: column[:2] for name, column in splats.extras.items()}
+    assert splats.sh is not None
+    few = replace(
+        splats,
+        means=splats.means[:2],
+        quats=splats.quats[:2],
+        log_scales=splats.log_scales[:2],
+        opacity_logits=splats.opacity_logits[:2],
+        sh=splats.sh[:2],
+        extras=extras,
+    )
+    write_splats(few, tmp_path / "few.ply")
+    again = read_splats(tmp_path / "few.ply")
+    assert again.count == 2
+    assert "comment kept" in again.header
+    assert torch.equal(again.means, splats.means[:2])
+
+
+def test_splats_made_in_code_are_written_in_the_usual_layout(tmp_path: Path) -> None:
+    splats = Splats(
+        means=torch.zeros(3, 3),
+        quats=torch.ones(3, 4),
+        log_scales=torch.zeros(3, 3),
+        opacity_logits=torch.zeros(3),
+        sh=torch.ones(3, 4, 3),
+        extras={"object": torch.arange(3, dtype=torch.int16)},
+    )
+    write_splats(splats, tmp_path / "made.ply")
+    again = read_splats(tmp_path / "made.ply")
+    assert again.layout[:6] == ("x", "y", "z", "nx", "ny", "nz")
+    assert again.sh is not None
+    assert torch.equal(again.sh, torch.ones(3, 4, 3))
+    assert torch.equal(again.extras["object"], splats.extras["object"])
+
+
+def test_failed_write_leaves_nothing_behind(tmp_path: Path) -> None:
+    splats = read_splats(with_ply(tmp_path, ply_bytes(INRIA)))
+    broken = replace(splats, layout=(*splats.layout, "ghost"))
+    with pytest.raises(InvalidSplats, match="'ghost'"):
+        write_splats(broken, tmp_path / "out.ply")
+    assert [path.name for path in tmp_path.iterdir()] == ["splats.ply"]
+
+
+HEADER = "ply\nformat binary_little_endian 1.0\n"
+MALFORMED = {
+    "empty file": (b"", "an empty file"),
+    "not a PLY": (b"PK\x03\x04zip", "expected a PLY file"),
+    "header bomb": (b"ply\n" + b"comment bomb\n" * 9000, "'end_header' within the first 65536 bytes"),
+    "too many lines": (HEADER.encode() + b"comment\n" * 2000 + b"end_header\n", "at most 1024 header lines"),
+    "ascii": (b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n", "format ascii 1.0"),
+    "big-endian": (b"ply\nformat binary_big_endian 1.0\nend_header\n", "binary little-endian"),
+    "list property": (
+        f"{HEADER}element vertex 1\nproperty list uchar int a\nend_header\n".encode(),
+        "scalar properties",
+    ),
+    "unknown type": (
+        f"{HEADER}element vertex 1\nproperty half a\nend_header\n".encode(),
+        "scalar properties",
+    ),
+    "negative count": (f"{HEADER}element vertex -5\nproperty float x\nend_header\n".encode(), "got '-5'"),
+    "huge count": (
+        f"{HEADER}element vertex 999999999999999\nproperty float x\nend_header\n".encode(),
+        "the file is truncated",
+    ),
+    "count bomb": (f"{HEADER}element vertex {'9' * 5000}\nend_header\n".encode(), "a count of splats"),
+    "other element first": (f"{HEADER}element chunk 1\nproperty float x\nend_header\n".encode(), "'vertex'"),
+    "second element": (
+        f"{HEADER}element vertex 1\nproperty float x\nelement face 1\nend_header\n".encode(),
+        "'vertex' as the only element",
+    ),
+    "same property twice": (
+        f"{HEADER}element vertex 1\nproperty float x\nproperty float x\nend_header\n".encode(),
+        "'x' twice",
+    ),
+    "no element": (f"{HEADER}end_header\n".encode(), "a header without one"),
+    "no format": (b"ply\nelement vertex 1\nproperty float x\nend_header\n", "format before"),
+    "foreign characters": (HEADER.encode() + b"comment \xff\nend_header\n", "an ASCII header"),
+    "truncated": (ply_bytes(INRIA)[:-1], "truncated"),
+    "trailing bytes": (ply_bytes(INRIA) + b"x", "does not describe"),
+    "empty scene": (ply_bytes(INRIA, count=0), "an empty scene"),
+    "missing opacity": (ply_bytes([n for n in INRIA if n != "opacity"]), r"'opacity'.*dialect is Inria 3DGS"),
+    "point cloud": (ply_bytes([*"xyz", "red", "green", "blue"]), "a point cloud, which has no splats"),
+    "odd number of f_rest": (ply_bytes([*INRIA, "f_rest_0"]), r"0, 9, 24, 45, 72 properties f_rest"),
+    "gap in f_rest": (ply_bytes([*INRIA, "f_rest_1"]), r"'f_rest_0'.*'f_rest_1' without it"),
+    "odd number of lobes": (ply_bytes([*DIALECTS["dbs"], "sb_params_12"]), "multiple of 6"),
+    "quantised opacity": (
+        ply_bytes(INRIA, types={"opacity": "uchar"}),
+        r"'opacity': expected float or double",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", MALFORMED)
+def test_malformed_file_is_refused_in_one_clear_line(case: str, tmp_path: Path) -> None:
+    content, message = MALFORMED[case]
+    with pytest.raises(InvalidSplats, match=message) as caught:
+        read_splats(with_ply(tmp_path, content))
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 600
+
+
+def test_missing_file_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InvalidSplats, match="No such file"):
+        read_splats(tmp_path / "nowhere.ply")
+    with pytest.raises(InvalidSplats, match="directory"):
+        read_splats(tmp_path)
+
+
+def test_nan_is_refused_with_its_splat(tmp_path: Path) -> None:
+    content = bytearray(ply_bytes(INRIA))
+    content[-4:] = np.float32(np.nan).tobytes()
+    with pytest.raises(InvalidSplats, match=r"quats: expected finite values.*splat 4"):
+        read_splats(with_ply(tmp_path, bytes(content)))
+
+
+def test_memory_stays_near_the_size_of_the_file(tmp_path: Path) -> None:
+    content = ply_bytes(DIALECTS["inria degree 3"], count=100_000)
+    path = with_ply(tmp_path, content)
+    tracemalloc.start()
+    try:
+        splats = read_splats(path)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert splats.count == 100_000
+    assert peak < 1.15 * len(content)
+
+
+@pytest.mark.parametrize("scene", ["plush", "tabletop"])
+def test_real_scene_is_written_back_to_the_byte(scene: str, shared_data: Path, tmp_path: Path) -> None:
+    path = shared_data / scene / "point_cloud.ply"
+    splats = read_splats(path)
+    assert splats.kernel is Kernel.GAUSSIAN_3D
+    assert splats.count == {"plush": 179_788, "tabletop": 166_000}[scene]
+    assert splats.sh_degree == {"plush": 1, "tabletop": 0}[scene]
+    write_splats(splats, tmp_path / "again.ply")
+    assert (tmp_path / "again.ply").read_bytes() == path.read_bytes()
