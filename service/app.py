@@ -1,0 +1,59 @@
+"""Wiring: the parts, the routes, the one error table. There is no global application."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+import anyio
+from fastapi import FastAPI
+
+from liftcore import __version__
+from service import problems
+from service.jobs.supervisor import Supervisor
+from service.limits import BodyLimit
+from service.parts import Parts
+from service.queries.warm import QueryLimits, WarmWorker
+from service.routes import assets, jobs, lifts, operations, queries
+from service.settings import ServiceSettings
+from service.store.store import Store
+
+
+def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, worker: WarmWorker) -> FastAPI:
+    """The application. It starts and stops the runner and the worker; the store is its caller's to close."""
+
+    @asynccontextmanager
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        checks = anyio.CapacityLimiter(settings.parallel_checks)
+        app.state.parts = Parts(settings, store, runner, worker, checks)
+        await anyio.to_thread.run_sync(worker.start)
+        await anyio.to_thread.run_sync(runner.start)
+        try:
+            yield
+        finally:
+            await anyio.to_thread.run_sync(runner.stop)
+            await anyio.to_thread.run_sync(worker.stop)
+
+    app = FastAPI(
+        title="splatlift",
+        version=__version__,
+        description="Lift 2D features onto trained splat scenes and query them in words.",
+        lifespan=lifespan,
+        responses=problems.RESPONSES,
+    )
+    app.add_middleware(BodyLimit, limit=settings.max_body_bytes)
+    problems.install(app)
+    for module in (operations, assets, jobs, lifts, queries):
+        app.include_router(module.router)
+    return app
+
+
+def assemble(settings: ServiceSettings, store: Store) -> FastAPI:
+    """The application with the usual runner and query worker."""
+    limits = QueryLimits(
+        waiting=settings.query_waiting,
+        seconds=settings.query_seconds,
+        scenes=settings.query_scenes,
+        answers=settings.query_answers,
+    )
+    return create_app(settings, store, Supervisor(store, threads=settings.lift_threads), WarmWorker(limits))

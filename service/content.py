@@ -1,0 +1,80 @@
+"""Answers with an entity tag: files with ranges, and pictures."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from fastapi import Request
+from fastapi.responses import FileResponse, Response
+from starlette.types import Receive, Scope, Send
+
+from service.errors import RangeNotSatisfiable
+
+ONE_RANGE = re.compile(r"bytes=\s*(?:(\d+)-(\d*)|-(\d+))\s*", re.ASCII)
+MAX_DIGITS = 18  # longer numbers are beyond every file
+
+
+def unchanged(request: Request, etag: str) -> Response | None:
+    """304 when the client has this entity already, else None."""
+    header = request.headers.get("if-none-match")
+    if header is None:
+        return None
+    tags = {tag.strip().removeprefix("W/") for tag in header.split(",")}
+    return Response(status_code=304, headers={"ETag": etag}) if etag in tags or "*" in tags else None
+
+
+def tagged(content: bytes, media_type: str, etag: str) -> Response:
+    """Content that a client may keep and must ask about."""
+    return Response(
+        content, media_type=media_type, headers={"ETag": etag, "Cache-Control": "private, no-cache"}
+    )
+
+
+def file_answer(request: Request, path: Path, *, sha256: str, filename: str) -> Response:
+    """A file whose bytes never change: 200, 206 for one range, 304 when the client has it.
+
+    Raises:
+        RangeNotSatisfiable: the range begins beyond the end.
+    """
+    etag = f'"{sha256}"'
+    same = unchanged(request, etag)
+    if same is not None:
+        return same
+    keep_range = _keeps_range(request, path.stat().st_size, etag)
+    return _StoredFile(path, etag=etag, filename=filename, keep_range=keep_range)
+
+
+def _keeps_range(request: Request, size: int, etag: str) -> bool:
+    """Whether the Range header counts: one range, well-formed, of the entity that the client thinks of."""
+    header = request.headers.get("range", "")
+    match = ONE_RANGE.fullmatch(header)
+    if match is None or request.headers.get("if-range", etag) != etag:
+        return False  # RFC 9110: what is not understood, or is of another version, is ignored
+    first, last, suffix = match.groups()
+    if first and last and _number(first) > _number(last):
+        return False
+    if (first and _number(first) >= size) or (suffix and _number(suffix) == 0):
+        raise RangeNotSatisfiable(
+            "Range", expected=f"a range within {size} bytes", got=header[:80], size=size
+        )
+    return not any(len(digits or "") > MAX_DIGITS for digits in match.groups())
+
+
+def _number(digits: str) -> int:
+    return int(digits) if len(digits) <= MAX_DIGITS else 10**MAX_DIGITS
+
+
+class _StoredFile(FileResponse):
+    """Starlette's file response with our entity tag, blind to Range headers that do not count."""
+
+    def __init__(self, path: Path, *, etag: str, filename: str, keep_range: bool) -> None:
+        headers = {"ETag": etag, "Cache-Control": "private, no-cache"}
+        super().__init__(path, headers=headers, filename=filename, media_type="application/octet-stream")
+        self._keep_range = keep_range
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if not self._keep_range:
+            headers = [pair for pair in scope["headers"] if pair[0] not in (b"range", b"if-range")]
+            scope = {**scope, "headers": headers}
+        await super().__call__(scope, receive, send)

@@ -1,0 +1,96 @@
+"""What can go wrong around the numerical core: errors of the HTTP service, in the project's one error tree.
+
+SplatliftError
+└── ServiceError
+    ├── InvalidRequest       a parameter or a body that no route understands   422
+    ├── DigestMismatch       the body is not what ?sha256= promised            422
+    ├── InvalidEncoding      a gzip body that does not decompress              422
+    ├── UnsupportedEncoding  a Content-Encoding that is not gzip               415
+    ├── TooLarge             more bytes than the operator allows               413
+    ├── RangeNotSatisfiable  a Range beyond the end of the content             416
+    ├── InUse                an asset that a job or a lift needs               409
+    ├── Busy                 too many queries are waiting                      503 + Retry-After
+    ├── TimedOut             a query that took longer than the operator allows 504
+    ├── Crashed              a process of ours died without an answer          500
+    └── Misconfigured        the operator's settings or data directory         (start-up only)
+"""
+
+from __future__ import annotations
+
+from liftcore.errors import SplatliftError
+
+
+class ServiceError(SplatliftError):
+    """An error of the service around the core."""
+
+    kind = "service"
+
+
+class InvalidRequest(ServiceError):
+    """A parameter or a body that the route does not understand."""
+
+    kind = "invalid-request"
+
+
+class DigestMismatch(ServiceError):
+    """The body's sha256 is not the promised one."""
+
+    kind = "digest-mismatch"
+
+
+class InvalidEncoding(ServiceError):
+    """A compressed body that does not decompress."""
+
+    kind = "invalid-encoding"
+
+
+class UnsupportedEncoding(ServiceError):
+    """A Content-Encoding that the service does not read."""
+
+    kind = "unsupported-encoding"
+
+
+class TooLarge(ServiceError):
+    """More bytes than the operator allows."""
+
+    kind = "too-large"
+
+
+class RangeNotSatisfiable(ServiceError):
+    """A Range header that asks beyond the end."""
+
+    kind = "range-not-satisfiable"
+
+    def __init__(self, argument: str, *, expected: str, got: str, hint: str = "", size: int = 0) -> None:
+        super().__init__(argument, expected=expected, got=got, hint=hint)
+        self.size = size  # bytes of the content, told in Content-Range
+
+
+class InUse(ServiceError):
+    """An asset that a job or a lift still needs."""
+
+    kind = "in-use"
+
+
+class Busy(ServiceError):
+    """The service has as much waiting work as it accepts."""
+
+    kind = "busy"
+
+
+class TimedOut(ServiceError):
+    """A query that took longer than the operator allows."""
+
+    kind = "timed-out"
+
+
+class Crashed(ServiceError):
+    """A process of the service died without an answer."""
+
+    kind = "crashed"
+
+
+class Misconfigured(ServiceError):
+    """Settings or a data directory with which the service does not start."""
+
+    kind = "misconfigured"

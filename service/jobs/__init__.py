@@ -1,0 +1,1 @@
+"""How jobs run: one supervisor thread, one child process a job."""

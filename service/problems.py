@@ -1,0 +1,140 @@
+"""The one table from errors to HTTP answers, and the RFC 9457 shape of every one of them."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from http import HTTPStatus
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from starlette.exceptions import HTTPException
+
+from liftcore import errors as core
+from liftcore.errors import SplatliftError
+from service import errors
+from service.wire import Problem
+
+MEDIA_TYPE = "application/problem+json"
+RETRY_AFTER_SECONDS = 2
+
+# Exception -> status and title. The nearest class in the exception's ancestry counts; `type` is its `kind`.
+TABLE: dict[type[SplatliftError], tuple[int, str]] = {
+    SplatliftError: (422, "The input is not usable"),
+    core.InvalidInput: (422, "The input is malformed"),
+    core.InvalidSplats: (422, "The splats are malformed"),
+    core.InvalidCameras: (422, "The cameras are malformed or not supported"),
+    core.InvalidFeatures: (422, "The features are malformed or do not fit the scene"),
+    core.InvalidLift: (422, "The lift is not usable"),
+    core.InvalidSettings: (422, "A setting is unknown or out of range"),
+    core.InvalidQuery: (422, "The query cannot be answered as asked"),
+    core.NotFound: (404, "There is no such thing here"),
+    core.Unavailable: (422, "This server lacks what that needs"),
+    errors.InvalidRequest: (422, "The request is malformed"),
+    errors.DigestMismatch: (422, "The body is not what its digest promised"),
+    errors.InvalidEncoding: (422, "The body does not decompress"),
+    errors.UnsupportedEncoding: (415, "The content encoding is not supported"),
+    errors.TooLarge: (413, "The body is too large"),
+    errors.RangeNotSatisfiable: (416, "The range is beyond the end"),
+    errors.InUse: (409, "The asset is in use"),
+    errors.Busy: (503, "The server is busy"),
+    errors.TimedOut: (504, "The query took too long"),
+    errors.Crashed: (500, "A process of the server died"),
+}
+
+# Errors that the framework raises by status, not by class.
+FRAMEWORK: dict[int, tuple[str, str]] = {
+    400: ("malformed-request", "The request is malformed"),
+    404: ("no-such-route", "There is no such route"),
+    405: ("method-not-allowed", "The route does not take this method"),
+    413: ("too-large", "The body is too large"),
+}
+
+# For OpenAPI: every route may answer with a problem.
+RESPONSES: dict[int | str, dict[str, Any]] = {
+    code: {
+        "description": "A problem (RFC 9457)",
+        "content": {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}},
+    }
+    for code in ("4XX", "5XX")
+}
+
+log = logging.getLogger(__name__)
+
+
+def problem_of(error: SplatliftError) -> Problem:
+    """The error as a problem."""
+    status, title = next(TABLE[cls] for cls in type(error).__mro__ if cls in TABLE)
+    return Problem(
+        type=f"/problems/{error.kind}",
+        title=title,
+        status=status,
+        detail=str(error),
+        argument=error.argument,
+        expected=error.expected,
+        got=error.got,
+        hint=error.hint or None,
+    )
+
+
+def answer(problem: Problem, headers: Mapping[str, str] | None = None) -> JSONResponse:
+    """The problem as a response."""
+    return JSONResponse(
+        problem.model_dump(exclude_none=True), problem.status, headers=headers, media_type=MEDIA_TYPE
+    )
+
+
+def install(app: FastAPI) -> None:
+    """Make every error of the application a problem."""
+    app.add_exception_handler(SplatliftError, _on_known)
+    app.add_exception_handler(RequestValidationError, _on_validation)
+    app.add_exception_handler(HTTPException, _on_framework)
+    app.add_exception_handler(Exception, _on_unexpected)
+
+
+def _on_known(request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, SplatliftError)
+    headers: dict[str, str] = {}
+    if isinstance(error, errors.Busy):
+        headers["Retry-After"] = str(RETRY_AFTER_SECONDS)
+    if isinstance(error, errors.RangeNotSatisfiable):
+        headers["Content-Range"] = f"bytes */{error.size}"
+    return answer(problem_of(error), headers)
+
+
+def _on_validation(request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, RequestValidationError)
+    first = error.errors()[0]
+    place = [str(part) for part in first["loc"]]
+    known = errors.InvalidRequest(
+        ".".join(place[1:]) or place[0],
+        expected=first["msg"][0].lower() + first["msg"][1:],
+        got="nothing" if first["type"] == "missing" else _short(first.get("input")),
+        hint=f"in the {place[0]} of the request",
+    )
+    return answer(problem_of(known))
+
+
+def _on_framework(request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, HTTPException)
+    phrase = HTTPStatus(error.status_code).phrase
+    slug, title = FRAMEWORK.get(error.status_code, (phrase.lower().replace(" ", "-"), phrase))
+    detail = f"{request.method} {request.url.path}: {error.detail}"
+    problem = Problem(type=f"/problems/{slug}", title=title, status=error.status_code, detail=detail)
+    return answer(problem, error.headers)
+
+
+def _on_unexpected(request: Request, error: Exception) -> JSONResponse:
+    # The details go to the log: they may name files or values that are not the client's.
+    log.error("%s %s failed", request.method, request.url.path, exc_info=error)
+    detail = "Something went wrong on our side; the server's log has the details."
+    return answer(
+        Problem(type="/problems/internal", title="An error of the server", status=500, detail=detail)
+    )
+
+
+def _short(value: object, limit: int = 120) -> str:
+    text = repr(value)
+    return text if len(text) <= limit else f"{text[:limit]}..."

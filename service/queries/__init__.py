@@ -1,0 +1,1 @@
+"""How queries run: one warm worker process that keeps lifts mapped and encoders loaded."""

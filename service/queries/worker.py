@@ -1,0 +1,40 @@
+"""The query process: reads requests from stdin, answers on stdout, ends when its server does.
+
+Run as ``python -m service.queries.worker SCENES ANSWERS``.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import traceback
+
+from liftcore.errors import SplatliftError
+from service.faults import fault_of
+from service.queries.answers import Answers
+from service.queries.frames import Frame, read_frame, write_frame
+
+
+def reply_to(request: Frame, answers: Answers) -> Frame:
+    """The answer, or the error as a header."""
+    try:
+        return answers.reply(request.header)
+    except SplatliftError as error:
+        return Frame({"fault": fault_of(error, request.header["names"])})
+    except Exception:
+        traceback.print_exc()
+        return Frame({"crash": True})
+
+
+def main() -> None:
+    """Answer until stdin ends."""
+    # Libraries may print; the pipe is for answers only.
+    out = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
+    answers = Answers(scenes=int(sys.argv[1]), answers=int(sys.argv[2]))
+    while (request := read_frame(sys.stdin.buffer)) is not None:
+        write_frame(out, reply_to(request, answers))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,115 @@
+"""/assets: uploads."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import anyio
+from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi.responses import JSONResponse
+
+from service import wire
+from service.content import file_answer
+from service.errors import DigestMismatch
+from service.parts import Here
+from service.store.assets import AssetRecord, CheckedUpload
+from service.uploads.checking import CheckLimits, check
+from service.uploads.intake import Intake, gzipped
+
+BATCH = 1 << 20  # bytes gathered before a thread writes them
+
+router = APIRouter(prefix="/assets", tags=["assets"])
+AssetId = Annotated[str, Path(description="sha256: and the digest of the bytes, in hex")]
+Sha256 = Annotated[
+    str | None,
+    Query(pattern="^[0-9a-fA-F]{64}$", description="of the content after decompression; checked if given"),
+]
+RAW_BODY = {
+    "requestBody": {
+        "required": True,
+        "description": "the file itself, with Content-Encoding: gzip if it is compressed",
+        "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}},
+    }
+}
+
+
+@router.put(
+    "/{kind}",
+    response_model=wire.Asset,
+    status_code=201,
+    responses={200: {"model": wire.Asset, "description": "It was here already"}},
+    openapi_extra=RAW_BODY,
+)
+async def upload(kind: wire.AssetKind, request: Request, here: Here, sha256: Sha256 = None) -> Response:
+    """Upload splats (PLY), cameras (JSON or a zip of a COLMAP model) or a feature pack (safetensors)."""
+    gzip = gzipped(request.headers.get("content-encoding", ""))
+    with here.store.files.draft(f".{kind}") as draft:
+        with Intake(draft, limit=here.settings.max_upload_bytes(kind), gzip=gzip) as intake:
+            await _receive(request, intake)
+            digest = intake.finish()
+        if sha256 is not None and digest != sha256.lower():
+            raise DigestMismatch("sha256", expected=sha256, got=digest, hint="upload the file again")
+        known = await anyio.to_thread.run_sync(here.store.assets.find, f"sha256:{digest}")
+        if known is not None and known.kind is kind:
+            return _reply(known, 200)
+        limits = CheckLimits(here.settings.check_seconds, here.settings.check_memory_bytes)
+        report = await anyio.to_thread.run_sync(check, kind, draft, limits, limiter=here.checks)
+        checked = CheckedUpload(draft, kind, digest, report.suffix, report.counts, report.warnings)
+        asset, new = await anyio.to_thread.run_sync(here.store.assets.add, checked)
+    return _reply(asset, 201 if new else 200)
+
+
+async def _receive(request: Request, intake: Intake) -> None:
+    batch = bytearray()
+    async for chunk in request.stream():
+        batch += chunk
+        if len(batch) >= BATCH:
+            await anyio.to_thread.run_sync(intake.feed, bytes(batch))
+            batch.clear()
+    await anyio.to_thread.run_sync(intake.feed, bytes(batch))
+
+
+@router.get("", response_model=wire.Assets)
+def list_assets(here: Here) -> wire.Assets:
+    """All assets, newest first."""
+    return wire.Assets(assets=[shape(asset) for asset in here.store.assets.all()])
+
+
+@router.get("/{asset}", response_model=wire.Asset)
+def get_asset(asset: AssetId, here: Here) -> wire.Asset:
+    """One asset."""
+    return shape(here.store.assets.get(asset))
+
+
+@router.get("/{asset}/content", response_class=Response)
+def get_content(asset: AssetId, request: Request, here: Here) -> Response:
+    """The bytes of an asset, or a range of them."""
+    found = here.store.assets.get(asset)
+    digest = found.id.removeprefix("sha256:")
+    return file_answer(
+        request, found.path, sha256=digest, filename=f"{found.kind}-{digest[:12]}{found.path.suffix}"
+    )
+
+
+@router.delete("/{asset}", status_code=204)
+def delete_asset(asset: AssetId, here: Here) -> None:
+    """Forget an asset that no job and no lift refers to."""
+    here.store.assets.delete(asset)
+
+
+def shape(asset: AssetRecord) -> wire.Asset:
+    """An asset as the wire has it."""
+    return wire.Asset(
+        id=asset.id,
+        kind=asset.kind,
+        bytes=asset.bytes,
+        counts=asset.counts,
+        warnings=asset.warnings,
+        created=asset.created,
+        links={"self": f"/assets/{asset.id}", "content": f"/assets/{asset.id}/content"},
+    )
+
+
+def _reply(asset: AssetRecord, status: int) -> Response:
+    location = {"Location": f"/assets/{asset.id}"}
+    return JSONResponse(shape(asset).model_dump(mode="json"), status, headers=location)

@@ -1,0 +1,61 @@
+"""/lifts: results."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter, Request, Response
+
+from service import wire
+from service.content import file_answer
+from service.parts import Here, Parts
+from service.store.lifts import LiftRecord
+
+router = APIRouter(prefix="/lifts", tags=["lifts"])
+
+
+@router.get("", response_model=wire.Lifts)
+def list_lifts(here: Here) -> wire.Lifts:
+    """All lifts, newest first."""
+    return wire.Lifts(lifts=[shape(lift, here) for lift in here.store.lifts.all()])
+
+
+@router.get("/{lift}", response_model=wire.Lift)
+def get_lift(lift: str, here: Here) -> wire.Lift:
+    """One lift: its settings, certificate and timings."""
+    return shape(here.store.lifts.get(lift), here)
+
+
+@router.get("/{lift}/features", response_class=Response)
+def get_features(lift: str, request: Request, here: Here) -> Response:
+    """The lift file (safetensors), or a range of it."""
+    found = here.store.lifts.get(lift)
+    return file_answer(request, found.path, sha256=found.sha256, filename=f"lift-{found.id}.safetensors")
+
+
+def shape(lift: LiftRecord, here: Parts) -> wire.Lift:
+    """A lift as the wire has it; paths of this machine stay here."""
+    job = here.store.jobs.get(lift.id)
+    metadata = lift.metadata
+    return wire.Lift(
+        id=lift.id,
+        bytes=lift.bytes,
+        sha256=lift.sha256,
+        splats=job.splats,
+        cameras=job.cameras,
+        features=list(job.features),
+        count=lift.count,
+        channels=lift.channels,
+        version=metadata["version"],
+        settings=metadata["settings"],
+        encoder=metadata["encoder"],
+        text_space=metadata["text_space"],
+        views=metadata["views"],
+        certificate=metadata["certificate"],
+        timings=metadata["timings"],
+        created=lift.created,
+        links={
+            "self": f"/lifts/{lift.id}",
+            "job": f"/jobs/{lift.id}",
+            "features": f"/lifts/{lift.id}/features",
+            "query": f"/query?lift={lift.id}&text=",
+        },
+    )

@@ -1,0 +1,105 @@
+"""What the operator decides. Every field is also an environment variable: SPLATLIFT_ and its name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pydantic import Field
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+from service.errors import InvalidRequest
+
+MiB = 1 << 20
+GiB = 1 << 30
+
+
+class ServiceSettings(BaseSettings):
+    """Settings of the service; nothing here can be changed over HTTP."""
+
+    model_config = SettingsConfigDict(env_prefix="SPLATLIFT_", frozen=True, extra="forbid")
+
+    data: Path = Field(
+        Path("splatlift-data"), description="the directory that holds the database and all files"
+    )
+    host: str = Field("127.0.0.1", description="the address to bind; loopback only until there are keys")
+    port: int = Field(8787, ge=0, le=65_535, description="the port to bind; 0 picks a free one")
+
+    max_splats_bytes: int = Field(4 * GiB, gt=0, description="the largest splat file, before and after gzip")
+    max_cameras_bytes: int = Field(
+        256 * MiB, gt=0, description="the largest camera file, before and after gzip"
+    )
+    max_features_bytes: int = Field(
+        16 * GiB, gt=0, description="the largest feature pack, before and after gzip"
+    )
+    max_body_bytes: int = Field(
+        MiB, gt=0, description="the largest body of any request that is not an upload"
+    )
+
+    parallel_checks: int = Field(2, ge=1, le=64, description="uploads that are validated at the same time")
+    check_seconds: float = Field(
+        300, gt=0, description="wall time that the validation of one upload may take"
+    )
+    check_memory_bytes: int = Field(
+        8 * GiB, gt=0, description="private memory that the validation of one upload may take (Linux)"
+    )
+
+    lift_threads: int | None = Field(
+        None, ge=1, description="threads of a lift; empty = as many as there are cores"
+    )
+
+    encoder: str = Field(
+        "minilm",
+        description="text encoder of lifts whose text space has none: minilm, table:FILE, open_clip:MODEL...",
+    )
+    text_spaces: dict[str, str] = Field(
+        default_factory=dict, description="text space -> text encoder, in the same notation (JSON object)"
+    )
+    query_waiting: int = Field(
+        16, ge=1, le=32, description="queries that may wait or run; more are answered 503"
+    )
+    query_seconds: float = Field(120, gt=0, description="wall time after which a query is given up")
+    query_scenes: int = Field(2, ge=1, description="lifts that the query process keeps open")
+    query_answers: int = Field(
+        16, ge=1, description="answers that the query process keeps for masks and maps"
+    )
+
+    def max_upload_bytes(self, kind: str) -> int:
+        """The size limit of an asset kind."""
+        limits = {
+            "splats": self.max_splats_bytes,
+            "cameras": self.max_cameras_bytes,
+            "features": self.max_features_bytes,
+        }
+        return limits[kind]
+
+    def encoder_spec(self, text_space: str, asked: str | None) -> str:
+        """The text encoder of a query: the one of the space asked for, else of the lift's, else the default.
+
+        Raises:
+            InvalidRequest: no encoder was set up under the name asked for, or the lift has no text space.
+        """
+        if asked is not None and asked != "default":
+            if asked not in self.text_spaces:
+                known = ", ".join(["default", *sorted(self.text_spaces)])
+                raise InvalidRequest(
+                    "encoder", expected="the name of a text space that the operator set up", got=repr(asked),
+                    hint=f"known here: {known}",
+                )  # fmt: skip
+            return self.text_spaces[asked]
+        if asked is None and text_space == "none" and "none" not in self.text_spaces:
+            raise InvalidRequest(
+                "lift", expected="features that share a space with a text encoder", got="text space 'none'",
+                hint="name an encoder with encoder= if you know better",
+            )  # fmt: skip
+        if asked is None and text_space in self.text_spaces:
+            return self.text_spaces[text_space]
+        return self.encoder
+
+
+def encoder_file(spec: str) -> Path | None:
+    """The file that an encoder specification names, None when it names none."""
+    if spec.startswith("table:"):
+        return Path(spec.removeprefix("table:"))
+    if spec.startswith("open_clip:") and "@" in spec:
+        return Path(spec.partition("@")[2])
+    return Path(spec) if spec.endswith(".safetensors") else None

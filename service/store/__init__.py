@@ -1,0 +1,1 @@
+"""What the service remembers: SQLite for facts, files for bytes, all below one data directory."""

@@ -1,0 +1,79 @@
+"""The files of the service: drafts that nobody sees, and blobs and lifts that are whole."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from service.errors import Misconfigured
+
+
+class DataDirectory:
+    """One directory, held by one server at a time.
+
+    ``blobs/ab/abcd....ply`` are assets by digest, ``lifts/ID.safetensors`` lifts by job, ``tmp/`` drafts.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self.root = root.absolute()
+        for name in ("blobs", "lifts", "tmp"):
+            (self.root / name).mkdir(parents=True, exist_ok=True)
+        self._lock = (self.root / "lock").open("w")
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            self._lock.close()
+            raise Misconfigured(
+                "data", expected="a directory that no other server uses", got=str(root),
+                hint="stop the other server or name another directory with --data",
+            ) from None  # fmt: skip
+        # Nothing below tmp/ was ever acknowledged, and the server that wrote it is gone.
+        for draft in (self.root / "tmp").iterdir():
+            draft.unlink()
+
+    @contextmanager
+    def draft(self, suffix: str) -> Iterator[Path]:
+        """A path to write to; what is still there when the block ends is removed."""
+        path = self.root / "tmp" / f"{secrets.token_hex(16)}{suffix}"
+        try:
+            yield path
+        finally:
+            for left in path.parent.glob(f"*{path.name}*"):  # with the drafts that writers keep beside it
+                left.unlink(missing_ok=True)
+
+    def blob(self, digest: str, suffix: str) -> Path:
+        """Where an asset of that digest lies."""
+        return self.root / "blobs" / digest[:2] / f"{digest}{suffix}"
+
+    def lift(self, job: str) -> Path:
+        """Where the lift of a job lies."""
+        return self.root / "lifts" / f"{job}.safetensors"
+
+    def relative(self, path: Path) -> str:
+        """The path as the database keeps it."""
+        return str(path.relative_to(self.root))
+
+    def publish(self, draft: Path, path: Path) -> None:
+        """Make a draft the file at ``path``: on the disk first, then there at once or not at all."""
+        path.parent.mkdir(exist_ok=True)
+        with draft.open("rb") as handle:
+            os.fsync(handle.fileno())
+        draft.replace(path)
+        for directory in (path.parent, path.parent.parent):
+            _sync_directory(directory)
+
+    def close(self) -> None:
+        """Let another server have the directory."""
+        self._lock.close()
+
+
+def _sync_directory(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

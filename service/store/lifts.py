@@ -1,0 +1,141 @@
+"""Lifts: the results of jobs."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from liftcore.errors import NotFound
+from service.errors import InvalidRequest
+from service.store.database import Database
+from service.store.files import DataDirectory
+
+
+@dataclass(frozen=True)
+class FinishedLift:
+    """What a job's process made: a draft and what it says about it."""
+
+    draft: Path
+    sha256: str
+    count: int  # P
+    channels: int  # F
+    metadata: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class LiftRecord:
+    """A lift as the store knows it."""
+
+    id: str  # the id of its job
+    bytes: int
+    sha256: str
+    path: Path
+    count: int
+    channels: int
+    metadata: dict[str, Any]
+    created: float
+
+
+class LiftStore:
+    """Lifts in the database, their bytes in lifts/."""
+
+    def __init__(self, database: Database, files: DataDirectory) -> None:
+        self._database = database
+        self._files = files
+
+    def finish(self, job: str, attempt: int, made: FinishedLift) -> bool:
+        """End an attempt with its lift: the file, the lift and the job's last state become true together.
+
+        Returns:
+            False when the attempt is no longer the job's running one; then nothing changes.
+        """
+        path = self._files.lift(job)
+        size = made.draft.stat().st_size
+        with self._database.write() as connection:
+            ended = connection.execute(
+                "UPDATE jobs SET state = 'succeeded', ended = ?"
+                " WHERE id = ? AND attempt = ? AND state = 'running'",
+                (time.time(), job, attempt),
+            )
+            if ended.rowcount != 1:
+                return False
+            self._files.publish(made.draft, path)
+            connection.execute(
+                "INSERT INTO lifts (id, bytes, sha256, file, count, channels, metadata, created)"
+                " VALUES (?,?,?,?,?,?,?,?)",
+                (
+                    job,
+                    size,
+                    made.sha256,
+                    self._files.relative(path),
+                    made.count,
+                    made.channels,
+                    json.dumps(made.metadata),
+                    time.time(),
+                ),
+            )
+        return True
+
+    def find(self, lift: str) -> LiftRecord | None:
+        """The lift of that id, None when there is none."""
+        with self._database.read() as connection:
+            row = connection.execute("SELECT * FROM lifts WHERE id = ?", (lift,)).fetchone()
+        return None if row is None else self._record(row)
+
+    def get(self, lift: str) -> LiftRecord:
+        """The lift of that id.
+
+        Raises:
+            NotFound: there is none.
+        """
+        found = self.find(lift)
+        if found is None:
+            raise NotFound(
+                "lift",
+                expected="the id of a lift",
+                got=lift,
+                hint="GET /lifts lists them; a lift has its job's id",
+            )
+        return found
+
+    def only(self) -> LiftRecord:
+        """The one lift that is here.
+
+        Raises:
+            NotFound: there is none at all.
+            InvalidRequest: there are several, so one must be named.
+        """
+        with self._database.read() as connection:
+            rows = connection.execute("SELECT * FROM lifts ORDER BY created DESC LIMIT 2").fetchall()
+        if not rows:
+            raise NotFound("lift", expected="at least one lift", got="none", hint="POST /lift first")
+        if len(rows) > 1:
+            raise InvalidRequest(
+                "lift",
+                expected="the id of a lift, as there are several",
+                got="nothing",
+                hint="GET /lifts lists them",
+            )
+        return self._record(rows[0])
+
+    def all(self) -> list[LiftRecord]:
+        """Every lift, newest first."""
+        with self._database.read() as connection:
+            rows = connection.execute("SELECT * FROM lifts ORDER BY created DESC, id").fetchall()
+        return [self._record(row) for row in rows]
+
+    def _record(self, row: sqlite3.Row) -> LiftRecord:
+        return LiftRecord(
+            id=row["id"],
+            bytes=row["bytes"],
+            sha256=row["sha256"],
+            path=self._files.root / row["file"],
+            count=row["count"],
+            channels=row["channels"],
+            metadata=json.loads(row["metadata"]),
+            created=row["created"],
+        )

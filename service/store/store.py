@@ -1,0 +1,50 @@
+"""The store: everything below one data directory."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+from service.store.assets import AssetStore
+from service.store.database import Database
+from service.store.files import DataDirectory
+from service.store.jobs import JobStore
+from service.store.lifts import LiftStore
+
+
+@dataclass(frozen=True)
+class Store:
+    """Assets, jobs and lifts, with the files and the database that hold them."""
+
+    files: DataDirectory
+    database: Database
+    assets: AssetStore
+    jobs: JobStore
+    lifts: LiftStore
+
+    @classmethod
+    def open(cls, root: Path) -> Self:
+        """Open or make the data directory.
+
+        Raises:
+            Misconfigured: another server holds it, or a later release wrote it.
+        """
+        files = DataDirectory(root)
+        try:
+            database = Database(files.root / "service.sqlite")
+        except BaseException:
+            files.close()
+            raise
+        return cls(
+            files=files,
+            database=database,
+            assets=AssetStore(database, files),
+            jobs=JobStore(database),
+            lifts=LiftStore(database, files),
+        )
+
+    def close(self) -> None:
+        """Close the database and let the directory go."""
+        self.database.close()
+        self.files.close()

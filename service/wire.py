@@ -1,0 +1,183 @@
+"""What goes over the wire: the JSON that the service takes and gives."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+ASSET_ID = r"^sha256:[0-9a-f]{64}$"
+JOB_ID = r"^[0-9a-f]{32}$"
+
+AssetId = Annotated[str, Field(pattern=ASSET_ID, description="sha256: and the digest of the bytes, in hex")]
+JobId = Annotated[str, Field(pattern=JOB_ID)]
+Scalar = bool | int | float | str
+
+
+class AssetKind(StrEnum):
+    """What an upload is."""
+
+    SPLATS = "splats"
+    CAMERAS = "cameras"
+    FEATURES = "features"
+
+
+class JobState(StrEnum):
+    """Where a job is."""
+
+    QUEUED = "queued"
+    RUNNING = "running"
+    SUCCEEDED = "succeeded"
+    FAILED = "failed"
+
+
+class Problem(BaseModel):
+    """An RFC 9457 problem; the fields after ``detail`` are there when the error names them."""
+
+    type: str = Field(description="a stable URI reference, /problems/ and a slug")
+    title: str
+    status: int
+    detail: str
+    argument: str | None = None
+    expected: str | None = None
+    got: str | None = None
+    hint: str | None = None
+
+
+class Asset(BaseModel):
+    """An uploaded file."""
+
+    id: AssetId
+    kind: AssetKind
+    bytes: int
+    counts: dict[str, Any] = Field(description="what is in it: splats, views, channels and so on")
+    warnings: list[str]
+    created: float = Field(description="seconds since 1970")
+    links: dict[str, str]
+
+
+class Assets(BaseModel):
+    """All assets, newest first."""
+
+    assets: list[Asset]
+
+
+class LiftRequest(BaseModel):
+    """What to lift. The assets must be here already."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    splats: AssetId
+    cameras: AssetId
+    features: Annotated[list[AssetId], Field(min_length=1, max_length=10_000)]
+    settings: dict[str, Scalar] = Field(
+        default_factory=dict,
+        description="preset and knobs of the lift; those left out take the preset's values",
+    )
+
+
+class Progress(BaseModel):
+    """How far the current stage of a job is."""
+
+    stage: str
+    done: int
+    total: int
+    unit: str
+    eta_s: float | None = Field(description="seconds until the end of this stage, at its pace so far")
+
+
+class Job(BaseModel):
+    """A lift on its way."""
+
+    id: JobId
+    state: JobState
+    attempt: int
+    splats: AssetId
+    cameras: AssetId
+    features: list[AssetId]
+    settings: dict[str, Any]
+    progress: Progress | None
+    problem: Problem | None
+    created: float
+    started: float | None
+    ended: float | None
+    links: dict[str, str]
+
+
+class Jobs(BaseModel):
+    """All jobs, newest first."""
+
+    jobs: list[Job]
+
+
+class Lift(BaseModel):
+    """Features on splats. A lift has the id of the job that made it."""
+
+    id: JobId
+    bytes: int
+    sha256: str
+    splats: AssetId
+    cameras: AssetId
+    features: list[AssetId]
+    count: int = Field(description="P, the number of splats")
+    channels: int = Field(description="F, the number of feature channels")
+    version: str
+    settings: dict[str, Any]
+    encoder: str = Field(description="the 2D encoder that made the features, as their packs tell it")
+    text_space: str = Field(description="the text space that the features share")
+    views: list[str] = Field(description="the views that were lifted")
+    certificate: dict[str, Any]
+    timings: dict[str, float] = Field(description="seconds a stage")
+    created: float
+    links: dict[str, str]
+
+
+class Lifts(BaseModel):
+    """All lifts, newest first."""
+
+    lifts: list[Lift]
+
+
+class Threshold(BaseModel):
+    """Which scores count as found, and why."""
+
+    value: float | None = Field(description="null when no score stands out")
+    method: str
+    explanation: str = Field(description="one sentence on how it was found")
+
+
+class TopSplat(BaseModel):
+    """One of the best splats."""
+
+    splat: int = Field(description="row in the splat file")
+    score: float
+    position: list[float] = Field(description="x y z, world frame")
+
+
+class Box(BaseModel):
+    """The axis-aligned box of the centres of the selected splats, world frame."""
+
+    low: list[float]
+    high: list[float]
+
+
+class QueryAnswer(BaseModel):
+    """Where a phrase is in a scene."""
+
+    text: str
+    lift: JobId
+    view: str | None
+    text_space: str
+    statistics: dict[str, Any] = Field(description="of the scores over the seen splats")
+    threshold: Threshold
+    count: int = Field(description="splats at or above the threshold")
+    top: list[TopSplat]
+    box: Box | None
+    links: dict[str, str]
+
+
+class Health(BaseModel):
+    """Whether the HTTP process answers."""
+
+    status: str
