@@ -1,0 +1,73 @@
+"""The cameras.json that Inria's trainer writes beside its splats."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from liftcore.errors import InvalidCameras
+from liftcore.files import whole_file
+from liftcore.scene.cameras import Camera, Cameras
+from liftcore.scene.json_file import entry, matrix, number, pixels
+from liftcore.scene.view_names import view_names
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+CENTRE_TOLERANCE = 1e-6  # pixels
+
+
+def parse_inria(document: Any, source: str) -> Cameras:
+    """The cameras of a cameras.json document; the format puts the principal point at the image's centre.
+
+    Raises:
+        InvalidCameras: a key is missing or malformed.
+    """
+    if not isinstance(document, list):
+        raise InvalidCameras(source, expected="a list of cameras", got=type(document).__name__)
+    images = [str(entry(record, "img_name", f"{source} camera {i}")) for i, record in enumerate(document)]
+    views = zip(view_names(images), document, strict=True)
+    return Cameras(tuple(_camera(name, record, source) for name, record in views))
+
+
+def _camera(name: str, record: dict[str, Any], source: str) -> Camera:
+    where = f"{source} camera {name!r}"
+    width, height = (pixels(entry(record, key, where), f"{where} {key}") for key in ("width", "height"))
+    fx, fy = (number(entry(record, key, where), f"{where} {key}") for key in ("fx", "fy"))
+    camera_to_world = matrix(entry(record, "rotation", where), (3,), 3, f"{where} rotation")
+    (position,) = matrix([entry(record, "position", where)], (1,), 3, f"{where} position")
+    pose = np.eye(4)
+    pose[:3, :3] = camera_to_world.T
+    pose[:3, 3] = -camera_to_world.T @ position
+    return Camera(name, width, height, fx, fy, width / 2, height / 2, world_to_camera=pose)
+
+
+def write_inria_cameras(cameras: Cameras, path: Path) -> None:
+    """Write cameras.json, whole or not at all.
+
+    Raises:
+        InvalidCameras: a principal point is off the image's centre, which the format cannot say.
+    """
+    records = [_record(i, camera) for i, camera in enumerate(cameras)]
+    with whole_file(path) as handle:
+        handle.write(json.dumps(records, indent=1).encode())
+
+
+def _record(index: int, camera: Camera) -> dict[str, Any]:
+    off = max(abs(camera.cx - camera.width / 2), abs(camera.cy - camera.height / 2))
+    if off > CENTRE_TOLERANCE:
+        got = f"one {off:g} pixels off in {camera.name!r}"
+        hint = "keep these cameras as a COLMAP model or transforms.json"
+        raise InvalidCameras("cameras.json", expected="principal points at the centre", got=got, hint=hint)
+    return {
+        "id": index,
+        "img_name": camera.name,
+        "width": camera.width,
+        "height": camera.height,
+        "position": camera.centre.tolist(),
+        "rotation": camera.world_to_camera[:3, :3].T.tolist(),
+        "fy": camera.fy,
+        "fx": camera.fx,
+    }

@@ -1,0 +1,95 @@
+"""nerfstudio's transforms.json: camera-to-world poses with OpenGL axes, shared or own intrinsics."""
+
+from __future__ import annotations
+
+import math
+from collections import ChainMap
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from liftcore.errors import InvalidCameras
+from liftcore.scene.camera_models import UNDISTORT, Intrinsics
+from liftcore.scene.cameras import Camera, Cameras
+from liftcore.scene.json_file import entry, matrix, number, pixels
+from liftcore.scene.view_names import view_names
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
+DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4")
+OPENGL_TO_OPENCV = np.diag(
+    [1.0, -1.0, -1.0, 1.0]
+)  # of the camera's axes: y up and z back become down and ahead
+
+
+def parse_transforms(document: Any, source: str) -> Cameras:
+    """The cameras of a transforms.json document, in the frame that its poses are in.
+
+    A frame's own intrinsics come before the shared ones. A scene trained in another frame (nerfstudio
+    normalises poses unless told not to) must be exported together with its cameras.
+
+    Raises:
+        InvalidCameras: a key is missing or malformed, or a camera is distorted.
+    """
+    frames = entry(document, "frames", source)
+    if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
+        raise InvalidCameras(f"{source} frames", expected="a list of objects", got=repr(frames)[:60])
+    files = [str(entry(frame, "file_path", f"{source} frame {i}")) for i, frame in enumerate(frames)]
+    views = zip(view_names(files), frames, strict=True)
+    return Cameras(tuple(_camera(name, ChainMap(frame, document), source) for name, frame in views))
+
+
+def _camera(name: str, keys: Mapping[str, Any], source: str) -> Camera:
+    where = f"{source} frame {name!r}"
+    _refuse_distortion(keys, where)
+    if "w" not in keys or "h" not in keys:
+        hint = 'add the image size as "w" and "h"'
+        raise InvalidCameras(where, expected="an image size, w and h", got="none", hint=hint)
+    width, height = pixels(keys["w"], f"{where} w"), pixels(keys["h"], f"{where} h")
+    pose = np.eye(4)
+    given = matrix(keys.get("transform_matrix"), (3, 4), 4, f"{where} transform_matrix")
+    pose[: len(given)] = given
+    camera_to_world = pose @ OPENGL_TO_OPENCV
+    world_to_camera = np.eye(4)
+    world_to_camera[:3, :3] = camera_to_world[:3, :3].T
+    world_to_camera[:3, 3] = -camera_to_world[:3, :3].T @ camera_to_world[:3, 3]
+    intrinsics = _intrinsics(keys, width, height, where)
+    return Camera(name, width, height, *intrinsics, world_to_camera=world_to_camera)
+
+
+def _intrinsics(keys: Mapping[str, Any], width: int, height: int, where: str) -> Intrinsics:
+    fx = _focal(keys, "x", width, where)
+    fy = _focal(keys, "y", height, where)
+    fx = fy if fx is None else fx
+    fy = fx if fy is None else fy
+    if fx is None or fy is None:
+        raise InvalidCameras(
+            where, expected="fl_x or camera_angle_x", got="neither", hint="add a focal length"
+        )
+    cx = number(keys.get("cx", width / 2), f"{where} cx")
+    cy = number(keys.get("cy", height / 2), f"{where} cy")
+    return Intrinsics(fx, fy, cx, cy)
+
+
+def _focal(keys: Mapping[str, Any], axis: str, side: int, where: str) -> float | None:
+    if f"fl_{axis}" in keys:
+        return number(keys[f"fl_{axis}"], f"{where} fl_{axis}")
+    if f"camera_angle_{axis}" not in keys:
+        return None
+    angle = number(keys[f"camera_angle_{axis}"], f"{where} camera_angle_{axis}")
+    if not 0 < angle < math.pi:
+        raise InvalidCameras(f"{where} camera_angle_{axis}", expected="an angle in 0..pi", got=f"{angle:g}")
+    return 0.5 * side / math.tan(0.5 * angle)
+
+
+def _refuse_distortion(keys: Mapping[str, Any], where: str) -> None:
+    model = keys.get("camera_model", "PINHOLE")
+    if model not in PERSPECTIVE or keys.get("is_fisheye"):
+        got = repr(model)[:60] if model not in PERSPECTIVE else "is_fisheye"
+        raise InvalidCameras(where, expected="a perspective camera", got=got, hint=UNDISTORT)
+    for key in DISTORTION:
+        if number(keys.get(key, 0), f"{where} {key}") != 0:
+            got = f"{key} = {keys[key]:g}"
+            raise InvalidCameras(where, expected="a camera without distortion", got=got, hint=UNDISTORT)
