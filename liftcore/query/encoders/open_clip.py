@@ -91,11 +91,12 @@ def _check_model(label: str, model_name: str) -> None:
 def _from_tag(label: str, model_name: str, tag: str) -> tuple[Any, Any]:
     tags = _library().list_pretrained_tags_by_model(model_name)
     if not tag:
+        known = ", ".join(tags) or "none"
         raise Unavailable(
             label,
             expected="weights: a tag or a file",
             got="none",
-            hint=f"open_clip:{model_name}/TAG or open_clip:{model_name}@FILE; tags: {', '.join(tags) or 'none'}",
+            hint=f"open_clip:{model_name}/TAG or open_clip:{model_name}@FILE; tags: {known}",
         )
     if tag not in tags:
         raise InvalidQuery(label, expected=f"one of the tags {', '.join(tags) or '(none)'}", got=repr(tag))

@@ -1,0 +1,106 @@
+"""Colours: of splats as a camera sees them, and of scores as people read them."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from liftcore.scene.cameras import Camera
+    from liftcore.scene.splats import Splats
+
+# Real spherical harmonics, in the field's order and signs (Condon-Shortley phase left in).
+SH_C0 = 0.28209479177387814  # 1 / (2 sqrt(pi))
+SH_C1 = math.sqrt(3 / (4 * math.pi))
+SH_C2 = (
+    math.sqrt(15 / (4 * math.pi)),
+    math.sqrt(5 / (16 * math.pi)),
+    math.sqrt(15 / (16 * math.pi)),
+)
+SH_C3 = (
+    math.sqrt(35 / (32 * math.pi)),
+    math.sqrt(105 / (4 * math.pi)),
+    math.sqrt(21 / (32 * math.pi)),
+    math.sqrt(7 / (16 * math.pi)),
+    math.sqrt(105 / (16 * math.pi)),
+)
+NO_COLOUR = 0.6  # grey of splats whose file holds no colours
+
+# The map runs from dark violet over green to light yellow: its lightness rises evenly, so that equal steps of
+# score look equal, also in grey.
+_MAP_STEPS = 256
+_MAP_LIGHTNESS = (0.18, 0.93)
+_MAP_HUE = (math.radians(300), math.radians(105))
+_MAP_CHROMA = (0.10, 0.17)
+
+
+def seen_colours(splats: Splats, camera: Camera) -> Tensor:
+    """The colours of splats from a camera, ``max(0, 0.5 + sum_k SH_k(d) c_k)`` with d from camera to splat.
+
+    Args:
+        splats: the scene, with spherical harmonics of degree 0 to 3; coefficients above are left out.
+        camera: where they are seen from.
+
+    Returns:
+        [P, 3] f32, at least zero; grey for splats without colours.
+    """
+    if splats.sh is None:
+        return torch.full((splats.count, 3), NO_COLOUR)
+    centre = torch.from_numpy(np.asarray(camera.centre, dtype=np.float32))
+    directions = torch.nn.functional.normalize(splats.means - centre, dim=1)
+    basis = _sh_basis(directions, min(splats.sh_degree or 0, 3))
+    colours = torch.einsum("pk,pkc->pc", basis, splats.sh[:, : basis.shape[1]])
+    return (colours + 0.5).clamp_min(0.0)
+
+
+def _sh_basis(directions: Tensor, degree: int) -> Tensor:
+    """[P, 3] unit vectors -> [P, (degree + 1)^2] values of the real spherical harmonics."""
+    x, y, z = directions.unbind(dim=1)
+    terms = [torch.full_like(x, SH_C0)]
+    if degree >= 1:
+        terms += [-SH_C1 * y, SH_C1 * z, -SH_C1 * x]
+    if degree >= 2:
+        a, b, c = SH_C2
+        terms += [a * x * y, -a * y * z, b * (3 * z * z - 1), -a * x * z, c * (x * x - y * y)]
+    if degree >= 3:
+        a, b, c, d, e = SH_C3
+        terms += [
+            -a * y * (3 * x * x - y * y),
+            b * x * y * z,
+            -c * y * (5 * z * z - 1),
+            d * z * (5 * z * z - 3),
+            -c * x * (5 * z * z - 1),
+            e * z * (x * x - y * y),
+            -a * x * (x * x - 3 * y * y),
+        ]
+    return torch.stack(terms, dim=1)
+
+
+def colour_map() -> np.ndarray:
+    """[256, 3] u8 sRGB, an arc through OKLab (Ottosson 2020) of evenly rising lightness."""
+    step = np.linspace(0.0, 1.0, _MAP_STEPS)
+    lightness = np.interp(step, (0, 1), _MAP_LIGHTNESS)
+    hue = np.interp(step, (0, 1), _MAP_HUE)
+    chroma = np.interp(step, (0, 1), _MAP_CHROMA)
+    return _srgb(lightness, chroma * np.cos(hue), chroma * np.sin(hue))
+
+
+def _srgb(lightness: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    long = (lightness + 0.3963377774 * a + 0.2158037573 * b) ** 3
+    medium = (lightness - 0.1055613458 * a - 0.0638541728 * b) ** 3
+    short = (lightness - 0.0894841775 * a - 1.2914855480 * b) ** 3
+    linear = np.stack(
+        [
+            4.0767416621 * long - 3.3077115913 * medium + 0.2309699292 * short,
+            -1.2684380046 * long + 2.6097574011 * medium - 0.3413193965 * short,
+            -0.0041960863 * long - 0.7034186147 * medium + 1.7076147010 * short,
+        ],
+        axis=-1,
+    ).clip(0.0, 1.0)
+    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    return np.round(255 * encoded).astype(np.uint8)

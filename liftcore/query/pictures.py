@@ -1,0 +1,129 @@
+"""Pictures of answers, as PNG bytes or files: masks, heat maps, renders and overlays."""
+
+from __future__ import annotations
+
+import io
+from typing import TYPE_CHECKING
+
+import numpy as np
+from PIL import Image
+
+from liftcore.files import whole_file
+from liftcore.query.colours import colour_map, seen_colours
+from liftcore.raster.protocol import Walk
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from liftcore.query.ask import Look
+    from liftcore.query.scene import QueryScene
+
+_HEAT_RANGE = (
+    0.01,
+    0.999,
+)  # quantiles of the attention that the colour map spans: one hot pixel dims no picture
+_DIM = 0.35  # brightness that an overlay leaves to what was not found
+_OUTLINE = np.array([255, 209, 64], dtype=np.uint8)  # sRGB of the line around what was found
+
+
+def mask_png(look: Look) -> bytes:
+    """The mask, white where found, one 8-bit channel [H, W]."""
+    return _png(_mask(look))
+
+
+def attention_png(look: Look) -> bytes:
+    """The attention through the colour map, RGB [H, W, 3]; black where the ray misses the scene."""
+    return _png(_heat(look))
+
+
+def render_png(scene: QueryScene, view: str) -> bytes:
+    """The scene as a camera sees it, RGB [H, W, 3] on black.
+
+    Raises:
+        NotFound: no camera has this name.
+        InvalidLift: the splats or the cameras moved or changed since the lift.
+    """
+    return _png(render(scene, view))
+
+
+def overlay_png(image: np.ndarray, look: Look) -> bytes:
+    """An image [H, W, 3] u8 with what was found bright and outlined, and the rest dimmed."""
+    return _png(_overlay(image, look))
+
+
+def save_mask(look: Look, path: Path) -> None:
+    """Write `mask_png` to a file."""
+    _save(mask_png(look), path)
+
+
+def save_attention(look: Look, path: Path) -> None:
+    """Write `attention_png` to a file."""
+    _save(attention_png(look), path)
+
+
+def save_render(scene: QueryScene, view: str, path: Path) -> None:
+    """Write `render_png` to a file."""
+    _save(render_png(scene, view), path)
+
+
+def save_overlay(image: np.ndarray, look: Look, path: Path) -> None:
+    """Write `overlay_png` to a file."""
+    _save(overlay_png(image, look), path)
+
+
+def render(scene: QueryScene, view: str) -> np.ndarray:
+    """The colours of a view, [H, W, 3] u8 sRGB on black, with the opacities as trained (gain 1).
+
+    Raises:
+        NotFound: no camera has this name.
+        InvalidLift: the splats or the cameras moved or changed since the lift.
+    """
+    camera = scene.cameras.get(view)
+    image = scene.raster.render(camera, seen_colours(scene.splats, camera), Walk())
+    return np.round(255 * image.numpy().clip(0.0, 1.0)).astype(np.uint8)
+
+
+def _mask(look: Look) -> np.ndarray:
+    return look.mask.numpy().astype(np.uint8) * 255
+
+
+def _heat(look: Look) -> np.ndarray:
+    attention = look.attention.numpy()
+    met = look.row_sums.numpy() > 0
+    if not met.any():
+        return np.zeros((*attention.shape, 3), dtype=np.uint8)
+    low, high = np.quantile(attention[met], _HEAT_RANGE)
+    colours = colour_map()
+    level = (attention - low) / (high - low) if high > low else np.zeros_like(attention)
+    picture = colours[np.round(level.clip(0.0, 1.0) * (len(colours) - 1)).astype(np.int64)]
+    picture[~met] = 0
+    return picture
+
+
+def _overlay(image: np.ndarray, look: Look) -> np.ndarray:
+    mask = look.mask.numpy()
+    picture = np.where(mask[..., None], image, (_DIM * image).astype(np.uint8))
+    picture[_border(mask)] = _OUTLINE
+    return picture
+
+
+def _border(mask: np.ndarray) -> np.ndarray:
+    """Pixels outside a mask that touch it, sideways or diagonally."""
+    padded = np.pad(mask, 1)
+    height, width = mask.shape
+    near = np.zeros_like(mask)
+    for dy in range(3):
+        for dx in range(3):
+            near |= padded[dy : dy + height, dx : dx + width]
+    return near & ~mask
+
+
+def _png(pixels: np.ndarray) -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(pixels)).save(buffer, format="PNG")
+    return buffer.getvalue()
+
+
+def _save(content: bytes, path: Path) -> None:
+    with whole_file(path) as handle:
+        handle.write(content)

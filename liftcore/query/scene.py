@@ -1,0 +1,85 @@
+"""A lift opened for queries, with the scene that it was made from."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Self
+
+from liftcore.artifact import Lift, load_lift
+from liftcore.query.scores import feature_norms
+from liftcore.query.unchanged import unchanged
+from liftcore.raster.protocol import Walk
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from liftcore.raster.protocol import Raster
+    from liftcore.scene.cameras import Cameras
+    from liftcore.scene.splats import Splats
+
+
+class QueryScene:
+    """Features, and on demand the splats, the cameras and the raster that turn scores into pictures.
+
+    Scores need the lift file alone. The scene's own files are found where the lift remembers them, are
+    checked against their digests when first used, and are loaded once.
+    """
+
+    def __init__(self, lift: Lift, path: Path) -> None:
+        self.lift = lift
+        self.path = path
+
+    @classmethod
+    def open(cls, path: Path) -> Self:
+        """Open a lift; its features are mapped, not read.
+
+        Raises:
+            InvalidLift: the file is missing or is not a lift.
+        """
+        return cls(load_lift(path), path)
+
+    @cached_property
+    def norms(self) -> Tensor:
+        """[P] f32, the features' norms, computed once a lift."""
+        return feature_norms(self.lift.features)
+
+    @property
+    def channels(self) -> int:
+        """F."""
+        return int(self.lift.features.shape[1])
+
+    @cached_property
+    def splats(self) -> Splats:
+        """The splats that were lifted.
+
+        Raises:
+            InvalidLift: their file moved, or is another than the one that was lifted.
+        """
+        from liftcore.scene.load import load_splats
+
+        return load_splats(unchanged("splats", self.lift.metadata.splats, self.path))
+
+    @cached_property
+    def cameras(self) -> Cameras:
+        """The cameras of the scene, all of them, also those that the lift left out.
+
+        Raises:
+            InvalidLift: their file moved, or is another than the one that was lifted.
+        """
+        from liftcore.scene.load import load_cameras
+
+        return load_cameras(unchanged("cameras", self.lift.metadata.cameras, self.path))
+
+    @cached_property
+    def raster(self) -> Raster:
+        """A for this scene."""
+        from liftcore.raster.cpu import CpuRaster
+
+        return CpuRaster(self.splats, threads=None)
+
+    @property
+    def walk(self) -> Walk:
+        """How rays walk when scores are rendered: with the lift's rendering gain (App. Tikhonov)."""
+        settings = self.lift.metadata.settings
+        return Walk(settings.render_gain, settings.alpha_cap, settings.transmittance_stop)
