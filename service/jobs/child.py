@@ -1,8 +1,8 @@
 """The process of one job: reads its order from stdin, lifts, and says how it goes in JSON lines on stdout.
 
-Run as ``python -m service.jobs.child``. Messages are ``{"event": "progress", ...}``, any number of times, then
-one ``{"event": "done", ...}`` or ``{"event": "fault", "fault": {...}}``. It writes nothing but its draft, so
-whatever ends it leaves nothing behind.
+Run as ``python -m service.jobs.child``. Messages are ``{"event": "progress", ...}``, any number of times,
+then one ``{"event": "done", ...}`` or ``{"event": "fault", "fault": {...}}``. It writes nothing but its
+draft, so whatever ends it leaves nothing behind.
 """
 
 from __future__ import annotations

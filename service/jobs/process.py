@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 GRACE_SECONDS = 3.0
@@ -18,12 +19,13 @@ GRACE_SECONDS = 3.0
 class JobProcess:
     """Started with an order, read for messages, and ended with its whole process group."""
 
-    def __init__(self, order: dict[str, Any]) -> None:
+    def __init__(self, order: dict[str, Any], scratch: Path) -> None:
         self._process = subprocess.Popen(
             [sys.executable, "-m", "service.jobs.child"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             start_new_session=True,
+            env=os.environ | {"TMPDIR": str(scratch)},
         )
         # The number of a group is ours only until its leader is reaped, so signals and the reaping exclude
         # each other.

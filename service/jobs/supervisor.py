@@ -65,20 +65,21 @@ class Supervisor:
             self._wake.wait(IDLE_SECONDS)
 
     def _run(self, job: JobRecord) -> None:
-        with self._store.files.draft(".safetensors") as draft:
+        files = self._store.files
+        with files.draft(".safetensors") as draft, files.scratch() as scratch:
             try:
-                last, status = self._converse(job, draft)
+                last, status = self._converse(job, draft, scratch)
                 self._settle(job, draft, last, status)
             except Exception:
                 log.exception("job %s could not be run", job.id)
                 self._fail(job, Crashed("job", expected="a process that runs", got="an error of the server"))
 
-    def _converse(self, job: JobRecord, draft: Path) -> tuple[dict[str, Any], int]:
+    def _converse(self, job: JobRecord, draft: Path, scratch: Path) -> tuple[dict[str, Any], int]:
         """Run the child to its end; its last message that was not progress, and its exit status."""
         with self._process_lock:
             if self._stopping.is_set():
                 return {"event": "nothing"}, 0
-            self._process = process = JobProcess(self._order(job, draft))
+            self._process = process = JobProcess(self._order(job, draft), scratch)
         last: dict[str, Any] = {"event": "nothing"}
         pace = Pace()
         try:

@@ -96,10 +96,10 @@ class Answers:
         return Frame({}, file.getvalue())
 
     def _mask(self, request: dict[str, Any]) -> Frame:
-        return Frame({}, mask_png(self._look(request).mask))
+        return Frame({}, mask_png(self._look(request)))
 
     def _attention(self, request: dict[str, Any]) -> Frame:
-        return Frame({}, attention_png(self._look(request).attention))
+        return Frame({}, attention_png(self._look(request)))
 
     def _render(self, request: dict[str, Any]) -> Frame:
         return Frame({}, render_png(self._scene(request), request["view"]))

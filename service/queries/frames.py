@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, field
-from typing import Any, BinaryIO
+from typing import IO, Any
 
 
 @dataclass(frozen=True)
@@ -15,7 +15,7 @@ class Frame:
     body: bytes = field(default=b"", repr=False)
 
 
-def write_frame(out: BinaryIO, frame: Frame) -> None:
+def write_frame(out: IO[bytes], frame: Frame) -> None:
     """Send one message."""
     line = json.dumps({"bytes": len(frame.body), "header": frame.header}, allow_nan=False)
     out.write(line.encode() + b"\n")
@@ -23,7 +23,7 @@ def write_frame(out: BinaryIO, frame: Frame) -> None:
     out.flush()
 
 
-def read_frame(source: BinaryIO) -> Frame | None:
+def read_frame(source: IO[bytes]) -> Frame | None:
     """The next message, None when the other side is gone."""
     line = source.readline()
     if not line.endswith(b"\n"):

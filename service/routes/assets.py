@@ -43,7 +43,8 @@ RAW_BODY = {
 async def upload(kind: wire.AssetKind, request: Request, here: Here, sha256: Sha256 = None) -> Response:
     """Upload splats (PLY), cameras (JSON or a zip of a COLMAP model) or a feature pack (safetensors)."""
     gzip = gzipped(request.headers.get("content-encoding", ""))
-    with here.store.files.draft(f".{kind}") as draft:
+    files = here.store.files
+    with files.draft(f".{kind}") as draft, files.scratch() as scratch:
         with Intake(draft, limit=here.settings.max_upload_bytes(kind), gzip=gzip) as intake:
             await _receive(request, intake)
             digest = intake.finish()
@@ -52,7 +53,7 @@ async def upload(kind: wire.AssetKind, request: Request, here: Here, sha256: Sha
         known = await anyio.to_thread.run_sync(here.store.assets.find, f"sha256:{digest}")
         if known is not None and known.kind is kind:
             return _reply(known, 200)
-        limits = CheckLimits(here.settings.check_seconds, here.settings.check_memory_bytes)
+        limits = CheckLimits(scratch, here.settings.check_seconds, here.settings.check_memory_bytes)
         report = await anyio.to_thread.run_sync(check, kind, draft, limits, limiter=here.checks)
         checked = CheckedUpload(draft, kind, digest, report.suffix, report.counts, report.warnings)
         asset, new = await anyio.to_thread.run_sync(here.store.assets.add, checked)

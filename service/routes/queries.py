@@ -18,8 +18,12 @@ from service.store.lifts import LiftRecord
 
 router = APIRouter(tags=["queries"])
 
-PNG = {200: {"content": {"image/png": {"schema": {"type": "string", "format": "binary"}}}}}
-NPY = {200: {"content": {"application/x-npy": {"schema": {"type": "string", "format": "binary"}}}}}
+PNG: dict[int | str, dict[str, Any]] = {
+    200: {"content": {"image/png": {"schema": {"type": "string", "format": "binary"}}}}
+}
+NPY: dict[int | str, dict[str, Any]] = {
+    200: {"content": {"application/x-npy": {"schema": {"type": "string", "format": "binary"}}}}
+}
 
 LiftParameter = Annotated[
     str | None, Query(pattern=wire.JOB_ID, description="the lift; may be left out when there is exactly one")

@@ -5,6 +5,8 @@ from __future__ import annotations
 import fcntl
 import os
 import secrets
+import shutil
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -32,8 +34,8 @@ class DataDirectory:
                 hint="stop the other server or name another directory with --data",
             ) from None  # fmt: skip
         # Nothing below tmp/ was ever acknowledged, and the server that wrote it is gone.
-        for draft in (self.root / "tmp").iterdir():
-            draft.unlink()
+        shutil.rmtree(self.root / "tmp")
+        (self.root / "tmp").mkdir()
 
     @contextmanager
     def draft(self, suffix: str) -> Iterator[Path]:
@@ -44,6 +46,12 @@ class DataDirectory:
         finally:
             for left in path.parent.glob(f"*{path.name}*"):  # with the drafts that writers keep beside it
                 left.unlink(missing_ok=True)
+
+    @contextmanager
+    def scratch(self) -> Iterator[Path]:
+        """A folder for what a child process unpacks; nothing of it is left, however the child ends."""
+        with tempfile.TemporaryDirectory(dir=self.root / "tmp") as folder:
+            yield Path(folder)
 
     def blob(self, digest: str, suffix: str) -> Path:
         """Where an asset of that digest lies."""

@@ -28,8 +28,9 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class CheckLimits:
-    """What one check may take."""
+    """What one check may take, and where it may unpack."""
 
+    scratch: Path
     seconds: float
     memory_bytes: int
 
@@ -57,6 +58,7 @@ def check(kind: AssetKind, path: Path, limits: CheckLimits) -> Report:
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         start_new_session=True,
+        env=os.environ | {"TMPDIR": str(limits.scratch)},
     )
     with process:
         try:
@@ -72,7 +74,7 @@ def check(kind: AssetKind, path: Path, limits: CheckLimits) -> Report:
 
 def _report(kind: AssetKind, output: bytes, returncode: int, trace: bytes) -> Report:
     messages = [json.loads(line) for line in output.splitlines()]
-    last = messages[-1] if messages else {"event": "nothing"}
+    last: dict[str, Any] = messages[-1] if messages else {"event": "nothing"}
     if last["event"] == "valid":
         return Report(suffix=last["suffix"], counts=last["counts"], warnings=last["warnings"])
     if last["event"] == "invalid":
