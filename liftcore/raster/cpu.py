@@ -20,7 +20,13 @@ from liftcore.raster.depth_order import depth_order
 from liftcore.raster.projection import RECORD, axes_of, opacities, project_gaussians, view_of
 from liftcore.raster.protocol import RayRows, RegionWeights, Walk
 from liftcore.raster.readings import reading_of
-from liftcore.raster.region_weights import count_entries, group_entries, merge_rows, split_evidence, weigh_tiles
+from liftcore.raster.region_weights import (
+    count_entries,
+    group_entries,
+    merge_rows,
+    split_evidence,
+    weigh_tiles,
+)
 from liftcore.raster.rendering import render_tiles, top_tiles, trace_rays
 from liftcore.raster.tiles import count_tiles, fill_tiles, tile_places
 from liftcore.raster.walk import Frame
@@ -38,7 +44,6 @@ if TYPE_CHECKING:
 SPLAT_SHARES = 8  # shares of the projection, the binning and the merge
 TILE_SHARES = 48  # shares of the blending; more of them even out crowded tiles
 RENDER_CHANNELS = 32  # channels a pass of the render, so that a tile's sums stay in the cache
-
 
 
 class CpuRaster:
@@ -70,7 +75,9 @@ class CpuRaster:
         self._depths = np.empty(splats.count, np.float32)
         self._frames: OrderedDict[tuple[Camera, Walk], Frame] = OrderedDict()
 
-    def region_weights(self, camera: Camera, observation: Observation, walk: Walk, power: int) -> RegionWeights:
+    def region_weights(
+        self, camera: Camera, observation: Observation, walk: Walk, power: int
+    ) -> RegionWeights:
         """``A^p^T S`` of a view and the evidence of plain weights. See the protocol."""
         if power not in (1, 2):
             raise InvalidInput("power", expected="1 or 2", got=str(power))
@@ -86,7 +93,9 @@ class CpuRaster:
         """``A X``: values [P, C] f32 -> [H, W, C] f32. See the protocol."""
         if values.ndim != 2 or values.shape[0] != self.splats.count:
             raise InvalidInput(
-                "values", expected=f"one row for each of {self.splats.count} splats", got=f"{list(values.shape)}"
+                "values",
+                expected=f"one row for each of {self.splats.count} splats",
+                got=f"{list(values.shape)}",
             )
         frame = self._frame(camera, walk)
         channels = values.shape[1]
@@ -96,7 +105,10 @@ class CpuRaster:
             block = np.ascontiguousarray(values[:, begin:end].to(torch.float32).numpy())
             target = np.zeros((camera.height, camera.width, end - begin), np.float32)
             self._over_tiles(
-                frame, lambda first, last, block=block, target=target: render_tiles(first, last, frame, block, target)
+                frame,
+                lambda first, last, block=block, target=target: render_tiles(
+                    first, last, frame, block, target
+                ),
             )
             image[:, :, begin:end] = target
         return torch.from_numpy(image)
@@ -137,7 +149,10 @@ class CpuRaster:
         arrays = (self._means, self._axes, opacity, plain, view, self._records, self._depths, ids)
         bounds = _shares(self.splats.count, SPLAT_SHARES)
         counts = self._map(lambda first, last: project_gaussians(first, last, *arrays), bounds)
-        used = [np.arange(first, first + count, dtype=np.int32) for (first, _), count in zip(bounds, counts, strict=True)]
+        used = [
+            np.arange(first, first + count, dtype=np.int32)
+            for (first, _), count in zip(bounds, counts, strict=True)
+        ]
         places = np.concatenate(used) if used else np.empty(0, np.int32)
         return ids, depth_order(self._depths[places].view(np.uint32), places)
 
@@ -169,7 +184,8 @@ class CpuRaster:
             group_entries(*share, cursors, columns, weights)
         kept = np.zeros(count, np.int64)
         self._map(
-            lambda first, last: merge_rows(first, last, starts, columns, weights, kept), _shares(count, SPLAT_SHARES)
+            lambda first, last: merge_rows(first, last, starts, columns, weights, codebook_rows + 1, kept),
+            _shares(count, SPLAT_SHARES),
         )
         rows, total = int((kept > 0).sum()), int(kept.sum())
         out = (

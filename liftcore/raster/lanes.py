@@ -70,15 +70,11 @@ def _exp2_negative(builder: ir.IRBuilder, exponent: ir.Value) -> ir.Value:
     rest = builder.fsub(clamped, builder.sitofp(whole, _FLOATS))
     value = _constant(_EXP2[-1])
     for coefficient in reversed(_EXP2[:-1]):
-        value = builder.fadd(
-            builder.fmul(value, rest, flags=_FUSE), _constant(coefficient), flags=_FUSE
-        )
+        value = builder.fadd(builder.fmul(value, rest, flags=_FUSE), _constant(coefficient), flags=_FUSE)
     bias = ir.Constant(_INTS, [127] * LANES)
     shift = ir.Constant(_INTS, [23] * LANES)
     power = builder.bitcast(builder.shl(builder.sub(bias, whole), shift), _FLOATS)
     return builder.fmul(value, power)
-
-
 
 
 @intrinsic
@@ -162,9 +158,7 @@ def square_lanes(typingctx, weights, row):
 @intrinsic
 def add_product_lanes(typingctx, total, offset, weights, row, factors, tap):
     """``total[offset + i] += weights[row + i] * factors[tap + i]``."""
-    signature = types.void(
-        _FLOAT_ARRAY, types.intp, _FLOAT_ARRAY, types.intp, _FLOAT_ARRAY, types.intp
-    )
+    signature = types.void(_FLOAT_ARRAY, types.intp, _FLOAT_ARRAY, types.intp, _FLOAT_ARRAY, types.intp)
 
     def codegen(context, builder, signature, args):
         total, offset, weights, row, factors, tap = args

@@ -10,21 +10,24 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from liftcore.raster.constants import TILE
 from liftcore.raster.lanes import LANES, add_lanes, add_product_lanes, square_lanes
+from liftcore.raster.projection import PLAIN
 from liftcore.raster.readings import MAX_SLOTS, new_taps, read_tile
 from liftcore.raster.walk import (
     CHECK_EVERY,
+    HALVES,
     blend,
     blend_plain,
+    footprint,
     look,
     new_rays,
     row_centre,
-    row_range,
     start_rays,
     touches,
 )
 
-LONG_ROW = 64  # entries; longer rows are merge-sorted first
+LONG_ROW = 64  # entries; longer rows are sorted by the library
 
 
 @njit(nogil=True, cache=True)
@@ -45,79 +48,92 @@ def weigh_tiles(first, last, frame, reading, power, with_plain):
     local = np.zeros(MAX_SLOTS * reading.levels, np.float32)
     evidence = np.zeros(LANES, np.float32)
     limits = (np.float32(frame.cap), np.float32(frame.stop))
-    places = np.empty(1 << 14, np.int32)
-    columns = np.empty(1 << 14, np.int32)
-    weights = np.empty(1 << 14, np.float32)
+    records, items, starts = frame.records, frame.items, frame.starts
+    tap_starts, tap_slots, tap_whole = taps.starts, taps.slots, taps.whole
+    evidence_source = plain.weights if with_plain else rays.weights
+    places = np.empty(1 << 16, np.int32)
+    columns = np.empty(1 << 16, np.int32)
+    weights = np.empty(1 << 16, np.float32)
     count = 0
     for tile in range(first, last):
-        if frame.starts[tile] == frame.starts[tile + 1]:
+        if starts[tile] == starts[tile + 1]:
             continue
-        x0 = float((tile % frame.columns) * 16)
-        y0 = float((tile // frame.columns) * 16)
+        x0 = float((tile % frame.columns) * TILE)
+        y0 = float((tile // frame.columns) * TILE)
         start_rays(rays, frame, tile)
         start_rays(plain, frame, tile)
         read_tile(taps, reading, frame, tile)
-        for step in range(frame.starts[tile], frame.starts[tile + 1]):
-            if (step - frame.starts[tile]) % CHECK_EVERY == 0:
-                alive = look(rays)
-                if with_plain:
-                    alive |= look(plain)
-                    for half in range(rays.alive.shape[0]):
-                        rays.alive[half] |= plain.alive[half]
-                if not alive:
-                    break
-            place = frame.items[step]
-            record = frame.records[place]
-            top, bottom = row_range(record, y0)
-            met = False
+        room = taps.sizes[1] + reading.levels + 1
+        for step in range(starts[tile], starts[tile + 1]):
+            if (step - starts[tile]) % CHECK_EVERY == 0 and not look_at_both(rays, plain, with_plain):
+                break
+            place = items[step]
+            splat = footprint(records, place, x0, y0)
             low_slot, high_slot = MAX_SLOTS, -1
-            for row in range(top, bottom + 1):
-                centre, base = row_centre(record, row, x0, y0)
+            for row in range(splat.top, splat.bottom + 1):
+                centre, base = row_centre(splat, row)
                 for side in range(2):
                     half = 2 * row + side
-                    if not rays.alive[half] or not touches(record, centre, base, side):
+                    if not rays.alive[half] or not touches(splat, centre, base, side):
                         continue
-                    met = True
                     offset = half * LANES
-                    blend(rays, record, centre, base, half, limits)
+                    blend(rays, splat, centre, base, half, limits)
                     if with_plain:
-                        blend_plain(plain, rays.falloff, record, half, limits)
-                        add_lanes(evidence, 0, plain.weights, offset)
-                    else:
-                        add_lanes(evidence, 0, rays.weights, offset)
+                        blend_plain(plain, rays.falloff, records[place, PLAIN], half, limits)
+                    add_lanes(evidence, 0, evidence_source, offset)
                     if power == 2:
                         square_lanes(rays.weights, offset)
-                    for tap in range(taps.starts[half], taps.starts[half + 1]):
-                        slot = taps.slots[tap]
+                    for tap in range(tap_starts[half], tap_starts[half + 1]):
+                        slot = tap_slots[tap]
                         low_slot = min(low_slot, slot)
                         high_slot = max(high_slot, slot)
-                        if taps.whole[tap]:
+                        if tap_whole[tap]:
                             add_lanes(slots, slot * LANES, rays.weights, offset)
                         else:
                             add_product_lanes(
                                 slots, slot * LANES, rays.weights, offset, taps.factors, tap * LANES
                             )
-            if not met:
-                continue
-            room = taps.sizes[1] + 1
             if count + room > places.shape[0]:
                 places, columns, weights = _grow(places, columns, weights, count + room)
-            count = _flush_slots(taps, slots, local, low_slot, high_slot, place, places, columns, weights, count)
             total = _drain(evidence, 0)
             if total > 0:
                 places[count] = place
                 columns[count] = reading.codebook_rows
                 weights[count] = total
                 count += 1
+            if high_slot == low_slot:  # most splats meet one slot a tile
+                total = _drain(slots, low_slot * LANES)
+                for level in range(reading.levels if total > 0 else 0):
+                    column = taps.slot_columns[low_slot, level]
+                    if column >= 0:
+                        places[count] = place
+                        columns[count] = taps.columns[column]
+                        weights[count] = total
+                        count += 1
+            elif high_slot >= 0:
+                kept = _flush_slots(taps, slots, local, low_slot, high_slot, columns, weights, count)
+                places[count:kept] = place
+                count = kept
     return places[:count], columns[:count], weights[:count]
+
+
+@njit(nogil=True, cache=True, inline="always")
+def look_at_both(rays, plain, with_plain):
+    """Note in ``rays.alive`` which half rows let light through, with or without the gain; whether any does."""
+    alive = look(rays)
+    if with_plain:
+        alive |= look(plain)
+        for half in range(HALVES):
+            rays.alive[half] |= plain.alive[half]
+    return alive
 
 
 @njit(nogil=True, cache=True, inline="always")
 def _drain(lanes, offset):
     """The sum of eight lanes, in a fixed tree; the lanes are zero afterwards."""
-    total = (
-        (lanes[offset] + lanes[offset + 4]) + (lanes[offset + 2] + lanes[offset + 6])
-    ) + ((lanes[offset + 1] + lanes[offset + 5]) + (lanes[offset + 3] + lanes[offset + 7]))
+    total = ((lanes[offset] + lanes[offset + 4]) + (lanes[offset + 2] + lanes[offset + 6])) + (
+        (lanes[offset + 1] + lanes[offset + 5]) + (lanes[offset + 3] + lanes[offset + 7])
+    )
     for lane in range(LANES):
         lanes[offset + lane] = 0
     return total
@@ -136,7 +152,7 @@ def _grow(places, columns, weights, needed):
 
 
 @njit(nogil=True, cache=True)
-def _flush_slots(taps, slots, local, low_slot, high_slot, place, places, columns, weights, count):
+def _flush_slots(taps, slots, local, low_slot, high_slot, columns, weights, count):
     """Expand a splat's slots to codebook rows and append them; slots and local sums are zero afterwards."""
     levels = taps.slot_columns.shape[1]
     low_column, high_column = taps.sizes[1], -1
@@ -152,7 +168,6 @@ def _flush_slots(taps, slots, local, low_slot, high_slot, place, places, columns
                 high_column = max(high_column, column)
     for column in range(low_column, high_column + 1):
         if local[column] > 0:
-            places[count] = place
             columns[count] = taps.columns[column]
             weights[count] = local[column]
             count += 1
@@ -178,37 +193,33 @@ def count_entries(places, counts):
 
 
 @njit(nogil=True, cache=True)
-def merge_rows(first, last, starts, columns, weights, kept):
-    """Sort each record's entries by column and sum equal columns in float64, in place.
+def merge_rows(first, last, starts, columns, weights, column_count, kept):
+    """Sum each record's entries by column in float64 and sort them by column, in place.
 
     ``kept`` [P] i64 receives how many entries each of the records ``first..last`` keeps.
     """
+    sums = np.zeros(column_count)
     for row in range(first, last):
         begin, end = starts[row], starts[row + 1]
-        if end - begin > LONG_ROW:
-            order = np.argsort(columns[begin:end], kind="mergesort")
-            columns[begin:end] = columns[begin:end][order]
-            weights[begin:end] = weights[begin:end][order]
-        for i in range(begin + 1, end):  # insertion sort: stable, and most rows are short
-            column, weight = columns[i], weights[i]
+        out = begin
+        for i in range(begin, end):
+            column = columns[i]
+            if sums[column] == 0:
+                columns[out] = column  # out <= i: entries before i are already summed
+                out += 1
+            sums[column] += weights[i]
+        if out - begin > LONG_ROW:
+            columns[begin:out] = np.sort(columns[begin:out])
+        for i in range(begin + 1, out):  # insertion sort: most rows are short
+            column = columns[i]
             k = i - 1
             while k >= begin and columns[k] > column:
                 columns[k + 1] = columns[k]
-                weights[k + 1] = weights[k]
                 k -= 1
             columns[k + 1] = column
-            weights[k + 1] = weight
-        out = begin
-        i = begin
-        while i < end:
-            column = columns[i]
-            total = 0.0
-            while i < end and columns[i] == column:
-                total += weights[i]
-                i += 1
-            columns[out] = column
-            weights[out] = total
-            out += 1
+        for i in range(begin, out):
+            weights[i] = sums[columns[i]]
+            sums[columns[i]] = 0
         kept[row] = out - begin
 
 

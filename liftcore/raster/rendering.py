@@ -13,10 +13,10 @@ from liftcore.raster.projection import KX, KY, MX, MY, OPACITY, SLOPE
 from liftcore.raster.walk import (
     CHECK_EVERY,
     blend,
+    footprint,
     look,
     new_rays,
     row_centre,
-    row_range,
     start_rays,
     touches,
 )
@@ -41,20 +41,19 @@ def render_tiles(first, last, frame, values, image):
             if (step - frame.starts[tile]) % CHECK_EVERY == 0 and not look(rays):
                 break
             place = frame.items[step]
-            record = frame.records[place]
-            splat = frame.ids[place]
-            top, bottom = row_range(record, float(y0))
-            for row in range(top, bottom + 1):
-                centre, base = row_centre(record, row, float(x0), float(y0))
+            splat = footprint(frame.records, place, float(x0), float(y0))
+            number = frame.ids[place]
+            for row in range(splat.top, splat.bottom + 1):
+                centre, base = row_centre(splat, row)
                 for side in range(2):
                     half = 2 * row + side
-                    if not rays.alive[half] or not touches(record, centre, base, side):
+                    if not rays.alive[half] or not touches(splat, centre, base, side):
                         continue
-                    blend(rays, record, centre, base, half, limits)
+                    blend(rays, splat, centre, base, half, limits)
                     offset = half * LANES
                     for channel in range(channels):
                         target = channel * PIXELS + offset
-                        add_scaled_lanes(sums, target, rays.weights, offset, values[splat, channel])
+                        add_scaled_lanes(sums, target, rays.weights, offset, values[number, channel])
         for y in range(min(TILE, frame.height - y0)):
             for x in range(min(TILE, frame.width - x0)):
                 for channel in range(channels):
@@ -80,16 +79,15 @@ def top_tiles(first, last, frame, ids, weights):
             if (step - frame.starts[tile]) % CHECK_EVERY == 0 and not look(rays):
                 break
             place = frame.items[step]
-            record = frame.records[place]
-            splat = frame.ids[place]
-            top, bottom = row_range(record, float(y0))
-            for row in range(top, bottom + 1):
-                centre, base = row_centre(record, row, float(x0), float(y0))
+            splat = footprint(frame.records, place, float(x0), float(y0))
+            number = frame.ids[place]
+            for row in range(splat.top, splat.bottom + 1):
+                centre, base = row_centre(splat, row)
                 for side in range(2):
                     half = 2 * row + side
-                    if not rays.alive[half] or not touches(record, centre, base, side):
+                    if not rays.alive[half] or not touches(splat, centre, base, side):
                         continue
-                    blend(rays, record, centre, base, half, limits)
+                    blend(rays, splat, centre, base, half, limits)
                     for lane in range(LANES):
                         weight = rays.weights[half * LANES + lane]
                         if weight <= 0:
@@ -103,7 +101,7 @@ def top_tiles(first, last, frame, ids, weights):
                             k -= 1
                         if k < count:
                             weights[y, x, k] = weight
-                            ids[y, x, k] = splat
+                            ids[y, x, k] = number
 
 
 @njit(nogil=True, cache=True)
@@ -145,5 +143,3 @@ def trace_rays(frame, pixels):
             count += 1
         row_starts[i + 1] = count
     return row_starts, splats[:count], weights[:count]
-
-

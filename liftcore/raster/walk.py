@@ -6,6 +6,7 @@ A tile is 16 rows of two half rows of eight pixels. Products (region weights, re
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +14,7 @@ from numba import njit
 
 from liftcore.raster.constants import ALPHA_FLOOR, TILE
 from liftcore.raster.lanes import LANES, blend_lanes, gaussian_lanes
-from liftcore.raster.projection import EXTENT_Y, KX, KY, MX, MY, OPACITY, PLAIN, REACH, SLOPE
+from liftcore.raster.projection import EXTENT_Y, KX, KY, MX, MY, OPACITY, REACH, SLOPE
 
 HALVES = TILE * TILE // LANES  # half rows of a tile
 CHECK_EVERY = 16  # splats between two looks at which half rows still let light through
@@ -80,44 +81,68 @@ def look(rays):
     return any_alive
 
 
-@njit(nogil=True, cache=True, inline="always")
-def row_range(record, y0):
-    """The tile's first and last pixel row that the footprint can reach (last < first: none)."""
-    top = np.ceil(record[MY] - record[EXTENT_Y] - 0.5 - y0)
-    bottom = np.floor(record[MY] + record[EXTENT_Y] - 0.5 - y0)
-    return int(max(0.0, top)), int(min(TILE - 1.0, bottom))
+class Footprint(NamedTuple):
+    """One splat as a tile sees it: the record relative to the tile's first pixel centre."""
+
+    top: int  # first pixel row of the tile that it can reach
+    bottom: int  # last one; before the first when there is none
+    mx: float
+    my: float
+    slope: float
+    kx: float
+    ky: float
+    reach: float
+    opacity: float
 
 
 @njit(nogil=True, cache=True, inline="always")
-def row_centre(record, row, x0, y0):
-    """The footprint in one pixel row: its centre in lanes from x0, its exponent there."""
-    dy = y0 + row + 0.5 - record[MY]
-    return record[MX] + record[SLOPE] * dy - x0 - 0.5, record[KY] * dy * dy
+def footprint(records, place, x0, y0):
+    """The record of a splat for the tile whose first pixel is (x0, y0)."""
+    my = records[place, MY] - y0 - 0.5
+    extent = records[place, EXTENT_Y]
+    return Footprint(
+        int(max(0.0, math.ceil(my - extent))),
+        int(min(TILE - 1.0, math.floor(my + extent))),
+        records[place, MX] - x0 - 0.5,
+        my,
+        records[place, SLOPE],
+        records[place, KX],
+        records[place, KY],
+        records[place, REACH],
+        records[place, OPACITY],
+    )
 
 
 @njit(nogil=True, cache=True, inline="always")
-def touches(record, centre, base, side):
+def row_centre(splat, row):
+    """The footprint in one pixel row: its centre in lanes, its exponent there."""
+    dy = row - splat.my
+    return splat.mx + splat.slope * dy, splat.ky * dy * dy
+
+
+@njit(nogil=True, cache=True, inline="always")
+def touches(splat, centre, base, side):
     """Whether any lane of half row ``side`` (0 left, 1 right) can reach the alpha floor."""
     near = max(0.0, max(side * LANES - centre, centre - (side * LANES + LANES - 1)))
-    return record[KX] * near * near + base <= record[REACH]
+    return splat.kx * near * near + base <= splat.reach
 
 
 @njit(nogil=True, cache=True, inline="always")
-def blend(rays, record, centre, base, half, limits):
+def blend(rays, splat, centre, base, half, limits):
     """Composite the splat over half row ``half``; its weights lie in ``rays.weights`` afterwards.
 
     ``limits = (cap, stop)`` as float32.
     """
     offset = half * LANES
     start = np.float32((half % 2) * LANES - centre)
-    gaussian_lanes(rays.falloff, offset, start, np.float32(record[KX]), np.float32(base))
-    alpha = (np.float32(record[OPACITY]), limits[0], np.float32(ALPHA_FLOOR), limits[1])
+    gaussian_lanes(rays.falloff, offset, start, np.float32(splat.kx), np.float32(base))
+    alpha = (np.float32(splat.opacity), limits[0], np.float32(ALPHA_FLOOR), limits[1])
     blend_lanes(rays.weights, offset, rays.falloff, rays.transmittance, offset, alpha)
 
 
 @njit(nogil=True, cache=True, inline="always")
-def blend_plain(plain, falloff, record, half, limits):
+def blend_plain(plain, falloff, opacity, half, limits):
     """The same splat for the rays without opacity gain, from the falloff that ``blend`` left."""
     offset = half * LANES
-    alpha = (np.float32(record[PLAIN]), limits[0], np.float32(ALPHA_FLOOR), limits[1])
+    alpha = (np.float32(opacity), limits[0], np.float32(ALPHA_FLOOR), limits[1])
     blend_lanes(plain.weights, offset, falloff, plain.transmittance, offset, alpha)

@@ -1,0 +1,183 @@
+"""The plain float64 rasterizer that every fast path is held to.
+
+Read it beside the paper: for each splat the EWA projection, for each ray the walk of Eq. 1, one splat after the
+other, and A [rays, splats] written out as a dense matrix. It is slow and needs R x P memory; use it on small scenes.
+Nothing is shared with the CPU backend but the constants.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from liftcore.observe.observation import Observation, RegionMap
+from liftcore.raster.constants import ALPHA_FLOOR, FIELD_MARGIN, LOW_PASS, NEAR_PLANE
+from liftcore.raster.protocol import RayRows, RegionWeights, Walk
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from liftcore.scene.cameras import Camera
+    from liftcore.scene.splats import Splats
+
+CUT_BAND = 1e-4  # relative distance to a cut-off within which float32 may decide otherwise
+
+
+@dataclass(frozen=True)
+class DenseView:
+    """A of one view, and the rays whose value hangs on a knife's edge."""
+
+    A: np.ndarray  # [H * W, P] f64, row i = y * W + x
+    cut: np.ndarray  # [H * W] bool: some alpha or T of the ray lies within CUT_BAND of its cut-off
+
+
+def rotation(quat: np.ndarray) -> np.ndarray:
+    """[3, 3] f64 of a quaternion w x y z of any length; zero counts as identity."""
+    length = np.linalg.norm(quat)
+    w, x, y, z = quat / length if length > 0 else np.array([1.0, 0.0, 0.0, 0.0])
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def projected_gaussian(splats: Splats, j: int, camera: Camera) -> tuple[np.ndarray, np.ndarray, float]:
+    """Mean [2] in pixels, conic [2, 2] and camera depth of splat j (EWA: cov = J W Sigma W^T J^T + 0.3 I)."""
+    R, t = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
+    x, y, z = R @ splats.means[j].double().numpy() + t
+    mean = np.array([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy])
+    margin_x = FIELD_MARGIN * 0.5 * camera.width / camera.fx
+    margin_y = FIELD_MARGIN * 0.5 * camera.height / camera.fy
+    u = np.clip(x / z, -camera.cx / camera.fx - margin_x, (camera.width - camera.cx) / camera.fx + margin_x)
+    v = np.clip(y / z, -camera.cy / camera.fy - margin_y, (camera.height - camera.cy) / camera.fy + margin_y)
+    J = np.array([[camera.fx / z, 0, -camera.fx * u / z], [0, camera.fy / z, -camera.fy * v / z]])
+    M = rotation(splats.quats[j].double().numpy()) @ np.diag(np.exp(splats.log_scales[j].double().numpy()))
+    cov = J @ R @ M @ M.T @ R.T @ J.T + LOW_PASS * np.eye(2)
+    return mean, np.linalg.inv(cov), float(z)
+
+
+def dense_view(splats: Splats, camera: Camera, walk: Walk) -> DenseView:
+    """A of one view (paper Eq. 1): ``w = alpha T``, front to back, with the field's cut-offs.
+
+    The order is by camera depth rounded to float32, ties by row; the stop is exclusive.
+    """
+    y, x = np.mgrid[: camera.height, : camera.width]
+    pixels = np.stack([x.ravel() + 0.5, y.ravel() + 0.5], axis=1)
+    rays = pixels.shape[0]
+    z = (splats.means.double().numpy() @ camera.world_to_camera[2, :3]) + camera.world_to_camera[2, 3]
+    A = np.zeros((rays, splats.count))
+    cut = np.zeros(rays, bool)
+    T = np.ones(rays)
+    done = np.zeros(rays, bool)
+    for j in np.argsort(z.astype(np.float32), kind="stable"):
+        if z[j] < NEAR_PLANE:
+            continue
+        mean, conic, _ = projected_gaussian(splats, int(j), camera)
+        d = pixels - mean
+        sigma = 0.5 * np.einsum("ri,ij,rj->r", d, conic, d)
+        opacity = 1 / (1 + np.exp(-walk.gain * float(splats.opacity_logits[j])))
+        raw = opacity * np.exp(-sigma)
+        alpha = np.where(raw < ALPHA_FLOOR, 0.0, np.minimum(raw, walk.alpha_cap))
+        after = T * (1 - alpha)
+        stops = (after <= walk.transmittance_stop) & ~done
+        cut |= ~done & (np.abs(raw / ALPHA_FLOOR - 1) < CUT_BAND)
+        if walk.transmittance_stop > 0:
+            cut |= ~done & (alpha > 0) & (np.abs(after / walk.transmittance_stop - 1) < CUT_BAND)
+        done |= stops
+        A[:, j] = np.where(done, 0.0, alpha * T)
+        T = np.where(done, T, after)
+    return DenseView(A, cut)
+
+
+def reading_matrix(observation: Observation, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
+    """S [rows, M] f64 and the ray of every row [rows]: one row a labelled level and ray, or one a ray for grids."""
+    rays = np.arange(width * height)
+    x, y = rays % width, rays // width
+    if isinstance(observation, RegionMap):
+        labels = observation.labels.numpy()
+        levels, rows, columns = labels.shape
+        at = labels[:, ((2 * y + 1) * rows) // (2 * height), ((2 * x + 1) * columns) // (2 * width)]
+        level, ray = np.nonzero(at >= 0)
+        S = np.zeros((ray.shape[0], observation.codebook.shape[0]))
+        S[np.arange(ray.shape[0]), at[level, ray]] = 1.0
+        return S, ray
+    rows, columns = observation.grid.shape[:2]
+    S = np.zeros((rays.shape[0], rows * columns))
+    u = np.clip((x + 0.5) * columns / width - 0.5, 0, columns - 1)
+    v = np.clip((y + 0.5) * rows / height - 0.5, 0, rows - 1)
+    for right in (0, 1):
+        for below in (0, 1):
+            column = np.minimum(np.floor(u).astype(int) + right, columns - 1)
+            row = np.minimum(np.floor(v).astype(int) + below, rows - 1)
+            share = (u % 1 if right else 1 - u % 1) * (v % 1 if below else 1 - v % 1)
+            np.add.at(S, (rays, row * columns + column), share)
+    return S, rays
+
+
+class OracleRaster:
+    """The dense reference as a backend (``liftcore.raster.protocol.Raster``), for conformance tests."""
+
+    def __init__(self, splats: Splats) -> None:
+        self.splats = splats
+
+    def region_weights(
+        self, camera: Camera, observation: Observation, walk: Walk, power: int
+    ) -> RegionWeights:
+        """``A^p^T S`` by dense products, and the evidence of plain weights."""
+        S, ray = reading_matrix(observation, camera.width, camera.height)
+        A = dense_view(self.splats, camera, walk).A
+        W = (A[ray] ** power).T @ S
+        plain = dense_view(self.splats, camera, Walk(1.0, walk.alpha_cap, walk.transmittance_stop)).A.sum(
+            axis=0
+        )
+        rows, columns = np.nonzero(W)
+        splats, counts = np.unique(rows, return_counts=True)
+        met = np.flatnonzero(plain)
+        return RegionWeights(
+            torch.from_numpy(splats.astype(np.int32)),
+            torch.from_numpy(np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)),
+            torch.from_numpy(columns.astype(np.int32)),
+            torch.from_numpy(W[rows, columns].astype(np.float32)),
+            torch.from_numpy(met.astype(np.int32)),
+            torch.from_numpy(plain[met].astype(np.float32)),
+        )
+
+    def render(self, camera: Camera, values: Tensor, walk: Walk) -> Tensor:
+        """``A X`` by a dense product."""
+        image = dense_view(self.splats, camera, walk).A @ values.double().numpy()
+        return torch.from_numpy(image.astype(np.float32)).reshape(camera.height, camera.width, -1)
+
+    def row_sums(self, camera: Camera, walk: Walk) -> Tensor:
+        """``A 1``."""
+        return self.render(camera, torch.ones(self.splats.count, 1), walk)[:, :, 0]
+
+    def top_weights(self, camera: Camera, walk: Walk, count: int) -> tuple[Tensor, Tensor]:
+        """The largest weights of every ray by a full sort."""
+        A = dense_view(self.splats, camera, walk).A
+        order = np.argsort(-A, axis=1, kind="stable")[:, :count]
+        weights = np.take_along_axis(A, order, axis=1)
+        missing = count - order.shape[1]
+        order = np.pad(np.where(weights > 0, order, -1), ((0, 0), (0, missing)), constant_values=-1)
+        weights = np.pad(weights, ((0, 0), (0, missing)))
+        shape = (camera.height, camera.width, count)
+        ids = torch.from_numpy(order.astype(np.int32)).reshape(shape)
+        return ids, torch.from_numpy(weights.astype(np.float32)).reshape(shape)
+
+    def ray_rows(self, camera: Camera, pixels: Tensor, walk: Walk) -> RayRows:
+        """Rows of A, read off the dense matrix (in row order, not in depth order)."""
+        A = dense_view(self.splats, camera, walk).A
+        rows = A[(pixels[:, 1] * camera.width + pixels[:, 0]).numpy()]
+        ray, splats = np.nonzero(rows)
+        starts = np.concatenate([[0], np.cumsum(np.bincount(ray, minlength=rows.shape[0]))])
+        weights = rows[ray, splats].astype(np.float32)
+        return RayRows(
+            torch.from_numpy(starts.astype(np.int64)),
+            torch.from_numpy(splats.astype(np.int32)),
+            torch.from_numpy(weights),
+        )

@@ -1,0 +1,78 @@
+"""Small random scenes that the conformance suite and the property tests share."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from hypothesis import strategies as st
+
+from liftcore.observe.observation import FeatureGrid, Observation, RegionMap
+from liftcore.scene.cameras import Camera
+from liftcore.scene.splats import Splats
+
+
+def random_splats(seed: int, count: int = 40, spread: float = 1.0) -> Splats:
+    """Splats around the origin: needles, discs and balls, faint and opaque."""
+    rng = np.random.default_rng(seed)
+    return Splats(
+        means=torch.tensor(rng.normal(0, spread, (count, 3)), dtype=torch.float32),
+        quats=torch.tensor(rng.normal(0, 1, (count, 4)), dtype=torch.float32),
+        log_scales=torch.tensor(rng.uniform(-4.5, -0.5, (count, 3)), dtype=torch.float32),
+        opacity_logits=torch.tensor(rng.normal(0, 3, count), dtype=torch.float32),
+        sh=torch.tensor(rng.normal(0, 1, (count, 1, 3)), dtype=torch.float32),
+    )
+
+
+def look_at(name: str, centre: np.ndarray, width: int, height: int, focal: float) -> Camera:
+    """A camera at ``centre`` that looks at the origin."""
+    forward = -centre / np.linalg.norm(centre)
+    helper = np.array([0.0, 1.0, 0.0]) if abs(forward[1]) < 0.9 else np.array([1.0, 0.0, 0.0])
+    right = np.cross(helper, forward)
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    pose = np.eye(4)
+    pose[:3, :3] = rotation
+    pose[:3, 3] = -rotation @ centre
+    return Camera(name, width, height, focal, focal * 1.1, width / 2 + 0.7, height / 2 - 0.4, pose)
+
+
+def random_camera(seed: int, width: int = 37, height: int = 29, name: str = "v0") -> Camera:
+    """A camera somewhere around the scene; the size is no multiple of a tile."""
+    rng = np.random.default_rng(seed + 1_000)
+    direction = rng.normal(0, 1, 3)
+    centre = direction / np.linalg.norm(direction) * rng.uniform(2.5, 5.0)
+    return look_at(name, centre, width, height, focal=rng.uniform(0.7, 1.5) * width)
+
+
+def random_regions(
+    seed: int, levels: int = 2, rows: int = 5, size: tuple[int, int] = (15, 18), F: int = 6
+) -> RegionMap:
+    """Blocky label maps of another size than the image, some pixels unlabelled."""
+    rng = np.random.default_rng(seed + 2_000)
+    coarse = rng.integers(-1, rows, (levels, -(-size[0] // 3), -(-size[1] // 4)))
+    labels = np.repeat(np.repeat(coarse, 3, axis=1), 4, axis=2)[:, : size[0], : size[1]]
+    codebook = rng.normal(0, 1, (rows, F))
+    codebook /= np.linalg.norm(codebook, axis=1, keepdims=True)
+    return RegionMap(
+        torch.tensor(labels.copy(), dtype=torch.int32), torch.tensor(codebook, dtype=torch.float32)
+    )
+
+
+def random_grid(seed: int, size: tuple[int, int] = (7, 9), F: int = 6) -> FeatureGrid:
+    """A grid of random vectors."""
+    rng = np.random.default_rng(seed + 3_000)
+    return FeatureGrid(torch.tensor(rng.normal(0, 1, (*size, F)), dtype=torch.float32))
+
+
+@st.composite
+def scenes(draw: st.DrawFn) -> tuple[Splats, Camera, Observation]:
+    """A scene, a view and what the view observes."""
+    seed = draw(st.integers(0, 2**20))
+    splats = random_splats(
+        seed, count=draw(st.integers(1, 60)), spread=draw(st.sampled_from([0.2, 1.0, 3.0]))
+    )
+    camera = random_camera(seed, width=draw(st.integers(1, 50)), height=draw(st.integers(1, 40)))
+    size = (draw(st.integers(1, 45)), draw(st.integers(1, 55)))
+    if draw(st.booleans()):
+        return splats, camera, random_grid(seed, size)
+    return splats, camera, random_regions(seed, draw(st.integers(1, 4)), draw(st.integers(1, 9)), size)
