@@ -1,0 +1,58 @@
+"""Folders of one file a view, read when a view is asked for."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING
+
+from liftcore.errors import InvalidFeatures
+from liftcore.observe.observation import Observation
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+PICKLED = (".pt", ".pth", ".pkl")
+
+
+class ViewFolder(Mapping[str, Observation]):
+    """Views of a folder by name; each is read anew when it is asked for."""
+
+    def __init__(self, files: Mapping[str, Path]) -> None:
+        self.files = files
+
+    @abstractmethod
+    def read(self, view: str) -> Observation:
+        """Read and check one view."""
+
+    def __getitem__(self, view: str) -> Observation:
+        return self.read(view)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.files)
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+
+def npy_files(folder: Path, suffix: str) -> dict[str, Path]:
+    """View name -> file, of the files in the folder whose names end so, sorted.
+
+    Raises:
+        InvalidFeatures: there is none; pickles are named as the reason where there are some.
+    """
+    if not folder.is_dir():
+        raise InvalidFeatures(str(folder), expected=f"a folder of *{suffix} files", got="no such folder")
+    files = sorted(path for path in folder.iterdir() if path.is_file())
+    found = {path.name.removesuffix(suffix): path for path in files if path.name.endswith(suffix)}
+    if found:
+        return found
+    pickles = [path.name for path in files if path.suffix.lower() in PICKLED]
+    if pickles:
+        raise InvalidFeatures(
+            str(folder),
+            expected=f"*{suffix} files",
+            got=f"{len(pickles)} pickles ({pickles[0]}), which may run code when they are opened",
+            hint="save them as .npy with the program that wrote them: numpy.save(name, tensor.cpu().numpy())",
+        )
+    raise InvalidFeatures(str(folder), expected=f"*{suffix} files", got=f"{len(files)} other files")

@@ -1,0 +1,48 @@
+"""NumPy files from strangers: mapped, never unpickled, and believed only as far as their size goes."""
+
+from __future__ import annotations
+
+import math
+from tokenize import TokenError
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from liftcore.errors import InvalidFeatures
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+# Version 3 is for named columns only, which no array of numbers has.
+READERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+# What NumPy raises over a header that is no Python literal, besides its own ValueError.
+PARSE_ERRORS = (ValueError, TypeError, SyntaxError, EOFError, RecursionError, MemoryError, TokenError)
+HINT = "save plain arrays with numpy.save"
+
+
+def open_npy(path: Path) -> np.ndarray:
+    """Map a ``.npy`` file of numbers.
+
+    Raises:
+        InvalidFeatures: the file is no ``.npy`` file, holds Python objects, or has another size than it says.
+    """
+    try:
+        with path.open("rb") as handle:
+            version = np.lib.format.read_magic(handle)
+            if version not in READERS:
+                raise ValueError(f"format version {version}")
+            shape, _, dtype = READERS[version](handle)
+            offset, size = handle.tell(), handle.seek(0, 2)
+        if dtype.hasobject or dtype.kind not in "fiu":
+            got = "Python objects, which may run code" if dtype.hasobject else str(dtype)
+            raise InvalidFeatures(str(path), expected="an array of numbers", got=got, hint=HINT)
+        if any(side < 1 for side in shape) or offset + math.prod(shape) * dtype.itemsize != size:
+            expected = f"{dtype} {list(shape)} as its header says"
+            raise InvalidFeatures(str(path), expected=expected, got=f"a file of {size} bytes", hint=HINT)
+        return np.load(path, mmap_mode="r", allow_pickle=False)
+    except OSError as error:
+        got = f"one that does not open ({error.strerror})"
+        raise InvalidFeatures(str(path), expected="a .npy file", got=got) from None
+    except PARSE_ERRORS as error:
+        got = f"one that does not parse ({str(error)[:120]})"
+        raise InvalidFeatures(str(path), expected="a .npy file", got=got, hint=HINT) from None

@@ -1,0 +1,252 @@
+"""Feature packs: what 2D encoders saw, view by view, in one file that can be mapped and holds no code.
+
+A pack is a ``.safetensors`` file. A view ``V`` is either regions, ``V/labels`` [L, h, w] (u8 with 255 for
+none, i16 or i32 with -1) with ``V/codebook`` [M, F], or a grid, ``V/grid`` [h, w, F].
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from liftcore.errors import InvalidFeatures
+from liftcore.observe.observation import NO_LABEL, FeatureGrid, Observation, RegionMap
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+    from pathlib import Path
+
+    from torch import Tensor
+
+    from liftcore.scene.cameras import Cameras
+
+MAX_HEADER_BYTES = 32 * 1024 * 1024
+MAX_CHANNELS = 1 << 16
+U8_NO_LABEL = 255
+LABEL_TYPES = ("U8", "I16", "I32")
+FEATURE_TYPES = ("F16", "F32", "BF16")
+PARTS = ("labels", "codebook", "grid")
+
+
+@dataclass(frozen=True)
+class TensorSpec:
+    """What a header says of a tensor."""
+
+    dtype: str  # safetensors' name: "F16"
+    shape: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class _PackFile:
+    path: Path
+    handle: Any  # an open safetensors mapping
+    specs: dict[str, TensorSpec]
+    metadata: dict[str, str]
+
+
+@dataclass(frozen=True)
+class FeaturePacks:
+    """One or more packs that make one set of views. Headers are checked; tensors are read when asked for."""
+
+    views: tuple[str, ...]  # sorted
+    channels: int  # F
+    encoder: str  # the 2D encoder as the packs tell it, "" when they do not
+    text_space: str  # the text encoder that shares the space; "" unknown, "none" when there is none
+    normalised: bool | None  # whether codebook rows and grid cells are unit vectors; None when not told
+    paths: tuple[Path, ...]
+    _files: dict[str, _PackFile]  # view -> its pack
+
+    def is_regions(self, view: str) -> bool:
+        """Whether the view is a region map; else it is a grid."""
+        return f"{view}/labels" in self._file(view).specs
+
+    def specs(self, view: str) -> dict[str, TensorSpec]:
+        """The view's tensors by part (labels, codebook, grid), from the header alone."""
+        specs = self._file(view).specs
+        return {part: specs[f"{view}/{part}"] for part in PARTS if f"{view}/{part}" in specs}
+
+    def observation(self, view: str) -> Observation:
+        """Read and check one view.
+
+        Raises:
+            InvalidFeatures: no such view, a label out of the codebook, or a feature that is not finite.
+        """
+        pack = self._file(view)
+        if self.is_regions(view):
+            codebook = _features(pack, view, "codebook")
+            return RegionMap(_labels(pack, view, rows=codebook.shape[0]), codebook)
+        return FeatureGrid(_features(pack, view, "grid"))
+
+    def _file(self, view: str) -> _PackFile:
+        if view not in self._files:
+            raise InvalidFeatures("view", expected="a view of the feature packs", got=repr(view))
+        return self._files[view]
+
+
+def open_packs(paths: Sequence[Path]) -> FeaturePacks:
+    """Open packs as one; only headers are read.
+
+    Raises:
+        InvalidFeatures: a file is no feature pack, a view is malformed or in two packs, or the packs do not
+            share their channels and their encoder.
+    """
+    files: dict[str, _PackFile] = {}
+    channels: dict[int, str] = {}
+    packs = [_open(path) for path in paths]
+    for pack in packs:
+        for view in _views(pack):
+            if view in files:
+                got = f"{view!r} in {files[view].path} and {pack.path}"
+                raise InvalidFeatures("features", expected="each view in one pack", got=got)
+            channels.setdefault(_check_view(pack, view), f"{pack.path} view {view!r}")
+            files[view] = pack
+    if not files:
+        raise InvalidFeatures("features", expected="at least one view", got=f"{len(packs)} packs without any")
+    if len(channels) > 1:
+        (one, here), (other, there) = list(channels.items())[:2]
+        got = f"{one} in {here} and {other} in {there}"
+        raise InvalidFeatures("features", expected="the same channels in every view", got=got)
+    normalised = _agreed(packs, "normalised").lower()
+    return FeaturePacks(
+        views=tuple(sorted(files)),
+        channels=next(iter(channels)),
+        encoder=_agreed(packs, "encoder"),
+        text_space=_agreed(packs, "text_space"),
+        normalised={"true": True, "false": False}.get(normalised),
+        paths=tuple(paths),
+        _files=files,
+    )
+
+
+def pair(packs: FeaturePacks, cameras: Cameras) -> tuple[list[str], list[str]]:
+    """The views that have a camera, and those that have none (to be skipped and reported).
+
+    Raises:
+        InvalidFeatures: no view has a camera.
+    """
+    names = cameras.by_name
+    paired = [view for view in packs.views if view in names]
+    if not paired:
+        raise InvalidFeatures(
+            "features",
+            expected="views named like the cameras",
+            got=f"views {_examples(packs.views)} and cameras {_examples(names)}, none in common",
+            hint="a view is named after its image, without the extension",
+        )
+    return paired, [view for view in packs.views if view not in names]
+
+
+def _examples(names: Iterable[str]) -> str:
+    return ", ".join(repr(name) for name in sorted(names)[:3])
+
+
+def _open(path: Path) -> _PackFile:
+    from safetensors import SafetensorError, safe_open
+
+    _check_start(path)
+    try:
+        handle: Any = safe_open(str(path), framework="pt")
+        slices = {name: handle.get_slice(name) for name in tuple(handle.keys())}
+        specs = {name: TensorSpec(part.get_dtype(), tuple(part.get_shape())) for name, part in slices.items()}
+        return _PackFile(path, handle, specs, handle.metadata() or {})
+    except (SafetensorError, OSError) as error:
+        got = f"a file that does not open as one ({str(error)[:120]})"
+        raise InvalidFeatures(str(path), expected="a feature pack (.safetensors)", got=got) from None
+
+
+def _check_start(path: Path) -> None:
+    """Refuse what is no safetensors file, and headers of absurd length, before they are parsed."""
+    try:
+        with path.open("rb") as handle:
+            start = handle.read(9)
+    except OSError as error:
+        got = f"a file that does not open ({error.strerror})"
+        raise InvalidFeatures(str(path), expected="a feature pack (.safetensors)", got=got) from None
+    if start[:2] in (b"PK", b"\x80\x02") or path.suffix.lower() in (".pt", ".pth", ".pkl"):
+        raise InvalidFeatures(
+            str(path),
+            expected="a feature pack (.safetensors)",
+            got="a Python pickle or a zip, which may run code when it is opened",
+            hint="save the features as .npy files and run 'splatlift pack npy'",
+        )
+    if len(start) < 9 or start[8:] != b"{":
+        got = f"a file that begins with {start!r}" if start else "an empty file"
+        hint = "make packs with 'splatlift pack'"
+        raise InvalidFeatures(str(path), expected="a feature pack (.safetensors)", got=got, hint=hint)
+    (length,) = struct.unpack("<Q", start[:8])
+    if length > MAX_HEADER_BYTES:
+        got = f"{length} bytes"
+        raise InvalidFeatures(str(path), expected=f"a header of at most {MAX_HEADER_BYTES} bytes", got=got)
+
+
+def _views(pack: _PackFile) -> list[str]:
+    views: dict[str, None] = {}
+    for key in pack.specs:
+        view, _, part = key.rpartition("/")
+        if not view or part not in PARTS:
+            hint = "a table of text embeddings belongs to a query" if key == "embeddings" else ""
+            expected = "tensors 'VIEW/labels' with 'VIEW/codebook', or 'VIEW/grid'"
+            raise InvalidFeatures(str(pack.path), expected=expected, got=repr(key)[:120], hint=hint)
+        views[view] = None
+    return list(views)
+
+
+def _check_view(pack: _PackFile, view: str) -> int:
+    """Check the header of one view; its channels."""
+    parts = {part: pack.specs[f"{view}/{part}"] for part in PARTS if f"{view}/{part}" in pack.specs}
+    where = f"{pack.path} view {view!r}"
+    if set(parts) not in ({"grid"}, {"labels", "codebook"}):
+        raise InvalidFeatures(where, expected="labels with a codebook, or a grid", got=" with ".join(parts))
+    if "grid" in parts:
+        return _check_tensor(parts["grid"], FEATURE_TYPES, "h w F", f"{where} grid")[-1]
+    labels = parts["labels"]
+    _check_tensor(labels, LABEL_TYPES, "h w" if len(labels.shape) == 2 else "L h w", f"{where} labels")
+    return _check_tensor(parts["codebook"], FEATURE_TYPES, "M F", f"{where} codebook")[-1]
+
+
+def _check_tensor(spec: TensorSpec, types: tuple[str, ...], axes: str, where: str) -> tuple[int, ...]:
+    fits = len(spec.shape) == len(axes.split()) and all(spec.shape) and spec.dtype in types
+    if not fits or (axes.endswith("F") and spec.shape[-1] > MAX_CHANNELS):
+        expected = f"{' or '.join(types)} [{axes.replace(' ', ', ')}], no side empty"
+        raise InvalidFeatures(where, expected=expected, got=f"{spec.dtype} {list(spec.shape)}")
+    return spec.shape
+
+
+def _agreed(packs: Sequence[_PackFile], key: str) -> str:
+    values = {pack.metadata.get(key, ""): pack.path for pack in packs}
+    told = {value: path for value, path in values.items() if value}
+    if len(told) > 1:
+        got = " and ".join(f"{value[:80]!r} in {path}" for value, path in told.items())
+        hint = "features of different spaces cannot make one lift"
+        raise InvalidFeatures("features", expected=f"one {key} in all packs", got=got, hint=hint)
+    return next(iter(told), "")
+
+
+def _features(pack: _PackFile, view: str, part: str) -> Tensor:
+    """[.., F] f16 or f32, finite."""
+    values: Tensor = pack.handle.get_tensor(f"{view}/{part}")
+    values = values.float() if values.dtype == torch.bfloat16 else values
+    bad = int((~torch.isfinite(values)).sum())
+    if bad:
+        got = f"{bad} of {values.numel()} that are NaN or infinite"
+        raise InvalidFeatures(f"{pack.path} view {view!r} {part}", expected="finite values", got=got)
+    return values
+
+
+def _labels(pack: _PackFile, view: str, rows: int) -> Tensor:
+    """[L, h, w] i32 with -1 for none, all below ``rows``."""
+    stored: Tensor = pack.handle.get_tensor(f"{view}/labels")
+    labels = stored.to(torch.int32)
+    if stored.dtype == torch.uint8:
+        labels[stored == U8_NO_LABEL] = NO_LABEL
+    low, high = (int(value) for value in torch.aminmax(labels))
+    if low < NO_LABEL or high >= rows:
+        raise InvalidFeatures(
+            f"{pack.path} view {view!r} labels",
+            expected=f"rows of its codebook (0..{rows - 1}) or {NO_LABEL} for none",
+            got=f"the label {low if low < NO_LABEL else high}",
+        )
+    return labels if labels.ndim == 3 else labels[None]

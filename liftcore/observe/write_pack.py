@@ -1,0 +1,93 @@
+"""Write feature packs one view at a time, so that memory holds one view, not the pack."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+import torch
+
+from liftcore.errors import InvalidFeatures
+from liftcore.files import whole_file
+from liftcore.observe.observation import Observation, RegionMap
+from liftcore.observe.pack import MAX_HEADER_BYTES
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+    from pathlib import Path
+
+    from torch import Tensor
+
+_TYPES = {torch.float32: "F32", torch.int32: "I32", torch.float16: "F16", torch.int16: "I16"}
+LARGEST_I16 = 32_767
+
+
+def write_pack(path: Path, observations: Mapping[str, Observation], metadata: Mapping[str, str]) -> None:
+    """Write views as a feature pack, whole or not at all.
+
+    ``observations`` may read its views when they are asked for: each is asked for twice, once for its shape
+    and once for its bytes, and forgotten in between. Labels are stored as int16 where the codebook allows.
+
+    Args:
+        path: the file to write.
+        observations: view name -> what it observes.
+        metadata: ``encoder``, ``text_space``, ``normalised`` ("true" or "false") and what else to keep.
+
+    Raises:
+        InvalidFeatures: there are no views, their channels differ, or a feature is not finite.
+    """
+    if not observations:
+        raise InvalidFeatures(str(path), expected="at least one view", got="none")
+    header, offsets = _header(observations, metadata)
+    with whole_file(path) as handle:
+        handle.write(len(header).to_bytes(8, "little") + header)
+        start = handle.tell()
+        for view, observation in observations.items():
+            for key, tensor in _tensors(view, observation):
+                handle.seek(start + offsets[key])
+                handle.write(tensor.contiguous().numpy().tobytes())
+
+
+def _header(
+    observations: Mapping[str, Observation], metadata: Mapping[str, str]
+) -> tuple[bytes, dict[str, int]]:
+    specs = []
+    channels: dict[int, str] = {}
+    for view, observation in observations.items():
+        channels.setdefault(_checked_channels(view, observation), view)
+        specs += [(key, tensor.dtype, tuple(tensor.shape)) for key, tensor in _tensors(view, observation)]
+    if len(channels) > 1:
+        got = ", ".join(f"{count} in {view!r}" for count, view in list(channels.items())[:3])
+        raise InvalidFeatures("features", expected="the same channels in every view", got=got)
+    # Wide types first keeps every tensor aligned to its own width, which a mapping needs.
+    specs.sort(key=lambda spec: -spec[1].itemsize)
+    header: dict[str, object] = {"__metadata__": dict(metadata)}
+    offsets: dict[str, int] = {}
+    end = 0
+    for key, dtype, shape in specs:
+        offsets[key] = end
+        end += torch.Size(shape).numel() * dtype.itemsize
+        header[key] = {"dtype": _TYPES[dtype], "shape": shape, "data_offsets": (offsets[key], end)}
+    text = json.dumps(header, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 8)
+    if len(text) > MAX_HEADER_BYTES:
+        raise InvalidFeatures("views", expected="fewer views in a pack", got=str(len(observations)))
+    return text, offsets
+
+
+def _checked_channels(view: str, observation: Observation) -> int:
+    values = observation.codebook
+    bad = int((~torch.isfinite(values)).sum())
+    if bad:
+        got = f"{bad} of {values.numel()} that are NaN or infinite"
+        raise InvalidFeatures(f"view {view!r}", expected="finite features", got=got)
+    return values.shape[-1]
+
+
+def _tensors(view: str, observation: Observation) -> Iterator[tuple[str, Tensor]]:
+    if isinstance(observation, RegionMap):
+        narrow = observation.codebook.shape[0] <= LARGEST_I16
+        yield f"{view}/labels", observation.labels.to(torch.int16 if narrow else torch.int32)
+        yield f"{view}/codebook", observation.codebook
+    else:
+        yield f"{view}/grid", observation.grid
