@@ -46,7 +46,7 @@ def sample(surface: Callable[[np.ndarray, np.ndarray], np.ndarray], count: int, 
 
 
 def _spread(surface: Callable, count: int, rng: Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Parameters whose density follows the area, with few gaps: candidates are drawn by stratified quantiles."""
+    """Parameters whose density follows the area, drawn by stratified quantiles so that gaps are few."""
     candidates = rng.random((_OVERSAMPLING * count, 2))
     along, across = _slopes(surface, *candidates.T)
     area = np.linalg.norm(np.cross(along, across), axis=1)
@@ -111,22 +111,34 @@ def lathe(centre: tuple, radii: tuple[float, ...], heights: tuple[float, ...]) -
     return points
 
 
-def tube(path: Callable[[np.ndarray], np.ndarray], radius: Callable[[np.ndarray], np.ndarray]) -> Callable:
+def tube(path: Callable, radius: Callable, plane_normal: tuple) -> Callable:
     """A tube along a path that lies in one plane. ``path``: [n] in 0..1 -> [n, 3]; ``radius``: [n] -> [n]."""
+    # The path's plane has one normal: it never vanishes along the way, unlike the curvature.
+    side = _unit(np.array([plane_normal], float))
 
     def points(u: np.ndarray, v: np.ndarray) -> np.ndarray:
         step = _unit(path(v + _STEP) - path(v - _STEP))
-        # The path's plane has one normal: it never vanishes along the way, unlike the curvature.
-        chord = path(np.array([0.5])) - path(np.array([0.0]))
-        side = np.cross(chord, path(np.array([1.0])) - path(np.array([0.0])) + 1e-9)
-        side = _unit(side if np.linalg.norm(side) > 1e-6 else _any_normal(chord))
         other = np.cross(step, side)
         angle = 2 * np.pi * u[:, None]
-        return path(v) + radius(v)[:, None] * (np.cos(angle) * other + np.sin(angle) * side)
+        return path(v) + radius(v)[:, None] * (np.cos(angle) * other - np.sin(angle) * side)
 
     return points
 
 
-def _any_normal(direction: np.ndarray) -> np.ndarray:
-    axis = np.eye(3)[[int(np.argmin(np.abs(direction[0])))]]
-    return np.cross(direction, axis)
+def leaf(root: tuple, reach: tuple, width: float, droop: float) -> Callable:
+    """A blade that rises from a root along ``reach`` and bends down by ``droop`` at its tip."""
+    origin, along = np.array(root, float), np.array(reach, float)
+    across = _unit(np.cross(along, [[0.0, 0.0, 1.0]]))[0]
+
+    def points(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        half = width * np.sin(np.pi * np.clip(v, 0.0, 1.0)) ** 0.7
+        fold = 0.35 * np.abs(2 * u - 1) * half
+        rise = -droop * v**2 + fold
+        return (
+            origin
+            + v[:, None] * along
+            + ((2 * u - 1) * half)[:, None] * across
+            + rise[:, None] * np.array([0.0, 0.0, 1.0])
+        )
+
+    return points

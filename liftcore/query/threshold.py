@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 
 METHODS = ("auto", "valley", "paper", "otsu")
 BINS = 256
-SMOOTHING = 3.0  # bins, standard deviation of the Gaussian that removes a histogram's ripples
-LEAST_PEAK = 5e-4  # of the mass: what lies above a valley must be at least this to count as found
-DEPTH = 0.5  # a valley must fall to this share of its peak, else it is a ripple
+SMOOTHING = 4.0  # bins, standard deviation of the Gaussian that removes a histogram's ripples
+LEAST_PEAK = 3e-4  # of the mass: what lies above a valley must be at least this to count as found
+DEPTH = 0.6  # a valley must fall to this share of its peak, else it is a ripple
 
 
 @dataclass(frozen=True)
@@ -128,8 +128,8 @@ def _valley(histogram: Histogram) -> tuple[float, str]:
         if above[valley] >= LEAST_PEAK and smooth[valley] <= DEPTH * smooth[peak]:
             value = histogram.edge(valley)
             return value, (
-                f"From the top down, the histogram's first hill lies at {histogram.edge(peak):.4g} and the valley "
-                f"before it at {value:.4g}; {above[valley]:.1%} lies above."
+                f"From the top down, the histogram's first hill lies at {histogram.edge(peak):.4g} and the "
+                f"valley before it at {value:.4g}; {above[valley]:.1%} lies above."
             )
     return _fallback(histogram, "no hill with a valley before it")
 
@@ -142,8 +142,8 @@ def _paper(histogram: Histogram) -> tuple[float, str]:
         if valley > peak and smooth[valley] < smooth[peak]:
             value = histogram.edge(valley)
             return value, (
-                f"The histogram's largest peak lies at {histogram.edge(peak):.4g} and the next valley above it "
-                f"at {value:.4g}."
+                f"The histogram's largest peak lies at {histogram.edge(peak):.4g} and the next valley above "
+                f"it at {value:.4g}."
             )
     return _fallback(histogram, "no valley above its largest peak")
 

@@ -1,0 +1,171 @@
+"""What stands on the table: surfaces, paints and how many splats each takes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from liftcore.demo import paints, surfaces
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from liftcore.demo.paints import Paint
+
+
+@dataclass(frozen=True)
+class Piece:
+    """One painted surface of a part of an object."""
+
+    thing: str  # the object's name
+    part: str  # the part's name
+    surface: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    paint: Paint
+    splats: int
+    two_sided: bool = False  # lit from whichever side the light is on
+    glow: float = 0.0  # light of its own, 0..1
+
+
+def still_life_pieces() -> list[Piece]:
+    """All pieces, background first. Decimetres, z up, the table top at z = 0, cameras on the side of -y."""
+    return [*_room(), *_mug(), *_bowl(), *_fruit(), *_book(), *_lamp(), *_plant()]
+
+
+# Bases on the table, for contact shadows: centre x, y and radius.
+FOOTPRINTS = ((-2.5, -1.5, 0.62), (0.1, -0.1, 1.0), (2.5, -1.55, 1.15), (3.2, 1.3, 0.75), (-3.3, 1.2, 0.75))
+
+
+def _room() -> list[Piece]:
+    top = surfaces.rectangle((-7.0, -4.2, 0.0), (14.0, 0.0, 0.0), (0.0, 7.2, 0.0))
+    front = surfaces.rectangle((-7.0, -4.2, -0.35), (14.0, 0.0, 0.0), (0.0, 0.0, 0.35))
+    return [
+        Piece("wall", "wall", _curved_wall, paints.plaster, 6000),
+        Piece("floor", "floor", surfaces.disc((0.0, 0.0, -4.0), 15.0), paints.tiles, 4500),
+        Piece("table", "table top", top, paints.wood, 13000),
+        Piece("table", "table edge", front, paints.wood, 900),
+    ]
+
+
+def _curved_wall(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    # A hollow half cylinder, wide enough that no camera looks past it; its inside faces the cameras.
+    angle = np.pi * (1.25 - 1.5 * u)
+    return np.stack([12.0 * np.cos(angle), 10.0 * np.sin(angle) - 3.0, 12.5 * v - 4.2], axis=1)
+
+
+def _mug() -> list[Piece]:
+    x, y = -2.5, -1.5
+    outside = surfaces.lathe((x, y, 0), (0.05, 0.5, 0.54, 0.54), (0.0, 0.0, 0.12, 1.25))
+    inside = surfaces.lathe((x, y, 0), (0.54, 0.49, 0.48), (1.25, 1.24, 0.1))
+
+    def bow(t: np.ndarray) -> np.ndarray:
+        angle = np.pi * (t - 0.5)
+        return np.stack(
+            [x - 0.5 - 0.42 * np.cos(angle), np.full_like(t, y) - 0.1, 0.64 + 0.38 * np.sin(angle)], axis=1
+        )
+
+    handle = surfaces.tube(bow, lambda t: np.full_like(t, 0.095), (0.0, 1.0, 0.0))
+    coffee = surfaces.disc((x, y, 1.05), 0.48)
+    return [
+        Piece("mug", "mug body", outside, paints.glaze, 2200),
+        Piece("mug", "mug body", inside, paints.plain(0.93, 0.92, 0.88), 900),
+        Piece("mug", "mug body", coffee, paints.plain(0.24, 0.13, 0.07), 350),
+        Piece("mug", "mug handle", handle, paints.plain(0.16, 0.34, 0.62), 700),
+    ]
+
+
+def _bowl() -> list[Piece]:
+    centre = (0.1, -0.1, 0.0)
+    outside = surfaces.lathe(centre, (0.1, 0.6, 1.05, 1.35, 1.5), (0.0, 0.02, 0.2, 0.5, 0.85))
+    inside = surfaces.lathe(centre, (1.5, 1.43, 1.28, 0.95, 0.05), (0.85, 0.82, 0.5, 0.22, 0.1))
+    return [
+        Piece("bowl", "bowl", outside, paints.ceramic, 2600),
+        Piece("bowl", "bowl", inside, paints.plain(0.88, 0.87, 0.83), 1500),
+    ]
+
+
+def _fruit() -> list[Piece]:
+    def apple(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        angle, height = 2 * np.pi * u, np.pi * (v - 0.5)
+        ring = 0.56 * np.cos(height) * (1.0 + 0.12 * np.sin(height))
+        dimple = 0.52 * np.sin(height) - 0.16 * np.exp(-((ring / 0.18) ** 2)) * np.sign(np.sin(height))
+        return np.array([-0.55, -0.35, 0.92]) + np.stack(
+            [ring * np.cos(angle), ring * np.sin(angle), dimple], axis=1
+        )
+
+    def arc(t: np.ndarray) -> np.ndarray:
+        angle = np.pi * (0.1 + 0.8 * t)
+        return np.stack(
+            [0.2 - 1.15 * np.cos(angle), np.full_like(t, 0.42) + 0.2 * t, 0.85 + 0.85 * np.sin(angle) ** 1.5],
+            axis=1,
+        )
+
+    def stem(t: np.ndarray) -> np.ndarray:
+        return np.stack([-0.55 + 0.08 * t, np.full_like(t, -0.35), 1.28 + 0.32 * t], axis=1)
+
+    banana = surfaces.tube(arc, lambda t: 0.04 + 0.2 * np.sin(np.pi * np.clip(t, 0, 1)) ** 0.55, (0.0, 1.0, 0.0))
+    return [
+        Piece("apple", "apple", apple, paints.apple_skin, 1900),
+        Piece(
+            "apple",
+            "apple",
+            surfaces.tube(stem, lambda t: np.full_like(t, 0.03), (0, 1, 0)),
+            paints.plain(0.3, 0.2, 0.1),
+            80,
+        ),
+        Piece("orange", "orange", surfaces.ellipsoid((0.62, -0.42, 0.95), (0.56, 0.56, 0.54)), paints.orange_peel, 1900),
+        Piece("banana", "banana", banana, paints.banana_peel, 1900),
+    ]
+
+
+def _book() -> list[Piece]:
+    centre, turn = np.array([2.5, -1.55, 0.0]), np.radians(24.0)
+    a = np.array([np.cos(turn), np.sin(turn), 0.0])
+    b = np.array([-np.sin(turn), np.cos(turn), 0.0])
+    up = np.array([0.0, 0.0, 1.0])
+
+    def side(origin: tuple, first: np.ndarray, second: np.ndarray) -> Callable:
+        corner = centre + origin[0] * a + origin[1] * b + origin[2] * up
+        return surfaces.rectangle(tuple(corner), tuple(first), tuple(second))
+
+    w, h, t = 1.5, 2.1, 0.42
+    return [
+        Piece("book", "book cover", side((-w / 2, -h / 2, t), w * a, h * b), paints.book_cover, 2300),
+        Piece("book", "book cover", side((-w / 2, h / 2, 0), -h * b, t * up), paints.plain(0.45, 0.09, 0.1), 500),
+        Piece("book", "book pages", side((-w / 2, -h / 2, 0), w * a, t * up), paints.pages, 700),
+        Piece("book", "book pages", side((w / 2, -h / 2, 0), h * b, t * up), paints.pages, 700),
+    ]
+
+
+def _lamp() -> list[Piece]:
+    centre = (3.2, 1.3, 0.0)
+    foot = surfaces.lathe(centre, (0.75, 0.75, 0.6, 0.1, 0.07), (0.0, 0.12, 0.2, 0.32, 0.5))
+    pole = surfaces.lathe(centre, (0.07, 0.07), (0.4, 3.3))
+    shade = surfaces.lathe(centre, (1.25, 0.62), (2.5, 4.0))
+    return [
+        Piece("lamp", "lamp stand", foot, paints.plain(0.62, 0.5, 0.26), 900),
+        Piece("lamp", "lamp stand", pole, paints.plain(0.66, 0.54, 0.3), 500),
+        Piece("lamp", "lamp shade", shade, paints.shade_cloth, 2600, two_sided=True, glow=0.62),
+    ]
+
+
+def _plant() -> list[Piece]:
+    x, y = -3.3, 1.2
+    pot = surfaces.lathe((x, y, 0), (0.55, 0.62, 0.78, 0.86, 0.86), (0.0, 0.3, 0.95, 1.0, 1.2))
+    pieces = [
+        Piece("plant", "plant pot", pot, paints.terracotta, 1700),
+        Piece("plant", "plant pot", surfaces.disc((x, y, 1.1), 0.84), paints.plain(0.2, 0.14, 0.09), 500),
+    ]
+    for k in range(15):
+        angle = 2.4 * k  # the golden angle, nearly: leaves spread without repeating
+        out = 0.75 + 0.55 * ((k * 7) % 5) / 4
+        rise = 2.6 - 1.1 * ((k * 3) % 4) / 3
+        blade = surfaces.leaf(
+            (x + 0.1 * np.cos(angle), y + 0.1 * np.sin(angle), 1.1),
+            (out * np.cos(angle), out * np.sin(angle), rise),
+            0.26,
+            0.5 * out,
+        )
+        pieces.append(Piece("plant", "plant leaves", blade, paints.leaf_green, 320, two_sided=True))
+    return pieces
