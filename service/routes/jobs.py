@@ -8,6 +8,7 @@ from liftcore.errors import InvalidSettings
 from liftcore.solve.settings import LiftSettings
 from service import wire
 from service.faults import error_of
+from service.jobs.fit import check_fit
 from service.parts import Here
 from service.problems import problem_of
 from service.store.jobs import JobRecord
@@ -19,6 +20,10 @@ router = APIRouter(tags=["jobs"])
 def submit(order: wire.LiftRequest, response: Response, here: Here) -> wire.Job:
     """Lift features onto splats. The job is on the disk before this answers."""
     settings = parse_settings(order.settings)
+    cameras = here.store.assets.get(order.cameras, wire.AssetKind.CAMERAS)
+    packs = [here.store.assets.get(pack, wire.AssetKind.FEATURES) for pack in order.features]
+    here.store.assets.get(order.splats, wire.AssetKind.SPLATS)
+    check_fit(cameras, packs)
     job = here.store.jobs.submit(
         order.splats, order.cameras, order.features, settings.model_dump(mode="json")
     )

@@ -45,7 +45,13 @@ def check_features(path: Path) -> dict[str, Any]:
     packs = open_packs([path])
     for name in packs.views:
         packs.observation(name)
-    counts = {"views": len(packs.views), "channels": packs.channels, "names": list(packs.views)}
+    counts = {
+        "views": len(packs.views),
+        "channels": packs.channels,
+        "encoder": packs.encoder,
+        "text_space": packs.text_space,
+        "names": list(packs.views),
+    }
     return {"suffix": ".safetensors", "counts": counts, "warnings": _warnings(inspect_features(path))}
 
 

@@ -1,0 +1,101 @@
+"""A running application around a data directory of its own, and a scene that was lifted through it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fastapi.testclient import TestClient
+
+from service.app import assemble
+from service.settings import ServiceSettings
+from service.store.store import Store
+
+from .following import ended
+from .tiny_scene import TinyScene, make_scene
+
+
+@contextmanager
+def serving(data: Path, table: Path, **settings: Any) -> Iterator[TestClient]:
+    """The application over a data directory, with the text table of the tiny scene."""
+    chosen = ServiceSettings(data=data, encoder=f"table:{table}", text_spaces={"spare": "minilm"}, **settings)
+    store = Store.open(chosen.data)
+    try:
+        with TestClient(assemble(chosen, store), raise_server_exceptions=False) as client:
+            yield client
+    finally:
+        store.close()
+
+
+@dataclass(frozen=True)
+class Uploaded:
+    """The ids of the tiny scene's assets."""
+
+    splats: str
+    cameras: str
+    features: str
+
+    def order(self, **settings: Any) -> dict[str, Any]:
+        """The body of a POST /lift."""
+        return {
+            "splats": self.splats,
+            "cameras": self.cameras,
+            "features": [self.features],
+            "settings": settings,
+        }
+
+
+@pytest.fixture(scope="session")
+def scene() -> TinyScene:
+    return make_scene()
+
+
+@pytest.fixture(scope="session")
+def table(scene: TinyScene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("encoder") / "table.safetensors"
+    path.write_bytes(scene.table)
+    return path
+
+
+@pytest.fixture
+def start(tmp_path: Path, table: Path) -> Callable[..., Any]:
+    """Start applications with other settings, each over the test's own data directory."""
+    return lambda folder="data", **settings: serving(tmp_path / folder, table, **settings)
+
+
+@pytest.fixture(scope="session")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("service") / "data"
+
+
+@pytest.fixture(scope="session")
+def client(data: Path, table: Path) -> Iterator[TestClient]:
+    """One application for all tests that leave it as they found it."""
+    with serving(data, table, max_splats_bytes=200_000) as client:
+        yield client
+
+
+@pytest.fixture(scope="session")
+def uploaded(client: TestClient, scene: TinyScene) -> Uploaded:
+    replies = [
+        client.put("/assets/splats", content=scene.splats),
+        client.put("/assets/cameras", content=scene.cameras),
+        client.put("/assets/features", content=scene.features),
+    ]
+    for reply in replies:
+        assert reply.status_code == 201, reply.text
+    return Uploaded(*(reply.json()["id"] for reply in replies))
+
+
+@pytest.fixture(scope="session")
+def lift(client: TestClient, uploaded: Uploaded) -> dict[str, Any]:
+    """The lift of the tiny scene, as GET /lifts/{id} tells it."""
+    reply = client.post("/lift", json=uploaded.order(preset="row-sum"))
+    assert reply.status_code == 202, reply.text
+    job = ended(client, reply.headers["location"])
+    assert job["state"] == "succeeded", job
+    return client.get(job["links"]["lift"]).json()

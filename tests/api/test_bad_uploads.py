@@ -1,0 +1,184 @@
+"""Bad uploads are the client's problem, told in one line, and leave nothing behind."""
+
+from __future__ import annotations
+
+import gzip
+import hashlib
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fastapi.testclient import TestClient
+
+from .tiny_scene import (
+    PROPERTIES,
+    TinyScene,
+    cameras_document,
+    codebook,
+    labels,
+    pack,
+    ply,
+    splat_rows,
+)
+
+
+def files_below(data: Path) -> set[str]:
+    """Every file but the database's own."""
+    found = (path for path in data.rglob("*") if path.is_file())
+    return {str(path) for path in found if not path.name.startswith("service.sqlite")}
+
+
+def truncated_ply() -> bytes:
+    return ply(splat_rows())[:-10]
+
+
+def header_bomb() -> bytes:
+    return b"ply\nformat binary_little_endian 1.0\n" + b"comment " + b"x" * 150_000
+
+
+def counting_bomb() -> bytes:
+    return ply(splat_rows()).replace(b"element vertex 60", b"element vertex 6000000000")
+
+
+def splat_with_nan() -> bytes:
+    rows = splat_rows()
+    rows[5, 0] = np.nan
+    return ply(rows)
+
+
+def wrong_property() -> bytes:
+    return ply(splat_rows(), [name.replace("opacity", "opaqueness") for name in PROPERTIES])
+
+
+def empty_scene() -> bytes:
+    return ply(splat_rows()[:0])
+
+
+def camera_without_pose() -> bytes:
+    document = cameras_document()
+    frames = document["frames"]
+    assert isinstance(frames, list)
+    del frames[1]["transform_matrix"]
+    return json.dumps(document).encode()
+
+
+def no_views() -> bytes:
+    return json.dumps(cameras_document() | {"frames": []}).encode()
+
+
+def distorted() -> bytes:
+    return json.dumps(cameras_document() | {"k1": 0.3, "camera_model": "OPENCV"}).encode()
+
+
+def label_out_of_the_codebook() -> bytes:
+    by_view = {name: view.copy() for name, view in labels().items()}
+    by_view["left"][0, 3, 3] = 3
+    return pack(by_view)
+
+
+def codebook_with_nan() -> bytes:
+    rows = codebook().copy()
+    rows[0, 0] = np.inf
+    return pack(labels(), rows)
+
+
+def no_bytes() -> bytes:
+    return b""
+
+
+def garbage() -> bytes:
+    return bytes(range(256)) * 40
+
+
+BAD: list[tuple[str, Callable[[], bytes]]] = [
+    ("splats", truncated_ply),
+    ("splats", header_bomb),
+    ("splats", counting_bomb),
+    ("splats", splat_with_nan),
+    ("splats", wrong_property),
+    ("splats", empty_scene),
+    ("splats", no_bytes),
+    ("cameras", camera_without_pose),
+    ("cameras", no_views),
+    ("cameras", distorted),
+    ("cameras", garbage),
+    ("features", label_out_of_the_codebook),
+    ("features", codebook_with_nan),
+    ("features", garbage),
+]
+
+
+@pytest.mark.parametrize(("kind", "make"), BAD, ids=[f"{kind}-{make.__name__}" for kind, make in BAD])
+def test_malformed_upload_is_refused_and_gone(
+    client: TestClient, data: Path, kind: str, make: Callable[[], bytes]
+) -> None:
+    before = files_below(data)
+    content = make()
+    reply = client.put(f"/assets/{kind}", content=content)
+    assert reply.status_code == 422, reply.text
+    problem = reply.json()
+    assert problem["type"] == f"/problems/invalid-{kind}"
+    assert problem["expected"] and problem["got"]
+    assert str(data) not in reply.text, "the server's paths are its own"
+    assert files_below(data) == before
+    digest = hashlib.sha256(content).hexdigest()
+    assert client.get(f"/assets/sha256:{digest}").status_code == 404
+
+
+def test_upload_beyond_the_limit_is_413(client: TestClient, data: Path) -> None:
+    before = files_below(data)
+    reply = client.put("/assets/splats", content=b"ply\n" + b"\0" * 200_000)
+    assert (reply.status_code, reply.json()["type"]) == (413, "/problems/too-large")
+    assert files_below(data) == before
+
+
+def test_gzip_bomb_is_413(client: TestClient, data: Path) -> None:
+    before = files_below(data)
+    bomb = gzip.compress(b"\0" * 50_000_000)
+    assert len(bomb) < 200_000
+    reply = client.put("/assets/splats", content=bomb, headers={"Content-Encoding": "gzip"})
+    assert (reply.status_code, reply.json()["type"]) == (413, "/problems/too-large")
+    assert files_below(data) == before
+
+
+@pytest.mark.parametrize("spoil", [lambda body: body[:-9], lambda body: b"no gzip" + body, lambda _: b""])
+def test_broken_gzip_is_refused(
+    client: TestClient, data: Path, scene: TinyScene, spoil: Callable[[bytes], bytes]
+) -> None:
+    before = files_below(data)
+    body = spoil(gzip.compress(scene.splats))
+    reply = client.put("/assets/splats", content=body, headers={"Content-Encoding": "gzip"})
+    assert (reply.status_code, reply.json()["type"]) == (422, "/problems/invalid-encoding")
+    assert files_below(data) == before
+
+
+def test_zstd_is_said_not_to_be_supported(client: TestClient) -> None:
+    reply = client.put("/assets/splats", content=b"...", headers={"Content-Encoding": "zstd"})
+    assert reply.status_code == 415
+    assert "zstd" in reply.json()["got"] and "gzip" in reply.json()["expected"]
+
+
+def test_wrong_digest_is_refused(client: TestClient, data: Path, scene: TinyScene) -> None:
+    before = files_below(data)
+    reply = client.put("/assets/splats", content=scene.splats, params={"sha256": "0" * 64})
+    assert (reply.status_code, reply.json()["type"]) == (422, "/problems/digest-mismatch")
+    assert files_below(data) == before
+
+
+def test_check_that_takes_too_long_is_ended(start: Callable[..., TestClient], scene: TinyScene) -> None:
+    with start(check_seconds=0.05) as client:
+        reply = client.put("/assets/splats", content=scene.splats)
+    assert reply.status_code == 422 and "takes longer" in reply.json()["got"]
+
+
+def test_check_that_needs_too_much_memory_is_ended(
+    start: Callable[..., TestClient], scene: TinyScene
+) -> None:
+    rows = np.tile(splat_rows(), (40_000, 1))  # 134 MB
+    with start(check_memory_bytes=400 << 20) as client:
+        small = client.put("/assets/splats", content=scene.splats)
+        reply = client.put("/assets/splats", content=ply(np.tile(rows, (3, 1))))
+    assert small.status_code == 201, small.text
+    assert reply.status_code == 422, reply.text

@@ -1,0 +1,139 @@
+"""The main job over HTTP: upload, lift, query, pictures."""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import numpy as np
+import pytest
+from fastapi.testclient import TestClient
+from PIL import Image
+
+from .conftest import Uploaded
+from .tiny_scene import CHANNELS, HEIGHT, SPLATS_A_CLUSTER, VIEWS, WIDTH, WORDS, colmap_zip
+
+COUNT = 3 * SPLATS_A_CLUSTER
+
+
+def picture(content: bytes) -> np.ndarray:
+    return np.asarray(Image.open(io.BytesIO(content)))
+
+
+def test_assets_say_what_is_in_them(client: TestClient, uploaded: Uploaded) -> None:
+    splats = client.get(f"/assets/{uploaded.splats}").json()
+    assert (splats["kind"], splats["counts"]["splats"], splats["counts"]["kernel"]) == (
+        "splats",
+        COUNT,
+        "3dgs",
+    )
+    cameras = client.get(f"/assets/{uploaded.cameras}").json()
+    assert cameras["counts"]["views"] == len(VIEWS)
+    features = client.get(f"/assets/{uploaded.features}").json()
+    assert (features["counts"]["channels"], features["counts"]["text_space"]) == (CHANNELS, "tiny")
+    listed = {asset["id"] for asset in client.get("/assets").json()["assets"]}
+    assert {uploaded.splats, uploaded.cameras, uploaded.features} <= listed
+
+
+def test_job_tells_its_story(client: TestClient, lift: dict[str, Any], uploaded: Uploaded) -> None:
+    job = client.get(lift["links"]["job"]).json()
+    assert (job["state"], job["attempt"], job["problem"]) == ("succeeded", 1, None)
+    assert job["splats"] == uploaded.splats and job["features"] == [uploaded.features]
+    assert job["settings"]["preset"] == "row-sum" and job["settings"]["power"] == 1
+    assert job["created"] <= job["started"] <= job["ended"]
+    progress = job["progress"]
+    assert progress["done"] == progress["total"] and progress["unit"]
+    assert job["id"] in {found["id"] for found in client.get("/jobs").json()["jobs"]}
+
+
+def test_lift_tells_how_far_to_trust_it(client: TestClient, lift: dict[str, Any]) -> None:
+    assert (lift["count"], lift["channels"]) == (COUNT, CHANNELS)
+    assert sorted(lift["views"]) == sorted(VIEWS)
+    assert lift["text_space"] == "tiny" and lift["certificate"] and lift["timings"]
+    assert "/" not in lift["splats"]
+    assert lift in client.get("/lifts").json()["lifts"]
+
+
+def test_lift_file_is_downloaded_whole_and_in_parts(client: TestClient, lift: dict[str, Any]) -> None:
+    whole = client.get(lift["links"]["features"])
+    assert whole.status_code == 200 and len(whole.content) == lift["bytes"]
+    assert whole.headers["etag"] == f'"{lift["sha256"]}"'
+    part = client.get(lift["links"]["features"], headers={"Range": "bytes=8-15"})
+    assert part.status_code == 206 and part.content == whole.content[8:16]
+    tag = {"If-None-Match": whole.headers["etag"]}
+    assert client.get(lift["links"]["features"], headers=tag).status_code == 304
+
+
+@pytest.mark.parametrize("cluster", range(3))
+def test_query_finds_the_cluster_of_the_word(client: TestClient, lift: dict[str, Any], cluster: int) -> None:
+    answer = client.get("/query", params={"text": WORDS[cluster], "view": "middle", "threshold": 0.5}).json()
+    assert answer["lift"] == lift["id"]  # left out of the request: there is only one
+    rows = range(cluster * SPLATS_A_CLUSTER, (cluster + 1) * SPLATS_A_CLUSTER)
+    assert {splat["splat"] for splat in answer["top"]} <= set(rows)
+    assert [splat["score"] for splat in answer["top"]] == sorted(
+        (splat["score"] for splat in answer["top"]), reverse=True
+    )
+    assert 0.8 * SPLATS_A_CLUSTER <= answer["count"] <= 1.2 * SPLATS_A_CLUSTER
+    middle = (cluster - 1) * 1.2
+    assert answer["box"]["low"][0] < middle < answer["box"]["high"][0]
+    assert answer["threshold"] == {"value": 0.5, "method": "fixed"} | {
+        "explanation": answer["threshold"]["explanation"]
+    }
+
+
+def test_scores_are_one_float_a_splat(client: TestClient, lift: dict[str, Any]) -> None:
+    answer = client.get("/query", params={"text": "book", "lift": lift["id"], "threshold": 0.5}).json()
+    reply = client.get(answer["links"]["scores"])
+    scores = np.load(io.BytesIO(reply.content), allow_pickle=False)
+    assert scores.shape == (COUNT,) and scores.dtype == np.float32
+    best = answer["top"][0]
+    assert scores[best["splat"]] == pytest.approx(best["score"]) and scores.max() == pytest.approx(
+        best["score"]
+    )
+    assert int((scores >= 0.5).sum()) == answer["count"]
+
+
+def test_mask_lies_where_the_word_is(client: TestClient, lift: dict[str, Any]) -> None:
+    params = {"text": "lamp", "lift": lift["id"], "view": "middle", "threshold": 0.5}
+    reply = client.get("/query/mask", params=params)
+    assert reply.headers["content-type"] == "image/png"
+    mask = picture(reply.content)
+    assert mask.shape == (HEIGHT, WIDTH) and set(np.unique(mask)) == {0, 255}
+    columns = np.nonzero(mask)[1]
+    assert columns.min() >= WIDTH // 2  # the lamp is the cluster on the right
+
+
+@pytest.mark.parametrize("path", ["/query/attention", "/query/mask", "/render"])
+def test_pictures_have_the_size_of_the_view_and_a_tag(
+    client: TestClient, lift: dict[str, Any], path: str
+) -> None:
+    params = {"text": "apple", "lift": lift["id"], "view": "left"}
+    reply = client.get(path, params=params)
+    assert reply.status_code == 200, reply.text
+    assert picture(reply.content).shape[:2] == (HEIGHT, WIDTH)
+    again = client.get(path, params=params, headers={"If-None-Match": reply.headers["etag"]})
+    assert again.status_code == 304 and again.content == b""
+    other = client.get(
+        path, params=params | {"view": "right"}, headers={"If-None-Match": reply.headers["etag"]}
+    )
+    assert other.status_code == 200
+
+
+def test_negatives_change_the_scores(client: TestClient, lift: dict[str, Any]) -> None:
+    params = {"text": "apple", "lift": lift["id"]}
+    plain = client.get("/query/scores", params=params).content
+    against = client.get("/query/scores", params=params | {"negatives": ["book", "lamp"]})
+    assert against.status_code == 200 and against.content != plain
+
+
+def test_links_of_an_answer_lead_somewhere(client: TestClient, lift: dict[str, Any]) -> None:
+    answer = client.get("/query", params={"text": "apple", "negatives": ["book"]}).json()
+    for name, link in answer["links"].items():
+        assert client.get(link).status_code == 200, name
+
+
+def test_colmap_cameras_come_as_a_zip(client: TestClient, uploaded: Uploaded) -> None:
+    reply = client.put("/assets/cameras", content=colmap_zip())
+    assert reply.status_code == 201, reply.text
+    assert reply.json()["counts"]["names"] == list(VIEWS)
+    assert client.delete(reply.json()["links"]["self"]).status_code == 204

@@ -1,0 +1,192 @@
+"""Every error has the one shape of RFC 9457, on every route."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from typing import Any
+
+import httpx
+import pytest
+from fastapi import FastAPI
+from fastapi.testclient import TestClient
+
+from liftcore.errors import SplatliftError
+from service import problems
+from service.faults import error_of, fault_of
+from service.problems import TABLE, problem_of
+
+from .conftest import Uploaded
+
+ROUTES = {
+    "/healthz",
+    "/assets",
+    "/assets/{kind}",
+    "/assets/{asset}",
+    "/assets/{asset}/content",
+    "/lift",
+    "/jobs",
+    "/jobs/{job}",
+    "/lifts",
+    "/lifts/{lift}",
+    "/lifts/{lift}/features",
+    "/query",
+    "/query/scores",
+    "/query/mask",
+    "/query/attention",
+    "/render",
+}
+NOBODY = "0" * 32
+NO_ASSET = "sha256:" + "0" * 64
+
+
+def assert_problem(reply: httpx.Response) -> dict[str, Any]:
+    """The reply is a problem; its body."""
+    assert reply.headers["content-type"] == "application/problem+json", reply.text
+    body = reply.json()
+    assert body["status"] == reply.status_code >= 400
+    assert re.fullmatch(r"/problems/[a-z]+(-[a-z]+)*", body["type"])
+    assert body["title"] and body["detail"] and "\n" not in body["detail"]
+    return body
+
+
+def every_route(client: TestClient) -> list[tuple[str, str]]:
+    """Method and path of every documented route."""
+    paths = client.get("/openapi.json").json()["paths"]
+    return [(method.upper(), path) for path, methods in paths.items() for method in methods]
+
+
+def test_every_route_answers_nonsense_with_a_problem(client: TestClient) -> None:
+    routes = every_route(client)
+    assert len(routes) >= 17
+    for method, path in routes:
+        address = path.replace("{kind}", "nonsense").replace("{asset}", NO_ASSET)
+        address = re.sub(r"\{\w+\}", NOBODY, address)
+        reply = client.request(method, address, params={"lift": "nonsense"}, content=b"{nonsense")
+        if reply.status_code >= 400:
+            assert 400 <= assert_problem(reply)["status"] < 500, f"{method} {path}"
+        else:
+            assert path in ("/healthz", "/assets", "/jobs", "/lifts"), f"{method} {path} took nonsense"
+
+
+def test_every_route_refuses_other_methods_with_a_problem(client: TestClient) -> None:
+    for _, path in every_route(client):
+        reply = client.request("PATCH", re.sub(r"\{\w+\}", "x", path))
+        assert assert_problem(reply)["type"] == "/problems/method-not-allowed"
+        assert reply.headers["allow"]
+
+
+def test_unknown_route_is_a_problem(client: TestClient) -> None:
+    assert assert_problem(client.get("/nowhere"))["type"] == "/problems/no-such-route"
+
+
+@pytest.mark.parametrize(
+    "path",
+    [f"/jobs/{NOBODY}", f"/lifts/{NOBODY}", f"/lifts/{NOBODY}/features", f"/assets/{NO_ASSET}/content"],
+)
+def test_unknown_thing_is_404(client: TestClient, path: str) -> None:
+    assert assert_problem(client.get(path))["type"] == "/problems/not-found"
+
+
+@pytest.mark.parametrize(
+    ("change", "status", "kind"),
+    [
+        ({"settings": {"preset": "magic"}}, 422, "invalid-settings"),
+        ({"settings": {"power": 3}}, 422, "invalid-settings"),
+        ({"settings": {"prest": "row-sum"}}, 422, "invalid-settings"),
+        ({"settings": {"cls": 1}}, 422, "invalid-settings"),
+        ({"settings": {"self": 1}}, 422, "invalid-settings"),
+        ({"settings": {"preset": ["row-sum"]}}, 422, "invalid-request"),
+        ({"settings": {"alpha_cap": math.inf}}, 422, "invalid-settings"),
+        ({"settings": {"lift_gain": math.nan}}, 422, "invalid-settings"),
+        ({"splats": NO_ASSET}, 404, "not-found"),
+        ({"features": [NO_ASSET]}, 404, "not-found"),
+        ({"features": []}, 422, "invalid-request"),
+        ({"cameras": "sha256:short"}, 422, "invalid-request"),
+        ({"extra": 1}, 422, "invalid-request"),
+    ],
+)
+def test_bad_order_is_refused_before_it_is_a_job(
+    client: TestClient, uploaded: Uploaded, change: dict[str, Any], status: int, kind: str
+) -> None:
+    before = len(client.get("/jobs").json()["jobs"])
+    content = json.dumps(uploaded.order() | change)
+    reply = client.post("/lift", content=content, headers={"Content-Type": "application/json"})
+    body = assert_problem(reply)
+    assert (body["status"], body["type"]) == (status, f"/problems/{kind}")
+    assert len(client.get("/jobs").json()["jobs"]) == before
+
+
+def test_assets_in_the_wrong_place_are_refused(client: TestClient, uploaded: Uploaded) -> None:
+    body = assert_problem(client.post("/lift", json=uploaded.order() | {"splats": uploaded.cameras}))
+    assert body["status"] == 404 and "cameras" in body["got"]
+
+
+def test_one_pack_twice_is_refused(client: TestClient, uploaded: Uploaded) -> None:
+    twice = uploaded.order() | {"features": [uploaded.features, uploaded.features]}
+    assert assert_problem(client.post("/lift", json=twice))["type"] == "/problems/invalid-features"
+
+
+def test_long_body_is_413(client: TestClient) -> None:
+    reply = client.post("/lift", content=b" " * 2_000_000, headers={"Content-Type": "application/json"})
+    assert assert_problem(reply)["type"] == "/problems/too-large"
+
+
+@pytest.mark.parametrize(
+    ("path", "change", "status", "kind"),
+    [
+        ("/query", {"text": ""}, 422, "invalid-request"),
+        ("/query", {"text": "   "}, 422, "invalid-query"),
+        ("/query", {"text": "zeppelin"}, 422, "invalid-query"),
+        ("/query", {"lift": NOBODY}, 404, "not-found"),
+        ("/query", {"view": "behind"}, 404, "not-found"),
+        ("/query", {"threshold": "high"}, 422, "invalid-request"),
+        ("/query", {"threshold": "nan"}, 422, "invalid-request"),
+        ("/query", {"top": "-1"}, 422, "invalid-request"),
+        ("/query", {"negatives": "zeppelin"}, 422, "invalid-query"),
+        ("/query", {"encoder": "table:/etc/passwd"}, 422, "invalid-request"),
+        ("/query", {"encoder": "spare"}, 422, "invalid-query"),  # MiniLM: 384 channels and not 8
+        ("/query/mask", {"view": "behind"}, 404, "not-found"),
+        ("/query/mask", {}, 422, "invalid-request"),
+        ("/query/scores", {"lift": "../../etc/passwd"}, 422, "invalid-request"),
+        ("/render", {"view": "behind"}, 404, "not-found"),
+    ],
+)
+def test_bad_query_is_a_problem(
+    client: TestClient, lift: dict[str, Any], path: str, change: dict[str, str], status: int, kind: str
+) -> None:
+    reply = client.get(path, params={"text": "apple", "lift": lift["id"]} | change)
+    body = assert_problem(reply)
+    assert (body["status"], body["type"]) == (status, f"/problems/{kind}"), body
+
+
+def test_unexpected_error_says_nothing_of_itself() -> None:
+    app = FastAPI()
+    problems.install(app)
+
+    @app.get("/broken")
+    def broken() -> None:
+        raise RuntimeError("the secret")
+
+    reply = TestClient(app, raise_server_exceptions=False).get("/broken")
+    assert assert_problem(reply)["type"] == "/problems/internal"
+    assert "secret" not in reply.text
+
+
+def test_every_error_has_a_row_and_crosses_processes() -> None:
+    for cls in TABLE:
+        error = cls("place", expected="this", got="that at /data/blobs/x", hint="try")
+        back = error_of(fault_of(error, {"/data/blobs/x": "splats y"}))
+        assert type(back) is cls and back.got == "that at splats y"
+        assert problem_of(back).type == f"/problems/{cls.kind}"
+    kinds = [cls.kind for cls in TABLE]
+    assert len(set(kinds)) == len(kinds)
+    assert issubclass(next(iter(TABLE)), SplatliftError)
+
+
+def test_openapi_names_the_problem_and_the_routes(client: TestClient) -> None:
+    document = client.get("/openapi.json").json()
+    assert "Problem" in document["components"]["schemas"]
+    assert "HTTPValidationError" not in document["components"]["schemas"]
+    assert set(document["paths"]) == ROUTES

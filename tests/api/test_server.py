@@ -1,0 +1,134 @@
+"""The real server process: what it binds, prints and loads, and that it answers over a socket."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import httpx
+import pytest
+
+from service.__main__ import main, parse
+from service.errors import Misconfigured
+from service.settings import ServiceSettings
+
+from .conftest import Uploaded
+from .following import ended
+from .tiny_scene import TinyScene
+
+ROOT = Path(__file__).parents[2]
+
+
+@contextmanager
+def server(data: Path, table: Path) -> Iterator[str]:
+    """A server process; its address."""
+    command = [
+        sys.executable,
+        "-m",
+        "service",
+        "--port",
+        "0",
+        "--data",
+        str(data),
+        "--text-space",
+        f"tiny=table:{table}",
+    ]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT)
+    with process:
+        try:
+            assert process.stdout is not None
+            line = process.stdout.readline()
+            assert line.startswith("listening on http://127.0.0.1:"), line
+            yield line.split()[-1]
+        finally:
+            process.send_signal(signal.SIGTERM)
+            assert process.wait(60) in (0, -signal.SIGTERM)
+
+
+def test_server_process_does_the_main_job(tmp_path: Path, scene: TinyScene, table: Path) -> None:
+    with server(tmp_path, table) as address, httpx.Client(base_url=address, timeout=120) as client:
+        assert client.get("/healthz").json() == {"status": "ok"}
+        contents = {"splats": scene.splats, "cameras": scene.cameras, "features": scene.features}
+        ids = [client.put(f"/assets/{kind}", content=body).json()["id"] for kind, body in contents.items()]
+        job = ended(client, client.post("/lift", json=Uploaded(*ids).order()).headers["location"])
+        assert job["state"] == "succeeded", job
+        answer = client.get("/query", params={"text": "lamp", "view": "right"}).json()
+        assert answer["top"][0]["splat"] >= 40
+        assert client.get(answer["links"]["mask"]).content.startswith(b"\x89PNG")
+        assert "<title>splatlift</title>" in client.get("/").text
+
+
+def test_http_process_loads_neither_torch_nor_numba_nor_hdbscan() -> None:
+    code = (
+        "import sys, service.app, service.__main__\n"
+        "print(sorted({'torch', 'numba', 'hdbscan', 'plyfile', 'open_clip'} & set(sys.modules)))"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT
+    )
+    assert result.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.0.2.1", "example.org"])
+def test_binding_beyond_loopback_is_refused(
+    host: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["--host", host, "--data", str(tmp_path / "data"), "--port", "0"]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and "loopback" in said and "keys" in said
+    assert not (tmp_path / "data").exists()
+
+
+@pytest.mark.parametrize(
+    "arguments", [["--port", "70000"], ["--text-space", "name"], ["--text-space", "=minilm"]]
+)
+def test_bad_settings_are_one_line(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(arguments) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_settings_come_from_the_environment_and_the_command_line_wins(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("SPLATLIFT_PORT", "1234")
+    monkeypatch.setenv("SPLATLIFT_QUERY_SECONDS", "7")
+    monkeypatch.setenv("SPLATLIFT_TEXT_SPACES", '{"a": "minilm"}')
+    assert (parse([]).port, parse([]).query_seconds) == (1234, 7)
+    assert parse([]).text_spaces == {"a": "minilm"}
+    assert parse(["--port", "1", "--text-space", "b=table:x=y"]).text_spaces == {"b": "table:x=y"}
+    assert parse(["--port", "1"]).port == 1
+
+
+def test_every_setting_is_described() -> None:
+    for name, field in ServiceSettings.model_fields.items():
+        assert field.description, name
+
+
+def test_encoder_is_chosen_by_text_space_and_never_by_the_client(tmp_path: Path) -> None:
+    settings = ServiceSettings(data=tmp_path, encoder="minilm", text_spaces={"clip": "open_clip:X@w.pt"})
+    assert settings.encoder_spec("clip", None) == "open_clip:X@w.pt"
+    assert settings.encoder_spec("unknown", None) == settings.encoder_spec("clip", "default") == "minilm"
+    assert settings.encoder_spec("none", "clip") == "open_clip:X@w.pt"
+    for space, asked in (("clip", "table:secret"), ("none", None)):
+        with pytest.raises(Exception, match="expected"):
+            settings.encoder_spec(space, asked)
+
+
+def test_taken_port_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    import socket
+
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        assert main(["--port", str(port), "--data", str(tmp_path / "data")]) == 2
+    assert "free port" in capsys.readouterr().err
+
+
+def test_refusal_is_the_service_own_error() -> None:
+    assert issubclass(Misconfigured, Exception) and os.environ.get("SPLATLIFT_HOST") is None
