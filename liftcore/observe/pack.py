@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from liftcore.errors import InvalidFeatures
+from liftcore.observe.finite import check_finite
 from liftcore.observe.observation import NO_LABEL, FeatureGrid, Observation, RegionMap
 
 if TYPE_CHECKING:
@@ -229,10 +230,7 @@ def _features(pack: _PackFile, view: str, part: str) -> Tensor:
     """[.., F] f16 or f32, finite."""
     values: Tensor = pack.handle.get_tensor(f"{view}/{part}")
     values = values.float() if values.dtype == torch.bfloat16 else values
-    bad = int((~torch.isfinite(values)).sum())
-    if bad:
-        got = f"{bad} of {values.numel()} that are NaN or infinite"
-        raise InvalidFeatures(f"{pack.path} view {view!r} {part}", expected="finite values", got=got)
+    check_finite(values, f"{pack.path} view {view!r} {part}")
     return values
 
 

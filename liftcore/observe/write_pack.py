@@ -9,6 +9,7 @@ import torch
 
 from liftcore.errors import InvalidFeatures
 from liftcore.files import whole_file
+from liftcore.observe.finite import check_finite
 from liftcore.observe.observation import Observation, RegionMap
 from liftcore.observe.pack import MAX_HEADER_BYTES
 
@@ -48,13 +49,12 @@ def write_pack(path: Path, observations: Mapping[str, Observation], metadata: Ma
                 handle.write(tensor.contiguous().numpy().tobytes())
 
 
-def _header(
-    observations: Mapping[str, Observation], metadata: Mapping[str, str]
-) -> tuple[bytes, dict[str, int]]:
+def _header(observations: Mapping[str, Observation], metadata: Mapping[str, str]) -> tuple[bytes, dict[str, int]]:
     specs = []
     channels: dict[int, str] = {}
     for view, observation in observations.items():
-        channels.setdefault(_checked_channels(view, observation), view)
+        check_finite(observation.codebook, f"view {view!r} features")
+        channels.setdefault(observation.codebook.shape[-1], view)
         specs += [(key, tensor.dtype, tuple(tensor.shape)) for key, tensor in _tensors(view, observation)]
     if len(channels) > 1:
         got = ", ".join(f"{count} in {view!r}" for count, view in list(channels.items())[:3])
@@ -73,15 +73,6 @@ def _header(
     if len(text) > MAX_HEADER_BYTES:
         raise InvalidFeatures("views", expected="fewer views in a pack", got=str(len(observations)))
     return text, offsets
-
-
-def _checked_channels(view: str, observation: Observation) -> int:
-    values = observation.codebook
-    bad = int((~torch.isfinite(values)).sum())
-    if bad:
-        got = f"{bad} of {values.numel()} that are NaN or infinite"
-        raise InvalidFeatures(f"view {view!r}", expected="finite features", got=got)
-    return values.shape[-1]
 
 
 def _tensors(view: str, observation: Observation) -> Iterator[tuple[str, Tensor]]:

@@ -67,9 +67,7 @@ def read_colmap(folder: Path) -> Cameras:
 def _camera(name: str, image: _Image, sensors: Mapping[int, _Sensor], source: str) -> Camera:
     sensor = sensors.get(image.camera)
     if sensor is None:
-        raise InvalidCameras(
-            source, expected="images of known cameras", got=f"{name!r} of camera {image.camera}"
-        )
+        raise InvalidCameras(source, expected="images of known cameras", got=f"{name!r} of camera {image.camera}")
     pose = np.eye(4)
     pose[:3, :3] = _rotation(np.array(image.quaternion), f"{source} image {name!r}")
     pose[:3, 3] = image.translation
@@ -80,9 +78,7 @@ def _rotation(quaternion: np.ndarray, source: str) -> np.ndarray:
     """[3, 3] of a quaternion w x y z of any length but zero."""
     length = float(np.linalg.norm(quaternion))
     if not np.isfinite(length) or length == 0:
-        raise InvalidCameras(
-            source, expected="a finite quaternion that is not zero", got=str(quaternion.tolist())
-        )
+        raise InvalidCameras(source, expected="a finite quaternion that is not zero", got=str(quaternion.tolist()))
     w, x, y, z = quaternion / length
     return np.array(
         [
@@ -162,9 +158,7 @@ def _text_lines(path: Path) -> Iterator[str]:
     with path.open("rb") as handle:
         while line := handle.readline(MAX_TEXT_LINE):
             if len(line) == MAX_TEXT_LINE:
-                raise InvalidCameras(
-                    str(path), expected=f"lines under {MAX_TEXT_LINE} bytes", got="a longer one"
-                )
+                raise InvalidCameras(str(path), expected=f"lines under {MAX_TEXT_LINE} bytes", got="a longer one")
             yield line.decode("utf-8", errors="replace").strip()
 
 

@@ -26,9 +26,7 @@ def read_json(path: Path) -> Any:
         with path.open("rb") as handle:
             content = handle.read(MAX_JSON_BYTES + 1)
         if len(content) > MAX_JSON_BYTES:
-            raise InvalidCameras(
-                str(path), expected=f"JSON of at most {MAX_JSON_BYTES} bytes", got="a larger file"
-            )
+            raise InvalidCameras(str(path), expected=f"JSON of at most {MAX_JSON_BYTES} bytes", got="a larger file")
         return json.loads(content)
     except OSError as error:
         got = f"one that does not open ({error.strerror})"

@@ -124,9 +124,7 @@ def _model_members(archive: zipfile.ZipFile, path: Path) -> Iterator[zipfile.Zip
         raise InvalidCameras(str(path), expected=f"at most {MAX_ZIP_MEMBERS} files", got=str(len(members)))
     files = {member.filename: member for member in members if not member.is_dir()}
     for kind in ("bin", "txt"):
-        roots = [
-            PurePosixPath(name).parent for name in files if PurePosixPath(name).name == f"cameras.{kind}"
-        ]
+        roots = [PurePosixPath(name).parent for name in files if PurePosixPath(name).name == f"cameras.{kind}"]
         for root in sorted(roots, key=lambda root: (len(root.parts), str(root))):
             names = [str(root / f"{part}.{kind}") for part in ("cameras", "images")]
             if all(name in files for name in names):
@@ -143,8 +141,6 @@ def _unzip(archive: zipfile.ZipFile, member: zipfile.ZipInfo, target: Path, budg
             written += len(block)
             if written > budget:
                 limit = f"at most {MAX_UNZIPPED_BYTES} bytes unzipped"
-                raise InvalidCameras(
-                    member.filename, expected=limit, got="more", hint="leave points out of the zip"
-                )
+                raise InvalidCameras(member.filename, expected=limit, got="more", hint="leave points out of the zip")
             sink.write(block)
     return written

@@ -75,13 +75,9 @@ def write_splats(splats: Splats, path: Path) -> None:
 def _read_columns(
     path: Path, header: PlyHeader, slots: Mapping[str, Slot]
 ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    fields = {
-        field: np.empty((header.count, *shape), np.float32) for field, shape in _field_shapes(slots).items()
-    }
+    fields = {field: np.empty((header.count, *shape), np.float32) for field, shape in _field_shapes(slots).items()}
     extras = {
-        column.name: np.empty(header.count, column.code)
-        for column in header.properties
-        if column.name not in slots
+        column.name: np.empty(header.count, column.code) for column in header.properties if column.name not in slots
     }
     targets = {name: fields[slot.field][(slice(None), *slot.index)] for name, slot in slots.items()} | extras
     table = _mapped_rows(path)
@@ -107,9 +103,7 @@ def _mapped_rows(path: Path) -> np.ndarray:
     try:
         return PlyData.read(str(path), mmap="r")["vertex"].data
     except (PlyParseError, ValueError, OSError) as error:
-        raise InvalidSplats(
-            str(path), expected="a PLY file", got=f"one that does not parse ({error})"
-        ) from None
+        raise InvalidSplats(str(path), expected="a PLY file", got=f"one that does not parse ({error})") from None
 
 
 def _tensors(arrays: Mapping[str, np.ndarray]) -> dict[str, Tensor]:
@@ -151,9 +145,7 @@ def _columns_of(splats: Splats, layout: Sequence[str]) -> dict[str, np.ndarray]:
 def _model_column(splats: Splats, name: str, slot: Slot) -> np.ndarray:
     values: Tensor | None = getattr(splats, slot.field)
     if values is None or any(i >= n for i, n in zip(slot.index, values.shape[1:], strict=True)):
-        raise InvalidSplats(
-            "layout", expected="columns of the splats", got=repr(name), hint="clear the layout"
-        )
+        raise InvalidSplats("layout", expected="columns of the splats", got=repr(name), hint="clear the layout")
     return values.numpy()[(slice(None), *slot.index)]
 
 

@@ -144,9 +144,7 @@ def _colour(names: Sequence[str], source: str) -> dict[str, Slot]:
 def _lobes(names: Sequence[str], source: str) -> dict[str, Slot]:
     count = _numbered(names, "sb_params", source)
     if count % LOBE_CHANNELS:
-        raise InvalidSplats(
-            source, expected=f"a multiple of {LOBE_CHANNELS} properties sb_params_*", got=str(count)
-        )
+        raise InvalidSplats(source, expected=f"a multiple of {LOBE_CHANNELS} properties sb_params_*", got=str(count))
     lobes = count // LOBE_CHANNELS
     return {f"sb_params_{i}": Slot("sb_params", (i % lobes, i // lobes)) for i in range(count)}
 

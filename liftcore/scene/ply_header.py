@@ -107,9 +107,7 @@ def parse_header(head: bytes, source: str) -> PlyHeader:
         InvalidSplats: the bytes are not the header of a splat PLY.
     """
     if head[:4] not in (b"ply\n", b"ply\r"):
-        raise InvalidSplats(
-            source, expected="a PLY file (first line 'ply')", got=_first_bytes(head), hint=_EXPORT
-        )
+        raise InvalidSplats(source, expected="a PLY file (first line 'ply')", got=_first_bytes(head), hint=_EXPORT)
     end = _END.search(head)
     if end is None:
         limit = f"'end_header' within the first {MAX_HEADER_BYTES} bytes"

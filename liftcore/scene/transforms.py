@@ -19,9 +19,7 @@ if TYPE_CHECKING:
 
 PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4")
-OPENGL_TO_OPENCV = np.diag(
-    [1.0, -1.0, -1.0, 1.0]
-)  # of the camera's axes: y up and z back become down and ahead
+OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # of the camera's axes: y up and z back become down and ahead
 
 
 def parse_transforms(document: Any, source: str) -> Cameras:
@@ -65,9 +63,7 @@ def _intrinsics(keys: Mapping[str, Any], width: int, height: int, where: str) ->
     fx = fy if fx is None else fx
     fy = fx if fy is None else fy
     if fx is None or fy is None:
-        raise InvalidCameras(
-            where, expected="fl_x or camera_angle_x", got="neither", hint="add a focal length"
-        )
+        raise InvalidCameras(where, expected="fl_x or camera_angle_x", got="neither", hint="add a focal length")
     cx = number(keys.get("cx", width / 2), f"{where} cx")
     cy = number(keys.get("cy", height / 2), f"{where} cy")
     return Intrinsics(fx, fy, cx, cy)

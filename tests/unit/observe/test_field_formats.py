@@ -111,9 +111,7 @@ def test_array_of_objects_is_never_unpickled(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("shape", [(1 << 40,), (1 << 20, 1 << 20, 1 << 20), (0, 4), (-4,), (9,)])
-def test_array_header_is_believed_only_as_far_as_the_file_goes(
-    shape: tuple[int, ...], tmp_path: Path
-) -> None:
+def test_array_header_is_believed_only_as_far_as_the_file_goes(shape: tuple[int, ...], tmp_path: Path) -> None:
     path = tmp_path / "bomb.npy"
     with path.open("wb") as handle:
         np.lib.format.write_array_header_1_0(handle, {"descr": "<f4", "fortran_order": False, "shape": shape})

@@ -234,7 +234,7 @@ def test_pack_that_cannot_be_right_is_not_written(tmp_path: Path) -> None:
     bad = {
         "at least one view": {},
         "the same channels": {"a": FeatureGrid(torch.ones(1, 1, 2)), "b": FeatureGrid(torch.ones(1, 1, 3))},
-        "finite features": {"a": FeatureGrid(torch.full((1, 1, 2), torch.nan))},
+        "finite values": {"a": FeatureGrid(torch.full((1, 1, 2), torch.nan))},
     }
     for message, views in bad.items():
         with pytest.raises(InvalidFeatures, match=message):

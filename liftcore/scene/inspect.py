@@ -1,0 +1,128 @@
+"""What is in a file of splats or cameras, and what looks wrong with it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from liftcore.scene.load import load_cameras, load_splats
+from liftcore.scene.ply_dialect import nearest_dialect
+from liftcore.scene.splats import Kernel
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from torch import Tensor
+
+    from liftcore.scene.cameras import Cameras
+    from liftcore.scene.splats import Splats
+
+QUANTILES = {"min": 0.0, "q01": 0.01, "median": 0.5, "q99": 0.99, "max": 1.0}
+ALPHA_FLOOR = 1 / 255  # a Gaussian never reaches a ray with less
+FAR = 1e5  # scene units; float32 resolves only a hundredth there
+TINY = 1e-7  # scene units
+LARGEST = 1e300  # shown in place of what overflows, which JSON cannot hold
+OFF_CENTRE = 0.1  # of the image's side
+
+
+def inspect_file(path: Path) -> dict[str, Any]:
+    """Describe a splat file or a camera file or folder, recognised by content.
+
+    Returns:
+        ``kind`` (splats or cameras), ``bytes``, counts and ranges, and ``warnings``: what looks wrong.
+
+    Raises:
+        InvalidSplats, InvalidCameras: the file is malformed.
+    """
+    if is_splats(path):
+        return {"kind": "splats", "bytes": path.stat().st_size, **describe_splats(load_splats(path))}
+    files = [path] if path.is_file() else [file for file in path.rglob("*") if file.is_file()]
+    size = sum(file.stat().st_size for file in files)
+    return {"kind": "cameras", "bytes": size, **describe_cameras(load_cameras(path))}
+
+
+def is_splats(path: Path) -> bool:
+    """Whether the file begins like a PLY, or is named like one or like a checkpoint."""
+    if path.suffix.lower() in (".ply", ".pt", ".pth", ".ckpt"):
+        return True
+    if not path.is_file():
+        return False
+    with path.open("rb") as handle:
+        return handle.read(3) == b"ply"
+
+
+def describe_splats(splats: Splats) -> dict[str, Any]:
+    """Counts, ranges (after activation) and warnings of splats."""
+    low, high = splats.means.amin(dim=0), splats.means.amax(dim=0)
+    opacities = torch.sigmoid(splats.opacity_logits)
+    scales = torch.exp(splats.log_scales.double()).clamp(max=LARGEST)
+    return {
+        "splats": splats.count,
+        "kernel": splats.kernel.value,
+        "dialect": nearest_dialect(splats.layout),
+        "sh_degree": splats.sh_degree,
+        "extras": sorted(splats.extras),
+        "box": [low.tolist(), high.tolist()],
+        "scales": _quantiles(scales),
+        "opacities": _quantiles(opacities),
+        "warnings": _splat_warnings(splats, scales, opacities),
+    }
+
+
+def describe_cameras(cameras: Cameras) -> dict[str, Any]:
+    """Counts, ranges and warnings of cameras."""
+    centres = np.stack([camera.centre for camera in cameras])
+    sizes = sorted({f"{camera.width}x{camera.height}" for camera in cameras})
+    focals = [focal for camera in cameras for focal in (camera.fx, camera.fy)]
+    return {
+        "views": len(cameras),
+        "names": [camera.name for camera in cameras],
+        "sizes": sizes,
+        "focal_lengths": {"min": min(focals), "max": max(focals)},
+        "box": [centres.min(axis=0).tolist(), centres.max(axis=0).tolist()],
+        "warnings": _camera_warnings(cameras, centres),
+    }
+
+
+def _quantiles(values: Tensor) -> dict[str, float]:
+    # torch.quantile refuses large inputs; numpy's partition does not.
+    flat = values.double().flatten().numpy()
+    found = np.quantile(flat, list(QUANTILES.values()), method="nearest")
+    return dict(zip(QUANTILES, found.tolist(), strict=True))
+
+
+def _splat_warnings(splats: Splats, scales: Tensor, opacities: Tensor) -> list[str]:
+    zero_quats = int((splats.quats == 0).all(dim=1).sum())
+    extent = float((splats.means.amax(dim=0).double() - splats.means.amin(dim=0)).max())
+    large = int((scales.amax(dim=1) > extent).sum()) if splats.count > 1 and extent > 0 else 0
+    tiny = int((scales.amax(dim=1) < TINY).sum())
+    far = int((splats.means.abs().amax(dim=1) > FAR).sum())
+    faint = int((opacities < ALPHA_FLOOR).sum()) if splats.kernel is not Kernel.BETA else 0
+    counted = {
+        "have a zero quaternion, which counts as no rotation": zero_quats,
+        "are larger than the scene": large,
+        f"are smaller than {TINY:g} scene units on every axis": tiny,
+        f"lie further than {FAR:g} scene units from the origin, where float32 is coarse": far,
+        "have an opacity below 1/255 and are never seen": faint,
+    }
+    warnings = [f"{count} of {splats.count} splats {what}" for what, count in counted.items() if count]
+    if splats.sh is None:
+        warnings.append("no colour: renders in RGB are not possible")
+    return warnings
+
+
+def _camera_warnings(cameras: Cameras, centres: np.ndarray) -> list[str]:
+    off = [
+        camera.name
+        for camera in cameras
+        if abs(camera.cx / camera.width - 0.5) > OFF_CENTRE or abs(camera.cy / camera.height - 0.5) > OFF_CENTRE
+    ]
+    warnings = []
+    if off:
+        warnings.append(f"{len(off)} views have their principal point far off the centre, such as {off[0]!r}")
+    places = len(np.unique(centres, axis=0))
+    if places < len(cameras):
+        warnings.append(f"{len(cameras)} views share {places} places")
+    return warnings

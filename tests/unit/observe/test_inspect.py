@@ -1,0 +1,133 @@
+"""Inspecting a file says what it is, how much there is of it, and what looks wrong."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from liftcore.artifact import InputFile, Lift, LiftMetadata, save_lift
+from liftcore.errors import InvalidInput, SplatliftError
+from liftcore.observe.inspect import inspect_file
+from liftcore.observe.observation import FeatureGrid, RegionMap
+from liftcore.observe.write_pack import write_pack
+from liftcore.scene.cameras import Camera, Cameras
+from liftcore.scene.inria import write_inria_cameras
+from liftcore.scene.ply import write_splats
+from liftcore.scene.splats import Splats
+from liftcore.solve.settings import LiftSettings
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+def inspected(path: Path) -> dict[str, Any]:
+    """What is found, which must survive strict JSON."""
+    return json.loads(json.dumps(inspect_file(path), allow_nan=False))
+
+
+def test_splats_are_described_and_their_faults_counted(tmp_path: Path) -> None:
+    quats = torch.ones(4, 4)
+    quats[1] = 0
+    splats = Splats(
+        means=torch.tensor([[0.0, 0, 0], [1, 1, 1], [2, 2, 2], [1e7, 0, 0]]),
+        quats=quats,
+        log_scales=torch.tensor([[0.0] * 3, [-40.0] * 3, [1e6, 0, 0], [0.0] * 3]),
+        opacity_logits=torch.tensor([0.0, 1e4, -1e4, 2.0]),
+    )
+    write_splats(splats, tmp_path / "s.ply")
+    found = inspected(tmp_path / "s.ply")
+    assert (found["kind"], found["splats"], found["kernel"], found["sh_degree"]) == ("splats", 4, "3dgs", None)
+    assert found["opacities"]["max"] == 1
+    text = " | ".join(found["warnings"])
+    for words in (
+        "1 of 4 splats have a zero quaternion",
+        "larger than",
+        "smaller than",
+        "lie further",
+        "below 1/255",
+    ):
+        assert words in text
+
+
+def test_cameras_are_described(tmp_path: Path) -> None:
+    views = tuple(Camera(name, 40, 30, 5.0, 6.0, 20.0, 15.0, np.eye(4)) for name in "ab")
+    write_inria_cameras(Cameras(views), tmp_path / "cameras.json")
+    found = inspected(tmp_path)
+    assert (found["kind"], found["views"], found["sizes"]) == ("cameras", 2, ["40x30"])
+    assert found["focal_lengths"] == {"min": 5.0, "max": 6.0}
+    assert found["warnings"] == ["2 views share 1 places"]
+
+
+def test_features_are_described_and_their_faults_counted(tmp_path: Path) -> None:
+    codebook = torch.tensor([[3.0, 4.0], [0.0, 0.0], [1.0, 0.0]])
+    labels = torch.tensor([[[0, 1], [-1, -1]]], dtype=torch.int32)
+    views = {"a": RegionMap(labels, codebook), "b": FeatureGrid(torch.ones(1, 2, 2))}
+    write_pack(tmp_path / "p", views, {"normalised": "true"})
+    found = inspected(tmp_path / "p")
+    assert (found["kind"], found["views"], found["region_maps"], found["grids"]) == ("features", 2, 1, 1)
+    assert (found["channels"], found["codebook_rows"], found["unlabelled"]) == (2, 5, 0.5)
+    assert found["norms"] == {"min": 1.0, "max": 5.0}
+    assert found["warnings"] == [
+        "the pack says normalised, but its vectors have norms from 1 to 5",
+        "1 of 5 codebook rows are zero",
+        "1 of 5 codebook rows are read by no label",
+        "the pack does not name its encoder",
+    ]
+
+
+def test_lift_is_described(tmp_path: Path) -> None:
+    gone = InputFile(path="/nowhere/s.ply", sha256="0")
+    metadata = LiftMetadata(
+        version="1",
+        settings=LiftSettings.of(),
+        splats=gone,
+        cameras=gone,
+        features=(gone,),
+        encoder="clip",
+        text_space="",
+        views=("a",),
+        certificate={"beta": 0.1},
+        timings={},
+    )
+    seen = torch.tensor([True, False])
+    save_lift(Lift(torch.ones(2, 3), torch.tensor([2.0, 0]), torch.tensor([0.5, 0]), seen, metadata), tmp_path / "l")
+    found = inspected(tmp_path / "l")
+    assert (found["kind"], found["splats"], found["channels"], found["seen_share"]) == ("lift", 2, 3, 0.5)
+    assert found["settings"]["preset"] == "tikhonov"
+    assert found["warnings"][0] == "1 of 2 splats have no evidence and zero features"
+    assert "no longer at" in found["warnings"][1]
+
+
+def test_text_table_is_described(tmp_path: Path) -> None:
+    save_file({"embeddings": torch.eye(2)}, str(tmp_path / "t"), metadata={"words": '["cat"]', "encoder": "clip"})
+    found = inspected(tmp_path / "t")
+    assert (found["kind"], found["rows"], found["channels"], found["words"]) == ("table", 2, 2, ["cat"])
+    assert found["warnings"] == ["1 words for 2 rows"]
+
+
+@pytest.mark.parametrize("content", [b"", b"hello", b"ply\n", b"PK\x03\x04", b"\x08\0\0\0\0\0\0\0{broken}", b"{}"])
+def test_what_is_nothing_of_ours_is_refused(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "x").write_bytes(content)
+    with pytest.raises(SplatliftError) as caught:
+        inspect_file(tmp_path / "x")
+    assert "\n" not in str(caught.value)
+    with pytest.raises(InvalidInput, match="nothing of that name"):
+        inspect_file(tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("plush/point_cloud.ply", "splats"),
+        ("plush", "cameras"),
+        ("tabletop/features_hard.safetensors", "features"),
+        ("text_tables/lvis_clip_vit_b_32.safetensors", "table"),
+    ],
+)
+def test_real_files_are_recognised(name: str, kind: str, shared_data: Path) -> None:
+    assert inspected(shared_data / name)["kind"] == kind
