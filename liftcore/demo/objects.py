@@ -90,9 +90,7 @@ def _fruit() -> list[Piece]:
         angle, height = 2 * np.pi * u, np.pi * (v - 0.5)
         ring = 0.56 * np.cos(height) * (1.0 + 0.12 * np.sin(height))
         dimple = 0.52 * np.sin(height) - 0.16 * np.exp(-((ring / 0.18) ** 2)) * np.sign(np.sin(height))
-        return np.array([-0.55, -0.35, 0.92]) + np.stack(
-            [ring * np.cos(angle), ring * np.sin(angle), dimple], axis=1
-        )
+        return np.array([-0.55, -0.35, 0.92]) + np.stack([ring * np.cos(angle), ring * np.sin(angle), dimple], axis=1)
 
     def arc(t: np.ndarray) -> np.ndarray:
         angle = np.pi * (0.1 + 0.8 * t)
@@ -114,7 +112,13 @@ def _fruit() -> list[Piece]:
             paints.plain(0.3, 0.2, 0.1),
             80,
         ),
-        Piece("orange", "orange", surfaces.ellipsoid((0.62, -0.42, 0.95), (0.56, 0.56, 0.54)), paints.orange_peel, 1900),
+        Piece(
+            "orange",
+            "orange",
+            surfaces.ellipsoid((0.62, -0.42, 0.95), (0.56, 0.56, 0.54)),
+            paints.orange_peel,
+            1900,
+        ),
         Piece("banana", "banana", banana, paints.banana_peel, 1900),
     ]
 

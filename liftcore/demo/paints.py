@@ -1,7 +1,7 @@
 """Paints: the colour of a surface point before the light falls on it.
 
-A paint maps points [n, 3] (world, decimetres) and parameters [n, 2] (0..1 along the surface) to linear-looking
-sRGB [n, 3] in 0..1.
+A paint maps points [n, 3] (world, decimetres) and parameters [n, 2] (0..1 along the surface) to sRGB [n, 3]
+in 0..1.
 """
 
 from __future__ import annotations

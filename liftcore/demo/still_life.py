@@ -1,4 +1,4 @@
-"""The still life as splats and cameras: generated from a seed, the same on every machine's double precision."""
+"""The still life as splats and cameras: generated from a seed, the same at every run."""
 
 from __future__ import annotations
 
@@ -25,7 +25,6 @@ FLATNESS = 0.08  # thickness over width
 LIGHT = np.array([-5.0, -7.0, 9.0])  # decimetres, a window in front on the left
 BULB = np.array([3.2, 1.3, 2.9])  # decimetres, inside the lamp's shade
 AMBIENT, WINDOW, LAMP = 0.42, 0.62, 1.1
-LEAST_ROW_SUM = 0.5  # a ray below it has no true label
 
 
 @dataclass(frozen=True)
@@ -67,9 +66,7 @@ def still_life(seed: int = 7, views: int = 22) -> StillLife:
         things=things,
         parts=parts,
         thing_of_part=tuple(owner[part] for part in parts),
-        splat_parts=np.concatenate(
-            [np.full(piece.splats, parts.index(piece.part), np.int32) for piece in pieces]
-        ),
+        splat_parts=np.concatenate([np.full(piece.splats, parts.index(piece.part), np.int32) for piece in pieces]),
     )
 
 

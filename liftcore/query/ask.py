@@ -77,9 +77,7 @@ class Found:
     """Where an answer lies in the world."""
 
     best: tuple[TopSplat, ...]  # descending by score
-    box: (
-        tuple[tuple[float, ...], tuple[float, ...]] | None
-    )  # least and greatest corner of the selected; None = none
+    box: tuple[tuple[float, ...], tuple[float, ...]] | None  # least and greatest corner of the selected; None = none
 
 
 def ask(
@@ -151,9 +149,7 @@ def top(answer: Answer, scene: QueryScene, count: int) -> Found:
         InvalidLift: the splats moved or changed since the lift.
     """
     means = scene.splats.means
-    scores, order = torch.topk(
-        torch.where(answer.seen, answer.scores, -torch.inf), min(count, len(answer.scores))
-    )
+    scores, order = torch.topk(torch.where(answer.seen, answer.scores, -torch.inf), min(count, len(answer.scores)))
     best = tuple(
         TopSplat(row, score, _point(means[row]))
         for row, score in zip(order.tolist(), scores.tolist(), strict=True)

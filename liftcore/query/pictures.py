@@ -48,7 +48,7 @@ def render_png(scene: QueryScene, view: str) -> bytes:
 
 def overlay_png(image: np.ndarray, look: Look) -> bytes:
     """An image [H, W, 3] u8 with what was found bright and outlined, and the rest dimmed."""
-    return _png(_overlay(image, look))
+    return _png(overlay(image, look.mask.numpy()))
 
 
 def save_mask(look: Look, path: Path) -> None:
@@ -100,8 +100,8 @@ def _heat(look: Look) -> np.ndarray:
     return picture
 
 
-def _overlay(image: np.ndarray, look: Look) -> np.ndarray:
-    mask = look.mask.numpy()
+def overlay(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """[H, W, 3] u8: an image with a mask [H, W] bool bright and outlined, and the rest dimmed."""
     picture = np.where(mask[..., None], image, (_DIM * image).astype(np.uint8))
     picture[_border(mask)] = _OUTLINE
     return picture

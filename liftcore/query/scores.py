@@ -109,9 +109,7 @@ def _unit_rows(texts: Tensor, channels: int) -> Tensor:
     wide = texts.to(torch.float32)
     lengths = torch.linalg.vector_norm(wide, dim=1, keepdim=True)
     if not bool(torch.isfinite(lengths).all()) or bool((lengths == 0).any()):
-        raise InvalidQuery(
-            "text vector", expected="a finite vector with a direction", got="zero, NaN or infinity"
-        )
+        raise InvalidQuery("text vector", expected="a finite vector with a direction", got="zero, NaN or infinity")
     return wide / lengths
 
 

@@ -76,9 +76,7 @@ class TableEncoder:
         if not isinstance(words, list) or not all(isinstance(word, str) for word in words):
             raise InvalidQuery(name, expected="metadata words, a JSON list of strings", got="none")
         if embeddings.dtype not in (torch.float16, torch.float32):
-            raise InvalidQuery(
-                name, expected="float16 or float32", got=str(embeddings.dtype).removeprefix("torch.")
-            )
+            raise InvalidQuery(name, expected="float16 or float32", got=str(embeddings.dtype).removeprefix("torch."))
         return cls(name, words, embeddings)
 
     def encode(self, texts: Sequence[str]) -> Tensor:

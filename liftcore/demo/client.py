@@ -1,0 +1,92 @@
+"""The demo's talk with the service: uploads, a lift, questions, pictures."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Any
+
+import httpx
+
+from liftcore.errors import InvalidInput, SplatliftError, Unavailable
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+_PART = 1 << 20  # bytes of an upload sent at once
+_POLL_SECONDS = 0.25
+_TIMEOUT = httpx.Timeout(600.0, connect=10.0)  # the first query loads an encoder
+_ENDED = ("succeeded", "failed", "canceled")
+
+
+class Client:
+    """One conversation. Answers of 4xx and 5xx become errors with the service's own words.
+
+    Raises:
+        InvalidInput: the service refused a request.
+        Unavailable: it cannot be reached, or failed itself.
+    """
+
+    def __init__(self, url: str) -> None:
+        # The service is on this machine: a proxy of the environment has no part in it.
+        self._http = httpx.Client(base_url=url, timeout=_TIMEOUT, trust_env=False)
+
+    def close(self) -> None:
+        """End the conversation."""
+        self._http.close()
+
+    def upload(self, kind: str, path: Path) -> dict[str, Any]:
+        """``PUT /assets/{kind}``: the asset, with its id and counts."""
+
+        def parts() -> Iterator[bytes]:
+            with path.open("rb") as handle:
+                while part := handle.read(_PART):
+                    yield part
+
+        return self._call("PUT", f"/assets/{kind}", content=parts()).json()
+
+    def lift(
+        self, order: dict[str, Any], progress: Callable[[dict[str, Any]], None]
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """``POST /lift`` and wait: the ended job and its lift."""
+        job = self._call("POST", "/lift", json=order).json()
+        while job["state"] not in _ENDED:
+            progress(job)
+            time.sleep(_POLL_SECONDS)
+            job = self._call("GET", f"/jobs/{job['id']}").json()
+        progress(job)
+        if job["state"] != "succeeded":
+            raise _refusal("lift", job.get("problem") or {}, job["state"])
+        return job, self._call("GET", f"/lifts/{job['id']}").json()
+
+    def ask(self, lift: str, text: str, **more: str) -> tuple[dict[str, Any], float]:
+        """``GET /query``: the answer, and the milliseconds that it took to come."""
+        begin = time.perf_counter()
+        answer = self._call("GET", "/query", params={"lift": lift, "text": text, **more}).json()
+        return answer, 1e3 * (time.perf_counter() - begin)
+
+    def picture(self, path: str, **parameters: str) -> tuple[bytes, float]:
+        """A PNG of the service, and the milliseconds that it took to come."""
+        begin = time.perf_counter()
+        content = self._call("GET", path, params=parameters).content
+        return content, 1e3 * (time.perf_counter() - begin)
+
+    def _call(self, method: str, path: str, **how: Any) -> httpx.Response:
+        try:
+            response = self._http.request(method, path, **how)
+        except httpx.HTTPError as error:
+            raise Unavailable("service", expected=f"an answer to {method} {path}", got=repr(error)) from None
+        if response.is_success:
+            return response
+        kind = response.headers.get("content-type", "")
+        problem = response.json() if "json" in kind else {"detail": response.text[:200]}
+        raise _refusal(f"{method} {path}", problem, str(response.status_code))
+
+
+def _refusal(what: str, problem: dict[str, Any], status: str) -> SplatliftError:
+    """The service's problem as an error of ours: field by field where it has the fields, else its sentence."""
+    kind = Unavailable if problem.get("status", 0) >= 500 else InvalidInput
+    if problem.get("expected") and problem.get("got"):
+        argument = problem.get("argument") or what
+        return kind(argument, expected=problem["expected"], got=problem["got"], hint=problem.get("hint") or "")
+    return kind(what, expected="success", got=problem.get("detail") or problem.get("title") or status)

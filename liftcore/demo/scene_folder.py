@@ -1,0 +1,154 @@
+"""What a scene folder holds: splats, cameras, a feature pack, words, and the truth where somebody knows it."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from liftcore.errors import InvalidInput
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+_CAMERA_FILES = ("cameras.json", "transforms.json", "cameras.zip")
+_MODEL_FOLDERS = ("sparse/0", "sparse")
+_TABLE = "text_table.safetensors"
+_PHRASES = 3  # asked when nobody says which
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What is really there."""
+
+    names: tuple[str, ...]  # object names
+    splat_objects: np.ndarray  # [P] integers, rows of names; -1 = none
+    masks: Mapping[str, np.ndarray]  # view -> [H, W] integers, rows of names; -1 = none
+    meant: Mapping[str, tuple[str, ...]]  # phrase -> the objects that it means
+
+    def mask_of(self, phrase: str, view: str) -> np.ndarray | None:
+        """[H, W] bool, where the phrase's objects are; None when the phrase or the view has no truth."""
+        if phrase not in self.meant or view not in self.masks:
+            return None
+        rows = [self.names.index(name) for name in self.meant[phrase]]
+        return np.isin(self.masks[view], rows)
+
+
+@dataclass(frozen=True)
+class DemoScene:
+    """A scene ready for the service."""
+
+    name: str
+    splats: Path
+    cameras: Path
+    features: Path
+    encoder: str  # specification of the text encoder
+    phrases: tuple[str, ...]
+    views: tuple[str, ...]  # to look from, the pictured one first; views with truth where there are any
+    truth: Truth | None
+
+
+def find_scene(folder: Path, phrases: Sequence[str], scratch: Path) -> DemoScene:
+    """A scene folder as it is: the files are found by name, a COLMAP model is zipped for the upload.
+
+    Args:
+        folder: holds a ``.ply``, cameras (``cameras.json``, ``transforms.json``, ``sparse/0``) and a pack.
+        phrases: what to ask; empty = three objects of ``truth.json``.
+        scratch: where to put the zipped model.
+
+    Raises:
+        InvalidInput: something is missing; the error says what.
+    """
+    if not folder.is_dir():
+        raise InvalidInput("--scene", expected="a folder", got=f"nothing at {folder}")
+    truth = _read_truth(folder)
+    asked = tuple(phrases) or _phrases_of(truth)
+    if not asked:
+        raise InvalidInput(
+            "--phrase", expected="something to look for", got="none", hint="this scene does not say what it shows"
+        )
+    cameras = _cameras(folder, scratch)
+    table = folder / _TABLE
+    return DemoScene(
+        name=folder.name,
+        splats=_first(folder, "*.ply", "splats"),
+        cameras=cameras,
+        features=_features(folder),
+        encoder=f"table:{table}" if table.is_file() else "minilm",
+        phrases=asked,
+        views=tuple(truth.masks) if truth else _some_views(cameras),
+        truth=truth,
+    )
+
+
+def _first(folder: Path, pattern: str, what: str) -> Path:
+    found = sorted(folder.glob(pattern)) or sorted(folder.glob(f"point_cloud/*/{pattern}"))
+    if not found:
+        raise InvalidInput(f"{what} of {folder.name}", expected=f"a {pattern[1:]} file", got="none")
+    return found[-1]
+
+
+def _cameras(folder: Path, scratch: Path) -> Path:
+    for name in _CAMERA_FILES:
+        if (folder / name).is_file():
+            return folder / name
+    for name in _MODEL_FOLDERS:
+        files = sorted(path for path in (folder / name).glob("*") if path.suffix in (".bin", ".txt"))
+        if files:
+            scratch.mkdir(parents=True, exist_ok=True)
+            packed = scratch / "cameras.zip"
+            with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+                for file in files:
+                    archive.write(file, file.name)
+            return packed
+    wanted = ", ".join([*_CAMERA_FILES, *_MODEL_FOLDERS])
+    raise InvalidInput(f"cameras of {folder.name}", expected=f"one of {wanted}", got="none")
+
+
+def _features(folder: Path) -> Path:
+    from safetensors import SafetensorError, safe_open
+
+    preferred = folder / "features.safetensors"
+    for path in [preferred, *sorted(folder.glob("*.safetensors"))]:
+        try:
+            with safe_open(str(path), framework="pt") as handle:
+                names = list(handle.keys())
+                if any(name.endswith(("/codebook", "/grid")) for name in names):
+                    return path
+        except (SafetensorError, OSError):
+            continue
+    raise InvalidInput(f"features of {folder.name}", expected="a feature pack (.safetensors)", got="none")
+
+
+def _read_truth(folder: Path) -> Truth | None:
+    """``truth.json`` names the objects, ``truth.safetensors`` holds ``splat_object`` and ``VIEW/mask``."""
+    from safetensors.numpy import load_file
+
+    names_file, arrays_file = folder / "truth.json", folder / "truth.safetensors"
+    if not (names_file.is_file() and arrays_file.is_file()):
+        return None
+    document = json.loads(names_file.read_text())
+    arrays = load_file(arrays_file)
+    names = tuple(str(thing["class"]) for thing in document["objects"])
+    meant = {f"the {name}": (name,) for name in names} | {name: (name,) for name in names}
+    return Truth(
+        names=names,
+        splat_objects=arrays["splat_object"],
+        masks={key.removesuffix("/mask"): mask for key, mask in arrays.items() if key.endswith("/mask")},
+        meant=meant | {phrase: tuple(things) for phrase, things in document.get("phrases", {}).items()},
+    )
+
+
+def _phrases_of(truth: Truth | None) -> tuple[str, ...]:
+    return () if truth is None else tuple(f"the {name}" for name in truth.names[:_PHRASES])
+
+
+def _some_views(cameras: Path) -> tuple[str, ...]:
+    from liftcore.scene.load import load_cameras
+
+    views = [camera.name for camera in load_cameras(cameras)]
+    return (views[len(views) // 2],)
