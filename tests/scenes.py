@@ -53,9 +53,7 @@ def random_regions(
     labels = np.repeat(np.repeat(coarse, 3, axis=1), 4, axis=2)[:, : size[0], : size[1]]
     codebook = rng.normal(0, 1, (rows, F))
     codebook /= np.linalg.norm(codebook, axis=1, keepdims=True)
-    return RegionMap(
-        torch.tensor(labels.copy(), dtype=torch.int32), torch.tensor(codebook, dtype=torch.float32)
-    )
+    return RegionMap(torch.tensor(labels.copy(), dtype=torch.int32), torch.tensor(codebook, dtype=torch.float32))
 
 
 def random_grid(seed: int, size: tuple[int, int] = (7, 9), F: int = 6) -> FeatureGrid:
@@ -68,11 +66,17 @@ def random_grid(seed: int, size: tuple[int, int] = (7, 9), F: int = 6) -> Featur
 def scenes(draw: st.DrawFn) -> tuple[Splats, Camera, Observation]:
     """A scene, a view and what the view observes."""
     seed = draw(st.integers(0, 2**20))
-    splats = random_splats(
-        seed, count=draw(st.integers(1, 60)), spread=draw(st.sampled_from([0.2, 1.0, 3.0]))
-    )
+    splats = random_splats(seed, count=draw(st.integers(1, 60)), spread=draw(st.sampled_from([0.2, 1.0, 3.0])))
     camera = random_camera(seed, width=draw(st.integers(1, 50)), height=draw(st.integers(1, 40)))
     size = (draw(st.integers(1, 45)), draw(st.integers(1, 55)))
     if draw(st.booleans()):
         return splats, camera, random_grid(seed, size)
     return splats, camera, random_regions(seed, draw(st.integers(1, 4)), draw(st.integers(1, 9)), size)
+
+
+def centred(camera: Camera) -> Camera:
+    """The camera with its principal point at the image's centre, as Inria's files assume."""
+    return Camera(
+        camera.name, camera.width, camera.height, camera.fx, camera.fy,
+        camera.width / 2, camera.height / 2, camera.world_to_camera,
+    )  # fmt: skip

@@ -75,9 +75,7 @@ class CpuRaster:
         self._depths = np.empty(splats.count, np.float32)
         self._frames: OrderedDict[tuple[Camera, Walk], Frame] = OrderedDict()
 
-    def region_weights(
-        self, camera: Camera, observation: Observation, walk: Walk, power: int
-    ) -> RegionWeights:
+    def region_weights(self, camera: Camera, observation: Observation, walk: Walk, power: int) -> RegionWeights:
         """``A^p^T S`` of a view and the evidence of plain weights. See the protocol."""
         if power not in (1, 2):
             raise InvalidInput("power", expected="1 or 2", got=str(power))
@@ -106,9 +104,7 @@ class CpuRaster:
             target = np.zeros((camera.height, camera.width, end - begin), np.float32)
             self._over_tiles(
                 frame,
-                lambda first, last, block=block, target=target: render_tiles(
-                    first, last, frame, block, target
-                ),
+                lambda first, last, block=block, target=target: render_tiles(first, last, frame, block, target),
             )
             image[:, :, begin:end] = target
         return torch.from_numpy(image)
@@ -150,8 +146,7 @@ class CpuRaster:
         bounds = _shares(self.splats.count, SPLAT_SHARES)
         counts = self._map(lambda first, last: project_gaussians(first, last, *arrays), bounds)
         used = [
-            np.arange(first, first + count, dtype=np.int32)
-            for (first, _), count in zip(bounds, counts, strict=True)
+            np.arange(first, first + count, dtype=np.int32) for (first, _), count in zip(bounds, counts, strict=True)
         ]
         places = np.concatenate(used) if used else np.empty(0, np.int32)
         return ids, depth_order(self._depths[places].view(np.uint32), places)

@@ -6,13 +6,14 @@ Ties keep the order of the splats' rows, so the order, and with it every product
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from liftcore.jit import kernel
 
 _DIGIT = 11  # bits a pass; three passes cover a float32
 _BUCKETS = 1 << _DIGIT
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def depth_order(keys, places):
     """Sort ``places`` by their keys.
 

@@ -126,16 +126,12 @@ class OracleRaster:
     def __init__(self, splats: Splats) -> None:
         self.splats = splats
 
-    def region_weights(
-        self, camera: Camera, observation: Observation, walk: Walk, power: int
-    ) -> RegionWeights:
+    def region_weights(self, camera: Camera, observation: Observation, walk: Walk, power: int) -> RegionWeights:
         """``A^p^T S`` by dense products, and the evidence of plain weights."""
         S, ray = reading_matrix(observation, camera.width, camera.height)
         A = dense_view(self.splats, camera, walk).A
         W = (A[ray] ** power).T @ S
-        plain = dense_view(self.splats, camera, Walk(1.0, walk.alpha_cap, walk.transmittance_stop)).A.sum(
-            axis=0
-        )
+        plain = dense_view(self.splats, camera, Walk(1.0, walk.alpha_cap, walk.transmittance_stop)).A.sum(axis=0)
         rows, columns = np.nonzero(W)
         splats, counts = np.unique(rows, return_counts=True)
         met = np.flatnonzero(plain)

@@ -14,9 +14,9 @@ import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from liftcore.raster.constants import ALPHA_FLOOR, FIELD_MARGIN, LOW_PASS, MAX_LOG_SCALE, NEAR_PLANE
+from liftcore.jit import kernel
 
 if TYPE_CHECKING:
     from liftcore.scene.cameras import Camera
@@ -81,7 +81,7 @@ def axes_of(splats: Splats) -> np.ndarray:
     return rotation * np.exp(log_scales)[:, None, :]
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def project_gaussians(first, last, means, axes, opacity, plain, view, records, depths, ids):
     """Footprints of splats ``first..last`` that touch the image, packed from row ``first`` on.
 

@@ -45,9 +45,7 @@ class RayRows:
 class Raster(Protocol):
     """A for one scene. Every product is deterministic to the bit, whatever the number of threads."""
 
-    def region_weights(
-        self, camera: Camera, observation: Observation, walk: Walk, power: int
-    ) -> RegionWeights:
+    def region_weights(self, camera: Camera, observation: Observation, walk: Walk, power: int) -> RegionWeights:
         """``A^p^T S`` of a view (power 1 or 2) and the evidence of plain weights."""
         ...
 

@@ -12,10 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numba import njit
 
 from liftcore.observe.observation import FeatureGrid, Observation, RegionMap
 from liftcore.raster.constants import TILE
+from liftcore.jit import kernel
 from liftcore.raster.lanes import LANES
 from liftcore.raster.walk import HALVES
 
@@ -67,9 +67,7 @@ def reading_of(observation: Observation, width: int, height: int) -> Reading:
     cell_x, share_x = _taps(width, columns)
     cell_y, share_y = _taps(height, rows)
     no_labels = np.empty((0, 0, 0), np.int32)
-    return Reading(
-        True, 1, no_labels, no_ints, no_ints, cell_x, cell_y, share_x, share_y, columns, rows * columns
-    )
+    return Reading(True, 1, no_labels, no_ints, no_ints, cell_x, cell_y, share_x, share_y, columns, rows * columns)
 
 
 def _nearest(pixels: int, cells: int) -> np.ndarray:
@@ -90,7 +88,7 @@ def observation_size(observation: FeatureGrid | RegionMap) -> tuple[int, int]:
     return int(shape[0]), int(shape[1])
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def new_taps(levels):
     """Room for one tile's taps."""
     return TileTaps(
@@ -104,7 +102,7 @@ def new_taps(levels):
     )
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def read_tile(taps, reading, frame, tile):
     """Fill ``taps`` with what the tile's pixels read."""
     x0 = (tile % frame.columns) * TILE
@@ -116,7 +114,7 @@ def read_tile(taps, reading, frame, tile):
         _read_regions(taps, reading, frame, x0, y0)
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _local_column(taps, column):
     """The tile's local number of a codebook row, new or known."""
     known = taps.sizes[1]
@@ -128,7 +126,7 @@ def _local_column(taps, column):
     return known
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _slot_of_labels(taps, reading, tuples, y, x):
     """The slot of the label tuple at label pixel (y, x); NO_SLOT when no level labels it."""
     levels = reading.levels
@@ -152,7 +150,7 @@ def _slot_of_labels(taps, reading, tuples, y, x):
     return known
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _read_regions(taps, reading, frame, x0, y0):
     tuples = np.empty((TILE * TILE, reading.levels), np.int32)
     slots = np.empty(LANES, np.int32)
@@ -190,7 +188,7 @@ def _read_regions(taps, reading, frame, x0, y0):
     taps.starts[HALVES] = count
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _read_grid(taps, reading, frame, x0, y0):
     known = np.empty(MAX_SLOTS, np.int32)  # the grid cell of each slot
     count = 0
@@ -223,7 +221,7 @@ def _read_grid(taps, reading, frame, x0, y0):
     taps.starts[HALVES] = count
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _slot_of_cell(taps, known, cell):
     slots = taps.sizes[0]
     for slot in range(slots - 1, -1, -1):

@@ -8,9 +8,9 @@ the evidence: the sum of plain weights over all rays.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from liftcore.raster.constants import TILE
+from liftcore.jit import inlined, kernel
 from liftcore.raster.lanes import LANES, add_lanes, add_product_lanes, square_lanes
 from liftcore.raster.projection import PLAIN
 from liftcore.raster.readings import MAX_SLOTS, new_taps, read_tile
@@ -30,7 +30,7 @@ from liftcore.raster.walk import (
 LONG_ROW = 64  # entries; longer rows are sorted by the library
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def weigh_tiles(first, last, frame, reading, power, with_plain):
     """Entries of tiles ``first..last``.
 
@@ -90,9 +90,7 @@ def weigh_tiles(first, last, frame, reading, power, with_plain):
                         if tap_whole[tap]:
                             add_lanes(slots, slot * LANES, rays.weights, offset)
                         else:
-                            add_product_lanes(
-                                slots, slot * LANES, rays.weights, offset, taps.factors, tap * LANES
-                            )
+                            add_product_lanes(slots, slot * LANES, rays.weights, offset, taps.factors, tap * LANES)
             if count + room > places.shape[0]:
                 places, columns, weights = _grow(places, columns, weights, count + room)
             total = _drain(evidence, 0)
@@ -117,7 +115,7 @@ def weigh_tiles(first, last, frame, reading, power, with_plain):
     return places[:count], columns[:count], weights[:count]
 
 
-@njit(nogil=True, cache=True, inline="always")
+@inlined
 def look_at_both(rays, plain, with_plain):
     """Note in ``rays.alive`` which half rows let light through, with or without the gain; whether any does."""
     alive = look(rays)
@@ -128,7 +126,7 @@ def look_at_both(rays, plain, with_plain):
     return alive
 
 
-@njit(nogil=True, cache=True, inline="always")
+@inlined
 def _drain(lanes, offset):
     """The sum of eight lanes, in a fixed tree; the lanes are zero afterwards."""
     total = ((lanes[offset] + lanes[offset + 4]) + (lanes[offset + 2] + lanes[offset + 6])) + (
@@ -139,7 +137,7 @@ def _drain(lanes, offset):
     return total
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _grow(places, columns, weights, needed):
     size = max(2 * places.shape[0], needed)
     new_places = np.empty(size, np.int32)
@@ -151,7 +149,7 @@ def _grow(places, columns, weights, needed):
     return new_places, new_columns, new_weights
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _flush_slots(taps, slots, local, low_slot, high_slot, columns, weights, count):
     """Expand a splat's slots to codebook rows and append them; slots and local sums are zero afterwards."""
     levels = taps.slot_columns.shape[1]
@@ -175,7 +173,7 @@ def _flush_slots(taps, slots, local, low_slot, high_slot, columns, weights, coun
     return count
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def group_entries(places, columns, weights, cursors, grouped_columns, grouped_weights):
     """Scatter one share's entries to their records' ranges (cursors [P + 1] i64 move on)."""
     for i in range(places.shape[0]):
@@ -185,14 +183,14 @@ def group_entries(places, columns, weights, cursors, grouped_columns, grouped_we
         grouped_weights[at] = weights[i]
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def count_entries(places, counts):
     """Add to ``counts`` [P] i64 how many entries each record has."""
     for place in places:
         counts[place] += 1
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def merge_rows(first, last, starts, columns, weights, column_count, kept):
     """Sum each record's entries by column in float64 and sort them by column, in place.
 
@@ -223,7 +221,7 @@ def merge_rows(first, last, starts, columns, weights, column_count, kept):
         kept[row] = out - begin
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def split_evidence(starts, kept, columns, weights, evidence_column, ids, out):
     """Pack the merged rows: region weights on one side, the evidence column on the other.
 

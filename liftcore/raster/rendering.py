@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from liftcore.raster.constants import ALPHA_FLOOR, TILE
+from liftcore.jit import kernel
 from liftcore.raster.lanes import LANES, add_scaled_lanes
 from liftcore.raster.projection import KX, KY, MX, MY, OPACITY, SLOPE
 from liftcore.raster.walk import (
@@ -24,7 +24,7 @@ from liftcore.raster.walk import (
 PIXELS = TILE * TILE
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def render_tiles(first, last, frame, values, image):
     """Composite ``values`` [P, C] f32 over tiles ``first..last`` into ``image`` [H, W, C] f32."""
     channels = values.shape[1]
@@ -61,7 +61,7 @@ def render_tiles(first, last, frame, values, image):
         sums[:] = 0
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def top_tiles(first, last, frame, ids, weights):
     """The largest weights of every ray of tiles ``first..last``, descending.
 
@@ -104,7 +104,7 @@ def top_tiles(first, last, frame, ids, weights):
                             ids[y, x, k] = number
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def trace_rays(frame, pixels):
     """Rows of A for single pixels, one ray at a time, in float64.
 

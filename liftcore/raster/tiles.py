@@ -10,13 +10,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from liftcore.raster.constants import TILE
+from liftcore.jit import inlined, kernel
 from liftcore.raster.projection import EXTENT_X, EXTENT_Y, KX, KY, LEAN, MX, MY, REACH, SLOPE
 
 
-@njit(nogil=True, cache=True, inline="always")
+@inlined
 def _tile_rows(record, rows):
     """First and last tile row whose pixel centres the footprint can reach."""
     top = math.floor((math.ceil(record[MY] - record[EXTENT_Y] - 0.5)) / TILE)
@@ -24,14 +24,14 @@ def _tile_rows(record, rows):
     return max(0.0, top), min(rows - 1.0, bottom)
 
 
-@njit(nogil=True, cache=True, inline="always")
+@inlined
 def _edge(record, dy, side):
     """x of the footprint's left (-1) or right (+1) edge at dy, relative to its centre."""
     room = max(0.0, record[REACH] - record[KY] * dy * dy)
     return record[SLOPE] * dy + side * math.sqrt(room / record[KX])
 
 
-@njit(nogil=True, cache=True, inline="always")
+@inlined
 def _tile_columns(record, tile_row, columns):
     """First and last tile column that the footprint touches between a tile row's first and last pixel centres."""
     low = max(tile_row * TILE + 0.5 - record[MY], -record[EXTENT_Y])
@@ -46,7 +46,7 @@ def _tile_columns(record, tile_row, columns):
     return max(0.0, first), min(columns - 1.0, last)
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def count_tiles(order, records, rows, columns, counts):
     """Add to ``counts`` [rows * columns] i64 how many of ``order``'s footprints touch each tile."""
     for place in order:
@@ -58,7 +58,7 @@ def count_tiles(order, records, rows, columns, counts):
                 counts[tile_row * columns + column] += 1
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def fill_tiles(order, records, rows, columns, cursors, items):
     """Write ``order``'s places into ``items`` [n] i32 from each tile's cursor on."""
     for place in order:

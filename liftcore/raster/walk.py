@@ -10,9 +10,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from liftcore.raster.constants import ALPHA_FLOOR, TILE
+from liftcore.jit import inlined, kernel
 from liftcore.raster.lanes import LANES, blend_lanes, gaussian_lanes
 from liftcore.raster.projection import EXTENT_Y, KX, KY, MX, MY, OPACITY, REACH, SLOPE
 
@@ -44,7 +44,7 @@ class Rays(NamedTuple):
     alive: np.ndarray  # [32] u8, half rows that still let light through
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def new_rays():
     """Room for one tile's rays."""
     pixels = TILE * TILE
@@ -56,7 +56,7 @@ def new_rays():
     )
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def start_rays(rays, frame, tile):
     """Light every ray of a tile that lies inside the image."""
     x0 = (tile % frame.columns) * TILE
@@ -68,7 +68,7 @@ def start_rays(rays, frame, tile):
     look(rays)
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def look(rays):
     """Note which half rows still let light through; whether any does."""
     any_alive = False
@@ -95,7 +95,7 @@ class Footprint(NamedTuple):
     opacity: float
 
 
-@njit(nogil=True, cache=True, inline="always")
+@inlined
 def footprint(records, place, x0, y0):
     """The record of a splat for the tile whose first pixel is (x0, y0)."""
     my = records[place, MY] - y0 - 0.5
@@ -113,21 +113,21 @@ def footprint(records, place, x0, y0):
     )
 
 
-@njit(nogil=True, cache=True, inline="always")
+@inlined
 def row_centre(splat, row):
     """The footprint in one pixel row: its centre in lanes, its exponent there."""
     dy = row - splat.my
     return splat.mx + splat.slope * dy, splat.ky * dy * dy
 
 
-@njit(nogil=True, cache=True, inline="always")
+@inlined
 def touches(splat, centre, base, side):
     """Whether any lane of half row ``side`` (0 left, 1 right) can reach the alpha floor."""
     near = max(0.0, max(side * LANES - centre, centre - (side * LANES + LANES - 1)))
     return splat.kx * near * near + base <= splat.reach
 
 
-@njit(nogil=True, cache=True, inline="always")
+@inlined
 def blend(rays, splat, centre, base, half, limits):
     """Composite the splat over half row ``half``; its weights lie in ``rays.weights`` afterwards.
 
@@ -140,7 +140,7 @@ def blend(rays, splat, centre, base, half, limits):
     blend_lanes(rays.weights, offset, rays.falloff, rays.transmittance, offset, alpha)
 
 
-@njit(nogil=True, cache=True, inline="always")
+@inlined
 def blend_plain(plain, falloff, opacity, half, limits):
     """The same splat for the rays without opacity gain, from the falloff that ``blend`` left."""
     offset = half * LANES

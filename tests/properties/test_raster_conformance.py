@@ -47,10 +47,7 @@ def test_region_weights_equal_the_oracle(scene, walk, power):
     splats, camera, observation = scene
     view = dense_view(splats, camera, walk)
     S, ray = reading_matrix(observation, camera.width, camera.height)
-    if (
-        dense_view(splats, camera, Walk(1.0, walk.alpha_cap, walk.transmittance_stop)).cut.any()
-        or view.cut.any()
-    ):
+    if dense_view(splats, camera, Walk(1.0, walk.alpha_cap, walk.transmittance_stop)).cut.any() or view.cut.any():
         return  # the pooled test counts the flips
     expected = (view.A[ray] ** power).T @ S
     weights = CpuRaster(splats, threads=2).region_weights(camera, observation, walk, power)
@@ -110,9 +107,7 @@ def test_ray_rows_are_rows_of_a(scene):
     pixels = torch.tensor(np.stack([x.ravel(), y.ravel()], axis=1), dtype=torch.int32)
     rows = CpuRaster(splats).ray_rows(camera, pixels, Walk())
     A = np.zeros_like(view.A)
-    A[np.repeat(np.arange(A.shape[0]), np.diff(rows.row_starts.numpy())), rows.splats.numpy()] = (
-        rows.weights.numpy()
-    )
+    A[np.repeat(np.arange(A.shape[0]), np.diff(rows.row_starts.numpy())), rows.splats.numpy()] = rows.weights.numpy()
     assert np.abs(A - view.A)[~view.cut].max(initial=0) < INSIDE
 
 

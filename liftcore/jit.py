@@ -1,0 +1,42 @@
+"""How kernels are compiled: without the interpreter lock, cached on disk by the content of the sources.
+
+numba's cache looks at a kernel's own file only, so a change in a function that it calls would go unseen. Here the
+cache folder is named after a digest of the sources of all packages that have kernels, and a stale kernel can never be loaded.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+from pathlib import Path
+
+import numba
+from numba import njit
+
+
+def _source_digest() -> str:
+    digest = hashlib.sha256(numba.__version__.encode())
+    for package in ("raster", "solve", "query"):
+        for source in sorted((Path(__file__).parent / package).glob("*.py")):
+            digest.update(source.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def _cache_folder() -> Path:
+    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    folder = base / "splatlift" / "kernels" / _source_digest()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        return folder
+    except OSError:  # a home that cannot be written: containers, services
+        return Path(tempfile.gettempdir()) / f"splatlift-kernels-{os.getuid()}-{_source_digest()}"
+
+
+if not os.environ.get("NUMBA_CACHE_DIR"):
+    numba.config.CACHE_DIR = str(_cache_folder())
+
+kernel = njit(nogil=True, cache=True)
+inlined = njit(nogil=True, cache=True, inline="always")
+# Sums may be reordered into lanes; the order is fixed at compile time, so results still repeat to the bit.
+vectorised = njit(nogil=True, cache=True, fastmath={"reassoc", "contract", "nsz"})

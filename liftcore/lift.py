@@ -1,0 +1,119 @@
+"""The pipeline, as the paper reads: A from the scene, B from the packs, X in closed form, and its certificate."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+
+from liftcore import __version__
+from liftcore.artifact import InputFile, Lift, LiftMetadata
+from liftcore.observe.pack import open_packs, pair
+from liftcore.progress import Progress, silent
+from liftcore.raster.cpu import CpuRaster
+from liftcore.raster.warm_up import warm_up
+from liftcore.scene.load import load_cameras, load_splats
+from liftcore.solve.accumulate import accumulate
+from liftcore.solve.certificate import certify
+from liftcore.solve.closed_form import solve_closed_form
+from liftcore.solve.view_weights import ViewWeights
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from liftcore.solve.settings import LiftSettings
+
+
+@dataclass
+class Timings:
+    """Seconds a stage."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Time the block under that name."""
+        start = time.perf_counter()
+        yield
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+
+
+def lift(
+    splats: Path,
+    cameras: Path,
+    features: Sequence[Path],
+    settings: LiftSettings,
+    *,
+    threads: int | None = None,
+    progress: Progress = silent,
+) -> Lift:
+    """Lift the features of the packs onto the splats.
+
+    Args:
+        splats: a PLY of any dialect. cameras: COLMAP, transforms.json or cameras.json. features: feature packs.
+        threads: None takes the cores that this process may use. The number changes no bit of the result.
+        progress: told of every view and slice; an exception from it stops the work.
+
+    Raises:
+        InvalidInput: a file is malformed, or the packs do not fit the cameras.
+        Unavailable: the kernel of the splats is not implemented.
+    """
+    timings = Timings()
+    with timings.stage("read"):
+        scene, views = load_splats(splats), load_cameras(cameras)
+        packs = open_packs(features)
+        names, unpaired = pair(packs, views)
+    with timings.stage("digest"):
+        inputs = [input_file(path) for path in (splats, cameras, *features)]
+    with timings.stage("compile"):
+        warm_up()
+    with ViewWeights() as store:
+        with timings.stage("geometry"):
+            raster = CpuRaster(scene, threads)
+            geometry = accumulate(raster, (scene.count, views), packs, names, settings, store, progress)
+        codebooks = [packs.observation(name).codebook for name in names]
+        with timings.stage("solve"):
+            dtype = getattr(torch, settings.dtype)
+            solution = solve_closed_form(
+                store, codebooks.__getitem__, geometry.denominators, dtype, progress, threads
+            )
+        with timings.stage("certify"):
+            certificate = certify(geometry, solution.features, codebooks.__getitem__, settings)
+        certificate |= {"weights_entries": sum(len(part.columns) for part in store), "views_without_camera": unpaired}
+    metadata = LiftMetadata(
+        version=__version__,
+        settings=settings,
+        splats=inputs[0],
+        cameras=inputs[1],
+        features=tuple(inputs[2:]),
+        encoder=packs.encoder,
+        text_space=packs.text_space,
+        views=tuple(names),
+        certificate=certificate,
+        timings=timings.seconds,
+    )
+    evidence = torch.from_numpy(geometry.evidence).to(torch.float32)
+    seen = torch.from_numpy(geometry.denominators > 0)
+    return Lift(solution.features, evidence, solution.agreement, seen, metadata)
+
+
+def input_file(path: Path) -> InputFile:
+    """Where an input is and what it is: the digest of the file, or of the sorted names and digests of a folder."""
+    resolved = path.resolve()
+    if not resolved.is_dir():
+        return InputFile(path=str(resolved), sha256=_digest(resolved))
+    total = hashlib.sha256()
+    for part in sorted(resolved.rglob("*")):
+        if part.is_file():
+            total.update(f"{part.relative_to(resolved)} {_digest(part)}\n".encode())
+    return InputFile(path=str(resolved), sha256=total.hexdigest())
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as handle:
+        return hashlib.file_digest(handle, "sha256").hexdigest()

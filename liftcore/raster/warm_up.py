@@ -1,0 +1,25 @@
+"""Compile the kernels, or load them from the disk cache, before anything is timed."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from liftcore.observe.observation import FeatureGrid, RegionMap
+from liftcore.raster.cpu import CpuRaster
+from liftcore.raster.protocol import Walk
+from liftcore.scene.cameras import Camera
+from liftcore.scene.splats import Splats
+
+
+def warm_up() -> None:
+    """Run every product once on one splat. A first run on a machine compiles; later ones load in well under a second."""
+    splats = Splats(torch.tensor([[0.0, 0.0, 2.0]]), torch.zeros(1, 4), torch.zeros(1, 3), torch.zeros(1))
+    camera = Camera("warm-up", 16, 16, 16.0, 16.0, 8.0, 8.0, np.eye(4))
+    raster = CpuRaster(splats, threads=1)
+    regions = RegionMap(torch.zeros(1, 1, 1, dtype=torch.int32), torch.ones(1, 1))
+    for observation in (regions, FeatureGrid(torch.ones(1, 1, 1))):
+        raster.region_weights(camera, observation, Walk(), 1)
+    raster.row_sums(camera, Walk())
+    raster.top_weights(camera, Walk(), 1)
+    raster.ray_rows(camera, torch.zeros(1, 2, dtype=torch.int32), Walk())

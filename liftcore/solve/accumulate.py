@@ -1,0 +1,89 @@
+"""The geometry phase: one walk a view, everything that the solution needs, no feature channel touched."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from liftcore.raster.protocol import RayRows, Walk
+from liftcore.solve.readout import Readout, read_pixels, sample_pixels
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from liftcore.observe.pack import FeaturePacks
+    from liftcore.progress import Progress
+    from liftcore.raster.protocol import Raster, RegionWeights
+    from liftcore.scene.cameras import Cameras
+    from liftcore.solve.settings import LiftSettings
+    from liftcore.solve.view_weights import ViewWeights
+
+
+@dataclass(frozen=True)
+class SampledRays:
+    """Some rays of one view: their rows of A and what they read of the codebook."""
+
+    rows: RayRows
+    readout: Readout
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """What all views together say about the splats."""
+
+    evidence: np.ndarray  # [P] f64, sum of plain weights, each ray once
+    denominators: np.ndarray  # [P] f64, sum of w^p over labelled rays and levels
+    samples: tuple[SampledRays, ...]  # for the certificate, one a view
+
+
+def lift_walk(settings: LiftSettings) -> Walk:
+    """The walk that lifts."""
+    return Walk(settings.lift_gain, settings.alpha_cap, settings.transmittance_stop)
+
+
+def render_walk(settings: LiftSettings) -> Walk:
+    """The walk that renders attention maps and masks."""
+    return Walk(settings.render_gain, settings.alpha_cap, settings.transmittance_stop)
+
+
+def accumulate(
+    raster: Raster,
+    scene: tuple[int, Cameras],
+    packs: FeaturePacks,
+    views: Sequence[str],
+    settings: LiftSettings,
+    store: ViewWeights,
+    progress: Progress,
+) -> Geometry:
+    """Walk every view once: ``W_v`` into the store, evidence, denominators, and sampled rows of A.
+
+    Args:
+        scene: the number of splats and the cameras.
+        views: the names to lift, in the order of the sums.
+        store: receives one RegionWeights a view.
+    """
+    count, cameras = scene
+    evidence, denominators = np.zeros(count), np.zeros(count)
+    walk = lift_walk(settings)
+    samples = []
+    rays = -(-settings.certificate_rays // len(views))
+    for number, name in enumerate(views):
+        camera, observation = cameras.get(name), packs.observation(name)
+        weights = raster.region_weights(camera, observation, walk, settings.power)
+        evidence[weights.evidence_splats.numpy()] += weights.evidence.numpy()
+        denominators[weights.splats.numpy()] += row_totals(weights)
+        store.append(weights)
+        pixels = sample_pixels(camera, rays, seed=(settings.seed, number))
+        readout = read_pixels(observation, camera, pixels)
+        samples.append(SampledRays(raster.ray_rows(camera, pixels, walk), readout))
+        progress("geometry", number + 1, len(views), "views")
+    return Geometry(evidence, denominators, tuple(samples))
+
+
+def row_totals(weights: RegionWeights) -> np.ndarray:
+    """[n] f64, ``W 1``: the sum of each row."""
+    if weights.splats.numel() == 0:
+        return np.zeros(0)
+    return np.add.reduceat(weights.weights.numpy().astype(np.float64), weights.row_starts.numpy()[:-1])

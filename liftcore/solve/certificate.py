@@ -1,0 +1,139 @@
+"""The certificate: what a lift measured of itself, on a stated sample of rays.
+
+All sums are over the sampled rays and the A that the lift used (its opacity gain, power 1)::
+
+    L(x') = mean_i || sum_j A_ij x_j - B_i ||^2          J(x') = mean_i sum_j A_ij || x_j - B_i ||^2
+    Delta_ij = || x_j - B_i ||,  mu_i = sum_j a_ij Delta_ij,  beta_i = sum_j a_ij (Delta_ij^2 - mu_i^2) / mu_i^2
+
+with ``a_ij = A_ij / sum_j A_ij``. A ray has a row i for each labelled level. The paper defines beta at the optimum
+x^; here it is measured at the answer x', which is what a user has.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from liftcore.jit import vectorised
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from torch import Tensor
+
+    from liftcore.solve.accumulate import Geometry, SampledRays
+    from liftcore.solve.settings import LiftSettings
+
+_MU_FLOOR = 1e-6  # a row whose splats all equal what it observed has no dispersion to speak of
+
+
+@dataclass(frozen=True)
+class ViewMeasures:
+    """Per-row measures of one view's sample."""
+
+    row_sums: np.ndarray  # [n] f64, a value a ray
+    residuals: np.ndarray  # [rows] f64, ||A x - B||^2
+    surrogates: np.ndarray  # [rows] f64, sum_j A ||x_j - B||^2
+    betas: np.ndarray  # [rows] f64
+
+
+def certify(
+    geometry: Geometry, features: Tensor, codebooks: Callable[[int], Tensor], settings: LiftSettings
+) -> dict[str, Any]:
+    """Measure the lift on its sampled rays.
+
+    Args:
+        features: [P, F], as they are stored.
+        codebooks: view number -> E_v [M, F].
+
+    Returns:
+        Plain numbers, ready for JSON; None where nothing was sampled.
+    """
+    views = [measure_view(sample, features, codebooks(number)) for number, sample in enumerate(geometry.samples)]
+    row_sums = np.concatenate([view.row_sums for view in views])
+    residuals = np.concatenate([view.residuals for view in views])
+    surrogates = np.concatenate([view.surrogates for view in views])
+    betas = np.concatenate([view.betas for view in views])
+    beta = _quantiles(betas)
+    return {
+        "rays": int(row_sums.size),
+        "rows": int(residuals.size),
+        "alpha_gain": settings.lift_gain,
+        "row_sum_mean": _mean(row_sums),
+        "row_sum_std": float(row_sums.std()) if row_sums.size else None,
+        "row_sum_min": float(row_sums.min()) if row_sums.size else None,
+        "residual": _mean(residuals),
+        "surrogate": _mean(surrogates),
+        "beta": beta,
+        "bound": None if beta["max"] is None else 1.0 + beta["max"],
+        "seen_share": float((geometry.denominators > 0).mean()),
+        "evidence_over_half_share": float((geometry.evidence > 0.5).mean()),
+    }
+
+
+def measure_view(sample: SampledRays, features: Tensor, codebook: Tensor) -> ViewMeasures:
+    """Row sums, residuals, surrogates and betas of one view's sampled rays."""
+    starts = sample.rows.row_starts.numpy()
+    lengths = np.diff(starts)
+    ray_of_entry = np.repeat(np.arange(lengths.size), lengths)
+    weights = sample.rows.weights.numpy().astype(np.float64)
+    row_sums = np.bincount(ray_of_entry, weights, minlength=lengths.size)
+    X = features[sample.rows.splats.long()].float().numpy()  # [entries, F]
+    B = sample.readout.observed(codebook).numpy()  # [rows, F]
+    measures = measure_rows(sample.readout.rays, starts, weights, X, B)
+    return ViewMeasures(row_sums, measures[:, 0], measures[:, 1], measures[:, 2])
+
+
+@vectorised
+def measure_rows(rays, starts, weights, X, B):
+    """Residual, surrogate and beta of every row, [rows, 3] f64.
+
+    Args:
+        rays: [rows] i64, the ray of a row. starts: [n + 1] i64, each ray's entries.
+        weights: [entries] f64. X: [entries, F] f32, the entries' splats. B: [rows, F] f32.
+    """
+    measures = np.zeros((rays.shape[0], 3))
+    channels = B.shape[1]
+    rendered = np.empty(channels, np.float32)
+    for row in range(rays.shape[0]):
+        rendered[:] = 0
+        observed = B[row]
+        surrogate = distance = total = 0.0
+        for entry in range(starts[rays[row]], starts[rays[row] + 1]):
+            weight = weights[entry]
+            small_weight = np.float32(weight)
+            lifted = X[entry]
+            square = np.float32(0.0)
+            for c in range(channels):
+                rendered[c] += small_weight * lifted[c]
+                difference = lifted[c] - observed[c]
+                square += difference * difference
+            surrogate += weight * square
+            distance += weight * math.sqrt(square)
+            total += weight
+        residual = np.float32(0.0)
+        for c in range(channels):
+            difference = rendered[c] - observed[c]
+            residual += difference * difference
+        measures[row, 0] = residual
+        measures[row, 1] = surrogate
+        if distance > _MU_FLOOR * total:
+            measures[row, 2] = max(surrogate * total / distance**2 - 1.0, 0.0)
+    return measures
+
+
+def _mean(values: np.ndarray) -> float | None:
+    return float(values.mean()) if values.size else None
+
+
+def _quantiles(values: np.ndarray) -> dict[str, float | None]:
+    if not values.size:
+        return {"median": None, "p99": None, "max": None}
+    return {
+        "median": float(np.median(values)),
+        "p99": float(np.quantile(values, 0.99)),
+        "max": float(values.max()),
+    }

@@ -1,0 +1,129 @@
+"""The closed form: ``x_j = sum_v W_v[j] E_v / sum W[j]`` (paper Eq. 6, App. Tikhonov for squared weights).
+
+X is never held in float32 as a whole. Splats go in blocks and channels in slices, so that a block of X and a slice
+of a view's codebook stay in the cache while all views add to them.
+"""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from liftcore.jit import kernel
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from torch import Tensor
+
+    from liftcore.progress import Progress
+    from liftcore.solve.view_weights import ViewWeights
+
+BLOCK = 2_048  # splats a block
+SLICE = 128  # channels a slice
+FLOAT16_MAX = 65_504.0
+UNIT_TOLERANCE = 5e-3  # float16 unit vectors are off by less
+
+
+@dataclass(frozen=True)
+class Solution:
+    """X and how much the inputs of each splat agreed."""
+
+    features: Tensor  # [P, F] f16 or f32, zero rows where nothing was seen
+    agreement: Tensor  # [P] f32, norm of the weighted mean of unit codebook rows
+
+
+@kernel
+def add_weighted_rows(first, last, offset, splats, row_starts, columns, weights, codebook, block):
+    """``block[splats[r] - offset] += sum_k weights[k] codebook[columns[k]]`` for CSR rows ``first..last``.
+
+    Args:
+        codebook: [M, C] f32. block: [B, C] f32, C the width of a slice.
+    """
+    width = codebook.shape[1]
+    for row in range(first, last):
+        target = block[splats[row] - offset]
+        for k in range(row_starts[row], row_starts[row + 1]):
+            weight = weights[k]
+            source = codebook[columns[k]]
+            for c in range(width):
+                target[c] += weight * source[c]
+
+
+def solve_closed_form(
+    store: ViewWeights,
+    codebooks: Callable[[int], Tensor],
+    denominators: np.ndarray,
+    dtype: torch.dtype,
+    progress: Progress,
+    threads: int | None = None,
+) -> Solution:
+    """Solve for X, slice by slice of channels and block by block of splats.
+
+    Args:
+        store: W of every view.
+        codebooks: view number -> E_v [M, F] f16 or f32.
+        denominators: [P] f64, row sums of W over all views.
+        dtype: how X is stored; float16 becomes float32 when a codebook goes beyond float16.
+        threads: None takes the cores that this process may use. The number changes no bit.
+    """
+    books = [codebooks(view) for view in range(len(store))]
+    channels = books[0].shape[1]
+    norms = [torch.linalg.vector_norm(book.to(torch.float32), dim=1) for book in books]
+    unit = all(bool(((norm - 1).abs() < UNIT_TOLERANCE).all()) for norm in norms)
+    if dtype == torch.float16 and max(float(book.abs().max()) for book in books) > FLOAT16_MAX:
+        dtype = torch.float32
+    count = denominators.shape[0]
+    features = torch.zeros(count, channels, dtype=dtype)
+    squares = np.zeros(count)
+    scale = np.divide(1.0, denominators, out=np.zeros(count), where=denominators > 0)
+    slices = [(begin, min(begin + SLICE, channels)) for begin in range(0, channels, SLICE)]
+    with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
+        for number, (begin, end) in enumerate(slices):
+            parts = [np.ascontiguousarray(book[:, begin:end].to(torch.float32).numpy()) for book in books]
+            result = features[:, begin:end]
+            sums = _solve_slice(pool, store, parts, scale, result)
+            if not unit:
+                unit_parts = [
+                    part / np.maximum(norm.numpy(), 1e-30)[:, None] for part, norm in zip(parts, norms, strict=True)
+                ]
+                sums = _solve_slice(pool, store, unit_parts, scale, None)
+            squares += sums
+            progress("solve", number + 1, len(slices), "slices")
+    agreement = np.sqrt(squares).clip(0.0, 1.0).astype(np.float32)
+    return Solution(features, torch.from_numpy(agreement))
+
+
+def _solve_slice(
+    pool: ThreadPoolExecutor,
+    store: ViewWeights,
+    parts: Sequence[np.ndarray],
+    scale: np.ndarray,
+    result: Tensor | None,
+) -> np.ndarray:
+    """One slice of channels for all splats; written to ``result`` [P, C]. Gives the squared norms [P] f64."""
+    count = scale.shape[0]
+    squares = np.zeros(count)
+
+    def solve_block(offset: int) -> None:
+        end = min(offset + BLOCK, count)
+        block = np.zeros((end - offset, parts[0].shape[1]), np.float32)
+        for weights, part in zip(store, parts, strict=True):
+            first, last = np.searchsorted(weights.splats.numpy(), (offset, end))
+            if first < last:
+                add_weighted_rows(
+                    first, last, offset, weights.splats.numpy(), weights.row_starts.numpy(),
+                    weights.columns.numpy(), weights.weights.numpy(), part, block,
+                )  # fmt: skip
+        block *= scale[offset:end, None].astype(np.float32)
+        squares[offset:end] = np.einsum("jc,jc->j", block, block, dtype=np.float64)
+        if result is not None:
+            result[offset:end] = torch.from_numpy(block).to(result.dtype)
+
+    list(pool.map(solve_block, range(0, count, BLOCK)))
+    return squares

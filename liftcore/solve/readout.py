@@ -1,0 +1,63 @@
+"""B for single rays: which codebook rows a few sampled pixels read, and how much."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from liftcore.observe.observation import Observation, RegionMap
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from liftcore.scene.cameras import Camera
+
+
+@dataclass(frozen=True)
+class Readout:
+    """Rows of S for n sampled rays; a ray has a row for each labelled level, or one for a grid."""
+
+    rays: np.ndarray  # [rows] i64, which of the sampled rays
+    columns: np.ndarray  # [rows, taps] i64, codebook rows
+    shares: np.ndarray  # [rows, taps] f64, sum to one
+
+    def observed(self, codebook: Tensor) -> Tensor:
+        """B [rows, F] f32 of the sampled rays."""
+        taken = codebook[torch.from_numpy(self.columns)].to(torch.float32)
+        return (taken * torch.from_numpy(self.shares).to(torch.float32)[:, :, None]).sum(dim=1)
+
+
+def sample_pixels(camera: Camera, count: int, seed: tuple[int, int]) -> Tensor:
+    """[n, 2] i32: up to ``count`` different pixels (x, y) of a view, in image order, by an explicit seed."""
+    total = camera.width * camera.height
+    chosen = np.random.default_rng(seed).choice(total, size=min(count, total), replace=False)
+    chosen.sort()
+    return torch.from_numpy(np.stack([chosen % camera.width, chosen // camera.width], axis=1).astype(np.int32))
+
+
+def read_pixels(observation: Observation, camera: Camera, pixels: Tensor) -> Readout:
+    """The rows of S of the given pixels [n, 2] (x, y)."""
+    x, y = pixels.numpy().astype(np.int64).T
+    if isinstance(observation, RegionMap):
+        _, rows, columns = observation.labels.shape
+        label_y = (2 * y + 1) * rows // (2 * camera.height)
+        label_x = (2 * x + 1) * columns // (2 * camera.width)
+        labels = observation.labels.numpy()[:, label_y, label_x]
+        level, ray = np.nonzero(labels >= 0)
+        return Readout(ray, labels[level, ray][:, None].astype(np.int64), np.ones((ray.shape[0], 1)))
+    rows, columns = observation.grid.shape[:2]
+    u = ((x + 0.5) * columns / camera.width - 0.5).clip(0, columns - 1)
+    v = ((y + 0.5) * rows / camera.height - 0.5).clip(0, rows - 1)
+    left, top = np.floor(u).astype(np.int64), np.floor(v).astype(np.int64)
+    right, bottom = np.minimum(left + 1, columns - 1), np.minimum(top + 1, rows - 1)
+    share_x, share_y = u - left, v - top
+    cells = np.stack(
+        [top * columns + left, top * columns + right, bottom * columns + left, bottom * columns + right], axis=1
+    )
+    shares = np.stack(
+        [(1 - share_y) * (1 - share_x), (1 - share_y) * share_x, share_y * (1 - share_x), share_y * share_x], axis=1
+    )
+    return Readout(np.arange(x.shape[0]), cells, shares)

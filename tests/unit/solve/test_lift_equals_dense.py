@@ -1,0 +1,105 @@
+"""The whole pipeline, from files to the lift file, against the dense definition of the paper."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from liftcore.artifact import load_lift, save_lift
+from liftcore.lift import lift
+from liftcore.observe.write_pack import write_pack
+from liftcore.raster.oracle import dense_view, reading_matrix
+from liftcore.raster.protocol import Walk
+from liftcore.scene.cameras import Cameras
+from liftcore.scene.inria import write_inria_cameras
+from liftcore.scene.load import load_cameras
+from liftcore.scene.ply import write_splats
+from liftcore.solve.settings import LiftSettings
+from tests.scenes import centred, random_camera, random_grid, random_regions, random_splats
+
+PRESETS = ("row-sum", "tikhonov")
+
+
+def write_scene(folder: Path, seed: int, grids: bool = False) -> tuple[Path, Path, Path]:
+    """A random scene of three views on disk: splats, cameras, features."""
+    views = tuple(centred(random_camera(seed + k, 32 + 5 * k, 24 + 3 * k, name=f"v{k}")) for k in range(3))
+    observations = {
+        camera.name: random_grid(seed + k) if grids else random_regions(seed + k) for k, camera in enumerate(views)
+    }
+    paths = folder / "splats.ply", folder / "cameras.json", folder / "features.safetensors"
+    write_splats(random_splats(seed, 50), paths[0])
+    write_inria_cameras(Cameras(views), paths[1])
+    write_pack(paths[2], observations, {"encoder": "random"})
+    return paths
+
+
+def dense_lift(seed: int, cameras: Cameras, preset: str, grids: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """X, evidence and seen by the paper's formulas, in float64."""
+    power, gain = (1, 1.0) if preset == "row-sum" else (2, 1.2)
+    splats = random_splats(seed, 50)
+    numerator, denominator, evidence = np.zeros((50, 6)), np.zeros(50), np.zeros(50)
+    for k, camera in enumerate(cameras):
+        observation = random_grid(seed + k) if grids else random_regions(seed + k)
+        S, ray = reading_matrix(observation, camera.width, camera.height)
+        B = S @ observation.codebook.double().numpy()
+        weights = dense_view(splats, camera, Walk(gain)).A[ray] ** power
+        numerator += weights.T @ B
+        denominator += weights.sum(axis=0)
+        evidence += dense_view(splats, camera, Walk()).A.sum(axis=0)
+    seen = denominator > 0
+    X = np.divide(numerator, denominator[:, None], out=np.zeros_like(numerator), where=seen[:, None])
+    return X, evidence, seen
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("grids", [False, True])
+@pytest.mark.parametrize("seed", range(4))
+def test_a_lift_equals_the_dense_definition(tmp_path, preset, grids, seed):
+    splats, cameras, features = write_scene(tmp_path, seed, grids)
+    save_lift(lift(splats, cameras, [features], LiftSettings.of(preset=preset)), tmp_path / "lift.safetensors")
+    got = load_lift(tmp_path / "lift.safetensors")
+    X, evidence, seen = dense_lift(seed, load_cameras(cameras), preset, grids)
+    assert np.array_equal(got.seen.numpy(), seen)
+    error = np.linalg.norm(got.features.double().numpy() - X, axis=1)
+    assert (error <= 1e-3 * np.linalg.norm(X, axis=1) + 1e-7).all()
+    assert np.abs(got.evidence.numpy() - evidence).max() < 1e-4
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_agreement_is_the_norm_of_the_mean_of_unit_inputs(tmp_path, preset):
+    splats, cameras, features = write_scene(tmp_path, 5)
+    got = lift(splats, cameras, [features], LiftSettings.of(preset=preset, dtype="float32"))
+    norms = torch.linalg.vector_norm(got.features, dim=1)  # the codebooks of random_regions are unit vectors
+    assert torch.allclose(got.agreement, norms, atol=1e-5)
+    assert float(got.agreement.max()) <= 1.0
+
+
+def test_agreement_does_not_depend_on_the_length_of_inputs(tmp_path):
+    splats, cameras, features = write_scene(tmp_path, 6)
+    plain = lift(splats, cameras, [features], LiftSettings.of(preset="row-sum"))
+    longer = {f"v{k}": random_regions(6 + k) for k in range(3)}
+    longer = {name: type(o)(o.labels, o.codebook * 7.0) for name, o in longer.items()}
+    write_pack(tmp_path / "longer.safetensors", longer, {})
+    scaled = lift(splats, cameras, [tmp_path / "longer.safetensors"], LiftSettings.of(preset="row-sum"))
+    assert torch.allclose(plain.agreement, scaled.agreement, atol=1e-4)
+
+
+def test_the_number_of_threads_changes_no_bit_of_a_lift(tmp_path):
+    paths = write_scene(tmp_path, 7)
+    runs = [lift(paths[0], paths[1], [paths[2]], LiftSettings.of(), threads=n) for n in (1, 2, 5)]
+    for other in runs[1:]:
+        assert torch.equal(runs[0].features, other.features)
+        assert torch.equal(runs[0].agreement, other.agreement)
+        assert torch.equal(runs[0].evidence, other.evidence)
+        assert runs[0].metadata.certificate == other.metadata.certificate
+
+
+def test_weights_in_files_give_the_same_lift_as_weights_in_memory(tmp_path, monkeypatch):
+    paths = write_scene(tmp_path, 8)
+    memory = lift(paths[0], paths[1], [paths[2]], LiftSettings.of())
+    monkeypatch.setattr("liftcore.solve.view_weights.MEMORY_LIMIT", 0)
+    files = lift(paths[0], paths[1], [paths[2]], LiftSettings.of())
+    assert torch.equal(memory.features, files.features)
