@@ -26,9 +26,7 @@ def unchanged(request: Request, etag: str) -> Response | None:
 
 def tagged(content: bytes, media_type: str, etag: str) -> Response:
     """Content that a client may keep and must ask about."""
-    return Response(
-        content, media_type=media_type, headers={"ETag": etag, "Cache-Control": "private, no-cache"}
-    )
+    return Response(content, media_type=media_type, headers={"ETag": etag, "Cache-Control": "private, no-cache"})
 
 
 def file_answer(request: Request, path: Path, *, sha256: str, filename: str) -> Response:
@@ -55,9 +53,7 @@ def _keeps_range(request: Request, size: int, etag: str) -> bool:
     if first and last and _number(first) > _number(last):
         return False
     if (first and _number(first) >= size) or (suffix and _number(suffix) == 0):
-        raise RangeNotSatisfiable(
-            "Range", expected=f"a range within {size} bytes", got=header[:80], size=size
-        )
+        raise RangeNotSatisfiable("Range", expected=f"a range within {size} bytes", got=header[:80], size=size)
     return not any(len(digits or "") > MAX_DIGITS for digits in match.groups())
 
 

@@ -81,9 +81,7 @@ def problem_of(error: SplatliftError) -> Problem:
 
 def answer(problem: Problem, headers: Mapping[str, str] | None = None) -> JSONResponse:
     """The problem as a response."""
-    return JSONResponse(
-        problem.model_dump(exclude_none=True), problem.status, headers=headers, media_type=MEDIA_TYPE
-    )
+    return JSONResponse(problem.model_dump(exclude_none=True), problem.status, headers=headers, media_type=MEDIA_TYPE)
 
 
 def install(app: FastAPI) -> None:
@@ -130,9 +128,7 @@ def _on_unexpected(request: Request, error: Exception) -> JSONResponse:
     # The details go to the log: they may name files or values that are not the client's.
     log.error("%s %s failed", request.method, request.url.path, exc_info=error)
     detail = "Something went wrong on our side; the server's log has the details."
-    return answer(
-        Problem(type="/problems/internal", title="An error of the server", status=500, detail=detail)
-    )
+    return answer(Problem(type="/problems/internal", title="An error of the server", status=500, detail=detail))
 
 
 def _short(value: object, limit: int = 120) -> str:

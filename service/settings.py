@@ -18,34 +18,22 @@ class ServiceSettings(BaseSettings):
 
     model_config = SettingsConfigDict(env_prefix="SPLATLIFT_", frozen=True, extra="forbid")
 
-    data: Path = Field(
-        Path("splatlift-data"), description="the directory that holds the database and all files"
-    )
+    data: Path = Field(Path("splatlift-data"), description="the directory that holds the database and all files")
     host: str = Field("127.0.0.1", description="the address to bind; loopback only until there are keys")
     port: int = Field(8787, ge=0, le=65_535, description="the port to bind; 0 picks a free one")
 
     max_splats_bytes: int = Field(4 * GiB, gt=0, description="the largest splat file, before and after gzip")
-    max_cameras_bytes: int = Field(
-        256 * MiB, gt=0, description="the largest camera file, before and after gzip"
-    )
-    max_features_bytes: int = Field(
-        16 * GiB, gt=0, description="the largest feature pack, before and after gzip"
-    )
-    max_body_bytes: int = Field(
-        MiB, gt=0, description="the largest body of any request that is not an upload"
-    )
+    max_cameras_bytes: int = Field(256 * MiB, gt=0, description="the largest camera file, before and after gzip")
+    max_features_bytes: int = Field(16 * GiB, gt=0, description="the largest feature pack, before and after gzip")
+    max_body_bytes: int = Field(MiB, gt=0, description="the largest body of any request that is not an upload")
 
     parallel_checks: int = Field(2, ge=1, le=64, description="uploads that are validated at the same time")
-    check_seconds: float = Field(
-        300, gt=0, description="wall time that the validation of one upload may take"
-    )
+    check_seconds: float = Field(300, gt=0, description="wall time that the validation of one upload may take")
     check_memory_bytes: int = Field(
         8 * GiB, gt=0, description="private memory that the validation of one upload may take (Linux)"
     )
 
-    lift_threads: int | None = Field(
-        None, ge=1, description="threads of a lift; empty = as many as there are cores"
-    )
+    lift_threads: int | None = Field(None, ge=1, description="threads of a lift; empty = as many as there are cores")
 
     encoder: str = Field(
         "minilm",
@@ -54,14 +42,10 @@ class ServiceSettings(BaseSettings):
     text_spaces: dict[str, str] = Field(
         default_factory=dict, description="text space -> text encoder, in the same notation (JSON object)"
     )
-    query_waiting: int = Field(
-        16, ge=1, le=32, description="queries that may wait or run; more are answered 503"
-    )
+    query_waiting: int = Field(16, ge=1, le=32, description="queries that may wait or run; more are answered 503")
     query_seconds: float = Field(120, gt=0, description="wall time after which a query is given up")
     query_scenes: int = Field(2, ge=1, description="lifts that the query process keeps open")
-    query_answers: int = Field(
-        16, ge=1, description="answers that the query process keeps for masks and maps"
-    )
+    query_answers: int = Field(16, ge=1, description="answers that the query process keeps for masks and maps")
 
     def max_upload_bytes(self, kind: str) -> int:
         """The size limit of an asset kind."""

@@ -16,10 +16,9 @@ import time
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from liftcore.lift import lift
-
 from liftcore.artifact import save_lift
 from liftcore.errors import SplatliftError
+from liftcore.lift import lift
 from liftcore.solve.settings import LiftSettings
 from service.faults import fault_of
 

@@ -89,9 +89,7 @@ class WarmWorker:
     def _ask(self, request: dict[str, Any]) -> Frame:
         for _ in range(2):  # it may have died while idle, so the first silence is not the request's fault
             if self._stopped:
-                raise Busy(
-                    "query", expected="a running server", got="one that stops", hint="ask the next one"
-                )
+                raise Busy("query", expected="a running server", got="one that stops", hint="ask the next one")
             reply = self._exchange(request)
             if reply is not None:
                 return reply

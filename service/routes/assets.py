@@ -87,9 +87,7 @@ def get_content(asset: AssetId, request: Request, here: Here) -> Response:
     """The bytes of an asset, or a range of them."""
     found = here.store.assets.get(asset)
     digest = found.id.removeprefix("sha256:")
-    return file_answer(
-        request, found.path, sha256=digest, filename=f"{found.kind}-{digest[:12]}{found.path.suffix}"
-    )
+    return file_answer(request, found.path, sha256=digest, filename=f"{found.kind}-{digest[:12]}{found.path.suffix}")
 
 
 @router.delete("/{asset}", status_code=204)

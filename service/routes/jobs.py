@@ -24,9 +24,7 @@ def submit(order: wire.LiftRequest, response: Response, here: Here) -> wire.Job:
     packs = [here.store.assets.get(pack, wire.AssetKind.FEATURES) for pack in order.features]
     here.store.assets.get(order.splats, wire.AssetKind.SPLATS)
     check_fit(cameras, packs)
-    job = here.store.jobs.submit(
-        order.splats, order.cameras, order.features, settings.model_dump(mode="json")
-    )
+    job = here.store.jobs.submit(order.splats, order.cameras, order.features, settings.model_dump(mode="json"))
     here.runner.wake()
     response.headers["Location"] = f"/jobs/{job}"
     return shape(here.store.jobs.get(job))

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 from urllib.parse import urlencode
 
 from fastapi import APIRouter, Depends, Query, Request, Response
+from pydantic import Field
 
 from liftcore import __version__
 from service import wire
@@ -28,6 +29,7 @@ NPY: dict[int | str, dict[str, Any]] = {
 LiftParameter = Annotated[
     str | None, Query(pattern=wire.JOB_ID, description="the lift; may be left out when there is exactly one")
 ]
+Number = Annotated[float, Field(ge=-1e6, le=1e6)]  # which NaN is not
 View = Annotated[str, Query(min_length=1, max_length=500, description="the name of a camera")]
 
 
@@ -42,8 +44,8 @@ class Phrase:
             list[str] | None, Query(max_length=32, description="what it is not; may be given several times")
         ] = None,
         threshold: Annotated[
-            Literal["auto"] | float,
-            Query(description="auto, or the score from which a splat counts as found"),
+            Literal["auto", "valley", "paper", "otsu"] | Number,
+            Query(description="how to find it, or the score from which a splat counts as found"),
         ] = "auto",
         encoder: Annotated[
             str | None, Query(max_length=200, description="a text space that the operator set up, or default")
@@ -162,9 +164,7 @@ def _encoder_names(spec: str) -> dict[str, str]:
     return {} if file is None else {str(file): "the encoder's file"}
 
 
-def _entity(
-    request: Request, here: Parts, asked: dict[str, Any], lift: LiftRecord, media_type: str
-) -> Response:
+def _entity(request: Request, here: Parts, asked: dict[str, Any], lift: LiftRecord, media_type: str) -> Response:
     etag = entity_tag(asked, lift)
     return unchanged(request, etag) or tagged(here.queries.call(asked).body, media_type, etag)
 

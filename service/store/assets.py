@@ -66,8 +66,7 @@ class AssetStore:
             else:
                 self._files.publish(upload.draft, path)
                 connection.execute(
-                    "INSERT INTO assets (id, kind, bytes, file, counts, warnings, created)"
-                    " VALUES (?,?,?,?,?,?,?)",
+                    "INSERT INTO assets (id, kind, bytes, file, counts, warnings, created) VALUES (?,?,?,?,?,?,?)",
                     (
                         asset,
                         upload.kind,
@@ -96,13 +95,9 @@ class AssetStore:
         found = self.find(asset)
         name = f"{kind or 'asset'}"
         if found is None:
-            raise NotFound(
-                name, expected="the id of an asset that is here", got=asset, hint="PUT /assets/... first"
-            )
+            raise NotFound(name, expected="the id of an asset that is here", got=asset, hint="PUT /assets/... first")
         if kind is not None and found.kind is not kind:
-            raise NotFound(
-                name, expected=f"an asset of kind {kind}", got=f"{asset}, which is of kind {found.kind}"
-            )
+            raise NotFound(name, expected=f"an asset of kind {kind}", got=f"{asset}, which is of kind {found.kind}")
         return found
 
     def all(self) -> list[AssetRecord]:

@@ -54,13 +54,10 @@ class JobStore:
             wanted = [(splats, AssetKind.SPLATS), (cameras, AssetKind.CAMERAS)]
             wanted += [(asset, AssetKind.FEATURES) for asset in features]
             for asset, kind in wanted:
-                if not connection.execute(
-                    "SELECT 1 FROM assets WHERE id = ? AND kind = ?", (asset, kind)
-                ).fetchone():
+                if not connection.execute("SELECT 1 FROM assets WHERE id = ? AND kind = ?", (asset, kind)).fetchone():
                     raise NotFound(kind, expected=f"the id of an asset of kind {kind}", got=asset)
             connection.execute(
-                "INSERT INTO jobs (id, state, splats, cameras, settings, created)"
-                " VALUES (?, 'queued', ?, ?, ?, ?)",
+                "INSERT INTO jobs (id, state, splats, cameras, settings, created) VALUES (?, 'queued', ?, ?, ?, ?)",
                 (job, splats, cameras, json.dumps(settings), time.time()),
             )
             connection.executemany(

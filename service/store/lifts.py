@@ -57,8 +57,7 @@ class LiftStore:
         size = made.draft.stat().st_size
         with self._database.write() as connection:
             ended = connection.execute(
-                "UPDATE jobs SET state = 'succeeded', ended = ?"
-                " WHERE id = ? AND attempt = ? AND state = 'running'",
+                "UPDATE jobs SET state = 'succeeded', ended = ? WHERE id = ? AND attempt = ? AND state = 'running'",
                 (time.time(), job, attempt),
             )
             if ended.rowcount != 1:

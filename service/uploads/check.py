@@ -7,6 +7,7 @@ Run as ``python -m service.uploads.check KIND PATH MEMORY_BYTES``. It says ``rea
 from __future__ import annotations
 
 import json
+import math
 import os
 import resource
 import sys
@@ -14,11 +15,10 @@ import zipfile
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from liftcore.observe.inspect import inspect_file as inspect_features
-from liftcore.observe.pack import open_packs
-from liftcore.scene.inspect import inspect_file as inspect_scene
-
 from liftcore.errors import InvalidInput, SplatliftError
+from liftcore.observe.inspect import describe_packs
+from liftcore.observe.pack import open_packs
+from liftcore.scene.inspect import describe_cameras, describe_splats
 from liftcore.scene.load import load_cameras, load_splats
 from service.faults import fault_of
 from service.uploads.checking import INVALID
@@ -26,33 +26,19 @@ from service.wire import AssetKind
 
 
 def check_splats(path: Path) -> dict[str, Any]:
-    """Read every splat; suffix, counts and warnings."""
-    splats = load_splats(path)
-    counts = {"splats": splats.count, "kernel": splats.kernel.value, "sh_degree": splats.sh_degree}
-    return {"suffix": ".ply", "counts": counts, "warnings": _warnings(inspect_scene(path))}
+    """Read and describe every splat."""
+    return {"suffix": ".ply", "found": describe_splats(load_splats(path))}
 
 
 def check_cameras(path: Path) -> dict[str, Any]:
-    """Read every camera; suffix, counts and warnings."""
+    """Read and describe every camera."""
     cameras = load_cameras(path)
-    suffix = ".zip" if zipfile.is_zipfile(path) else ".json"
-    counts = {"views": len(cameras), "names": [camera.name for camera in cameras]}
-    return {"suffix": suffix, "counts": counts, "warnings": _warnings(inspect_scene(path))}
+    return {"suffix": ".zip" if zipfile.is_zipfile(path) else ".json", "found": describe_cameras(cameras)}
 
 
 def check_features(path: Path) -> dict[str, Any]:
-    """Read every observation; suffix, counts and warnings."""
-    packs = open_packs([path])
-    for name in packs.views:
-        packs.observation(name)
-    counts = {
-        "views": len(packs.views),
-        "channels": packs.channels,
-        "encoder": packs.encoder,
-        "text_space": packs.text_space,
-        "names": list(packs.views),
-    }
-    return {"suffix": ".safetensors", "counts": counts, "warnings": _warnings(inspect_features(path))}
+    """Read and describe every observation."""
+    return {"suffix": ".safetensors", "found": describe_packs(open_packs([path]))}
 
 
 CHECKS = {
@@ -65,20 +51,35 @@ CHECKS = {
 def run(kind: AssetKind, path: Path) -> dict[str, Any]:
     """Check one file; the last message."""
     try:
-        return {"event": "valid", **CHECKS[kind](path)}
+        checked = CHECKS[kind](path)
     except SplatliftError as error:
-        found: SplatliftError = error
+        return _invalid(error, kind, path)
     except MemoryError:
-        found = _out_of_memory(kind)
-    return {"event": "invalid", "fault": fault_of(found, {str(path): kind})}
+        return _invalid(_out_of_memory(kind), kind, path)
+    counts = _finite(checked["found"])
+    return {
+        "event": "valid",
+        "suffix": checked["suffix"],
+        "warnings": [str(warning) for warning in counts.pop("warnings")],
+        "counts": counts,
+    }
+
+
+def _invalid(error: SplatliftError, kind: AssetKind, path: Path) -> dict[str, Any]:
+    return {"event": "invalid", "fault": fault_of(error, {str(path): kind})}
 
 
 def _out_of_memory(kind: AssetKind) -> InvalidInput:
     return INVALID[kind](kind, expected="a file that fits the memory of a check", got="one that needs more")
 
 
-def _warnings(inspection: dict[str, Any]) -> list[str]:
-    return [str(warning) for warning in inspection.get("warnings", [])]
+def _finite(value: Any) -> Any:
+    """The value with null for what JSON cannot say: norms of float32 rows may be infinite."""
+    if isinstance(value, dict):
+        return {name: _finite(inner) for name, inner in value.items()}
+    if isinstance(value, list):
+        return [_finite(inner) for inner in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _say(out: BinaryIO, message: dict[str, Any]) -> None:

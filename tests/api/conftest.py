@@ -22,7 +22,9 @@ from .tiny_scene import TinyScene, make_scene
 @contextmanager
 def serving(data: Path, table: Path, **settings: Any) -> Iterator[TestClient]:
     """The application over a data directory, with the text table of the tiny scene."""
-    chosen = ServiceSettings(data=data, encoder=f"table:{table}", text_spaces={"spare": "minilm"}, **settings)
+    chosen = ServiceSettings.model_validate(
+        {"data": data, "encoder": f"table:{table}", "text_spaces": {"spare": "minilm"}, **settings}
+    )
     store = Store.open(chosen.data)
     try:
         with TestClient(assemble(chosen, store), raise_server_exceptions=False) as client:

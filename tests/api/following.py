@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import time
-from typing import Any
-
-import httpx
+from typing import Any, Protocol
 
 PATIENCE_SECONDS = 180.0
 
 
-def ended(client: httpx.Client, job: str) -> dict[str, Any]:
+class Client(Protocol):
+    """What httpx's client and the test client have in common."""
+
+    def get(self, url: str, /) -> Any:
+        """The response to a GET."""
+        ...
+
+
+def ended(client: Client, job: str) -> dict[str, Any]:
     """Poll a job until it has ended; the job."""
     deadline = time.monotonic() + PATIENCE_SECONDS
     while time.monotonic() < deadline:

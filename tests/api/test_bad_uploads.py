@@ -173,9 +173,7 @@ def test_check_that_takes_too_long_is_ended(start: Callable[..., TestClient], sc
     assert reply.status_code == 422 and "takes longer" in reply.json()["got"]
 
 
-def test_check_that_needs_too_much_memory_is_ended(
-    start: Callable[..., TestClient], scene: TinyScene
-) -> None:
+def test_check_that_needs_too_much_memory_is_ended(start: Callable[..., TestClient], scene: TinyScene) -> None:
     rows = np.tile(splat_rows(), (40_000, 1))  # 134 MB
     with start(check_memory_bytes=400 << 20) as client:
         small = client.put("/assets/splats", content=scene.splats)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
 from service.errors import Misconfigured
@@ -64,14 +65,10 @@ def test_child_that_dies_without_a_word_fails_its_job(
 
 def upload(client: TestClient, scene: TinyScene) -> Uploaded:
     contents = {"splats": scene.splats, "cameras": scene.cameras, "features": scene.features}
-    return Uploaded(
-        *(client.put(f"/assets/{kind}", content=body).json()["id"] for kind, body in contents.items())
-    )
+    return Uploaded(*(client.put(f"/assets/{kind}", content=body).json()["id"] for kind, body in contents.items()))
 
 
-def test_job_interrupted_by_a_stop_goes_on_at_the_next_start(
-    start: Callable[..., Any], scene: TinyScene
-) -> None:
+def test_job_interrupted_by_a_stop_goes_on_at_the_next_start(start: Callable[..., Any], scene: TinyScene) -> None:
     with start() as client:
         uploaded = upload(client, scene)
         location = client.post("/lift", json=uploaded.order()).headers["location"]
@@ -83,9 +80,7 @@ def test_job_interrupted_by_a_stop_goes_on_at_the_next_start(
         assert client.get("/query", params={"text": "apple"}).status_code == 200
 
 
-def test_moved_data_directory_still_answers(
-    start: Callable[..., Any], scene: TinyScene, tmp_path: Path
-) -> None:
+def test_moved_data_directory_still_answers(start: Callable[..., Any], scene: TinyScene, tmp_path: Path) -> None:
     with start() as client:
         uploaded = upload(client, scene)
         ended(client, client.post("/lift", json=uploaded.order()).headers["location"])
@@ -95,7 +90,8 @@ def test_moved_data_directory_still_answers(
 
 
 def test_query_worker_that_died_is_replaced(client: TestClient, lift: dict[str, Any]) -> None:
-    worker = client.app.state.parts.queries  # type: ignore[attr-defined]
+    assert isinstance(client.app, FastAPI)
+    worker = client.app.state.parts.queries
     assert client.get("/query", params={"text": "apple", "lift": lift["id"]}).status_code == 200
     worker._process.kill()
     assert client.get("/query", params={"text": "book", "lift": lift["id"]}).status_code == 200
@@ -108,9 +104,7 @@ def test_job_of_a_dead_server_is_queued_again_then_failed(store: Store) -> None:
         assert claimed is not None and (claimed.id, claimed.attempt) == (job, attempt)
         store.jobs.requeue_orphans()
     found = store.jobs.get(job)
-    assert (
-        found.state is JobState.FAILED and found.problem is not None and "3 attempts" in found.problem["got"]
-    )
+    assert found.state is JobState.FAILED and found.problem is not None and "3 attempts" in found.problem["got"]
     assert store.jobs.claim() is None
 
 

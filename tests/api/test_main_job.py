@@ -87,9 +87,7 @@ def test_scores_are_one_float_a_splat(client: TestClient, lift: dict[str, Any]) 
     scores = np.load(io.BytesIO(reply.content), allow_pickle=False)
     assert scores.shape == (COUNT,) and scores.dtype == np.float32
     best = answer["top"][0]
-    assert scores[best["splat"]] == pytest.approx(best["score"]) and scores.max() == pytest.approx(
-        best["score"]
-    )
+    assert scores[best["splat"]] == pytest.approx(best["score"]) and scores.max() == pytest.approx(best["score"])
     assert int((scores >= 0.5).sum()) == answer["count"]
 
 
@@ -104,18 +102,14 @@ def test_mask_lies_where_the_word_is(client: TestClient, lift: dict[str, Any]) -
 
 
 @pytest.mark.parametrize("path", ["/query/attention", "/query/mask", "/render"])
-def test_pictures_have_the_size_of_the_view_and_a_tag(
-    client: TestClient, lift: dict[str, Any], path: str
-) -> None:
+def test_pictures_have_the_size_of_the_view_and_a_tag(client: TestClient, lift: dict[str, Any], path: str) -> None:
     params = {"text": "apple", "lift": lift["id"], "view": "left"}
     reply = client.get(path, params=params)
     assert reply.status_code == 200, reply.text
     assert picture(reply.content).shape[:2] == (HEIGHT, WIDTH)
     again = client.get(path, params=params, headers={"If-None-Match": reply.headers["etag"]})
     assert again.status_code == 304 and again.content == b""
-    other = client.get(
-        path, params=params | {"view": "right"}, headers={"If-None-Match": reply.headers["etag"]}
-    )
+    other = client.get(path, params=params | {"view": "right"}, headers={"If-None-Match": reply.headers["etag"]})
     assert other.status_code == 200
 
 

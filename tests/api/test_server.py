@@ -68,25 +68,19 @@ def test_http_process_loads_neither_torch_nor_numba_nor_hdbscan() -> None:
         "import sys, service.app, service.__main__\n"
         "print(sorted({'torch', 'numba', 'hdbscan', 'plyfile', 'open_clip'} & set(sys.modules)))"
     )
-    result = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT
-    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
     assert result.stdout.strip() == "[]"
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.0.2.1", "example.org"])
-def test_binding_beyond_loopback_is_refused(
-    host: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_binding_beyond_loopback_is_refused(host: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--host", host, "--data", str(tmp_path / "data"), "--port", "0"]) == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and "loopback" in said and "keys" in said
     assert not (tmp_path / "data").exists()
 
 
-@pytest.mark.parametrize(
-    "arguments", [["--port", "70000"], ["--text-space", "name"], ["--text-space", "=minilm"]]
-)
+@pytest.mark.parametrize("arguments", [["--port", "70000"], ["--text-space", "name"], ["--text-space", "=minilm"]])
 def test_bad_settings_are_one_line(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(arguments) == 2
     assert capsys.readouterr().err.count("\n") == 1
@@ -100,7 +94,7 @@ def test_settings_come_from_the_environment_and_the_command_line_wins(
     monkeypatch.setenv("SPLATLIFT_TEXT_SPACES", '{"a": "minilm"}')
     assert (parse([]).port, parse([]).query_seconds) == (1234, 7)
     assert parse([]).text_spaces == {"a": "minilm"}
-    assert parse(["--port", "1", "--text-space", "b=table:x=y"]).text_spaces == {"b": "table:x=y"}
+    assert parse(["--port", "1", "--text-space", "a=table:x=y"]).text_spaces == {"a": "table:x=y"}
     assert parse(["--port", "1"]).port == 1
 
 
@@ -110,7 +104,7 @@ def test_every_setting_is_described() -> None:
 
 
 def test_encoder_is_chosen_by_text_space_and_never_by_the_client(tmp_path: Path) -> None:
-    settings = ServiceSettings(data=tmp_path, encoder="minilm", text_spaces={"clip": "open_clip:X@w.pt"})
+    settings = ServiceSettings.model_validate({"data": tmp_path, "text_spaces": {"clip": "open_clip:X@w.pt"}})
     assert settings.encoder_spec("clip", None) == "open_clip:X@w.pt"
     assert settings.encoder_spec("unknown", None) == settings.encoder_spec("clip", "default") == "minilm"
     assert settings.encoder_spec("none", "clip") == "open_clip:X@w.pt"

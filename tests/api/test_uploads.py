@@ -19,9 +19,7 @@ def test_same_bytes_are_the_same_asset(client: TestClient, uploaded: Uploaded, s
     assert uploaded.splats == f"sha256:{hashlib.sha256(scene.splats).hexdigest()}"
 
 
-def test_gzip_gives_the_asset_of_the_content(
-    client: TestClient, uploaded: Uploaded, scene: TinyScene
-) -> None:
+def test_gzip_gives_the_asset_of_the_content(client: TestClient, uploaded: Uploaded, scene: TinyScene) -> None:
     half = len(scene.splats) // 2
     parts = gzip.compress(scene.splats[:half]) + gzip.compress(scene.splats[half:])
     digest = uploaded.splats.removeprefix("sha256:")
@@ -34,9 +32,7 @@ def test_gzip_gives_the_asset_of_the_content(
     assert reply.status_code == 200 and reply.json()["id"] == uploaded.splats
 
 
-def test_body_may_come_in_pieces_of_unknown_number(
-    client: TestClient, uploaded: Uploaded, scene: TinyScene
-) -> None:
+def test_body_may_come_in_pieces_of_unknown_number(client: TestClient, uploaded: Uploaded, scene: TinyScene) -> None:
     def pieces() -> Iterator[bytes]:
         for start in range(0, len(scene.splats), 100):
             yield scene.splats[start : start + 100]
@@ -74,17 +70,13 @@ def test_ranges(
 
 
 @pytest.mark.parametrize("header", ["bytes=999999-", "bytes=-0", "bytes=" + "9" * 5000 + "-"])
-def test_range_beyond_the_end_is_416(
-    client: TestClient, uploaded: Uploaded, scene: TinyScene, header: str
-) -> None:
+def test_range_beyond_the_end_is_416(client: TestClient, uploaded: Uploaded, scene: TinyScene, header: str) -> None:
     reply = client.get(f"/assets/{uploaded.splats}/content", headers={"Range": header})
     assert (reply.status_code, reply.json()["type"]) == (416, "/problems/range-not-satisfiable")
     assert reply.headers["content-range"] == f"bytes */{len(scene.splats)}"
 
 
-def test_range_of_another_version_gives_the_whole(
-    client: TestClient, uploaded: Uploaded, scene: TinyScene
-) -> None:
+def test_range_of_another_version_gives_the_whole(client: TestClient, uploaded: Uploaded, scene: TinyScene) -> None:
     headers = {"Range": "bytes=0-3", "If-Range": '"another"'}
     reply = client.get(f"/assets/{uploaded.splats}/content", headers=headers)
     assert (reply.status_code, reply.content) == (200, scene.splats)
