@@ -12,6 +12,7 @@ from liftcore.files import whole_file
 from liftcore.observe.finite import check_finite
 from liftcore.observe.observation import Observation, RegionMap
 from liftcore.observe.pack import MAX_HEADER_BYTES
+from liftcore.progress import Progress, silent
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -23,7 +24,12 @@ _TYPES = {torch.float32: "F32", torch.int32: "I32", torch.float16: "F16", torch.
 LARGEST_I16 = 32_767
 
 
-def write_pack(path: Path, observations: Mapping[str, Observation], metadata: Mapping[str, str]) -> None:
+def write_pack(
+    path: Path,
+    observations: Mapping[str, Observation],
+    metadata: Mapping[str, str],
+    progress: Progress = silent,
+) -> None:
     """Write views as a feature pack, whole or not at all.
 
     ``observations`` may read its views when they are asked for: each is asked for twice, once for its shape
@@ -33,29 +39,34 @@ def write_pack(path: Path, observations: Mapping[str, Observation], metadata: Ma
         path: the file to write.
         observations: view name -> what it observes.
         metadata: ``encoder``, ``text_space``, ``normalised`` ("true" or "false") and what else to keep.
+        progress: told about the stages "check" and "pack", in views.
 
     Raises:
         InvalidFeatures: there are no views, their channels differ, or a feature is not finite.
     """
     if not observations:
         raise InvalidFeatures(str(path), expected="at least one view", got="none")
-    header, offsets = _header(observations, metadata)
+    header, offsets = _header(observations, metadata, progress)
     with whole_file(path) as handle:
         handle.write(len(header).to_bytes(8, "little") + header)
         start = handle.tell()
-        for view, observation in observations.items():
+        for done, (view, observation) in enumerate(observations.items(), start=1):
             for key, tensor in _tensors(view, observation):
                 handle.seek(start + offsets[key])
                 handle.write(tensor.contiguous().numpy().tobytes())
+            progress("pack", done, len(observations), "views")
 
 
-def _header(observations: Mapping[str, Observation], metadata: Mapping[str, str]) -> tuple[bytes, dict[str, int]]:
+def _header(
+    observations: Mapping[str, Observation], metadata: Mapping[str, str], progress: Progress
+) -> tuple[bytes, dict[str, int]]:
     specs = []
     channels: dict[int, str] = {}
-    for view, observation in observations.items():
+    for done, (view, observation) in enumerate(observations.items(), start=1):
         check_finite(observation.codebook, f"view {view!r} features")
         channels.setdefault(observation.codebook.shape[-1], view)
         specs += [(key, tensor.dtype, tuple(tensor.shape)) for key, tensor in _tensors(view, observation)]
+        progress("check", done, len(observations), "views")
     if len(channels) > 1:
         got = ", ".join(f"{count} in {view!r}" for count, view in list(channels.items())[:3])
         raise InvalidFeatures("features", expected="the same channels in every view", got=got)

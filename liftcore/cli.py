@@ -1,0 +1,146 @@
+"""``splatlift``: the command line.
+
+Exit status: 0; 2 for input that is the user's to mend, with one line on stderr that says what; 1 for our own
+fault. With ``--json`` stdout holds one JSON object and nothing else.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, NoReturn
+
+from liftcore import __version__
+from liftcore.errors import SplatliftError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+BAD_INPUT = 2
+OUR_FAULT = 1
+INTERRUPTED = 130
+
+
+class _Parser(argparse.ArgumentParser):
+    """Argument errors are bad input like any other: one line, exit 2."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(BAD_INPUT, f"{self.prog}: {' '.join(message.split())}; see '{self.prog} --help'\n")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command; the exit status."""
+    try:
+        options = build_parser().parse_args(argv)
+    except SystemExit as end:
+        return end.code if isinstance(end.code, int) else 0
+    try:
+        # The command's own module, and what it needs, is loaded only now: --help stays quick.
+        return importlib.import_module(f"liftcore.commands.{options.command}").run(options)
+    except SplatliftError as error:
+        print(f"splatlift: {error}", file=sys.stderr)
+        return BAD_INPUT
+    except KeyboardInterrupt:
+        print("splatlift: interrupted", file=sys.stderr)
+        return INTERRUPTED
+    except Exception as error:
+        if options.debug:
+            raise
+        what = " ".join(f"{type(error).__name__}: {error}".split())[:400]
+        print(f"splatlift: our fault: {what} (--debug shows where)", file=sys.stderr)
+        return OUR_FAULT
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """All commands and their options."""
+    parser = _Parser(prog="splatlift", description="Lift 2D features onto trained splats and query them in words.")
+    parser.add_argument("--version", action="version", version=f"splatlift {__version__}")
+    shared = _Parser(add_help=False)
+    shared.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
+    shared.add_argument("--debug", action="store_true", help="show the traceback of our own faults")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=_Parser)
+    _add_demo(commands.add_parser("demo", parents=[shared], help="the whole job, through the real service"))
+    _add_serve(commands.add_parser("serve", parents=[shared], help="run the HTTP service"))
+    _add_lift(commands.add_parser("lift", parents=[shared], help="lift features onto splats"))
+    _add_query(commands.add_parser("query", parents=[shared], help="find what words say in a lift"))
+    _add_pack(commands.add_parser("pack", help="make a feature pack of the field's formats"), shared)
+    _add_inspect(commands.add_parser("inspect", parents=[shared], help="what is in a file, and what is wrong"))
+    _add_bench(commands.add_parser("bench", parents=[shared], help="how fast this machine lifts"))
+    return parser
+
+
+def _add_demo(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--scene", type=Path, metavar="DIR", help="a scene of your own; else a small still life")
+    parser.add_argument("--out", type=Path, default=Path("demo-output"), metavar="DIR", help="for the pictures")
+
+
+def _add_serve(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--host", help="the address to bind")
+    parser.add_argument("--port", type=int, help="the port to bind; 0 picks a free one")
+    parser.add_argument("--data", type=Path, metavar="DIR", help="for the database and all files")
+    parser.add_argument("--encoder", metavar="NAME", help="the default text encoder")
+
+
+def _add_lift(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("splats", type=Path, help="trained splats (.ply)")
+    parser.add_argument("cameras", type=Path, help="COLMAP folder or .zip, transforms.json or cameras.json")
+    parser.add_argument("features", type=Path, nargs="+", help="feature packs (.safetensors)")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="LIFT", help="the lift to write")
+    parser.add_argument("--preset", metavar="NAME", help="a published choice of weights: row-sum, tikhonov")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="one setting")
+    parser.add_argument("--threads", type=_count, metavar="N", help="else as many as there are cores")
+
+
+def _add_query(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("lift", type=Path, help="a lift (.safetensors)")
+    parser.add_argument("text", help="the words to look for")
+    words = parser.add_mutually_exclusive_group()
+    words.add_argument("--table", type=Path, metavar="FILE", help="precomputed text embeddings")
+    words.add_argument("--encoder", metavar="NAME", help="minilm, open_clip:MODEL[/PRETRAINED], table:FILE")
+    parser.add_argument("--negative", nargs="+", default=[], metavar="WORD", help="words to compete with")
+    parser.add_argument("--threshold", default="auto", metavar="T", help="auto, valley, paper, otsu or a number")
+    parser.add_argument("--top", type=_count, default=0, metavar="N", help="name the best N splats")
+    parser.add_argument("--view", metavar="NAME", help="the camera to see the answer from")
+    parser.add_argument("--mask", type=Path, metavar="PNG", help="write the mask of the view")
+    parser.add_argument("--attention", type=Path, metavar="PNG", help="write the attention map of the view")
+    parser.add_argument("--scores", type=Path, metavar="NPY", help="write the scores [P], float32")
+
+
+def _add_pack(parser: argparse.ArgumentParser, shared: _Parser) -> None:
+    formats = parser.add_subparsers(dest="format", required=True, metavar="FORMAT", parser_class=_Parser)
+    langsplat = formats.add_parser("langsplat", parents=[shared], help="IMG_s.npy and IMG_f.npy")
+    arrays = formats.add_parser("npy", parents=[shared], help="IMG.npy, a dense map a view")
+    arrays.add_argument("--layout", choices=("hwc", "chw"), default="hwc", help="the order of the axes")
+    for command in (langsplat, arrays):
+        command.add_argument("folder", type=Path, help="the folder of the files")
+        command.add_argument("-o", "--output", type=Path, required=True, metavar="PACK", help="the pack to write")
+        command.add_argument("--encoder-name", metavar="NAME", help="the 2D encoder that made the features")
+        command.add_argument("--text-space", metavar="NAME", help="the text encoder that shares the space")
+        command.add_argument("--normalised", action=argparse.BooleanOptionalAction, help="unit vectors or not")
+
+
+def _add_inspect(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("file", type=Path, help="splats, cameras, features, a lift or a text table")
+
+
+def _add_bench(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--scene", type=Path, metavar="DIR", help="a real scene; else a synthetic one")
+    parser.add_argument("--splats", type=_count, metavar="N", help="splats of the synthetic scene")
+    parser.add_argument("--size", metavar="WxH", help="image size of the synthetic scene")
+    parser.add_argument("--channels", type=_count, metavar="F")
+    parser.add_argument("--levels", type=_count, metavar="L", help="label levels")
+    parser.add_argument("--views", type=_count, metavar="N")
+    parser.add_argument("--threads", type=_count, metavar="N")
+
+
+def _count(text: str) -> int:
+    value = int(text) if text.isascii() and text.isdigit() else 0
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"expected a whole number of one or more, got {text!r}")
+    return value
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,57 @@
+"""``splatlift pack``: the field's feature formats become feature packs."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from liftcore.commands.bars import progress_bars
+from liftcore.commands.reply import free_output, reply
+
+if TYPE_CHECKING:
+    import argparse
+
+    from liftcore.observe.folder import ViewFolder
+
+
+def run(options: argparse.Namespace) -> int:
+    """Write the pack whole or not at all, and say what is in it."""
+    out = free_output(options.output, [])
+    from liftcore.observe.pack import open_packs
+    from liftcore.observe.write_pack import write_pack
+
+    with progress_bars() as progress:
+        write_pack(out, _views(options), _metadata(options), progress)
+    packs = open_packs([out])
+    document = {
+        "out": str(out),
+        "bytes": out.stat().st_size,
+        "views": len(packs.views),
+        "channels": packs.channels,
+        "encoder": packs.encoder,
+        "text_space": packs.text_space,
+        "normalised": packs.normalised,
+    }
+    line = f"{out}: {len(packs.views)} views, {packs.channels} channels, {document['bytes']} bytes"
+    reply(document, as_json=options.json, lines=[line])
+    return 0
+
+
+def _views(options: argparse.Namespace) -> ViewFolder:
+    if options.format == "langsplat":
+        from liftcore.observe.langsplat import langsplat_views
+
+        return langsplat_views(options.folder)
+    from liftcore.observe.arrays import array_views
+
+    return array_views(options.folder, options.layout)
+
+
+def _metadata(options: argparse.Namespace) -> dict[str, str]:
+    metadata = {"source": options.format}
+    if options.encoder_name:
+        metadata["encoder"] = options.encoder_name
+    if options.text_space:
+        metadata["text_space"] = options.text_space
+    if options.normalised is not None:
+        metadata["normalised"] = "true" if options.normalised else "false"
+    return metadata

@@ -1,0 +1,127 @@
+"""``splatlift query``: where in a lifted scene is what the words say?"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from liftcore.commands.reply import free_output, reply
+from liftcore.errors import InvalidQuery
+from liftcore.files import whole_file
+
+if TYPE_CHECKING:
+    import argparse
+    from collections.abc import Iterable
+    from pathlib import Path
+
+    from liftcore.query.ask import Answer, Look
+    from liftcore.query.scene import QueryScene
+
+
+def run(options: argparse.Namespace) -> int:
+    """Ask, look where a view is named, write what was asked for, and say what was found."""
+    if (options.mask or options.attention) and not options.view:
+        raise InvalidQuery("--mask and --attention", expected="a view to see them from", got="no --view")
+    for path in (options.mask, options.attention, options.scores):
+        if path is not None:
+            free_output(path, [options.lift])
+    from liftcore.query.ask import ask, look, top
+    from liftcore.query.encoders import open_encoder
+    from liftcore.query.scene import QueryScene
+
+    scene = QueryScene.open(options.lift)
+    encoder = open_encoder(_encoder(options, scene))
+    answer = ask(
+        scene,
+        options.text,
+        encoder,
+        negatives=tuple(options.negative),
+        threshold=_threshold(options.threshold),
+    )
+    seen = look(scene, answer, options.view) if options.view else None
+    document = _document(answer, seen, encoder.name)
+    if options.top:
+        found = top(answer, scene, options.top)
+        document["top"] = [
+            {"splat": best.splat, "score": best.score, "position": best.position} for best in found.best
+        ]
+        document["box"] = found.box
+    document["files"] = _write(options, answer, seen)
+    reply(document, as_json=options.json, lines=_lines(document))
+    return 0
+
+
+def _encoder(options: argparse.Namespace, scene: QueryScene) -> str:
+    if options.table:
+        return f"table:{options.table}"
+    if options.encoder:
+        return options.encoder
+    space = scene.lift.metadata.text_space
+    if space in ("", "none"):
+        raise InvalidQuery(
+            "encoder",
+            expected="--table FILE or --encoder NAME",
+            got="neither, and the lift does not name its text space",
+        )
+    return space
+
+
+def _threshold(text: str) -> str | float:
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+def _document(answer: Answer, seen: Look | None, encoder: str) -> dict[str, Any]:
+    document: dict[str, Any] = {
+        "text": answer.text,
+        "negatives": list(answer.negatives),
+        "encoder": encoder,
+        "splats": len(answer.scores),
+        "selected": int(answer.selected.sum()),
+        "threshold": answer.threshold,
+        "threshold_method": answer.threshold_method,
+        "explanation": answer.explanation,
+        "statistics": dict(answer.statistics),
+    }
+    if seen is not None:
+        document["view"] = {
+            "name": seen.view,
+            "threshold": seen.threshold,
+            "explanation": seen.explanation,
+            "mask_share": float(seen.mask.float().mean()),
+        }
+    return document
+
+
+def _write(options: argparse.Namespace, answer: Answer, seen: Look | None) -> dict[str, str]:
+    from liftcore.query.pictures import save_attention, save_mask
+
+    files: dict[str, Path] = {}
+    if options.scores:
+        import numpy as np
+
+        with whole_file(options.scores) as handle:
+            np.save(handle, answer.scores.numpy())
+        files["scores"] = options.scores
+    if seen is not None and options.mask:
+        save_mask(seen, options.mask)
+        files["mask"] = options.mask
+    if seen is not None and options.attention:
+        save_attention(seen, options.attention)
+        files["attention"] = options.attention
+    return {kind: str(path) for kind, path in files.items()}
+
+
+def _lines(document: dict[str, Any]) -> Iterable[str]:
+    yield (
+        f"{document['text']!r}: {document['selected']} of {document['splats']} splats at or above "
+        f"{document['threshold']:.4g} ({document['explanation']})"
+    )
+    if "view" in document:
+        view = document["view"]
+        yield f"  view {view['name']}: {view['mask_share']:.2%} of the image ({view['explanation']})"
+    for best in document.get("top", []):
+        position = ", ".join(f"{value:.4g}" for value in best["position"])
+        yield f"  splat {best['splat']}: score {best['score']:.4g} at {position}"
+    yield from (f"  {kind}: {path}" for kind, path in document["files"].items())

@@ -1,0 +1,71 @@
+"""How commands answer: one JSON object, or lines for people."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from liftcore.errors import InvalidInput
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from pathlib import Path
+
+SHOWN_ITEMS = 6  # of a list, for people
+
+
+def reply(document: Mapping[str, Any], *, as_json: bool, lines: Iterable[str] | None = None) -> None:
+    """Print one JSON object, or else ``lines``, or else the document's entries, a line each."""
+    if as_json:
+        print(json.dumps(_strict(document), allow_nan=False))
+        return
+    for line in lines if lines is not None else _entries(document):
+        print(line)
+
+
+def free_output(path: Path, inputs: Sequence[Path]) -> Path:
+    """An output path that is no folder and none of the inputs.
+
+    Raises:
+        InvalidInput: it is.
+    """
+    if path.is_dir():
+        raise InvalidInput("output", expected="a file to write", got=f"the folder {path}")
+    if any(path.exists() and source.exists() and path.samefile(source) for source in inputs):
+        raise InvalidInput("output", expected="another file than the inputs", got=str(path))
+    return path
+
+
+def _strict(value: Any) -> Any:
+    """JSON has no NaN and no infinity: they become null."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {str(key): _strict(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_strict(item) for item in value]
+    return value
+
+
+def _entries(document: Mapping[str, Any]) -> Iterable[str]:
+    width = max((len(str(key)) for key in document), default=0)
+    for key, value in document.items():
+        if key == "warnings":
+            yield from (f"warning: {warning}" for warning in value)
+        else:
+            yield f"{str(key).replace('_', ' '):<{width}}  {shown(value)}"
+
+
+def shown(value: Any) -> str:
+    """A value in short, for people."""
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {shown(item)}" for key, item in value.items()) or "-"
+    if isinstance(value, list | tuple):
+        more = [f"... ({len(value)})"] if len(value) > SHOWN_ITEMS else []
+        items = [f"({shown(item)})" if isinstance(item, list | tuple) else shown(item) for item in value]
+        return ", ".join([*items[:SHOWN_ITEMS], *more]) or "-"
+    return "-" if value is None or value == "" else str(value)

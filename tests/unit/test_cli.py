@@ -1,0 +1,311 @@
+"""The command line: one JSON object or one line of error, and the exit status says whose fault it was."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+import torch
+
+from liftcore import cli
+from liftcore.artifact import load_lift
+from liftcore.commands import bars, reply
+from liftcore.commands.bench import image_size
+from liftcore.commands.lift import settings_of
+from liftcore.errors import InvalidInput, InvalidSettings, SplatliftError
+from liftcore.observe.observation import RegionMap
+from liftcore.observe.pack import open_packs
+from liftcore.observe.write_pack import write_pack
+from liftcore.scene.cameras import Camera, Cameras
+from liftcore.scene.inria import write_inria_cameras
+from liftcore.scene.ply import write_splats
+from liftcore.scene.splats import Splats
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+COMMANDS = ["demo", "serve", "lift", "query", "pack", "inspect", "bench"]
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    """Two splats before one camera, red at its left and green at its right, with a region for each."""
+    splats = Splats(
+        means=torch.tensor([[-0.5, 0.0, 2.0], [0.5, 0.0, 2.0]]),
+        quats=torch.tensor([[1.0, 0, 0, 0]] * 2),
+        log_scales=torch.full((2, 3), -1.5),
+        opacity_logits=torch.full((2,), 4.0),
+        sh=torch.zeros(2, 1, 3),
+    )
+    write_splats(splats, tmp_path / "splats.ply")
+    camera = Camera("front", 32, 16, 16.0, 16.0, 16.0, 8.0, np.eye(4))
+    write_inria_cameras(Cameras((camera,)), tmp_path / "cameras.json")
+    labels = torch.zeros(1, 16, 32, dtype=torch.int32)
+    labels[..., 16:] = 1
+    regions = RegionMap(labels, torch.eye(2, 3))
+    metadata = {"encoder": "toy", "text_space": "none"}
+    write_pack(tmp_path / "pack.safetensors", {"front": regions, "lost": regions}, metadata)
+    return tmp_path
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
+    status = cli.main([str(argument) for argument in arguments])
+    captured = capsys.readouterr()
+    return status, captured.out, captured.err
+
+
+def lift_arguments(scene: Path, *more: object) -> list[object]:
+    files = [scene / name for name in ("splats.ply", "cameras.json", "pack.safetensors")]
+    return ["lift", *files, "-o", scene / "lift.safetensors", *more]
+
+
+def assert_one_line(err: str) -> None:
+    assert err.endswith("\n")
+    assert err.count("\n") == 1
+
+
+def test_scene_is_lifted_inspected_and_queried(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from safetensors.torch import save_file
+
+    status, out, err = run(capsys, *lift_arguments(scene, "--preset", "row-sum", "--json"))
+    assert (status, err) == (0, "")
+    document = json.loads(out)
+    assert (document["splats"], document["channels"], document["views"]) == (2, 3, 1)
+    assert document["settings"]["preset"] == "row-sum"
+    assert document["seen_share"] == 1
+    assert document["warnings"] == ["1 views have features but no camera and were skipped: lost"]
+    assert {"certificate", "timings", "out"} <= set(document)
+    features = load_lift(scene / "lift.safetensors").features
+    assert features[0, 0] > 0.9
+    assert features[1, 1] > 0.9
+
+    words = '["left", "right"]'
+    save_file({"embeddings": torch.eye(2, 3)}, str(scene / "table"), metadata={"words": words})
+    files = {kind: scene / name for kind, name in (("mask", "m.png"), ("attention", "a.png"), ("scores", "s.npy"))}
+    written = [part for kind, path in files.items() for part in (f"--{kind}", path)]
+    question = ["query", scene / "lift.safetensors", "left", "--table", scene / "table", "--threshold", "0.5"]
+    status, out, err = run(capsys, *question, "--view", "front", "--top", 1, "--json", *written)
+    assert (status, err) == (0, "")
+    document = json.loads(out)
+    assert document["selected"] == 1
+    assert document["top"][0]["splat"] == 0
+    assert document["files"] == {kind: str(path) for kind, path in files.items()}
+    scores = np.load(files["scores"])
+    assert scores.dtype == np.float32
+    assert scores[0] > 0.9
+    assert all(path.read_bytes()[:4] == b"\x89PNG" for path in (files["mask"], files["attention"]))
+
+    status, out, err = run(capsys, *question)
+    assert status == 0
+    assert "'left': 1 of 2 splats" in out
+    status, out, err = run(capsys, "inspect", scene / "lift.safetensors", "--json")
+    assert json.loads(out)["kind"] == "lift"
+    status, out, err = run(capsys, *question[:3])
+    assert status == 2
+    assert "--table FILE or --encoder NAME" in err
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["--preset", "magic"], "preset"),
+        (["--set", "power=3"], "power"),
+        (["--set", "nonsense=1"], "nonsense"),
+        (["--set", "power"], "key=value"),
+    ],
+)
+def test_wrong_settings_exit_2_with_one_line(
+    more: list[str], message: str, scene: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for flags in ([], ["--json"]):
+        status, out, err = run(capsys, *lift_arguments(scene, *more, *flags))
+        assert (status, out) == (2, "")
+        assert message in err
+        assert_one_line(err)
+
+
+@pytest.mark.parametrize("broken", ["splats.ply", "cameras.json", "pack.safetensors"])
+@pytest.mark.parametrize("damage", ["missing", "empty", "cut", "text"])
+def test_bad_input_exits_2_and_leaves_nothing(
+    broken: str, damage: str, scene: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = scene / broken
+    content = {"empty": b"", "cut": path.read_bytes()[:-7], "text": b"hello"}
+    if damage == "missing":
+        path.unlink()
+    else:
+        path.write_bytes(content[damage])
+    before = sorted(scene.iterdir())
+    status, out, err = run(capsys, *lift_arguments(scene, "--json"))
+    assert (status, out) == (2, "")
+    assert_one_line(err)
+    assert broken in err
+    assert sorted(scene.iterdir()) == before
+
+
+def test_output_is_never_an_input_or_a_folder(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    files = [scene / name for name in ("splats.ply", "cameras.json", "pack.safetensors")]
+    for out, message in ((scene, "the folder"), (files[0], "another file than the inputs")):
+        status, _, err = run(capsys, "lift", *files, "-o", out)
+        assert status == 2
+        assert message in err
+
+
+def test_picture_without_a_view_is_refused(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, _, err = run(capsys, "query", scene / "l", "cat", "--mask", scene / "m.png")
+    assert status == 2
+    assert "no --view" in err
+
+
+def test_settings_are_json_or_words() -> None:
+    settings = settings_of("row-sum", ["power=2", "lift_gain=0.8", "dtype=float32", "certificate_rays=0"])
+    assert (settings.power, settings.lift_gain, settings.dtype) == (2, 0.8, "float32")
+    with pytest.raises(InvalidSettings):
+        settings_of(None, ["=1"])
+
+
+def test_langsplat_folder_is_packed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "language_features"
+    folder.mkdir()
+    np.save(folder / "a_s.npy", np.zeros((4, 2, 2), np.float32))
+    np.save(folder / "a_f.npy", np.ones((1, 5), np.float32))
+    options = ["--encoder-name", "clip", "--text-space", "open_clip:ViT-B-16", "--normalised", "--json"]
+    status, out, err = run(capsys, "pack", "langsplat", folder, "-o", tmp_path / "p.safetensors", *options)
+    assert (status, err) == (0, "")
+    document = json.loads(out)
+    assert (document["views"], document["channels"], document["normalised"]) == (1, 5, True)
+    assert document["text_space"] == "open_clip:ViT-B-16"
+    (folder / "a_f.npy").unlink()
+    status, out, err = run(capsys, "pack", "langsplat", folder, "-o", tmp_path / "q.safetensors")
+    assert (status, out) == (2, "")
+    assert_one_line(err)
+    assert not (tmp_path / "q.safetensors").exists()
+
+
+def test_arrays_are_packed_in_either_layout(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "maps").mkdir()
+    np.save(tmp_path / "maps" / "a.npy", np.ones((3, 4, 5), np.float16))
+    for layout, channels in (("hwc", 5), ("chw", 3)):
+        out = tmp_path / f"{layout}.safetensors"
+        status, text, _ = run(capsys, "pack", "npy", tmp_path / "maps", "-o", out, "--layout", layout)
+        assert status == 0
+        assert f"1 views, {channels} channels" in text
+        assert open_packs([out]).channels == channels
+
+
+def test_inspect_speaks_to_people_and_programs(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, _ = run(capsys, "inspect", scene / "splats.ply")
+    assert status == 0
+    assert "3dgs" in out
+    status, out, _ = run(capsys, "inspect", scene / "splats.ply", "--json")
+    assert json.loads(out)["splats"] == 2
+    assert out.count("\n") == 1
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, err = run(capsys, command, "--help")
+    assert (status, err) == (0, "")
+    assert f"splatlift {command}" in out
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [[], ["dance"], ["lift"], ["lift", "a", "b", "c"], ["bench", "--splats", "-3"], ["inspect", "a", "b"]],
+)
+def test_wrong_arguments_exit_2_with_one_line(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, err = run(capsys, *arguments)
+    assert (status, out) == (2, "")
+    assert_one_line(err)
+
+
+def test_our_own_fault_exits_1_with_one_line(
+    scene: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(path: Path) -> dict[str, Any]:
+        raise RuntimeError("two\nlines")
+
+    monkeypatch.setattr("liftcore.observe.inspect.inspect_file", broken)
+    status, out, err = run(capsys, "inspect", scene, "--json")
+    assert (status, out) == (1, "")
+    assert_one_line(err)
+    assert "RuntimeError: two lines" in err
+    with pytest.raises(RuntimeError):
+        cli.main(["inspect", str(scene), "--debug"])
+
+
+def test_serve_becomes_the_service(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    calls: list[list[str]] = []
+
+    def execv(program: str, arguments: list[str]) -> None:
+        assert program == sys.executable
+        calls.append(arguments[1:])
+        raise KeyboardInterrupt  # the real one does not return either
+
+    monkeypatch.setattr(os, "execv", execv)
+    assert run(capsys, "serve", "--port", "0", "--data", "d", "--encoder", "minilm")[0] == cli.INTERRUPTED
+    assert calls == [["-m", "service", "--port", "0", "--data", "d", "--encoder", "minilm"]]
+
+
+def test_demo_and_bench_pass_their_options_on(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    seen: list[Any] = []
+    fakes = {
+        "liftcore.demo.run": {"run_demo": lambda *arguments: seen.append(arguments) or 0},
+        "liftcore.measure.bench": {"run_bench": lambda options: seen.append(options) or {"seconds": 1.0}},
+    }
+    for name, functions in fakes.items():
+        module = type(sys)(name)
+        vars(module).update(functions)
+        monkeypatch.setitem(sys.modules, name, module)
+    assert run(capsys, "demo", "--out", tmp_path, "--json")[0] == 0
+    assert seen.pop() == (None, tmp_path, True)
+    status, out, _ = run(capsys, "bench", "--size", "986x728", "--splats", 1000, "--json")
+    assert (status, json.loads(out)) == (0, {"seconds": 1.0})
+    assert seen[0]["size"] == (986, 728)
+    assert seen[0]["splats"] == 1000
+    assert seen[0]["scene"] is None
+
+
+@pytest.mark.parametrize("text", ["986", "0x7", "axb", "9x", "1x1x1", "-1x2"])
+def test_image_size_is_wxh(text: str) -> None:
+    with pytest.raises(InvalidInput, match="WxH"):
+        image_size(text)
+
+
+def test_json_replies_are_strict(capsys: pytest.CaptureFixture[str]) -> None:
+    reply.reply({"a": float("nan"), "b": [float("inf"), (1, 2)], "c": {"d": -float("inf")}}, as_json=True)
+    assert json.loads(capsys.readouterr().out) == {"a": None, "b": [None, [1, 2]], "c": {"d": None}}
+
+
+def test_progress_is_drawn_only_on_a_terminal(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for watched in (False, True):
+        monkeypatch.setattr(sys.stderr, "isatty", lambda watched=watched: watched)
+        with bars.progress_bars() as progress:
+            for done in range(4):
+                progress("geometry", done, 3, "views")
+            progress("solve", 1, 1, "slices")
+        captured = capsys.readouterr()
+        assert captured.out == ""
+        assert ("geometry" in captured.err and "solve" in captured.err) is watched
+
+
+def test_help_loads_nothing_heavy() -> None:
+    code = (
+        "import sys; from liftcore.cli import main; status = main(['--help']); "
+        "heavy = {'torch', 'numba', 'numpy', 'pydantic', 'tqdm'} & set(sys.modules); sys.exit(status or bool(heavy))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False, capture_output=True).returncode == 0
+
+
+def test_every_error_of_ours_is_one_line() -> None:
+    error = SplatliftError("a\nb", expected="c\nd", got="e\tf", hint="g\n")
+    assert str(error) == "a b: expected c d, got e f; g"
