@@ -16,7 +16,7 @@ from numba import njit
 
 
 def _source_digest() -> str:
-    digest = hashlib.sha256(numba.__version__.encode())
+    digest = hashlib.sha256(numba.__version__.encode() + (Path(__file__).parent / "lanes.py").read_bytes())
     for package in ("raster", "solve", "query"):
         for source in sorted((Path(__file__).parent / package).glob("*.py")):
             digest.update(source.read_bytes())

@@ -127,6 +127,10 @@ class CpuRaster:
         starts, splats, weights = trace_rays(frame, np.ascontiguousarray(pixels.to(torch.int32).numpy()))
         return RayRows(torch.from_numpy(starts), torch.from_numpy(splats), torch.from_numpy(weights))
 
+    def forget(self) -> None:
+        """Drop the projected view that is kept for the next product."""
+        self._frames.clear()
+
     def _frame(self, camera: Camera, walk: Walk) -> Frame:
         """The view projected and binned; the last one is kept."""
         key = (camera, walk)

@@ -11,7 +11,7 @@ import numpy as np
 
 from liftcore.raster.constants import TILE
 from liftcore.jit import inlined, kernel
-from liftcore.raster.lanes import LANES, add_lanes, add_product_lanes, square_lanes
+from liftcore.lanes import LANES, add_lanes, add_product_lanes, square_lanes
 from liftcore.raster.projection import PLAIN
 from liftcore.raster.readings import MAX_SLOTS, new_taps, read_tile
 from liftcore.raster.walk import (

@@ -13,7 +13,7 @@ import numpy as np
 
 from liftcore.raster.constants import ALPHA_FLOOR, TILE
 from liftcore.jit import inlined, kernel
-from liftcore.raster.lanes import LANES, blend_lanes, gaussian_lanes
+from liftcore.lanes import LANES, blend_lanes, gaussian_lanes
 from liftcore.raster.projection import EXTENT_Y, KX, KY, MX, MY, OPACITY, REACH, SLOPE
 
 HALVES = TILE * TILE // LANES  # half rows of a tile

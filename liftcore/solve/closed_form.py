@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from liftcore.jit import kernel
+from liftcore.jit import kernel, vectorised
+from liftcore.lanes import WIDE, add_weighted_row
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -24,10 +25,11 @@ if TYPE_CHECKING:
     from liftcore.progress import Progress
     from liftcore.solve.view_weights import ViewWeights
 
-BLOCK = 2_048  # splats a block
+BLOCK = 1_024  # splats a block; with a slice of channels half a megabyte
 SLICE = 128  # channels a slice
 FLOAT16_MAX = 65_504.0
 UNIT_TOLERANCE = 5e-3  # float16 unit vectors are off by less
+_TINY = 1e-30  # keeps the unit vector of a zero row zero
 
 
 @dataclass(frozen=True)
@@ -39,20 +41,34 @@ class Solution:
 
 
 @kernel
-def add_weighted_rows(first, last, offset, splats, row_starts, columns, weights, codebook, block):
-    """``block[splats[r] - offset] += sum_k weights[k] codebook[columns[k]]`` for CSR rows ``first..last``.
+def add_weighted_rows(first, last, offset, weights, codebook, block):
+    """``block[splats[r] - offset] += W[r] codebook`` for the CSR rows ``first..last``.
 
     Args:
-        codebook: [M, C] f32. block: [B, C] f32, C the width of a slice.
+        weights: (splats [n] i32, row_starts [n + 1] i64, columns [nnz] i32, weights [nnz] f32).
+        codebook: [M, C] f32. block: [B, C] f32. C is a multiple of WIDE.
     """
+    splats, row_starts, columns, values = weights
     width = codebook.shape[1]
+    source, target = codebook.reshape(-1), block.reshape(-1)
     for row in range(first, last):
-        target = block[splats[row] - offset]
-        for k in range(row_starts[row], row_starts[row + 1]):
-            weight = weights[k]
-            source = codebook[columns[k]]
-            for c in range(width):
-                target[c] += weight * source[c]
+        place = (splats[row] - offset) * width
+        entries = (row_starts[row], row_starts[row + 1])
+        for channel in range(0, width, WIDE):
+            add_weighted_row(target, place + channel, source, entries, columns, values, (width, channel))
+
+
+@vectorised
+def finish_rows(block, scale, squares):
+    """Divide the rows of ``block`` [B, C] f32 by their denominators, and note their squared norms [B] f64."""
+    for row in range(block.shape[0]):
+        factor = np.float32(scale[row])
+        total = np.float32(0.0)
+        for c in range(block.shape[1]):
+            value = block[row, c] * factor
+            block[row, c] = value
+            total += value * value
+        squares[row] = total
 
 
 def solve_closed_form(
@@ -85,18 +101,23 @@ def solve_closed_form(
     slices = [(begin, min(begin + SLICE, channels)) for begin in range(0, channels, SLICE)]
     with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
         for number, (begin, end) in enumerate(slices):
-            parts = [np.ascontiguousarray(book[:, begin:end].to(torch.float32).numpy()) for book in books]
-            result = features[:, begin:end]
-            sums = _solve_slice(pool, store, parts, scale, result)
+            parts = [_slice_of(book, begin, end) for book in books]
+            sums = _solve_slice(pool, store, parts, scale, features[:, begin:end])
             if not unit:
-                unit_parts = [
-                    part / np.maximum(norm.numpy(), 1e-30)[:, None] for part, norm in zip(parts, norms, strict=True)
-                ]
-                sums = _solve_slice(pool, store, unit_parts, scale, None)
+                for part, norm in zip(parts, norms, strict=True):
+                    part /= np.maximum(norm.numpy(), _TINY)[:, None]
+                sums = _solve_slice(pool, store, parts, scale, None)
             squares += sums
             progress("solve", number + 1, len(slices), "slices")
     agreement = np.sqrt(squares).clip(0.0, 1.0).astype(np.float32)
     return Solution(features, torch.from_numpy(agreement))
+
+
+def _slice_of(book: Tensor, begin: int, end: int) -> np.ndarray:
+    """Channels ``begin..end`` of a codebook as [M, C] f32, C padded with zeros to a multiple of WIDE."""
+    part = np.zeros((book.shape[0], -(-(end - begin) // WIDE) * WIDE), np.float32)
+    part[:, : end - begin] = book[:, begin:end].to(torch.float32).numpy()
+    return part
 
 
 def _solve_slice(
@@ -109,21 +130,20 @@ def _solve_slice(
     """One slice of channels for all splats; written to ``result`` [P, C]. Gives the squared norms [P] f64."""
     count = scale.shape[0]
     squares = np.zeros(count)
+    views = [
+        (view.splats.numpy(), view.row_starts.numpy(), view.columns.numpy(), view.weights.numpy()) for view in store
+    ]
 
     def solve_block(offset: int) -> None:
         end = min(offset + BLOCK, count)
         block = np.zeros((end - offset, parts[0].shape[1]), np.float32)
-        for weights, part in zip(store, parts, strict=True):
-            first, last = np.searchsorted(weights.splats.numpy(), (offset, end))
+        for weights, part in zip(views, parts, strict=True):
+            first, last = np.searchsorted(weights[0], (offset, end))
             if first < last:
-                add_weighted_rows(
-                    first, last, offset, weights.splats.numpy(), weights.row_starts.numpy(),
-                    weights.columns.numpy(), weights.weights.numpy(), part, block,
-                )  # fmt: skip
-        block *= scale[offset:end, None].astype(np.float32)
-        squares[offset:end] = np.einsum("jc,jc->j", block, block, dtype=np.float64)
+                add_weighted_rows(first, last, offset, weights, part, block)
+        finish_rows(block, scale[offset:end], squares[offset:end])
         if result is not None:
-            result[offset:end] = torch.from_numpy(block).to(result.dtype)
+            result[offset:end] = torch.from_numpy(block[:, : result.shape[1]]).to(result.dtype)
 
     list(pool.map(solve_block, range(0, count, BLOCK)))
     return squares

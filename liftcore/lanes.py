@@ -1,4 +1,4 @@
-"""Eight float32 lanes at a time: the vector instructions of the pixel loop.
+"""Eight float32 lanes at a time: the vector instructions of the pixel loop and of the solution.
 
 numba's automatic vectorisation stops at aliasing and wrap-around checks inside the blending loop. These
 intrinsics build the same arithmetic as LLVM vectors of eight lanes, which LLVM lowers to AVX2, SSE or NEON.
@@ -183,6 +183,45 @@ def add_scaled_lanes(typingctx, total, offset, weights, row, scale):
         weight = _load(builder, _pointer(context, builder, signature.args[2], weights, row))
         product = builder.fmul(weight, _splat(builder, scale), flags=_FUSE)
         builder.store(builder.fadd(_load(builder, place), product, flags=_FUSE), place, align=4)
+        return context.get_dummy_value()
+
+    return signature, codegen
+
+
+WIDE = 4 * LANES  # channels that add_weighted_row keeps in registers
+
+
+@intrinsic
+def add_weighted_row(typingctx, target, place, source, entries, columns, weights, span):
+    """``target[place + i] += sum_k weights[k] source[columns[k] * stride + channel + i]`` for 32 channels.
+
+    ``span = (stride, channel)`` of the flat source, ``entries = (first, last)``. The sums stay in registers.
+    """
+    integers = types.UniTuple(types.intp, 2)
+    signature = types.void(
+        _FLOAT_ARRAY, types.intp, _FLOAT_ARRAY, integers, types.Array(types.int32, 1, "C"), _FLOAT_ARRAY, integers
+    )
+
+    def codegen(context, builder, signature, args):
+        target, place, source, entries, columns, weights, span = args
+        array = signature.args
+        first, last = cgutils.unpack_tuple(builder, entries)
+        stride, channel = cgutils.unpack_tuple(builder, span)
+        column_data = context.make_array(array[4])(context, builder, value=columns).data
+        weight_data = context.make_array(array[5])(context, builder, value=weights).data
+        steps = [ir.Constant(place.type, LANES * part) for part in range(WIDE // LANES)]
+        places = [_pointer(context, builder, array[0], target, builder.add(place, step)) for step in steps]
+        sums = [cgutils.alloca_once_value(builder, _load(builder, pointer)) for pointer in places]
+        with cgutils.for_range_slice(builder, first, last, ir.Constant(place.type, 1)) as (k, _):
+            column = builder.sext(builder.load(builder.gep(column_data, [k])), place.type)
+            weight = _splat(builder, builder.load(builder.gep(weight_data, [k])))
+            base = builder.add(builder.mul(column, stride), channel)
+            for step, total in zip(steps, sums, strict=True):
+                row = _load(builder, _pointer(context, builder, array[2], source, builder.add(base, step)))
+                product = builder.fmul(row, weight, flags=_FUSE)
+                builder.store(builder.fadd(builder.load(total), product, flags=_FUSE), total)
+        for pointer, total in zip(places, sums, strict=True):
+            builder.store(builder.load(total), pointer, align=4)
         return context.get_dummy_value()
 
     return signature, codegen

@@ -1,0 +1,164 @@
+"""`splatlift bench`: how long a view takes, stage by stage, and how much memory the whole lift needs."""
+
+from __future__ import annotations
+
+import os
+import platform
+import resource
+import statistics
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from liftcore.errors import InvalidInput
+from liftcore.measure.synthetic import room_cameras, room_regions, room_splats
+from liftcore.observe.observation import Observation, RegionMap
+from liftcore.raster.cpu import CpuRaster
+from liftcore.raster.warm_up import warm_up
+from liftcore.solve.accumulate import lift_walk, row_totals
+from liftcore.solve.closed_form import solve_closed_form
+from liftcore.solve.settings import LiftSettings, Preset
+from liftcore.solve.view_weights import ViewWeights
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from liftcore.scene.cameras import Camera
+    from liftcore.scene.splats import Splats
+
+
+@dataclass(frozen=True)
+class Workload:
+    """What is lifted: a scene, and views with label maps over random unit codebooks."""
+
+    name: str
+    splats: Splats
+    views: Sequence[tuple[Camera, Observation]]
+
+
+def run_bench(options: dict[str, Any]) -> dict[str, Any]:
+    """Time the lift of a real scene (``scene``: a folder) or of a synthetic room.
+
+    Args:
+        options: scene (folder or None), splats, size ("WxH"), channels, levels, views, threads.
+
+    Returns:
+        Plain numbers, ready for JSON: hardware, versions, seconds a view by stage (medians), peak memory.
+    """
+    start = time.perf_counter()
+    warm_up()
+    compile_seconds = time.perf_counter() - start
+    work = _workload(options)
+    presets = {str(preset): time_lift(work, preset, options.get("threads")) for preset in Preset}
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    return {
+        "workload": work.name,
+        "splats": work.splats.count,
+        "views": len(work.views),
+        "width": work.views[0][0].width,
+        "height": work.views[0][0].height,
+        "channels": work.views[0][1].codebook.shape[1],
+        "levels": options.get("levels") or 4,
+        "compile_or_load_s": compile_seconds,
+        "presets": presets,
+        "peak_memory_bytes": peak,
+        "hardware": hardware(),
+    }
+
+
+def time_lift(work: Workload, preset: Preset, threads: int | None = None) -> dict[str, Any]:
+    """Seconds a view of geometry and solution, medians over the views, one after the other."""
+    settings = LiftSettings.of(preset=preset)
+    raster = CpuRaster(work.splats, threads)
+    walk = lift_walk(settings)
+    denominators = np.zeros(work.splats.count)
+    geometry, entries = [], 0
+    with ViewWeights() as store:
+        camera, observation = work.views[0]
+        raster.region_weights(camera, observation, walk, settings.power)  # warm caches, not counted
+        raster.forget()
+        for camera, observation in work.views:
+            start = time.perf_counter()
+            weights = raster.region_weights(camera, observation, walk, settings.power)
+            denominators[weights.splats.numpy()] += row_totals(weights)
+            store.append(weights)
+            geometry.append(time.perf_counter() - start)
+            entries += len(weights.columns)
+        start = time.perf_counter()
+        books = [observation.codebook for _, observation in work.views]
+        solve_closed_form(store, books.__getitem__, denominators, torch.float16, lambda *_: None, threads)
+        solve = (time.perf_counter() - start) / len(work.views)
+    return {
+        "geometry_s_per_view": statistics.median(geometry),
+        "geometry_s_per_view_min": min(geometry),
+        "solve_s_per_view": solve,
+        "total_s_per_view": statistics.median(geometry) + solve,
+        "weights_entries_per_view": entries / len(work.views),
+    }
+
+
+def _workload(options: dict[str, Any]) -> Workload:
+    channels, levels = options.get("channels") or 512, options.get("levels") or 4
+    count = options.get("views") or 8
+    if options.get("scene"):
+        return _real(Path(options["scene"]), channels, levels, count)
+    width, height = _size(options.get("size") or "986x728")
+    cameras = room_cameras(count, width, height)
+    splats = room_splats(options.get("splats") or 1_000_000)
+    views = [(camera, room_regions(camera, k, levels, channels)) for k, camera in enumerate(cameras)]
+    return Workload("synthetic room", splats, views)
+
+
+def _real(folder: Path, channels: int, levels: int, count: int) -> Workload:
+    """A scene folder with point_cloud.ply, cameras.json and regions.safetensors or features.safetensors."""
+    from liftcore.observe.pack import open_packs, pair
+    from liftcore.scene.load import load_cameras, load_splats
+
+    packs = [folder / name for name in ("regions.safetensors", "features.safetensors") if (folder / name).is_file()]
+    if not packs:
+        raise InvalidInput("scene", expected="a folder with regions.safetensors", got=str(folder))
+    features = open_packs(packs[:1])
+    cameras = load_cameras(folder / "cameras.json")
+    names = pair(features, cameras)[0][:count]
+    views = []
+    for number, name in enumerate(names):
+        observed = features.observation(name)
+        if not isinstance(observed, RegionMap):
+            raise InvalidInput("scene", expected="a pack of region maps", got=f"grids in {packs[0].name}")
+        repeats = -(-levels // observed.labels.shape[0])
+        labels = observed.labels.repeat(repeats, 1, 1)[:levels]
+        generator = torch.Generator().manual_seed(number)
+        codebook = torch.randn(observed.codebook.shape[0], channels, generator=generator)
+        codebook = torch.nn.functional.normalize(codebook, dim=1).half()
+        views.append((cameras.get(name), RegionMap(labels, codebook)))
+    return Workload(folder.name, load_splats(folder / "point_cloud.ply"), views)
+
+
+def _size(text: str) -> tuple[int, int]:
+    parts = text.lower().split("x")
+    if len(parts) != 2 or not all(part.isdigit() for part in parts):
+        raise InvalidInput("size", expected="WIDTHxHEIGHT in pixels", got=repr(text))
+    return int(parts[0]), int(parts[1])
+
+
+def hardware() -> dict[str, Any]:
+    """The machine and the versions that a figure was taken on."""
+    import numba
+
+    model = platform.processor()
+    info = Path("/proc/cpuinfo")
+    if info.is_file():
+        names = [line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if "model name" in line]
+        model = names[0] if names else model
+    return {
+        "cpu": model,
+        "cores": len(os.sched_getaffinity(0)),
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "numba": numba.__version__,
+        "numpy": np.__version__,
+    }
