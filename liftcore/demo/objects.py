@@ -104,10 +104,10 @@ def _fruit() -> list[Piece]:
 
     banana = surfaces.tube(arc, lambda t: 0.04 + 0.2 * np.sin(np.pi * np.clip(t, 0, 1)) ** 0.55, (0.0, 1.0, 0.0))
     return [
-        Piece("apple", "apple", apple, paints.apple_skin, 1900),
+        Piece("red apple", "red apple", apple, paints.apple_skin, 1900),
         Piece(
-            "apple",
-            "apple",
+            "red apple",
+            "red apple",
             surfaces.tube(stem, lambda t: np.full_like(t, 0.03), (0, 1, 0)),
             paints.plain(0.3, 0.2, 0.1),
             80,
@@ -119,7 +119,7 @@ def _fruit() -> list[Piece]:
             paints.orange_peel,
             1900,
         ),
-        Piece("banana", "banana", banana, paints.banana_peel, 1900),
+        Piece("yellow banana", "yellow banana", banana, paints.banana_peel, 1900),
     ]
 
 
@@ -148,9 +148,9 @@ def _lamp() -> list[Piece]:
     pole = surfaces.lathe(centre, (0.07, 0.07), (0.4, 3.3))
     shade = surfaces.lathe(centre, (1.25, 0.62), (2.5, 4.0))
     return [
-        Piece("lamp", "lamp stand", foot, paints.plain(0.62, 0.5, 0.26), 900),
-        Piece("lamp", "lamp stand", pole, paints.plain(0.66, 0.54, 0.3), 500),
-        Piece("lamp", "lamp shade", shade, paints.shade_cloth, 2600, two_sided=True, glow=0.62),
+        Piece("lamp", "lamp post", foot, paints.plain(0.62, 0.5, 0.26), 900),
+        Piece("lamp", "lamp post", pole, paints.plain(0.66, 0.54, 0.3), 500),
+        Piece("lamp", "lamp shade", shade, paints.shade_cloth, 2600, two_sided=True, glow=0.48),
     ]
 
 
@@ -158,8 +158,8 @@ def _plant() -> list[Piece]:
     x, y = -3.3, 1.2
     pot = surfaces.lathe((x, y, 0), (0.55, 0.62, 0.78, 0.86, 0.86), (0.0, 0.3, 0.95, 1.0, 1.2))
     pieces = [
-        Piece("plant", "plant pot", pot, paints.terracotta, 1700),
-        Piece("plant", "plant pot", surfaces.disc((x, y, 1.1), 0.84), paints.plain(0.2, 0.14, 0.09), 500),
+        Piece("potted plant", "plant pot", pot, paints.terracotta, 1700),
+        Piece("potted plant", "plant pot", surfaces.disc((x, y, 1.1), 0.84), paints.plain(0.2, 0.14, 0.09), 500),
     ]
     for k in range(15):
         angle = 2.4 * k  # the golden angle, nearly: leaves spread without repeating
@@ -171,5 +171,5 @@ def _plant() -> list[Piece]:
             0.26,
             0.5 * out,
         )
-        pieces.append(Piece("plant", "plant leaves", blade, paints.leaf_green, 320, two_sided=True))
+        pieces.append(Piece("potted plant", "plant leaves", blade, paints.leaf_green, 320, two_sided=True))
     return pieces

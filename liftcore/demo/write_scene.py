@@ -20,7 +20,7 @@ PICTURED = "view_07"  # of the held-out views, the one that shows every object w
 # Phrases that name no object: the sentence encoder has to know what they mean.
 PHRASES = {
     "something to drink coffee from": ("mug",),
-    "fresh fruit": ("apple", "orange", "banana"),
+    "fresh fruit": ("red apple", "orange", "yellow banana"),
     "reading light": ("lamp",),
 }
 

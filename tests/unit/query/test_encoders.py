@@ -1,0 +1,141 @@
+"""Text encoders: look-ups, meanings, shapes, and what is said when something is missing."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from liftcore.errors import InvalidQuery, Unavailable
+from liftcore.query.encoders import open_encoder
+from liftcore.query.encoders.minilm import MiniLmEncoder
+from liftcore.query.encoders.open_clip import OpenClipEncoder
+
+WORDS = ["alarm_clock", "Teapot", "the end", "a"]
+
+
+@pytest.fixture
+def table(tmp_path: Path) -> Path:
+    path = tmp_path / "words.safetensors"
+    rows = torch.eye(4, 6).mul(3).half()
+    save_file({"embeddings": rows}, str(path), metadata={"words": json.dumps(WORDS)})
+    return path
+
+
+@pytest.fixture(scope="module")
+def minilm() -> MiniLmEncoder:
+    return MiniLmEncoder()
+
+
+@pytest.mark.parametrize("text", ["alarm clock", "Alarm_Clock", "an alarm  clock", "THE ALARM CLOCK"])
+def test_spelling_variants_find_the_same_word(table: Path, text: str) -> None:
+    encoder = open_encoder(f"table:{table}")
+    assert encoder.encode([text]).tolist() == [[1.0, 0, 0, 0, 0, 0]]
+    assert encoder.channels == 6
+
+
+def test_a_word_that_begins_with_an_article_is_found(table: Path) -> None:
+    encoder = open_encoder(str(table))
+    assert encoder.encode(["the end", "a", "teapot"]).argmax(dim=1).tolist() == [2, 3, 1]
+
+
+def test_an_unknown_word_names_the_nearest_ones(table: Path) -> None:
+    with pytest.raises(InvalidQuery, match="teapot"):
+        open_encoder(str(table)).encode(["teapott"])
+
+
+@pytest.mark.parametrize(
+    ("rows", "words"),
+    [
+        (torch.eye(3, 6), WORDS),
+        (torch.ones(4), WORDS),
+        (torch.zeros(4, 6), WORDS),
+        (torch.full((4, 6), torch.inf), WORDS),
+        (torch.eye(4, 6).double(), WORDS),
+        (torch.eye(4, 6), {"a": 1}),
+        (torch.eye(4, 6), [1, 2, 3, 4]),
+        (torch.empty(0, 6), []),
+    ],
+)
+def test_a_malformed_table_is_refused(tmp_path: Path, rows: torch.Tensor, words: object) -> None:
+    path = tmp_path / "bad.safetensors"
+    save_file({"embeddings": rows}, str(path), metadata={"words": json.dumps(words)})
+    with pytest.raises(InvalidQuery):
+        open_encoder(str(path))
+
+
+def test_a_file_that_is_no_table_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "bad.safetensors"
+    path.write_bytes(b"not a table")
+    with pytest.raises(InvalidQuery):
+        open_encoder(str(path))
+    with pytest.raises(InvalidQuery, match="nothing at"):
+        open_encoder(f"table:{tmp_path / 'none.safetensors'}")
+    save_file({"other": torch.eye(4)}, str(path), metadata={"words": json.dumps(WORDS)})
+    with pytest.raises(InvalidQuery, match="embeddings"):
+        open_encoder(str(path))
+
+
+@pytest.mark.parametrize("spec", ["", "clip", "table:", "open_clip:", "minilm:large"])
+def test_an_unknown_encoder_is_refused_with_those_that_exist(spec: str) -> None:
+    with pytest.raises(InvalidQuery, match="minilm"):
+        open_encoder(spec)
+
+
+def test_the_sentence_encoder_knows_what_words_mean(minilm: MiniLmEncoder) -> None:
+    things = ["mug", "red apple", "book", "lamp", "wall"]
+    questions = ["something to drink coffee from", "fresh fruit", "a novel to read", "reading light"]
+    similarity = minilm.encode(questions) @ minilm.encode(things).T
+    assert similarity.argmax(dim=1).tolist() == [0, 1, 2, 3]
+
+
+def test_the_sentence_encoder_gives_unit_rows_and_no_noise(
+    minilm: MiniLmEncoder, capfd: pytest.CaptureFixture[str]
+) -> None:
+    rows = minilm.encode(["a", "b c"])
+    assert rows.shape == (2, minilm.channels) and rows.dtype == torch.float32
+    torch.testing.assert_close(rows.norm(dim=1), torch.ones(2))
+    assert minilm.encode([]).shape == (0, 384)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_an_empty_text_is_refused(minilm: MiniLmEncoder) -> None:
+    with pytest.raises(InvalidQuery, match="empty"):
+        minilm.encode(["mug", "  "])
+
+
+@pytest.fixture(scope="module")
+def clip() -> OpenClipEncoder:
+    return OpenClipEncoder._with_random_weights("ViT-B-32")
+
+
+def test_open_clip_gives_unit_rows_of_its_width(clip: OpenClipEncoder) -> None:
+    rows = clip.encode(["a cat", "a dog on a mat"])
+    assert rows.shape == (2, 512) and clip.channels == 512
+    torch.testing.assert_close(rows.norm(dim=1), torch.ones(2))
+
+
+def test_open_clip_without_weights_is_unavailable_and_never_random() -> None:
+    with pytest.raises(Unavailable, match="tag or a file"):
+        open_encoder("open_clip:ViT-B-32")
+    with pytest.raises(Unavailable, match="nothing at"):
+        open_encoder("open_clip:ViT-B-32@/no/such/file.pt")
+
+
+def test_open_clip_names_the_nearest_model_and_the_tags() -> None:
+    with pytest.raises(InvalidQuery, match="ViT-B-32"):
+        open_encoder("open_clip:ViT-B-33/openai")
+    with pytest.raises(InvalidQuery, match="openai"):
+        open_encoder("open_clip:ViT-B-32/none")
+
+
+def test_open_clip_refuses_a_pickle_that_holds_code(tmp_path: Path) -> None:
+    path = tmp_path / "weights.pt"
+    torch.save({"state_dict": Path("code")}, path)
+    with pytest.raises(InvalidQuery, match="nothing else"):
+        open_encoder(f"open_clip:ViT-B-32@{path}")
+    with pytest.raises(InvalidQuery, match="ending in"):
+        open_encoder(f"open_clip:ViT-B-32@{Path(__file__)}")

@@ -1,0 +1,60 @@
+"""Scores against their dense definitions in float64."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from liftcore.errors import InvalidQuery
+from liftcore.query.scores import cosine, cosines, feature_norms, relevancy
+
+
+@given(
+    count=st.integers(1, 5000),
+    channels=st.sampled_from([1, 3, 64, 512]),
+    dtype=st.sampled_from([torch.float16, torch.float32]),
+    seed=st.integers(0, 99),
+)
+@settings(max_examples=25, deadline=None)
+def test_cosine_equals_its_definition(count: int, channels: int, dtype: torch.dtype, seed: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    features = torch.randn(count, channels, generator=generator).to(dtype)
+    text = torch.randn(channels, generator=generator)
+    wide = features.double()
+    expected = (wide @ text.double()) / (wide.norm(dim=1) * text.double().norm()).clamp_min(1e-300)
+    found = cosine(features, feature_norms(features), text)
+    torch.testing.assert_close(
+        found.double()[wide.norm(dim=1) > 0], expected[wide.norm(dim=1) > 0], atol=1e-5, rtol=0
+    )
+
+
+def test_a_splat_without_a_feature_scores_the_minimum() -> None:
+    features = torch.tensor([[0.0, 0.0], [1.0, 0.0]])
+    assert cosine(features, feature_norms(features), torch.tensor([1.0, 0.0])).tolist() == [-1.0, 1.0]
+
+
+def test_several_texts_in_one_pass_equal_one_by_one() -> None:
+    features = torch.randn(3000, 96).half()
+    norms, texts = feature_norms(features), torch.randn(4, 96)
+    together = cosines(features, norms, texts)
+    for column, text in enumerate(texts):
+        torch.testing.assert_close(together[:, column], cosine(features, norms, text), atol=1e-6, rtol=0)
+
+
+def test_relevancy_is_the_least_softmax_over_negatives() -> None:
+    similarities = torch.rand(100, 5, dtype=torch.float64) - 0.5
+    pairs = [torch.softmax(10 * similarities[:, [0, n]], dim=1)[:, 0] for n in range(1, 5)]
+    torch.testing.assert_close(relevancy(similarities), torch.stack(pairs).amin(dim=0))
+
+
+def test_relevancy_of_a_half_means_as_near_as_the_nearest_negative() -> None:
+    assert relevancy(torch.tensor([[0.3, 0.3, 0.1]])).item() == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("text", [torch.zeros(8), torch.full((8,), torch.nan), torch.ones(7)])
+def test_a_text_without_direction_or_of_another_length_is_refused(text: torch.Tensor) -> None:
+    features = torch.randn(5, 8)
+    with pytest.raises(InvalidQuery):
+        cosine(features, feature_norms(features), text)

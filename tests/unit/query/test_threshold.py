@@ -1,0 +1,116 @@
+"""Thresholds without ground truth: where they fall, and that nothing makes them fail."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from liftcore.errors import InvalidQuery
+from liftcore.query.threshold import METHODS, find_threshold
+
+SEARCHED = METHODS  # every method that looks at the scores
+
+
+def hills(*parts: tuple[float, float, int], seed: int = 0) -> torch.Tensor:
+    """Normal hills of (mean, deviation, count)."""
+    rng = np.random.default_rng(seed)
+    return torch.from_numpy(np.concatenate([rng.normal(*part) for part in parts]).astype(np.float32))
+
+
+@pytest.mark.parametrize("method", SEARCHED)
+def test_two_hills_are_parted_between_them(method: str) -> None:
+    scores = hills((0.2, 0.01, 9000), (0.3, 0.01, 3000))
+    assert 0.22 < find_threshold(scores, method).value < 0.285
+
+
+def test_auto_finds_a_small_object_beside_two_large_backgrounds() -> None:
+    scores = hills((0.15, 0.01, 50_000), (0.2, 0.01, 50_000), (0.3, 0.005, 500))
+    assert 0.22 < find_threshold(scores, "auto").value < 0.29
+
+
+def test_paper_takes_the_valley_next_to_the_largest_peak_and_auto_the_topmost() -> None:
+    scores = hills((0.15, 0.008, 50_000), (0.2, 0.008, 20_000), (0.3, 0.005, 3000))
+    assert 0.16 < find_threshold(scores, "paper").value < 0.19
+    assert 0.22 < find_threshold(scores, "auto").value < 0.29
+
+
+def test_a_few_stray_scores_are_no_object() -> None:
+    scores = torch.cat([hills((0.2, 0.01, 50_000), (0.3, 0.01, 5000)), torch.tensor([0.5, 0.51])])
+    assert 0.22 < find_threshold(scores, "auto").value < 0.29
+
+
+def test_one_hill_falls_back_to_otsu_and_says_so() -> None:
+    rising = torch.linspace(0, 1, 10_000) ** 0.5  # the histogram only rises
+    found = find_threshold(rising, "paper")
+    assert found.value == find_threshold(rising, "otsu").value
+    assert "stands in" in found.explanation
+
+
+@pytest.mark.parametrize("method", SEARCHED)
+@pytest.mark.parametrize("count", [1, 2, 1000])
+def test_equal_scores_give_that_score(method: str, count: int) -> None:
+    found = find_threshold(torch.full((count,), 0.25), method)
+    assert found.value == 0.25
+    assert "no valley" in found.explanation
+
+
+@pytest.mark.parametrize("method", SEARCHED)
+def test_no_scores_find_nothing(method: str) -> None:
+    assert find_threshold(torch.empty(0), method).value == math.inf
+
+
+def test_a_given_threshold_is_kept() -> None:
+    found = find_threshold(torch.rand(10), 0.3)
+    assert (found.value, found.method) == (0.3, "fixed")
+
+
+@pytest.mark.parametrize("method", ["best", math.nan, math.inf])
+def test_an_unknown_method_or_number_is_refused(method: str | float) -> None:
+    with pytest.raises(InvalidQuery):
+        find_threshold(torch.rand(10), method)
+
+
+def test_scores_that_are_not_finite_are_refused() -> None:
+    with pytest.raises(InvalidQuery, match="finite"):
+        find_threshold(torch.tensor([0.1, math.nan]), "auto")
+
+
+def test_weights_count_like_repeated_scores() -> None:
+    scores = hills((0.2, 0.01, 2000), (0.3, 0.01, 500))
+    weights = torch.where(scores > 0.25, 3.0, 1.0)
+    repeated = torch.cat([scores, scores[scores > 0.25], scores[scores > 0.25]])
+    for method in SEARCHED:
+        weighted = find_threshold(scores, method, weights).value
+        assert weighted == pytest.approx(find_threshold(repeated, method).value, abs=2e-3)
+
+
+SCORES = hnp.arrays(np.float32, st.integers(1, 300), elements=st.floats(-1, 1, width=32, allow_subnormal=False))
+
+
+@given(scores=SCORES, method=st.sampled_from(SEARCHED))
+@settings(max_examples=200, deadline=None)
+def test_any_scores_have_a_threshold_between_their_least_and_greatest(scores: np.ndarray, method: str) -> None:
+    found = find_threshold(torch.from_numpy(scores), method)
+    assert scores.min() <= found.value <= scores.max()
+    assert found.explanation.endswith(".")
+
+
+@given(
+    seed=st.integers(0, 1000),
+    method=st.sampled_from(SEARCHED),
+    scale=st.sampled_from([0.125, 2.0, 64.0]),
+    shift=st.sampled_from([0.0, -4.0, 16.0]),
+)
+@settings(max_examples=60, deadline=None)
+def test_thresholds_move_with_the_scores(seed: int, method: str, scale: float, shift: float) -> None:
+    scores = hills((0.2, 0.02, 3000), (0.35, 0.02, 900), (0.6, 0.03, 400), seed=seed)
+    plain = find_threshold(scores, method).value
+    moved = find_threshold(scores * scale + shift, method).value
+    spread = float(scores.max() - scores.min())
+    assert (moved - shift) / scale == pytest.approx(plain, abs=0.02 * spread)
