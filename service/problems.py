@@ -11,6 +11,7 @@ from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 
 from liftcore import errors as core
 from liftcore.errors import SplatliftError
@@ -89,6 +90,7 @@ def install(app: FastAPI) -> None:
     app.add_exception_handler(SplatliftError, _on_known)
     app.add_exception_handler(RequestValidationError, _on_validation)
     app.add_exception_handler(HTTPException, _on_framework)
+    app.add_exception_handler(ClientDisconnect, _on_disconnect)
     app.add_exception_handler(Exception, _on_unexpected)
 
 
@@ -122,6 +124,12 @@ def _on_framework(request: Request, error: Exception) -> JSONResponse:
     detail = f"{request.method} {request.url.path}: {error.detail}"
     problem = Problem(type=f"/problems/{slug}", title=title, status=error.status_code, detail=detail)
     return answer(problem, error.headers)
+
+
+def _on_disconnect(request: Request, error: Exception) -> JSONResponse:
+    # Nobody reads this; without it the log would tell of an error of ours.
+    detail = "The client left before the end of the body."
+    return answer(Problem(type="/problems/malformed-request", title=FRAMEWORK[400][1], status=400, detail=detail))
 
 
 def _on_unexpected(request: Request, error: Exception) -> JSONResponse:

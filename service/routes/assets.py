@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import AsyncIterator
+from contextlib import ExitStack, asynccontextmanager
+from pathlib import Path as FilePath
 from typing import Annotated
 
 import anyio
@@ -13,6 +16,7 @@ from service.content import file_answer
 from service.errors import DigestMismatch
 from service.parts import Here
 from service.store.assets import AssetRecord, CheckedUpload
+from service.store.files import DataDirectory
 from service.uploads.checking import CheckLimits, check
 from service.uploads.intake import Intake, gzipped
 
@@ -43,8 +47,7 @@ RAW_BODY = {
 async def upload(kind: wire.AssetKind, request: Request, here: Here, sha256: Sha256 = None) -> Response:
     """Upload splats (PLY), cameras (JSON or a zip of a COLMAP model) or a feature pack (safetensors)."""
     gzip = gzipped(request.headers.get("content-encoding", ""))
-    files = here.store.files
-    with files.draft(f".{kind}") as draft, files.scratch() as scratch:
+    async with _workspace(here.store.files, kind) as (draft, scratch):
         with Intake(draft, limit=here.settings.max_upload_bytes(kind), gzip=gzip) as intake:
             await _receive(request, intake)
             digest = intake.finish()
@@ -58,6 +61,17 @@ async def upload(kind: wire.AssetKind, request: Request, here: Here, sha256: Sha
         checked = CheckedUpload(draft, kind, digest, report.suffix, report.counts, report.warnings)
         asset, new = await anyio.to_thread.run_sync(here.store.assets.add, checked)
     return _reply(asset, 201 if new else 200)
+
+
+@asynccontextmanager
+async def _workspace(files: DataDirectory, kind: wire.AssetKind) -> AsyncIterator[tuple[FilePath, FilePath]]:
+    """A draft and a folder for one upload; both go in a thread, as removing gigabytes takes its time."""
+    stack = ExitStack()
+    try:
+        yield stack.enter_context(files.draft(f".{kind}")), stack.enter_context(files.scratch())
+    finally:
+        with anyio.CancelScope(shield=True):
+            await anyio.to_thread.run_sync(stack.close)
 
 
 async def _receive(request: Request, intake: Intake) -> None:

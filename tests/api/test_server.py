@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import signal
+import socket
 import subprocess
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -14,7 +15,6 @@ import httpx
 import pytest
 
 from service.__main__ import main, parse
-from service.errors import Misconfigured
 from service.settings import ServiceSettings
 
 from .conftest import Uploaded
@@ -114,8 +114,6 @@ def test_encoder_is_chosen_by_text_space_and_never_by_the_client(tmp_path: Path)
 
 
 def test_taken_port_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    import socket
-
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
@@ -124,5 +122,21 @@ def test_taken_port_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert "free port" in capsys.readouterr().err
 
 
-def test_refusal_is_the_service_own_error() -> None:
-    assert issubclass(Misconfigured, Exception) and os.environ.get("SPLATLIFT_HOST") is None
+def test_upload_that_breaks_off_leaves_nothing(tmp_path: Path, table: Path) -> None:
+    with server(tmp_path, table) as address:
+        url = httpx.URL(address)
+        with socket.create_connection((url.host, url.port or 80)) as client:
+            client.sendall(
+                b"PUT /assets/splats HTTP/1.1\r\nHost: x\r\nContent-Length: 9000000\r\n\r\n" + b"p" * 2_000_000
+            )
+            wait_until(lambda: any((tmp_path / "tmp").iterdir()))
+        wait_until(lambda: not any((tmp_path / "tmp").iterdir()))
+        assert httpx.get(f"{address}/assets").json() == {"assets": []}
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
+    """Wait a little for something that is about to happen."""
+    deadline = time.monotonic() + 20
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
