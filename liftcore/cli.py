@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
@@ -38,13 +39,19 @@ def main(argv: Sequence[str] | None = None) -> int:
         return end.code if isinstance(end.code, int) else 0
     try:
         # The command's own module, and what it needs, is loaded only now: --help stays quick.
-        return importlib.import_module(f"liftcore.commands.{options.command}").run(options)
+        status = importlib.import_module(f"liftcore.commands.{options.command}").run(options)
+        sys.stdout.flush()
+        return status
     except SplatliftError as error:
         print(f"splatlift: {error}", file=sys.stderr)
         return BAD_INPUT
     except KeyboardInterrupt:
         print("splatlift: interrupted", file=sys.stderr)
         return INTERRUPTED
+    except BrokenPipeError:
+        # Whoever read the answer has seen enough; what is still buffered goes nowhere, without a complaint.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return OUR_FAULT
     except Exception as error:
         if options.debug:
             raise

@@ -63,9 +63,12 @@ def shown(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.6g}"
     if isinstance(value, Mapping):
-        return ", ".join(f"{key} {shown(item)}" for key, item in value.items()) or "-"
+        return ", ".join(f"{key} {_nested(item)}" for key, item in value.items()) or "-"
     if isinstance(value, list | tuple):
         more = [f"... ({len(value)})"] if len(value) > SHOWN_ITEMS else []
-        items = [f"({shown(item)})" if isinstance(item, list | tuple) else shown(item) for item in value]
-        return ", ".join([*items[:SHOWN_ITEMS], *more]) or "-"
+        return ", ".join([*map(_nested, value[:SHOWN_ITEMS]), *more]) or "-"
     return "-" if value is None or value == "" else str(value)
+
+
+def _nested(value: Any) -> str:
+    return f"({shown(value)})" if isinstance(value, Mapping | list | tuple) else shown(value)

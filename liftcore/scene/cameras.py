@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
 MAX_SIDE = 32_768  # pixels; larger images are a broken header, not a photo
+MAX_REACH = 1e12  # scene units from the origin; float32 has no detail left long before
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,9 +42,15 @@ class Camera:
         if pose.shape != (4, 4) or not np.isfinite(pose).all():
             self._refuse("pose", "a finite 4x4 matrix", f"shape {list(pose.shape)}")
         rotation = pose[:3, :3]
-        error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+        # Large entries are refused before the product, which they could overflow.
+        error = float(np.abs(rotation).max())
+        if error <= 2:
+            error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
         if error > 1e-3 or np.linalg.det(rotation) < 0:
             self._refuse("pose", "a proper rotation", f"a matrix off by {error:.2g}")
+        reach = float(np.abs(pose[:3, 3]).max())
+        if reach > MAX_REACH:
+            self._refuse("pose", f"a translation within {MAX_REACH:g}", f"{reach:.2g}")
 
     def _refuse(self, part: str, expected: str, got: str) -> None:
         raise InvalidCameras(f"camera {self.name!r} {part}", expected=expected, got=got)
@@ -52,6 +59,15 @@ class Camera:
     def centre(self) -> np.ndarray:
         """[3] f64, the camera's centre in the world frame."""
         return -self.world_to_camera[:3, :3].T @ self.world_to_camera[:3, 3]
+
+
+def world_to_camera(camera_to_world: np.ndarray, centre: np.ndarray) -> np.ndarray:
+    """[4, 4] f64 of a camera's axes in the world, [3, 3], and its centre, [3]; a ``Camera`` validates it."""
+    pose = np.eye(4)
+    pose[:3, :3] = camera_to_world.T
+    with np.errstate(over="ignore", invalid="ignore"):  # what overflows is not finite, and is refused as such
+        pose[:3, 3] = -camera_to_world.T @ centre
+    return pose
 
 
 @dataclass(frozen=True)

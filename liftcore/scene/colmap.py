@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from liftcore.errors import InvalidCameras
-from liftcore.scene.camera_models import COLMAP_MODELS, MODELS_BY_NAME, Intrinsics, pinhole
+from liftcore.scene.camera_models import COLMAP_MODELS, MODELS_BY_NAME, UNDISTORT, Intrinsics, pinhole
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.view_names import view_names
 
@@ -44,18 +44,23 @@ def has_model(folder: Path) -> bool:
     return any((folder / f"cameras.{kind}").is_file() for kind in ("bin", "txt"))
 
 
+def model_files(folder: Path) -> list[Path]:
+    """Its cameras and its images; binary files are preferred, as in COLMAP. They need not be there."""
+    kind = "bin" if (folder / "cameras.bin").is_file() else "txt"
+    return [folder / f"cameras.{kind}", folder / f"images.{kind}"]
+
+
 def read_colmap(folder: Path) -> Cameras:
-    """The cameras of a sparse model, by image name; binary files are preferred, as in COLMAP.
+    """The cameras of a sparse model, by image name.
 
     Raises:
         InvalidCameras: a file is missing or malformed, or a camera is distorted.
     """
-    kind = "bin" if (folder / "cameras.bin").is_file() else "txt"
-    camera_file, image_file = folder / f"cameras.{kind}", folder / f"images.{kind}"
+    camera_file, image_file = model_files(folder)
     for path in (camera_file, image_file):
         if not path.is_file():
             raise InvalidCameras(str(folder), expected=f"the file {path.name}", got="a folder without it")
-    if kind == "bin":
+    if camera_file.suffix == ".bin":
         sensors, images = _read_binary(camera_file, image_file)
     else:
         sensors, images = dict(_text_sensors(camera_file)), list(_text_images(image_file))
@@ -141,7 +146,8 @@ def _read_binary(camera_file: Path, image_file: Path) -> tuple[dict[int, _Sensor
 def _binary_sensor(data: _Bytes) -> tuple[int, _Sensor]:
     number, model, width, height = data.take("<IiQQ")
     if not 0 <= model < len(COLMAP_MODELS):
-        raise InvalidCameras(data.source, expected="a camera model that we know", got=f"model id {model}")
+        got = f"camera model id {model}"
+        raise InvalidCameras(data.source, expected="a pinhole camera", got=got, hint=UNDISTORT)
     parameters = data.take(f"<{COLMAP_MODELS[model].parameters}d")
     intrinsics = pinhole(COLMAP_MODELS[model], parameters, f"{data.source} camera {number}")
     return number, _Sensor(width, height, intrinsics)
@@ -173,7 +179,7 @@ def _text_sensors(path: Path) -> Iterator[tuple[int, _Sensor]]:
         except ValueError:
             raise _bad_line(path, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]", line) from None
         if model not in MODELS_BY_NAME:
-            raise InvalidCameras(str(path), expected="a camera model that we know", got=model[:60])
+            raise InvalidCameras(str(path), expected="a pinhole camera", got=model[:60], hint=UNDISTORT)
         yield camera, _Sensor(*size, pinhole(MODELS_BY_NAME[model], parameters, f"{path} camera {camera}"))
 
 

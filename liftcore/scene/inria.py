@@ -5,11 +5,9 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from liftcore.errors import InvalidCameras
 from liftcore.files import whole_file
-from liftcore.scene.cameras import Camera, Cameras
+from liftcore.scene.cameras import Camera, Cameras, world_to_camera
 from liftcore.scene.json_file import entry, matrix, number, pixels
 from liftcore.scene.view_names import view_names
 
@@ -36,11 +34,9 @@ def _camera(name: str, record: dict[str, Any], source: str) -> Camera:
     where = f"{source} camera {name!r}"
     width, height = (pixels(entry(record, key, where), f"{where} {key}") for key in ("width", "height"))
     fx, fy = (number(entry(record, key, where), f"{where} {key}") for key in ("fx", "fy"))
-    camera_to_world = matrix(entry(record, "rotation", where), (3,), 3, f"{where} rotation")
+    rotation = matrix(entry(record, "rotation", where), (3,), 3, f"{where} rotation")
     (position,) = matrix([entry(record, "position", where)], (1,), 3, f"{where} position")
-    pose = np.eye(4)
-    pose[:3, :3] = camera_to_world.T
-    pose[:3, 3] = -camera_to_world.T @ position
+    pose = world_to_camera(rotation, position)
     return Camera(name, width, height, fx, fy, width / 2, height / 2, world_to_camera=pose)
 
 

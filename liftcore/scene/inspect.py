@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from liftcore.scene.load import load_cameras, load_splats
+from liftcore.scene.load import camera_files, load_cameras, load_splats
 from liftcore.scene.ply_dialect import nearest_dialect
 from liftcore.scene.splats import Kernel
 
@@ -38,8 +38,7 @@ def inspect_file(path: Path) -> dict[str, Any]:
     """
     if is_splats(path):
         return {"kind": "splats", "bytes": path.stat().st_size, **describe_splats(load_splats(path))}
-    files = [path] if path.is_file() else [file for file in path.rglob("*") if file.is_file()]
-    size = sum(file.stat().st_size for file in files)
+    size = sum(file.stat().st_size for file in ([path] if path.is_file() else camera_files(path)))
     return {"kind": "cameras", "bytes": size, **describe_cameras(load_cameras(path))}
 
 

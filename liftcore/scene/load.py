@@ -9,7 +9,7 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
 
 from liftcore.errors import InvalidCameras, InvalidSplats
-from liftcore.scene.colmap import has_model, read_colmap
+from liftcore.scene.colmap import has_model, model_files, read_colmap
 from liftcore.scene.inria import parse_inria
 from liftcore.scene.json_file import read_json
 from liftcore.scene.transforms import parse_transforms
@@ -72,13 +72,20 @@ def load_cameras(path: Path) -> Cameras:
     return _from_json(path)
 
 
-def _from_folder(folder: Path) -> Cameras:
+def camera_files(folder: Path) -> list[Path]:
+    """The files of a folder that its cameras are read from."""
     for name in MODEL_FOLDERS:
         if has_model(folder / name):
-            return read_colmap(folder / name)
-    for name in JSON_FILES:
-        if (folder / name).is_file():
-            return _from_json(folder / name)
+            return model_files(folder / name)
+    return [folder / name for name in JSON_FILES if (folder / name).is_file()][:1]
+
+
+def _from_folder(folder: Path) -> Cameras:
+    files = camera_files(folder)
+    if len(files) == 1:
+        return _from_json(files[0])
+    if files:
+        return read_colmap(files[0].parent)
     raise InvalidCameras(str(folder), expected=CAMERA_FORMATS, got="a folder without any of them")
 
 

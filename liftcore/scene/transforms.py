@@ -10,7 +10,7 @@ import numpy as np
 
 from liftcore.errors import InvalidCameras
 from liftcore.scene.camera_models import UNDISTORT, Intrinsics
-from liftcore.scene.cameras import Camera, Cameras
+from liftcore.scene.cameras import Camera, Cameras, world_to_camera
 from liftcore.scene.json_file import entry, matrix, number, pixels
 from liftcore.scene.view_names import view_names
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4")
-OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # of the camera's axes: y up and z back become down and ahead
+OPENGL_TO_OPENCV = np.array([1.0, -1.0, -1.0])  # a camera's y up and z back become down and ahead
 
 
 def parse_transforms(document: Any, source: str) -> Cameras:
@@ -46,15 +46,10 @@ def _camera(name: str, keys: Mapping[str, Any], source: str) -> Camera:
         hint = 'add the image size as "w" and "h"'
         raise InvalidCameras(where, expected="an image size, w and h", got="none", hint=hint)
     width, height = pixels(keys["w"], f"{where} w"), pixels(keys["h"], f"{where} h")
-    pose = np.eye(4)
     given = matrix(keys.get("transform_matrix"), (3, 4), 4, f"{where} transform_matrix")
-    pose[: len(given)] = given
-    camera_to_world = pose @ OPENGL_TO_OPENCV
-    world_to_camera = np.eye(4)
-    world_to_camera[:3, :3] = camera_to_world[:3, :3].T
-    world_to_camera[:3, 3] = -camera_to_world[:3, :3].T @ camera_to_world[:3, 3]
+    pose = world_to_camera(given[:3, :3] * OPENGL_TO_OPENCV, given[:3, 3])
     intrinsics = _intrinsics(keys, width, height, where)
-    return Camera(name, width, height, *intrinsics, world_to_camera=world_to_camera)
+    return Camera(name, width, height, *intrinsics, world_to_camera=pose)
 
 
 def _intrinsics(keys: Mapping[str, Any], width: int, height: int, where: str) -> Intrinsics:

@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import json
+import struct
 import tempfile
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from liftcore.errors import InvalidSplats
+from liftcore.errors import InvalidCameras, InvalidFeatures, InvalidSplats
+from liftcore.observe.npy import open_npy
+from liftcore.observe.observation import FeatureGrid, RegionMap
+from liftcore.observe.pack import open_packs
+from liftcore.observe.write_pack import write_pack
+from liftcore.scene.load import load_cameras
 from liftcore.scene.ply import read_splats, write_splats
 from liftcore.scene.ply_dialect import usual_layout
 from liftcore.scene.ply_header import parse_header
@@ -86,9 +94,7 @@ def test_every_layout_is_written_back_to_the_byte(kernel, sh_rows, lobes, count,
     for i, name in enumerate(names):
         rows[name] = np.arange(count) + i
     lines = [f"property {words[codes[name]]} {name}" for name in names]
-    header = "\n".join(
-        ["ply", "format binary_little_endian 1.0", f"element vertex {count}", *lines, "end_header\n"]
-    )
+    header = "\n".join(["ply", "format binary_little_endian 1.0", f"element vertex {count}", *lines, "end_header\n"])
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "splats.ply"
         path.write_bytes(header.encode() + rows.tobytes())
@@ -110,3 +116,103 @@ def test_file_cut_anywhere_is_refused(cut: int) -> None:
         path.write_bytes(content[: min(cut, len(content) - 1)])
         with pytest.raises(InvalidSplats):
             read_splats(path)
+
+
+def camera_documents() -> list[bytes]:
+    """One valid file of each camera format, each a few hundred bytes."""
+    pose = np.eye(4).tolist()
+    frame = {"file_path": "a.png", "transform_matrix": pose}
+    transforms = {"fl_x": 50.0, "w": 64, "h": 48, "frames": [frame, {**frame, "file_path": "b.png"}]}
+    record = {"id": 0, "img_name": "a", "width": 64, "height": 48, "fx": 50.0, "fy": 50.0}
+    inria = [{**record, "position": [0.0, 0.0, 0.0], "rotation": np.eye(3).tolist()}]
+    return [json.dumps(document).encode() for document in (transforms, inria)]
+
+
+COLMAP = {
+    "cameras.bin": struct.pack("<QIiQQ4d", 1, 1, 1, 64, 48, 50.0, 50.0, 32.0, 24.0),
+    "images.bin": struct.pack("<QI7dI", 1, 1, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1) + b"a.png\0" + bytes(8),
+    "cameras.txt": b"# list\n1 PINHOLE 64 48 50 50 32 24\n",
+    "images.txt": b"1 1 0 0 0 0 0 1 1 a.png\n\n2 1 0 0 0 0 0 1 1 b.png\n1 2 -1\n",
+}
+edits = st.lists(st.tuples(st.integers(0, 400), st.integers(0, 255)), max_size=6)
+
+
+def edited(content: bytes, changes: list[tuple[int, int]], keep: int) -> bytes:
+    """The content with some bytes changed, cut after ``keep``."""
+    changed = bytearray(content)
+    for place, value in changes:
+        changed[place % len(changed)] = value
+    return bytes(changed[:keep])
+
+
+@given(st.sampled_from(camera_documents()), edits, st.integers(0, 1000))
+@settings(max_examples=200, deadline=None)
+def test_any_damage_to_camera_json_is_cameras_or_an_error_of_ours(content, changes, keep) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "cameras.json"
+        path.write_bytes(edited(content, changes, keep))
+        try:
+            assert len(load_cameras(path)) > 0
+        except InvalidCameras as error:
+            assert "\n" not in str(error)
+
+
+@given(st.floats(), st.floats(), st.integers(0, 15))
+@settings(max_examples=100, deadline=None)
+def test_any_number_in_a_pose_is_a_camera_or_an_error_of_ours(focal, value, place) -> None:
+    pose = np.eye(4)
+    pose.flat[place] = value
+    frame = {"file_path": "a.png", "transform_matrix": pose.tolist()}
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "transforms.json"
+        path.write_text(json.dumps({"fl_x": focal, "w": 64, "h": 48, "frames": [frame]}))
+        try:
+            assert np.isfinite(load_cameras(path).views[0].centre).all()
+        except InvalidCameras as error:
+            assert "\n" not in str(error)
+
+
+@given(st.sampled_from(["bin", "txt"]), st.booleans(), edits, st.integers(0, 1000))
+@settings(max_examples=300, deadline=None)
+def test_any_damage_to_a_sparse_model_is_cameras_or_an_error_of_ours(kind, images, changes, keep) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        names = [f"cameras.{kind}", f"images.{kind}"]
+        for name in names:
+            damage = name == names[images]
+            (Path(folder) / name).write_bytes(edited(COLMAP[name], changes, keep) if damage else COLMAP[name])
+        try:
+            assert len(load_cameras(Path(folder))) > 0
+        except InvalidCameras as error:
+            assert "\n" not in str(error)
+
+
+@given(edits, st.integers(0, 2000), st.binary(max_size=60))
+@settings(max_examples=200, deadline=None)
+def test_any_damage_to_a_pack_is_a_pack_or_an_error_of_ours(changes, keep, noise) -> None:
+    labels = torch.tensor([[[0, -1], [1, 0]]], dtype=torch.int32)
+    views = {"a": RegionMap(labels, torch.eye(2, 3)), "b": FeatureGrid(torch.ones(1, 2, 3))}
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "pack"
+        write_pack(path, views, {"encoder": "e"})
+        content = edited(path.read_bytes(), changes, keep)
+        for damaged_content in (content, noise, content[:8] + noise):
+            path.write_bytes(damaged_content)
+            try:
+                packs = open_packs([path])
+                for view in packs.views:
+                    assert packs.observation(view).codebook.shape[-1] == packs.channels
+            except InvalidFeatures as error:
+                assert "\n" not in str(error)
+
+
+@given(edits, st.integers(0, 300))
+@settings(max_examples=150, deadline=None)
+def test_any_damage_to_an_array_is_an_array_or_an_error_of_ours(changes, keep) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "a.npy"
+        np.save(path, np.ones((3, 4), np.float32))
+        path.write_bytes(edited(path.read_bytes(), changes, keep))
+        try:
+            assert open_npy(path).size > 0
+        except InvalidFeatures as error:
+            assert "\n" not in str(error)
