@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
+_TOLD = ("splats", "views", "channels")  # counts of an upload that people care about
 _NAMING = 200  # best splats that vote on the name of what was found
 
 
@@ -118,7 +119,7 @@ def _converse(subject: DemoScene, url: str, out: Path, say: _Voice) -> dict[str,
 
 
 def _counts(kind: str, asset: dict[str, Any]) -> str:
-    numbers = ", ".join(f"{value} {name}" for name, value in asset["counts"].items() if isinstance(value, int))
+    numbers = ", ".join(f"{value} {name}" for name, value in asset["counts"].items() if name in _TOLD)
     return f"{kind} ({numbers})" if numbers else kind
 
 

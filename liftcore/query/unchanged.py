@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,8 +9,6 @@ from liftcore.errors import InvalidLift
 
 if TYPE_CHECKING:
     from liftcore.artifact import InputFile
-
-_READ = 1 << 20  # bytes read at once
 
 
 def unchanged(role: str, remembered: InputFile, lift: Path) -> Path:
@@ -33,7 +30,10 @@ def unchanged(role: str, remembered: InputFile, lift: Path) -> Path:
             got="nothing there",
             hint=f"move the {role} back to {path}, or lift again from where they are now",
         )
-    if digest(path) != remembered.sha256:
+    # The lift's own digest: one definition for files and folders, where it was taken and where it is checked.
+    from liftcore.lift import input_file
+
+    if input_file(path).sha256 != remembered.sha256:
         raise InvalidLift(
             str(lift),
             expected=f"the {role} that were lifted at {path}",
@@ -41,15 +41,3 @@ def unchanged(role: str, remembered: InputFile, lift: Path) -> Path:
             hint=f"the {role} changed since the lift: restore them, or lift again",
         )
     return path
-
-
-def digest(path: Path) -> str:
-    """SHA-256 of a file's bytes; for a folder, of the sorted lines ``name digest`` of its files."""
-    if path.is_dir():
-        lines = sorted(f"{file.name} {digest(file)}" for file in path.iterdir() if file.is_file())
-        return hashlib.sha256("\n".join(lines).encode()).hexdigest()
-    total = hashlib.sha256()
-    with path.open("rb") as handle:
-        while part := handle.read(_READ):
-            total.update(part)
-    return total.hexdigest()

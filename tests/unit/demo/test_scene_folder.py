@@ -1,0 +1,71 @@
+"""Finding what a scene folder holds, and saying what it lacks."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.numpy import save_file as save_arrays
+from safetensors.torch import save_file
+
+from liftcore.demo.scene_folder import find_scene
+from liftcore.errors import InvalidInput
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    scene = tmp_path / "scene"
+    (scene / "sparse" / "0").mkdir(parents=True)
+    (scene / "point_cloud.ply").touch()
+    for name in ("cameras.bin", "images.bin"):
+        (scene / "sparse" / "0" / name).write_bytes(b"model")
+    save_file({"words": torch.ones(1)}, str(scene / "a.safetensors"))
+    save_file({"v/grid": torch.ones(1, 1, 2)}, str(scene / "grids.safetensors"))
+    objects = [{"class": name} for name in ("cat", "boat", "cow", "fish")]
+    (scene / "truth.json").write_text(json.dumps({"objects": objects}))
+    truth = {"splat_object": np.array([0, 1], np.int16), "v/mask": np.array([[0, -1, 3]], np.int16)}
+    save_arrays(truth, str(scene / "truth.safetensors"))
+    return scene
+
+
+def test_a_scene_is_found_by_what_its_files_are(folder: Path, tmp_path: Path) -> None:
+    scene = find_scene(folder, (), tmp_path / "scratch")
+    assert scene.splats.name == "point_cloud.ply"
+    assert scene.features.name == "grids.safetensors"
+    assert scene.encoder == "minilm"
+    assert zipfile.ZipFile(scene.cameras).namelist() == ["cameras.bin", "images.bin"]
+    assert scene.phrases == ("the cat", "the boat", "the cow")
+    assert scene.views == ("v",)
+    assert scene.truth is not None
+    mask = scene.truth.mask_of("the fish", "v")
+    assert mask is not None and mask.tolist() == [[False, False, True]]
+    assert scene.truth.mask_of("the unknown", "v") is None
+
+
+def test_phrases_of_the_user_come_first_and_a_table_is_the_encoder(folder: Path, tmp_path: Path) -> None:
+    (folder / "text_table.safetensors").touch()
+    (folder / "cameras.json").touch()
+    (folder / "features.safetensors").write_bytes((folder / "grids.safetensors").read_bytes())
+    scene = find_scene(folder, ["a whale"], tmp_path)
+    assert scene.phrases == ("a whale",)
+    assert scene.encoder == f"table:{folder / 'text_table.safetensors'}"
+    assert (scene.cameras.name, scene.features.name) == ("cameras.json", "features.safetensors")
+
+
+@pytest.mark.parametrize(
+    ("missing", "message"),
+    [("point_cloud.ply", "splats"), ("grids.safetensors", "features"), ("truth.json", "--phrase")],
+)
+def test_what_is_missing_is_named(folder: Path, tmp_path: Path, missing: str, message: str) -> None:
+    (folder / missing).unlink()
+    with pytest.raises(InvalidInput, match=message):
+        find_scene(folder, (), tmp_path)
+
+
+def test_a_folder_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InvalidInput, match="folder"):
+        find_scene(tmp_path / "none", (), tmp_path)

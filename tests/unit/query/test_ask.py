@@ -1,0 +1,164 @@
+"""Questions to a lift: what is selected, what is seen, and what is said when the scene moved or changed."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from liftcore.artifact import Lift, LiftMetadata, save_lift
+from liftcore.errors import InvalidLift, InvalidQuery, NotFound
+from liftcore.lift import input_file
+from liftcore.query.ask import ask, look, top
+from liftcore.query.colours import SH_C0, seen_colours
+from liftcore.query.pictures import attention_png, mask_png, overlay_png, render, render_png
+from liftcore.query.scene import QueryScene
+from liftcore.scene.cameras import Cameras
+from liftcore.scene.inria import write_inria_cameras
+from liftcore.scene.ply import write_splats
+from liftcore.scene.splats import Splats
+from liftcore.solve.settings import LiftSettings
+from tests.scenes import look_at, random_splats
+
+COUNT = 60
+
+
+class Axes:
+    """Encodes "x", "y", "z" as unit axes."""
+
+    name = "axes"
+
+    def __init__(self, channels: int = 3) -> None:
+        self.channels = channels
+
+    def encode(self, texts: Sequence[str]) -> torch.Tensor:
+        return torch.eye(self.channels)[["xyz".index(text) for text in texts]]
+
+
+@pytest.fixture
+def lift_file(tmp_path: Path) -> Path:
+    splats = random_splats(3, COUNT)
+    camera = look_at("front", np.array([0.0, -4.0, 0.5]), 40, 30, 40.0)
+    camera = type(camera)("front", 40, 30, 40.0, 40.0, 20.0, 15.0, camera.world_to_camera)
+    write_splats(splats, tmp_path / "splats.ply")
+    write_inria_cameras(Cameras((camera,)), tmp_path / "cameras.json")
+    features = torch.eye(3)[torch.arange(COUNT) % 3] + 0.01
+    features[-1] = 0
+    metadata = LiftMetadata(
+        version="0", settings=LiftSettings.of(), splats=input_file(tmp_path / "splats.ply"),
+        cameras=input_file(tmp_path / "cameras.json"), features=(), encoder="axes", text_space="axes",
+        views=("front",), certificate={}, timings={},
+    )  # fmt: skip
+    seen = torch.arange(COUNT) < COUNT - 1
+    lift = Lift(features.half(), torch.ones(COUNT), torch.ones(COUNT), seen, metadata)
+    save_lift(lift, tmp_path / "scene.lift")
+    return tmp_path / "scene.lift"
+
+
+def test_the_splats_that_mean_the_text_are_selected(lift_file: Path) -> None:
+    answer = ask(QueryScene.open(lift_file), "y", Axes())
+    assert answer.selected.nonzero()[:, 0].tolist() == list(range(1, COUNT - 1, 3))
+    assert answer.count == len(range(1, COUNT - 1, 3))
+    assert answer.statistics["min"] <= answer.statistics["q50"] <= answer.statistics["max"]
+    assert answer.explanation
+
+
+def test_a_splat_that_was_never_seen_is_never_selected(lift_file: Path) -> None:
+    scene = QueryScene.open(lift_file)
+    for negatives in ((), ("x",)):
+        answer = ask(scene, "z", Axes(), negatives=negatives, threshold=-5.0)
+        assert not answer.selected[-1]
+        assert answer.scores[-1] == answer.scores.min()
+        assert answer.count == COUNT - 1
+
+
+def test_negatives_make_it_relevancy(lift_file: Path) -> None:
+    answer = ask(QueryScene.open(lift_file), "x", Axes(), negatives=["y", "z"], threshold=0.5)
+    assert answer.relevancy and answer.threshold_method == "fixed"
+    assert answer.selected.nonzero()[:, 0].tolist() == list(range(0, COUNT - 1, 3))
+
+
+def test_an_encoder_of_another_space_is_refused_with_both_named(lift_file: Path) -> None:
+    with pytest.raises(InvalidQuery, match=r"3 channels.*axes.*axes with 5"):
+        ask(QueryScene.open(lift_file), "x", Axes(5))
+
+
+def test_a_look_is_the_scores_rendered_and_cut(lift_file: Path) -> None:
+    scene = QueryScene.open(lift_file)
+    answer = ask(scene, "x", Axes(), threshold=0.4)
+    seen = look(scene, answer, "front")
+    scores = torch.where(answer.seen, answer.scores, 0.0)[:, None]
+    camera = scene.cameras.get("front")
+    torch.testing.assert_close(seen.attention, scene.raster.render(camera, scores, scene.walk)[:, :, 0])
+    torch.testing.assert_close(seen.row_sums, scene.raster.row_sums(camera, scene.walk))
+    assert scene.walk.gain == scene.lift.metadata.settings.render_gain == 1.2
+    assert torch.equal(seen.mask, (seen.attention >= 0.4) & (seen.row_sums >= 0.5))
+    with pytest.raises(NotFound, match="front"):
+        look(scene, answer, "frond")
+
+
+def test_the_best_splats_come_with_their_places_and_a_box(lift_file: Path) -> None:
+    scene = QueryScene.open(lift_file)
+    answer = ask(scene, "x", Axes())
+    found = top(answer, scene, 4)
+    assert [best.splat % 3 for best in found.best] == [0] * 4
+    assert found.best[0].position == pytest.approx(scene.splats.means[found.best[0].splat].tolist())
+    assert found.box is not None
+    assert torch.all(scene.splats.means[answer.selected] >= torch.tensor(found.box[0]))
+    assert top(ask(scene, "x", Axes(), threshold=2.0), scene, 1).box is None
+
+
+def test_a_scene_that_moved_is_said_with_where_it_was(lift_file: Path) -> None:
+    (lift_file.parent / "splats.ply").rename(lift_file.parent / "elsewhere.ply")
+    scene = QueryScene.open(lift_file)
+    assert ask(scene, "x", Axes()).count > 0  # scores need no splats
+    with pytest.raises(InvalidLift, match=r"splats at .*splats\.ply"):
+        _ = scene.splats
+
+
+def test_a_scene_that_changed_is_not_taken_for_the_old_one(lift_file: Path) -> None:
+    file = lift_file.parent / "cameras.json"
+    file.write_text(file.read_text() + " ")
+    with pytest.raises(InvalidLift, match="cameras changed since the lift"):
+        _ = QueryScene.open(lift_file).cameras
+
+
+def test_pictures_have_the_size_of_the_view(lift_file: Path) -> None:
+    scene = QueryScene.open(lift_file)
+    seen = look(scene, ask(scene, "x", Axes()), "front")
+    image = render(scene, "front")
+    contents = {
+        "L": [mask_png(seen)],
+        "RGB": [attention_png(seen), render_png(scene, "front"), overlay_png(image, seen)],
+    }
+    for mode, pictures in contents.items():
+        for content in pictures:
+            with Image.open(io.BytesIO(content)) as picture:
+                assert (picture.size, picture.mode) == ((40, 30), mode)
+    with Image.open(io.BytesIO(mask_png(seen))) as picture:
+        assert np.array_equal(np.asarray(picture) > 0, seen.mask.numpy())
+
+
+def test_colours_follow_the_spherical_harmonics() -> None:
+    camera = look_at("v", np.array([0.0, 0.0, -3.0]), 8, 8, 8.0)
+    plain = random_splats(0, 5)
+    grey = Splats(plain.means, plain.quats, plain.log_scales, plain.opacity_logits, sh=torch.zeros(5, 16, 3))
+    assert torch.allclose(seen_colours(grey, camera), torch.tensor(0.5))
+    assert plain.sh is not None
+    expected = (0.5 + SH_C0 * plain.sh[:, 0]).clamp_min(0)
+    torch.testing.assert_close(seen_colours(plain, camera), expected)
+
+
+def test_the_harmonics_are_orthonormal_on_the_sphere() -> None:
+    from liftcore.query.colours import _sh_basis
+
+    generator = torch.Generator().manual_seed(0)
+    directions = torch.nn.functional.normalize(torch.randn(200_000, 3, generator=generator), dim=1)
+    basis = _sh_basis(directions, 3).double()
+    gram = 4 * torch.pi * (basis.T @ basis) / len(basis)
+    torch.testing.assert_close(gram, torch.eye(16, dtype=torch.float64), atol=0.03, rtol=0)
