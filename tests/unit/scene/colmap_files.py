@@ -19,9 +19,7 @@ def binary_files(cameras=None, images=None) -> dict[str, bytes]:
     images = IMAGES if images is None else images
     first = struct.pack("<Q", len(cameras))
     for number, (model, _, parameters) in cameras.items():
-        first += struct.pack("<IiQQ", number, model, 640, 480) + struct.pack(
-            f"<{len(parameters)}d", *parameters
-        )
+        first += struct.pack("<IiQQ", number, model, 640, 480) + struct.pack(f"<{len(parameters)}d", *parameters)
     second = struct.pack("<Q", len(images))
     for i, (camera, quaternion, translation, name) in enumerate(images):
         second += struct.pack("<I7dI", i, *quaternion, *translation, camera) + name.encode() + b"\0"

@@ -39,9 +39,7 @@ def transforms_of(cameras: Cameras) -> dict[str, Any]:
         pose = np.linalg.inv(camera.world_to_camera) @ FLIP
         size = {"w": camera.width, "h": camera.height}
         lens = {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
-        frames.append(
-            {"file_path": f"images/{camera.name}.png", "transform_matrix": pose.tolist(), **size, **lens}
-        )
+        frames.append({"file_path": f"images/{camera.name}.png", "transform_matrix": pose.tolist(), **size, **lens})
     return {"frames": frames}
 
 
@@ -67,9 +65,7 @@ def test_colmap_poses_are_world_to_camera(model: Path) -> None:
     assert (first.fx, first.fy, first.cx, first.cy) == (500.0, 510.0, 320.5, 239.5)
     assert (second.fx, second.fy) == (400.0, 400.0)
     assert np.allclose(first.centre, [0, 0, -2])
-    assert np.allclose(
-        second.world_to_camera[:3, :3] @ [1, 0, 0], [0, 1, 0]
-    )  # a third of a turn about (1, 1, 1)
+    assert np.allclose(second.world_to_camera[:3, :3] @ [1, 0, 0], [0, 1, 0])  # a third of a turn about (1, 1, 1)
     assert np.allclose(third.world_to_camera[:3, :3], np.diag([-1, 1, -1]))  # the quaternion is normalised
 
 

@@ -41,9 +41,7 @@ def ply_bytes(names: list[str], count: int = 5, types: dict[str, str] | None = N
     rows = np.zeros(count, dtype)
     generator = np.random.default_rng(0)
     for name in names:
-        rows[name] = (
-            generator.normal(size=count) if types.get(name, "float")[-1] in "te" else np.arange(count)
-        )
+        rows[name] = generator.normal(size=count) if types.get(name, "float")[-1] in "te" else np.arange(count)
     lines = [f"property {types.get(name, 'float')} {name}" for name in names]
     header = "\n".join(["ply", "format binary_little_endian 1.0", f"{head}element vertex {count}", *lines])
     return header.encode() + b"\nend_header\n" + rows.tobytes()
