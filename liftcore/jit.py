@@ -1,7 +1,8 @@
 """How kernels are compiled: without the interpreter lock, cached on disk by the content of the sources.
 
 numba's cache looks at a kernel's own file only, so a change in a function that it calls would go unseen. Here the
-cache folder is named after a digest of the sources of all packages that have kernels, and a stale kernel can never be loaded.
+cache folder is named after a digest of the sources of all packages that have kernels, so a stale kernel can never
+be loaded.
 """
 
 from __future__ import annotations

@@ -192,23 +192,25 @@ WIDE = 4 * LANES  # channels that add_weighted_row keeps in registers
 
 
 @intrinsic
-def add_weighted_row(typingctx, target, place, source, entries, columns, weights, span):
+def add_weighted_row(typingctx, target, place, source, entries, sparse, span):
     """``target[place + i] += sum_k weights[k] source[columns[k] * stride + channel + i]`` for 32 channels.
 
-    ``span = (stride, channel)`` of the flat source, ``entries = (first, last)``. The sums stay in registers.
+    ``sparse = (columns i32, weights f32)``, ``entries = (first, last)`` of them, ``span = (stride, channel)`` of the
+    flat source. The sums stay in registers.
     """
     integers = types.UniTuple(types.intp, 2)
-    signature = types.void(
-        _FLOAT_ARRAY, types.intp, _FLOAT_ARRAY, integers, types.Array(types.int32, 1, "C"), _FLOAT_ARRAY, integers
-    )
+    pair = types.Tuple([types.Array(types.int32, 1, "C"), _FLOAT_ARRAY])
+    signature = types.void(_FLOAT_ARRAY, types.intp, _FLOAT_ARRAY, integers, pair, integers)
 
     def codegen(context, builder, signature, args):
-        target, place, source, entries, columns, weights, span = args
+        target, place, source, entries, sparse, span = args
         array = signature.args
         first, last = cgutils.unpack_tuple(builder, entries)
         stride, channel = cgutils.unpack_tuple(builder, span)
-        column_data = context.make_array(array[4])(context, builder, value=columns).data
-        weight_data = context.make_array(array[5])(context, builder, value=weights).data
+        column_data, weight_data = (
+            context.make_array(kind)(context, builder, value=part).data
+            for kind, part in zip(pair.types, cgutils.unpack_tuple(builder, sparse), strict=True)
+        )
         steps = [ir.Constant(place.type, LANES * part) for part in range(WIDE // LANES)]
         places = [_pointer(context, builder, array[0], target, builder.add(place, step)) for step in steps]
         sums = [cgutils.alloca_once_value(builder, _load(builder, pointer)) for pointer in places]

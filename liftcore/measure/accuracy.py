@@ -37,7 +37,7 @@ def rendered_scores(raster: Raster, camera: Camera, features: Tensor, classes: T
 
 
 def class_ious(labels: Tensor, truth: Tensor, count: int) -> Tensor:
-    """IoU of every class over all given pixels: labels, truth [...] int -> [count] f64, NaN where absent from both."""
+    """IoU of every class over all pixels: labels, truth [...] int -> [count] f64, NaN where absent from both."""
     ious = torch.full((count,), float("nan"), dtype=torch.float64)
     for k in range(count):
         mine, real = labels == k, truth == k

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from collections import OrderedDict
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -41,7 +42,8 @@ if TYPE_CHECKING:
     from liftcore.scene.cameras import Camera
     from liftcore.scene.splats import Splats
 
-SPLAT_SHARES = 8  # shares of the projection, the binning and the merge
+SPLAT_SHARES = 8  # shares of the projection and the binning
+MERGE_SHARES = 4  # ranges of splats in the merge; each reads all entries and takes its own
 TILE_SHARES = 48  # shares of the blending; more of them even out crowded tiles
 RENDER_CHANNELS = 32  # channels a pass of the render, so that a tile's sums stay in the cache
 
@@ -172,20 +174,26 @@ class CpuRaster:
     def _merge(self, frame: Frame, entries: list, codebook_rows: int) -> RegionWeights:
         """Entries of all tile shares -> one row a splat."""
         count = self.splats.count
+        ranges = _shares(count, MERGE_SHARES)
         starts = np.zeros(count + 1, np.int64)
-        for places, _, _ in entries:
-            count_entries(places, starts[1:])
+        kept = np.zeros(count, np.int64)
+
+        def count_range(first: int, last: int) -> None:
+            for places, _, _ in entries:
+                count_entries(first, last, places, starts[1:])
+
+        self._map(count_range, ranges)
         np.cumsum(starts, out=starts)
         columns = np.empty(starts[-1], np.int32)
         weights = np.empty(starts[-1], np.float32)
         cursors = starts[:-1].copy()
-        for share in entries:
-            group_entries(*share, cursors, columns, weights)
-        kept = np.zeros(count, np.int64)
-        self._map(
-            lambda first, last: merge_rows(first, last, starts, columns, weights, codebook_rows + 1, kept),
-            _shares(count, SPLAT_SHARES),
-        )
+
+        def merge_range(first: int, last: int) -> None:
+            for share in entries:
+                group_entries(first, last, share, cursors, columns, weights)
+            merge_rows(first, last, starts, columns, weights, codebook_rows + 1, kept)
+
+        self._map(merge_range, ranges)
         rows, total = int((kept > 0).sum()), int(kept.sum())
         out = (
             np.empty(rows, np.int32), np.empty(rows + 1, np.int64), np.empty(total, np.int32),
@@ -205,7 +213,7 @@ class CpuRaster:
         tiles = frame.columns * frame.rows
         marks = np.linspace(0, frame.starts[-1], TILE_SHARES + 1)
         edges = np.unique(np.concatenate([[0], np.searchsorted(frame.starts, marks[1:-1]), [tiles]]))
-        return self._map(work, [(int(a), int(b)) for a, b in zip(edges[:-1], edges[1:], strict=True)])
+        return self._map(work, [(int(a), int(b)) for a, b in pairwise(edges)])
 
     def _map(self, work: Callable, shares: list) -> list:
         if self.threads == 1:
@@ -216,4 +224,4 @@ class CpuRaster:
 def _shares(total: int, count: int) -> list[tuple[int, int]]:
     """``count`` ranges that cover ``total`` items."""
     edges = [total * k // count for k in range(count + 1)]
-    return list(zip(edges[:-1], edges[1:], strict=True))
+    return list(pairwise(edges))

@@ -101,7 +101,7 @@ def reading_matrix(observation: Observation, width: int, height: int) -> tuple[n
     x, y = rays % width, rays // width
     if isinstance(observation, RegionMap):
         labels = observation.labels.numpy()
-        levels, rows, columns = labels.shape
+        rows, columns = labels.shape[1:]
         at = labels[:, ((2 * y + 1) * rows) // (2 * height), ((2 * x + 1) * columns) // (2 * width)]
         level, ray = np.nonzero(at >= 0)
         S = np.zeros((ray.shape[0], observation.codebook.shape[0]))

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from liftcore.raster.constants import ALPHA_FLOOR, FIELD_MARGIN, LOW_PASS, MAX_LOG_SCALE, NEAR_PLANE
 from liftcore.jit import kernel
+from liftcore.raster.constants import ALPHA_FLOOR, FIELD_MARGIN, LOW_PASS, MAX_LOG_SCALE, NEAR_PLANE
 
 if TYPE_CHECKING:
     from liftcore.scene.cameras import Camera

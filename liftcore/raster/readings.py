@@ -13,10 +13,10 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from liftcore.observe.observation import FeatureGrid, Observation, RegionMap
-from liftcore.raster.constants import TILE
 from liftcore.jit import kernel
 from liftcore.lanes import LANES
+from liftcore.observe.observation import FeatureGrid, Observation, RegionMap
+from liftcore.raster.constants import TILE
 from liftcore.raster.walk import HALVES
 
 MAX_SLOTS = 4 * TILE * TILE  # every pixel reads four cells of its own at worst

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from liftcore.raster.constants import TILE
 from liftcore.jit import inlined, kernel
 from liftcore.lanes import LANES, add_lanes, add_product_lanes, square_lanes
+from liftcore.raster.constants import TILE
 from liftcore.raster.projection import PLAIN
 from liftcore.raster.readings import MAX_SLOTS, new_taps, read_tile
 from liftcore.raster.walk import (
@@ -174,20 +174,27 @@ def _flush_slots(taps, slots, local, low_slot, high_slot, columns, weights, coun
 
 
 @kernel
-def group_entries(places, columns, weights, cursors, grouped_columns, grouped_weights):
-    """Scatter one share's entries to their records' ranges (cursors [P + 1] i64 move on)."""
-    for i in range(places.shape[0]):
-        at = cursors[places[i]]
-        cursors[places[i]] = at + 1
-        grouped_columns[at] = columns[i]
-        grouped_weights[at] = weights[i]
+def count_entries(first, last, places, counts):
+    """Add to ``counts`` [P] i64 how many entries each of the records ``first..last`` has."""
+    for place in places:
+        if first <= place < last:
+            counts[place] += 1
 
 
 @kernel
-def count_entries(places, counts):
-    """Add to ``counts`` [P] i64 how many entries each record has."""
-    for place in places:
-        counts[place] += 1
+def group_entries(first, last, entries, cursors, columns, weights):
+    """Scatter the entries of the records ``first..last`` to their ranges (cursors [P] i64 move on).
+
+    ``entries = (places, columns, weights)`` of one tile share, as ``weigh_tiles`` gave them.
+    """
+    places, entry_columns, entry_weights = entries
+    for i in range(places.shape[0]):
+        place = places[i]
+        if first <= place < last:
+            at = cursors[place]
+            cursors[place] = at + 1
+            columns[at] = entry_columns[i]
+            weights[at] = entry_weights[i]
 
 
 @kernel

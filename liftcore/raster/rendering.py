@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
-from liftcore.raster.constants import ALPHA_FLOOR, TILE
 from liftcore.jit import kernel
 from liftcore.lanes import LANES, add_scaled_lanes
+from liftcore.raster.constants import ALPHA_FLOOR, TILE
 from liftcore.raster.projection import KX, KY, MX, MY, OPACITY, SLOPE
 from liftcore.raster.walk import (
     CHECK_EVERY,

@@ -11,8 +11,8 @@ import math
 
 import numpy as np
 
-from liftcore.raster.constants import TILE
 from liftcore.jit import inlined, kernel
+from liftcore.raster.constants import TILE
 from liftcore.raster.projection import EXTENT_X, EXTENT_Y, KX, KY, LEAN, MX, MY, REACH, SLOPE
 
 

@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from liftcore.raster.constants import ALPHA_FLOOR, TILE
 from liftcore.jit import inlined, kernel
 from liftcore.lanes import LANES, blend_lanes, gaussian_lanes
+from liftcore.raster.constants import ALPHA_FLOOR, TILE
 from liftcore.raster.projection import EXTENT_Y, KX, KY, MX, MY, OPACITY, REACH, SLOPE
 
 HALVES = TILE * TILE // LANES  # half rows of a tile
@@ -123,7 +123,7 @@ def row_centre(splat, row):
 @inlined
 def touches(splat, centre, base, side):
     """Whether any lane of half row ``side`` (0 left, 1 right) can reach the alpha floor."""
-    near = max(0.0, max(side * LANES - centre, centre - (side * LANES + LANES - 1)))
+    near = max(0.0, side * LANES - centre, centre - (side * LANES + LANES - 1))
     return splat.kx * near * near + base <= splat.reach
 
 

@@ -13,7 +13,7 @@ from liftcore.scene.splats import Splats
 
 
 def warm_up() -> None:
-    """Run every product once on one splat. A first run on a machine compiles; later ones load in well under a second."""
+    """Run every product once on one splat. The first run on a machine compiles, later ones load."""
     splats = Splats(torch.tensor([[0.0, 0.0, 2.0]]), torch.zeros(1, 4), torch.zeros(1, 3), torch.zeros(1))
     camera = Camera("warm-up", 16, 16, 16.0, 16.0, 8.0, 8.0, np.eye(4))
     raster = CpuRaster(splats, threads=1)

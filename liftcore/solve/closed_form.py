@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from liftcore.progress import Progress
     from liftcore.solve.view_weights import ViewWeights
 
-BLOCK = 1_024  # splats a block; with a slice of channels half a megabyte
+BLOCK = 4_096  # splats a block; with a slice of channels two megabytes
 SLICE = 128  # channels a slice
 FLOAT16_MAX = 65_504.0
 UNIT_TOLERANCE = 5e-3  # float16 unit vectors are off by less
@@ -55,7 +55,7 @@ def add_weighted_rows(first, last, offset, weights, codebook, block):
         place = (splats[row] - offset) * width
         entries = (row_starts[row], row_starts[row + 1])
         for channel in range(0, width, WIDE):
-            add_weighted_row(target, place + channel, source, entries, columns, values, (width, channel))
+            add_weighted_row(target, place + channel, source, entries, (columns, values), (width, channel))
 
 
 @vectorised
@@ -104,9 +104,10 @@ def solve_closed_form(
             parts = [_slice_of(book, begin, end) for book in books]
             sums = _solve_slice(pool, store, parts, scale, features[:, begin:end])
             if not unit:
-                for part, norm in zip(parts, norms, strict=True):
-                    part /= np.maximum(norm.numpy(), _TINY)[:, None]
-                sums = _solve_slice(pool, store, parts, scale, None)
+                directions = [
+                    part / np.maximum(norm.numpy(), _TINY)[:, None] for part, norm in zip(parts, norms, strict=True)
+                ]
+                sums = _solve_slice(pool, store, directions, scale, None)
             squares += sums
             progress("solve", number + 1, len(slices), "slices")
     agreement = np.sqrt(squares).clip(0.0, 1.0).astype(np.float32)
@@ -130,20 +131,21 @@ def _solve_slice(
     """One slice of channels for all splats; written to ``result`` [P, C]. Gives the squared norms [P] f64."""
     count = scale.shape[0]
     squares = np.zeros(count)
+    edges = np.arange(0, count + BLOCK, BLOCK)
     views = [
         (view.splats.numpy(), view.row_starts.numpy(), view.columns.numpy(), view.weights.numpy()) for view in store
     ]
+    bounds = [np.searchsorted(view[0], edges.astype(view[0].dtype)) for view in views]
 
-    def solve_block(offset: int) -> None:
-        end = min(offset + BLOCK, count)
+    def solve_block(number: int) -> None:
+        offset, end = edges[number], min(edges[number + 1], count)
         block = np.zeros((end - offset, parts[0].shape[1]), np.float32)
-        for weights, part in zip(views, parts, strict=True):
-            first, last = np.searchsorted(weights[0], (offset, end))
-            if first < last:
-                add_weighted_rows(first, last, offset, weights, part, block)
+        for weights, part, rows in zip(views, parts, bounds, strict=True):
+            if rows[number] < rows[number + 1]:
+                add_weighted_rows(rows[number], rows[number + 1], offset, weights, part, block)
         finish_rows(block, scale[offset:end], squares[offset:end])
         if result is not None:
             result[offset:end] = torch.from_numpy(block[:, : result.shape[1]]).to(result.dtype)
 
-    list(pool.map(solve_block, range(0, count, BLOCK)))
+    list(pool.map(solve_block, range(len(edges) - 1)))
     return squares
