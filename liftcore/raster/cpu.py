@@ -18,16 +18,11 @@ import torch
 from liftcore.errors import InvalidInput, Unavailable
 from liftcore.raster.constants import TILE
 from liftcore.raster.depth_order import depth_order
+from liftcore.raster.merging import count_entries, gather_entries, merge_range
 from liftcore.raster.projection import RECORD, axes_of, opacities, project_gaussians, view_of
 from liftcore.raster.protocol import RayRows, RegionWeights, Walk
 from liftcore.raster.readings import reading_of
-from liftcore.raster.region_weights import (
-    count_entries,
-    group_entries,
-    merge_rows,
-    split_evidence,
-    weigh_tiles,
-)
+from liftcore.raster.region_weights import weigh_tiles
 from liftcore.raster.rendering import render_tiles, top_tiles, trace_rays
 from liftcore.raster.tiles import count_tiles, fill_tiles, tile_places
 from liftcore.raster.walk import Frame
@@ -173,35 +168,27 @@ class CpuRaster:
 
     def _merge(self, frame: Frame, entries: list, codebook_rows: int) -> RegionWeights:
         """Entries of all tile shares -> one row a splat."""
-        count = self.splats.count
-        ranges = _shares(count, MERGE_SHARES)
-        starts = np.zeros(count + 1, np.int64)
-        kept = np.zeros(count, np.int64)
+        slot_rows = np.concatenate([share[4] for share in entries])
+        bases = np.cumsum([0, *(share[4].shape[0] for share in entries)])
 
-        def count_range(first: int, last: int) -> None:
-            for places, _, _ in entries:
-                count_entries(first, last, places, starts[1:])
-
-        self._map(count_range, ranges)
-        np.cumsum(starts, out=starts)
-        columns = np.empty(starts[-1], np.int32)
-        weights = np.empty(starts[-1], np.float32)
-        cursors = starts[:-1].copy()
-
-        def merge_range(first: int, last: int) -> None:
+        def merge(first: int, last: int) -> tuple[np.ndarray, ...]:
+            starts = np.zeros(last - first + 1, np.int64)
             for share in entries:
-                group_entries(first, last, share, cursors, columns, weights)
-            merge_rows(first, last, starts, columns, weights, codebook_rows + 1, kept)
+                count_entries(first, last, share[0], starts)
+            np.cumsum(starts, out=starts)
+            total = starts[-1]
+            gathered = np.empty(total, np.int32), np.empty(total, np.float32), np.empty(total, np.float32)
+            cursors = starts[:-1].copy()
+            for share, base in zip(entries, bases[:-1], strict=True):
+                gather_entries(first, last, share[:4], base, cursors, gathered)
+            return merge_range(starts, gathered, slot_rows, codebook_rows, frame.ids[first:last])
 
-        self._map(merge_range, ranges)
-        rows, total = int((kept > 0).sum()), int(kept.sum())
-        out = (
-            np.empty(rows, np.int32), np.empty(rows + 1, np.int64), np.empty(total, np.int32),
-            np.empty(total, np.float32), np.empty(rows, np.int32), np.empty(rows, np.float32),
-        )  # fmt: skip
-        used, nonzero, met = split_evidence(starts, kept, columns, weights, codebook_rows, frame.ids, out)
-        ends = (used, used + 1, nonzero, nonzero, met, met)
-        return RegionWeights(*(torch.from_numpy(part[:end]) for part, end in zip(out, ends, strict=True)))
+        parts = self._map(merge, _shares(self.splats.count, MERGE_SHARES))
+        splats, lengths, columns, weights, met, evidence = (np.concatenate(part) for part in zip(*parts, strict=True))
+        row_starts = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
+        return RegionWeights(
+            *(torch.from_numpy(part) for part in (splats, row_starts, columns, weights, met, evidence))
+        )
 
     def _opacity(self, gain: float) -> np.ndarray:
         if gain not in self._opacities:

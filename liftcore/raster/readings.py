@@ -37,7 +37,7 @@ class Reading(NamedTuple):
     share_x: np.ndarray  # [W] f32, the right column's share
     share_y: np.ndarray  # [H] f32
     grid_width: int
-    codebook_rows: int  # M; column M of W is the evidence of all rays
+    codebook_rows: int  # M
 
 
 class TileTaps(NamedTuple):
@@ -47,9 +47,8 @@ class TileTaps(NamedTuple):
     slots: np.ndarray  # [MAX_TAPS] i32
     whole: np.ndarray  # [MAX_TAPS] u8, 1 = all factors are one
     factors: np.ndarray  # [MAX_TAPS * 8] f32
-    slot_columns: np.ndarray  # [MAX_SLOTS, levels] i32, local columns of a slot, -1 none
-    columns: np.ndarray  # [MAX_SLOTS * levels] i32, codebook rows of the tile's local columns
-    sizes: np.ndarray  # [2] i32, slots and local columns in use
+    slot_rows: np.ndarray  # [MAX_SLOTS, levels] i32, the codebook rows of a slot, -1 none
+    sizes: np.ndarray  # [2] i32: slots in use; 1 when all pixels read slot 0 and nothing else
 
 
 def reading_of(observation: Observation, width: int, height: int) -> Reading:
@@ -97,7 +96,6 @@ def new_taps(levels):
         np.zeros(MAX_TAPS, np.uint8),
         np.zeros(MAX_TAPS * LANES, np.float32),
         np.zeros((MAX_SLOTS, levels), np.int32),
-        np.zeros(MAX_SLOTS * levels, np.int32),
         np.zeros(2, np.int32),
     )
 
@@ -115,19 +113,7 @@ def read_tile(taps, reading, frame, tile):
 
 
 @kernel
-def _local_column(taps, column):
-    """The tile's local number of a codebook row, new or known."""
-    known = taps.sizes[1]
-    for k in range(known - 1, -1, -1):
-        if taps.columns[k] == column:
-            return k
-    taps.columns[known] = column
-    taps.sizes[1] = known + 1
-    return known
-
-
-@kernel
-def _slot_of_labels(taps, reading, tuples, y, x):
+def _slot_of_labels(taps, reading, y, x):
     """The slot of the label tuple at label pixel (y, x); NO_SLOT when no level labels it."""
     levels = reading.levels
     labelled = False
@@ -139,22 +125,20 @@ def _slot_of_labels(taps, reading, tuples, y, x):
     for slot in range(known - 1, -1, -1):
         same = True
         for level in range(levels):
-            same &= tuples[slot, level] == reading.labels[level, y, x]
+            same &= taps.slot_rows[slot, level] == reading.labels[level, y, x]
         if same:
             return slot
     for level in range(levels):
-        label = reading.labels[level, y, x]
-        tuples[known, level] = label
-        taps.slot_columns[known, level] = _local_column(taps, label) if label >= 0 else NO_SLOT
+        taps.slot_rows[known, level] = reading.labels[level, y, x]
     taps.sizes[0] = known + 1
     return known
 
 
 @kernel
 def _read_regions(taps, reading, frame, x0, y0):
-    tuples = np.empty((TILE * TILE, reading.levels), np.int32)
     slots = np.empty(LANES, np.int32)
     count = 0
+    alone = True
     for half in range(HALVES):
         taps.starts[half] = count
         y = y0 + half // 2
@@ -169,7 +153,7 @@ def _read_regions(taps, reading, frame, x0, y0):
             if lane > 0 and label_x == last_x and label_y == last_y:
                 slots[lane] = slots[lane - 1]
             else:
-                slots[lane] = _slot_of_labels(taps, reading, tuples, label_y, label_x)
+                slots[lane] = _slot_of_labels(taps, reading, label_y, label_x)
             last_x, last_y = label_x, label_y
         first_tap = count
         for lane in range(LANES):
@@ -185,7 +169,9 @@ def _read_regions(taps, reading, frame, x0, y0):
             taps.factors[tap * LANES + lane] = 1
         whole = count == first_tap + 1 and taps.factors[first_tap * LANES : count * LANES].min() > 0
         taps.whole[first_tap:count] = whole
+        alone &= whole
     taps.starts[HALVES] = count
+    taps.sizes[1] = alone and taps.sizes[0] == 1
 
 
 @kernel
@@ -228,8 +214,6 @@ def _slot_of_cell(taps, known, cell):
         if known[slot] == cell:
             return slot
     known[slots] = cell
-    taps.columns[slots] = cell
-    taps.slot_columns[slots, 0] = slots
+    taps.slot_rows[slots, 0] = cell
     taps.sizes[0] = slots + 1
-    taps.sizes[1] = slots + 1
     return slots

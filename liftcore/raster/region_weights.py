@@ -1,8 +1,8 @@
 """``W = A^p^T S`` of one view: the lift's only look at pixels.
 
-Every tile writes (record, column, weight) entries into its share's buffer; a counting sort gathers them by splat
-and each splat's few entries are sorted by column and summed in float64. Column M, one past the codebook, carries
-the evidence: the sum of plain weights over all rays.
+Every tile writes entries (record, slot, weight, evidence) into its share's buffer: what a splat gave to the pixels
+of one slot, and on its first entry of the tile the sum of its plain weights over all rays. A counting sort gathers
+the entries by splat; only then are slots expanded to the codebook rows of all levels and summed, in float64.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from liftcore.jit import inlined, kernel
 from liftcore.lanes import LANES, add_lanes, add_product_lanes, square_lanes
 from liftcore.raster.constants import TILE
 from liftcore.raster.projection import PLAIN
-from liftcore.raster.readings import MAX_SLOTS, new_taps, read_tile
+from liftcore.raster.readings import MAX_SLOTS, NO_SLOT, new_taps, read_tile
 from liftcore.raster.walk import (
     CHECK_EVERY,
     HALVES,
@@ -27,8 +27,6 @@ from liftcore.raster.walk import (
     touches,
 )
 
-LONG_ROW = 64  # entries; longer rows are sorted by the library
-
 
 @kernel
 def weigh_tiles(first, last, frame, reading, power, with_plain):
@@ -39,22 +37,24 @@ def weigh_tiles(first, last, frame, reading, power, with_plain):
         with_plain: whether the evidence needs rays of its own, without the opacity gain.
 
     Returns:
-        places [n] i32 (records), columns [n] i32, weights [n] f32, near to far tile by tile.
+        places [n] i32 (records), slots [n] i32 (-1 none), weights [n] f32, evidence [n] f32, near to far tile by
+        tile; and slot_rows [s, levels] i32, the codebook rows of a slot (-1 none).
     """
-    rays = new_rays()
-    plain = new_rays()
+    rays, plain = new_rays(), new_rays()
     taps = new_taps(reading.levels)
-    slots = np.zeros(MAX_SLOTS * LANES, np.float32)
-    local = np.zeros(MAX_SLOTS * reading.levels, np.float32)
-    evidence = np.zeros(LANES, np.float32)
+    sums = np.zeros(MAX_SLOTS * LANES, np.float32)
+    plain_sum = np.zeros(LANES, np.float32)
     limits = (np.float32(frame.cap), np.float32(frame.stop))
     records, items, starts = frame.records, frame.items, frame.starts
-    tap_starts, tap_slots, tap_whole = taps.starts, taps.slots, taps.whole
+    tap_starts, tap_slots, tap_whole, factors = taps.starts, taps.slots, taps.whole, taps.factors
+    weights_now = rays.weights
     evidence_source = plain.weights if with_plain else rays.weights
-    places = np.empty(1 << 16, np.int32)
-    columns = np.empty(1 << 16, np.int32)
-    weights = np.empty(1 << 16, np.float32)
-    count = 0
+    reuse = power == 1 and not with_plain  # then a slot that all pixels read holds just the evidence
+    size = 1 << 15
+    places, slots = np.empty(size, np.int32), np.empty(size, np.int32)
+    weights, evidence = np.empty(size, np.float32), np.empty(size, np.float32)
+    slot_rows = np.empty((1 << 12, reading.levels), np.int32)
+    count = slot_count = 0
     for tile in range(first, last):
         if starts[tile] == starts[tile + 1]:
             continue
@@ -63,13 +63,16 @@ def weigh_tiles(first, last, frame, reading, power, with_plain):
         start_rays(rays, frame, tile)
         start_rays(plain, frame, tile)
         read_tile(taps, reading, frame, tile)
-        room = taps.sizes[1] + reading.levels + 1
+        used, alone = taps.sizes[0], taps.sizes[1] == 1
+        if slot_count + used > slot_rows.shape[0]:
+            slot_rows = _grown_rows(slot_rows, slot_count + used)
+        slot_rows[slot_count : slot_count + used] = taps.slot_rows[:used]
         for step in range(starts[tile], starts[tile + 1]):
             if (step - starts[tile]) % CHECK_EVERY == 0 and not look_at_both(rays, plain, with_plain):
                 break
             place = items[step]
             splat = footprint(records, place, x0, y0)
-            low_slot, high_slot = MAX_SLOTS, -1
+            low, high = MAX_SLOTS, -1
             for row in range(splat.top, splat.bottom + 1):
                 centre, base = row_centre(splat, row)
                 for side in range(2):
@@ -80,39 +83,40 @@ def weigh_tiles(first, last, frame, reading, power, with_plain):
                     blend(rays, splat, centre, base, half, limits)
                     if with_plain:
                         blend_plain(plain, rays.falloff, records[place, PLAIN], half, limits)
-                    add_lanes(evidence, 0, evidence_source, offset)
+                    add_lanes(plain_sum, 0, evidence_source, offset)
+                    if alone and reuse:
+                        continue
                     if power == 2:
-                        square_lanes(rays.weights, offset)
+                        square_lanes(weights_now, offset)
                     for tap in range(tap_starts[half], tap_starts[half + 1]):
                         slot = tap_slots[tap]
-                        low_slot = min(low_slot, slot)
-                        high_slot = max(high_slot, slot)
+                        low, high = min(low, slot), max(high, slot)
                         if tap_whole[tap]:
-                            add_lanes(slots, slot * LANES, rays.weights, offset)
+                            add_lanes(sums, slot * LANES, weights_now, offset)
                         else:
-                            add_product_lanes(slots, slot * LANES, rays.weights, offset, taps.factors, tap * LANES)
-            if count + room > places.shape[0]:
-                places, columns, weights = _grow(places, columns, weights, count + room)
-            total = _drain(evidence, 0)
-            if total > 0:
-                places[count] = place
-                columns[count] = reading.codebook_rows
-                weights[count] = total
+                            add_product_lanes(sums, slot * LANES, weights_now, offset, factors, tap * LANES)
+            total = _drain(plain_sum, 0)
+            if count + used + 1 > places.shape[0]:
+                places, slots, weights, evidence = _grown(places, slots, weights, evidence, count + used + 1)
+            before = count
+            if alone and reuse:
+                low, high = 0, -1
+                if total > 0:
+                    slots[count], weights[count] = slot_count, total
+                    count += 1
+            for slot in range(low, high + 1):
+                part = _drain(sums, slot * LANES)
+                if part > 0:
+                    slots[count], weights[count] = slot_count + slot, part
+                    count += 1
+            if count == before and total > 0:
+                slots[count], weights[count] = NO_SLOT, 0.0
                 count += 1
-            if high_slot == low_slot:  # most splats meet one slot a tile
-                total = _drain(slots, low_slot * LANES)
-                for level in range(reading.levels if total > 0 else 0):
-                    column = taps.slot_columns[low_slot, level]
-                    if column >= 0:
-                        places[count] = place
-                        columns[count] = taps.columns[column]
-                        weights[count] = total
-                        count += 1
-            elif high_slot >= 0:
-                kept = _flush_slots(taps, slots, local, low_slot, high_slot, columns, weights, count)
-                places[count:kept] = place
-                count = kept
-    return places[:count], columns[:count], weights[:count]
+            for entry in range(before, count):
+                places[entry] = place
+                evidence[entry] = total if entry == before else 0.0
+        slot_count += used
+    return places[:count], slots[:count], weights[:count], evidence[:count], slot_rows[:slot_count]
 
 
 @inlined
@@ -138,122 +142,18 @@ def _drain(lanes, offset):
 
 
 @kernel
-def _grow(places, columns, weights, needed):
+def _grown(places, slots, weights, evidence, needed):
     size = max(2 * places.shape[0], needed)
-    new_places = np.empty(size, np.int32)
-    new_columns = np.empty(size, np.int32)
-    new_weights = np.empty(size, np.float32)
-    new_places[: places.shape[0]] = places
-    new_columns[: columns.shape[0]] = columns
-    new_weights[: weights.shape[0]] = weights
-    return new_places, new_columns, new_weights
+    new_places, new_slots = np.empty(size, np.int32), np.empty(size, np.int32)
+    new_weights, new_evidence = np.empty(size, np.float32), np.empty(size, np.float32)
+    kept = places.shape[0]
+    new_places[:kept], new_slots[:kept] = places, slots
+    new_weights[:kept], new_evidence[:kept] = weights, evidence
+    return new_places, new_slots, new_weights, new_evidence
 
 
 @kernel
-def _flush_slots(taps, slots, local, low_slot, high_slot, columns, weights, count):
-    """Expand a splat's slots to codebook rows and append them; slots and local sums are zero afterwards."""
-    levels = taps.slot_columns.shape[1]
-    low_column, high_column = taps.sizes[1], -1
-    for slot in range(low_slot, high_slot + 1):
-        total = _drain(slots, slot * LANES)
-        if total <= 0:
-            continue
-        for level in range(levels):
-            column = taps.slot_columns[slot, level]
-            if column >= 0:
-                local[column] += total
-                low_column = min(low_column, column)
-                high_column = max(high_column, column)
-    for column in range(low_column, high_column + 1):
-        if local[column] > 0:
-            columns[count] = taps.columns[column]
-            weights[count] = local[column]
-            count += 1
-            local[column] = 0
-    return count
-
-
-@kernel
-def count_entries(first, last, places, counts):
-    """Add to ``counts`` [P] i64 how many entries each of the records ``first..last`` has."""
-    for place in places:
-        if first <= place < last:
-            counts[place] += 1
-
-
-@kernel
-def group_entries(first, last, entries, cursors, columns, weights):
-    """Scatter the entries of the records ``first..last`` to their ranges (cursors [P] i64 move on).
-
-    ``entries = (places, columns, weights)`` of one tile share, as ``weigh_tiles`` gave them.
-    """
-    places, entry_columns, entry_weights = entries
-    for i in range(places.shape[0]):
-        place = places[i]
-        if first <= place < last:
-            at = cursors[place]
-            cursors[place] = at + 1
-            columns[at] = entry_columns[i]
-            weights[at] = entry_weights[i]
-
-
-@kernel
-def merge_rows(first, last, starts, columns, weights, column_count, kept):
-    """Sum each record's entries by column in float64 and sort them by column, in place.
-
-    ``kept`` [P] i64 receives how many entries each of the records ``first..last`` keeps.
-    """
-    sums = np.zeros(column_count)
-    for row in range(first, last):
-        begin, end = starts[row], starts[row + 1]
-        out = begin
-        for i in range(begin, end):
-            column = columns[i]
-            if sums[column] == 0:
-                columns[out] = column  # out <= i: entries before i are already summed
-                out += 1
-            sums[column] += weights[i]
-        if out - begin > LONG_ROW:
-            columns[begin:out] = np.sort(columns[begin:out])
-        for i in range(begin + 1, out):  # insertion sort: most rows are short
-            column = columns[i]
-            k = i - 1
-            while k >= begin and columns[k] > column:
-                columns[k + 1] = columns[k]
-                k -= 1
-            columns[k + 1] = column
-        for i in range(begin, out):
-            weights[i] = sums[columns[i]]
-            sums[columns[i]] = 0
-        kept[row] = out - begin
-
-
-@kernel
-def split_evidence(starts, kept, columns, weights, evidence_column, ids, out):
-    """Pack the merged rows: region weights on one side, the evidence column on the other.
-
-    ``out = (splats, row_starts, columns, weights, evidence_splats, evidence)``, sized by the caller.
-
-    Returns:
-        (rows, entries, evidence rows) written.
-    """
-    splats, row_starts, out_columns, out_weights, evidence_splats, evidence = out
-    rows = entries = met = 0
-    row_starts[0] = 0
-    for row in range(kept.shape[0]):
-        begin = starts[row]
-        end = begin + kept[row]
-        if end > begin and columns[end - 1] == evidence_column:
-            end -= 1
-            evidence_splats[met] = ids[row]
-            evidence[met] = weights[end]
-            met += 1
-        if end > begin:
-            splats[rows] = ids[row]
-            for i in range(begin, end):
-                out_columns[entries] = columns[i]
-                out_weights[entries] = weights[i]
-                entries += 1
-            rows += 1
-            row_starts[rows] = entries
-    return rows, entries, met
+def _grown_rows(slot_rows, needed):
+    grown = np.empty((max(2 * slot_rows.shape[0], needed), slot_rows.shape[1]), np.int32)
+    grown[: slot_rows.shape[0]] = slot_rows
+    return grown

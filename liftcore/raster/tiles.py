@@ -34,6 +34,10 @@ def _edge(record, dy, side):
 @inlined
 def _tile_columns(record, tile_row, columns):
     """First and last tile column that the footprint touches between a tile row's first and last pixel centres."""
+    narrow = math.floor(math.ceil(record[MX] - record[EXTENT_X] - 0.5) / TILE)
+    wide = math.floor(math.floor(record[MX] + record[EXTENT_X] - 0.5) / TILE)
+    if narrow == wide:  # one column at most: no need to look closer
+        return max(0.0, narrow), min(columns - 1.0, wide)
     low = max(tile_row * TILE + 0.5 - record[MY], -record[EXTENT_Y])
     high = min(tile_row * TILE + TILE - 0.5 - record[MY], record[EXTENT_Y])
     if low > high:

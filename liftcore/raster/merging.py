@@ -1,0 +1,117 @@
+"""From tile entries to one sparse row a splat.
+
+Ranges of splats are merged independently: each range counts its entries, gathers them by splat in the order of the
+tiles, expands slots to codebook rows and sums in float64. What a range gives depends on nothing but the entries.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from liftcore.jit import kernel
+
+LONG_ROW = 64  # columns; longer rows are sorted by the library
+
+
+@kernel
+def count_entries(first, last, places, counts):
+    """Add to ``counts`` [last - first + 1] i64, shifted by one, how many entries each record has."""
+    for place in places:
+        if first <= place < last:
+            counts[place - first + 1] += 1
+
+
+@kernel
+def gather_entries(first, last, entries, slot_base, cursors, gathered):
+    """Scatter the entries of the records ``first..last`` to their places (cursors move on).
+
+    ``entries = (places, slots, weights, evidence)`` of one tile share, its slots counted from ``slot_base``;
+    ``gathered = (slots, weights, evidence)``.
+    """
+    places, slots, weights, evidence = entries
+    out_slots, out_weights, out_evidence = gathered
+    for i in range(places.shape[0]):
+        place = places[i]
+        if first <= place < last:
+            at = cursors[place - first]
+            cursors[place - first] = at + 1
+            out_slots[at] = slots[i] + slot_base if slots[i] >= 0 else -1
+            out_weights[at] = weights[i]
+            out_evidence[at] = evidence[i]
+
+
+@kernel
+def merge_range(starts, gathered, slot_rows, codebook_rows, ids):
+    """Expand, sum and sort the entries of a range of records.
+
+    Args:
+        starts: [n + 1] i64, each record's entries in ``gathered = (slots, weights, evidence)``.
+        slot_rows: [S, levels] i32. codebook_rows: M. ids: [n] i32, the splat of each record.
+
+    Returns:
+        splats [r] i32, lengths [r] i64, columns [nnz] i32, weights [nnz] f32, and the splats [m] i32 and sums [m] f32
+        of the evidence.
+    """
+    slots, values, plain = gathered
+    levels = slot_rows.shape[1]
+    records = ids.shape[0]
+    sums = np.zeros(codebook_rows)
+    touched = np.empty(codebook_rows, np.int32)
+    splats, lengths = np.empty(records, np.int32), np.empty(records, np.int64)
+    met, evidence = np.empty(records, np.int32), np.empty(records, np.float32)
+    columns = np.empty(max(1024, 2 * slots.shape[0]), np.int32)
+    weights = np.empty(columns.shape[0], np.float32)
+    rows = count = met_count = 0
+    for record in range(records):
+        total, length = 0.0, 0
+        for i in range(starts[record], starts[record + 1]):
+            total += plain[i]
+            if slots[i] < 0:
+                continue
+            for level in range(levels):
+                column = slot_rows[slots[i], level]
+                if column >= 0:
+                    if sums[column] == 0:
+                        touched[length] = column
+                        length += 1
+                    sums[column] += values[i]
+        if total > 0:
+            met[met_count], evidence[met_count] = ids[record], total
+            met_count += 1
+        if length == 0:
+            continue
+        _sort(touched, length)
+        if count + length > columns.shape[0]:
+            columns, weights = _grown(columns, weights, count + length)
+        for k in range(length):
+            columns[count + k] = touched[k]
+            weights[count + k] = sums[touched[k]]
+            sums[touched[k]] = 0
+        count += length
+        splats[rows], lengths[rows] = ids[record], length
+        rows += 1
+    return splats[:rows], lengths[:rows], columns[:count], weights[:count], met[:met_count], evidence[:met_count]
+
+
+@kernel
+def _sort(values, length):
+    """Sort the first ``length`` values in place; most rows are short."""
+    if length > LONG_ROW:
+        values[:length] = np.sort(values[:length])
+        return
+    for i in range(1, length):
+        value = values[i]
+        k = i - 1
+        while k >= 0 and values[k] > value:
+            values[k + 1] = values[k]
+            k -= 1
+        values[k + 1] = value
+
+
+@kernel
+def _grown(columns, weights, needed):
+    size = max(2 * columns.shape[0], needed)
+    new_columns, new_weights = np.empty(size, np.int32), np.empty(size, np.float32)
+    new_columns[: columns.shape[0]] = columns
+    new_weights[: weights.shape[0]] = weights
+    return new_columns, new_weights
