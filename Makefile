@@ -1,0 +1,49 @@
+# Every target makes the environment first: .venv, from requirements.lock, once.
+
+PYTHON ?= python3
+BIN := .venv/bin
+READY := .venv/.ready
+SHARED := ../shared/data
+SCENE ?=
+OUT ?= demo-output
+
+.PHONY: demo test lint format serve bench setup clean
+
+demo: $(READY)  ## the whole job through the real service; SCENE=DIR takes a scene of your own
+	$(BIN)/splatlift demo --out "$(OUT)" $(if $(SCENE),--scene "$(SCENE)")
+
+test: lint  ## everything that must hold
+	@if [ -d $(SHARED) ]; then echo "real scenes: found in $(SHARED)"; \
+	else echo "real scenes: no $(SHARED) here, so the tests on them are skipped"; fi
+	$(BIN)/python -m pytest -rs
+
+lint: $(READY)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/basedpyright
+	$(BIN)/lint-imports
+
+format: $(READY)
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+serve: $(READY)
+	$(BIN)/splatlift serve
+
+bench: $(READY)
+	$(BIN)/splatlift bench $(if $(SCENE),--scene "$(SCENE)")
+
+setup: $(READY)
+
+# torch first: were it installed as what another package needs, pip would take the newest build instead.
+$(READY): requirements.lock pyproject.toml
+	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "splatlift needs Python 3.11 or later")'
+	@echo "making .venv: a few minutes, once"
+	[ -x $(BIN)/python ] || $(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet "$$(grep '^torch==' requirements.lock)"
+	$(BIN)/python -m pip install --quiet -r requirements.lock
+	$(BIN)/python -m pip install --quiet --no-deps -e .
+	touch $@
+
+clean:
+	rm -rf .venv build dist *.egg-info .pytest_cache .ruff_cache .hypothesis .import_linter_cache demo-output
