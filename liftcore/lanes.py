@@ -7,11 +7,18 @@ A tile row of 16 pixels is two such half rows.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
+
+from liftcore.jit import kernel
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 LANES = 8
 
@@ -22,9 +29,19 @@ _INTS = ir.VectorType(_INT, LANES)
 _FUSE = ("contract",)  # a*b + c may become one fused instruction
 _FLOAT_ARRAY = types.Array(types.float32, 1, "C")
 
+# Where a tile's state lies in its one flat float32 array. One array keeps one pointer in a register.
+PIXELS = 256
+TRANSMITTANCE = 0  # [256], 0 = the ray is done
+WEIGHTS = PIXELS  # [256], of the splat at hand
+PLAIN_TRANSMITTANCE = 2 * PIXELS  # [256], of the rays without opacity gain
+EVIDENCE = 3 * PIXELS  # [8], sums of plain weights of the splat at hand, lane by lane
+_TABLE = EVIDENCE + LANES  # rows of eight equal constants: operands in memory cost no instruction of their own
+
 # 2^-f on [0, 1) as a polynomial with p(0) = 1, relative error below 6e-9 (Chebyshev nodes, degree 6).
 _EXP2_DEGREE = 6
 _MAX_EXPONENT = 120.0  # larger exponents are far below the alpha floor
+_LANE_ROW, _CLAMP_ROW, _FLOOR_ROW, _CAP_ROW, _STOP_ROW, _EXP2_ROW = range(6)  # then one row a coefficient
+STATE = _TABLE + (_EXP2_ROW + _EXP2_DEGREE + 1) * LANES  # length of the array
 
 
 def _exp2_coefficients() -> list[float]:
@@ -36,7 +53,27 @@ def _exp2_coefficients() -> list[float]:
     return [1.0, *solution.tolist()]
 
 
-_EXP2 = _exp2_coefficients()
+_EXP2 = np.array(_exp2_coefficients(), np.float32)
+
+
+@kernel
+def new_state(floor, cap, stop):
+    """A tile's state [STATE] f32: all rays done, the constants of the walk in place."""
+    state = np.zeros(STATE, np.float32)
+    for lane in range(LANES):
+        state[_TABLE + _LANE_ROW * LANES + lane] = lane
+        state[_TABLE + _CLAMP_ROW * LANES + lane] = _MAX_EXPONENT
+        state[_TABLE + _FLOOR_ROW * LANES + lane] = floor
+        state[_TABLE + _CAP_ROW * LANES + lane] = cap
+        state[_TABLE + _STOP_ROW * LANES + lane] = stop
+        for k in range(_EXP2_DEGREE + 1):
+            state[_TABLE + (_EXP2_ROW + k) * LANES + lane] = _EXP2[k]
+    return state
+
+
+def _compiled(function: Callable) -> Any:
+    """An intrinsic; callers leave out the typing context, which no static type can say."""
+    return intrinsic(function)
 
 
 def _constant(value: float) -> ir.Constant:
@@ -63,69 +100,99 @@ def _minimum(builder: ir.IRBuilder, left: ir.Value, right: ir.Value) -> ir.Value
     return builder.select(builder.fcmp_ordered("<", left, right), left, right)
 
 
-def _exp2_negative(builder: ir.IRBuilder, exponent: ir.Value) -> ir.Value:
-    """``2^-e`` for e >= 0: integer part through the exponent bits, the rest by polynomial."""
-    clamped = _minimum(builder, exponent, _constant(_MAX_EXPONENT))
+def _row(builder: ir.IRBuilder, state: ir.Value, row: int) -> ir.Value:
+    """A row of the constant table."""
+    place = builder.gep(state, [ir.Constant(ir.IntType(64), _TABLE + row * LANES)])
+    return _load(builder, builder.bitcast(place, _FLOATS.as_pointer()))
+
+
+def _fused(builder: ir.IRBuilder, left: ir.Value, right: ir.Value, term: ir.Value) -> ir.Value:
+    """``left * right + term``, one instruction where the machine has it."""
+    return builder.fadd(builder.fmul(left, right, flags=_FUSE), term, flags=_FUSE)
+
+
+def _exp2_negative(builder: ir.IRBuilder, state: ir.Value, exponent: ir.Value) -> ir.Value:
+    """``2^-e`` for e >= 0: the fraction by polynomial, the whole part subtracted from the exponent bits."""
+    clamped = _minimum(builder, exponent, _row(builder, state, _CLAMP_ROW))
     whole = builder.fptosi(clamped, _INTS)
     rest = builder.fsub(clamped, builder.sitofp(whole, _FLOATS))
-    value = _constant(_EXP2[-1])
-    for coefficient in reversed(_EXP2[:-1]):
-        value = builder.fadd(builder.fmul(value, rest, flags=_FUSE), _constant(coefficient), flags=_FUSE)
-    bias = ir.Constant(_INTS, [127] * LANES)
-    shift = ir.Constant(_INTS, [23] * LANES)
-    power = builder.bitcast(builder.shl(builder.sub(bias, whole), shift), _FLOATS)
-    return builder.fmul(value, power)
+    square = builder.fmul(rest, rest)
+    pairs = [  # Estrin's scheme: three short chains instead of one long one
+        _fused(builder, _row(builder, state, _EXP2_ROW + k + 1), rest, _row(builder, state, _EXP2_ROW + k))
+        for k in (0, 2, 4)
+    ]
+    high = _fused(builder, _row(builder, state, _EXP2_ROW + 6), square, pairs[2])
+    low = _fused(builder, pairs[1], square, pairs[0])
+    value = _fused(builder, high, builder.fmul(square, square), low)
+    shifted = builder.shl(whole, ir.Constant(_INTS, [23] * LANES))
+    return builder.bitcast(builder.sub(builder.bitcast(value, _INTS), shifted), _FLOATS)
 
 
-@intrinsic
-def gaussian_lanes(typingctx, falloff, offset, start, curvature, base):
-    """``falloff[offset + i] = 2^-(base + curvature (start + i)^2)`` for eight lanes."""
-    signature = types.void(_FLOAT_ARRAY, types.intp, types.float32, types.float32, types.float32)
+def _composite(builder: ir.IRBuilder, state: ir.Value, falloff: ir.Value, opacity: ir.Value, place: ir.Value):
+    """Weights of one splat on eight rays whose T lies at ``place`` (paper Eq. 1); T moves on.
 
-    def codegen(context, builder, signature, args):
-        array, offset, start, curvature, base = args
-        lane = ir.Constant(_FLOATS, [float(i) for i in range(LANES)])
-        u = builder.fadd(_splat(builder, start), lane)
-        scaled = builder.fmul(_splat(builder, curvature), u)
-        exponent = builder.fadd(builder.fmul(scaled, u, flags=_FUSE), _splat(builder, base), flags=_FUSE)
-        value = _exp2_negative(builder, exponent)
-        builder.store(value, _pointer(context, builder, signature.args[0], array, offset), align=4)
-        return context.get_dummy_value()
-
-    return signature, codegen
-
-
-@intrinsic
-def blend_lanes(typingctx, weights, offset, falloff, transmittance, row, alpha):
-    """Composite one splat over eight pixels, front to back (paper Eq. 1).
-
-    ``alpha = (opacity, cap, floor, stop)``: ``a = min(cap, opacity falloff)``, nothing below the floor;
-    ``w = a T``; a ray whose next T would be at or below the stop takes nothing and is done (T = 0).
+    ``a = min(cap, opacity falloff)``, nothing below the floor; ``w = a T``; a ray whose next T would be at or below
+    the stop takes nothing and is done (T = 0).
     """
-    scalars = types.UniTuple(types.float32, 4)
-    signature = types.void(_FLOAT_ARRAY, types.intp, _FLOAT_ARRAY, _FLOAT_ARRAY, types.intp, scalars)
+    zero = _constant(0.0)
+    raw = _minimum(builder, builder.fmul(opacity, falloff), _row(builder, state, _CAP_ROW))
+    alpha = builder.select(builder.fcmp_ordered(">=", raw, _row(builder, state, _FLOOR_ROW)), raw, zero)
+    before = _load(builder, place)
+    after = builder.fmul(before, builder.fsub(_row(builder, state, _EXP2_ROW), alpha))  # the first coefficient is 1
+    alive = builder.fcmp_ordered(">", after, _row(builder, state, _STOP_ROW))
+    builder.store(builder.select(alive, after, zero), place, align=4)
+    return builder.select(alive, builder.fmul(alpha, before), zero)
+
+
+def _blend_code(plain: bool):
+    """Code of ``blend_lanes`` (plain = False) and ``blend_both_lanes`` (plain = True)."""
 
     def codegen(context, builder, signature, args):
-        weights, offset, falloff, transmittance, row, alpha = args
-        opacity, cap, floor, stop = (_splat(builder, part) for part in cgutils.unpack_tuple(builder, alpha))
-        zero = _constant(0.0)
-        shape = _load(builder, _pointer(context, builder, signature.args[2], falloff, offset))
-        raw = _minimum(builder, builder.fmul(opacity, shape), cap)
-        value = builder.select(builder.fcmp_ordered(">=", raw, floor), raw, zero)
-        place = _pointer(context, builder, signature.args[3], transmittance, row)
-        before = _load(builder, place)
-        weight = builder.fmul(value, before)
-        after = builder.fmul(before, builder.fsub(_constant(1.0), value))
-        alive = builder.fcmp_ordered(">", after, stop)
-        builder.store(builder.select(alive, after, zero), place, align=4)
-        target = _pointer(context, builder, signature.args[0], weights, offset)
-        builder.store(builder.select(alive, weight, zero), target, align=4)
+        array, offset, splat = args
+        state = context.make_array(signature.args[0])(context, builder, value=array).data
+        parts = [_splat(builder, part) for part in cgutils.unpack_tuple(builder, splat)]
+        start, curvature, base, opacity = parts[:4]
+
+        def at(part: int) -> ir.Value:
+            place = builder.gep(state, [builder.add(offset, ir.Constant(offset.type, part))])
+            return builder.bitcast(place, _FLOATS.as_pointer())
+
+        u = builder.fadd(start, _row(builder, state, _LANE_ROW))
+        exponent = _fused(builder, builder.fmul(curvature, u), u, base)
+        falloff = _exp2_negative(builder, state, exponent)
+        weight = _composite(builder, state, falloff, opacity, at(TRANSMITTANCE))
+        builder.store(weight, at(WEIGHTS), align=4)
+        if plain:
+            weight = _composite(builder, state, falloff, parts[4], at(PLAIN_TRANSMITTANCE))
+        sums = builder.bitcast(builder.gep(state, [ir.Constant(offset.type, EVIDENCE)]), _FLOATS.as_pointer())
+        builder.store(builder.fadd(_load(builder, sums), weight), sums, align=4)
         return context.get_dummy_value()
 
-    return signature, codegen
+    return codegen
 
 
-@intrinsic
+@_compiled
+def blend_lanes(typingctx, state, offset, splat):
+    """Composite one splat over the eight pixels from ``offset`` on.
+
+    ``splat = (start, curvature, base, opacity)``: lane i has the falloff ``2^-(base + curvature (start + i)^2)``.
+    The weights lie in ``state[WEIGHTS + offset:]`` afterwards and are added to the evidence lanes.
+    """
+    signature = types.void(_FLOAT_ARRAY, types.intp, types.UniTuple(types.float32, 4))
+    return signature, _blend_code(plain=False)
+
+
+@_compiled
+def blend_both_lanes(typingctx, state, offset, splat):
+    """``blend_lanes`` for the rays with opacity gain, and the evidence from rays of their own without it.
+
+    ``splat = (start, curvature, base, opacity, plain opacity)``.
+    """
+    signature = types.void(_FLOAT_ARRAY, types.intp, types.UniTuple(types.float32, 5))
+    return signature, _blend_code(plain=True)
+
+
+@_compiled
 def add_lanes(typingctx, total, offset, weights, row):
     """``total[offset + i] += weights[row + i]``."""
     signature = types.void(_FLOAT_ARRAY, types.intp, _FLOAT_ARRAY, types.intp)
@@ -140,7 +207,7 @@ def add_lanes(typingctx, total, offset, weights, row):
     return signature, codegen
 
 
-@intrinsic
+@_compiled
 def square_lanes(typingctx, weights, row):
     """``weights[row + i] *= weights[row + i]``."""
     signature = types.void(_FLOAT_ARRAY, types.intp)
@@ -155,7 +222,7 @@ def square_lanes(typingctx, weights, row):
     return signature, codegen
 
 
-@intrinsic
+@_compiled
 def add_product_lanes(typingctx, total, offset, weights, row, factors, tap):
     """``total[offset + i] += weights[row + i] * factors[tap + i]``."""
     signature = types.void(_FLOAT_ARRAY, types.intp, _FLOAT_ARRAY, types.intp, _FLOAT_ARRAY, types.intp)
@@ -165,14 +232,13 @@ def add_product_lanes(typingctx, total, offset, weights, row, factors, tap):
         place = _pointer(context, builder, signature.args[0], total, offset)
         weight = _load(builder, _pointer(context, builder, signature.args[2], weights, row))
         factor = _load(builder, _pointer(context, builder, signature.args[4], factors, tap))
-        product = builder.fmul(weight, factor, flags=_FUSE)
-        builder.store(builder.fadd(_load(builder, place), product, flags=_FUSE), place, align=4)
+        builder.store(_fused(builder, weight, factor, _load(builder, place)), place, align=4)
         return context.get_dummy_value()
 
     return signature, codegen
 
 
-@intrinsic
+@_compiled
 def add_scaled_lanes(typingctx, total, offset, weights, row, scale):
     """``total[offset + i] += weights[row + i] * scale``."""
     signature = types.void(_FLOAT_ARRAY, types.intp, _FLOAT_ARRAY, types.intp, types.float32)
@@ -181,8 +247,7 @@ def add_scaled_lanes(typingctx, total, offset, weights, row, scale):
         total, offset, weights, row, scale = args
         place = _pointer(context, builder, signature.args[0], total, offset)
         weight = _load(builder, _pointer(context, builder, signature.args[2], weights, row))
-        product = builder.fmul(weight, _splat(builder, scale), flags=_FUSE)
-        builder.store(builder.fadd(_load(builder, place), product, flags=_FUSE), place, align=4)
+        builder.store(_fused(builder, weight, _splat(builder, scale), _load(builder, place)), place, align=4)
         return context.get_dummy_value()
 
     return signature, codegen
@@ -191,7 +256,7 @@ def add_scaled_lanes(typingctx, total, offset, weights, row, scale):
 WIDE = 4 * LANES  # channels that add_weighted_row keeps in registers
 
 
-@intrinsic
+@_compiled
 def add_weighted_row(typingctx, target, place, source, entries, sparse, span):
     """``target[place + i] += sum_k weights[k] source[columns[k] * stride + channel + i]`` for 32 channels.
 
@@ -220,8 +285,7 @@ def add_weighted_row(typingctx, target, place, source, entries, sparse, span):
             base = builder.add(builder.mul(column, stride), channel)
             for step, total in zip(steps, sums, strict=True):
                 row = _load(builder, _pointer(context, builder, array[2], source, builder.add(base, step)))
-                product = builder.fmul(row, weight, flags=_FUSE)
-                builder.store(builder.fadd(builder.load(total), product, flags=_FUSE), total)
+                builder.store(_fused(builder, row, weight, builder.load(total)), total)
         for pointer, total in zip(places, sums, strict=True):
             builder.store(builder.load(total), pointer, align=4)
         return context.get_dummy_value()

@@ -30,12 +30,11 @@ def room_splats(count: int, seed: int = 0) -> Splats:
     scales = np.stack([np.full(count, radius), np.full(count, radius), np.full(count, radius * 0.05)], axis=1)
     scales *= rng.lognormal(0, 0.4, (count, 3))
     logits = rng.normal(1.5, 2.0, count)
-    as_float = {"dtype": torch.float32}
     return Splats(
-        torch.tensor(points, **as_float),
-        torch.tensor(_quats_to(normals), **as_float),
-        torch.tensor(np.log(scales), **as_float),
-        torch.tensor(logits, **as_float),
+        torch.tensor(points, dtype=torch.float32),
+        torch.tensor(_quats_to(normals), dtype=torch.float32),
+        torch.tensor(np.log(scales), dtype=torch.float32),
+        torch.tensor(logits, dtype=torch.float32),
     )
 
 
@@ -57,7 +56,7 @@ def room_cameras(count: int, width: int, height: int) -> list[Camera]:
 
 def room_regions(camera: Camera, seed: int, levels: int, channels: int) -> RegionMap:
     """Label maps like SAM's four levels: Voronoi regions, finer level by level, over random unit vectors."""
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     rng = np.random.default_rng(seed)
     height, width = camera.height // 2, camera.width // 2
@@ -67,7 +66,7 @@ def room_regions(camera: Camera, seed: int, levels: int, channels: int) -> Regio
     for level in range(levels):
         regions = 20 * 2**level
         sites = rng.uniform(0, 1, (regions, 2)) * [height, width]
-        maps.append(first + cKDTree(sites).query(pixels)[1].reshape(height, width))
+        maps.append(first + KDTree(sites).query(pixels)[1].reshape(height, width))
         first += regions
     generator = torch.Generator().manual_seed(seed)
     codebook = torch.nn.functional.normalize(torch.randn(first, channels, generator=generator), dim=1).half()

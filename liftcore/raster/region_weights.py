@@ -10,15 +10,13 @@ from __future__ import annotations
 import numpy as np
 
 from liftcore.jit import inlined, kernel
-from liftcore.lanes import LANES, add_lanes, add_product_lanes, square_lanes
+from liftcore.lanes import EVIDENCE, LANES, WEIGHTS, add_lanes, add_product_lanes, square_lanes
 from liftcore.raster.constants import TILE
-from liftcore.raster.projection import PLAIN
 from liftcore.raster.readings import MAX_SLOTS, NO_SLOT, new_taps, read_tile
 from liftcore.raster.walk import (
     CHECK_EVERY,
-    HALVES,
     blend,
-    blend_plain,
+    blend_both,
     footprint,
     look,
     new_rays,
@@ -40,15 +38,12 @@ def weigh_tiles(first, last, frame, reading, power, with_plain):
         places [n] i32 (records), slots [n] i32 (-1 none), weights [n] f32, evidence [n] f32, near to far tile by
         tile; and slot_rows [s, levels] i32, the codebook rows of a slot (-1 none).
     """
-    rays, plain = new_rays(), new_rays()
+    rays = new_rays(frame)
+    state = rays.state
     taps = new_taps(reading.levels)
     sums = np.zeros(MAX_SLOTS * LANES, np.float32)
-    plain_sum = np.zeros(LANES, np.float32)
-    limits = (np.float32(frame.cap), np.float32(frame.stop))
     records, items, starts = frame.records, frame.items, frame.starts
     tap_starts, tap_slots, tap_whole, factors = taps.starts, taps.slots, taps.whole, taps.factors
-    weights_now = rays.weights
-    evidence_source = plain.weights if with_plain else rays.weights
     reuse = power == 1 and not with_plain  # then a slot that all pixels read holds just the evidence
     size = 1 << 15
     places, slots = np.empty(size, np.int32), np.empty(size, np.int32)
@@ -61,14 +56,13 @@ def weigh_tiles(first, last, frame, reading, power, with_plain):
         x0 = float((tile % frame.columns) * TILE)
         y0 = float((tile // frame.columns) * TILE)
         start_rays(rays, frame, tile)
-        start_rays(plain, frame, tile)
         read_tile(taps, reading, frame, tile)
         used, alone = taps.sizes[0], taps.sizes[1] == 1
         if slot_count + used > slot_rows.shape[0]:
             slot_rows = _grown_rows(slot_rows, slot_count + used)
         slot_rows[slot_count : slot_count + used] = taps.slot_rows[:used]
         for step in range(starts[tile], starts[tile + 1]):
-            if (step - starts[tile]) % CHECK_EVERY == 0 and not look_at_both(rays, plain, with_plain):
+            if (step - starts[tile]) % CHECK_EVERY == 0 and not look(rays, with_plain):
                 break
             place = items[step]
             splat = footprint(records, place, x0, y0)
@@ -79,23 +73,23 @@ def weigh_tiles(first, last, frame, reading, power, with_plain):
                     half = 2 * row + side
                     if not rays.alive[half] or not touches(splat, centre, base, side):
                         continue
-                    offset = half * LANES
-                    blend(rays, splat, centre, base, half, limits)
                     if with_plain:
-                        blend_plain(plain, rays.falloff, records[place, PLAIN], half, limits)
-                    add_lanes(plain_sum, 0, evidence_source, offset)
+                        blend_both(rays, splat, centre, base, half)
+                    else:
+                        blend(rays, splat, centre, base, half)
                     if alone and reuse:
                         continue
+                    offset = WEIGHTS + half * LANES
                     if power == 2:
-                        square_lanes(weights_now, offset)
+                        square_lanes(state, offset)
                     for tap in range(tap_starts[half], tap_starts[half + 1]):
                         slot = tap_slots[tap]
                         low, high = min(low, slot), max(high, slot)
                         if tap_whole[tap]:
-                            add_lanes(sums, slot * LANES, weights_now, offset)
+                            add_lanes(sums, slot * LANES, state, offset)
                         else:
-                            add_product_lanes(sums, slot * LANES, weights_now, offset, factors, tap * LANES)
-            total = _drain(plain_sum, 0)
+                            add_product_lanes(sums, slot * LANES, state, offset, factors, tap * LANES)
+            total = _drain(state, EVIDENCE)
             if count + used + 1 > places.shape[0]:
                 places, slots, weights, evidence = _grown(places, slots, weights, evidence, count + used + 1)
             before = count
@@ -117,17 +111,6 @@ def weigh_tiles(first, last, frame, reading, power, with_plain):
                 evidence[entry] = total if entry == before else 0.0
         slot_count += used
     return places[:count], slots[:count], weights[:count], evidence[:count], slot_rows[:slot_count]
-
-
-@inlined
-def look_at_both(rays, plain, with_plain):
-    """Note in ``rays.alive`` which half rows let light through, with or without the gain; whether any does."""
-    alive = look(rays)
-    if with_plain:
-        alive |= look(plain)
-        for half in range(HALVES):
-            rays.alive[half] |= plain.alive[half]
-    return alive
 
 
 @inlined

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from liftcore.jit import kernel
-from liftcore.lanes import LANES, add_scaled_lanes
+from liftcore.lanes import LANES, PIXELS, WEIGHTS, add_scaled_lanes
 from liftcore.raster.constants import ALPHA_FLOOR, TILE
 from liftcore.raster.projection import KX, KY, MX, MY, OPACITY, SLOPE
 from liftcore.raster.walk import (
@@ -21,16 +21,13 @@ from liftcore.raster.walk import (
     touches,
 )
 
-PIXELS = TILE * TILE
-
 
 @kernel
 def render_tiles(first, last, frame, values, image):
     """Composite ``values`` [P, C] f32 over tiles ``first..last`` into ``image`` [H, W, C] f32."""
     channels = values.shape[1]
-    rays = new_rays()
+    rays = new_rays(frame)
     sums = np.zeros(channels * PIXELS, np.float32)
-    limits = (np.float32(frame.cap), np.float32(frame.stop))
     for tile in range(first, last):
         if frame.starts[tile] == frame.starts[tile + 1]:
             continue
@@ -38,7 +35,7 @@ def render_tiles(first, last, frame, values, image):
         y0 = (tile // frame.columns) * TILE
         start_rays(rays, frame, tile)
         for step in range(frame.starts[tile], frame.starts[tile + 1]):
-            if (step - frame.starts[tile]) % CHECK_EVERY == 0 and not look(rays):
+            if (step - frame.starts[tile]) % CHECK_EVERY == 0 and not look(rays, False):
                 break
             place = frame.items[step]
             splat = footprint(frame.records, place, float(x0), float(y0))
@@ -49,11 +46,11 @@ def render_tiles(first, last, frame, values, image):
                     half = 2 * row + side
                     if not rays.alive[half] or not touches(splat, centre, base, side):
                         continue
-                    blend(rays, splat, centre, base, half, limits)
+                    blend(rays, splat, centre, base, half)
                     offset = half * LANES
                     for channel in range(channels):
                         target = channel * PIXELS + offset
-                        add_scaled_lanes(sums, target, rays.weights, offset, values[number, channel])
+                        add_scaled_lanes(sums, target, rays.state, WEIGHTS + offset, values[number, channel])
         for y in range(min(TILE, frame.height - y0)):
             for x in range(min(TILE, frame.width - x0)):
                 for channel in range(channels):
@@ -69,14 +66,13 @@ def top_tiles(first, last, frame, ids, weights):
         ids: [H, W, K] i32, filled with -1 before. weights: [H, W, K] f32, filled with 0 before.
     """
     count = ids.shape[2]
-    rays = new_rays()
-    limits = (np.float32(frame.cap), np.float32(frame.stop))
+    rays = new_rays(frame)
     for tile in range(first, last):
         x0 = (tile % frame.columns) * TILE
         y0 = (tile // frame.columns) * TILE
         start_rays(rays, frame, tile)
         for step in range(frame.starts[tile], frame.starts[tile + 1]):
-            if (step - frame.starts[tile]) % CHECK_EVERY == 0 and not look(rays):
+            if (step - frame.starts[tile]) % CHECK_EVERY == 0 and not look(rays, False):
                 break
             place = frame.items[step]
             splat = footprint(frame.records, place, float(x0), float(y0))
@@ -87,9 +83,9 @@ def top_tiles(first, last, frame, ids, weights):
                     half = 2 * row + side
                     if not rays.alive[half] or not touches(splat, centre, base, side):
                         continue
-                    blend(rays, splat, centre, base, half, limits)
+                    blend(rays, splat, centre, base, half)
                     for lane in range(LANES):
-                        weight = rays.weights[half * LANES + lane]
+                        weight = rays.state[WEIGHTS + half * LANES + lane]
                         if weight <= 0:
                             continue
                         y, x = y0 + row, x0 + side * LANES + lane

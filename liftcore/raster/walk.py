@@ -12,9 +12,16 @@ from typing import NamedTuple
 import numpy as np
 
 from liftcore.jit import inlined, kernel
-from liftcore.lanes import LANES, blend_lanes, gaussian_lanes
+from liftcore.lanes import (
+    LANES,
+    PLAIN_TRANSMITTANCE,
+    TRANSMITTANCE,
+    blend_both_lanes,
+    blend_lanes,
+    new_state,
+)
 from liftcore.raster.constants import ALPHA_FLOOR, TILE
-from liftcore.raster.projection import EXTENT_Y, KX, KY, MX, MY, OPACITY, REACH, SLOPE
+from liftcore.raster.projection import EXTENT_Y, KX, KY, MX, MY, OPACITY, PLAIN, REACH, SLOPE
 
 HALVES = TILE * TILE // LANES  # half rows of a tile
 CHECK_EVERY = 16  # splats between two looks at which half rows still let light through
@@ -38,22 +45,14 @@ class Frame(NamedTuple):
 class Rays(NamedTuple):
     """The state of a tile's 256 rays."""
 
-    transmittance: np.ndarray  # [256] f32, 0 = done
-    weights: np.ndarray  # [256] f32, of the splat at hand
-    falloff: np.ndarray  # [256] f32, of the splat at hand
-    alive: np.ndarray  # [32] u8, half rows that still let light through
+    state: np.ndarray  # [STATE] f32, laid out as liftcore.lanes says
+    alive: np.ndarray  # [32] u8, half rows that still let light through, with or without the gain
 
 
 @kernel
-def new_rays():
+def new_rays(frame):
     """Room for one tile's rays."""
-    pixels = TILE * TILE
-    return Rays(
-        np.zeros(pixels, np.float32),
-        np.zeros(pixels, np.float32),
-        np.zeros(pixels, np.float32),
-        np.zeros(HALVES, np.uint8),
-    )
+    return Rays(new_state(ALPHA_FLOOR, frame.cap, frame.stop), np.zeros(HALVES, np.uint8))
 
 
 @kernel
@@ -63,19 +62,22 @@ def start_rays(rays, frame, tile):
     y0 = (tile // frame.columns) * TILE
     for y in range(TILE):
         for x in range(TILE):
-            inside = x0 + x < frame.width and y0 + y < frame.height
-            rays.transmittance[y * TILE + x] = np.float32(1.0) if inside else np.float32(0.0)
-    look(rays)
+            light = np.float32(x0 + x < frame.width and y0 + y < frame.height)
+            rays.state[TRANSMITTANCE + y * TILE + x] = light
+            rays.state[PLAIN_TRANSMITTANCE + y * TILE + x] = light
 
 
 @kernel
-def look(rays):
-    """Note which half rows still let light through; whether any does."""
+def look(rays, with_plain):
+    """Note which half rows still let light through, with or without the gain; whether any does."""
     any_alive = False
     for half in range(HALVES):
         light = np.float32(0.0)
         for lane in range(LANES):
-            light = max(light, rays.transmittance[half * LANES + lane])
+            light = max(light, rays.state[TRANSMITTANCE + half * LANES + lane])
+        if with_plain:
+            for lane in range(LANES):
+                light = max(light, rays.state[PLAIN_TRANSMITTANCE + half * LANES + lane])
         rays.alive[half] = light > 0
         any_alive |= light > 0
     return any_alive
@@ -93,6 +95,7 @@ class Footprint(NamedTuple):
     ky: float
     reach: float
     opacity: float
+    plain: float  # opacity without the gain
 
 
 @inlined
@@ -110,6 +113,7 @@ def footprint(records, place, x0, y0):
         records[place, KY],
         records[place, REACH],
         records[place, OPACITY],
+        records[place, PLAIN],
     )
 
 
@@ -128,21 +132,16 @@ def touches(splat, centre, base, side):
 
 
 @inlined
-def blend(rays, splat, centre, base, half, limits):
-    """Composite the splat over half row ``half``; its weights lie in ``rays.weights`` afterwards.
-
-    ``limits = (cap, stop)`` as float32.
-    """
-    offset = half * LANES
+def blend(rays, splat, centre, base, half):
+    """Composite the splat over half row ``half``: its weights are in the state, and in the evidence lanes."""
     start = np.float32((half % 2) * LANES - centre)
-    gaussian_lanes(rays.falloff, offset, start, np.float32(splat.kx), np.float32(base))
-    alpha = (np.float32(splat.opacity), limits[0], np.float32(ALPHA_FLOOR), limits[1])
-    blend_lanes(rays.weights, offset, rays.falloff, rays.transmittance, offset, alpha)
+    footprint = (start, np.float32(splat.kx), np.float32(base), np.float32(splat.opacity))
+    blend_lanes(rays.state, half * LANES, footprint)
 
 
 @inlined
-def blend_plain(plain, falloff, opacity, half, limits):
-    """The same splat for the rays without opacity gain, from the falloff that ``blend`` left."""
-    offset = half * LANES
-    alpha = (np.float32(opacity), limits[0], np.float32(ALPHA_FLOOR), limits[1])
-    blend_lanes(plain.weights, offset, falloff, plain.transmittance, offset, alpha)
+def blend_both(rays, splat, centre, base, half):
+    """The same with the evidence taken from the rays without opacity gain."""
+    start = np.float32((half % 2) * LANES - centre)
+    opacity, plain = np.float32(splat.opacity), np.float32(splat.plain)
+    blend_both_lanes(rays.state, half * LANES, (start, np.float32(splat.kx), np.float32(base), opacity, plain))
