@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numba
 from numba import njit
+from numba.core import config
 
 
 def _source_digest() -> str:
@@ -35,7 +36,7 @@ def _cache_folder() -> Path:
 
 
 if not os.environ.get("NUMBA_CACHE_DIR"):
-    numba.config.CACHE_DIR = str(_cache_folder())
+    config.__dict__["CACHE_DIR"] = str(_cache_folder())  # a plain module of settings, filled at import
 
 kernel = njit(nogil=True, cache=True)
 inlined = njit(nogil=True, cache=True, inline="always")

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 LANES = 8
 
+Builder = Any  # llvmlite's IRBuilder; what it infers of its own decorated methods is wrong
+
 _FLOAT = ir.FloatType()
 _INT = ir.IntType(32)
 _FLOATS = ir.VectorType(_FLOAT, LANES)
@@ -80,7 +82,7 @@ def _constant(value: float) -> ir.Constant:
     return ir.Constant(_FLOATS, [float(np.float32(value))] * LANES)
 
 
-def _splat(builder: ir.IRBuilder, scalar: ir.Value) -> ir.Value:
+def _splat(builder: Builder, scalar: ir.Value) -> ir.Value:
     undefined = ir.Constant(_FLOATS, ir.Undefined)
     first = builder.insert_element(undefined, scalar, ir.Constant(_INT, 0))
     mask = ir.Constant(ir.VectorType(_INT, LANES), [0] * LANES)
@@ -92,26 +94,26 @@ def _pointer(context, builder, array_type, array, offset) -> ir.Value:
     return builder.bitcast(builder.gep(data, [offset]), _FLOATS.as_pointer())
 
 
-def _load(builder: ir.IRBuilder, pointer: ir.Value) -> ir.Value:
+def _load(builder: Builder, pointer: ir.Value) -> ir.Value:
     return builder.load(pointer, align=4)
 
 
-def _minimum(builder: ir.IRBuilder, left: ir.Value, right: ir.Value) -> ir.Value:
+def _minimum(builder: Builder, left: ir.Value, right: ir.Value) -> ir.Value:
     return builder.select(builder.fcmp_ordered("<", left, right), left, right)
 
 
-def _row(builder: ir.IRBuilder, state: ir.Value, row: int) -> ir.Value:
+def _row(builder: Builder, state: ir.Value, row: int) -> ir.Value:
     """A row of the constant table."""
     place = builder.gep(state, [ir.Constant(ir.IntType(64), _TABLE + row * LANES)])
     return _load(builder, builder.bitcast(place, _FLOATS.as_pointer()))
 
 
-def _fused(builder: ir.IRBuilder, left: ir.Value, right: ir.Value, term: ir.Value) -> ir.Value:
+def _fused(builder: Builder, left: ir.Value, right: ir.Value, term: ir.Value) -> ir.Value:
     """``left * right + term``, one instruction where the machine has it."""
     return builder.fadd(builder.fmul(left, right, flags=_FUSE), term, flags=_FUSE)
 
 
-def _exp2_negative(builder: ir.IRBuilder, state: ir.Value, exponent: ir.Value) -> ir.Value:
+def _exp2_negative(builder: Builder, state: ir.Value, exponent: ir.Value) -> ir.Value:
     """``2^-e`` for e >= 0: the fraction by polynomial, the whole part subtracted from the exponent bits."""
     clamped = _minimum(builder, exponent, _row(builder, state, _CLAMP_ROW))
     whole = builder.fptosi(clamped, _INTS)
@@ -128,7 +130,7 @@ def _exp2_negative(builder: ir.IRBuilder, state: ir.Value, exponent: ir.Value) -
     return builder.bitcast(builder.sub(builder.bitcast(value, _INTS), shifted), _FLOATS)
 
 
-def _composite(builder: ir.IRBuilder, state: ir.Value, falloff: ir.Value, opacity: ir.Value, place: ir.Value):
+def _composite(builder: Builder, state: ir.Value, falloff: ir.Value, opacity: ir.Value, place: ir.Value) -> ir.Value:
     """Weights of one splat on eight rays whose T lies at ``place`` (paper Eq. 1); T moves on.
 
     ``a = min(cap, opacity falloff)``, nothing below the floor; ``w = a T``; a ray whose next T would be at or below

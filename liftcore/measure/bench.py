@@ -17,6 +17,7 @@ import torch
 from liftcore.errors import InvalidInput
 from liftcore.measure.synthetic import room_cameras, room_regions, room_splats
 from liftcore.observe.observation import Observation, RegionMap
+from liftcore.progress import silent
 from liftcore.raster.cpu import CpuRaster
 from liftcore.raster.warm_up import warm_up
 from liftcore.solve.accumulate import lift_walk, row_totals
@@ -90,7 +91,7 @@ def time_lift(work: Workload, preset: Preset, threads: int | None = None) -> dic
             entries += len(weights.columns)
         start = time.perf_counter()
         books = [observation.codebook for _, observation in work.views]
-        solve_closed_form(store, books.__getitem__, denominators, torch.float16, lambda *_: None, threads)
+        solve_closed_form(store, books.__getitem__, denominators, torch.float16, silent, threads)
         solve = (time.perf_counter() - start) / len(work.views)
     return {
         "geometry_s_per_view": statistics.median(geometry),
