@@ -1,0 +1,76 @@
+"""The certificate against the definitions of the paper, on all rays of small scenes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from liftcore.lift import lift
+from liftcore.raster.oracle import dense_view, reading_matrix
+from liftcore.raster.protocol import Walk
+from liftcore.scene.load import load_cameras
+from liftcore.solve.settings import LiftSettings
+from tests.scenes import random_grid, random_regions, random_splats
+from tests.unit.solve.test_lift_equals_dense import write_scene
+
+ALL_RAYS = 1_000_000
+
+
+def dense_measures(X: np.ndarray, seed: int, cameras, gain: float, grids: bool) -> dict[str, float]:
+    """Row sums, L, J and beta over every labelled row of every view, in float64."""
+    sums, residuals, surrogates, betas = [], [], [], []
+    for k, camera in enumerate(cameras):
+        observation = random_grid(seed + k) if grids else random_regions(seed + k)
+        S, ray = reading_matrix(observation, camera.width, camera.height)
+        B = S @ observation.codebook.double().numpy()
+        A = dense_view(random_splats(seed, 50), camera, Walk(gain)).A
+        sums.append(A.sum(axis=1))
+        rows = A[ray]
+        squares = ((X[None] - B[:, None]) ** 2).sum(axis=2)
+        residuals.append(((rows @ X - B) ** 2).sum(axis=1))
+        surrogates.append((rows * squares).sum(axis=1))
+        total = rows.sum(axis=1)
+        met = total > 0
+        share = rows[met] / total[met, None]
+        mu = (share * np.sqrt(squares[met])).sum(axis=1)
+        betas.append((share * squares[met]).sum(axis=1) / mu**2 - 1)
+    row_sums = np.concatenate(sums)
+    return {
+        "row_sum_mean": row_sums.mean(),
+        "row_sum_std": row_sums.std(),
+        "residual": np.concatenate(residuals).mean(),
+        "surrogate": np.concatenate(surrogates).mean(),
+        "bound": 1 + np.concatenate(betas).max(),
+    }
+
+
+@pytest.mark.parametrize("grids", [False, True])
+@pytest.mark.parametrize("preset", ["row-sum", "tikhonov"])
+def test_a_certificate_over_all_rays_equals_the_papers_definitions(tmp_path, preset, grids):
+    paths = write_scene(tmp_path, 3, grids)
+    settings = LiftSettings.of(preset=preset, certificate_rays=ALL_RAYS, dtype="float32")
+    result = lift(paths[0], paths[1], [paths[2]], settings)
+    expected = dense_measures(result.features.double().numpy(), 3, load_cameras(paths[1]), settings.lift_gain, grids)
+    certificate = result.metadata.certificate
+    for name, value in expected.items():
+        assert certificate[name] == pytest.approx(value, rel=1e-3, abs=1e-6), name
+
+
+def test_the_closed_form_minimises_the_surrogate(tmp_path):
+    paths = write_scene(tmp_path, 4)
+    settings = LiftSettings.of(preset="row-sum", certificate_rays=ALL_RAYS, dtype="float32")
+    X = lift(paths[0], paths[1], [paths[2]], settings).features.double().numpy()
+    cameras = load_cameras(paths[1])
+    least = dense_measures(X, 4, cameras, 1.0, grids=False)["surrogate"]
+    for seed in range(5):
+        other = X + np.random.default_rng(seed).normal(0, 1e-2, X.shape)
+        assert dense_measures(other, 4, cameras, 1.0, grids=False)["surrogate"] > least
+
+
+def test_a_lift_without_sampled_rays_says_that_nothing_was_measured(tmp_path):
+    paths = write_scene(tmp_path, 5)
+    certificate = lift(paths[0], paths[1], [paths[2]], LiftSettings.of(certificate_rays=0)).metadata.certificate
+    assert certificate["rays"] == 0
+    assert certificate["residual"] is None
+    assert certificate["bound"] is None
+    assert 0 < certificate["seen_share"] <= 1
