@@ -17,7 +17,7 @@ from liftcore.observe.pack import open_packs, pair
 from liftcore.progress import Progress, silent
 from liftcore.raster.cpu import CpuRaster
 from liftcore.raster.warm_up import warm_up
-from liftcore.scene.load import load_cameras, load_splats
+from liftcore.scene.load import camera_files, load_cameras, load_splats
 from liftcore.solve.accumulate import accumulate
 from liftcore.solve.certificate import certify
 from liftcore.solve.closed_form import solve_closed_form
@@ -76,7 +76,7 @@ def lift(
         with timings.stage("geometry"):
             raster = CpuRaster(scene, threads)
             geometry = accumulate(raster, (scene.count, views), packs, names, settings, store, progress)
-        codebooks = [packs.observation(name).codebook for name in names]
+        codebooks = geometry.codebooks
         with timings.stage("solve"):
             dtype = getattr(torch, settings.dtype)
             solution = solve_closed_form(
@@ -103,14 +103,16 @@ def lift(
 
 
 def input_file(path: Path) -> InputFile:
-    """Where an input is and what it is: the digest of the file, or of the sorted names and digests of a folder."""
+    """Where an input is and what it is: the digest of the file, or of the names and digests of a folder's cameras.
+
+    Photos, features and lifts that lie in the same folder do not count: they may come and go.
+    """
     resolved = path.resolve()
     if not resolved.is_dir():
         return InputFile(path=str(resolved), sha256=_digest(resolved))
     total = hashlib.sha256()
-    for part in sorted(resolved.rglob("*")):
-        if part.is_file():
-            total.update(f"{part.relative_to(resolved)} {_digest(part)}\n".encode())
+    for part in camera_files(resolved):
+        total.update(f"{part.relative_to(resolved)} {_digest(part)}\n".encode())
     return InputFile(path=str(resolved), sha256=total.hexdigest())
 
 

@@ -6,12 +6,16 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 
+from liftcore.observe.observation import FeatureGrid, Observation, RegionMap
 from liftcore.raster.protocol import RayRows, Walk
 from liftcore.solve.readout import Readout, read_pixels, sample_pixels
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
+    from torch import Tensor
 
     from liftcore.observe.pack import FeaturePacks
     from liftcore.progress import Progress
@@ -36,6 +40,7 @@ class Geometry:
     evidence: np.ndarray  # [P] f64, sum of plain weights, each ray once
     denominators: np.ndarray  # [P] f64, sum of w^p over labelled rays and levels
     samples: tuple[SampledRays, ...]  # for the certificate, one a view
+    codebooks: tuple[Tensor, ...]  # E [M, F] of every view, as its observation was read
 
 
 def lift_walk(settings: LiftSettings) -> Walk:
@@ -46,6 +51,15 @@ def lift_walk(settings: LiftSettings) -> Walk:
 def render_walk(settings: LiftSettings) -> Walk:
     """The walk that renders attention maps and masks."""
     return Walk(settings.render_gain, settings.alpha_cap, settings.transmittance_stop)
+
+
+def as_read(observation: Observation, settings: LiftSettings) -> Observation:
+    """The observation as the settings read it: with ``nearest``, a grid is a map of regions of one cell each."""
+    if not isinstance(observation, FeatureGrid) or settings.grid_reading == "bilinear":
+        return observation
+    rows, columns = observation.grid.shape[:2]
+    cells = torch.arange(rows * columns, dtype=torch.int32).reshape(1, rows, columns)
+    return RegionMap(cells, observation.codebook)
 
 
 def accumulate(
@@ -67,10 +81,10 @@ def accumulate(
     count, cameras = scene
     evidence, denominators = np.zeros(count), np.zeros(count)
     walk = lift_walk(settings)
-    samples = []
+    samples, codebooks = [], []
     rays = -(-settings.certificate_rays // len(views))
     for number, name in enumerate(views):
-        camera, observation = cameras.get(name), packs.observation(name)
+        camera, observation = cameras.get(name), as_read(packs.observation(name), settings)
         weights = raster.region_weights(camera, observation, walk, settings.power)
         evidence[weights.evidence_splats.numpy()] += weights.evidence.numpy()
         denominators[weights.splats.numpy()] += row_totals(weights)
@@ -78,8 +92,9 @@ def accumulate(
         pixels = sample_pixels(camera, rays, seed=(settings.seed, number))
         readout = read_pixels(observation, camera, pixels)
         samples.append(SampledRays(raster.ray_rows(camera, pixels, walk), readout))
+        codebooks.append(observation.codebook)
         progress("geometry", number + 1, len(views), "views")
-    return Geometry(evidence, denominators, tuple(samples))
+    return Geometry(evidence, denominators, tuple(samples), tuple(codebooks))
 
 
 def row_totals(weights: RegionWeights) -> np.ndarray:

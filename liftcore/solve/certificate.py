@@ -20,13 +20,15 @@ import numpy as np
 from liftcore.jit import vectorised
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     from torch import Tensor
 
     from liftcore.solve.accumulate import Geometry, SampledRays
     from liftcore.solve.settings import LiftSettings
 
+_CHUNK_VALUES = 1 << 24  # float32 values gathered at a time: 64 MB, however long the rays and the vectors are
+_READS_A_RAY = 8  # levels or taps of a ray; few scenes have more
 _MU_FLOOR = 1e-6  # a row whose splats all equal what it observed has no dispersion to speak of
 
 
@@ -81,10 +83,25 @@ def measure_view(sample: SampledRays, features: Tensor, codebook: Tensor) -> Vie
     ray_of_entry = np.repeat(np.arange(lengths.size), lengths)
     weights = sample.rows.weights.numpy().astype(np.float64)
     row_sums = np.bincount(ray_of_entry, weights, minlength=lengths.size)
-    X = features[sample.rows.splats.long()].float().numpy()  # [entries, F]
-    B = sample.readout.observed(codebook).numpy()  # [rows, F]
-    measures = measure_rows(sample.readout.rays, starts, weights, X, B)
+    readout, splats = sample.readout, sample.rows.splats.long()
+    measures = np.zeros((readout.rays.size, 3))
+    for first, last in _ray_chunks(starts, _CHUNK_VALUES // features.shape[1]):
+        chosen = (readout.rays >= first) & (readout.rays < last)
+        X = features[splats[starts[first] : starts[last]]].float().numpy()  # [entries, F]
+        B = readout.rows(chosen).observed(codebook).numpy()  # [rows, F]
+        own_starts, own_weights = starts[first : last + 1] - starts[first], weights[starts[first] : starts[last]]
+        measures[chosen] = measure_rows(readout.rays[chosen] - first, own_starts, own_weights, X, B)
     return ViewMeasures(row_sums, measures[:, 0], measures[:, 1], measures[:, 2])
+
+
+def _ray_chunks(starts: np.ndarray, entries: int) -> Iterator[tuple[int, int]]:
+    """Ranges of rays that together have at most so many entries, or one ray each; and at most so many rays."""
+    first, rays = 0, starts.size - 1
+    while first < rays:
+        fitting = int(np.searchsorted(starts, starts[first] + entries, side="right")) - 1
+        last = min(max(fitting, first + 1), first + max(entries // _READS_A_RAY, 1), rays)
+        yield first, last
+        first = last
 
 
 @vectorised

@@ -1,11 +1,13 @@
 """The closed form: ``x_j = sum_v W_v[j] E_v / sum W[j]`` (paper Eq. 6, App. Tikhonov for squared weights).
 
 X is never held in float32 as a whole. Splats go in blocks and channels in slices, so that a block of X and a slice
-of a view's codebook stay in the cache while all views add to them.
+of a view's codebook stay in the cache while all views add to them. Weights are divided by their sum before they meet
+the codebook: a mean cannot overflow where its inputs do not, and faint splats keep their digits.
 """
 
 from __future__ import annotations
 
+import math
 import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -26,10 +28,12 @@ if TYPE_CHECKING:
     from liftcore.solve.view_weights import ViewWeights
 
 BLOCK = 4_096  # splats a block; with a slice of channels two megabytes
-SLICE = 128  # channels a slice
+SLICE = 128  # channels a slice, fewer where the codebooks of all views are long
+SLICE_BYTES = 1 << 28  # of a slice of all codebooks, which dense maps would go far beyond
 FLOAT16_MAX = 65_504.0
+FLOAT16_STEP = 2.0**-25  # the largest rounding error of its small values
+FLOAT16_ERROR = 1e-4  # of the longest vector, which float16 must hold
 UNIT_TOLERANCE = 5e-3  # float16 unit vectors are off by less
-_TINY = 1e-30  # keeps the unit vector of a zero row zero
 
 
 @dataclass(frozen=True)
@@ -41,33 +45,35 @@ class Solution:
 
 
 @kernel
-def add_weighted_rows(first, last, offset, weights, codebook, block):
-    """``block[splats[r] - offset] += W[r] codebook`` for the CSR rows ``first..last``.
+def add_weighted_rows(first, last, offset, weights, scale, codebook, block):
+    """``block[splats[r] - offset] += W[r] scale[splats[r]] codebook`` for the CSR rows ``first..last``.
 
     Args:
         weights: (splats [n] i32, row_starts [n + 1] i64, columns [nnz] i32, weights [nnz] f32).
-        codebook: [M, C] f32. block: [B, C] f32. C is a multiple of WIDE.
+        scale: [P] f64. codebook: [M, C] f32. block: [B, C] f32. C is a multiple of WIDE.
     """
     splats, row_starts, columns, values = weights
     width = codebook.shape[1]
     source, target = codebook.reshape(-1), block.reshape(-1)
+    begin = row_starts[first]
+    shares = np.empty(row_starts[last] - begin, np.float32)
+    own_columns = columns[begin : row_starts[last]]
     for row in range(first, last):
+        entries = (row_starts[row] - begin, row_starts[row + 1] - begin)
+        for k in range(entries[0], entries[1]):
+            shares[k] = values[begin + k] * scale[splats[row]]
         place = (splats[row] - offset) * width
-        entries = (row_starts[row], row_starts[row + 1])
         for channel in range(0, width, WIDE):
-            add_weighted_row(target, place + channel, source, entries, (columns, values), (width, channel))
+            add_weighted_row(target, place + channel, source, entries, (own_columns, shares), (width, channel))
 
 
 @vectorised
-def finish_rows(block, scale, squares):
-    """Divide the rows of ``block`` [B, C] f32 by their denominators, and note their squared norms [B] f64."""
+def square_norms(block, squares):
+    """The squared norms [B] f64 of the rows of ``block`` [B, C] f32."""
     for row in range(block.shape[0]):
-        factor = np.float32(scale[row])
         total = np.float32(0.0)
         for c in range(block.shape[1]):
-            value = block[row, c] * factor
-            block[row, c] = value
-            total += value * value
+            total += block[row, c] * block[row, c]
         squares[row] = total
 
 
@@ -85,33 +91,45 @@ def solve_closed_form(
         store: W of every view.
         codebooks: view number -> E_v [M, F] f16 or f32.
         denominators: [P] f64, row sums of W over all views.
-        dtype: how X is stored; float16 becomes float32 when a codebook goes beyond float16.
+        dtype: how X is stored; float16 becomes float32 when the codebooks are too large or too small for it.
         threads: None takes the cores that this process may use. The number changes no bit.
     """
     books = [codebooks(view) for view in range(len(store))]
     channels = books[0].shape[1]
-    norms = [torch.linalg.vector_norm(book.to(torch.float32), dim=1) for book in books]
-    unit = all(bool(((norm - 1).abs() < UNIT_TOLERANCE).all()) for norm in norms)
-    if dtype == torch.float16 and max(float(book.abs().max()) for book in books) > FLOAT16_MAX:
+    norms = [torch.linalg.vector_norm(book, dim=1, dtype=torch.float64).numpy() for book in books]
+    unit = all(bool((np.abs(norm - 1) < UNIT_TOLERANCE).all()) for norm in norms)
+    if dtype == torch.float16 and not _fits_float16(books, max(float(norm.max()) for norm in norms)):
         dtype = torch.float32
     count = denominators.shape[0]
     features = torch.zeros(count, channels, dtype=dtype)
     squares = np.zeros(count)
     scale = np.divide(1.0, denominators, out=np.zeros(count), where=denominators > 0)
-    slices = [(begin, min(begin + SLICE, channels)) for begin in range(0, channels, SLICE)]
+    step = _slice_width(sum(book.shape[0] for book in books))
+    slices = [(begin, min(begin + step, channels)) for begin in range(0, channels, step)]
     with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
         for number, (begin, end) in enumerate(slices):
             parts = [_slice_of(book, begin, end) for book in books]
             sums = _solve_slice(pool, store, parts, scale, features[:, begin:end])
             if not unit:
-                directions = [
-                    part / np.maximum(norm.numpy(), _TINY)[:, None] for part, norm in zip(parts, norms, strict=True)
-                ]
-                sums = _solve_slice(pool, store, directions, scale, None)
+                for part, norm in zip(parts, norms, strict=True):
+                    np.divide(part, norm[:, None], out=part, where=norm[:, None] > 0, casting="same_kind")
+                sums = _solve_slice(pool, store, parts, scale, None)
             squares += sums
             progress("solve", number + 1, len(slices), "slices")
     agreement = np.sqrt(squares).clip(0.0, 1.0).astype(np.float32)
     return Solution(features, torch.from_numpy(agreement))
+
+
+def _fits_float16(books: Sequence[Tensor], longest: float) -> bool:
+    """Whether float16 holds every value of the codebooks, and the longest of their rows to FLOAT16_ERROR."""
+    if any(max(abs(float(end)) for end in torch.aminmax(book)) > FLOAT16_MAX for book in books):
+        return False
+    return longest == 0 or FLOAT16_STEP * math.sqrt(books[0].shape[1]) <= FLOAT16_ERROR * longest
+
+
+def _slice_width(rows: int) -> int:
+    """Channels a slice, a multiple of WIDE, for codebooks of so many rows together."""
+    return min(SLICE, max(WIDE, SLICE_BYTES // (4 * rows) // WIDE * WIDE))
 
 
 def _slice_of(book: Tensor, begin: int, end: int) -> np.ndarray:
@@ -142,8 +160,8 @@ def _solve_slice(
         block = np.zeros((end - offset, parts[0].shape[1]), np.float32)
         for weights, part, rows in zip(views, parts, bounds, strict=True):
             if rows[number] < rows[number + 1]:
-                add_weighted_rows(rows[number], rows[number + 1], offset, weights, part, block)
-        finish_rows(block, scale[offset:end], squares[offset:end])
+                add_weighted_rows(rows[number], rows[number + 1], offset, weights, scale, part, block)
+        square_norms(block, squares[offset:end])
         if result is not None:
             result[offset:end] = torch.from_numpy(block[:, : result.shape[1]]).to(result.dtype)
 

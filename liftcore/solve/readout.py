@@ -24,6 +24,10 @@ class Readout:
     columns: np.ndarray  # [rows, taps] i64, codebook rows
     shares: np.ndarray  # [rows, taps] f64, sum to one
 
+    def rows(self, chosen: np.ndarray) -> Readout:
+        """Only the chosen rows [rows] bool; rays keep their numbers."""
+        return Readout(self.rays[chosen], self.columns[chosen], self.shares[chosen])
+
     def observed(self, codebook: Tensor) -> Tensor:
         """B [rows, F] f32 of the sampled rays."""
         taken = codebook[torch.from_numpy(self.columns)].to(torch.float32)

@@ -13,6 +13,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from liftcore.errors import InvalidSettings
 
 TIKHONOV_GAIN = 1.2  # lambda of the paper's Tikhonov Guidance (App. Tikhonov, lambda sweep)
+LARGEST_ALPHA = 0.9999999  # nearer to one, float32 says one, and the ray has no light left to go on with
+_SHOWN = 80  # characters of a wrong value in an error
 
 
 class Preset(StrEnum):
@@ -37,9 +39,14 @@ class LiftSettings(BaseModel):
     power: Literal[1, 2] = Field(2, description="the weight's exponent: w or w^2")
     lift_gain: float = Field(TIKHONOV_GAIN, gt=0, le=16, description="lambda on the opacity logits, lifting")
     render_gain: float = Field(TIKHONOV_GAIN, gt=0, le=16, description="lambda on the opacity logits, rendering")
-    alpha_cap: float = Field(0.99, gt=0, lt=1, description="the largest alpha of a splat on a ray")
+    alpha_cap: float = Field(0.99, gt=0, le=LARGEST_ALPHA, description="the largest alpha of a splat on a ray")
     transmittance_stop: float = Field(1e-4, ge=0, lt=1, description="a ray ends before T falls to this")
-    dtype: Literal["float16", "float32"] = Field("float16", description="how features are stored")
+    grid_reading: Literal["bilinear", "nearest"] = Field(
+        "bilinear", description="what a pixel reads of a feature grid: four cells by distance, or the nearest alone"
+    )
+    dtype: Literal["float16", "float32"] = Field(
+        "float16", description="how features are stored, if it can hold them"
+    )
     certificate_rays: int = Field(20_000, ge=0, le=10_000_000, description="rays sampled for the certificate")
     seed: int = Field(0, ge=0, lt=2**31, description="of the certificate's sample")
 
@@ -49,10 +56,11 @@ class LiftSettings(BaseModel):
         if not isinstance(values, dict):
             return values
         name = values.get("preset", Preset.TIKHONOV)
-        return {**_PRESETS[Preset(name)], **values} if name in set(Preset) else values
+        known = isinstance(name, str) and name in set(Preset)
+        return {**_PRESETS[Preset(name)], **values} if known else values
 
     @classmethod
-    def of(cls, **values: Any) -> Self:
+    def of(cls, /, **values: Any) -> Self:
         """Settings from keyword arguments, with errors in the project's own words.
 
         Raises:
@@ -66,4 +74,4 @@ class LiftSettings(BaseModel):
             expected = first["msg"][0].lower() + first["msg"][1:]
             known = ", ".join(cls.model_fields)
             hint = f"the settings are {known}" if first["type"] == "extra_forbidden" else ""
-            raise InvalidSettings(name, expected=expected, got=repr(first["input"]), hint=hint) from None
+            raise InvalidSettings(name, expected=expected, got=repr(first["input"])[:_SHOWN], hint=hint) from None
