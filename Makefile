@@ -6,6 +6,7 @@ READY := .venv/.ready
 SHARED := ../shared/data
 SCENE ?=
 OUT ?= demo-output
+TORCH_PIP ?=
 
 .PHONY: demo test lint format serve bench setup clean
 
@@ -40,7 +41,7 @@ $(READY): requirements.lock pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "splatlift needs Python 3.11 or later")'
 	@echo "making .venv: a few minutes, once"
 	[ -x $(BIN)/python ] || $(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet "$$(grep '^torch==' requirements.lock)"
+	$(BIN)/python -m pip install --quiet $(TORCH_PIP) "$$(grep '^torch==' requirements.lock)"
 	$(BIN)/python -m pip install --quiet -r requirements.lock
 	$(BIN)/python -m pip install --quiet --no-deps -e .
 	touch $@

@@ -1,0 +1,80 @@
+"""The README's examples run, and show what the service really answers."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+from fastapi.routing import APIRoute
+from pydantic import BaseModel
+
+from liftcore.cli import main
+from service import wire
+from service.routes import assets, jobs, lifts, operations, queries
+from tests.api.tiny_scene import WIDTH, make_scene
+
+from .readme import blocks, text
+
+ROUTES: tuple[ModuleType, ...] = (operations, assets, jobs, lifts, queries)
+SHAPES: dict[str, type[BaseModel]] = {  # a field that no other answer has -> the answer
+    "counts": wire.Asset,
+    "attempt": wire.Job,
+    "threshold": wire.QueryAnswer,
+    "detail": wire.Problem,
+}
+
+
+@pytest.fixture
+def scene_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The tiny scene under the names that the README uses, as the working directory."""
+    scene = make_scene()
+    for name, content in (
+        ("scene.ply", scene.splats),
+        ("cameras.json", scene.cameras),
+        ("features.safetensors", scene.features),
+        ("words.safetensors", scene.table),
+    ):
+        (tmp_path / name).write_bytes(content)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_python_example_finds_the_apple(scene_folder: Path) -> None:
+    (example,) = blocks("README.md", "python")
+    names: dict[str, object] = {}
+    exec(compile(example, "README.md", "exec"), names)
+    mask = names["mask"]
+    columns = mask.nonzero()[:, 1]  # pyright: ignore[reportAttributeAccessIssue]
+    assert len(columns) > 0
+    assert int(columns.max()) < WIDTH // 2  # the apple is the cluster on the left
+
+
+def test_command_line_example_writes_its_files(scene_folder: Path) -> None:
+    lines = [line for block in blocks("README.md", "sh") for line in block.splitlines()]
+    commands = [line.split()[1:] for line in lines if line.startswith("splatlift ")]
+    assert [main(command) for command in commands] == [0] * len(commands)
+    assert (scene_folder / "apple.png").is_file()
+
+
+def test_json_examples_show_fields_that_the_service_sends() -> None:
+    examples = [json.loads(block) for block in blocks("README.md", "json")]
+    seen = set()
+    for example in examples:
+        model = next(model for field, model in SHAPES.items() if field in example)
+        assert example.keys() <= model.model_fields.keys()
+        seen.add(model)
+    assert seen == set(SHAPES.values())
+
+
+def test_every_route_is_in_the_readme_and_no_other() -> None:
+    rows = [line.split(" | ")[0] for line in text("README.md").splitlines() if line.startswith("| `")]
+    named = {match for row in rows for match in re.findall(r"`([A-Z]+ /[^`]*)`", row)}
+    real = set()
+    for module in ROUTES:
+        for route in module.router.routes:
+            assert isinstance(route, APIRoute)
+            real |= {f"{method} {route.path}" for method in route.methods}
+    assert named == real
