@@ -146,8 +146,8 @@ def _composite(builder: Builder, state: ir.Value, falloff: ir.Value, opacity: ir
     return builder.select(alive, builder.fmul(alpha, before), zero)
 
 
-def _blend_code(plain: bool):
-    """Code of ``blend_lanes`` (plain = False) and ``blend_both_lanes`` (plain = True)."""
+def _blend_code(plain: bool, power: int) -> Callable:
+    """Code of the four blends: with evidence from plain rays of their own or not, weights or their squares."""
 
     def codegen(context, builder, signature, args):
         array, offset, splat = args
@@ -163,7 +163,7 @@ def _blend_code(plain: bool):
         exponent = _fused(builder, builder.fmul(curvature, u), u, base)
         falloff = _exp2_negative(builder, state, exponent)
         weight = _composite(builder, state, falloff, opacity, at(TRANSMITTANCE))
-        builder.store(weight, at(WEIGHTS), align=4)
+        builder.store(weight if power == 1 else builder.fmul(weight, weight), at(WEIGHTS), align=4)
         if plain:
             weight = _composite(builder, state, falloff, parts[4], at(PLAIN_TRANSMITTANCE))
         sums = builder.bitcast(builder.gep(state, [ir.Constant(offset.type, EVIDENCE)]), _FLOATS.as_pointer())
@@ -173,6 +173,10 @@ def _blend_code(plain: bool):
     return codegen
 
 
+_BLEND = types.void(_FLOAT_ARRAY, types.intp, types.UniTuple(types.float32, 4))
+_BLEND_BOTH = types.void(_FLOAT_ARRAY, types.intp, types.UniTuple(types.float32, 5))
+
+
 @_compiled
 def blend_lanes(typingctx, state, offset, splat):
     """Composite one splat over the eight pixels from ``offset`` on.
@@ -180,8 +184,13 @@ def blend_lanes(typingctx, state, offset, splat):
     ``splat = (start, curvature, base, opacity)``: lane i has the falloff ``2^-(base + curvature (start + i)^2)``.
     The weights lie in ``state[WEIGHTS + offset:]`` afterwards and are added to the evidence lanes.
     """
-    signature = types.void(_FLOAT_ARRAY, types.intp, types.UniTuple(types.float32, 4))
-    return signature, _blend_code(plain=False)
+    return _BLEND, _blend_code(plain=False, power=1)
+
+
+@_compiled
+def blend_squared_lanes(typingctx, state, offset, splat):
+    """``blend_lanes`` that leaves the squares of the weights; the evidence is of the weights themselves."""
+    return _BLEND, _blend_code(plain=False, power=2)
 
 
 @_compiled
@@ -190,8 +199,13 @@ def blend_both_lanes(typingctx, state, offset, splat):
 
     ``splat = (start, curvature, base, opacity, plain opacity)``.
     """
-    signature = types.void(_FLOAT_ARRAY, types.intp, types.UniTuple(types.float32, 5))
-    return signature, _blend_code(plain=True)
+    return _BLEND_BOTH, _blend_code(plain=True, power=1)
+
+
+@_compiled
+def blend_both_squared_lanes(typingctx, state, offset, splat):
+    """``blend_both_lanes`` that leaves the squares of the weights."""
+    return _BLEND_BOTH, _blend_code(plain=True, power=2)
 
 
 @_compiled
@@ -204,21 +218,6 @@ def add_lanes(typingctx, total, offset, weights, row):
         place = _pointer(context, builder, signature.args[0], total, offset)
         term = _load(builder, _pointer(context, builder, signature.args[2], weights, row))
         builder.store(builder.fadd(_load(builder, place), term), place, align=4)
-        return context.get_dummy_value()
-
-    return signature, codegen
-
-
-@_compiled
-def square_lanes(typingctx, weights, row):
-    """``weights[row + i] *= weights[row + i]``."""
-    signature = types.void(_FLOAT_ARRAY, types.intp)
-
-    def codegen(context, builder, signature, args):
-        weights, row = args
-        place = _pointer(context, builder, signature.args[0], weights, row)
-        value = _load(builder, place)
-        builder.store(builder.fmul(value, value), place, align=4)
         return context.get_dummy_value()
 
     return signature, codegen

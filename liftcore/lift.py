@@ -83,7 +83,7 @@ def lift(
                 store, codebooks.__getitem__, geometry.denominators, dtype, progress, threads
             )
         with timings.stage("certify"):
-            certificate = certify(geometry, solution.features, codebooks.__getitem__, settings)
+            certificate = certify(geometry, solution.features, codebooks.__getitem__, settings, threads)
         certificate |= {"weights_entries": sum(len(part.columns) for part in store), "views_without_camera": unpaired}
     metadata = LiftMetadata(
         version=__version__,

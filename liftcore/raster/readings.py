@@ -22,6 +22,7 @@ from liftcore.raster.walk import HALVES
 MAX_SLOTS = 4 * TILE * TILE  # every pixel reads four cells of its own at worst
 MAX_TAPS = HALVES * 4 * LANES  # every lane of a half row reads four cells of its own at worst
 NO_SLOT = -1
+SEVERAL = -2  # a half row whose pixels read several slots, or parts of one
 
 
 class Reading(NamedTuple):
@@ -45,7 +46,7 @@ class TileTaps(NamedTuple):
 
     starts: np.ndarray  # [33] i32, each half row's taps
     slots: np.ndarray  # [MAX_TAPS] i32
-    whole: np.ndarray  # [MAX_TAPS] u8, 1 = all factors are one
+    alone: np.ndarray  # [32] i32, the slot that all pixels of a half row read and nothing else; -1 none, -2 see taps
     factors: np.ndarray  # [MAX_TAPS * 8] f32
     slot_rows: np.ndarray  # [MAX_SLOTS, levels] i32, the codebook rows of a slot, -1 none
     sizes: np.ndarray  # [2] i32: slots in use; 1 when all pixels read slot 0 and nothing else
@@ -93,7 +94,7 @@ def new_taps(levels):
     return TileTaps(
         np.zeros(HALVES + 1, np.int32),
         np.zeros(MAX_TAPS, np.int32),
-        np.zeros(MAX_TAPS, np.uint8),
+        np.full(HALVES, NO_SLOT, np.int32),
         np.zeros(MAX_TAPS * LANES, np.float32),
         np.zeros((MAX_SLOTS, levels), np.int32),
         np.zeros(2, np.int32),
@@ -138,9 +139,10 @@ def _slot_of_labels(taps, reading, y, x):
 def _read_regions(taps, reading, frame, x0, y0):
     slots = np.empty(LANES, np.int32)
     count = 0
-    alone = True
+    uniform = True
     for half in range(HALVES):
         taps.starts[half] = count
+        taps.alone[half] = NO_SLOT
         y = y0 + half // 2
         left = x0 + (half % 2) * LANES
         if y >= frame.height or left >= frame.width:
@@ -167,11 +169,13 @@ def _read_regions(taps, reading, frame, x0, y0):
                 taps.factors[tap * LANES : tap * LANES + LANES] = 0
                 count += 1
             taps.factors[tap * LANES + lane] = 1
-        whole = count == first_tap + 1 and taps.factors[first_tap * LANES : count * LANES].min() > 0
-        taps.whole[first_tap:count] = whole
-        alone &= whole
+        if count == first_tap + 1 and taps.factors[first_tap * LANES : count * LANES].min() > 0:
+            taps.alone[half] = taps.slots[first_tap]
+        elif count > first_tap:
+            taps.alone[half] = SEVERAL
+        uniform &= taps.alone[half] == 0
     taps.starts[HALVES] = count
-    taps.sizes[1] = alone and taps.sizes[0] == 1
+    taps.sizes[1] = uniform and taps.sizes[0] == 1
 
 
 @kernel
@@ -180,6 +184,7 @@ def _read_grid(taps, reading, frame, x0, y0):
     count = 0
     for half in range(HALVES):
         taps.starts[half] = count
+        taps.alone[half] = NO_SLOT
         y = y0 + half // 2
         left = x0 + (half % 2) * LANES
         if y >= frame.height or left >= frame.width:
@@ -200,10 +205,10 @@ def _read_grid(taps, reading, frame, x0, y0):
                     tap += 1
                 if tap == count:
                     taps.slots[tap] = slot
-                    taps.whole[tap] = 0
                     taps.factors[tap * LANES : tap * LANES + LANES] = 0
                     count += 1
                 taps.factors[tap * LANES + lane] += share_x * share_y
+        taps.alone[half] = SEVERAL
     taps.starts[HALVES] = count
 
 

@@ -10,13 +10,12 @@ from __future__ import annotations
 import numpy as np
 
 from liftcore.jit import inlined, kernel
-from liftcore.lanes import EVIDENCE, LANES, WEIGHTS, add_lanes, add_product_lanes, square_lanes
+from liftcore.lanes import EVIDENCE, LANES, WEIGHTS, add_lanes, add_product_lanes
 from liftcore.raster.constants import TILE
 from liftcore.raster.readings import MAX_SLOTS, NO_SLOT, new_taps, read_tile
 from liftcore.raster.walk import (
     CHECK_EVERY,
-    blend,
-    blend_both,
+    blend_power,
     footprint,
     look,
     new_rays,
@@ -43,7 +42,7 @@ def weigh_tiles(first, last, frame, reading, power, with_plain):
     taps = new_taps(reading.levels)
     sums = np.zeros(MAX_SLOTS * LANES, np.float32)
     records, items, starts = frame.records, frame.items, frame.starts
-    tap_starts, tap_slots, tap_whole, factors = taps.starts, taps.slots, taps.whole, taps.factors
+    tap_starts, tap_slots, alone, factors = taps.starts, taps.slots, taps.alone, taps.factors
     reuse = power == 1 and not with_plain  # then a slot that all pixels read holds just the evidence
     size = 1 << 15
     places, slots = np.empty(size, np.int32), np.empty(size, np.int32)
@@ -57,7 +56,7 @@ def weigh_tiles(first, last, frame, reading, power, with_plain):
         y0 = float((tile // frame.columns) * TILE)
         start_rays(rays, frame, tile)
         read_tile(taps, reading, frame, tile)
-        used, alone = taps.sizes[0], taps.sizes[1] == 1
+        used, whole_tile = taps.sizes[0], reuse and taps.sizes[1] == 1
         if slot_count + used > slot_rows.shape[0]:
             slot_rows = _grown_rows(slot_rows, slot_count + used)
         slot_rows[slot_count : slot_count + used] = taps.slot_rows[:used]
@@ -73,31 +72,26 @@ def weigh_tiles(first, last, frame, reading, power, with_plain):
                     half = 2 * row + side
                     if not rays.alive[half] or not touches(splat, centre, base, side):
                         continue
-                    if with_plain:
-                        blend_both(rays, splat, centre, base, half)
-                    else:
-                        blend(rays, splat, centre, base, half)
-                    if alone and reuse:
+                    blend_power(rays, splat, centre, base, half, power, with_plain)
+                    if whole_tile:
                         continue
                     offset = WEIGHTS + half * LANES
-                    if power == 2:
-                        square_lanes(state, offset)
+                    slot = alone[half]
+                    if slot >= 0:
+                        low, high = min(low, slot), max(high, slot)
+                        add_lanes(sums, slot * LANES, state, offset)
+                        continue
                     for tap in range(tap_starts[half], tap_starts[half + 1]):
                         slot = tap_slots[tap]
                         low, high = min(low, slot), max(high, slot)
-                        if tap_whole[tap]:
-                            add_lanes(sums, slot * LANES, state, offset)
-                        else:
-                            add_product_lanes(sums, slot * LANES, state, offset, factors, tap * LANES)
+                        add_product_lanes(sums, slot * LANES, state, offset, factors, tap * LANES)
             total = _drain(state, EVIDENCE)
             if count + used + 1 > places.shape[0]:
                 places, slots, weights, evidence = _grown(places, slots, weights, evidence, count + used + 1)
             before = count
-            if alone and reuse:
-                low, high = 0, -1
-                if total > 0:
-                    slots[count], weights[count] = slot_count, total
-                    count += 1
+            if whole_tile and total > 0:
+                slots[count], weights[count] = slot_count, total
+                count += 1
             for slot in range(low, high + 1):
                 part = _drain(sums, slot * LANES)
                 if part > 0:

@@ -17,7 +17,9 @@ from liftcore.lanes import (
     PLAIN_TRANSMITTANCE,
     TRANSMITTANCE,
     blend_both_lanes,
+    blend_both_squared_lanes,
     blend_lanes,
+    blend_squared_lanes,
     new_state,
 )
 from liftcore.raster.constants import ALPHA_FLOOR, TILE
@@ -135,13 +137,21 @@ def touches(splat, centre, base, side):
 def blend(rays, splat, centre, base, half):
     """Composite the splat over half row ``half``: its weights are in the state, and in the evidence lanes."""
     start = np.float32((half % 2) * LANES - centre)
-    footprint = (start, np.float32(splat.kx), np.float32(base), np.float32(splat.opacity))
-    blend_lanes(rays.state, half * LANES, footprint)
+    shape = (start, np.float32(splat.kx), np.float32(base), np.float32(splat.opacity))
+    blend_lanes(rays.state, half * LANES, shape)
 
 
 @inlined
-def blend_both(rays, splat, centre, base, half):
-    """The same with the evidence taken from the rays without opacity gain."""
+def blend_power(rays, splat, centre, base, half, power, with_plain):
+    """``blend`` that leaves weights or squared weights; with the evidence from plain rays if asked."""
     start = np.float32((half % 2) * LANES - centre)
-    opacity, plain = np.float32(splat.opacity), np.float32(splat.plain)
-    blend_both_lanes(rays.state, half * LANES, (start, np.float32(splat.kx), np.float32(base), opacity, plain))
+    shape = (start, np.float32(splat.kx), np.float32(base), np.float32(splat.opacity))
+    both = (*shape, np.float32(splat.plain))
+    if with_plain and power == 2:
+        blend_both_squared_lanes(rays.state, half * LANES, both)
+    elif with_plain:
+        blend_both_lanes(rays.state, half * LANES, both)
+    elif power == 2:
+        blend_squared_lanes(rays.state, half * LANES, shape)
+    else:
+        blend_lanes(rays.state, half * LANES, shape)

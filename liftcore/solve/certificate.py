@@ -12,6 +12,8 @@ x^; here it is measured at the answer x', which is what a user has.
 from __future__ import annotations
 
 import math
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -43,18 +45,25 @@ class ViewMeasures:
 
 
 def certify(
-    geometry: Geometry, features: Tensor, codebooks: Callable[[int], Tensor], settings: LiftSettings
+    geometry: Geometry,
+    features: Tensor,
+    codebooks: Callable[[int], Tensor],
+    settings: LiftSettings,
+    threads: int | None = None,
 ) -> dict[str, Any]:
     """Measure the lift on its sampled rays.
 
     Args:
         features: [P, F], as they are stored.
         codebooks: view number -> E_v [M, F].
+        threads: None takes the cores that this process may use. The number changes no bit.
 
     Returns:
         Plain numbers, ready for JSON; None where nothing was sampled.
     """
-    views = [measure_view(sample, features, codebooks(number)) for number, sample in enumerate(geometry.samples)]
+    with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
+        books = [codebooks(number) for number in range(len(geometry.samples))]
+        views = list(pool.map(lambda sample, book: measure_view(sample, features, book), geometry.samples, books))
     row_sums = np.concatenate([view.row_sums for view in views])
     residuals = np.concatenate([view.residuals for view in views])
     surrogates = np.concatenate([view.surrogates for view in views])

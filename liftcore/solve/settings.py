@@ -47,7 +47,7 @@ class LiftSettings(BaseModel):
     dtype: Literal["float16", "float32"] = Field(
         "float16", description="how features are stored, if it can hold them"
     )
-    certificate_rays: int = Field(20_000, ge=0, le=10_000_000, description="rays sampled for the certificate")
+    certificate_rays: int = Field(10_000, ge=0, le=10_000_000, description="rays sampled for the certificate")
     seed: int = Field(0, ge=0, lt=2**31, description="of the certificate's sample")
 
     @model_validator(mode="before")
