@@ -46,6 +46,8 @@ RENDER_CHANNELS = 32  # channels a pass of the render, so that a tile's sums sta
 class CpuRaster:
     """A for one scene of 3D Gaussians (``liftcore.raster.protocol.Raster``).
 
+    One call at a time: the footprints of the view at hand live in buffers that the next view overwrites.
+
     Args:
         splats: the scene.
         threads: how many threads work; None takes the cores that this process may use. The number changes no bit.

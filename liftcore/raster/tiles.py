@@ -19,8 +19,8 @@ from liftcore.raster.projection import EXTENT_X, EXTENT_Y, KX, KY, LEAN, MX, MY,
 @inlined
 def _tile_rows(record, rows):
     """First and last tile row whose pixel centres the footprint can reach."""
-    top = math.floor((math.ceil(record[MY] - record[EXTENT_Y] - 0.5)) / TILE)
-    bottom = math.floor((math.floor(record[MY] + record[EXTENT_Y] - 0.5)) / TILE)
+    top = np.floor((np.ceil(record[MY] - record[EXTENT_Y] - 0.5)) / TILE)
+    bottom = np.floor((np.floor(record[MY] + record[EXTENT_Y] - 0.5)) / TILE)
     return max(0.0, top), min(rows - 1.0, bottom)
 
 
@@ -34,8 +34,8 @@ def _edge(record, dy, side):
 @inlined
 def _tile_columns(record, tile_row, columns):
     """First and last tile column that the footprint touches between a tile row's first and last pixel centres."""
-    narrow = math.floor(math.ceil(record[MX] - record[EXTENT_X] - 0.5) / TILE)
-    wide = math.floor(math.floor(record[MX] + record[EXTENT_X] - 0.5) / TILE)
+    narrow = np.floor(np.ceil(record[MX] - record[EXTENT_X] - 0.5) / TILE)
+    wide = np.floor(np.floor(record[MX] + record[EXTENT_X] - 0.5) / TILE)
     if narrow == wide:  # one column at most: no need to look closer
         return max(0.0, narrow), min(columns - 1.0, wide)
     low = max(tile_row * TILE + 0.5 - record[MY], -record[EXTENT_Y])
@@ -45,8 +45,8 @@ def _tile_columns(record, tile_row, columns):
     lean = record[LEAN]
     right = record[EXTENT_X] if low <= lean <= high else _edge(record, low if lean < low else high, 1.0)
     left = -record[EXTENT_X] if low <= -lean <= high else _edge(record, low if -lean < low else high, -1.0)
-    first = math.floor(math.ceil(record[MX] + left - 0.5) / TILE)
-    last = math.floor(math.floor(record[MX] + right - 0.5) / TILE)
+    first = np.floor(np.ceil(record[MX] + left - 0.5) / TILE)
+    last = np.floor(np.floor(record[MX] + right - 0.5) / TILE)
     return max(0.0, first), min(columns - 1.0, last)
 
 

@@ -6,7 +6,6 @@ A tile is 16 rows of two half rows of eight pixels. Products (region weights, re
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -106,8 +105,8 @@ def footprint(records, place, x0, y0):
     my = records[place, MY] - y0 - 0.5
     extent = records[place, EXTENT_Y]
     return Footprint(
-        int(max(0.0, math.ceil(my - extent))),
-        int(min(TILE - 1.0, math.floor(my + extent))),
+        int(max(0.0, np.ceil(my - extent))),
+        int(min(TILE - 1.0, np.floor(my + extent))),
         records[place, MX] - x0 - 0.5,
         my,
         records[place, SLOPE],
