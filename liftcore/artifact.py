@@ -7,20 +7,22 @@ its metadata hold settings, inputs with digests, the encoder, the certificate, t
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import torch
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from liftcore.errors import InvalidLift
+from liftcore.files import whole_file
 from liftcore.solve.settings import LiftSettings
 
 if TYPE_CHECKING:
     from torch import Tensor
 
 FORMAT = "splatlift-lift/1"
+TENSORS = ("features", "evidence", "agreement", "seen")
 
 
 class InputFile(BaseModel):
@@ -62,31 +64,24 @@ class Lift:
 
 
 def save_lift(lift: Lift, path: Path) -> None:
-    """Write the lift whole or not at all (temporary file, fsync, rename)."""
-    from safetensors.torch import save_file
+    """Write the lift whole or not at all (temporary file, fsync, rename), with no copy of X in memory."""
+    from liftcore.safetensors_header import safetensors_header, tensor_bytes
 
-    path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(f".{path.name}.{os.getpid()}.part")
-    tensors = {
-        "features": lift.features,
-        "evidence": lift.evidence,
-        "agreement": lift.agreement,
-        "seen": lift.seen,
-    }
-    try:
-        save_file(tensors, str(draft), metadata={"splatlift": lift.metadata.model_dump_json()})
-        with draft.open("rb") as handle:
-            os.fsync(handle.fileno())
-        draft.replace(path)
-    finally:
-        draft.unlink(missing_ok=True)
+    tensors = {name: getattr(lift, name) for name in TENSORS}
+    specs = [(name, tensor.dtype, tuple(tensor.shape)) for name, tensor in tensors.items()]
+    header, offsets = safetensors_header(specs, {"splatlift": lift.metadata.model_dump_json()})
+    with whole_file(path) as handle:
+        handle.write(header)
+        for name, offset in offsets.items():
+            handle.seek(len(header) + offset)
+            handle.write(tensor_bytes(tensors[name]))
 
 
 def load_lift(path: Path) -> Lift:
     """Open a lift file; the tensors are mapped, not read.
 
     Raises:
-        InvalidLift: the file is missing, is not a safetensors file, or is not a lift.
+        InvalidLift: the file is missing, is not a safetensors file, or is not a lift with a row a splat.
     """
     from safetensors import SafetensorError, safe_open
 
@@ -95,11 +90,22 @@ def load_lift(path: Path) -> Lift:
             metadata = (handle.metadata() or {}).get("splatlift")
             if metadata is None:
                 raise InvalidLift(str(path), expected="a lift file", got="safetensors without lift metadata")
-            tensors = {name: handle.get_tensor(name) for name in ("features", "evidence", "agreement", "seen")}
-        return Lift(**tensors, metadata=LiftMetadata.model_validate_json(metadata))
+            tensors = {name: handle.get_tensor(name) for name in TENSORS}
+        lift = Lift(**tensors, metadata=LiftMetadata.model_validate_json(metadata))
     except FileNotFoundError:
         raise InvalidLift(str(path), expected="a lift file", got="no such file") from None
     except (SafetensorError, OSError, ValidationError, json.JSONDecodeError) as error:
         raise InvalidLift(
             str(path), expected="a lift file (.safetensors)", got=f"a file that does not open as one: {error}"
         ) from None
+    _check_shapes(lift, path)
+    return lift
+
+
+def _check_shapes(lift: Lift, path: Path) -> None:
+    rows = lift.features.shape[:1]
+    fits = lift.features.ndim == 2 and lift.features.dtype in (torch.float16, torch.float32) and lift.features.numel()
+    columns = ((lift.evidence, torch.float32), (lift.agreement, torch.float32), (lift.seen, torch.bool))
+    if not fits or any(column.shape != rows or column.dtype != dtype for column, dtype in columns):
+        shapes = {name: list(getattr(lift, name).shape) for name in TENSORS}
+        raise InvalidLift(str(path), expected="one row a splat in every tensor of a lift", got=str(shapes))

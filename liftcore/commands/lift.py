@@ -6,7 +6,7 @@ import json
 from typing import TYPE_CHECKING, Any
 
 from liftcore.commands.bars import progress_bars
-from liftcore.commands.reply import free_output, reply, shown
+from liftcore.commands.reply import free_output, reply, shown, writing
 from liftcore.errors import InvalidSettings
 from liftcore.solve.settings import LiftSettings
 
@@ -20,9 +20,12 @@ if TYPE_CHECKING:
 def run(options: argparse.Namespace) -> int:
     """Lift, write the lift whole or not at all, and say what came of it."""
     settings = settings_of(options.preset, options.set)
-    out = free_output(options.output, [options.splats, options.cameras, *options.features])
     from liftcore.artifact import save_lift
     from liftcore.lift import lift
+    from liftcore.scene.load import camera_files
+
+    views = camera_files(options.cameras) if options.cameras.is_dir() else [options.cameras]
+    out = free_output(options.output, [options.splats, *views, *options.features])
 
     with progress_bars() as progress:
         result = lift(
@@ -33,7 +36,8 @@ def run(options: argparse.Namespace) -> int:
             threads=options.threads,
             progress=progress,
         )
-    save_lift(result, out)
+    with writing(out):
+        save_lift(result, out)
     document = {"out": str(out), **_summary(result), "warnings": _warnings(result)}
     reply(document, as_json=options.json, lines=_lines(document))
     return 0
@@ -52,7 +56,7 @@ def settings_of(preset: str | None, pairs: Sequence[str]) -> LiftSettings:
             raise InvalidSettings("--set", expected="key=value", got=repr(pair))
         try:
             values[key] = json.loads(text)
-        except ValueError:
+        except (ValueError, RecursionError):
             values[key] = text
     return LiftSettings.of(**values)
 

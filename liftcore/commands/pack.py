@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from liftcore.commands.bars import progress_bars
-from liftcore.commands.reply import free_output, reply
+from liftcore.commands.reply import free_output, reply, writing
 
 if TYPE_CHECKING:
     import argparse
@@ -15,12 +15,13 @@ if TYPE_CHECKING:
 
 def run(options: argparse.Namespace) -> int:
     """Write the pack whole or not at all, and say what is in it."""
-    out = free_output(options.output, [])
     from liftcore.observe.pack import open_packs
     from liftcore.observe.write_pack import write_pack
 
-    with progress_bars() as progress:
-        write_pack(out, _views(options), _metadata(options), progress)
+    views = _views(options)
+    out = free_output(options.output, list(options.folder.glob("*.npy")))
+    with progress_bars() as progress, writing(out):
+        write_pack(out, views, _metadata(options), progress)
     packs = open_packs([out])
     document = {
         "out": str(out),

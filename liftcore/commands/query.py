@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from liftcore.commands.reply import free_output, reply
+from liftcore.commands.reply import free_output, reply, writing
 from liftcore.errors import InvalidQuery
 from liftcore.files import whole_file
 
@@ -21,9 +21,11 @@ def run(options: argparse.Namespace) -> int:
     """Ask, look where a view is named, write what was asked for, and say what was found."""
     if (options.mask or options.attention) and not options.view:
         raise InvalidQuery("--mask and --attention", expected="a view to see them from", got="no --view")
-    for path in (options.mask, options.attention, options.scores):
-        if path is not None:
-            free_output(path, [options.lift])
+    outputs = [path.absolute() for path in (options.mask, options.attention, options.scores) if path is not None]
+    if len(set(outputs)) < len(outputs):
+        raise InvalidQuery("--mask, --attention and --scores", expected="a file each", got="the same file twice")
+    for path in outputs:
+        free_output(path, [options.lift, *([options.table] if options.table else [])])
     from liftcore.query.ask import ask, look, top
     from liftcore.query.encoders import open_encoder
     from liftcore.query.scene import QueryScene
@@ -101,14 +103,16 @@ def _write(options: argparse.Namespace, answer: Answer, seen: Look | None) -> di
     if options.scores:
         import numpy as np
 
-        with whole_file(options.scores) as handle:
+        with writing(options.scores), whole_file(options.scores) as handle:
             np.save(handle, answer.scores.numpy())
         files["scores"] = options.scores
     if seen is not None and options.mask:
-        save_mask(seen, options.mask)
+        with writing(options.mask):
+            save_mask(seen, options.mask)
         files["mask"] = options.mask
     if seen is not None and options.attention:
-        save_attention(seen, options.attention)
+        with writing(options.attention):
+            save_attention(seen, options.attention)
         files["attention"] = options.attention
     return {kind: str(path) for kind, path in files.items()}
 

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from collections.abc import Mapping, Sequence
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from liftcore.errors import InvalidInput
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Iterator
     from pathlib import Path
 
 SHOWN_ITEMS = 6  # of a list, for people
@@ -26,16 +28,36 @@ def reply(document: Mapping[str, Any], *, as_json: bool, lines: Iterable[str] | 
 
 
 def free_output(path: Path, inputs: Sequence[Path]) -> Path:
-    """An output path that is no folder and none of the inputs.
+    """An output path that can be written, and is no folder and none of the inputs.
+
+    Checked before the work, so that an hour of it is not lost over a misspelt name.
 
     Raises:
-        InvalidInput: it is.
+        InvalidInput: it is one of these, or no file can be made there.
     """
-    if path.is_dir():
-        raise InvalidInput("output", expected="a file to write", got=f"the folder {path}")
-    if any(path.exists() and source.exists() and path.samefile(source) for source in inputs):
-        raise InvalidInput("output", expected="another file than the inputs", got=str(path))
+    with writing(path):
+        if path.is_dir():
+            raise InvalidInput("output", expected="a file to write", got=f"the folder {path}")
+        if any(path.exists() and source.exists() and path.samefile(source) for source in inputs):
+            raise InvalidInput("output", expected="another file than the inputs", got=str(path))
+        folder = next(parent for parent in path.absolute().parents if os.path.lexists(parent))
+        if not folder.is_dir() or not os.access(folder, os.W_OK | os.X_OK):
+            raise InvalidInput("output", expected="a folder that can be written", got=str(folder))
     return path
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Say which output failed, and why, when the disk is full or the folder is not for us to write.
+
+    Raises:
+        InvalidInput: the operating system refused.
+    """
+    try:
+        yield
+    except OSError as error:
+        got = f"{path} ({error.strerror or error})"
+        raise InvalidInput("output", expected="a file that can be written", got=got) from None
 
 
 def _strict(value: Any) -> Any:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from typing import TYPE_CHECKING
 
 import torch
@@ -13,6 +12,7 @@ from liftcore.observe.finite import check_finite
 from liftcore.observe.observation import Observation, RegionMap
 from liftcore.observe.pack import MAX_HEADER_BYTES
 from liftcore.progress import Progress, silent
+from liftcore.safetensors_header import safetensors_header, tensor_bytes
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
     from torch import Tensor
 
-_TYPES = {torch.float32: "F32", torch.int32: "I32", torch.float16: "F16", torch.int16: "I16"}
 LARGEST_I16 = 32_767
 
 
@@ -48,12 +47,12 @@ def write_pack(
         raise InvalidFeatures(str(path), expected="at least one view", got="none")
     header, offsets = _header(observations, metadata, progress)
     with whole_file(path) as handle:
-        handle.write(len(header).to_bytes(8, "little") + header)
+        handle.write(header)
         start = handle.tell()
         for done, (view, observation) in enumerate(observations.items(), start=1):
             for key, tensor in _tensors(view, observation):
                 handle.seek(start + offsets[key])
-                handle.write(tensor.contiguous().numpy().tobytes())
+                handle.write(tensor_bytes(tensor))
             progress("pack", done, len(observations), "views")
 
 
@@ -70,20 +69,10 @@ def _header(
     if len(channels) > 1:
         got = ", ".join(f"{count} in {view!r}" for count, view in list(channels.items())[:3])
         raise InvalidFeatures("features", expected="the same channels in every view", got=got)
-    # Wide types first keeps every tensor aligned to its own width, which a mapping needs.
-    specs.sort(key=lambda spec: -spec[1].itemsize)
-    header: dict[str, object] = {"__metadata__": dict(metadata)}
-    offsets: dict[str, int] = {}
-    end = 0
-    for key, dtype, shape in specs:
-        offsets[key] = end
-        end += torch.Size(shape).numel() * dtype.itemsize
-        header[key] = {"dtype": _TYPES[dtype], "shape": shape, "data_offsets": (offsets[key], end)}
-    text = json.dumps(header, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 8)
-    if len(text) > MAX_HEADER_BYTES:
+    header, offsets = safetensors_header(specs, metadata)
+    if len(header) > MAX_HEADER_BYTES:
         raise InvalidFeatures("views", expected="fewer views in a pack", got=str(len(observations)))
-    return text, offsets
+    return header, offsets
 
 
 def _tensors(view: str, observation: Observation) -> Iterator[tuple[str, Tensor]]:

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
 MAX_SIDE = 32_768  # pixels; larger images are a broken header, not a photo
+MIN_FOCAL, MAX_FOCAL = 1e-3, 1e9  # pixels; float64 squares of what they project stay finite
+MAX_OFF_CENTRE = 1e9  # pixels of the principal point
 MAX_REACH = 1e12  # scene units from the origin; float32 has no detail left long before
 
 
@@ -39,6 +41,10 @@ class Camera:
         intrinsics = (self.fx, self.fy, self.cx, self.cy)
         if not all(math.isfinite(value) for value in intrinsics) or self.fx <= 0 or self.fy <= 0:
             self._refuse("intrinsics", "finite fx, fy, cx, cy with positive focal lengths", str(intrinsics))
+        if not (min(intrinsics[:2]) >= MIN_FOCAL and max(intrinsics[:2]) <= MAX_FOCAL):
+            self._refuse("intrinsics", f"focal lengths in {MIN_FOCAL:g}..{MAX_FOCAL:g} pixels", str(intrinsics))
+        if max(abs(self.cx), abs(self.cy)) > MAX_OFF_CENTRE:
+            self._refuse("intrinsics", f"a principal point within {MAX_OFF_CENTRE:g} pixels", str(intrinsics))
         if pose.shape != (4, 4) or not np.isfinite(pose).all():
             self._refuse("pose", "a finite 4x4 matrix", f"shape {list(pose.shape)}")
         rotation = pose[:3, :3]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import mmap
 import struct
 from dataclasses import dataclass
@@ -81,8 +82,8 @@ def _camera(name: str, image: _Image, sensors: Mapping[int, _Sensor], source: st
 
 def _rotation(quaternion: np.ndarray, source: str) -> np.ndarray:
     """[3, 3] of a quaternion w x y z of any length but zero."""
-    length = float(np.linalg.norm(quaternion))
-    if not np.isfinite(length) or length == 0:
+    length = math.hypot(*quaternion)  # which squares nothing that could overflow
+    if not math.isfinite(length) or length == 0:
         raise InvalidCameras(source, expected="a finite quaternion that is not zero", got=str(quaternion.tolist()))
     w, x, y, z = quaternion / length
     return np.array(

@@ -1,0 +1,43 @@
+"""The header of a safetensors file, for writers that stream their tensors after it."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+import torch
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+    from torch import Tensor
+
+    Spec = tuple[str, torch.dtype, tuple[int, ...]]  # a tensor's name, type and shape
+
+TYPES = {
+    torch.float32: "F32",
+    torch.int32: "I32",
+    torch.float16: "F16",
+    torch.int16: "I16",
+    torch.bool: "BOOL",
+}
+
+
+def safetensors_header(specs: Iterable[Spec], metadata: Mapping[str, str]) -> tuple[bytes, dict[str, int]]:
+    """The bytes before the first tensor, and where each tensor begins behind them."""
+    header: dict[str, object] = {"__metadata__": dict(metadata)}
+    offsets: dict[str, int] = {}
+    end = 0
+    # Wide types first keeps every tensor aligned to its own width, which a mapping needs.
+    for key, dtype, shape in sorted(specs, key=lambda spec: -spec[1].itemsize):
+        offsets[key] = end
+        end += torch.Size(shape).numel() * dtype.itemsize
+        header[key] = {"dtype": TYPES[dtype], "shape": shape, "data_offsets": (offsets[key], end)}
+    text = json.dumps(header, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 8)
+    return len(text).to_bytes(8, "little") + text, offsets
+
+
+def tensor_bytes(tensor: Tensor) -> memoryview:
+    """A tensor's bytes in row order, without a copy where it lies so already."""
+    return tensor.contiguous().flatten().view(torch.uint8).numpy().data
