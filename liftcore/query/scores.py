@@ -11,19 +11,14 @@ from typing import TYPE_CHECKING
 import torch
 
 from liftcore.errors import InvalidQuery
+from liftcore.query.products import norms_of, products_with
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from torch import Tensor
 
 DEFAULT_NEGATIVES = ("object", "things", "stuff", "texture")  # LangSplat's canonical phrases
 RELEVANCY_SHARPNESS = 10.0  # the softmax's inverse temperature in LERF and LangSplat
 LOWEST_COSINE = -1.0  # what a splat without a feature scores
-
-# float16 rows are widened block by block: a block of this many float32 values stays in the last-level cache,
-# where the product reads it. 0.5 M values were the fastest of 32 k to 2 M on two cores.
-_BLOCK_VALUES = 1 << 19
 
 
 def feature_norms(features: Tensor) -> Tensor:
@@ -35,10 +30,7 @@ def feature_norms(features: Tensor) -> Tensor:
     Returns:
         [P] f32, zero for zero rows.
     """
-    norms = torch.empty(features.shape[0])
-    for rows, block in _wide_blocks(features):
-        torch.linalg.vector_norm(block, dim=1, out=norms[rows])
-    return norms
+    return norms_of(features)
 
 
 def cosine(features: Tensor, norms: Tensor, text: Tensor) -> Tensor:
@@ -72,14 +64,7 @@ def cosines(features: Tensor, norms: Tensor, texts: Tensor) -> Tensor:
     Raises:
         InvalidQuery: a text's vector has another length than the features, is zero or is not finite.
     """
-    directions = _unit_rows(texts, features.shape[1]).T.contiguous()
-    products = torch.empty(features.shape[0], directions.shape[1])
-    for rows, block in _wide_blocks(features):
-        # A matrix of one column goes the slow way through the library; a vector does not.
-        if directions.shape[1] == 1:
-            torch.mv(block, directions[:, 0], out=products[rows, 0])
-        else:
-            torch.mm(block, directions, out=products[rows])
+    products = products_with(features, _unit_rows(texts, features.shape[1]))
     products /= norms.clamp_min(torch.finfo(torch.float32).tiny)[:, None]
     products.clamp_(-1.0, 1.0)
     products[norms == 0] = LOWEST_COSINE
@@ -111,14 +96,3 @@ def _unit_rows(texts: Tensor, channels: int) -> Tensor:
     if not bool(torch.isfinite(lengths).all()) or bool((lengths == 0).any()):
         raise InvalidQuery("text vector", expected="a finite vector with a direction", got="zero, NaN or infinity")
     return wide / lengths
-
-
-def _wide_blocks(features: Tensor) -> Iterator[tuple[slice, Tensor]]:
-    """Consecutive blocks of rows in float32, in one buffer that the next block overwrites."""
-    count, channels = features.shape
-    rows = max(1, _BLOCK_VALUES // max(1, channels))
-    buffer = torch.empty(min(rows, count), channels) if features.dtype != torch.float32 else None
-    for start in range(0, count, rows):
-        stop = min(start + rows, count)
-        block = features[start:stop]
-        yield slice(start, stop), block if buffer is None else buffer[: stop - start].copy_(block)
