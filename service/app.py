@@ -55,5 +55,6 @@ def assemble(settings: ServiceSettings, store: Store) -> FastAPI:
         seconds=settings.query_seconds,
         scenes=settings.query_scenes,
         answers=settings.query_answers,
+        encoder=settings.encoder,
     )
     return create_app(settings, store, Supervisor(store, threads=settings.lift_threads), WarmWorker(limits))

@@ -87,3 +87,13 @@ def encoder_file(spec: str) -> Path | None:
     if spec.startswith("open_clip:") and "@" in spec:
         return Path(spec.partition("@")[2])
     return Path(spec) if spec.endswith(".safetensors") else None
+
+
+def encoder_version(spec: str) -> list[int] | None:
+    """What changes when the file of an encoder does: its time and size; None without a file."""
+    file = encoder_file(spec)
+    try:
+        status = file.stat() if file is not None else None
+    except OSError:
+        return None
+    return None if status is None else [status.st_mtime_ns, status.st_size]

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
+import json
 import math
+import threading
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import asdict, replace
@@ -14,13 +17,19 @@ import numpy as np
 import torch
 
 from liftcore.artifact import load_lift
+from liftcore.errors import SplatliftError
 from liftcore.query.ask import Answer, Look, ask, look, top
 from liftcore.query.encoders import TextEncoder, open_encoder
+from liftcore.query.encoders.remembering import RememberingEncoder
 from liftcore.query.pictures import attention_png, mask_png, render_png
+from liftcore.query.products import norms_of, products_with
 from liftcore.query.scene import QueryScene
+from liftcore.raster.warm_up import warm_up
 from service.queries.frames import Frame
 
 T = TypeVar("T")
+LOOKS = 4  # views kept: the mask and the map of an answer are two readings of one render
+WARM_UP_TEXT = "something"
 
 
 class Kept(Generic[T]):
@@ -46,7 +55,9 @@ class Answers:
     def __init__(self, *, scenes: int, answers: int) -> None:
         self._scenes: Kept[QueryScene] = Kept(scenes)
         self._answers: Kept[Answer] = Kept(answers)
-        self._encoders: dict[str, TextEncoder] = {}
+        self._looks: Kept[Look] = Kept(LOOKS)
+        self._encoders: dict[str, tuple[object, TextEncoder]] = {}  # spec -> version of its file, encoder
+        self._opening = threading.RLock()  # of encoders, which the warm-up opens too
         self._operations: dict[str, Callable[[dict[str, Any]], Frame]] = {
             "query": self._query,
             "scores": self._scores,
@@ -54,6 +65,18 @@ class Answers:
             "attention": self._attention,
             "render": self._render,
         }
+
+    def warm_up(self, encoder: str, version: object) -> None:
+        """Load what the first query would wait for: an encoder, and the compiled kernels.
+
+        An encoder that does not open is told to whoever asks for it.
+        """
+        with contextlib.suppress(SplatliftError), self._opening:
+            self._encoder(encoder, version).encode([WARM_UP_TEXT])
+        for dtype in (torch.float16, torch.float32):
+            row = torch.ones(1, 1, dtype=dtype)
+            products_with(row, norms_of(row)[None])
+        warm_up()
 
     def reply(self, request: dict[str, Any]) -> Frame:
         """The reply to one request; ``operation`` says which.
@@ -66,23 +89,26 @@ class Answers:
     def _scene(self, request: dict[str, Any]) -> QueryScene:
         return self._scenes.get(request["lift"], lambda: open_scene(request))
 
-    def _encoder(self, spec: str) -> TextEncoder:
-        if spec not in self._encoders:
-            self._encoders[spec] = open_encoder(spec)
-        return self._encoders[spec]
+    def _encoder(self, spec: str, version: object) -> TextEncoder:
+        with self._opening:
+            known = self._encoders.get(spec)
+            if known is None or known[0] != version:  # a table that the operator replaced is another table
+                known = self._encoders[spec] = (version, RememberingEncoder(open_encoder(spec)))
+            return known[1]
 
     def _answer(self, request: dict[str, Any]) -> Answer:
-        negatives = tuple(request["negatives"])
-        key = (request["lift"], request["encoder"], request["text"], negatives, request["threshold"])
         scene = self._scene(request)
-        encoder = self._encoder(request["encoder"])
-        return self._answers.get(
-            key,
-            lambda: ask(scene, request["text"], encoder, negatives=negatives, threshold=request["threshold"]),
-        )
+        encoder = self._encoder(request["encoder"], request["encoder_version"])
+
+        def make() -> Answer:
+            how = {"negatives": tuple(request["negatives"]), "threshold": request["threshold"]}
+            return ask(scene, request["text"], encoder, **how)
+
+        return self._answers.get(_question(request), make)
 
     def _look(self, request: dict[str, Any]) -> Look:
-        return look(self._scene(request), self._answer(request), request["view"])
+        answer, view = self._answer(request), request["view"]
+        return self._looks.get((_question(request), view), lambda: look(self._scene(request), answer, view))
 
     def _query(self, request: dict[str, Any]) -> Frame:
         scene, answer = self._scene(request), self._answer(request)
@@ -103,6 +129,20 @@ class Answers:
 
     def _render(self, request: dict[str, Any]) -> Frame:
         return Frame({}, render_png(self._scene(request), request["view"]))
+
+
+def use_one_library_thread() -> None:
+    """Let the libraries compute in the calling thread.
+
+    A query is a row of small operations, each of which would wait for a team of threads to meet; beside a lift that
+    keeps the cores busy they meet late. The kernels bring threads of their own.
+    """
+    torch.set_num_threads(1)
+
+
+def _question(request: dict[str, Any]) -> tuple[object, ...]:
+    names = ("lift", "encoder", "encoder_version", "text", "negatives", "threshold")
+    return tuple(json.dumps(request[name]) for name in names)
 
 
 def open_scene(request: dict[str, Any]) -> QueryScene:

@@ -26,6 +26,7 @@ class QueryLimits:
     seconds: float  # of one call, waiting included
     scenes: int  # lifts kept open
     answers: int  # answers kept
+    encoder: str  # specification of the text encoder that is loaded before it is asked for
 
 
 class WarmWorker:
@@ -126,7 +127,7 @@ class WarmWorker:
     def _spawn(self) -> None:
         self._bury()
         command = [sys.executable, "-m", "service.queries.worker"]
-        command += [str(self._limits.scenes), str(self._limits.answers)]
+        command += [str(self._limits.scenes), str(self._limits.answers), self._limits.encoder]
         self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True
         )

@@ -1,18 +1,21 @@
 """The query process: reads requests from stdin, answers on stdout, ends when its server does.
 
-Run as ``python -m service.queries.worker SCENES ANSWERS``.
+Run as ``python -m service.queries.worker SCENES ANSWERS ENCODER``. It warms up while it waits: the compiled
+kernels and the encoder named are loaded beside the first requests, which wait for no more than they need.
 """
 
 from __future__ import annotations
 
 import os
 import sys
+import threading
 import traceback
 
 from liftcore.errors import SplatliftError
 from service.faults import fault_of
-from service.queries.answers import Answers
+from service.queries.answers import Answers, use_one_library_thread
 from service.queries.frames import Frame, read_frame, write_frame
+from service.settings import encoder_version
 
 
 def reply_to(request: Frame, answers: Answers) -> Frame:
@@ -26,12 +29,21 @@ def reply_to(request: Frame, answers: Answers) -> Frame:
         return Frame({"crash": True})
 
 
+def _warm_up(answers: Answers, encoder: str) -> None:
+    try:
+        answers.warm_up(encoder, encoder_version(encoder))
+    except Exception:  # whoever asks will meet it again, and is told
+        traceback.print_exc()
+
+
 def main() -> None:
     """Answer until stdin ends."""
     # Libraries may print; the pipe is for answers only.
     out = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
+    use_one_library_thread()
     answers = Answers(scenes=int(sys.argv[1]), answers=int(sys.argv[2]))
+    threading.Thread(target=_warm_up, args=(answers, sys.argv[3]), daemon=True).start()
     while (request := read_frame(sys.stdin.buffer)) is not None:
         write_frame(out, reply_to(request, answers))
 

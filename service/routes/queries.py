@@ -14,7 +14,7 @@ from liftcore import __version__
 from service import wire
 from service.content import tagged, unchanged
 from service.parts import Here, Parts
-from service.settings import encoder_file
+from service.settings import encoder_file, encoder_version
 from service.store.lifts import LiftRecord
 
 router = APIRouter(tags=["queries"])
@@ -136,6 +136,7 @@ def _request(operation: str, phrase: Phrase, lift: LiftRecord, here: Parts) -> d
     asked = _scene_request(operation, lift, here)
     return asked | {
         "encoder": spec,
+        "encoder_version": encoder_version(spec),
         "text": phrase.text,
         "negatives": phrase.negatives,
         "threshold": phrase.threshold,
@@ -172,10 +173,6 @@ def _entity(request: Request, here: Parts, asked: dict[str, Any], lift: LiftReco
 def entity_tag(asked: dict[str, Any], lift: LiftRecord) -> str:
     """The tag of an answer, from all that decides it: so 304 costs no query."""
     decides = {name: value for name, value in asked.items() if name != "names"}
-    file = encoder_file(asked.get("encoder", ""))
-    if file is not None and file.exists():
-        status = file.stat()
-        decides["encoder_file"] = [status.st_mtime_ns, status.st_size]
     decides["lift"] = lift.sha256
     decides["version"] = __version__
     return f'"{hashlib.sha256(json.dumps(decides, sort_keys=True).encode()).hexdigest()}"'
