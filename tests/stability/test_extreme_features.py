@@ -1,0 +1,192 @@
+"""The solution at its extremes: any length and size of vectors, any map, any number of labels."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+import torch
+
+from liftcore.artifact import Lift, load_lift, save_lift
+from liftcore.errors import InvalidFeatures
+from liftcore.lift import lift
+from liftcore.observe.observation import FeatureGrid, Observation, RegionMap
+from liftcore.observe.write_pack import write_pack
+from liftcore.raster.oracle import reading_matrix
+from liftcore.raster.protocol import Walk
+from liftcore.scene.cameras import Camera, Cameras
+from liftcore.scene.inria import write_inria_cameras
+from liftcore.scene.ply import write_splats
+from liftcore.scene.splats import Splats
+from liftcore.solve.settings import LiftSettings
+from tests.scenes import random_splats
+from tests.stability.extremes import exact_view, splats_at
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+WIDTH, HEIGHT = 16, 12
+SCENE = random_splats(11, 30)
+
+
+def camera(name: str = "v0", back: float = 4.0) -> Camera:
+    pose = np.eye(4)
+    pose[2, 3] = back
+    return Camera(name, WIDTH, HEIGHT, 16.0, 16.0, WIDTH / 2, HEIGHT / 2, pose)
+
+
+def lifted(folder: Path, views: dict[str, Observation], splats: Splats = SCENE, **values: object) -> Lift:
+    """Through the files and back; a view named ``away`` looks where nothing is."""
+    write_splats(splats, folder / "splats.ply")
+    cameras = Cameras(tuple(camera(name, back=-1e6 if name == "away" else 4.0) for name in views))
+    write_inria_cameras(cameras, folder / "cameras.json")
+    write_pack(folder / "pack.safetensors", views, {})
+    paths = folder / "splats.ply", folder / "cameras.json", folder / "pack.safetensors"
+    save_lift(lift(paths[0], paths[1], paths[2:], LiftSettings.of(**values)), folder / "lift.safetensors")
+    return load_lift(folder / "lift.safetensors")
+
+
+def assert_sound(got: Lift, observation: Observation, splats: Splats = SCENE, stop: float = 1e-4) -> None:
+    """Row-sum features equal the dense definition, relative to the longest input; everything is finite."""
+    S, ray = reading_matrix(observation, WIDTH, HEIGHT)
+    A = exact_view(splats, camera(), Walk(transmittance_stop=stop)).A[ray]
+    total = A.sum(axis=0)
+    book = observation.codebook.double().numpy()
+    X = np.divide(
+        A.T @ (S @ book), total[:, None], out=np.zeros((splats.count, book.shape[1])), where=total[:, None] > 0
+    )
+    assert np.array_equal(got.seen.numpy(), total > 0)
+    error = np.abs(got.features.double().numpy() - X).max()
+    assert error <= 1e-3 * max(np.abs(book).max(), 1e-300)
+    for tensor in (got.features, got.evidence, got.agreement):
+        assert bool(torch.isfinite(tensor).all())
+    assert 0 <= float(got.agreement.min()) <= float(got.agreement.max()) <= 1
+    assert not got.features[~got.seen].any()
+    certificate = got.metadata.certificate
+    assert all(np.isfinite(certificate[key]) for key in ("row_sum_mean", "residual", "surrogate", "bound"))
+
+
+def checkerboard(rows: int, channels: int, scale: float = 1.0, dtype: torch.dtype = torch.float32) -> RegionMap:
+    """Regions of 4x4 pixels that read ``rows`` random vectors."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    labels = torch.tensor((y // 4 * 4 + x // 4) % rows, dtype=torch.int32)[None]
+    vectors = np.random.default_rng(rows).uniform(-1, 1, (rows, channels))
+    return RegionMap(labels, torch.tensor(vectors / np.abs(vectors).max() * scale).to(dtype))
+
+
+@pytest.mark.parametrize("channels", [1, 2, 31, 33, 8_192])
+def test_any_number_of_channels_equals_the_dense_definition(tmp_path, channels):
+    observation = checkerboard(5, channels)
+    assert_sound(lifted(tmp_path, {"v0": observation}, preset="row-sum"), observation)
+
+
+@pytest.mark.parametrize(
+    ("scale", "given", "stored"),
+    [
+        (65_504.0, torch.float16, torch.float16),
+        (65_504.0, torch.float32, torch.float16),
+        (70_000.0, torch.float32, torch.float32),
+        (1e14, torch.float32, torch.float32),
+        (1e-4, torch.float16, torch.float32),
+        (1e-20, torch.float32, torch.float32),
+    ],
+)
+def test_vectors_of_any_length_are_stored_in_a_type_that_holds_them(tmp_path, scale, given, stored):
+    observation = checkerboard(5, 40, scale, given)
+    got = lifted(tmp_path, {"v0": observation}, preset="row-sum")
+    assert got.features.dtype == stored
+    assert_sound(got, observation)
+
+
+def test_agreement_is_the_same_at_any_length_of_the_vectors(tmp_path):
+    runs = [lifted(tmp_path, {"v0": checkerboard(5, 40, scale)}).agreement for scale in (1.0, 1e14, 1e-25)]
+    assert torch.allclose(runs[0], runs[1], atol=1e-5)
+    assert torch.allclose(runs[0], runs[2], atol=1e-5)
+
+
+def test_vectors_beyond_any_encoder_are_refused(tmp_path):
+    with pytest.raises(InvalidFeatures, match="finite values within"):
+        lifted(tmp_path, {"v0": checkerboard(5, 40, 3e38)})
+
+
+def test_zero_rows_of_a_codebook_lift_to_zero_without_a_direction(tmp_path):
+    observation = checkerboard(3, 7)
+    observation.codebook[1] = 0
+    assert_sound(lifted(tmp_path, {"v0": observation}, preset="row-sum"), observation)
+    nothing = RegionMap(observation.labels, torch.zeros(3, 7))
+    got = lifted(tmp_path, {"v0": nothing}, preset="row-sum")
+    assert_sound(got, nothing)
+    assert float(got.agreement.max()) == 0
+
+
+def maps() -> dict[str, Observation]:
+    one_pixel = torch.full((1, HEIGHT, WIDTH), -1, dtype=torch.int32)
+    one_pixel[0, 6, 8] = 1
+    large = torch.arange(100 * 130, dtype=torch.int32).reshape(1, 100, 130) % 4
+    rng = np.random.default_rng(0)
+    return {
+        "one pixel": RegionMap(one_pixel, torch.eye(4, 6)),
+        "1x1 labels": RegionMap(torch.full((2, 1, 1), 2, dtype=torch.int32), torch.eye(4, 6)),
+        "labels larger than the image": RegionMap(large, torch.eye(4, 6)),
+        "a region a pixel": RegionMap(torch.arange(192, dtype=torch.int32).reshape(1, 12, 16), torch.eye(192, 6)),
+        "1x1 grid": FeatureGrid(torch.ones(1, 1, 6)),
+        "grid of one row": FeatureGrid(torch.tensor(rng.uniform(size=(1, 9, 6)), dtype=torch.float32)),
+        "grid finer than the pixels": FeatureGrid(torch.tensor(rng.uniform(size=(50, 70, 6)), dtype=torch.float32)),
+    }
+
+
+@pytest.mark.parametrize("name", list(maps()))
+def test_maps_of_any_size_equal_the_dense_definition(tmp_path, name):
+    observation = maps()[name]
+    assert_sound(lifted(tmp_path, {"v0": observation}, preset="row-sum"), observation)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (5, 7), (12, 16), (50, 70)])
+def test_the_nearest_reading_of_a_grid_takes_the_cell_under_the_pixel(tmp_path, size):
+    vectors = np.random.default_rng(1).uniform(size=(*size, 6))
+    grid = FeatureGrid(torch.tensor(vectors, dtype=torch.float32))
+    cells = RegionMap(torch.arange(size[0] * size[1], dtype=torch.int32).reshape(1, *size), grid.codebook)
+    got = lifted(tmp_path, {"v0": grid}, preset="row-sum", grid_reading="nearest")
+    assert_sound(got, cells)
+    as_regions = lifted(tmp_path, {"v0": cells}, preset="row-sum")
+    assert torch.equal(got.features, as_regions.features)
+    assert got.metadata.certificate == as_regions.metadata.certificate
+
+
+def test_a_lift_without_any_label_succeeds_with_nothing_seen(tmp_path):
+    for name in ("v0", "away"):
+        blank = RegionMap(torch.full((2, 3, 4), -1, dtype=torch.int32), torch.ones(2, 5))
+        got = lifted(tmp_path, {name: blank})
+        assert not got.seen.any()
+        assert not got.features.any()
+        assert not got.agreement.any()
+        assert bool((got.evidence > 0).any()) is (name == "v0")
+        assert got.metadata.certificate["residual"] is None
+        assert got.metadata.certificate["row_sum_mean"] is not None
+
+
+@pytest.mark.parametrize("limit", [0, 1 << 30])
+def test_a_view_that_sees_nothing_changes_nothing(tmp_path, monkeypatch, limit):
+    monkeypatch.setattr("liftcore.solve.view_weights.MEMORY_LIMIT", limit)
+    observation = checkerboard(5, 9)
+    alone = lifted(tmp_path, {"v0": observation})
+    both = lifted(tmp_path, {"away": observation, "v0": observation})
+    assert torch.equal(alone.features, both.features)
+    assert torch.equal(alone.evidence, both.evidence)
+
+
+@pytest.mark.parametrize("preset", ["row-sum", "tikhonov"])
+def test_splats_behind_forty_opaque_ones_stay_finite_without_a_stop(tmp_path, preset):
+    splats = splats_at([(0.0, 0.0, 0.1 * k) for k in range(40)], log_scales=0.5, logits=1e4)
+    got = lifted(tmp_path, {"v0": checkerboard(5, 9)}, splats, preset=preset, transmittance_stop=0)
+    for tensor in (got.features, got.evidence, got.agreement):
+        assert bool(torch.isfinite(tensor).all())
+    assert float(got.features.abs().max()) <= 1.001
+    assert int(got.seen.sum()) > 5
+
+
+def test_an_opaque_splat_is_lifted_at_the_largest_cap_that_is_allowed(tmp_path):
+    splats = splats_at([(0.0, 0.0, 0.0)], log_scales=2.0, logits=1e4)
+    got = lifted(tmp_path, {"v0": checkerboard(5, 9)}, splats, alpha_cap=0.9999999, transmittance_stop=0)
+    assert float(got.evidence[0]) > 0.9 * WIDTH * HEIGHT
