@@ -16,14 +16,19 @@ from service.settings import ServiceSettings
 from service.store.store import Store
 
 from .following import ended
-from .tiny_scene import TinyScene, make_scene
+from .tiny_scene import CHANNELS, TinyScene, make_scene, text_table
 
 
 @contextmanager
 def serving(data: Path, table: Path, **settings: Any) -> Iterator[TestClient]:
     """The application over a data directory, with the text table of the tiny scene."""
     chosen = ServiceSettings.model_validate(
-        {"data": data, "encoder": f"table:{table}", "text_spaces": {"spare": "minilm"}, **settings}
+        {
+            "data": data,
+            "encoder": f"table:{table}",
+            "text_spaces": {"spare": f"table:{table.with_name('narrow.safetensors')}"},
+            **settings,
+        }
     )
     store = Store.open(chosen.data)
     try:
@@ -60,6 +65,7 @@ def scene() -> TinyScene:
 def table(scene: TinyScene, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("encoder") / "table.safetensors"
     path.write_bytes(scene.table)
+    path.with_name("narrow.safetensors").write_bytes(text_table(CHANNELS - 3))  # of another space
     return path
 
 

@@ -44,7 +44,7 @@ def submit(store: Store) -> str:
 
 
 def test_child_that_dies_without_a_word_fails_its_job(
-    start: Callable[..., Any], scene: TinyScene, monkeypatch: pytest.MonkeyPatch
+    client: TestClient, uploaded: Uploaded, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     started: list[int] = []
     begin = process.JobProcess.__init__
@@ -55,9 +55,7 @@ def test_child_that_dies_without_a_word_fails_its_job(
         os.kill(self.pid, signal.SIGKILL)
 
     monkeypatch.setattr(process.JobProcess, "__init__", killed)
-    with start() as client:
-        uploaded = upload(client, scene)
-        job = ended(client, client.post("/lift", json=uploaded.order()).headers["location"])
+    job = ended(client, client.post("/lift", json=uploaded.order()).headers["location"])
     assert job["state"] == "failed" and job["problem"]["type"] == "/problems/crashed"
     assert "signal 9" in job["problem"]["detail"]
     assert len(started) == 1
@@ -68,24 +66,19 @@ def upload(client: TestClient, scene: TinyScene) -> Uploaded:
     return Uploaded(*(client.put(f"/assets/{kind}", content=body).json()["id"] for kind, body in contents.items()))
 
 
-def test_job_interrupted_by_a_stop_goes_on_at_the_next_start(start: Callable[..., Any], scene: TinyScene) -> None:
+def test_job_interrupted_by_a_stop_goes_on_where_the_data_directory_is_next(
+    start: Callable[..., Any], scene: TinyScene, tmp_path: Path
+) -> None:
     with start() as client:
         uploaded = upload(client, scene)
         location = client.post("/lift", json=uploaded.order()).headers["location"]
         while client.get(location).json()["state"] == "queued":
             time.sleep(0.01)
-    with start() as client:
+    (tmp_path / "data").rename(tmp_path / "moved")
+    with start("moved") as client:
         job = ended(client, location)
         assert job["state"] == "succeeded" and job["attempt"] in (1, 2)
         assert client.get("/query", params={"text": "apple"}).status_code == 200
-
-
-def test_moved_data_directory_still_answers(start: Callable[..., Any], scene: TinyScene, tmp_path: Path) -> None:
-    with start() as client:
-        uploaded = upload(client, scene)
-        ended(client, client.post("/lift", json=uploaded.order()).headers["location"])
-    (tmp_path / "data").rename(tmp_path / "moved")
-    with start("moved") as client:
         assert client.get("/query/mask", params={"text": "apple", "view": "left"}).status_code == 200
 
 

@@ -145,7 +145,7 @@ def test_long_body_is_413(client: TestClient) -> None:
         ("/query", {"top": "-1"}, 422, "invalid-request"),
         ("/query", {"negatives": "zeppelin"}, 422, "invalid-query"),
         ("/query", {"encoder": "table:/etc/passwd"}, 422, "invalid-request"),
-        ("/query", {"encoder": "spare"}, 422, "invalid-query"),  # MiniLM: 384 channels and not 8
+        ("/query", {"encoder": "spare"}, 422, "invalid-query"),  # 5 channels and not 8
         ("/query/mask", {"view": "behind"}, 404, "not-found"),
         ("/query/mask", {}, 422, "invalid-request"),
         ("/query/scores", {"lift": "../../etc/passwd"}, 422, "invalid-request"),

@@ -35,6 +35,8 @@ def server(data: Path, table: Path) -> Iterator[str]:
         "0",
         "--data",
         str(data),
+        "--encoder",
+        f"table:{table}",
         "--text-space",
         f"tiny=table:{table}",
     ]

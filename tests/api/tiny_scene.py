@@ -104,9 +104,9 @@ def labels() -> dict[str, np.ndarray]:
     return found
 
 
-def codebook() -> np.ndarray:
-    """[3, 8] f32, one unit row a word."""
-    return np.eye(3, CHANNELS, dtype=np.float32)
+def codebook(channels: int = CHANNELS) -> np.ndarray:
+    """[3, channels] f32, one unit row a word."""
+    return np.eye(3, channels, dtype=np.float32)
 
 
 def pack(by_view: dict[str, np.ndarray], rows: np.ndarray | None = None) -> bytes:
@@ -119,6 +119,6 @@ def pack(by_view: dict[str, np.ndarray], rows: np.ndarray | None = None) -> byte
     return save(tensors, metadata={"encoder": "by hand", "text_space": "tiny", "normalised": "true"})
 
 
-def text_table() -> bytes:
+def text_table(channels: int = CHANNELS) -> bytes:
     """A text table with the three words."""
-    return save({"embeddings": codebook()}, metadata={"words": json.dumps(WORDS)})
+    return save({"embeddings": codebook(channels)}, metadata={"words": json.dumps(WORDS)})
