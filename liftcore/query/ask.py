@@ -9,7 +9,8 @@ import numpy as np
 import torch
 
 from liftcore.errors import InvalidQuery
-from liftcore.query.scores import LOWEST_COSINE, cosines, relevancy
+from liftcore.query.products import LOWEST_COSINE
+from liftcore.query.scores import cosines, relevancy
 from liftcore.query.threshold import find_threshold
 
 if TYPE_CHECKING:

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 # A float16 shifted to float32's place is the number times 2^-112, as the exponents' biases are 127 and 15.
 HALF_SCALE = 2.0**112
 SIGN_AND_MAGNITUDE = np.int32(-0x70002000)  # bits 31 and 27..13, where a shifted float16 lies
+LOWEST_COSINE = -1.0  # what a splat without a feature scores
 SHARE_ROWS = 8_192  # rows a share; the bits of the result depend on no row but one's own
 
 
@@ -52,26 +53,34 @@ def _square(row, scale):
 
 
 @vectorised
-def multiply_halves(first, last, halves, directions, products):
-    """``products[j, n] = halves[j] . directions[n]`` for rows first..last.
+def _cosine(product, norm):
+    if norm == 0:
+        return np.float32(LOWEST_COSINE)
+    return min(max(product / norm, np.float32(-1.0)), np.float32(1.0))
+
+
+@vectorised
+def compare_halves(first, last, halves, norms, directions, cosines):
+    """``cosines[j, n] = halves[j] . directions[n] / norms[j]`` for rows first..last, -1 where the norm is zero.
 
     Args:
-        halves: [P, F] i16, the bits of float16. directions: [n, F] f32, times HALF_SCALE. products: [P, n] f32.
+        halves: [P, F] i16, the bits of float16. norms: [P] f32. directions: [n, F] f32, unit rows times HALF_SCALE.
+        cosines: [P, n] f32.
     """
     words = np.empty(halves.shape[1], np.int32)
     row = words.view(np.float32)
     for j in range(first, last):
         _widen(halves[j], words)
         for n in range(directions.shape[0]):
-            products[j, n] = _dot(row, directions[n])
+            cosines[j, n] = _cosine(_dot(row, directions[n]), norms[j])
 
 
 @vectorised
-def multiply_floats(first, last, floats, directions, products):
+def compare_floats(first, last, floats, norms, directions, cosines):
     """The same for rows [P, F] f32 and unscaled directions."""
     for j in range(first, last):
         for n in range(directions.shape[0]):
-            products[j, n] = _dot(floats[j], directions[n])
+            cosines[j, n] = _cosine(_dot(floats[j], directions[n]), norms[j])
 
 
 @vectorised
@@ -91,25 +100,27 @@ def norm_floats(first, last, floats, norms):
         norms[j] = np.sqrt(_square(floats[j], np.float32(1.0)))
 
 
-def products_with(features: Tensor, directions: Tensor) -> Tensor:
-    """``features @ directions.T``.
+def cosines_of(features: Tensor, norms: Tensor, directions: Tensor) -> Tensor:
+    """Cosines of the rows to unit vectors.
 
     Args:
         features: [P, F] f16 or f32, finite.
-        directions: [n, F] f32, of length one.
+        norms: [P] f32, from `norms_of`.
+        directions: [n, F] f32, unit rows.
 
     Returns:
-        [P, n] f32.
+        [P, n] f32 in [-1, 1]; -1 for zero rows.
     """
     rows, work, scale = (
-        (_bits(features), multiply_halves, HALF_SCALE)
+        (_bits(features), compare_halves, HALF_SCALE)
         if features.dtype == torch.float16
-        else (_floats(features), multiply_floats, 1.0)
+        else (_floats(features), compare_floats, 1.0)
     )
     columns = np.ascontiguousarray(directions.to(torch.float32).numpy() * np.float32(scale))
-    products = np.empty((features.shape[0], columns.shape[0]), np.float32)
-    _over_rows(features.shape[0], lambda first, last: work(first, last, rows, columns, products))
-    return torch.from_numpy(products)
+    lengths = norms.contiguous().numpy()
+    cosines = np.empty((features.shape[0], columns.shape[0]), np.float32)
+    _over_rows(features.shape[0], lambda first, last: work(first, last, rows, lengths, columns, cosines))
+    return torch.from_numpy(cosines)
 
 
 def norms_of(features: Tensor) -> Tensor:

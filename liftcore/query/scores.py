@@ -11,14 +11,13 @@ from typing import TYPE_CHECKING
 import torch
 
 from liftcore.errors import InvalidQuery
-from liftcore.query.products import norms_of, products_with
+from liftcore.query.products import cosines_of, norms_of
 
 if TYPE_CHECKING:
     from torch import Tensor
 
 DEFAULT_NEGATIVES = ("object", "things", "stuff", "texture")  # LangSplat's canonical phrases
 RELEVANCY_SHARPNESS = 10.0  # the softmax's inverse temperature in LERF and LangSplat
-LOWEST_COSINE = -1.0  # what a splat without a feature scores
 
 
 def feature_norms(features: Tensor) -> Tensor:
@@ -64,11 +63,7 @@ def cosines(features: Tensor, norms: Tensor, texts: Tensor) -> Tensor:
     Raises:
         InvalidQuery: a text's vector has another length than the features, is zero or is not finite.
     """
-    products = products_with(features, _unit_rows(texts, features.shape[1]))
-    products /= norms.clamp_min(torch.finfo(torch.float32).tiny)[:, None]
-    products.clamp_(-1.0, 1.0)
-    products[norms == 0] = LOWEST_COSINE
-    return products
+    return cosines_of(features, norms, _unit_rows(texts, features.shape[1]))
 
 
 def relevancy(similarities: Tensor) -> Tensor:

@@ -22,7 +22,7 @@ from liftcore.query.ask import Answer, Look, ask, look, top
 from liftcore.query.encoders import TextEncoder, open_encoder
 from liftcore.query.encoders.remembering import RememberingEncoder
 from liftcore.query.pictures import attention_png, mask_png, render_png
-from liftcore.query.products import norms_of, products_with
+from liftcore.query.products import cosines_of, norms_of
 from liftcore.query.scene import QueryScene
 from liftcore.raster.warm_up import warm_up
 from service.queries.frames import Frame
@@ -75,7 +75,7 @@ class Answers:
             self._encoder(encoder, version).encode([WARM_UP_TEXT])
         for dtype in (torch.float16, torch.float32):
             row = torch.ones(1, 1, dtype=dtype)
-            products_with(row, norms_of(row)[None])
+            cosines_of(row, norms_of(row), row.to(torch.float32))
         warm_up()
 
     def reply(self, request: dict[str, Any]) -> Frame:
