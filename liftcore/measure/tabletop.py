@@ -1,0 +1,196 @@
+"""Accuracy on the tabletop scene, beside the baselines that its data README gives.
+
+    python -m liftcore.measure.tabletop DIR [--json]
+
+Each row is one lift. Splat accuracy is the share of splats whose most similar class vector is their own class, over
+the splats whose evidence from the 52 views of ``features.safetensors`` exceeds 0.5, whatever the lift; and over those
+whose largest weight on any ray of these views exceeds 0.1. mIoU is of the argmax over the class scores, rendered in
+the held-out views with the opacity gain of the lift.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from liftcore.errors import InvalidInput
+from liftcore.lift import lift
+from liftcore.measure.accuracy import class_ious, class_scores, rendered_scores, splat_accuracy
+from liftcore.measure.bench import hardware
+from liftcore.observe.observation import NO_LABEL, RegionMap
+from liftcore.observe.pack import open_packs
+from liftcore.raster.cpu import CpuRaster
+from liftcore.raster.protocol import Walk
+from liftcore.scene.load import load_cameras, load_splats
+from liftcore.solve.accumulate import render_walk
+from liftcore.solve.settings import LiftSettings
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from torch import Tensor
+
+    from liftcore.scene.cameras import Cameras
+
+EVIDENCE_PACK = "features"  # its views say which splats count
+EVIDENCE_OVER = 0.5
+WEIGHT_OVER = 0.1
+LARGE_A_RAY = 9  # weights over 0.1 that a ray can have, as they sum to one at most
+
+
+@dataclass(frozen=True)
+class Case:
+    """One lift, and the figures that the data README gives for it (None where it gives none)."""
+
+    pack: str
+    power: int
+    gain: float  # lambda, lifting and rendering
+    accuracy: float | None = None
+    miou: float | None = None
+    grid_reading: str = "bilinear"
+
+    @property
+    def settings(self) -> LiftSettings:
+        """The weights w or w^2 of the row, with a small certificate."""
+        return LiftSettings.of(
+            preset="row-sum" if self.power == 1 else "tikhonov",
+            lift_gain=self.gain,
+            render_gain=self.gain,
+            grid_reading=self.grid_reading,
+            certificate_rays=0,
+        )
+
+    @property
+    def name(self) -> str:
+        """As the table prints it."""
+        weights = ("w" if self.power == 1 else "w^2") + ("" if self.gain == 1 else f", lambda {self.gain:g}")
+        reading = f" {self.grid_reading}" if self.pack == "grids" else ""
+        return f"{self.pack}{reading}, {weights}"
+
+
+# The README's grids were read at the nearest cell, so its figures stand at that reading.
+CASES = (
+    Case("features_clean", 1, 1.0, 0.958, 0.995),
+    Case("features_clean", 2, 1.0, 0.959, 0.997),
+    Case("features_clean", 2, 1.2),
+    Case("features", 1, 1.0, 0.952, 0.989),
+    Case("features", 2, 1.0, 0.947, 0.988),
+    Case("features", 2, 1.2),
+    Case("features_hard", 1, 1.0, 0.900, 0.935),
+    Case("features_hard", 2, 1.0, 0.900, 0.939),
+    Case("features_hard", 2, 1.2, 0.899, 0.940),
+    Case("grids", 1, 1.0, 0.914, 0.896, "nearest"),
+    Case("grids", 2, 1.0, 0.895, 0.875, "nearest"),
+    Case("grids", 2, 1.2, grid_reading="nearest"),
+    Case("grids", 1, 1.0),
+    Case("grids", 2, 1.0),
+    Case("grids", 2, 1.2),
+)
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What a lift reached."""
+
+    accuracy: float  # over splats with evidence over 0.5
+    accuracy_visible: float  # over splats with a weight over 0.1
+    miou: float
+    seconds: float  # of the lift, without reading the truth
+
+
+class Tabletop:
+    """The scene and its truth, opened once for many lifts."""
+
+    def __init__(self, folder: Path) -> None:
+        from safetensors import safe_open
+
+        self.folder = folder
+        try:
+            document = json.loads((folder / "truth.json").read_text())
+            with safe_open(str(folder / "truth.safetensors"), framework="pt") as truth:
+                self.objects: Tensor = truth.get_tensor("splat_object")  # [P] i16, the class of every splat
+                self.held_out = {view: truth.get_tensor(f"{view}/mask") for view in document["held_out_views"]}
+            with safe_open(str(folder / "text_table.safetensors"), framework="pt") as table:
+                vectors = table.get_tensor("embeddings")[[thing["lvis_row"] for thing in document["objects"]]]
+        except OSError as error:
+            raise InvalidInput(str(folder), expected="the tabletop scene with its truth", got=str(error)) from None
+        self.classes: Tensor = torch.nn.functional.normalize(vectors.float(), dim=1)  # [K, F]
+        self.cameras: Cameras = load_cameras(folder / "cameras.json")
+        self.raster = CpuRaster(load_splats(folder / "point_cloud.ply"))
+        self.counted, self.visible = self._counted_splats()
+
+    def _counted_splats(self) -> tuple[Tensor, Tensor]:
+        """Splats with evidence over 0.5, and with a weight over 0.1, in the views of EVIDENCE_PACK."""
+        nothing = RegionMap(torch.full((1, 1, 1), NO_LABEL, dtype=torch.int32), torch.ones(1, 1))
+        count = self.raster.splats.count
+        evidence, visible = np.zeros(count), torch.zeros(count, dtype=torch.bool)
+        for view in open_packs([self.folder / f"{EVIDENCE_PACK}.safetensors"]).views:
+            camera = self.cameras.get(view)
+            weights = self.raster.region_weights(camera, nothing, Walk(), 1)
+            evidence[weights.evidence_splats.numpy()] += weights.evidence.numpy()
+            ids, large = self.raster.top_weights(camera, Walk(), LARGE_A_RAY)
+            visible[ids[large > WEIGHT_OVER].long()] = True
+        return torch.from_numpy(evidence > EVIDENCE_OVER), visible
+
+    def measure(self, case: Case) -> Figures:
+        """Lift, classify the splats, and look from the held-out views."""
+        start = time.perf_counter()
+        paths = [self.folder / name for name in ("point_cloud.ply", "cameras.json", f"{case.pack}.safetensors")]
+        features = lift(paths[0], paths[1], paths[2:], case.settings).features
+        seconds = time.perf_counter() - start
+        scores = class_scores(features, self.classes)
+        seen = [self._argmax(view, features, case.settings) for view in self.held_out]
+        ious = class_ious(torch.stack(seen), torch.stack(list(self.held_out.values())), len(self.classes))
+        return Figures(
+            splat_accuracy(scores, self.objects, self.counted),
+            splat_accuracy(scores, self.objects, self.visible),
+            float(ious.nanmean()),
+            seconds,
+        )
+
+    def _argmax(self, view: str, features: Tensor, settings: LiftSettings) -> Tensor:
+        camera = self.cameras.get(view)
+        return rendered_scores(self.raster, camera, features, self.classes, render_walk(settings)).argmax(dim=2)
+
+
+def measure_all(folder: Path, cases: Sequence[Case] = CASES) -> dict[str, Any]:
+    """All cases as plain numbers, with the hardware that took the seconds."""
+    scene = Tabletop(folder)
+    rows = [{"name": case.name, "baseline": asdict(case), **asdict(scene.measure(case))} for case in cases]
+    counted = {"evidence_over_half": int(scene.counted.sum()), "weight_over_a_tenth": int(scene.visible.sum())}
+    return {"splats": scene.raster.splats.count, **counted, "rows": rows, "hardware": hardware()}
+
+
+def table_of(document: dict[str, Any]) -> str:
+    """The rows beside their baselines, and the machine, for people."""
+    head = f"{'features, weights':<34}{'accuracy':>9}{'base':>7}{'visible':>9}{'mIoU':>8}{'base':>7}{'lift s':>8}"
+    lines = [head]
+    for row in document["rows"]:
+        base = [f"{row['baseline'][key]:.3f}" if row["baseline"][key] else "-" for key in ("accuracy", "miou")]
+        lines.append(
+            f"{row['name']:<34}{row['accuracy']:>9.4f}{base[0]:>7}{row['accuracy_visible']:>9.4f}"
+            f"{row['miou']:>8.4f}{base[1]:>7}{row['seconds']:>8.1f}"
+        )
+    lines.append(", ".join(f"{key} {value}" for key, value in document["hardware"].items()))
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Print the table, or one JSON object."""
+    parser = argparse.ArgumentParser(prog="python -m liftcore.measure.tabletop", description=__doc__)
+    parser.add_argument("folder", type=Path, metavar="DIR", help="the tabletop scene")
+    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
+    options = parser.parse_args()
+    document = measure_all(options.folder)
+    print(json.dumps(document) if options.json else table_of(document))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,220 @@
+"""What a user can get wrong: one line on stderr, exit 2, nothing half-written, and stdout empty with --json."""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+import subprocess
+import sys
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from liftcore import cli
+from liftcore.observe.write_pack import write_pack
+from liftcore.scene.cameras import Camera, Cameras
+from liftcore.scene.inria import write_inria_cameras
+from liftcore.scene.ply import write_splats
+from tests.scenes import random_grid, random_regions, random_splats
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+LIFT = ["lift", "splats.ply", "cameras.json", "pack.safetensors", "-o", "lift.safetensors"]
+
+
+@pytest.fixture
+def scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A good scene in the working directory."""
+    write_splats(random_splats(1, 20), tmp_path / "splats.ply")
+    pose = np.eye(4)
+    pose[2, 3] = 4.0
+    write_inria_cameras(Cameras((Camera("v0", 16, 12, 16.0, 16.0, 8.0, 6.0, pose),)), tmp_path / "cameras.json")
+    write_pack(tmp_path / "pack.safetensors", {"v0": random_regions(1)}, {})
+    save_file({"embeddings": torch.eye(2, 6)}, str(tmp_path / "table"), metadata={"words": '["cat", "dog"]'})
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def files(folder: Path) -> dict[str, int]:
+    return {str(path.relative_to(folder)): path.lstat().st_size for path in sorted(folder.rglob("*"))}
+
+
+def assert_refused(capsys: pytest.CaptureFixture[str], folder: Path, arguments: list[str], words: str = "") -> None:
+    for more in ([], ["--json"]):
+        before = files(folder)
+        status = cli.main([*arguments, *more])
+        captured = capsys.readouterr()
+        assert (status, captured.out) == (2, ""), captured.err
+        assert captured.err.count("\n") == 1
+        assert words in captured.err
+        assert files(folder) == before
+
+
+def cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-5])
+
+
+def bomb(path: Path) -> None:
+    path.write_bytes(path.read_bytes().replace(b"vertex 20", b"vertex 99999999999"))
+
+
+def not_a_number(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    content[-4:] = np.float32("nan").tobytes()
+    path.write_bytes(bytes(content))
+
+
+def no_splats(path: Path) -> None:
+    head = path.read_bytes().split(b"end_header\n")[0] + b"end_header\n"
+    path.write_bytes(head.replace(b"vertex 20", b"vertex 0"))
+
+
+def wrong_property(path: Path) -> None:
+    path.write_bytes(path.read_bytes().replace(b"opacity", b"opaqity"))
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (cut, "truncated"),
+        (bomb, "rows"),
+        (not_a_number, "finite"),
+        (no_splats, "empty scene"),
+        (wrong_property, "'opacity'"),
+    ],
+)
+def test_broken_splats_are_refused(scene: Path, capsys, damage: Callable[[Path], None], words: str) -> None:
+    damage(scene / "splats.ply")
+    assert_refused(capsys, scene, LIFT, words)
+
+
+def test_a_label_out_of_the_codebook_is_refused(scene: Path, capsys) -> None:
+    labels = torch.full((1, 4, 4), 7, dtype=torch.int16)
+    save_file({"v0/labels": labels, "v0/codebook": torch.ones(2, 3)}, str(scene / "pack.safetensors"))
+    assert_refused(capsys, scene, LIFT, "the label 7")
+
+
+def test_features_whose_views_have_no_camera_are_refused(scene: Path, capsys) -> None:
+    write_pack(scene / "pack.safetensors", {"elsewhere": random_grid(1)}, {})
+    assert_refused(capsys, scene, LIFT, "none in common")
+
+
+@pytest.mark.parametrize("place", [1, 2, 3])
+@pytest.mark.parametrize("other", ["missing", "folder", "splats.ply", "table", "made.safetensors"])
+def test_a_wrong_kind_of_file_is_refused_wherever_it_stands(scene: Path, capsys, place: int, other: str) -> None:
+    (scene / "folder").mkdir()
+    assert cli.main([*LIFT[:5], "made.safetensors"]) == 0
+    capsys.readouterr()
+    arguments = [*LIFT]
+    if arguments[place] == other:
+        return
+    arguments[place] = other
+    assert_refused(capsys, scene, arguments)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        ["--preset", "magic"],
+        ["--set", "nonsense=1"],
+        ["--set", "cls=1"],
+        ["--set", "preset=[1]"],
+        ["--set", "lift_gain=NaN"],
+        ["--set", "lift_gain=1e999"],
+        ["--set", "alpha_cap=1"],
+        ["--set", "grid_reading=cubic"],
+        ["--set", "power=" + "[" * 100_000],
+        ["--threads", "0"],
+    ],
+    ids=lambda settings: " ".join(settings)[:30],
+)
+def test_wrong_settings_are_refused(scene: Path, capsys, settings: list[str]) -> None:
+    assert_refused(capsys, scene, [*LIFT, *settings])
+
+
+@pytest.mark.parametrize("same", ["splats.ply", "cameras.json", "pack.safetensors", "./pack.safetensors"])
+def test_an_output_that_is_an_input_is_refused(scene: Path, capsys, same: str) -> None:
+    assert_refused(capsys, scene, [*LIFT[:5], same], "another file than the inputs")
+
+
+def test_a_pack_given_twice_is_refused(scene: Path, capsys) -> None:
+    assert_refused(capsys, scene, [*LIFT[:4], "pack.safetensors", *LIFT[4:]], "each view in one pack")
+
+
+def test_an_output_below_a_file_is_refused_before_the_work(scene: Path, capsys) -> None:
+    assert_refused(capsys, scene, [*LIFT[:5], "splats.ply/lift.safetensors"], "output")
+    assert_refused(capsys, scene, [*LIFT[:5], "x" * 300], "output")
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_an_output_in_a_locked_folder_is_refused_before_the_work(scene: Path, capsys) -> None:
+    (scene / "locked").mkdir(mode=0o500)
+    assert_refused(capsys, scene, [*LIFT[:5], "locked/lift.safetensors"], "can be written")
+
+
+def test_a_folder_of_the_output_that_is_missing_is_made(scene: Path, capsys) -> None:
+    assert cli.main([*LIFT[:5], "new/folder/lift.safetensors", "--json"]) == 0
+    captured = capsys.readouterr()
+    assert json.loads(captured.out)["splats"] == 20
+    assert captured.out.count("\n") == 1
+    assert captured.err == ""
+    made = scene / "new" / "folder" / "lift.safetensors"
+    umask = os.umask(0)
+    os.umask(umask)
+    assert stat.S_IMODE(made.stat().st_mode) == 0o666 & ~umask
+    assert [path.name for path in made.parent.iterdir()] == [made.name]
+
+
+def test_broken_questions_are_refused(scene: Path, capsys) -> None:
+    assert cli.main(LIFT) == 0
+    capsys.readouterr()
+    ask = ["query", "lift.safetensors", "cat", "--table", "table"]
+    assert_refused(capsys, scene, ["query", "pack.safetensors", *ask[2:]], "lift")
+    assert_refused(capsys, scene, ["query", "nowhere", *ask[2:]])
+    assert_refused(capsys, scene, ["query", "lift.safetensors", "horse", *ask[3:]])
+    assert_refused(capsys, scene, [*ask[:4], "lift.safetensors"])
+    assert_refused(capsys, scene, [*ask, "--view", "v9"], "v0")
+    assert_refused(capsys, scene, [*ask, "--view", "v0", "--mask", "a.png", "--attention", "a.png"], "twice")
+    assert_refused(capsys, scene, [*ask, "--scores", "table"], "another file")
+    assert_refused(capsys, scene, [*ask, "--threshold", "maybe"])
+
+
+def test_a_lift_answers_from_any_folder_until_its_splats_move(scene: Path, capsys, monkeypatch) -> None:
+    assert cli.main(LIFT) == 0
+    elsewhere = scene / "elsewhere"
+    elsewhere.mkdir()
+    monkeypatch.chdir(elsewhere)
+    ask = ["query", "../lift.safetensors", "cat", "--table", "../table", "--view", "v0", "--mask", "m.png", "--json"]
+    capsys.readouterr()
+    assert cli.main(ask) == 0
+    assert json.loads(capsys.readouterr().out)["view"]["name"] == "v0"
+    (scene / "splats.ply").rename(scene / "moved.ply")
+    (elsewhere / "m.png").unlink()
+    assert_refused(capsys, scene, ask[:-1], "nothing there")
+
+
+def test_a_lift_beside_its_cameras_does_not_change_them(scene: Path, capsys) -> None:
+    arguments = ["lift", "splats.ply", ".", "pack.safetensors", "-o", "lift.safetensors"]
+    assert cli.main(arguments) == 0
+    assert cli.main(["query", "lift.safetensors", "cat", "--table", "table", "--view", "v0"]) == 0
+    assert cli.main(arguments) == 0
+    capsys.readouterr()
+    assert_refused(capsys, scene, [*arguments[:5], "cameras.json"], "another file than the inputs")
+
+
+def test_a_process_of_its_own_says_the_same(scene: Path) -> None:
+    cut(scene / "splats.ply")
+    before = files(scene)
+    done = subprocess.run(
+        [sys.executable, "-m", "liftcore.cli", *LIFT, "--json"], check=False, capture_output=True, text=True
+    )
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.count("\n") == 1
+    assert "truncated" in done.stderr
+    assert files(scene) == before
