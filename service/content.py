@@ -9,6 +9,7 @@ from fastapi import Request
 from fastapi.responses import FileResponse, Response
 from starlette.types import Receive, Scope, Send
 
+from liftcore.errors import NotFound
 from service.errors import RangeNotSatisfiable
 
 ONE_RANGE = re.compile(r"bytes=\s*(?:(\d+)-(\d*)|-(\d+))\s*", re.ASCII)
@@ -34,12 +35,17 @@ def file_answer(request: Request, path: Path, *, sha256: str, filename: str) -> 
 
     Raises:
         RangeNotSatisfiable: the range begins beyond the end.
+        NotFound: the file was deleted since it was looked up.
     """
     etag = f'"{sha256}"'
     same = unchanged(request, etag)
     if same is not None:
         return same
-    keep_range = _keeps_range(request, path.stat().st_size, etag)
+    try:
+        size = path.stat().st_size
+    except FileNotFoundError:
+        raise NotFound("content", expected="a file that is here", got="one that was just deleted") from None
+    keep_range = _keeps_range(request, size, etag)
     return _StoredFile(path, etag=etag, filename=filename, keep_range=keep_range)
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import logging
+import sqlite3
 from collections.abc import Mapping
 from http import HTTPStatus
 from typing import Any
@@ -82,7 +84,8 @@ def problem_of(error: SplatliftError) -> Problem:
 
 def answer(problem: Problem, headers: Mapping[str, str] | None = None) -> JSONResponse:
     """The problem as a response."""
-    return JSONResponse(problem.model_dump(exclude_none=True), problem.status, headers=headers, media_type=MEDIA_TYPE)
+    told = {name: _plain(value) for name, value in problem.model_dump(exclude_none=True).items()}
+    return JSONResponse(told, problem.status, headers=headers, media_type=MEDIA_TYPE)
 
 
 def install(app: FastAPI) -> None:
@@ -91,6 +94,8 @@ def install(app: FastAPI) -> None:
     app.add_exception_handler(RequestValidationError, _on_validation)
     app.add_exception_handler(HTTPException, _on_framework)
     app.add_exception_handler(ClientDisconnect, _on_disconnect)
+    app.add_exception_handler(OSError, _on_system)
+    app.add_exception_handler(sqlite3.OperationalError, _on_system)
     app.add_exception_handler(Exception, _on_unexpected)
 
 
@@ -132,11 +137,27 @@ def _on_disconnect(request: Request, error: Exception) -> JSONResponse:
     return answer(Problem(type="/problems/malformed-request", title=FRAMEWORK[400][1], status=400, detail=detail))
 
 
+def _on_system(request: Request, error: Exception) -> JSONResponse:
+    code = getattr(error, "errno", None)
+    if code not in (errno.ENOSPC, errno.EDQUOT) and getattr(error, "sqlite_errorcode", None) != sqlite3.SQLITE_FULL:
+        return _on_unexpected(request, error)
+    log.error("%s %s: the disk is full", request.method, request.url.path)
+    detail = "The server's disk is full; what was sent is not kept."
+    return answer(Problem(type="/problems/no-space", title="There is no room left", status=507, detail=detail))
+
+
 def _on_unexpected(request: Request, error: Exception) -> JSONResponse:
     # The details go to the log: they may name files or values that are not the client's.
     log.error("%s %s failed", request.method, request.url.path, exc_info=error)
     detail = "Something went wrong on our side; the server's log has the details."
     return answer(Problem(type="/problems/internal", title="An error of the server", status=500, detail=detail))
+
+
+def _plain(value: Any) -> Any:
+    """Text on one line that UTF-8 can carry: what a client sent may be half a surrogate pair, or hold line ends."""
+    if not isinstance(value, str):
+        return value
+    return " ".join(value.encode("utf-8", "backslashreplace").decode().split())
 
 
 def _short(value: object, limit: int = 120) -> str:

@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image
 
 from liftcore.demo.client import Client
-from liftcore.demo.scene_folder import DemoScene, Truth, find_scene
+from liftcore.demo.scene_folder import NO_WORDS, DemoScene, Truth, find_scene
 from liftcore.demo.server import Server
 from liftcore.demo.write_scene import write_still_life
 from liftcore.query.pictures import overlay
@@ -21,6 +21,8 @@ from liftcore.query.pictures import overlay
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
+
+    from liftcore.demo.still_life import StillLife
 
 _TOLD = ("splats", "views", "channels")  # counts of an upload that people care about
 _NAMING = 200  # best splats that vote on the name of what was found
@@ -42,14 +44,21 @@ class Finding:
     pictures: dict[str, str]  # what -> file name
 
 
-def run_demo(scene: Path | None, out: Path, as_json: bool, phrases: Sequence[str] = ()) -> int:
+def run_demo(
+    scene: Path | None,
+    out: Path,
+    as_json: bool,
+    phrases: Sequence[str] = (),
+    generated: StillLife | None = None,
+) -> int:
     """Run the demo and say what was found.
 
     Args:
         scene: a scene folder; None = the still life, generated.
         out: where the pictures go, and the service's data while it runs.
         as_json: print one JSON object on stdout and nothing else.
-        phrases: what to look for; empty = three phrases that suit the scene.
+        phrases: what to look for; empty = three phrases that suit the scene, none if its features have no words.
+        generated: the still life to take in place of the usual one.
 
     Returns:
         The exit status, 0.
@@ -63,7 +72,7 @@ def run_demo(scene: Path | None, out: Path, as_json: bool, phrases: Sequence[str
     say = _Voice(quiet=as_json)
     if scene is None:
         say.line("Making a still life: a table, a mug, a bowl of fruit, a book, a lamp and a plant.")
-        subject = write_still_life(out / "scene", phrases)
+        subject = write_still_life(out / "scene", phrases, generated)
     else:
         subject = find_scene(scene, phrases, out / "scene")
     with Server(out / "service", subject.encoder) as server:
@@ -96,10 +105,12 @@ def _converse(subject: DemoScene, url: str, out: Path, say: _Voice) -> dict[str,
         job, lift = client.lift({**order, "features": [assets["features"]["id"]]}, say.progress)
         took = (job["ended"] or 0) - (job["started"] or 0)
         say.line(f"Lifted {lift['channels']} channels onto {lift['count']:,} splats in {took:.1f} s.")
-        # The first question loads the text encoder; it is asked once apart, so that times are of warm queries.
-        client.ask(lift["id"], subject.phrases[0], threshold="0")
-        render, _ = client.picture("/render", lift=lift["id"], view=subject.views[0])
-        (out / f"render-{subject.views[0]}.png").write_bytes(render)
+        pictures = _save_renders(client, lift["id"], subject.views[0], out)
+        if not subject.phrases:
+            say.line(_silence(subject, pictures))
+        else:
+            # The first question opens the lift; it is asked once apart, so that times are of warm queries.
+            client.ask(lift["id"], subject.phrases[0], threshold="0")
         findings = []
         for phrase in subject.phrases:
             findings.append(_find(client, lift["id"], phrase, subject, out))
@@ -114,8 +125,28 @@ def _converse(subject: DemoScene, url: str, out: Path, say: _Voice) -> dict[str,
         "lift_seconds": took,
         "certificate": lift["certificate"],
         "view": subject.views[0],
+        "text_space": subject.text_space,
+        "pictures": pictures,
         "phrases": [asdict(finding) for finding in findings],
     }
+
+
+def _save_renders(client: Client, lift: str, view: str, out: Path) -> dict[str, str]:
+    """The colours and the features of the pictured view; what -> file name."""
+    names = {"rgb": f"render-{view}.png", "pca": f"features-{view}.png"}
+    for what, name in names.items():
+        content, _ = client.picture("/render", lift=lift, view=view, what=what)
+        (out / name).write_bytes(content)
+    return names
+
+
+def _silence(subject: DemoScene, pictures: dict[str, str]) -> str:
+    """Why nothing is asked, and what to look at instead."""
+    if subject.text_space == NO_WORDS:
+        why = "Its features share a space with no text encoder: they have no words, so no phrase is asked."
+    else:
+        why = "Nothing says what this scene shows, so no phrase is asked; `splatlift query` asks yours."
+    return f"  {why}\n      {pictures['pca']} shows three principal components of the features as colours."
 
 
 def _counts(kind: str, asset: dict[str, Any]) -> str:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 _CAMERA_FILES = ("cameras.json", "transforms.json", "cameras.zip")
 _MODEL_FOLDERS = ("sparse/0", "sparse")
 _TABLE = "text_table.safetensors"
+NO_WORDS = "none"  # the text space of features that no text encoder shares
 _PHRASES = 3  # asked when nobody says which
 
 
@@ -47,7 +48,8 @@ class DemoScene:
     cameras: Path
     features: Path
     encoder: str  # specification of the text encoder
-    phrases: tuple[str, ...]
+    text_space: str  # of the features; "none" when no text encoder shares it
+    phrases: tuple[str, ...]  # empty = nothing can be asked, or nobody knows what
     views: tuple[str, ...]  # to look from, the pictured one first; views with truth where there are any
     truth: Truth | None
 
@@ -57,7 +59,7 @@ def find_scene(folder: Path, phrases: Sequence[str], scratch: Path) -> DemoScene
 
     Args:
         folder: holds a ``.ply``, cameras (``cameras.json``, ``transforms.json``, ``sparse/0``) and a pack.
-        phrases: what to ask; empty = three objects of ``truth.json``.
+        phrases: what to ask; empty = three objects of ``truth.json`` if the features have words, else nothing.
         scratch: where to put the zipped model.
 
     Raises:
@@ -66,19 +68,17 @@ def find_scene(folder: Path, phrases: Sequence[str], scratch: Path) -> DemoScene
     if not folder.is_dir():
         raise InvalidInput("--scene", expected="a folder", got=f"nothing at {folder}")
     truth = _read_truth(folder)
-    asked = tuple(phrases) or _phrases_of(truth)
-    if not asked:
-        raise InvalidInput(
-            "--phrase", expected="something to look for", got="none", hint="this scene does not say what it shows"
-        )
     cameras = _cameras(folder, scratch)
-    table = folder / _TABLE
+    table, features = folder / _TABLE, _features(folder)
+    text_space = _text_space(features)
+    asked = tuple(phrases) or (_phrases_of(truth) if text_space != NO_WORDS else ())
     return DemoScene(
         name=folder.name,
         splats=_first(folder, "*.ply", "splats"),
         cameras=cameras,
-        features=_features(folder),
+        features=features,
         encoder=f"table:{table}" if table.is_file() else "minilm",
+        text_space=text_space,
         phrases=asked,
         views=tuple(truth.masks) if truth else _some_views(cameras),
         truth=truth,
@@ -122,6 +122,13 @@ def _features(folder: Path) -> Path:
         except (SafetensorError, OSError):
             continue
     raise InvalidInput(f"features of {folder.name}", expected="a feature pack (.safetensors)", got="none")
+
+
+def _text_space(features: Path) -> str:
+    from safetensors import safe_open
+
+    with safe_open(str(features), framework="pt") as handle:
+        return (handle.metadata() or {}).get("text_space") or NO_WORDS
 
 
 def _read_truth(folder: Path) -> Truth | None:

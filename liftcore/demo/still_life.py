@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -45,15 +45,16 @@ class StillLife:
         return np.array(self.thing_of_part, dtype=np.int32)[self.splat_parts]
 
 
-def still_life(seed: int = 7, views: int = 22) -> StillLife:
+def still_life(seed: int = 7, views: int = 22, density: float = 1.0) -> StillLife:
     """Build the scene.
 
     Args:
         seed: of everything random in it.
         views: how many cameras stand on the arc; every fifth is held out.
+        density: share of the usual number of splats; fewer ones are larger.
     """
     rng = np.random.default_rng(seed)
-    pieces = still_life_pieces()
+    pieces = [replace(piece, splats=max(1, round(density * piece.splats))) for piece in still_life_pieces()]
     samples = [sample(piece.surface, piece.splats, rng) for piece in pieces]
     parts = tuple(dict.fromkeys(piece.part for piece in pieces))
     things = tuple(dict.fromkeys(piece.thing for piece in pieces))

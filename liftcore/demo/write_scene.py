@@ -25,7 +25,7 @@ PHRASES = {
 }
 
 
-def write_still_life(folder: Path, phrases: Sequence[str]) -> DemoScene:
+def write_still_life(folder: Path, phrases: Sequence[str], scene: StillLife | None = None) -> DemoScene:
     """Make the still life and write ``point_cloud.ply``, ``cameras.json`` and ``features.safetensors``.
 
     Raises:
@@ -37,7 +37,7 @@ def write_still_life(folder: Path, phrases: Sequence[str]) -> DemoScene:
     from liftcore.scene.inria import write_inria_cameras
     from liftcore.scene.ply import write_splats
 
-    scene = still_life(SEED)
+    scene = scene or still_life(SEED)
     raster = CpuRaster(scene.splats, threads=None)
     observed = observe(scene, raster, open_encoder("minilm"), Mistakes(), SEED)
     splats, cameras, features = (
@@ -56,8 +56,9 @@ def write_still_life(folder: Path, phrases: Sequence[str]) -> DemoScene:
         cameras=cameras,
         features=features,
         encoder="minilm",
+        text_space="minilm",
         phrases=tuple(phrases) or tuple(PHRASES),
-        views=(PICTURED, *(view for view in scene.held_out if view != PICTURED)),
+        views=tuple(sorted(scene.held_out, key=lambda view: view != PICTURED)),
         truth=_truth(scene, raster),
     )
 

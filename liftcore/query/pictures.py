@@ -36,14 +36,14 @@ def attention_png(look: Look) -> bytes:
     return _png(_heat(look))
 
 
-def render_png(scene: QueryScene, view: str) -> bytes:
-    """The scene as a camera sees it, RGB [H, W, 3] on black.
+def render_png(scene: QueryScene, view: str, what: str = "rgb") -> bytes:
+    """The scene as a camera sees it, RGB [H, W, 3] on black: its colours, or its features (``pca``).
 
     Raises:
         NotFound: no camera has this name.
         InvalidLift: the splats or the cameras moved or changed since the lift.
     """
-    return _png(render(scene, view))
+    return _png(render(scene, view, what))
 
 
 def overlay_png(image: np.ndarray, look: Look) -> bytes:
@@ -71,15 +71,18 @@ def save_overlay(image: np.ndarray, look: Look, path: Path) -> None:
     _save(overlay_png(image, look), path)
 
 
-def render(scene: QueryScene, view: str) -> np.ndarray:
+def render(scene: QueryScene, view: str, what: str = "rgb") -> np.ndarray:
     """The colours of a view, [H, W, 3] u8 sRGB on black, with the opacities as trained (gain 1).
+
+    ``rgb`` takes the splats' own colours, ``pca`` the first three principal components of their features.
 
     Raises:
         NotFound: no camera has this name.
         InvalidLift: the splats or the cameras moved or changed since the lift.
     """
     camera = scene.cameras.get(view)
-    image = scene.raster.render(camera, seen_colours(scene.splats, camera), Walk())
+    colours = scene.principal if what == "pca" else seen_colours(scene.splats, camera)
+    image = scene.raster.render(camera, colours, Walk())
     return np.round(255 * image.numpy().clip(0.0, 1.0)).astype(np.uint8)
 
 

@@ -44,6 +44,13 @@ class QueryScene:
         """[P] f32, the features' norms, computed once a lift."""
         return feature_norms(self.lift.features)
 
+    @cached_property
+    def principal(self) -> Tensor:
+        """[P, 3] f32 in 0..1, the features as colours."""
+        from liftcore.query.principal import principal_colours
+
+        return principal_colours(self.lift.features, self.lift.evidence)
+
     @property
     def channels(self) -> int:
         """F."""

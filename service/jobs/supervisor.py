@@ -66,13 +66,13 @@ class Supervisor:
 
     def _run(self, job: JobRecord) -> None:
         files = self._store.files
-        with files.draft(".safetensors") as draft, files.scratch() as scratch:
-            try:
+        try:  # around the draft too: a full disk must not leave the job running for ever
+            with files.draft(".safetensors") as draft, files.scratch() as scratch:
                 last, status = self._converse(job, draft, scratch)
                 self._settle(job, draft, last, status)
-            except Exception:
-                log.exception("job %s could not be run", job.id)
-                self._fail(job, Crashed("job", expected="a process that runs", got="an error of the server"))
+        except Exception:
+            log.exception("job %s could not be run", job.id)
+            self._fail(job, Crashed("job", expected="a process that runs", got="an error of the server"))
 
     def _converse(self, job: JobRecord, draft: Path, scratch: Path) -> tuple[dict[str, Any], int]:
         """Run the child to its end; its last message that was not progress, and its exit status."""

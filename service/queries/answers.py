@@ -128,7 +128,7 @@ class Answers:
         return Frame({}, attention_png(self._look(request)))
 
     def _render(self, request: dict[str, Any]) -> Frame:
-        return Frame({}, render_png(self._scene(request), request["view"]))
+        return Frame({}, render_png(self._scene(request), request["view"], request["what"]))
 
 
 def use_one_library_thread() -> None:

@@ -119,10 +119,18 @@ def attention(phrase: PhraseParameters, view: View, request: Request, here: Here
 
 
 @router.get("/render", responses=PNG, response_class=Response)
-def render(view: View, request: Request, here: Here, lift: LiftParameter = None) -> Response:
-    """The splats in their colours, from a view: a PNG."""
+def render(
+    view: View,
+    request: Request,
+    here: Here,
+    lift: LiftParameter = None,
+    what: Annotated[
+        Literal["rgb", "pca"], Query(description="the splats' colours, or three principal components of features")
+    ] = "rgb",
+) -> Response:
+    """The splats from a view, in their colours or in those of their features: a PNG."""
     found = find_lift(lift, here)
-    asked = _scene_request("render", found, here) | {"view": view}
+    asked = _scene_request("render", found, here) | {"view": view, "what": what}
     return _entity(request, here, asked, found, "image/png")
 
 

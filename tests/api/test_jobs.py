@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import time
@@ -15,7 +16,9 @@ from fastapi.testclient import TestClient
 
 from service.errors import Misconfigured
 from service.jobs import process
+from service.jobs.supervisor import Supervisor
 from service.store.assets import CheckedUpload
+from service.store.files import DataDirectory
 from service.store.jobs import MAX_ATTEMPTS
 from service.store.store import Store
 from service.wire import AssetKind, JobState
@@ -88,6 +91,23 @@ def test_query_worker_that_died_is_replaced(client: TestClient, lift: dict[str, 
     assert client.get("/query", params={"text": "apple", "lift": lift["id"]}).status_code == 200
     worker._process.kill()
     assert client.get("/query", params={"text": "book", "lift": lift["id"]}).status_code == 200
+
+
+def test_job_that_gets_no_room_fails_instead_of_running_for_ever(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(self: DataDirectory) -> Any:
+        raise OSError(errno.ENOSPC, "no space left")
+
+    monkeypatch.setattr(DataDirectory, "scratch", full)
+    job = submit(store)
+    supervisor = Supervisor(store, threads=1)
+    supervisor.start()
+    deadline = time.monotonic() + 20
+    while store.jobs.get(job).state is not JobState.FAILED:
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    supervisor.stop()
 
 
 def test_job_of_a_dead_server_is_queued_again_then_failed(store: Store) -> None:

@@ -113,6 +113,15 @@ def test_pictures_have_the_size_of_the_view_and_a_tag(client: TestClient, lift: 
     assert other.status_code == 200
 
 
+def test_features_are_shown_as_colours(client: TestClient, lift: dict[str, Any]) -> None:
+    params = {"lift": lift["id"], "view": "middle"}
+    plain = picture(client.get("/render", params=params).content)
+    features = client.get("/render", params=params | {"what": "pca"})
+    shown = picture(features.content)
+    assert features.status_code == 200 and shown.shape == plain.shape == (HEIGHT, WIDTH, 3)
+    assert (shown != plain).any() and shown.max() > 128
+
+
 def test_negatives_change_the_scores(client: TestClient, lift: dict[str, Any]) -> None:
     params = {"text": "apple", "lift": lift["id"]}
     plain = client.get("/query/scores", params=params).content

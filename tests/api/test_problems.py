@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import re
+import sqlite3
 from typing import Any
 
 import pytest
@@ -150,6 +152,7 @@ def test_long_body_is_413(client: TestClient) -> None:
         ("/query/mask", {}, 422, "invalid-request"),
         ("/query/scores", {"lift": "../../etc/passwd"}, 422, "invalid-request"),
         ("/render", {"view": "behind"}, 404, "not-found"),
+        ("/render", {"view": "left", "what": "x-rays"}, 422, "invalid-request"),
     ],
 )
 def test_bad_query_is_a_problem(
@@ -171,6 +174,44 @@ def test_unexpected_error_says_nothing_of_itself() -> None:
     reply = TestClient(app, raise_server_exceptions=False).get("/broken")
     assert assert_problem(reply)["type"] == "/problems/internal"
     assert "secret" not in reply.text
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        b'{"\\ud800": 1}',
+        b'{"settings": {"\\ud800": 1}}',
+        b'{"settings": {"a\\nb": 1}}',
+        b'{"settings": {"preset": "\\ud800"}}',
+        b'{"settings": {"power": 1' + b"0" * 5000 + b"}}",
+        b"[" * 100_000,
+        b"\xff\xfe",
+    ],
+)
+def test_no_body_makes_it_our_fault(client: TestClient, uploaded: Uploaded, body: bytes) -> None:
+    if body.startswith(b'{"settings'):  # the rest of the order is right, so that the settings are read
+        body = (
+            json.dumps({name: value for name, value in uploaded.order().items() if name != "settings"}).encode()[:-1]
+            + b", "
+            + body[1:]
+        )
+    reply = client.post("/lift", content=body, headers={"Content-Type": "application/json"})
+    assert 400 <= assert_problem(reply)["status"] < 500
+
+
+@pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "full"), sqlite3.OperationalError("disk is full")])
+def test_full_disk_is_507(error: Exception) -> None:
+    if isinstance(error, sqlite3.OperationalError):
+        error.sqlite_errorcode = sqlite3.SQLITE_FULL
+    app = FastAPI()
+    problems.install(app)
+
+    @app.get("/")
+    def full() -> None:
+        raise error
+
+    reply = TestClient(app, raise_server_exceptions=False).get("/")
+    assert (assert_problem(reply)["type"], reply.status_code) == ("/problems/no-space", 507)
 
 
 def test_every_error_has_a_row_and_crosses_processes() -> None:

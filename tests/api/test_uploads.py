@@ -5,9 +5,14 @@ from __future__ import annotations
 import gzip
 import hashlib
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
+from fastapi import Request
 from fastapi.testclient import TestClient
+
+from liftcore.errors import NotFound
+from service.content import file_answer
 
 from .conftest import Uploaded
 from .tiny_scene import TinyScene, ply, splat_rows
@@ -110,3 +115,9 @@ def test_deleted_asset_is_gone_and_may_come_back(client: TestClient) -> None:
     assert client.delete(path).status_code == 404
     assert client.put("/assets/splats", content=content).status_code == 201
     assert client.delete(path).status_code == 204
+
+
+def test_content_that_goes_while_it_is_asked_for_is_404(tmp_path: Path) -> None:
+    request = Request({"type": "http", "headers": []})
+    with pytest.raises(NotFound, match="deleted"):
+        file_answer(request, tmp_path / "gone", sha256="0" * 64, filename="x")

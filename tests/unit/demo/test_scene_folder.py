@@ -15,6 +15,11 @@ from safetensors.torch import save_file
 from liftcore.demo.scene_folder import find_scene
 from liftcore.errors import InvalidInput
 
+INRIA_CAMERA = {
+    "id": 0, "img_name": "v", "width": 4, "height": 3, "fx": 4.0, "fy": 4.0,
+    "position": [0.0, 0.0, 0.0], "rotation": [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+}  # fmt: skip
+
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
@@ -24,7 +29,7 @@ def folder(tmp_path: Path) -> Path:
     for name in ("cameras.bin", "images.bin"):
         (scene / "sparse" / "0" / name).write_bytes(b"model")
     save_file({"words": torch.ones(1)}, str(scene / "a.safetensors"))
-    save_file({"v/grid": torch.ones(1, 1, 2)}, str(scene / "grids.safetensors"))
+    save_file({"v/grid": torch.ones(1, 1, 2)}, str(scene / "grids.safetensors"), metadata={"text_space": "animals"})
     objects = [{"class": name} for name in ("cat", "boat", "cow", "fish")]
     (scene / "truth.json").write_text(json.dumps({"objects": objects}))
     truth = {"splat_object": np.array([0, 1], np.int16), "v/mask": np.array([[0, -1, 3]], np.int16)}
@@ -58,7 +63,7 @@ def test_phrases_of_the_user_come_first_and_a_table_is_the_encoder(folder: Path,
 
 @pytest.mark.parametrize(
     ("missing", "message"),
-    [("point_cloud.ply", "splats"), ("grids.safetensors", "features"), ("truth.json", "--phrase")],
+    [("point_cloud.ply", "splats"), ("grids.safetensors", "features")],
 )
 def test_what_is_missing_is_named(folder: Path, tmp_path: Path, missing: str, message: str) -> None:
     (folder / missing).unlink()
@@ -69,3 +74,16 @@ def test_what_is_missing_is_named(folder: Path, tmp_path: Path, missing: str, me
 def test_a_folder_that_is_not_there_is_named(tmp_path: Path) -> None:
     with pytest.raises(InvalidInput, match="folder"):
         find_scene(tmp_path / "none", (), tmp_path)
+
+
+def test_a_scene_that_says_nothing_of_itself_is_asked_nothing(folder: Path, tmp_path: Path) -> None:
+    (folder / "truth.json").unlink()
+    (folder / "cameras.json").write_text(json.dumps([INRIA_CAMERA]))
+    scene = find_scene(folder, (), tmp_path)
+    assert (scene.phrases, scene.text_space, scene.views) == ((), "animals", ("v",))
+
+
+def test_features_without_words_are_asked_nothing(folder: Path, tmp_path: Path) -> None:
+    save_file({"v/grid": torch.ones(1, 1, 2)}, str(folder / "grids.safetensors"))
+    scene = find_scene(folder, (), tmp_path)
+    assert (scene.phrases, scene.text_space) == ((), "none")

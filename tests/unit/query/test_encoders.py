@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ from liftcore.errors import InvalidQuery, Unavailable
 from liftcore.query.encoders import open_encoder
 from liftcore.query.encoders.minilm import MiniLmEncoder
 from liftcore.query.encoders.open_clip import OpenClipEncoder
+from liftcore.query.encoders.remembering import RememberingEncoder
 
 WORDS = ["alarm_clock", "Teapot", "the end", "a"]
 
@@ -139,3 +141,23 @@ def test_open_clip_refuses_a_pickle_that_holds_code(tmp_path: Path) -> None:
         open_encoder(f"open_clip:ViT-B-32@{path}")
     with pytest.raises(InvalidQuery, match="ending in"):
         open_encoder(f"open_clip:ViT-B-32@{Path(__file__)}")
+
+
+def test_a_remembered_text_is_read_once_and_the_oldest_is_forgotten() -> None:
+    asked: list[str] = []
+
+    class Counting:
+        name, channels = "counting", 2
+
+        def encode(self, texts: Sequence[str]) -> torch.Tensor:
+            asked.extend(texts)
+            return torch.tensor([[float(len(text)), 1.0] for text in texts])
+
+    encoder = RememberingEncoder(Counting(), size=2)
+    first = encoder.encode(["a", "bb", "a"])
+    assert first[:, 0].tolist() == [1.0, 2.0, 1.0] and asked == ["a", "bb"]
+    encoder.encode(["a", "ccc"])
+    assert asked == ["a", "bb", "ccc"]
+    encoder.encode(["bb"])
+    assert asked == ["a", "bb", "ccc", "bb"]
+    assert encoder.encode([]).shape == (0, 2) and (encoder.name, encoder.channels) == ("counting", 2)

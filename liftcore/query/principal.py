@@ -1,0 +1,66 @@
+"""Features as colours: their three principal components, for people who look before they read."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+SAMPLE = 32_768  # rows that decide the components
+SEED = 0
+COMPONENTS = 3
+_RANGE = (0.02, 0.98)  # weighted-sample quantiles that the colours span
+_BLOCK = 16_384  # rows widened at once
+
+
+def principal_colours(features: Tensor, weights: Tensor) -> Tensor:
+    """The first three principal components of unit features as red, green and blue.
+
+    The components are those of a seeded sample of the rows, drawn with the weights as odds: splats that no ray
+    meets decide nothing. Signs are fixed (the largest entry of a component is positive), so the same lift has the
+    same colours at every run.
+
+    Args:
+        features: [P, F] f16 or f32; zero rows stay black.
+        weights: [P] f32 at least zero, such as the evidence.
+
+    Returns:
+        [P, 3] f32 in 0..1.
+    """
+    known = (features != 0).any(dim=1)
+    odds = torch.where(known, weights.to(torch.float32), 0.0)
+    colours = torch.zeros(features.shape[0], COMPONENTS)
+    if not bool((odds > 0).any()):
+        return colours
+    rows = _draw(odds)
+    sample = _unit(features[rows])
+    centre = sample.mean(dim=0)
+    axes = _axes(sample - centre)
+    shown = (sample - centre) @ axes
+    low, high = torch.quantile(shown, torch.tensor(_RANGE), dim=0)
+    for first in range(0, features.shape[0], _BLOCK):
+        block = slice(first, first + _BLOCK)
+        levels = ((_unit(features[block]) - centre) @ axes - low) / (high - low).clamp_min(1e-12)
+        colours[block, : axes.shape[1]] = levels.clamp(0.0, 1.0) * known[block, None]
+    return colours
+
+
+def _draw(odds: Tensor) -> Tensor:
+    """Seeded rows [SAMPLE] i64 with probabilities proportional to the odds [P] (inverse of the running sum)."""
+    running = torch.cumsum(odds.double(), dim=0)
+    marks = torch.rand(SAMPLE, generator=torch.Generator().manual_seed(SEED), dtype=torch.float64) * running[-1]
+    return torch.searchsorted(running, marks, right=True).clamp_max(len(odds) - 1)
+
+
+def _axes(centred: Tensor) -> Tensor:
+    """[F, at most 3], the directions of the largest variance."""
+    vectors = torch.linalg.eigh(centred.T @ centred / len(centred)).eigenvectors.flip(1)[:, :COMPONENTS]
+    largest = vectors.abs().argmax(dim=0)
+    return vectors * vectors.gather(0, largest[None]).sign()
+
+
+def _unit(rows: Tensor) -> Tensor:
+    return torch.nn.functional.normalize(rows.to(torch.float32), dim=1)
