@@ -7,9 +7,12 @@ be loaded.
 
 from __future__ import annotations
 
+import atexit
 import hashlib
 import os
+import shutil
 import tempfile
+from contextlib import suppress
 from pathlib import Path
 
 import numba
@@ -18,7 +21,9 @@ from numba.core import config
 
 
 def _source_digest() -> str:
-    digest = hashlib.sha256(numba.__version__.encode() + (Path(__file__).parent / "lanes.py").read_bytes())
+    digest = hashlib.sha256(numba.__version__.encode())
+    for module in (Path(__file__), Path(__file__).with_name("lanes.py")):
+        digest.update(module.read_bytes())
     for package in ("raster", "solve", "query"):
         for source in sorted((Path(__file__).parent / package).glob("*.py")):
             digest.update(source.read_bytes())
@@ -28,11 +33,15 @@ def _source_digest() -> str:
 def _cache_folder() -> Path:
     base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     folder = base / "splatlift" / "kernels" / _source_digest()
-    try:
+    with suppress(OSError):
         folder.mkdir(parents=True, exist_ok=True)
+    if os.access(folder, os.W_OK):
         return folder
-    except OSError:  # a home that cannot be written: containers, services
-        return Path(tempfile.gettempdir()) / f"splatlift-kernels-{os.getuid()}-{_source_digest()}"
+    # A home that cannot be written: compile anew in each process. A shared name in the temporary folder would let
+    # others plant code, for cached kernels are code.
+    private = Path(tempfile.mkdtemp(prefix="splatlift-kernels-"))
+    atexit.register(shutil.rmtree, private, ignore_errors=True)
+    return private
 
 
 if not os.environ.get("NUMBA_CACHE_DIR"):

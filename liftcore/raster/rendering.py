@@ -102,7 +102,7 @@ def top_tiles(first, last, frame, ids, weights):
 
 @kernel
 def trace_rays(frame, pixels):
-    """Rows of A for single pixels, one ray at a time, in float64.
+    """Rows of A for single pixels, one ray at a time; alpha and T in float32, so that cut-offs fall as in the lanes.
 
     Args:
         pixels: [n, 2] i32, x and y.
@@ -114,21 +114,23 @@ def trace_rays(frame, pixels):
     splats = np.empty(1 << 12, np.int32)
     weights = np.empty(1 << 12, np.float32)
     count = 0
+    one, floor = np.float32(1.0), np.float32(ALPHA_FLOOR)
+    cap, stop = np.float32(frame.cap), np.float32(frame.stop)
     for i in range(pixels.shape[0]):
         x, y = pixels[i, 0], pixels[i, 1]
         tile = (y // TILE) * frame.columns + x // TILE
-        light = 1.0
+        light = one
         for step in range(frame.starts[tile], frame.starts[tile + 1]):
             place = frame.items[step]
             record = frame.records[place]
             dy = y + 0.5 - record[MY]
             dx = x + 0.5 - record[MX] - record[SLOPE] * dy
             exponent = record[KX] * dx * dx + record[KY] * dy * dy
-            alpha = min(frame.cap, record[OPACITY] * math.pow(2.0, -exponent))
-            if alpha < ALPHA_FLOOR:
+            alpha = min(cap, np.float32(record[OPACITY] * math.pow(2.0, -exponent)))
+            if alpha < floor:
                 continue
-            after = light * (1 - alpha)
-            if after <= frame.stop:
+            after = light * (one - alpha)
+            if after <= stop:
                 break
             if count == splats.shape[0]:
                 splats = np.concatenate((splats, np.empty_like(splats)))

@@ -5,7 +5,8 @@ All sums are over the sampled rays and the A that the lift used (its opacity gai
     L(x') = mean_i || sum_j A_ij x_j - B_i ||^2          J(x') = mean_i sum_j A_ij || x_j - B_i ||^2
     Delta_ij = || x_j - B_i ||,  mu_i = sum_j a_ij Delta_ij,  beta_i = sum_j a_ij (Delta_ij^2 - mu_i^2) / mu_i^2
 
-with ``a_ij = A_ij / sum_j A_ij``. A ray has a row i for each labelled level. The paper defines beta at the optimum
+``L <= J`` (Jensen) where rows sum to one; a ray that meets nothing has ``L = ||B||^2`` and ``J = 0``.
+Here ``a_ij = A_ij / sum_j A_ij``. A ray has a row i for each labelled level. The paper defines beta at the optimum
 x^; here it is measured at the answer x', which is what a user has.
 """
 

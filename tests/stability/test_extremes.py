@@ -195,7 +195,6 @@ def test_a_million_rays_of_one_splat_sum_as_in_float64():
         assert float(got.evidence[0]) == pytest.approx(exact.sum(), rel=1e-6)
 
 
-@pytest.mark.xfail(strict=True, reason="ray_rows compares T with the stop in float64, the other products in float32")
 def test_two_saturated_splats_weigh_the_same_in_the_lift_and_in_its_certificate():
     # (1 - cap)^2 is the stop itself with the field's constants: every way to A must fall on the same side.
     splats, camera = splats_at([(0.0, 0.0, 2.0), (0.0, 0.0, 3.0)], log_scales=2.0, logits=1e4), camera_at_origin()
