@@ -27,6 +27,7 @@ from liftcore.measure.synthetic import room_cameras, room_splats
 from liftcore.query.ask import ask, look
 from liftcore.query.pictures import mask_png
 from liftcore.query.scene import QueryScene
+from liftcore.scene.cameras import Cameras
 from liftcore.scene.inria import write_inria_cameras
 from liftcore.scene.ply import write_splats
 from liftcore.solve.settings import LiftSettings
@@ -65,7 +66,7 @@ def write_random_lift(folder: Path, splats: int, channels: int, size: tuple[int,
     scene = [nothing, nothing]
     if size is not None:
         write_splats(room_splats(splats), folder / "splats.ply")
-        write_inria_cameras(room_cameras(1, *size), folder / "cameras.json")
+        write_inria_cameras(Cameras(tuple(room_cameras(1, *size))), folder / "cameras.json")
         scene = [input_file(folder / name) for name in ("splats.ply", "cameras.json")]
     metadata = LiftMetadata(
         version=__version__, settings=LiftSettings.of(), splats=scene[0], cameras=scene[1], features=(),

@@ -22,6 +22,11 @@ if TYPE_CHECKING:
     from liftcore.query.scene import QueryScene
 
 MINIMUM_ROW_SUM = 0.5  # below it a ray mostly misses the scene: neither histogram nor mask takes it
+# A splat counts in the histogram by its evidence, up to this many rays' worth of weight: what hardly a ray met
+# scores by the chance of a few pixels, and such splats fill the valleys. They are still selected by their scores.
+# Mean IoU of the selected splats over tabletop's 14 phrases, unweighted -> weighted: `row-sum`, noisy features
+# .929 -> .925, hard ones .757 -> .819 (the best possible threshold: .931 and .874).
+MOST_EVIDENCE = 20.0
 _QUANTILES = (0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
 _NO_RELEVANCY = 0.0  # what a splat without a feature scores in relevancy
 
@@ -108,7 +113,7 @@ def ask(
     seen = scene.lift.seen & (scene.norms > 0)
     scores = torch.where(seen, scores, _NO_RELEVANCY if negatives else LOWEST_COSINE)
     known = scores[seen]
-    found = find_threshold(known, threshold)
+    found = find_threshold(known, threshold, _weights(scene, seen))
     return Answer(
         text=text,
         negatives=tuple(negatives),
@@ -159,6 +164,12 @@ def top(answer: Answer, scene: QueryScene, count: int) -> Found:
     chosen = means[answer.selected]
     box = (_point(chosen.amin(dim=0)), _point(chosen.amax(dim=0))) if len(chosen) else None
     return Found(best, box)
+
+
+def _weights(scene: QueryScene, seen: Tensor) -> Tensor | None:
+    """How much each seen splat counts in the histogram; None when none has evidence."""
+    weights = scene.lift.evidence[seen].clamp_max(MOST_EVIDENCE)
+    return weights if bool((weights > 0).any()) else None
 
 
 def _check_space(scene: QueryScene, encoder: TextEncoder) -> None:

@@ -77,6 +77,23 @@ def test_a_splat_that_was_never_seen_is_never_selected(lift_file: Path) -> None:
         assert answer.count == COUNT - 1
 
 
+def test_splats_that_hardly_a_ray_met_do_not_decide_the_threshold(lift_file: Path) -> None:
+    scene = QueryScene.open(lift_file)
+    plain = ask(scene, "x", Axes())
+    stray = torch.zeros(COUNT, 3)
+    stray[:, 0], stray[:, 1] = 1.0, torch.linspace(0.0, 3.0, COUNT)  # scores all over the range
+    crowd = Lift(
+        torch.cat([scene.lift.features, stray.half()]),
+        torch.cat([scene.lift.evidence, torch.full((COUNT,), 1e-4)]),
+        torch.ones(2 * COUNT),
+        torch.cat([scene.lift.seen, torch.ones(COUNT, dtype=torch.bool)]),
+        scene.lift.metadata,
+    )
+    answer = ask(QueryScene(crowd, lift_file), "x", Axes())
+    assert torch.equal(answer.selected[:COUNT], plain.selected)
+    assert answer.selected[COUNT] and answer.count > plain.count  # they are selected all the same
+
+
 def test_negatives_make_it_relevancy(lift_file: Path) -> None:
     answer = ask(QueryScene.open(lift_file), "x", Axes(), negatives=["y", "z"], threshold=0.5)
     assert answer.relevancy and answer.threshold_method == "fixed"
