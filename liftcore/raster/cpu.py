@@ -24,7 +24,7 @@ from liftcore.raster.protocol import RayRows, RegionWeights, Walk
 from liftcore.raster.readings import reading_of
 from liftcore.raster.region_weights import weigh_tiles
 from liftcore.raster.rendering import render_tiles, top_tiles, trace_rays
-from liftcore.raster.tiles import count_tiles, fill_tiles, tile_places
+from liftcore.raster.tiles import fill_tiles, list_tiles, tile_places
 from liftcore.raster.walk import Frame
 from liftcore.scene.splats import Kernel
 
@@ -38,7 +38,6 @@ if TYPE_CHECKING:
     from liftcore.scene.splats import Splats
 
 SPLAT_SHARES = 8  # shares of the projection and the binning
-MERGE_SHARES = 4  # ranges of splats in the merge; each reads all entries and takes its own
 TILE_SHARES = 48  # shares of the blending; more of them even out crowded tiles
 RENDER_CHANNELS = 32  # channels a pass of the render, so that a tile's sums stay in the cache
 
@@ -158,11 +157,11 @@ class CpuRaster:
         columns, rows = -(-camera.width // TILE), -(-camera.height // TILE)
         bounds = _shares(order.shape[0], SPLAT_SHARES)
         counts = np.zeros((len(bounds), rows * columns), np.int64)
-        shares = [(order[first:last], k) for k, (first, last) in enumerate(bounds)]
-        self._map(lambda part, k: count_tiles(part, self._records, rows, columns, counts[k]), shares)
+        parts = [order[first:last] for first, last in bounds]
+        lists = self._map(lambda k: list_tiles(parts[k], self._records, rows, columns, counts[k]), _numbers(parts))
         starts, cursors = tile_places(counts)
         items = np.empty(starts[-1], np.int32)
-        self._map(lambda part, k: fill_tiles(part, self._records, rows, columns, cursors[k], items), shares)
+        self._map(lambda k: fill_tiles(parts[k], *lists[k], cursors[k], items), _numbers(parts))
         return Frame(
             self._records, ids, starts, items, columns, rows, camera.width, camera.height,
             walk.alpha_cap, walk.transmittance_stop,
@@ -185,7 +184,8 @@ class CpuRaster:
                 gather_entries(first, last, share[:4], base, cursors, gathered)
             return merge_range(starts, gathered, slot_rows, codebook_rows, frame.ids[first:last])
 
-        parts = self._map(merge, _shares(self.splats.count, MERGE_SHARES))
+        # A range's rows depend on its own entries only, so their number may follow the threads: fewer reads of all.
+        parts = self._map(merge, _shares(self.splats.count, self.threads))
         splats, lengths, columns, weights, met, evidence = (np.concatenate(part) for part in zip(*parts, strict=True))
         row_starts = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
         return RegionWeights(
@@ -208,6 +208,11 @@ class CpuRaster:
         if self.threads == 1:
             return [work(*share) for share in shares]
         return list(self._pool.map(lambda share: work(*share), shares))
+
+
+def _numbers(parts: list) -> list[tuple[int]]:
+    """(0,), (1,), ... for ``_map``."""
+    return [(k,) for k in range(len(parts))]
 
 
 def _shares(total: int, count: int) -> list[tuple[int, int]]:

@@ -1,8 +1,8 @@
 """Which splats touch which tile: a counting sort of the depth order into 16 x 16 pixel tiles.
 
-The depth order is cut into a fixed number of shares; each share counts, a prefix sum gives every (tile, share)
-its place, and each share writes there. No two threads write the same place and the order inside a tile is the
-depth order, so the result does not depend on the number of threads.
+The depth order is cut into a fixed number of shares; each share lists its tiles and counts them, a prefix sum gives
+every (tile, share) its place, and each share writes there. No two threads write the same place and the order inside a
+tile is the depth order, so the result does not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -51,29 +51,45 @@ def _tile_columns(record, tile_row, columns):
 
 
 @kernel
-def count_tiles(order, records, rows, columns, counts):
-    """Add to ``counts`` [rows * columns] i64 how many of ``order``'s footprints touch each tile."""
-    for place in order:
-        record = records[place]
+def list_tiles(order, records, rows, columns, counts):
+    """The tiles that each of ``order``'s footprints touches, one footprint after the other.
+
+    Args:
+        counts: [rows * columns] i64, zeros; receives how many footprints touch each tile.
+
+    Returns:
+        lengths [n] i32, how many tiles each footprint touches; tiles [sum] i32, row by row.
+    """
+    lengths = np.zeros(order.shape[0], np.int32)
+    tiles = np.empty(max(1024, 4 * order.shape[0]), np.int32)
+    count = 0
+    for i in range(order.shape[0]):
+        record = records[order[i]]
+        before = count
         top, bottom = _tile_rows(record, rows)
         for tile_row in range(int(top), int(bottom) + 1):
             first, last = _tile_columns(record, tile_row, columns)
+            if count + columns > tiles.shape[0]:
+                tiles = np.concatenate((tiles, np.empty_like(tiles), np.empty(columns, np.int32)))
             for column in range(int(first), int(last) + 1):
-                counts[tile_row * columns + column] += 1
+                tile = tile_row * columns + column
+                tiles[count] = tile
+                counts[tile] += 1
+                count += 1
+        lengths[i] = count - before
+    return lengths, tiles[:count]
 
 
 @kernel
-def fill_tiles(order, records, rows, columns, cursors, items):
+def fill_tiles(order, lengths, tiles, cursors, items):
     """Write ``order``'s places into ``items`` [n] i32 from each tile's cursor on."""
-    for place in order:
-        record = records[place]
-        top, bottom = _tile_rows(record, rows)
-        for tile_row in range(int(top), int(bottom) + 1):
-            first, last = _tile_columns(record, tile_row, columns)
-            for column in range(int(first), int(last) + 1):
-                tile = tile_row * columns + column
-                items[cursors[tile]] = place
-                cursors[tile] += 1
+    at = 0
+    for i in range(order.shape[0]):
+        for _ in range(lengths[i]):
+            tile = tiles[at]
+            items[cursors[tile]] = order[i]
+            cursors[tile] += 1
+            at += 1
 
 
 def tile_places(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
