@@ -48,7 +48,7 @@ class DemoScene:
     cameras: Path
     features: Path
     encoder: str  # specification of the text encoder
-    text_space: str  # of the features; "none" when no text encoder shares it
+    text_space: str  # of the features; "none" when no text encoder shares it, "" when the pack does not say
     phrases: tuple[str, ...]  # empty = nothing can be asked, or nobody knows what
     views: tuple[str, ...]  # to look from, the pictured one first; views with truth where there are any
     truth: Truth | None
@@ -70,7 +70,7 @@ def find_scene(folder: Path, phrases: Sequence[str], scratch: Path) -> DemoScene
     truth = _read_truth(folder)
     cameras = _cameras(folder, scratch)
     table, features = folder / _TABLE, _features(folder)
-    text_space = _text_space(features)
+    text_space = _text_space(features, table)
     asked = tuple(phrases) or (_phrases_of(truth) if text_space != NO_WORDS else ())
     return DemoScene(
         name=folder.name,
@@ -124,11 +124,13 @@ def _features(folder: Path) -> Path:
     raise InvalidInput(f"features of {folder.name}", expected="a feature pack (.safetensors)", got="none")
 
 
-def _text_space(features: Path) -> str:
+def _text_space(features: Path, table: Path) -> str:
+    """What the pack says; a pack that says nothing has words if a table of them lies beside it."""
     from safetensors import safe_open
 
     with safe_open(str(features), framework="pt") as handle:
-        return (handle.metadata() or {}).get("text_space") or NO_WORDS
+        told = (handle.metadata() or {}).get("text_space")
+    return told or ("" if table.is_file() else NO_WORDS)
 
 
 def _read_truth(folder: Path) -> Truth | None:

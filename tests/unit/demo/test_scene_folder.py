@@ -87,3 +87,10 @@ def test_features_without_words_are_asked_nothing(folder: Path, tmp_path: Path) 
     save_file({"v/grid": torch.ones(1, 1, 2)}, str(folder / "grids.safetensors"))
     scene = find_scene(folder, (), tmp_path)
     assert (scene.phrases, scene.text_space) == ((), "none")
+
+
+def test_a_pack_that_names_no_text_space_has_the_words_of_the_table_beside_it(folder: Path, tmp_path: Path) -> None:
+    save_file({"v/grid": torch.ones(1, 1, 2)}, str(folder / "grids.safetensors"))
+    assert find_scene(folder, (), tmp_path / "bare").phrases == ()
+    (folder / "text_table.safetensors").touch()
+    assert find_scene(folder, (), tmp_path / "worded").phrases == ("the cat", "the boat", "the cow")
