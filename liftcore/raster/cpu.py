@@ -161,7 +161,7 @@ class CpuRaster:
         lists = self._map(lambda k: list_tiles(parts[k], self._records, rows, columns, counts[k]), _numbers(parts))
         starts, cursors = tile_places(counts)
         items = np.empty(starts[-1], np.int32)
-        self._map(lambda k: fill_tiles(parts[k], *lists[k], cursors[k], items), _numbers(parts))
+        self._map(lambda k: fill_tiles(parts[k], lists[k][0], lists[k][1], cursors[k], items), _numbers(parts))
         return Frame(
             self._records, ids, starts, items, columns, rows, camera.width, camera.height,
             walk.alpha_cap, walk.transmittance_stop,
