@@ -61,16 +61,6 @@ def save_attention(look: Look, path: Path) -> None:
     _save(attention_png(look), path)
 
 
-def save_render(scene: QueryScene, view: str, path: Path) -> None:
-    """Write `render_png` to a file."""
-    _save(render_png(scene, view), path)
-
-
-def save_overlay(image: np.ndarray, look: Look, path: Path) -> None:
-    """Write `overlay_png` to a file."""
-    _save(overlay_png(image, look), path)
-
-
 def render(scene: QueryScene, view: str, what: str = "rgb") -> np.ndarray:
     """The colours of a view, [H, W, 3] u8 sRGB on black, with the opacities as trained (gain 1).
 

@@ -15,7 +15,7 @@ import torch
 
 from liftcore.jit import kernel
 from liftcore.lanes import LANES
-from liftcore.observe.observation import FeatureGrid, Observation, RegionMap
+from liftcore.observe.observation import Observation, RegionMap
 from liftcore.raster.constants import TILE
 from liftcore.raster.walk import HALVES
 
@@ -80,12 +80,6 @@ def _taps(pixels: int, cells: int) -> tuple[np.ndarray, np.ndarray]:
     position = ((np.arange(pixels) + 0.5) * cells / pixels - 0.5).clip(0, cells - 1)
     left = np.minimum(np.floor(position), max(cells - 2, 0)).astype(np.int32)
     return left, (position - left).astype(np.float32)
-
-
-def observation_size(observation: FeatureGrid | RegionMap) -> tuple[int, int]:
-    """Rows and columns of the label map or the grid."""
-    shape = observation.labels.shape[1:] if isinstance(observation, RegionMap) else observation.grid.shape[:2]
-    return int(shape[0]), int(shape[1])
 
 
 @kernel

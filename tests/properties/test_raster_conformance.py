@@ -9,7 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from liftcore.raster.cpu import CpuRaster
-from liftcore.raster.oracle import dense_view, reading_matrix
+from liftcore.raster.oracle import OracleRaster, dense_view, reading_matrix
 from liftcore.raster.protocol import RegionWeights, Walk
 from tests.scenes import random_camera, random_grid, random_regions, random_splats, scenes
 
@@ -121,3 +121,19 @@ def test_the_number_of_threads_changes_no_bit(walk):
                 assert torch.equal(getattr(runs[0], name), getattr(other, name)), name
         images = [CpuRaster(splats, threads=n).row_sums(camera, walk) for n in (1, 2, 5)]
         assert all(torch.equal(images[0], image) for image in images[1:])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_oracle_is_a_backend_that_gives_the_same_products(seed):
+    splats, camera, walk = random_splats(seed, 30), random_camera(seed), Walk()
+    if dense_view(splats, camera, walk).cut.any():
+        camera = random_camera(seed + 100)
+    fast, plain = CpuRaster(splats), OracleRaster(splats)
+    observation = random_regions(seed)
+    rows = observation.codebook.shape[0]
+    ours, theirs = (raster.region_weights(camera, observation, walk, 2) for raster in (fast, plain))
+    assert np.abs(dense(ours, 30, rows) - dense(theirs, 30, rows)).max() < INSIDE
+    assert torch.equal(ours.evidence_splats, theirs.evidence_splats)
+    assert torch.allclose(fast.row_sums(camera, walk), plain.row_sums(camera, walk), atol=INSIDE)
+    mine, reference = (raster.top_weights(camera, walk, 3)[1] for raster in (fast, plain))
+    assert torch.allclose(mine, reference, atol=INSIDE)
