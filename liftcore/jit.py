@@ -1,8 +1,7 @@
 """How kernels are compiled: without the interpreter lock, cached on disk by the content of the sources.
 
 numba's cache looks at a kernel's own file only, so a change in a function that it calls would go unseen. Here the
-cache folder is named after a digest of the sources of all packages that have kernels, so a stale kernel can never
-be loaded.
+cache folder is named after a digest of all sources that kernels are made of, so a stale kernel can never be loaded.
 """
 
 from __future__ import annotations
@@ -20,13 +19,18 @@ from numba import njit
 from numba.core import config
 
 
+def _kernel_sources() -> list[Path]:
+    """The files whose code or constants kernels are made of: a change in any other compiles nothing anew."""
+    root = Path(__file__).parent
+    own = [Path(__file__), root / "lanes.py", root / "raster" / "constants.py"]
+    rooms = [source for package in ("raster", "solve", "query") for source in sorted((root / package).glob("*.py"))]
+    return own + [source for source in rooms if b"from liftcore.jit import" in source.read_bytes()]
+
+
 def _source_digest() -> str:
     digest = hashlib.sha256(numba.__version__.encode())
-    for module in (Path(__file__), Path(__file__).with_name("lanes.py")):
-        digest.update(module.read_bytes())
-    for package in ("raster", "solve", "query"):
-        for source in sorted((Path(__file__).parent / package).glob("*.py")):
-            digest.update(source.read_bytes())
+    for source in _kernel_sources():
+        digest.update(source.read_bytes())
     return digest.hexdigest()[:16]
 
 
