@@ -144,9 +144,12 @@ class Tabletop:
         start = time.perf_counter()
         paths = [self.folder / name for name in ("point_cloud.ply", "cameras.json", f"{case.pack}.safetensors")]
         features = lift(paths[0], paths[1], paths[2:], case.settings).features
-        seconds = time.perf_counter() - start
+        return self.judge(features, case.settings, time.perf_counter() - start)
+
+    def judge(self, features: Tensor, settings: LiftSettings, seconds: float = 0.0) -> Figures:
+        """The figures of lifted features [P, F] against the truth; the settings say how they are rendered."""
         scores = class_scores(features, self.classes)
-        seen = [self._argmax(view, features, case.settings) for view in self.held_out]
+        seen = [self._argmax(view, features, settings) for view in self.held_out]
         ious = class_ious(torch.stack(seen), torch.stack(list(self.held_out.values())), len(self.classes))
         return Figures(
             splat_accuracy(scores, self.objects, self.counted),
