@@ -20,7 +20,7 @@ from liftcore.observe.observation import Observation, RegionMap
 from liftcore.progress import silent
 from liftcore.raster.cpu import CpuRaster
 from liftcore.raster.warm_up import warm_up
-from liftcore.solve.accumulate import lift_walk, row_totals
+from liftcore.solve.accumulate import lift_walk, row_totals, weighting_of
 from liftcore.solve.closed_form import solve_closed_form
 from liftcore.solve.settings import LiftSettings, Preset
 from liftcore.solve.view_weights import ViewWeights
@@ -75,16 +75,16 @@ def time_lift(work: Workload, preset: Preset, threads: int | None = None) -> dic
     """Seconds a view of geometry and solution, medians over the views, one after the other."""
     settings = LiftSettings.of(preset=preset)
     raster = CpuRaster(work.splats, threads)
-    walk = lift_walk(settings)
+    walk, weighting = lift_walk(settings), weighting_of(settings)
     denominators = np.zeros(work.splats.count)
     geometry, entries = [], 0
     with ViewWeights() as store:
         camera, observation = work.views[0]
-        raster.region_weights(camera, observation, walk, settings.power)  # warm caches, not counted
+        raster.region_weights(camera, observation, walk, weighting)  # warm caches, not counted
         raster.forget()
         for camera, observation in work.views:
             start = time.perf_counter()
-            weights = raster.region_weights(camera, observation, walk, settings.power)
+            weights = raster.region_weights(camera, observation, walk, weighting)
             denominators[weights.splats.numpy()] += row_totals(weights)
             store.append(weights)
             geometry.append(time.perf_counter() - start)

@@ -27,7 +27,7 @@ from liftcore.measure.bench import hardware
 from liftcore.observe.observation import NO_LABEL, RegionMap
 from liftcore.observe.pack import open_packs
 from liftcore.raster.cpu import CpuRaster
-from liftcore.raster.protocol import Walk
+from liftcore.raster.protocol import Walk, Weighting
 from liftcore.scene.load import load_cameras, load_splats
 from liftcore.solve.accumulate import render_walk
 from liftcore.solve.settings import LiftSettings
@@ -133,7 +133,7 @@ class Tabletop:
         evidence, visible = np.zeros(count), torch.zeros(count, dtype=torch.bool)
         for view in open_packs([self.folder / f"{EVIDENCE_PACK}.safetensors"]).views:
             camera = self.cameras.get(view)
-            weights = self.raster.region_weights(camera, nothing, Walk(), 1)
+            weights = self.raster.region_weights(camera, nothing, Walk(), Weighting())
             evidence[weights.evidence_splats.numpy()] += weights.evidence.numpy()
             ids, large = self.raster.top_weights(camera, Walk(), LARGE_A_RAY)
             visible[ids[large > WEIGHT_OVER].long()] = True

@@ -20,7 +20,7 @@ from liftcore.raster.constants import TILE
 from liftcore.raster.depth_order import depth_order
 from liftcore.raster.merging import count_entries, gather_entries, merge_range
 from liftcore.raster.projection import RECORD, axes_of, opacities, project_gaussians, view_of
-from liftcore.raster.protocol import RayRows, RegionWeights, Walk
+from liftcore.raster.protocol import RayRows, RegionWeights, Selection, Walk, Weighting
 from liftcore.raster.readings import reading_of
 from liftcore.raster.region_weights import weigh_tiles
 from liftcore.raster.rendering import render_tiles, top_tiles, trace_rays
@@ -73,15 +73,16 @@ class CpuRaster:
         self._depths = np.empty(splats.count, np.float32)
         self._frames: OrderedDict[tuple[Camera, Walk], Frame] = OrderedDict()
 
-    def region_weights(self, camera: Camera, observation: Observation, walk: Walk, power: int) -> RegionWeights:
-        """``A^p^T S`` of a view and the evidence of plain weights. See the protocol."""
-        if power not in (1, 2):
-            raise InvalidInput("power", expected="1 or 2", got=str(power))
+    def region_weights(
+        self, camera: Camera, observation: Observation, walk: Walk, weighting: Weighting
+    ) -> RegionWeights:
+        """``A'^T S`` of a view and the evidence of plain weights. See the protocol."""
+        _check_weighting(weighting, walk)
         frame = self._frame(camera, walk)
         reading = reading_of(observation, camera.width, camera.height)
         with_plain = walk.gain != 1.0
         entries = self._over_tiles(
-            frame, lambda first, last: weigh_tiles(first, last, frame, reading, power, with_plain)
+            frame, lambda first, last: weigh_tiles(first, last, frame, reading, weighting.power, with_plain)
         )
         return self._merge(frame, entries, reading.codebook_rows)
 
@@ -131,6 +132,8 @@ class CpuRaster:
 
     def _frame(self, camera: Camera, walk: Walk) -> Frame:
         """The view projected and binned; the last one is kept."""
+        if walk.antialiased:
+            raise Unavailable("antialiased", expected="false", got="true", hint="the compensation is not there yet")
         key = (camera, walk)
         frame = self._frames.pop(key, None)
         if frame is None:
@@ -208,6 +211,13 @@ class CpuRaster:
         if self.threads == 1:
             return [work(*share) for share in shares]
         return list(self._pool.map(lambda share: work(*share), shares))
+
+
+def _check_weighting(weighting: Weighting, walk: Walk) -> None:
+    if weighting.power not in (0, 1, 2):
+        raise InvalidInput("power", expected="0, 1 or 2", got=str(weighting.power))
+    if weighting.selection is not Selection.ALL or weighting.floor > 0 or walk.stride != 1:
+        raise Unavailable("weighting", expected="all weights of every ray", got=f"{weighting} with {walk}")
 
 
 def _numbers(parts: list) -> list[tuple[int]]:

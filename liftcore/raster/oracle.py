@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from liftcore.errors import Unavailable
 from liftcore.observe.observation import Observation, RegionMap
 from liftcore.raster.constants import ALPHA_FLOOR, FIELD_MARGIN, LOW_PASS, NEAR_PLANE
-from liftcore.raster.protocol import RayRows, RegionWeights, Walk
+from liftcore.raster.protocol import RayRows, RegionWeights, Selection, Walk, Weighting
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -126,11 +127,15 @@ class OracleRaster:
     def __init__(self, splats: Splats) -> None:
         self.splats = splats
 
-    def region_weights(self, camera: Camera, observation: Observation, walk: Walk, power: int) -> RegionWeights:
-        """``A^p^T S`` by dense products, and the evidence of plain weights."""
+    def region_weights(
+        self, camera: Camera, observation: Observation, walk: Walk, weighting: Weighting
+    ) -> RegionWeights:
+        """``A'^T S`` by dense products, and the evidence of plain weights."""
+        if weighting.selection is not Selection.ALL or weighting.floor > 0 or walk.stride != 1:
+            raise Unavailable("weighting", expected="all weights of every ray", got=str(weighting))
         S, ray = reading_matrix(observation, camera.width, camera.height)
         A = dense_view(self.splats, camera, walk).A
-        W = (A[ray] ** power).T @ S
+        W = np.where(A > 0, A**weighting.power, 0.0)[ray].T @ S
         plain = dense_view(self.splats, camera, Walk(1.0, walk.alpha_cap, walk.transmittance_stop)).A.sum(axis=0)
         rows, columns = np.nonzero(W)
         splats, counts = np.unique(rows, return_counts=True)

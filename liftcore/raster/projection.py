@@ -35,6 +35,7 @@ class View(NamedTuple):
     limits: np.ndarray  # [4] f64, x/z and y/z bounds for the Jacobian: -x +x -y +y
     width: int
     height: int
+    low_pass: float  # px^2, of the view's own pixels: coarser pixels have a smaller one
 
 
 def view_of(camera: Camera) -> View:
@@ -51,7 +52,7 @@ def view_of(camera: Camera) -> View:
     )
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
     pose = np.ascontiguousarray(camera.world_to_camera[:3])
-    return View(pose, intrinsics, limits, camera.width, camera.height)
+    return View(pose, intrinsics, limits, camera.width, camera.height, LOW_PASS)
 
 
 def opacities(splats: Splats, gain: float) -> np.ndarray:
@@ -95,6 +96,7 @@ def project_gaussians(first, last, means, axes, opacity, plain, view, records, d
     pose, intrinsics, limits = view.pose, view.intrinsics, view.limits
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
     half_log2e = 0.5 / math.log(2.0)
+    low_pass = view.low_pass
     row = first
     for j in range(first, last):
         strongest = max(opacity[j], plain[j])
@@ -108,8 +110,8 @@ def project_gaussians(first, last, means, axes, opacity, plain, view, records, d
         slope_x = fx * min(limits[1], max(-limits[0], x / z)) / z
         slope_y = fy * min(limits[3], max(-limits[2], y / z)) / z
         # L = J W R S, the projected axes: cov = L L^T + low-pass.
-        xx = LOW_PASS
-        yy = LOW_PASS
+        xx = low_pass
+        yy = low_pass
         xy = 0.0
         minors = 0.0
         previous_u = previous_v = first_u = first_v = 0.0
@@ -129,7 +131,7 @@ def project_gaussians(first, last, means, axes, opacity, plain, view, records, d
             if k == 2:
                 minors += (first_u * v - first_v * u) ** 2
             previous_u, previous_v = u, v
-        det = minors + LOW_PASS * (xx + yy - LOW_PASS)
+        det = minors + low_pass * (xx + yy - low_pass)
         reach = math.log2(strongest / ALPHA_FLOOR)
         spread = math.sqrt(reach / half_log2e)
         extent_x = spread * math.sqrt(xx)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
@@ -19,16 +20,45 @@ class Walk:
     gain: float = 1.0  # lambda: alpha~ = sigmoid(lambda theta)
     alpha_cap: float = 0.99  # the largest alpha of a splat on a ray
     transmittance_stop: float = 1e-4  # exclusive: the splat that would bring T to it or below adds nothing
+    antialiased: bool = False  # the mip filter's opacity compensation, 3DGS only
+    stride: int = 1  # region weights look at every n-th pixel in x and in y; renders at all of them
+    offset: tuple[int, int] = (0, 0)  # the first such pixel (x, y), each below the stride
+
+
+class Selection(StrEnum):
+    """Which of a ray's weights count."""
+
+    ALL = "all"
+    TOP_K = "top-k"  # the k largest of the ray, equal ones near to far (argmax lifting: k = 1; Dr. Splat)
+    FRONT_MASS = "front-mass"  # those in front of which less than a share of the light was taken (VALA's gate)
+    CENTRE = "centre"  # one ray a splat: that of the pixel which holds its projected centre (Occam's LGS)
+
+
+@dataclass(frozen=True)
+class Weighting:
+    """What counts as the weight of a splat on a ray: some of ``w = alpha T``, to a power."""
+
+    power: int = 1  # 0, 1 or 2 of what was selected; 0: each kept weight counts one
+    selection: Selection = Selection.ALL
+    count: int = 1  # k of top-k, at most MOST_OF_A_RAY
+    mass: float = 0.75  # of front-mass: a weight counts while 1 - T before it is below this
+    floor: float = 0.0  # a smaller weight counts none, in every selection
+
+
+MOST_OF_A_RAY = 64  # the largest k of top-k
 
 
 @dataclass(frozen=True)
 class RegionWeights:
-    """``W = A^p^T S`` of one view, sparse by rows of the splats that it saw, and ``A^T 1``."""
+    """``W = A'^T S`` of one view, sparse by rows of the splats that it saw, and ``A^T 1``.
+
+    ``A'`` holds the weights that the weighting selects, to its power; for all of them at power 1 it is A.
+    """
 
     splats: Tensor  # [n] i32 ascending, the splats with a row
     row_starts: Tensor  # [n + 1] i64, CSR row pointers
     columns: Tensor  # [nnz] i32 ascending in a row, rows of the codebook
-    weights: Tensor  # [nnz] f32, sums over rays of w^p times the reading S
+    weights: Tensor  # [nnz] f32, sums over rays of the selected w^p times the reading S
     evidence_splats: Tensor  # [m] i32 ascending, the splats that any ray met, labelled or not
     evidence: Tensor  # [m] f32, sum of plain weights w (gain 1, power 1), each ray once
 
@@ -45,8 +75,10 @@ class RayRows:
 class Raster(Protocol):
     """A for one scene. Every product is deterministic to the bit, whatever the number of threads."""
 
-    def region_weights(self, camera: Camera, observation: Observation, walk: Walk, power: int) -> RegionWeights:
-        """``A^p^T S`` of a view (power 1 or 2) and the evidence of plain weights."""
+    def region_weights(
+        self, camera: Camera, observation: Observation, walk: Walk, weighting: Weighting
+    ) -> RegionWeights:
+        """``A'^T S`` of a view and the evidence of plain weights, over the rays that the walk's stride leaves."""
         ...
 
     def render(self, camera: Camera, values: Tensor, walk: Walk) -> Tensor:

@@ -1,4 +1,4 @@
-"""``W = A^p^T S`` of one view: the lift's only look at pixels.
+"""``W = A'^T S`` of one view: the lift's only look at pixels.
 
 Every tile writes entries (record, slot, weight, evidence) into its share's buffer: what a splat gave to the pixels
 of one slot, and on its first entry of the tile the sum of its plain weights over all rays. A counting sort gathers
@@ -30,7 +30,7 @@ def weigh_tiles(first, last, frame, reading, power, with_plain):
     """Entries of tiles ``first..last``.
 
     Args:
-        frame: Frame. reading: Reading. power: 1 or 2.
+        frame: Frame. reading: Reading. power: 0, 1 or 2.
         with_plain: whether the evidence needs rays of its own, without the opacity gain.
 
     Returns:
@@ -73,6 +73,8 @@ def weigh_tiles(first, last, frame, reading, power, with_plain):
                     if not rays.alive[half] or not touches(splat, centre, base, side):
                         continue
                     blend_power(rays, splat, centre, base, half, power, with_plain)
+                    if power == 0:
+                        _count_lanes(state, WEIGHTS + half * LANES)
                     if whole_tile:
                         continue
                     offset = WEIGHTS + half * LANES
@@ -105,6 +107,13 @@ def weigh_tiles(first, last, frame, reading, power, with_plain):
                 evidence[entry] = total if entry == before else 0.0
         slot_count += used
     return places[:count], slots[:count], weights[:count], evidence[:count], slot_rows[:slot_count]
+
+
+@inlined
+def _count_lanes(state, offset):
+    """Every weight counts one."""
+    for lane in range(LANES):
+        state[offset + lane] = np.float32(state[offset + lane] > 0)
 
 
 @inlined

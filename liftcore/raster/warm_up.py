@@ -7,7 +7,7 @@ import torch
 
 from liftcore.observe.observation import FeatureGrid, RegionMap
 from liftcore.raster.cpu import CpuRaster
-from liftcore.raster.protocol import Walk
+from liftcore.raster.protocol import Walk, Weighting
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Splats
 
@@ -19,7 +19,7 @@ def warm_up() -> None:
     raster = CpuRaster(splats, threads=1)
     regions = RegionMap(torch.zeros(1, 1, 1, dtype=torch.int32), torch.ones(1, 1))
     for observation in (regions, FeatureGrid(torch.ones(1, 1, 1))):
-        raster.region_weights(camera, observation, Walk(), 1)
+        raster.region_weights(camera, observation, Walk(), Weighting())
     raster.row_sums(camera, Walk())
     raster.top_weights(camera, Walk(), 1)
     raster.ray_rows(camera, torch.zeros(1, 2, dtype=torch.int32), Walk())

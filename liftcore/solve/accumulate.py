@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from liftcore.observe.observation import FeatureGrid, Observation, RegionMap
-from liftcore.raster.protocol import RayRows, Walk
+from liftcore.raster.protocol import RayRows, Walk, Weighting
 from liftcore.solve.readout import Readout, read_pixels, sample_pixels
 
 if TYPE_CHECKING:
@@ -48,6 +48,11 @@ def lift_walk(settings: LiftSettings) -> Walk:
     return Walk(settings.lift_gain, settings.alpha_cap, settings.transmittance_stop)
 
 
+def weighting_of(settings: LiftSettings) -> Weighting:
+    """What counts as a weight when lifting."""
+    return Weighting(settings.power)
+
+
 def render_walk(settings: LiftSettings) -> Walk:
     """The walk that renders attention maps and masks."""
     return Walk(settings.render_gain, settings.alpha_cap, settings.transmittance_stop)
@@ -80,12 +85,12 @@ def accumulate(
     """
     count, cameras = scene
     evidence, denominators = np.zeros(count), np.zeros(count)
-    walk = lift_walk(settings)
+    walk, weighting = lift_walk(settings), weighting_of(settings)
     samples, codebooks = [], []
     rays = -(-settings.certificate_rays // len(views))
     for number, name in enumerate(views):
         camera, observation = cameras.get(name), as_read(packs.observation(name), settings)
-        weights = raster.region_weights(camera, observation, walk, settings.power)
+        weights = raster.region_weights(camera, observation, walk, weighting)
         evidence[weights.evidence_splats.numpy()] += weights.evidence.numpy()
         denominators[weights.splats.numpy()] += row_totals(weights)
         store.append(weights)

@@ -10,7 +10,7 @@ import torch
 from liftcore.observe.observation import RegionMap
 from liftcore.raster.cpu import CpuRaster
 from liftcore.raster.oracle import DenseView, dense_view
-from liftcore.raster.protocol import Walk
+from liftcore.raster.protocol import Walk, Weighting
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Splats
 
@@ -59,7 +59,8 @@ def weights_of(splats: Splats, camera: Camera, walk: Walk, power: int = 1) -> tu
     """A^p [H * W, P] and the evidence [P], through region weights with one region a pixel."""
     rays = camera.width * camera.height
     labels = torch.arange(rays, dtype=torch.int32).reshape(1, camera.height, camera.width)
-    got = CpuRaster(splats, threads=2).region_weights(camera, RegionMap(labels, torch.ones(rays, 1)), walk, power)
+    every_ray = RegionMap(labels, torch.ones(rays, 1))
+    got = CpuRaster(splats, threads=2).region_weights(camera, every_ray, walk, Weighting(power))
     A = np.zeros((rays, splats.count))
     rows = np.repeat(got.splats.numpy(), np.diff(got.row_starts.numpy()))
     A[got.columns.numpy(), rows] = got.weights.numpy()

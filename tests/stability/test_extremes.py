@@ -12,7 +12,7 @@ from liftcore.observe.observation import RegionMap
 from liftcore.raster.constants import ALPHA_FLOOR
 from liftcore.raster.cpu import CpuRaster
 from liftcore.raster.oracle import projected_gaussian
-from liftcore.raster.protocol import Walk
+from liftcore.raster.protocol import Walk, Weighting
 from liftcore.scene.cameras import Camera
 from tests.scenes import random_splats
 from tests.stability.extremes import (
@@ -190,7 +190,7 @@ def test_a_million_rays_of_one_splat_sum_as_in_float64():
     assert (exact > 0).sum() > 500_000
     one_region = RegionMap(torch.zeros(1, 1, 1, dtype=torch.int32), torch.ones(1, 1))
     for power in (1, 2):
-        got = CpuRaster(splats).region_weights(camera, one_region, Walk(), power)
+        got = CpuRaster(splats).region_weights(camera, one_region, Walk(), Weighting(power))
         assert float(got.weights[0]) == pytest.approx((exact**power).sum(), rel=1e-6)
         assert float(got.evidence[0]) == pytest.approx(exact.sum(), rel=1e-6)
 
