@@ -20,6 +20,7 @@ from liftcore.raster.warm_up import warm_up
 from liftcore.scene.load import camera_files, load_cameras, load_splats
 from liftcore.solve.accumulate import accumulate
 from liftcore.solve.certificate import certify
+from liftcore.solve.checkpoint import Checkpoint, identity, resumed
 from liftcore.solve.closed_form import solve_closed_form
 from liftcore.solve.view_weights import ViewWeights
 
@@ -51,6 +52,7 @@ def lift(
     *,
     threads: int | None = None,
     progress: Progress = silent,
+    checkpoint: Checkpoint | None = None,
 ) -> Lift:
     """Lift the features of the packs onto the splats.
 
@@ -58,6 +60,7 @@ def lift(
         splats: a PLY of any dialect. cameras: COLMAP, transforms.json or cameras.json. features: feature packs.
         threads: None takes the cores that this process may use. The number changes no bit of the result.
         progress: told of every view and slice; an exception from it stops the work.
+        checkpoint: keeps walked views on the disk; the same lift goes on from there, identical to the bit.
 
     Raises:
         InvalidInput: a file is malformed, or the packs do not fit the cameras.
@@ -75,7 +78,9 @@ def lift(
     with ViewWeights() as store:
         with timings.stage("geometry"):
             raster = CpuRaster(scene, threads)
-            geometry = accumulate(raster, (scene.count, views), packs, names, settings, store, progress)
+            key = identity([part.sha256 for part in inputs], settings) if checkpoint else ""
+            with resumed(raster, checkpoint, key) as walked:
+                geometry = accumulate(walked, (scene.count, views), packs, names, settings, store, progress)
         codebooks = geometry.codebooks
         with timings.stage("solve"):
             dtype = getattr(torch, settings.dtype)

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     Spec = tuple[str, torch.dtype, tuple[int, ...]]  # a tensor's name, type and shape
 
 TYPES = {
+    torch.float64: "F64",
+    torch.int64: "I64",
     torch.float32: "F32",
     torch.int32: "I32",
     torch.float16: "F16",

@@ -1,0 +1,114 @@
+"""A lift that was killed goes on from its last block and gives the same bits as one that was not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from liftcore.artifact import TENSORS, Lift
+from liftcore.lift import lift
+from liftcore.raster.cpu import CpuRaster
+from liftcore.solve.checkpoint import Checkpoint, identity
+from liftcore.solve.settings import LiftSettings
+
+from .test_lift_equals_dense import write_scene
+
+
+class Killed(Exception):
+    """Stands for what ends a process between two calls."""
+
+
+@pytest.fixture
+def walks(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The views that were really walked."""
+    walked: list[str] = []
+    walk = CpuRaster.region_weights
+
+    def counted(self: CpuRaster, camera: Any, *rest: Any, **named: Any) -> Any:
+        if camera.name != "warm-up":
+            walked.append(camera.name)
+        return walk(self, camera, *rest, **named)
+
+    monkeypatch.setattr(CpuRaster, "region_weights", counted)
+    return walked
+
+
+def killing(stage: str, at: int) -> Callable[..., None]:
+    def progress(now: str, done: int, total: int, unit: str) -> None:
+        if (now, done) == (stage, at):
+            raise Killed
+
+    return progress
+
+
+def assert_same(one: Lift, other: Lift) -> None:
+    for name in TENSORS:
+        first, second = getattr(one, name), getattr(other, name)
+        assert first.dtype == second.dtype
+        assert torch.equal(first.view(torch.uint8), second.view(torch.uint8)), name
+    assert one.metadata.certificate == other.metadata.certificate
+
+
+@pytest.mark.parametrize("grids", [False, True])
+@pytest.mark.parametrize("kills", [(1,), (2,), (1, 2), (1, 1, 2)])
+def test_killed_lift_goes_on_from_its_last_block_to_the_same_bits(
+    tmp_path: Path, walks: list[str], grids: bool, kills: tuple[int, ...]
+) -> None:
+    scene = write_scene(tmp_path, 3, grids)
+    settings = LiftSettings.of(certificate_rays=50)
+    whole = lift(scene[0], scene[1], [scene[2]], settings)
+    walks.clear()
+    checkpoint = Checkpoint(tmp_path / "kept", seconds=0)
+    for at in kills:
+        with pytest.raises(Killed):
+            lift(scene[0], scene[1], [scene[2]], settings, progress=killing("geometry", at), checkpoint=checkpoint)
+    again = lift(scene[0], scene[1], [scene[2]], settings, checkpoint=checkpoint)
+    assert walks == ["v0", "v1", "v2"]  # none twice
+    assert_same(whole, again)
+
+
+def test_lift_killed_while_it_solves_walks_no_view_again(tmp_path: Path, walks: list[str]) -> None:
+    scene = write_scene(tmp_path, 4)
+    settings, checkpoint = LiftSettings.of(), Checkpoint(tmp_path / "kept")
+    with pytest.raises(Killed):
+        lift(scene[0], scene[1], [scene[2]], settings, progress=killing("solve", 1), checkpoint=checkpoint)
+    again = lift(scene[0], scene[1], [scene[2]], settings, checkpoint=checkpoint)
+    assert walks == ["v0", "v1", "v2"]
+    assert_same(lift(scene[0], scene[1], [scene[2]], settings), again)
+
+
+def test_checkpoint_of_other_settings_or_inputs_is_never_used(tmp_path: Path, walks: list[str]) -> None:
+    scene = write_scene(tmp_path, 5)
+    checkpoint = Checkpoint(tmp_path / "kept", seconds=0)
+    lift(scene[0], scene[1], [scene[2]], LiftSettings.of(preset="row-sum"), checkpoint=checkpoint)
+    other = lift(scene[0], scene[1], [scene[2]], LiftSettings.of(preset="tikhonov"), checkpoint=checkpoint)
+    assert len(walks) == 6
+    assert_same(lift(scene[0], scene[1], [scene[2]], LiftSettings.of(preset="tikhonov")), other)
+    assert identity(["a"], LiftSettings.of()) != identity(["b"], LiftSettings.of())
+
+
+@pytest.mark.parametrize("length", [0, 7, 200])
+def test_block_that_is_not_whole_is_walked_again(tmp_path: Path, walks: list[str], length: int) -> None:
+    scene = write_scene(tmp_path, 6)
+    settings, checkpoint = LiftSettings.of(), Checkpoint(tmp_path / "kept", seconds=0)
+    whole = lift(scene[0], scene[1], [scene[2]], settings, checkpoint=checkpoint)
+    blocks = sorted(checkpoint.folder.iterdir())
+    blocks[2].write_bytes(blocks[2].read_bytes()[:length])  # a call of the second view
+    walks.clear()
+    assert_same(whole, lift(scene[0], scene[1], [scene[2]], settings, checkpoint=checkpoint))
+    assert walks == ["v1", "v2"]
+
+
+def test_lift_without_room_for_its_checkpoint_goes_on(tmp_path: Path) -> None:
+    scene = write_scene(tmp_path, 7)
+    (tmp_path / "file").write_bytes(b"")
+    nowhere = Checkpoint(tmp_path / "file" / "kept", seconds=0)
+    settings = LiftSettings.of()
+    assert_same(
+        lift(scene[0], scene[1], [scene[2]], settings),
+        lift(scene[0], scene[1], [scene[2]], settings, checkpoint=nowhere),
+    )
