@@ -73,6 +73,7 @@ def build_parser() -> argparse.ArgumentParser:
     _add_lift(commands.add_parser("lift", parents=[shared], help="lift features onto splats"))
     _add_query(commands.add_parser("query", parents=[shared], help="find what words say in a lift"))
     _add_pack(commands.add_parser("pack", help="make a feature pack of the field's formats"), shared)
+    _add_encode(commands.add_parser("encode", parents=[shared], help="make a feature pack of images"))
     _add_inspect(commands.add_parser("inspect", parents=[shared], help="what is in a file, and what is wrong"))
     _add_bench(commands.add_parser("bench", parents=[shared], help="how fast this machine lifts"))
     return parser
@@ -126,6 +127,23 @@ def _add_pack(parser: argparse.ArgumentParser, shared: _Parser) -> None:
         command.add_argument("--encoder-name", metavar="NAME", help="the 2D encoder that made the features")
         command.add_argument("--text-space", metavar="NAME", help="the text encoder that shares the space")
         command.add_argument("--normalised", action=argparse.BooleanOptionalAction, help="unit vectors or not")
+
+
+def _add_encode(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("images", type=Path, nargs="+", help="images, or folders of them")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="PACK", help="the pack to write")
+    parser.add_argument(
+        "--encoder",
+        required=True,
+        metavar="SPEC",
+        help="maskclip:MODEL/TAG, clip:MODEL/TAG, timm:NAME, or MODEL@FILE",
+    )
+    parser.add_argument("--size", type=_count, metavar="PX", help="the images' shorter side; else the model's own")
+    parser.add_argument("--batch", type=_count, default=1, metavar="N", help="images that are encoded together")
+    parser.add_argument("--device", default="cpu", metavar="NAME", help="where the model runs, as torch names it")
+    parser.add_argument(
+        "--normalised", action=argparse.BooleanOptionalAction, default=True, help="unit vectors, or as they come"
+    )
 
 
 def _add_inspect(parser: argparse.ArgumentParser) -> None:

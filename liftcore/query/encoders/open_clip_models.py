@@ -1,0 +1,150 @@
+"""CLIP models of open_clip, with weights by name or from a local file; their text and image towers use them apart."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from liftcore.errors import InvalidQuery, Unavailable
+from liftcore.query.encoders.torchvision_ops import import_torchvision
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from torch import Tensor
+
+# open_clip reads these with weights_only; its loader of big_vision .npz files has no such switch.
+WEIGHT_SUFFIXES = (".safetensors", ".pt", ".pth", ".bin", ".ckpt")
+
+
+@dataclass(frozen=True)
+class OpenedModel:
+    """A model with its weights."""
+
+    name: str  # ``open_clip:MODEL/TAG``, or ``open_clip:MODEL`` for weights of a file
+    model_name: str  # open_clip's name of the architecture
+    model: Any  # open_clip's module, both towers
+
+
+def open_model(kind: str, spec: str) -> OpenedModel:
+    """Load ``MODEL/PRETRAINED_TAG`` (cached or downloaded by open_clip) or ``MODEL@WEIGHTS_FILE``.
+
+    Local files are read with ``weights_only``: a pickle that holds more than tensors is refused.
+
+    Args:
+        kind: what the user wrote before the colon, for messages.
+        spec: what stood behind it.
+
+    Raises:
+        InvalidQuery: an unknown model or tag, or a file that is not weights of this model.
+        Unavailable: no weights were named, or they cannot be had here.
+    """
+    model_name, at, file = spec.partition("@")
+    model_name, _, tag = (model_name, "", "") if at else spec.partition("/")
+    label = f"encoder {kind}:{spec}"
+    _check_model(label, model_name)
+    if at:
+        return OpenedModel(f"open_clip:{model_name}", model_name, _from_file(label, model_name, Path(file)))
+    return OpenedModel(f"open_clip:{model_name}/{tag}", model_name, _from_tag(kind, model_name, tag))
+
+
+def create_model(model_name: str, pretrained: str | None) -> Any:
+    """A model with the weights of a tag or a file; None = random ones, for tests of plumbing only."""
+    with _quiet():
+        return library().create_model(
+            model_name,
+            pretrained=pretrained,
+            require_pretrained=pretrained is not None,
+            pretrained_text=False,
+            weights_only=True,
+        )
+
+
+def tokenizer_of(model_name: str) -> Callable[[list[str]], Tensor]:
+    """The model's tokenizer."""
+    with _quiet():
+        return library().get_tokenizer(model_name)
+
+
+def library() -> Any:
+    """The module open_clip.
+
+    Raises:
+        Unavailable: it is not installed.
+    """
+    try:
+        import_torchvision()
+        import open_clip
+    except ImportError as error:
+        raise Unavailable(
+            "encoder open_clip", expected="the package open_clip_torch", got=str(error), hint="pip install it"
+        ) from None
+    return open_clip
+
+
+def _check_model(label: str, model_name: str) -> None:
+    known = library().list_models()
+    if model_name not in known:
+        from rapidfuzz import process
+
+        near = [match[0] for match in process.extract(model_name, known, limit=3)]
+        raise InvalidQuery(
+            label,
+            expected="a model that open_clip knows",
+            got=repr(model_name),
+            hint=f"nearest: {', '.join(near)}",
+        )
+
+
+def _from_tag(kind: str, model_name: str, tag: str) -> Any:
+    label = f"encoder {kind}:{model_name}/{tag}" if tag else f"encoder {kind}:{model_name}"
+    tags = library().list_pretrained_tags_by_model(model_name)
+    if not tag:
+        known = ", ".join(tags) or "none"
+        raise Unavailable(
+            label,
+            expected="weights: a tag or a file",
+            got="none",
+            hint=f"{kind}:{model_name}/TAG or {kind}:{model_name}@FILE; tags: {known}",
+        )
+    if tag not in tags:
+        raise InvalidQuery(label, expected=f"one of the tags {', '.join(tags) or '(none)'}", got=repr(tag))
+    try:
+        return create_model(model_name, tag)
+    except Exception as error:  # the hub's clients raise their own, urllib's and OSError's kinds
+        raise Unavailable(
+            label,
+            expected="weights in the cache or a network to fetch them",
+            got=str(error)[:200],
+            hint=f"download them elsewhere and use {kind}:{model_name}@FILE",
+        ) from None
+
+
+def _from_file(label: str, model_name: str, path: Path) -> Any:
+    if not path.is_file():
+        raise Unavailable(label, expected="a file of weights", got=f"nothing at {path}")
+    if path.suffix not in WEIGHT_SUFFIXES:
+        raise InvalidQuery(label, expected=f"a file ending in {', '.join(WEIGHT_SUFFIXES)}", got=path.name)
+    try:
+        return create_model(model_name, str(path))
+    except Exception as error:  # unpickling and state dicts fail in many kinds; all mean "not these weights"
+        raise InvalidQuery(
+            label, expected=f"tensors of {model_name} and nothing else in {path.name}", got=str(error)[:200]
+        ) from None
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """open_clip logs to the root logger and warns of activations: what matters is raised as an error."""
+    before = logging.root.manager.disable
+    logging.disable(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logging.disable(before)

@@ -1,0 +1,107 @@
+"""``splatlift encode`` from photos to a lift that words can be asked of, with weights that know nothing."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from PIL import Image
+
+from liftcore import cli
+from liftcore.observe.observation import FeatureGrid
+from liftcore.observe.pack import open_packs
+
+
+@pytest.fixture
+def photos(tmp_path: Path) -> Path:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for k, name in enumerate(["left.png", "middle.jpg", "right.png"]):
+        Image.effect_noise((64, 48), 40 + 10 * k).convert("RGB").save(folder / name)
+    return folder
+
+
+@pytest.fixture
+def weights(tmp_path: Path) -> Path:
+    from liftcore.query.encoders.open_clip_models import create_model
+
+    torch.manual_seed(5)
+    path = tmp_path / "clip.pt"
+    torch.save(create_model("ViT-S-32-alt", None).state_dict(), path)
+    return path
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
+    status = cli.main([str(argument) for argument in arguments])
+    captured = capsys.readouterr()
+    return status, captured.out, captured.err
+
+
+def test_encoded_photos_are_lifted_and_asked_in_the_text_space_of_their_pack(
+    photos: Path, weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from tests.api.tiny_scene import make_scene
+
+    pack, lifted = tmp_path / "pack.safetensors", tmp_path / "lift.safetensors"
+    spec = f"maskclip:ViT-S-32-alt@{weights}"
+    options = ["--encoder", spec, "--size", 64, "--batch", 2, "--json"]
+    status, out, err = run(capsys, "encode", photos, "-o", pack, *options)
+    assert (status, err) == (0, "")
+    document = json.loads(out)
+    assert (document["views"], document["channels"], document["patch"], document["size"]) == (3, 256, 32, 64)
+    assert document["text_space"] == f"open_clip:ViT-S-32-alt@{weights}"
+    assert document["warnings"] == []
+    packs = open_packs([pack])
+    assert (packs.views, packs.normalised) == (("left", "middle", "right"), True)
+    observed = packs.observation("left")
+    assert isinstance(observed, FeatureGrid)
+    assert observed.grid.shape == (2, 3, 256)
+    scene = make_scene()
+    (tmp_path / "scene.ply").write_bytes(scene.splats)
+    (tmp_path / "cameras.json").write_bytes(scene.cameras)
+    assert run(capsys, "lift", tmp_path / "scene.ply", tmp_path / "cameras.json", pack, "-o", lifted)[0] == 0
+    status, out, err = run(capsys, "query", lifted, "an apple", "--json")
+    assert (status, err) == (0, "")
+    assert json.loads(out)["encoder"] == "open_clip:ViT-S-32-alt"
+
+
+def test_backbones_without_words_say_so(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from liftcore.observe.encoders.timm_backbone import TimmEncoder
+
+    torch.manual_seed(6)
+    weights, pack = tmp_path / "resnet.pt", tmp_path / "pack.safetensors"
+    torch.save(TimmEncoder._with_random_weights("resnet18")._model.state_dict(), weights)
+    status, out, err = run(
+        capsys, "encode", photos / "left.png", "-o", pack, "--encoder", f"timm:resnet18@{weights}", "--no-normalised"
+    )
+    assert (status, err) == (0, "")
+    assert "1 views, 512 channels" in out and "no words" in out
+    packs = open_packs([pack])
+    assert (packs.text_space, packs.normalised, packs.encoder) == ("none", False, "timm:resnet18")
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["--encoder", "maskclip:ViT-B-32"], "tag or a file"),
+        (["--encoder", "magic"], "one of maskclip"),
+        (["--encoder", "timm:resnet18", "--size", "0"], "--size"),
+        (["--encoder", "timm:resnet18", "--device", "abacus"], "--device"),
+        ([], "--encoder"),
+    ],
+)
+def test_what_cannot_be_encoded_exits_2_with_one_line(
+    more: list[str], message: str, photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    status, out, err = run(capsys, "encode", photos, "-o", tmp_path / "pack.safetensors", *more)
+    assert (status, out) == (2, "")
+    assert message in err and err.count("\n") == 1
+    assert not (tmp_path / "pack.safetensors").exists()
+
+
+def test_the_output_is_never_one_of_the_photos(photos: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, _, err = run(capsys, "encode", photos, "-o", photos / "left.png", "--encoder", "timm:resnet18")
+    assert status == 2
+    assert "another file than the inputs" in err
