@@ -71,6 +71,7 @@ def lift(
         scene, views = load_splats(splats), load_cameras(cameras)
         packs = open_packs(features)
         names, unpaired = pair(packs, views)
+        names = names[:: settings.view_stride]
     with timings.stage("digest"):
         inputs = [input_file(path) for path in (splats, cameras, *features)]
     with timings.stage("compile"):

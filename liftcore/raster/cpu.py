@@ -20,10 +20,12 @@ from liftcore.raster.constants import TILE
 from liftcore.raster.depth_order import depth_order
 from liftcore.raster.merging import count_entries, gather_entries, merge_range
 from liftcore.raster.projection import RECORD, axes_of, opacities, project_gaussians, view_of
-from liftcore.raster.protocol import RayRows, RegionWeights, Selection, Walk, Weighting
+from liftcore.raster.protocol import RayRows, RegionWeights, Walk, Weighting
 from liftcore.raster.readings import reading_of
 from liftcore.raster.region_weights import weigh_tiles
 from liftcore.raster.rendering import render_tiles, top_tiles, trace_rays
+from liftcore.raster.selection import choice_of
+from liftcore.raster.strided import check_stride, every_pixel, places_on, strided
 from liftcore.raster.tiles import fill_tiles, list_tiles, tile_places
 from liftcore.raster.walk import Frame
 from liftcore.scene.splats import Kernel
@@ -34,6 +36,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from liftcore.observe.observation import Observation
+    from liftcore.raster.projection import View
     from liftcore.scene.cameras import Camera
     from liftcore.scene.splats import Splats
 
@@ -77,12 +80,12 @@ class CpuRaster:
         self, camera: Camera, observation: Observation, walk: Walk, weighting: Weighting
     ) -> RegionWeights:
         """``A'^T S`` of a view and the evidence of plain weights. See the protocol."""
-        _check_weighting(weighting, walk)
+        choice = choice_of(weighting)
         frame = self._frame(camera, walk)
-        reading = reading_of(observation, camera.width, camera.height)
+        reading = reading_of(observation, camera.width, camera.height, walk)
         with_plain = walk.gain != 1.0
         entries = self._over_tiles(
-            frame, lambda first, last: weigh_tiles(first, last, frame, reading, weighting.power, with_plain)
+            frame, lambda first, last: weigh_tiles(first, last, frame, reading, choice, with_plain)
         )
         return self._merge(frame, entries, reading.codebook_rows)
 
@@ -94,7 +97,7 @@ class CpuRaster:
                 expected=f"one row for each of {self.splats.count} splats",
                 got=f"{list(values.shape)}",
             )
-        frame = self._frame(camera, walk)
+        frame = self._frame(camera, every_pixel(walk))
         channels = values.shape[1]
         image = np.zeros((camera.height, camera.width, channels), np.float32)
         for begin in range(0, channels, RENDER_CHANNELS):
@@ -114,7 +117,7 @@ class CpuRaster:
 
     def top_weights(self, camera: Camera, walk: Walk, count: int) -> tuple[Tensor, Tensor]:
         """The largest weights of every ray, descending. See the protocol."""
-        frame = self._frame(camera, walk)
+        frame = self._frame(camera, every_pixel(walk))
         ids = np.full((camera.height, camera.width, count), -1, np.int32)
         weights = np.zeros((camera.height, camera.width, count), np.float32)
         self._over_tiles(frame, lambda first, last: top_tiles(first, last, frame, ids, weights))
@@ -122,8 +125,11 @@ class CpuRaster:
 
     def ray_rows(self, camera: Camera, pixels: Tensor, walk: Walk) -> RayRows:
         """Rows of A for single pixels [n, 2] (x, y). See the protocol."""
+        places = places_on(walk, pixels)
+        if places is None:  # not all of them are rays of the strided view
+            places, walk = pixels, every_pixel(walk)
         frame = self._frame(camera, walk)
-        starts, splats, weights = trace_rays(frame, np.ascontiguousarray(pixels.to(torch.int32).numpy()))
+        starts, splats, weights = trace_rays(frame, np.ascontiguousarray(places.to(torch.int32).numpy()))
         return RayRows(torch.from_numpy(starts), torch.from_numpy(splats), torch.from_numpy(weights))
 
     def forget(self) -> None:
@@ -138,14 +144,15 @@ class CpuRaster:
         frame = self._frames.pop(key, None)
         if frame is None:
             self._frames.clear()  # before, so that one frame's memory is the most ever held
-            frame = self._bin(camera, walk, *self._project(camera, walk))
+            check_stride(walk, camera)
+            view = strided(view_of(camera), walk)
+            frame = self._bin(view, walk, *self._project(view, walk))
         self._frames[key] = frame
         return frame
 
-    def _project(self, camera: Camera, walk: Walk) -> tuple[np.ndarray, np.ndarray]:
+    def _project(self, view: View, walk: Walk) -> tuple[np.ndarray, np.ndarray]:
         """Fill the records; give the splat of every record [P] i32 and the depth order [n] i32."""
         ids = np.full(self.splats.count, -1, np.int32)
-        view = view_of(camera)
         opacity, plain = self._opacity(walk.gain), self._opacity(1.0)
         arrays = (self._means, self._axes, opacity, plain, view, self._records, self._depths, ids)
         bounds = _shares(self.splats.count, SPLAT_SHARES)
@@ -156,8 +163,8 @@ class CpuRaster:
         places = np.concatenate(used) if used else np.empty(0, np.int32)
         return ids, depth_order(self._depths[places].view(np.uint32), places)
 
-    def _bin(self, camera: Camera, walk: Walk, ids: np.ndarray, order: np.ndarray) -> Frame:
-        columns, rows = -(-camera.width // TILE), -(-camera.height // TILE)
+    def _bin(self, view: View, walk: Walk, ids: np.ndarray, order: np.ndarray) -> Frame:
+        columns, rows = -(-view.width // TILE), -(-view.height // TILE)
         bounds = _shares(order.shape[0], SPLAT_SHARES)
         counts = np.zeros((len(bounds), rows * columns), np.int64)
         parts = [order[first:last] for first, last in bounds]
@@ -166,7 +173,7 @@ class CpuRaster:
         items = np.empty(starts[-1], np.int32)
         self._map(lambda k: fill_tiles(parts[k], lists[k][0], lists[k][1], cursors[k], items), _numbers(parts))
         return Frame(
-            self._records, ids, starts, items, columns, rows, camera.width, camera.height,
+            self._records, ids, starts, items, columns, rows, view.width, view.height,
             walk.alpha_cap, walk.transmittance_stop,
         )  # fmt: skip
 
@@ -211,13 +218,6 @@ class CpuRaster:
         if self.threads == 1:
             return [work(*share) for share in shares]
         return list(self._pool.map(lambda share: work(*share), shares))
-
-
-def _check_weighting(weighting: Weighting, walk: Walk) -> None:
-    if weighting.power not in (0, 1, 2):
-        raise InvalidInput("power", expected="0, 1 or 2", got=str(weighting.power))
-    if weighting.selection is not Selection.ALL or weighting.floor > 0 or walk.stride != 1:
-        raise Unavailable("weighting", expected="all weights of every ray", got=f"{weighting} with {walk}")
 
 
 def _numbers(parts: list) -> list[tuple[int]]:

@@ -7,16 +7,16 @@ Nothing is shared with the CPU backend but the constants.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
-from liftcore.errors import Unavailable
 from liftcore.observe.observation import Observation, RegionMap
 from liftcore.raster.constants import ALPHA_FLOOR, FIELD_MARGIN, LOW_PASS, NEAR_PLANE
-from liftcore.raster.protocol import RayRows, RegionWeights, Selection, Walk, Weighting
+from liftcore.raster.oracle_weights import counted_weights, walked_rays
+from liftcore.raster.protocol import RayRows, RegionWeights, Walk, Weighting
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -131,12 +131,12 @@ class OracleRaster:
         self, camera: Camera, observation: Observation, walk: Walk, weighting: Weighting
     ) -> RegionWeights:
         """``A'^T S`` by dense products, and the evidence of plain weights."""
-        if weighting.selection is not Selection.ALL or weighting.floor > 0 or walk.stride != 1:
-            raise Unavailable("weighting", expected="all weights of every ray", got=str(weighting))
         S, ray = reading_matrix(observation, camera.width, camera.height)
         A = dense_view(self.splats, camera, walk).A
-        W = np.where(A > 0, A**weighting.power, 0.0)[ray].T @ S
-        plain = dense_view(self.splats, camera, Walk(1.0, walk.alpha_cap, walk.transmittance_stop)).A.sum(axis=0)
+        walked = walked_rays(camera, walk)
+        chosen = counted_weights(A, self.splats, camera, walk, weighting)[0]
+        W = chosen[ray[walked[ray]]].T @ S[walked[ray]]
+        plain = dense_view(self.splats, camera, replace(walk, gain=1.0)).A[walked].sum(axis=0)
         rows, columns = np.nonzero(W)
         splats, counts = np.unique(rows, return_counts=True)
         met = np.flatnonzero(plain)

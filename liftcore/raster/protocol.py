@@ -82,7 +82,7 @@ class Raster(Protocol):
         ...
 
     def render(self, camera: Camera, values: Tensor, walk: Walk) -> Tensor:
-        """``A X``: values [P, F] f32 -> [H, W, F] f32, background zero, not divided by the row sum."""
+        """``A X``: values [P, F] f32 -> [H, W, F] f32, background zero, not divided by the row sum; never strided."""
         ...
 
     def row_sums(self, camera: Camera, walk: Walk) -> Tensor:
@@ -94,5 +94,5 @@ class Raster(Protocol):
         ...
 
     def ray_rows(self, camera: Camera, pixels: Tensor, walk: Walk) -> RayRows:
-        """Rows of A for the rays of pixels [n, 2] i32 (x, y)."""
+        """Rows of A for the rays of pixels [n, 2] i32 (x, y) of the full view, whatever the walk's stride."""
         ...

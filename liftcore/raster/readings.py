@@ -8,7 +8,7 @@ neither labels nor channels; slots are expanded to codebook rows once a splat is
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
@@ -18,6 +18,9 @@ from liftcore.lanes import LANES
 from liftcore.observe.observation import Observation, RegionMap
 from liftcore.raster.constants import TILE
 from liftcore.raster.walk import HALVES
+
+if TYPE_CHECKING:
+    from liftcore.raster.protocol import Walk
 
 MAX_SLOTS = 4 * TILE * TILE  # every pixel reads four cells of its own at worst
 MAX_TAPS = HALVES * 4 * LANES  # every lane of a half row reads four cells of its own at worst
@@ -52,20 +55,23 @@ class TileTaps(NamedTuple):
     sizes: np.ndarray  # [2] i32: slots in use; 1 when all pixels read slot 0 and nothing else
 
 
-def reading_of(observation: Observation, width: int, height: int) -> Reading:
-    """S of an observation for an image of ``width`` x ``height`` pixels."""
+def reading_of(observation: Observation, width: int, height: int, walk: Walk) -> Reading:
+    """S of an observation for the walk's pixels of an image of ``width`` x ``height``."""
+    left, top = (slice(first, None, walk.stride) for first in walk.offset)
     no_ints = np.empty(0, np.int32)
     no_floats = np.empty(0, np.float32)
     if isinstance(observation, RegionMap):
         labels = np.ascontiguousarray(observation.labels.to(torch.int32).numpy())
         levels, rows, columns = labels.shape
+        label_x = np.ascontiguousarray(_nearest(width, columns)[left])
+        label_y = np.ascontiguousarray(_nearest(height, rows)[top])
         return Reading(
-            False, levels, labels, _nearest(width, columns), _nearest(height, rows),
+            False, levels, labels, label_x, label_y,
             no_ints, no_ints, no_floats, no_floats, 0, observation.codebook.shape[0],
         )  # fmt: skip
     rows, columns = observation.grid.shape[:2]
-    cell_x, share_x = _taps(width, columns)
-    cell_y, share_y = _taps(height, rows)
+    cell_x, share_x = (np.ascontiguousarray(part[left]) for part in _taps(width, columns))
+    cell_y, share_y = (np.ascontiguousarray(part[top]) for part in _taps(height, rows))
     no_labels = np.empty((0, 0, 0), np.int32)
     return Reading(True, 1, no_labels, no_ints, no_ints, cell_x, cell_y, share_x, share_y, columns, rows * columns)
 

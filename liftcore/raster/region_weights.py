@@ -13,6 +13,7 @@ from liftcore.jit import inlined, kernel
 from liftcore.lanes import EVIDENCE, LANES, WEIGHTS, add_lanes, add_product_lanes
 from liftcore.raster.constants import TILE
 from liftcore.raster.readings import MAX_SLOTS, NO_SLOT, new_taps, read_tile
+from liftcore.raster.selection import CENTRAL, LARGEST, NO_SPOT, choose, new_marks, rank_tile, spot_of
 from liftcore.raster.walk import (
     CHECK_EVERY,
     blend_power,
@@ -26,11 +27,11 @@ from liftcore.raster.walk import (
 
 
 @kernel
-def weigh_tiles(first, last, frame, reading, power, with_plain):
+def weigh_tiles(first, last, frame, reading, choice, with_plain):
     """Entries of tiles ``first..last``.
 
     Args:
-        frame: Frame. reading: Reading. power: 0, 1 or 2.
+        frame: Frame. reading: Reading. choice: Choice, what counts as a weight.
         with_plain: whether the evidence needs rays of its own, without the opacity gain.
 
     Returns:
@@ -43,7 +44,12 @@ def weigh_tiles(first, last, frame, reading, power, with_plain):
     sums = np.zeros(MAX_SLOTS * LANES, np.float32)
     records, items, starts = frame.records, frame.items, frame.starts
     tap_starts, tap_slots, alone, factors = taps.starts, taps.slots, taps.alone, taps.factors
-    reuse = power == 1 and not with_plain  # then a slot that all pixels read holds just the evidence
+    gated = choice.gated
+    power = 1 if gated else choice.power  # what the blending leaves
+    marks = new_marks(choice)
+    least, room = marks.least, marks.room
+    spot = NO_SPOT
+    reuse = power == 1 and not with_plain and not gated  # then a slot that all pixels read holds just the evidence
     size = 1 << 15
     places, slots = np.empty(size, np.int32), np.empty(size, np.int32)
     weights, evidence = np.empty(size, np.float32), np.empty(size, np.float32)
@@ -54,6 +60,8 @@ def weigh_tiles(first, last, frame, reading, power, with_plain):
             continue
         x0 = float((tile % frame.columns) * TILE)
         y0 = float((tile // frame.columns) * TILE)
+        if choice.kind == LARGEST:
+            rank_tile(rays, frame, tile, marks, choice.count)
         start_rays(rays, frame, tile)
         read_tile(taps, reading, frame, tile)
         used, whole_tile = taps.sizes[0], reuse and taps.sizes[1] == 1
@@ -65,6 +73,8 @@ def weigh_tiles(first, last, frame, reading, power, with_plain):
                 break
             place = items[step]
             splat = footprint(records, place, x0, y0)
+            if choice.kind == CENTRAL:
+                spot = spot_of(splat)
             low, high = MAX_SLOTS, -1
             for row in range(splat.top, splat.bottom + 1):
                 centre, base = row_centre(splat, row)
@@ -73,8 +83,8 @@ def weigh_tiles(first, last, frame, reading, power, with_plain):
                     if not rays.alive[half] or not touches(splat, centre, base, side):
                         continue
                     blend_power(rays, splat, centre, base, half, power, with_plain)
-                    if power == 0:
-                        _count_lanes(state, WEIGHTS + half * LANES)
+                    if gated and not choose(choice, state, least, room, half, spot):
+                        continue
                     if whole_tile:
                         continue
                     offset = WEIGHTS + half * LANES
@@ -107,13 +117,6 @@ def weigh_tiles(first, last, frame, reading, power, with_plain):
                 evidence[entry] = total if entry == before else 0.0
         slot_count += used
     return places[:count], slots[:count], weights[:count], evidence[:count], slot_rows[:slot_count]
-
-
-@inlined
-def _count_lanes(state, offset):
-    """Every weight counts one."""
-    for lane in range(LANES):
-        state[offset + lane] = np.float32(state[offset + lane] > 0)
 
 
 @inlined

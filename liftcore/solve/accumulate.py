@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
+from liftcore.observe.levels import at_levels
 from liftcore.observe.observation import FeatureGrid, Observation, RegionMap
 from liftcore.raster.protocol import RayRows, Walk, Weighting
 from liftcore.solve.readout import Readout, read_pixels, sample_pixels
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from liftcore.observe.pack import FeaturePacks
     from liftcore.progress import Progress
     from liftcore.raster.protocol import Raster, RegionWeights
-    from liftcore.scene.cameras import Cameras
+    from liftcore.scene.cameras import Camera, Cameras
     from liftcore.solve.settings import LiftSettings
     from liftcore.solve.view_weights import ViewWeights
 
@@ -37,7 +38,7 @@ class SampledRays:
 class Geometry:
     """What all views together say about the splats."""
 
-    evidence: np.ndarray  # [P] f64, sum of plain weights, each ray once
+    evidence: np.ndarray  # [P] f64, sum of plain weights, each ray once; a strided walk's times stride^2
     denominators: np.ndarray  # [P] f64, sum of w^p over labelled rays and levels
     samples: tuple[SampledRays, ...]  # for the certificate, one a view
     codebooks: tuple[Tensor, ...]  # E [M, F] of every view, as its observation was read
@@ -50,7 +51,14 @@ def lift_walk(settings: LiftSettings) -> Walk:
 
 def weighting_of(settings: LiftSettings) -> Weighting:
     """What counts as a weight when lifting."""
-    return Weighting(settings.power)
+    return Weighting(settings.power, settings.selection, settings.k, settings.mass, settings.weight_floor)
+
+
+def strided_walk(walk: Walk, settings: LiftSettings, camera: Camera, number: int) -> Walk:
+    """The walk with the stride, its first pixel drawn for view ``number``: no pixel is left out in all views."""
+    rng = np.random.default_rng((settings.seed, number, settings.stride))
+    left, top = (int(rng.integers(min(settings.stride, side))) for side in (camera.width, camera.height))
+    return replace(walk, stride=settings.stride, offset=(left, top))
 
 
 def render_walk(settings: LiftSettings) -> Walk:
@@ -58,8 +66,13 @@ def render_walk(settings: LiftSettings) -> Walk:
     return Walk(settings.render_gain, settings.alpha_cap, settings.transmittance_stop)
 
 
-def as_read(observation: Observation, settings: LiftSettings) -> Observation:
-    """The observation as the settings read it: with ``nearest``, a grid is a map of regions of one cell each."""
+def as_read(observation: Observation, settings: LiftSettings, view: str) -> Observation:
+    """The observation as the settings read it: its levels, and with ``nearest`` a grid as regions of one cell each.
+
+    Raises:
+        InvalidFeatures: the view lacks the level that the settings ask for.
+    """
+    observation = at_levels(observation, settings.levels, view)
     if not isinstance(observation, FeatureGrid) or settings.grid_reading == "bilinear":
         return observation
     rows, columns = observation.grid.shape[:2]
@@ -85,16 +98,17 @@ def accumulate(
     """
     count, cameras = scene
     evidence, denominators = np.zeros(count), np.zeros(count)
-    walk, weighting = lift_walk(settings), weighting_of(settings)
+    weighting = weighting_of(settings)
     samples, codebooks = [], []
     rays = -(-settings.certificate_rays // len(views))
     for number, name in enumerate(views):
-        camera, observation = cameras.get(name), as_read(packs.observation(name), settings)
+        camera, observation = cameras.get(name), as_read(packs.observation(name), settings, name)
+        walk = strided_walk(lift_walk(settings), settings, camera, number)
         weights = raster.region_weights(camera, observation, walk, weighting)
-        evidence[weights.evidence_splats.numpy()] += weights.evidence.numpy()
+        evidence[weights.evidence_splats.numpy()] += weights.evidence.numpy() * float(settings.stride**2)
         denominators[weights.splats.numpy()] += row_totals(weights)
         store.append(weights)
-        pixels = sample_pixels(camera, rays, seed=(settings.seed, number))
+        pixels = sample_pixels(camera, rays, (settings.seed, number), walk)
         readout = read_pixels(observation, camera, pixels)
         samples.append(SampledRays(raster.ray_rows(camera, pixels, walk), readout))
         codebooks.append(observation.codebook)

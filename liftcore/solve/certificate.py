@@ -1,6 +1,8 @@
 """The certificate: what a lift measured of itself, on a stated sample of rays.
 
-All sums are over the sampled rays and the A that the lift used (its opacity gain, power 1)::
+All sums are over the sampled rays and the A that the lift used: its opacity gain, but power 1 and every weight of
+the ray, whatever the preset selects. So the residual says how the answer renders, not how well it fits the weights
+that were kept. With a stride, rays are sampled among those that the lift saw; B is read as its ``levels`` say::
 
     L(x') = mean_i || sum_j A_ij x_j - B_i ||^2          J(x') = mean_i sum_j A_ij || x_j - B_i ||^2
     Delta_ij = || x_j - B_i ||,  mu_i = sum_j a_ij Delta_ij,  beta_i = sum_j a_ij (Delta_ij^2 - mu_i^2) / mu_i^2

@@ -13,6 +13,7 @@ from liftcore.observe.observation import Observation, RegionMap
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from liftcore.raster.protocol import Walk
     from liftcore.scene.cameras import Camera
 
 
@@ -34,12 +35,15 @@ class Readout:
         return (taken * torch.from_numpy(self.shares).to(torch.float32)[:, :, None]).sum(dim=1)
 
 
-def sample_pixels(camera: Camera, count: int, seed: tuple[int, int]) -> Tensor:
-    """[n, 2] i32: up to ``count`` different pixels (x, y) of a view, in image order, by an explicit seed."""
-    total = camera.width * camera.height
+def sample_pixels(camera: Camera, count: int, seed: tuple[int, int], walk: Walk) -> Tensor:
+    """[n, 2] i32: up to ``count`` different pixels (x, y) that the walk sees, in image order, by an explicit seed."""
+    left, top = walk.offset
+    columns, rows = np.arange(left, camera.width, walk.stride), np.arange(top, camera.height, walk.stride)
+    total = columns.size * rows.size
     chosen = np.random.default_rng(seed).choice(total, size=min(count, total), replace=False)
     chosen.sort()
-    return torch.from_numpy(np.stack([chosen % camera.width, chosen // camera.width], axis=1).astype(np.int32))
+    places = np.stack([columns[chosen % columns.size], rows[chosen // columns.size]], axis=1)
+    return torch.from_numpy(places.astype(np.int32))
 
 
 def read_pixels(observation: Observation, camera: Camera, pixels: Tensor) -> Readout:

@@ -6,14 +6,16 @@ Importing this module loads neither torch nor numba: the service validates reque
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from liftcore.errors import InvalidSettings
+from liftcore.raster.protocol import MOST_OF_A_RAY, Selection
 
 TIKHONOV_GAIN = 1.2  # lambda of the paper's Tikhonov Guidance (App. Tikhonov, lambda sweep)
 LARGEST_ALPHA = 0.9999999  # nearer to one, float32 says one, and the ray has no light left to go on with
+VISIBLE_WEIGHT = 0.05  # a splat that weighs less at its centre is hidden there, or hardly there at all
 _SHOWN = 80  # characters of a wrong value in an error
 
 
@@ -22,11 +24,23 @@ class Preset(StrEnum):
 
     ROW_SUM = "row-sum"  # x_j = sum w b / sum w, Eq. 6
     TIKHONOV = "tikhonov"  # x_j = sum w~^2 b / sum w~^2 with alpha~ = sigmoid(1.2 theta)
+    ARGMAX = "argmax"  # the largest w of a ray alone
+    TOP_K = "top-k"  # the 40 largest w of a ray (Dr. Splat's paper)
+    FRONT_MASS = "front-mass"  # the front splats, until three quarters of the light are taken (VALA's gate)
+    CENTRE = "centre"  # one ray a splat and view, through its projected centre (Occam's LGS)
+    MEAN = "mean"  # the same ray, and the plain mean over the views that see the splat (Semantic Gaussians)
 
+
+_LINEAR = {"power": 1, "lift_gain": 1.0, "render_gain": 1.0}
 
 _PRESETS: dict[Preset, dict[str, Any]] = {
-    Preset.ROW_SUM: {"power": 1, "lift_gain": 1.0, "render_gain": 1.0},
+    Preset.ROW_SUM: _LINEAR,
     Preset.TIKHONOV: {"power": 2, "lift_gain": TIKHONOV_GAIN, "render_gain": TIKHONOV_GAIN},
+    Preset.ARGMAX: {**_LINEAR, "selection": Selection.TOP_K, "k": 1},
+    Preset.TOP_K: {**_LINEAR, "selection": Selection.TOP_K, "k": 40},
+    Preset.FRONT_MASS: {**_LINEAR, "selection": Selection.FRONT_MASS, "mass": 0.75},
+    Preset.CENTRE: {**_LINEAR, "selection": Selection.CENTRE},
+    Preset.MEAN: {**_LINEAR, "selection": Selection.CENTRE, "power": 0, "weight_floor": VISIBLE_WEIGHT},
 }
 
 
@@ -36,11 +50,20 @@ class LiftSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     preset: Preset = Preset.TIKHONOV
-    power: Literal[1, 2] = Field(2, description="the weight's exponent: w or w^2")
+    selection: Selection = Field(Selection.ALL, description="which of a ray's weights count")
+    k: int = Field(40, ge=1, le=MOST_OF_A_RAY, description="how many weights of a ray top-k keeps")
+    mass: float = Field(0.75, gt=0, le=1, description="the share of the light within which front-mass keeps weights")
+    weight_floor: float = Field(0.0, ge=0, lt=1, description="smaller weights count none, in every selection")
+    power: Literal[0, 1, 2] = Field(2, description="a kept weight's exponent: 1, w or w^2")
     lift_gain: float = Field(TIKHONOV_GAIN, gt=0, le=16, description="lambda on the opacity logits, lifting")
     render_gain: float = Field(TIKHONOV_GAIN, gt=0, le=16, description="lambda on the opacity logits, rendering")
     alpha_cap: float = Field(0.99, gt=0, le=LARGEST_ALPHA, description="the largest alpha of a splat on a ray")
     transmittance_stop: float = Field(1e-4, ge=0, lt=1, description="a ray ends before T falls to this")
+    stride: int = Field(1, ge=1, le=64, description="lift from every n-th pixel in x and in y")
+    view_stride: int = Field(1, ge=1, description="lift from every n-th view, from the first on")
+    levels: Literal["rows", "composite"] | Annotated[int, Field(strict=True, ge=0)] = Field(
+        "rows", description="levels as rows of their own, summed in composite regions, or one level by its number"
+    )
     grid_reading: Literal["bilinear", "nearest"] = Field(
         "bilinear", description="what a pixel reads of a feature grid: four cells by distance, or the nearest alone"
     )
@@ -48,7 +71,7 @@ class LiftSettings(BaseModel):
         "float16", description="how features are stored, if it can hold them"
     )
     certificate_rays: int = Field(10_000, ge=0, le=10_000_000, description="rays sampled for the certificate")
-    seed: int = Field(0, ge=0, lt=2**31, description="of the certificate's sample")
+    seed: int = Field(0, ge=0, lt=2**31, description="of the certificate's sample and the stride's first pixels")
 
     @model_validator(mode="before")
     @classmethod
