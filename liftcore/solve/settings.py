@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from liftcore.errors import InvalidSettings
-from liftcore.raster.protocol import MOST_OF_A_RAY, Selection
+from liftcore.raster.weighting import MOST_OF_A_RAY, Selection
 
 TIKHONOV_GAIN = 1.2  # lambda of the paper's Tikhonov Guidance (App. Tikhonov, lambda sweep)
 LARGEST_ALPHA = 0.9999999  # nearer to one, float32 says one, and the ray has no light left to go on with
