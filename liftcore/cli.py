@@ -75,6 +75,7 @@ def build_parser() -> argparse.ArgumentParser:
     _add_pack(commands.add_parser("pack", help="make a feature pack of the field's formats"), shared)
     _add_encode(commands.add_parser("encode", parents=[shared], help="make a feature pack of images"))
     _add_inspect(commands.add_parser("inspect", parents=[shared], help="what is in a file, and what is wrong"))
+    _add_evaluate(commands.add_parser("evaluate", parents=[shared], help="lifts against the field's labels"))
     _add_bench(commands.add_parser("bench", parents=[shared], help="how fast this machine lifts"))
     return parser
 
@@ -148,6 +149,23 @@ def _add_encode(parser: argparse.ArgumentParser) -> None:
 
 def _add_inspect(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("file", type=Path, help="splats, cameras, features, a lift or a text table")
+
+
+def _add_evaluate(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("dataset", choices=("lerf-ovs", "3d-ovs"), help="whose labels")
+    parser.add_argument(
+        "lifts", nargs="+", metavar="LIFT", help="SCENE=LIFT, SCENE.lift.safetensors, or a folder of those"
+    )
+    parser.add_argument("--data", type=Path, required=True, metavar="DIR", help="the dataset, or its labels")
+    words = parser.add_mutually_exclusive_group()
+    words.add_argument("--table", type=Path, metavar="FILE", help="precomputed text embeddings")
+    words.add_argument("--encoder", metavar="NAME", help="else the one that the lift's text space names")
+    parser.add_argument("--protocol", nargs="+", choices=("P1", "P2", "P3"), help="else all three")
+    parser.add_argument(
+        "--threshold", default="auto", metavar="T", help="of P2 and P3: auto, valley, paper, otsu, a number"
+    )
+    parser.add_argument("--negative", nargs="+", default=[], metavar="WORD", help="words to compete with")
+    parser.add_argument("--held-out", type=Path, metavar="FILE", help="the only frames to judge, a name a line")
 
 
 def _add_bench(parser: argparse.ArgumentParser) -> None:

@@ -28,7 +28,7 @@ from liftcore.scene.splats import Splats
 if TYPE_CHECKING:
     from pathlib import Path
 
-COMMANDS = ["demo", "serve", "lift", "query", "pack", "encode", "inspect", "bench"]
+COMMANDS = ["demo", "serve", "lift", "query", "pack", "encode", "inspect", "evaluate", "bench"]
 
 
 @pytest.fixture

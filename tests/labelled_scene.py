@@ -1,0 +1,125 @@
+"""A wall of splats with an apple and a book on it, a lift that knows which splat is which, and labels of it.
+
+The wall fills the image of a camera four units before it: 160 x 120 pixels, 25 pixels a unit. Objects are
+rectangles of pixels of the first frame; the second camera stands 0.2 units to the right, so they move 5 pixels left.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+from safetensors.torch import save_file
+
+from liftcore.artifact import Lift, LiftMetadata, save_lift
+from liftcore.lift import input_file
+from liftcore.scene.cameras import Camera, Cameras
+from liftcore.scene.inria import write_inria_cameras
+from liftcore.scene.ply import write_splats
+from liftcore.scene.splats import Splats
+from liftcore.solve.settings import LiftSettings
+
+WIDTH, HEIGHT, FOCAL, DISTANCE = 160, 120, 100.0, 4.0
+SPACING = 0.08  # units between splats: 2 pixels
+THINGS = {"red apple": (20, 30, 60, 80), "book": (90, 20, 140, 100)}  # x1 y1 x2 y2 of the first frame, ends outside
+WORDS = ("wall", *THINGS, "object", "things", "stuff", "texture", "unicorn")
+FRAMES = {"frame_00001": 0, "frame_00002": 5}  # name -> pixels that things lie further left
+LIFTED = "frame_00001"
+
+
+def write_lift(folder: Path, name: str = "kitchen.lift.safetensors") -> Path:
+    """Splats, cameras, words and a lift that is right about every splat; the lift's path."""
+    columns, rows = (np.arange(-0.6, size * DISTANCE / FOCAL + 0.6, SPACING) for size in (WIDTH, HEIGHT))
+    x, y = (axis.ravel() for axis in np.meshgrid(columns, rows))
+    pixels = np.stack([x, y], axis=1) * FOCAL / DISTANCE
+    owner = np.zeros(len(x), np.int64)
+    for row, (x1, y1, x2, y2) in enumerate(THINGS.values(), start=1):
+        owner[((pixels >= (x1, y1)) & (pixels < (x2, y2))).all(axis=1)] = row
+    count = len(x)
+    middle = np.array([WIDTH, HEIGHT]) * DISTANCE / FOCAL / 2
+    splats = Splats(
+        means=torch.tensor(np.stack([x - middle[0], y - middle[1], np.full(count, DISTANCE)], axis=1)).float(),
+        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
+        log_scales=torch.full((count, 3), float(np.log(0.55 * SPACING))),
+        opacity_logits=torch.full((count,), 4.0),
+        sh=torch.zeros(count, 1, 3),
+    )
+    write_splats(splats, folder / "splats.ply")
+    cameras = []
+    for frame, left in FRAMES.items():
+        pose = np.eye(4)
+        pose[0, 3] = -left * DISTANCE / FOCAL
+        cameras.append(Camera(frame, WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, pose))
+    write_inria_cameras(Cameras(tuple(cameras)), folder / "cameras.json")
+    words = torch.eye(len(WORDS))
+    save_file({"embeddings": words}, str(folder / "words.safetensors"), metadata={"words": json.dumps(WORDS)})
+    metadata = LiftMetadata(
+        version="test",
+        settings=LiftSettings.of(preset="row-sum"),
+        splats=input_file(folder / "splats.ply"),
+        cameras=input_file(folder / "cameras.json"),
+        features=(),
+        encoder="by hand",
+        text_space=f"table:{folder / 'words.safetensors'}",
+        views=(LIFTED,),
+        certificate={},
+        timings={},
+    )
+    seen, ones = torch.ones(count, dtype=torch.bool), torch.ones(count)
+    path = folder / name
+    save_lift(Lift(words[owner].half(), ones * 9, ones, seen, metadata), path)
+    return path
+
+
+def truth(name: str, left: int = 0) -> np.ndarray:
+    """[120, 160] bool, where a thing is in a frame."""
+    mask = np.zeros((HEIGHT, WIDTH), bool)
+    x1, y1, x2, y2 = THINGS[name]
+    mask[y1:y2, x1 - left : x2 - left] = True
+    return mask
+
+
+def rectangle(x1: float, y1: float, x2: float, y2: float) -> list[list[float]]:
+    """A polygon whose outline is the rectangle's outermost pixels."""
+    return [[x1, y1], [x2 - 1, y1], [x2 - 1, y2 - 1], [x1, y2 - 1]]
+
+
+def isat(objects: list[tuple[str, list[list[float]]]], scale: int = 1) -> dict[str, object]:
+    """Labels as ISAT writes them, of an image that is larger by a factor."""
+    entries = []
+    for category, points in objects:
+        scaled = [[x * scale, y * scale] for x, y in points]
+        entries.append({"category": category, "group": 1, "segmentation": scaled, "layer": 1.0, "iscrowd": False})
+    info = {"description": "ISAT", "name": "frame.jpg", "width": WIDTH * scale, "height": HEIGHT * scale, "depth": 3}
+    return {"info": info, "objects": entries}
+
+
+def write_lerf_labels(folder: Path, scene: str = "kitchen") -> Path:
+    """LeRF-OVS's layout: the apple in two polygons, the second frame labelled at twice the size."""
+    labels = folder / "lerf_ovs" / "label" / scene
+    labels.mkdir(parents=True)
+    for scale, (frame, left) in enumerate(FRAMES.items(), start=1):
+        x1, y1, x2, y2 = THINGS["red apple"]
+        halves = [(x1 - left, y1, x1 - left + 20, y2), (x1 - left + 20, y1, x2 - left, y2)]
+        book = THINGS["book"]
+        objects = [("red apple", rectangle(*half)) for half in halves]
+        objects.append(("book", rectangle(book[0] - left, book[1], book[2] - left, book[3])))
+        (labels / f"{frame}.json").write_text(json.dumps(isat(objects, scale)))
+    return folder / "lerf_ovs"
+
+
+def write_3d_ovs_labels(folder: Path, scene: str = "kitchen") -> Path:
+    """3D-OVS's layout: a mask a class; the unicorn, a class without masks, is nowhere."""
+    labels = folder / "3d_ovs" / scene / "segmentations"
+    labels.mkdir(parents=True)
+    (labels / "classes.txt").write_text("red apple\nbook\nunicorn\n")
+    for frame, left in FRAMES.items():
+        (labels / frame).mkdir()
+        for name in THINGS:
+            mask = Image.fromarray(truth(name, left).astype(np.uint8) * 255)
+            suffix = "png" if left else "jpg"
+            mask.resize((WIDTH * 2, HEIGHT * 2), Image.Resampling.NEAREST).save(labels / frame / f"{name}.{suffix}")
+    return folder / "3d_ovs"

@@ -1,0 +1,177 @@
+"""``splatlift evaluate`` on labels in the layouts of LeRF-OVS and 3D-OVS: a lift that is right scores near one."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from liftcore import cli
+from tests.labelled_scene import FRAMES, LIFTED, isat, rectangle, write_3d_ovs_labels, write_lerf_labels, write_lift
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A lift and both kinds of labels; tests only read them."""
+    made = tmp_path_factory.mktemp("evaluate")
+    write_lift(made)
+    write_lerf_labels(made)
+    write_3d_ovs_labels(made)
+    save_file({"embeddings": torch.eye(4)}, str(made / "other.table"), metadata={"words": '["a", "b", "c", "d"]'})
+    return made
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
+    status = cli.main([str(argument) for argument in arguments])
+    captured = capsys.readouterr()
+    return status, captured.out, captured.err
+
+
+def evaluate(capsys: pytest.CaptureFixture[str], *arguments: object) -> dict[str, Any]:
+    status, out, err = run(capsys, "evaluate", *arguments, "--json")
+    assert (status, err) == (0, "")
+    return json.loads(out)
+
+
+def test_a_right_lift_scores_near_one_in_every_protocol_of_lerf_ovs(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lift = folder / "kitchen.lift.safetensors"
+    document = evaluate(capsys, "lerf-ovs", lift, "--data", folder / "lerf_ovs")
+    assert [row["protocol"] for row in document["measured"]] == ["P1", "P2", "P3"]
+    for row in document["measured"]:
+        assert row["scene"] == "kitchen" and row["frames"] == list(FRAMES) and row["lifted_frames"] == [LIFTED]
+        found = row["means"]["all labelled"]
+        assert (found["frames"], found["objects"]) == (2, 4)
+        assert min(found["object_micro"], found["frame_macro"], found["class_pooled"]) > 0.9
+        assert (found["accuracy_25"], found["accuracy_50"]) == (1, 1)
+        assert found["localised"] == (None if row["protocol"] == "P2" else 1)
+        assert row["means"]["held out"]["frames"] == 1
+        assert {thing["lifted"] for thing in row["objects"] if thing["view"] == LIFTED} == {True}
+        assert row["classes"].keys() == {"red apple", "book"}
+        mean = document["mean_of_scenes"][row["protocol"]]
+        assert mean["all labelled"]["object_micro"] == found["object_micro"]
+    assert document["warnings"] == [f"kitchen: 1 of 2 judged frames were lifted: {LIFTED}"]
+    assert document["settings"]["threshold"] == "auto"
+
+
+def test_a_wrong_label_has_the_iou_that_its_pixels_give(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The book's label is a half of the book, and an apple's lies where the wall is."""
+    labels = tmp_path / "kitchen"
+    labels.mkdir()
+    half = isat([("book", rectangle(90, 20, 140, 60)), ("red apple", rectangle(0, 0, 10, 10))])
+    (labels / "frame_00001.json").write_text(json.dumps(half))
+    lift = f"kitchen={folder / 'kitchen.lift.safetensors'}"
+    options = ["--data", tmp_path, "--protocol", "P2", "P3", "--threshold", 0.5]
+    document = evaluate(capsys, "lerf-ovs", lift, *options)
+    for row in document["measured"]:
+        ious = {thing["category"]: thing["iou"] for thing in row["objects"]}
+        assert ious["red apple"] == 0
+        assert ious["book"] == pytest.approx(0.5, abs=0.03)
+        assert row["means"]["all labelled"]["accuracy_25"] == 0.5
+
+
+def test_3d_ovs_pools_the_pixels_of_a_class(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    document = evaluate(capsys, "3d-ovs", folder, "--data", folder / "3d_ovs", "--protocol", "P3", "--threshold", 0.5)
+    (row,) = document["measured"]
+    assert row["classes"].keys() == {"red apple", "book"}  # the unicorn is nowhere
+    for name, pooled in row["classes"].items():
+        things = [thing for thing in row["objects"] if thing["category"] == name]
+        assert pooled == sum(t["intersection"] for t in things) / sum(t["union"] for t in things) > 0.9
+    found = row["means"]["all labelled"]
+    assert found["class_pooled"] == pytest.approx(sum(row["classes"].values()) / 2)
+    assert found["objects"] == 4
+    assert any("unicorn" in warning for warning in document["warnings"])
+
+
+def test_only_held_out_frames_are_judged_and_lifted_ones_are_named(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    names = tmp_path / "held_out.txt"
+    arguments = ["lerf-ovs", folder, "--data", folder / "lerf_ovs", "--protocol", "P3", "--held-out", names]
+    names.write_text("frame_00002.jpg\n\n")
+    document = evaluate(capsys, *arguments)
+    (row,) = document["measured"]
+    assert (row["frames"], row["lifted_frames"], row["means"].keys()) == (["frame_00002"], [], {"all labelled"})
+    assert document["warnings"] == [] and document["settings"]["held_out"] == ["frame_00002"]
+    names.write_text("frame_00001\n")
+    assert "though the list holds them out" in evaluate(capsys, *arguments)["warnings"][0]
+    for content, message in (("frame_9\n", "held-out ones"), ("\n", "none in")):
+        names.write_text(content)
+        status, out, err = run(capsys, "evaluate", *arguments)
+        assert (status, out) == (2, "") and message in err and err.count("\n") == 1
+
+
+def test_published_rows_stand_beside_and_never_in_a_mean(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    lift = folder / "kitchen.lift.safetensors"
+    arguments = ["lerf-ovs", lift, "--data", folder / "lerf_ovs", "--protocol", "P3", "--threshold", "0.5"]
+    document = evaluate(capsys, *arguments)
+    assert {row["dataset"] for row in document["published"]} == {"lerf-ovs"}
+    assert all(row["source"] and row["protocol"] for row in document["published"])
+    assert document["mean_of_scenes"]["P3"]["all labelled"]["object_micro"] > 0.9
+    status, out, err = run(capsys, "evaluate", *arguments)
+    assert (status, err) == (0, "")
+    lines = out.splitlines()
+    kinds = [line.split()[0] for line in lines[1:]]
+    assert set(kinds) == {"measured", "published", "warning:"} and kinds == sorted(kinds)
+    measured = [line for line in lines if line.startswith("measured")]
+    assert all(" P3 " in line for line in measured)
+    ours = next(line for line in lines if "65.1" in line)
+    assert ours.split()[:7] == ["published", "P3", "mIoU", "67.6", "68.5", "62.3", "62.1"]
+
+
+def test_frames_without_cameras_or_objects_are_named(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = tmp_path / "lerf_ovs"
+    shutil.copytree(folder / "lerf_ovs", data)
+    labels = data / "label" / "kitchen"
+    shutil.copy(labels / "frame_00001.json", labels / "frame_00009.json")
+    (labels / "frame_00002.json").write_text(json.dumps(isat([])))
+    arguments = ["lerf-ovs", folder, "--data", data, "--protocol", "P2"]
+    warnings = evaluate(capsys, *arguments)["warnings"]
+    assert any("frame_00009 have labels but no camera" in warning for warning in warnings)
+    assert any("frame_00002 have no labelled object" in warning for warning in warnings)
+    for name in ("frame_00001", "frame_00002"):
+        (labels / f"{name}.json").unlink()
+    status, _, err = run(capsys, "evaluate", *arguments)
+    assert status == 2 and "frames named like the lift's cameras" in err
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["nothing.safetensors"], "nothing at"),
+        (["{folder}/kitchen.lift.safetensors", "kitchen={folder}/kitchen.lift.safetensors"], "one lift a scene"),
+        (["{folder}/words.safetensors"], "lift"),
+        (["{folder}", "--threshold", "soon"], "threshold"),
+        (["{folder}", "--negative", "dragon"], "dragon"),
+        (["{folder}", "--held-out", "{folder}/none.txt"], "--held-out"),
+        (["{folder}", "--table", "{folder}/other.table"], "channels"),
+        (["{folder}", "--threshold", "nan"], "threshold"),
+        (["{folder}", "--protocol", "P4"], "P4"),
+    ],
+)
+def test_what_cannot_be_judged_exits_2_with_one_line(
+    more: list[str], message: str, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = [text.format(folder=folder) for text in more]
+    status, out, err = run(capsys, "evaluate", "lerf-ovs", *given, "--data", folder / "lerf_ovs")
+    assert (status, out) == (2, "")
+    assert message in err and err.count("\n") == 1
+
+
+def test_a_category_that_the_table_lacks_is_named(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "frame_00001.json").write_text(json.dumps(isat([("griffin", rectangle(0, 0, 9, 9))])))
+    lift = folder / "kitchen.lift.safetensors"
+    status, _, err = run(capsys, "evaluate", "lerf-ovs", lift, "--data", tmp_path)
+    assert status == 2 and "griffin" in err
