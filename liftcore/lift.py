@@ -18,10 +18,13 @@ from liftcore.progress import Progress, silent
 from liftcore.raster.cpu import CpuRaster
 from liftcore.raster.warm_up import warm_up
 from liftcore.scene.load import camera_files, load_cameras, load_splats
-from liftcore.solve.accumulate import accumulate
+from liftcore.solve.accumulate import accumulate, as_read, lift_walk
+from liftcore.solve.all_rays import AllRays
 from liftcore.solve.certificate import certify
 from liftcore.solve.checkpoint import Checkpoint, identity, resumed
 from liftcore.solve.closed_form import solve_closed_form
+from liftcore.solve.least_squares import refine
+from liftcore.solve.reference import reference
 from liftcore.solve.view_weights import ViewWeights
 
 if TYPE_CHECKING:
@@ -88,8 +91,27 @@ def lift(
             solution = solve_closed_form(
                 store, codebooks.__getitem__, geometry.denominators, dtype, progress, threads
             )
+        X, seen, notes = solution.features, geometry.denominators > 0, {}
+        rays = None
+        if settings.cg_steps or settings.reference_channels:
+            with timings.stage("rays"):
+                rays = AllRays(
+                    raster,
+                    scene.count,
+                    [views.get(name) for name in names],
+                    lambda view: as_read(packs.observation(names[view]), settings, names[view]),
+                    lift_walk(settings),
+                    progress,
+                )
+        if rays and settings.cg_steps:
+            with timings.stage("refine"):
+                refinement = refine(rays, X, seen, codebooks, settings, progress)
+                X, notes["refinement"] = refinement.features, refinement.stats
+        if rays and settings.reference_channels:
+            with timings.stage("reference"):
+                notes["reference"] = reference(rays, X, seen, geometry.samples, codebooks, settings, progress)
         with timings.stage("certify"):
-            certificate = certify(geometry, solution.features, codebooks.__getitem__, settings, threads)
+            certificate = certify(geometry, X, codebooks.__getitem__, settings, threads) | notes
         certificate |= {"weights_entries": sum(len(part.columns) for part in store), "views_without_camera": unpaired}
     metadata = LiftMetadata(
         version=__version__,
@@ -104,8 +126,7 @@ def lift(
         timings=timings.seconds,
     )
     evidence = torch.from_numpy(geometry.evidence).to(torch.float32)
-    seen = torch.from_numpy(geometry.denominators > 0)
-    return Lift(solution.features, evidence, solution.agreement, seen, metadata)
+    return Lift(X, evidence, solution.agreement, torch.from_numpy(seen), metadata)
 
 
 def input_file(path: Path) -> InputFile:

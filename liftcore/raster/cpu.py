@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from liftcore.errors import InvalidInput, Unavailable
+from liftcore.raster.adjoint import add_sums, gather_tiles
 from liftcore.raster.constants import TILE
 from liftcore.raster.depth_order import depth_order
 from liftcore.raster.merging import count_entries, gather_entries, merge_range
@@ -110,6 +111,30 @@ class CpuRaster:
             )
             image[:, :, begin:end] = target
         return torch.from_numpy(image)
+
+    def adjoint(self, camera: Camera, values: Tensor, walk: Walk) -> Tensor:
+        """``A^T Y``: values [H, W, C] f32 -> [P, C] f32. See the protocol."""
+        if values.ndim != 3 or values.shape[:2] != (camera.height, camera.width):
+            raise InvalidInput(
+                "values",
+                expected=f"an image of {camera.height} rows of {camera.width} pixels",
+                got=f"{list(values.shape)}",
+            )
+        frame = self._frame(camera, every_pixel(walk))
+        channels = values.shape[2]
+        result = np.zeros((self.splats.count, channels), np.float32)
+        for begin in range(0, channels, RENDER_CHANNELS):
+            end = min(begin + RENDER_CHANNELS, channels)
+            image = np.ascontiguousarray(values[:, :, begin:end].to(torch.float32).numpy())
+            shares = self._over_tiles(frame, lambda first, last, image=image: gather_tiles(first, last, frame, image))
+
+            def merge(first: int, last: int, shares: list = shares, begin: int = begin) -> None:
+                for share in shares:
+                    add_sums(first, last, share, frame.ids, result, begin)
+
+            # Each record is in one range and its shares come in order, so the number of ranges changes no sum.
+            self._map(merge, _shares(self.splats.count, self.threads))
+        return torch.from_numpy(result)
 
     def row_sums(self, camera: Camera, walk: Walk) -> Tensor:
         """``A 1``: [H, W] f32."""

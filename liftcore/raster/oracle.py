@@ -154,6 +154,11 @@ class OracleRaster:
         image = dense_view(self.splats, camera, walk).A @ values.double().numpy()
         return torch.from_numpy(image.astype(np.float32)).reshape(camera.height, camera.width, -1)
 
+    def adjoint(self, camera: Camera, values: Tensor, walk: Walk) -> Tensor:
+        """``A^T Y`` by a dense product."""
+        Y = values.double().numpy().reshape(camera.height * camera.width, -1)
+        return torch.from_numpy((dense_view(self.splats, camera, walk).A.T @ Y).astype(np.float32))
+
     def row_sums(self, camera: Camera, walk: Walk) -> Tensor:
         """``A 1``."""
         return self.render(camera, torch.ones(self.splats.count, 1), walk)[:, :, 0]

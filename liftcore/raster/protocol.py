@@ -66,6 +66,10 @@ class Raster(Protocol):
         """``A X``: values [P, F] f32 -> [H, W, F] f32, background zero, not divided by the row sum; never strided."""
         ...
 
+    def adjoint(self, camera: Camera, values: Tensor, walk: Walk) -> Tensor:
+        """``A^T Y``: values [H, W, C] f32 -> [P, C] f32, the transpose of the render; never strided."""
+        ...
+
     def row_sums(self, camera: Camera, walk: Walk) -> Tensor:
         """``A 1``: [H, W] f32 (Property 2)."""
         ...

@@ -20,6 +20,7 @@ def warm_up() -> None:
     regions = RegionMap(torch.zeros(1, 1, 1, dtype=torch.int32), torch.ones(1, 1))
     for observation in (regions, FeatureGrid(torch.ones(1, 1, 1))):
         raster.region_weights(camera, observation, Walk(), Weighting())
+    raster.adjoint(camera, torch.ones(16, 16, 1), Walk())
     raster.row_sums(camera, Walk())
     raster.top_weights(camera, Walk(), 1)
     raster.ray_rows(camera, torch.zeros(1, 2, dtype=torch.int32), Walk())

@@ -9,7 +9,8 @@ that were kept. With a stride, rays are sampled among those that the lift saw; B
 
 ``L <= J`` (Jensen) where rows sum to one; a ray that meets nothing has ``L = ||B||^2`` and ``J = 0``.
 Here ``a_ij = A_ij / sum_j A_ij``. A ray has a row i for each labelled level. The paper defines beta at the optimum
-x^; here it is measured at the answer x', which is what a user has.
+x^; here it is measured at the answer x', which is what a user has, and so ``1 + beta`` here is a sign and no proof.
+``solve/reference.py`` finds x^, and says which beta the theorem is about.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from __future__ import annotations
 import math
 import os
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,7 +26,7 @@ import numpy as np
 from liftcore.jit import vectorised
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Sequence
 
     from torch import Tensor
 
@@ -39,7 +40,7 @@ _MU_FLOOR = 1e-6  # a row whose splats all equal what it observed has no dispers
 
 @dataclass(frozen=True)
 class ViewMeasures:
-    """Per-row measures of one view's sample."""
+    """Per-row measures of sampled rays."""
 
     row_sums: np.ndarray  # [n] f64, a value a ray
     residuals: np.ndarray  # [rows] f64, ||A x - B||^2
@@ -64,14 +65,10 @@ def certify(
     Returns:
         Plain numbers, ready for JSON; None where nothing was sampled.
     """
-    with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
-        books = [codebooks(number) for number in range(len(geometry.samples))]
-        views = list(pool.map(lambda sample, book: measure_view(sample, features, book), geometry.samples, books))
-    row_sums = np.concatenate([view.row_sums for view in views])
-    residuals = np.concatenate([view.residuals for view in views])
-    surrogates = np.concatenate([view.surrogates for view in views])
-    betas = np.concatenate([view.betas for view in views])
-    beta = _quantiles(betas)
+    books = [codebooks(number) for number in range(len(geometry.samples))]
+    measures = measure_samples(geometry.samples, features, books, threads)
+    row_sums, residuals = measures.row_sums, measures.residuals
+    beta = quantiles(measures.betas)
     return {
         "rays": int(row_sums.size),
         "rows": int(residuals.size),
@@ -80,12 +77,22 @@ def certify(
         "row_sum_std": float(row_sums.std()) if row_sums.size else None,
         "row_sum_min": float(row_sums.min()) if row_sums.size else None,
         "residual": _mean(residuals),
-        "surrogate": _mean(surrogates),
+        "surrogate": _mean(measures.surrogates),
         "beta": beta,
         "bound": None if beta["max"] is None else 1.0 + beta["max"],
         "seen_share": float((geometry.denominators > 0).mean()),
         "evidence_over_half_share": float((geometry.evidence > 0.5).mean()),
     }
+
+
+def measure_samples(
+    samples: Sequence[SampledRays], features: Tensor, codebooks: Sequence[Tensor], threads: int | None = None
+) -> ViewMeasures:
+    """The measures of all views' sampled rays, one view after the other: features [P, C], codebooks [M, C]."""
+    with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
+        views = list(pool.map(lambda sample, book: measure_view(sample, features, book), samples, codebooks))
+    names = [part.name for part in fields(ViewMeasures)]
+    return ViewMeasures(*(np.concatenate([getattr(view, name) for view in views]) for name in names))
 
 
 def measure_view(sample: SampledRays, features: Tensor, codebook: Tensor) -> ViewMeasures:
@@ -158,11 +165,9 @@ def _mean(values: np.ndarray) -> float | None:
     return float(values.mean()) if values.size else None
 
 
-def _quantiles(values: np.ndarray) -> dict[str, float | None]:
+def quantiles(values: np.ndarray) -> dict[str, float | None]:
+    """Median, p99 and max; None where there is no value, or no finite one."""
     if not values.size:
         return {"median": None, "p99": None, "max": None}
-    return {
-        "median": float(np.median(values)),
-        "p99": float(np.quantile(values, 0.99)),
-        "max": float(values.max()),
-    }
+    found = {"median": np.median(values), "p99": np.quantile(values, 0.99), "max": values.max()}
+    return {name: float(value) if np.isfinite(value) else None for name, value in found.items()}

@@ -1,0 +1,73 @@
+"""A and B of a small scene as dense float64 matrices, with the raster's own weights: the least squares' oracle."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from liftcore.observe.observation import Observation
+from liftcore.raster.cpu import CpuRaster
+from liftcore.raster.oracle import reading_matrix
+from liftcore.raster.protocol import Walk
+from liftcore.scene.cameras import Camera
+from liftcore.scene.splats import Splats
+from liftcore.solve.all_rays import AllRays
+from tests.scenes import random_camera, random_grid, random_regions, random_splats
+
+
+def dense_view(raster: CpuRaster, camera: Camera, walk: Walk) -> np.ndarray:
+    """A [H * W, P] f64 as the raster traces it."""
+    y, x = np.mgrid[: camera.height, : camera.width]
+    pixels = torch.tensor(np.stack([x.ravel(), y.ravel()], axis=1), dtype=torch.int32)
+    rows = raster.ray_rows(camera, pixels, walk)
+    A = np.zeros((len(pixels), raster.splats.count))
+    A[np.repeat(np.arange(len(A)), np.diff(rows.row_starts.numpy())), rows.splats.numpy()] = rows.weights.numpy()
+    return A
+
+
+class SmallScene:
+    """Three views of a random scene: the operator, and A [rows, P] and B [rows, F] of the same rays."""
+
+    def __init__(
+        self,
+        seed: int,
+        grids: bool = False,
+        splats: Splats | None = None,
+        walk: Walk | None = None,
+        views: Sequence[Camera] | None = None,
+        observations: Sequence[Observation] | None = None,
+    ) -> None:
+        self.walk = walk or Walk()
+        self.splats = splats or random_splats(seed, 25)
+        around = [random_camera(seed + k, 22 + 3 * k, 17 + 2 * k, name=f"v{k}") for k in range(3)]
+        self.views = list(views or around)
+        made = [random_grid(seed + k) if grids else random_regions(seed + k) for k in range(3)]
+        self.observations = list(observations or made)
+        self.raster = CpuRaster(self.splats, threads=2)
+        parts = [self._rows(view, seen) for view, seen in zip(self.views, self.observations, strict=True)]
+        self.A, self.B = (np.concatenate(part) for part in zip(*parts, strict=True))
+        self.row_sums = self.A.sum(axis=0)
+        self.seen = self.row_sums > 0
+        safe = np.where(self.seen, self.row_sums, 1.0)
+        self.closed_form = torch.tensor(self.A.T @ self.B / safe[:, None], dtype=torch.float32)
+        self.codebooks = [observation.codebook for observation in self.observations]
+
+    def _rows(self, view: Camera, observation: Observation) -> tuple[np.ndarray, np.ndarray]:
+        S, ray = reading_matrix(observation, view.width, view.height)
+        return dense_view(self.raster, view, self.walk)[ray], S @ observation.codebook.double().numpy()
+
+    def rays(self, threads: int = 2) -> AllRays:
+        raster = CpuRaster(self.splats, threads)
+        return AllRays(raster, self.splats.count, self.views, self.observations.__getitem__, self.walk)
+
+    def damped(self, damping: float) -> np.ndarray:
+        """X [P, F] f64 of the damped normal equations, by a dense solver; where singular, the shortest step."""
+        X0 = self.closed_form.double().numpy()
+        K = self.A.T @ self.A + damping * np.diag(self.row_sums)
+        return X0 + np.linalg.lstsq(K, self.A.T @ (self.B - self.A @ X0), rcond=1e-12)[0]
+
+    def loss(self, X: np.ndarray | torch.Tensor) -> float:
+        """``|A X - B|^2``."""
+        return float(((self.A @ np.asarray(X, np.float64) - self.B) ** 2).sum())

@@ -1,0 +1,181 @@
+"""Damped least squares against dense solvers, on scenes small enough for both."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from liftcore.lift import lift
+from liftcore.observe.observation import Observation, RegionMap
+from liftcore.progress import silent
+from liftcore.solve.channels import BLOCK, blocks, principal_axes, random_axes
+from liftcore.solve.least_squares import Refinement, refine
+from liftcore.solve.settings import LiftSettings
+from tests.unit.solve.dense_rays import SmallScene
+from tests.unit.solve.test_lift_equals_dense import write_scene
+
+SEEDS = st.integers(0, 2**16)
+few = settings(max_examples=6, deadline=None)
+
+
+def refined(scene: SmallScene, dtype: torch.dtype = torch.float32, **chosen: float) -> Refinement:
+    knobs = LiftSettings.of(**{"cg_steps": 200, "damping": 0.1, **chosen})
+    features = scene.closed_form.clone().to(dtype)
+    return refine(scene.rays(), features, scene.seen, scene.codebooks, knobs, silent)
+
+
+def with_codebook(observation: Observation, codebook: torch.Tensor) -> RegionMap:
+    assert isinstance(observation, RegionMap)
+    return RegionMap(observation.labels, codebook)
+
+
+@few
+@given(SEEDS, st.booleans())
+def test_the_operator_is_the_dense_one(seed, grids):
+    scene = SmallScene(seed, grids)
+    rays = scene.rays()
+    X = np.random.default_rng(seed).normal(size=(scene.splats.count, 4)).astype(np.float32)
+    scale = max(1.0, scene.row_sums.max())
+    assert rays.rows == scene.A.shape[0]
+    assert np.abs(rays.normal(X) - scene.A.T @ (scene.A @ X)).max() < 1e-4 * scale
+    assert np.abs(rays.row_sums - scene.row_sums).max() < 1e-5 * scale
+    assert np.abs(rays.diagonal - (scene.A**2).sum(axis=0)).max() < 1e-5 * scale
+    (part,) = blocks(scene.B.shape[1])
+    X0 = scene.closed_form.numpy()
+    gradient, loss = rays.gradient(X0, part.project)
+    assert np.abs(gradient - scene.A.T @ (scene.B - scene.A @ X0)).max() < 1e-4 * scale
+    assert loss == pytest.approx(scene.loss(X0), rel=1e-4)
+
+
+@few
+@given(SEEDS, st.booleans(), st.sampled_from([0.03, 0.3, 1.0, 10.0]))
+def test_damped_steps_end_at_the_damped_normal_equations(seed, grids, damping):
+    scene = SmallScene(seed, grids)
+    made = refined(scene, damping=damping)
+    expected = scene.damped(damping)
+    assert made.result == "converged"
+    assert np.abs(made.features.numpy() - expected).max() < 5e-3 * max(1.0, np.abs(expected).max())
+
+
+@few
+@given(SEEDS)
+def test_undamped_steps_reach_the_least_squares_loss(seed):
+    scene = SmallScene(seed)
+    least = scene.loss(np.linalg.lstsq(scene.A, scene.B, rcond=1e-12)[0])
+    made = refined(scene, damping=0.0, cg_steps=200)
+    first = scene.loss(scene.closed_form)
+    assert least - 1e-6 <= scene.loss(made.features) <= least + 2e-3 * first
+
+
+def test_a_large_damping_is_the_closed_form():
+    scene = SmallScene(1)
+    assert torch.allclose(refined(scene, damping=1e6).features, scene.closed_form, atol=1e-5)
+
+
+@pytest.mark.parametrize("damping", [0.0, 0.3])
+def test_the_residuals_told_are_those_of_the_dense_matrix_and_fall(damping):
+    scene = SmallScene(2)
+    for steps in (1, 4, 9):
+        made = refined(scene, damping=damping, cg_steps=steps)
+        told = np.array(made.stats["residuals"]) * len(scene.B)
+        assert len(told) == made.stats["steps"] + 1 <= steps + 1
+        assert told[0] == pytest.approx(scene.loss(scene.closed_form), rel=1e-4)
+        assert told[-1] == pytest.approx(scene.loss(made.features), rel=1e-3)
+    if damping == 0:
+        assert (np.diff(told) <= 1e-6 * told[0]).all()
+    assert "steps" in made.message
+    assert str(damping) in made.message or f"{damping:g}" in made.message
+
+
+def test_a_full_basis_gives_the_solution_of_all_channels():
+    wide = SmallScene(3)
+    rng = np.random.default_rng(0)
+    mix = torch.tensor(rng.normal(size=(6, 40)), dtype=torch.float32)  # 40 channels of rank 6
+    mixed = [with_codebook(seen, seen.codebook @ mix) for seen in wide.observations]
+    scene = SmallScene(3, observations=mixed)
+    whole, reduced = refined(scene, damping=0.3), refined(scene, damping=0.3, cg_basis=6)
+    assert reduced.stats["channels"] == 6
+    assert whole.stats["channels"] == 40
+    assert torch.allclose(whole.features, reduced.features, atol=2e-3)
+
+
+def test_what_lies_outside_the_basis_is_kept():
+    scene = SmallScene(4)
+    axes = principal_axes(scene.codebooks, 2)
+    made = refined(scene, damping=0.1, cg_basis=2)
+    step = made.features - scene.closed_form
+    assert float(step.norm()) > 0.1
+    assert torch.allclose(step @ axes @ axes.T, step, atol=1e-5)
+
+
+def test_axes_hold_most_of_the_squares_and_repeat_to_the_bit():
+    generator = torch.Generator().manual_seed(0)
+    spread = torch.logspace(0, -3, 20)
+    books = [torch.randn(50, 20, generator=generator) * spread for _ in range(3)]
+    axes = principal_axes(books, 4)
+    exact = torch.linalg.svd(torch.cat(books), full_matrices=False).Vh[:4].T
+    assert torch.allclose(axes.T @ axes, torch.eye(4), atol=1e-5)
+    assert torch.allclose(axes @ axes.T, exact @ exact.T, atol=1e-3)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(3)
+    again = principal_axes(books, 4)
+    torch.set_num_threads(threads)
+    assert torch.equal(axes, again)
+
+
+def test_random_projections_keep_lengths_in_the_mean():
+    rows = torch.randn(200, 64, generator=torch.Generator().manual_seed(1))
+    kept = (rows @ random_axes(64, 500, seed=0)).square().sum() / rows.square().sum()
+    assert float(kept) == pytest.approx(1.0, abs=0.05)
+
+
+def test_blocks_cover_all_channels_once():
+    for channels in (1, BLOCK, BLOCK + 1, 3 * BLOCK):
+        covered = [c for part in blocks(channels) for c in range(part.begin, part.end)]
+        assert covered == list(range(channels))
+
+
+def test_unseen_splats_stay_zero():
+    scene = SmallScene(5)
+    hidden = np.flatnonzero(scene.seen)[0]
+    scene.seen[hidden] = False
+    scene.closed_form[~torch.from_numpy(scene.seen)] = 0
+    assert (refined(scene, damping=0.0).features[~torch.from_numpy(scene.seen)] == 0).all()
+
+
+def test_float16_features_that_grow_too_large_become_float32():
+    large = [with_codebook(seen, seen.codebook * 6e4) for seen in SmallScene(6).observations]
+    scene = SmallScene(6, observations=large)
+    made = refined(scene, torch.float16, damping=0.0)
+    assert torch.isfinite(made.features).all()
+    assert made.features.dtype == torch.float32
+
+
+def test_the_number_of_threads_changes_no_bit_of_a_refined_lift(tmp_path):
+    paths = write_scene(tmp_path, 7)
+    knobs = LiftSettings.of(cg_steps=5, damping=0.1, cg_basis=3, reference_channels=4)
+    runs = [lift(paths[0], paths[1], [paths[2]], knobs, threads=n) for n in (1, 2, 5)]
+    for other in runs[1:]:
+        assert torch.equal(runs[0].features, other.features)
+        assert runs[0].metadata.certificate == other.metadata.certificate
+
+
+def test_a_lift_takes_no_step_unless_asked(tmp_path):
+    paths = write_scene(tmp_path, 8)
+    said = []
+
+    def progress(stage: str, done: int, total: int, unit: str) -> None:
+        said.append((stage, done, total, unit))
+
+    plain = lift(paths[0], paths[1], [paths[2]], LiftSettings.of(), progress=progress)
+    assert "refinement" not in plain.metadata.certificate
+    assert not any(stage in ("refine", "rays") for stage, *_ in said)
+    steps = lift(paths[0], paths[1], [paths[2]], LiftSettings.of(cg_steps=3, damping=0.1), progress=progress)
+    told = steps.metadata.certificate["refinement"]
+    assert [word for word in said if word[0] == "refine"][-1] == ("refine", 3, 3, "steps")
+    assert told["residuals"][-1] < told["residuals"][0]
+    assert steps.metadata.certificate["residual"] < plain.metadata.certificate["residual"]
+    assert not torch.equal(steps.features, plain.features)
