@@ -73,7 +73,7 @@ class LiftSettings(BaseModel):
     certificate_rays: int = Field(10_000, ge=0, le=10_000_000, description="rays sampled for the certificate")
     seed: int = Field(0, ge=0, lt=2**31, description="of the certificate's sample and projections, and of strides")
     cg_steps: int = Field(0, ge=0, le=10_000, description="least-squares steps from the closed form on, 0 = none")
-    damping: float = Field(0.3, ge=0, le=1e6, description="mu, pulls least squares towards the closed form")
+    damping: float = Field(1.0, ge=0, le=1e6, description="mu, pulls least squares towards the closed form")
     cg_basis: int = Field(0, ge=0, le=65_536, description="principal feature directions refined, 0 = all channels")
     reference_channels: int = Field(
         0, ge=0, le=1_024, description="random projections in which the certificate finds L(x^), 0 = off"

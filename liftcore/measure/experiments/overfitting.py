@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 TITLE = "Least squares under wrong masks"
 SOURCE = "the closed form against the smallest |A X - B|^2 (paper, Sec. 3.2), several dampings"
 PACK = "features_hard"
-DAMPINGS = (0.0, 0.03, 0.3, 3.0)
+DAMPINGS = (0.0, 0.1, 0.3, 1.0)
 STEPS = 20
 COLUMNS = ("damping", "steps", "residual", "accuracy", "cosine", "miou")
 _SMALL = 1e-12
