@@ -8,7 +8,7 @@ SCENE ?=
 OUT ?= demo-output
 TORCH_PIP ?=
 
-.PHONY: demo test lint format serve bench setup clean
+.PHONY: demo test soak lint format serve bench setup clean
 
 demo: $(READY)  ## the whole job through the real service; SCENE=DIR takes a scene of your own
 	$(BIN)/splatlift demo --out "$(OUT)" $(if $(SCENE),--scene "$(SCENE)")
@@ -17,6 +17,9 @@ test: lint  ## everything that must hold
 	@if [ -d $(SHARED) ]; then echo "real scenes: found in $(SHARED)"; \
 	else echo "real scenes: no $(SHARED) here, so the tests on them are skipped"; fi
 	$(BIN)/python -m pytest -rs
+
+soak: $(READY)  ## the long proofs of docs/reliability.md: prints their figures, takes an hour or so
+	$(BIN)/python -m tests.crash.soak
 
 lint: $(READY)
 	$(BIN)/ruff check .

@@ -16,12 +16,22 @@ from pydantic import ValidationError
 from liftcore.errors import SplatliftError
 from service.app import assemble
 from service.errors import Misconfigured
+from service.jobs.streams import EventStreams
 from service.settings import ServiceSettings
 from service.store.store import Store
 
 
 class AnnouncingServer(uvicorn.Server):
-    """Says on stdout where it listens, once it does."""
+    """Says on stdout where it listens, once it does, and to streams that it ends, before it waits for their end."""
+
+    def __init__(self, config: uvicorn.Config, streams: EventStreams) -> None:
+        super().__init__(config)
+        self._streams = streams
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Stop in order."""
+        self._streams.close()
+        await super().shutdown(sockets)
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Start, then say so."""
@@ -96,13 +106,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         settings = parse(sys.argv[1:] if arguments is None else arguments)
         listener = bind(settings.host, settings.port)
-        store = Store.open(settings.data)
+        store = Store.open(settings.data, floor_bytes=settings.disk_floor_bytes)
     except SplatliftError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     try:
-        config = uvicorn.Config(assemble(settings, store), log_level="warning", server_header=False)
-        AnnouncingServer(config).run(sockets=[listener])
+        app = assemble(settings, store)
+        config = uvicorn.Config(app, log_level="warning", server_header=False)
+        AnnouncingServer(config, app.state.streams).run(sockets=[listener])
     finally:
         store.close()
         listener.close()

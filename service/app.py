@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
@@ -10,27 +11,36 @@ from fastapi import FastAPI
 
 from liftcore import __version__
 from service import problems
+from service.jobs.limits import LiftLimits
+from service.jobs.streams import EventStreams
 from service.jobs.supervisor import Supervisor
 from service.limits import BodyLimit
 from service.parts import Parts
 from service.queries.warm import QueryLimits, WarmWorker
 from service.routes import assets, jobs, lifts, operations, queries
 from service.settings import ServiceSettings
+from service.store.garbage import Collector
 from service.store.store import Store
 
 
 def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, worker: WarmWorker) -> FastAPI:
     """The application. It starts and stops the runner and the worker; the store is its caller's to close."""
 
+    streams = EventStreams(settings.max_streams)
+    collector = Collector(store, every_seconds=settings.garbage_seconds, grace_seconds=settings.garbage_grace_seconds)
+
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         checks = anyio.CapacityLimiter(settings.parallel_checks)
-        app.state.parts = Parts(settings, store, runner, worker, checks)
+        app.state.parts = Parts(settings, store, runner, worker, streams, checks)
         await anyio.to_thread.run_sync(worker.start)
         await anyio.to_thread.run_sync(runner.start)
+        collector.start()
         try:
             yield
         finally:
+            streams.close()
+            await anyio.to_thread.run_sync(collector.stop)
             await anyio.to_thread.run_sync(runner.stop)
             await anyio.to_thread.run_sync(worker.stop)
 
@@ -41,6 +51,7 @@ def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, work
         lifespan=lifespan,
         responses=problems.RESPONSES,
     )
+    app.state.streams = streams
     app.add_middleware(BodyLimit, limit=settings.max_body_bytes)
     problems.install(app)
     for module in (operations, assets, jobs, lifts, queries):
@@ -57,4 +68,17 @@ def assemble(settings: ServiceSettings, store: Store) -> FastAPI:
         answers=settings.query_answers,
         encoder=settings.encoder,
     )
-    return create_app(settings, store, Supervisor(store, threads=settings.lift_threads), WarmWorker(limits))
+    return create_app(settings, store, Supervisor(store, lift_limits(settings)), WarmWorker(limits))
+
+
+def lift_limits(settings: ServiceSettings) -> LiftLimits:
+    """What the settings allow a lift."""
+    cores = len(os.sched_getaffinity(0))
+    return LiftLimits(
+        parallel=settings.parallel_lifts,
+        threads=settings.lift_threads or max(1, cores // settings.parallel_lifts),
+        seconds=settings.lift_seconds,
+        memory_bytes=settings.lift_memory_bytes,
+        lease_seconds=settings.lease_seconds,
+        checkpoint_seconds=settings.checkpoint_seconds,
+    )

@@ -9,7 +9,11 @@ SplatliftError
     ├── TooLarge             more bytes than the operator allows               413
     ├── RangeNotSatisfiable  a Range beyond the end of the content             416
     ├── InUse                an asset that a job or a lift needs               409
-    ├── Busy                 too many queries are waiting                      503 + Retry-After
+    ├── Conflict             a job whose state does not allow that             409
+    ├── KeyReused            an Idempotency-Key that came with another order   422
+    ├── OverLimit            a lift beyond the operator's time or memory       422
+    ├── NoSpace              less free disk than the operator wants to keep    507
+    ├── Busy                 too many queries or jobs are waiting              503 + Retry-After
     ├── TimedOut             a query that took longer than the operator allows 504
     ├── Crashed              a process of ours died without an answer          500
     └── Misconfigured        the operator's settings or data directory         (start-up only)
@@ -72,10 +76,38 @@ class InUse(ServiceError):
     kind = "in-use"
 
 
+class Conflict(ServiceError):
+    """A job whose state does not allow what was asked."""
+
+    kind = "conflict"
+
+
+class KeyReused(ServiceError):
+    """An Idempotency-Key that came with another order before."""
+
+    kind = "key-reused"
+
+
+class OverLimit(ServiceError):
+    """A lift that needs more time or memory than the operator allows."""
+
+    kind = "over-limit"
+
+
+class NoSpace(ServiceError):
+    """Less free disk than the operator wants to keep."""
+
+    kind = "no-space"
+
+
 class Busy(ServiceError):
     """The service has as much waiting work as it accepts."""
 
     kind = "busy"
+
+    def __init__(self, argument: str, *, expected: str, got: str, hint: str = "", retry_after: int = 2) -> None:
+        super().__init__(argument, expected=expected, got=got, hint=hint)
+        self.retry_after = retry_after  # seconds, told in Retry-After
 
 
 class TimedOut(ServiceError):

@@ -8,6 +8,7 @@ from typing import Annotated
 import anyio
 from fastapi import Depends, Request
 
+from service.jobs.streams import EventStreams
 from service.jobs.supervisor import Supervisor
 from service.queries.warm import WarmWorker
 from service.settings import ServiceSettings
@@ -22,6 +23,7 @@ class Parts:
     store: Store
     runner: Supervisor
     queries: WarmWorker
+    streams: EventStreams
     checks: anyio.CapacityLimiter  # uploads that are validated at the same time
 
 

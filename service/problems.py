@@ -21,7 +21,7 @@ from service import errors
 from service.wire import Problem
 
 MEDIA_TYPE = "application/problem+json"
-RETRY_AFTER_SECONDS = 2
+NO_SPACE = "There is no room left"
 
 # Exception -> status and title. The nearest class in the exception's ancestry counts; `type` is its `kind`.
 TABLE: dict[type[SplatliftError], tuple[int, str]] = {
@@ -42,6 +42,10 @@ TABLE: dict[type[SplatliftError], tuple[int, str]] = {
     errors.TooLarge: (413, "The body is too large"),
     errors.RangeNotSatisfiable: (416, "The range is beyond the end"),
     errors.InUse: (409, "The asset is in use"),
+    errors.Conflict: (409, "The job's state does not allow that"),
+    errors.KeyReused: (422, "The key belongs to another order"),
+    errors.OverLimit: (422, "The lift needs more than the server allows"),
+    errors.NoSpace: (507, NO_SPACE),
     errors.Busy: (503, "The server is busy"),
     errors.TimedOut: (504, "The query took too long"),
     errors.Crashed: (500, "A process of the server died"),
@@ -103,7 +107,7 @@ def _on_known(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, SplatliftError)
     headers: dict[str, str] = {}
     if isinstance(error, errors.Busy):
-        headers["Retry-After"] = str(RETRY_AFTER_SECONDS)
+        headers["Retry-After"] = str(error.retry_after)
     if isinstance(error, errors.RangeNotSatisfiable):
         headers["Content-Range"] = f"bytes */{error.size}"
     return answer(problem_of(error), headers)
@@ -143,7 +147,7 @@ def _on_system(request: Request, error: Exception) -> JSONResponse:
         return _on_unexpected(request, error)
     log.error("%s %s: the disk is full", request.method, request.url.path)
     detail = "The server's disk is full; what was sent is not kept."
-    return answer(Problem(type="/problems/no-space", title="There is no room left", status=507, detail=detail))
+    return answer(Problem(type="/problems/no-space", title=NO_SPACE, status=507, detail=detail))
 
 
 def _on_unexpected(request: Request, error: Exception) -> JSONResponse:

@@ -33,7 +33,26 @@ class ServiceSettings(BaseSettings):
         8 * GiB, gt=0, description="private memory that the validation of one upload may take (Linux)"
     )
 
-    lift_threads: int | None = Field(None, ge=1, description="threads of a lift; empty = as many as there are cores")
+    disk_floor_bytes: int = Field(
+        256 * MiB, ge=0, description="free disk that uploads and jobs must leave; else they are answered 507"
+    )
+    garbage_seconds: float = Field(3600, gt=0, description="time between collections of garbage; one is at start-up")
+    garbage_grace_seconds: float = Field(3600, ge=0, description="how long a file without an owner is left alone")
+
+    lift_threads: int | None = Field(
+        None, ge=1, description="threads of a lift; not set = the cores shared out among the parallel lifts"
+    )
+    parallel_lifts: int = Field(1, ge=1, le=64, description="lifts that run at the same time")
+    max_queued: int = Field(100, ge=1, description="jobs that may wait in line; more are answered 503")
+    lift_seconds: float = Field(86_400, gt=0, description="wall time that one attempt at a lift may take")
+    lift_memory_bytes: int | None = Field(
+        None, ge=1, description="private memory of a lift's process (Linux); not set = no limit"
+    )
+    lease_seconds: float = Field(
+        30, ge=3, description="silence after which a lift's process is given up and its job goes back in line"
+    )
+    checkpoint_seconds: float = Field(2, ge=0, description="work that a killed lift may have to do again")
+    max_streams: int = Field(32, ge=1, description="clients that may follow events at the same time; more get 503")
 
     encoder: str = Field(
         "minilm",

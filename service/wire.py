@@ -28,8 +28,13 @@ class JobState(StrEnum):
 
     QUEUED = "queued"
     RUNNING = "running"
+    CANCELING = "canceling"  # asked for, and not yet true
     SUCCEEDED = "succeeded"
     FAILED = "failed"
+    CANCELED = "canceled"
+
+
+ENDED = frozenset({JobState.SUCCEEDED, JobState.FAILED, JobState.CANCELED})
 
 
 class Problem(BaseModel):
@@ -109,6 +114,21 @@ class Jobs(BaseModel):
     """All jobs, newest first."""
 
     jobs: list[Job]
+
+
+class JobStep(BaseModel):
+    """The data of a ``state`` event: where a job came to be."""
+
+    state: JobState
+    attempt: int
+    problem: Problem | None
+
+
+class LogLine(BaseModel):
+    """The data of a ``log`` event."""
+
+    line: str
+    time: float = Field(description="seconds since 1970")
 
 
 class Lift(BaseModel):

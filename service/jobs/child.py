@@ -1,12 +1,14 @@
-"""The process of one job: reads its order from stdin, lifts, and says how it goes in JSON lines on stdout.
+"""The process of one job: reads its order, lifts, and says how it goes in JSON lines on stdout.
 
-Run as ``python -m service.jobs.child``. Messages are ``{"event": "progress", ...}``, any number of times,
-then one ``{"event": "done", ...}`` or ``{"event": "fault", "fault": {...}}``. It writes nothing but its
-draft, so whatever ends it leaves nothing behind.
+Run as ``python -m service.jobs.child ORDER``, with a JSON file. Messages are ``{"event": "progress", ...}`` and
+``{"event": "beat"}``, any number of times, then one ``{"event": "done", ...}`` or ``{"event": "fault", ...}``. It
+writes nothing but its draft and its checkpoint, so whatever ends it leaves no half a result behind. It ends by
+itself when its stdin closes.
 """
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
@@ -19,10 +21,14 @@ from typing import Any, BinaryIO
 from liftcore.artifact import save_lift
 from liftcore.errors import SplatliftError
 from liftcore.lift import lift
+from liftcore.solve.checkpoint import Checkpoint
 from liftcore.solve.settings import LiftSettings
+from service.errors import OverLimit
 from service.faults import fault_of
 
 NICENESS = 5  # queries come first
+FIRST_TO_GO = 500  # when the machine runs out of memory, this process is ended rather than the server
+SECONDS_BETWEEN_BEATS = 1.0
 SECONDS_BETWEEN_WORDS = 0.25
 
 
@@ -33,6 +39,7 @@ class Reporter:
         self._out = out
         self._stage = ""
         self._last = 0.0
+        self._turn = threading.Lock()  # one message at a time
 
     def __call__(self, stage: str, done: int, total: int, unit: str) -> None:
         """Say how far the work is (`liftcore.progress.Progress`)."""
@@ -44,8 +51,15 @@ class Reporter:
 
     def say(self, message: dict[str, Any]) -> None:
         """Write one message."""
-        self._out.write(json.dumps(message).encode() + b"\n")
-        self._out.flush()
+        with self._turn:
+            self._out.write(json.dumps(message).encode() + b"\n")
+            self._out.flush()
+
+    def beat(self) -> None:
+        """Say for ever that this process is alive."""
+        while True:
+            self.say({"event": "beat"})
+            time.sleep(SECONDS_BETWEEN_BEATS)
 
 
 def run(order: dict[str, Any], report: Reporter) -> dict[str, Any]:
@@ -62,11 +76,15 @@ def run(order: dict[str, Any], report: Reporter) -> dict[str, Any]:
             LiftSettings.of(**order["settings"]),
             threads=order["threads"],
             progress=report,
+            checkpoint=Checkpoint(Path(order["work"]), order["checkpoint_seconds"]),
         )
         output = Path(order["output"])
         save_lift(made, output)
     except SplatliftError as error:
         return {"event": "fault", "fault": fault_of(error, order["names"])}
+    except MemoryError:
+        error = OverLimit("lift", expected="a lift that fits this machine's memory", got="one that needs more")
+        return {"event": "fault", "fault": fault_of(error)}
     return {
         "event": "done",
         "sha256": _sha256(output),
@@ -89,25 +107,17 @@ def _end_with_parent(stdin: BinaryIO) -> None:
 
 def main() -> None:
     """Run one job."""
-    os.nice(NICENESS)
     # Libraries may print; the pipe is for messages only.
     out = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     stdin = os.fdopen(os.dup(0), "rb", buffering=0)
-    order = json.loads(_line(stdin))
     threading.Thread(target=_end_with_parent, args=(stdin,), daemon=True).start()
     report = Reporter(out)
-    report.say(run(order, report))
-
-
-def _line(stdin: BinaryIO) -> bytes:
-    line = b""
-    while not line.endswith(b"\n"):
-        piece = stdin.read(65_536)
-        if not piece:
-            sys.exit(3)
-        line += piece
-    return line
+    threading.Thread(target=report.beat, daemon=True).start()
+    os.nice(NICENESS)
+    with contextlib.suppress(OSError):
+        Path("/proc/self/oom_score_adj").write_text(str(FIRST_TO_GO))
+    report.say(run(json.loads(Path(sys.argv[1]).read_bytes()), report))
 
 
 if __name__ == "__main__":

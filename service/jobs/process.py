@@ -1,77 +1,98 @@
-"""A child process of one job, as the supervisor holds it."""
+"""A child process of one job, as the thread that runs the job holds it."""
 
 from __future__ import annotations
 
 import contextlib
 import json
 import os
+import select
 import signal
 import subprocess
-import sys
-import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
-GRACE_SECONDS = 3.0
+PIECE = 1 << 16
+GONE_SECONDS = 3.0  # the kernel takes a moment to end a group
 
 
 class JobProcess:
-    """Started with an order, read for messages, and ended with its whole process group."""
+    """Started in a process group of its own, heard in JSON lines, and ended with its whole group.
 
-    def __init__(self, order: dict[str, Any], scratch: Path) -> None:
+    Its standard input is a lifeline: it closes when the server ends, however the server ends.
+    """
+
+    def __init__(self, command: Sequence[str], environment: Mapping[str, str]) -> None:
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "service.jobs.child"],
+            command,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             start_new_session=True,
-            env=os.environ | {"TMPDIR": str(scratch)},
+            env=os.environ | dict(environment),
         )
-        # The number of a group is ours only until its leader is reaped, so signals and the reaping exclude
-        # each other.
-        self._reaping = threading.Lock()
-        self._reaped = threading.Event()
-        assert self._process.stdin is not None
-        with contextlib.suppress(BrokenPipeError):  # it died at once; the missing messages tell
-            self._process.stdin.write(json.dumps(order).encode() + b"\n")
-            self._process.stdin.flush()
+        assert self._process.stdout is not None
+        self._pipe = self._process.stdout.fileno()
+        self._open = True
+        self._rest = b""
+        self._status: int | None = None
+        os.set_blocking(self._pipe, False)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.end()
 
     @property
     def pid(self) -> int:
         """The child's process id, which is also its group's."""
         return self._process.pid
 
-    def messages(self) -> Iterator[dict[str, Any]]:
-        """What the child says, until it closes its end."""
-        assert self._process.stdout is not None
-        for line in self._process.stdout:
-            if line.endswith(b"\n"):  # a half line is what a killed writer leaves
-                yield json.loads(line)
+    def listen(self, seconds: float) -> list[dict[str, Any]]:
+        """What the child says; returns at its first words, at its end, or after so many seconds."""
+        if not self._open:
+            time.sleep(seconds)
+            return []
+        if not select.select([self._pipe], [], [], seconds)[0]:
+            return []
+        with contextlib.suppress(BlockingIOError):
+            while piece := os.read(self._pipe, PIECE):
+                self._rest += piece
+            self._open = False
+        *lines, self._rest = self._rest.split(b"\n")  # a half line at the end is what a killed writer leaves
+        return [json.loads(line) for line in lines]
 
-    def wait(self) -> int:
-        """The exit status; negative for the signal that ended it. Nothing of the group is left after this."""
-        os.waitid(os.P_PID, self._process.pid, os.WEXITED | os.WNOWAIT)
-        with self._reaping:
-            os.killpg(self._process.pid, signal.SIGKILL)  # what the child itself may have started
-            status = self._process.wait()
-            self._reaped.set()
-        for pipe in (self._process.stdin, self._process.stdout):
-            assert pipe is not None
-            with contextlib.suppress(BrokenPipeError):  # an order that was never read
+    def ended(self) -> bool:
+        """Whether the child itself has ended."""
+        return os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOWAIT | os.WNOHANG) is not None
+
+    def private_bytes(self) -> int:
+        """Memory that is the child's own: mapped files, however large, do not count. 0 where Linux does not tell."""
+        with contextlib.suppress(OSError):
+            for line in Path(f"/proc/{self.pid}/status").read_text().splitlines():
+                if line.startswith("RssAnon:"):
+                    return int(line.split()[1]) << 10
+        return 0
+
+    def end(self) -> int:
+        """End the whole group at once; the child's exit status, negative for a signal. No process is left after this.
+
+        The child writes drafts and checkpoints only, and those are whole or absent, so nothing is lost by haste.
+        """
+        if self._status is None:
+            # The leader is not reaped yet, so the number of the group is still ours.
+            os.killpg(self.pid, signal.SIGKILL)
+            self._status = self._process.wait()
+            self._await_group()
+            for pipe in (self._process.stdin, self._process.stdout):
+                assert pipe is not None
                 pipe.close()
-        return status
+        return self._status
 
-    def stop(self) -> None:
-        """End the process group: politely, then not. Another thread waits for the end."""
-        self._signal(signal.SIGTERM)
-        if not self._reaped.wait(GRACE_SECONDS):
-            self._signal(signal.SIGKILL)
-
-    def kill(self) -> None:
-        """End the process group at once."""
-        self._signal(signal.SIGKILL)
-
-    def _signal(self, number: signal.Signals) -> None:
-        with self._reaping:
-            if not self._reaped.is_set():
-                os.killpg(self._process.pid, number)
+    def _await_group(self) -> None:
+        deadline = time.monotonic() + GONE_SECONDS
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            while time.monotonic() < deadline:
+                os.killpg(self.pid, 0)
+                time.sleep(0.005)

@@ -47,9 +47,10 @@ RAW_BODY = {
 async def upload(kind: wire.AssetKind, request: Request, here: Here, sha256: Sha256 = None) -> Response:
     """Upload splats (PLY), cameras (JSON or a zip of a COLMAP model) or a feature pack (safetensors)."""
     gzip = gzipped(request.headers.get("content-encoding", ""))
+    here.store.files.require_room()
     async with _workspace(here.store.files, kind) as (draft, scratch):
         with Intake(draft, limit=here.settings.max_upload_bytes(kind), gzip=gzip) as intake:
-            await _receive(request, intake)
+            await _receive(request, intake, here.store.files)
             digest = intake.finish()
         if sha256 is not None and digest != sha256.lower():
             raise DigestMismatch("sha256", expected=sha256, got=digest, hint="upload the file again")
@@ -74,11 +75,12 @@ async def _workspace(files: DataDirectory, kind: wire.AssetKind) -> AsyncIterato
             await anyio.to_thread.run_sync(stack.close)
 
 
-async def _receive(request: Request, intake: Intake) -> None:
+async def _receive(request: Request, intake: Intake, files: DataDirectory) -> None:
     batch = bytearray()
     async for chunk in request.stream():
         batch += chunk
         if len(batch) >= BATCH:
+            files.require_room(len(batch))
             await anyio.to_thread.run_sync(intake.feed, bytes(batch))
             batch.clear()
     await anyio.to_thread.run_sync(intake.feed, bytes(batch))

@@ -2,32 +2,68 @@
 
 from __future__ import annotations
 
-from fastapi import APIRouter, Response
+from functools import partial
+from typing import Annotated, Any
+
+import anyio
+from fastapi import APIRouter, Header, Query, Response
+from fastapi.responses import JSONResponse
 
 from liftcore.errors import InvalidSettings
 from liftcore.solve.settings import LiftSettings
 from service import wire
 from service.faults import error_of
 from service.jobs.fit import check_fit
-from service.parts import Here
+from service.parts import Here, Parts
 from service.problems import problem_of
-from service.store.jobs import JobRecord
+from service.store.events import Event, EventKind
+from service.store.jobs import JobOrder, JobRecord, fingerprint
 
 router = APIRouter(tags=["jobs"])
 
+Key = Annotated[
+    str | None,
+    Header(
+        alias="Idempotency-Key", min_length=1, max_length=255, pattern=r"^[\x20-\x7e]+$",
+        description="chosen by the client; the same order with the same key is the same job",
+    ),
+]  # fmt: skip
+LastEvent = Annotated[
+    int, Header(alias="Last-Event-ID", ge=0, le=2**53, description="the last event that the client has")
+]
+EVENTS: dict[int | str, dict[str, Any]] = {
+    200: {
+        "description": "Server-sent events: state, progress and log, each with an id and JSON data",
+        "content": {"text/event-stream": {"schema": {"type": "string"}}},
+    },
+    204: {"description": "The job has ended, and the client has its last event"},
+}
 
-@router.post("/lift", response_model=wire.Job, status_code=202)
-def submit(order: wire.LiftRequest, response: Response, here: Here) -> wire.Job:
+
+@router.post(
+    "/lift",
+    response_model=wire.Job,
+    status_code=202,
+    responses={200: {"model": wire.Job, "description": "The job that the same key made before"}},
+)
+def submit(order: wire.LiftRequest, here: Here, key: Key = None) -> Response:
     """Lift features onto splats. The job is on the disk before this answers."""
     settings = parse_settings(order.settings)
-    cameras = here.store.assets.get(order.cameras, wire.AssetKind.CAMERAS)
-    packs = [here.store.assets.get(pack, wire.AssetKind.FEATURES) for pack in order.features]
-    here.store.assets.get(order.splats, wire.AssetKind.SPLATS)
-    check_fit(cameras, packs)
-    job = here.store.jobs.submit(order.splats, order.cameras, order.features, settings.model_dump(mode="json"))
-    here.runner.wake()
-    response.headers["Location"] = f"/jobs/{job}"
-    return shape(here.store.jobs.get(job))
+    wanted = JobOrder(
+        splats=order.splats,
+        cameras=order.cameras,
+        features=tuple(order.features),
+        settings=settings.model_dump(mode="json"),
+        key=key,
+        fingerprint=None if key is None else fingerprint(order.model_dump(mode="json")),
+    )
+    job, new = here.store.jobs.repeated(wanted), False
+    if job is None:
+        require_fit(wanted, here)
+        job, new = here.store.jobs.submit(wanted, max_queued=here.settings.max_queued)
+        here.runner.wake()
+    shaped = shape(here.store.jobs.get(job)).model_dump(mode="json")
+    return JSONResponse(shaped, 202 if new else 200, headers={"Location": f"/jobs/{job}"})
 
 
 @router.get("/jobs", response_model=wire.Jobs)
@@ -40,6 +76,49 @@ def list_jobs(here: Here) -> wire.Jobs:
 def get_job(job: str, here: Here) -> wire.Job:
     """One job: its state, its progress, and what came of it."""
     return shape(here.store.jobs.get(job))
+
+
+@router.get("/jobs/{job}/events", response_class=Response, responses=EVENTS)
+async def follow_job(job: str, here: Here, last_event: LastEvent = 0) -> Response:
+    """What happens to a job, as it happens: its states, latest progress and log. Ends after the last state."""
+    look = partial(here.store.events.after, job)
+    state = await anyio.to_thread.run_sync(here.store.attempts.state, job)
+    if not await anyio.to_thread.run_sync(look, last_event) and state in wire.ENDED:
+        return Response(status_code=204)
+    return here.streams.answer(look, event_data, last_event)
+
+
+@router.post(
+    "/jobs/{job}/cancel",
+    response_model=wire.Job,
+    status_code=202,
+    responses={200: {"model": wire.Job, "description": "It is canceled, and nothing of it runs any more"}},
+)
+def cancel_job(job: str, here: Here) -> Response:
+    """End a job. It is ``canceling`` until its processes are gone, then ``canceled``; asking twice does no harm."""
+    here.store.attempts.cancel(job)
+    found = here.store.jobs.get(job)
+    status = 200 if found.state is wire.JobState.CANCELED else 202
+    return JSONResponse(shape(found).model_dump(mode="json"), status, headers={"Location": f"/jobs/{job}"})
+
+
+@router.delete("/jobs/{job}", status_code=204)
+def delete_job(
+    job: str,
+    here: Here,
+    with_lift: Annotated[bool, Query(description="its lift goes too; without this a job with a lift stays")] = False,
+) -> None:
+    """Forget a job that has ended."""
+    here.store.jobs.delete(job, with_lift=with_lift)
+
+
+def require_fit(order: JobOrder, here: Parts) -> None:
+    """Refuse an order that cannot become a lift, or that there is no room for."""
+    cameras = here.store.assets.get(order.cameras, wire.AssetKind.CAMERAS)
+    packs = [here.store.assets.get(pack, wire.AssetKind.FEATURES) for pack in order.features]
+    here.store.assets.get(order.splats, wire.AssetKind.SPLATS)
+    check_fit(cameras, packs)
+    here.store.files.require_room()
 
 
 def parse_settings(given: dict[str, wire.Scalar]) -> LiftSettings:
@@ -55,9 +134,22 @@ def parse_settings(given: dict[str, wire.Scalar]) -> LiftSettings:
     return LiftSettings.of(**given)
 
 
+def event_data(event: Event) -> str:
+    """An event's data as the wire has it."""
+    if event.kind is EventKind.PROGRESS:
+        return wire.Progress.model_validate(event.data).model_dump_json()
+    if event.kind is EventKind.LOG:
+        return wire.LogLine.model_validate(event.data).model_dump_json()
+    problem = event.data["problem"]
+    told = None if problem is None else problem_of(error_of(problem))
+    return wire.JobStep(state=event.data["state"], attempt=event.data["attempt"], problem=told).model_dump_json()
+
+
 def shape(job: JobRecord) -> wire.Job:
     """A job as the wire has it."""
-    links = {"self": f"/jobs/{job.id}"}
+    links = {"self": f"/jobs/{job.id}", "events": f"/jobs/{job.id}/events"}
+    if job.state not in wire.ENDED:
+        links["cancel"] = f"/jobs/{job.id}/cancel"
     if job.state is wire.JobState.SUCCEEDED:
         links |= {"lift": f"/lifts/{job.id}", "features": f"/lifts/{job.id}/features"}
     return wire.Job(

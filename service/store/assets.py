@@ -130,6 +130,25 @@ class AssetStore:
             # After the commit: a crash here leaves bytes that nobody knows of, never an asset without bytes.
             found.path.unlink(missing_ok=True)
 
+    def collect(self, older_than: float) -> list[Path]:
+        """Remove bytes that no asset has: what a crash between a blob and its row left.
+
+        Args:
+            older_than: seconds since 1970; younger files stay.
+
+        Returns:
+            What was removed.
+        """
+        removed = []
+        with self._blobs:  # so no upload is between its blob and its row
+            with self._database.read() as connection:
+                known = {row["file"] for row in connection.execute("SELECT file FROM assets")}
+            for path in (self._files.root / "blobs").glob("*/*"):
+                if self._files.relative(path) not in known and path.stat().st_mtime < older_than:
+                    path.unlink()
+                    removed.append(path)
+        return removed
+
     def _record(self, row: sqlite3.Row) -> AssetRecord:
         return AssetRecord(
             id=row["id"],

@@ -1,4 +1,4 @@
-"""The database: one connection that writes, a few that read, and the schema."""
+"""The database: one connection that writes, and a few that read."""
 
 from __future__ import annotations
 
@@ -10,54 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from service.errors import Misconfigured
-
-SCHEMA_VERSION = 1
-SCHEMA = """
-CREATE TABLE assets (
-    id TEXT PRIMARY KEY,            -- sha256:...
-    kind TEXT NOT NULL,             -- splats, cameras, features
-    bytes INTEGER NOT NULL,
-    file TEXT NOT NULL,             -- path below the data directory
-    counts TEXT NOT NULL,           -- JSON
-    warnings TEXT NOT NULL,         -- JSON
-    created REAL NOT NULL
-) STRICT;
-
-CREATE TABLE jobs (
-    id TEXT PRIMARY KEY,
-    state TEXT NOT NULL,            -- queued, running, succeeded, failed
-    attempt INTEGER NOT NULL DEFAULT 0,
-    released INTEGER NOT NULL DEFAULT 0,  -- attempts that ended with an orderly stop of the server
-    splats TEXT NOT NULL REFERENCES assets (id),
-    cameras TEXT NOT NULL REFERENCES assets (id),
-    settings TEXT NOT NULL,         -- JSON
-    progress TEXT,                  -- JSON
-    problem TEXT,                   -- JSON: kind, argument, expected, got, hint
-    created REAL NOT NULL,
-    started REAL,
-    ended REAL
-) STRICT;
-CREATE INDEX jobs_in_line ON jobs (state, created);
-
-CREATE TABLE job_features (
-    job TEXT NOT NULL REFERENCES jobs (id) ON DELETE CASCADE,
-    place INTEGER NOT NULL,
-    asset TEXT NOT NULL REFERENCES assets (id),
-    PRIMARY KEY (job, place)
-) STRICT;
-CREATE INDEX job_features_of_asset ON job_features (asset);
-
-CREATE TABLE lifts (
-    id TEXT PRIMARY KEY REFERENCES jobs (id),
-    bytes INTEGER NOT NULL,
-    sha256 TEXT NOT NULL,
-    file TEXT NOT NULL,             -- path below the data directory
-    count INTEGER NOT NULL,
-    channels INTEGER NOT NULL,
-    metadata TEXT NOT NULL,         -- JSON, as in the lift file
-    created REAL NOT NULL
-) STRICT;
-"""
+from service.store.schema import MIGRATIONS
 
 
 class Database:
@@ -68,7 +21,11 @@ class Database:
         self._write_lock = threading.Lock()
         self._idle: queue.LifoQueue[sqlite3.Connection] = queue.LifoQueue()
         self._writer = self._connect()
-        self._migrate()
+        try:
+            self._migrate()
+        except BaseException:
+            self._writer.close()
+            raise
 
     def _connect(self) -> sqlite3.Connection:
         connection = sqlite3.connect(self._path, isolation_level=None, check_same_thread=False, timeout=30)
@@ -79,14 +36,17 @@ class Database:
         return connection
 
     def _migrate(self) -> None:
-        version = self._writer.execute("PRAGMA user_version").fetchone()[0]
-        if version == 0:
-            self._writer.executescript(f"BEGIN IMMEDIATE; {SCHEMA} PRAGMA user_version = {SCHEMA_VERSION}; COMMIT;")
-        elif version != SCHEMA_VERSION:
-            raise Misconfigured(
-                "data", expected=f"a database of schema version {SCHEMA_VERSION}", got=f"version {version}",
-                hint="use the release that wrote it, or another data directory",
-            )  # fmt: skip
+        with self.write() as connection:  # all steps or none
+            version = connection.execute("PRAGMA user_version").fetchone()[0]
+            if version > len(MIGRATIONS):
+                raise Misconfigured(
+                    "data", expected=f"a database of schema version {len(MIGRATIONS)} or less", got=f"{version}",
+                    hint="use the release that wrote it, or another data directory",
+                )  # fmt: skip
+            for step in MIGRATIONS[version:]:
+                for statement in _statements(step):
+                    connection.execute(statement)
+            connection.execute(f"PRAGMA user_version = {len(MIGRATIONS)}")
 
     @contextmanager
     def write(self) -> Iterator[sqlite3.Connection]:
@@ -118,3 +78,13 @@ class Database:
             self._writer.close()
         while not self._idle.empty():
             self._idle.get_nowait().close()
+
+
+def _statements(script: str) -> Iterator[str]:
+    """The statements of a script, one by one: `executescript` would commit before it begins."""
+    statement = ""
+    for line in script.splitlines(keepends=True):
+        statement += line
+        if sqlite3.complete_statement(statement):
+            yield statement
+            statement = ""

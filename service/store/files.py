@@ -6,23 +6,29 @@ import fcntl
 import os
 import secrets
 import shutil
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from service.errors import Misconfigured
+from service.errors import Misconfigured, NoSpace
 
 
 class DataDirectory:
     """One directory, held by one server at a time.
 
-    ``blobs/ab/abcd....ply`` are assets by digest, ``lifts/ID.safetensors`` lifts by job, ``tmp/`` drafts.
+    ``blobs/ab/abcd....ply`` are assets by digest, ``lifts/ID.safetensors`` lifts by job, ``work/ID/`` what a job
+    that was interrupted goes on from, ``tmp/`` drafts.
+
+    Args:
+        root: the directory; made when it is not there.
+        floor_bytes: free disk that new work must leave.
     """
 
-    def __init__(self, root: Path) -> None:
+    def __init__(self, root: Path, *, floor_bytes: int = 0) -> None:
         self.root = root.absolute()
-        for name in ("blobs", "lifts", "tmp"):
+        self._floor = floor_bytes
+        self._live: set[str] = set()  # names below tmp/ that are in use; adding and removing one is atomic
+        for name in ("blobs", "lifts", "work", "tmp"):
             (self.root / name).mkdir(parents=True, exist_ok=True)
         self._lock = (self.root / "lock").open("w")
         try:
@@ -41,17 +47,54 @@ class DataDirectory:
     def draft(self, suffix: str) -> Iterator[Path]:
         """A path to write to; what is still there when the block ends is removed."""
         path = self.root / "tmp" / f"{secrets.token_hex(16)}{suffix}"
+        self._live.add(path.name)
         try:
             yield path
         finally:
+            self._live.discard(path.name)
             for left in path.parent.glob(f"*{path.name}*"):  # with the drafts that writers keep beside it
                 left.unlink(missing_ok=True)
 
     @contextmanager
     def scratch(self) -> Iterator[Path]:
         """A folder for what a child process unpacks; nothing of it is left, however the child ends."""
-        with tempfile.TemporaryDirectory(dir=self.root / "tmp") as folder:
-            yield Path(folder)
+        folder = self.root / "tmp" / secrets.token_hex(16)
+        self._live.add(folder.name)
+        folder.mkdir(mode=0o700)
+        try:
+            yield folder
+        finally:
+            self._live.discard(folder.name)
+            shutil.rmtree(folder, ignore_errors=True)
+
+    def left_over(self) -> list[Path]:
+        """What lies below tmp/ and belongs to no draft and no scratch folder that is still open."""
+        live = set(self._live)
+        return [path for path in (self.root / "tmp").iterdir() if not any(name in path.name for name in live)]
+
+    def require_room(self, coming: int = 0) -> None:
+        """See that there is room for new work.
+
+        Args:
+            coming: bytes that are known to come.
+
+        Raises:
+            NoSpace: less than the floor would be left.
+        """
+        free = shutil.disk_usage(self.root).free
+        if free - coming < self._floor:
+            raise NoSpace(
+                "data", expected=f"{self._floor + coming} bytes of free disk", got=f"{free}",
+                hint="delete assets, or jobs with their lifts, or ask the operator for room",
+            )  # fmt: skip
+
+    def work(self, job: str) -> Path:
+        """The folder of what a job has done so far; its child makes it."""
+        return self.root / "work" / job
+
+    def forget_work(self, job: str) -> None:
+        """Remove that folder."""
+        shutil.rmtree(self.work(job), ignore_errors=True)
 
     def blob(self, digest: str, suffix: str) -> Path:
         """Where an asset of that digest lies."""

@@ -1,22 +1,35 @@
-"""Jobs: what was acknowledged, and how far it is."""
+"""Jobs: what was acknowledged, and what became of it."""
 
 from __future__ import annotations
 
+import hashlib
 import json
 import secrets
 import sqlite3
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from liftcore.errors import NotFound
-from service.errors import Crashed
-from service.faults import fault_of
+from service.errors import Busy, Conflict, KeyReused
 from service.store.database import Database
-from service.wire import AssetKind, JobState
+from service.store.events import EventKind, note
+from service.store.files import DataDirectory
+from service.wire import ENDED, AssetKind, JobState
 
-MAX_ATTEMPTS = 3
+QUEUE_RETRY_SECONDS = 30  # a lift takes seconds to minutes, and one must end before the line is shorter
+
+
+@dataclass(frozen=True)
+class JobOrder:
+    """What a client wants to have lifted."""
+
+    splats: str
+    cameras: str
+    features: tuple[str, ...]
+    settings: dict[str, Any] = field(default_factory=dict)  # all of them, with defaults filled in
+    key: str | None = None  # Idempotency-Key
+    fingerprint: str | None = None  # of the order as it was sent, with a key
 
 
 @dataclass(frozen=True)
@@ -35,36 +48,67 @@ class JobRecord:
     created: float
     started: float | None
     ended: float | None
+    leased_until: float | None
+
+
+def fingerprint(order: dict[str, Any]) -> str:
+    """The digest of an order, by which a repeated one is known."""
+    return hashlib.sha256(json.dumps(order, sort_keys=True).encode()).hexdigest()
 
 
 class JobStore:
-    """The queue of jobs and its history."""
+    """The line of jobs and their history. Attempts at them are in `service.store.attempts`."""
 
-    def __init__(self, database: Database) -> None:
+    def __init__(self, database: Database, files: DataDirectory) -> None:
         self._database = database
+        self._files = files
 
-    def submit(self, splats: str, cameras: str, features: Sequence[str], settings: Mapping[str, Any]) -> str:
+    def submit(self, order: JobOrder, *, max_queued: int = 1_000_000) -> tuple[str, bool]:
         """Put a job in line; it is on the disk when this returns.
+
+        Returns:
+            The id, and whether the job is new: an order with the key of an earlier one is that one.
 
         Raises:
             NotFound: an asset was deleted meanwhile.
+            Busy: there are ``max_queued`` jobs in line.
+            KeyReused: the key came with another order before.
         """
         job = secrets.token_hex(16)
         with self._database.write() as connection:
-            wanted = [(splats, AssetKind.SPLATS), (cameras, AssetKind.CAMERAS)]
-            wanted += [(asset, AssetKind.FEATURES) for asset in features]
-            for asset, kind in wanted:
-                if not connection.execute("SELECT 1 FROM assets WHERE id = ? AND kind = ?", (asset, kind)).fetchone():
-                    raise NotFound(kind, expected=f"the id of an asset of kind {kind}", got=asset)
+            known = _of_key(connection, order)
+            if known is not None:
+                return known, False
+            _require_place(connection, max_queued)
+            _require_assets(connection, order)
             connection.execute(
-                "INSERT INTO jobs (id, state, splats, cameras, settings, created) VALUES (?, 'queued', ?, ?, ?, ?)",
-                (job, splats, cameras, json.dumps(settings), time.time()),
+                "INSERT INTO jobs (id, state, splats, cameras, settings, created, idempotency_key, fingerprint)"
+                " VALUES (?, 'queued', ?, ?, ?, ?, ?, ?)",
+                (
+                    job,
+                    order.splats,
+                    order.cameras,
+                    json.dumps(order.settings),
+                    time.time(),
+                    order.key,
+                    order.fingerprint,
+                ),
             )
             connection.executemany(
                 "INSERT INTO job_features (job, place, asset) VALUES (?, ?, ?)",
-                [(job, place, asset) for place, asset in enumerate(features)],
+                [(job, place, asset) for place, asset in enumerate(order.features)],
             )
-        return job
+            note(connection, job, EventKind.STATE, {"state": JobState.QUEUED, "attempt": 0, "problem": None})
+        return job, True
+
+    def repeated(self, order: JobOrder) -> str | None:
+        """The job that an earlier order with this key made, None when the key is new or there is none.
+
+        Raises:
+            KeyReused: the key came with another order before.
+        """
+        with self._database.read() as connection:
+            return _of_key(connection, order)
 
     def get(self, job: str) -> JobRecord:
         """The job of that id.
@@ -76,67 +120,44 @@ class JobStore:
             row = connection.execute("SELECT * FROM jobs WHERE id = ?", (job,)).fetchone()
             if row is None:
                 raise NotFound("job", expected="the id of a job", got=job)
-            return _record(connection, row)
+            return record(connection, row)
 
     def all(self) -> list[JobRecord]:
         """Every job, newest first."""
         with self._database.read() as connection:
             rows = connection.execute("SELECT * FROM jobs ORDER BY created DESC, id").fetchall()
-            return [_record(connection, row) for row in rows]
+            return [record(connection, row) for row in rows]
 
-    def claim(self) -> JobRecord | None:
-        """Take the oldest queued job and make it running, as a new attempt."""
+    def delete(self, job: str, *, with_lift: bool) -> None:
+        """Forget a job that has ended, its events and its lift.
+
+        Raises:
+            NotFound: there is none.
+            Conflict: it has not ended, or it has a lift that was not given up.
+        """
         with self._database.write() as connection:
-            row = connection.execute(
-                "UPDATE jobs SET state = 'running', attempt = attempt + 1, started = ?, progress = NULL"
-                " WHERE id = (SELECT id FROM jobs WHERE state = 'queued' ORDER BY created, id LIMIT 1)"
-                " RETURNING *",
-                (time.time(),),
-            ).fetchone()
-            return None if row is None else _record(connection, row)
-
-    def advance(self, job: str, attempt: int, progress: Mapping[str, Any]) -> None:
-        """Note how far an attempt is; a note from an older attempt is dropped."""
-        with self._database.write() as connection:
-            connection.execute(
-                "UPDATE jobs SET progress = ? WHERE id = ? AND attempt = ? AND state = 'running'",
-                (json.dumps(progress), job, attempt),
-            )
-
-    def fail(self, job: str, attempt: int, error: Mapping[str, str]) -> None:
-        """End an attempt with a problem."""
-        with self._database.write() as connection:
-            connection.execute(
-                "UPDATE jobs SET state = 'failed', problem = ?, ended = ?"
-                " WHERE id = ? AND attempt = ? AND state = 'running'",
-                (json.dumps(error), time.time(), job, attempt),
-            )
-
-    def release(self, job: str, attempt: int) -> None:
-        """Put an attempt that an orderly stop interrupted back in line; it does not count as a failure."""
-        with self._database.write() as connection:
-            connection.execute(
-                "UPDATE jobs SET state = 'queued', released = released + 1, progress = NULL"
-                " WHERE id = ? AND attempt = ? AND state = 'running'",
-                (job, attempt),
-            )
-
-    def requeue_orphans(self) -> None:
-        """At start-up: what a dead server left running goes back in line, or fails after its last attempt."""
-        ended = Crashed(
-            "job", expected="an attempt that ends", got=f"a server that died in all {MAX_ATTEMPTS} attempts",
-            hint="look at the server's memory and log, then POST /lift again",
-        )  # fmt: skip
-        with self._database.write() as connection:
-            connection.execute(
-                "UPDATE jobs SET state = 'failed', problem = ?, ended = ?"
-                " WHERE state = 'running' AND attempt - released >= ?",
-                (json.dumps(fault_of(ended)), time.time(), MAX_ATTEMPTS),
-            )
-            connection.execute("UPDATE jobs SET state = 'queued', progress = NULL WHERE state = 'running'")
+            row = connection.execute("SELECT state FROM jobs WHERE id = ?", (job,)).fetchone()
+            if row is None:
+                raise NotFound("job", expected="the id of a job", got=job)
+            if row["state"] not in ENDED:
+                raise Conflict(
+                    "job", expected="a job that has ended", got=f"one that is {row['state']}",
+                    hint=f"POST /jobs/{job}/cancel first",
+                )  # fmt: skip
+            lift = connection.execute("DELETE FROM lifts WHERE id = ? RETURNING file", (job,)).fetchall()
+            if lift and not with_lift:
+                raise Conflict(
+                    "job", expected="a job without a lift", got="one whose lift would go with it",
+                    hint="say with_lift=true if that is meant",
+                )  # fmt: skip
+            connection.execute("DELETE FROM jobs WHERE id = ?", (job,))
+        # After the commit: a crash here leaves files that the collection of garbage finds.
+        self._files.lift(job).unlink(missing_ok=True)
+        self._files.forget_work(job)
 
 
-def _record(connection: sqlite3.Connection, row: sqlite3.Row) -> JobRecord:
+def record(connection: sqlite3.Connection, row: sqlite3.Row) -> JobRecord:
+    """A row of the table as a record."""
     features = connection.execute("SELECT asset FROM job_features WHERE job = ? ORDER BY place", (row["id"],))
     return JobRecord(
         id=row["id"],
@@ -151,4 +172,34 @@ def _record(connection: sqlite3.Connection, row: sqlite3.Row) -> JobRecord:
         created=row["created"],
         started=row["started"],
         ended=row["ended"],
+        leased_until=row["leased_until"],
     )
+
+
+def _of_key(connection: sqlite3.Connection, order: JobOrder) -> str | None:
+    if order.key is None:
+        return None
+    row = connection.execute("SELECT id, fingerprint FROM jobs WHERE idempotency_key = ?", (order.key,)).fetchone()
+    if row is not None and row["fingerprint"] != order.fingerprint:
+        raise KeyReused(
+            "Idempotency-Key", expected="the order that came with this key before", got="another order",
+            hint=f"the key belongs to /jobs/{row['id']}; take a new one",
+        )  # fmt: skip
+    return None if row is None else row["id"]
+
+
+def _require_place(connection: sqlite3.Connection, max_queued: int) -> None:
+    queued = connection.execute("SELECT count(*) FROM jobs WHERE state = 'queued'").fetchone()[0]
+    if queued >= max_queued:
+        raise Busy(
+            "lift", expected=f"fewer than {max_queued} jobs in line", got=f"{queued}", hint="try again later",
+            retry_after=QUEUE_RETRY_SECONDS,
+        )  # fmt: skip
+
+
+def _require_assets(connection: sqlite3.Connection, order: JobOrder) -> None:
+    wanted = [(order.splats, AssetKind.SPLATS), (order.cameras, AssetKind.CAMERAS)]
+    wanted += [(asset, AssetKind.FEATURES) for asset in order.features]
+    for asset, kind in wanted:
+        if not connection.execute("SELECT 1 FROM assets WHERE id = ? AND kind = ?", (asset, kind)).fetchone():
+            raise NotFound(kind, expected=f"the id of an asset of kind {kind}", got=asset)

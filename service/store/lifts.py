@@ -11,6 +11,7 @@ from typing import Any
 
 from liftcore.errors import NotFound
 from service.errors import InvalidRequest
+from service.store.attempts import told
 from service.store.database import Database
 from service.store.files import DataDirectory
 
@@ -51,17 +52,19 @@ class LiftStore:
         """End an attempt with its lift: the file, the lift and the job's last state become true together.
 
         Returns:
-            False when the attempt is no longer the job's running one; then nothing changes.
+            False when the attempt is no longer the job's running one, or is to be canceled; then nothing changes.
         """
         path = self._files.lift(job)
         size = made.draft.stat().st_size
         with self._database.write() as connection:
             ended = connection.execute(
-                "UPDATE jobs SET state = 'succeeded', ended = ? WHERE id = ? AND attempt = ? AND state = 'running'",
+                "UPDATE jobs SET state = 'succeeded', ended = ?, leased_until = NULL"
+                " WHERE id = ? AND attempt = ? AND state = 'running' RETURNING *",
                 (time.time(), job, attempt),
-            )
-            if ended.rowcount != 1:
+            ).fetchone()
+            if ended is None:
                 return False
+            told(connection, ended)
             self._files.publish(made.draft, path)
             connection.execute(
                 "INSERT INTO lifts (id, bytes, sha256, file, count, channels, metadata, created)"
@@ -126,6 +129,24 @@ class LiftStore:
         with self._database.read() as connection:
             rows = connection.execute("SELECT * FROM lifts ORDER BY created DESC, id").fetchall()
         return [self._record(row) for row in rows]
+
+    def collect(self, older_than: float) -> list[Path]:
+        """Remove files that no lift has: what a crash between a file and its row left.
+
+        Args:
+            older_than: seconds since 1970; younger files stay.
+
+        Returns:
+            What was removed.
+        """
+        removed = []
+        with self._database.write() as connection:  # so no lift is between its file and its row
+            known = {row["file"] for row in connection.execute("SELECT file FROM lifts")}
+            for path in (self._files.root / "lifts").iterdir():
+                if self._files.relative(path) not in known and path.stat().st_mtime < older_than:
+                    path.unlink()
+                    removed.append(path)
+        return removed
 
     def _record(self, row: sqlite3.Row) -> LiftRecord:
         return LiftRecord(

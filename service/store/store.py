@@ -7,7 +7,9 @@ from pathlib import Path
 from typing import Self
 
 from service.store.assets import AssetStore
+from service.store.attempts import AttemptStore
 from service.store.database import Database
+from service.store.events import EventStore
 from service.store.files import DataDirectory
 from service.store.jobs import JobStore
 from service.store.lifts import LiftStore
@@ -21,16 +23,22 @@ class Store:
     database: Database
     assets: AssetStore
     jobs: JobStore
+    attempts: AttemptStore
+    events: EventStore
     lifts: LiftStore
 
     @classmethod
-    def open(cls, root: Path) -> Self:
+    def open(cls, root: Path, *, floor_bytes: int = 0) -> Self:
         """Open or make the data directory.
+
+        Args:
+            root: the directory.
+            floor_bytes: free disk that new work must leave.
 
         Raises:
             Misconfigured: another server holds it, or a later release wrote it.
         """
-        files = DataDirectory(root)
+        files = DataDirectory(root, floor_bytes=floor_bytes)
         try:
             database = Database(files.root / "service.sqlite")
         except BaseException:
@@ -40,7 +48,9 @@ class Store:
             files=files,
             database=database,
             assets=AssetStore(database, files),
-            jobs=JobStore(database),
+            jobs=JobStore(database, files),
+            attempts=AttemptStore(database),
+            events=EventStore(database),
             lifts=LiftStore(database, files),
         )
 

@@ -30,7 +30,7 @@ def serving(data: Path, table: Path, **settings: Any) -> Iterator[TestClient]:
             **settings,
         }
     )
-    store = Store.open(chosen.data)
+    store = Store.open(chosen.data, floor_bytes=chosen.disk_floor_bytes)
     try:
         with TestClient(assemble(chosen, store), raise_server_exceptions=False) as client:
             yield client

@@ -21,7 +21,7 @@ def ended(client: Client, job: str) -> dict[str, Any]:
     deadline = time.monotonic() + PATIENCE_SECONDS
     while time.monotonic() < deadline:
         found = client.get(job).json()
-        if found["state"] in ("succeeded", "failed"):
+        if found["state"] in ("succeeded", "failed", "canceled"):
             return found
         time.sleep(0.1)
     raise AssertionError(f"{job} did not end within {PATIENCE_SECONDS:g} s")

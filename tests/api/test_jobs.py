@@ -1,12 +1,13 @@
-"""What jobs promise: crashes are told, and the jobs of a stopped or dead server go on."""
+"""What jobs promise over HTTP: keys, cancel, events, limits; and that they outlive their server."""
 
 from __future__ import annotations
 
-import errno
-import os
-import signal
+import json
+import shutil
+import sqlite3
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,54 +15,192 @@ import pytest
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
+from service.app import create_app
 from service.errors import Misconfigured
-from service.jobs import process
+from service.jobs.limits import LiftLimits
 from service.jobs.supervisor import Supervisor
-from service.store.assets import CheckedUpload
-from service.store.files import DataDirectory
-from service.store.jobs import MAX_ATTEMPTS
+from service.queries.warm import QueryLimits, WarmWorker
+from service.settings import ServiceSettings
+from service.store.schema import MIGRATIONS
 from service.store.store import Store
-from service.wire import AssetKind, JobState
+from service.wire import JobState
+from tests.crash.conftest import order, stand_in
 
 from .conftest import Uploaded
 from .following import ended
+from .test_problems import assert_problem
 from .tiny_scene import TinyScene
+
+Quick = Callable[..., AbstractContextManager[tuple[TestClient, dict[str, Any]]]]
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> Any:
+def store(tmp_path: Path) -> Iterator[Store]:
     opened = Store.open(tmp_path / "data")
     yield opened
     opened.close()
 
 
-def submit(store: Store) -> str:
-    """A job over assets whose content nobody looks at."""
-    ids = []
-    for kind in AssetKind:
-        with store.files.draft(".bin") as draft:
-            draft.write_bytes(kind.encode())
-            digest = kind.encode().hex().ljust(64, "0")
-            ids.append(store.assets.add(CheckedUpload(draft, kind, digest, ".bin", {}, []))[0].id)
-    return store.jobs.submit(ids[0], ids[1], ids[2:], {})
+@pytest.fixture
+def quick(store: Store) -> Quick:
+    """The application with stand-ins for lifts, and the body of an order that it takes."""
+
+    @contextmanager
+    def serve(behaviour: str, **settings: Any) -> Iterator[tuple[TestClient, dict[str, Any]]]:
+        chosen = ServiceSettings.model_validate({"data": store.files.root, **settings})
+        worker = WarmWorker(QueryLimits(waiting=1, seconds=1, scenes=1, answers=1, encoder="minilm"))
+        supervisor = Supervisor(store, LiftLimits(), command=stand_in(behaviour))
+        known = order(store)
+        body = {"splats": known.splats, "cameras": known.cameras, "features": list(known.features)}
+        with TestClient(create_app(chosen, store, supervisor, worker), raise_server_exceptions=False) as client:
+            yield client, body
+
+    return serve
 
 
-def test_child_that_dies_without_a_word_fails_its_job(
-    client: TestClient, uploaded: Uploaded, monkeypatch: pytest.MonkeyPatch
+def application(client: TestClient) -> FastAPI:
+    """The application behind a client."""
+    assert isinstance(client.app, FastAPI)
+    return client.app
+
+
+def events(text: str) -> list[tuple[int, str, dict[str, Any]]]:
+    """The events of a stream: id, name, data."""
+    found = []
+    for block in text.strip().split("\n\n"):
+        fields = dict(line.split(": ", 1) for line in block.split("\n") if not line.startswith(":"))
+        if fields:
+            found.append((int(fields["id"]), fields["event"], json.loads(fields["data"])))
+    return found
+
+
+def test_same_key_and_order_are_the_same_job(quick: Quick) -> None:
+    with quick("answer") as (client, body):
+        first = client.post("/lift", json=body, headers={"Idempotency-Key": "one"})
+        again = client.post("/lift", json=body, headers={"Idempotency-Key": "one"})
+        assert (first.status_code, again.status_code) == (202, 200)
+        assert first.json()["id"] == again.json()["id"] and first.headers["location"] == again.headers["location"]
+        ended(client, first.headers["location"])
+        late = client.post("/lift", json=body, headers={"Idempotency-Key": "one"})
+        assert late.status_code == 200 and late.json()["state"] == "succeeded"
+        assert len(client.get("/jobs").json()["jobs"]) == 1
+        other = client.post("/lift", json=body, headers={"Idempotency-Key": "two"})
+        assert other.status_code == 202 and other.json()["id"] != first.json()["id"]
+
+
+def test_same_key_with_another_order_is_refused(quick: Quick) -> None:
+    with quick("answer") as (client, body):
+        client.post("/lift", json=body, headers={"Idempotency-Key": "one"})
+        changed = body | {"settings": {"preset": "row-sum"}}
+        reply = client.post("/lift", json=changed, headers={"Idempotency-Key": "one"})
+        assert (assert_problem(reply)["type"], reply.status_code) == ("/problems/key-reused", 422)
+        for key in ("", "x" * 256):
+            reply = client.post("/lift", json=body, headers={"Idempotency-Key": key})
+            assert assert_problem(reply)["status"] == 422
+
+
+def test_full_line_is_503_with_retry_after_and_a_known_key_still_finds_its_job(quick: Quick) -> None:
+    with quick("hang", max_queued=1) as (client, body):
+        location = client.post("/lift", json=body).headers["location"]
+        while client.get(location).json()["state"] == "queued":
+            time.sleep(0.01)
+        assert client.post("/lift", json=body, headers={"Idempotency-Key": "k"}).status_code == 202
+        reply = client.post("/lift", json=body)
+        assert (assert_problem(reply)["type"], reply.status_code) == ("/problems/busy", 503)
+        assert int(reply.headers["retry-after"]) > 0
+        assert client.post("/lift", json=body, headers={"Idempotency-Key": "k"}).status_code == 200
+
+
+def test_cancel_over_http(quick: Quick) -> None:
+    with quick("hang") as (client, body):
+        running = client.post("/lift", json=body).headers["location"]
+        while client.get(running).json()["state"] != "running":
+            time.sleep(0.01)
+        waiting = client.post("/lift", json=body).headers["location"]
+        assert client.get(waiting).json()["links"]["cancel"] == f"{waiting}/cancel"
+        reply = client.post(f"{waiting}/cancel")
+        assert (reply.status_code, reply.json()["state"]) == (200, "canceled")
+        reply = client.post(f"{running}/cancel")
+        assert (reply.status_code, reply.json()["state"]) == (202, "canceling")
+        assert ended(client, running)["state"] == "canceled"
+        for job in (running, waiting):
+            reply = client.post(f"{job}/cancel")
+            assert (reply.status_code, reply.json()["state"]) == (200, "canceled")
+
+
+def test_ended_job_cannot_be_canceled_and_only_an_ended_one_can_be_deleted(quick: Quick, store: Store) -> None:
+    with quick("slowly") as (client, body):
+        job = client.post("/lift", json=body).headers["location"]
+        reply = client.delete(job)
+        assert (assert_problem(reply)["type"], reply.status_code) == ("/problems/conflict", 409)
+        assert ended(client, job)["state"] == "succeeded"
+        assert assert_problem(client.post(f"{job}/cancel"))["status"] == 409
+        reply = client.delete(job)  # a retried DELETE must not cost a lift that nobody gave up
+        assert reply.status_code == 409 and "with_lift" in reply.json()["hint"]
+        lift = store.files.lift(job.rpartition("/")[2])
+        assert lift.exists() and client.get(job.replace("jobs", "lifts")).status_code == 200
+        assert client.delete(job, params={"with_lift": True}).status_code == 204
+        assert not lift.exists() and client.get(job.replace("jobs", "lifts")).status_code == 404
+        for reply in (client.get(job), client.delete(job), client.get(f"{job}/events"), client.post(f"{job}/cancel")):
+            assert assert_problem(reply)["status"] == 404
+        assert client.delete(f"/assets/{body['splats']}").status_code == 204  # nothing needs it any more
+
+
+def test_events_tell_the_whole_story_and_go_on_after_the_last_one_seen(quick: Quick) -> None:
+    with quick("slowly") as (client, body):
+        job = client.post("/lift", json=body).headers["location"]
+        reply = client.get(f"{job}/events")  # returns when the stream ends
+        assert reply.headers["content-type"].startswith("text/event-stream")
+        story = events(reply.text)
+        assert [data["state"] for _, name, data in story if name == "state"] == ["queued", "running", "succeeded"]
+        assert {name for _, name, _ in story} == {"state", "progress", "log"}
+        numbers = [number for number, _, _ in story]
+        assert numbers == sorted(set(numbers))
+        third = {"Last-Event-ID": str(numbers[2])}
+        kept = [event for event in events(client.get(f"{job}/events", headers=third).text) if event[1] != "progress"]
+        assert kept == [event for event in story[3:] if event[1] != "progress"]
+        assert client.get(f"{job}/events", headers={"Last-Event-ID": str(numbers[-1])}).status_code == 204
+        for nonsense in ("x", "-1", "9" * 30):
+            reply = client.get(f"{job}/events", headers={"Last-Event-ID": nonsense})
+            assert assert_problem(reply)["status"] == 422
+
+
+def test_failed_job_tells_its_problem_in_its_events(quick: Quick) -> None:
+    with quick("die") as (client, body):
+        job = client.post("/lift", json=body).headers["location"]
+        *_, (_, name, last) = events(client.get(f"{job}/events").text)
+        assert (name, last["state"], last["attempt"]) == ("state", "failed", 3)
+        assert last["problem"] == client.get(job).json()["problem"]
+        assert last["problem"]["type"] == "/problems/crashed"
+
+
+def test_streams_are_bounded(quick: Quick) -> None:
+    with quick("answer", max_streams=1) as (client, body):
+        job = client.post("/lift", json=body).headers["location"]
+        ended(client, job)
+        streams = application(client).state.streams
+        streams.open = 1  # as if another client followed
+        reply = client.get(f"{job}/events")
+        assert (assert_problem(reply)["type"], reply.status_code) == ("/problems/busy", 503)
+        streams.open = 0
+        assert client.get(f"{job}/events").status_code == 200 and streams.open == 0
+
+
+def test_no_work_is_taken_below_the_disk_floor_and_the_service_lives(
+    quick: Quick, scene: TinyScene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    started: list[int] = []
-    begin = process.JobProcess.__init__
-
-    def killed(self: process.JobProcess, order: dict[str, Any], scratch: Path) -> None:
-        begin(self, order, scratch)
-        started.append(self.pid)
-        os.kill(self.pid, signal.SIGKILL)
-
-    monkeypatch.setattr(process.JobProcess, "__init__", killed)
-    job = ended(client, client.post("/lift", json=uploaded.order()).headers["location"])
-    assert job["state"] == "failed" and job["problem"]["type"] == "/problems/crashed"
-    assert "signal 9" in job["problem"]["detail"]
-    assert len(started) == 1
+    usage = shutil.disk_usage("/")
+    with quick("answer", disk_floor_bytes=1000) as (client, body):
+        application(client).state.parts.store.files._floor = 1000
+        monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=999))
+        for reply in (
+            client.put("/assets/splats", content=scene.splats),
+            client.post("/lift", json=body),
+        ):
+            assert (assert_problem(reply)["type"], reply.status_code) == ("/problems/no-space", 507)
+        assert client.get("/jobs").json() == {"jobs": []} and len(client.get("/assets").json()["assets"]) == 3
+        monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=1000))
+        assert ended(client, client.post("/lift", json=body).headers["location"])["state"] == "succeeded"
 
 
 def upload(client: TestClient, scene: TinyScene) -> Uploaded:
@@ -93,62 +232,6 @@ def test_query_worker_that_died_is_replaced(client: TestClient, lift: dict[str, 
     assert client.get("/query", params={"text": "book", "lift": lift["id"]}).status_code == 200
 
 
-def test_job_that_gets_no_room_fails_instead_of_running_for_ever(
-    store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def full(self: DataDirectory) -> Any:
-        raise OSError(errno.ENOSPC, "no space left")
-
-    monkeypatch.setattr(DataDirectory, "scratch", full)
-    job = submit(store)
-    supervisor = Supervisor(store, threads=1)
-    supervisor.start()
-    deadline = time.monotonic() + 20
-    while store.jobs.get(job).state is not JobState.FAILED:
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
-    supervisor.stop()
-
-
-def test_job_of_a_dead_server_is_queued_again_then_failed(store: Store) -> None:
-    job = submit(store)
-    for attempt in range(1, MAX_ATTEMPTS + 1):
-        claimed = store.jobs.claim()
-        assert claimed is not None and (claimed.id, claimed.attempt) == (job, attempt)
-        store.jobs.requeue_orphans()
-    found = store.jobs.get(job)
-    assert found.state is JobState.FAILED and found.problem is not None and "3 attempts" in found.problem["got"]
-    assert store.jobs.claim() is None
-
-
-def test_orderly_stops_do_not_use_up_attempts(store: Store) -> None:
-    job = submit(store)
-    for _ in range(2 * MAX_ATTEMPTS):
-        claimed = store.jobs.claim()
-        assert claimed is not None
-        store.jobs.release(job, claimed.attempt)
-    store.jobs.requeue_orphans()
-    assert store.jobs.get(job).state is JobState.QUEUED
-
-
-def test_word_of_a_stale_attempt_is_dropped(store: Store) -> None:
-    job = submit(store)
-    assert store.jobs.claim() is not None
-    store.jobs.requeue_orphans()
-    assert store.jobs.claim() is not None
-    store.jobs.fail(job, 1, {"kind": "crashed"})
-    store.jobs.advance(job, 1, {"stage": "old"})
-    found = store.jobs.get(job)
-    assert (found.state, found.attempt, found.progress) == (JobState.RUNNING, 2, None)
-
-
-def test_jobs_are_claimed_in_order(store: Store) -> None:
-    jobs = [submit(store) for _ in range(3)]
-    claimed = [store.jobs.claim() for _ in jobs]
-    assert [job.id for job in claimed if job is not None] == jobs
-    assert [job.id for job in store.jobs.all()] == jobs[::-1]
-
-
 def test_one_server_a_data_directory(store: Store) -> None:
     with pytest.raises(Misconfigured, match="no other server"):
         Store.open(store.files.root)
@@ -165,10 +248,53 @@ def test_database_of_a_later_release_is_refused(tmp_path: Path) -> None:
 
 def test_store_remembers_after_reopening(tmp_path: Path) -> None:
     store = Store.open(tmp_path)
-    job = submit(store)
+    job = store.jobs.submit(order(store))[0]
     (tmp_path / "tmp" / "left-over").write_bytes(b"half a file")
     store.close()
     store = Store.open(tmp_path)
     assert store.jobs.get(job).state is JobState.QUEUED and len(store.assets.all()) == 3
     assert list((tmp_path / "tmp").iterdir()) == []
     store.close()
+
+
+def test_database_of_the_first_schema_is_taken_over(tmp_path: Path) -> None:
+    (tmp_path / "data").mkdir()
+    old = sqlite3.connect(tmp_path / "data" / "service.sqlite")
+    old.executescript(f"BEGIN; {MIGRATIONS[0]} PRAGMA user_version = 1; COMMIT;")
+    old.executemany(
+        "INSERT INTO assets VALUES (?, ?, 1, 'blobs/x', '{}', '[]', 0)",
+        [("s", "splats"), ("c", "cameras"), ("f", "features")],
+    )
+    problem = json.dumps({"kind": "crashed", "argument": "job", "expected": "a", "got": "b", "hint": ""})
+    for job, state, told in (("a", "running", None), ("b", "queued", None), ("c", "failed", problem)):
+        old.execute(
+            "INSERT INTO jobs (id, state, attempt, splats, cameras, settings, problem, created)"
+            " VALUES (?, ?, 1, 's', 'c', '{}', ?, 0)",
+            (job, state, told),
+        )
+        old.execute("INSERT INTO job_features VALUES (?, 0, 'f')", (job,))
+    old.commit()
+    old.close()
+    store = Store.open(tmp_path / "data")
+    assert store.jobs.get("a").features == ("f",)
+    store.attempts.lose_all("the server died")
+    assert [store.jobs.get(job).state for job in "abc"] == [JobState.QUEUED, JobState.QUEUED, JobState.FAILED]
+    (last,) = store.events.after("c", 0)
+    assert last.data == {"state": "failed", "attempt": 1, "problem": json.loads(problem)}
+    with store.database.read() as connection:
+        assert connection.execute("PRAGMA user_version").fetchone()[0] == len(MIGRATIONS)
+    store.close()
+    Store.open(tmp_path / "data").close()  # and once is enough
+
+
+def test_migration_that_breaks_off_changes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        "service.store.database.MIGRATIONS", (*MIGRATIONS, "CREATE TABLE x (a);\nCREATE TABLE x (a);")
+    )
+    with pytest.raises(sqlite3.OperationalError):
+        Store.open(tmp_path / "data")
+    monkeypatch.undo()
+    left = sqlite3.connect(tmp_path / "data" / "service.sqlite")
+    assert left.execute("SELECT count(*) FROM sqlite_master").fetchone()[0] == 0
+    left.close()
+    Store.open(tmp_path / "data").close()

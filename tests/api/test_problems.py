@@ -29,6 +29,8 @@ ROUTES = {
     "/lift",
     "/jobs",
     "/jobs/{job}",
+    "/jobs/{job}/events",
+    "/jobs/{job}/cancel",
     "/lifts",
     "/lifts/{lift}",
     "/lifts/{lift}/features",

@@ -1,0 +1,72 @@
+"""The schema of the database, as the steps that lead to it. A step that was released is never changed."""
+
+from __future__ import annotations
+
+# MIGRATIONS[n] leads from version n to n + 1; the version is SQLite's user_version.
+MIGRATIONS = (
+    """
+CREATE TABLE assets (
+    id TEXT PRIMARY KEY,            -- sha256:...
+    kind TEXT NOT NULL,             -- splats, cameras, features
+    bytes INTEGER NOT NULL,
+    file TEXT NOT NULL,             -- path below the data directory
+    counts TEXT NOT NULL,           -- JSON
+    warnings TEXT NOT NULL,         -- JSON
+    created REAL NOT NULL
+) STRICT;
+
+CREATE TABLE jobs (
+    id TEXT PRIMARY KEY,
+    state TEXT NOT NULL,            -- as service.wire.JobState
+    attempt INTEGER NOT NULL DEFAULT 0,
+    released INTEGER NOT NULL DEFAULT 0,  -- attempts that ended with an orderly stop of the server
+    splats TEXT NOT NULL REFERENCES assets (id),
+    cameras TEXT NOT NULL REFERENCES assets (id),
+    settings TEXT NOT NULL,         -- JSON
+    progress TEXT,                  -- JSON
+    problem TEXT,                   -- JSON: kind, argument, expected, got, hint
+    created REAL NOT NULL,
+    started REAL,
+    ended REAL
+) STRICT;
+CREATE INDEX jobs_in_line ON jobs (state, created);
+
+CREATE TABLE job_features (
+    job TEXT NOT NULL REFERENCES jobs (id) ON DELETE CASCADE,
+    place INTEGER NOT NULL,
+    asset TEXT NOT NULL REFERENCES assets (id),
+    PRIMARY KEY (job, place)
+) STRICT;
+CREATE INDEX job_features_of_asset ON job_features (asset);
+
+CREATE TABLE lifts (
+    id TEXT PRIMARY KEY REFERENCES jobs (id),
+    bytes INTEGER NOT NULL,
+    sha256 TEXT NOT NULL,
+    file TEXT NOT NULL,             -- path below the data directory
+    count INTEGER NOT NULL,
+    channels INTEGER NOT NULL,
+    metadata TEXT NOT NULL,         -- JSON, as in the lift file
+    created REAL NOT NULL
+) STRICT;
+""",
+    """
+ALTER TABLE jobs ADD COLUMN leased_until REAL;      -- a running attempt is lost when it is silent until then
+ALTER TABLE jobs ADD COLUMN idempotency_key TEXT;   -- as the client sent it
+ALTER TABLE jobs ADD COLUMN fingerprint TEXT;       -- sha256 of the order that came with the key
+CREATE UNIQUE INDEX jobs_by_key ON jobs (idempotency_key);
+
+CREATE TABLE job_events (
+    job TEXT NOT NULL REFERENCES jobs (id) ON DELETE CASCADE,
+    number INTEGER NOT NULL,        -- ascending in a job; never given twice
+    kind TEXT NOT NULL,             -- state, progress, log
+    data TEXT NOT NULL,             -- JSON
+    created REAL NOT NULL,
+    PRIMARY KEY (job, number)
+) STRICT, WITHOUT ROWID;
+INSERT INTO job_events
+    SELECT id, 1, 'state',
+        json_object('state', state, 'attempt', attempt, 'problem', json(coalesce(problem, 'null'))), created
+    FROM jobs;
+""",
+)

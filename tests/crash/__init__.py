@@ -1,0 +1,1 @@
+"""What the service promises when processes die, stop, are canceled, or the disk is full."""

@@ -1,0 +1,83 @@
+"""A store and a supervisor whose children are stand-ins."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from service.jobs.limits import LiftLimits
+from service.jobs.supervisor import Supervisor
+from service.store.assets import CheckedUpload
+from service.store.jobs import JobOrder, JobRecord
+from service.store.store import Store
+from service.wire import ENDED, AssetKind
+
+Supervising = Callable[..., AbstractContextManager[Supervisor]]
+
+
+def stand_in(behaviour: str) -> list[str]:
+    """The command of a stand-in."""
+    return [sys.executable, "-S", "-E", str(Path(__file__).with_name("stand_in.py")), behaviour]
+
+
+def order(store: Store, **settings: Any) -> JobOrder:
+    """An order over assets whose content nobody looks at."""
+    ids = []
+    for kind in AssetKind:
+        with store.files.draft(".bin") as draft:
+            draft.write_bytes(kind.encode())
+            digest = kind.encode().hex().ljust(64, "0")
+            checked = CheckedUpload(draft, kind, digest, ".bin", {"names": ["v"], "channels": 1}, [])
+            ids.append(store.assets.add(checked)[0].id)
+    return JobOrder(ids[0], ids[1], (ids[2],), settings)
+
+
+def until(condition: Callable[[], Any], seconds: float = 60.0) -> None:
+    """Wait for something that is about to happen."""
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "it did not happen"
+        time.sleep(0.01)
+
+
+def ended(store: Store, job: str) -> JobRecord:
+    """The job, once it has ended."""
+    until(lambda: store.jobs.get(job).state in ENDED)
+    return store.jobs.get(job)
+
+
+def alive(pid: int) -> bool:
+    """Whether a process runs; one that is dead and not yet reaped does not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in ("Z", "X")
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[Store]:
+    opened = Store.open(tmp_path / "data")
+    yield opened
+    opened.close()
+
+
+@pytest.fixture
+def supervising(store: Store) -> Supervising:
+    """Run a supervisor whose children behave as told."""
+
+    @contextmanager
+    def run(behaviour: str, **limits: Any) -> Iterator[Supervisor]:
+        supervisor = Supervisor(store, LiftLimits(**limits), command=stand_in(behaviour))
+        supervisor.start()
+        try:
+            yield supervisor
+        finally:
+            supervisor.stop()
+
+    return run

@@ -1,0 +1,175 @@
+"""The long proofs, each a loop that gives figures: short in the tests, long in ``make soak``."""
+
+from __future__ import annotations
+
+import hashlib
+import random
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from liftcore.observe.write_pack import write_pack
+from liftcore.scene.cameras import Cameras
+from liftcore.scene.inria import write_inria_cameras
+from liftcore.scene.ply import write_splats
+from service.store.assets import CheckedUpload
+from service.store.store import Store
+from service.wire import AssetKind
+from tests.scenes import centred, random_camera, random_regions, random_splats
+
+from .server import POINTS
+from .service_process import ServiceProcess, kill_processes_of, usage
+
+KILLS_A_JOB = 2  # the third attempt is the last
+WARM_UP_JOBS = 5  # before the first look at what a server holds
+SUFFIXES = {"splats": ".ply", "cameras": ".json", "features": ".safetensors"}
+NOTHING = {kind: kind.encode() for kind in SUFFIXES}  # a scene for stand-ins, which look at none
+ANSWERS = ("--behaviour", "answer")
+
+
+def scene_files(folder: Path, *, views: int, splats: int, width: int) -> dict[str, bytes]:
+    """A random scene: kind -> bytes."""
+    cameras = tuple(centred(random_camera(k, width, width * 3 // 4, name=f"v{k:03d}")) for k in range(views))
+    observations = {camera.name: random_regions(k, F=32) for k, camera in enumerate(cameras)}
+    paths = {
+        "splats": folder / "splats.ply",
+        "cameras": folder / "cameras.json",
+        "features": folder / "features.safetensors",
+    }
+    write_splats(random_splats(0, splats), paths["splats"])
+    write_inria_cameras(Cameras(cameras), paths["cameras"])
+    write_pack(paths["features"], dict(observations), {"encoder": "random"})
+    return {kind: path.read_bytes() for kind, path in paths.items()}
+
+
+def stored(data: Path, files: dict[str, bytes]) -> dict[str, Any]:
+    """Put a scene into a data directory that no server holds; the body of an order of its lift."""
+    names = {"names": ["v000"], "channels": 1}  # all that an order asks of a check
+    ids = {}
+    store = Store.open(data)
+    for kind, content in files.items():
+        with store.files.draft(".part") as draft:
+            draft.write_bytes(content)
+            digest, suffix = hashlib.sha256(content).hexdigest(), SUFFIXES[kind]
+            ids[kind] = store.assets.add(CheckedUpload(draft, AssetKind(kind), digest, suffix, names, []))[0].id
+    store.close()
+    return {**ids, "features": [ids["features"]]}
+
+
+def insist(service: ServiceProcess, body: dict[str, Any], key: str) -> str:
+    """Order a lift as a client does that was cut off: again with the same key, when the server is back."""
+    job = service.lift(body, key)
+    while job is None:
+        service.wait()
+        service.start()
+        job = service.lift(body, key)
+    return job
+
+
+def kill_loop(files: dict[str, bytes], *, kills: int, seconds: float, seed: int = 0) -> dict[str, Any]:
+    """Kill the server or the child of a job at random moments, twice a job.
+
+    Args:
+        files: the scene to lift.
+        kills: how many, unless ``seconds`` end first.
+        seconds: no job begins after these.
+        seed: of the moments and the victims.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        body = stored(Path(folder), files)
+        with ServiceProcess(Path(folder)) as service:
+            return _kill_jobs(service, body, kills, seconds, random.Random(seed))
+
+
+def _kill_jobs(
+    service: ServiceProcess, body: dict[str, Any], kills: int, seconds: float, chance: random.Random
+) -> dict[str, Any]:
+    victims: Counter[str] = Counter()
+    stages: Counter[str] = Counter()
+    figures: Counter[str] = Counter(jobs=0, lost=0, doubled=0, digests_equal=0, resumed=0)
+    begun = time.monotonic()
+    reference = insist(service, body, "undisturbed")
+    service.ended(reference)
+    whole = time.monotonic() - begun
+    wanted = service.digest(reference)
+    while victims.total() < kills and time.monotonic() - begun < seconds:
+        key = f"job {figures['jobs']}"
+        job = insist(service, body, key)
+        for _ in range(min(KILLS_A_JOB, kills - victims.total())):
+            time.sleep(chance.uniform(0, whole))
+            stages[_stage(service.job(job))] += 1
+            if chance.random() < 0.5 and kill_processes_of(job):
+                victims["child"] += 1
+            else:
+                victims["server"] += 1
+                service.kill()
+                service.start()
+        found = service.ended(job)
+        figures["jobs"] += 1
+        figures["lost"] += found["state"] != "succeeded" or insist(service, body, key) != job
+        figures["doubled"] += service.times_succeeded(job) > 1
+        figures["resumed"] += "blocks of walked views are kept" in service.client.get(f"/jobs/{job}/events").text
+        if found["state"] == "succeeded":
+            figures["digests_equal"] += service.digest(job) == wanted
+    jobs = service.client.get("/jobs").json()["jobs"]
+    figures["doubled"] += len(jobs) - figures["jobs"] - 1
+    return {
+        "kills": victims.total(),
+        "victims": dict(victims),
+        "killed_while": dict(stages),
+        **figures,
+        "undisturbed_seconds": round(whole, 2),
+        "seconds": round(time.monotonic() - begun),
+    }
+
+
+def _stage(job: dict[str, Any]) -> str:
+    if job["state"] != "running":
+        return job["state"]
+    return "starting" if job["progress"] is None else job["progress"]["stage"]
+
+
+def fault_points(points: list[str]) -> dict[str, str]:
+    """Kill the server at each named point of a job's life, start it again, and say what came of the job."""
+    return {point: _at_point(point) for point in points}
+
+
+def _at_point(point: str) -> str:
+    with tempfile.TemporaryDirectory() as folder:
+        body = stored(Path(folder), NOTHING)
+        with ServiceProcess(Path(folder), *ANSWERS, "--point", point) as service:
+            first = service.lift(body, "key")
+            assert service.wait() == -9, point
+            service.start(*ANSWERS)
+            job = service.lift(body, "key")
+            assert job is not None and first in (None, job)
+            state = service.ended(job)["state"]
+            jobs, times = len(service.client.get("/jobs").json()["jobs"]), service.times_succeeded(job)
+            lift = service.client.get(f"/lifts/{job}/features").status_code
+    once = (state, jobs, times, lift) == ("succeeded", 1, 1, 200)
+    return "finished once" if once else f"{state}: {jobs} jobs, {times} times, the lift gives {lift}"
+
+
+def leak_loop(jobs: int) -> dict[str, Any]:
+    """Run jobs through one server, each followed by a stream, and see what it holds."""
+    with tempfile.TemporaryDirectory() as folder:
+        body = stored(Path(folder), NOTHING)
+        seen = []
+        with ServiceProcess(Path(folder), *ANSWERS) as service:
+            for number in range(WARM_UP_JOBS + jobs):
+                job = service.lift(body, str(number))
+                assert job is not None
+                assert service.times_succeeded(job) == 1  # the stream ends with the job
+                if number >= WARM_UP_JOBS - 1:
+                    time.sleep(0.5)
+                    seen.append(usage(service.pid))
+        left = [path.name for room in ("work", "tmp") for path in (Path(folder) / room).iterdir()]
+    growth = {name: int(np.median([look[name] for look in seen[-3:]])) - seen[0][name] for name in seen[0]}
+    return {"jobs": jobs, "first": seen[0], "last": seen[-1], "growth": growth, "left_over": left}
+
+
+ALL_POINTS = list(POINTS)

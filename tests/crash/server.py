@@ -1,0 +1,92 @@
+"""The service without queries, as a process that kills itself at a named point.
+
+    python -m tests.crash.server DATA [--behaviour NAME] [--point NAME]
+
+The point is a place in the service's own code, wrapped here: the service itself knows nothing of faults.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import socket
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, cast
+
+import uvicorn
+
+from service.__main__ import AnnouncingServer
+from service.app import create_app, lift_limits
+from service.jobs.attempt import CHILD
+from service.jobs.process import JobProcess
+from service.jobs.supervisor import Supervisor
+from service.queries.warm import WarmWorker
+from service.settings import ServiceSettings
+from service.store.attempts import AttemptStore
+from service.store.files import DataDirectory
+from service.store.jobs import JobStore
+from service.store.lifts import LiftStore
+from service.store.store import Store
+
+from .conftest import stand_in
+
+# Name -> class, method, and whether the process dies before or after it.
+POINTS: dict[str, tuple[type, str, str]] = {
+    "before the job is in line": (JobStore, "submit", "before"),
+    "after the job is in line, before the 202": (JobStore, "submit", "after"),
+    "after the claim": (AttemptStore, "claim", "after"),
+    "after the child has begun": (JobProcess, "__init__", "after"),
+    "after some progress": (AttemptStore, "advance", "after"),
+    "before the lift is published": (DataDirectory, "publish", "before"),
+    "after the lift is published, before it has a row": (DataDirectory, "publish", "after"),
+    "after the lift has its row": (LiftStore, "finish", "after"),
+    "before the work is forgotten": (DataDirectory, "forget_work", "before"),
+}
+
+
+class NoQueries:
+    """Stands in for the query worker, which takes seconds to start and has no part in this."""
+
+    def start(self) -> None: ...
+
+    def stop(self) -> None: ...
+
+
+def arm(point: str) -> None:
+    """Make this process kill itself when it comes to the point."""
+    owner, name, when = POINTS[point]
+    method: Callable[..., Any] = getattr(owner, name)
+
+    def deadly(*given: Any, **named: Any) -> Any:
+        result = method(*given, **named) if when == "after" else None
+        if when == "before" or result is not None or name != "claim":  # an empty line is no claim
+            os.kill(os.getpid(), signal.SIGKILL)
+        return result
+
+    setattr(owner, name, deadly)
+
+
+def main() -> None:
+    """Serve."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--behaviour", default="")
+    parser.add_argument("--point", choices=POINTS)
+    given = parser.parse_args()
+    chosen = {"data": given.data, "checkpoint_seconds": 0.0, "garbage_grace_seconds": 0.0}
+    settings = ServiceSettings.model_validate(chosen)
+    store = Store.open(settings.data)
+    if given.point:
+        arm(given.point)
+    command = stand_in(given.behaviour) if given.behaviour else CHILD
+    runner = Supervisor(store, lift_limits(settings), command=command)
+    app = create_app(settings, store, runner, cast("WarmWorker", NoQueries()))
+    listener = socket.create_server(("127.0.0.1", 0))
+    AnnouncingServer(uvicorn.Config(app, log_level="warning"), app.state.streams).run(sockets=[listener])
+    store.close()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,109 @@
+"""Stands in for the process of a job: says what it is told to, without the seconds that a lift takes to begin.
+
+    python stand_in.py BEHAVIOUR ORDER
+
+It talks as ``service.jobs.child`` does. A lift of it is its job's inputs, digested; what it needs to know of earlier
+attempts lies in its work folder.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+
+def say(**message: Any) -> None:
+    print(json.dumps(message), flush=True)
+
+
+def finish(order: dict[str, Any]) -> None:
+    content = hashlib.sha256(json.dumps([order["splats"], order["settings"]]).encode()).digest()
+    Path(order["output"]).write_bytes(content)
+    names = {"encoder": "", "text_space": "none", "views": []}
+    metadata = {"version": "0", "settings": {}, "certificate": {}, "timings": {}, **names}
+    sha256 = hashlib.sha256(content).hexdigest()
+    say(event="done", sha256=sha256, count=1, channels=1, metadata=metadata)
+
+
+def first_time(order: dict[str, Any]) -> bool:
+    work = Path(order["work"])
+    work.mkdir(parents=True, exist_ok=True)
+    attempts = work / "attempts"
+    before = attempts.read_text().split() if attempts.exists() else []
+    attempts.write_text(" ".join([*before, str(os.getpid())]))
+    return not before
+
+
+def answer(order: dict[str, Any]) -> None:
+    say(event="progress", stage="geometry", done=0, total=2, unit="views")
+    say(event="progress", stage="geometry", done=1, total=2, unit="views")
+    say(event="progress", stage="solve", done=1, total=1, unit="slices")
+    finish(order)
+
+
+def hang(order: dict[str, Any]) -> None:
+    first_time(order)
+    child = subprocess.Popen([sys.executable, "-S", "-c", "import time; time.sleep(600)"])
+    (Path(order["work"]) / "grandchild").write_text(str(child.pid))
+    while True:
+        say(event="beat")
+        time.sleep(0.1)
+
+
+def die(order: dict[str, Any]) -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def die_once(order: dict[str, Any]) -> None:
+    die(order) if first_time(order) else answer(order)
+
+
+def stop_once(order: dict[str, Any]) -> None:
+    if first_time(order):
+        os.kill(os.getpid(), signal.SIGSTOP)  # and if it is ever continued, it claims to be done
+    answer(order)
+
+
+def eat(order: dict[str, Any]) -> None:
+    eaten = []
+    while True:
+        eaten.append(bytearray(os.urandom(1 << 20)) * 16)
+        time.sleep(0.02)
+
+
+def meet(order: dict[str, Any]) -> None:
+    """Wait until another one of us runs."""
+    first_time(order)
+    while len(list(Path(order["work"]).parent.glob("*/attempts"))) < 2:
+        time.sleep(0.02)
+    answer(order)
+
+
+def slowly(order: dict[str, Any]) -> None:
+    """Take half a second."""
+    time.sleep(0.5)
+    answer(order)
+
+
+BEHAVIOURS: dict[str, Callable[[dict[str, Any]], None]] = {
+    function.__name__: function for function in (answer, hang, die, die_once, stop_once, eat, meet, slowly)
+}
+
+
+def end_with_parent() -> None:
+    sys.stdin.buffer.raw.read()  # pyright: ignore[reportAttributeAccessIssue]
+    os._exit(3)
+
+
+if __name__ == "__main__":
+    threading.Thread(target=end_with_parent, daemon=True).start()
+    BEHAVIOURS[sys.argv[1]](json.loads(Path(sys.argv[2]).read_bytes()))

@@ -1,0 +1,258 @@
+"""The store does what a dict does, whatever the order of calls, crashes and collections between them."""
+
+from __future__ import annotations
+
+import hashlib
+import tempfile
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import Bundle, RuleBasedStateMachine, initialize, invariant, multiple, precondition, rule
+
+from liftcore.errors import NotFound
+from service.errors import Busy, Conflict, InUse, KeyReused
+from service.store.assets import CheckedUpload
+from service.store.attempts import MAX_ATTEMPTS
+from service.store.events import EventKind
+from service.store.garbage import collect
+from service.store.jobs import JobOrder
+from service.store.lifts import FinishedLift
+from service.store.store import Store
+from service.wire import ENDED, AssetKind, JobState
+
+LEASE = 60.0
+MAX_QUEUED = 3
+ROOMS = ("blobs", "lifts", "work", "tmp")
+
+
+@dataclass
+class Model:
+    """A job as the model knows it."""
+
+    order: JobOrder
+    state: str = "queued"
+    attempt: int = 0
+    released: int = 0
+    lift: bytes | None = None
+    story: list[str] = field(default_factory=lambda: ["queued"])
+
+    def move(self, state: str) -> None:
+        self.state = state
+        self.story.append(state)
+
+
+class StoreMachine(RuleBasedStateMachine):
+    """Rules are what routes, the supervisor, crashes and the collector do; the model is two dicts and a line."""
+
+    contents = Bundle("contents")
+    attempts = Bundle("attempts")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.folder = tempfile.TemporaryDirectory()
+        self.store = Store.open(Path(self.folder.name))
+        self.assets: dict[str, bytes] = {}
+        self.jobs: dict[str, Model] = {}
+
+    def teardown(self) -> None:
+        self.store.close()
+        self.folder.cleanup()
+
+    @initialize(target=contents)
+    def begin(self) -> Any:
+        return multiple(*(self.put(kind, b"first") for kind in AssetKind))
+
+    def put(self, kind: AssetKind, content: bytes) -> str:
+        content = kind.encode() + content
+        digest = hashlib.sha256(content).hexdigest()
+        with self.store.files.draft(".bin") as draft:
+            draft.write_bytes(content)
+            asset, new = self.store.assets.add(CheckedUpload(draft, kind, digest, ".bin", {}, []))
+        assert new == (asset.id not in self.assets)
+        self.assets[asset.id] = content
+        return asset.id
+
+    @rule(target=contents, kind=st.sampled_from(AssetKind), content=st.binary(max_size=2))
+    def upload(self, kind: AssetKind, content: bytes) -> str:
+        return self.put(kind, content)
+
+    @precondition(lambda self: len(self.assets) > 1)
+    @rule(asset=contents)
+    def delete_asset(self, asset: str) -> None:
+        used = any(asset in (job.order.splats, job.order.cameras, *job.order.features) for job in self.jobs.values())
+        expected = None if asset in self.assets and not used else InUse if asset in self.assets else NotFound
+        if expected is None:
+            self.store.assets.delete(asset)
+            del self.assets[asset]
+        else:
+            with pytest.raises(expected):
+                self.store.assets.delete(asset)
+
+    @rule(
+        data=st.data(),
+        key=st.none() | st.sampled_from(["a", "b"]),
+        print_=st.sampled_from(["x", "x", "y"]),
+        mistaken=st.sampled_from([False] * 9 + [True]),
+    )
+    def submit(self, data: Any, key: str | None, print_: str, mistaken: bool) -> None:
+        chosen = []
+        for kind in AssetKind:
+            right = [asset for asset in sorted(self.assets) if self.assets[asset].startswith(kind.encode())]
+            chosen.append(data.draw(st.sampled_from(sorted(self.assets) if mistaken or not right else right)))
+        order = JobOrder(chosen[0], chosen[1], (chosen[2],), {}, key, print_)
+        known = [job for job, model in self.jobs.items() if key is not None and model.order.key == key]
+        kinds = [self.store.assets.get(asset).kind for asset in chosen]
+        if known and self.jobs[known[0]].order.fingerprint != print_:
+            expected: type[Exception] | None = KeyReused
+        elif not known and sum(model.state == "queued" for model in self.jobs.values()) >= MAX_QUEUED:
+            expected = Busy
+        elif not known and kinds != list(AssetKind):
+            expected = NotFound
+        else:
+            expected = None
+        if expected is not None:
+            with pytest.raises(expected):
+                self.store.jobs.submit(order, max_queued=MAX_QUEUED)
+            return
+        job, new = self.store.jobs.submit(order, max_queued=MAX_QUEUED)
+        assert new == (not known) and (new or job == known[0])
+        if new:
+            self.jobs[job] = Model(order)
+
+    @rule(target=attempts)
+    def claim(self) -> tuple[str, int]:
+        claimed = self.store.attempts.claim(LEASE)
+        line = [job for job, model in self.jobs.items() if model.state == "queued"]
+        if claimed is None:
+            assert not line
+            return "0" * 32, 1
+        assert claimed.id == line[0]  # the oldest; dicts keep their order
+        model = self.jobs[claimed.id]
+        model.attempt += 1
+        model.move("running")
+        return claimed.id, claimed.attempt
+
+    def owner(self, attempt: tuple[str, int]) -> Model | None:
+        """The job when this attempt is its present one, however old the claim is."""
+        model = self.jobs.get(attempt[0])
+        owns = model is not None and model.attempt == attempt[1] and model.state in ("running", "canceling")
+        return model if owns else None
+
+    @rule(attempt=attempts, content=st.binary(max_size=3))
+    def finish(self, attempt: tuple[str, int], content: bytes) -> None:
+        model = self.owner(attempt)
+        with self.store.files.draft(".safetensors") as draft:
+            draft.write_bytes(content)
+            done = self.store.lifts.finish(*attempt, FinishedLift(draft, "0" * 64, 1, 1, {}))
+        assert done == (model is not None and model.state == "running")
+        if done and model is not None:
+            model.lift = content
+            model.move("succeeded")
+
+    @rule(attempt=attempts)
+    def fail(self, attempt: tuple[str, int]) -> None:
+        model = self.owner(attempt)
+        fault = {"kind": "crashed", "argument": "", "expected": "", "got": "", "hint": ""}
+        self.store.attempts.fail(*attempt, fault)
+        if model is not None:
+            model.move("canceled" if model.state == "canceling" else "failed")
+
+    @rule(attempt=attempts)
+    def release(self, attempt: tuple[str, int]) -> None:
+        model = self.owner(attempt)
+        self.store.attempts.release(*attempt)
+        if model is not None:
+            model.released += 1
+            model.move("canceled" if model.state == "canceling" else "queued")
+
+    @rule(attempt=attempts)
+    def lose(self, attempt: tuple[str, int]) -> None:
+        model = self.owner(attempt)
+        self.store.attempts.lose(*attempt, "why")
+        if model is not None:
+            self.lost(model)
+
+    def lost(self, model: Model) -> None:
+        if model.state == "canceling":
+            model.move("canceled")
+        else:
+            model.move("failed" if model.attempt - model.released >= MAX_ATTEMPTS else "queued")
+
+    @rule(attempt=attempts)
+    def renew_and_advance(self, attempt: tuple[str, int]) -> None:
+        owned = self.owner(attempt) is not None
+        assert (self.store.attempts.renew(*attempt, LEASE) is not None) == owned
+        self.store.attempts.advance(*attempt, {"done": 1})
+
+    @precondition(lambda self: self.jobs)
+    @rule(data=st.data())
+    def cancel(self, data: Any) -> None:
+        job = data.draw(st.sampled_from(sorted(self.jobs)))
+        model = self.jobs[job]
+        if model.state in ("succeeded", "failed"):
+            with pytest.raises(Conflict):
+                self.store.attempts.cancel(job)
+            return
+        assert self.store.attempts.cancel(job) == (model.state in ("queued", "running"))
+        if model.state in ("queued", "running"):
+            model.move("canceled" if model.state == "queued" else "canceling")
+
+    @precondition(lambda self: self.jobs)
+    @rule(data=st.data(), with_lift=st.booleans())
+    def delete_job(self, data: Any, with_lift: bool) -> None:
+        job = data.draw(st.sampled_from(sorted(self.jobs)))
+        model = self.jobs[job]
+        if model.state in ENDED and (model.lift is None or with_lift):
+            self.store.jobs.delete(job, with_lift=with_lift)
+            del self.jobs[job]
+        else:
+            with pytest.raises(Conflict):
+                self.store.jobs.delete(job, with_lift=with_lift)
+
+    @rule()
+    def collect(self) -> None:
+        assert collect(self.store, time.time() + 1) == []  # without a crash there is no garbage
+
+    @rule()
+    def crash_and_start_again(self) -> None:
+        """Close without a word to the attempts, as a killed server does; litter lies about."""
+        root = self.store.files.root
+        self.store.close()
+        litter = (root / "blobs" / "ab" / "abcd.ply", root / "lifts" / "x.safetensors", root / "tmp" / "y")
+        for path in litter:
+            path.parent.mkdir(exist_ok=True)
+            path.write_bytes(b"half")
+        self.store = Store.open(root)
+        self.store.attempts.lose_all("the server died")
+        for model in self.jobs.values():
+            if model.state in ("running", "canceling"):
+                self.lost(model)
+        assert set(collect(self.store, time.time() + 1)) == set(litter[:2])
+
+    @invariant()
+    def agrees(self) -> None:
+        assert {asset.id: asset.path.read_bytes() for asset in self.store.assets.all()} == self.assets
+        found = {job.id: (job.state, job.attempt) for job in self.store.jobs.all()}
+        assert found == {job: (JobState(model.state), model.attempt) for job, model in self.jobs.items()}
+        lifts = {lift.id: lift.path.read_bytes() for lift in self.store.lifts.all()}
+        assert lifts == {job: model.lift for job, model in self.jobs.items() if model.lift is not None}
+        for job, model in self.jobs.items():
+            events = self.store.events.after(job, 0)
+            assert [event.data["state"] for event in events if event.kind is EventKind.STATE] == model.story
+            assert model.story.count("succeeded") <= 1
+        files = [path for room in ROOMS for path in (self.store.files.root / room).rglob("*") if path.is_file()]
+        assert len(files) == len(self.assets) + len(lifts)
+
+
+TestStoreMachine = StoreMachine.TestCase
+TestStoreMachine.settings = settings(
+    max_examples=15,
+    stateful_step_count=30,
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much],
+)
