@@ -12,6 +12,8 @@ from pathlib import Path
 from service.errors import Misconfigured
 from service.store.schema import MIGRATIONS
 
+MOST_IDLE = 4  # connections kept for the next readers; those of a rush are closed after it
+
 
 class Database:
     """SQLite in WAL mode: an acknowledged write is on the disk (as far as the disk tells the truth)."""
@@ -70,7 +72,10 @@ class Database:
         try:
             yield connection
         finally:
-            self._idle.put(connection)
+            if self._idle.qsize() < MOST_IDLE:
+                self._idle.put(connection)
+            else:
+                connection.close()
 
     def close(self) -> None:
         """Close every connection."""

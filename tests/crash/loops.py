@@ -25,6 +25,9 @@ from .server import POINTS
 from .service_process import ServiceProcess, kill_processes_of, usage
 
 KILLS_A_JOB = 2  # the third attempt is the last
+POOLED = (
+    6  # descriptors of read connections that a server may come to hold after the first look; a leak has one a job
+)
 WARM_UP_JOBS = 5  # before the first look at what a server holds
 SUFFIXES = {"splats": ".ply", "cameras": ".json", "features": ".safetensors"}
 NOTHING = {kind: kind.encode() for kind in SUFFIXES}  # a scene for stand-ins, which look at none

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from .loops import fault_points, kill_loop, leak_loop, scene_files
+from .loops import POOLED, fault_points, kill_loop, leak_loop, scene_files
 
 IN_SHORT = (
     "after the job is in line, before the 202",
@@ -29,6 +29,6 @@ def test_jobs_survive_kills_at_random_points_with_the_same_bits(tmp_path: Path) 
 
 def test_nothing_leaks_over_jobs() -> None:
     found = leak_loop(jobs=10)
-    assert found["growth"]["descriptors"] <= 0 and found["growth"]["threads"] <= 0
+    assert found["growth"]["descriptors"] <= POOLED and found["growth"]["threads"] <= 1
     assert found["growth"]["resident_kb"] < 8_192
     assert found["left_over"] == []
