@@ -1,7 +1,8 @@
 """The lift file: features on splats, with all that is needed to trust and to use them.
 
-A ``.safetensors`` file holds ``features`` [P, F], ``evidence`` [P], ``agreement`` [P] and ``seen`` [P];
-its metadata hold settings, inputs with digests, the encoder, the certificate, timings and the version, as JSON.
+A ``.safetensors`` file holds ``features`` [P, F], ``evidence`` [P], ``agreement`` [P] and ``seen`` [P]; after
+Post-Lifting Aggregation also ``cluster`` [P] i32, -1 for splats in none, and ``cluster_features`` [K, F]. Its
+metadata hold settings, inputs with digests, the encoder, the certificate, timings and the version, as JSON.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 
 FORMAT = "splatlift-lift/1"
 TENSORS = ("features", "evidence", "agreement", "seen")
+CLUSTER_TENSORS = ("cluster", "cluster_features")  # in lifts with aggregation only
 
 
 class InputFile(BaseModel):
@@ -61,13 +63,16 @@ class Lift:
     agreement: Tensor  # [P] f32 in 0..1, norm of the weighted mean of unit inputs
     seen: Tensor  # [P] bool, whether any labelled ray reached the splat
     metadata: LiftMetadata
+    cluster: Tensor | None = None  # [P] i32, -1 = in no cluster; None without aggregation
+    cluster_features: Tensor | None = None  # [K, F] like features; a zero row: its splats keep their own
 
 
 def save_lift(lift: Lift, path: Path) -> None:
     """Write the lift whole or not at all (temporary file, fsync, rename), with no copy of X in memory."""
     from liftcore.safetensors_header import safetensors_header, tensor_bytes
 
-    tensors = {name: getattr(lift, name) for name in TENSORS}
+    present = TENSORS if lift.cluster is None else TENSORS + CLUSTER_TENSORS
+    tensors = {name: getattr(lift, name) for name in present}
     specs = [(name, tensor.dtype, tuple(tensor.shape)) for name, tensor in tensors.items()]
     header, offsets = safetensors_header(specs, {"splatlift": lift.metadata.model_dump_json()})
     with whole_file(path) as handle:
@@ -90,7 +95,8 @@ def load_lift(path: Path) -> Lift:
             metadata = (handle.metadata() or {}).get("splatlift")
             if metadata is None:
                 raise InvalidLift(str(path), expected="a lift file", got="safetensors without lift metadata")
-            tensors = {name: handle.get_tensor(name) for name in TENSORS}
+            clusters = [name for name in CLUSTER_TENSORS if name in tuple(handle.keys())]
+            tensors = {name: handle.get_tensor(name) for name in (*TENSORS, *clusters)}
         lift = Lift(**tensors, metadata=LiftMetadata.model_validate_json(metadata))
     except FileNotFoundError:
         raise InvalidLift(str(path), expected="a lift file", got="no such file") from None
@@ -109,3 +115,17 @@ def _check_shapes(lift: Lift, path: Path) -> None:
     if not fits or any(column.shape != rows or column.dtype != dtype for column, dtype in columns):
         shapes = {name: list(getattr(lift, name).shape) for name in TENSORS}
         raise InvalidLift(str(path), expected="one row a splat in every tensor of a lift", got=str(shapes))
+    _check_clusters(lift, path)
+
+
+def _check_clusters(lift: Lift, path: Path) -> None:
+    cluster, means = lift.cluster, lift.cluster_features
+    if cluster is None and means is None:
+        return
+    if cluster is None or means is None:
+        raise InvalidLift(str(path), expected="cluster and cluster_features, or neither", got="one of them")
+    fits = cluster.shape == lift.features.shape[:1] and cluster.dtype == torch.int32
+    fits &= means.ndim == 2 and means.shape[1:] == lift.features.shape[1:] and means.dtype == lift.features.dtype
+    if not fits or int(cluster.min()) < -1 or int(cluster.max()) >= means.shape[0]:
+        got = f"{list(cluster.shape)} {cluster.dtype} and {list(means.shape)} {means.dtype}"
+        raise InvalidLift(str(path), expected="a cluster of -1 or a row of cluster_features for each splat", got=got)

@@ -19,6 +19,7 @@ from liftcore.raster.cpu import CpuRaster
 from liftcore.raster.warm_up import warm_up
 from liftcore.scene.load import camera_files, load_cameras, load_splats
 from liftcore.solve.accumulate import accumulate, as_read, lift_walk
+from liftcore.solve.aggregation import aggregate
 from liftcore.solve.all_rays import AllRays
 from liftcore.solve.certificate import certify
 from liftcore.solve.checkpoint import Checkpoint, identity, resumed
@@ -110,6 +111,12 @@ def lift(
         if rays and settings.reference_channels:
             with timings.stage("reference"):
                 notes["reference"] = reference(rays, X, seen, geometry.samples, codebooks, settings, progress)
+        aggregation = None
+        if settings.aggregation:
+            with timings.stage("aggregate"):
+                lifted = (raster, views, packs, names)
+                aggregation = aggregate(X, geometry.evidence, lifted, settings, progress, threads)
+                notes["aggregation"] = aggregation.facts
         with timings.stage("certify"):
             certificate = certify(geometry, X, codebooks.__getitem__, settings, threads) | notes
         certificate |= {"weights_entries": sum(len(part.columns) for part in store), "views_without_camera": unpaired}
@@ -125,8 +132,15 @@ def lift(
         certificate=certificate,
         timings=timings.seconds,
     )
-    evidence = torch.from_numpy(geometry.evidence).to(torch.float32)
-    return Lift(X, evidence, solution.agreement, torch.from_numpy(seen), metadata)
+    return Lift(
+        features=X,
+        evidence=torch.from_numpy(geometry.evidence).to(torch.float32),
+        agreement=solution.agreement,
+        seen=torch.from_numpy(seen),
+        metadata=metadata,
+        cluster=aggregation.clusters if aggregation else None,
+        cluster_features=aggregation.cluster_features if aggregation else None,
+    )
 
 
 def input_file(path: Path) -> InputFile:

@@ -121,6 +121,11 @@ PRESET_CASES = (
         for pack in ("features", "features_hard", "grids")
         for preset in Preset
     ),
+    *(
+        preset_case(pack, preset, aggregation=True)
+        for pack in ("features", "features_hard", "grids")
+        for preset in ("row-sum", "tikhonov")
+    ),
     preset_case("features_hard", "front-mass", (0.895, 0.938), power=2),
     preset_case("features_hard", "front-mass", weight_floor=0.13),
     preset_case("features_hard", "top-k", (0.875, 0.939), k=5),

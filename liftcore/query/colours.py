@@ -29,6 +29,7 @@ SH_C3 = (
     math.sqrt(7 / (16 * math.pi)),
     math.sqrt(105 / (16 * math.pi)),
 )
+NO_CLUSTER_COLOUR = (90, 90, 90)  # sRGB of splats in no cluster
 NO_COLOUR = 0.6  # grey of splats whose file holds no colours
 
 # The map runs from dark violet over green to light yellow: its lightness rises evenly, so that equal steps of
@@ -37,6 +38,9 @@ _MAP_STEPS = 256
 _MAP_LIGHTNESS = (0.18, 0.93)
 _MAP_HUE = (math.radians(300), math.radians(105))
 _MAP_CHROMA = (0.10, 0.17)
+
+_CLUSTER_LIGHTNESS = (0.72, 0.86, 0.58)
+_CLUSTER_CHROMA = 0.13
 
 
 def seen_colours(splats: Splats, camera: Camera) -> Tensor:
@@ -88,6 +92,19 @@ def colour_map() -> np.ndarray:
     hue = np.interp(step, (0, 1), _MAP_HUE)
     chroma = np.interp(step, (0, 1), _MAP_CHROMA)
     return _srgb(lightness, chroma * np.cos(hue), chroma * np.sin(hue))
+
+
+def cluster_colours(count: int) -> np.ndarray:
+    """[count + 1, 3] u8 sRGB: a colour a cluster, and grey last, where label -1 points.
+
+    Hues turn by the golden angle, so that any first few are far apart; three levels of lightness part what the eye
+    would take for one hue.
+    """
+    number = np.arange(count)
+    hue = number * math.pi * (3 - math.sqrt(5))
+    lightness = np.array(_CLUSTER_LIGHTNESS)[number % len(_CLUSTER_LIGHTNESS)]
+    colours = _srgb(lightness, _CLUSTER_CHROMA * np.cos(hue), _CLUSTER_CHROMA * np.sin(hue))
+    return np.concatenate([colours, np.array([NO_CLUSTER_COLOUR], dtype=np.uint8)])
 
 
 def _srgb(lightness: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from PIL import Image
 
+from liftcore.errors import InvalidQuery
 from liftcore.files import whole_file
-from liftcore.query.colours import colour_map, seen_colours
+from liftcore.query.colours import cluster_colours, colour_map, seen_colours
 from liftcore.raster.protocol import Walk
 
 if TYPE_CHECKING:
@@ -37,10 +38,11 @@ def attention_png(look: Look) -> bytes:
 
 
 def render_png(scene: QueryScene, view: str, what: str = "rgb") -> bytes:
-    """The scene as a camera sees it, RGB [H, W, 3] on black: its colours, or its features (``pca``).
+    """The scene as a camera sees it, RGB [H, W, 3] on black: its colours, features (``pca``) or clusters.
 
     Raises:
         NotFound: no camera has this name.
+        InvalidQuery: clusters are asked for, and the lift has none.
         InvalidLift: the splats or the cameras moved or changed since the lift.
     """
     return _png(render(scene, view, what))
@@ -64,16 +66,41 @@ def save_attention(look: Look, path: Path) -> None:
 def render(scene: QueryScene, view: str, what: str = "rgb") -> np.ndarray:
     """The colours of a view, [H, W, 3] u8 sRGB on black, with the opacities as trained (gain 1).
 
-    ``rgb`` takes the splats' own colours, ``pca`` the first three principal components of their features.
+    ``rgb`` takes the splats' own colours, ``pca`` the first three principal components of their features, and
+    ``cluster`` one colour a cluster (`render_clusters`).
 
     Raises:
         NotFound: no camera has this name.
+        InvalidQuery: clusters are asked for, and the lift has none.
         InvalidLift: the splats or the cameras moved or changed since the lift.
     """
+    if what == "cluster":
+        return render_clusters(scene, view)
     camera = scene.cameras.get(view)
     colours = scene.principal if what == "pca" else seen_colours(scene.splats, camera)
     image = scene.raster.render(camera, colours, Walk())
     return np.round(255 * image.numpy().clip(0.0, 1.0)).astype(np.uint8)
+
+
+def render_clusters(scene: QueryScene, view: str) -> np.ndarray:
+    """The cluster of the most weight on each ray, [H, W, 3] u8: as aggregation saw it, with the rendering gain.
+
+    Grey where unclustered splats have the most, black where the ray misses the scene.
+
+    Raises:
+        NotFound: no camera has this name.
+        InvalidQuery: the lift has no clusters.
+        InvalidLift: the splats or the cameras moved or changed since the lift.
+    """
+    clusters, means = scene.lift.cluster, scene.lift.cluster_features
+    if clusters is None or means is None:
+        hint = "lift again with the setting aggregation=true"
+        raise InvalidQuery("what", expected="a lift with clusters", got="a lift without aggregation", hint=hint)
+    camera = scene.cameras.get(view)
+    shown = scene.raster.strongest_labels(camera, clusters, scene.walk).numpy()
+    picture = cluster_colours(means.shape[0])[shown]  # the last colour is that of label -1
+    picture[scene.raster.row_sums(camera, scene.walk).numpy() <= 0] = 0
+    return picture
 
 
 def _mask(look: Look) -> np.ndarray:

@@ -27,6 +27,7 @@ from liftcore.raster.region_weights import weigh_tiles
 from liftcore.raster.rendering import render_tiles, top_tiles, trace_rays
 from liftcore.raster.selection import choice_of
 from liftcore.raster.strided import check_stride, every_pixel, places_on, strided
+from liftcore.raster.strongest import strongest_tiles
 from liftcore.raster.tiles import fill_tiles, list_tiles, tile_places
 from liftcore.raster.walk import Frame
 from liftcore.scene.splats import Kernel
@@ -147,6 +148,18 @@ class CpuRaster:
         weights = np.zeros((camera.height, camera.width, count), np.float32)
         self._over_tiles(frame, lambda first, last: top_tiles(first, last, frame, ids, weights))
         return torch.from_numpy(ids), torch.from_numpy(weights)
+
+    def strongest_labels(self, camera: Camera, labels: Tensor, walk: Walk) -> Tensor:
+        """``argmax(A onehot(labels))``: labels [P] i32 in -1..K - 1 -> [H, W] i32. See the protocol."""
+        if labels.ndim != 1 or labels.shape[0] != self.splats.count or int(labels.min()) < -1:
+            got = f"{list(labels.shape)}, the smallest {int(labels.min())}"
+            expected = f"a label of -1 or more for each of {self.splats.count} splats"
+            raise InvalidInput("labels", expected=expected, got=got)
+        frame = self._frame(camera, walk)
+        flat, count = np.ascontiguousarray(labels.to(torch.int32).numpy()), int(labels.max()) + 1
+        image = np.full((camera.height, camera.width), -1, np.int32)
+        self._over_tiles(frame, lambda first, last: strongest_tiles(first, last, frame, flat, count, image))
+        return torch.from_numpy(image)
 
     def ray_rows(self, camera: Camera, pixels: Tensor, walk: Walk) -> RayRows:
         """Rows of A for single pixels [n, 2] (x, y). See the protocol."""

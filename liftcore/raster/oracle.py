@@ -175,6 +175,12 @@ class OracleRaster:
         ids = torch.from_numpy(order.astype(np.int32)).reshape(shape)
         return ids, torch.from_numpy(weights.astype(np.float32)).reshape(shape)
 
+    def strongest_labels(self, camera: Camera, labels: Tensor, walk: Walk) -> Tensor:
+        """``argmax(A Gamma) - 1`` with the one-hot matrix Gamma [P, K + 1] written out, its first column for -1."""
+        onehot = np.eye(int(labels.max()) + 2)[labels.numpy() + 1]
+        sums = dense_view(self.splats, camera, walk).A @ onehot
+        return torch.from_numpy(sums.argmax(axis=1).astype(np.int32) - 1).reshape(camera.height, camera.width)
+
     def ray_rows(self, camera: Camera, pixels: Tensor, walk: Walk) -> RayRows:
         """Rows of A, read off the dense matrix (in row order, not in depth order)."""
         A = dense_view(self.splats, camera, walk).A

@@ -78,6 +78,13 @@ class Raster(Protocol):
         """The largest weights of every ray, descending: ids [H, W, count] i32 (-1 = none), weights f32."""
         ...
 
+    def strongest_labels(self, camera: Camera, labels: Tensor, walk: Walk) -> Tensor:
+        """``argmax(A onehot(labels))``: labels [P] i32 in -1..K - 1 -> [H, W] i32.
+
+        Label -1 is a class like the others; rays that miss the scene get -1 too. Equal sums go to the smallest label.
+        """
+        ...
+
     def ray_rows(self, camera: Camera, pixels: Tensor, walk: Walk) -> RayRows:
         """Rows of A for the rays of pixels [n, 2] i32 (x, y) of the full view, whatever the walk's stride."""
         ...

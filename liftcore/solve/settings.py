@@ -70,8 +70,14 @@ class LiftSettings(BaseModel):
     dtype: Literal["float16", "float32"] = Field(
         "float16", description="how features are stored, if it can hold them"
     )
+    aggregation: bool = Field(False, description="Post-Lifting Aggregation: one feature a cluster of splats")
+    aggregation_iou: float = Field(0.75, gt=0, le=1, description="from which IoU with its cluster a region is kept")
+    aggregation_cluster_size: int = Field(500, ge=2, le=10_000_000, description="splats at least in a cluster")
+    aggregation_neighbours: int = Field(10, ge=1, le=1_000, description="neighbours that a splat's density reaches")
+    aggregation_sample: int = Field(10_000, ge=2, le=50_000, description="splats that HDBSCAN sees")
+    aggregation_channels: int = Field(50, ge=1, le=1_024, description="principal components that it sees")
     certificate_rays: int = Field(10_000, ge=0, le=10_000_000, description="rays sampled for the certificate")
-    seed: int = Field(0, ge=0, lt=2**31, description="of the certificate's sample and projections, and of strides")
+    seed: int = Field(0, ge=0, lt=2**31, description="of samples, random projections and strides")
     cg_steps: int = Field(0, ge=0, le=10_000, description="least-squares steps from the closed form on, 0 = none")
     damping: float = Field(1.0, ge=0, le=1e6, description="mu, pulls least squares towards the closed form")
     cg_basis: int = Field(0, ge=0, le=65_536, description="principal feature directions refined, 0 = all channels")

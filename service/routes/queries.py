@@ -125,10 +125,11 @@ def render(
     here: Here,
     lift: LiftParameter = None,
     what: Annotated[
-        Literal["rgb", "pca"], Query(description="the splats' colours, or three principal components of features")
+        Literal["rgb", "pca", "cluster"],
+        Query(description="the splats' colours, three principal components of features, or clusters"),
     ] = "rgb",
 ) -> Response:
-    """The splats from a view, in their colours or in those of their features: a PNG."""
+    """The splats from a view, in their colours or in those of their features or clusters: a PNG."""
     found = find_lift(lift, here)
     asked = _scene_request("render", found, here) | {"view": view, "what": what}
     return _entity(request, here, asked, found, "image/png")

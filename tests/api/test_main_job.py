@@ -122,6 +122,14 @@ def test_features_are_shown_as_colours(client: TestClient, lift: dict[str, Any])
     assert (shown != plain).any() and shown.max() > 128
 
 
+def test_clusters_of_a_lift_without_aggregation_are_a_problem_that_says_so(
+    client: TestClient, lift: dict[str, Any]
+) -> None:
+    reply = client.get("/render", params={"lift": lift["id"], "view": "middle", "what": "cluster"})
+    assert reply.status_code == 422 and reply.json()["type"].endswith("invalid-query")
+    assert "aggregation" in reply.json()["detail"]
+
+
 def test_negatives_change_the_scores(client: TestClient, lift: dict[str, Any]) -> None:
     params = {"text": "apple", "lift": lift["id"]}
     plain = client.get("/query/scores", params=params).content

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +12,11 @@ import pytest
 import torch
 from PIL import Image
 
-from liftcore.artifact import Lift, LiftMetadata, save_lift
+from liftcore.artifact import Lift, LiftMetadata, load_lift, save_lift
 from liftcore.errors import InvalidLift, InvalidQuery, NotFound
 from liftcore.lift import input_file
 from liftcore.query.ask import ask, look, top
-from liftcore.query.colours import SH_C0, seen_colours
+from liftcore.query.colours import NO_CLUSTER_COLOUR, SH_C0, cluster_colours, seen_colours
 from liftcore.query.pictures import attention_png, mask_png, overlay_png, render, render_png
 from liftcore.query.scene import QueryScene
 from liftcore.scene.cameras import Cameras
@@ -179,3 +180,29 @@ def test_the_harmonics_are_orthonormal_on_the_sphere() -> None:
     basis = _sh_basis(directions, 3).double()
     gram = 4 * torch.pi * (basis.T @ basis) / len(basis)
     torch.testing.assert_close(gram, torch.eye(16, dtype=torch.float64), atol=0.03, rtol=0)
+
+
+def test_clusters_are_shown_in_their_colours_and_the_rest_in_grey(lift_file: Path, tmp_path: Path) -> None:
+    plain = load_lift(lift_file)
+    clusters = (torch.arange(COUNT) % 3 - 1).to(torch.int32)
+    save_lift(replace(plain, cluster=clusters, cluster_features=torch.ones(2, 3).half()), tmp_path / "clustered")
+    scene = QueryScene.open(tmp_path / "clustered")
+    shown = render(scene, "front", "cluster")
+    labels = scene.raster.strongest_labels(scene.cameras.get("front"), clusters, scene.walk).numpy()
+    met = scene.raster.row_sums(scene.cameras.get("front"), scene.walk).numpy() > 0
+    assert {-1, 0, 1} == set(labels[met].tolist())
+    for label, colour in zip((0, 1, -1), cluster_colours(2), strict=True):
+        assert (shown[met & (labels == label)] == colour).all()
+    assert not shown[~met].any()
+
+
+def test_many_clusters_have_colours_that_can_be_told_apart() -> None:
+    colours = cluster_colours(24).astype(int)
+    assert colours.shape == (25, 3) and tuple(colours[-1]) == NO_CLUSTER_COLOUR
+    apart = np.abs(colours[:, None] - colours[None]).max(axis=2)[~np.eye(25, dtype=bool)]
+    assert apart.min() >= 16
+
+
+def test_a_lift_without_clusters_cannot_show_them(lift_file: Path) -> None:
+    with pytest.raises(InvalidQuery, match="aggregation"):
+        render_png(QueryScene.open(lift_file), "front", "cluster")

@@ -1,0 +1,169 @@
+"""Post-Lifting Aggregation (paper, Post Aggregation Filtering): one feature a cluster, from the regions it confirms.
+
+1. Cluster the splats by their lifted features (`clustering`).
+2. Show the clusters in every lifted view: ``kappa = argmax(A onehot(cluster))``, unclustered splats being a class.
+3. Keep the regions whose IoU with their majority cluster's footprint reaches tau (`region_filter`).
+4. A cluster's feature is the mean of its kept regions' codebook rows, and its splats take it.
+
+Splats in no cluster, and those of clusters without a kept region, keep their own features. Grids have no regions to
+filter: where no view has any, a cluster's feature is the mean of its splats' features, weighted by evidence.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from scipy.sparse import csr_matrix
+
+from liftcore.observe.levels import at_levels
+from liftcore.observe.observation import RegionMap
+from liftcore.solve.accumulate import render_walk
+from liftcore.solve.clustering import BLOCK, NO_CLUSTER, Clustering, cluster_splats
+from liftcore.solve.region_filter import match_regions
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from torch import Tensor
+
+    from liftcore.observe.observation import Observation
+    from liftcore.observe.pack import FeaturePacks
+    from liftcore.progress import Progress
+    from liftcore.raster.protocol import Raster
+    from liftcore.scene.cameras import Cameras
+    from liftcore.solve.settings import LiftSettings
+
+
+@dataclass(frozen=True)
+class Aggregation:
+    """Clusters and their features."""
+
+    clusters: Tensor  # [P] i32, -1 = in no cluster
+    cluster_features: Tensor  # [K, F] like the features; a zero row where the splats keep their own
+    facts: dict[str, Any]  # for the certificate
+
+
+@dataclass
+class KeptRegions:
+    """What the kept regions of all views add up to."""
+
+    sums: np.ndarray  # [K, F] f64, of their codebook rows
+    counts: np.ndarray  # [K] i64, how many they are
+    regions: int = 0  # of all views, kept or not
+
+    def add(self, codebook: Tensor, clusters: np.ndarray, kept: np.ndarray) -> None:
+        """Add the kept rows [M] bool of a codebook [M, F] to their clusters [M]."""
+        rows = np.flatnonzero(kept)
+        np.add.at(self.sums, clusters[rows], codebook[torch.from_numpy(rows)].to(torch.float64).numpy())
+        np.add.at(self.counts, clusters[rows], 1)
+
+
+def aggregate(
+    features: Tensor,
+    evidence: np.ndarray,
+    views: tuple[Raster, Cameras, FeaturePacks, Sequence[str]],
+    settings: LiftSettings,
+    progress: Progress,
+    threads: int | None = None,
+) -> Aggregation:
+    """Aggregate lifted features, in place.
+
+    Args:
+        features: [P, F] f16 or f32; rows of splats whose cluster has a feature are overwritten with it.
+        evidence: [P] f64, sums of plain weights.
+        views: the raster, the cameras, the packs and the names of the lifted views.
+        threads: None takes the cores that this process may use. The number changes no bit.
+    """
+    names = views[3]
+    progress("aggregate", 0, len(names), "views")
+    clustering = cluster_splats(features, evidence, settings, threads)
+    region_views = [name for name in names if views[2].is_regions(name)]
+    if clustering.count == 0:
+        merged, facts = torch.zeros(0, features.shape[1], dtype=features.dtype), {}
+    elif region_views:
+        kept = filter_regions(clustering, features.shape[1], views, settings, progress)
+        merged = kept_means(kept, features.dtype)
+        facts = {"filter": "iou", "regions": kept.regions, "kept_regions": int(kept.counts.sum())}
+    else:
+        merged = evidence_means(features, evidence, clustering)
+        facts = {"filter": "none: grids have no regions"}
+    share = spread(features, clustering.labels, merged)
+    progress("aggregate", len(names), len(names), "views")
+    return Aggregation(clustering.labels, merged, clustering_facts(clustering, merged) | facts | {"changed": share})
+
+
+def clustering_facts(clustering: Clustering, merged: Tensor) -> dict[str, Any]:
+    """What the certificate says of the clusters."""
+    return {
+        "clusters": clustering.count,
+        "clusters_with_feature": int((merged != 0).any(dim=1).sum()),
+        "unclustered_share": float((clustering.labels == NO_CLUSTER).float().mean()),
+        "sample": clustering.sample,
+        "smallest_in_sample": clustering.smallest,
+        "sample_noise_share": clustering.sample_noise,
+    }
+
+
+def filter_regions(
+    clustering: Clustering,
+    channels: int,
+    views: tuple[Raster, Cameras, FeaturePacks, Sequence[str]],
+    settings: LiftSettings,
+    progress: Progress,
+) -> KeptRegions:
+    """Render the clusters to every lifted view and keep the regions that match one by ``aggregation_iou``."""
+    raster, cameras, packs, names = views
+    kept = KeptRegions(np.zeros((clustering.count, channels)), np.zeros(clustering.count, np.int64))
+    walk = render_walk(settings)
+    for number, name in enumerate(names):
+        observation = masks_of(packs.observation(name), settings, name)
+        if isinstance(observation, RegionMap):
+            kappa = raster.strongest_labels(cameras.get(name), clustering.labels, walk).numpy()
+            rows = observation.codebook.shape[0]
+            matches = match_regions(observation.labels.numpy(), kappa, rows, clustering.count)
+            reliable = (matches.clusters >= 0) & (matches.ious >= settings.aggregation_iou)
+            kept.add(observation.codebook, matches.clusters, reliable)
+            kept.regions += int(matches.present.sum())
+        progress("aggregate", number + 1, len(names), "views")
+    return kept
+
+
+def masks_of(observation: Observation, settings: LiftSettings, view: str) -> Observation:
+    """The masks that are filtered: those of one level where it was lifted alone, else all.
+
+    Composite regions are pieces of masks; no cluster's footprint would match them.
+    """
+    return at_levels(observation, "rows" if settings.levels == "composite" else settings.levels, view)
+
+
+def kept_means(kept: KeptRegions, dtype: torch.dtype) -> Tensor:
+    """[K, F]: the mean of each cluster's kept rows; zero where there is none."""
+    means = kept.sums / np.maximum(kept.counts, 1)[:, None]
+    return torch.from_numpy(means).to(dtype)
+
+
+def evidence_means(features: Tensor, evidence: np.ndarray, clustering: Clustering) -> Tensor:
+    """[K, F]: the mean of the features of each cluster's splats, weighted by their evidence."""
+    labels = clustering.labels.numpy()
+    sums, totals = np.zeros((clustering.count, features.shape[1])), np.zeros(clustering.count)
+    for first in range(0, labels.size, BLOCK):
+        own = np.flatnonzero(labels[first : first + BLOCK] >= 0)
+        clusters, weights = labels[first + own], evidence[first + own]
+        shares = csr_matrix((weights, (clusters, np.arange(own.size))), shape=(clustering.count, own.size))
+        sums += shares @ features[torch.from_numpy(first + own)].to(torch.float32).numpy()
+        totals += np.bincount(clusters, weights, minlength=clustering.count)
+    means = np.divide(sums, totals[:, None], out=sums, where=totals[:, None] > 0)
+    return torch.from_numpy(means).to(features.dtype)
+
+
+def spread(features: Tensor, labels: Tensor, merged: Tensor) -> float:
+    """Give every splat its cluster's feature, where there is one; the share of splats that took one."""
+    filled = torch.cat([(merged != 0).any(dim=1), torch.zeros(1, dtype=torch.bool)])  # the last is label -1
+    taken = filled[labels.long()]
+    for first in range(0, features.shape[0], BLOCK):
+        rows = first + torch.nonzero(taken[first : first + BLOCK])[:, 0]
+        features[rows] = merged[labels[rows].long()]
+    return float(taken.float().mean())

@@ -1,0 +1,223 @@
+"""Aggregation from clusters to features, against loops over pixels, regions and splats."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from liftcore.artifact import CLUSTER_TENSORS, load_lift, save_lift
+from liftcore.errors import InvalidLift
+from liftcore.lift import lift
+from liftcore.observe.observation import FeatureGrid, RegionMap
+from liftcore.observe.pack import open_packs
+from liftcore.observe.write_pack import write_pack
+from liftcore.progress import silent
+from liftcore.raster.cpu import CpuRaster
+from liftcore.raster.oracle import OracleRaster, dense_view
+from liftcore.scene.cameras import Cameras
+from liftcore.scene.inria import write_inria_cameras
+from liftcore.scene.ply import write_splats
+from liftcore.solve.accumulate import render_walk
+from liftcore.solve.aggregation import KeptRegions, evidence_means, filter_regions, kept_means, spread
+from liftcore.solve.clustering import Clustering
+from liftcore.solve.settings import LiftSettings
+from tests.scenes import centred, random_camera, random_grid, random_regions, random_splats
+
+SETTINGS = LiftSettings.of(aggregation=True, aggregation_iou=0.3, certificate_rays=10)
+P, K = 40, 3
+
+
+def clustering_of(labels: np.ndarray, count: int = K) -> Clustering:
+    return Clustering(torch.tensor(labels, dtype=torch.int32), count, labels.size, 2, 0.0)
+
+
+@given(st.integers(0, 2**20))
+@settings(max_examples=15, deadline=None)
+def test_kept_regions_are_those_of_the_paper_pixel_by_pixel(tmp_path_factory, seed):
+    splats = random_splats(seed, P)
+    views = tuple(random_camera(seed + k, 21 + 4 * k, 17, name=f"v{k}") for k in range(2))
+    maps = {"v0": random_regions(seed, 2, 5, (9, 14)), "v1": random_grid(seed)}
+    path = tmp_path_factory.mktemp("pack") / "features.safetensors"
+    write_pack(path, maps, {"encoder": "random"})
+    labels = np.random.default_rng(seed).integers(-1, K, P)
+    lifted = (OracleRaster(splats), Cameras(views), open_packs([path]), ("v0", "v1"))
+    kept = filter_regions(clustering_of(labels), 6, lifted, SETTINGS, silent)
+
+    onehot = np.array([[float(label == k) for k in range(-1, K)] for label in labels])
+    A = dense_view(splats, views[0], render_walk(SETTINGS)).A
+    kappa = ((A @ onehot).argmax(axis=1) - 1).reshape(17, 21)
+    sums, counts, present = np.zeros((K, 6)), np.zeros(K, int), 0
+    for row, vector in enumerate(maps["v0"].codebook.double().numpy()):
+        y, x = ((np.arange(17) + 0.5) * 9 / 17).astype(int), ((np.arange(21) + 0.5) * 14 / 21).astype(int)
+        mask = (maps["v0"].labels.numpy()[:, y][:, :, x] == row).any(axis=0)
+        present += int(mask.any())
+        shares = [(mask & (kappa == k)).sum() for k in range(-1, K)]
+        majority = int(np.argmax(shares)) - 1
+        if mask.any() and majority >= 0:
+            footprint = kappa == majority
+            if (mask & footprint).sum() / (mask | footprint).sum() >= SETTINGS.aggregation_iou:
+                sums[majority] += vector
+                counts[majority] += 1
+    assert kept.regions == present
+    assert kept.counts.tolist() == counts.tolist()
+    assert np.abs(kept.sums - sums).max() < 1e-6
+
+
+@given(st.integers(0, 2**20), st.integers(1, 60), st.integers(1, 5))
+@settings(max_examples=40, deadline=None)
+def test_splats_take_the_mean_of_their_clusters_kept_regions_and_the_others_keep_their_own(seed, count, channels):
+    rng = np.random.default_rng(seed)
+    labels = rng.integers(-1, K, count)
+    features = torch.tensor(rng.normal(size=(count, channels)), dtype=torch.float32)
+    before = features.clone()
+    kept = KeptRegions(np.zeros((K, channels)), np.zeros(K, np.int64))
+    own: list[list[np.ndarray]] = [[] for _ in range(K)]
+    for _ in range(2):
+        codebook = torch.tensor(rng.normal(size=(7, channels)), dtype=torch.float32)
+        clusters, chosen = rng.integers(0, K - 1, 7), rng.random(7) < 0.5  # the last cluster gets none
+        kept.add(codebook, clusters, chosen)
+        for row in np.flatnonzero(chosen):
+            own[clusters[row]].append(codebook[row].double().numpy())
+    merged = kept_means(kept, torch.float32)
+    share = spread(features, torch.tensor(labels, dtype=torch.int32), merged)
+    took = 0
+    for j, label in enumerate(labels):
+        if label >= 0 and own[label]:
+            took += 1
+            assert np.abs(features[j].numpy() - np.mean(own[label], axis=0)).max() < 1e-6
+        else:
+            assert torch.equal(features[j], before[j])
+    assert share == pytest.approx(took / count)
+    assert not merged[K - 1].any()
+
+
+def test_clusters_of_grids_take_the_mean_of_their_splats_weighted_by_evidence():
+    rng = np.random.default_rng(0)
+    labels, evidence = rng.integers(-1, K - 1, 500), rng.uniform(0, 3, 500)
+    features = torch.tensor(rng.normal(size=(500, 4)), dtype=torch.float32)
+    means = evidence_means(features, evidence, clustering_of(labels)).numpy()
+    for k in range(K - 1):
+        weights = evidence * (labels == k)
+        assert np.abs(means[k] - weights @ features.double().numpy() / weights.sum()).max() < 1e-6
+    assert not means[K - 1].any()
+
+
+def write_scene(folder, kind: str):
+    """Two groups of splats left and right of the middle, seen by three cameras; splats, cameras, features."""
+    splats = random_splats(5, 400, spread=0.3)
+    side = torch.arange(400) % 2
+    splats.means[:, 0] += torch.where(side == 0, -1.2, 1.2)
+    pose = np.eye(4)
+    pose[2, 3] = 4.0
+    views = []
+    for k in range(3):
+        base = centred(random_camera(0, 40 + 8 * k, 30, name=f"v{k}"))
+        views.append(replace(base, fx=40.0, fy=40.0, world_to_camera=pose))
+    maps: dict[str, RegionMap | FeatureGrid] = {}
+    for k, camera in enumerate(views):
+        labels = torch.zeros(1, 15, 20, dtype=torch.int32)
+        labels[:, :, 10:] = 1
+        noise = np.random.default_rng(k).normal(0, 0.05, (2, 6))
+        codebook = torch.tensor(np.eye(2, 6) + noise, dtype=torch.float32)
+        maps[camera.name] = RegionMap(labels, codebook)
+        if kind == "grids":
+            maps[camera.name] = FeatureGrid(codebook[labels[0].long()])
+    maps["nowhere"] = maps["v0"]
+    paths = folder / "splats.ply", folder / "cameras.json", folder / "features.safetensors"
+    write_splats(splats, paths[0])
+    write_inria_cameras(Cameras(tuple(views)), paths[1])
+    write_pack(paths[2], maps, {"encoder": "random"})
+    return paths, side
+
+
+KNOBS = {"aggregation_cluster_size": 40, "certificate_rays": 10, "aggregation_iou": 0.2}
+
+
+@pytest.mark.parametrize("kind", ["regions", "grids"])
+def test_a_lift_with_aggregation_has_one_feature_a_cluster_and_says_so(tmp_path, kind):
+    (splats, cameras, features), side = write_scene(tmp_path, kind)
+    runs = [lift(splats, cameras, [features], LiftSettings.of(aggregation=True, **KNOBS), threads=n) for n in (1, 3)]
+    result = runs[0]
+    assert torch.equal(result.features, runs[1].features)
+    save_lift(result, tmp_path / "lift")
+    opened = load_lift(tmp_path / "lift")
+    assert opened.cluster is not None and opened.cluster_features is not None
+    facts = opened.metadata.certificate["aggregation"]
+    assert facts["clusters"] == opened.cluster_features.shape[0] >= 2
+    assert ("kept_regions" in facts) == (kind == "regions")
+    assert facts["filter"].startswith("iou" if kind == "regions" else "none")
+    taken = (opened.cluster >= 0) & (opened.cluster_features != 0).any(dim=1)[opened.cluster.long()]
+    assert facts["changed"] == pytest.approx(float(taken.float().mean())) and facts["changed"] > 0.3
+    assert torch.equal(opened.features[taken], opened.cluster_features[opened.cluster[taken].long()])
+    agree = opened.features[taken].float()[:, :2].argmax(dim=1) == side[taken]
+    assert float(agree.float().mean()) > 0.95
+
+
+def test_a_lift_without_clusters_is_the_lift_without_aggregation_and_says_so(tmp_path):
+    (splats, cameras, features), _ = write_scene(tmp_path, "regions")
+    plain = lift(splats, cameras, [features], LiftSettings.of(certificate_rays=10))
+    none = lift(splats, cameras, [features], LiftSettings.of(aggregation=True, certificate_rays=10))
+    assert none.metadata.certificate["aggregation"]["clusters"] == 0
+    assert none.metadata.certificate["aggregation"]["changed"] == 0
+    assert torch.equal(plain.features, none.features)
+    assert none.cluster is not None and bool((none.cluster == -1).all())
+    save_lift(none, tmp_path / "none")
+    assert load_lift(tmp_path / "none").cluster_features.shape == (0, 6)
+    save_lift(plain, tmp_path / "plain")
+    assert load_lift(tmp_path / "plain").cluster is None
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"cluster": torch.full((400,), 3, dtype=torch.int32)},
+        {"cluster": torch.full((400,), -2, dtype=torch.int32)},
+        {"cluster": torch.zeros(399, dtype=torch.int32)},
+        {"cluster": torch.zeros(400, dtype=torch.int64)},
+        {"cluster_features": torch.zeros(3, 5, dtype=torch.float16)},
+    ],
+)
+def test_a_lift_whose_clusters_do_not_fit_is_refused(tmp_path, changed):
+    (splats, cameras, features), _ = write_scene(tmp_path, "regions")
+    plain = lift(splats, cameras, [features], LiftSettings.of(certificate_rays=10))
+    parts = {"cluster": torch.zeros(400, dtype=torch.int32), "cluster_features": torch.zeros(3, 6).half()}
+    assert set(parts) == set(CLUSTER_TENSORS)
+    save_lift(replace(plain, **parts | changed), tmp_path / "lift")
+    with pytest.raises(InvalidLift):
+        load_lift(tmp_path / "lift")
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_one_splat_is_aggregated_without_harm(tmp_path, channels):
+    write_splats(random_splats(0, 1), tmp_path / "splats.ply")
+    camera = centred(random_camera(0, name="v0"))
+    write_inria_cameras(Cameras((camera,)), tmp_path / "cameras.json")
+    write_pack(tmp_path / "f.safetensors", {"v0": random_regions(0, F=channels)}, {"encoder": "random"})
+    paths = tmp_path / "splats.ply", tmp_path / "cameras.json"
+    result = lift(*paths, [tmp_path / "f.safetensors"], LiftSettings.of(aggregation=True, certificate_rays=10))
+    assert result.cluster is not None and result.cluster.tolist() == [-1]
+    assert bool(torch.isfinite(result.features).all())
+
+
+def test_the_strongest_labels_are_those_of_the_one_hot_render():
+    for seed in range(6):
+        splats, camera = random_splats(seed, 80), random_camera(seed, 50, 37)
+        labels = torch.tensor(np.random.default_rng(seed).integers(-1, 60, 80), dtype=torch.int32)
+        walk = render_walk(SETTINGS)
+        view = dense_view(splats, camera, walk)
+        sums = view.A @ np.eye(61)[labels.numpy() + 1]
+        ranked = np.sort(sums, axis=1)
+        clear = (ranked[:, -1] - ranked[:, -2] > 1e-4) & ~view.cut
+        runs = [CpuRaster(splats, threads=n).strongest_labels(camera, labels, walk) for n in (1, 2, 5)]
+        assert all(torch.equal(runs[0], other) for other in runs[1:])
+        shown = runs[0].numpy().ravel()
+        assert np.array_equal(shown[clear], (sums.argmax(axis=1) - 1)[clear])
+        assert clear.mean() > 0.3
+        assert (shown[view.A.sum(axis=1) == 0] == -1).all()
+        reference = OracleRaster(splats).strongest_labels(camera, labels, walk).numpy().ravel()
+        assert np.array_equal(shown[clear], reference[clear])

@@ -1,0 +1,113 @@
+"""Planted clusters are found, on any number of threads, and what has none says so."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from liftcore.solve.clustering import NO_CLUSTER, cluster_splats, draw
+from liftcore.solve.principal_axes import principal_axes
+from liftcore.solve.settings import LiftSettings
+
+SETTINGS = LiftSettings.of(aggregation=True, aggregation_cluster_size=20, aggregation_neighbours=5)
+
+
+def planted(count: int, channels: int = 24, groups: int = 4, seed: int = 0) -> tuple[torch.Tensor, np.ndarray]:
+    """Features [P, F] f16 around ``groups`` directions in a narrow cone, and the group of each row."""
+    rng = np.random.default_rng(seed)
+    group = rng.integers(0, groups, count)
+    vectors = 3 * np.ones(channels) / np.sqrt(channels) + rng.normal(0, 1, (groups, channels)) / np.sqrt(channels)
+    rows = vectors[group] + rng.normal(0, 0.1, (count, channels)) / np.sqrt(channels)
+    return torch.tensor(rows * rng.uniform(0.2, 1.0, (count, 1)), dtype=torch.float16), group
+
+
+def same_partition(labels: np.ndarray, group: np.ndarray) -> bool:
+    pairs = {(int(a), int(b)) for a, b in zip(labels, group, strict=True)}
+    return len(pairs) == len({a for a, _ in pairs}) == len({b for _, b in pairs})
+
+
+def test_planted_clusters_are_found_whatever_the_lengths_of_the_features():
+    features, group = planted(600)
+    found = cluster_splats(features, np.ones(600), SETTINGS)
+    labels = found.labels.numpy()
+    assert found.count == 4
+    assert (labels == NO_CLUSTER).mean() < 0.05
+    assert same_partition(labels[labels >= 0], group[labels >= 0])
+
+
+def test_splats_outside_the_sample_join_their_cluster():
+    features, group = planted(5_000)
+    few = SETTINGS.model_copy(update={"aggregation_sample": 400, "aggregation_cluster_size": 250})
+    found = cluster_splats(features, np.ones(5_000), few)
+    labels = found.labels.numpy()
+    assert found.sample == 400 and found.smallest == 20
+    assert (labels >= 0).mean() > 0.9
+    assert same_partition(labels[labels >= 0], group[labels >= 0])
+
+
+def test_a_feature_far_from_every_cluster_stays_unclustered():
+    features, _ = planted(600)
+    features[7] = -features[7]
+    features[8] = 0
+    labels = cluster_splats(features, np.ones(600), SETTINGS).labels
+    assert labels[7] == labels[8] == NO_CLUSTER
+
+
+@pytest.mark.parametrize("channels", [1, 24])
+def test_the_number_of_threads_changes_no_label(channels):
+    features, _ = planted(20_000, channels)
+    features[::3] *= -1
+    few = SETTINGS.model_copy(update={"aggregation_sample": 500})
+    runs = [cluster_splats(features, np.ones(20_000), few, threads).labels for threads in (1, 2, 5)]
+    assert runs[0].max() >= 1
+    assert all(torch.equal(runs[0], other) for other in runs[1:])
+
+
+@pytest.mark.parametrize(
+    "features",
+    [
+        torch.ones(1, 4),
+        torch.ones(1, 1),
+        torch.zeros(100, 4),
+        torch.ones(300, 1),
+        torch.full((300, 4), 6e4).half(),
+        torch.full((300, 4), 1e-38),
+        torch.tensor([[1.0, 0.0], [0.0, 1.0]]),
+    ],
+)
+def test_features_without_clusters_give_none(features):
+    found = cluster_splats(features, np.ones(len(features)), SETTINGS)
+    assert found.count == 0
+    assert bool((found.labels == NO_CLUSTER).all())
+
+
+@pytest.mark.parametrize("scale", [1e-38, 1e30])
+def test_equal_features_in_two_groups_are_two_clusters_at_any_scale(scale):
+    features = torch.cat([torch.ones(150, 1), -torch.ones(150, 1)]) * scale
+    found = cluster_splats(features, np.ones(300), SETTINGS)
+    assert found.count == 2
+    assert found.labels[:150].unique().numel() == found.labels[150:].unique().numel() == 1
+    assert found.labels[0] != found.labels[150]
+
+
+def test_splats_without_evidence_are_never_drawn_and_faint_ones_less_often():
+    odds = np.concatenate([np.zeros(1_000), np.full(1_000, 0.1), np.ones(1_000)])
+    rows = draw(odds, 500, seed=0)
+    assert rows.size == np.unique(rows).size == 500 and rows.min() >= 1_000
+    assert (rows >= 2_000).mean() > 0.8
+    assert np.array_equal(rows, draw(odds, 500, seed=0))
+    assert not np.array_equal(rows, draw(odds, 500, seed=1))
+    assert draw(odds, 5_000, seed=0).tolist() == list(range(1_000, 3_000))
+
+
+def test_wide_features_have_the_same_axes_as_by_all_eigenvectors(monkeypatch):
+    monkeypatch.setattr("liftcore.solve.principal_axes.EXACT_CHANNELS", 8)
+    rng = np.random.default_rng(0)
+    F = 60
+    rows = (rng.normal(size=(300, 5)) * [9, 7, 5, 4, 3]) @ rng.normal(size=(5, F)) + 0.1 * rng.normal(size=(300, F))
+    rows = (rows - rows.mean(axis=0)).astype(np.float32)
+    exact = np.linalg.svd(rows.astype(np.float64), full_matrices=False)[2][:5].T
+    axes = principal_axes(rows, 5)
+    assert np.abs(np.abs((exact * axes).sum(axis=0)) - 1).max() < 1e-4
+    assert np.abs(axes.T @ axes - np.eye(5)).max() < 1e-5
