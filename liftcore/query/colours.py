@@ -97,12 +97,12 @@ def colour_map() -> np.ndarray:
 def cluster_colours(count: int) -> np.ndarray:
     """[count + 1, 3] u8 sRGB: a colour a cluster, and grey last, where label -1 points.
 
-    Hues turn by the golden angle, so that any first few are far apart; three levels of lightness part what the eye
-    would take for one hue.
+    Three levels of lightness take turns. The hues of each turn by the golden angle, so that any first few are far
+    apart, and those of neighbouring levels stand a third of it aside.
     """
-    number = np.arange(count)
-    hue = number * math.pi * (3 - math.sqrt(5))
-    lightness = np.array(_CLUSTER_LIGHTNESS)[number % len(_CLUSTER_LIGHTNESS)]
+    turn, level = np.divmod(np.arange(count), len(_CLUSTER_LIGHTNESS))
+    hue = (turn + level / len(_CLUSTER_LIGHTNESS)) * math.pi * (3 - math.sqrt(5))
+    lightness = np.array(_CLUSTER_LIGHTNESS)[level]
     colours = _srgb(lightness, _CLUSTER_CHROMA * np.cos(hue), _CLUSTER_CHROMA * np.sin(hue))
     return np.concatenate([colours, np.array([NO_CLUSTER_COLOUR], dtype=np.uint8)])
 
