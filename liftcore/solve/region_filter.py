@@ -63,13 +63,14 @@ def contingency(labels: np.ndarray, kappa: np.ndarray, rows: int, clusters: int)
 def _largest(table: csr_matrix) -> tuple[np.ndarray, np.ndarray]:
     """Column and value of the largest entry of each row, the first of equal ones; (0, 0) for an empty row."""
     table.sort_indices()
+    indices, starts, data = (np.asarray(part) for part in (table.indices, table.indptr, table.data))
     columns, values = np.zeros(table.shape[0], np.int64), np.zeros(table.shape[0], np.int64)
-    filled = np.flatnonzero(np.diff(table.indptr))
+    lengths = np.diff(starts)
+    filled = np.flatnonzero(lengths)
     if filled.size:
-        starts = table.indptr[filled]
-        largest = np.maximum.reduceat(table.data, starts)
-        row_of_entry = np.repeat(np.arange(filled.size), np.diff(table.indptr)[filled])
-        places = np.flatnonzero(table.data == largest[row_of_entry])
+        largest = np.maximum.reduceat(data, starts[filled])
+        row_of_entry = np.repeat(np.arange(filled.size), lengths[filled])
+        places = np.flatnonzero(data == largest[row_of_entry])
         first = places[np.unique(row_of_entry[places], return_index=True)[1]]
-        columns[filled], values[filled] = table.indices[first], largest
+        columns[filled], values[filled] = indices[first], largest
     return columns, values

@@ -167,7 +167,8 @@ def test_a_lift_without_clusters_is_the_lift_without_aggregation_and_says_so(tmp
     assert torch.equal(plain.features, none.features)
     assert none.cluster is not None and bool((none.cluster == -1).all())
     save_lift(none, tmp_path / "none")
-    assert load_lift(tmp_path / "none").cluster_features.shape == (0, 6)
+    means = load_lift(tmp_path / "none").cluster_features
+    assert means is not None and means.shape == (0, 6)
     save_lift(plain, tmp_path / "plain")
     assert load_lift(tmp_path / "plain").cluster is None
 
