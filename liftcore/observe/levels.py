@@ -61,7 +61,7 @@ def _one_level(observation: Observation, level: int, view: str) -> Observation:
 def _distinct(labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The distinct columns [L, n] of labels [L, pixels], and which of them each pixel [pixels] has."""
     choices = int(labels.max()) + 2  # labels and none
-    key = np.zeros(labels.shape[1], np.int64)
+    key, first = np.zeros(labels.shape[1], np.int64), np.zeros(1, np.int64)
     for level in labels:  # numbered anew at each level, so that keys stay below pixels * choices
         _, first, key = np.unique(key * choices + level + 1, return_index=True, return_inverse=True)
     return labels[:, first], key

@@ -37,10 +37,10 @@ def counted_weights(
     else:
         counts, cut = np.ones_like(w, bool), np.zeros(w.shape[0], bool)
     counts &= (w > 0) & (w >= weighting.floor)
-    cut |= (np.abs(w - weighting.floor) < EDGE_BAND * weighting.floor).any(axis=1)
+    cut = cut | (np.abs(w - weighting.floor) < EDGE_BAND * weighting.floor).any(axis=1)
     chosen = np.zeros_like(A)
     chosen[:, order] = np.where(counts, w**weighting.power, 0.0)
-    return chosen, cut
+    return chosen, np.asarray(cut)
 
 
 def walked_rays(camera: Camera, walk: Walk) -> np.ndarray:
