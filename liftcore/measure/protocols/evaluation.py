@@ -164,7 +164,7 @@ def _truth(
         warnings.append(f"{labels.name}: {_named(empty)} have no labelled object")
     absent = _absent(truth)
     if absent:
-        warnings.append(f"{labels.name}: {_named(absent)} cover no pixel of their frames and have no IoU there")
+        warnings.append(f"{labels.name}: {_named(absent)} cover no pixel of some frames and have no IoU there")
     return truth, warnings
 
 

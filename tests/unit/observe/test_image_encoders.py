@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -53,14 +54,20 @@ def small_encoder(kind: str, tower: Any) -> ClipImageEncoder:
     return ClipImageEncoder(kind, opened, opened.name, torch.device("cpu"))
 
 
-@pytest.fixture(scope="module")
+@cache
+def backbone(name: str) -> TimmEncoder:
+    torch.manual_seed(5)
+    return TimmEncoder._with_random_weights(name)
+
+
+@pytest.fixture
 def resnet() -> TimmEncoder:
-    return TimmEncoder._with_random_weights("resnet18")
+    return backbone("resnet18")
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def vit() -> TimmEncoder:
-    return TimmEncoder._with_random_weights("vit_tiny_patch16_224")
+    return backbone("vit_tiny_patch16_224")
 
 
 def test_maskclip_is_the_last_attention_when_each_token_sees_itself_alone() -> None:
@@ -117,8 +124,8 @@ ENCODERS = {
     "maskclip ViT": lambda: small_encoder("maskclip", small_vit()),
     "clip ViT": lambda: small_encoder("clip", small_vit()),
     "maskclip ResNet": lambda: small_encoder("maskclip", small_resnet()),
-    "timm ViT": lambda: TimmEncoder._with_random_weights("vit_tiny_patch16_224"),
-    "timm ResNet": lambda: TimmEncoder._with_random_weights("resnet18"),
+    "timm ViT": lambda: backbone("vit_tiny_patch16_224"),
+    "timm ResNet": lambda: backbone("resnet18"),
 }
 
 
