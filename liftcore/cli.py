@@ -71,7 +71,7 @@ def build_parser() -> argparse.ArgumentParser:
     _add_demo(commands.add_parser("demo", parents=[shared], help="the whole job, through the real service"))
     _add_serve(commands.add_parser("serve", parents=[shared], help="run the HTTP service"))
     _add_lift(commands.add_parser("lift", parents=[shared], help="lift features onto splats"))
-    _add_query(commands.add_parser("query", parents=[shared], help="find what words say in a lift"))
+    _add_query(commands.add_parser("query", parents=[shared], help="find words and examples in a lift"))
     _add_pack(commands.add_parser("pack", help="make a feature pack of the field's formats"), shared)
     _add_encode(commands.add_parser("encode", parents=[shared], help="make a feature pack of images"))
     _add_inspect(commands.add_parser("inspect", parents=[shared], help="what is in a file, and what is wrong"))
@@ -104,12 +104,18 @@ def _add_lift(parser: argparse.ArgumentParser) -> None:
 
 def _add_query(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("lift", type=Path, help="a lift (.safetensors)")
-    parser.add_argument("text", help="the words to look for")
+    parser.add_argument("text", nargs="?", help="the words to look for; may be left out beside --like")
+    like = "VIEW:x,y (a pixel), region:VIEW:LEVEL:ID, splat:J or a vector FILE.npy; may be given several times"
+    parser.add_argument("--like", action="append", default=[], metavar="EXAMPLE", help=f"more of this: {like}")
+    parser.add_argument("--unlike", action="append", default=[], metavar="EXAMPLE", help="less of that, likewise")
     words = parser.add_mutually_exclusive_group()
     words.add_argument("--table", type=Path, metavar="FILE", help="precomputed text embeddings")
     words.add_argument("--encoder", metavar="NAME", help="minilm, open_clip:MODEL[/PRETRAINED], table:FILE")
     parser.add_argument("--negative", nargs="+", default=[], metavar="WORD", help="words to compete with")
-    parser.add_argument("--threshold", default="auto", metavar="T", help="auto, valley, paper, otsu or a number")
+    methods = "auto, valley, paper, otsu, stability or a number"
+    parser.add_argument("--threshold", default="auto", metavar="T", help=methods)
+    parser.add_argument("--instances", type=_count, metavar="N", help="how many there are, if you know")
+    parser.add_argument("--keep", choices=("all", "largest"), default="all", help="components of the mask")
     parser.add_argument("--top", type=_count, default=0, metavar="N", help="name the best N splats")
     parser.add_argument("--view", metavar="NAME", help="the camera to see the answer from")
     parser.add_argument("--mask", type=Path, metavar="PNG", help="write the mask of the view")

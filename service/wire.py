@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -182,10 +182,65 @@ class Box(BaseModel):
     high: list[float]
 
 
-class QueryAnswer(BaseModel):
-    """Where a phrase is in a scene."""
+Text = Annotated[str, Field(min_length=1, max_length=1000)]
+Notation = Annotated[
+    str, Field(min_length=1, max_length=600, description="VIEW:x,y, region:VIEW:LEVEL:ID or splat:J")
+]
+Vector = Annotated[list[Annotated[float, Field(allow_inf_nan=False)]], Field(min_length=1, max_length=65_536)]
+ViewName = Annotated[str, Field(min_length=1, max_length=500, description="the name of a camera")]
+Number = Annotated[float, Field(ge=-1e6, le=1e6)]  # which NaN is not
 
-    text: str
+
+class Question(BaseModel):
+    """What all queries share: the words, and how to find what they mean."""
+
+    lift: JobId | None = Field(None, description="the lift; may be left out when there is exactly one")
+    text: list[Text] = Field([], max_length=32, description="what to look for; may be given several times")
+    negatives: list[Text] = Field([], max_length=32, description="what it is not; may be given several times")
+    threshold: Literal["auto", "valley", "paper", "otsu", "stability"] | Number = Field(
+        "auto", description="how to find it, or the score from which a splat counts as found"
+    )
+    instances: int | None = Field(None, ge=1, le=100, description="how many there are, if you know")
+    keep: Literal["all", "largest"] = Field("all", description="components of a mask")
+    encoder: str | None = Field(None, max_length=200, description="a text space that the operator set up, or default")
+
+
+class Asked(Question):
+    """A query in a URL."""
+
+    like: list[Notation] = Field([], max_length=32, description="an example of it; may be given several times")
+    unlike: list[Notation] = Field([], max_length=32, description="an example of what it is not, likewise")
+
+
+class AskedWhere(Asked):
+    """Where something is."""
+
+    view: ViewName | None = Field(None, description="for the links")
+    top: int = Field(10, ge=0, le=1000, description="how many of the best splats to list")
+
+
+class AskedInView(Asked):
+    """Where something is in a view."""
+
+    view: ViewName
+
+
+class AskedInBody(Question):
+    """A query in a body, where an example may also be a vector [F]."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    like: list[Notation | Vector] = Field([], max_length=32, description="examples of it, or vectors")
+    unlike: list[Notation | Vector] = Field([], max_length=32, description="examples of what it is not, likewise")
+    view: ViewName | None = Field(None, description="for pictures, and for the links")
+    top: int = Field(10, ge=0, le=1000, description="how many of the best splats to list")
+
+
+class QueryAnswer(BaseModel):
+    """Where in a scene is what was asked for."""
+
+    text: list[str]
+    like: list[str] = Field(description="the examples, in their notation; vectors by their length")
     lift: JobId
     view: str | None
     text_space: str

@@ -1,7 +1,8 @@
-"""``splatlift query``: where in a lifted scene is what the words say?"""
+"""``splatlift query``: where in a lifted scene is what the words say, or what is like this example?"""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from liftcore.commands.reply import free_output, reply, writing
@@ -11,9 +12,11 @@ from liftcore.files import whole_file
 if TYPE_CHECKING:
     import argparse
     from collections.abc import Iterable
-    from pathlib import Path
 
     from liftcore.query.ask import Answer, Look
+    from liftcore.query.encoders import TextEncoder
+    from liftcore.query.example import Example
+    from liftcore.query.query import Query
     from liftcore.query.scene import QueryScene
 
 
@@ -27,20 +30,15 @@ def run(options: argparse.Namespace) -> int:
     for path in outputs:
         free_output(path, [options.lift, *([options.table] if options.table else [])])
     from liftcore.query.ask import ask, look, top
-    from liftcore.query.encoders import open_encoder
+    from liftcore.query.query import texts_of
     from liftcore.query.scene import QueryScene
 
+    query = _query(options)
     scene = QueryScene.open(options.lift)
-    encoder = open_encoder(_encoder(options, scene))
-    answer = ask(
-        scene,
-        options.text,
-        encoder,
-        negatives=tuple(options.negative),
-        threshold=_threshold(options.threshold),
-    )
+    encoder = _encoder(options, scene) if texts_of(query.terms) else None
+    answer = ask(scene, query, encoder)
     seen = look(scene, answer, options.view) if options.view else None
-    document = _document(answer, seen, encoder.name)
+    document = _document(answer, seen, encoder)
     if options.top:
         found = top(answer, scene, options.top)
         document["top"] = [
@@ -52,19 +50,41 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _encoder(options: argparse.Namespace, scene: QueryScene) -> str:
-    if options.table:
-        return f"table:{options.table}"
-    if options.encoder:
-        return options.encoder
+def _query(options: argparse.Namespace) -> Query:
+    from liftcore.query.query import Query
+
+    return Query(
+        positives=(*([options.text] if options.text is not None else []), *_examples(options.like, "--like")),
+        negatives=(*options.negative, *_examples(options.unlike, "--unlike")),
+        threshold=_threshold(options.threshold),
+        instances=options.instances,
+        keep=options.keep,
+    )
+
+
+def _examples(notations: list[str], argument: str) -> list[Example]:
+    from liftcore.query.example import parse_example
+    from liftcore.query.vector_file import read_vector
+
+    return [
+        read_vector(Path(notation)) if notation.endswith(".npy") else parse_example(notation, argument)
+        for notation in notations
+    ]
+
+
+def _encoder(options: argparse.Namespace, scene: QueryScene) -> TextEncoder:
+    from liftcore.query.encoders import open_encoder
+
     space = scene.lift.metadata.text_space
-    if space in ("", "none"):
+    spec = f"table:{options.table}" if options.table else options.encoder or space
+    if spec in ("", "none"):
         raise InvalidQuery(
             "encoder",
             expected="--table FILE or --encoder NAME",
             got="neither, and the lift does not name its text space",
+            hint="or ask by example, with --like",
         )
-    return space
+    return open_encoder(spec)
 
 
 def _threshold(text: str) -> str | float:
@@ -74,11 +94,11 @@ def _threshold(text: str) -> str | float:
         return text
 
 
-def _document(answer: Answer, seen: Look | None, encoder: str) -> dict[str, Any]:
+def _document(answer: Answer, seen: Look | None, encoder: TextEncoder | None) -> dict[str, Any]:
     document: dict[str, Any] = {
-        "text": answer.text,
-        "negatives": list(answer.negatives),
-        "encoder": encoder,
+        "query": [str(term) for term in answer.query.positives],
+        "negatives": [str(term) for term in answer.query.negatives],
+        "encoder": encoder.name if encoder else None,
         "splats": len(answer.scores),
         "selected": int(answer.selected.sum()),
         "threshold": answer.threshold,
@@ -119,8 +139,8 @@ def _write(options: argparse.Namespace, answer: Answer, seen: Look | None) -> di
 
 def _lines(document: dict[str, Any]) -> Iterable[str]:
     yield (
-        f"{document['text']!r}: {document['selected']} of {document['splats']} splats at or above "
-        f"{document['threshold']:.4g} ({document['explanation']})"
+        f"{', '.join(map(repr, document['query']))}: {document['selected']} of {document['splats']} splats "
+        f"at or above {document['threshold']:.4g} ({document['explanation']})"
     )
     if "view" in document:
         view = document["view"]

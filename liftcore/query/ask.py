@@ -1,4 +1,4 @@
-"""Ask a lift for words: which splats answer, and where they lie in a view."""
+"""Ask a lift for words and examples: which splats answer, and where they lie in a view."""
 
 from __future__ import annotations
 
@@ -8,47 +8,42 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from liftcore.errors import InvalidQuery
+from liftcore.query.components import largest_component
+from liftcore.query.directions import MINIMUM_ROW_SUM, directions
 from liftcore.query.products import LOWEST_COSINE
-from liftcore.query.scores import cosines, relevancy
+from liftcore.query.query import Query
+from liftcore.query.scores import combine, cosines
 from liftcore.query.threshold import find_threshold
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Mapping
 
     from torch import Tensor
 
     from liftcore.query.encoders import TextEncoder
     from liftcore.query.scene import QueryScene
 
-MINIMUM_ROW_SUM = 0.5  # below it a ray mostly misses the scene: neither histogram nor mask takes it
-# A splat counts in the histogram by its evidence, up to this many rays' worth of weight: what hardly a ray met
-# scores by the chance of a few pixels, and such splats fill the valleys. They are still selected by their scores.
-# Mean IoU of the selected splats over tabletop's 14 phrases, unweighted -> weighted: `row-sum`, noisy features
-# .929 -> .925, hard ones .757 -> .819 (the best possible threshold: .931 and .874).
-MOST_EVIDENCE = 20.0
 _QUANTILES = (0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
 _NO_RELEVANCY = 0.0  # what a splat without a feature scores in relevancy
 
 
 @dataclass(frozen=True)
 class Answer:
-    """How a scene answers a text."""
+    """How a scene answers a query."""
 
-    text: str
-    negatives: tuple[str, ...]  # empty for plain cosine
+    query: Query
     scores: Tensor  # [P] f32, cosine in -1..1 or relevancy in 0..1; the minimum where not seen
     seen: Tensor  # [P] bool, whether the splat has a feature
     threshold: float  # on the scores
-    threshold_method: str  # what was asked for: auto, paper, valley, otsu or fixed
+    threshold_method: str  # what was asked for: auto, valley, paper, otsu, stability or fixed
     explanation: str  # one sentence on how the threshold was found
     selected: Tensor  # [P] bool, seen and at or above the threshold
     statistics: Mapping[str, float]  # min, max, mean and quantiles q01..q99 of the seen scores
 
     @property
     def relevancy(self) -> bool:
-        """Whether the scores are LangSplat's relevancy instead of cosines."""
-        return bool(self.negatives)
+        """Whether the scores weigh positives against negatives, instead of being cosines."""
+        return bool(self.query.negatives)
 
     @property
     def count(self) -> int:
@@ -86,37 +81,31 @@ class Found:
     box: tuple[tuple[float, ...], tuple[float, ...]] | None  # least and greatest corner of the selected; None = none
 
 
-def ask(
-    scene: QueryScene,
-    text: str,
-    encoder: TextEncoder,
-    *,
-    negatives: Sequence[str] = (),
-    threshold: str | float = "auto",
-) -> Answer:
-    """Score every splat for a text and choose those that answer it.
+def ask(scene: QueryScene, query: Query | str, encoder: TextEncoder | None = None) -> Answer:
+    """Score every splat for a query and choose those that answer it.
+
+    A splat counts in the histogram by its evidence: what hardly a ray met scores by the chance of a few pixels. It is
+    still selected by its score.
 
     Args:
         scene: an opened lift.
-        text: the words to look for.
-        encoder: the text encoder whose space the lifted features live in.
-        negatives: words that the text competes with; with any, scores are LangSplat's relevancy.
-        threshold: ``auto``, ``valley``, ``paper``, ``otsu``, or a number on the scores.
+        query: words and examples, or one text alone.
+        encoder: the text encoder whose space the lifted features live in; examples need none.
 
     Raises:
-        InvalidQuery: the encoder's vectors have another length than the lift's, the encoder cannot read a
-            text, or the threshold is unknown.
+        InvalidQuery: a text without an encoder of the lift's space, or a term that has no feature.
+        NotFound: an example names a view or a region that is not there.
+        InvalidLift: an example needs the scene's files, and they moved or changed.
     """
-    _check_space(scene, encoder)
-    similarities = cosines(scene.lift.features, scene.norms, encoder.encode([text, *negatives]))
-    scores = relevancy(similarities) if negatives else similarities[:, 0]
+    query = Query((query,)) if isinstance(query, str) else query
+    terms = directions(scene, query.terms, encoder)
+    scores = combine(cosines(scene.lift.features, scene.norms, terms), len(query.positives))
     seen = scene.lift.seen & (scene.norms > 0)
-    scores = torch.where(seen, scores, _NO_RELEVANCY if negatives else LOWEST_COSINE)
+    scores = torch.where(seen, scores, _NO_RELEVANCY if query.negatives else LOWEST_COSINE)
     known = scores[seen]
-    found = find_threshold(known, threshold, _weights(scene, seen))
+    found = find_threshold(known, query.threshold, _weights(scene, seen), query.instances)
     return Answer(
-        text=text,
-        negatives=tuple(negatives),
+        query=query,
         scores=scores,
         seen=seen,
         threshold=found.value,
@@ -130,7 +119,8 @@ def ask(
 def look(scene: QueryScene, answer: Answer, view: str) -> Look:
     """See an answer from a camera: attention, and a mask by the view's own threshold.
 
-    The threshold is found again on the view's map, as the paper does; a fixed one is kept.
+    The threshold is found again on the view's map, as the paper does; a fixed one is kept. All components of the
+    mask stay, unless the query asks for the largest.
 
     Raises:
         NotFound: no camera has this name.
@@ -142,9 +132,10 @@ def look(scene: QueryScene, answer: Answer, view: str) -> Look:
     image = scene.raster.render(scene.cameras.get(view), values, scene.walk)
     attention, row_sums = image[..., 0].contiguous(), image[..., 1].contiguous()
     met = row_sums >= MINIMUM_ROW_SUM
-    fixed = answer.threshold_method == "fixed"
-    found = find_threshold(attention[met], answer.threshold if fixed else answer.threshold_method)
+    query = answer.query
+    found = find_threshold(attention[met], query.threshold, instances=query.instances)
     mask = met & (attention >= found.value)
+    mask = largest_component(mask) if query.keep == "largest" else mask
     return Look(view, attention, row_sums, mask, found.value, found.method, found.explanation)
 
 
@@ -168,19 +159,8 @@ def top(answer: Answer, scene: QueryScene, count: int) -> Found:
 
 def _weights(scene: QueryScene, seen: Tensor) -> Tensor | None:
     """How much each seen splat counts in the histogram; None when none has evidence."""
-    weights = scene.lift.evidence[seen].clamp_max(MOST_EVIDENCE)
+    weights = scene.lift.evidence[seen]
     return weights if bool((weights > 0).any()) else None
-
-
-def _check_space(scene: QueryScene, encoder: TextEncoder) -> None:
-    if encoder.channels != scene.channels:
-        space = scene.lift.metadata.text_space or "none"
-        raise InvalidQuery(
-            "encoder",
-            expected=f"{scene.channels} channels as the lift has (its text space: {space})",
-            got=f"{encoder.name} with {encoder.channels}",
-            hint="query with the text encoder that belongs to the features' image encoder",
-        )
 
 
 def _statistics(scores: Tensor) -> dict[str, float]:

@@ -12,8 +12,11 @@ from liftcore.query.unchanged import unchanged
 from liftcore.raster.protocol import Walk
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from torch import Tensor
 
+    from liftcore.observe.pack import FeaturePacks
     from liftcore.raster.protocol import Raster
     from liftcore.scene.cameras import Cameras
     from liftcore.scene.splats import Splats
@@ -29,6 +32,7 @@ class QueryScene:
     def __init__(self, lift: Lift, path: Path) -> None:
         self.lift = lift
         self.path = path
+        self._packs_at = [Path(file.path) for file in lift.metadata.features]
 
     @classmethod
     def open(cls, path: Path) -> Self:
@@ -77,6 +81,23 @@ class QueryScene:
         from liftcore.scene.load import load_cameras
 
         return load_cameras(unchanged("cameras", self.lift.metadata.cameras, self.path))
+
+    @cached_property
+    def packs(self) -> FeaturePacks:
+        """The feature packs that were lifted; queries by region read a row of them.
+
+        Raises:
+            InvalidLift: a pack moved, or is another than the one that was lifted.
+        """
+        from liftcore.observe.pack import open_packs
+
+        files = zip(self.lift.metadata.features, self._packs_at, strict=True)
+        moved = [file.model_copy(update={"path": str(path)}) for file, path in files]
+        return open_packs([unchanged("features", file, self.path) for file in moved])
+
+    def find_packs(self, paths: Sequence[Path]) -> None:
+        """Say where the feature packs lie now, when they moved since the lift; in the lift's order."""
+        self._packs_at = list(paths)
 
     @cached_property
     def raster(self) -> Raster:

@@ -1,4 +1,4 @@
-"""How well every splat answers a text: cosine, or LangSplat's relevancy against negatives.
+"""How well every splat answers a query: cosine to its positives, or relevancy against its negatives.
 
 Lifted rows are sums of unit vectors and not unit themselves, so their norms divide every score. The norms
 belong to the lift and not to the text: they are computed once and passed in.
@@ -66,19 +66,31 @@ def cosines(features: Tensor, norms: Tensor, texts: Tensor) -> Tensor:
     return cosines_of(features, norms, _unit_rows(texts, features.shape[1]))
 
 
-def relevancy(similarities: Tensor) -> Tensor:
-    """LangSplat's relevancy: ``min_n softmax(10 [cos t, cos n])_0 = sigmoid(10 (cos t - max_n cos n))``.
+def combine(similarities: Tensor, positives: int) -> Tensor:
+    """One score a splat from its cosines to all terms of a query.
 
-    Above 0.5 the text is nearer than every negative.
+    Without negatives it is the cosine to the nearest positive, and with negatives a softmax between the nearest
+    positive and the nearest negative:
+
+        s_j = max_p cos(x_j, p)
+        s_j = sigmoid(10 (max_p cos(x_j, p) - max_n cos(x_j, n)))
+
+    The latter is LangSplat's relevancy ``min_n softmax(10 [cos p, cos n])_0`` where there is one positive. Above 0.5
+    a splat is nearer to what is wanted than to anything unwanted. The largest and not the mean cosine counts, so that
+    positives may be different things; cosines to words and to examples differ in scale (CLIP's words lie apart from
+    its images), so among both the examples decide.
 
     Args:
-        similarities: [P, 1 + N] f32, cosines to the text and to N >= 1 negatives.
+        similarities: [P, n] f32, cosines to the positives, then to the negatives.
+        positives: how many of the n are positives, at least one.
 
     Returns:
-        [P] f32 in (0, 1).
+        [P] f32, in -1..1 without negatives, else in 0..1.
     """
-    margin = similarities[:, 0] - similarities[:, 1:].amax(dim=1)
-    return torch.sigmoid(RELEVANCY_SHARPNESS * margin)
+    nearest = similarities[:, :positives].amax(dim=1)
+    if similarities.shape[1] == positives:
+        return nearest
+    return torch.sigmoid(RELEVANCY_SHARPNESS * (nearest - similarities[:, positives:].amax(dim=1)))
 
 
 def _unit_rows(texts: Tensor, channels: int) -> Tensor:

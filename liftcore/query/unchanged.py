@@ -15,7 +15,7 @@ def unchanged(role: str, remembered: InputFile, lift: Path) -> Path:
     """The path of an input, once its bytes are known to be those that were lifted.
 
     Args:
-        role: what the input is, for the message: ``splats`` or ``cameras``.
+        role: what the input is, for the message: ``splats``, ``cameras`` or ``features``.
         remembered: where it was at lift time, and its SHA-256.
         lift: the lift file that remembers it.
 

@@ -21,8 +21,10 @@ from liftcore.errors import SplatliftError
 from liftcore.query.ask import Answer, Look, ask, look, top
 from liftcore.query.encoders import TextEncoder, open_encoder
 from liftcore.query.encoders.remembering import RememberingEncoder
+from liftcore.query.example import Example, Vector, parse_example
 from liftcore.query.pictures import attention_png, mask_png, render_png
 from liftcore.query.products import cosines_of, norms_of
+from liftcore.query.query import Query
 from liftcore.query.scene import QueryScene
 from liftcore.raster.warm_up import warm_up
 from service.queries.frames import Frame
@@ -87,7 +89,10 @@ class Answers:
         return self._operations[request["operation"]](request)
 
     def _scene(self, request: dict[str, Any]) -> QueryScene:
-        return self._scenes.get(request["lift"], lambda: open_scene(request))
+        scene = self._scenes.get(request["lift"], lambda: open_scene(request))
+        if "features" in request:
+            scene.find_packs([Path(path) for path in request["features"]])
+        return scene
 
     def _encoder(self, spec: str, version: object) -> TextEncoder:
         with self._opening:
@@ -97,12 +102,10 @@ class Answers:
             return known[1]
 
     def _answer(self, request: dict[str, Any]) -> Answer:
-        scene = self._scene(request)
-        encoder = self._encoder(request["encoder"], request["encoder_version"])
-
         def make() -> Answer:
-            how = {"negatives": tuple(request["negatives"]), "threshold": request["threshold"]}
-            return ask(scene, request["text"], encoder, **how)
+            spec = request["encoder"]
+            encoder = None if spec is None else self._encoder(spec, request["encoder_version"])
+            return ask(self._scene(request), query_of(request["query"]), encoder)
 
         return self._answers.get(_question(request), make)
 
@@ -141,8 +144,28 @@ def use_one_library_thread() -> None:
 
 
 def _question(request: dict[str, Any]) -> tuple[object, ...]:
-    names = ("lift", "encoder", "encoder_version", "text", "negatives", "threshold")
+    names = ("lift", "encoder", "encoder_version", "query")
     return tuple(json.dumps(request[name]) for name in names)
+
+
+def query_of(asked: dict[str, Any]) -> Query:
+    """The query of a request.
+
+    Raises:
+        InvalidQuery: it asks for nothing, or an example has no known notation.
+    """
+    like, unlike = ([_example(example, name) for example in asked[name]] for name in ("like", "unlike"))
+    return Query(
+        positives=(*asked["text"], *like),
+        negatives=(*asked["negatives"], *unlike),
+        threshold=asked["threshold"],
+        instances=asked["instances"],
+        keep=asked["keep"],
+    )
+
+
+def _example(example: str | list[float], argument: str) -> Example:
+    return parse_example(example, argument) if isinstance(example, str) else Vector(tuple(example))
 
 
 def open_scene(request: dict[str, Any]) -> QueryScene:

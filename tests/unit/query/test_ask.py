@@ -18,6 +18,7 @@ from liftcore.lift import input_file
 from liftcore.query.ask import ask, look, top
 from liftcore.query.colours import NO_CLUSTER_COLOUR, SH_C0, cluster_colours, seen_colours
 from liftcore.query.pictures import attention_png, mask_png, overlay_png, render, render_png
+from liftcore.query.query import Query
 from liftcore.query.scene import QueryScene
 from liftcore.scene.cameras import Cameras
 from liftcore.scene.inria import write_inria_cameras
@@ -72,7 +73,7 @@ def test_the_splats_that_mean_the_text_are_selected(lift_file: Path) -> None:
 def test_a_splat_that_was_never_seen_is_never_selected(lift_file: Path) -> None:
     scene = QueryScene.open(lift_file)
     for negatives in ((), ("x",)):
-        answer = ask(scene, "z", Axes(), negatives=negatives, threshold=-5.0)
+        answer = ask(scene, Query(("z",), negatives, threshold=-5.0), Axes())
         assert not answer.selected[-1]
         assert answer.scores[-1] == answer.scores.min()
         assert answer.count == COUNT - 1
@@ -96,7 +97,7 @@ def test_splats_that_hardly_a_ray_met_do_not_decide_the_threshold(lift_file: Pat
 
 
 def test_negatives_make_it_relevancy(lift_file: Path) -> None:
-    answer = ask(QueryScene.open(lift_file), "x", Axes(), negatives=["y", "z"], threshold=0.5)
+    answer = ask(QueryScene.open(lift_file), Query(("x",), ("y", "z"), threshold=0.5), Axes())
     assert answer.relevancy and answer.threshold_method == "fixed"
     assert answer.selected.nonzero()[:, 0].tolist() == list(range(0, COUNT - 1, 3))
 
@@ -108,7 +109,7 @@ def test_an_encoder_of_another_space_is_refused_with_both_named(lift_file: Path)
 
 def test_a_look_is_the_scores_rendered_and_cut(lift_file: Path) -> None:
     scene = QueryScene.open(lift_file)
-    answer = ask(scene, "x", Axes(), threshold=0.4)
+    answer = ask(scene, Query(("x",), threshold=0.4), Axes())
     seen = look(scene, answer, "front")
     scores = torch.where(answer.seen, answer.scores, 0.0)[:, None]
     camera = scene.cameras.get("front")
@@ -128,7 +129,7 @@ def test_the_best_splats_come_with_their_places_and_a_box(lift_file: Path) -> No
     assert found.best[0].position == pytest.approx(scene.splats.means[found.best[0].splat].tolist())
     assert found.box is not None
     assert torch.all(scene.splats.means[answer.selected] >= torch.tensor(found.box[0]))
-    assert top(ask(scene, "x", Axes(), threshold=2.0), scene, 1).box is None
+    assert top(ask(scene, Query(("x",), threshold=2.0), Axes()), scene, 1).box is None
 
 
 def test_a_scene_that_moved_is_said_with_where_it_was(lift_file: Path) -> None:

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from liftcore.errors import InvalidQuery
-from liftcore.query.scores import cosine, cosines, feature_norms, relevancy
+from liftcore.query.scores import combine, cosine, cosines, feature_norms
 
 
 @given(
@@ -46,11 +46,20 @@ def test_several_texts_in_one_pass_equal_one_by_one() -> None:
 def test_relevancy_is_the_least_softmax_over_negatives() -> None:
     similarities = torch.rand(100, 5, dtype=torch.float64) - 0.5
     pairs = [torch.softmax(10 * similarities[:, [0, n]], dim=1)[:, 0] for n in range(1, 5)]
-    torch.testing.assert_close(relevancy(similarities), torch.stack(pairs).amin(dim=0))
+    torch.testing.assert_close(combine(similarities, 1), torch.stack(pairs).amin(dim=0))
 
 
 def test_relevancy_of_a_half_means_as_near_as_the_nearest_negative() -> None:
-    assert relevancy(torch.tensor([[0.3, 0.3, 0.1]])).item() == pytest.approx(0.5)
+    assert combine(torch.tensor([[0.3, 0.3, 0.1]]), 1).item() == pytest.approx(0.5)
+
+
+def test_several_positives_are_as_good_as_the_nearest_one() -> None:
+    similarities = torch.rand(100, 5) - 0.5
+    assert torch.equal(combine(similarities[:, :3], 3), similarities[:, :3].amax(dim=1))
+    against = torch.softmax(
+        10 * torch.stack([similarities[:, :3].amax(1), similarities[:, 3:].amax(1)], dim=1), dim=1
+    )
+    torch.testing.assert_close(combine(similarities, 3), against[:, 0])
 
 
 @pytest.mark.parametrize("text", [torch.zeros(8), torch.full((8,), torch.nan), torch.ones(7)])

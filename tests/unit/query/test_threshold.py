@@ -42,7 +42,41 @@ def test_paper_takes_the_valley_next_to_the_largest_peak_and_auto_the_topmost() 
 
 def test_a_few_stray_scores_are_no_object() -> None:
     scores = torch.cat([hills((0.2, 0.01, 50_000), (0.3, 0.01, 5000)), torch.tensor([0.5, 0.51])])
-    assert 0.22 < find_threshold(scores, "auto").value < 0.29
+    for method in ("auto", "valley"):
+        assert 0.22 < find_threshold(scores, method).value < 0.29
+
+
+@pytest.mark.parametrize("count", [100, 1000, 10_000])
+def test_auto_finds_a_hill_whatever_its_size(count: int) -> None:
+    scores = hills((0.2, 0.02, 50_000), (0.4, 0.01, count))
+    assert 0.28 < find_threshold(scores, "auto").value < 0.38
+
+
+@pytest.mark.parametrize(
+    ("instances", "low", "high"), [(1, 0.45, 0.55), (2, 0.3, 0.4), (3, 0.22, 0.28), (9, 0.22, 0.28)]
+)
+def test_the_users_count_of_instances_chooses_the_hill(instances: int, low: float, high: float) -> None:
+    scores = hills((0.2, 0.01, 50_000), (0.3, 0.01, 3000), (0.4, 0.01, 2000), (0.6, 0.01, 1000))
+    for method in ("auto", "valley"):
+        found = find_threshold(scores, method, instances=instances)
+        assert low < found.value < high
+    assert ("there are no 9" in found.explanation) == (instances == 9)
+
+
+@pytest.mark.parametrize(("method", "instances"), [("otsu", 1), (0.3, 2), ("auto", 0), ("valley", -1)])
+def test_instances_that_nothing_counts_are_refused(method: str | float, instances: int) -> None:
+    with pytest.raises(InvalidQuery, match="instances"):
+        find_threshold(torch.rand(10), method, instances=instances)
+
+
+def test_the_stable_stretch_lies_between_the_hills() -> None:
+    scores = hills((0.2, 0.02, 9000), (0.5, 0.02, 3000))
+    found = find_threshold(scores, "stability")
+    assert 0.27 < found.value < 0.43 and "stable from" in found.explanation
+
+
+def test_a_ramp_is_nowhere_stable_and_says_so() -> None:
+    assert "stands in" in find_threshold(torch.linspace(0, 1, 10_000), "stability").explanation
 
 
 def test_one_hill_falls_back_to_otsu_and_says_so() -> None:
@@ -99,6 +133,21 @@ def test_any_scores_have_a_threshold_between_their_least_and_greatest(scores: np
     found = find_threshold(torch.from_numpy(scores), method)
     assert scores.min() <= found.value <= scores.max()
     assert found.explanation.endswith(".")
+
+
+@given(scores=SCORES, method=st.sampled_from(SEARCHED), power=st.integers(-3, 6))
+@settings(max_examples=100, deadline=None)
+def test_thresholds_scale_with_any_scores(scores: np.ndarray, method: str, power: int) -> None:
+    scores = np.where(np.abs(scores) < 1e-6, 0, scores).astype(np.float32)
+    scaled = find_threshold(torch.from_numpy(scores * np.float32(2.0**power)), method).value
+    assert scaled == find_threshold(torch.from_numpy(scores), method).value * 2.0**power
+
+
+@given(scores=SCORES, method=st.sampled_from(SEARCHED), seed=st.integers(0, 99))
+@settings(max_examples=100, deadline=None)
+def test_the_order_of_the_scores_does_not_matter(scores: np.ndarray, method: str, seed: int) -> None:
+    mixed = np.random.default_rng(seed).permutation(scores)
+    assert find_threshold(torch.from_numpy(mixed), method) == find_threshold(torch.from_numpy(scores), method)
 
 
 @given(

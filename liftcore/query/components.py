@@ -1,0 +1,30 @@
+"""Connected components of a mask."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+
+def largest_component(mask: Tensor) -> Tensor:
+    """The largest 8-connected component of a mask, the topmost of equals.
+
+    Args:
+        mask: [H, W] bool.
+
+    Returns:
+        [H, W] bool, empty where the mask is.
+    """
+    from scipy.ndimage import label
+
+    labels, count = label(mask.numpy(), structure=np.ones((3, 3)))
+    if count < 2:
+        return mask
+    sizes = np.bincount(labels.ravel())
+    sizes[0] = 0  # the background
+    return torch.from_numpy(labels == sizes.argmax())

@@ -1,0 +1,115 @@
+"""The directions in feature space that a query names."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+
+from liftcore.errors import InvalidQuery, NotFound
+from liftcore.observe.observation import RegionMap
+from liftcore.query.example import Example, OneSplat, Pixel, Region
+from liftcore.query.query import texts_of
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from torch import Tensor
+
+    from liftcore.query.encoders import TextEncoder
+    from liftcore.query.query import Term
+    from liftcore.query.scene import QueryScene
+
+MINIMUM_ROW_SUM = 0.5  # below it a ray mostly misses the scene: no histogram, no mask and no example takes it
+
+
+def directions(scene: QueryScene, terms: Sequence[Term], encoder: TextEncoder | None) -> Tensor:
+    """The unit vector of every term, [n, F] f32.
+
+    Raises:
+        InvalidQuery: a text without an encoder or with one of another space, a text that it cannot read, or an
+            example that has no feature: outside the image, on a ray that misses the scene, of another length.
+        NotFound: an example names a view or a region that is not there.
+        InvalidLift: the splats, the cameras or the packs that an example needs moved or changed.
+    """
+    texts = texts_of(terms)
+    words = iter(_encode(scene, texts, encoder) if texts else ())
+    return torch.stack([next(words) if isinstance(term, str) else _of_example(scene, term) for term in terms])
+
+
+def _encode(scene: QueryScene, texts: list[str], encoder: TextEncoder | None) -> Tensor:
+    space = scene.lift.metadata.text_space or "none"
+    if encoder is None:
+        hint = "name a text encoder of the lift's space, or ask by example"
+        raise InvalidQuery("encoder", expected=f"one for the text space {space}", got="none", hint=hint)
+    if encoder.channels != scene.channels:
+        raise InvalidQuery(
+            "encoder",
+            expected=f"{scene.channels} channels as the lift has (its text space: {space})",
+            got=f"{encoder.name} with {encoder.channels}",
+            hint="query with the text encoder that belongs to the features' image encoder",
+        )
+    return torch.stack([_unit(row, text) for row, text in zip(encoder.encode(texts), texts, strict=True)])
+
+
+def _of_example(scene: QueryScene, example: Example) -> Tensor:
+    if isinstance(example, Pixel):
+        return _unit(_rendered(scene, example), str(example))
+    if isinstance(example, Region):
+        return _unit(_codebook_row(scene, example), str(example))
+    if isinstance(example, OneSplat):
+        return _unit(_splat_row(scene, example), str(example))
+    if len(example.values) != scene.channels:
+        raise InvalidQuery("vector", expected=f"{scene.channels} channels, as the lift has", got=str(example))
+    return _unit(torch.tensor(example.values, dtype=torch.float64), "vector")
+
+
+def _rendered(scene: QueryScene, pixel: Pixel) -> Tensor:
+    """``sum_j A_ij x_j`` of the pixel's ray, [F] f64, walked as scores are rendered."""
+    camera = scene.cameras.get(pixel.view)
+    if not (0 <= pixel.x < camera.width and 0 <= pixel.y < camera.height):
+        expected = f"x in 0..{camera.width - 1} and y in 0..{camera.height - 1}"
+        raise InvalidQuery(str(pixel), expected=expected, got=f"{pixel.x},{pixel.y}")
+    row = scene.raster.ray_rows(camera, torch.tensor([[pixel.x, pixel.y]], dtype=torch.int32), scene.walk)
+    met = float(row.weights.sum())
+    if met < MINIMUM_ROW_SUM:
+        raise InvalidQuery(
+            str(pixel), expected="a pixel that shows the scene", got=f"a ray that splats fill by {met:.1%}",
+            hint="pick a pixel on a surface",
+        )  # fmt: skip
+    return row.weights.double() @ scene.lift.features[row.splats.long()].double()
+
+
+def _codebook_row(scene: QueryScene, example: Region) -> Tensor:
+    packs = scene.packs
+    if example.view not in packs.views:
+        raise NotFound(str(example), expected="a view of the lift's feature packs", got=repr(example.view))
+    observation = packs.observation(example.view)
+    if not isinstance(observation, RegionMap):
+        hint = "ask by a pixel, VIEW:x,y"
+        raise InvalidQuery(str(example), expected="a view with regions", got="a feature grid", hint=hint)
+    levels = observation.labels.shape[0]
+    if example.level >= levels:
+        raise NotFound(str(example), expected=f"a level in 0..{levels - 1}", got=str(example.level))
+    if not bool((observation.labels[example.level] == example.region).any()):
+        expected = f"a label of level {example.level} in view {example.view!r}"
+        raise NotFound(str(example), expected=expected, got=str(example.region))
+    return observation.codebook[example.region].double()
+
+
+def _splat_row(scene: QueryScene, example: OneSplat) -> Tensor:
+    count = scene.lift.features.shape[0]
+    if example.splat >= count:
+        raise InvalidQuery(str(example), expected=f"a splat in 0..{count - 1}", got=str(example.splat))
+    return scene.lift.features[example.splat].double()
+
+
+def _unit(vector: Tensor, name: str) -> Tensor:
+    """[F] f32 of length one. Scaled by its largest entry first, so that no square overflows or vanishes."""
+    wide = vector.to(torch.float64)
+    largest = wide.abs().max()
+    if not bool(torch.isfinite(largest)) or float(largest) == 0:
+        got = "nothing but zeros" if float(largest) == 0 else "NaN or infinity"
+        raise InvalidQuery(name, expected="a finite feature with a direction", got=got)
+    scaled = wide / largest
+    return (scaled / torch.linalg.vector_norm(scaled)).to(torch.float32)
