@@ -2,8 +2,8 @@
 
 As there: the scores are stretched to 0..1, thresholds run in steps of 0.01, the slope of the share found passes a
 median filter of five, and stable are slopes below 0.4 with a share of 0.005 to 0.9, over five steps at least.
-Different here: the released code compares label levels and takes the least sensitive one. We have one map, so the least
-sensitive stable stretch of the sweep counts, and its middle is the threshold.
+Different here: the released code compares label levels and takes the least sensitive one. We have one map, so the
+least sensitive stable stretch of the sweep counts, and its middle is the threshold.
 """
 
 from __future__ import annotations

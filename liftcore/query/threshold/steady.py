@@ -1,8 +1,8 @@
 """The automatic threshold: where the share found is steadiest.
 
 Let ``S(t)`` be the share of the scores at or above t. Raising t past a hill of the histogram loses its scores,
-between hills it loses hardly any. The valley wanted is not the deepest one: a small object's hill is low on both sides.
-So the share's log-odds are watched, which count a loss against what is left on either side:
+between hills it loses hardly any. The valley wanted is not the deepest one: a small object's hill is low on both
+sides. So the share's log-odds are watched, which count a loss against what is left on either side:
 
     t* = argmin_t  -d/dt log(S / (1 - S)) = argmin_t  p(t) / (S(t) (1 - S(t)))
 
