@@ -9,6 +9,7 @@ import torch
 
 from liftcore.measure.protocols import Prediction
 from liftcore.query.ask import MINIMUM_ROW_SUM, ask
+from liftcore.query.query import Query
 from liftcore.query.threshold import find_threshold
 
 if TYPE_CHECKING:
@@ -34,7 +35,7 @@ class RenderedScores:
         self._threshold = threshold
         columns = []
         for text in texts:
-            answer = ask(scene, text, encoder, negatives=negatives, threshold=threshold)
+            answer = ask(scene, Query((text,), tuple(negatives), threshold), encoder)
             # A splat without a feature adds nothing to a ray.
             columns.append(torch.where(answer.seen, answer.scores, 0.0))
         self._values = torch.stack([*columns, torch.ones(scene.lift.features.shape[0])], dim=1)  # [P, n + 1]

@@ -9,6 +9,7 @@ import torch
 
 from liftcore.measure.protocols import Prediction
 from liftcore.query.ask import ask
+from liftcore.query.query import Query
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -35,7 +36,7 @@ class SelectedSplats:
     ) -> None:
         self._scene = scene
         self._selected = {
-            text: ask(scene, text, encoder, negatives=negatives, threshold=threshold).selected for text in texts
+            text: ask(scene, Query((text,), tuple(negatives), threshold), encoder).selected for text in texts
         }
 
     def look(self, view: str) -> dict[str, Prediction]:

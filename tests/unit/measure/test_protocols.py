@@ -20,6 +20,7 @@ from liftcore.measure.protocols.selected_splats import SelectedSplats
 from liftcore.measure.protocols.three_d_ovs import three_d_ovs_scenes
 from liftcore.query.ask import ask, look
 from liftcore.query.encoders import open_encoder
+from liftcore.query.query import Query
 from liftcore.query.scene import QueryScene
 from tests.labelled_scene import HEIGHT, WIDTH, isat, rectangle, write_lift
 
@@ -140,7 +141,7 @@ def test_p2_sees_the_selected_splats_alone(scene: QueryScene) -> None:
 
     texts, encoder = ["red apple", "unicorn"], words(scene)
     protocol = SelectedSplats(scene, texts, encoder, threshold=0.5)
-    chosen = ask(scene, "red apple", encoder, threshold=0.5).selected
+    chosen = ask(scene, Query(("red apple",), threshold=0.5), encoder).selected
     splats = scene.splats
     few = replace(
         splats,
@@ -158,7 +159,7 @@ def test_p3_makes_the_masks_that_a_query_makes(scene: QueryScene, threshold: str
     texts, encoder = ["book", "red apple"], words(scene)
     found = RenderedScores(scene, texts, encoder, threshold).look("frame_00002")
     for text in texts:
-        seen = look(scene, ask(scene, text, encoder, threshold=threshold), "frame_00002")
+        seen = look(scene, ask(scene, Query((text,), threshold=threshold), encoder), "frame_00002")
         assert (found[text].mask == seen.mask.numpy()).all() and found[text].mask.any()
         x, y = found[text].peak or (0, 0)
         assert seen.attention[y, x] == seen.attention.max()

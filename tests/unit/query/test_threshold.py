@@ -63,6 +63,11 @@ def test_the_users_count_of_instances_chooses_the_hill(instances: int, low: floa
     assert ("there are no 9" in found.explanation) == (instances == 9)
 
 
+def test_auto_says_when_nothing_stands_apart() -> None:
+    assert "with care" in find_threshold(hills((0.2, 0.05, 50_000)), "auto").explanation
+    assert "with care" not in find_threshold(hills((0.2, 0.02, 50_000), (0.4, 0.01, 500)), "auto").explanation
+
+
 @pytest.mark.parametrize(("method", "instances"), [("otsu", 1), (0.3, 2), ("auto", 0), ("valley", -1)])
 def test_instances_that_nothing_counts_are_refused(method: str | float, instances: int) -> None:
     with pytest.raises(InvalidQuery, match="instances"):
