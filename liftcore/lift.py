@@ -26,6 +26,7 @@ from liftcore.solve.checkpoint import Checkpoint, identity, resumed
 from liftcore.solve.closed_form import solve_closed_form
 from liftcore.solve.least_squares import refine
 from liftcore.solve.reference import reference
+from liftcore.solve.robust import robust_weights
 from liftcore.solve.view_weights import ViewWeights
 
 if TYPE_CHECKING:
@@ -87,10 +88,14 @@ def lift(
             with resumed(raster, checkpoint, key) as walked:
                 geometry = accumulate(walked, (scene.count, views), packs, names, settings, store, progress)
         codebooks = geometry.codebooks
+        with timings.stage("robust"):
+            weights = robust_weights(
+                store, codebooks, geometry.denominators, settings.robust_steps, progress, threads
+            )
         with timings.stage("solve"):
             dtype = getattr(torch, settings.dtype)
             solution = solve_closed_form(
-                store, codebooks.__getitem__, geometry.denominators, dtype, progress, threads
+                weights, codebooks.__getitem__, geometry.denominators, dtype, progress, threads
             )
         X, seen, notes = solution.features, geometry.denominators > 0, {}
         rays = None

@@ -1,6 +1,6 @@
 """Accuracy on the tabletop scene, beside the baselines that its data README gives.
 
-    python -m liftcore.measure.tabletop DIR [--presets] [--json]
+    python -m liftcore.measure.tabletop DIR [--presets] [--robust N] [--json]
 
 Each row is one lift. Splat accuracy is the share of splats whose most similar class vector is their own class, over
 the splats whose evidence from the 52 views of ``features.safetensors`` exceeds 0.5, whatever the lift; and over those
@@ -14,7 +14,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -58,6 +58,7 @@ class Case:
     grid_reading: str = "bilinear"
     preset: str = "row-sum"
     knobs: tuple[tuple[str, float], ...] = ()  # settings beside the preset
+    robust_steps: int = 0
 
     @property
     def settings(self) -> LiftSettings:
@@ -67,17 +68,19 @@ class Case:
             "lift_gain": self.gain,
             "render_gain": self.gain,
             "grid_reading": self.grid_reading,
+            "robust_steps": self.robust_steps,
         }
         return LiftSettings.of(preset=self.preset, certificate_rays=0, **{**own, **dict(self.knobs)})
 
     @property
     def name(self) -> str:
         """As the table prints it."""
+        robust = f", robust {self.robust_steps}" if self.robust_steps else ""
         if self.preset != "row-sum" or self.knobs:
-            return ", ".join([self.pack, self.preset, *(f"{key} {value:g}" for key, value in self.knobs)])
+            return ", ".join([self.pack, self.preset, *(f"{key} {value:g}" for key, value in self.knobs)]) + robust
         weights = ("w" if self.power == 1 else "w^2") + ("" if self.gain == 1 else f", lambda {self.gain:g}")
         reading = f" {self.grid_reading}" if self.pack == "grids" else ""
-        return f"{self.pack}{reading}, {weights}"
+        return f"{self.pack}{reading}, {weights}{robust}"
 
 
 # The README's grids were read at the nearest cell, so its figures stand at that reading.
@@ -214,12 +217,12 @@ def measure_all(folder: Path, cases: Sequence[Case] = CASES) -> dict[str, Any]:
 
 def table_of(document: dict[str, Any]) -> str:
     """The rows beside their baselines, and the machine, for people."""
-    head = f"{'features, weights':<34}{'accuracy':>9}{'base':>7}{'visible':>9}{'mIoU':>8}{'base':>7}{'lift s':>8}"
+    head = f"{'features, weights':<38}{'accuracy':>9}{'base':>7}{'visible':>9}{'mIoU':>8}{'base':>7}{'lift s':>8}"
     lines = [head]
     for row in document["rows"]:
         base = [f"{row['baseline'][key]:.3f}" if row["baseline"][key] else "-" for key in ("accuracy", "miou")]
         lines.append(
-            f"{row['name']:<34}{row['accuracy']:>9.4f}{base[0]:>7}{row['accuracy_visible']:>9.4f}"
+            f"{row['name']:<38}{row['accuracy']:>9.4f}{base[0]:>7}{row['accuracy_visible']:>9.4f}"
             f"{row['miou']:>8.4f}{base[1]:>7}{row['seconds']:>8.1f}"
         )
     lines.append(", ".join(f"{key} {value}" for key, value in document["hardware"].items()))
@@ -232,8 +235,10 @@ def main() -> None:
     parser.add_argument("folder", type=Path, metavar="DIR", help="the tabletop scene")
     parser.add_argument("--presets", action="store_true", help="all presets on noisy, hard and grid features")
     parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
+    parser.add_argument("--robust", type=int, default=0, metavar="N", help="lift with N robust steps")
     options = parser.parse_args()
-    document = measure_all(options.folder, PRESET_CASES if options.presets else CASES)
+    cases = PRESET_CASES if options.presets else CASES
+    document = measure_all(options.folder, [replace(case, robust_steps=options.robust) for case in cases])
     print(json.dumps(document) if options.json else table_of(document))
 
 

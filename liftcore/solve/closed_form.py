@@ -104,11 +104,11 @@ def solve_closed_form(
     features = torch.zeros(count, channels, dtype=dtype)
     squares = np.zeros(count)
     scale = np.divide(1.0, denominators, out=np.zeros(count), where=denominators > 0)
-    step = _slice_width(sum(book.shape[0] for book in books))
+    step = slice_width(sum(book.shape[0] for book in books))
     slices = [(begin, min(begin + step, channels)) for begin in range(0, channels, step)]
     with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
         for number, (begin, end) in enumerate(slices):
-            parts = [_slice_of(book, begin, end) for book in books]
+            parts = [slice_of(book, begin, end) for book in books]
             sums = _solve_slice(pool, store, parts, scale, features[:, begin:end])
             if not unit:
                 for part, norm in zip(parts, norms, strict=True):
@@ -127,12 +127,12 @@ def _fits_float16(books: Sequence[Tensor], longest: float) -> bool:
     return longest == 0 or FLOAT16_STEP * math.sqrt(books[0].shape[1]) <= FLOAT16_ERROR * longest
 
 
-def _slice_width(rows: int) -> int:
+def slice_width(rows: int) -> int:
     """Channels a slice, a multiple of WIDE, for codebooks of so many rows together."""
     return min(SLICE, max(WIDE, SLICE_BYTES // (4 * rows) // WIDE * WIDE))
 
 
-def _slice_of(book: Tensor, begin: int, end: int) -> np.ndarray:
+def slice_of(book: Tensor, begin: int, end: int) -> np.ndarray:
     """Channels ``begin..end`` of a codebook as [M, C] f32, C padded with zeros to a multiple of WIDE."""
     part = np.zeros((book.shape[0], -(-(end - begin) // WIDE) * WIDE), np.float32)
     part[:, : end - begin] = book[:, begin:end].to(torch.float32).numpy()

@@ -67,6 +67,7 @@ class LiftSettings(BaseModel):
     grid_reading: Literal["bilinear", "nearest"] = Field(
         "bilinear", description="what a pixel reads of a feature grid: four cells by distance, or the nearest alone"
     )
+    robust_steps: int = Field(0, ge=0, le=100, description="times that regions are reweighted by their agreement")
     dtype: Literal["float16", "float32"] = Field(
         "float16", description="how features are stored, if it can hold them"
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
@@ -14,6 +14,8 @@ from liftcore.raster.protocol import RegionWeights
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+
+    from torch import Tensor
 
 MEMORY_LIMIT = 1 << 30  # bytes of W that stay in memory; later views go to files
 
@@ -49,15 +51,37 @@ class ViewWeights:
             weights = self._to_file(weights)
         self._views.append(weights)
 
+    def blank(self) -> ViewWeights:
+        """The same sparsity with weights of their own, zero until they are written: columns are shared, not copied.
+
+        The new weights stay in memory while there is room, else in files of this store, which must stay open.
+        """
+        copy = ViewWeights(self._limit)
+        for number, weights in enumerate(self._views):
+            copy._views.append(replace(weights, weights=self._zeros(number, weights.weights)))
+        return copy
+
+    def _zeros(self, view: int, like: Tensor) -> Tensor:
+        self.bytes += like.nbytes
+        if self.bytes <= self._limit or like.nbytes == 0:
+            return torch.zeros_like(like)
+        self.mapped_bytes += like.nbytes
+        path = self._path(f"{view}-weights-from-{self.bytes}")
+        mapped = np.lib.format.open_memmap(path, mode="w+", dtype=np.float32, shape=tuple(like.shape))
+        return torch.from_numpy(mapped)
+
     def _to_file(self, weights: RegionWeights) -> RegionWeights:
-        if self._folder is None:
-            self._folder = tempfile.TemporaryDirectory(prefix="splatlift-weights-")
         mapped = {}
         for field in fields(weights):
-            path = Path(self._folder.name) / f"{len(self._views)}-{field.name}.npy"
+            path = self._path(f"{len(self._views)}-{field.name}")
             np.save(path, _array(weights, field.name))
             mapped[field.name] = torch.from_numpy(np.load(path, mmap_mode="c"))
         return RegionWeights(**mapped)
+
+    def _path(self, name: str) -> Path:
+        if self._folder is None:
+            self._folder = tempfile.TemporaryDirectory(prefix="splatlift-weights-")
+        return Path(self._folder.name) / f"{name}.npy"
 
     def __len__(self) -> int:
         return len(self._views)

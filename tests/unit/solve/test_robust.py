@@ -1,0 +1,217 @@
+"""The robust step on W against its definition in plain float64, and what it promises."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from liftcore.lift import lift
+from liftcore.progress import silent
+from liftcore.raster.protocol import RegionWeights
+from liftcore.solve.robust import NO_CONSENSUS, robust_weights
+from liftcore.solve.settings import LiftSettings
+from liftcore.solve.view_weights import ViewWeights
+from tests.unit.solve.test_lift_equals_dense import write_scene
+
+
+@dataclass
+class Scene:
+    """W [P, M] f32 and E [M, F] of every view, dense."""
+
+    weights: list[np.ndarray]
+    books: list[torch.Tensor]
+
+    @property
+    def denominators(self) -> np.ndarray:
+        return np.sum([view.sum(axis=1, dtype=np.float64) for view in self.weights], axis=0)
+
+    def store(self, memory_limit: int | None = None) -> ViewWeights:
+        store = ViewWeights(memory_limit)
+        for view in self.weights:
+            store.append(sparse(view))
+        return store
+
+    def after(self, steps: int, threads: int = 2, memory_limit: int | None = None) -> list[np.ndarray]:
+        """The weights of every view after so many steps, dense."""
+        with self.store(memory_limit) as store:
+            result = robust_weights(store, self.books, self.denominators, steps, silent, threads)
+            return [dense(view, like) for view, like in zip(result, self.weights, strict=True)]
+
+
+def sparse(view: np.ndarray) -> RegionWeights:
+    splats = np.nonzero(view.any(axis=1))[0].astype(np.int32)
+    rows, columns = np.nonzero(view)
+    starts = np.concatenate([[0], np.cumsum((view[splats] != 0).sum(axis=1))]).astype(np.int64)
+    parts = splats, starts, columns.astype(np.int32), view[rows, columns].astype(np.float32)
+    nothing = torch.zeros(0)
+    return RegionWeights(*(torch.from_numpy(part) for part in parts), nothing.int(), nothing)
+
+
+def dense(weights: RegionWeights, like: np.ndarray) -> np.ndarray:
+    rows = np.repeat(weights.splats.numpy(), np.diff(weights.row_starts.numpy()))
+    result = np.zeros_like(like)
+    result[rows, weights.columns.numpy()] = weights.weights.numpy()
+    return result
+
+
+def over(values: np.ndarray, lengths: np.ndarray) -> np.ndarray:
+    return np.divide(values, lengths, out=np.zeros_like(values), where=lengths > 0)
+
+
+def defined(scene: Scene, steps: int) -> list[np.ndarray]:
+    """The module's equation, line by line."""
+    first = [view.astype(np.float64) for view in scene.weights]
+    books = [book.double().numpy() for book in scene.books]
+    units = [over(book, np.linalg.norm(book, axis=1, keepdims=True)) for book in books]
+    columns = [view.sum(axis=0) * (np.linalg.norm(book, axis=1) > 0) for view, book in zip(first, books, strict=True)]
+    mean = sum(c @ u for c, u in zip(columns, units, strict=True)) / (sum(c.sum() for c in columns) or 1.0)
+    e = []
+    for unit in units:
+        away = np.where(unit.any(axis=1, keepdims=True), unit - mean, 0.0)
+        lengths = np.linalg.norm(away, axis=1, keepdims=True)
+        e.append(over(away, np.where(lengths > 1e-6, lengths, 0.0)))
+    D, current = scene.denominators[:, None], first
+    for _ in range(steps):
+        everything = sum(w @ v for w, v in zip(current, e, strict=True))
+        cosines = []
+        for w, v in zip(current, e, strict=True):
+            r = over(everything - w @ v, D)
+            lengths = np.linalg.norm(r, axis=1, keepdims=True)
+            cosines.append(np.maximum(over(r, np.where(lengths > NO_CONSENSUS, lengths, 0.0)) @ v.T, 0.0))
+        usual = sum((w * c).sum() for w, c in zip(first, cosines, strict=True)) / (sum(w.sum() for w in first) or 1.0)
+        shares = [over(w.sum(axis=1, keepdims=True), D) for w in current]
+        new = [w * ((1 - p) * c + p * usual) for w, c, p in zip(first, cosines, shares, strict=True)]
+        gain = over(D, sum(w.sum(axis=1, keepdims=True) for w in new))
+        current = [np.where(gain > 0, w * gain, old) for w, old in zip(new, first, strict=True)]
+    return current
+
+
+@st.composite
+def scenes(draw: st.DrawFn) -> Scene:
+    """Random sparse weights and codebooks: unseen splats, splats of one view, empty views, zero vectors, float16."""
+    rng = np.random.default_rng(draw(st.integers(0, 2**20)))
+    count, channels = draw(st.integers(1, 30)), draw(st.sampled_from([2, 5, 33, 200]))
+    dtype = draw(st.sampled_from([torch.float16, torch.float32]))
+    size = draw(st.sampled_from([1e-9, 1.0, 1e6]))
+    scene = Scene([], [])
+    for _ in range(draw(st.integers(1, 5))):
+        rows = draw(st.integers(1, 6))
+        kept = rng.random((count, rows)) < draw(st.sampled_from([0.0, 0.3, 0.9]))
+        scene.weights.append((rng.random((count, rows)) * kept * size).astype(np.float32))
+        book = rng.normal(0.5, 1, (rows, channels)) * rng.uniform(0.1, 9, (rows, 1)) * (rng.random((rows, 1)) < 0.9)
+        scene.books.append(torch.tensor(book, dtype=dtype))
+    return scene
+
+
+@settings(max_examples=30, deadline=None)
+@given(scenes(), st.integers(0, 3))
+def test_the_steps_equal_their_definition_and_keep_every_splats_sum(scene, steps):
+    got, expected, D = scene.after(steps), defined(scene, steps), scene.denominators
+    for mine, real in zip(got, expected, strict=True):
+        assert np.abs(over(mine - real, D[:, None])).max() < 2e-3
+    sums = np.sum([view.sum(axis=1, dtype=np.float64) for view in got], axis=0)
+    assert np.allclose(sums, D, rtol=1e-5)
+
+
+def random_scene(seed: int, count: int = 9_000, views: int = 4, rows: int = 7, channels: int = 150) -> Scene:
+    """More than two blocks of splats, more than one slice of channels."""
+    rng = np.random.default_rng(seed)
+    kept = [rng.random((count, rows)) * (rng.random((count, rows)) < 0.3) for _ in range(views)]
+    books = [torch.tensor(rng.normal(0, 1, (rows, channels)), dtype=torch.float32) for _ in range(views)]
+    return Scene([view.astype(np.float32) for view in kept], books)
+
+
+def test_neither_threads_nor_files_change_a_bit_and_the_first_weights_stay():
+    scene = random_scene(0)
+    expected = scene.after(3, threads=1)
+    for other in (scene.after(3, threads=5), scene.after(3, memory_limit=0)):
+        assert all(np.array_equal(a, b) for a, b in zip(expected, other, strict=True))
+    with scene.store() as store:
+        assert robust_weights(store, scene.books, scene.denominators, 0, silent) is store
+        robust_weights(store, scene.books, scene.denominators, 2, silent)
+        assert all(np.array_equal(dense(a, b), b) for a, b in zip(store, scene.weights, strict=True))
+
+
+def things(noise: float, views: int = 8, seed: int = 0) -> tuple[Scene, np.random.Generator]:
+    """Forty splats, half of each of two things, seen right by every view; all vectors in a narrow cone."""
+    rng = np.random.default_rng(seed)
+    cone, own = rng.normal(0, 1, 64), rng.normal(0, 0.3, (2, 64))
+    weights = [np.kron(np.eye(2), np.ones((20, 1))) * rng.uniform(0.5, 1, (40, 1)) for _ in range(views)]
+    books = [torch.tensor(cone + own + rng.normal(0, noise, (2, 64)), dtype=torch.float32) for _ in range(views)]
+    return Scene([view.astype(np.float32) for view in weights], books), rng
+
+
+def shares(weights: list[np.ndarray], splat: int) -> np.ndarray:
+    """Of every view in the weight of a splat."""
+    own = np.array([view[splat].sum() for view in weights])
+    return own / own.sum()
+
+
+def test_one_wrong_view_loses_its_weight_to_the_others():
+    scene, _ = things(noise=0.1)
+    scene.weights[3][:5] = scene.weights[3][:5, ::-1].copy()
+    before, after = shares(scene.weights, 0), shares(scene.after(1), 0)
+    assert after[3] < 0.2 * before[3]
+    others = np.arange(8) != 3
+    assert np.allclose(after[others] / after[others].sum(), before[others] / before[others].sum(), atol=0.01)
+
+
+def test_a_scene_without_outliers_changes_little():
+    scene, _ = things(noise=0.05)
+    for splat in (0, 20):
+        assert np.abs(shares(scene.after(2), splat) - shares(scene.weights, splat)).max() < 0.01
+
+
+def test_a_view_that_holds_most_of_the_weight_is_not_outvoted():
+    scene, _ = things(noise=0.1, views=4)
+    scene.weights[0][0] *= 20
+    for view in scene.weights[1:]:
+        view[0] = view[0, ::-1].copy()
+    assert shares(scene.after(1), 0)[0] > shares(scene.weights, 0)[0] > 0.8
+
+
+def test_a_heavy_region_is_not_rewarded_for_its_own_noise():
+    rng = np.random.default_rng(1)
+    books = [torch.tensor(rng.normal(0, 1, (40, 300)), dtype=torch.float32) for _ in range(6)]
+    weights = [np.eye(40, dtype=np.float32)[rng.permutation(40)] for _ in range(6)]
+    weights[0] *= 3
+    scene = Scene(weights, books)
+    heavy = [shares(scene.after(1), splat)[0] for splat in range(40)]
+    by_the_mean = []
+    for splat in range(40):
+        seen = torch.cat([book[view[splat] > 0] for book, view in zip(books, weights, strict=True)])
+        own = torch.tensor([view[splat].sum() for view in weights])
+        cosines = torch.nn.functional.cosine_similarity(seen, own @ seen, dim=1)
+        by_the_mean.append(float(own[0] * cosines[0] / (own @ cosines)))
+    assert np.mean(by_the_mean) > 0.6
+    assert np.mean(heavy) < 0.5
+
+
+def test_a_splat_of_one_view_does_not_change():
+    scene, _ = things(noise=0.1)
+    for view in scene.weights[1:]:
+        view[7] = 0
+    assert np.allclose(scene.after(2)[0][7], scene.weights[0][7], rtol=1e-6)
+
+
+@pytest.mark.parametrize("value", [0.0, 1.0])
+def test_nothing_changes_where_no_vector_has_a_direction(value):
+    scene = random_scene(2, count=50)
+    same = Scene(scene.weights, [torch.full_like(book, value) for book in scene.books])
+    assert all(np.array_equal(a, b) for a, b in zip(same.after(2), scene.weights, strict=True))
+
+
+def test_a_robust_lift_keeps_what_is_seen_and_how_much(tmp_path):
+    paths = write_scene(tmp_path, 9)
+    plain, robust = (
+        lift(paths[0], paths[1], [paths[2]], LiftSettings.of(robust_steps=steps, dtype="float32")) for steps in (0, 1)
+    )
+    assert torch.equal(plain.seen, robust.seen)
+    assert torch.equal(plain.evidence, robust.evidence)
+    assert not torch.equal(plain.features, robust.features)
+    assert float(robust.agreement.mean()) > float(plain.agreement.mean())
