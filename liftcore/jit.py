@@ -22,7 +22,8 @@ from numba.core import config
 def _kernel_sources() -> list[Path]:
     """The files whose code or constants kernels are made of: a change in any other compiles nothing anew."""
     root = Path(__file__).parent
-    own = [Path(__file__), *sorted(root.glob("lanes*.py")), root / "raster" / "constants.py"]
+    named = [root / "raster" / name for name in ("constants.py", "records.py")]
+    own = [Path(__file__), *sorted(root.glob("lanes*.py")), *named]
     rooms = [source for package in ("raster", "solve", "query") for source in sorted((root / package).glob("*.py"))]
     return own + [source for source in rooms if b"from liftcore.jit import" in source.read_bytes()]
 

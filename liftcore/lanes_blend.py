@@ -31,6 +31,7 @@ from liftcore.lanes import (
     load_lanes,
     minimum,
 )
+from liftcore.raster.constants import LARGEST_EXPONENT
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -82,7 +83,6 @@ class DiscLanes(NamedTuple):
 
 # 2^-f on [0, 1) as a polynomial with p(0) = 1, relative error below 6e-9 (Chebyshev nodes, degree 6).
 _EXP2_DEGREE = 6
-LARGEST_EXPONENT = 120.0  # 2^-120 is far below the alpha floor; kernels without a floor count smaller alphas as none
 # log2(1 + f) / f on [sqrt(1/2) - 1, sqrt(2) - 1], relative error below 5e-9.
 _LOG2_DEGREE = 9
 _LOG2_E = 1.0 / math.log(2.0)

@@ -15,6 +15,7 @@ from liftcore import __version__
 from liftcore.artifact import InputFile, Lift, LiftMetadata
 from liftcore.observe.pack import open_packs, pair
 from liftcore.progress import Progress, silent
+from liftcore.raster.antialiased import check_antialiased
 from liftcore.raster.cpu import CpuRaster
 from liftcore.raster.warm_up import warm_up
 from liftcore.scene.load import camera_files, load_cameras, load_splats
@@ -69,18 +70,19 @@ def lift(
 
     Raises:
         InvalidInput: a file is malformed, or the packs do not fit the cameras.
-        Unavailable: the kernel of the splats is not implemented.
+        InvalidSettings: the splats' kernel has no opacity compensation, and the settings ask for it.
     """
     timings = Timings()
     with timings.stage("read"):
         scene, views = load_splats(splats), load_cameras(cameras)
+        check_antialiased(scene.kernel, settings.antialiased)
         packs = open_packs(features)
         names, unpaired = pair(packs, views)
         names = names[:: settings.view_stride]
     with timings.stage("digest"):
         inputs = [input_file(path) for path in (splats, cameras, *features)]
     with timings.stage("compile"):
-        warm_up()
+        warm_up(scene.kernel)
     with ViewWeights() as store:
         with timings.stage("geometry"):
             raster = CpuRaster(scene, threads)

@@ -23,3 +23,13 @@ def _compiled_kernels() -> None:
     from liftcore.raster.warm_up import warm_up
 
     warm_up()
+
+
+@pytest.fixture(scope="session")
+def every_kernel() -> None:
+    """The other kernels' compiled code too, for the tests that walk them."""
+    from liftcore.raster.warm_up import warm_up
+    from liftcore.scene.splats import Kernel
+
+    for kernel in Kernel:
+        warm_up(kernel)

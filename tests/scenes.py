@@ -2,25 +2,40 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
 import numpy as np
 import torch
 from hypothesis import strategies as st
 
 from liftcore.observe.observation import FeatureGrid, Observation, RegionMap
 from liftcore.scene.cameras import Camera
-from liftcore.scene.splats import Splats
+from liftcore.scene.splats import Kernel, Splats
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
-def random_splats(seed: int, count: int = 40, spread: float = 1.0) -> Splats:
-    """Splats around the origin: needles, discs and balls, faint and opaque."""
+def random_splats(seed: int, count: int = 40, spread: float = 1.0, kernel: Kernel = Kernel.GAUSSIAN_3D) -> Splats:
+    """Splats around the origin: needles, discs and balls, faint and opaque; for DBS with falloffs flat and steep."""
     rng = np.random.default_rng(seed)
-    return Splats(
+    splats = Splats(
         means=torch.tensor(rng.normal(0, spread, (count, 3)), dtype=torch.float32),
         quats=torch.tensor(rng.normal(0, 1, (count, 4)), dtype=torch.float32),
         log_scales=torch.tensor(rng.uniform(-4.5, -0.5, (count, 3)), dtype=torch.float32),
         opacity_logits=torch.tensor(rng.normal(0, 3, count), dtype=torch.float32),
         sh=torch.tensor(rng.normal(0, 1, (count, 1, 3)), dtype=torch.float32),
     )
+    betas = torch.tensor(rng.normal(0, 1.5, count), dtype=torch.float32)
+    return of_kernel(splats, kernel, betas)
+
+
+def of_kernel(splats: Splats, kernel: Kernel, betas: Tensor) -> Splats:
+    """The same numbers read as splats of another kernel: 2DGS takes the first two scales, DBS the betas [P]."""
+    if kernel is Kernel.GAUSSIAN_2D:
+        return replace(splats, kernel=kernel, log_scales=splats.log_scales[:, :2].contiguous())
+    return replace(splats, kernel=kernel, beta=betas) if kernel is Kernel.BETA else splats
 
 
 def look_at(name: str, centre: np.ndarray, width: int, height: int, focal: float) -> Camera:
@@ -63,10 +78,11 @@ def random_grid(seed: int, size: tuple[int, int] = (7, 9), F: int = 6) -> Featur
 
 
 @st.composite
-def scenes(draw: st.DrawFn) -> tuple[Splats, Camera, Observation]:
+def scenes(draw: st.DrawFn, kernel: Kernel = Kernel.GAUSSIAN_3D) -> tuple[Splats, Camera, Observation]:
     """A scene, a view and what the view observes."""
     seed = draw(st.integers(0, 2**20))
-    splats = random_splats(seed, count=draw(st.integers(1, 60)), spread=draw(st.sampled_from([0.2, 1.0, 3.0])))
+    spread = draw(st.sampled_from([0.2, 1.0, 3.0]))
+    splats = random_splats(seed, draw(st.integers(1, 60)), spread, kernel)
     camera = random_camera(seed, width=draw(st.integers(1, 50)), height=draw(st.integers(1, 40)))
     size = (draw(st.integers(1, 45)), draw(st.integers(1, 55)))
     if draw(st.booleans()):

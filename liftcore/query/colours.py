@@ -30,6 +30,8 @@ SH_C3 = (
     math.sqrt(105 / (16 * math.pi)),
 )
 NO_CLUSTER_COLOUR = (90, 90, 90)  # sRGB of splats in no cluster
+_LOBE_SHARPNESS = 10 * math.log(2)
+_LARGEST_POWER = 1e30
 NO_COLOUR = 0.6  # grey of splats whose file holds no colours
 
 # The map runs from dark violet over green to light yellow: its lightness rises evenly, so that equal steps of
@@ -44,10 +46,11 @@ _CLUSTER_CHROMA = 0.13
 
 
 def seen_colours(splats: Splats, camera: Camera) -> Tensor:
-    """The colours of splats from a camera, ``max(0, 0.5 + sum_k SH_k(d) c_k)`` with d from camera to splat.
+    """The colours of splats from a camera, ``max(0, 0.5 + sum_k SH_k(d) c_k + lobes)`` with d from camera to splat.
 
     Args:
-        splats: the scene, with spherical harmonics of degree 0 to 3; coefficients above are left out.
+        splats: the scene, with spherical harmonics of degree 0 to 3; coefficients above are left out. The lobes of
+            DBS are added where the file has them.
         camera: where they are seen from.
 
     Returns:
@@ -59,7 +62,30 @@ def seen_colours(splats: Splats, camera: Camera) -> Tensor:
     directions = torch.nn.functional.normalize(splats.means - centre, dim=1)
     basis = _sh_basis(directions, min(splats.sh_degree or 0, 3))
     colours = torch.einsum("pk,pkc->pc", basis, splats.sh[:, : basis.shape[1]])
+    if splats.sb_params is not None:
+        colours += _lobes(directions, splats.sb_params)
     return (colours + 0.5).clamp_min(0.0)
+
+
+def _lobes(directions: Tensor, sb_params: Tensor) -> Tensor:
+    """Spherical beta lobes (DBS): ``sum_s softplus(rgb_s) max(0, mu_s d)^(4 exp(b_s))``.
+
+    Args:
+        directions: [P, 3] f32, unit, from camera to splat.
+        sb_params: [P, S, 6] f32, r g b theta phi b of each lobe, with
+            ``mu = (sin theta cos phi, sin theta sin phi, cos theta)`` and a softplus of sharpness 10 ln 2.
+
+    Returns:
+        [P, 3] f32.
+    """
+    colour = torch.nn.functional.softplus(sb_params[..., :3], beta=_LOBE_SHARPNESS)
+    theta, phi, b = sb_params[..., 3:].unbind(dim=2)
+    mu = torch.stack([theta.sin() * phi.cos(), theta.sin() * phi.sin(), theta.cos()], dim=2)
+    facing = torch.einsum("psk,pk->ps", mu, directions)
+    # Powers by logarithms: the exponent may be infinite, and a lobe seen from behind gives nothing at any exponent.
+    exponent = (4.0 * b.exp()).clamp_max(_LARGEST_POWER)
+    power = (exponent * facing.clamp(1e-30, 1.0).log()).exp()
+    return torch.einsum("ps,psc->pc", torch.where(facing > 0, power, 0.0), colour)
 
 
 def _sh_basis(directions: Tensor, degree: int) -> Tensor:

@@ -78,7 +78,7 @@ def render(scene: QueryScene, view: str, what: str = "rgb") -> np.ndarray:
         return render_clusters(scene, view)
     camera = scene.cameras.get(view)
     colours = scene.principal if what == "pca" else seen_colours(scene.splats, camera)
-    image = scene.raster.render(camera, colours, Walk())
+    image = scene.raster.render(camera, colours, Walk(antialiased=scene.walk.antialiased))
     return np.round(255 * image.numpy().clip(0.0, 1.0)).astype(np.uint8)
 
 

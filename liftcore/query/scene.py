@@ -110,4 +110,4 @@ class QueryScene:
     def walk(self) -> Walk:
         """How rays walk when scores are rendered: with the lift's rendering gain (App. Tikhonov)."""
         settings = self.lift.metadata.settings
-        return Walk(settings.render_gain, settings.alpha_cap, settings.transmittance_stop)
+        return Walk(settings.render_gain, settings.alpha_cap, settings.transmittance_stop, settings.antialiased)

@@ -11,16 +11,8 @@ import numpy as np
 from liftcore.jit import inlined, kernel
 from liftcore.lanes import LANES, PIXELS, WEIGHTS, add_product_lanes
 from liftcore.raster.constants import TILE
-from liftcore.raster.walk import (
-    CHECK_EVERY,
-    blend,
-    footprint,
-    look,
-    new_rays,
-    row_centre,
-    start_rays,
-    touches,
-)
+from liftcore.raster.footprints import footprint, row_of, touches
+from liftcore.raster.walk import CHECK_EVERY, blend, look, new_rays, start_rays
 
 
 @kernel
@@ -49,15 +41,15 @@ def gather_tiles(first, last, frame, image):
             if (step - frame.starts[tile]) % CHECK_EVERY == 0 and not look(rays, False):
                 break
             place = frame.items[step]
-            splat = footprint(frame.records, place, float(x0), float(y0))
+            splat = footprint(frame.kernel, frame.records, place, float(x0), float(y0))
             met = False
             for row in range(splat.top, splat.bottom + 1):
-                centre, base = row_centre(splat, row)
+                line = row_of(splat, row)
                 for side in range(2):
                     half = 2 * row + side
-                    if not rays.alive[half] or not touches(splat, centre, base, side):
+                    if not rays.alive[half] or not touches(splat, line, side):
                         continue
-                    blend(rays, splat, centre, base, half)
+                    blend(rays, splat, line, half)
                     met = True
                     offset = half * LANES
                     for channel in range(channels):

@@ -15,12 +15,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from liftcore.errors import InvalidInput, Unavailable
+from liftcore.errors import InvalidInput
 from liftcore.raster.adjoint import add_sums, gather_tiles
+from liftcore.raster.antialiased import check_antialiased
 from liftcore.raster.constants import TILE
 from liftcore.raster.depth_order import depth_order
+from liftcore.raster.kernels import RECORDS, activated, kernel_in, project, with_gain
 from liftcore.raster.merging import count_entries, gather_entries, merge_range
-from liftcore.raster.projection import RECORD, axes_of, opacities, project_gaussians, view_of
+from liftcore.raster.projection import Targets, view_of
 from liftcore.raster.protocol import RayRows, RegionWeights, Walk, Weighting
 from liftcore.raster.readings import reading_of
 from liftcore.raster.region_weights import weigh_tiles
@@ -30,7 +32,6 @@ from liftcore.raster.strided import check_stride, every_pixel, places_on, stride
 from liftcore.raster.strongest import strongest_tiles
 from liftcore.raster.tiles import fill_tiles, list_tiles, tile_places
 from liftcore.raster.walk import Frame
-from liftcore.scene.splats import Kernel
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from liftcore.observe.observation import Observation
-    from liftcore.raster.projection import View
+    from liftcore.raster.projection import Scene, View
     from liftcore.scene.cameras import Camera
     from liftcore.scene.splats import Splats
 
@@ -48,33 +49,22 @@ RENDER_CHANNELS = 32  # channels a pass of the render, so that a tile's sums sta
 
 
 class CpuRaster:
-    """A for one scene of 3D Gaussians (``liftcore.raster.protocol.Raster``).
+    """A for one scene, of any kernel (``liftcore.raster.protocol.Raster``).
 
     One call at a time: the footprints of the view at hand live in buffers that the next view overwrites.
 
     Args:
         splats: the scene.
         threads: how many threads work; None takes the cores that this process may use. The number changes no bit.
-
-    Raises:
-        Unavailable: the kernel of the splats is not implemented here yet.
     """
 
     def __init__(self, splats: Splats, threads: int | None = None) -> None:
-        if splats.kernel is not Kernel.GAUSSIAN_3D:
-            raise Unavailable(
-                "splats",
-                expected="3D Gaussian splats (kernel 3dgs)",
-                got=f"kernel {splats.kernel}",
-                hint="2DGS and DBS files are read and inspected; lifting them is not implemented yet",
-            )
         self.splats = splats
         self.threads = threads or len(os.sched_getaffinity(0))
         self._pool = ThreadPoolExecutor(self.threads)
-        self._means = np.ascontiguousarray(splats.means.numpy())
-        self._axes = axes_of(splats)
-        self._opacities: dict[float, np.ndarray] = {}
-        self._records = np.empty((splats.count, RECORD))
+        self._scene = activated(splats, 1.0)
+        self._gain = 1.0  # of the scene
+        self._records = np.empty((splats.count, RECORDS[splats.kernel]))
         self._depths = np.empty(splats.count, np.float32)
         self._frames: OrderedDict[tuple[Camera, Walk], Frame] = OrderedDict()
 
@@ -176,11 +166,10 @@ class CpuRaster:
 
     def _frame(self, camera: Camera, walk: Walk) -> Frame:
         """The view projected and binned; the last one is kept."""
-        if walk.antialiased:
-            raise Unavailable("antialiased", expected="false", got="true", hint="the compensation is not there yet")
         key = (camera, walk)
         frame = self._frames.pop(key, None)
         if frame is None:
+            check_antialiased(self.splats.kernel, walk.antialiased)
             self._frames.clear()  # before, so that one frame's memory is the most ever held
             check_stride(walk, camera)
             view = strided(view_of(camera), walk)
@@ -190,28 +179,30 @@ class CpuRaster:
 
     def _project(self, view: View, walk: Walk) -> tuple[np.ndarray, np.ndarray]:
         """Fill the records; give the splat of every record [P] i32 and the depth order [n] i32."""
-        ids = np.full(self.splats.count, -1, np.int32)
-        opacity, plain = self._opacity(walk.gain), self._opacity(1.0)
-        arrays = (self._means, self._axes, opacity, plain, view, self._records, self._depths, ids)
+        targets = Targets(self._records, self._depths, np.full(self.splats.count, -1, np.int32))
+        scene, kernel = self._activated(walk.gain), self.splats.kernel
         bounds = _shares(self.splats.count, SPLAT_SHARES)
-        counts = self._map(lambda first, last: project_gaussians(first, last, *arrays), bounds)
+        counts = self._map(
+            lambda first, last: project((first, last), scene, view, kernel, walk.antialiased, targets), bounds
+        )
         used = [
             np.arange(first, first + count, dtype=np.int32) for (first, _), count in zip(bounds, counts, strict=True)
         ]
         places = np.concatenate(used) if used else np.empty(0, np.int32)
-        return ids, depth_order(self._depths[places].view(np.uint32), places)
+        return targets.ids, depth_order(self._depths[places].view(np.uint32), places)
 
     def _bin(self, view: View, walk: Walk, ids: np.ndarray, order: np.ndarray) -> Frame:
         columns, rows = -(-view.width // TILE), -(-view.height // TILE)
+        kernel, records = kernel_in(view, self.splats.kernel), self._records
         bounds = _shares(order.shape[0], SPLAT_SHARES)
         counts = np.zeros((len(bounds), rows * columns), np.int64)
         parts = [order[first:last] for first, last in bounds]
-        lists = self._map(lambda k: list_tiles(parts[k], self._records, rows, columns, counts[k]), _numbers(parts))
+        lists = self._map(lambda k: list_tiles(parts[k], kernel, records, rows, columns, counts[k]), _numbers(parts))
         starts, cursors = tile_places(counts)
         items = np.empty(starts[-1], np.int32)
         self._map(lambda k: fill_tiles(parts[k], lists[k][0], lists[k][1], cursors[k], items), _numbers(parts))
         return Frame(
-            self._records, ids, starts, items, columns, rows, view.width, view.height,
+            kernel, records, ids, starts, items, columns, rows, view.width, view.height,
             walk.alpha_cap, walk.transmittance_stop,
         )  # fmt: skip
 
@@ -240,10 +231,10 @@ class CpuRaster:
             *(torch.from_numpy(part) for part in (splats, row_starts, columns, weights, met, evidence))
         )
 
-    def _opacity(self, gain: float) -> np.ndarray:
-        if gain not in self._opacities:
-            self._opacities[gain] = opacities(self.splats, gain)
-        return self._opacities[gain]
+    def _activated(self, gain: float) -> Scene:
+        if gain != self._gain:
+            self._scene, self._gain = with_gain(self._scene, self.splats, gain), gain
+        return self._scene
 
     def _over_tiles(self, frame: Frame, work: Callable) -> list:
         """Run ``work(first, last)`` over tile shares of about equal length in list items."""

@@ -1,7 +1,7 @@
 """The plain float64 rasterizer that every fast path is held to.
 
-Read it beside the paper: for each splat the EWA projection, for each ray the walk of Eq. 1, one splat after the
-other, and A [rays, splats] written out as a dense matrix. It is slow and needs R x P memory; use it on small scenes.
+Read it beside the paper: for each splat its footprint, for each ray the walk of Eq. 1, one splat after the other, and
+A [rays, splats] written out as a dense matrix. It is slow and needs R x P memory; use it on small scenes.
 Nothing is shared with the CPU backend but the constants.
 """
 
@@ -14,7 +14,9 @@ import numpy as np
 import torch
 
 from liftcore.observe.observation import Observation, RegionMap
-from liftcore.raster.constants import ALPHA_FLOOR, FIELD_MARGIN, LOW_PASS, NEAR_PLANE
+from liftcore.raster.antialiased import check_antialiased
+from liftcore.raster.constants import NEAR_PLANE
+from liftcore.raster.oracle_footprints import CUT_BAND, alphas
 from liftcore.raster.oracle_weights import counted_weights, walked_rays
 from liftcore.raster.protocol import RayRows, RegionWeights, Walk, Weighting
 
@@ -23,8 +25,6 @@ if TYPE_CHECKING:
 
     from liftcore.scene.cameras import Camera
     from liftcore.scene.splats import Splats
-
-CUT_BAND = 1e-4  # relative distance to a cut-off within which float32 may decide otherwise
 
 
 @dataclass(frozen=True)
@@ -35,39 +35,12 @@ class DenseView:
     cut: np.ndarray  # [H * W] bool: some alpha or T of the ray lies within CUT_BAND of its cut-off
 
 
-def rotation(quat: np.ndarray) -> np.ndarray:
-    """[3, 3] f64 of a quaternion w x y z of any length; zero counts as identity."""
-    length = np.linalg.norm(quat)
-    w, x, y, z = quat / length if length > 0 else np.array([1.0, 0.0, 0.0, 0.0])
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
-def projected_gaussian(splats: Splats, j: int, camera: Camera) -> tuple[np.ndarray, np.ndarray, float]:
-    """Mean [2] in pixels, conic [2, 2] and camera depth of splat j (EWA: cov = J W Sigma W^T J^T + 0.3 I)."""
-    R, t = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
-    x, y, z = R @ splats.means[j].double().numpy() + t
-    mean = np.array([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy])
-    margin_x = FIELD_MARGIN * 0.5 * camera.width / camera.fx
-    margin_y = FIELD_MARGIN * 0.5 * camera.height / camera.fy
-    u = np.clip(x / z, -camera.cx / camera.fx - margin_x, (camera.width - camera.cx) / camera.fx + margin_x)
-    v = np.clip(y / z, -camera.cy / camera.fy - margin_y, (camera.height - camera.cy) / camera.fy + margin_y)
-    J = np.array([[camera.fx / z, 0, -camera.fx * u / z], [0, camera.fy / z, -camera.fy * v / z]])
-    M = rotation(splats.quats[j].double().numpy()) @ np.diag(np.exp(splats.log_scales[j].double().numpy()))
-    cov = J @ R @ M @ M.T @ R.T @ J.T + LOW_PASS * np.eye(2)
-    return mean, np.linalg.inv(cov), float(z)
-
-
 def dense_view(splats: Splats, camera: Camera, walk: Walk) -> DenseView:
     """A of one view (paper Eq. 1): ``w = alpha T``, front to back, with the field's cut-offs.
 
     The order is by camera depth rounded to float32, ties by row; the stop is exclusive.
     """
+    check_antialiased(splats.kernel, walk.antialiased)
     y, x = np.mgrid[: camera.height, : camera.width]
     pixels = np.stack([x.ravel() + 0.5, y.ravel() + 0.5], axis=1)
     rays = pixels.shape[0]
@@ -79,15 +52,11 @@ def dense_view(splats: Splats, camera: Camera, walk: Walk) -> DenseView:
     for j in np.argsort(z.astype(np.float32), kind="stable"):
         if z[j] < NEAR_PLANE:
             continue
-        mean, conic, _ = projected_gaussian(splats, int(j), camera)
-        d = pixels - mean
-        sigma = 0.5 * np.einsum("ri,ij,rj->r", d, conic, d)
-        opacity = 1 / (1 + np.exp(-walk.gain * float(splats.opacity_logits[j])))
-        raw = opacity * np.exp(-sigma)
-        alpha = np.where(raw < ALPHA_FLOOR, 0.0, np.minimum(raw, walk.alpha_cap))
+        raw, hard = alphas(splats, int(j), camera, walk, pixels)
+        alpha = np.minimum(raw, walk.alpha_cap)
         after = T * (1 - alpha)
         stops = (after <= walk.transmittance_stop) & ~done
-        cut |= ~done & (np.abs(raw / ALPHA_FLOOR - 1) < CUT_BAND)
+        cut |= ~done & hard
         if walk.transmittance_stop > 0:
             cut |= ~done & (alpha > 0) & (np.abs(after / walk.transmittance_stop - 1) < CUT_BAND)
         done |= stops

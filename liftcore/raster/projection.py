@@ -1,11 +1,12 @@
-"""Splats to screen footprints: EWA projection of 3D Gaussians (paper's delta_pr for 3DGS).
+"""Splats to screen footprints: EWA projection of 3D Gaussians and of beta kernels (paper's delta_pr).
 
 Every footprint is an ellipse written row by row, which needs no subtraction of large numbers::
 
-    e(x, y) = kx (x - mx - slope dy)^2 + ky dy^2,   dy = y - my,   alpha = opacity 2^-e
+    e(x, y) = kx (x - mx - slope dy)^2 + ky dy^2,   dy = y - my
 
-``kx = log2(e) cov_yy / (2 det)``, ``ky = log2(e) / (2 cov_yy)``, ``slope = cov_xy / cov_yy``. The determinant is a
-sum of squares (Cauchy-Binet over the three axes), so needles a thousand pixels long keep all their digits.
+``kx = unit cov_yy / det``, ``ky = unit / cov_yy``, ``slope = cov_xy / cov_yy``. For 3DGS the unit is log2(e) / 2, so
+that ``alpha = opacity 2^-e``; for DBS it is one, and e is sigma. The determinant is a sum of squares (Cauchy-Binet
+over the three axes), so needles a thousand pixels long keep all their digits.
 """
 
 from __future__ import annotations
@@ -15,16 +16,47 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from liftcore.jit import kernel
-from liftcore.raster.constants import ALPHA_FLOOR, FIELD_MARGIN, LOW_PASS, MAX_LOG_SCALE, NEAR_PLANE
+from liftcore.jit import inlined, kernel
+from liftcore.raster.constants import FIELD_MARGIN, LOW_PASS, MAX_LOG_SCALE, NEAR_PLANE
+from liftcore.raster.records import (
+    BETA,
+    EXTENT_X,
+    EXTENT_Y,
+    KX,
+    KY,
+    LEAN,
+    MX,
+    MY,
+    OPACITY,
+    PLAIN,
+    REACH,
+    SLOPE,
+)
 
 if TYPE_CHECKING:
     from liftcore.scene.cameras import Camera
     from liftcore.scene.splats import Splats
 
-# Columns of a footprint record (float64).
-MX, MY, SLOPE, KX, KY, REACH, EXTENT_X, EXTENT_Y, LEAN, OPACITY, PLAIN = range(11)
-RECORD = 11
+HALF_LOG2_E = 0.5 / math.log(2.0)  # 2^-(HALF_LOG2_E q) = exp(-q / 2)
+
+
+class Scene(NamedTuple):
+    """The splats, activated, as the compiled code takes them."""
+
+    means: np.ndarray  # [P, 3] f32, world
+    axes: np.ndarray  # [P, 3, 3] f64 ([P, 3, 2] for 2DGS), scaled axes in columns, world
+    opacity: np.ndarray  # [P] f64, with the gain
+    plain: np.ndarray  # [P] f64, without it
+    reach: np.ndarray  # [P] f64, the largest e (or sigma) with a weight; negative for none
+    beta: np.ndarray  # [P] f64, DBS only ([0] otherwise): the exponent
+
+
+class Targets(NamedTuple):
+    """Where a projection writes, a row a splat."""
+
+    records: np.ndarray  # [P, RECORD] f64
+    depths: np.ndarray  # [P] f32
+    ids: np.ndarray  # [P] i32
 
 
 class View(NamedTuple):
@@ -63,7 +95,7 @@ def opacities(splats: Splats, gain: float) -> np.ndarray:
 
 
 def axes_of(splats: Splats) -> np.ndarray:
-    """[P, 3, 3] f64, ``R diag(exp(log_scales))``: column k is the splat's axis k, world frame."""
+    """[P, 3, 3] f64, ``R diag(exp(log_scales))``: column k is the splat's axis k, world frame; two axes for 2DGS."""
     quats = splats.quats.numpy().astype(np.float64)
     norms = np.linalg.norm(quats, axis=1, keepdims=True)
     unit = np.where(norms > 0, quats / np.where(norms > 0, norms, 1.0), np.array([1.0, 0.0, 0.0, 0.0]))
@@ -79,32 +111,51 @@ def axes_of(splats: Splats) -> np.ndarray:
     rotation[:, 2, 1] = 2 * (y * z + w * x)
     rotation[:, 2, 2] = 1 - 2 * (x * x + y * y)
     log_scales = splats.log_scales.numpy().astype(np.float64).clip(-MAX_LOG_SCALE, MAX_LOG_SCALE)
-    return rotation * np.exp(log_scales)[:, None, :]
+    return np.ascontiguousarray(rotation[:, :, : log_scales.shape[1]] * np.exp(log_scales)[:, None, :])
+
+
+@inlined
+def to_camera(pose, vectors, j):
+    """Row j of [P, 3] points in the camera's frame."""
+    px, py, pz = vectors[j, 0], vectors[j, 1], vectors[j, 2]
+    x = pose[0, 0] * px + pose[0, 1] * py + pose[0, 2] * pz + pose[0, 3]
+    y = pose[1, 0] * px + pose[1, 1] * py + pose[1, 2] * pz + pose[1, 3]
+    z = pose[2, 0] * px + pose[2, 1] * py + pose[2, 2] * pz + pose[2, 3]
+    return x, y, z
+
+
+@inlined
+def turned(pose, axes, j, k):
+    """Axis k of splat j in the camera's frame."""
+    px, py, pz = axes[j, 0, k], axes[j, 1, k], axes[j, 2, k]
+    x = pose[0, 0] * px + pose[0, 1] * py + pose[0, 2] * pz
+    y = pose[1, 0] * px + pose[1, 1] * py + pose[1, 2] * pz
+    z = pose[2, 0] * px + pose[2, 1] * py + pose[2, 2] * pz
+    return x, y, z
 
 
 @kernel
-def project_gaussians(first, last, means, axes, opacity, plain, view, records, depths, ids):
-    """Footprints of splats ``first..last`` that touch the image, packed from row ``first`` on.
+def project_ellipses(first, last, scene, view, unit, antialiased, targets):
+    """Footprints of the splats ``first..last`` that touch the image, packed from row ``first`` on.
 
     Args:
-        means: [P, 3] f32, world. axes: [P, 3, 3] f64. opacity, plain: [P] f64, with and without the gain.
-        records: [P, RECORD] f64, depths: [P] f32, ids: [P] i32, all written.
+        scene: Scene. view: View. unit: of e, see above. targets: Targets, written.
+        antialiased: opacities times ``sqrt(det(cov) / det(cov + low-pass))`` (the mip filter's compensation).
 
     Returns:
         The number of rows written.
     """
     pose, intrinsics, limits = view.pose, view.intrinsics, view.limits
+    means, axes, records = scene.means, scene.axes, targets.records
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
-    half_log2e = 0.5 / math.log(2.0)
     low_pass = view.low_pass
+    has_beta = scene.beta.shape[0] > 0
     row = first
     for j in range(first, last):
-        strongest = max(opacity[j], plain[j])
-        if strongest < ALPHA_FLOOR:
+        reach = scene.reach[j]
+        if reach < 0:
             continue
-        x = pose[0, 0] * means[j, 0] + pose[0, 1] * means[j, 1] + pose[0, 2] * means[j, 2] + pose[0, 3]
-        y = pose[1, 0] * means[j, 0] + pose[1, 1] * means[j, 1] + pose[1, 2] * means[j, 2] + pose[1, 3]
-        z = pose[2, 0] * means[j, 0] + pose[2, 1] * means[j, 1] + pose[2, 2] * means[j, 2] + pose[2, 3]
+        x, y, z = to_camera(pose, means, j)
         if not z >= NEAR_PLANE:
             continue
         slope_x = fx * min(limits[1], max(-limits[0], x / z)) / z
@@ -116,9 +167,7 @@ def project_gaussians(first, last, means, axes, opacity, plain, view, records, d
         minors = 0.0
         previous_u = previous_v = first_u = first_v = 0.0
         for k in range(3):
-            ax = pose[0, 0] * axes[j, 0, k] + pose[0, 1] * axes[j, 1, k] + pose[0, 2] * axes[j, 2, k]
-            ay = pose[1, 0] * axes[j, 0, k] + pose[1, 1] * axes[j, 1, k] + pose[1, 2] * axes[j, 2, k]
-            az = pose[2, 0] * axes[j, 0, k] + pose[2, 1] * axes[j, 1, k] + pose[2, 2] * axes[j, 2, k]
+            ax, ay, az = turned(pose, axes, j, k)
             u = fx / z * ax - slope_x * az
             v = fy / z * ay - slope_y * az
             xx += u * u
@@ -132,8 +181,12 @@ def project_gaussians(first, last, means, axes, opacity, plain, view, records, d
                 minors += (first_u * v - first_v * u) ** 2
             previous_u, previous_v = u, v
         det = minors + low_pass * (xx + yy - low_pass)
-        reach = math.log2(strongest / ALPHA_FLOOR)
-        spread = math.sqrt(reach / half_log2e)
+        faded = math.sqrt(minors / det) if antialiased else 1.0
+        if faded < 1.0:
+            reach += math.log2(faded) if faded > 0 else -math.inf
+            if reach < 0:
+                continue
+        spread = math.sqrt(reach / unit)
         extent_x = spread * math.sqrt(xx)
         extent_y = spread * math.sqrt(yy)
         mx = fx * x / z + cx
@@ -146,15 +199,17 @@ def project_gaussians(first, last, means, axes, opacity, plain, view, records, d
         records[row, MX] = mx
         records[row, MY] = my
         records[row, SLOPE] = xy / yy
-        records[row, KX] = half_log2e * yy / det
-        records[row, KY] = half_log2e / yy
+        records[row, KX] = unit * yy / det
+        records[row, KY] = unit / yy
         records[row, REACH] = reach
         records[row, EXTENT_X] = extent_x
         records[row, EXTENT_Y] = extent_y
         records[row, LEAN] = xy / xx * extent_x
-        records[row, OPACITY] = opacity[j]
-        records[row, PLAIN] = plain[j]
-        depths[row] = z
-        ids[row] = j
+        records[row, OPACITY] = faded * scene.opacity[j]
+        records[row, PLAIN] = faded * scene.plain[j]
+        if has_beta:
+            records[row, BETA] = scene.beta[j]
+        targets.depths[row] = z
+        targets.ids[row] = j
         row += 1
     return row - first

@@ -12,18 +12,10 @@ import numpy as np
 from liftcore.jit import inlined, kernel
 from liftcore.lanes import EVIDENCE, LANES, WEIGHTS, add_lanes, add_product_lanes
 from liftcore.raster.constants import TILE
+from liftcore.raster.footprints import footprint, row_of, touches
 from liftcore.raster.readings import MAX_SLOTS, NO_SLOT, new_taps, read_tile
 from liftcore.raster.selection import CENTRAL, LARGEST, NO_SPOT, choose, new_marks, rank_tile, spot_of
-from liftcore.raster.walk import (
-    CHECK_EVERY,
-    blend_power,
-    footprint,
-    look,
-    new_rays,
-    row_centre,
-    start_rays,
-    touches,
-)
+from liftcore.raster.walk import CHECK_EVERY, blend_power, look, new_rays, start_rays
 
 
 @kernel
@@ -72,17 +64,17 @@ def weigh_tiles(first, last, frame, reading, choice, with_plain):
             if (step - starts[tile]) % CHECK_EVERY == 0 and not look(rays, with_plain):
                 break
             place = items[step]
-            splat = footprint(records, place, x0, y0)
+            splat = footprint(frame.kernel, records, place, x0, y0)
             if choice.kind == CENTRAL:
                 spot = spot_of(splat)
             low, high = MAX_SLOTS, -1
             for row in range(splat.top, splat.bottom + 1):
-                centre, base = row_centre(splat, row)
+                line = row_of(splat, row)
                 for side in range(2):
                     half = 2 * row + side
-                    if not rays.alive[half] or not touches(splat, centre, base, side):
+                    if not rays.alive[half] or not touches(splat, line, side):
                         continue
-                    blend_power(rays, splat, centre, base, half, power, with_plain)
+                    blend_power(rays, splat, line, half, power, with_plain)
                     if gated and not choose(choice, state, least, room, half, spot):
                         continue
                     if whole_tile:

@@ -2,24 +2,13 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from liftcore.jit import kernel
 from liftcore.lanes import LANES, PIXELS, WEIGHTS, add_scaled_lanes
-from liftcore.raster.constants import ALPHA_FLOOR, TILE
-from liftcore.raster.projection import KX, KY, MX, MY, OPACITY, SLOPE
-from liftcore.raster.walk import (
-    CHECK_EVERY,
-    blend,
-    footprint,
-    look,
-    new_rays,
-    row_centre,
-    start_rays,
-    touches,
-)
+from liftcore.raster.constants import TILE
+from liftcore.raster.footprints import alpha_at, footprint, row_of, touches
+from liftcore.raster.walk import CHECK_EVERY, blend, look, new_rays, start_rays
 
 
 @kernel
@@ -38,15 +27,15 @@ def render_tiles(first, last, frame, values, image):
             if (step - frame.starts[tile]) % CHECK_EVERY == 0 and not look(rays, False):
                 break
             place = frame.items[step]
-            splat = footprint(frame.records, place, float(x0), float(y0))
+            splat = footprint(frame.kernel, frame.records, place, float(x0), float(y0))
             number = frame.ids[place]
             for row in range(splat.top, splat.bottom + 1):
-                centre, base = row_centre(splat, row)
+                line = row_of(splat, row)
                 for side in range(2):
                     half = 2 * row + side
-                    if not rays.alive[half] or not touches(splat, centre, base, side):
+                    if not rays.alive[half] or not touches(splat, line, side):
                         continue
-                    blend(rays, splat, centre, base, half)
+                    blend(rays, splat, line, half)
                     offset = half * LANES
                     for channel in range(channels):
                         target = channel * PIXELS + offset
@@ -75,15 +64,15 @@ def top_tiles(first, last, frame, ids, weights):
             if (step - frame.starts[tile]) % CHECK_EVERY == 0 and not look(rays, False):
                 break
             place = frame.items[step]
-            splat = footprint(frame.records, place, float(x0), float(y0))
+            splat = footprint(frame.kernel, frame.records, place, float(x0), float(y0))
             number = frame.ids[place]
             for row in range(splat.top, splat.bottom + 1):
-                centre, base = row_centre(splat, row)
+                line = row_of(splat, row)
                 for side in range(2):
                     half = 2 * row + side
-                    if not rays.alive[half] or not touches(splat, centre, base, side):
+                    if not rays.alive[half] or not touches(splat, line, side):
                         continue
-                    blend(rays, splat, centre, base, half)
+                    blend(rays, splat, line, half)
                     for lane in range(LANES):
                         weight = rays.state[WEIGHTS + half * LANES + lane]
                         if weight <= 0:
@@ -114,7 +103,7 @@ def trace_rays(frame, pixels):
     splats = np.empty(1 << 12, np.int32)
     weights = np.empty(1 << 12, np.float32)
     count = 0
-    one, floor = np.float32(1.0), np.float32(ALPHA_FLOOR)
+    one, floor = np.float32(1.0), np.float32(frame.kernel.floor)
     cap, stop = np.float32(frame.cap), np.float32(frame.stop)
     for i in range(pixels.shape[0]):
         x, y = pixels[i, 0], pixels[i, 1]
@@ -122,12 +111,8 @@ def trace_rays(frame, pixels):
         light = one
         for step in range(frame.starts[tile], frame.starts[tile + 1]):
             place = frame.items[step]
-            record = frame.records[place]
-            dy = y + 0.5 - record[MY]
-            dx = x + 0.5 - record[MX] - record[SLOPE] * dy
-            exponent = record[KX] * dx * dx + record[KY] * dy * dy
-            alpha = min(cap, np.float32(record[OPACITY] * math.pow(2.0, -exponent)))
-            if alpha < floor:
+            alpha = min(cap, np.float32(alpha_at(frame.kernel, frame.records[place], x + 0.5, y + 0.5)))
+            if alpha < floor or alpha == 0:
                 continue
             after = light * (one - alpha)
             if after <= stop:

@@ -15,8 +15,9 @@ from liftcore.errors import InvalidInput
 from liftcore.jit import inlined, kernel
 from liftcore.lanes import EVIDENCE, LANES, PIXELS, TRANSMITTANCE, WEIGHTS
 from liftcore.raster.constants import TILE
+from liftcore.raster.footprints import footprint, row_of, touches
 from liftcore.raster.protocol import MOST_OF_A_RAY, Selection, Weighting
-from liftcore.raster.walk import CHECK_EVERY, blend, footprint, look, row_centre, start_rays, touches
+from liftcore.raster.walk import CHECK_EVERY, blend, look, start_rays
 
 EVERY, LARGEST, FRONT, CENTRAL = range(4)
 _KINDS = {
@@ -96,14 +97,14 @@ def rank_tile(rays, frame, tile, marks, count):
     for step in range(frame.starts[tile], frame.starts[tile + 1]):
         if (step - frame.starts[tile]) % CHECK_EVERY == 0 and not look(rays, False):
             break
-        splat = footprint(frame.records, frame.items[step], x0, y0)
+        splat = footprint(frame.kernel, frame.records, frame.items[step], x0, y0)
         for row in range(splat.top, splat.bottom + 1):
-            centre, base = row_centre(splat, row)
+            line = row_of(splat, row)
             for side in range(2):
                 half = 2 * row + side
-                if not rays.alive[half] or not touches(splat, centre, base, side):
+                if not rays.alive[half] or not touches(splat, line, side):
                     continue
-                blend(rays, splat, centre, base, half)
+                blend(rays, splat, line, half)
                 for pixel in range(half * LANES, half * LANES + LANES):
                     weight = state[WEIGHTS + pixel]
                     if weight > marks.least[pixel]:

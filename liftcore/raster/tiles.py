@@ -13,14 +13,23 @@ import numpy as np
 
 from liftcore.jit import inlined, kernel
 from liftcore.raster.constants import TILE
-from liftcore.raster.projection import EXTENT_X, EXTENT_Y, KX, KY, LEAN, MX, MY, REACH, SLOPE
+from liftcore.raster.footprints import circle_of
+from liftcore.raster.records import EXTENT_X, EXTENT_Y, KX, KY, LEAN, MX, MY, REACH, SLOPE
 
 
 @inlined
-def _tile_rows(record, rows):
+def _tiles_between(low, high):
+    """First and last tile of a row or column whose pixel centres lie between two places; none when none does."""
+    return np.floor(np.ceil(low - 0.5) / TILE), np.floor(np.floor(high - 0.5) / TILE)
+
+
+@inlined
+def _tile_rows(record, circle, rows):
     """First and last tile row whose pixel centres the footprint can reach."""
-    top = np.floor((np.ceil(record[MY] - record[EXTENT_Y] - 0.5)) / TILE)
-    bottom = np.floor((np.floor(record[MY] + record[EXTENT_Y] - 0.5)) / TILE)
+    top, bottom = _tiles_between(record[MY] - record[EXTENT_Y], record[MY] + record[EXTENT_Y])
+    if circle[2] >= 0:
+        near_top, near_bottom = _tiles_between(circle[1] - circle[2], circle[1] + circle[2])
+        top, bottom = min(top, near_top), max(bottom, near_bottom)
     return max(0.0, top), min(rows - 1.0, bottom)
 
 
@@ -32,12 +41,11 @@ def _edge(record, dy, side):
 
 
 @inlined
-def _tile_columns(record, tile_row, columns):
-    """First and last tile column that the footprint touches between a tile row's first and last pixel centres."""
-    narrow = np.floor(np.ceil(record[MX] - record[EXTENT_X] - 0.5) / TILE)
-    wide = np.floor(np.floor(record[MX] + record[EXTENT_X] - 0.5) / TILE)
+def _outline_columns(record, tile_row):
+    """First and last tile column that the outline touches between a tile row's first and last pixel centres."""
+    narrow, wide = _tiles_between(record[MX] - record[EXTENT_X], record[MX] + record[EXTENT_X])
     if narrow == wide:  # one column at most: no need to look closer
-        return max(0.0, narrow), min(columns - 1.0, wide)
+        return narrow, wide
     low = max(tile_row * TILE + 0.5 - record[MY], -record[EXTENT_Y])
     high = min(tile_row * TILE + TILE - 0.5 - record[MY], record[EXTENT_Y])
     if low > high:
@@ -45,16 +53,28 @@ def _tile_columns(record, tile_row, columns):
     lean = record[LEAN]
     right = record[EXTENT_X] if low <= lean <= high else _edge(record, low if lean < low else high, 1.0)
     left = -record[EXTENT_X] if low <= -lean <= high else _edge(record, low if -lean < low else high, -1.0)
-    first = np.floor(np.ceil(record[MX] + left - 0.5) / TILE)
-    last = np.floor(np.floor(record[MX] + right - 0.5) / TILE)
+    return _tiles_between(record[MX] + left, record[MX] + right)
+
+
+@inlined
+def _tile_columns(record, circle, tile_row, columns):
+    """First and last tile column that the footprint touches in a tile row."""
+    first, last = _outline_columns(record, tile_row)
+    if circle[2] >= 0 and abs(tile_row * TILE + 0.5 * TILE - circle[1]) <= circle[2] + 0.5 * TILE:
+        near_first, near_last = _tiles_between(circle[0] - circle[2], circle[0] + circle[2])
+        if first > last:
+            first, last = near_first, near_last
+        else:
+            first, last = min(first, near_first), max(last, near_last)
     return max(0.0, first), min(columns - 1.0, last)
 
 
 @kernel
-def list_tiles(order, records, rows, columns, counts):
+def list_tiles(order, kernel, records, rows, columns, counts):
     """The tiles that each of ``order``'s footprints touches, one footprint after the other.
 
     Args:
+        order: [n] i32, places of records. kernel: of the frame, as liftcore.raster.footprints says.
         counts: [rows * columns] i64, zeros; receives how many footprints touch each tile.
 
     Returns:
@@ -66,9 +86,10 @@ def list_tiles(order, records, rows, columns, counts):
     for i in range(order.shape[0]):
         record = records[order[i]]
         before = count
-        top, bottom = _tile_rows(record, rows)
+        circle = circle_of(kernel, record)
+        top, bottom = _tile_rows(record, circle, rows)
         for tile_row in range(int(top), int(bottom) + 1):
-            first, last = _tile_columns(record, tile_row, columns)
+            first, last = _tile_columns(record, circle, tile_row, columns)
             if count + columns > tiles.shape[0]:
                 tiles = np.concatenate((tiles, np.empty_like(tiles), np.empty(columns, np.int32)))
             for column in range(int(first), int(last) + 1):

@@ -11,18 +11,10 @@ from typing import NamedTuple
 import numpy as np
 
 from liftcore.jit import inlined, kernel
-from liftcore.lanes import (
-    LANES,
-    PLAIN_TRANSMITTANCE,
-    TRANSMITTANCE,
-    blend_both_lanes,
-    blend_both_squared_lanes,
-    blend_lanes,
-    blend_squared_lanes,
-    new_state,
-)
-from liftcore.raster.constants import ALPHA_FLOOR, TILE
-from liftcore.raster.projection import EXTENT_Y, KX, KY, MX, MY, OPACITY, PLAIN, REACH, SLOPE
+from liftcore.lanes import LANES, PLAIN_TRANSMITTANCE, TRANSMITTANCE
+from liftcore.lanes_blend import blend_lanes, blend_squared_lanes, new_state
+from liftcore.raster.constants import TILE
+from liftcore.raster.footprints import Betas, Discs, Gaussians, lanes_of
 
 HALVES = TILE * TILE // LANES  # half rows of a tile
 CHECK_EVERY = 16  # splats between two looks at which half rows still let light through
@@ -31,6 +23,7 @@ CHECK_EVERY = 16  # splats between two looks at which half rows still let light 
 class Frame(NamedTuple):
     """One view, projected and binned."""
 
+    kernel: Gaussians | Betas | Discs  # its class is the footprint's, at compile time
     records: np.ndarray  # [P, RECORD] f64, footprints; rows in use are named by ids
     ids: np.ndarray  # [P] i32, the splat of a record
     starts: np.ndarray  # [tiles + 1] i64, each tile's list in items
@@ -46,14 +39,14 @@ class Frame(NamedTuple):
 class Rays(NamedTuple):
     """The state of a tile's 256 rays."""
 
-    state: np.ndarray  # [STATE] f32, laid out as liftcore.lanes says
+    state: np.ndarray  # [STATE] f32, laid out as liftcore.lanes and liftcore.lanes_blend say
     alive: np.ndarray  # [32] u8, half rows that still let light through, with or without the gain
 
 
 @kernel
 def new_rays(frame):
     """Room for one tile's rays."""
-    return Rays(new_state(ALPHA_FLOOR, frame.cap, frame.stop), np.zeros(HALVES, np.uint8))
+    return Rays(new_state(frame.kernel.floor, frame.cap, frame.stop), np.zeros(HALVES, np.uint8))
 
 
 @kernel
@@ -84,73 +77,23 @@ def look(rays, with_plain):
     return any_alive
 
 
-class Footprint(NamedTuple):
-    """One splat as a tile sees it: the record relative to the tile's first pixel centre."""
-
-    top: int  # first pixel row of the tile that it can reach
-    bottom: int  # last one; before the first when there is none
-    mx: float
-    my: float
-    slope: float
-    kx: float
-    ky: float
-    reach: float
-    opacity: float
-    plain: float  # opacity without the gain
-
-
 @inlined
-def footprint(records, place, x0, y0):
-    """The record of a splat for the tile whose first pixel is (x0, y0)."""
-    my = records[place, MY] - y0 - 0.5
-    extent = records[place, EXTENT_Y]
-    return Footprint(
-        int(max(0.0, np.ceil(my - extent))),
-        int(min(TILE - 1.0, np.floor(my + extent))),
-        records[place, MX] - x0 - 0.5,
-        my,
-        records[place, SLOPE],
-        records[place, KX],
-        records[place, KY],
-        records[place, REACH],
-        records[place, OPACITY],
-        records[place, PLAIN],
-    )
-
-
-@inlined
-def row_centre(splat, row):
-    """The footprint in one pixel row: its centre in lanes, its exponent there."""
-    dy = row - splat.my
-    return splat.mx + splat.slope * dy, splat.ky * dy * dy
-
-
-@inlined
-def touches(splat, centre, base, side):
-    """Whether any lane of half row ``side`` (0 left, 1 right) can reach the alpha floor."""
-    near = max(0.0, side * LANES - centre, centre - (side * LANES + LANES - 1))
-    return splat.kx * near * near + base <= splat.reach
-
-
-@inlined
-def blend(rays, splat, centre, base, half):
+def blend(rays, splat, line, half):
     """Composite the splat over half row ``half``: its weights are in the state, and in the evidence lanes."""
-    start = np.float32((half % 2) * LANES - centre)
-    shape = (start, np.float32(splat.kx), np.float32(base), np.float32(splat.opacity))
-    blend_lanes(rays.state, half * LANES, shape)
+    blend_lanes(rays.state, half * LANES, lanes_of(splat, line, half % 2), (np.float32(splat.opacity),))
 
 
 @inlined
-def blend_power(rays, splat, centre, base, half, power, with_plain):
+def blend_power(rays, splat, line, half, power, with_plain):
     """``blend`` that leaves weights or squared weights; with the evidence from plain rays if asked."""
-    start = np.float32((half % 2) * LANES - centre)
-    shape = (start, np.float32(splat.kx), np.float32(base), np.float32(splat.opacity))
-    both = (*shape, np.float32(splat.plain))
+    shape = lanes_of(splat, line, half % 2)
+    alone = (np.float32(splat.opacity),)
+    both = (np.float32(splat.opacity), np.float32(splat.plain))
     if with_plain and power == 2:
-        blend_both_squared_lanes(rays.state, half * LANES, both)
+        blend_squared_lanes(rays.state, half * LANES, shape, both)
     elif with_plain:
-        blend_both_lanes(rays.state, half * LANES, both)
+        blend_lanes(rays.state, half * LANES, shape, both)
     elif power == 2:
-        blend_squared_lanes(rays.state, half * LANES, shape)
+        blend_squared_lanes(rays.state, half * LANES, shape, alone)
     else:
-        blend_lanes(rays.state, half * LANES, shape)
+        blend_lanes(rays.state, half * LANES, shape, alone)

@@ -9,12 +9,23 @@ from liftcore.observe.observation import FeatureGrid, RegionMap
 from liftcore.raster.cpu import CpuRaster
 from liftcore.raster.protocol import Walk, Weighting
 from liftcore.scene.cameras import Camera
-from liftcore.scene.splats import Splats
+from liftcore.scene.ply_dialect import scale_count
+from liftcore.scene.splats import Kernel, Splats
 
 
-def warm_up() -> None:
-    """Run every product once on one splat. The first run on a machine compiles, later ones load."""
-    splats = Splats(torch.tensor([[0.0, 0.0, 2.0]]), torch.zeros(1, 4), torch.zeros(1, 3), torch.zeros(1))
+def warm_up(kernel: Kernel = Kernel.GAUSSIAN_3D) -> None:
+    """Run every product once on one splat of the kernel. The first run on a machine compiles, later ones load.
+
+    Each kernel is compiled for itself, so a scene waits for its own alone.
+    """
+    splats = Splats(
+        torch.tensor([[0.0, 0.0, 2.0]]),
+        torch.zeros(1, 4),
+        torch.zeros(1, scale_count(kernel)),
+        torch.zeros(1),
+        kernel=kernel,
+        beta=torch.zeros(1) if kernel is Kernel.BETA else None,
+    )
     camera = Camera("warm-up", 16, 16, 16.0, 16.0, 8.0, 8.0, np.eye(4))
     raster = CpuRaster(splats, threads=1)
     regions = RegionMap(torch.zeros(1, 1, 1, dtype=torch.int32), torch.ones(1, 1))

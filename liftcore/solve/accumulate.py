@@ -46,7 +46,7 @@ class Geometry:
 
 def lift_walk(settings: LiftSettings) -> Walk:
     """The walk that lifts."""
-    return Walk(settings.lift_gain, settings.alpha_cap, settings.transmittance_stop)
+    return Walk(settings.lift_gain, settings.alpha_cap, settings.transmittance_stop, settings.antialiased)
 
 
 def weighting_of(settings: LiftSettings) -> Weighting:
@@ -63,7 +63,7 @@ def strided_walk(walk: Walk, settings: LiftSettings, camera: Camera, number: int
 
 def render_walk(settings: LiftSettings) -> Walk:
     """The walk that renders attention maps and masks."""
-    return Walk(settings.render_gain, settings.alpha_cap, settings.transmittance_stop)
+    return Walk(settings.render_gain, settings.alpha_cap, settings.transmittance_stop, settings.antialiased)
 
 
 def as_read(observation: Observation, settings: LiftSettings, view: str) -> Observation:

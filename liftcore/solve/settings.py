@@ -59,6 +59,7 @@ class LiftSettings(BaseModel):
     render_gain: float = Field(TIKHONOV_GAIN, gt=0, le=16, description="lambda on the opacity logits, rendering")
     alpha_cap: float = Field(0.99, gt=0, le=LARGEST_ALPHA, description="the largest alpha of a splat on a ray")
     transmittance_stop: float = Field(1e-4, ge=0, lt=1, description="a ray ends before T falls to this")
+    antialiased: bool = Field(False, description="opacities compensated for the low-pass (mip filter), 3DGS only")
     stride: int = Field(1, ge=1, le=64, description="lift from every n-th pixel in x and in y")
     view_stride: int = Field(1, ge=1, description="lift from every n-th view, from the first on")
     levels: Literal["rows", "composite"] | Annotated[int, Field(strict=True, ge=0)] = Field(

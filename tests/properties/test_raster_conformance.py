@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
 import numpy as np
 import pytest
 import torch
@@ -11,13 +14,39 @@ from hypothesis import strategies as st
 from liftcore.raster.cpu import CpuRaster
 from liftcore.raster.oracle import OracleRaster, dense_view, reading_matrix
 from liftcore.raster.protocol import RegionWeights, Walk, Weighting
+from liftcore.scene.splats import Kernel, Splats
 from tests.scenes import random_camera, random_grid, random_regions, random_splats, scenes
+
+if TYPE_CHECKING:
+    from liftcore.observe.observation import Observation
+    from liftcore.scene.cameras import Camera
 
 INSIDE = 1e-5  # absolute, on weights
 FLIPS = 1e-2  # of rays: on tiny random images one ray in a hundred; the pooled test below holds 1e-4
 WALKS = (Walk(), Walk(gain=1.2), Walk(gain=0.5), Walk(alpha_cap=0.999, transmittance_stop=0.05))
+FOOTPRINTS = {
+    "3dgs": (Kernel.GAUSSIAN_3D, False),
+    "3dgs antialiased": (Kernel.GAUSSIAN_3D, True),
+    "2dgs": (Kernel.GAUSSIAN_2D, False),
+    "dbs": (Kernel.BETA, False),
+}
 
-hypothesis_settings = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+pytestmark = pytest.mark.usefixtures("every_kernel")
+hypothesis_settings = settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+every_footprint = pytest.mark.parametrize("footprint", FOOTPRINTS)
+
+
+def drawn(data: st.DataObject, footprint: str) -> tuple[Splats, Camera, Observation, Walk]:
+    """A scene of the kernel, a view, what it observes, and a walk."""
+    kernel, antialiased = FOOTPRINTS[footprint]
+    splats, camera, observation = data.draw(scenes(kernel))
+    return splats, camera, observation, replace(data.draw(st.sampled_from(WALKS)), antialiased=antialiased)
+
+
+def seeded(footprint: str, seed: int, count: int) -> tuple[Splats, Walk]:
+    """A random scene of the kernel, and its plain walk."""
+    kernel, antialiased = FOOTPRINTS[footprint]
+    return random_splats(seed, count, kernel=kernel), Walk(antialiased=antialiased)
 
 
 def dense(weights: RegionWeights, splats: int, rows: int) -> np.ndarray:
@@ -28,10 +57,11 @@ def dense(weights: RegionWeights, splats: int, rows: int) -> np.ndarray:
     return W
 
 
+@every_footprint
 @hypothesis_settings
-@given(scenes(), st.sampled_from(WALKS))
-def test_renders_equal_the_oracle(scene, walk):
-    splats, camera, _ = scene
+@given(st.data())
+def test_renders_equal_the_oracle(footprint, data):
+    splats, camera, _, walk = drawn(data, footprint)
     values = torch.tensor(np.random.default_rng(0).uniform(0, 1, (splats.count, 3)), dtype=torch.float32)
     view = dense_view(splats, camera, walk)
     expected = (view.A @ values.double().numpy()).reshape(camera.height, camera.width, 3)
@@ -41,13 +71,14 @@ def test_renders_equal_the_oracle(scene, walk):
     assert (np.abs(image - expected).max(axis=2) > INSIDE).mean() <= max(FLIPS, 1 / inside.size)
 
 
+@every_footprint
 @hypothesis_settings
-@given(scenes(), st.sampled_from(WALKS), st.sampled_from([0, 1, 2]))
-def test_region_weights_equal_the_oracle(scene, walk, power):
-    splats, camera, observation = scene
+@given(st.data(), st.sampled_from([0, 1, 2]))
+def test_region_weights_equal_the_oracle(footprint, data, power):
+    splats, camera, observation, walk = drawn(data, footprint)
     view = dense_view(splats, camera, walk)
     S, ray = reading_matrix(observation, camera.width, camera.height)
-    if dense_view(splats, camera, Walk(1.0, walk.alpha_cap, walk.transmittance_stop)).cut.any() or view.cut.any():
+    if dense_view(splats, camera, replace(walk, gain=1.0)).cut.any() or view.cut.any():
         return  # the pooled test counts the flips
     expected = np.where(view.A > 0, view.A**power, 0.0)[ray].T @ S
     weights = CpuRaster(splats, threads=2).region_weights(camera, observation, walk, Weighting(power))
@@ -55,11 +86,12 @@ def test_region_weights_equal_the_oracle(scene, walk, power):
     assert np.abs(W - expected).max(initial=0) < INSIDE * max(1.0, expected.max(initial=0))
 
 
+@every_footprint
 @hypothesis_settings
-@given(scenes(), st.sampled_from(WALKS))
-def test_evidence_is_the_sum_of_plain_weights_whatever_the_gain(scene, walk):
-    splats, camera, observation = scene
-    view = dense_view(splats, camera, Walk(1.0, walk.alpha_cap, walk.transmittance_stop))
+@given(st.data())
+def test_evidence_is_the_sum_of_plain_weights_whatever_the_gain(footprint, data):
+    splats, camera, observation, walk = drawn(data, footprint)
+    view = dense_view(splats, camera, replace(walk, gain=1.0))
     weights = CpuRaster(splats, threads=2).region_weights(camera, observation, walk, Weighting(2))
     evidence = np.zeros(splats.count)
     evidence[weights.evidence_splats.numpy()] = weights.evidence.numpy()
@@ -68,14 +100,14 @@ def test_evidence_is_the_sum_of_plain_weights_whatever_the_gain(scene, walk):
         assert np.abs(evidence - expected).max() < INSIDE * max(1.0, expected.max())
 
 
-def test_flips_at_the_cut_offs_are_rare_and_unbiased():
+@every_footprint
+def test_flips_at_the_cut_offs_are_rare_and_unbiased(footprint):
     rays = flips = 0
     drift = 0.0
-    for seed in range(60):
-        splats, camera = random_splats(seed, 80), random_camera(seed, 64, 48)
-        values = torch.ones(splats.count, 1)
-        expected = dense_view(splats, camera, Walk()).A.sum(axis=1)
-        error = CpuRaster(splats).render(camera, values, Walk()).numpy().ravel() - expected
+    for seed in range(30):
+        (splats, walk), camera = seeded(footprint, seed, 80), random_camera(seed, 64, 48)
+        expected = dense_view(splats, camera, walk).A.sum(axis=1)
+        error = CpuRaster(splats).render(camera, torch.ones(splats.count, 1), walk).numpy().ravel() - expected
         rays += error.size
         flips += int((np.abs(error) > INSIDE).sum())
         drift += float(error.sum())
@@ -83,12 +115,13 @@ def test_flips_at_the_cut_offs_are_rare_and_unbiased():
     assert abs(drift) / rays < 1e-6
 
 
+@every_footprint
 @hypothesis_settings
-@given(scenes(), st.integers(1, 7))
-def test_top_weights_are_the_largest_of_each_ray(scene, count):
-    splats, camera, _ = scene
-    view = dense_view(splats, camera, Walk())
-    ids, weights = CpuRaster(splats).top_weights(camera, Walk(), count)
+@given(st.data(), st.integers(1, 7))
+def test_top_weights_are_the_largest_of_each_ray(footprint, data, count):
+    splats, camera, _, walk = drawn(data, footprint)
+    view = dense_view(splats, camera, walk)
+    ids, weights = CpuRaster(splats).top_weights(camera, walk, count)
     expected = -np.sort(-view.A, axis=1)[:, :count]
     expected = np.pad(expected, ((0, 0), (0, count - expected.shape[1])))
     got = weights.numpy().reshape(-1, count)
@@ -98,22 +131,25 @@ def test_top_weights_are_the_largest_of_each_ray(scene, count):
     assert np.abs(named - got)[~view.cut].max(initial=0) < INSIDE
 
 
+@every_footprint
 @hypothesis_settings
-@given(scenes())
-def test_ray_rows_are_rows_of_a(scene):
-    splats, camera, _ = scene
-    view = dense_view(splats, camera, Walk())
+@given(st.data())
+def test_ray_rows_are_rows_of_a(footprint, data):
+    splats, camera, _, walk = drawn(data, footprint)
+    view = dense_view(splats, camera, walk)
     y, x = np.mgrid[: camera.height, : camera.width]
     pixels = torch.tensor(np.stack([x.ravel(), y.ravel()], axis=1), dtype=torch.int32)
-    rows = CpuRaster(splats).ray_rows(camera, pixels, Walk())
+    rows = CpuRaster(splats).ray_rows(camera, pixels, walk)
     A = np.zeros_like(view.A)
     A[np.repeat(np.arange(A.shape[0]), np.diff(rows.row_starts.numpy())), rows.splats.numpy()] = rows.weights.numpy()
     assert np.abs(A - view.A)[~view.cut].max(initial=0) < INSIDE
 
 
-@pytest.mark.parametrize("walk", WALKS)
-def test_the_number_of_threads_changes_no_bit(walk):
-    splats, camera = random_splats(7, 3_000), random_camera(7, 200, 150)
+@every_footprint
+@pytest.mark.parametrize("gain", [1.0, 1.2])
+def test_the_number_of_threads_changes_no_bit(footprint, gain):
+    (splats, walk), camera = seeded(footprint, 7, 3_000), random_camera(7, 200, 150)
+    walk = replace(walk, gain=gain)
     for observation in (random_regions(7, 4, 30, (75, 100)), random_grid(7, (10, 13))):
         runs = [
             CpuRaster(splats, threads=n).region_weights(camera, observation, walk, Weighting(2)) for n in (1, 2, 5)
@@ -121,13 +157,14 @@ def test_the_number_of_threads_changes_no_bit(walk):
         for other in runs[1:]:
             for name in RegionWeights.__dataclass_fields__:
                 assert torch.equal(getattr(runs[0], name), getattr(other, name)), name
-        images = [CpuRaster(splats, threads=n).row_sums(camera, walk) for n in (1, 2, 5)]
-        assert all(torch.equal(images[0], image) for image in images[1:])
+    images = [CpuRaster(splats, threads=n).row_sums(camera, walk) for n in (1, 2, 5)]
+    assert all(torch.equal(images[0], image) for image in images[1:])
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_the_oracle_is_a_backend_that_gives_the_same_products(seed):
-    splats, camera, walk = random_splats(seed, 30), random_camera(seed), Walk()
+@every_footprint
+@pytest.mark.parametrize("seed", range(2))
+def test_the_oracle_is_a_backend_that_gives_the_same_products(footprint, seed):
+    (splats, walk), camera = seeded(footprint, seed, 30), random_camera(seed)
     if dense_view(splats, camera, walk).cut.any():
         camera = random_camera(seed + 100)
     fast, plain = CpuRaster(splats), OracleRaster(splats)

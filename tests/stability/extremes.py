@@ -12,7 +12,8 @@ from liftcore.raster.cpu import CpuRaster
 from liftcore.raster.oracle import DenseView, dense_view
 from liftcore.raster.protocol import Walk, Weighting
 from liftcore.scene.cameras import Camera
-from liftcore.scene.splats import Splats
+from liftcore.scene.splats import Kernel, Splats
+from tests.scenes import of_kernel
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -28,19 +29,22 @@ def splats_at(
     log_scales: ArrayLike = -2.0,
     logits: ArrayLike = 1.0,
     quats: ArrayLike = IDENTITY,
+    kernel: Kernel = Kernel.GAUSSIAN_3D,
+    betas: ArrayLike = 0.0,
 ) -> Splats:
-    """Splats at the means; what is given once holds for all of them."""
+    """Splats at the means; what is given once holds for all of them. Three scales, whatever the kernel keeps."""
 
     def column(values: ArrayLike, shape: tuple[int, ...]) -> torch.Tensor:
         return torch.tensor(np.broadcast_to(np.asarray(values, np.float32), shape).copy())
 
     count = len(means)
-    return Splats(
+    splats = Splats(
         column(np.asarray(means), (count, 3)),
         column(quats, (count, 4)),
         column(log_scales, (count, 3)),
         column(logits, (count,)),
     )
+    return of_kernel(splats, kernel, column(betas, (count,)))
 
 
 def camera_at_origin(width: int = 16, height: int = 12, focal: float = 16.0, name: str = "v0") -> Camera:

@@ -11,7 +11,7 @@ import torch
 from liftcore.observe.observation import RegionMap
 from liftcore.raster.constants import ALPHA_FLOOR
 from liftcore.raster.cpu import CpuRaster
-from liftcore.raster.oracle import projected_gaussian
+from liftcore.raster.oracle_footprints import projected_gaussian
 from liftcore.raster.protocol import Walk, Weighting
 from liftcore.scene.cameras import Camera
 from tests.scenes import random_splats

@@ -1,0 +1,199 @@
+"""2DGS and DBS at their extremes, one promise each, against the float64 oracle."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from liftcore.errors import InvalidSettings
+from liftcore.raster.cpu import CpuRaster
+from liftcore.raster.oracle import dense_view
+from liftcore.raster.protocol import Walk
+from liftcore.scene.cameras import Camera
+from liftcore.scene.splats import Kernel
+from tests.scenes import random_camera, random_splats
+from tests.stability.extremes import assert_equals_the_oracle, camera_at_origin, splats_at, traced, weights_of
+
+pytestmark = pytest.mark.usefixtures("every_kernel")
+
+DISC, BETA = Kernel.GAUSSIAN_2D, Kernel.BETA
+ROW = [(0.3 * k - 0.6, 0.1 * k, 2.0 + 0.2 * k) for k in range(5)]
+TURNED = (0.9, 0.1, 0.3, 0.2)
+
+
+def about_x(angle: float) -> tuple[float, float, float, float]:
+    """The quaternion that turns by ``angle`` about the x axis."""
+    return (math.cos(angle / 2), math.sin(angle / 2), 0.0, 0.0)
+
+
+both = pytest.mark.parametrize("kernel", [DISC, BETA])
+
+
+def test_a_ray_that_has_stopped_takes_nothing_of_the_discs_behind():
+    # The released 2DGS kernel does not ask in its inner loop whether a ray is done: in later batches it adds
+    # alpha times the transmittance that the ray had when it stopped.
+    means = [(0.0, 0.0, 1.0 + 0.01 * k) for k in range(700)]
+    splats = splats_at(means, log_scales=1.0, logits=[2.0] * 8 + [-2.0] * 692, kernel=DISC)
+    A = assert_equals_the_oracle(splats, camera_at_origin())
+    got = weights_of(splats, camera_at_origin(), Walk())[0]
+    last = (A > 0).sum(axis=1).max()
+    assert last < 12
+    assert got[:, last:].max() == 0
+    assert got.sum(axis=1).max() <= 1.0
+
+
+@both
+@pytest.mark.parametrize("gain", [0.1, 1.2, 16.0])
+def test_logits_of_ten_thousand_are_opaque_or_absent(kernel, gain):
+    splats = splats_at(ROW, logits=[1e4, -1e4, 0.5, 1e4, -1e4], kernel=kernel)
+    A = assert_equals_the_oracle(splats, camera_at_origin(), Walk(gain))
+    assert A[:, [1, 4]].max() == 0
+    assert A[:, 0].max() > 0.9
+
+
+@both
+@pytest.mark.parametrize("scale", [1e-12, 1e-3, 1e6, 1e20])
+def test_scales_from_dust_to_worlds_equal_the_oracle(kernel, scale):
+    for quats in (TURNED, (1.0, 0.0, 0.0, 0.0)):
+        splats = splats_at(ROW, log_scales=math.log(scale), kernel=kernel, quats=quats)
+        assert assert_equals_the_oracle(splats, camera_at_origin()).max() > 1e-3
+
+
+@both
+@pytest.mark.parametrize("log_scale", [-80.0, 80.0])
+def test_scales_beyond_all_bounds_stay_finite(kernel, log_scale):
+    A, evidence = weights_of(splats_at(ROW, log_scales=log_scale, kernel=kernel), camera_at_origin(), Walk())
+    assert np.isfinite(A).all()
+    assert evidence.max() > 0
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-7, 1e-5, 1e-3, 0.1])
+def test_discs_seen_edge_on_equal_the_oracle(angle):
+    # About the ray of its own centre, each disc is turned to show its edge but for a small angle.
+    for height in (0.0, 0.4):
+        tilt = math.pi / 2 - math.atan2(height, 2.0) + angle
+        splats = splats_at([(0.0, height, 2.0)] * 2, log_scales=[-0.5, 0.3, 0.0], quats=about_x(tilt), kernel=DISC)
+        assert assert_equals_the_oracle(splats, camera_at_origin(24, 24)).max() > 0.1
+        assert_equals_the_oracle(splats, camera_at_origin(64, 48, focal=700.0))
+
+
+@pytest.mark.parametrize("height", [-0.5, 0.01, 0.3])
+@pytest.mark.parametrize("tilt", [math.pi / 2, 1.4, 1.2])
+def test_discs_that_pass_the_camera_end_at_their_horizon(height, tilt):
+    # A floor around the camera: half of its crossings lie behind, and its horizon goes through the image.
+    splats = splats_at([(0.0, height, 0.5), (0.3, height, 3.0)], log_scales=2.0, quats=about_x(tilt), kernel=DISC)
+    A = assert_equals_the_oracle(splats, camera_at_origin(40, 40))
+    met = (A > 0).any(axis=1)
+    assert met.any()
+    assert not met.all()
+
+
+def test_crossings_behind_the_camera_do_not_count():
+    # The plane rises towards the camera and passes behind it: rays upwards meet it only backwards.
+    splats = splats_at([(0.0, 0.2, 0.1)], log_scales=3.0, quats=about_x(math.pi / 2 + 1e-3), kernel=DISC)
+    camera = Camera("v0", 21, 21, 10.0, 10.0, 10.5, 10.5, np.eye(4))
+    A = assert_equals_the_oracle(splats, camera).reshape(21, 21)
+    assert A[:5, 10].max() == 0
+    assert A[14:, 10].min() > 0.5
+
+
+def test_discs_beside_and_around_the_camera_equal_the_oracle():
+    means = [(side * x, 0.3 * x, 0.0101) for x in (0.01, 1.0, 100.0) for side in (-1, 1)]
+    for quats in (TURNED, (0.707, 0.0, 0.707, 0.0), (1.0, 0.0, 0.0, 0.0)):
+        assert_equals_the_oracle(splats_at(means, [-1.0, 1.0, 0.0], quats=quats, kernel=DISC), camera_at_origin())
+
+
+@both
+def test_the_near_plane_keeps_what_lies_on_it_and_drops_what_lies_before(kernel):
+    on = float(np.nextafter(np.float32(0.01), np.float32(1)))
+    below = float(np.nextafter(np.float32(on), np.float32(0)))
+    means = [(0.0, 0.0, z) for z in (on, below, 0.0, -0.01, -5.0)]
+    A = assert_equals_the_oracle(splats_at(means, log_scales=-4.0, kernel=kernel), camera_at_origin())
+    assert A[:, 0].max() > 0
+    assert A[:, 1:].max() == 0
+
+
+@both
+def test_zero_quaternions_count_as_no_rotation(kernel):
+    zero = splats_at(ROW, [0.0, -2.0, -3.0], quats=(0.0, 0.0, 0.0, 0.0), kernel=kernel)
+    A = assert_equals_the_oracle(zero, camera_at_origin())
+    plain = splats_at(ROW, [0.0, -2.0, -3.0], kernel=kernel)
+    assert np.array_equal(A, dense_view(plain, camera_at_origin(), Walk()).A)
+
+
+@both
+@pytest.mark.parametrize("turn", [(1.0, 0.0, 0.0, 0.0), (0.707, 0.0, 0.707, 0.0), (0.707, 0.707, 0.0, 0.0), TURNED])
+def test_needles_side_on_and_end_on_equal_the_oracle(kernel, turn):
+    splats = splats_at(ROW, log_scales=[0.0, -math.log(1e3), -math.log(1e3)], quats=turn, kernel=kernel)
+    assert_equals_the_oracle(splats, camera_at_origin())
+    assert_equals_the_oracle(splats, camera_at_origin(64, 48, focal=2_000.0))
+
+
+@pytest.mark.parametrize("b", [-1e4, -80.0, -10.0, -3.0, 0.0, 3.0, math.log(250_000.0), 80.0, 1e4])
+def test_beta_from_a_cylinder_to_a_point_equals_the_oracle(b):
+    with np.errstate(over="ignore"):
+        # An axis of the camera goes through the middle of a pixel, so even a point has a weight.
+        splats = splats_at([(0.0, 0.0, 2.0), *ROW], log_scales=-0.5, betas=b, kernel=BETA)
+        A = assert_equals_the_oracle(splats, camera_at_origin(40, 30))
+    assert A.max() > 0.5
+
+
+def test_a_beta_of_zero_is_a_cylinder_and_of_four_a_bell():
+    camera = camera_at_origin(41, 41, focal=60.0)
+    centre, flat = [(0.0, 0.0, 2.0)], math.log(0.4)
+    cylinder = traced(splats_at(centre, flat, betas=-200.0, kernel=BETA), camera, Walk())
+    alpha = 1 / (1 + math.exp(-1.0))
+    assert set(np.unique(cylinder.round(5))) == {0.0, round(alpha, 5)}
+    bell = traced(splats_at(centre, flat, betas=0.0, kernel=BETA), camera, Walk()).reshape(41, 41)
+    radius = 0.4 * 60 / 2
+    row = alpha * np.maximum(1 - (np.arange(41) - 20) ** 2 / (radius**2 + 0.3), 0) ** 4
+    assert np.abs(bell[20] - row).max() < 1e-6
+
+
+@both
+def test_a_view_that_sees_nothing_has_no_weights(kernel):
+    behind = splats_at([(0.0, 0.0, -2.0), (1e6, 0.0, 1.0)], kernel=kernel)
+    A, evidence = weights_of(behind, camera_at_origin(), Walk())
+    assert A.max() == 0
+    assert evidence.max() == 0
+    assert traced(behind, camera_at_origin(), Walk()).max() == 0
+
+
+@both
+def test_images_of_any_shape_equal_the_oracle(kernel):
+    for size in ((1, 1), (1, 40), (40, 1), (17, 33)):
+        assert_equals_the_oracle(random_splats(1, kernel=kernel), camera_at_origin(*size))
+
+
+@both
+def test_the_opacity_compensation_is_refused_where_it_means_nothing(kernel):
+    splats, camera, walk = random_splats(0, 5, kernel=kernel), random_camera(0), Walk(antialiased=True)
+    for make in (lambda: CpuRaster(splats).row_sums(camera, walk), lambda: dense_view(splats, camera, walk)):
+        with pytest.raises(InvalidSettings, match="3D Gaussians"):
+            make()
+
+
+def test_the_opacity_compensation_fades_small_splats_and_leaves_large_ones():
+    small, large = math.log(1e-4), math.log(0.5)
+    for log_scale, share in ((small, 0.0), (large, 1.0)):
+        splats = splats_at([(0.0, 0.0, 2.0)], log_scale)
+        plain, faded = (
+            float(CpuRaster(splats).row_sums(camera_at_origin(focal=160.0), Walk(antialiased=on))[6, 8])
+            for on in (False, True)
+        )
+        assert plain == pytest.approx(1 / (1 + math.exp(-1.0)), abs=1e-4)
+        assert faded == pytest.approx(share * plain, abs=1e-3)
+
+
+def test_flat_gaussians_and_discs_agree_where_the_low_pass_is_small():
+    # Seen from the front, a disc and a Gaussian without thickness differ in their low-pass alone.
+    flat = splats_at([(0.0, 0.0, 2.0)], log_scales=[-0.7, -1.2, -12.0])
+    disc = replace(flat, kernel=DISC, log_scales=flat.log_scales[:, :2].contiguous())
+    camera = camera_at_origin(64, 48, focal=120.0)
+    images = [CpuRaster(splats).row_sums(camera, Walk()) for splats in (flat, disc)]
+    assert float((images[0] - images[1]).abs().max()) < 5e-3
+    assert torch.isfinite(images[1]).all()
