@@ -23,7 +23,7 @@ from liftcore.query.scene import QueryScene
 from liftcore.scene.cameras import Cameras
 from liftcore.scene.inria import write_inria_cameras
 from liftcore.scene.ply import write_splats
-from liftcore.scene.splats import Splats
+from liftcore.scene.splats import Kernel, Splats
 from liftcore.solve.settings import LiftSettings
 from tests.scenes import look_at, random_splats
 
@@ -171,6 +171,31 @@ def test_colours_follow_the_spherical_harmonics() -> None:
     assert plain.sh is not None
     expected = (0.5 + SH_C0 * plain.sh[:, 0]).clamp_min(0)
     torch.testing.assert_close(seen_colours(plain, camera), expected)
+
+
+def test_spherical_beta_lobes_add_to_the_base_colour() -> None:
+    camera = look_at("v", np.array([0.0, 0.0, -3.0]), 8, 8, 8.0)
+    bare = random_splats(0, 5, kernel=Kernel.BETA)
+    rng = np.random.default_rng(0)
+    lobes = rng.normal(0, 1, (5, 2, 6)).astype(np.float32)
+    splats = replace(bare, sb_params=torch.from_numpy(lobes))
+    expected = np.zeros((5, 3))
+    for p in range(5):
+        direction = bare.means[p].double().numpy() - np.array([0.0, 0.0, -3.0])
+        direction /= np.linalg.norm(direction)
+        assert bare.sh is not None
+        expected[p] = 0.5 + SH_C0 * bare.sh[p, 0].double().numpy()
+        for r, g, b, theta, phi, beta in lobes[p].astype(np.float64):
+            axis = np.array([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)])
+            sharpness = 10 * np.log(2)
+            colour = np.log1p(np.exp(sharpness * np.array([r, g, b]))) / sharpness
+            expected[p] += colour * max(0.0, axis @ direction) ** (4 * np.exp(beta))
+    torch.testing.assert_close(
+        seen_colours(splats, camera), torch.from_numpy(expected.clip(0)).float(), atol=1e-5, rtol=1e-5
+    )
+    wild = torch.tensor([0.0, 0.0, 0.0, 1.0, 1.0, 1e4]).expand(5, 1, 6).contiguous()
+    for sign in (1, -1):
+        assert seen_colours(replace(bare, sb_params=wild * sign), camera).isfinite().all()
 
 
 def test_the_harmonics_are_orthonormal_on_the_sphere() -> None:
