@@ -42,18 +42,18 @@ if TYPE_CHECKING:
 class GaussianLanes(NamedTuple):
     """``e = base + curvature (start + i)^2``."""
 
-    start: float
-    curvature: float
-    base: float
+    start: np.float32
+    curvature: np.float32
+    base: np.float32
 
 
 class BetaLanes(NamedTuple):
     """``sigma = base + curvature (start + i)^2``, ``2^-e = (1 - sigma)^beta``, zero from ``sigma = 1`` on."""
 
-    start: float
-    curvature: float
-    base: float
-    beta: float
+    start: np.float32
+    curvature: np.float32
+    base: np.float32
+    beta: np.float32
 
 
 class DiscLanes(NamedTuple):
@@ -64,21 +64,21 @@ class DiscLanes(NamedTuple):
     digits where s is small.
     """
 
-    start: float
-    curvature: float
-    base: float
-    s: float
-    s_rest: float
-    s_step: float
-    s_step_rest: float
-    t: float
-    t_rest: float
-    t_step: float
-    t_step_rest: float
-    d: float
-    d_rest: float
-    d_step: float
-    d_step_rest: float
+    start: np.float32
+    curvature: np.float32
+    base: np.float32
+    s: np.float32
+    s_rest: np.float32
+    s_step: np.float32
+    s_step_rest: np.float32
+    t: np.float32
+    t_rest: np.float32
+    t_step: np.float32
+    t_step_rest: np.float32
+    d: np.float32
+    d_rest: np.float32
+    d_step: np.float32
+    d_step_rest: np.float32
 
 
 # 2^-f on [0, 1) as a polynomial with p(0) = 1, relative error below 6e-9 (Chebyshev nodes, degree 6).

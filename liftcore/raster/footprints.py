@@ -144,27 +144,27 @@ class DiscRow(NamedTuple):
     d: float
 
 
-def footprint(kernel, records, place, x0, y0):
+def footprint(kernel, records, place, x0, y0) -> Any:
     """The record of a splat for the tile whose first pixel is (x0, y0)."""
 
 
-def row_of(splat, row):
+def row_of(splat, row) -> Any:
     """The footprint in one pixel row of the tile."""
 
 
-def touches(splat, line, side):
+def touches(splat, line, side) -> Any:
     """Whether any lane of half row ``side`` (0 left, 1 right) can have a weight."""
 
 
-def lanes_of(splat, line, side):
+def lanes_of(splat, line, side) -> Any:
     """The footprint on half row ``side``, for ``liftcore.lanes_blend``."""
 
 
-def alpha_at(kernel, record, x, y):
+def alpha_at(kernel, record, x, y) -> Any:
     """Alpha at one point of the image, before cap and floor, f64."""
 
 
-def circle_of(kernel, record):
+def circle_of(kernel, record) -> Any:
     """Centre x, y and radius, px, of a circle that the splat reaches beside its outline; a radius below 0 is none."""
 
 

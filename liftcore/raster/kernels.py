@@ -55,9 +55,13 @@ def _betas(splats: Splats) -> np.ndarray:
 def kernel_in(view: View, kernel: Kernel) -> Gaussians | Betas | Discs:
     """The kernel's constants in a view; their class tells the compiled code which kernel it is."""
     if kernel is Kernel.GAUSSIAN_2D:
-        # exp(-g / 2) with g = 2 |p - mu|^2, in pixels of the full view
-        return Discs(ALPHA_FLOOR, 2.0 * HALF_LOG2_E * LOW_PASS / view.low_pass)
+        return Discs(ALPHA_FLOOR, _disc_curvature(view))
     return BETAS if kernel is Kernel.BETA else GAUSSIANS
+
+
+def _disc_curvature(view: View) -> float:
+    """Of the low-pass of 2DGS, ``exp(-g / 2)`` with ``g = 2 |p - mu|^2`` in pixels of the full view."""
+    return 2.0 * HALF_LOG2_E * LOW_PASS / view.low_pass
 
 
 def project(
@@ -65,6 +69,6 @@ def project(
 ) -> int:
     """Footprints of the splats in ``bounds`` that touch the image, packed from its first row on; their number."""
     if kernel is Kernel.GAUSSIAN_2D:
-        return project_discs(*bounds, scene, view, kernel_in(view, kernel).curvature, targets)
+        return project_discs(*bounds, scene, view, _disc_curvature(view), targets)
     unit = 1.0 if kernel is Kernel.BETA else HALF_LOG2_E
     return project_ellipses(*bounds, scene, view, unit, antialiased, targets)

@@ -11,19 +11,25 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from liftcore.observe.observation import Observation, RegionMap
 from liftcore.raster.cpu import CpuRaster
 from liftcore.raster.oracle import OracleRaster, dense_view, reading_matrix
-from liftcore.raster.protocol import RegionWeights, Walk, Weighting
+from liftcore.raster.oracle_weights import counted_weights, walked_rays
+from liftcore.raster.protocol import RegionWeights, Selection, Walk, Weighting
 from liftcore.scene.splats import Kernel, Splats
 from tests.scenes import random_camera, random_grid, random_regions, random_splats, scenes
 
 if TYPE_CHECKING:
-    from liftcore.observe.observation import Observation
     from liftcore.scene.cameras import Camera
 
 INSIDE = 1e-5  # absolute, on weights
 FLIPS = 1e-2  # of rays: on tiny random images one ray in a hundred; the pooled test below holds 1e-4
 WALKS = (Walk(), Walk(gain=1.2), Walk(gain=0.5), Walk(alpha_cap=0.999, transmittance_stop=0.05))
+SELECTIONS = (
+    Weighting(1, Selection.TOP_K, count=2),
+    Weighting(2, Selection.FRONT_MASS, mass=0.6, floor=0.02),
+    Weighting(1, Selection.CENTRE),
+)
 FOOTPRINTS = {
     "3dgs": (Kernel.GAUSSIAN_3D, False),
     "3dgs antialiased": (Kernel.GAUSSIAN_3D, True),
@@ -98,6 +104,24 @@ def test_evidence_is_the_sum_of_plain_weights_whatever_the_gain(footprint, data)
     if not view.cut.any():
         expected = view.A.sum(axis=0)
         assert np.abs(evidence - expected).max() < INSIDE * max(1.0, expected.max())
+
+
+@every_footprint
+@hypothesis_settings
+@given(st.data(), st.sampled_from(SELECTIONS), st.sampled_from([1, 3]))
+def test_selections_and_strides_equal_the_oracle(footprint, data, weighting, stride):
+    splats, camera, _, walk = drawn(data, footprint)
+    walk = replace(walk, stride=stride)
+    view = dense_view(splats, camera, walk)
+    chosen, hard = counted_weights(view.A, splats, camera, walk, weighting)
+    rays = camera.width * camera.height
+    labels = torch.arange(rays, dtype=torch.int32).reshape(1, camera.height, camera.width)
+    one_a_ray = RegionMap(labels, torch.ones(rays, 1))
+    W = dense(CpuRaster(splats, threads=2).region_weights(camera, one_a_ray, walk, weighting), splats.count, rays)
+    walked = walked_rays(camera, walk)
+    assert W[:, ~walked].max(initial=0) == 0
+    clear = walked & ~view.cut & ~hard
+    assert np.abs(W.T - chosen)[clear].max(initial=0) < INSIDE
 
 
 @every_footprint
