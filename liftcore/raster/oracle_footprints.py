@@ -76,7 +76,8 @@ def alphas(splats: Splats, j: int, camera: Camera, walk: Walk, pixels: np.ndarra
     sigma = np.einsum("ri,ij,rj->r", pixels - mean, conic, pixels - mean)
     if splats.kernel is Kernel.BETA:
         assert splats.beta is not None
-        return _beta_kernel(opacity, sigma, 4 * np.exp(float(splats.beta[j])))
+        with np.errstate(over="ignore"):
+            return _beta_kernel(opacity, sigma, 4 * np.exp(float(splats.beta[j])))
     if walk.antialiased:
         opacity *= compensation
     return _above_the_floor(opacity * np.exp(-sigma / 2), np.zeros(len(sigma), bool))
@@ -120,8 +121,9 @@ def _beta_kernel(opacity: float, sigma: np.ndarray, beta: float) -> tuple[np.nda
     inside = sigma < 1
     within = np.where(inside, sigma, 0.0)
     logarithm = np.log1p(-within)
-    exponent = -beta * logarithm / np.log(2.0)
+    with np.errstate(invalid="ignore", over="ignore"):  # an infinite beta leaves the point sigma = 0
+        exponent = np.where(within > 0, -beta * logarithm / np.log(2.0), 0.0)
+        steep = opacity * beta * within * np.exp((beta - 1) * logarithm)
     raw = np.where(inside & (exponent < LARGEST_EXPONENT), opacity * np.exp2(-exponent), 0.0)
-    steep = opacity * beta * within * np.exp((beta - 1) * logarithm)
     jump = (beta < 1) & (np.abs(sigma - 1) < _SUPPORT_BAND)
     return raw, (steep > _STEEPEST) | jump | (np.abs(exponent / LARGEST_EXPONENT - 1) < _SUPPORT_BAND)

@@ -87,9 +87,8 @@ def test_discs_that_pass_the_camera_end_at_their_horizon(height, tilt):
     # A floor around the camera: half of its crossings lie behind, and its horizon goes through the image.
     splats = splats_at([(0.0, height, 0.5), (0.3, height, 3.0)], log_scales=2.0, quats=about_x(tilt), kernel=DISC)
     A = assert_equals_the_oracle(splats, camera_at_origin(40, 40))
-    met = (A > 0).any(axis=1)
-    assert met.any()
-    assert not met.all()
+    assert (A > 0).any()
+    assert (A == 0).any(axis=0).all()  # no disc is met by all rays
 
 
 def test_crossings_behind_the_camera_do_not_count():
@@ -135,10 +134,9 @@ def test_needles_side_on_and_end_on_equal_the_oracle(kernel, turn):
 
 @pytest.mark.parametrize("b", [-1e4, -80.0, -10.0, -3.0, 0.0, 3.0, math.log(250_000.0), 80.0, 1e4])
 def test_beta_from_a_cylinder_to_a_point_equals_the_oracle(b):
-    with np.errstate(over="ignore"):
-        # An axis of the camera goes through the middle of a pixel, so even a point has a weight.
-        splats = splats_at([(0.0, 0.0, 2.0), *ROW], log_scales=-0.5, betas=b, kernel=BETA)
-        A = assert_equals_the_oracle(splats, camera_at_origin(40, 30))
+    # An axis of the camera goes through the middle of a pixel, so even a point has a weight.
+    splats = splats_at([(0.0, 0.0, 2.0), *ROW], log_scales=-0.5, betas=b, kernel=BETA)
+    A = assert_equals_the_oracle(splats, camera_at_origin(40, 30))
     assert A.max() > 0.5
 
 

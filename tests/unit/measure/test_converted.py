@@ -34,11 +34,12 @@ def test_a_disc_keeps_the_two_longest_axes_where_they_were():
 
 
 def test_flat_splats_look_the_same_as_discs():
-    for order in ([-1.0, -1.5, -9.0], [-1.0, -9.0, -1.5], [-9.0, -1.0, -1.5]):
+    for order in ([-2.5, -3.2, -9.0], [-2.5, -9.0, -3.2], [-9.0, -2.5, -3.2]):
         splats = splats_at([(0.0, 0.0, 0.0), (0.2, 0.1, 0.4)], order, quats=(0.9, 0.2, -0.4, 0.1))
-        camera = look_at("v", np.array([1.5, 1.0, -3.0]), 120, 90, 300.0)
+        camera = look_at("v", np.array([1.5, 1.0, -3.0]), 480, 360, 1_200.0)
         images = [CpuRaster(made).row_sums(camera, Walk()) for made in (splats, to_discs(splats))]
-        assert float((images[0] - images[1]).abs().mean()) < 0.01
+        # What stays between them is the perspective inside a splat, which 3DGS takes to be linear, and the low-pass.
+        assert float((images[0] - images[1]).abs().sum()) < 0.1 * float(images[0].sum())
 
 
 def test_a_beta_kernel_covers_as_much_of_the_image_as_its_gaussian():
