@@ -11,7 +11,8 @@ import numpy as np
 from liftcore.jit import kernel
 from liftcore.lanes import LANES, PIXELS, WEIGHTS, add_lanes
 from liftcore.raster.constants import TILE
-from liftcore.raster.walk import CHECK_EVERY, blend, footprint, look, new_rays, row_centre, start_rays, touches
+from liftcore.raster.footprints import footprint, row_of, touches
+from liftcore.raster.walk import CHECK_EVERY, blend, look, new_rays, start_rays
 
 _SLOTS = 32  # labels of a tile that there is room for at first
 
@@ -38,7 +39,7 @@ def strongest_tiles(first, last, frame, labels, count, image):
             if (step - frame.starts[tile]) % CHECK_EVERY == 0 and not look(rays, False):
                 break
             place = frame.items[step]
-            splat = footprint(frame.records, place, float(x0), float(y0))
+            splat = footprint(frame.kernel, frame.records, place, float(x0), float(y0))
             label = labels[frame.ids[place]]
             slot = slot_of[label + 1]
             if slot < 0:
@@ -49,12 +50,12 @@ def strongest_tiles(first, last, frame, labels, count, image):
                 if slots * PIXELS > sums.shape[0]:
                     sums = np.concatenate((sums, np.zeros_like(sums)))
             for row in range(splat.top, splat.bottom + 1):
-                centre, base = row_centre(splat, row)
+                line = row_of(splat, row)
                 for side in range(2):
                     half = 2 * row + side
-                    if not rays.alive[half] or not touches(splat, centre, base, side):
+                    if not rays.alive[half] or not touches(splat, line, side):
                         continue
-                    blend(rays, splat, centre, base, half)
+                    blend(rays, splat, line, half)
                     offset = half * LANES
                     add_lanes(sums, slot * PIXELS + offset, rays.state, WEIGHTS + offset)
         _read_off(sums, slots, label_of, (x0, y0), image)
