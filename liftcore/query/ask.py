@@ -12,7 +12,7 @@ from liftcore.query.components import largest_component
 from liftcore.query.directions import MINIMUM_ROW_SUM, directions
 from liftcore.query.products import LOWEST_COSINE
 from liftcore.query.query import Query
-from liftcore.query.scores import combine, cosines
+from liftcore.query.scores import combine, cosines, cosines_about
 from liftcore.query.threshold import find_threshold
 
 if TYPE_CHECKING:
@@ -98,8 +98,7 @@ def ask(scene: QueryScene, query: Query | str, encoder: TextEncoder | None = Non
         InvalidLift: an example needs the scene's files, and they moved or changed.
     """
     query = Query((query,)) if isinstance(query, str) else query
-    terms = directions(scene, query.terms, encoder)
-    scores = combine(cosines(scene.lift.features, scene.norms, terms), len(query.positives))
+    scores = combine(_similarities(scene, query, encoder), len(query.positives))
     seen = scene.lift.seen & (scene.norms > 0)
     scores = torch.where(seen, scores, _NO_RELEVANCY if query.negatives else LOWEST_COSINE)
     known = scores[seen]
@@ -155,6 +154,18 @@ def top(answer: Answer, scene: QueryScene, count: int) -> Found:
     chosen = means[answer.selected]
     box = (_point(chosen.amin(dim=0)), _point(chosen.amax(dim=0))) if len(chosen) else None
     return Found(best, box)
+
+
+def _similarities(scene: QueryScene, query: Query, encoder: TextEncoder | None) -> Tensor:
+    """[P, n] f32, how like each term of the query every splat is."""
+    rows = directions(scene, query.terms, encoder)
+    words = torch.tensor([isinstance(term, str) for term in query.terms])
+    similarities = torch.empty(scene.lift.features.shape[0], len(rows))
+    if words.any():
+        similarities[:, words] = cosines(scene.lift.features, scene.norms, rows[words])
+    if not words.all():
+        similarities[:, ~words] = cosines_about(scene.lift.features, scene.norms, scene.mean, rows[~words])
+    return similarities
 
 
 def _weights(scene: QueryScene, seen: Tensor) -> Tensor | None:

@@ -22,9 +22,10 @@ def largest_component(mask: Tensor) -> Tensor:
     """
     from scipy.ndimage import label
 
-    labels, count = label(mask.numpy(), structure=np.ones((3, 3)))
-    if count < 2:
-        return mask
+    labels = np.empty(mask.shape, np.int32)
+    label(mask.numpy(), structure=np.ones((3, 3)), output=labels)
     sizes = np.bincount(labels.ravel())
     sizes[0] = 0  # the background
+    if not sizes.any():
+        return mask
     return torch.from_numpy(labels == sizes.argmax())

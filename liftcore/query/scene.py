@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 from liftcore.artifact import Lift, load_lift
-from liftcore.query.scores import feature_norms
+from liftcore.query.scores import feature_norms, mean_direction
 from liftcore.query.unchanged import unchanged
 from liftcore.raster.protocol import Walk
 
@@ -47,6 +47,11 @@ class QueryScene:
     def norms(self) -> Tensor:
         """[P] f32, the features' norms, computed once a lift."""
         return feature_norms(self.lift.features)
+
+    @cached_property
+    def mean(self) -> Tensor:
+        """[F] f32, the mean of the unit features, weighted by evidence: what all the scene's features share."""
+        return mean_direction(self.lift.features, self.norms, self.lift.evidence)
 
     @cached_property
     def principal(self) -> Tensor:

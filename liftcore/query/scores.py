@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 DEFAULT_NEGATIVES = ("object", "things", "stuff", "texture")  # LangSplat's canonical phrases
+_BLOCK = 16_384  # rows widened at once
+LEAST_OFFSET = 1e-3  # from the mean, of unit features: what is nearer has no direction that float16 could tell
 RELEVANCY_SHARPNESS = 10.0  # the softmax's inverse temperature in LERF and LangSplat
 
 
@@ -66,6 +68,48 @@ def cosines(features: Tensor, norms: Tensor, texts: Tensor) -> Tensor:
     return cosines_of(features, norms, _unit_rows(texts, features.shape[1]))
 
 
+def mean_direction(features: Tensor, norms: Tensor, weights: Tensor) -> Tensor:
+    """The weighted mean of the unit rows, [F] f32; of zero rows and weights nothing but zeros.
+
+    Args:
+        features: [P, F] f16 or f32. norms: [P] f32, from `feature_norms`. weights: [P] f32, at least zero.
+    """
+    shares = torch.where(norms > 0, weights.double() / norms.clamp_min(1e-30).double(), 0.0)
+    total = torch.zeros(features.shape[1], dtype=torch.float64)
+    for first in range(0, features.shape[0], _BLOCK):
+        block = slice(first, first + _BLOCK)
+        total += (features[block].to(torch.float32) * shares[block, None].to(torch.float32)).sum(dim=0).double()
+    weight = float(weights[norms > 0].double().sum())
+    return (total / weight if weight > 0 else total).to(torch.float32)
+
+
+def cosines_about(features: Tensor, norms: Tensor, mean: Tensor, examples: Tensor) -> Tensor:
+    """Cosine to examples as seen from the scene's mean feature, ``cos(x_j / |x_j| - mean, e - mean)``.
+
+    Image features lie in a narrow cone: what they share says nothing about this thing or that, and drowns what
+    tells them apart. Words lie in another cone, so they are compared by plain cosines.
+
+    Args:
+        features: [P, F] f16 or f32. norms: [P] f32, from `feature_norms`.
+        mean: [F] f32, the mean of the unit features, of length below one.
+        examples: [n, F] f32, unit rows.
+
+    Returns:
+        [P, n] f32 in [-1, 1]; 0 for a splat or an example that is the mean.
+    """
+    length = float(torch.linalg.vector_norm(mean))
+    offsets = examples - mean
+    reaches = torch.linalg.vector_norm(offsets, dim=1)
+    # One pass gives <x, e - mean> and <x, mean>, and these give all: |x - mean|^2 = 1 - 2 <x, mean> + |mean|^2.
+    rows = torch.cat([offsets, mean[None]]) / torch.cat([reaches, torch.tensor([length])]).clamp_min(1e-12)[:, None]
+    along = cosines_of(features, norms, rows)
+    products = along[:, :-1] * reaches - offsets @ mean
+    distances = (1 - 2 * length * along[:, -1:] + length**2).clamp_min(0.0).sqrt()
+    known = (distances > LEAST_OFFSET) & (reaches > LEAST_OFFSET)
+    scale = (distances * reaches).clamp_min(LEAST_OFFSET**2)
+    return torch.where(known, (products / scale).clamp(-1.0, 1.0), 0.0)
+
+
 def combine(similarities: Tensor, positives: int) -> Tensor:
     """One score a splat from its cosines to all terms of a query.
 
@@ -81,7 +125,8 @@ def combine(similarities: Tensor, positives: int) -> Tensor:
     its images), so among both the examples decide.
 
     Args:
-        similarities: [P, n] f32, cosines to the positives, then to the negatives.
+        similarities: [P, n] f32, cosines to the positives, then to the negatives; plain for words, and about the
+            scene's mean for examples (`cosines_about`).
         positives: how many of the n are positives, at least one.
 
     Returns:

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from liftcore.errors import InvalidQuery
-from liftcore.query.scores import combine, cosine, cosines, feature_norms
+from liftcore.query.scores import combine, cosine, cosines, cosines_about, feature_norms, mean_direction
 
 
 @given(
@@ -51,6 +51,37 @@ def test_relevancy_is_the_least_softmax_over_negatives() -> None:
 
 def test_relevancy_of_a_half_means_as_near_as_the_nearest_negative() -> None:
     assert combine(torch.tensor([[0.3, 0.3, 0.1]]), 1).item() == pytest.approx(0.5)
+
+
+@given(
+    seed=st.integers(0, 99),
+    cone=st.sampled_from([0.0, 0.5, 0.95]),
+    dtype=st.sampled_from([torch.float16, torch.float32]),
+)
+@settings(max_examples=30, deadline=None)
+def test_cosines_about_the_mean_equal_their_definition(seed: int, cone: float, dtype: torch.dtype) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    features = (torch.randn(400, 32, generator=generator) + cone * 20 * torch.ones(32)).to(dtype)
+    features[7] = 0
+    norms, weights = feature_norms(features), torch.rand(400, generator=generator)
+    unit = torch.nn.functional.normalize(features.double(), dim=1)
+    shares = weights.double() * (norms > 0)
+    mean = (unit * shares[:, None]).sum(dim=0) / shares.sum()
+    found = mean_direction(features, norms, weights)
+    torch.testing.assert_close(found.double(), mean, atol=1e-5, rtol=0)
+    examples = unit[:3].float()
+    expected = torch.nn.functional.cosine_similarity((unit - mean)[:, None], (unit[:3] - mean)[None], dim=2)
+    about = cosines_about(features, norms, found, examples)
+    kept = norms > 0
+    torch.testing.assert_close(about[kept].double(), expected[kept], atol=3e-3, rtol=0)
+
+
+def test_a_scene_of_one_feature_is_all_alike() -> None:
+    features = torch.ones(5, 4)
+    norms = feature_norms(features)
+    mean = mean_direction(features, norms, torch.ones(5))
+    assert cosines_about(features, norms, mean, features[:1] / 2).tolist() == [[0.0]] * 5
+    assert mean_direction(features, norms, torch.zeros(5)).tolist() == [0.0] * 4
 
 
 def test_several_positives_are_as_good_as_the_nearest_one() -> None:
