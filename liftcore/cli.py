@@ -19,6 +19,10 @@ from liftcore.errors import SplatliftError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+EXPERIMENTS = (
+    "ablation", "fidelity", "kernels", "lambda_sweep", "mask_noise", "overfitting", "pose_noise", "row_sums",
+)  # fmt: skip
+
 BAD_INPUT = 2
 OUR_FAULT = 1
 INTERRUPTED = 130
@@ -77,6 +81,9 @@ def build_parser() -> argparse.ArgumentParser:
     _add_inspect(commands.add_parser("inspect", parents=[shared], help="what is in a file, and what is wrong"))
     _add_evaluate(commands.add_parser("evaluate", parents=[shared], help="lifts against the field's labels"))
     _add_bench(commands.add_parser("bench", parents=[shared], help="how fast this machine lifts"))
+    _add_experiment(
+        commands.add_parser("experiment", parents=[shared], help="what the paper measured, on a scene of yours")
+    )
     return parser
 
 
@@ -182,6 +189,13 @@ def _add_bench(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--levels", type=_count, metavar="L", help="label levels")
     parser.add_argument("--views", type=_count, metavar="N")
     parser.add_argument("--threads", type=_count, metavar="N")
+
+
+def _add_experiment(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("name", choices=EXPERIMENTS, metavar="NAME", help=", ".join(EXPERIMENTS))
+    parser.add_argument("scene", type=Path, metavar="SCENE", help="point_cloud.ply, cameras.json and feature packs")
+    parser.add_argument("-o", "--out", type=Path, default=Path("experiments"), metavar="DIR", help="of JSON and plot")
+    parser.add_argument("--every", type=_count, default=1, metavar="N", help="take every n-th feature view only")
 
 
 def _count(text: str) -> int:

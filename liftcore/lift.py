@@ -2,52 +2,62 @@
 
 from __future__ import annotations
 
-import hashlib
-import time
-from contextlib import contextmanager
-from dataclasses import dataclass, field
-from pathlib import Path
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import torch
 
 from liftcore import __version__
-from liftcore.artifact import InputFile, Lift, LiftMetadata
-from liftcore.observe.pack import open_packs, pair
+from liftcore.artifact import Lift, LiftMetadata
+from liftcore.input_files import input_file
+from liftcore.observe.pack import FeaturePacks, open_packs, pair
 from liftcore.progress import Progress, silent
 from liftcore.raster.antialiased import check_antialiased
 from liftcore.raster.cpu import CpuRaster
 from liftcore.raster.warm_up import warm_up
-from liftcore.scene.load import camera_files, load_cameras, load_splats
-from liftcore.solve.accumulate import accumulate, as_read, lift_walk
-from liftcore.solve.aggregation import aggregate
+from liftcore.scene.load import load_cameras, load_splats
+from liftcore.solve.accumulate import Geometry, accumulate, as_read, lift_walk
+from liftcore.solve.aggregation import Aggregation, aggregate
 from liftcore.solve.all_rays import AllRays
 from liftcore.solve.certificate import certify
 from liftcore.solve.checkpoint import Checkpoint, identity, resumed
-from liftcore.solve.closed_form import solve_closed_form
+from liftcore.solve.closed_form import Solution, solve_closed_form
 from liftcore.solve.least_squares import refine
 from liftcore.solve.reference import reference
 from liftcore.solve.robust import robust_weights
 from liftcore.solve.view_weights import ViewWeights
+from liftcore.timings import Timings
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Sequence
+    from pathlib import Path
 
+    from liftcore.artifact import InputFile
+    from liftcore.raster.protocol import Raster
+    from liftcore.scene.cameras import Cameras
+    from liftcore.scene.splats import Splats
     from liftcore.solve.settings import LiftSettings
 
 
-@dataclass
-class Timings:
-    """Seconds a stage."""
+@dataclass(frozen=True)
+class Sources:
+    """What a lift is made from, opened and checked."""
 
-    seconds: dict[str, float] = field(default_factory=dict)
+    splats: Splats
+    cameras: Cameras
+    packs: FeaturePacks
+    views: list[str]  # that are lifted, in the order of the sums
+    unpaired: list[str]  # views with features and no camera
 
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        """Time the block under that name."""
-        start = time.perf_counter()
-        yield
-        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+
+@dataclass(frozen=True)
+class Run:
+    """How a lift is done, and whom it tells."""
+
+    settings: LiftSettings
+    threads: int | None
+    progress: Progress
+    timings: Timings
 
 
 def lift(
@@ -72,98 +82,105 @@ def lift(
         InvalidInput: a file is malformed, or the packs do not fit the cameras.
         InvalidSettings: the splats' kernel has no opacity compensation, and the settings ask for it.
     """
-    timings = Timings()
-    with timings.stage("read"):
-        scene, views = load_splats(splats), load_cameras(cameras)
-        check_antialiased(scene.kernel, settings.antialiased)
-        packs = open_packs(features)
-        names, unpaired = pair(packs, views)
-        names = names[:: settings.view_stride]
-    with timings.stage("digest"):
+    run = Run(settings, threads, progress, Timings())
+    with run.timings.stage("read"):
+        sources = open_sources(splats, cameras, features, settings)
+    with run.timings.stage("digest"):
         inputs = [input_file(path) for path in (splats, cameras, *features)]
-    with timings.stage("compile"):
-        warm_up(scene.kernel)
+    with run.timings.stage("compile"):
+        warm_up(sources.splats.kernel)
+    raster = CpuRaster(sources.splats, threads)
     with ViewWeights() as store:
-        with timings.stage("geometry"):
-            raster = CpuRaster(scene, threads)
-            key = identity([part.sha256 for part in inputs], settings) if checkpoint else ""
-            with resumed(raster, checkpoint, key) as walked:
-                geometry = accumulate(walked, (scene.count, views), packs, names, settings, store, progress)
-        codebooks = geometry.codebooks
-        with timings.stage("robust"):
-            weights = robust_weights(
-                store, codebooks, geometry.denominators, settings.robust_steps, progress, threads
-            )
-        with timings.stage("solve"):
-            dtype = getattr(torch, settings.dtype)
-            solution = solve_closed_form(
-                weights, codebooks.__getitem__, geometry.denominators, dtype, progress, threads
-            )
-        X, seen, notes = solution.features, geometry.denominators > 0, {}
-        rays = None
-        if settings.cg_steps or settings.reference_channels:
-            with timings.stage("rays"):
-                rays = AllRays(
-                    raster,
-                    scene.count,
-                    [views.get(name) for name in names],
-                    lambda view: as_read(packs.observation(names[view]), settings, names[view]),
-                    lift_walk(settings),
-                    progress,
-                )
-        if rays and settings.cg_steps:
-            with timings.stage("refine"):
-                refinement = refine(rays, X, seen, codebooks, settings, progress)
-                X, notes["refinement"] = refinement.features, refinement.stats
-        if rays and settings.reference_channels:
-            with timings.stage("reference"):
-                notes["reference"] = reference(rays, X, seen, geometry.samples, codebooks, settings, progress)
-        aggregation = None
-        if settings.aggregation:
-            with timings.stage("aggregate"):
-                lifted = (raster, views, packs, names)
-                aggregation = aggregate(X, geometry.evidence, lifted, settings, progress, threads)
-                notes["aggregation"] = aggregation.facts
-        with timings.stage("certify"):
-            certificate = certify(geometry, X, codebooks.__getitem__, settings, threads) | notes
-        certificate |= {"weights_entries": sum(len(part.columns) for part in store), "views_without_camera": unpaired}
-    metadata = LiftMetadata(
-        version=__version__,
-        settings=settings,
-        splats=inputs[0],
-        cameras=inputs[1],
-        features=tuple(inputs[2:]),
-        encoder=packs.encoder,
-        text_space=packs.text_space,
-        views=tuple(names),
-        certificate=certificate,
-        timings=timings.seconds,
-    )
+        key = identity([part.sha256 for part in inputs], settings) if checkpoint else ""
+        with run.timings.stage("geometry"), resumed(raster, checkpoint, key) as walked:
+            scene = (sources.splats.count, sources.cameras)
+            geometry = accumulate(walked, scene, sources.packs, sources.views, settings, store, progress)
+        solution = _solve(run, store, geometry)
+        facts: dict[str, Any] = {
+            "weights_entries": sum(len(part.columns) for part in store),
+            "views_without_camera": sources.unpaired,
+        }
+    X, notes = _refine(run, sources, raster, geometry, solution)
+    aggregation = _aggregate(run, sources, raster, geometry, X) if settings.aggregation else None
+    notes |= {"aggregation": aggregation.facts} if aggregation else {}
+    with run.timings.stage("certify"):
+        certificate = certify(geometry, X, geometry.codebooks.__getitem__, settings, threads) | notes | facts
     return Lift(
         features=X,
         evidence=torch.from_numpy(geometry.evidence).to(torch.float32),
         agreement=solution.agreement,
-        seen=torch.from_numpy(seen),
-        metadata=metadata,
+        seen=torch.from_numpy(geometry.denominators > 0),
+        metadata=_metadata(run, sources, inputs, certificate),
         cluster=aggregation.clusters if aggregation else None,
         cluster_features=aggregation.cluster_features if aggregation else None,
     )
 
 
-def input_file(path: Path) -> InputFile:
-    """Where an input is and what it is: the digest of the file, or of the names and digests of a folder's cameras.
-
-    Photos, features and lifts that lie in the same folder do not count: they may come and go.
-    """
-    resolved = path.resolve()
-    if not resolved.is_dir():
-        return InputFile(path=str(resolved), sha256=_digest(resolved))
-    total = hashlib.sha256()
-    for part in camera_files(resolved):
-        total.update(f"{part.relative_to(resolved)} {_digest(part)}\n".encode())
-    return InputFile(path=str(resolved), sha256=total.hexdigest())
+def open_sources(splats: Path, cameras: Path, features: Sequence[Path], settings: LiftSettings) -> Sources:
+    """Open what a lift is made from; views are paired by name, and every ``view_stride``-th is lifted."""
+    scene, views, packs = load_splats(splats), load_cameras(cameras), open_packs(features)
+    check_antialiased(scene.kernel, settings.antialiased)
+    names, unpaired = pair(packs, views)
+    return Sources(scene, views, packs, names[:: settings.view_stride], unpaired)
 
 
-def _digest(path: Path) -> str:
-    with path.open("rb") as handle:
-        return hashlib.file_digest(handle, "sha256").hexdigest()
+def _solve(run: Run, store: ViewWeights, geometry: Geometry) -> Solution:
+    """The closed form, from weights that the robust steps may have changed."""
+    settings, books = run.settings, geometry.codebooks
+    with run.timings.stage("robust"):
+        weights = robust_weights(
+            store, books, geometry.denominators, settings.robust_steps, run.progress, run.threads
+        )
+    with run.timings.stage("solve"):
+        dtype = getattr(torch, settings.dtype)
+        return solve_closed_form(weights, books.__getitem__, geometry.denominators, dtype, run.progress, run.threads)
+
+
+def _refine(
+    run: Run, sources: Sources, raster: Raster, geometry: Geometry, solution: Solution
+) -> tuple[torch.Tensor, dict[str, Any]]:
+    """X after the conjugate gradient steps that the settings ask for, and what is known of the optimum."""
+    settings, progress, X = run.settings, run.progress, solution.features
+    notes: dict[str, Any] = {}
+    if not settings.cg_steps and not settings.reference_channels:
+        return X, notes
+    seen, names = geometry.denominators > 0, sources.views
+    with run.timings.stage("rays"):
+        rays = AllRays(
+            raster,
+            sources.splats.count,
+            [sources.cameras.get(name) for name in names],
+            lambda view: as_read(sources.packs.observation(names[view]), settings, names[view]),
+            lift_walk(settings),
+            progress,
+        )
+    if settings.cg_steps:
+        with run.timings.stage("refine"):
+            refinement = refine(rays, X, seen, geometry.codebooks, settings, progress)
+            X, notes["refinement"] = refinement.features, refinement.stats
+    if settings.reference_channels:
+        with run.timings.stage("reference"):
+            notes["reference"] = reference(rays, X, seen, geometry.samples, geometry.codebooks, settings, progress)
+    return X, notes
+
+
+def _aggregate(run: Run, sources: Sources, raster: Raster, geometry: Geometry, X: torch.Tensor) -> Aggregation:
+    """Aggregate X in place."""
+    with run.timings.stage("aggregate"):
+        lifted = (raster, sources.cameras, sources.packs, sources.views)
+        return aggregate(X, geometry.evidence, lifted, run.settings, run.progress, run.threads)
+
+
+def _metadata(run: Run, sources: Sources, inputs: list[InputFile], certificate: dict[str, Any]) -> LiftMetadata:
+    return LiftMetadata(
+        version=__version__,
+        settings=run.settings,
+        splats=inputs[0],
+        cameras=inputs[1],
+        features=tuple(inputs[2:]),
+        encoder=sources.packs.encoder,
+        text_space=sources.packs.text_space,
+        views=tuple(sources.views),
+        certificate=certificate,
+        timings=run.timings.seconds,
+    )

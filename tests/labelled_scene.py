@@ -15,7 +15,7 @@ from PIL import Image
 from safetensors.torch import save_file
 
 from liftcore.artifact import Lift, LiftMetadata, save_lift
-from liftcore.lift import input_file
+from liftcore.input_files import input_file
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.inria import write_inria_cameras
 from liftcore.scene.ply import write_splats

@@ -34,10 +34,11 @@ from liftcore.solve.accumulate import render_walk
 from liftcore.solve.settings import LiftSettings, Preset
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from torch import Tensor
 
+    from liftcore.raster.protocol import Raster
     from liftcore.scene.cameras import Cameras
 
 EVIDENCE_PACK = "features"  # its views say which splats count
@@ -190,10 +191,17 @@ class Tabletop:
         features = lift(paths[0], paths[1], paths[2:], case.settings).features
         return self.judge(features, case.settings, time.perf_counter() - start)
 
-    def judge(self, features: Tensor, settings: LiftSettings, seconds: float = 0.0) -> Figures:
-        """The figures of lifted features [P, F] against the truth; the settings say how they are rendered."""
+    def judge(
+        self, features: Tensor, settings: LiftSettings, seconds: float = 0.0, raster: Raster | None = None
+    ) -> Figures:
+        """The figures of lifted features [P, F] against the truth; the settings say how they are rendered.
+
+        Args:
+            raster: of the same splats in another form; None takes the scene's own.
+        """
         scores = class_scores(features, self.classes)
-        seen = [self._argmax(view, features, settings) for view in self.held_out]
+        maps = self.maps(features, settings, raster or self.raster)
+        seen = [image.argmax(dim=2) for image in maps]
         ious = class_ious(torch.stack(seen), torch.stack(list(self.held_out.values())), len(self.classes))
         return Figures(
             splat_accuracy(scores, self.objects, self.counted),
@@ -202,9 +210,11 @@ class Tabletop:
             seconds,
         )
 
-    def _argmax(self, view: str, features: Tensor, settings: LiftSettings) -> Tensor:
-        camera = self.cameras.get(view)
-        return rendered_scores(self.raster, camera, features, self.classes, render_walk(settings)).argmax(dim=2)
+    def maps(self, features: Tensor, settings: LiftSettings, raster: Raster) -> Iterator[Tensor]:
+        """Each held-out view's rendered class scores [H, W, K] f32."""
+        for view in self.held_out:
+            camera = self.cameras.get(view)
+            yield rendered_scores(raster, camera, features, self.classes, render_walk(settings))
 
 
 def measure_all(folder: Path, cases: Sequence[Case] = CASES) -> dict[str, Any]:

@@ -25,6 +25,8 @@ def largest_component(mask: Tensor) -> Tensor:
     labels = np.empty(mask.shape, np.int32)
     label(mask.numpy(), structure=np.ones((3, 3)), output=labels)
     sizes = np.bincount(labels.ravel())
+    if sizes.size < 3:  # the background and one component at most
+        return mask
     sizes[0] = 0  # the background
     if not sizes.any():
         return mask

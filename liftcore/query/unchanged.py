@@ -31,7 +31,7 @@ def unchanged(role: str, remembered: InputFile, lift: Path) -> Path:
             hint=f"move the {role} back to {path}, or lift again from where they are now",
         )
     # The lift's own digest: one definition for files and folders, where it was taken and where it is checked.
-    from liftcore.lift import input_file
+    from liftcore.input_files import input_file
 
     if input_file(path).sha256 != remembered.sha256:
         raise InvalidLift(

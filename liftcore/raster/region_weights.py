@@ -53,7 +53,7 @@ def weigh_tiles(first, last, frame, reading, choice, with_plain):
         x0 = float((tile % frame.columns) * TILE)
         y0 = float((tile // frame.columns) * TILE)
         if choice.kind == LARGEST:
-            rank_tile(rays, frame, tile, marks, choice.count)
+            rank_tile(rays, frame, tile, marks, choice.k)
         start_rays(rays, frame, tile)
         read_tile(taps, reading, frame, tile)
         used, whole_tile = taps.sizes[0], reuse and taps.sizes[1] == 1

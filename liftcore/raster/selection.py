@@ -35,7 +35,7 @@ class Choice(NamedTuple):
     gated: bool  # whether any weight may be left out or counted otherwise than blending leaves it
     kind: int
     power: int
-    count: int  # k of top-k
+    k: int  # of top-k
     light: np.float32  # of front-mass: a weight counts while T before it is above this
     floor: np.float32
 
@@ -78,7 +78,7 @@ def new_marks(choice):
     """Room for one tile's marks; empty unless the choice is top-k."""
     pixels = PIXELS if choice.kind == LARGEST else 0
     return Marks(
-        np.zeros(pixels * choice.count, np.float32),
+        np.zeros(pixels * choice.k, np.float32),
         np.zeros(pixels, np.int32),
         np.zeros(pixels, np.float32),
         np.zeros(pixels, np.int32),

@@ -63,8 +63,8 @@ def contingency(labels: np.ndarray, kappa: np.ndarray, rows: int, clusters: int)
 def _largest(table: csr_matrix) -> tuple[np.ndarray, np.ndarray]:
     """Column and value of the largest entry of each row, the first of equal ones; (0, 0) for an empty row."""
     table.sort_indices()
-    indices, starts, data = (np.asarray(part) for part in (table.indices, table.indptr, table.data))
-    columns, values = np.zeros(table.shape[0], np.int64), np.zeros(table.shape[0], np.int64)
+    indices, starts, data = (np.asarray(part, np.int64) for part in (table.indices, table.indptr, table.data))
+    columns, values = np.zeros(starts.size - 1, np.int64), np.zeros(starts.size - 1, np.int64)
     lengths = np.diff(starts)
     filled = np.flatnonzero(lengths)
     if filled.size:

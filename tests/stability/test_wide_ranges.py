@@ -7,7 +7,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from liftcore.raster.constants import NEAR_PLANE
-from liftcore.raster.oracle import projected_gaussian
+from liftcore.raster.oracle_footprints import projected_gaussian
 from liftcore.raster.protocol import Walk
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Splats

@@ -1,7 +1,5 @@
 """Least squares believes wrong masks: the residual falls while the splats get worse, unless it is damped.
 
-    python -m liftcore.measure.experiments.overfitting --scene DIR --out DIR [--every N]
-
 From the row-sum lift of the tabletop scene with its hard masks, conjugate gradients go towards the smallest
 ``|A X - B|^2`` with several dampings. All runs in the channels ``X C^T``, C the class vectors: closed form and least
 squares are linear in B, so these are exactly the class scores of the full solutions, at the cost of 14 channels.
@@ -9,19 +7,13 @@ squares are linear in B, so these are exactly the class scores of the full solut
 
 from __future__ import annotations
 
-import argparse
-import time
 from dataclasses import dataclass
-from datetime import UTC, datetime
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
 from liftcore.measure.accuracy import class_ious, splat_accuracy
-from liftcore.measure.bench import hardware
-from liftcore.measure.experiments.figure import save_experiment
 from liftcore.measure.tabletop import Tabletop
 from liftcore.observe.observation import Observation, RegionMap
 from liftcore.observe.pack import open_packs
@@ -36,6 +28,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from torch import Tensor
 
+    from liftcore.measure.experiments.subject import Subject
+
 TITLE = "Least squares under wrong masks"
 SOURCE = "the closed form against the smallest |A X - B|^2 (paper, Sec. 3.2), several dampings"
 PACK = "features_hard"
@@ -43,24 +37,6 @@ DAMPINGS = (0.0, 0.1, 0.3, 1.0)
 STEPS = 20
 COLUMNS = ("damping", "steps", "residual", "accuracy", "cosine", "miou")
 _SMALL = 1e-12
-
-
-class Subject(Protocol):
-    """A scene folder, of which every n-th feature view is taken."""
-
-    @property
-    def folder(self) -> Path: ...
-
-    @property
-    def every(self) -> int: ...
-
-
-@dataclass(frozen=True)
-class SceneFolder:
-    """A subject by its path."""
-
-    folder: Path
-    every: int = 1
 
 
 @dataclass(frozen=True)
@@ -162,31 +138,3 @@ def draw(figure: Figure, document: Mapping[str, Any]) -> None:
         axes.spines[["top", "right"]].set_visible(False)
     panels[0].legend(title="damping")
     figure.suptitle(document["title"])
-
-
-def main() -> None:
-    """Run it, write JSON and PNG, and print the rows."""
-    parser = argparse.ArgumentParser(prog="python -m liftcore.measure.experiments.overfitting", description=__doc__)
-    parser.add_argument("--scene", type=Path, default=Path("../shared/data/tabletop"), help="the tabletop scene")
-    parser.add_argument("--out", type=Path, required=True, help="the folder for JSON and PNG")
-    parser.add_argument("--every", type=int, default=4, help="take every n-th feature view")
-    options = parser.parse_args()
-    start = time.perf_counter()
-    document = {
-        "experiment": "overfitting",
-        "title": TITLE,
-        "source": SOURCE,
-        "scene": options.scene.resolve().name,
-        **measure(SceneFolder(options.scene, options.every)),
-        "command": f"{parser.prog} --scene {options.scene} --out {options.out} --every {options.every}",
-        "date": datetime.now(UTC).date().isoformat(),
-        "seconds": time.perf_counter() - start,
-        "hardware": hardware(),
-    }
-    save_experiment(f"overfitting-{document['scene']}", document, draw, options.out)
-    for row in document["rows"]:
-        print("  ".join(f"{name} {row[name]}" for name in COLUMNS))
-
-
-if __name__ == "__main__":
-    main()

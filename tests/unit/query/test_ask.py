@@ -14,7 +14,7 @@ from PIL import Image
 
 from liftcore.artifact import Lift, LiftMetadata, load_lift, save_lift
 from liftcore.errors import InvalidLift, InvalidQuery, NotFound
-from liftcore.lift import input_file
+from liftcore.input_files import input_file
 from liftcore.query.ask import ask, look, top
 from liftcore.query.colours import NO_CLUSTER_COLOUR, SH_C0, cluster_colours, seen_colours
 from liftcore.query.pictures import attention_png, mask_png, overlay_png, render, render_png

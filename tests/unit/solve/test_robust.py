@@ -49,7 +49,8 @@ def sparse(view: np.ndarray) -> RegionWeights:
     starts = np.concatenate([[0], np.cumsum((view[splats] != 0).sum(axis=1))]).astype(np.int64)
     parts = splats, starts, columns.astype(np.int32), view[rows, columns].astype(np.float32)
     nothing = torch.zeros(0)
-    return RegionWeights(*(torch.from_numpy(part) for part in parts), nothing.int(), nothing)
+    tensors = [torch.from_numpy(part) for part in parts]
+    return RegionWeights(*tensors, evidence_splats=nothing.int(), evidence=nothing)
 
 
 def dense(weights: RegionWeights, like: np.ndarray) -> np.ndarray:
@@ -86,7 +87,7 @@ def defined(scene: Scene, steps: int) -> list[np.ndarray]:
         usual = sum((w * c).sum() for w, c in zip(first, cosines, strict=True)) / (sum(w.sum() for w in first) or 1.0)
         shares = [over(w.sum(axis=1, keepdims=True), D) for w in current]
         new = [w * ((1 - p) * c + p * usual) for w, c, p in zip(first, cosines, shares, strict=True)]
-        gain = over(D, sum(w.sum(axis=1, keepdims=True) for w in new))
+        gain = over(D, np.sum([w.sum(axis=1, keepdims=True) for w in new], axis=0))
         current = [np.where(gain > 0, w * gain, old) for w, old in zip(new, first, strict=True)]
     return current
 

@@ -1,0 +1,22 @@
+"""``splatlift experiment``: what the paper measured, on a scene of one's own."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from liftcore.commands.reply import reply
+
+if TYPE_CHECKING:
+    import argparse
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run one experiment; print its table, or its document with ``--json``; JSON and plot go to a folder."""
+    from liftcore.measure.experiments.run import run_experiment, table_of
+
+    document = run_experiment(options.name, options.scene, options.out, options.every)
+    lines = [f"{document['title']} ({document['source']})", "", *table_of(document), ""]
+    machine = ", ".join(f"{key} {value}" for key, value in document["hardware"].items())
+    lines += [f"{document['date']}, {document['seconds']:.0f} s on {machine}", *document["files"]]
+    reply(document, as_json=options.json, lines=lines)
+    return 0

@@ -1,0 +1,89 @@
+"""Each experiment runs as a command on a scene with truth, and finds what is known of that scene."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from liftcore.cli import EXPERIMENTS, main
+from liftcore.measure.experiments.report import page_of
+from tests.truth_scene import write_truth_scene
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The small scene, written once."""
+    return write_truth_scene(tmp_path_factory.mktemp("balls"))
+
+
+def run(name: str, scene: Path, out: Path) -> dict:
+    """The document that the command writes."""
+    assert main(["experiment", name, str(scene), "-o", str(out)]) == 0
+    with Image.open(out / f"{name}-{scene.name}.png") as plot:
+        assert min(plot.size) > 400
+    return json.loads((out / f"{name}-{scene.name}.json").read_text())
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_every_experiment_has_a_title_a_source_and_rows(scene, tmp_path, name, monkeypatch):
+    _keep_it_short(monkeypatch)
+    document = run(name, scene, tmp_path)
+    assert document["title"] and document["source"] and document["rows"]
+    assert all(column in row for row in document["rows"] for column in document["columns"])
+    assert document["command"].startswith(f"splatlift experiment {name}")
+    assert document["hardware"]["cores"] >= 1
+
+
+def _keep_it_short(monkeypatch):
+    """Fewer points a curve; each kind of point stays."""
+    from liftcore.measure.experiments import fidelity, lambda_sweep, mask_noise, overfitting, pose_noise
+
+    monkeypatch.setattr(fidelity, "PRESETS", ("row-sum", "tikhonov"))
+    monkeypatch.setattr(lambda_sweep, "PAIRS", ((1.0, 1.0), (1.2, 1.2), (0.5, 1.0)))
+    monkeypatch.setattr(mask_noise, "RATES", (0.0, 0.6))
+    monkeypatch.setattr(overfitting, "STEPS", 3)
+    monkeypatch.setattr(pose_noise, "SHARES", (0, 100))
+    monkeypatch.setattr(pose_noise, "SEEDS", (0,))
+
+
+def test_row_sums_stay_below_one(scene, tmp_path):
+    rows = run("row_sums", scene, tmp_path)["rows"]
+    assert [row["gain"] for row in rows] == [1.0, 1.2]
+    assert all(0 <= row["min"] <= row["mean"] <= 1 for row in rows)
+
+
+def test_wrong_masks_cost_accuracy(scene, tmp_path, monkeypatch):
+    _keep_it_short(monkeypatch)
+    rows = {(row["method"], row["rate"]): row for row in run("mask_noise", scene, tmp_path)["rows"]}
+    assert rows["row-sum", 0.0]["accuracy"] > 0.99
+    assert rows["row-sum", 0.6]["miou"] < rows["row-sum", 0.0]["miou"]
+
+
+def test_wrong_poses_cost_accuracy(scene, tmp_path, monkeypatch):
+    _keep_it_short(monkeypatch)
+    monkeypatch.setattr("liftcore.measure.noise.POSE_DEGREES", 15.0)
+    rows = {(row["method"], row["noisy_of_100"]): row for row in run("pose_noise", scene, tmp_path)["rows"]}
+    assert rows["tikhonov", 100]["miou"] < rows["tikhonov", 0]["miou"]
+
+
+def test_exact_masks_are_rendered_faithfully(scene, tmp_path, monkeypatch):
+    _keep_it_short(monkeypatch)
+    rows = {(row["pack"], row["preset"]): row for row in run("fidelity", scene, tmp_path)["rows"]}
+    assert rows["features_clean", "row-sum"]["cosine"] > 0.9
+    assert rows["features_hard", "row-sum"]["cosine"] < rows["features_clean", "row-sum"]["cosine"]
+
+
+def test_the_report_holds_every_table_and_plot(scene, tmp_path):
+    run("row_sums", scene, tmp_path / "found")
+    page = page_of(tmp_path / "found")
+    assert "## Row sums of A" in page
+    assert f"(found/row_sums-{scene.name}.png)" in page
+    assert page.count("\n| ") >= 3
+
+
+def test_a_folder_that_is_no_scene_is_bad_input(tmp_path, capsys):
+    assert main(["experiment", "row_sums", str(tmp_path)]) == 2
+    assert "point_cloud.ply" in capsys.readouterr().err
