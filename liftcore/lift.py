@@ -22,6 +22,7 @@ from liftcore.solve.all_rays import AllRays
 from liftcore.solve.certificate import certify
 from liftcore.solve.checkpoint import Checkpoint, identity, resumed
 from liftcore.solve.closed_form import Solution, solve_closed_form
+from liftcore.solve.kept_columns import kept_columns
 from liftcore.solve.least_squares import refine
 from liftcore.solve.reference import reference
 from liftcore.solve.robust import robust_weights
@@ -95,14 +96,17 @@ def lift(
         with run.timings.stage("geometry"), resumed(raster, checkpoint, key) as walked:
             scene = (sources.splats.count, sources.cameras)
             geometry = accumulate(walked, scene, sources.packs, sources.views, settings, store, progress)
-        solution = _solve(run, store, geometry)
+        weights, solution = _solve(run, store, geometry)
+        X, notes = _refine(run, sources, raster, geometry, solution)
+        aggregation = _aggregate(run, sources, raster, geometry, X) if settings.aggregation else None
+        if aggregation:
+            notes["aggregation"] = aggregation.facts
+            if settings.aggregation_resolve:
+                notes["aggregation"]["resolved"] = _resolve(run, weights, geometry, aggregation, X)
         facts: dict[str, Any] = {
             "weights_entries": sum(len(part.columns) for part in store),
             "views_without_camera": sources.unpaired,
         }
-    X, notes = _refine(run, sources, raster, geometry, solution)
-    aggregation = _aggregate(run, sources, raster, geometry, X) if settings.aggregation else None
-    notes |= {"aggregation": aggregation.facts} if aggregation else {}
     with run.timings.stage("certify"):
         certificate = certify(geometry, X, geometry.codebooks.__getitem__, settings, threads) | notes | facts
     return Lift(
@@ -124,8 +128,8 @@ def open_sources(splats: Path, cameras: Path, features: Sequence[Path], settings
     return Sources(scene, views, packs, names[:: settings.view_stride], unpaired)
 
 
-def _solve(run: Run, store: ViewWeights, geometry: Geometry) -> Solution:
-    """The closed form, from weights that the robust steps may have changed."""
+def _solve(run: Run, store: ViewWeights, geometry: Geometry) -> tuple[ViewWeights, Solution]:
+    """The weights, which the robust steps may have changed, and the closed form of them."""
     settings, books = run.settings, geometry.codebooks
     with run.timings.stage("robust"):
         weights = robust_weights(
@@ -133,7 +137,9 @@ def _solve(run: Run, store: ViewWeights, geometry: Geometry) -> Solution:
         )
     with run.timings.stage("solve"):
         dtype = getattr(torch, settings.dtype)
-        return solve_closed_form(weights, books.__getitem__, geometry.denominators, dtype, run.progress, run.threads)
+        return weights, solve_closed_form(
+            weights, books.__getitem__, geometry.denominators, dtype, run.progress, run.threads
+        )
 
 
 def _refine(
@@ -169,6 +175,19 @@ def _aggregate(run: Run, sources: Sources, raster: Raster, geometry: Geometry, X
     with run.timings.stage("aggregate"):
         lifted = (raster, sources.cameras, sources.packs, sources.views)
         return aggregate(X, geometry.evidence, lifted, run.settings, run.progress, run.threads)
+
+
+def _resolve(run: Run, weights: ViewWeights, geometry: Geometry, aggregation: Aggregation, X: torch.Tensor) -> float:
+    """Solve again, from the kept regions alone, for splats that took no cluster's feature; their share of all."""
+    if all(rows is None for rows in aggregation.kept):
+        return 0.0
+    with run.timings.stage("resolve"):
+        fewer, denominators = kept_columns(weights, aggregation.kept, X.shape[0])
+        books = geometry.codebooks.__getitem__
+        again = solve_closed_form(fewer, books, denominators, X.dtype, run.progress, run.threads).features
+        chosen = aggregation.own & torch.from_numpy(denominators > 0)
+        X[chosen] = again[chosen].to(X.dtype)
+        return float(chosen.float().mean())
 
 
 def _metadata(run: Run, sources: Sources, inputs: list[InputFile], certificate: dict[str, Any]) -> LiftMetadata:

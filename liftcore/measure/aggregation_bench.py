@@ -93,7 +93,7 @@ def run(count: int, views: int, size: tuple[int, int], channels: int) -> dict[st
             matches = match_regions(observation.labels.numpy(), kappa, rows, clustering.count)
             kept.add(observation.codebook, matches.clusters, matches.clusters >= 0)  # all, for the most work
     with stages.stage("merge"):
-        share = spread(features, clustering.labels, kept_means(kept, features.dtype))
+        share = float(spread(features, clustering.labels, kept_means(kept, features.dtype)).float().mean())
     total = {key: sum(stage[key] for stage in stages.seconds.values()) for key in ("wall", "processor")}
     return {
         "splats": count, "views": views, "width": size[0], "height": size[1], "channels": channels,

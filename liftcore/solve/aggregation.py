@@ -5,13 +5,14 @@
 3. Keep the regions whose IoU with their majority cluster's footprint reaches tau (`region_filter`).
 4. A cluster's feature is the mean of its kept regions' codebook rows, and its splats take it.
 
-Splats in no cluster, and those of clusters without a kept region, keep their own features. Grids have no regions to
-filter: where no view has any, a cluster's feature is the mean of its splats' features, weighted by evidence.
+Splats in no cluster, and those of clusters without a kept region, keep their own features, or with
+``aggregation_resolve`` are solved for again from the kept regions alone. Grids have no regions to filter: where no
+view has any, a cluster's feature is the mean of its splats' features, weighted by evidence.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -44,6 +45,8 @@ class Aggregation:
     clusters: Tensor  # [P] i32, -1 = in no cluster
     cluster_features: Tensor  # [K, F] like the features; a zero row where the splats keep their own
     facts: dict[str, Any]  # for the certificate
+    own: Tensor  # [P] bool, the splats that kept their own features
+    kept: tuple[np.ndarray | None, ...]  # [M_v] bool a view, the regions that were kept; None = no regions to filter
 
 
 @dataclass
@@ -53,6 +56,7 @@ class KeptRegions:
     sums: np.ndarray  # [K, F] f64, of their codebook rows
     counts: np.ndarray  # [K] i64, how many they are
     regions: int = 0  # of all views, kept or not
+    masks: dict[str, np.ndarray] = field(default_factory=dict)  # view -> [M] bool, which codebook rows are kept
 
     def add(self, codebook: Tensor, clusters: np.ndarray, kept: np.ndarray) -> None:
         """Add the kept rows [M] bool of a codebook [M, F] to their clusters [M]."""
@@ -81,18 +85,20 @@ def aggregate(
     progress("aggregate", 0, len(names), "views")
     clustering = cluster_splats(features, evidence, settings, threads)
     region_views = [name for name in names if views[2].is_regions(name)]
+    masks: dict[str, np.ndarray] = {}
     if clustering.count == 0:
         merged, facts = torch.zeros(0, features.shape[1], dtype=features.dtype), {}
     elif region_views:
         kept = filter_regions(clustering, features.shape[1], views, settings, progress)
-        merged = kept_means(kept, features.dtype)
+        merged, masks = kept_means(kept, features.dtype), kept.masks
         facts = {"filter": "iou", "regions": kept.regions, "kept_regions": int(kept.counts.sum())}
     else:
         merged = evidence_means(features, evidence, clustering)
         facts = {"filter": "none: grids have no regions"}
-    share = spread(features, clustering.labels, merged)
+    taken = spread(features, clustering.labels, merged)
     progress("aggregate", len(names), len(names), "views")
-    return Aggregation(clustering.labels, merged, clustering_facts(clustering, merged) | facts | {"changed": share})
+    facts = clustering_facts(clustering, merged) | facts | {"changed": float(taken.float().mean())}
+    return Aggregation(clustering.labels, merged, facts, ~taken, tuple(masks.get(name) for name in names))
 
 
 def clustering_facts(clustering: Clustering, merged: Tensor) -> dict[str, Any]:
@@ -126,6 +132,7 @@ def filter_regions(
             matches = match_regions(observation.labels.numpy(), kappa, rows, clustering.count)
             reliable = (matches.clusters >= 0) & (matches.ious >= settings.aggregation_iou)
             kept.add(observation.codebook, matches.clusters, reliable)
+            kept.masks[name] = reliable
             kept.regions += int(matches.present.sum())
         progress("aggregate", number + 1, len(names), "views")
     return kept
@@ -159,11 +166,11 @@ def evidence_means(features: Tensor, evidence: np.ndarray, clustering: Clusterin
     return torch.from_numpy(means).to(features.dtype)
 
 
-def spread(features: Tensor, labels: Tensor, merged: Tensor) -> float:
-    """Give every splat its cluster's feature, where there is one; the share of splats that took one."""
+def spread(features: Tensor, labels: Tensor, merged: Tensor) -> Tensor:
+    """Give every splat its cluster's feature, where there is one; which splats took one, [P] bool."""
     filled = torch.cat([(merged != 0).any(dim=1), torch.zeros(1, dtype=torch.bool)])  # the last is label -1
     taken = filled[labels.long()]
     for first in range(0, features.shape[0], BLOCK):
         rows = first + torch.nonzero(taken[first : first + BLOCK])[:, 0]
         features[rows] = merged[labels[rows].long()]
-    return float(taken.float().mean())
+    return taken

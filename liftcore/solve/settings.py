@@ -77,6 +77,9 @@ class LiftSettings(BaseModel):
     aggregation_cluster_size: int = Field(500, ge=2, le=10_000_000, description="splats at least in a cluster")
     aggregation_neighbours: int = Field(10, ge=1, le=1_000, description="neighbours that a splat's density reaches")
     aggregation_sample: int = Field(10_000, ge=2, le=50_000, description="splats that HDBSCAN sees")
+    aggregation_resolve: bool = Field(
+        False, description="splats without a cluster's feature are solved for again from the kept regions alone"
+    )
     aggregation_channels: int = Field(50, ge=1, le=1_024, description="principal components that it sees")
     certificate_rays: int = Field(10_000, ge=0, le=10_000_000, description="rays sampled for the certificate")
     seed: int = Field(0, ge=0, lt=2**31, description="of samples, random projections and strides")
@@ -95,6 +98,12 @@ class LiftSettings(BaseModel):
         name = values.get("preset", Preset.TIKHONOV)
         known = isinstance(name, str) and name in set(Preset)
         return {**_PRESETS[Preset(name)], **values} if known else values
+
+    @model_validator(mode="after")
+    def _resolves_whole_regions(self) -> Self:
+        if self.aggregation_resolve and self.levels == "composite":
+            raise ValueError("aggregation_resolve drops regions, which levels=composite cuts to pieces")
+        return self
 
     @classmethod
     def of(cls, /, **values: Any) -> Self:

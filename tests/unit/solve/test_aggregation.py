@@ -21,6 +21,7 @@ from liftcore.raster.cpu import CpuRaster
 from liftcore.raster.oracle import OracleRaster, dense_view
 from liftcore.scene.cameras import Cameras
 from liftcore.scene.inria import write_inria_cameras
+from liftcore.scene.load import load_cameras, load_splats
 from liftcore.scene.ply import write_splats
 from liftcore.solve.accumulate import render_walk
 from liftcore.solve.aggregation import KeptRegions, evidence_means, filter_regions, kept_means, spread
@@ -84,7 +85,7 @@ def test_splats_take_the_mean_of_their_clusters_kept_regions_and_the_others_keep
         for row in np.flatnonzero(chosen):
             own[clusters[row]].append(codebook[row].double().numpy())
     merged = kept_means(kept, torch.float32)
-    share = spread(features, torch.tensor(labels, dtype=torch.int32), merged)
+    share = float(spread(features, torch.tensor(labels, dtype=torch.int32), merged).float().mean())
     took = 0
     for j, label in enumerate(labels):
         if label >= 0 and own[label]:
@@ -156,6 +157,41 @@ def test_a_lift_with_aggregation_has_one_feature_a_cluster_and_says_so(tmp_path,
     assert torch.equal(opened.features[taken], opened.cluster_features[opened.cluster[taken].long()])
     agree = opened.features[taken].float()[:, :2].argmax(dim=1) == side[taken]
     assert float(agree.float().mean()) > 0.95
+
+
+def test_what_takes_no_cluster_is_solved_again_as_if_the_other_regions_had_never_been(tmp_path):
+    (splats, cameras, features), _ = write_scene(tmp_path, "regions")
+    # A third of the first view is a region that no cluster confirms.
+    packs = open_packs([features])
+    maps = {name: packs.observation(name) for name in packs.views}
+    first = maps["v0"]
+    assert isinstance(first, RegionMap)
+    labels = first.labels.clone()
+    labels[:, :, 7:13] = 2
+    wrong = RegionMap(labels, torch.cat([first.codebook, torch.eye(6)[5:].to(first.codebook.dtype)]))
+    write_pack(features, maps | {"v0": wrong}, {"encoder": "random"})
+    knobs = KNOBS | {"aggregation_iou": 0.3, "dtype": "float32"}
+    result = lift(splats, cameras, [features], LiftSettings.of(aggregation=True, aggregation_resolve=True, **knobs))
+    facts = result.metadata.certificate["aggregation"]
+    assert facts["kept_regions"] < facts["regions"] and facts["resolved"] > 0
+
+    lifted = (CpuRaster(load_splats(splats)), load_cameras(cameras), open_packs([features]), result.metadata.views)
+    assert result.cluster is not None and result.cluster_features is not None
+    clustering = clustering_of(result.cluster.numpy(), result.cluster_features.shape[0])
+    kept = filter_regions(clustering, 6, lifted, LiftSettings.of(aggregation=True, **knobs), silent).masks
+    for name, observation in (maps | {"v0": wrong}).items():
+        if name in kept and isinstance(observation, RegionMap):
+            dropped = torch.from_numpy(~kept[name])
+            observation.labels[(observation.labels >= 0) & dropped[observation.labels.clamp_min(0).long()]] = -1
+            maps[name] = observation
+    write_pack(tmp_path / "kept.safetensors", maps, {"encoder": "random"})
+    without = lift(
+        splats, cameras, [tmp_path / "kept.safetensors"], LiftSettings.of(**(knobs | {"aggregation_iou": 0.75}))
+    )
+    own = ~(result.cluster_features != 0).any(dim=1)[result.cluster.long()] | (result.cluster < 0)
+    again = own & without.seen
+    assert facts["resolved"] == pytest.approx(float(again.float().mean()))
+    assert torch.allclose(result.features[again], without.features[again], atol=1e-6)
 
 
 def test_a_lift_without_clusters_is_the_lift_without_aggregation_and_says_so(tmp_path):
