@@ -36,8 +36,8 @@ PACKS = ("features_clean", "features", "features_hard", "grids", "regions")
 PRESETS = ("row-sum", "tikhonov", "argmax", "top-k", "front-mass", "centre", "mean")
 PIXELS = 1_000  # a view
 NOTE = (
-    "Vectors of one encoder lie in a narrow cone, so that even unlike ones have a large cosine: compare rows, and read "
-    "no quality into a figure by itself."
+    "Vectors of one encoder lie in a narrow cone, so that even unlike ones have a large cosine: compare rows, and "
+    "read no quality into a figure by itself."
 )
 COLUMNS = ("pack", "preset", "views", "cosine", "held_out_views", "held_out_cosine")
 
