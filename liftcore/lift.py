@@ -122,8 +122,9 @@ def lift(
 
 def open_sources(splats: Path, cameras: Path, features: Sequence[Path], settings: LiftSettings) -> Sources:
     """Open what a lift is made from; views are paired by name, and every ``view_stride``-th is lifted."""
-    scene, views, packs = load_splats(splats), load_cameras(cameras), open_packs(features)
+    scene, views = load_splats(splats), load_cameras(cameras)
     check_antialiased(scene.kernel, settings.antialiased)
+    packs = open_packs(features)
     names, unpaired = pair(packs, views)
     return Sources(scene, views, packs, names[:: settings.view_stride], unpaired)
 
