@@ -10,6 +10,7 @@ processor seconds, of all threads together, hardly do.
 from __future__ import annotations
 
 import argparse
+import importlib
 import json
 import time
 from contextlib import contextmanager
@@ -79,8 +80,7 @@ def run(count: int, views: int, size: tuple[int, int], channels: int) -> dict[st
     observations = [room_regions(camera, k, levels=4, channels=channels) for k, camera in enumerate(cameras)]
     features = grouped_features(splats.means, channels)
     warm_up()
-    import hdbscan  # noqa: F401  (what it takes to load is no part of the clustering)
-
+    importlib.import_module("hdbscan")  # what it takes to load is no part of the clustering
     raster, stages = CpuRaster(splats), Stages()
     with stages.stage("cluster"):
         clustering = cluster_splats(features, np.ones(count), settings)

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from liftcore.solve.principal_axes import principal_axes
+
 if TYPE_CHECKING:
     from torch import Tensor
 
@@ -38,7 +40,7 @@ def principal_colours(features: Tensor, weights: Tensor) -> Tensor:
     rows = _draw(odds)
     sample = _unit(features[rows])
     centre = sample.mean(dim=0)
-    axes = _axes(sample - centre)
+    axes = torch.from_numpy(principal_axes((sample - centre).numpy(), COMPONENTS))
     shown = (sample - centre) @ axes
     low, high = torch.quantile(shown, torch.tensor(_RANGE), dim=0)
     for first in range(0, features.shape[0], _BLOCK):
@@ -53,13 +55,6 @@ def _draw(odds: Tensor) -> Tensor:
     running = torch.cumsum(odds.double(), dim=0)
     marks = torch.rand(SAMPLE, generator=torch.Generator().manual_seed(SEED), dtype=torch.float64) * running[-1]
     return torch.searchsorted(running, marks, right=True).clamp_max(len(odds) - 1)
-
-
-def _axes(centred: Tensor) -> Tensor:
-    """[F, at most 3], the directions of the largest variance."""
-    vectors = torch.linalg.eigh(centred.T @ centred / len(centred)).eigenvectors.flip(1)[:, :COMPONENTS]
-    largest = vectors.abs().argmax(dim=0)
-    return vectors * vectors.gather(0, largest[None]).sign()
 
 
 def _unit(rows: Tensor) -> Tensor:

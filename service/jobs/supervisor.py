@@ -68,8 +68,12 @@ class Supervisor:
                     continue
             except Exception:  # the thread must outlive a full disk or a locked database
                 log.exception("the supervisor stumbled")
-            with self._bell:
-                self._bell.wait_for(lambda: self._rung != rung or self._stopping.is_set(), IDLE_SECONDS)  # noqa: B023
+            self._rest(rung)
+
+    def _rest(self, rung: int) -> None:
+        """Wait for a ring of the bell after that one, for a stop, or for IDLE_SECONDS."""
+        with self._bell:
+            self._bell.wait_for(lambda: self._rung != rung or self._stopping.is_set(), IDLE_SECONDS)
 
     def _run(self, job: JobRecord) -> None:
         try:

@@ -1,11 +1,12 @@
 """How the field measures open-vocabulary segmentation: three protocols whose numbers cannot be compared.
 
-| protocol | what is segmented | localised when |
-|---|---|---|
-| P1 | features are rendered, a relevancy map is made in 2D and cut at 0.4 (LangSplat) | its peak lies in a box of the object |
-| P2 | splats are selected in 3D and their silhouette is rendered alone (OpenGaussian) | IoU of at least 0.25 (and 0.5) |
-| P3 | splats are scored in 3D, scores are rendered and cut in 2D (LaGa, Splat Feature Solver) | its peak lies in the object's mask |
-"""  # noqa: E501
+- P1 (LangSplat): features are rendered, a relevancy map is made in 2D and cut at 0.4. Localised when its peak lies in
+  a box of the object.
+- P2 (OpenGaussian): splats are selected in 3D and their silhouette is rendered alone. Localised at an IoU of at least
+  0.25 (and 0.5).
+- P3 (LaGa, Splat Feature Solver): splats are scored in 3D, scores are rendered and cut in 2D. Localised when the peak
+  of the map lies in the object's mask.
+"""
 
 from __future__ import annotations
 

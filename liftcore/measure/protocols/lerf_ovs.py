@@ -1,4 +1,4 @@
-"""LeRF-OVS labels: ``label/SCENE/frame_XXXXX.json``, polygons as the annotation tool ISAT writes them."""
+"""LeRF-OVS labels: ``label/SCENE/frame_*.json``, polygons as the annotation tool ISAT writes them."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def lerf_scenes(data: Path) -> dict[str, LerfScene]:
         if files:
             found[folder.name] = LerfScene(folder.name, files)
     if not found:
-        raise InvalidInput("--data", expected="LeRF-OVS with label/SCENE/frame_XXXXX.json", got=f"none in {data}")
+        raise InvalidInput("--data", expected="LeRF-OVS with label/SCENE/frame_*.json", got=f"none in {data}")
     return found
 
 

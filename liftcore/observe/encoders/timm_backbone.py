@@ -11,6 +11,7 @@ import torch
 from liftcore.errors import InvalidInput, Unavailable
 from liftcore.observe.encoders import Pixels
 from liftcore.observe.encoders.cell_shift import cell_shift, kept, shifted
+from liftcore.query.encoders.open_clip_models import WEIGHT_SUFFIXES
 from liftcore.query.encoders.torchvision_ops import import_torchvision
 
 if TYPE_CHECKING:
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
 
     from torch import Tensor
 
-WEIGHT_SUFFIXES = (".safetensors", ".pt", ".pth", ".bin", ".ckpt")
 # What checkpoints hold beside the backbone: classifiers, and what only the training needed.
 _LEFT_OVER = ("mask_token",)
 _PROBE = (2, 3)  # rows and columns of the grid that a new encoder must give

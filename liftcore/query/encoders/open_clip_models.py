@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from torch import Tensor
 
-# open_clip reads these with weights_only; its loader of big_vision .npz files has no such switch.
+# open_clip and timm read these with weights_only; the loader of big_vision .npz files has no such switch.
 WEIGHT_SUFFIXES = (".safetensors", ".pt", ".pth", ".bin", ".ckpt")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -41,9 +42,9 @@ Encode = Callable[..., tuple[Encoded, dict[str, Tensor]]]
 
 @pytest.fixture
 def encode(tmp_path: Path) -> Encode:
-    def run(folder: Path, encoder: MeanColour | None = None, **settings: object) -> tuple[Encoded, dict[str, Tensor]]:
+    def run(folder: Path, encoder: MeanColour | None = None, **settings: Any) -> tuple[Encoded, dict[str, Tensor]]:
         out = tmp_path / "out" / "pack.safetensors"
-        chosen = EncodeSettings(**({"normalised": False} | settings))  # type: ignore[arg-type]
+        chosen = EncodeSettings(**{"normalised": False, **settings})
         done = encode_images(find_images([folder]), encoder or MeanColour(), out, chosen)
         assert [path.name for path in out.parent.iterdir()] == [out.name]
         packs = open_packs([out])
