@@ -14,7 +14,8 @@ import uvicorn
 from pydantic import ValidationError
 
 from liftcore.errors import SplatliftError
-from service.app import assemble
+from service.app import assemble, pace_of
+from service.connection import watched
 from service.errors import Misconfigured
 from service.jobs.streams import EventStreams
 from service.settings import ServiceSettings
@@ -112,7 +113,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     try:
         app = assemble(settings, store)
-        config = uvicorn.Config(app, log_level="warning", server_header=False)
+        connection = watched(pace_of(settings), settings.max_connections)
+        config = uvicorn.Config(app, http=connection, log_level="warning", server_header=False)
         AnnouncingServer(config, app.state.streams).run(sockets=[listener])
     finally:
         store.close()

@@ -14,7 +14,7 @@ from service import problems
 from service.jobs.limits import LiftLimits
 from service.jobs.streams import EventStreams
 from service.jobs.supervisor import Supervisor
-from service.limits import BodyLimit
+from service.limits import BodyLimit, Pace
 from service.parts import Parts
 from service.queries.warm import QueryLimits, WarmWorker
 from service.routes import assets, jobs, lifts, operations, queries
@@ -52,7 +52,7 @@ def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, work
         responses=problems.RESPONSES,
     )
     app.state.streams = streams
-    app.add_middleware(BodyLimit, limit=settings.max_body_bytes)
+    app.add_middleware(BodyLimit, limit=settings.max_body_bytes, pace=pace_of(settings))
     problems.install(app)
     for module in (operations, assets, jobs, lifts, queries):
         app.include_router(module.router)
@@ -69,6 +69,11 @@ def assemble(settings: ServiceSettings, store: Store) -> FastAPI:
         encoder=settings.encoder,
     )
     return create_app(settings, store, Supervisor(store, lift_limits(settings)), WarmWorker(limits))
+
+
+def pace_of(settings: ServiceSettings) -> Pace:
+    """What the settings ask of clients."""
+    return Pace(settings.min_bytes_per_second, settings.slow_grace_seconds, settings.header_seconds)
 
 
 def lift_limits(settings: ServiceSettings) -> LiftLimits:

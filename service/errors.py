@@ -4,8 +4,8 @@ SplatliftError
 └── ServiceError
     ├── InvalidRequest       a parameter or a body that no route understands   422
     ├── DigestMismatch       the body is not what ?sha256= promised            422
-    ├── InvalidEncoding      a gzip body that does not decompress              422
-    ├── UnsupportedEncoding  a Content-Encoding that is not gzip               415
+    ├── InvalidEncoding      a compressed body that does not decompress        422
+    ├── UnsupportedEncoding  a Content-Encoding that is neither gzip nor zstd  415
     ├── TooLarge             more bytes than the operator allows               413
     ├── RangeNotSatisfiable  a Range beyond the end of the content             416
     ├── InUse                an asset that a job or a lift needs               409

@@ -56,6 +56,7 @@ FRAMEWORK: dict[int, tuple[str, str]] = {
     400: ("malformed-request", "The request is malformed"),
     404: ("no-such-route", "There is no such route"),
     405: ("method-not-allowed", "The route does not take this method"),
+    408: ("too-slow", "The request came too slowly"),
     413: ("too-large", "The body is too large"),
 }
 

@@ -22,10 +22,17 @@ class ServiceSettings(BaseSettings):
     host: str = Field("127.0.0.1", description="the address to bind; loopback only until there are keys")
     port: int = Field(8787, ge=0, le=65_535, description="the port to bind; 0 picks a free one")
 
-    max_splats_bytes: int = Field(4 * GiB, gt=0, description="the largest splat file, before and after gzip")
-    max_cameras_bytes: int = Field(256 * MiB, gt=0, description="the largest camera file, before and after gzip")
-    max_features_bytes: int = Field(16 * GiB, gt=0, description="the largest feature pack, before and after gzip")
+    max_splats_bytes: int = Field(4 * GiB, gt=0, description="the largest splat file, compressed or not")
+    max_cameras_bytes: int = Field(256 * MiB, gt=0, description="the largest camera file, compressed or not")
+    max_features_bytes: int = Field(16 * GiB, gt=0, description="the largest feature pack, compressed or not")
     max_body_bytes: int = Field(MiB, gt=0, description="the largest body of any request that is not an upload")
+
+    min_bytes_per_second: int = Field(
+        1024, ge=1, description="the least speed of a client that sends a body; slower ones get 408 and are cut off"
+    )
+    slow_grace_seconds: float = Field(10, gt=0, description="the time over which that speed is measured")
+    header_seconds: float = Field(10, gt=0, description="how long the headers of a request may take to come")
+    max_connections: int = Field(400, ge=1, description="connections that may be open; more get 503")
 
     parallel_checks: int = Field(2, ge=1, le=64, description="uploads that are validated at the same time")
     check_seconds: float = Field(300, gt=0, description="wall time that the validation of one upload may take")

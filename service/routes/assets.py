@@ -18,7 +18,8 @@ from service.parts import Here
 from service.store.assets import AssetRecord, CheckedUpload
 from service.store.files import DataDirectory
 from service.uploads.checking import CheckLimits, check
-from service.uploads.intake import Intake, gzipped
+from service.uploads.decoding import coding_of
+from service.uploads.intake import Intake
 
 BATCH = 1 << 20  # bytes gathered before a thread writes them
 
@@ -31,7 +32,7 @@ Sha256 = Annotated[
 RAW_BODY = {
     "requestBody": {
         "required": True,
-        "description": "the file itself, with Content-Encoding: gzip if it is compressed",
+        "description": "the file itself, with Content-Encoding: gzip or zstd if it is compressed",
         "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}},
     }
 }
@@ -46,10 +47,10 @@ RAW_BODY = {
 )
 async def upload(kind: wire.AssetKind, request: Request, here: Here, sha256: Sha256 = None) -> Response:
     """Upload splats (PLY), cameras (JSON or a zip of a COLMAP model) or a feature pack (safetensors)."""
-    gzip = gzipped(request.headers.get("content-encoding", ""))
+    coding = coding_of(", ".join(request.headers.getlist("content-encoding")))
     here.store.files.require_room()
     async with _workspace(here.store.files, kind) as (draft, scratch):
-        with Intake(draft, limit=here.settings.max_upload_bytes(kind), gzip=gzip) as intake:
+        with Intake(draft, limit=here.settings.max_upload_bytes(kind), coding=coding) as intake:
             await _receive(request, intake, here.store.files)
             digest = intake.finish()
         if sha256 is not None and digest != sha256.lower():

@@ -4,18 +4,27 @@ from __future__ import annotations
 
 import gzip
 import hashlib
+import json
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
+import zstandard
 from fastapi import Request
 from fastapi.testclient import TestClient
+from hypothesis import given
+from hypothesis import strategies as st
 
 from liftcore.errors import NotFound
+from liftcore.observe.inspect import inspect_file
 from service.content import file_answer
+from service.uploads.decoding import GZIP, ZSTD, Coding, Decoding
+from service.wire import AssetKind
 
 from .conftest import Uploaded
-from .tiny_scene import TinyScene, ply, splat_rows
+from .tiny_scene import CHANNELS, TinyScene, cameras_document, codebook, labels, pack, ply, splat_rows
 
 
 def test_same_bytes_are_the_same_asset(client: TestClient, uploaded: Uploaded, scene: TinyScene) -> None:
@@ -24,17 +33,66 @@ def test_same_bytes_are_the_same_asset(client: TestClient, uploaded: Uploaded, s
     assert uploaded.splats == f"sha256:{hashlib.sha256(scene.splats).hexdigest()}"
 
 
-def test_gzip_gives_the_asset_of_the_content(client: TestClient, uploaded: Uploaded, scene: TinyScene) -> None:
+@pytest.mark.parametrize("coding", ["gzip", "x-gzip", "zstd", "ZSTD"])
+def test_compressed_upload_gives_the_asset_of_the_content(
+    client: TestClient, uploaded: Uploaded, scene: TinyScene, coding: str
+) -> None:
+    compress = zstandard.ZstdCompressor().compress if coding.lower() == "zstd" else gzip.compress
     half = len(scene.splats) // 2
-    parts = gzip.compress(scene.splats[:half]) + gzip.compress(scene.splats[half:])
     digest = uploaded.splats.removeprefix("sha256:")
     reply = client.put(
         "/assets/splats",
-        content=parts,
-        headers={"Content-Encoding": "gzip"},
+        content=compress(scene.splats[:half]) + compress(scene.splats[half:]),
+        headers={"Content-Encoding": coding},
         params={"sha256": digest.upper()},
     )
     assert reply.status_code == 200 and reply.json()["id"] == uploaded.splats
+
+
+@given(
+    content=st.binary(max_size=5_000),
+    cuts=st.lists(st.integers(0, 5_000), max_size=4),
+    pieces=st.integers(1, 700),
+    coding=st.sampled_from([GZIP, ZSTD]),
+)
+def test_what_was_compressed_comes_out_however_it_is_cut(
+    content: bytes, cuts: list[int], pieces: int, coding: Coding
+) -> None:
+    compress = gzip.compress if coding is GZIP else zstandard.ZstdCompressor(write_checksum=True).compress
+    ends = [0, *sorted(cuts), len(content)]
+    body = b"".join(compress(content[first:last]) for first, last in pairwise(ends))
+    decoded = Decoding(coding)
+    found = b"".join(
+        out for first in range(0, len(body), pieces) for out in decoded.feed(body[first : first + pieces])
+    )
+    decoded.finish()
+    assert found == content
+
+
+def worth_a_warning() -> dict[str, bytes]:
+    """A file of each kind that is valid and looks wrong."""
+    rows = splat_rows()
+    rows[0, 10:14] = 0.0  # no rotation
+    rows[1, 6] = -9.0  # never seen
+    document = cameras_document()
+    frames = document["frames"]
+    assert isinstance(frames, list)
+    frames[1]["transform_matrix"] = frames[0]["transform_matrix"]
+    unread = np.concatenate([codebook(), np.zeros((1, CHANNELS), np.float32)])
+    return {"splats": ply(rows), "cameras": json.dumps(document).encode(), "features": pack(labels(), unread)}
+
+
+@pytest.mark.parametrize("kind", list(AssetKind))
+def test_asset_keeps_the_warnings_of_inspect(client: TestClient, tmp_path: Path, kind: AssetKind) -> None:
+    content = worth_a_warning()[kind]
+    file = tmp_path / "file"
+    file.write_bytes(content)
+    warned = inspect_file(file)["warnings"]
+    assert warned
+    asset = client.put(f"/assets/{kind}", content=content)
+    assert asset.status_code == 201 and asset.json()["warnings"] == warned
+    assert client.get(asset.headers["location"]).json()["warnings"] == warned
+    assert client.delete(asset.headers["location"]).status_code == 204
 
 
 def test_body_may_come_in_pieces_of_unknown_number(client: TestClient, uploaded: Uploaded, scene: TinyScene) -> None:
