@@ -4,34 +4,43 @@ from __future__ import annotations
 
 import argparse
 import ipaddress
-import logging
+import math
+import signal
 import socket
 import sys
 from collections.abc import Sequence
+from types import FrameType
 from typing import Any
 
 import uvicorn
+from fastapi import FastAPI
 from pydantic import ValidationError
 
 from liftcore.errors import SplatliftError
 from service.app import assemble, pace_of
 from service.connection import watched
 from service.errors import Misconfigured
-from service.jobs.streams import EventStreams
+from service.logs import start_logging
 from service.settings import ServiceSettings
+from service.stopping import Stopping
 from service.store.store import Store
 
 
 class AnnouncingServer(uvicorn.Server):
-    """Says on stdout where it listens, once it does, and to streams that it ends, before it waits for their end."""
+    """Says on stdout where it listens, once it does, and stops in order: what it is told to stop by is no failure."""
 
-    def __init__(self, config: uvicorn.Config, streams: EventStreams) -> None:
+    def __init__(self, config: uvicorn.Config, stopping: Stopping) -> None:
         super().__init__(config)
-        self._streams = streams
+        self._stopping = stopping
+
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        """Stop at the first signal; at a second SIGINT at once. uvicorn would die of the signal after the stop."""
+        self.force_exit = self.force_exit or (self.should_exit and sig == signal.SIGINT)
+        self.should_exit = True
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """Stop in order."""
-        self._streams.close()
+        """Refuse work and put back what runs while the port still answers, then close it."""
+        await self._stopping.begin()
         await super().shutdown(sockets)
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
@@ -101,9 +110,18 @@ def bind(host: str, port: int) -> socket.socket:
     return listener
 
 
+def server_of(app: FastAPI, settings: ServiceSettings) -> AnnouncingServer:
+    """The server of an application."""
+    connection = watched(pace_of(settings), settings.max_connections)
+    config = uvicorn.Config(
+        app, http=connection, log_config=None, log_level="warning", access_log=False, server_header=False, ws="none",
+        timeout_graceful_shutdown=math.ceil(settings.stop_seconds),
+    )  # fmt: skip
+    return AnnouncingServer(config, app.state.stopping)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the service until it is told to stop; the exit status."""
-    logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(levelname)s %(name)s: %(message)s")
     try:
         settings = parse(sys.argv[1:] if arguments is None else arguments)
         listener = bind(settings.host, settings.port)
@@ -111,11 +129,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except SplatliftError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    start_logging(settings.log_format)
     try:
         app = assemble(settings, store)
-        connection = watched(pace_of(settings), settings.max_connections)
-        config = uvicorn.Config(app, http=connection, log_level="warning", server_header=False)
-        AnnouncingServer(config, app.state.streams).run(sockets=[listener])
+        server_of(app, settings).run(sockets=[listener])
     finally:
         store.close()
         listener.close()

@@ -15,24 +15,36 @@ from service.jobs.limits import LiftLimits
 from service.jobs.streams import EventStreams
 from service.jobs.supervisor import Supervisor
 from service.limits import BodyLimit, Pace
+from service.metrics import Metrics
 from service.parts import Parts
 from service.queries.warm import QueryLimits, WarmWorker
+from service.readiness import Readiness
+from service.recorder import RecordedApp
 from service.routes import assets, jobs, lifts, operations, queries
 from service.settings import ServiceSettings
+from service.stopping import RefuseWork, Stopping
 from service.store.garbage import Collector
 from service.store.store import Store
+from service.versions import versions
 
 
 def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, worker: WarmWorker) -> FastAPI:
     """The application. It starts and stops the runner and the worker; the store is its caller's to close."""
 
     streams = EventStreams(settings.max_streams)
+    stopping = Stopping(streams, runner, notice_seconds=settings.notice_seconds)
+    readiness = Readiness(store, runner, worker, stopping)
+    metrics = Metrics(store, worker, streams, build=versions(settings.commit))
+    runner.tell(metrics.attempted)
+    worker.tell(metrics.queried)
     collector = Collector(store, every_seconds=settings.garbage_seconds, grace_seconds=settings.garbage_grace_seconds)
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        checks = anyio.CapacityLimiter(settings.parallel_checks)
-        app.state.parts = Parts(settings, store, runner, worker, streams, checks)
+        checks, scrapes = anyio.CapacityLimiter(settings.parallel_checks), anyio.CapacityLimiter(1)
+        app.state.parts = Parts(
+            settings, store, runner, worker, streams, checks, metrics=metrics, scrapes=scrapes, readiness=readiness
+        )
         await anyio.to_thread.run_sync(worker.start)
         await anyio.to_thread.run_sync(runner.start)
         collector.start()
@@ -44,15 +56,16 @@ def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, work
             await anyio.to_thread.run_sync(runner.stop)
             await anyio.to_thread.run_sync(worker.stop)
 
-    app = FastAPI(
+    app = RecordedApp(
         title="splatlift",
         version=__version__,
         description="Lift 2D features onto trained splat scenes and query them in words.",
         lifespan=lifespan,
         responses=problems.RESPONSES,
     )
-    app.state.streams = streams
+    app.state.stopping, app.state.metrics = stopping, metrics
     app.add_middleware(BodyLimit, limit=settings.max_body_bytes, pace=pace_of(settings))
+    app.add_middleware(RefuseWork, stopping=stopping)
     problems.install(app)
     for module in (operations, assets, jobs, lifts, queries):
         app.include_router(module.router)

@@ -15,7 +15,7 @@ from typing import ClassVar
 import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from service import problems
+from service import problems, request_id
 from service.limits import Pace
 from service.wire import Problem
 
@@ -121,7 +121,9 @@ def watched(pace: Pace, most: int) -> type[WatchedConnection]:
 def _answer(status: int, slug: str, title: str, detail: str, headers: Mapping[str, str]) -> bytes:
     """A problem as it goes over the wire when there is no request to answer."""
     problem = Problem(type=f"/problems/{slug}", title=title, status=status, detail=detail)
-    reply = problems.answer(problem, {**headers, "Connection": "close"})
+    made = request_id.chosen(())
+    with request_id.working_for(made):
+        reply = problems.answer(problem, {**headers, "Connection": "close", "X-Request-ID": made})
     lines = [f"HTTP/1.1 {status} {HTTPStatus(status).phrase}".encode()]
     lines += [name + b": " + value for name, value in reply.raw_headers]
     return b"\r\n".join([*lines, b"", bytes(reply.body)])

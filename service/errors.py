@@ -14,6 +14,7 @@ SplatliftError
     ├── OverLimit            a lift beyond the operator's time or memory       422
     ├── NoSpace              less free disk than the operator wants to keep    507
     ├── Busy                 too many queries or jobs are waiting              503 + Retry-After
+    ├── NotReady             a check of /readyz that failed                    503 + Retry-After
     ├── TimedOut             a query that took longer than the operator allows 504
     ├── Crashed              a process of ours died without an answer          500
     └── Misconfigured        the operator's settings or data directory         (start-up only)
@@ -108,6 +109,12 @@ class Busy(ServiceError):
     def __init__(self, argument: str, *, expected: str, got: str, hint: str = "", retry_after: int = 2) -> None:
         super().__init__(argument, expected=expected, got=got, hint=hint)
         self.retry_after = retry_after  # seconds, told in Retry-After
+
+
+class NotReady(Busy):
+    """The service cannot work now: it stops, or a check failed."""
+
+    kind = "not-ready"
 
 
 class TimedOut(ServiceError):

@@ -10,7 +10,9 @@ from fastapi import Depends, Request
 
 from service.jobs.streams import EventStreams
 from service.jobs.supervisor import Supervisor
+from service.metrics import Metrics
 from service.queries.warm import WarmWorker
+from service.readiness import Readiness
 from service.settings import ServiceSettings
 from service.store.store import Store
 
@@ -25,9 +27,13 @@ class Parts:
     queries: WarmWorker
     streams: EventStreams
     checks: anyio.CapacityLimiter  # uploads that are validated at the same time
+    metrics: Metrics
+    scrapes: anyio.CapacityLimiter  # those who read the metrics at the same time
+    readiness: Readiness
 
 
-def _parts(request: Request) -> Parts:
+# Async: a sync dependency waits for a thread of the pool, and every route with it.
+async def _parts(request: Request) -> Parts:
     return request.app.state.parts
 
 

@@ -14,13 +14,15 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
+from starlette.routing import Match
 
 from liftcore import errors as core
 from liftcore.errors import SplatliftError
-from service import errors
+from service import errors, request_id
 from service.wire import Problem
 
 MEDIA_TYPE = "application/problem+json"
+METHODS = ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS")
 NO_SPACE = "There is no room left"
 
 # Exception -> status and title. The nearest class in the exception's ancestry counts; `type` is its `kind`.
@@ -47,6 +49,7 @@ TABLE: dict[type[SplatliftError], tuple[int, str]] = {
     errors.OverLimit: (422, "The lift needs more than the server allows"),
     errors.NoSpace: (507, NO_SPACE),
     errors.Busy: (503, "The server is busy"),
+    errors.NotReady: (503, "The server is not ready"),
     errors.TimedOut: (504, "The query took too long"),
     errors.Crashed: (500, "A process of the server died"),
 }
@@ -88,13 +91,15 @@ def problem_of(error: SplatliftError) -> Problem:
 
 
 def answer(problem: Problem, headers: Mapping[str, str] | None = None) -> JSONResponse:
-    """The problem as a response."""
+    """The problem as a response to the request that is worked for."""
+    problem = problem.model_copy(update={"request_id": request_id.current()})
     told = {name: _plain(value) for name, value in problem.model_dump(exclude_none=True).items()}
     return JSONResponse(told, problem.status, headers=headers, media_type=MEDIA_TYPE)
 
 
 def install(app: FastAPI) -> None:
-    """Make every error of the application a problem."""
+    """Make every error of the application a problem. The handlers are async: a sync one would wait for a thread of
+    the pool, and a bad request behind every slow route."""
     app.add_exception_handler(SplatliftError, _on_known)
     app.add_exception_handler(RequestValidationError, _on_validation)
     app.add_exception_handler(HTTPException, _on_framework)
@@ -104,7 +109,7 @@ def install(app: FastAPI) -> None:
     app.add_exception_handler(Exception, _on_unexpected)
 
 
-def _on_known(request: Request, error: Exception) -> JSONResponse:
+async def _on_known(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, SplatliftError)
     headers: dict[str, str] = {}
     if isinstance(error, errors.Busy):
@@ -114,7 +119,7 @@ def _on_known(request: Request, error: Exception) -> JSONResponse:
     return answer(problem_of(error), headers)
 
 
-def _on_validation(request: Request, error: Exception) -> JSONResponse:
+async def _on_validation(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, RequestValidationError)
     first = error.errors()[0]
     place = [str(part) for part in first["loc"]]
@@ -127,35 +132,49 @@ def _on_validation(request: Request, error: Exception) -> JSONResponse:
     return answer(problem_of(known))
 
 
-def _on_framework(request: Request, error: Exception) -> JSONResponse:
+async def _on_framework(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, HTTPException)
     phrase = HTTPStatus(error.status_code).phrase
     slug, title = FRAMEWORK.get(error.status_code, (phrase.lower().replace(" ", "-"), phrase))
     detail = f"{request.method} {request.url.path}: {error.detail}"
     problem = Problem(type=f"/problems/{slug}", title=title, status=error.status_code, detail=detail)
-    return answer(problem, error.headers)
+    headers = dict(error.headers or {})
+    if error.status_code == HTTPStatus.METHOD_NOT_ALLOWED:
+        headers["Allow"] = ", ".join(_methods_of(request))
+    return answer(problem, headers)
 
 
-def _on_disconnect(request: Request, error: Exception) -> JSONResponse:
+async def _on_disconnect(request: Request, error: Exception) -> JSONResponse:
     # Nobody reads this; without it the log would tell of an error of ours.
     detail = "The client left before the end of the body."
     return answer(Problem(type="/problems/malformed-request", title=FRAMEWORK[400][1], status=400, detail=detail))
 
 
-def _on_system(request: Request, error: Exception) -> JSONResponse:
+async def _on_system(request: Request, error: Exception) -> JSONResponse:
     code = getattr(error, "errno", None)
     if code not in (errno.ENOSPC, errno.EDQUOT) and getattr(error, "sqlite_errorcode", None) != sqlite3.SQLITE_FULL:
-        return _on_unexpected(request, error)
+        return await _on_unexpected(request, error)
     log.error("%s %s: the disk is full", request.method, request.url.path)
     detail = "The server's disk is full; what was sent is not kept."
     return answer(Problem(type="/problems/no-space", title=NO_SPACE, status=507, detail=detail))
 
 
-def _on_unexpected(request: Request, error: Exception) -> JSONResponse:
+async def _on_unexpected(request: Request, error: Exception) -> JSONResponse:
     # The details go to the log: they may name files or values that are not the client's.
     log.error("%s %s failed", request.method, request.url.path, exc_info=error)
     detail = "Something went wrong on our side; the server's log has the details."
     return answer(Problem(type="/problems/internal", title="An error of the server", status=500, detail=detail))
+
+
+def _methods_of(request: Request) -> list[str]:
+    """What the path takes, by all of its routes: the framework tells of the first one only."""
+    scopes = {method: {**request.scope, "method": method} for method in METHODS}
+    routes = request.app.routes
+    return [
+        method
+        for method, scope in scopes.items()
+        if any(route.matches(dict(scope))[0] is Match.FULL for route in routes)
+    ]
 
 
 def _plain(value: Any) -> Any:

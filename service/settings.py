@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 from pydantic import Field
 from pydantic_settings import BaseSettings, SettingsConfigDict
@@ -21,6 +22,13 @@ class ServiceSettings(BaseSettings):
     data: Path = Field(Path("splatlift-data"), description="the directory that holds the database and all files")
     host: str = Field("127.0.0.1", description="the address to bind; loopback only until there are keys")
     port: int = Field(8787, ge=0, le=65_535, description="the port to bind; 0 picks a free one")
+
+    log_format: Literal["json", "text"] = Field("json", description="of the log on stderr: json or text")
+    commit: str | None = Field(None, description="the git commit that this was built from, for /version")
+    notice_seconds: float = Field(
+        0, ge=0, le=600, description="how long a stopping server still listens, for a load balancer to notice"
+    )
+    stop_seconds: float = Field(10, gt=0, le=600, description="time that open requests have to end in a stop")
 
     max_splats_bytes: int = Field(4 * GiB, gt=0, description="the largest splat file, compressed or not")
     max_cameras_bytes: int = Field(256 * MiB, gt=0, description="the largest camera file, compressed or not")

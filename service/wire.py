@@ -48,6 +48,7 @@ class Problem(BaseModel):
     expected: str | None = None
     got: str | None = None
     hint: str | None = None
+    request_id: Annotated[str | None, Field(description="as in X-Request-ID; the log has it too")] = None
 
 
 class Asset(BaseModel):
@@ -107,6 +108,7 @@ class Job(BaseModel):
     created: float
     started: float | None
     ended: float | None
+    request_id: str | None = Field(description="the X-Request-ID of the request that made it")
     links: dict[str, str]
 
 
@@ -256,3 +258,21 @@ class Health(BaseModel):
     """Whether the HTTP process answers."""
 
     status: str
+
+
+class Ready(BaseModel):
+    """The service can work."""
+
+    status: str
+    checks: list[str] = Field(description="what was looked at")
+
+
+class Version(BaseModel):
+    """What runs here."""
+
+    version: str = Field(description="of splatlift")
+    api: str = Field(description="of the routes and their JSON")
+    database: int = Field(description="of the database's schema")
+    commit: str | None = Field(description="the git commit that this was built from, if the operator said so")
+    python: str
+    packages: dict[str, str] = Field(description="versions of what matters most")

@@ -61,7 +61,7 @@ class Attempt:
             order.write_text(json.dumps(self._order(draft)), encoding="utf-8")
             environment = mark(self._job.id) | {"TMPDIR": str(scratch)}
             heard = _Heard()
-            self._log(f"attempt {self._job.attempt} begins{self._kept()}")
+            self._log(f"attempt {self._job.attempt} begins{self._asked()}{self._kept()}")
             with JobProcess([*self._command, str(order)], environment) as process:
                 why = self._follow(process, heard, stopping)
                 status = process.end()
@@ -133,6 +133,9 @@ class Attempt:
 
     def _log(self, text: str) -> None:
         self._store.attempts.log(self._job.id, self._job.attempt, text)
+
+    def _asked(self) -> str:
+        return f", asked for by request {self._job.request_id}" if self._job.request_id else ""
 
     def _kept(self) -> str:
         blocks = len(list(self._store.files.work(self._job.id).glob("*.safetensors")))

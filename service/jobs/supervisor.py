@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections.abc import Callable, Sequence
 
+from service import request_id
 from service.errors import Crashed
 from service.faults import fault_of
 from service.jobs.attempt import CHILD, Attempt
@@ -30,6 +32,7 @@ class Supervisor:
         self._bell = threading.Condition()
         self._rung = 0
         self._stopping = threading.Event()
+        self._told: Callable[[str, float], None] | None = None
         self._threads = [
             threading.Thread(target=self._loop, name=f"supervisor-{number}", daemon=True)
             for number in range(limits.parallel)
@@ -43,6 +46,14 @@ class Supervisor:
         self._store.attempts.lose_all("the server died")
         for thread in self._threads:
             thread.start()
+
+    def tell(self, told: Callable[[str, float], None]) -> None:
+        """Call this after each attempt, with the state that its job came to and the seconds that it took."""
+        self._told = told
+
+    def alive(self) -> bool:
+        """Whether all threads live."""
+        return all(thread.is_alive() for thread in self._threads)
 
     def wake(self) -> None:
         """Say that there is a new job."""
@@ -76,12 +87,19 @@ class Supervisor:
             self._bell.wait_for(lambda: self._rung != rung or self._stopping.is_set(), IDLE_SECONDS)
 
     def _run(self, job: JobRecord) -> None:
-        try:
-            Attempt(job, self._store, self._limits, self._command).run(self._stopping)
-        except Exception:
-            log.exception("job %s could not be run", job.id)
-            error = Crashed("job", expected="a process that runs", got="an error of the server")
-            self._insist(lambda: self._store.attempts.fail(job.id, job.attempt, fault_of(error)))
+        begun = time.monotonic()
+        with request_id.working_for(job.request_id):
+            log.info("job %s, attempt %d begins", job.id, job.attempt)
+            try:
+                Attempt(job, self._store, self._limits, self._command).run(self._stopping)
+            except Exception:
+                log.exception("job %s could not be run", job.id)
+                error = Crashed("job", expected="a process that runs", got="an error of the server")
+                self._insist(lambda: self._store.attempts.fail(job.id, job.attempt, fault_of(error)))
+            outcome, seconds = self._store.attempts.state(job.id) or "deleted", time.monotonic() - begun
+            log.info("job %s, attempt %d: %s after %.3f s", job.id, job.attempt, outcome, seconds)
+        if self._told is not None:
+            self._told(outcome, seconds)
 
     def _insist(self, note: Callable[[], None]) -> None:
         """Note the end of a job, however long the disk is full: else it would seem to run for ever."""

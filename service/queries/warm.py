@@ -7,10 +7,12 @@ import logging
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
+from liftcore.errors import SplatliftError
 from service.errors import Busy, Crashed, TimedOut
 from service.faults import error_of
 from service.queries.frames import Frame, read_frame, write_frame
@@ -38,6 +40,8 @@ class WarmWorker:
         self._turn = threading.Lock()
         self._process: subprocess.Popen[bytes] | None = None
         self._stopped = False
+        self._told: Callable[[str, str, float], None] | None = None
+        self._spawned = 0
 
     def start(self) -> None:
         """Start the process, so that the first query finds it warm."""
@@ -53,7 +57,49 @@ class WarmWorker:
         with self._turn:
             self._bury()
 
+    def tell(self, told: Callable[[str, str, float], None]) -> None:
+        """Call this after each call, with its operation, what came of it and the seconds that it took."""
+        self._told = told
+
+    @property
+    def restarts(self) -> int:
+        """Processes after the first."""
+        return max(0, self._spawned - 1)
+
+    def alive(self) -> bool:
+        """Whether the process lives."""
+        process = self._process
+        return process is not None and process.poll() is None
+
+    def revive(self) -> bool:
+        """Whether the process lives; when it does not, and no call is about to see to it, a new one starts."""
+        if self.alive() or self._stopped or not self._turn.acquire(blocking=False):
+            return self.alive()
+        try:
+            self._spawn()
+        finally:
+            self._turn.release()
+        return False
+
     def call(self, request: dict[str, Any]) -> Frame:
+        """Ask the worker, and tell what came of it.
+
+        Raises:
+            SplatliftError: as `_call` does.
+        """
+        begun, outcome = time.monotonic(), "crashed"
+        try:
+            reply = self._call(request)
+            outcome = "answered"
+        except SplatliftError as error:
+            outcome = error.kind
+            raise
+        finally:
+            if self._told is not None:
+                self._told(request["operation"], outcome, time.monotonic() - begun)
+        return reply
+
+    def _call(self, request: dict[str, Any]) -> Frame:
         """Ask the worker.
 
         Raises:
@@ -128,6 +174,7 @@ class WarmWorker:
         self._bury()
         command = [sys.executable, "-m", "service.queries.worker"]
         command += [str(self._limits.scenes), str(self._limits.answers), self._limits.encoder]
+        self._spawned += 1
         self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True
         )

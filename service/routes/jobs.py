@@ -11,7 +11,7 @@ from fastapi.responses import JSONResponse
 
 from liftcore.errors import InvalidSettings
 from liftcore.solve.settings import LiftSettings
-from service import wire
+from service import request_id, wire
 from service.faults import error_of
 from service.jobs.fit import check_fit
 from service.parts import Here, Parts
@@ -56,6 +56,7 @@ def submit(order: wire.LiftRequest, here: Here, key: Key = None) -> Response:
         settings=settings.model_dump(mode="json"),
         key=key,
         fingerprint=None if key is None else fingerprint(order.model_dump(mode="json")),
+        request_id=request_id.current(),
     )
     job, new = here.store.jobs.repeated(wanted), False
     if job is None:
@@ -165,5 +166,6 @@ def shape(job: JobRecord) -> wire.Job:
         created=job.created,
         started=job.started,
         ended=job.ended,
+        request_id=job.request_id,
         links=links,
     )

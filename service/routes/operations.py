@@ -1,24 +1,57 @@
-"""/healthz, and the page."""
+"""How the service is: /healthz, /readyz, /version, /metrics; and the page."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
-from fastapi import APIRouter
+import anyio
+from fastapi import APIRouter, Response
 from fastapi.responses import HTMLResponse
 
 from service import wire
+from service.parts import Here
+from service.readiness import CHECKS
+from service.versions import versions
 
 PAGE = Path(__file__).parents[1] / "web" / "index.html"
+METRICS_TYPE = "text/plain; version=0.0.4; charset=utf-8"
+METRICS: dict[int | str, dict[str, Any]] = {
+    200: {
+        "description": "The Prometheus text format",
+        "content": {METRICS_TYPE: {"schema": {"type": "string"}}},
+    }
+}
 
 router = APIRouter(tags=["operations"])
 
 
-# Async, and with nothing to wait for: a sync route would queue behind every slow one in the thread pool.
+# All of them are async, and wait for no thread of the common pool: a sync route would queue behind every slow one.
 @router.get("/healthz", response_model=wire.Health)
 async def healthz() -> wire.Health:
     """Whether the HTTP process answers."""
     return wire.Health(status="ok")
+
+
+@router.get("/readyz", response_model=wire.Ready)
+async def readyz(here: Here) -> wire.Ready:
+    """Whether the service can work: writes to its database, has disk to work with, and all its parts live. Else 503,
+    with the checks that failed; also while the service stops."""
+    await here.readiness.require()
+    return wire.Ready(status="ready", checks=list(CHECKS))
+
+
+@router.get("/version", response_model=wire.Version)
+async def version(here: Here) -> wire.Version:
+    """What runs here."""
+    return versions(here.settings.commit)
+
+
+@router.get("/metrics", response_class=Response, responses=METRICS)
+async def metrics(here: Here) -> Response:
+    """Counters and gauges for Prometheus."""
+    text = await anyio.to_thread.run_sync(here.metrics.text, limiter=here.scrapes)
+    return Response(text, headers={"Content-Type": METRICS_TYPE})
 
 
 @router.get("/", response_class=HTMLResponse, include_in_schema=False)

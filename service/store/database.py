@@ -77,6 +77,16 @@ class Database:
             else:
                 connection.close()
 
+    def prove_writable(self) -> None:
+        """Write what is there already, as far as the disk.
+
+        Raises:
+            sqlite3.Error, OSError: it cannot be written.
+        """
+        with self.write() as connection:
+            version = connection.execute("PRAGMA user_version").fetchone()[0]
+            connection.execute(f"PRAGMA user_version = {version}")
+
     def close(self) -> None:
         """Close every connection."""
         with self._write_lock:

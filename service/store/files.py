@@ -72,6 +72,15 @@ class DataDirectory:
         live = set(self._live)
         return [path for path in (self.root / "tmp").iterdir() if not any(name in path.name for name in live)]
 
+    @property
+    def floor_bytes(self) -> int:
+        """Free disk that new work must leave."""
+        return self._floor
+
+    def free_bytes(self) -> int:
+        """Free disk that is ours to use."""
+        return shutil.disk_usage(self.root).free
+
     def require_room(self, coming: int = 0) -> None:
         """See that there is room for new work.
 
@@ -81,7 +90,7 @@ class DataDirectory:
         Raises:
             NoSpace: less than the floor would be left.
         """
-        free = shutil.disk_usage(self.root).free
+        free = self.free_bytes()
         if free - coming < self._floor:
             raise NoSpace(
                 "data", expected=f"{self._floor + coming} bytes of free disk", got=f"{free}",

@@ -30,6 +30,7 @@ class JobOrder:
     settings: dict[str, Any] = field(default_factory=dict)  # all of them, with defaults filled in
     key: str | None = None  # Idempotency-Key
     fingerprint: str | None = None  # of the order as it was sent, with a key
+    request_id: str | None = None  # of the request that brings it
 
 
 @dataclass(frozen=True)
@@ -49,6 +50,7 @@ class JobRecord:
     started: float | None
     ended: float | None
     leased_until: float | None
+    request_id: str | None = None
 
 
 def fingerprint(order: dict[str, Any]) -> str:
@@ -82,8 +84,8 @@ class JobStore:
             _require_place(connection, max_queued)
             _require_assets(connection, order)
             connection.execute(
-                "INSERT INTO jobs (id, state, splats, cameras, settings, created, idempotency_key, fingerprint)"
-                " VALUES (?, 'queued', ?, ?, ?, ?, ?, ?)",
+                "INSERT INTO jobs (id, state, splats, cameras, settings, created, idempotency_key, fingerprint,"
+                " request_id) VALUES (?, 'queued', ?, ?, ?, ?, ?, ?, ?)",
                 (
                     job,
                     order.splats,
@@ -92,6 +94,7 @@ class JobStore:
                     time.time(),
                     order.key,
                     order.fingerprint,
+                    order.request_id,
                 ),
             )
             connection.executemany(
@@ -121,6 +124,12 @@ class JobStore:
             if row is None:
                 raise NotFound("job", expected="the id of a job", got=job)
             return record(connection, row)
+
+    def count_by_state(self) -> dict[JobState, int]:
+        """How many jobs there are in each state that has any."""
+        with self._database.read() as connection:
+            rows = connection.execute("SELECT state, count(*) FROM jobs GROUP BY state").fetchall()
+        return {JobState(state): count for state, count in rows}
 
     def all(self) -> list[JobRecord]:
         """Every job, newest first."""
@@ -173,6 +182,7 @@ def record(connection: sqlite3.Connection, row: sqlite3.Row) -> JobRecord:
         started=row["started"],
         ended=row["ended"],
         leased_until=row["leased_until"],
+        request_id=row["request_id"],
     )
 
 

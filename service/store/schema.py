@@ -69,4 +69,7 @@ INSERT INTO job_events
         json_object('state', state, 'attempt', attempt, 'problem', json(coalesce(problem, 'null'))), created
     FROM jobs;
 """,
+    """
+ALTER TABLE jobs ADD COLUMN request_id TEXT;        -- X-Request-ID of the request that made it
+""",
 )

@@ -18,6 +18,8 @@ from service.store.store import Store
 from .following import ended
 from .tiny_scene import CHANNELS, TinyScene, make_scene, text_table
 
+LIFT_REQUEST = "the-request-of-the-lift"
+
 
 @contextmanager
 def serving(data: Path, table: Path, **settings: Any) -> Iterator[TestClient]:
@@ -102,7 +104,7 @@ def uploaded(client: TestClient, scene: TinyScene) -> Uploaded:
 @pytest.fixture(scope="session")
 def lift(client: TestClient, uploaded: Uploaded) -> dict[str, Any]:
     """The lift of the tiny scene, as GET /lifts/{id} tells it."""
-    reply = client.post("/lift", json=uploaded.order(preset="row-sum"))
+    reply = client.post("/lift", json=uploaded.order(preset="row-sum"), headers={"X-Request-ID": LIFT_REQUEST})
     assert reply.status_code == 202, reply.text
     job = ended(client, reply.headers["location"])
     assert job["state"] == "succeeded", job

@@ -178,7 +178,7 @@ def test_streams_are_bounded(quick: Quick) -> None:
     with quick("answer", max_streams=1) as (client, body):
         job = client.post("/lift", json=body).headers["location"]
         ended(client, job)
-        streams = application(client).state.streams
+        streams = application(client).state.parts.streams
         streams.open = 1  # as if another client followed
         reply = client.get(f"{job}/events")
         assert (assert_problem(reply)["type"], reply.status_code) == ("/problems/busy", 503)

@@ -22,6 +22,9 @@ from .conftest import Uploaded
 
 ROUTES = {
     "/healthz",
+    "/readyz",
+    "/version",
+    "/metrics",
     "/assets",
     "/assets/{kind}",
     "/assets/{asset}",
@@ -40,6 +43,7 @@ ROUTES = {
     "/query/attention",
     "/render",
 }
+TAKES_NOTHING = {"/healthz", "/readyz", "/version", "/metrics", "/assets", "/jobs", "/lifts"}
 NOBODY = "0" * 32
 NO_ASSET = "sha256:" + "0" * 64
 
@@ -70,7 +74,7 @@ def test_every_route_answers_nonsense_with_a_problem(client: TestClient) -> None
         if reply.status_code >= 400:
             assert 400 <= assert_problem(reply)["status"] < 500, f"{method} {path}"
         else:
-            assert path in ("/healthz", "/assets", "/jobs", "/lifts"), f"{method} {path} took nonsense"
+            assert path in TAKES_NOTHING, f"{method} {path} took nonsense"
 
 
 def test_every_route_refuses_other_methods_with_a_problem(client: TestClient) -> None:

@@ -24,19 +24,12 @@ from service.settings import ServiceSettings
 from service.store.assets import CheckedUpload
 from service.store.store import Store
 from service.wire import AssetKind
+from tests.crash.server import NoQueries
 
 PATIENCE_SECONDS = 30.0  # for what takes half a second; the machine may be busy
 HEAD = b"PUT /assets/splats HTTP/1.1\r\nHost: x\r\nContent-Length: 5000\r\n\r\n"
 JSON_HEAD = b"POST /lift HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\nContent-Length: 5000\r\n\r\n"
 Served = Callable[..., AbstractContextManager[tuple[str, int]]]
-
-
-class NoQueries:
-    """Stands in for the query worker, which takes seconds to start and has no part in this."""
-
-    def start(self) -> None: ...
-
-    def stop(self) -> None: ...
 
 
 @contextmanager

@@ -15,9 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
-import uvicorn
-
-from service.__main__ import AnnouncingServer
+from service.__main__ import server_of
 from service.app import create_app, lift_limits
 from service.jobs.attempt import CHILD
 from service.jobs.process import JobProcess
@@ -53,6 +51,16 @@ class NoQueries:
 
     def stop(self) -> None: ...
 
+    def tell(self, told: object) -> None: ...
+
+    def alive(self) -> bool:
+        return True
+
+    def revive(self) -> bool:
+        return True
+
+    restarts = 0
+
 
 def arm(point: str) -> None:
     """Make this process kill itself when it comes to the point."""
@@ -84,7 +92,7 @@ def main() -> None:
     runner = Supervisor(store, lift_limits(settings), command=command)
     app = create_app(settings, store, runner, cast("WarmWorker", NoQueries()))
     listener = socket.create_server(("127.0.0.1", 0))
-    AnnouncingServer(uvicorn.Config(app, log_level="warning"), app.state.streams).run(sockets=[listener])
+    server_of(app, settings).run(sockets=[listener])
     store.close()
 
 
