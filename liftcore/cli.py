@@ -75,6 +75,7 @@ def build_parser() -> argparse.ArgumentParser:
     _add_demo(commands.add_parser("demo", parents=[shared], help="the whole job, through the real service"))
     _add_serve(commands.add_parser("serve", parents=[shared], help="run the HTTP service"))
     _add_lift(commands.add_parser("lift", parents=[shared], help="lift features onto splats"))
+    _add_plan(commands.add_parser("plan", parents=[shared], help="what a lift would do and need"))
     _add_query(commands.add_parser("query", parents=[shared], help="find words and examples in a lift"))
     _add_pack(commands.add_parser("pack", help="make a feature pack of the field's formats"), shared)
     _add_encode(commands.add_parser("encode", parents=[shared], help="make a feature pack of images"))
@@ -100,13 +101,28 @@ def _add_serve(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_lift(parser: argparse.ArgumentParser) -> None:
+    _add_sources(parser)
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="LIFT", help="the lift to write")
+    _add_settings(parser)
+    parser.add_argument("--explain", action="store_true", help="print the plan before the work")
+    parser.add_argument("--threads", type=_count, metavar="N", help="else as many as there are cores")
+
+
+def _add_plan(parser: argparse.ArgumentParser) -> None:
+    _add_sources(parser)
+    _add_settings(parser)
+
+
+def _add_sources(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("splats", type=Path, help="trained splats (.ply)")
     parser.add_argument("cameras", type=Path, help="COLMAP folder or .zip, transforms.json or cameras.json")
     parser.add_argument("features", type=Path, nargs="+", help="feature packs (.safetensors)")
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="LIFT", help="the lift to write")
+
+
+def _add_settings(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--preset", metavar="NAME", help="a published choice of weights: row-sum, tikhonov")
+    parser.add_argument("--speed", metavar="NAME", help="the dial: exact, balanced, fast or draft")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="one setting")
-    parser.add_argument("--threads", type=_count, metavar="N", help="else as many as there are cores")
 
 
 def _add_query(parser: argparse.ArgumentParser) -> None:

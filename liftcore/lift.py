@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -11,6 +11,7 @@ from liftcore import __version__
 from liftcore.artifact import Lift, LiftMetadata
 from liftcore.input_files import input_file
 from liftcore.observe.pack import FeaturePacks, open_packs, pair
+from liftcore.plan.plan import plan_lift
 from liftcore.progress import Progress, silent
 from liftcore.raster.antialiased import check_antialiased
 from liftcore.raster.cpu import CpuRaster
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from liftcore.artifact import InputFile
+    from liftcore.plan.plan import Plan
     from liftcore.raster.protocol import Raster
     from liftcore.scene.cameras import Cameras
     from liftcore.scene.splats import Splats
@@ -47,7 +49,7 @@ class Sources:
     splats: Splats
     cameras: Cameras
     packs: FeaturePacks
-    views: list[str]  # that are lifted, in the order of the sums
+    views: list[str]  # that may be lifted, in the order of the sums
     unpaired: list[str]  # views with features and no camera
 
 
@@ -82,14 +84,24 @@ def lift(
     Raises:
         InvalidInput: a file is malformed, or the packs do not fit the cameras.
         InvalidSettings: the splats' kernel has no opacity compensation, and the settings ask for it.
+        Unavailable: the machine's free memory cannot hold the result.
     """
     run = Run(settings, threads, progress, Timings())
     with run.timings.stage("read"):
         sources = open_sources(splats, cameras, features, settings)
     with run.timings.stage("digest"):
         inputs = [input_file(path) for path in (splats, cameras, *features)]
+    return lift_sources(run, sources, inputs, checkpoint)
+
+
+def lift_sources(run: Run, sources: Sources, inputs: list[InputFile], checkpoint: Checkpoint | None = None) -> Lift:
+    """The lift of what is open already: ``inputs`` are the files that it came from."""
+    settings, threads, progress = run.settings, run.threads, run.progress
     with run.timings.stage("compile"):
         warm_up(sources.splats.kernel)
+    with run.timings.stage("plan"):
+        plan = planned(sources, settings)
+        sources = replace(sources, views=list(plan.views))
     raster = CpuRaster(sources.splats, threads)
     with ViewWeights() as store:
         key = identity([part.sha256 for part in inputs], settings) if checkpoint else ""
@@ -106,6 +118,7 @@ def lift(
         facts: dict[str, Any] = {
             "weights_entries": sum(len(part.columns) for part in store),
             "views_without_camera": sources.unpaired,
+            "plan": plan.facts(),
         }
     with run.timings.stage("certify"):
         certificate = certify(geometry, X, geometry.codebooks.__getitem__, settings, threads) | notes | facts
@@ -121,12 +134,17 @@ def lift(
 
 
 def open_sources(splats: Path, cameras: Path, features: Sequence[Path], settings: LiftSettings) -> Sources:
-    """Open what a lift is made from; views are paired by name, and every ``view_stride``-th is lifted."""
-    scene, views = load_splats(splats), load_cameras(cameras)
+    """Open what a lift is made from; views are paired by name, and every ``view_stride``-th is taken."""
+    scene, views = load_splats(splats, colour=False), load_cameras(cameras)
     check_antialiased(scene.kernel, settings.antialiased)
     packs = open_packs(features)
     names, unpaired = pair(packs, views)
     return Sources(scene, views, packs, names[:: settings.view_stride], unpaired)
+
+
+def planned(sources: Sources, settings: LiftSettings) -> Plan:
+    """The plan of a lift from these sources."""
+    return plan_lift(sources.splats, sources.cameras, sources.packs, sources.views, settings)
 
 
 def _solve(run: Run, store: ViewWeights, geometry: Geometry) -> tuple[ViewWeights, Solution]:

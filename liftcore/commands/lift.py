@@ -15,11 +15,12 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from liftcore.artifact import Lift
+    from liftcore.plan.plan import Plan
 
 
 def run(options: argparse.Namespace) -> int:
     """Lift, write the lift whole or not at all, and say what came of it."""
-    settings = settings_of(options.preset, options.set)
+    settings = settings_of(options)
     from liftcore.artifact import save_lift
     from liftcore.lift import lift
     from liftcore.scene.load import camera_files
@@ -27,6 +28,8 @@ def run(options: argparse.Namespace) -> int:
     views = camera_files(options.cameras) if options.cameras.is_dir() else [options.cameras]
     out = free_output(options.output, [options.splats, *views, *options.features])
 
+    if options.explain and not options.json:  # the document holds the plan anyway
+        print(*plan_of(options, settings).lines(), sep="\n", flush=True)
     with progress_bars() as progress:
         result = lift(
             options.splats,
@@ -43,13 +46,24 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def settings_of(preset: str | None, pairs: Sequence[str]) -> LiftSettings:
-    """Settings of ``--preset`` and ``--set key=value``; a value is JSON, or else a word.
+def settings_of(options: argparse.Namespace) -> LiftSettings:
+    """Settings of ``--preset``, ``--speed`` and ``--set key=value``.
 
     Raises:
         InvalidSettings: a pair without ``=``, an unknown name or a value out of range.
     """
-    values: dict[str, Any] = {} if preset is None else {"preset": preset}
+    named = {"preset": options.preset, "speed": options.speed}
+    given = {name: value for name, value in named.items() if value is not None}
+    return LiftSettings.of(**{**given, **pairs_of(options.set)})
+
+
+def pairs_of(pairs: Sequence[str]) -> dict[str, Any]:
+    """Names and values of ``key=value``; a value is JSON, or else a word.
+
+    Raises:
+        InvalidSettings: a pair without ``=``.
+    """
+    values: dict[str, Any] = {}
     for pair in pairs:
         key, equals, text = pair.partition("=")
         if not equals or not key:
@@ -58,7 +72,14 @@ def settings_of(preset: str | None, pairs: Sequence[str]) -> LiftSettings:
             values[key] = json.loads(text)
         except (ValueError, RecursionError):
             values[key] = text
-    return LiftSettings.of(**values)
+    return values
+
+
+def plan_of(options: argparse.Namespace, settings: LiftSettings) -> Plan:
+    """The plan of the lift that the options describe."""
+    from liftcore.lift import open_sources, planned
+
+    return planned(open_sources(options.splats, options.cameras, options.features, settings), settings)
 
 
 def _summary(result: Lift) -> dict[str, Any]:
@@ -94,5 +115,6 @@ def _lines(document: dict[str, Any]) -> Iterable[str]:
     )
     for part in ("certificate", "timings"):
         for key, value in document[part].items():
-            yield f"  {key}: {shown(value)}"
+            if key != "plan" or part == "timings":  # a plan in full is what --explain prints
+                yield f"  {key}: {shown(value)}"
     yield from (f"warning: {warning}" for warning in document["warnings"])

@@ -81,6 +81,20 @@ class FeaturePacks:
             return RegionMap(_labels(pack, view, rows=codebook.shape[0]), codebook)
         return FeatureGrid(_features(pack, view, "grid"))
 
+    def sample_rows(self, view: str, count: int) -> Tensor:
+        """Some rows [n, F] of the view's codebook, ``count`` at most; nothing else of it is read or checked.
+
+        The first rows of a codebook, or evenly spaced cells of a grid.
+        """
+        part = "codebook" if self.is_regions(view) else "grid"
+        stored = self._file(view).handle.get_slice(f"{view}/{part}")
+        if part == "codebook":
+            return stored[:count]
+        height, width = self.specs(view)[part].shape[:2]
+        lines = _spread(height, round(count**0.5))
+        cells = _spread(width, count // len(lines))
+        return torch.cat([stored[line][cells] for line in lines])
+
     def _file(self, view: str) -> _PackFile:
         if view not in self._files:
             raise InvalidFeatures("view", expected="a view of the feature packs", got=repr(view))
@@ -138,6 +152,12 @@ def pair(packs: FeaturePacks, cameras: Cameras) -> tuple[list[str], list[str]]:
             hint="a view is named after its image, without the extension",
         )
     return paired, [view for view in packs.views if view not in names]
+
+
+def _spread(length: int, count: int) -> list[int]:
+    """At most ``count`` places of so many, evenly spaced and off the ends; one at least."""
+    steps = max(1, min(count, length))
+    return [(2 * k + 1) * length // (2 * steps) for k in range(steps)]
 
 
 def _examples(names: Iterable[str]) -> str:

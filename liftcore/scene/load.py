@@ -28,8 +28,8 @@ CAMERA_FORMATS = "a COLMAP sparse model (folder or .zip), a transforms.json or a
 PICKLED = (".pt", ".pth", ".ckpt", ".pkl")
 
 
-def load_splats(path: Path, kernel: Kernel | None = None) -> Splats:
-    """Read trained splats from a PLY of any dialect (``liftcore.scene.ply``).
+def load_splats(path: Path, kernel: Kernel | None = None, *, colour: bool = True) -> Splats:
+    """Read trained splats from a PLY of any dialect (``liftcore.scene.ply``), with or without their colours.
 
     Raises:
         InvalidSplats: the file is no splat PLY, or what it holds is malformed.
@@ -43,7 +43,7 @@ def load_splats(path: Path, kernel: Kernel | None = None) -> Splats:
             got="a Python pickle, which may run code when it is opened",
             hint="export the splats as PLY from the program that trained them",
         )
-    return read_splats(path, kernel)
+    return read_splats(path, kernel, colour=colour)
 
 
 def load_cameras(path: Path) -> Cameras:

@@ -11,7 +11,7 @@ import torch
 from liftcore.errors import InvalidSplats
 from liftcore.files import whole_file
 from liftcore.scene.ply_dialect import NORMALS, Slot, model_slots, recognise_kernel, usual_layout
-from liftcore.scene.ply_header import SCALAR_TYPES, PlyHeader, parse_header, read_header
+from liftcore.scene.ply_header import SCALAR_TYPES, PlyHeader, PlyProperty, parse_header, read_header
 from liftcore.scene.splats import Kernel, Splats
 
 if TYPE_CHECKING:
@@ -25,11 +25,15 @@ BLOCK_ROWS = 16_384  # rows converted at a time: a few MB, so that memory stays 
 _SPELLING = {code: name for name, code in reversed(SCALAR_TYPES.items())}  # the C names: "float", "uchar"
 
 
-def read_splats(path: Path, kernel: Kernel | None = None) -> Splats:
+COLOUR = ("sh", "sb_params")  # fields that a lift has no use for, and most of a file
+
+
+def read_splats(path: Path, kernel: Kernel | None = None, *, colour: bool = True) -> Splats:
     """Read trained splats from a binary little-endian PLY of any dialect.
 
     The kernel is recognised from the properties unless it is given. Columns that the model does not know are
-    kept as extras in their own type; ``double`` columns of the model become float32.
+    kept as extras in their own type; ``double`` columns of the model become float32. Without ``colour`` neither
+    colours nor extras are read or allocated, and what comes cannot be written back.
 
     Raises:
         InvalidSplats: the file is malformed, lacks a property of the kernel, or holds NaN or no splats.
@@ -48,7 +52,13 @@ def read_splats(path: Path, kernel: Kernel | None = None) -> Splats:
             )
     if header.count == 0:
         raise InvalidSplats(str(path), expected="at least one splat", got="an empty scene")
-    fields, extras = _read_columns(path, header, slots)
+    if not colour:
+        geometry = {name: slot for name, slot in slots.items() if slot.field not in COLOUR}
+        fields, extras = _read_columns(path, header, geometry, [])
+        with _named(path):
+            return Splats(**fields, kernel=kernel, extras=extras, layout=(), header=())
+    others = [column for column in header.properties if column.name not in slots]
+    fields, extras = _read_columns(path, header, slots, others)
     with _named(path):
         return Splats(**fields, kernel=kernel, extras=extras, layout=tuple(names), header=header.lines)
 
@@ -73,12 +83,10 @@ def write_splats(splats: Splats, path: Path) -> None:
 
 
 def _read_columns(
-    path: Path, header: PlyHeader, slots: Mapping[str, Slot]
+    path: Path, header: PlyHeader, slots: Mapping[str, Slot], others: Sequence[PlyProperty]
 ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     fields = {field: np.empty((header.count, *shape), np.float32) for field, shape in _field_shapes(slots).items()}
-    extras = {
-        column.name: np.empty(header.count, column.code) for column in header.properties if column.name not in slots
-    }
+    extras = {column.name: np.empty(header.count, column.code) for column in others}
     targets = {name: fields[slot.field][(slice(None), *slot.index)] for name, slot in slots.items()} | extras
     table = _mapped_rows(path)
     with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite and is refused as such

@@ -44,12 +44,30 @@ _PRESETS: dict[Preset, dict[str, Any]] = {
 }
 
 
+class Speed(StrEnum):
+    """Where the dial between speed and accuracy stands."""
+
+    EXACT = "exact"  # every pixel of every view
+    BALANCED = "balanced"
+    FAST = "fast"
+    DRAFT = "draft"
+
+
+_SPEEDS: dict[Speed, dict[str, Any]] = {
+    Speed.EXACT: {},
+    Speed.BALANCED: {"stride": 2, "certificate_rays": 2_000},
+    Speed.FAST: {"stride": 4, "coverage": 16, "certificate_rays": 1_000},
+    Speed.DRAFT: {"stride": 6, "coverage": 6, "transmittance_stop": 0.01, "certificate_rays": 500},
+}
+
+
 class LiftSettings(BaseModel):
     """All that decides the result of a lift. Knobs left out take the preset's values."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     preset: Preset = Preset.TIKHONOV
+    speed: Speed = Field(Speed.EXACT, description="the dial: sets stride, cut-off, coverage and certificate rays")
     selection: Selection = Field(Selection.ALL, description="which of a ray's weights count")
     k: int = Field(40, ge=1, le=MOST_OF_A_RAY, description="how many weights of a ray top-k keeps")
     mass: float = Field(0.75, gt=0, le=1, description="the share of the light within which front-mass keeps weights")
@@ -62,6 +80,7 @@ class LiftSettings(BaseModel):
     antialiased: bool = Field(False, description="opacities compensated for the low-pass (mip filter), 3DGS only")
     stride: int = Field(1, ge=1, le=64, description="lift from every n-th pixel in x and in y")
     view_stride: int = Field(1, ge=1, description="lift from every n-th view, from the first on")
+    coverage: int = Field(0, ge=0, description="views are chosen until they show a splat so often, 0 = all views")
     levels: Literal["rows", "composite"] | Annotated[int, Field(strict=True, ge=0)] = Field(
         "rows", description="levels as rows of their own, summed in composite regions, or one level by its number"
     )
@@ -92,12 +111,13 @@ class LiftSettings(BaseModel):
 
     @model_validator(mode="before")
     @classmethod
-    def _fill_from_preset(cls, values: Any) -> Any:
+    def _fill_from_preset_and_speed(cls, values: Any) -> Any:
         if not isinstance(values, dict):
             return values
-        name = values.get("preset", Preset.TIKHONOV)
-        known = isinstance(name, str) and name in set(Preset)
-        return {**_PRESETS[Preset(name)], **values} if known else values
+        preset, speed = values.get("preset", Preset.TIKHONOV), values.get("speed", Speed.EXACT)
+        weights = _PRESETS[Preset(preset)] if isinstance(preset, str) and preset in set(Preset) else {}
+        effort = _SPEEDS[Speed(speed)] if isinstance(speed, str) and speed in set(Speed) else {}
+        return {**weights, **effort, **values}
 
     @model_validator(mode="after")
     def _resolves_whole_regions(self) -> Self:

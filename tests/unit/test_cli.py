@@ -15,7 +15,7 @@ import torch
 from liftcore import cli
 from liftcore.artifact import load_lift
 from liftcore.commands import bars, reply
-from liftcore.commands.lift import settings_of
+from liftcore.commands.lift import pairs_of
 from liftcore.errors import InvalidSettings, SplatliftError
 from liftcore.observe.observation import RegionMap
 from liftcore.observe.pack import open_packs
@@ -24,11 +24,12 @@ from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.inria import write_inria_cameras
 from liftcore.scene.ply import write_splats
 from liftcore.scene.splats import Splats
+from liftcore.solve.settings import LiftSettings
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-COMMANDS = ["demo", "serve", "lift", "query", "pack", "encode", "inspect", "evaluate", "bench"]
+COMMANDS = ["demo", "serve", "lift", "plan", "query", "pack", "encode", "inspect", "evaluate", "bench"]
 
 
 @pytest.fixture
@@ -162,10 +163,29 @@ def test_picture_without_a_view_is_refused(scene: Path, capsys: pytest.CaptureFi
 
 
 def test_settings_are_json_or_words() -> None:
-    settings = settings_of("row-sum", ["power=2", "lift_gain=0.8", "dtype=float32", "certificate_rays=0"])
+    pairs = pairs_of(["power=2", "lift_gain=0.8", "dtype=float32", "certificate_rays=0"])
+    settings = LiftSettings.of(preset="row-sum", **pairs)
     assert (settings.power, settings.lift_gain, settings.dtype) == (2, 0.8, "float32")
     with pytest.raises(InvalidSettings):
-        settings_of(None, ["=1"])
+        pairs_of(["=1"])
+
+
+def test_plan_is_printed_alone_and_before_a_lift_and_kept_with_it(
+    scene: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = lift_arguments(scene)
+    status, out, err = run(capsys, "plan", *arguments[1:4], "--json")
+    assert (status, err) == (0, "")
+    plan = json.loads(out)
+    assert plan["views"] == {"lifted": ["front"], "left_out": []}
+    assert (plan["splats"], plan["channels"], plan["rank"], plan["dtype"]) == (2, 3, 2, "float16")
+    assert plan["memory_bytes"] == sum(plan["memory"].values())
+    status, out, _ = run(capsys, *arguments, "--explain", "--speed", "draft", "--set", "stride=1")
+    assert status == 0
+    assert out.startswith("plan: 2 splats (3dgs), 100.0% in some view's field\n")
+    made = load_lift(scene / "lift.safetensors").metadata
+    assert (made.settings.speed, made.settings.stride, made.settings.coverage) == ("draft", 1, 6)
+    assert made.certificate["plan"]["memory_bytes"] == plan["memory_bytes"]
 
 
 def test_langsplat_folder_is_packed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -13,6 +13,7 @@ import torch
 from liftcore.errors import InvalidSplats
 from liftcore.scene.ply import read_splats, write_splats
 from liftcore.scene.splats import Kernel, Splats
+from tests.scenes import random_splats
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -279,3 +280,16 @@ def test_real_scene_is_written_back_to_the_byte(scene: str, shared_data: Path, t
     assert splats.sh_degree == {"plush": 1, "tabletop": 0}[scene]
     write_splats(splats, tmp_path / "again.ply")
     assert (tmp_path / "again.ply").read_bytes() == path.read_bytes()
+
+
+@pytest.mark.parametrize("kernel", list(Kernel))
+def test_a_lift_reads_no_colours_and_no_extras(tmp_path, kernel):
+    splats = random_splats(4, 9, kernel=kernel)
+    extras = {"mask": torch.ones(9)}
+    write_splats(replace(splats, sh=torch.ones(9, 16, 3), extras=extras), tmp_path / "s.ply")
+    whole, bare = read_splats(tmp_path / "s.ply"), read_splats(tmp_path / "s.ply", colour=False)
+    assert whole.sh is not None
+    assert "mask" in whole.extras
+    assert (bare.sh, bare.sb_params, dict(bare.extras), bare.kernel) == (None, None, {}, kernel)
+    for name in ("means", "quats", "log_scales", "opacity_logits"):
+        assert torch.equal(getattr(bare, name), getattr(whole, name))

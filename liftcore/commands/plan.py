@@ -1,0 +1,20 @@
+"""``splatlift plan``: what a lift would do and need, without doing it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from liftcore.commands.lift import plan_of, settings_of
+from liftcore.commands.reply import reply
+
+if TYPE_CHECKING:
+    import argparse
+
+
+def run(options: argparse.Namespace) -> int:
+    """Print the plan."""
+    plan = plan_of(options, settings_of(options))
+    views = {"lifted": list(plan.views), "left_out": list(plan.left_out)}
+    document = {**plan.facts(), "views": views, "warnings": list(plan.warnings)}
+    reply(document, as_json=options.json, lines=plan.lines())
+    return 0

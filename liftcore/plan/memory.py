@@ -1,0 +1,97 @@
+"""What a lift will hold in memory at its peak, part by part, and how much the machine has left."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from liftcore.errors import Unavailable
+from liftcore.raster.constants import TILE
+from liftcore.raster.kernels import RECORDS
+from liftcore.solve.view_weights import MEMORY_LIMIT
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from liftcore.observe.pack import FeaturePacks
+    from liftcore.scene.cameras import Camera
+    from liftcore.scene.splats import Splats
+
+LIBRARIES = 450_000_000  # of torch, numba, numpy and the compiled kernels, before anything is read
+ENTRIES_A_SPLAT = 1.5  # of W, for a splat that a view sees and a level of its regions; measured on real scenes
+ENTRY_BYTES = 8 + 20 / ENTRIES_A_SPLAT  # column and weight, and a splat's ids, row start and evidence
+TILES_A_SPLAT = 6  # entries of tile lists and tile sums for a splat that a view sees, at full resolution
+TILE_ENTRY_BYTES = 4 + 4 + 2 * 16  # list, item, and an entry before and after it is gathered
+SCENE_BYTES = 9 * 8 + 3 * 8 + 3 * 8 + 4 + 8  # axes, opacities, reach; evidence, denominators, scale; order and ids
+SPARE = 0.9  # of the memory that is free: others grow too
+
+
+def memory_parts(
+    splats: Splats, packs: FeaturePacks, cameras: Mapping[str, Camera], seen_a_view: float, feature_bytes: int
+) -> dict[str, int]:
+    """Bytes of each part of a lift at its peak.
+
+    Args:
+        cameras: the views that are lifted, by name.
+        seen_a_view: how many splats a view can see, in the mean.
+        feature_bytes: of a number of X, 2 or 4.
+    """
+    inputs = sum(t.nbytes for t in (splats.means, splats.quats, splats.log_scales, splats.opacity_logits))
+    largest = max(camera.width * camera.height for camera in cameras.values())
+    levels = max(_levels(packs, view) for view in cameras)
+    weights = int(len(cameras) * seen_a_view * ENTRIES_A_SPLAT * ENTRY_BYTES * levels)
+    return {
+        "libraries": LIBRARIES,
+        "splats": inputs,
+        "scene": splats.count * (SCENE_BYTES + 8 * RECORDS[splats.kernel]),
+        "view": int(seen_a_view * TILES_A_SPLAT * TILE_ENTRY_BYTES) + 8 * largest // TILE**2,
+        "weights": min(weights, MEMORY_LIMIT),
+        "codebooks": sum(_codebook_bytes(packs, view) for view in cameras),
+        "features": splats.count * packs.channels * feature_bytes,
+    }
+
+
+def free_memory() -> int | None:
+    """Bytes that this process may still take: of the machine, or of its control group; None where neither says."""
+    found = []
+    try:
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+        found += [int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")]
+        group = Path("/sys/fs/cgroup")
+        limit, used = ((group / f"memory.{name}").read_text(encoding="ascii") for name in ("max", "current"))
+        found += [max(0, int(limit) - int(used))]
+    except (OSError, ValueError):  # not Linux, or a group without a limit
+        pass
+    return min(found, default=None)
+
+
+def check_memory(parts: Mapping[str, int], free: int | None) -> list[str]:
+    """What to say about the room that there is: nothing, or a warning.
+
+    Raises:
+        Unavailable: not even the features and codebooks fit.
+    """
+    if free is None:
+        return []
+    total, least = sum(parts.values()), parts["features"] + parts["codebooks"]
+    hint = "try dtype=float16, fewer views (coverage), fewer splats or fewer channels"
+    if least > free:
+        got = f"{least / 2**30:.1f} GiB for features and codebooks"
+        raise Unavailable("memory", expected=f"at most the {free / 2**30:.1f} GiB that are free", got=got, hint=hint)
+    if total > SPARE * free:
+        return [f"the lift may take {total / 2**30:.1f} GiB and {free / 2**30:.1f} GiB are free: {hint}"]
+    return []
+
+
+def _levels(packs: FeaturePacks, view: str) -> int:
+    labels = packs.specs(view).get("labels")
+    return labels.shape[0] if labels is not None and len(labels.shape) == 3 else 1
+
+
+def _codebook_bytes(packs: FeaturePacks, view: str) -> int:
+    """Of the view's codebook as it is kept: float16 stays, all else is float32."""
+    spec = next(spec for part, spec in packs.specs(view).items() if part != "labels")
+    numbers = 1
+    for side in spec.shape:
+        numbers *= side
+    return numbers * (2 if spec.dtype == "F16" else 4)

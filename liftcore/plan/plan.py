@@ -1,0 +1,120 @@
+"""The plan of a lift: what the scene needs, found out before the work and kept with its certificate."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from liftcore.plan.coverage import WELL_COVERED, choose_views, spare_views
+from liftcore.plan.memory import check_memory, free_memory, memory_parts
+from liftcore.plan.rank import ENOUGH, Rank, codebook_rank
+from liftcore.plan.visibility import visibility
+from liftcore.solve.accumulate import lift_walk
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from liftcore.observe.pack import FeaturePacks
+    from liftcore.scene.cameras import Cameras
+    from liftcore.scene.splats import Splats
+    from liftcore.solve.settings import LiftSettings
+
+SHOWN_VIEWS = 6  # names in a line for people
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a lift is about to do. Plain values: the same inputs and settings give the same plan."""
+
+    kernel: str
+    splats: int  # P
+    views: tuple[str, ...]  # that will be lifted, in the order of the sums
+    left_out: tuple[str, ...]  # that the settings' coverage leaves out
+    spare: tuple[str, ...]  # of those lifted: what they show, WELL_COVERED of the others show too
+    seen_share: float  # of the splats, that some view can see, before occlusion
+    splats_a_view: float
+    rank: Rank
+    dtype: str  # that X is stored as, when it can hold the codebooks
+    memory: Mapping[str, int]  # bytes a part
+    warnings: tuple[str, ...]  # of this machine, today
+
+    @property
+    def memory_bytes(self) -> int:
+        """The estimated peak."""
+        return sum(self.memory.values())
+
+    def facts(self) -> dict[str, Any]:
+        """Plain numbers for the certificate, without what only this machine has to do with."""
+        return {
+            "kernel": self.kernel,
+            "splats": self.splats,
+            "seen_share": self.seen_share,
+            "splats_a_view": self.splats_a_view,
+            "views": len(self.views),
+            "views_left_out": len(self.left_out),
+            "spare_views": list(self.spare),
+            "channels": self.rank.channels,
+            "rank": self.rank.rank,
+            "rank_rows": self.rank.rows,
+            "channels_enough": self.rank.enough,
+            "dtype": self.dtype,
+            "memory_bytes": self.memory_bytes,
+            "memory": dict(self.memory),
+        }
+
+    def lines(self) -> Iterator[str]:
+        """The plan for people."""
+        yield f"plan: {self.splats} splats ({self.kernel}), {self.seen_share:.1%} in some view's field"
+        yield f"  a view shows {self.splats_a_view:.0f} of them, before occlusion"
+        left = f", {len(self.left_out)} left out by coverage" if self.left_out else ""
+        yield f"  {len(self.views)} views{left}{self._spare_line()}"
+        bound = "at least " if self.rank.rank == self.rank.rows < self.rank.channels else ""
+        yield (
+            f"  {self.rank.channels} channels; {self.rank.rows} sampled codebook rows have rank {bound}"
+            f"{self.rank.rank}, and {self.rank.enough} directions hold {ENOUGH:.0%} of their squares"
+        )
+        parts = ", ".join(f"{name} {size / 2**20:.0f}" for name, size in self.memory.items())
+        yield f"  features as {self.dtype}; about {self.memory_bytes / 2**20:.0f} MiB at the peak ({parts})"
+        yield from (f"warning: {warning}" for warning in self.warnings)
+
+    def _spare_line(self) -> str:
+        if not self.spare:
+            return ""
+        some = ", ".join(self.spare[:SHOWN_VIEWS]) + (", ..." if len(self.spare) > SHOWN_VIEWS else "")
+        return f"; {len(self.spare)} add nothing that {WELL_COVERED} others do not show: {some}"
+
+
+def plan_lift(
+    splats: Splats, cameras: Cameras, packs: FeaturePacks, names: Sequence[str], settings: LiftSettings
+) -> Plan:
+    """Plan the lift of the views ``names``; the settings' coverage may choose among them.
+
+    Raises:
+        Unavailable: not even the features would fit this machine's memory.
+    """
+    by_name = {name: cameras.get(name) for name in names}
+    seen = visibility(splats, list(by_name.values()), lift_walk(settings))
+    chosen = choose_views(seen, settings.coverage) if settings.coverage else range(len(names))
+    views = [names[k] for k in chosen]
+    seen = seen.of(list(chosen))
+    parts = memory_parts(
+        splats,
+        packs,
+        {name: by_name[name] for name in views},
+        seen.splats_a_view,
+        2 if settings.dtype == "float16" else 4,
+    )
+    return Plan(
+        kernel=str(splats.kernel),
+        splats=splats.count,
+        views=tuple(views),
+        left_out=tuple(name for name in names if name not in set(views)),
+        spare=tuple(views[k] for k in spare_views(seen)),
+        seen_share=seen.seen_share,
+        splats_a_view=seen.splats_a_view,
+        rank=codebook_rank(packs, views),
+        dtype=settings.dtype,
+        memory=parts,
+        warnings=tuple(check_memory(parts, free_memory())),
+    )

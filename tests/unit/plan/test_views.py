@@ -1,0 +1,88 @@
+"""What the plan says of views and splats."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from liftcore.lift import lift
+from liftcore.plan.coverage import WELL_COVERED, choose_views, spare_views
+from liftcore.plan.visibility import SIDES, Visibility, side_of, visibility
+from liftcore.raster.cpu import CpuRaster
+from liftcore.raster.protocol import Walk, Weighting
+from liftcore.scene.splats import Kernel
+from liftcore.solve.settings import LiftSettings
+from tests.scenes import look_at, random_camera, random_regions, random_splats
+from tests.unit.solve.test_lift_equals_dense import write_scene
+
+
+def ring(count: int) -> list:
+    """Cameras on a ring around the origin."""
+    angles = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    places = [4 * np.array([np.cos(angle), 0.2, np.sin(angle)]) for angle in angles]
+    return [look_at(f"v{k}", place, 40, 30, 40.0) for k, place in enumerate(places)]
+
+
+def seen_as(in_view: list[list[int]], sides: list[int]) -> Visibility:
+    areas = np.array(in_view, np.float32)
+    return Visibility(areas, np.repeat(np.array(sides, np.uint8)[:, None], areas.shape[1], axis=1), areas.shape[1])
+
+
+@pytest.mark.parametrize("kernel", list(Kernel))
+@pytest.mark.usefixtures("every_kernel")
+def test_whatever_a_view_blends_is_in_its_field(kernel):
+    splats, cameras = random_splats(3, 60, spread=2.0, kernel=kernel), [random_camera(k) for k in range(4)]
+    seen = visibility(splats, cameras, Walk())
+    raster = CpuRaster(splats, threads=1)
+    for k, camera in enumerate(cameras):
+        met = raster.region_weights(camera, random_regions(k), Walk(), Weighting()).evidence_splats.numpy()
+        assert met.size
+        assert seen.in_view[k][met].all()
+    assert not seen.in_view.all()
+    assert seen.seen_share == seen.in_view.any(axis=0).mean()
+
+
+def test_every_direction_has_one_of_the_sides():
+    directions = np.random.default_rng(0).normal(size=(2_000, 3))
+    assert np.unique(side_of(directions)).tolist() == list(range(SIDES))
+
+
+def test_chosen_views_look_from_all_sides():
+    chosen = choose_views(visibility(random_splats(0, 80, 0.3), ring(24), Walk()), 6)
+    gaps = np.diff([*chosen, chosen[0] + 24])
+    assert len(chosen) == 6
+    assert gaps.max() <= 8  # of 24; the first six in order would leave one of 19
+
+
+def test_views_are_added_until_each_splat_is_shown_often_enough_and_the_choice_repeats():
+    seen = visibility(random_splats(1, 80, 1.0), [random_camera(k) for k in range(12)], Walk())
+    for times in (1, 3, 5):
+        chosen = choose_views(seen, times)
+        assert chosen == sorted(set(chosen)) == choose_views(seen, times)
+        shown = seen.in_view[:, seen.in_view.any(axis=0)]
+        assert shown[chosen].sum(axis=0).mean() >= times
+    assert choose_views(seen, 1_000) == list(range(12))
+
+
+def test_views_that_add_nothing_can_be_left_out_together():
+    alike, own = [[1, 1, 0]] * (WELL_COVERED + 3), [[0, 1, 1]]
+    spare = spare_views(seen_as(alike + own, [0] * (WELL_COVERED + 4)))
+    assert WELL_COVERED + 3 not in spare  # it alone shows the third splat
+    stay = [k for k in range(WELL_COVERED + 4) if k not in spare]
+    assert spare
+    assert np.array(alike + own)[stay].sum(axis=0)[0] >= WELL_COVERED
+
+
+def test_a_view_that_sees_nothing_is_spare():
+    assert spare_views(seen_as([[1, 1], [0, 0]], [0, 0])) == [1]
+
+
+def test_a_lift_with_coverage_is_the_lift_of_the_chosen_views(tmp_path):
+    paths = write_scene(tmp_path, 2)
+    made = lift(paths[0], paths[1], [paths[2]], LiftSettings.of(coverage=1, preset="row-sum"))
+    plan = made.metadata.certificate["plan"]
+    assert len(made.metadata.views) == plan["views"] == 3 - plan["views_left_out"] < 3
+    whole = lift(paths[0], paths[1], [paths[2]], LiftSettings.of(preset="row-sum"))
+    assert not torch.equal(made.features, whole.features)
+    assert bool((made.evidence <= whole.evidence + 1e-4).all())
