@@ -74,6 +74,7 @@ def build_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=_Parser)
     _add_demo(commands.add_parser("demo", parents=[shared], help="the whole job, through the real service"))
     _add_serve(commands.add_parser("serve", parents=[shared], help="run the HTTP service"))
+    _add_keys(commands.add_parser("keys", help="who may use the HTTP service"), shared)
     _add_lift(commands.add_parser("lift", parents=[shared], help="lift features onto splats"))
     _add_plan(commands.add_parser("plan", parents=[shared], help="what a lift would do and need"))
     _add_query(commands.add_parser("query", parents=[shared], help="find words and examples in a lift"))
@@ -98,6 +99,21 @@ def _add_serve(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--port", type=int, help="the port to bind; 0 picks a free one")
     parser.add_argument("--data", type=Path, metavar="DIR", help="for the database and all files")
     parser.add_argument("--encoder", metavar="NAME", help="the default text encoder")
+
+
+def _add_keys(parser: argparse.ArgumentParser, shared: _Parser) -> None:
+    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION", parser_class=_Parser)
+    create = actions.add_parser("create", parents=[shared], help="make a key and show it, once")
+    create.add_argument("--name", required=True, metavar="NAME", help="whose it is, or what for")
+    create.add_argument("--scopes", required=True, metavar="SCOPES", help="read,write,metrics,admin: what it may do")
+    create.add_argument("--max-bytes", metavar="N", help="of its assets and lifts; else as the server is set")
+    create.add_argument("--max-queued", metavar="N", help="jobs of it in line; else as the server is set")
+    create.add_argument("--max-uploads", metavar="N", help="at the same time; else as the server is set")
+    listing = actions.add_parser("list", parents=[shared], help="all keys, without their secrets")
+    revoke = actions.add_parser("revoke", parents=[shared], help="end a key; what it made stays, for admins")
+    revoke.add_argument("id", metavar="ID", help="as keys list shows it")
+    for action in (create, listing, revoke):
+        action.add_argument("--data", type=Path, metavar="DIR", help="the service's directory")
 
 
 def _add_lift(parser: argparse.ArgumentParser) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import ipaddress
 import math
 import signal
 import socket
@@ -20,10 +19,12 @@ from liftcore.errors import SplatliftError
 from service.app import assemble, pace_of
 from service.connection import watched
 from service.errors import Misconfigured
+from service.keys.hosts import is_loopback
 from service.logs import start_logging
 from service.settings import ServiceSettings
 from service.stopping import Stopping
-from service.store.store import Store
+from service.store.keys import any_key
+from service.store.store import DATABASE, Store
 
 
 class AnnouncingServer(uvicorn.Server):
@@ -61,7 +62,7 @@ def parse(arguments: Sequence[str]) -> ServiceSettings:
     parser = argparse.ArgumentParser(
         prog="python -m service", description=__doc__, argument_default=argparse.SUPPRESS
     )
-    parser.add_argument("--host", help="the address to bind; loopback only")
+    parser.add_argument("--host", help="the address to bind; beyond loopback only with keys")
     parser.add_argument("--port", type=int, help="the port to bind; 0 picks a free one")
     parser.add_argument("--data", help="the directory for the database and all files")
     parser.add_argument("--encoder", metavar="SPEC", help="the default text encoder: minilm, table:FILE, ...")
@@ -84,21 +85,25 @@ def parse(arguments: Sequence[str]) -> ServiceSettings:
         raise Misconfigured(name, expected=first["msg"].lower(), got=repr(first["input"])) from None
 
 
-def bind(host: str, port: int) -> socket.socket:
-    """A listening socket on a loopback address.
+def require_keys(settings: ServiceSettings) -> None:
+    """See that nobody beyond this machine comes in without a key.
 
     Raises:
-        Misconfigured: the address is not loopback, or it is taken.
+        Misconfigured: the address is not loopback, and there is no key.
     """
-    try:
-        loopback = host == "localhost" or ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        loopback = False
-    if not loopback:
+    if not is_loopback(settings.host) and not any_key(settings.data / DATABASE):
         raise Misconfigured(
-            "host", expected="a loopback address such as 127.0.0.1", got=host,
-            hint="this release has no access keys, so only this machine may reach it; keys are to come",
+            "host", expected="a loopback address such as 127.0.0.1, as there are no keys", got=settings.host,
+            hint=f"make one first: splatlift keys create --name NAME --scopes read,write --data {settings.data}",
         )  # fmt: skip
+
+
+def bind(host: str, port: int) -> socket.socket:
+    """A listening socket.
+
+    Raises:
+        Misconfigured: the address is not of this machine, or it is taken.
+    """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     listener = socket.socket(family, socket.SOCK_STREAM)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -106,7 +111,8 @@ def bind(host: str, port: int) -> socket.socket:
         listener.bind((host, port))
     except OSError as error:
         listener.close()
-        raise Misconfigured("port", expected="a free port", got=f"{port}: {error.strerror}") from None
+        got = f"{host} port {port}: {error.strerror}"
+        raise Misconfigured("host", expected="an address of this machine, with a free port", got=got) from None
     return listener
 
 
@@ -124,6 +130,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the service until it is told to stop; the exit status."""
     try:
         settings = parse(sys.argv[1:] if arguments is None else arguments)
+        require_keys(settings)
         listener = bind(settings.host, settings.port)
         store = Store.open(settings.data, floor_bytes=settings.disk_floor_bytes)
     except SplatliftError as error:

@@ -14,6 +14,8 @@ from service import problems
 from service.jobs.limits import LiftLimits
 from service.jobs.streams import EventStreams
 from service.jobs.supervisor import Supervisor
+from service.keys.document import describe_keys
+from service.keys.gate import Gate
 from service.limits import BodyLimit, Pace
 from service.metrics import Metrics
 from service.parts import Parts
@@ -66,9 +68,11 @@ def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, work
     app.state.stopping, app.state.metrics = stopping, metrics
     app.add_middleware(BodyLimit, limit=settings.max_body_bytes, pace=pace_of(settings))
     app.add_middleware(RefuseWork, stopping=stopping)
+    app.add_middleware(Gate, keys=store.keys, settings=settings)  # outside of it: no body of a stranger is read
     problems.install(app)
     for module in (operations, assets, jobs, lifts, queries):
         app.include_router(module.router)
+    describe_keys(app, store.keys)
     return app
 
 

@@ -2,6 +2,12 @@
 
 SplatliftError
 └── ServiceError
+    ├── Unauthorized         no key, or one that is not valid                  401 + WWW-Authenticate
+    ├── MissingScope         a key that may not do that                        403 + WWW-Authenticate
+    ├── ForeignOrigin        a web page of another site asks                   403
+    ├── Misdirected          a Host that is not this service                   421
+    ├── OverQuota            more bytes than the key may store                 403
+    ├── TooMany              more jobs in line or uploads than the key may     429 + Retry-After
     ├── InvalidRequest       a parameter or a body that no route understands   422
     ├── DigestMismatch       the body is not what ?sha256= promised            422
     ├── InvalidEncoding      a compressed body that does not decompress        422
@@ -29,6 +35,50 @@ class ServiceError(SplatliftError):
     """An error of the service around the core."""
 
     kind = "service"
+
+
+class Unauthorized(ServiceError):
+    """No key, or one that is not valid (any more)."""
+
+    kind = "unauthorized"
+
+
+class MissingScope(ServiceError):
+    """A key that was not made for this."""
+
+    kind = "missing-scope"
+
+    def __init__(self, argument: str, *, expected: str, got: str, hint: str = "", scope: str = "") -> None:
+        super().__init__(argument, expected=expected, got=got, hint=hint)
+        self.scope = scope  # the one that it lacks, told in WWW-Authenticate
+
+
+class ForeignOrigin(ServiceError):
+    """A web page of another site asks in its visitor's name."""
+
+    kind = "foreign-origin"
+
+
+class Misdirected(ServiceError):
+    """A Host header that does not mean this service."""
+
+    kind = "misdirected"
+
+
+class OverQuota(ServiceError):
+    """More bytes than a key may store."""
+
+    kind = "over-quota"
+
+
+class TooMany(ServiceError):
+    """More jobs in line, or uploads at a time, than a key may have."""
+
+    kind = "too-many"
+
+    def __init__(self, argument: str, *, expected: str, got: str, hint: str = "", retry_after: int = 2) -> None:
+        super().__init__(argument, expected=expected, got=got, hint=hint)
+        self.retry_after = retry_after  # seconds, told in Retry-After
 
 
 class InvalidRequest(ServiceError):

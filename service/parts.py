@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import anyio
@@ -10,6 +10,7 @@ from fastapi import Depends, Request
 
 from service.jobs.streams import EventStreams
 from service.jobs.supervisor import Supervisor
+from service.keys.gate import CALLER
 from service.metrics import Metrics
 from service.queries.warm import WarmWorker
 from service.readiness import Readiness
@@ -19,7 +20,7 @@ from service.store.store import Store
 
 @dataclass(frozen=True)
 class Parts:
-    """What `create_app` was given."""
+    """What `create_app` was given. Routes get the store as their caller sees it."""
 
     settings: ServiceSettings
     store: Store
@@ -34,7 +35,8 @@ class Parts:
 
 # Async: a sync dependency waits for a thread of the pool, and every route with it.
 async def _parts(request: Request) -> Parts:
-    return request.app.state.parts
+    parts: Parts = request.app.state.parts
+    return replace(parts, store=parts.store.seen_by(request.scope["state"][CALLER].owner))
 
 
 Here = Annotated[Parts, Depends(_parts)]

@@ -37,6 +37,12 @@ TABLE: dict[type[SplatliftError], tuple[int, str]] = {
     core.InvalidQuery: (422, "The query cannot be answered as asked"),
     core.NotFound: (404, "There is no such thing here"),
     core.Unavailable: (422, "This server lacks what that needs"),
+    errors.Unauthorized: (401, "A key is needed"),
+    errors.MissingScope: (403, "The key may not do that"),
+    errors.ForeignOrigin: (403, "Pages of other sites may not do that"),
+    errors.Misdirected: (421, "This is another host"),
+    errors.OverQuota: (403, "The key's quota is used up"),
+    errors.TooMany: (429, "The key asks for too much at a time"),
     errors.InvalidRequest: (422, "The request is malformed"),
     errors.DigestMismatch: (422, "The body is not what its digest promised"),
     errors.InvalidEncoding: (422, "The body does not decompress"),
@@ -111,11 +117,21 @@ def install(app: FastAPI) -> None:
 
 async def _on_known(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, SplatliftError)
+    return answer_to(error)
+
+
+def answer_to(error: SplatliftError) -> JSONResponse:
+    """The error as a response, with the headers that belong to it."""
     headers: dict[str, str] = {}
-    if isinstance(error, errors.Busy):
+    if isinstance(error, errors.Busy | errors.TooMany):
         headers["Retry-After"] = str(error.retry_after)
     if isinstance(error, errors.RangeNotSatisfiable):
         headers["Content-Range"] = f"bytes */{error.size}"
+    if isinstance(error, errors.Unauthorized):
+        given = ', error="invalid_token"' if error.got != "none" else ""  # RFC 6750, 3.1: no code without a key
+        headers["WWW-Authenticate"] = f'Bearer realm="splatlift"{given}'
+    if isinstance(error, errors.MissingScope):
+        headers["WWW-Authenticate"] = f'Bearer realm="splatlift", error="insufficient_scope", scope="{error.scope}"'
     return answer(problem_of(error), headers)
 
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field
-from pydantic_settings import BaseSettings, SettingsConfigDict
+from pydantic import Field, field_validator
+from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 from service.errors import InvalidRequest
 
@@ -20,8 +20,16 @@ class ServiceSettings(BaseSettings):
     model_config = SettingsConfigDict(env_prefix="SPLATLIFT_", frozen=True, extra="forbid")
 
     data: Path = Field(Path("splatlift-data"), description="the directory that holds the database and all files")
-    host: str = Field("127.0.0.1", description="the address to bind; loopback only until there are keys")
+    host: str = Field("127.0.0.1", description="the address to bind; beyond loopback only with keys")
     port: int = Field(8787, ge=0, le=65_535, description="the port to bind; 0 picks a free one")
+
+    allowed_hosts: Annotated[tuple[str, ...], NoDecode] = Field(
+        (), description="names in Host and Origin beside those of loopback and the bound address, with commas between"
+    )
+
+    key_bytes: int = Field(100 * GiB, ge=0, description="bytes of assets and lifts that a key may store")
+    key_queued: int = Field(20, ge=0, description="jobs of a key that may wait in line; more are answered 429")
+    key_uploads: int = Field(4, ge=0, description="uploads of a key at the same time; more are answered 429")
 
     log_format: Literal["json", "text"] = Field("json", description="of the log on stderr: json or text")
     commit: str | None = Field(None, description="the git commit that this was built from, for /version")
@@ -80,6 +88,11 @@ class ServiceSettings(BaseSettings):
     query_seconds: float = Field(120, gt=0, description="wall time after which a query is given up")
     query_scenes: int = Field(2, ge=1, description="lifts that the query process keeps open")
     query_answers: int = Field(16, ge=1, description="answers that the query process keeps for masks and maps")
+
+    @field_validator("allowed_hosts", mode="before")
+    @classmethod
+    def _names(cls, given: Any) -> Any:
+        return [name.strip() for name in given.split(",") if name.strip()] if isinstance(given, str) else given
 
     def max_upload_bytes(self, kind: str) -> int:
         """The size limit of an asset kind."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from typing import TYPE_CHECKING, Any
 
@@ -29,7 +30,9 @@ class Client:
 
     def __init__(self, url: str) -> None:
         # The service is on this machine: a proxy of the environment has no part in it.
-        self._http = httpx.Client(base_url=url, timeout=_TIMEOUT, trust_env=False)
+        key = os.environ.get("SPLATLIFT_KEY")
+        headers = {"Authorization": f"Bearer {key}"} if key else {}
+        self._http = httpx.Client(base_url=url, timeout=_TIMEOUT, trust_env=False, headers=headers)
 
     def close(self) -> None:
         """End the conversation."""

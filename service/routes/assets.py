@@ -49,6 +49,7 @@ async def upload(kind: wire.AssetKind, request: Request, here: Here, sha256: Sha
     """Upload splats (PLY), cameras (JSON or a zip of a COLMAP model) or a feature pack (safetensors)."""
     coding = coding_of(", ".join(request.headers.getlist("content-encoding")))
     here.store.files.require_room()
+    await anyio.to_thread.run_sync(here.store.assets.require_quota)
     async with _workspace(here.store.files, kind) as (draft, scratch):
         with Intake(draft, limit=here.settings.max_upload_bytes(kind), coding=coding) as intake:
             await _receive(request, intake, here.store.files)

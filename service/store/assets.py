@@ -14,6 +14,7 @@ from liftcore.errors import NotFound
 from service.errors import InUse
 from service.store.database import Database
 from service.store.files import DataDirectory
+from service.store.owners import SEEN, Owned, require_quota
 from service.wire import AssetKind
 
 
@@ -42,7 +43,14 @@ class CheckedUpload:
     warnings: list[str]
 
 
-class AssetStore:
+# What several owners have is one file and one row; each has it since its own upload.
+VISIBLE = (
+    "SELECT id, kind, bytes, file, counts, warnings, min(created) AS created"
+    f" FROM assets JOIN asset_owners ON asset = id WHERE {SEEN}"
+)
+
+
+class AssetStore(Owned):
     """Assets in the database, their bytes in blobs/."""
 
     def __init__(self, database: Database, files: DataDirectory) -> None:
@@ -55,35 +63,56 @@ class AssetStore:
         """Keep a checked upload.
 
         Returns:
-            The asset, and whether it is new.
+            The asset, and whether its owner did not have it before. That somebody else did, nobody learns: the bytes
+            take the same way to the disk.
+
+        Raises:
+            OverQuota: it would be more than the owner may store.
         """
         asset = f"sha256:{upload.sha256}"
-        path = self._files.blob(upload.sha256, upload.suffix)
-        size = upload.draft.stat().st_size
         with self._blobs, self._database.write() as connection:
-            if connection.execute("SELECT 1 FROM assets WHERE id = ?", (asset,)).fetchone():
-                new = False
-            else:
-                self._files.publish(upload.draft, path)
-                connection.execute(
-                    "INSERT INTO assets (id, kind, bytes, file, counts, warnings, created) VALUES (?,?,?,?,?,?,?)",
-                    (
-                        asset,
-                        upload.kind,
-                        size,
-                        self._files.relative(path),
-                        json.dumps(upload.counts),
-                        json.dumps(upload.warnings),
-                        time.time(),
-                    ),
-                )
-                new = True
-        return self.get(asset), new
+            owned = connection.execute(
+                "SELECT 1 FROM asset_owners WHERE asset = ? AND owner = ?", (asset, self._owner.key)
+            ).fetchone()
+            if owned is None:
+                require_quota(connection, self._owner, upload.draft.stat().st_size)
+                self._publish(connection, asset, upload)
+                own(connection, asset, self._owner.key)
+        return self.get(asset), owned is None
+
+    def _publish(self, connection: sqlite3.Connection, asset: str, upload: CheckedUpload) -> None:
+        """The bytes and the row; both may be there, and then the bytes are replaced by equal ones."""
+        row = connection.execute("SELECT file FROM assets WHERE id = ?", (asset,)).fetchone()
+        path = self._files.blob(upload.sha256, upload.suffix) if row is None else self._files.root / row["file"]
+        size = upload.draft.stat().st_size
+        self._files.publish(upload.draft, path)
+        connection.execute(
+            "INSERT OR IGNORE INTO assets (id, kind, bytes, file, counts, warnings) VALUES (?,?,?,?,?,?)",
+            (
+                asset,
+                upload.kind,
+                size,
+                self._files.relative(path),
+                json.dumps(upload.counts),
+                json.dumps(upload.warnings),
+            ),
+        )
+
+    def require_quota(self, coming: int = 1) -> None:
+        """See that the owner may store more, before bytes are on their way.
+
+        Raises:
+            OverQuota: it may not.
+        """
+        with self._database.read() as connection:
+            require_quota(connection, self._owner, coming)
 
     def find(self, asset: str) -> AssetRecord | None:
         """The asset of that id, None when there is none."""
         with self._database.read() as connection:
-            row = connection.execute("SELECT * FROM assets WHERE id = ?", (asset,)).fetchone()
+            row = connection.execute(
+                f"{VISIBLE} AND id = :asset GROUP BY id", self._owner.terms(asset=asset)
+            ).fetchone()
         return None if row is None else self._record(row)
 
     def get(self, asset: str, kind: AssetKind | None = None) -> AssetRecord:
@@ -103,32 +132,41 @@ class AssetStore:
     def all(self) -> list[AssetRecord]:
         """Every asset, newest first."""
         with self._database.read() as connection:
-            rows = connection.execute("SELECT * FROM assets ORDER BY created DESC, id").fetchall()
+            rows = connection.execute(
+                f"{VISIBLE} GROUP BY id ORDER BY min(created) DESC, id", self._owner.terms()
+            ).fetchall()
         return [self._record(row) for row in rows]
 
     def delete(self, asset: str) -> None:
-        """Forget an asset and its bytes.
+        """Take an asset from its owner, or from everybody when it is an admin who asks. Its bytes go with the last.
 
         Raises:
             NotFound: there is none.
-            InUse: a job or a lift refers to it.
+            InUse: a job or a lift of theirs refers to it.
         """
         with self._blobs:
             found = self.get(asset)
+            terms = self._owner.terms(asset=asset)
             with self._database.write() as connection:
                 users = connection.execute(
-                    "SELECT id FROM jobs WHERE splats = :a OR cameras = :a"
-                    " UNION SELECT job FROM job_features WHERE asset = :a LIMIT 4",
-                    {"a": asset},
+                    f"SELECT id FROM jobs WHERE {SEEN} AND (splats = :asset OR cameras = :asset OR EXISTS"
+                    " (SELECT 1 FROM job_features WHERE job = id AND asset = :asset)) LIMIT 4",
+                    terms,
                 ).fetchall()
                 if users:
                     raise InUse(
                         "asset", expected="an asset that no job and no lift refers to", got=asset,
                         hint=f"jobs that refer to it: {', '.join(row['id'] for row in users)}",
                     )  # fmt: skip
-                connection.execute("DELETE FROM assets WHERE id = ?", (asset,))
+                connection.execute(f"DELETE FROM asset_owners WHERE asset = :asset AND {SEEN}", terms)
+                last = connection.execute(
+                    "DELETE FROM assets WHERE id = :asset"
+                    " AND NOT EXISTS (SELECT 1 FROM asset_owners WHERE asset = :asset) RETURNING id",
+                    terms,
+                ).fetchall()
             # After the commit: a crash here leaves bytes that nobody knows of, never an asset without bytes.
-            found.path.unlink(missing_ok=True)
+            if last:
+                found.path.unlink(missing_ok=True)
 
     def collect(self, older_than: float) -> list[Path]:
         """Remove bytes that no asset has: what a crash between a blob and its row left.
@@ -159,3 +197,10 @@ class AssetStore:
             warnings=json.loads(row["warnings"]),
             created=row["created"],
         )
+
+
+def own(connection: sqlite3.Connection, asset: str, owner: str) -> None:
+    """Within a write transaction: let an owner have an asset that is here."""
+    connection.execute(
+        "INSERT OR IGNORE INTO asset_owners (asset, owner, created) VALUES (?, ?, ?)", (asset, owner, time.time())
+    )

@@ -17,7 +17,8 @@ from service.errors import Conflict, Crashed
 from service.faults import fault_of
 from service.store.database import Database
 from service.store.events import EventKind, log_line, note
-from service.store.jobs import JobRecord, record
+from service.store.jobs import JobRecord, find, record
+from service.store.owners import Owned
 from service.wire import ENDED, JobState
 
 MAX_ATTEMPTS = 3
@@ -26,7 +27,7 @@ MAX_ATTEMPTS = 3
 OWNS = "id = :job AND attempt = :attempt AND state IN ('running', 'canceling')"
 
 
-class AttemptStore:
+class AttemptStore(Owned):
     """What the supervisor notes, and the one thing that a client may ask of it: to cancel."""
 
     def __init__(self, database: Database) -> None:
@@ -51,7 +52,7 @@ class AttemptStore:
     def state(self, job: str) -> JobState | None:
         """Where a job is; None when there is none."""
         with self._database.read() as connection:
-            row = connection.execute("SELECT state FROM jobs WHERE id = ?", (job,)).fetchone()
+            row = find(connection, job, self._owner)
         return None if row is None else JobState(row["state"])
 
     def renew(self, job: str, attempt: int, lease_seconds: float) -> float | None:
@@ -116,7 +117,7 @@ class AttemptStore:
             Conflict: it has succeeded or failed.
         """
         with self._database.write() as connection:
-            row = connection.execute("SELECT * FROM jobs WHERE id = ?", (job,)).fetchone()
+            row = find(connection, job, self._owner)
             if row is None:
                 raise NotFound("job", expected="the id of a job", got=job)
             state = JobState(row["state"])

@@ -18,13 +18,13 @@ MOST_IDLE = 4  # connections kept for the next readers; those of a rush are clos
 class Database:
     """SQLite in WAL mode: an acknowledged write is on the disk (as far as the disk tells the truth)."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, migrate: bool = True) -> None:
         self._path = path
         self._write_lock = threading.Lock()
         self._idle: queue.LifoQueue[sqlite3.Connection] = queue.LifoQueue()
         self._writer = self._connect()
         try:
-            self._migrate()
+            self._migrate(migrate)
         except BaseException:
             self._writer.close()
             raise
@@ -37,13 +37,18 @@ class Database:
         connection.execute("PRAGMA foreign_keys = ON")
         return connection
 
-    def _migrate(self) -> None:
+    def _migrate(self, allowed: bool) -> None:
         with self.write() as connection:  # all steps or none
             version = connection.execute("PRAGMA user_version").fetchone()[0]
             if version > len(MIGRATIONS):
                 raise Misconfigured(
                     "data", expected=f"a database of schema version {len(MIGRATIONS)} or less", got=f"{version}",
                     hint="use the release that wrote it, or another data directory",
+                )  # fmt: skip
+            if version < len(MIGRATIONS) and not allowed:
+                raise Misconfigured(
+                    "data", expected=f"a database of schema version {len(MIGRATIONS)}", got=f"{version}",
+                    hint="an older server runs over it: start it again with this release first",
                 )  # fmt: skip
             for step in MIGRATIONS[version:]:
                 for statement in _statements(step):

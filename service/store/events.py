@@ -12,6 +12,7 @@ from typing import Any
 
 from liftcore.errors import NotFound
 from service.store.database import Database
+from service.store.owners import SEEN, Owned
 
 LOG_LINES = 200  # a job; older ones go
 LINE_CHARACTERS = 500
@@ -55,7 +56,7 @@ def log_line(text: str) -> dict[str, Any]:
     return {"line": text[:LINE_CHARACTERS], "time": round(time.time(), 3)}
 
 
-class EventStore:
+class EventStore(Owned):
     """The events of all jobs, for those who follow them."""
 
     def __init__(self, database: Database) -> None:
@@ -65,13 +66,18 @@ class EventStore:
         """The events of a job beyond a number, in order.
 
         Raises:
-            NotFound: there is no such job.
+            NotFound: there is no such job, or the key that follows it was revoked.
         """
         with self._database.read() as connection:
+            seen = connection.execute(
+                f"SELECT 1 FROM jobs WHERE id = :job AND {SEEN}"
+                " AND NOT EXISTS (SELECT 1 FROM keys WHERE id = :owner AND revoked IS NOT NULL)",
+                self._owner.terms(job=job),
+            )
+            if seen.fetchone() is None:
+                raise NotFound("job", expected="the id of a job", got=job)
             rows = connection.execute(
                 "SELECT number, kind, data FROM job_events WHERE job = ? AND number > ? ORDER BY number",
                 (job, number),
             ).fetchall()
-            if not rows and not connection.execute("SELECT 1 FROM jobs WHERE id = ?", (job,)).fetchone():
-                raise NotFound("job", expected="the id of a job", got=job)
         return [Event(row["number"], EventKind(row["kind"]), json.loads(row["data"])) for row in rows]

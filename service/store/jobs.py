@@ -12,12 +12,12 @@ from typing import Any
 
 from liftcore.errors import NotFound
 from service.errors import Busy, Conflict, KeyReused
+from service.store.assets import own
 from service.store.database import Database
 from service.store.events import EventKind, note
 from service.store.files import DataDirectory
+from service.store.owners import QUEUE_RETRY_SECONDS, SEEN, Owned, Owner, require_quota, require_turn
 from service.wire import ENDED, AssetKind, JobState
-
-QUEUE_RETRY_SECONDS = 30  # a lift takes seconds to minutes, and one must end before the line is shorter
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def fingerprint(order: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(order, sort_keys=True).encode()).hexdigest()
 
 
-class JobStore:
+class JobStore(Owned):
     """The line of jobs and their history. Attempts at them are in `service.store.attempts`."""
 
     def __init__(self, database: Database, files: DataDirectory) -> None:
@@ -72,22 +72,26 @@ class JobStore:
             The id, and whether the job is new: an order with the key of an earlier one is that one.
 
         Raises:
-            NotFound: an asset was deleted meanwhile.
+            NotFound: an asset was deleted meanwhile, or is not the owner's.
             Busy: there are ``max_queued`` jobs in line.
+            TooMany, OverQuota: the owner has as many in line, or stored, as it may.
             KeyReused: the key came with another order before.
         """
         job = secrets.token_hex(16)
         with self._database.write() as connection:
-            known = _of_key(connection, order)
+            known = _of_key(connection, order, self._owner)
             if known is not None:
                 return known, False
             _require_place(connection, max_queued)
-            _require_assets(connection, order)
+            require_turn(connection, self._owner)
+            _take_assets(connection, order, self._owner)
+            require_quota(connection, self._owner, 1)
             connection.execute(
-                "INSERT INTO jobs (id, state, splats, cameras, settings, created, idempotency_key, fingerprint,"
-                " request_id) VALUES (?, 'queued', ?, ?, ?, ?, ?, ?, ?)",
+                "INSERT INTO jobs (id, owner, state, splats, cameras, settings, created, idempotency_key,"
+                " fingerprint, request_id) VALUES (?, ?, 'queued', ?, ?, ?, ?, ?, ?, ?)",
                 (
                     job,
+                    self._owner.key,
                     order.splats,
                     order.cameras,
                     json.dumps(order.settings),
@@ -105,13 +109,13 @@ class JobStore:
         return job, True
 
     def repeated(self, order: JobOrder) -> str | None:
-        """The job that an earlier order with this key made, None when the key is new or there is none.
+        """The job that an earlier order of this owner with this Idempotency-Key made, None when there is none.
 
         Raises:
             KeyReused: the key came with another order before.
         """
         with self._database.read() as connection:
-            return _of_key(connection, order)
+            return _of_key(connection, order, self._owner)
 
     def get(self, job: str) -> JobRecord:
         """The job of that id.
@@ -120,7 +124,7 @@ class JobStore:
             NotFound: there is none.
         """
         with self._database.read() as connection:
-            row = connection.execute("SELECT * FROM jobs WHERE id = ?", (job,)).fetchone()
+            row = find(connection, job, self._owner)
             if row is None:
                 raise NotFound("job", expected="the id of a job", got=job)
             return record(connection, row)
@@ -134,7 +138,9 @@ class JobStore:
     def all(self) -> list[JobRecord]:
         """Every job, newest first."""
         with self._database.read() as connection:
-            rows = connection.execute("SELECT * FROM jobs ORDER BY created DESC, id").fetchall()
+            rows = connection.execute(
+                f"SELECT * FROM jobs WHERE {SEEN} ORDER BY created DESC, id", self._owner.terms()
+            ).fetchall()
             return [record(connection, row) for row in rows]
 
     def delete(self, job: str, *, with_lift: bool) -> None:
@@ -145,7 +151,7 @@ class JobStore:
             Conflict: it has not ended, or it has a lift that was not given up.
         """
         with self._database.write() as connection:
-            row = connection.execute("SELECT state FROM jobs WHERE id = ?", (job,)).fetchone()
+            row = find(connection, job, self._owner)
             if row is None:
                 raise NotFound("job", expected="the id of a job", got=job)
             if row["state"] not in ENDED:
@@ -163,6 +169,11 @@ class JobStore:
         # After the commit: a crash here leaves files that the collection of garbage finds.
         self._files.lift(job).unlink(missing_ok=True)
         self._files.forget_work(job)
+
+
+def find(connection: sqlite3.Connection, job: str, owner: Owner) -> sqlite3.Row | None:
+    """The row of a job that an owner sees."""
+    return connection.execute(f"SELECT * FROM jobs WHERE id = :job AND {SEEN}", owner.terms(job=job)).fetchone()
 
 
 def record(connection: sqlite3.Connection, row: sqlite3.Row) -> JobRecord:
@@ -186,10 +197,12 @@ def record(connection: sqlite3.Connection, row: sqlite3.Row) -> JobRecord:
     )
 
 
-def _of_key(connection: sqlite3.Connection, order: JobOrder) -> str | None:
+def _of_key(connection: sqlite3.Connection, order: JobOrder, owner: Owner) -> str | None:
     if order.key is None:
         return None
-    row = connection.execute("SELECT id, fingerprint FROM jobs WHERE idempotency_key = ?", (order.key,)).fetchone()
+    row = connection.execute(
+        "SELECT id, fingerprint FROM jobs WHERE owner = ? AND idempotency_key = ?", (owner.key, order.key)
+    ).fetchone()
     if row is not None and row["fingerprint"] != order.fingerprint:
         raise KeyReused(
             "Idempotency-Key", expected="the order that came with this key before", got="another order",
@@ -207,9 +220,15 @@ def _require_place(connection: sqlite3.Connection, max_queued: int) -> None:
         )  # fmt: skip
 
 
-def _require_assets(connection: sqlite3.Connection, order: JobOrder) -> None:
+def _take_assets(connection: sqlite3.Connection, order: JobOrder, owner: Owner) -> None:
+    """See that the assets are there; what the job of an admin needs of others, the admin has from now on."""
     wanted = [(order.splats, AssetKind.SPLATS), (order.cameras, AssetKind.CAMERAS)]
     wanted += [(asset, AssetKind.FEATURES) for asset in order.features]
     for asset, kind in wanted:
-        if not connection.execute("SELECT 1 FROM assets WHERE id = ? AND kind = ?", (asset, kind)).fetchone():
+        seen = connection.execute(
+            f"SELECT 1 FROM assets JOIN asset_owners ON asset = id WHERE id = :asset AND kind = :kind AND {SEEN}",
+            owner.terms(asset=asset, kind=kind),
+        )
+        if seen.fetchone() is None:
             raise NotFound(kind, expected=f"the id of an asset of kind {kind}", got=asset)
+        own(connection, asset, owner.key)

@@ -14,6 +14,7 @@ from service.errors import InvalidRequest
 from service.store.attempts import told
 from service.store.database import Database
 from service.store.files import DataDirectory
+from service.store.owners import SEEN, Owned
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,10 @@ class LiftRecord:
     created: float
 
 
-class LiftStore:
+VISIBLE = f"SELECT lifts.* FROM lifts JOIN jobs USING (id) WHERE {SEEN}"  # a lift belongs to whom its job does
+
+
+class LiftStore(Owned):
     """Lifts in the database, their bytes in lifts/."""
 
     def __init__(self, database: Database, files: DataDirectory) -> None:
@@ -85,7 +89,7 @@ class LiftStore:
     def find(self, lift: str) -> LiftRecord | None:
         """The lift of that id, None when there is none."""
         with self._database.read() as connection:
-            row = connection.execute("SELECT * FROM lifts WHERE id = ?", (lift,)).fetchone()
+            row = connection.execute(f"{VISIBLE} AND id = :lift", self._owner.terms(lift=lift)).fetchone()
         return None if row is None else self._record(row)
 
     def get(self, lift: str) -> LiftRecord:
@@ -112,7 +116,7 @@ class LiftStore:
             InvalidRequest: there are several, so one must be named.
         """
         with self._database.read() as connection:
-            rows = connection.execute("SELECT * FROM lifts ORDER BY created DESC LIMIT 2").fetchall()
+            rows = connection.execute(f"{VISIBLE} LIMIT 2", self._owner.terms()).fetchall()
         if not rows:
             raise NotFound("lift", expected="at least one lift", got="none", hint="POST /lift first")
         if len(rows) > 1:
@@ -127,7 +131,7 @@ class LiftStore:
     def all(self) -> list[LiftRecord]:
         """Every lift, newest first."""
         with self._database.read() as connection:
-            rows = connection.execute("SELECT * FROM lifts ORDER BY created DESC, id").fetchall()
+            rows = connection.execute(f"{VISIBLE} ORDER BY lifts.created DESC, id", self._owner.terms()).fetchall()
         return [self._record(row) for row in rows]
 
     def collect(self, older_than: float) -> list[Path]:

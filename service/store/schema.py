@@ -72,4 +72,31 @@ INSERT INTO job_events
     """
 ALTER TABLE jobs ADD COLUMN request_id TEXT;        -- X-Request-ID of the request that made it
 """,
+    """
+CREATE TABLE keys (
+    id TEXT PRIMARY KEY,
+    name TEXT NOT NULL,
+    digest TEXT NOT NULL UNIQUE,    -- sha256 of the secret in hex; the secret itself is nowhere
+    scopes TEXT NOT NULL,           -- as service.keys.scopes.Scope, with spaces between
+    max_bytes INTEGER,              -- what is not set is as the server's settings have it
+    max_queued INTEGER,
+    max_uploads INTEGER,
+    created REAL NOT NULL,
+    revoked REAL                    -- a revoked key stays: that there was one closes the service for good
+) STRICT;
+
+CREATE TABLE asset_owners (         -- two who uploaded the same bytes both have them
+    asset TEXT NOT NULL REFERENCES assets (id) ON DELETE CASCADE,
+    owner TEXT NOT NULL,            -- the id of a key; '' = made while there was none: of admins alone
+    created REAL NOT NULL,
+    PRIMARY KEY (asset, owner)
+) STRICT, WITHOUT ROWID;
+INSERT INTO asset_owners SELECT id, '', created FROM assets;
+CREATE INDEX asset_owners_by_owner ON asset_owners (owner);
+ALTER TABLE assets DROP COLUMN created;
+
+ALTER TABLE jobs ADD COLUMN owner TEXT NOT NULL DEFAULT '';  -- likewise
+DROP INDEX jobs_by_key;
+CREATE UNIQUE INDEX jobs_by_key ON jobs (owner, idempotency_key);
+""",
 )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Self
 
@@ -12,12 +12,16 @@ from service.store.database import Database
 from service.store.events import EventStore
 from service.store.files import DataDirectory
 from service.store.jobs import JobStore
+from service.store.keys import KeyStore
 from service.store.lifts import LiftStore
+from service.store.owners import Owner
+
+DATABASE = "service.sqlite"  # in the data directory
 
 
 @dataclass(frozen=True)
 class Store:
-    """Assets, jobs and lifts, with the files and the database that hold them."""
+    """Assets, jobs, lifts and keys, with the files and the database that hold them."""
 
     files: DataDirectory
     database: Database
@@ -26,6 +30,7 @@ class Store:
     attempts: AttemptStore
     events: EventStore
     lifts: LiftStore
+    keys: KeyStore
 
     @classmethod
     def open(cls, root: Path, *, floor_bytes: int = 0) -> Self:
@@ -40,7 +45,7 @@ class Store:
         """
         files = DataDirectory(root, floor_bytes=floor_bytes)
         try:
-            database = Database(files.root / "service.sqlite")
+            database = Database(files.root / DATABASE)
         except BaseException:
             files.close()
             raise
@@ -52,6 +57,18 @@ class Store:
             attempts=AttemptStore(database),
             events=EventStore(database),
             lifts=LiftStore(database, files),
+            keys=KeyStore(database),
+        )
+
+    def seen_by(self, owner: Owner) -> Self:
+        """The same store as an owner sees it: what others made is absent."""
+        return replace(
+            self,
+            assets=self.assets.seen_by(owner),
+            jobs=self.jobs.seen_by(owner),
+            attempts=self.attempts.seen_by(owner),
+            events=self.events.seen_by(owner),
+            lifts=self.lifts.seen_by(owner),
         )
 
     def close(self) -> None:

@@ -19,6 +19,7 @@ from .following import ended
 from .tiny_scene import CHANNELS, TinyScene, make_scene, text_table
 
 LIFT_REQUEST = "the-request-of-the-lift"
+ADDRESS = "http://127.0.0.1"
 
 
 @contextmanager
@@ -34,7 +35,7 @@ def serving(data: Path, table: Path, **settings: Any) -> Iterator[TestClient]:
     )
     store = Store.open(chosen.data, floor_bytes=chosen.disk_floor_bytes)
     try:
-        with TestClient(assemble(chosen, store), raise_server_exceptions=False) as client:
+        with TestClient(assemble(chosen, store), ADDRESS, raise_server_exceptions=False) as client:
             yield client
     finally:
         store.close()

@@ -26,7 +26,7 @@ from service.store.store import Store
 from service.wire import JobState
 from tests.crash.conftest import order, stand_in
 
-from .conftest import Uploaded
+from .conftest import ADDRESS, Uploaded
 from .following import ended
 from .test_problems import assert_problem
 from .tiny_scene import TinyScene
@@ -52,7 +52,8 @@ def quick(store: Store) -> Quick:
         supervisor = Supervisor(store, LiftLimits(), command=stand_in(behaviour))
         known = order(store)
         body = {"splats": known.splats, "cameras": known.cameras, "features": list(known.features)}
-        with TestClient(create_app(chosen, store, supervisor, worker), raise_server_exceptions=False) as client:
+        app = create_app(chosen, store, supervisor, worker)
+        with TestClient(app, ADDRESS, raise_server_exceptions=False) as client:
             yield client, body
 
     return serve

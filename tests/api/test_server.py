@@ -130,7 +130,8 @@ def test_upload_that_breaks_off_leaves_nothing(tmp_path: Path, table: Path) -> N
         url = httpx.URL(address)
         with socket.create_connection((url.host, url.port or 80)) as client:
             client.sendall(
-                b"PUT /assets/splats HTTP/1.1\r\nHost: x\r\nContent-Length: 9000000\r\n\r\n" + b"p" * 2_000_000
+                b"PUT /assets/splats HTTP/1.1\r\nHost: localhost\r\nContent-Length: 9000000\r\n\r\n"
+                + b"p" * 2_000_000
             )
             wait_until(lambda: any((tmp_path / "tmp").iterdir()))
         wait_until(lambda: not any((tmp_path / "tmp").iterdir()))

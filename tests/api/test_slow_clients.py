@@ -27,8 +27,10 @@ from service.wire import AssetKind
 from tests.crash.server import NoQueries
 
 PATIENCE_SECONDS = 30.0  # for what takes half a second; the machine may be busy
-HEAD = b"PUT /assets/splats HTTP/1.1\r\nHost: x\r\nContent-Length: 5000\r\n\r\n"
-JSON_HEAD = b"POST /lift HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\nContent-Length: 5000\r\n\r\n"
+HEAD = b"PUT /assets/splats HTTP/1.1\r\nHost: localhost\r\nContent-Length: 5000\r\n\r\n"
+JSON_HEAD = (
+    b"POST /lift HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: 5000\r\n\r\n"
+)
 Served = Callable[..., AbstractContextManager[tuple[str, int]]]
 
 
@@ -86,7 +88,7 @@ def answer(client: socket.socket) -> tuple[bytes, bytes]:
 
 def ask_for_health(client: socket.socket) -> None:
     """One request over a connection that stays open."""
-    client.sendall(b"GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n")
+    client.sendall(b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n")
     said = b""
     while b"ok" not in said.partition(b"\r\n\r\n")[2]:
         said += client.recv(1 << 16)
@@ -150,7 +152,7 @@ def test_body_that_comes_fast_and_then_trickles_is_408(address: tuple[str, int])
 
 def test_body_at_five_times_the_least_speed_is_taken(address: tuple[str, int]) -> None:
     with client_of(address) as client:
-        client.sendall(JSON_HEAD.replace(b"Host: x\r\n", b"Host: x\r\nConnection: close\r\n"))
+        client.sendall(JSON_HEAD.replace(b"Host: localhost\r\n", b"Host: localhost\r\nConnection: close\r\n"))
         for _ in range(20):
             client.sendall(b" " * 250)
             time.sleep(0.05)
@@ -158,7 +160,7 @@ def test_body_at_five_times_the_least_speed_is_taken(address: tuple[str, int]) -
     assert head.startswith(b"HTTP/1.1 422 ")  # read to its end, and found to be no order
 
 
-@pytest.mark.parametrize("begin", [b"G", b"GET / HTTP/1.1\r\nHost: x\r\n"], ids=["line", "headers"])
+@pytest.mark.parametrize("begin", [b"G", b"GET / HTTP/1.1\r\nHost: localhost\r\n"], ids=["line", "headers"])
 def test_headers_that_trickle_are_408_and_closed(address: tuple[str, int], begin: bytes) -> None:
     with client_of(address) as client:
         assert_problem(trickle(client, begin, b"a"), 408, "too-slow")
@@ -177,14 +179,18 @@ def test_connection_without_a_word_is_closed_without_one(address: tuple[str, int
 
 def test_body_that_trickles_on_after_its_answer_is_cut_off(address: tuple[str, int]) -> None:
     with client_of(address) as client:
-        head = b"GET /healthz HTTP/1.1\r\nHost: x\r\nContent-Length: 5000\r\n\r\n"
+        head = b"GET /healthz HTTP/1.1\r\nHost: localhost\r\nContent-Length: 5000\r\n\r\n"
         said, body = trickle(client, head, b" ")
     assert said.startswith(b"HTTP/1.1 200 ") and b"ok" in body
 
 
 @pytest.mark.parametrize(
     "nonsense",
-    [b"nonsense\r\n\r\n", b"GET / HTTP/1.1\r\nHost: x\r\nA: " + b"a" * 200_000, b"\x16\x03\x01" * 10 + b"\r\n\r\n"],
+    [
+        b"nonsense\r\n\r\n",
+        b"GET / HTTP/1.1\r\nHost: localhost\r\nA: " + b"a" * 200_000,
+        b"\x16\x03\x01" * 10 + b"\r\n\r\n",
+    ],
     ids=["no HTTP", "headers without an end", "TLS"],
 )
 def test_what_is_no_http_is_400_in_the_one_shape(address: tuple[str, int], nonsense: bytes) -> None:
@@ -195,7 +201,7 @@ def test_what_is_no_http_is_400_in_the_one_shape(address: tuple[str, int], nonse
 
 def test_chunk_without_a_length_is_400_in_the_one_shape(address: tuple[str, int]) -> None:
     with client_of(address) as client:
-        client.sendall(b"PUT /assets/splats HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\nzz\r\n")
+        client.sendall(b"PUT /assets/splats HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\nzz\r\n")
         assert_problem(answer(client), 400, "malformed-request")
 
 
@@ -224,7 +230,7 @@ def test_client_that_does_not_read_is_cut_off(tmp_path: Path) -> None:
     with served(tmp_path / "data", min_bytes_per_second=1 << 20) as address:
         path = f"/assets/sha256:{digest}/content"
         with client_of(address) as client:
-            client.sendall(f"GET {path} HTTP/1.1\r\nHost: x\r\n\r\n".encode())
+            client.sendall(f"GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
             time.sleep(2)
             head, body = answer(client)
         assert head.startswith(b"HTTP/1.1 200 ") and len(body) < len(content)

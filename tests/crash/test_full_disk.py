@@ -42,7 +42,7 @@ def test_full_disk_is_507_and_the_service_lives(small_disk: Path) -> None:
     settings = ServiceSettings.model_validate({"data": small_disk / "data"})
     runner = Supervisor(store, LiftLimits(), command=stand_in("answer"))
     app = create_app(settings, store, runner, cast("WarmWorker", NoQueries()))
-    with TestClient(app, raise_server_exceptions=False) as client:
+    with TestClient(app, "http://127.0.0.1", raise_server_exceptions=False) as client:
         upload = client.put("/assets/splats", content=b"x" * 4_000_000)
         assert (upload.status_code, upload.json()["type"]) == (507, "/problems/no-space")
         assert not any((small_disk / "data" / "tmp").iterdir())

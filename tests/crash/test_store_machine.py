@@ -22,12 +22,14 @@ from service.store.events import EventKind
 from service.store.garbage import collect
 from service.store.jobs import JobOrder
 from service.store.lifts import FinishedLift
+from service.store.owners import Owner, stored_bytes
 from service.store.store import Store
 from service.wire import ENDED, AssetKind, JobState
 
 LEASE = 60.0
 MAX_QUEUED = 3
 ROOMS = ("blobs", "lifts", "work", "tmp")
+OWNERS = {"": Owner(), "a": Owner("a", sees_all=False), "b": Owner("b", sees_all=False), "admin": Owner("admin")}
 
 
 @dataclass
@@ -35,6 +37,7 @@ class Model:
     """A job as the model knows it."""
 
     order: JobOrder
+    owner: str
     state: str = "queued"
     attempt: int = 0
     released: int = 0
@@ -47,7 +50,10 @@ class Model:
 
 
 class StoreMachine(RuleBasedStateMachine):
-    """Rules are what routes, the supervisor, crashes and the collector do; the model is two dicts and a line."""
+    """Rules are what routes, the supervisor, crashes and the collector do; the model is three dicts and a line.
+
+    Who asks is one of OWNERS: the service itself, two keys that see their own, and an admin.
+    """
 
     contents = Bundle("contents")
     attempts = Bundle("attempts")
@@ -57,6 +63,7 @@ class StoreMachine(RuleBasedStateMachine):
         self.folder = tempfile.TemporaryDirectory()
         self.store = Store.open(Path(self.folder.name))
         self.assets: dict[str, bytes] = {}
+        self.owned: dict[str, set[str]] = {}  # asset -> who has it
         self.jobs: dict[str, Model] = {}
 
     def teardown(self) -> None:
@@ -65,48 +72,75 @@ class StoreMachine(RuleBasedStateMachine):
 
     @initialize(target=contents)
     def begin(self) -> Any:
-        return multiple(*(self.put(kind, b"first") for kind in AssetKind))
+        return multiple(*(self.put(kind, b"first", "a") for kind in AssetKind))
 
-    def put(self, kind: AssetKind, content: bytes) -> str:
+    def sees(self, who: str, asset: str) -> bool:
+        return asset in self.assets and (OWNERS[who].sees_all or who in self.owned[asset])
+
+    def put(self, kind: AssetKind, content: bytes, who: str) -> str:
         content = kind.encode() + content
         digest = hashlib.sha256(content).hexdigest()
         with self.store.files.draft(".bin") as draft:
             draft.write_bytes(content)
-            asset, new = self.store.assets.add(CheckedUpload(draft, kind, digest, ".bin", {}, []))
-        assert new == (asset.id not in self.assets)
+            upload = CheckedUpload(draft, kind, digest, ".bin", {}, [])
+            asset, new = self.store.seen_by(OWNERS[who]).assets.add(upload)
+        assert new == (who not in self.owned.get(asset.id, set()))
         self.assets[asset.id] = content
+        self.owned.setdefault(asset.id, set()).add(who)
         return asset.id
 
-    @rule(target=contents, kind=st.sampled_from(AssetKind), content=st.binary(max_size=2))
-    def upload(self, kind: AssetKind, content: bytes) -> str:
-        return self.put(kind, content)
+    @rule(
+        target=contents,
+        kind=st.sampled_from(AssetKind),
+        content=st.just(b"first") | st.binary(max_size=2),
+        who=st.sampled_from([*OWNERS]),
+    )
+    def upload(self, kind: AssetKind, content: bytes, who: str) -> str:
+        return self.put(kind, content, who)
 
     @precondition(lambda self: len(self.assets) > 1)
-    @rule(asset=contents)
-    def delete_asset(self, asset: str) -> None:
-        used = any(asset in (job.order.splats, job.order.cameras, *job.order.features) for job in self.jobs.values())
-        expected = None if asset in self.assets and not used else InUse if asset in self.assets else NotFound
-        if expected is None:
-            self.store.assets.delete(asset)
-            del self.assets[asset]
+    @rule(asset=contents, who=st.sampled_from([*OWNERS]))
+    def delete_asset(self, asset: str, who: str) -> None:
+        used = [
+            job
+            for job, model in self.jobs.items()
+            if asset in (model.order.splats, model.order.cameras, *model.order.features)
+            and (OWNERS[who].sees_all or model.owner == who)
+        ]
+        seen = self.store.seen_by(OWNERS[who]).assets
+        if not self.sees(who, asset):
+            with pytest.raises(NotFound):
+                seen.delete(asset)
+        elif used:
+            with pytest.raises(InUse) as refused:
+                seen.delete(asset)
+            assert set(refused.value.hint.partition(": ")[2].split(", ")) <= set(used)
         else:
-            with pytest.raises(expected):
-                self.store.assets.delete(asset)
+            seen.delete(asset)
+            self.owned[asset] -= set(OWNERS) if OWNERS[who].sees_all else {who}
+            if not self.owned[asset]:
+                del self.assets[asset], self.owned[asset]
 
     @rule(
         data=st.data(),
         key=st.none() | st.sampled_from(["a", "b"]),
         print_=st.sampled_from(["x", "x", "y"]),
         mistaken=st.sampled_from([False] * 9 + [True]),
+        who=st.sampled_from(["a", "a", *OWNERS]),
     )
-    def submit(self, data: Any, key: str | None, print_: str, mistaken: bool) -> None:
+    def submit(self, data: Any, key: str | None, print_: str, mistaken: bool, who: str) -> None:
         chosen = []
         for kind in AssetKind:
             right = [asset for asset in sorted(self.assets) if self.assets[asset].startswith(kind.encode())]
             chosen.append(data.draw(st.sampled_from(sorted(self.assets) if mistaken or not right else right)))
         order = JobOrder(chosen[0], chosen[1], (chosen[2],), {}, key, print_)
-        known = [job for job, model in self.jobs.items() if key is not None and model.order.key == key]
-        kinds = [self.store.assets.get(asset).kind for asset in chosen]
+        known = [
+            job
+            for job, model in self.jobs.items()
+            if key is not None and (model.order.key, model.owner) == (key, who)
+        ]
+        seen = self.store.seen_by(OWNERS[who]).jobs
+        kinds = [self.store.assets.get(asset).kind if self.sees(who, asset) else None for asset in chosen]
         if known and self.jobs[known[0]].order.fingerprint != print_:
             expected: type[Exception] | None = KeyReused
         elif not known and sum(model.state == "queued" for model in self.jobs.values()) >= MAX_QUEUED:
@@ -117,12 +151,14 @@ class StoreMachine(RuleBasedStateMachine):
             expected = None
         if expected is not None:
             with pytest.raises(expected):
-                self.store.jobs.submit(order, max_queued=MAX_QUEUED)
+                seen.submit(order, max_queued=MAX_QUEUED)
             return
-        job, new = self.store.jobs.submit(order, max_queued=MAX_QUEUED)
+        job, new = seen.submit(order, max_queued=MAX_QUEUED)
         assert new == (not known) and (new or job == known[0])
         if new:
-            self.jobs[job] = Model(order)
+            self.jobs[job] = Model(order, who)
+            for asset in chosen:
+                self.owned[asset].add(who)
 
     @rule(target=attempts)
     def claim(self) -> tuple[str, int]:
@@ -190,29 +226,38 @@ class StoreMachine(RuleBasedStateMachine):
         self.store.attempts.advance(*attempt, {"done": 1})
 
     @precondition(lambda self: self.jobs)
-    @rule(data=st.data())
-    def cancel(self, data: Any) -> None:
+    @rule(data=st.data(), who=st.sampled_from([*OWNERS]))
+    def cancel(self, data: Any, who: str) -> None:
         job = data.draw(st.sampled_from(sorted(self.jobs)))
         model = self.jobs[job]
+        seen = self.store.seen_by(OWNERS[who]).attempts
+        if not OWNERS[who].sees_all and model.owner != who:
+            with pytest.raises(NotFound):
+                seen.cancel(job)
+            return
         if model.state in ("succeeded", "failed"):
             with pytest.raises(Conflict):
-                self.store.attempts.cancel(job)
+                seen.cancel(job)
             return
-        assert self.store.attempts.cancel(job) == (model.state in ("queued", "running"))
+        assert seen.cancel(job) == (model.state in ("queued", "running"))
         if model.state in ("queued", "running"):
             model.move("canceled" if model.state == "queued" else "canceling")
 
     @precondition(lambda self: self.jobs)
-    @rule(data=st.data(), with_lift=st.booleans())
-    def delete_job(self, data: Any, with_lift: bool) -> None:
+    @rule(data=st.data(), with_lift=st.booleans(), who=st.sampled_from([*OWNERS]))
+    def delete_job(self, data: Any, with_lift: bool, who: str) -> None:
         job = data.draw(st.sampled_from(sorted(self.jobs)))
         model = self.jobs[job]
-        if model.state in ENDED and (model.lift is None or with_lift):
-            self.store.jobs.delete(job, with_lift=with_lift)
+        seen = self.store.seen_by(OWNERS[who]).jobs
+        if not OWNERS[who].sees_all and model.owner != who:
+            with pytest.raises(NotFound):
+                seen.delete(job, with_lift=with_lift)
+        elif model.state in ENDED and (model.lift is None or with_lift):
+            seen.delete(job, with_lift=with_lift)
             del self.jobs[job]
         else:
             with pytest.raises(Conflict):
-                self.store.jobs.delete(job, with_lift=with_lift)
+                seen.delete(job, with_lift=with_lift)
 
     @rule()
     def collect(self) -> None:
@@ -245,8 +290,24 @@ class StoreMachine(RuleBasedStateMachine):
             events = self.store.events.after(job, 0)
             assert [event.data["state"] for event in events if event.kind is EventKind.STATE] == model.story
             assert model.story.count("succeeded") <= 1
+        for who in OWNERS:
+            self.sees_its_own(who)
         files = [path for room in ROOMS for path in (self.store.files.root / room).rglob("*") if path.is_file()]
         assert len(files) == len(self.assets) + len(lifts)
+
+    def sees_its_own(self, who: str) -> None:
+        seen, all_ = self.store.seen_by(OWNERS[who]), OWNERS[who].sees_all
+        jobs = {job for job, model in self.jobs.items() if all_ or model.owner == who}
+        assert {asset.id for asset in seen.assets.all()} == {asset for asset in self.assets if self.sees(who, asset)}
+        assert {job.id for job in seen.jobs.all()} == jobs
+        assert {lift.id for lift in seen.lifts.all()} == {job for job in jobs if self.jobs[job].lift is not None}
+        for job in self.jobs:
+            assert (seen.attempts.state(job) is not None) == (job in jobs)
+            assert (seen.lifts.find(job) is not None) == (job in jobs and self.jobs[job].lift is not None)
+        stored = sum(len(content) for asset, content in self.assets.items() if who in self.owned[asset])
+        stored += sum(len(model.lift or b"") for model in self.jobs.values() if model.owner == who)
+        with self.store.database.read() as connection:
+            assert stored_bytes(connection, OWNERS[who]) == stored
 
 
 TestStoreMachine = StoreMachine.TestCase

@@ -1,0 +1,91 @@
+"""Whose things are whose: what a part of the store shows depends on who looks."""
+
+from __future__ import annotations
+
+import copy
+import sqlite3
+from dataclasses import dataclass
+from typing import Any, Self
+
+from service.errors import OverQuota, TooMany
+
+# For WHERE clauses over a table with a column `owner`; its names are bound by `Owner.terms`.
+SEEN = "(:sees_all OR owner = :owner)"
+QUEUE_RETRY_SECONDS = 30  # a lift takes seconds to minutes, and one must end before the line is shorter
+
+
+@dataclass(frozen=True)
+class Owner:
+    """Who looks at the store, and what they may fill of it.
+
+    The default is the service itself, and everybody while there are no keys: it sees all, and what it makes belongs
+    to admins once there are keys.
+    """
+
+    key: str = ""  # the id of a key: what is made belongs to it
+    sees_all: bool = True
+    max_bytes: int | None = None  # of assets and lifts together; None = no limit
+    max_queued: int | None = None  # jobs in line
+
+    def terms(self, **more: Any) -> dict[str, Any]:
+        """Values for SEEN, and more."""
+        return {"sees_all": self.sees_all, "owner": self.key, **more}
+
+
+class Owned:
+    """A part of the store as an owner sees it; as it was opened, it shows everything.
+
+    What another owner made is absent, in every answer: it is not looked up and refused, it is not found.
+    """
+
+    _owner = Owner()
+
+    def seen_by(self, owner: Owner) -> Self:
+        """The same part, as that owner sees it."""
+        seen = copy.copy(self)
+        seen._owner = owner
+        return seen
+
+
+def stored_bytes(connection: sqlite3.Connection, owner: Owner) -> int:
+    """What an owner's assets and lifts take; bytes that several have count for each of them."""
+    assets = "SELECT total(bytes) FROM assets JOIN asset_owners ON asset = id WHERE owner = :owner"
+    lifts = "SELECT total(lifts.bytes) FROM lifts JOIN jobs USING (id) WHERE owner = :owner"
+    return int(connection.execute(f"SELECT ({assets}) + ({lifts})", {"owner": owner.key}).fetchone()[0])
+
+
+def require_quota(connection: sqlite3.Connection, owner: Owner, coming: int) -> None:
+    """See that an owner may store more.
+
+    Args:
+        connection: to read with, or of the transaction that will store it.
+        owner: who stores it.
+        coming: bytes.
+
+    Raises:
+        OverQuota: it would be more than the owner may store.
+    """
+    if owner.max_bytes is None:
+        return
+    used = stored_bytes(connection, owner)
+    if used + coming > owner.max_bytes:
+        raise OverQuota(
+            "key", expected=f"at most {owner.max_bytes} bytes of assets and lifts", got=f"{used} and {coming} more",
+            hint="delete assets, or jobs with their lifts, or ask the operator for more",
+        )  # fmt: skip
+
+
+def require_turn(connection: sqlite3.Connection, owner: Owner) -> None:
+    """See that an owner may put another job in line.
+
+    Raises:
+        TooMany: as many are in line as may be.
+    """
+    if owner.max_queued is None:
+        return
+    row = connection.execute("SELECT count(*) FROM jobs WHERE state = 'queued' AND owner = ?", (owner.key,))
+    if (queued := row.fetchone()[0]) >= owner.max_queued:
+        raise TooMany(
+            "lift", expected=f"fewer than {owner.max_queued} jobs of this key in line", got=f"{queued}",
+            hint="try again later", retry_after=QUEUE_RETRY_SECONDS,
+        )  # fmt: skip

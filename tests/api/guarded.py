@@ -1,0 +1,124 @@
+"""An application with keys, and one thing of each kind that belongs to Alice. No process runs behind it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+from fastapi import FastAPI
+from fastapi.testclient import TestClient
+from starlette.routing import Route
+
+from service.app import create_app
+from service.jobs.supervisor import Supervisor
+from service.keys.scopes import Scope
+from service.queries.warm import WarmWorker
+from service.settings import ServiceSettings
+from service.store.jobs import JobOrder
+from service.store.keys import Quota
+from service.store.lifts import FinishedLift
+from service.store.owners import Owner
+from service.store.store import Store
+from tests.crash.conftest import order
+from tests.crash.server import NoQueries
+
+from .conftest import ADDRESS
+
+SCOPES = {"alice": "read write", "bob": "read write", "boss": "admin"}
+METADATA = {
+    "settings": {}, "certificate": {}, "timings": {},
+    "version": "0", "encoder": "e", "text_space": "t", "views": ["v"],
+}  # fmt: skip
+
+
+class NoJobs(NoQueries):
+    """Stands in for the supervisor: jobs stay where the tests put them."""
+
+    def wake(self) -> None: ...
+
+
+@dataclass(frozen=True)
+class Guarded:
+    """The application, its store, the secrets by name, and what Alice has."""
+
+    client: TestClient
+    store: Store
+    secrets: Mapping[str, str]
+    ids: Mapping[str, str]  # of keys, by name
+    order: JobOrder
+    done: str  # a job with a lift
+    queued: str
+
+    def ask(self, name: str | None, method: str, path: str, **how: Any) -> Any:
+        """A request with somebody's key, or without one."""
+        headers = how.pop("headers", {}) | ({} if name is None else bearer(self.secrets[name]))
+        return self.client.request(method, path, headers=headers, **how)
+
+    def body(self) -> dict[str, Any]:
+        """Alice's order, as POST /lift takes it."""
+        return {
+            "splats": self.order.splats, "cameras": self.order.cameras, "features": list(self.order.features)
+        }  # fmt: skip
+
+
+def bearer(secret: str) -> dict[str, str]:
+    """The header that brings a key."""
+    return {"Authorization": f"Bearer {secret}"}
+
+
+@contextmanager
+def guarded(data: Path, **settings: Any) -> Iterator[Guarded]:
+    """Serve it."""
+    store = Store.open(data)
+    chosen = ServiceSettings.model_validate({"data": data, "disk_floor_bytes": 0, **settings})
+    app = create_app(chosen, store, cast("Supervisor", NoJobs()), cast("WarmWorker", NoQueries()))
+    made = {name: make_key(store, scopes) for name, scopes in SCOPES.items()}
+    ids, secrets = ({name: pair[place] for name, pair in made.items()} for place in (0, 1))
+    hers = store.seen_by(Owner(ids["alice"], sees_all=False))
+    wanted = order(hers)
+    done = hers.jobs.submit(wanted)[0]
+    finish(store, b"a lift")
+    queued = hers.jobs.submit(wanted)[0]
+    try:
+        with TestClient(app, ADDRESS, raise_server_exceptions=False) as client:
+            yield Guarded(client, store, secrets, ids, wanted, done, queued)
+    finally:
+        store.close()
+
+
+def make_key(store: Store, scopes: str, **quota: int) -> tuple[str, str]:
+    """The id and the secret of a new key."""
+    key, secret = store.keys.create("somebody", frozenset(map(Scope, scopes.split())), Quota(**quota))
+    return key.id, secret
+
+
+def finish(store: Store, content: bytes) -> None:
+    """Claim the oldest job in line and end it with a lift."""
+    claimed = store.attempts.claim(60)
+    assert claimed is not None
+    with store.files.draft(".safetensors") as draft:
+        draft.write_bytes(content)
+        assert store.lifts.finish(claimed.id, claimed.attempt, FinishedLift(draft, "0" * 64, 1, 1, METADATA))
+
+
+def every_route(app: FastAPI) -> list[tuple[str, str]]:
+    """Method and path of all that the application answers, documented or not."""
+    found: list[tuple[str, str]] = []
+    routes = list(app.routes)
+    while routes:
+        route = routes.pop(0)
+        if isinstance(route, Route):
+            found += [(method, route.path) for method in sorted(route.methods or ()) if method != "HEAD"]
+        else:
+            routes += vars(route)["original_router"].routes  # of a router that was included
+    return found
+
+
+def address(path: str, job: str, asset: str) -> str:
+    """A route's path with the ids in their places."""
+    path = path.replace("{kind}", "cameras").replace("{asset}", asset)
+    return re.sub(r"\{(job|lift)\}", job, path)

@@ -1,0 +1,183 @@
+"""The gate: which hosts and pages may ask, and how many uploads at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import anyio
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from starlette.datastructures import Headers
+
+from liftcore.errors import SplatliftError
+from service.errors import ForeignOrigin, Misdirected
+from service.keys.gate import CALLER, Gate
+from service.keys.hosts import Hosts, host_name, is_loopback
+from service.keys.scopes import OPEN, needed
+from service.settings import ServiceSettings
+from service.store.store import Store
+
+from .guarded import Guarded, bearer, guarded, make_key
+from .test_problems import assert_problem
+
+HERE = Hosts("127.0.0.1", ["lift.example.org"])
+EVERYWHERE = Hosts("0.0.0.0", [])
+
+
+@pytest.fixture
+def house(tmp_path: Path) -> Iterator[Guarded]:
+    with guarded(tmp_path / "data", allowed_hosts="Lift.example.org, other.example.org") as made:
+        yield made
+
+
+def check(hosts: Hosts, method: str = "GET", **headers: str) -> None:
+    hosts.check(method, Headers(headers))
+
+
+@pytest.mark.parametrize(
+    "host",
+    ["localhost", "LOCALHOST:8787", "127.0.0.1:1", "[::1]:8787", "[::1]", "lift.example.org:443", "localhost."],
+)
+def test_own_names_are_taken(host: str) -> None:
+    check(HERE, host=host)
+
+
+@pytest.mark.parametrize(
+    "host",
+    [
+        "evil.example", "evil.example:8787", "localhost.evil.example", "127.0.0.1.evil.example", "", ":80", "[::1",
+        "192.0.2.1", "localhost:port", "localhost@evil.example", "evil.example@localhost", "[localhost]", "[]",
+    ],
+)  # fmt: skip
+def test_other_names_are_misdirected(host: str) -> None:
+    with pytest.raises(Misdirected):
+        check(HERE, host=host)
+
+
+def test_without_a_host_or_with_two_nothing_is_said() -> None:
+    with pytest.raises(Misdirected):
+        check(HERE)
+    with pytest.raises(Misdirected):
+        HERE.check("GET", Headers(raw=[(b"host", b"localhost"), (b"host", b"localhost")]))
+
+
+def test_service_on_all_addresses_takes_digits_and_no_names() -> None:
+    check(EVERYWHERE, host="192.0.2.1:8787")
+    check(EVERYWHERE, host="[2001:db8::1]:8787")
+    with pytest.raises(Misdirected):
+        check(EVERYWHERE, host="evil.example")
+
+
+@given(st.text(st.characters(codec="latin-1"), max_size=40))
+def test_no_header_breaks_the_gate_and_only_names_pass(text: str) -> None:
+    try:
+        check(HERE, "POST", host=text, origin=text)
+    except SplatliftError:
+        return
+    assert host_name(text) in ("localhost", "127.0.0.1", "::1", "lift.example.org")
+
+
+@given(st.sampled_from(["GET", "HEAD", "POST", "PUT", "DELETE", "OPTIONS", "BREW"]), st.text(max_size=20))
+def test_what_is_not_listed_as_open_wants_a_scope(method: str, rest: str) -> None:
+    for path in ("/" + rest, *(f"{path}{rest}" for path in OPEN)):
+        assert (needed(method, path) is None) == (method in ("GET", "HEAD") and path in OPEN)
+
+
+@pytest.mark.parametrize("origin", ["http://localhost:8787", "https://lift.example.org", "http://LOCALHOST:8787"])
+def test_own_page_may_change_things(origin: str) -> None:
+    check(HERE, "POST", host="localhost:8787", origin=origin)
+
+
+@pytest.mark.parametrize(
+    "origin",
+    ["https://evil.example", "null", "", "http://localhost:3000", "http://localhost", "file://", "localhost:8787", "http://["],
+)  # fmt: skip
+def test_foreign_pages_may_only_look(origin: str) -> None:
+    check(HERE, "GET", host="localhost:8787", origin=origin)  # without CORS headers no page can read the answer
+    for method in ("POST", "PUT", "DELETE", "PATCH"):
+        with pytest.raises(ForeignOrigin):
+            check(HERE, method, host="localhost:8787", origin=origin)
+
+
+def test_gate_answers_with_problems(house: Guarded) -> None:
+    reply = house.ask("alice", "GET", "/jobs", headers={"Host": "evil.example"})
+    assert (assert_problem(reply)["type"], reply.status_code) == ("/problems/misdirected", 421)
+    assert house.ask(None, "GET", "/healthz", headers={"Host": "evil.example"}).status_code == 421
+    assert house.ask("alice", "GET", "/jobs", headers={"Host": "LIFT.example.org:80"}).status_code == 200
+    reply = house.ask("alice", "POST", f"/jobs/{house.queued}/cancel", headers={"Origin": "https://evil.example"})
+    assert (assert_problem(reply)["type"], reply.status_code) == ("/problems/foreign-origin", 403)
+    assert "access-control-allow-origin" not in reply.headers
+    own = house.ask("alice", "POST", f"/jobs/{house.queued}/cancel", headers={"Origin": "http://127.0.0.1"})
+    assert own.status_code == 200
+
+
+@pytest.mark.parametrize(
+    ("host", "loopback"),
+    [
+        ("localhost", True),
+        ("127.8.8.8", True),
+        ("::1", True),
+        ("0.0.0.0", False),
+        ("::", False),
+        ("example.org", False),
+    ],
+)
+def test_loopback_is_known(host: str, loopback: bool) -> None:
+    assert is_loopback(host) is loopback
+
+
+def test_uploads_at_a_time_have_a_quota_a_key(tmp_path: Path) -> None:
+    store = Store.open(tmp_path)
+    keys = {name: make_key(store, "write", max_uploads=2)[1] for name in ("alice", "bob")}
+    told: list[int] = []
+    most = 0
+
+    async def upload(gate: Gate, name: str, path: str = "/assets/splats") -> None:
+        async def send(message: Any) -> None:
+            if message["type"] == "http.response.start":
+                told.append(message["status"])
+
+        pairs = {"host": "localhost", **{key.lower(): value for key, value in bearer(keys[name]).items()}}
+        headers = [(key.encode(), value.encode()) for key, value in pairs.items()]
+        scope = {"type": "http", "method": "PUT", "path": path, "headers": headers}
+        await gate(scope, None, send)  # pyright: ignore[reportArgumentType]
+
+    async def run() -> None:
+        nonlocal most
+        release = anyio.Event()
+        inside: list[str] = []
+
+        async def slow(scope: Any, receive: Any, send: Any) -> None:
+            inside.append(scope["state"][CALLER].owner.key)
+            await release.wait()
+            raise OSError("it broke off")
+
+        gate = Gate(slow, store.keys, ServiceSettings.model_validate({"data": tmp_path}))
+
+        async def broken(name: str, path: str = "/assets/splats") -> None:
+            with pytest.raises(OSError, match="broke"):
+                await upload(gate, name, path)
+
+        async with anyio.create_task_group() as group:
+            for name in ("alice", "alice", "bob"):
+                group.start_soon(broken, name)
+            group.start_soon(broken, "alice", "/lift")  # no upload
+            while len(inside) < 4:
+                await anyio.sleep(0.01)
+            await upload(gate, "alice")
+            assert told == [429]
+            release.set()
+        async with anyio.create_task_group() as group:  # what broke off counts no more
+            group.start_soon(broken, "alice")
+            group.start_soon(broken, "alice")
+        assert told == [429]
+        most = len(inside)
+
+    try:
+        anyio.run(run)
+        assert most == 6
+    finally:
+        store.close()

@@ -1,0 +1,357 @@
+"""Keys: nobody comes in without one, none does more than it may, and none sees what is another's."""
+
+from __future__ import annotations
+
+import logging
+import re
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fastapi import FastAPI
+
+from service.__main__ import require_keys
+from service.errors import Misconfigured
+from service.keys.__main__ import main
+from service.keys.scopes import OPEN, Scope, needed
+from service.settings import ServiceSettings
+from service.store.owners import Owner
+from service.store.store import Store
+from service.wire import JobState
+from tests.crash.conftest import order
+
+from .guarded import Guarded, address, bearer, every_route, finish, guarded, make_key
+from .test_problems import assert_problem
+
+NOBODY = "e" * 32
+NO_ASSET = "sha256:" + "f" * 64
+OPEN_ROUTES = {"/", "/healthz", "/readyz", "/version", "/openapi.json", "/docs", "/docs/oauth2-redirect", "/redoc"}
+# Routes that name nothing of anybody: they show one's own things, or make new ones.
+NAMELESS = {("GET", "/metrics"), ("GET", "/assets"), ("PUT", "/assets/{kind}"), ("GET", "/jobs"), ("GET", "/lifts")}
+ASKING = {"text": "apple", "view": "v"}
+
+
+@pytest.fixture
+def house(tmp_path: Path) -> Iterator[Guarded]:
+    with guarded(tmp_path / "data") as made:
+        yield made
+
+
+def app_of(house: Guarded) -> FastAPI:
+    assert isinstance(house.client.app, FastAPI)
+    return house.client.app
+
+
+def closed_routes(house: Guarded) -> list[tuple[str, str]]:
+    routes = [(method, path) for method, path in every_route(app_of(house)) if path not in OPEN]
+    assert len(routes) >= 20
+    return routes
+
+
+def test_every_route_but_the_open_ones_wants_a_key(house: Guarded) -> None:
+    seen = set()
+    for method, path in every_route(app_of(house)):
+        reply = house.ask(None, method, address(path, house.done, house.order.splats), content=b"{")
+        if path in OPEN_ROUTES:
+            assert reply.status_code == 200, path
+            seen.add(path)
+        else:
+            assert (reply.status_code, reply.headers["www-authenticate"]) == (401, 'Bearer realm="splatlift"'), path
+            assert assert_problem(reply)["type"] == "/problems/unauthorized"
+    assert seen == OPEN_ROUTES
+    assert house.ask(None, "GET", "/nowhere").status_code == 401
+
+
+def test_every_route_wants_its_scope(house: Guarded) -> None:
+    for method, path in closed_routes(house):
+        wanted = needed(method, path)
+        assert wanted is not None
+        others = " ".join(scope for scope in Scope if scope not in (wanted, Scope.ADMIN))
+        secret = make_key(house.store, others)[1]
+        reply = house.client.request(
+            method, address(path, house.done, house.order.splats), headers=bearer(secret), content=b"{"
+        )
+        assert reply.status_code == 403, path
+        assert f'error="insufficient_scope", scope="{wanted}"' in reply.headers["www-authenticate"]
+        assert assert_problem(reply)["expected"] == f"a key with the scope {wanted}"
+    assert house.store.jobs.get(house.queued).state is JobState.QUEUED
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "scope"),
+    [
+        ("GET", "/jobs", "read"), ("HEAD", "/jobs", "read"), ("POST", "/query", "read"),
+        ("POST", "/query/mask", "read"), ("POST", "/lift", "write"), ("PUT", "/assets/splats", "write"),
+        ("DELETE", "/jobs/x", "write"), ("POST", "/jobs/x/cancel", "write"), ("GET", "/metrics", "metrics"),
+        ("POST", "/queryx", "write"), ("POST", "/", "write"), ("GET", "/healthz/", "read"),
+    ],
+)  # fmt: skip
+def test_scopes_are_as_documented(method: str, path: str, scope: str) -> None:
+    assert needed(method, path) == scope
+
+
+def naming(method: str, path: str, job: str, asset: str, house: Guarded) -> list[dict[str, Any]]:
+    """Requests to a route that name a job, a lift or an asset, once for each place that takes a name."""
+    if path == "/lift":
+        absent = {"splats": asset, "cameras": asset, "features": [asset]}
+        return [{"json": house.body() | {place: name}} for place, name in absent.items()]
+    if path.startswith("/query") or path == "/render":
+        asked = ASKING | {"lift": job}
+        return [{"json": asked | {"text": ["apple"]}} if method == "POST" else {"params": asked}]
+    assert "{" in path, f"{method} {path} names nothing: is it open to all, or does it belong into NAMELESS?"
+    return [{}]
+
+
+def test_what_is_anothers_is_absent_on_every_route(house: Guarded) -> None:
+    job, asset = house.done, house.order.splats
+    ids = re.compile("sha256:[0-9a-f]{64}|[0-9a-f]{32}")
+    for method, path in closed_routes(house):
+        if (method, path) in NAMELESS:
+            continue
+        real = naming(method, path, job, asset, house)
+        absent = naming(method, path, NOBODY, NO_ASSET, house)
+        for how, nothing in zip(real, absent, strict=True):
+            reply = house.ask("bob", method, address(path, job, asset), **how)
+            other = house.ask("bob", method, address(path, NOBODY, NO_ASSET), **nothing)
+            assert assert_problem(reply)["type"] == "/problems/not-found", f"{method} {path}"
+            assert reply.status_code == other.status_code == 404
+            texts = [ids.sub("ID", answer.text) for answer in (reply, other)]
+            assert texts[0] == texts[1], f"{method} {path}"
+    for path in ("/assets", "/jobs", "/lifts"):
+        assert list(house.ask("bob", "GET", path).json().values()) == [[]]
+    assert "at least one lift" in house.ask("bob", "GET", "/query", params=ASKING).json()["detail"]
+    assert house.ask("alice", "GET", f"/lifts/{house.done}/features").content == b"a lift"
+    assert house.store.jobs.get(house.queued).state is JobState.QUEUED
+
+
+def test_admins_see_and_touch_everything(house: Guarded) -> None:
+    assert [len(house.ask("boss", "GET", path).json()[path[1:]]) for path in ("/assets", "/jobs", "/lifts")] == [
+        3,
+        2,
+        1,
+    ]
+    assert house.ask("boss", "GET", f"/assets/{house.order.splats}/content").status_code == 200
+    assert house.ask("boss", "POST", f"/jobs/{house.queued}/cancel").status_code == 200
+    assert house.ask("boss", "DELETE", f"/jobs/{house.done}?with_lift=true").status_code == 204
+    assert house.ask("alice", "GET", f"/jobs/{house.done}").status_code == 404
+
+
+def test_admins_job_keeps_what_it_needs(house: Guarded) -> None:
+    job = house.ask("boss", "POST", "/lift", json=house.body())
+    assert job.status_code == 202
+    for hers in (house.done, house.queued):
+        house.ask("alice", "POST", f"/jobs/{hers}/cancel")
+        assert house.ask("alice", "DELETE", f"/jobs/{hers}?with_lift=true").status_code == 204
+    assert house.ask("alice", "GET", f"/jobs/{job.json()['id']}").status_code == 404
+    assert house.ask("alice", "DELETE", f"/assets/{house.order.splats}").status_code == 204
+    assert house.ask("alice", "GET", f"/assets/{house.order.splats}").status_code == 404
+    assert house.ask("boss", "GET", f"/assets/{house.order.splats}/content").status_code == 200
+    refused = house.ask("boss", "DELETE", f"/assets/{house.order.splats}")
+    assert refused.status_code == 409 and job.json()["id"] in refused.json()["hint"]
+
+
+def test_same_bytes_are_of_each_who_uploaded_them(tmp_path: Path, house: Guarded) -> None:
+    content = b'{"w": 4, "h": 4, "fl_x": 3, "fl_y": 3, "frames": [{"file_path": "a", "transform_matrix":' \
+        b' [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}]}'  # fmt: skip
+    first = house.ask("alice", "PUT", "/assets/cameras", content=content)
+    asset = first.json()["id"]
+    assert first.status_code == 201, first.text
+    assert house.ask("bob", "GET", f"/assets/{asset}").status_code == 404  # a digest is no proof
+    second = house.ask("bob", "PUT", "/assets/cameras", content=content)
+    assert second.status_code == 201  # new to him: that she has it, he does not learn
+    assert {**first.json(), "created": 0} == {**second.json(), "created": 0}
+    assert house.ask("bob", "PUT", "/assets/cameras", content=content).status_code == 200
+    assert house.ask("bob", "DELETE", f"/assets/{asset}").status_code == 204
+    assert house.ask("bob", "GET", f"/assets/{asset}/content").status_code == 404
+    assert house.ask("alice", "GET", f"/assets/{asset}/content").content == content
+    assert house.ask("alice", "DELETE", f"/assets/{asset}").status_code == 204
+    assert not list((tmp_path / "data" / "blobs").rglob("*.json"))
+
+
+def test_asset_in_use_names_ones_own_jobs_only(house: Guarded) -> None:
+    his = house.store.seen_by(_owner(house, "bob"))
+    order(his)
+    assert house.ask("bob", "DELETE", f"/assets/{house.order.splats}").status_code == 204  # her jobs are no matter
+    refused = house.ask("alice", "DELETE", f"/assets/{house.order.splats}")
+    assert refused.status_code == 409 and house.done in refused.json()["hint"]
+    order(his)
+    job = house.ask("bob", "POST", "/lift", json=house.body()).json()["id"]
+    hint = house.ask("bob", "DELETE", f"/assets/{house.order.splats}").json()["hint"]
+    assert job in hint and house.done not in hint and house.queued not in hint
+
+
+def test_idempotency_key_is_one_of_its_owner(house: Guarded) -> None:
+    order(house.store.seen_by(_owner(house, "bob")))
+    headers = {"Idempotency-Key": "monday"}
+    replies = [
+        house.ask(name, "POST", "/lift", json=house.body(), headers=headers)
+        for name in ("alice", "bob", "alice", "bob")
+    ]
+    assert [reply.status_code for reply in replies] == [202, 202, 200, 200]
+    assert len({reply.json()["id"] for reply in replies}) == 2
+    other = house.body() | {"settings": {"preset": "row-sum"}}
+    assert house.ask("boss", "POST", "/lift", json=other, headers=headers).status_code == 202
+
+
+def _owner(house: Guarded, name: str) -> Owner:
+    return Owner(house.ids[name], sees_all=False)
+
+
+# Making and revoking
+
+
+def test_open_until_the_first_key_and_never_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with guarded(tmp_path / "data") as house:
+        with house.store.database.write() as connection:
+            connection.execute("DELETE FROM keys")
+            connection.execute("UPDATE jobs SET owner = ''")
+            connection.execute("UPDATE asset_owners SET owner = ''")
+        assert house.ask(None, "GET", "/jobs").status_code == 200
+        assert len(house.ask(None, "GET", "/lifts").json()["lifts"]) == 1
+        assert "security" not in str(house.ask(None, "GET", "/openapi.json").json()["paths"])
+        where = ["--data", str(tmp_path / "data")]
+        assert main(["create", "--name", "first", "--scopes", "read", *where]) == 0  # while the server runs
+        secret = capsys.readouterr().out.strip()
+        assert house.ask(None, "GET", "/jobs").status_code == 401
+        mine = house.client.get("/jobs", headers=bearer(secret))
+        assert mine.status_code == 200 and mine.json() == {"jobs": []}  # what was before keys is of admins
+        _, admin = make_key(house.store, "admin")
+        assert len(house.client.get("/jobs", headers=bearer(admin)).json()["jobs"]) == 2
+        assert main(["list", *where]) == 0
+        line = capsys.readouterr().out.splitlines()[0].split()
+        assert secret not in " ".join(line) and "valid" in line
+        assert main(["revoke", line[0], *where]) == 0
+        assert "revoked" in capsys.readouterr().out
+        gone = house.client.get("/jobs", headers=bearer(secret))
+        assert gone.status_code == 401 and 'error="invalid_token"' in gone.headers["www-authenticate"]
+        assert house.ask(None, "GET", "/jobs").status_code == 401
+        document = house.ask(None, "GET", "/openapi.json").json()
+        assert document["paths"]["/lift"]["post"]["security"] == [{"key": ["write"]}]
+        assert "security" not in document["paths"]["/healthz"]["get"]
+
+
+def test_revoked_key_loses_its_streams(house: Guarded) -> None:
+    revoking = threading.Timer(0.5, lambda: house.store.keys.revoke(house.ids["alice"]))
+    revoking.start()
+    begin = time.monotonic()
+    reply = house.ask("alice", "GET", f"/jobs/{house.queued}/events")  # its job does not end
+    assert reply.status_code == 200 and '"queued"' in reply.text
+    assert time.monotonic() - begin < 20
+    assert house.ask("alice", "GET", "/jobs").status_code == 401
+
+
+@pytest.mark.parametrize(
+    "header",
+    ["", "Bearer", "Bearer ", "Basic {secret}", "{secret}", "Bearer {secret} x", "Bearer x{secret}", "Bearer {half}"],
+)
+def test_only_a_whole_key_as_bearer_counts(house: Guarded, header: str) -> None:
+    secret = house.secrets["alice"]
+    given = header.format(secret=secret, half=secret[:-1])
+    assert house.client.get("/jobs", headers={"Authorization": given}).status_code == 401
+    assert house.client.get("/jobs", headers={"Authorization": f"bearer  {secret}"}).status_code == 200
+
+
+def test_keys_come_neither_twice_nor_in_urls(house: Guarded) -> None:
+    twice = [("Authorization", f"Bearer {house.secrets[name]}") for name in ("alice", "bob")]
+    assert house.client.get("/jobs", headers=twice).status_code == 401
+    assert house.client.get("/jobs", params={"access_token": house.secrets["alice"]}).status_code == 401
+
+
+def test_secret_is_neither_kept_nor_logged(house: Guarded, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    secret = house.secrets["alice"]
+    assert len(secret) >= len("splatlift_") + 43  # 256 bits in base64
+    with caplog.at_level(logging.DEBUG):
+        house.ask("alice", "GET", "/jobs")
+        house.ask("alice", "GET", "/lifts/nothing")
+    assert secret not in caplog.text
+    files = [path for path in (tmp_path / "data").rglob("*") if path.is_file()]
+    assert files and not any(secret.encode() in path.read_bytes() for path in files)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["create", "--name", "x", "--scopes", "everything"],
+        ["create", "--name", "x", "--scopes", ","],
+        ["create", "--name", " ", "--scopes", "read"],
+        ["create", "--name", "a\nb", "--scopes", "read"],
+        ["revoke", "nobody"],
+    ],
+)
+def test_bad_commands_about_keys_are_one_line(
+    arguments: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Store.open(tmp_path).close()
+    assert main([*arguments, "--data", str(tmp_path)]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert main(["list", "--data", str(tmp_path / "nowhere")]) == 2
+    assert not (tmp_path / "nowhere").exists()
+
+
+def test_keys_are_not_made_under_a_server_of_an_older_release(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    store = Store.open(tmp_path)
+    try:
+        with store.database.write() as connection:
+            connection.execute("PRAGMA user_version = 1")
+        assert main(["create", "--name", "x", "--scopes", "read", "--data", str(tmp_path)]) == 2
+        assert "older server" in capsys.readouterr().err
+    finally:
+        store.close()
+
+
+# Quotas
+
+
+def test_stored_bytes_have_a_quota(tmp_path: Path) -> None:
+    with guarded(tmp_path / "data", key_bytes=10_000) as house:
+        used = sum(asset["bytes"] for asset in house.ask("alice", "GET", "/assets").json()["assets"]) + len(b"a lift")
+        ident, secret = make_key(house.store, "read write", max_bytes=used)
+        with house.store.database.write() as connection:
+            connection.execute("UPDATE asset_owners SET owner = ?", (ident,))
+            connection.execute("UPDATE jobs SET owner = ?", (ident,))
+        replies = [
+            house.client.put("/assets/splats", headers=bearer(secret), content=b"x"),
+            house.client.post("/lift", headers=bearer(secret), json=house.body()),
+        ]
+        for reply in replies:
+            assert (assert_problem(reply)["type"], reply.status_code) == ("/problems/over-quota", 403)
+            assert str(used) in reply.json()["expected"]
+        assert house.client.delete(f"/jobs/{house.done}?with_lift=true", headers=bearer(secret)).status_code == 204
+        assert house.client.post("/lift", headers=bearer(secret), json=house.body()).status_code == 202
+
+
+def test_upload_that_would_be_too_much_is_not_kept(tmp_path: Path) -> None:
+    with guarded(tmp_path / "data") as house:
+        his = house.store.seen_by(Owner(house.ids["bob"], sees_all=False, max_bytes=8))
+        with pytest.raises(Exception, match="at most 8 bytes"):
+            order(his)  # 6 bytes of splats, then 7 of cameras
+        assert [asset.bytes for asset in his.assets.all()] == [6]
+
+
+def test_jobs_in_line_have_a_quota_a_key(tmp_path: Path) -> None:
+    with guarded(tmp_path / "data", key_queued=2) as house:
+        assert house.ask("alice", "POST", "/lift", json=house.body()).status_code == 202
+        reply = house.ask("alice", "POST", "/lift", json=house.body())
+        assert (assert_problem(reply)["type"], reply.status_code) == ("/problems/too-many", 429)
+        assert int(reply.headers["retry-after"]) > 0
+        order(house.store.seen_by(_owner(house, "bob")))
+        assert house.ask("bob", "POST", "/lift", json=house.body()).status_code == 202
+        finish(house.store, b"")
+        assert house.ask("alice", "POST", "/lift", json=house.body()).status_code == 202
+
+
+def test_service_beyond_loopback_wants_a_key_first(tmp_path: Path) -> None:
+    beyond = ServiceSettings.model_validate({"data": tmp_path, "host": "0.0.0.0"})
+    store = Store.open(tmp_path)
+    try:
+        with pytest.raises(Misconfigured, match="splatlift keys create"):
+            require_keys(beyond)
+        make_key(store, "read")
+        require_keys(beyond)
+    finally:
+        store.close()
