@@ -82,7 +82,7 @@ def assemble(settings: ServiceSettings, store: Store) -> FastAPI:
         waiting=settings.query_waiting,
         seconds=settings.query_seconds,
         scenes=settings.query_scenes,
-        answers=settings.query_answers,
+        cache_bytes=settings.query_cache_bytes,
         encoder=settings.encoder,
     )
     return create_app(settings, store, Supervisor(store, lift_limits(settings)), WarmWorker(limits))

@@ -87,7 +87,9 @@ class ServiceSettings(BaseSettings):
     query_waiting: int = Field(16, ge=1, le=32, description="queries that may wait or run; more are answered 503")
     query_seconds: float = Field(120, gt=0, description="wall time after which a query is given up")
     query_scenes: int = Field(2, ge=1, description="lifts that the query process keeps open")
-    query_answers: int = Field(16, ge=1, description="answers that the query process keeps for masks and maps")
+    query_cache_bytes: int = Field(
+        256 * MiB, ge=0, description="answers and views that the query process keeps for what is asked next"
+    )
 
     @field_validator("allowed_hosts", mode="before")
     @classmethod

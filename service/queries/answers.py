@@ -7,18 +7,17 @@ import io
 import json
 import math
 import threading
-from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
 
 from liftcore.artifact import load_lift
 from liftcore.errors import SplatliftError
-from liftcore.query.ask import Answer, Look, ask, look, top
+from liftcore.query.ask import Answer, Look, Question, answers, look, question, top
 from liftcore.query.encoders import TextEncoder, open_encoder
 from liftcore.query.encoders.remembering import RememberingEncoder
 from liftcore.query.example import Example, Vector, parse_example
@@ -27,39 +26,30 @@ from liftcore.query.products import cosines_of, norms_of
 from liftcore.query.query import Query
 from liftcore.query.scene import QueryScene
 from liftcore.raster.warm_up import warm_up
+from liftcore.scene.splats import Kernel
 from service.queries.frames import Frame
+from service.queries.kept import Kept
 
-T = TypeVar("T")
-LOOKS = 4  # views kept: the mask and the map of an answer are two readings of one render
 WARM_UP_TEXT = "something"
-
-
-class Kept(Generic[T]):
-    """The few values used last."""
-
-    def __init__(self, size: int) -> None:
-        self._size = size
-        self._values: OrderedDict[object, T] = OrderedDict()
-
-    def get(self, key: object, make: Callable[[], T]) -> T:
-        """The value of a key, made when it is not here."""
-        if key not in self._values:
-            while len(self._values) >= self._size:  # first, so that the old and the new need no room together
-                self._values.popitem(last=False)
-            self._values[key] = make()
-        self._values.move_to_end(key)
-        return self._values[key]
+PRODUCT_BYTES = 128 << 20  # of the cosines that one pass over a lift's features may give
+COSINE_BYTES = 4  # of a splat and a direction
+ANSWER_BYTES = 6  # of a splat: its score, whether it was seen, whether it was selected
 
 
 class Answers:
-    """Replies to requests; a lift is known by its path, a text encoder by its specification."""
+    """Replies to requests; a lift is known by its path, a text encoder by its specification.
 
-    def __init__(self, *, scenes: int, answers: int) -> None:
+    Args:
+        scenes: lifts that are kept open.
+        cache_bytes: of the answers and views that are kept; the last one is kept whatever its size.
+    """
+
+    def __init__(self, *, scenes: int, cache_bytes: int) -> None:
         self._scenes: Kept[QueryScene] = Kept(scenes)
-        self._answers: Kept[Answer] = Kept(answers)
-        self._looks: Kept[Look] = Kept(LOOKS)
+        self._cache: Kept[Answer | Look] = Kept(cache_bytes, bytes_of)
         self._encoders: dict[str, tuple[object, TextEncoder]] = {}  # spec -> version of its file, encoder
         self._opening = threading.RLock()  # of encoders, which the warm-up opens too
+        self._warm: set[Kernel] = set()  # kernels of splats whose compiled code is loaded, or being loaded
         self._operations: dict[str, Callable[[dict[str, Any]], Frame]] = {
             "query": self._query,
             "scores": self._scores,
@@ -67,6 +57,11 @@ class Answers:
             "attention": self._attention,
             "render": self._render,
         }
+
+    @property
+    def kept_bytes(self) -> int:
+        """The size of the answers and views that are kept."""
+        return self._cache.size
 
     def warm_up(self, encoder: str, version: object) -> None:
         """Load what the first query would wait for: an encoder, and the compiled kernels.
@@ -78,21 +73,56 @@ class Answers:
         for dtype in (torch.float16, torch.float32):
             row = torch.ones(1, 1, dtype=dtype)
             cosines_of(row, norms_of(row), row.to(torch.float32))
-        warm_up()
+        self._warm_kernel(Kernel.GAUSSIAN_3D)
 
-    def reply(self, request: dict[str, Any]) -> Frame:
+    def reply(self, request: dict[str, Any], ahead: Sequence[dict[str, Any]] = ()) -> Frame:
         """The reply to one request; ``operation`` says which.
+
+        Args:
+            request: what is asked.
+            ahead: the requests that follow it. Questions among them to the same lift are answered in the same pass
+                over its features, which costs little more than one question alone, and kept for their turn.
 
         Raises:
             SplatliftError: what was asked cannot be answered.
         """
+        if "query" in request and _key(request) not in self._cache:
+            self._answer_together([request, *ahead])
         return self._operations[request["operation"]](request)
 
+    def _answer_together(self, requests: Sequence[dict[str, Any]]) -> None:
+        """Answer the first question, and more to its lift as far as one pass goes; errors wait for their turn."""
+        scene = self._scene(requests[0])
+        splats = scene.lift.features.shape[0]
+        room = min(PRODUCT_BYTES // (COSINE_BYTES * splats), self._cache.limit // (ANSWER_BYTES * splats))
+        asked: dict[object, Question] = {}
+        for request in requests:
+            if request["lift"] != requests[0]["lift"] or "query" not in request or _key(request) in self._cache:
+                continue
+            with contextlib.suppress(SplatliftError):
+                found = self._question(request)
+                if not asked or len(found.rows) <= room:
+                    asked[_key(request)] = found
+                    room -= len(found.rows)
+        if asked:
+            for key, answer in zip(asked, answers(scene, list(asked.values())), strict=True):
+                self._cache.put(key, answer)
+
     def _scene(self, request: dict[str, Any]) -> QueryScene:
-        scene = self._scenes.get(request["lift"], lambda: open_scene(request))
+        scene = self._scenes.get(request["lift"], lambda: self._open(request))
         if "features" in request:
             scene.find_packs([Path(path) for path in request["features"]])
         return scene
+
+    def _open(self, request: dict[str, Any]) -> QueryScene:
+        # Pictures come after numbers, so what draws them is loaded meanwhile.
+        threading.Thread(target=self._warm_kernel, args=(Kernel(request["kernel"]),), daemon=True).start()
+        return open_scene(request)
+
+    def _warm_kernel(self, kernel: Kernel) -> None:
+        if kernel not in self._warm:
+            self._warm.add(kernel)
+            warm_up(kernel)
 
     def _encoder(self, spec: str, version: object) -> TextEncoder:
         with self._opening:
@@ -101,17 +131,21 @@ class Answers:
                 known = self._encoders[spec] = (version, RememberingEncoder(open_encoder(spec)))
             return known[1]
 
-    def _answer(self, request: dict[str, Any]) -> Answer:
-        def make() -> Answer:
-            spec = request["encoder"]
-            encoder = None if spec is None else self._encoder(spec, request["encoder_version"])
-            return ask(self._scene(request), query_of(request["query"]), encoder)
+    def _question(self, request: dict[str, Any]) -> Question:
+        spec = request["encoder"]
+        encoder = None if spec is None else self._encoder(spec, request["encoder_version"])
+        return question(self._scene(request), query_of(request["query"]), encoder)
 
-        return self._answers.get(_question(request), make)
+    def _answer(self, request: dict[str, Any]) -> Answer:
+        made = self._cache.get(_key(request), lambda: answers(self._scene(request), [self._question(request)])[0])
+        assert isinstance(made, Answer)
+        return made
 
     def _look(self, request: dict[str, Any]) -> Look:
         answer, view = self._answer(request), request["view"]
-        return self._looks.get((_question(request), view), lambda: look(self._scene(request), answer, view))
+        made = self._cache.get((_key(request), view), lambda: look(self._scene(request), answer, view))
+        assert isinstance(made, Look)
+        return made
 
     def _query(self, request: dict[str, Any]) -> Frame:
         scene, answer = self._scene(request), self._answer(request)
@@ -143,9 +177,16 @@ def use_one_library_thread() -> None:
     torch.set_num_threads(1)
 
 
-def _question(request: dict[str, Any]) -> tuple[object, ...]:
+def _key(request: dict[str, Any]) -> tuple[object, ...]:
     names = ("lift", "encoder", "encoder_version", "query")
     return tuple(json.dumps(request[name]) for name in names)
+
+
+def bytes_of(made: Answer | Look) -> int:
+    """The memory that an answer or a view of one takes."""
+    if isinstance(made, Answer):
+        return made.scores.nbytes + made.seen.nbytes + made.selected.nbytes
+    return made.attention.nbytes + made.row_sums.nbytes + made.mask.nbytes
 
 
 def query_of(asked: dict[str, Any]) -> Query:

@@ -1,21 +1,25 @@
-"""The HTTP process's side of the query worker: one call at a time, few waiting, restarted when it dies."""
+"""The HTTP process's side of the query worker: few calls wait, are asked together, and survive the worker's death."""
 
 from __future__ import annotations
 
 import contextlib
 import logging
+import os
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 from liftcore.errors import SplatliftError
 from service.errors import Busy, Crashed, TimedOut
 from service.faults import error_of
 from service.queries.frames import Frame, read_frame, write_frame
+
+# Without these each array of a query is mapped anew and its pages are faulted in one by one: a fifth of its time.
+MEMORY = {"MALLOC_MMAP_THRESHOLD_": str(64 << 20), "MALLOC_TRIM_THRESHOLD_": str(256 << 20)}
 
 log = logging.getLogger(__name__)
 
@@ -25,19 +29,33 @@ class QueryLimits:
     """What queries may take."""
 
     waiting: int  # calls that wait or run
-    seconds: float  # of one call, waiting included
+    seconds: float  # until a call has its turn, and then until the next answer
     scenes: int  # lifts kept open
-    answers: int  # answers kept
+    cache_bytes: int  # of answers and views kept
     encoder: str  # specification of the text encoder that is loaded before it is asked for
 
 
+@dataclass(eq=False)
+class _Call:
+    """A request in the line, and what became of it."""
+
+    request: dict[str, Any]
+    reply: Frame | SplatliftError | None = field(default=None)
+
+
 class WarmWorker:
-    """A process that answers queries, and the line in front of it; any thread may call any method."""
+    """A process that answers queries, and the line in front of it; any thread may call any method.
+
+    Calls that wait while others are answered are asked together, so that questions to one lift share a pass over its
+    features. The thread of one of them speaks for all: it has the turn.
+    """
 
     def __init__(self, limits: QueryLimits) -> None:
         self._limits = limits
-        self._line = threading.BoundedSemaphore(limits.waiting)
-        self._turn = threading.Lock()
+        self._bell = threading.Condition()  # guards the next three; rings at each reply and at the end of each turn
+        self._places = limits.waiting
+        self._line: list[_Call] = []
+        self._taken = False  # whether a thread has the turn, and with it the process
         self._process: subprocess.Popen[bytes] | None = None
         self._stopped = False
         self._told: Callable[[str, str, float], None] | None = None
@@ -45,7 +63,7 @@ class WarmWorker:
 
     def start(self) -> None:
         """Start the process, so that the first query finds it warm."""
-        with self._turn:
+        with self._turn():
             self._spawn()
 
     def stop(self) -> None:
@@ -54,7 +72,7 @@ class WarmWorker:
         process = self._process
         if process is not None:
             process.kill()  # a query that still runs ends with it, and lets go of its turn
-        with self._turn:
+        with self._turn():
             self._bury()
 
     def tell(self, told: Callable[[str, str, float], None]) -> None:
@@ -73,12 +91,12 @@ class WarmWorker:
 
     def revive(self) -> bool:
         """Whether the process lives; when it does not, and no call is about to see to it, a new one starts."""
-        if self.alive() or self._stopped or not self._turn.acquire(blocking=False):
-            return self.alive()
-        try:
+        with self._bell:
+            if self.alive() or self._stopped or self._taken:
+                return self.alive()
+            self._taken = True
+        with self._turn(taken=True):
             self._spawn()
-        finally:
-            self._turn.release()
         return False
 
     def call(self, request: dict[str, Any]) -> Frame:
@@ -108,47 +126,109 @@ class WarmWorker:
             TimedOut: the answer took too long.
             Crashed: the worker died twice over this call, or failed with an error that is ours.
         """
+        call = _Call(request)
         with self._place():
-            reply = self._ask(request)
-        if "fault" in reply.header:
-            raise error_of(reply.header["fault"])
-        if "crash" in reply.header:
+            if not self._answered_by_another(call):
+                with self._turn(taken=True):
+                    self._answer(self._waiting())
+        if isinstance(call.reply, SplatliftError):
+            raise call.reply
+        assert call.reply is not None
+        if "fault" in call.reply.header:
+            raise error_of(call.reply.header["fault"])
+        if "crash" in call.reply.header:
             raise Crashed("query", expected="an answer", got="an error of the server")
-        return reply
+        return call.reply
+
+    def _busy(self) -> Busy:
+        line = f"at most {self._limits.waiting} waiting queries"
+        return Busy("query", expected=line, got="more", hint="try again soon")
 
     @contextlib.contextmanager
     def _place(self) -> Iterator[None]:
-        """A place in the line, then the turn."""
-        line = f"at most {self._limits.waiting} waiting queries"
-        busy = Busy("query", expected=line, got="more", hint="try again soon")
-        if not self._line.acquire(blocking=False):
-            raise busy
+        """A place in the line."""
+        with self._bell:
+            if self._places == 0:
+                raise self._busy()
+            self._places -= 1
         try:
-            if not self._turn.acquire(timeout=self._limits.seconds):
-                raise busy
-            try:
-                yield
-            finally:
-                self._turn.release()
+            yield
         finally:
-            self._line.release()
+            with self._bell:
+                self._places += 1
 
-    def _ask(self, request: dict[str, Any]) -> Frame:
-        for _ in range(2):  # it may have died while idle, so the first silence is not the request's fault
-            if self._stopped:
-                raise Busy("query", expected="a running server", got="one that stops", hint="ask the next one")
-            reply = self._exchange(request)
-            if reply is not None:
-                return reply
-            log.error("the query worker died; a new one starts")
-            self._bury()
-        raise Crashed("query", expected="an answer", got="a query process that died twice over it")
+    def _answered_by_another(self, call: _Call) -> bool:
+        """Wait for the reply, or else for the turn; whether it is the reply that came."""
+        with self._bell:
+            self._line.append(call)
+            come = self._bell.wait_for(lambda: call.reply is not None or not self._taken, self._limits.seconds)
+            if not come and call in self._line:
+                self._line.remove(call)
+                raise self._busy()
+            self._bell.wait_for(lambda: call.reply is not None or not self._taken)
+            if call.reply is None:
+                self._taken = True
+            return call.reply is not None
 
-    def _exchange(self, request: dict[str, Any]) -> Frame | None:
+    @contextlib.contextmanager
+    def _turn(self, *, taken: bool = False) -> Iterator[None]:
+        """The turn, to be let go at the end."""
+        if not taken:
+            with self._bell:
+                self._bell.wait_for(lambda: not self._taken)
+                self._taken = True
+        try:
+            yield
+        finally:
+            with self._bell:
+                self._taken = False
+                self._bell.notify_all()
+
+    def _waiting(self) -> list[_Call]:
+        with self._bell:
+            calls, self._line = self._line, []
+        return calls
+
+    def _answer(self, calls: list[_Call]) -> None:
+        """Answer all of them together. When the process dies over that, those without an answer go one by one."""
+        try:
+            self._exchange(calls)
+            for call in calls:
+                if call.reply is None:  # it may have died while idle, so the first silence is no call's fault
+                    log.error("the query worker died; a new one starts")
+                    self._bury()
+                    self._exchange([call])
+        finally:
+            for call in calls:
+                if call.reply is None:
+                    got = "a query process that died twice over it"
+                    self._reply(call, Crashed("query", expected="an answer", got=got))
+
+    def _exchange(self, calls: Sequence[_Call]) -> None:
+        """Ask the process; a call without a reply is one over which it died."""
+        if self._stopped:
+            stops = Busy("query", expected="a running server", got="one that stops", hint="ask the next one")
+            for call in calls:
+                self._reply(call, stops)
+            return
         if self._process is None or self._process.poll() is not None:
             self._spawn()
         process = self._process
         assert process is not None and process.stdin is not None and process.stdout is not None
+        try:
+            write_frame(process.stdin, Frame({"requests": [call.request for call in calls]}))
+        except BrokenPipeError:
+            return
+        for call in calls:
+            reply = self._next_reply(process)
+            if reply is None:
+                return
+            self._reply(call, reply)
+            if self._process is not process:  # it took too long, and was ended
+                return
+
+    def _next_reply(self, process: subprocess.Popen[bytes]) -> Frame | SplatliftError | None:
+        assert process.stdout is not None
         expired = threading.Event()
 
         def expire() -> None:
@@ -158,25 +238,31 @@ class WarmWorker:
         timer = threading.Timer(self._limits.seconds, expire)
         timer.start()
         try:
-            write_frame(process.stdin, Frame(request))
             reply = read_frame(process.stdout)
-        except BrokenPipeError:
-            reply = None
         finally:
             timer.cancel()
             timer.join()
         if expired.is_set():
             self._bury()
-            raise TimedOut("query", expected=f"an answer within {self._limits.seconds:g} s", got="none yet")
+            return TimedOut("query", expected=f"an answer within {self._limits.seconds:g} s", got="none yet")
         return reply
+
+    def _reply(self, call: _Call, reply: Frame | SplatliftError) -> None:
+        with self._bell:
+            call.reply = reply
+            self._bell.notify_all()
 
     def _spawn(self) -> None:
         self._bury()
         command = [sys.executable, "-m", "service.queries.worker"]
-        command += [str(self._limits.scenes), str(self._limits.answers), self._limits.encoder]
+        command += [str(self._limits.scenes), str(self._limits.cache_bytes), self._limits.encoder]
         self._spawned += 1
         self._process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            start_new_session=True,
+            env=MEMORY | os.environ,
         )
 
     def _bury(self) -> None:

@@ -1,7 +1,9 @@
 """The query process: reads requests from stdin, answers on stdout, ends when its server does.
 
-Run as ``python -m service.queries.worker SCENES ANSWERS ENCODER``. It warms up while it waits: the compiled
-kernels and the encoder named are loaded beside the first requests, which wait for no more than they need.
+Run as ``python -m service.queries.worker SCENES CACHE_BYTES ENCODER``. A message from the server is one or more
+requests that came at the same time; each is answered by a message of its own, in their order. It warms up while it
+waits: the compiled kernels and the encoder named are loaded beside the first requests, which wait for no more than
+they need.
 """
 
 from __future__ import annotations
@@ -10,6 +12,7 @@ import os
 import sys
 import threading
 import traceback
+from typing import Any
 
 from liftcore.errors import SplatliftError
 from service.faults import fault_of
@@ -18,12 +21,12 @@ from service.queries.frames import Frame, read_frame, write_frame
 from service.settings import encoder_version
 
 
-def reply_to(request: Frame, answers: Answers) -> Frame:
-    """The answer, or the error as a header."""
+def reply_to(requests: list[dict[str, Any]], answers: Answers) -> Frame:
+    """The answer to the first request, or the error as a header; the others are those that come next."""
     try:
-        return answers.reply(request.header)
+        return answers.reply(requests[0], requests[1:])
     except SplatliftError as error:
-        return Frame({"fault": fault_of(error, request.header["names"])})
+        return Frame({"fault": fault_of(error, requests[0]["names"])})
     except Exception:
         traceback.print_exc()
         return Frame({"crash": True})
@@ -42,10 +45,12 @@ def main() -> None:
     out = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     use_one_library_thread()
-    answers = Answers(scenes=int(sys.argv[1]), answers=int(sys.argv[2]))
+    answers = Answers(scenes=int(sys.argv[1]), cache_bytes=int(sys.argv[2]))
     threading.Thread(target=_warm_up, args=(answers, sys.argv[3]), daemon=True).start()
-    while (request := read_frame(sys.stdin.buffer)) is not None:
-        write_frame(out, reply_to(request, answers))
+    while (asked := read_frame(sys.stdin.buffer)) is not None:
+        requests = asked.header["requests"]
+        for first in range(len(requests)):
+            write_frame(out, reply_to(requests[first:], answers))
 
 
 if __name__ == "__main__":

@@ -31,6 +31,7 @@ def scene_request(operation: str, lift: LiftRecord, here: Parts) -> dict[str, An
         "lift": str(lift.path),
         "splats": str(splats.path),
         "cameras": str(cameras.path),
+        "kernel": splats.counts["kernel"],
         "names": {
             str(lift.path): f"lift {lift.id}",
             str(splats.path): f"splats {splats.id}",

@@ -1,0 +1,173 @@
+"""What the query process promises: questions asked together are answered as alone, and what it keeps has a size."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from fastapi import FastAPI
+from fastapi.testclient import TestClient
+
+from liftcore.query import ask
+from service import wire
+from service.parts import Parts
+from service.queries import answers
+from service.queries.answers import Answers
+from service.queries.frames import Frame
+from service.queries.kept import Kept
+from service.queries.worker import reply_to
+from service.routes.question import query_request
+
+from .tiny_scene import CHANNELS, WORDS
+
+AN_ANSWER = 6 * 60  # bytes, for the splats of the tiny scene
+AN_IMAGE = 9 * 32 * 24
+AXES = [[float(row == channel) for channel in range(CHANNELS)] for row in range(3)]
+QUESTIONS: list[dict[str, Any]] = [
+    *({"text": [word]} for word in WORDS),
+    {"text": list(WORDS), "negatives": ["book"], "threshold": "otsu"},
+    {"text": ["lamp"], "like": [AXES[0]]},
+    {"like": [AXES[1], [0.3, 0.4, 0, 0, 0, 0, 0, 0.5]], "unlike": [AXES[2]]},
+    {"text": ["zeppelin"]},  # which the table does not know
+    {"like": ["splat:7"]},
+    {"text": ["apple"]},  # again
+]
+
+
+def parts_of(client: TestClient) -> Parts:
+    assert isinstance(client.app, FastAPI)
+    return client.app.state.parts
+
+
+@pytest.fixture
+def request_of(client: TestClient, lift: dict[str, Any]) -> Callable[..., dict[str, Any]]:
+    """A request as the query process gets it."""
+    here = parts_of(client)
+    record = here.store.lifts.get(lift["id"])
+
+    def make(operation: str = "scores", **asked: Any) -> dict[str, Any]:
+        body = wire.AskedInBody.model_validate({"lift": lift["id"], **asked})
+        return query_request(operation, body, record, here) | {"view": "left", "top": 3}
+
+    return make
+
+
+@pytest.fixture
+def passes(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """The number of words of each pass over the features."""
+    seen: list[int] = []
+    original = ask.cosines
+
+    def counted(features: Any, norms: Any, rows: Any) -> Any:
+        seen.append(len(rows))
+        return original(features, norms, rows)
+
+    monkeypatch.setattr(ask, "cosines", counted)
+    return seen
+
+
+def told(frame: Frame) -> tuple[object, bytes]:
+    return frame.header, frame.body
+
+
+def test_questions_asked_together_are_answered_as_alone_to_the_bit(request_of: Callable[..., dict[str, Any]]) -> None:
+    requests = [request_of(operation, **asked) for asked in QUESTIONS for operation in ("scores", "query", "mask")]
+    together = Answers(scenes=1, cache_bytes=1 << 20)
+    found = [told(reply_to(requests[first:], together)) for first in range(len(requests))]
+    alone = [told(reply_to([request], Answers(scenes=1, cache_bytes=0))) for request in requests]
+    assert found == alone
+    assert sum("fault" in header for header, _ in found if isinstance(header, dict)) == 3
+    assert len({body for _, body in found}) > len(QUESTIONS)
+
+
+def test_questions_asked_together_take_one_pass_over_the_features(
+    request_of: Callable[..., dict[str, Any]], passes: list[int]
+) -> None:
+    requests = [request_of(text=[word], threshold=k / 8) for k in range(4) for word in WORDS]
+    together = Answers(scenes=1, cache_bytes=1 << 20)
+    for first in range(len(requests)):
+        reply_to(requests[first:], together)
+    assert passes == [12]
+
+
+def test_one_pass_takes_no_more_questions_than_may_be_kept_or_than_its_memory_allows(
+    request_of: Callable[..., dict[str, Any]], passes: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    requests = [request_of(text=[word], threshold=k / 8) for k in range(4) for word in WORDS]
+    few = Answers(scenes=1, cache_bytes=5 * AN_ANSWER)
+    for first in range(len(requests)):
+        reply_to(requests[first:], few)
+    assert passes == [5, 5, 2]
+    monkeypatch.setattr(answers, "PRODUCT_BYTES", 8 * 4 * 60)
+    reply_to(requests, Answers(scenes=1, cache_bytes=1 << 20))
+    assert passes[3:] == [8]
+
+
+def test_what_is_kept_stays_within_its_size_over_many_different_questions(
+    request_of: Callable[..., dict[str, Any]],
+) -> None:
+    limit = 10 * AN_ANSWER + 2 * AN_IMAGE
+    kept = Answers(scenes=1, cache_bytes=limit)
+    sizes = []
+    for number in range(300):
+        operation = "mask" if number % 3 == 0 else "scores"
+        reply_to([request_of(operation, text=["apple"], threshold=number / 300)], kept)
+        sizes.append(kept.kept_bytes)
+    assert max(sizes) <= limit and min(sizes[50:]) > limit / 2
+
+
+def test_cache_keeps_what_was_used_last() -> None:
+    kept: Kept[str] = Kept(7, len)
+    for word in ("one", "two", "three"):
+        kept.put(word, word)
+    assert ("one" in kept, "two" in kept, "three" in kept) == (False, False, True)
+    assert kept.get("two", lambda: "2") == "2" and kept.get("three", lambda: "again") == "three"
+    kept.put("long", "longer than all")
+    assert kept.size == len("longer than all")
+    assert kept.get("long", lambda: "again") == "longer than all"
+
+
+def test_many_clients_at_once_get_answers_to_their_own_questions(client: TestClient, lift: dict[str, Any]) -> None:
+    def ask_for(number: int) -> dict[str, Any]:
+        asked = {"text": WORDS[number % 3], "lift": lift["id"], "threshold": number / 100}
+        return client.get("/query", params=asked).json()
+
+    found: list[dict[str, Any]] = [{}] * 12
+
+    def run(number: int) -> None:
+        found[number] = ask_for(number)
+
+    threads = [threading.Thread(target=run, args=(number,)) for number in range(12)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert found == [ask_for(number) for number in range(12)]
+    assert {answer["top"][0]["splat"] // 20 for answer in found} == {0, 1, 2}
+
+
+def test_calls_of_a_worker_that_dies_are_answered_by_the_next(client: TestClient, lift: dict[str, Any]) -> None:
+    worker = parts_of(client).queries
+    process = worker._process
+    assert process is not None
+    os.kill(process.pid, signal.SIGSTOP)  # so that all calls are in the line, and the first asked, when it dies
+    replies: list[int] = []
+
+    def run(number: int) -> None:
+        asked = {"text": "book", "lift": lift["id"], "threshold": 0.5 + number / 100}
+        replies.append(client.get("/query", params=asked).status_code)
+
+    threads = [threading.Thread(target=run, args=(number,)) for number in range(4)]
+    for thread in threads:
+        thread.start()
+    while not worker._taken:
+        time.sleep(0.001)
+    os.kill(process.pid, signal.SIGKILL)
+    for thread in threads:
+        thread.join()
+    assert replies == [200] * 4
