@@ -25,6 +25,7 @@ from liftcore.solve.checkpoint import Checkpoint, identity, resumed
 from liftcore.solve.closed_form import Solution, solve_closed_form
 from liftcore.solve.kept_columns import kept_columns
 from liftcore.solve.least_squares import refine
+from liftcore.solve.lift_warnings import lift_warnings
 from liftcore.solve.reference import reference
 from liftcore.solve.robust import robust_weights
 from liftcore.solve.view_weights import ViewWeights
@@ -119,7 +120,10 @@ def lift_sources(run: Run, sources: Sources, inputs: list[InputFile], checkpoint
             "weights_entries": sum(len(part.columns) for part in store),
             "views_without_camera": sources.unpaired,
             "plan": plan.facts(),
+            "views_without_splats": _blind(sources.views, store),
         }
+    lifted = [sources.cameras.get(name) for name in sources.views]
+    facts["warnings"] = lift_warnings(sources.splats, lifted, geometry.denominators, settings.dtype, X.dtype, facts)
     with run.timings.stage("certify"):
         certificate = certify(geometry, X, geometry.codebooks.__getitem__, settings, threads) | notes | facts
     return Lift(
@@ -145,6 +149,11 @@ def open_sources(splats: Path, cameras: Path, features: Sequence[Path], settings
 def planned(sources: Sources, settings: LiftSettings) -> Plan:
     """The plan of a lift from these sources."""
     return plan_lift(sources.splats, sources.cameras, sources.packs, sources.views, settings)
+
+
+def _blind(views: Sequence[str], store: ViewWeights) -> list[str]:
+    """The views whose rays met no splat."""
+    return [name for name, part in zip(views, store, strict=True) if not part.evidence_splats.numel()]
 
 
 def _solve(run: Run, store: ViewWeights, geometry: Geometry) -> tuple[ViewWeights, Solution]:

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import TYPE_CHECKING
-
 import numpy as np
 import torch
 from hypothesis import strategies as st
 
+from liftcore.measure.stability.scenes import of_kernel
 from liftcore.observe.observation import FeatureGrid, Observation, RegionMap
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Kernel, Splats
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 
 def random_splats(seed: int, count: int = 40, spread: float = 1.0, kernel: Kernel = Kernel.GAUSSIAN_3D) -> Splats:
@@ -29,13 +24,6 @@ def random_splats(seed: int, count: int = 40, spread: float = 1.0, kernel: Kerne
     )
     betas = torch.tensor(rng.normal(0, 1.5, count), dtype=torch.float32)
     return of_kernel(splats, kernel, betas)
-
-
-def of_kernel(splats: Splats, kernel: Kernel, betas: Tensor) -> Splats:
-    """The same numbers read as splats of another kernel: 2DGS takes the first two scales, DBS the betas [P]."""
-    if kernel is Kernel.GAUSSIAN_2D:
-        return replace(splats, kernel=kernel, log_scales=splats.log_scales[:, :2].contiguous())
-    return replace(splats, kernel=kernel, beta=betas) if kernel is Kernel.BETA else splats
 
 
 def look_at(name: str, centre: np.ndarray, width: int, height: int, focal: float) -> Camera:

@@ -41,7 +41,7 @@ def run(options: argparse.Namespace) -> int:
         )
     with writing(out):
         save_lift(result, out)
-    document = {"out": str(out), **_summary(result), "warnings": _warnings(result)}
+    document = {"out": str(out), **_summary(result), "warnings": result.metadata.certificate["warnings"]}
     reply(document, as_json=options.json, lines=_lines(document))
     return 0
 
@@ -97,17 +97,6 @@ def _summary(result: Lift) -> dict[str, Any]:
     }
 
 
-def _warnings(result: Lift) -> list[str]:
-    skipped = result.metadata.certificate.get("views_without_camera", [])
-    warnings = []
-    if skipped:
-        some = ", ".join(skipped[:3])
-        warnings.append(f"{len(skipped)} views have features but no camera and were skipped: {some}")
-    if not bool(result.seen.any()):
-        warnings.append("no labelled ray reached any splat: check that splats and cameras share their frame")
-    return warnings
-
-
 def _lines(document: dict[str, Any]) -> Iterable[str]:
     yield (
         f"{document['out']}: {document['splats']} splats x {document['channels']} channels "
@@ -115,6 +104,6 @@ def _lines(document: dict[str, Any]) -> Iterable[str]:
     )
     for part in ("certificate", "timings"):
         for key, value in document[part].items():
-            if key != "plan" or part == "timings":  # a plan in full is what --explain prints
+            if part == "timings" or key not in ("plan", "warnings"):  # the plan in full is what --explain prints
                 yield f"  {key}: {shown(value)}"
     yield from (f"warning: {warning}" for warning in document["warnings"])

@@ -13,6 +13,7 @@ from liftcore.observe.observation import NO_LABEL, RegionMap
 from liftcore.observe.pack import open_packs
 from liftcore.scene.inspect import inspect_file as inspect_scene
 from liftcore.scene.inspect import is_splats
+from liftcore.solve.lift_warnings import UNSEEN
 
 if TYPE_CHECKING:
     from liftcore.artifact import Lift, LiftMetadata
@@ -88,7 +89,7 @@ def describe_packs(packs: FeaturePacks) -> dict[str, Any]:
 
 
 def _describe_view(observation: Observation, regions: bool) -> dict[str, Any]:
-    norms = torch.linalg.vector_norm(observation.codebook.float(), dim=1)
+    norms = torch.linalg.vector_norm(observation.codebook, dim=1, dtype=torch.float64)
     zero = norms == 0
     ends = [float(value) for value in torch.aminmax(norms[~zero])] if bool((~zero).any()) else []
     view = {"regions": regions, "rows": len(norms), "zero": int(zero.sum()), "norms": ends, "unlabelled": 0.0}
@@ -159,15 +160,15 @@ def _lift_warnings(lift: Lift, metadata: LiftMetadata) -> list[str]:
     count = len(lift.features)
     unseen = int((~lift.seen).sum())
     bad = int((~torch.isfinite(lift.features)).any(dim=1).sum())
-    warnings = []
+    warnings = list(metadata.certificate.get("warnings", ()))
     if unseen:
-        warnings.append(f"{unseen} of {count} splats have no evidence and zero features")
+        warnings.append(f"{unseen} of {count} {UNSEEN}")
     if bad:
         warnings.append(f"{bad} of {count} splats have features that are not finite")
     for name, file in (("splats", metadata.splats), ("cameras", metadata.cameras)):
         if not Path(file.path).exists():
             warnings.append(f"the {name} are no longer at {file.path}")
-    return warnings
+    return list(dict.fromkeys(warnings))
 
 
 def _describe_table(path: Path, metadata: dict[str, str]) -> dict[str, Any]:

@@ -3,6 +3,9 @@
 X is never held in float32 as a whole. Splats go in blocks and channels in slices, so that a block of X and a slice
 of a view's codebook stay in the cache while all views add to them. Weights are divided by their sum before they meet
 the codebook: a mean cannot overflow where its inputs do not, and faint splats keep their digits.
+
+Sums are float32 over a few hundred terms at most. Longer ones, of a splat behind a million regions or of thousands of
+views, are sums of such parts: added one by one, ten million equal terms would be wrong in their first digit.
 """
 
 from __future__ import annotations
@@ -27,6 +30,8 @@ if TYPE_CHECKING:
     from liftcore.progress import Progress
     from liftcore.solve.view_weights import ViewWeights
 
+LONG = 256  # entries of a row that float32 adds up one by one
+VIEWS = 64  # views that add to a block one by one
 BLOCK = 4_096  # splats a block; with a slice of channels two megabytes
 SLICE = 128  # channels a slice, fewer where the codebooks of all views are long
 SLICE_BYTES = 1 << 28  # of a slice of all codebooks, which dense maps would go far beyond
@@ -56,6 +61,7 @@ def add_weighted_rows(first, last, offset, weights, scale, codebook, block):
     width = codebook.shape[1]
     source, target = codebook.reshape(-1), block.reshape(-1)
     begin = row_starts[first]
+    part, total = np.zeros(width, np.float32), np.zeros(width)
     shares = np.empty(row_starts[last] - begin, np.float32)
     own_columns = columns[begin : row_starts[last]]
     for row in range(first, last):
@@ -63,8 +69,37 @@ def add_weighted_rows(first, last, offset, weights, scale, codebook, block):
         for k in range(entries[0], entries[1]):
             shares[k] = values[begin + k] * scale[splats[row]]
         place = (splats[row] - offset) * width
+        if entries[1] - entries[0] > LONG:
+            total[:] = 0
+            for start in range(entries[0], entries[1], LONG):
+                chunk = (start, min(start + LONG, entries[1]))
+                part[:] = 0
+                for channel in range(0, width, WIDE):
+                    add_weighted_row(part, channel, source, chunk, (own_columns, shares), (width, channel))
+                total += part
+            for channel in range(width):
+                target[place + channel] += total[channel]
+            continue
         for channel in range(0, width, WIDE):
             add_weighted_row(target, place + channel, source, entries, (own_columns, shares), (width, channel))
+
+
+def sum_views(met: Sequence[tuple], offset: int, scale: np.ndarray, block: np.ndarray) -> np.ndarray:
+    """Add the rows of all views to ``block`` [B, C] f32, some views at a time; gives the block.
+
+    Args:
+        met: (first, last, weights, codebook) of every view that met the block, as ``add_weighted_rows`` takes them.
+        offset: the first splat of the block. scale: [P] f64.
+    """
+    part = block if len(met) <= VIEWS else np.empty_like(block)
+    for start in range(0, len(met), VIEWS):
+        if part is not block:
+            part[:] = 0
+        for first, last, weights, codebook in met[start : start + VIEWS]:
+            add_weighted_rows(first, last, offset, weights, scale, codebook, part)
+        if part is not block:
+            block += part
+    return block
 
 
 @vectorised
@@ -157,10 +192,12 @@ def _solve_slice(
 
     def solve_block(number: int) -> None:
         offset, end = edges[number], min(edges[number + 1], count)
-        block = np.zeros((end - offset, parts[0].shape[1]), np.float32)
-        for weights, part, rows in zip(views, parts, bounds, strict=True):
-            if rows[number] < rows[number + 1]:
-                add_weighted_rows(rows[number], rows[number + 1], offset, weights, scale, part, block)
+        met = [
+            (rows[number], rows[number + 1], weights, part)
+            for weights, part, rows in zip(views, parts, bounds, strict=True)
+            if rows[number] < rows[number + 1]
+        ]
+        block = sum_views(met, offset, scale, np.zeros((end - offset, parts[0].shape[1]), np.float32))
         square_norms(block, squares[offset:end])
         if result is not None:
             result[offset:end] = torch.from_numpy(block[:, : result.shape[1]]).to(result.dtype)

@@ -38,7 +38,7 @@ import numpy as np
 
 from liftcore.jit import vectorised
 from liftcore.solve.accumulate import row_totals
-from liftcore.solve.closed_form import BLOCK, add_weighted_rows, slice_of, slice_width
+from liftcore.solve.closed_form import BLOCK, slice_of, slice_width, sum_views
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -206,8 +206,7 @@ def _judge_slice(
             for view, rows in enumerate(bounds)
             if rows[number] < rows[number + 1]
         ]
-        for view, first, last in met:
-            add_weighted_rows(first, last, offset, views[view], scale, parts[view], block)
+        sum_views([(first, last, views[view], parts[view]) for view, first, last in met], offset, scale, block)
         for view, first, last in met:
             rows = (first, last, offset)
             judge_rows(rows, views[view], scale, parts[view], block, agreements[view], squares[view])

@@ -1,0 +1,1 @@
+"""The extremes: each is a case that a command measures into ``docs/stability.md`` and that a test holds."""

@@ -1,0 +1,26 @@
+"""``python -m liftcore.measure.stability docs/stability.md``: measure every extreme and write the page."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from liftcore.files import whole_file
+from liftcore.measure.stability.page import page
+from liftcore.raster.warm_up import warm_up
+from liftcore.scene.splats import Kernel
+
+
+def main() -> None:
+    """Write the page whole or not at all."""
+    parser = argparse.ArgumentParser(prog="python -m liftcore.measure.stability", description=__doc__)
+    parser.add_argument("page", type=Path, metavar="FILE", help="the Markdown to write")
+    out = parser.parse_args().page
+    for kernel in Kernel:
+        warm_up(kernel)
+    with whole_file(out) as handle:
+        handle.write(page().encode())
+
+
+if __name__ == "__main__":
+    main()

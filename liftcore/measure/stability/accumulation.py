@@ -1,0 +1,98 @@
+"""Sums over 10^3 .. 10^7 rays for one splat: what float32 with its partial sums gives beside float64.
+
+Every sum of a lift is looked at: the region weights and the evidence of a view, ``A^T Y`` of the least squares, the
+closed form over the codebook rows that one splat reads, and the closed form over views. The worst for a sum is equal
+terms, for then all roundings go one way.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from liftcore.measure.stability.scenes import splats_at
+from liftcore.observe.observation import RegionMap
+from liftcore.progress import silent
+from liftcore.raster.cpu import CpuRaster
+from liftcore.raster.oracle_footprints import alphas
+from liftcore.raster.protocol import RegionWeights, Walk, Weighting
+from liftcore.scene.cameras import Camera
+from liftcore.scene.splats import Splats
+from liftcore.solve.closed_form import solve_closed_form
+from liftcore.solve.view_weights import ViewWeights
+
+SIDES = (32, 100, 316, 1_000, 3_162)  # pixels of square images: 10^3 .. 10^7 rays
+ROWS = 1_000  # of the codebook, which the entries read in turn
+MOST_VIEWS = 10_000
+
+
+def sums_of_rays(side: int) -> dict[str, float]:
+    """Relative errors of one faint splat's sums over an image of ``side`` squared, which it covers.
+
+    Returns:
+        by name: region weights, squared region weights, evidence, ``A^T 1``.
+    """
+    splats = splats_at([(0.0, 0.0, 2.0)], log_scales=[0.3, 0.1, 0.0], logits=-2.0)
+    camera = Camera("v0", side, side, 0.7 * side, 0.7 * side, side / 2, side / 2, np.eye(4))
+    exact, squares = _exact_sums(splats, camera)
+    raster, region = CpuRaster(splats), RegionMap(torch.zeros(1, 1, 1, dtype=torch.int32), torch.ones(1, 1))
+    plain = raster.region_weights(camera, region, Walk(), Weighting(1))
+    squared = raster.region_weights(camera, region, Walk(), Weighting(2))
+    adjoint = raster.adjoint(camera, torch.ones(side, side, 1), Walk())
+    found = {
+        "A^T S": float(plain.weights[0]) / exact,
+        "A^T S, squared weights": float(squared.weights[0]) / squares,
+        "evidence": float(plain.evidence[0]) / exact,
+        "A^T Y": float(adjoint[0, 0]) / exact,
+    }
+    return {name: abs(ratio - 1) for name, ratio in found.items()}
+
+
+def sums_of_entries(count: int, equal: bool) -> float:
+    """Relative error of x of a splat that reads ``count`` codebook rows of one view, by weights equal or random."""
+    return _solved([_entries(count, equal)], equal)
+
+
+def sums_of_views(count: int, equal: bool) -> float:
+    """The same of a splat that reads one row in each of ``count`` views."""
+    whole = _entries(count, equal)
+    one = torch.tensor([0, 1])
+    views = [_row(whole.columns[k : k + 1], whole.weights[k : k + 1], one) for k in range(count)]
+    return _solved(views, equal)
+
+
+def _exact_sums(splats: Splats, camera: Camera) -> tuple[float, float]:
+    """The sums of the one splat's alphas and of their squares, in float64, row by row of the image."""
+    x = np.arange(camera.width) + 0.5
+    total = squares = 0.0
+    for y in x:
+        alpha = alphas(splats, 0, camera, Walk(), np.stack([x, np.full_like(x, y)], axis=1))[0]
+        total += float(alpha.sum())
+        squares += float((alpha * alpha).sum())
+    return total, squares
+
+
+def _entries(count: int, equal: bool) -> RegionWeights:
+    rng = np.random.default_rng(0)
+    values = np.full(count, 0.3) if equal else rng.uniform(0, 1, count)
+    columns = torch.from_numpy((np.arange(count) % ROWS).astype(np.int32))
+    return _row(columns, torch.from_numpy(values.astype(np.float32)), torch.tensor([0, count]))
+
+
+def _row(columns: torch.Tensor, weights: torch.Tensor, starts: torch.Tensor) -> RegionWeights:
+    first = torch.zeros(1, dtype=torch.int32)
+    return RegionWeights(first, starts, columns, weights, first, torch.ones(1))
+
+
+def _solved(views: list[RegionWeights], equal: bool) -> float:
+    rng = np.random.default_rng(1)
+    book = torch.tensor(np.full((ROWS, 1), 0.7) if equal else rng.uniform(-1, 2, (ROWS, 1)), dtype=torch.float32)
+    total = value = 0.0
+    with ViewWeights() as store:
+        for view in views:
+            store.append(view)
+            weights = view.weights.double()
+            total += float(weights.sum())
+            value += float(weights @ book[view.columns.long(), 0].double())
+        solved = solve_closed_form(store, lambda _: book, np.array([total]), torch.float32, silent, threads=1)
+    return abs(float(solved.features[0, 0]) * total / value - 1)

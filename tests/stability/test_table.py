@@ -1,0 +1,46 @@
+"""Every row of docs/stability.md holds: the error is within its bound, the claim is so, and the user is told."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from liftcore.measure.stability.case import Extreme
+from liftcore.measure.stability.page import EXTREMES, TABLES, table_of
+from liftcore.measure.stability.wide import survey
+from liftcore.scene.splats import Kernel
+
+pytestmark = pytest.mark.usefixtures("every_kernel")
+PAGE = Path(__file__).parents[2] / "docs" / "stability.md"
+RAYS_FLIPPED = 1e-3  # of the wide scenes, which look for the cut-offs; the conformance suite holds 1e-4 on usual ones
+ROWS = [(extreme, kernel) for extreme in EXTREMES for kernel in extreme.kernels]
+
+
+@pytest.mark.parametrize(("extreme", "kernel"), ROWS, ids=[f"{row.name}-{kernel}" for row, kernel in ROWS])
+def test_the_extreme_is_survived_with_the_stated_error(extreme: Extreme, kernel: Kernel):
+    found = extreme.measure(kernel)
+    assert found.holds
+    assert found.error is None or found.error <= extreme.bound
+    assert extreme.told in " ".join(found.told)
+
+
+def test_the_page_has_the_rows_that_the_code_has():
+    tables = PAGE.read_text().split("## Sums over many rays")[0]
+    names = [line.split(" | ")[0].removeprefix("| ") for line in tables.splitlines() if line.startswith("| ")]
+    assert [name for name in names if name != "extreme"] == [extreme.name for extreme in EXTREMES]
+
+
+def test_a_row_says_what_was_measured():
+    head, rule, row = table_of(TABLES["Refused"][:1])
+    assert head.count("|") == rule.count("|") == row.count("|")
+    assert "refused | - | opacity_logits: expected finite values" in row
+
+
+@pytest.mark.parametrize("kernel", list(Kernel))
+def test_wide_scenes_equal_the_oracle_and_rarely_flip(kernel: Kernel):
+    got = survey(kernel, range(1_000, 1_020))
+    assert got.finite
+    assert got.error < 1e-5
+    assert got.flips <= max(1, RAYS_FLIPPED * got.rays)
+    assert got.judged >= 15
