@@ -9,6 +9,7 @@ from fastapi import FastAPI
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service import request_id
+from service.keys.gate import CALLER, Caller
 from service.metrics import Metrics, Served
 
 PATH_CHARACTERS = 200  # of a path in the log
@@ -64,6 +65,9 @@ class Recorder:
             "received": exchange.received,
             "sent": exchange.sent,
         }
+        caller: Caller | None = scope.get("state", {}).get(CALLER)
+        if caller is not None and caller.key is not None:
+            fields["key"] = caller.key
         if not exchange.complete:
             fields["broken_off"] = True
         log.info("%s %s %d", scope["method"], route or "(no route)", exchange.status, extra={"fields": fields})

@@ -32,6 +32,7 @@ class Caller:
 
     owner: Owner
     max_uploads: int | None = None
+    key: str | None = None  # its id, for the log
 
 
 EVERYBODY = Caller(Owner())  # while there are no keys
@@ -103,7 +104,8 @@ class Gate:
             max_bytes=settings.key_bytes if quota.max_bytes is None else quota.max_bytes,
             max_queued=settings.key_queued if quota.max_queued is None else quota.max_queued,
         )
-        return Caller(owner, settings.key_uploads if quota.max_uploads is None else quota.max_uploads)
+        uploads = settings.key_uploads if quota.max_uploads is None else quota.max_uploads
+        return Caller(owner, uploads, key.id)
 
     def _require_turn(self, caller: Caller) -> None:
         if caller.max_uploads is not None and self._uploads[caller.owner.key] >= caller.max_uploads:

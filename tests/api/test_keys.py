@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import logging
 import re
+import shutil
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -200,6 +201,25 @@ def _owner(house: Guarded, name: str) -> Owner:
     return Owner(house.ids[name], sees_all=False)
 
 
+def test_owner_asks_and_sees_pictures(
+    start: Callable[..., Any], data: Path, lift: dict[str, Any], tmp_path: Path
+) -> None:
+    shutil.copytree(data, tmp_path / "data", ignore=shutil.ignore_patterns("lock"))  # while nothing is written there
+    with start() as client:
+        store: Store = client.app.state.parts.store
+        (owner, secret), (_, other) = make_key(store, "read"), make_key(store, "read write")
+        with store.database.write() as connection:
+            connection.execute("UPDATE jobs SET owner = ?", (owner,))
+            connection.execute("UPDATE asset_owners SET owner = ?", (owner,))
+        path, asked = "/query/mask", {"text": "apple", "view": "left", "like": "region:left:0:1"}
+        mask = client.get(path, params=asked, headers=bearer(secret))
+        assert mask.content.startswith(b"\x89PNG")
+        tag = {"If-None-Match": mask.headers["etag"]}
+        assert client.get(path, params=asked, headers=bearer(secret) | tag).status_code == 304
+        named = asked | {"lift": lift["id"]}
+        assert client.get(path, params=named, headers=bearer(other) | tag).status_code == 404
+
+
 # Making and revoking
 
 
@@ -265,8 +285,12 @@ def test_secret_is_neither_kept_nor_logged(house: Guarded, tmp_path: Path, caplo
     assert len(secret) >= len("splatlift_") + 43  # 256 bits in base64
     with caplog.at_level(logging.DEBUG):
         house.ask("alice", "GET", "/jobs")
-        house.ask("alice", "GET", "/lifts/nothing")
-    assert secret not in caplog.text
+        house.ask("alice", "GET", "/lifts/nothing", params={"access_token": secret})
+        house.ask(None, "GET", "/jobs")
+    lines = [vars(record)["fields"] for record in caplog.records if record.name == "service.access"]
+    assert [line.get("key") for line in lines] == [house.ids["alice"], house.ids["alice"], None]
+    ours = [str(vars(record)) for record in caplog.records if not record.name.startswith("http")]  # not the client's
+    assert ours and not any(secret in line for line in ours)
     files = [path for path in (tmp_path / "data").rglob("*") if path.is_file()]
     assert files and not any(secret.encode() in path.read_bytes() for path in files)
 
