@@ -1,0 +1,126 @@
+"""The image and the compose file say what is true of this service. No image is built here: there is no engine."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from fnmatch import fnmatch
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from liftcore import __version__
+from service.settings import ServiceSettings
+from tests.crash.service_process import ServiceProcess
+
+from .readme import ROOT, text
+
+DEFAULTS = ServiceSettings.model_construct()
+
+
+def instructions() -> list[tuple[str, str]]:
+    """The instructions of the Dockerfile: name and arguments, continued lines joined."""
+    lines = [line for line in text("docker/Dockerfile").splitlines() if not line.startswith("#")]
+    whole = re.sub(r"\\\n\s*", "", "\n".join(lines))
+    return [(line.split()[0], line.split(maxsplit=1)[1]) for line in whole.splitlines() if line.strip()]
+
+
+def given(name: str) -> list[str]:
+    return [arguments for found, arguments in instructions() if found == name]
+
+
+def environment() -> dict[str, str]:
+    return dict(re.findall(r"([A-Z_]+)=(\S*)", " ".join(given("ENV"))))
+
+
+def services() -> dict[str, Any]:
+    return yaml.safe_load(text("docker/compose.yaml"))["services"]
+
+
+def health_check() -> list[str]:
+    (check,) = given("HEALTHCHECK")
+    return json.loads(check.partition(" CMD ")[2])
+
+
+def test_everything_that_is_copied_is_here_and_in_the_build_context() -> None:
+    kept = [line[1:] for line in text(".dockerignore").splitlines() if line.startswith("!")]
+    copied = [words.split() for words in given("COPY") if "--from=" not in words]
+    assert copied
+    for source in (source for words in copied for source in words[:-1]):
+        assert (ROOT / source).exists(), source
+        assert any(fnmatch(source, name) for name in kept), source
+    assert {source for words in copied for source in words[:-1]} == set(kept)
+
+
+def test_every_variable_is_a_setting() -> None:
+    named = set(re.findall(r"SPLATLIFT_[A-Z_]+", text("docker/Dockerfile") + text("docker/compose.yaml")))
+    assert named
+    assert {name.removeprefix("SPLATLIFT_").lower() for name in named} <= ServiceSettings.model_fields.keys()
+
+
+def test_the_port_is_the_services_own_everywhere() -> None:
+    assert given("EXPOSE") == [str(DEFAULTS.port)]
+    assert f"127.0.0.1:{DEFAULTS.port}/healthz" in " ".join(health_check())
+    for service in services().values():
+        assert service["ports"] == [f"127.0.0.1:{DEFAULTS.port}:{DEFAULTS.port}"]
+
+
+def test_versions_come_from_the_lock_and_torch_is_first() -> None:
+    installs = [run for run in given("RUN") if "pip install" in run]
+    assert "'^torch=='" in installs[0] and "requirements.lock" in installs[0]
+    assert any("--constraint requirements.lock" in run for run in installs)
+    assert all("lock" in run or "--no-deps ." in run for run in installs)
+    locked = {line.split("==")[0].lower().replace("_", "-") for line in text("requirements.lock").splitlines()}
+    needed = re.search(r"^dependencies = \[(.*?)^\]", text("pyproject.toml"), flags=re.MULTILINE | re.DOTALL)
+    assert needed is not None
+    names = {name.lower().replace("_", "-") for name in re.findall(r'"([A-Za-z0-9_.-]+)', needed[1])}
+    assert names <= locked
+
+
+def test_no_image_is_named_without_its_version() -> None:
+    arguments = dict(re.findall(r"(\w+)=(\S*)", " ".join(given("ARG"))))
+    stages = {words.split()[-1] for words in given("FROM")}
+    named = {words.split()[0] for words in given("FROM")} - stages
+    for image in (re.sub(r"\$\{(\w+)\}", lambda name: arguments[name[1]], one) for one in named):
+        assert image in stages or re.search(r":\d+\.\d+\.\d+", image), image
+    for service in services().values():
+        assert service["image"].split(":")[1].split("-")[0] == __version__
+    assert "latest" not in text("docker/Dockerfile") + text("docker/compose.yaml")
+
+
+def test_the_service_is_no_root_and_gets_its_signals() -> None:
+    names = [name for name, _ in instructions()]
+    assert names.index("USER") < names.index("CMD") and given("USER") != ["root"]
+    assert json.loads(given("ENTRYPOINT")[0])[0].endswith("tini")
+    assert json.loads(given("CMD")[0]) == ["python", "-m", "service"]  # exec form: no shell between
+    for service in services().values():
+        assert float(service["stop_grace_period"].rstrip("s")) > DEFAULTS.notice_seconds + DEFAULTS.stop_seconds
+        assert service["read_only"] and service["cap_drop"] == ["ALL"] and service["mem_limit"]
+
+
+def test_what_is_written_lies_in_the_volume() -> None:
+    assert given("VOLUME") == ["/data"]
+    for name in ("SPLATLIFT_DATA", "XDG_CACHE_HOME"):
+        assert Path(environment()[name]).is_relative_to("/data")
+    assert all("data:/data" in service["volumes"] for service in services().values())
+
+
+def test_no_secret_is_built_in() -> None:
+    named = " ".join(given("ARG") + given("ENV"))
+    assert not re.search(r"(?i)secret|token|password|_key", named)
+
+
+@pytest.mark.parametrize("alive", [True, False])
+def test_health_check_tells_a_live_server_from_a_dead_one(alive: bool, tmp_path: Path) -> None:
+    with ServiceProcess(tmp_path, "--behaviour", "answer") as service:
+        port = service.client.base_url.port
+        if not alive:
+            service.kill()
+        command = [word.replace(f":{DEFAULTS.port}/", f":{port}/") for word in health_check()]
+        assert command[0] == "python"
+        result = subprocess.run([sys.executable, *command[1:]], capture_output=True, timeout=60, check=False)
+    assert (result.returncode == 0) is alive
