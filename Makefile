@@ -8,7 +8,7 @@ SCENE ?=
 OUT ?= demo-output
 TORCH_PIP ?=
 
-.PHONY: demo test soak lint format serve bench setup clean
+.PHONY: demo test soak contract lint format serve bench setup clean
 
 demo: $(READY)  ## the whole job through the real service; SCENE=DIR takes a scene of your own
 	$(BIN)/splatlift demo --out "$(OUT)" $(if $(SCENE),--scene "$(SCENE)")
@@ -20,6 +20,9 @@ test: lint  ## everything that must hold
 
 soak: $(READY)  ## the long proofs of docs/reliability.md: prints their figures, takes an hour or so
 	$(BIN)/python -m tests.crash.soak
+
+contract: $(READY)  ## every operation against the OpenAPI document, without keys and with them; some minutes
+	$(BIN)/python -m tests.api.contract
 
 lint: $(READY)
 	$(BIN)/ruff check .

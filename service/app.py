@@ -64,6 +64,7 @@ def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, work
         description="Lift 2D features onto trained splat scenes and query them in words.",
         lifespan=lifespan,
         responses=problems.RESPONSES,
+        redirect_slashes=False,
     )
     app.state.stopping, app.state.metrics = stopping, metrics
     app.add_middleware(BodyLimit, limit=settings.max_body_bytes, pace=pace_of(settings))
@@ -78,14 +79,19 @@ def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, work
 
 def assemble(settings: ServiceSettings, store: Store) -> FastAPI:
     """The application with the usual runner and query worker."""
-    limits = QueryLimits(
+    runner, worker = Supervisor(store, lift_limits(settings)), WarmWorker(query_limits(settings))
+    return create_app(settings, store, runner, worker)
+
+
+def query_limits(settings: ServiceSettings) -> QueryLimits:
+    """What the settings allow queries."""
+    return QueryLimits(
         waiting=settings.query_waiting,
         seconds=settings.query_seconds,
         scenes=settings.query_scenes,
         cache_bytes=settings.query_cache_bytes,
         encoder=settings.encoder,
     )
-    return create_app(settings, store, Supervisor(store, lift_limits(settings)), WarmWorker(limits))
 
 
 def pace_of(settings: ServiceSettings) -> Pace:

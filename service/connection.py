@@ -8,6 +8,7 @@ time, or never reads what it asked for, would be kept for ever. Bodies are watch
 from __future__ import annotations
 
 import asyncio
+import sys
 from collections.abc import Mapping
 from http import HTTPStatus
 from typing import ClassVar
@@ -76,8 +77,12 @@ class WatchedConnection(H11Protocol):
             self._reading.cancel()
 
     def send_400_response(self, msg: str) -> None:
-        """Refuse what is no HTTP, in the shape of all our errors."""
-        self._refuse(400, "malformed-request", problems.FRAMEWORK[400][1], msg)
+        """Refuse what is no HTTP, in the shape of all our errors. Called while the error is handled."""
+        error = sys.exc_info()[1]
+        long = isinstance(error, h11.RemoteProtocolError) and error.error_status_hint == 431
+        status = 431 if long else 400
+        slug, title = problems.FRAMEWORK[status]
+        self._refuse(status, slug, title, msg)
 
     def _watch(self) -> None:
         """See that the clock runs while no request is being answered."""

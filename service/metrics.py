@@ -56,7 +56,7 @@ class Metrics:
             ("method", "route"), buckets=REQUEST_BUCKETS, registry=registry,
         )  # fmt: skip
         self._received = Counter(
-            "splatlift_http_request_body_bytes", "Bytes of request bodies; of PUT /assets/{kind}: uploads.",
+            "splatlift_http_request_body_bytes", "Bytes of request bodies; of PUT /assets/{asset}: uploads.",
             ("method", "route"), registry=registry,
         )  # fmt: skip
         self._attempts = Histogram(

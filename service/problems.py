@@ -23,6 +23,7 @@ from service.wire import Problem
 
 MEDIA_TYPE = "application/problem+json"
 METHODS = ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS")
+PATH_CHARACTERS = 200  # of what a client asked for, told back
 NO_SPACE = "There is no room left"
 
 # Exception -> status and title. The nearest class in the exception's ancestry counts; `type` is its `kind`.
@@ -67,6 +68,7 @@ FRAMEWORK: dict[int, tuple[str, str]] = {
     405: ("method-not-allowed", "The route does not take this method"),
     408: ("too-slow", "The request came too slowly"),
     413: ("too-large", "The body is too large"),
+    431: ("headers-too-large", "The request's line and headers are too large"),
 }
 
 # For OpenAPI: every route may answer with a problem.
@@ -152,7 +154,7 @@ async def _on_framework(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, HTTPException)
     phrase = HTTPStatus(error.status_code).phrase
     slug, title = FRAMEWORK.get(error.status_code, (phrase.lower().replace(" ", "-"), phrase))
-    detail = f"{request.method} {request.url.path}: {error.detail}"
+    detail = f"{request.method[:PATH_CHARACTERS]} {request.url.path[:PATH_CHARACTERS]}: {error.detail}"
     problem = Problem(type=f"/problems/{slug}", title=title, status=error.status_code, detail=detail)
     headers = dict(error.headers or {})
     if error.status_code == HTTPStatus.METHOD_NOT_ALLOWED:

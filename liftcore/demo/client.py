@@ -39,7 +39,7 @@ class Client:
         self._http.close()
 
     def upload(self, kind: str, path: Path) -> dict[str, Any]:
-        """``PUT /assets/{kind}``: the asset, with its id and counts."""
+        """``PUT /assets/KIND``: the asset, with its id and counts."""
 
         def parts() -> Iterator[bytes]:
             with path.open("rb") as handle:

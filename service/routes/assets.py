@@ -24,6 +24,8 @@ from service.uploads.intake import Intake
 BATCH = 1 << 20  # bytes gathered before a thread writes them
 
 router = APIRouter(prefix="/assets", tags=["assets"])
+# By the name of the other routes' part: to OpenAPI, two templates that match the same paths are one path twice.
+Kind = Annotated[wire.AssetKind, Path(alias="asset", description="what it is")]
 AssetId = Annotated[str, Path(description="sha256: and the digest of the bytes, in hex")]
 Sha256 = Annotated[
     str | None,
@@ -39,13 +41,13 @@ RAW_BODY = {
 
 
 @router.put(
-    "/{kind}",
+    "/{asset}",
     response_model=wire.Asset,
     status_code=201,
     responses={200: {"model": wire.Asset, "description": "It was here already"}},
     openapi_extra=RAW_BODY,
 )
-async def upload(kind: wire.AssetKind, request: Request, here: Here, sha256: Sha256 = None) -> Response:
+async def upload(kind: Kind, request: Request, here: Here, sha256: Sha256 = None) -> Response:
     """Upload splats (PLY), cameras (JSON or a zip of a COLMAP model) or a feature pack (safetensors)."""
     coding = coding_of(", ".join(request.headers.getlist("content-encoding")))
     here.store.files.require_room()

@@ -31,10 +31,20 @@ Key = Annotated[
 LastEvent = Annotated[
     int, Header(alias="Last-Event-ID", ge=0, le=2**53, description="the last event that the client has")
 ]
+EVENT = {
+    "type": "object",
+    "description": "one event",
+    "required": ["id", "event", "data"],
+    "properties": {
+        "id": {"type": "string", "pattern": "^[0-9]+$"},
+        "event": {"enum": [kind.value for kind in EventKind]},
+        "data": {"type": "string", "contentMediaType": "application/json"},
+    },
+}
 EVENTS: dict[int | str, dict[str, Any]] = {
     200: {
-        "description": "Server-sent events: state, progress and log, each with an id and JSON data",
-        "content": {"text/event-stream": {"schema": {"type": "string"}}},
+        "description": "Server-sent events; the data are a JobStep, a Progress or a LogLine as JSON",
+        "content": {"text/event-stream": {"schema": EVENT}},
     },
     204: {"description": "The job has ended, and the client has its last event"},
 }

@@ -31,7 +31,7 @@ NOBODY = "e" * 32
 NO_ASSET = "sha256:" + "f" * 64
 OPEN_ROUTES = {"/", "/healthz", "/readyz", "/version", "/openapi.json", "/docs", "/docs/oauth2-redirect", "/redoc"}
 # Routes that name nothing of anybody: they show one's own things, or make new ones.
-NAMELESS = {("GET", "/metrics"), ("GET", "/assets"), ("PUT", "/assets/{kind}"), ("GET", "/jobs"), ("GET", "/lifts")}
+NAMELESS = {("GET", "/metrics"), ("GET", "/assets"), ("PUT", "/assets/{asset}"), ("GET", "/jobs"), ("GET", "/lifts")}
 ASKING = {"text": "apple", "view": "v"}
 
 

@@ -26,7 +26,6 @@ ROUTES = {
     "/version",
     "/metrics",
     "/assets",
-    "/assets/{kind}",
     "/assets/{asset}",
     "/assets/{asset}/content",
     "/lift",

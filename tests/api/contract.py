@@ -1,0 +1,110 @@
+"""The service against its own OpenAPI document: schemathesis calls every operation over real sockets.
+
+    python -m tests.api.contract [--examples N]
+
+What would take seconds a call has a stand-in: the check of an upload takes any bytes, and a lift is done at once. So
+uploads and lifts succeed here, and what is made can be looked at, asked and deleted. Queries run in the real worker,
+over a store that may hold a real lift.
+"""
+
+from __future__ import annotations
+
+import argparse
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+from service.__main__ import server_of
+from service.app import create_app, lift_limits, query_limits
+from service.jobs.supervisor import Supervisor
+from service.keys.scopes import Scope
+from service.queries.warm import WarmWorker
+from service.settings import ServiceSettings
+from service.store.keys import Quota
+from service.store.store import Store
+from service.uploads.checking import Report
+from tests.crash.conftest import stand_in
+
+CHECKS = (
+    "not_a_server_error", "status_code_conformance", "content_type_conformance", "response_schema_conformance",
+    "response_headers_conformance", "negative_data_rejection", "missing_required_header", "unsupported_method",
+    "allow_header_conformance", "use_after_free", "ensure_resource_availability", "ignored_auth",
+)  # fmt: skip
+PHASES = ("examples", "coverage", "fuzzing", "stateful")
+SECONDS = 580
+
+
+@contextmanager
+def served(data: Path, *, keys: bool, **settings: Any) -> Iterator[tuple[str, str | None]]:
+    """A server in a thread over a data directory: its address, and a key that may do everything."""
+    chosen = ServiceSettings.model_validate({"data": data, **settings})
+    store = Store.open(chosen.data)
+    secret = store.keys.create("contract", frozenset({Scope.ADMIN}), Quota())[1] if keys else None
+    runner = Supervisor(store, lift_limits(chosen), command=stand_in("answer"))
+    listener = socket.create_server(("127.0.0.1", 0))
+    server = server_of(create_app(chosen, store, runner, WarmWorker(query_limits(chosen))), chosen)
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+    report = Report(".bin", {"names": ["v"], "channels": 1}, [])
+    with mock.patch("service.routes.assets.check", lambda *given: report):
+        thread.start()
+        try:
+            while not server.started:
+                time.sleep(0.01)
+            yield f"http://127.0.0.1:{listener.getsockname()[1]}", secret
+        finally:
+            server.should_exit = True
+            thread.join()
+            store.close()
+
+
+def conformance(
+    address: str, secret: str | None, *, examples: int, phases: tuple[str, ...] = PHASES, without: str | None = None
+) -> str:
+    """What schemathesis found wrong, as it tells it; empty when nothing is. The same seed makes the same calls.
+
+    Args:
+        address: of the server.
+        secret: a key.
+        examples: of each operation and phase.
+        phases: of schemathesis; those of `coverage` are as many as the schema has corners.
+        without: a pattern of paths that are left out.
+    """
+    command = [
+        str(Path(sys.executable).with_name("schemathesis")), "run", f"{address}/openapi.json", "--no-color",
+        "--checks", ",".join(CHECKS), "--phases", ",".join(phases), "--max-examples", str(examples),
+        "--seed", "1", "--generation-deterministic", "--continue-on-failure",
+        "--no-shrink", "--suppress-health-check", "all", "--warnings", "off", "--request-timeout", "60",
+    ]  # fmt: skip
+    command += [] if without is None else ["--exclude-path-regex", without]
+    command += [] if secret is None else ["--header", f"Authorization: Bearer {secret}"]
+    with tempfile.TemporaryDirectory() as folder:
+        found = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=SECONDS, check=False)
+    return "" if found.returncode == 0 else f"{found.stdout}\n{found.stderr}"
+
+
+def main() -> int:
+    """The long form, without keys and with them; 1 when something does not conform."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--examples", type=int, default=30, help="of each operation and phase")
+    given = parser.parse_args()
+    wrong = False
+    for keys in (False, True):
+        with tempfile.TemporaryDirectory() as folder, served(Path(folder) / "data", keys=keys) as (address, secret):
+            begun = time.monotonic()
+            found = conformance(address, secret, examples=given.examples)
+        wrong = wrong or bool(found)
+        told = found or "everything conforms"
+        print(f"--- {'with' if keys else 'without'} keys, {time.monotonic() - begun:.0f} s ---\n{told}", flush=True)
+    return int(wrong)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

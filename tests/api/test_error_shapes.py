@@ -1,0 +1,221 @@
+"""Whatever is sent to whatever route: a refusal has the one shape, the right status, and is never our fault.
+
+The routes come from the application itself, so a new one is held to this too.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fastapi import FastAPI
+from fastapi.routing import iter_route_contexts
+from fastapi.testclient import TestClient
+
+from .test_problems import NO_ASSET, NOBODY, assert_problem
+from .test_slow_clients import served
+
+METHODS = ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS", "TRACE", "BREW")
+ODD_PARTS = (
+    "%00",
+    "%FF%FE",
+    "%ED%A0%80",
+    "..%2F..%2Fetc%2Fpasswd",
+    "%E2%80%A8",
+    "%20",
+    "a" * 6000,
+    "%0d%0aX:y",
+    "-1",
+)
+ODD_VALUES = ("", "%00", "%FF%FE", "%ED%A0%80", "nan", "-1", "1e999", "9" * 5000, "%0d%0aX:y", "%5B%5D", "null")
+ODD_HEADERS = (
+    {"Idempotency-Key": b"\xe4"}, {"Idempotency-Key": b"k" * 300}, {"Last-Event-ID": b"x"}, {"Last-Event-ID": b"-1"},
+    {"Last-Event-ID": b"9" * 5000}, {"Content-Type": b"\xff"}, {"Content-Type": b"application/json; charset=utf-7"},
+    {"Content-Encoding": b"br"}, {"Content-Encoding": b"\xff"}, {"Range": b"bytes=" + b"9" * 5000 + b"-"},
+    {"If-None-Match": b"\xff"}, {"If-Range": b'"'}, {"Accept": b"image/x-nothing"}, {"Authorization": b"\xff"},
+    {"Cookie": b"=;\xff"}, {"Expect": b"magic"}, {"Transfer-Encoding": b"gzip"}, {"X-Request-ID": b"\xff"},
+)  # fmt: skip
+ODD_BODIES = (
+    b"", b"{", b"[]", b"null", b"\xff\xfe", b'"\xed\xa0\x80"', b"[" * 60_000, b'{"text": NaN}', b'{"\\ud800": 1}',
+    b"1" * 5000, b'{"text": [1], "text": {}}', b"\xef\xbb\xbf{}",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def routes(client: TestClient) -> dict[str, set[str]]:
+    """What the application takes: path template -> methods."""
+    assert isinstance(client.app, FastAPI)
+    found: dict[str, set[str]] = {}
+    for context in iter_route_contexts(client.app.routes):
+        if context.path is not None:
+            found.setdefault(context.path, set()).update(context.methods or ())
+    assert {"/", "/metrics", "/lift", "/openapi.json", "/assets/{asset}"} <= found.keys()
+    return found
+
+
+def address(path: str, part: str | None = None) -> str:
+    """A path of a template: of nothing that exists, or with an odd part."""
+    named = path.replace("{asset}", part or NO_ASSET)
+    return re.sub(r"\{\w+\}", part or NOBODY, named)
+
+
+def refused(reply: Any, method: str) -> str:
+    """The type of a problem; answers to HEAD have no body to tell it."""
+    if method != "HEAD":
+        return assert_problem(reply)["type"]
+    assert reply.headers["content-type"] == "application/problem+json" and not reply.content
+    return "(no body)"
+
+
+def assert_no_fault_of_ours(reply: Any, what: object) -> None:
+    """The request was taken, or refused as a problem; the server did not break over it."""
+    assert reply.status_code < 500, (what, reply.text)
+    if reply.status_code >= 400:
+        assert_problem(reply)
+
+
+def test_every_route_answers_405_to_what_it_does_not_take(client: TestClient, routes: dict[str, set[str]]) -> None:
+    for path, taken in routes.items():
+        for method in set(METHODS) - taken:
+            reply = client.request(method, address(path))
+            assert reply.status_code == 405, (method, path)
+            assert set(reply.headers["allow"].split(", ")) == taken
+            assert refused(reply, method) in ("/problems/method-not-allowed", "(no body)")
+
+
+@pytest.mark.parametrize(
+    "path", ["/nowhere", "/jobs/a/b/c", "//", "/%2e%2e/", "/Healthz", "/healthz/", "/%00", "/%FF"]
+)
+def test_unknown_paths_are_404_for_every_method(client: TestClient, path: str) -> None:
+    for method in METHODS:
+        reply = client.request(method, f"http://127.0.0.1{path}")
+        assert reply.status_code == 404, (method, reply.status_code, reply.headers)
+        assert refused(reply, method) in ("/problems/no-such-route", "(no body)")
+        assert len(reply.content) < 1000
+
+
+def test_odd_parts_of_paths_are_refused_as_problems(client: TestClient, routes: dict[str, set[str]]) -> None:
+    for path in routes:
+        for part in ODD_PARTS if "{" in path else ():
+            for method in ("GET", "PUT", "POST", "DELETE"):
+                reply = client.request(method, address(path, part))
+                assert 400 <= assert_problem(reply)["status"] < 500, (method, path, part)
+
+
+def test_odd_values_in_queries_break_nothing(client: TestClient, routes: dict[str, set[str]], lift: Any) -> None:
+    for path, taken in routes.items():
+        names = _query_names(client, path)
+        for value in ODD_VALUES:
+            for name in names:
+                needed = "".join(f"&{other}=left" for other in names & {"text", "view"} - {name})
+                for method in taken & {"GET", "POST", "PUT", "DELETE"}:
+                    reply = client.request(method, f"{address(path)}?{name}={value}{needed}")
+                    assert_no_fault_of_ours(reply, (method, path, name, value))
+
+
+def test_odd_headers_break_nothing(client: TestClient, routes: dict[str, set[str]]) -> None:
+    for path, taken in routes.items():
+        for odd in ODD_HEADERS:
+            headers = {name.encode(): value for name, value in odd.items()}
+            for method in taken:
+                reply = client.request(method, address(path), headers=headers)
+                assert_no_fault_of_ours(reply, (method, path, odd))
+
+
+@pytest.mark.parametrize("media", ["application/json", "text/plain", "multipart/form-data; boundary=x", "nonsense"])
+def test_odd_bodies_are_refused_as_problems(client: TestClient, routes: dict[str, set[str]], media: str) -> None:
+    for path, taken in routes.items():
+        for body in ODD_BODIES if "POST" in taken else ():
+            reply = client.post(address(path), content=body, headers={"Content-Type": media})
+            assert assert_problem(reply)["status"] in (400, 404, 415, 422), (path, media, body[:40])
+
+
+def test_long_bodies_are_413_where_bodies_are_read(client: TestClient, routes: dict[str, set[str]]) -> None:
+    for path, taken in routes.items():
+        if "POST" in taken and "{" not in path:
+            reply = client.post(path, content=b" " * 2_000_000, headers={"Content-Type": "application/json"})
+            assert assert_problem(reply)["status"] == 413, path
+
+
+def test_unknown_encodings_are_415(client: TestClient) -> None:
+    reply = client.put("/assets/splats", content=b"x", headers={"Content-Encoding": "br"})
+    assert assert_problem(reply)["status"] == 415
+
+
+@pytest.fixture(scope="module")
+def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, int]]:
+    """A server behind a socket, in no hurry."""
+    folder: Path = tmp_path_factory.mktemp("live") / "data"
+    with served(folder, header_seconds=30, slow_grace_seconds=30) as found:
+        yield found
+
+
+HOST = b"Host: 127.0.0.1\r\n"
+BAD_HTTP = {
+    "no HTTP": (b"GARBAGE\r\n\r\n", 400),
+    "TLS": (b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03" + bytes(64), 400),
+    "raw bytes in the path": (b"GET /\xff\xfe HTTP/1.1\r\n" + HOST + b"\r\n", 400),
+    "NUL in the path": (b"GET /\x00 HTTP/1.1\r\n" + HOST + b"\r\n", 400),
+    "NUL in a header": (b"GET /healthz HTTP/1.1\r\n" + HOST + b"X: a\x00b\r\n\r\n", 400),
+    "space in a header's name": (b"GET /healthz HTTP/1.1\r\n" + HOST + b"X y: z\r\n\r\n", 400),
+    "no Host": (b"GET /healthz HTTP/1.1\r\n\r\n", 400),
+    "two Hosts": (b"GET /healthz HTTP/1.1\r\n" + HOST + HOST + b"\r\n", 400),
+    "an overlong path": (b"GET /" + b"a" * 100_000, 431),
+    "an overlong header": (b"GET /healthz HTTP/1.1\r\n" + HOST + b"X: " + b"a" * 100_000, 431),
+    "two lengths": (b"POST /lift HTTP/1.1\r\n" + HOST + b"Content-Length: 1\r\nContent-Length: 2\r\n\r\nab", 400),
+    "a negative length": (b"POST /lift HTTP/1.1\r\n" + HOST + b"Content-Length: -1\r\n\r\n", 400),
+    "an unknown transfer": (b"POST /lift HTTP/1.1\r\n" + HOST + b"Transfer-Encoding: magic\r\n\r\n", 400),
+    "a bad chunk": (
+        b"POST /lift HTTP/1.1\r\n" + HOST + b"Content-Type: application/json\r\n"
+        b"Transfer-Encoding: chunked\r\n\r\nzz\r\n",
+        400,
+    ),
+    "a proxy's request": (b"GET http://example.org/ HTTP/1.1\r\n" + HOST + b"Connection: close\r\n\r\n", 404),
+    "OPTIONS *": (b"OPTIONS * HTTP/1.1\r\n" + HOST + b"Connection: close\r\n\r\n", 404),
+    "CONNECT": (b"CONNECT example.org:443 HTTP/1.1\r\n" + HOST + b"Connection: close\r\n\r\n", 404),
+    "a lower-case method": (b"get /healthz HTTP/1.1\r\n" + HOST + b"Connection: close\r\n\r\n", 405),
+    "a foreign Host": (b"GET /healthz HTTP/1.1\r\nHost: example.org\r\nConnection: close\r\n\r\n", 421),
+    "a WebSocket": (
+        b"GET /nowhere HTTP/1.1\r\n" + HOST + b"Connection: upgrade, close\r\nUpgrade: websocket\r\n"
+        b"Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Version: 13\r\n\r\n",
+        404,
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BAD_HTTP)
+def test_what_is_no_good_http_is_a_problem_too(live: tuple[str, int], name: str) -> None:
+    sent, status = BAD_HTTP[name]
+    head, body = exchange(live, sent)
+    assert head.startswith(f"HTTP/1.1 {status} "), head
+    assert "content-type: application/problem+json" in head.lower()
+    told = json.loads(body)
+    assert told["status"] == status and told["title"] and told["detail"]
+    assert told["type"].startswith("/problems/")
+    assert f"x-request-id: {told['request_id']}" in head.lower()
+
+
+def exchange(where: tuple[str, int], sent: bytes) -> tuple[str, str]:
+    """What comes back over a fresh connection until it closes: head and body."""
+    with socket.create_connection(where, timeout=60) as connection:
+        connection.sendall(sent)
+        received = b""
+        while piece := connection.recv(65_536):
+            received += piece
+    head, _, body = received.decode().partition("\r\n\r\n")
+    return head, body
+
+
+def _query_names(client: TestClient, path: str) -> set[str]:
+    operations = client.get("/openapi.json").json()["paths"].get(path, {})
+    return {
+        parameter["name"]
+        for operation in operations.values()
+        for parameter in operation.get("parameters", ())
+        if parameter["in"] == "query"
+    }
