@@ -6,7 +6,9 @@ none, i16 or i32 with -1) with ``V/codebook`` [M, F], or a grid, ``V/grid`` [h, 
 
 from __future__ import annotations
 
+import json
 import struct
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -201,6 +203,20 @@ def _check_start(path: Path) -> None:
     if length > MAX_HEADER_BYTES:
         got = f"{length} bytes"
         raise InvalidFeatures(str(path), expected=f"a header of at most {MAX_HEADER_BYTES} bytes", got=got)
+    _check_names(path, length)
+
+
+def _check_names(path: Path, length: int) -> None:
+    """Refuse headers that say a name twice, of which each reader believes another; safetensors refuses bad JSON."""
+
+    def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        if len(dict(pairs)) < len(pairs):
+            raise InvalidFeatures(str(path), expected="a header that says each name once", got="one twice")
+        return dict(pairs)
+
+    with path.open("rb") as handle, suppress(ValueError, RecursionError):
+        handle.seek(8)
+        json.loads(handle.read(length), object_pairs_hook=once)
 
 
 def _views(pack: _PackFile) -> list[str]:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from pathlib import PurePosixPath
 from typing import TYPE_CHECKING
+
+from liftcore.errors import InvalidCameras
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -27,10 +30,18 @@ IMAGE_SUFFIXES = frozenset(
         ".dng",
     ]
 )
+UNSAYABLE = re.compile("[\\x00-\\x1f\\x7f\\ud800-\\udfff]")
 
 
 def view_names(images: Sequence[str]) -> list[str]:
-    """One view name an image: the file's stem, or the relative path without extension where stems collide."""
+    """One view name an image: the file's stem, or the relative path without extension where stems collide.
+
+    Raises:
+        InvalidCameras: a name with control characters, or with half of a surrogate pair, which no UTF-8 can say.
+    """
+    for image in images:
+        if UNSAYABLE.search(image):
+            raise InvalidCameras("image name", expected="one of printable characters", got=ascii(image)[:60])
     paths = [_without_suffix(image) for image in images]
     stems = [PurePosixPath(path).name for path in paths]
     uses = Counter(stems)

@@ -1,0 +1,128 @@
+"""A corpus of hostile files, made by code: kind -> name -> bytes. None of them may be taken."""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+import zipfile
+from typing import Any
+
+from .tiny_scene import cameras_document, cameras_json
+
+PLY = b"ply\nformat binary_little_endian 1.0\n"
+CAMERA = "1 PINHOLE 32 24 30 30 16 12\n"
+CENTRAL = b"PK\x01\x02"  # begins a member's entry in a zip's directory
+
+
+def vertices(count: bytes, properties: bytes = b"property float x\n") -> bytes:
+    """A PLY with a count of vertices and no data."""
+    return PLY + b"element vertex " + count + b"\n" + properties + b"end_header\n"
+
+
+def splats() -> dict[str, bytes]:
+    """Bombs for the reader of splats."""
+    return {
+        "header of 64 MB without a line end": b"ply\n" + b"x" * (64 << 20),
+        "list property": vertices(b"1", b"property list int float x\n") + bytes(8),
+        "100,000 properties": vertices(b"1", b"".join(b"property float p%d\n" % k for k in range(100_000))),
+        "200,000 comments": PLY + b"comment\n" * 200_000 + b"end_header\n",
+        "negative count": vertices(b"-1"),
+        "count beyond 64 bits": vertices(b"18446744073709551617"),
+        "count whose bytes overflow": vertices(b"4611686018427387905"),
+        "count of 5,000 digits": vertices(b"9" * 5000),
+        "count that is no integer": vertices(b"1e9"),
+        "property without a width": vertices(b"1", b"property void x\n"),
+    }
+
+
+def cameras() -> dict[str, bytes]:
+    """Bombs for the readers of cameras."""
+    document, plain = cameras_document(), cameras_json()
+    model = [("sparse/0/cameras.txt", CAMERA.encode()), ("sparse/0/images.txt", b"x" * 1000)]
+    count = struct.pack("<Q", 2**63)
+    return {
+        "deep array": b"[" * 100_000,
+        "deep object": b'{"a":' * 100_000,
+        "deep array that ends": b"[" * 50_000 + b"]" * 50_000,
+        "NaN": json.dumps(document | {"fl_x": float("nan")}).encode(),
+        "Infinity": json.dumps(document | {"fl_x": float("inf")}).encode(),
+        "number beyond every float": plain.replace(b"30.0", b"1e999"),
+        "integer of 4,000 digits": plain.replace(b"30.0", b"9" * 4000),
+        "integer of 5,000 digits": plain.replace(b"30.0", b"9" * 5000),
+        "an image of 10^18 pixels": json.dumps(document | {"w": 10**18}).encode(),
+        "negative size": json.dumps(document | {"w": -5}).encode(),
+        "half a surrogate pair in a name": plain.replace(b"images/left", b"images/\\ud800left"),
+        "zero byte in a name": plain.replace(b"images/left", b"images/\\u0000left"),
+        "half a surrogate pair as a key": b'{"\\ud800": 1, "frames": []}',
+        "not UTF-8": b'{"a": "\xff\xfe"}',
+        "a million numbers": b"[" + b"1," * 1_000_000 + b"1]",
+        "zip of 600 MB of zeros": zipped([model[0], ("sparse/0/images.txt", bytes(600 << 20))]),
+        "zip that says too small a size": patched(zipped(model), 24, 10),
+        "zip that says too large a size": patched(zipped(model), 24, 0xFFFFFFFE),
+        "zip whose members overlap": patched(zipped(model), 42, 0),
+        "zip of 110,000 members": zipped([(f"f{k}", b"") for k in range(110_000)]),
+        "zip in a zip": zipped([("sparse/0/model.zip", zipped(model))]),
+        "zip without its end": zipped(model)[:-30],
+        "model of 2^63 cameras": zipped([("cameras.bin", count), ("images.bin", count)]),
+    }
+
+
+def features() -> dict[str, bytes]:
+    """Bombs for the reader of feature packs."""
+    deep = b'{"a":' * 100_000
+    grid = '"v/grid":{"dtype":"F32","shape":[1,1,2],"data_offsets":[0,8]}'
+    shape = b"{'descr': '<f8', 'fortran_order': False, 'shape': (500000000000,), }"
+    return {
+        "header of 2^63 bytes": safetensors(b"{}", 2**63),
+        "header beyond the end": safetensors(b"{}", 1000),
+        "header beyond its limit": safetensors(b"{", 33 << 20),
+        "overlapping offsets": pack({"v/grid": tensor([1, 1, 2], 0, 8), "w/grid": tensor([1, 1, 2], 4, 12)}, 12),
+        "offsets beyond the end": pack({"v/grid": tensor([1000, 1000, 1000], 0, 4 * 10**9)}, 8),
+        "offsets backwards": pack({"v/grid": tensor([1, 1, 2], 8, 0)}, 8),
+        "shape beyond 64 bits": pack({"v/grid": tensor([2**40, 2**40, 2], 0, 8)}, 8),
+        "shape that wraps to nothing": pack({"v/grid": tensor([2**63, 2, 2], 0, 0)}, 0),
+        "negative shape": pack({"v/grid": tensor([-1, -1, 2], 0, 8)}, 8),
+        "no channels": pack({"v/grid": tensor([1, 1, 0], 0, 0)}, 0),
+        "a tensor twice": safetensors(f"{{{grid},{grid}}}".encode()) + bytes(8),
+        "metadata twice": safetensors(f'{{"__metadata__":{{"a":"1","a":"2"}},{grid}}}'.encode()) + bytes(8),
+        "half a surrogate pair in a name": safetensors(f"{{{grid}}}".replace("v/", "\\ud800/").encode()) + bytes(8),
+        "deep header": safetensors(deep),
+        "deep metadata": safetensors(b'{"__metadata__":' + deep),
+        "npy that asks for 3.64 TiB": b"\x93NUMPY\x01\x00v\x00" + shape.ljust(117) + b"\n",
+        "pickle": b"\x80\x04\x95" + bytes(100),
+        "zip": zipped([("v.npy", b"x")]),
+    }
+
+
+CORPUS = {"splats": splats, "cameras": cameras, "features": features}
+
+
+def zipped(members: list[tuple[str, bytes]]) -> bytes:
+    """A zip of deflated members."""
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, member in members:
+            archive.writestr(name, member)
+    return content.getvalue()
+
+
+def patched(archive: bytes, place: int, number: int) -> bytes:
+    """The zip with another number in the directory entry of its last member."""
+    start = archive.rfind(CENTRAL) + place
+    return archive[:start] + struct.pack("<I", number) + archive[start + 4 :]
+
+
+def safetensors(header: bytes, length: int | None = None) -> bytes:
+    """A header with its length, or with a lie about it."""
+    return struct.pack("<Q", len(header) if length is None else length) + header
+
+
+def tensor(shape: list[int], first: int, last: int) -> dict[str, Any]:
+    """What a header says of a tensor."""
+    return {"dtype": "F32", "shape": shape, "data_offsets": [first, last]}
+
+
+def pack(tensors: dict[str, Any], size: int) -> bytes:
+    """A file with that header and so many bytes of data."""
+    return safetensors(json.dumps(tensors).encode()) + bytes(size)
