@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 EXPERIMENTS = (
-    "ablation", "fidelity", "kernels", "lambda_sweep", "mask_noise", "overfitting", "pose_noise", "row_sums",
+    "ablation", "conditioning", "fidelity", "kernels", "lambda_sweep", "mask_noise", "overfitting", "pose_noise",
+    "row_sums",
 )  # fmt: skip
 
 BAD_INPUT = 2

@@ -39,8 +39,11 @@ def test_every_experiment_has_a_title_a_source_and_rows(scene, tmp_path, name, m
 
 def _keep_it_short(monkeypatch):
     """Fewer points a curve; each kind of point stays."""
-    from liftcore.measure.experiments import fidelity, lambda_sweep, mask_noise, overfitting, pose_noise
+    from liftcore.measure.experiments import conditioning, fidelity, lambda_sweep, mask_noise, overfitting, pose_noise
 
+    monkeypatch.setattr(conditioning, "GAINS", (1.0, 4.0))
+    monkeypatch.setattr(conditioning, "RAYS", 3_000)
+    monkeypatch.setattr(conditioning, "ROOM_SPLATS", 100)
     monkeypatch.setattr(fidelity, "PRESETS", ("row-sum", "tikhonov"))
     monkeypatch.setattr(lambda_sweep, "PAIRS", ((1.0, 1.0), (1.2, 1.2), (0.5, 1.0)))
     monkeypatch.setattr(mask_noise, "RATES", (0.0, 0.6))
@@ -53,6 +56,15 @@ def test_row_sums_stay_below_one(scene, tmp_path):
     rows = run("row_sums", scene, tmp_path)["rows"]
     assert [row["gain"] for row in rows] == [1.0, 1.2]
     assert all(0 <= row["min"] <= row["mean"] <= 1 for row in rows)
+
+
+def test_polarised_opacities_leave_splats_more_to_themselves(scene, tmp_path, monkeypatch):
+    _keep_it_short(monkeypatch)
+    rows = [row for row in run("conditioning", scene, tmp_path)["rows"] if row["scene"] == "room"]
+    assert [row["gain"] for row in rows] == [1.0, 4.0]
+    assert rows[1]["own_share_w"] > rows[0]["own_share_w"]
+    assert all(row["own_share_w2"] > row["own_share_w"] and row["noise_w2"] > row["noise_w"] for row in rows)
+    assert all(row["cond_w"] > 1 and row["coupling"] > 1 for row in rows)
 
 
 def test_wrong_masks_cost_accuracy(scene, tmp_path, monkeypatch):
