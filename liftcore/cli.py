@@ -84,6 +84,7 @@ def build_parser() -> argparse.ArgumentParser:
     _add_inspect(commands.add_parser("inspect", parents=[shared], help="what is in a file, and what is wrong"))
     _add_evaluate(commands.add_parser("evaluate", parents=[shared], help="lifts against the field's labels"))
     _add_bench(commands.add_parser("bench", parents=[shared], help="how fast this machine lifts"))
+    _add_tradeoff(commands.add_parser("tradeoff", parents=[shared], help="speed against accuracy on your scene"))
     _add_experiment(
         commands.add_parser("experiment", parents=[shared], help="what the paper measured, on a scene of yours")
     )
@@ -140,6 +141,17 @@ def _add_settings(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--preset", metavar="NAME", help="a published choice of weights: row-sum, tikhonov")
     parser.add_argument("--speed", metavar="NAME", help="the dial: exact, balanced, fast or draft")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="one setting")
+
+
+def _add_tradeoff(parser: argparse.ArgumentParser) -> None:
+    _add_sources(parser)
+    parser.add_argument("--budget", type=_seconds, default=600.0, metavar="SECONDS", help="what it may take; 600")
+    parser.add_argument("-o", "--out", type=Path, default=Path("tradeoff"), metavar="DIR", help="of chart and table")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting of all runs")
+    parser.add_argument("--labels", type=Path, metavar="MASKS", help="VIEW/mask [h, w], numbers of classes")
+    parser.add_argument("--table", type=Path, metavar="FILE", help="text embeddings of the classes")
+    parser.add_argument("--classes", nargs="+", default=[], metavar="WORD", help="the classes, from number 0 on")
+    parser.add_argument("--threads", type=_count, metavar="N", help="else as many as there are cores")
 
 
 def _add_query(parser: argparse.ArgumentParser) -> None:
@@ -229,6 +241,16 @@ def _add_experiment(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scene", type=Path, metavar="SCENE", help="point_cloud.ply, cameras.json and feature packs")
     parser.add_argument("-o", "--out", type=Path, default=Path("experiments"), metavar="DIR", help="of JSON and plot")
     parser.add_argument("--every", type=_count, default=1, metavar="N", help="take every n-th feature view only")
+
+
+def _seconds(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"expected seconds, got {text!r}")
+    return value
 
 
 def _count(text: str) -> int:

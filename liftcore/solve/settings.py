@@ -56,8 +56,8 @@ class Speed(StrEnum):
 _SPEEDS: dict[Speed, dict[str, Any]] = {
     Speed.EXACT: {},
     Speed.BALANCED: {"stride": 2, "certificate_rays": 2_000},
-    Speed.FAST: {"stride": 4, "coverage": 16, "certificate_rays": 1_000},
-    Speed.DRAFT: {"stride": 6, "coverage": 6, "transmittance_stop": 0.01, "certificate_rays": 500},
+    Speed.FAST: {"stride": 4, "certificate_rays": 1_000},
+    Speed.DRAFT: {"stride": 6, "coverage": 12, "transmittance_stop": 0.003, "certificate_rays": 500},
 }
 
 

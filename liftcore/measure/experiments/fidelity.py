@@ -74,12 +74,12 @@ def rendered_cosine(
     """
     packs = open_packs([pack])
     names = pair(packs, cameras)[0][::every]
-    totals = [_view_cosines(raster, cameras.get(name), packs.observation(name), features, walk) for name in names]
+    totals = [view_cosines(raster, cameras.get(name), packs.observation(name), features, walk) for name in names]
     cosines = np.concatenate(totals)
     return float(cosines.mean()), len(names)
 
 
-def _view_cosines(
+def view_cosines(
     raster: Raster, camera: Camera, observation: Observation, features: Tensor, walk: Walk
 ) -> np.ndarray:
     """The cosine of every row of B that the sampled pixels of a view read."""

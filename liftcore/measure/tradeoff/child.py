@@ -1,0 +1,105 @@
+"""One run of the trade-off, in a process of its own so that its memory is its own: an order on stdin, JSON on stdout.
+
+python -m liftcore.measure.tradeoff.child < order.json
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from liftcore.errors import SplatliftError
+from liftcore.input_files import input_file
+from liftcore.lift import Run, lift_sources, open_sources
+from liftcore.measure.tradeoff.judge import judge
+from liftcore.measure.tradeoff.order import Order
+from liftcore.progress import silent
+from liftcore.raster.warm_up import warm_up
+from liftcore.solve.settings import LiftSettings
+from liftcore.timings import Timings
+
+if TYPE_CHECKING:
+    from liftcore.artifact import Lift
+
+APART = ("read", "digest", "compile")  # stages that the seconds of a lift leave out
+BAD_INPUT = 2
+
+
+def measured(order: Order) -> dict[str, Any]:
+    """Lift as ordered, and give the figures of the run and of its features."""
+    settings = LiftSettings.of(**order.settings)
+    run = Run(settings, order.threads, silent, Timings())
+    cpu, wall = time.process_time(), time.perf_counter()
+    with run.timings.stage("read"):
+        sources = open_sources(order.scene.splats, order.scene.cameras, order.scene.features, settings)
+    wanted = set(order.lifted)
+    sources = replace(sources, views=[view for view in sources.views if view in wanted])
+    read = {"cpu": time.process_time() - cpu, "wall": time.perf_counter() - wall}
+    with run.timings.stage("digest"):
+        inputs = [input_file(order.scene.splats)] * (2 + len(order.scene.features))
+    with run.timings.stage("compile"):
+        warm_up(sources.splats.kernel)  # the lift's own then takes no time
+    cpu, wall = time.process_time(), time.perf_counter()
+    made = lift_sources(run, sources, inputs)
+    seconds = {"cpu": time.process_time() - cpu, "wall": time.perf_counter() - wall}
+    figures = {
+        "cpu_s": seconds["cpu"],
+        "wall_s": seconds["wall"],
+        "cpu_with_reading_s": seconds["cpu"] + read["cpu"],
+        "wall_with_reading_s": seconds["wall"] + read["wall"],
+        "peak_memory_bytes": peak_memory(),
+        "load": os.getloadavg()[0],
+        "views": len(made.metadata.views),
+        "settings": made.metadata.settings.model_dump(mode="json"),
+        "seen_share": float(made.seen.float().mean()),
+        "timings": {name: value for name, value in made.metadata.timings.items() if name not in APART},
+    }
+    return figures | judge(order, sources, _reference(order, made), made)
+
+
+def _reference(order: Order, made: Lift) -> tuple[torch.Tensor, torch.Tensor]:
+    """Features [P, F] and evidence [P] of the exact run."""
+    path = order.reference / "exact.pt"
+    if order.exact:
+        torch.save({"features": made.features, "evidence": made.evidence}, path)
+        return made.features, made.evidence
+    if not path.is_file():
+        return made.features[:0], made.evidence[:0]
+    kept = torch.load(path, weights_only=True, mmap=True)
+    return kept["features"], kept["evidence"]
+
+
+def peak_memory() -> int:
+    """Bytes of this process at its largest.
+
+    Not ``ru_maxrss`` where Linux says better: that one survives exec, so a child starts from its parent's size.
+    """
+    status = Path("/proc/self/status")
+    if status.is_file():
+        lines = [line for line in status.read_text(encoding="ascii").splitlines() if line.startswith("VmHWM:")]
+        if lines:
+            return int(lines[0].split()[1]) * 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+
+def main() -> int:
+    """Run the order on stdin."""
+    try:
+        figures = measured(Order.of(json.load(sys.stdin)))
+    except SplatliftError as error:
+        print(json.dumps({"error": str(error)}))
+        return BAD_INPUT
+    print(json.dumps(figures))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,99 @@
+"""How good a run's features are: against the exact ones, the held-out views, and masks when there are some."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from liftcore.measure.accuracy import class_ious, rendered_scores
+from liftcore.measure.experiments.fidelity import view_cosines
+from liftcore.query.encoders.table import TableEncoder
+from liftcore.raster.cpu import CpuRaster
+from liftcore.solve.accumulate import render_walk
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from liftcore.artifact import Lift
+    from liftcore.lift import Sources
+    from liftcore.measure.tradeoff.order import Order, Scene
+
+LOW_QUANTILE = 0.05
+ROWS = 1 << 16  # compared at a time
+
+
+def judge(order: Order, sources: Sources, reference: tuple[Tensor, Tensor], made: Lift) -> dict[str, Any]:
+    """The figures of accuracy; None where there is nothing to compare with.
+
+    Args:
+        reference: features [P, F] and evidence [P] of the exact run, empty before it.
+    """
+    figures = cosine_figures(made.features, *reference)
+    raster, walk = CpuRaster(sources.splats, order.threads), render_walk(made.metadata.settings)
+    rows = [
+        view_cosines(raster, sources.cameras.get(view), sources.packs.observation(view), made.features, walk)
+        for view in order.held_out
+    ]
+    figures["held_out_cosine"] = float(np.concatenate(rows).mean()) if rows else None
+    figures["mask_iou"] = None
+    if order.scene.labels is not None and order.labelled:
+        classes = class_vectors(order.scene)
+        masks = labelled_masks(order.scene)
+        scores = (
+            rendered_scores(raster, sources.cameras.get(view), made.features, classes, walk)
+            for view in order.labelled
+        )
+        found = [
+            _resized(image.argmax(dim=2), masks[view]) for view, image in zip(order.labelled, scores, strict=True)
+        ]
+        truth = [masks[view].flatten() for view in order.labelled]
+        ious = class_ious(torch.cat(found), torch.cat(truth), len(classes))
+        figures["mask_iou"] = float(ious.nanmean())
+    return figures
+
+
+def cosine_figures(features: Tensor, exact: Tensor, evidence: Tensor) -> dict[str, float | None]:
+    """How near the features [P, F] are to the exact ones, over the splats that the exact run saw.
+
+    The mean weighted by evidence, the plain mean, and the quantile below which LOW_QUANTILE of the splats lie. A
+    splat that this run did not see counts zero.
+    """
+    if not exact.shape[0]:
+        return {"cosine": None, "cosine_plain": None, "cosine_q05": None}
+    parts, seen = [], []
+    for first in range(0, exact.shape[0], ROWS):
+        one, other = features[first : first + ROWS].float(), exact[first : first + ROWS].float()
+        parts.append(torch.nn.functional.cosine_similarity(one, other, dim=1).double())
+        seen.append((other != 0).any(dim=1))
+    chosen = torch.cat(seen)
+    cosines, weights = torch.cat(parts)[chosen], evidence[chosen].double()
+    return {
+        "cosine": float((cosines * weights).sum() / weights.sum()),
+        "cosine_plain": float(cosines.mean()),
+        "cosine_q05": float(np.quantile(cosines.numpy(), LOW_QUANTILE)),
+    }
+
+
+def class_vectors(scene: Scene) -> Tensor:
+    """The unit vectors [K, F] of the classes' words."""
+    if scene.table is None:
+        raise ValueError("labels come with a table of their words")
+    return torch.as_tensor(TableEncoder.open(scene.table).encode(scene.classes))
+
+
+def labelled_masks(scene: Scene) -> dict[str, Tensor]:
+    """View -> [h, w] i64 of class numbers."""
+    from safetensors import safe_open
+
+    with safe_open(str(scene.labels), framework="pt") as handle:
+        names = [name for name in tuple(handle.keys()) if name.endswith("/mask")]
+        return {name.removesuffix("/mask"): handle.get_tensor(name).long() for name in names}
+
+
+def _resized(labels: Tensor, mask: Tensor) -> Tensor:
+    """The labels [H, W] at the centres of the mask's pixels, flat."""
+    rows = ((2 * torch.arange(mask.shape[0]) + 1) * labels.shape[0]) // (2 * mask.shape[0])
+    columns = ((2 * torch.arange(mask.shape[1]) + 1) * labels.shape[1]) // (2 * mask.shape[1])
+    return labels[rows][:, columns].flatten()
