@@ -123,7 +123,8 @@ def lift_sources(run: Run, sources: Sources, inputs: list[InputFile], checkpoint
             "views_without_splats": _blind(sources.views, store),
         }
     lifted = [sources.cameras.get(name) for name in sources.views]
-    facts["warnings"] = lift_warnings(sources.splats, lifted, geometry.denominators, settings.dtype, X.dtype, facts)
+    found = lift_warnings(sources.splats, lifted, geometry.denominators, settings.dtype, X.dtype, facts)
+    facts["warnings"] = [*plan.warnings, *found]
     with run.timings.stage("certify"):
         certificate = certify(geometry, X, geometry.codebooks.__getitem__, settings, threads) | notes | facts
     return Lift(

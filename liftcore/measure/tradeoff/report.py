@@ -49,7 +49,7 @@ def page_of(document: Mapping[str, Any]) -> list[str]:
 
 def table_of(document: Mapping[str, Any]) -> list[str]:
     """The runs as a Markdown table, the fastest first; those of the front in bold."""
-    rows = sorted(document["runs"], key=lambda run: run["wall_s"])
+    rows = sorted(document["runs"], key=lambda run: run["cpu_s"])
     lines = [" | ".join(HEADS), "|".join("---" for _ in HEADS)]
     lines += [" | ".join(_cells(run, run["name"] in document["choice"]["front"])) for run in rows]
     return [f"|{line}|" if line.startswith("---") else f"| {line} |" for line in lines]
