@@ -8,7 +8,7 @@ SCENE ?=
 OUT ?= demo-output
 TORCH_PIP ?=
 
-.PHONY: demo test soak contract lint format serve bench setup clean
+.PHONY: demo test soak contract load lint format serve bench setup clean
 
 demo: $(READY)  ## the whole job through the real service; SCENE=DIR takes a scene of your own
 	$(BIN)/splatlift demo --out "$(OUT)" $(if $(SCENE),--scene "$(SCENE)")
@@ -23,6 +23,9 @@ soak: $(READY)  ## the long proofs of docs/reliability.md: prints their figures,
 
 contract: $(READY)  ## every operation against the OpenAPI document, without keys and with them; some minutes
 	$(BIN)/python -m tests.api.contract
+
+load: $(READY)  ## what clients wait for under load (docs/reliability.md): prints figures, takes some minutes
+	$(BIN)/python -m tests.load.measure
 
 lint: $(READY)
 	$(BIN)/ruff check .
