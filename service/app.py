@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
@@ -43,16 +44,19 @@ def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, work
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        ending = threading.Event()
         checks, scrapes = anyio.CapacityLimiter(settings.parallel_checks), anyio.CapacityLimiter(1)
         app.state.parts = Parts(
-            settings, store, runner, worker, streams, checks, metrics=metrics, scrapes=scrapes, readiness=readiness
-        )
+            settings, store, runner, worker, streams, checks, metrics=metrics, scrapes=scrapes,
+            readiness=readiness, ending=ending,
+        )  # fmt: skip
         await anyio.to_thread.run_sync(worker.start)
         await anyio.to_thread.run_sync(runner.start)
         collector.start()
         try:
             yield
         finally:
+            ending.set()
             streams.close()
             await anyio.to_thread.run_sync(collector.stop)
             await anyio.to_thread.run_sync(runner.stop)

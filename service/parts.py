@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass, replace
 from typing import Annotated
 
@@ -31,6 +32,7 @@ class Parts:
     metrics: Metrics
     scrapes: anyio.CapacityLimiter  # those who read the metrics at the same time
     readiness: Readiness
+    ending: threading.Event  # set when what still runs must end
 
 
 # Async: a sync dependency waits for a thread of the pool, and every route with it.

@@ -61,7 +61,8 @@ async def upload(kind: Kind, request: Request, here: Here, sha256: Sha256 = None
         known = await anyio.to_thread.run_sync(here.store.assets.find, f"sha256:{digest}")
         if known is not None and known.kind is kind:
             return _reply(known, 200)
-        limits = CheckLimits(scratch, here.settings.check_seconds, here.settings.check_memory_bytes)
+        allowed = here.settings
+        limits = CheckLimits(scratch, allowed.check_seconds, allowed.check_memory_bytes, here.ending)
         report = await anyio.to_thread.run_sync(check, kind, draft, limits, limiter=here.checks)
         checked = CheckedUpload(draft, kind, digest, report.suffix, report.counts, report.warnings)
         asset, new = await anyio.to_thread.run_sync(here.store.assets.add, checked)

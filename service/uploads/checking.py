@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import os
 import signal
 import subprocess
 import sys
+import threading
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from liftcore.errors import InvalidCameras, InvalidFeatures, InvalidInput, InvalidSplats
-from service.errors import Crashed
+from service.errors import Busy, Crashed
 from service.faults import error_of
 from service.wire import AssetKind
+
+TICK_SECONDS = 0.5  # how soon the end of the server is seen
 
 INVALID: dict[AssetKind, type[InvalidInput]] = {
     AssetKind.SPLATS: InvalidSplats,
@@ -33,6 +38,7 @@ class CheckLimits:
     scratch: Path
     seconds: float
     memory_bytes: int
+    ending: threading.Event  # set when the server must end, and every check with it
 
 
 @dataclass(frozen=True)
@@ -50,6 +56,7 @@ def check(kind: AssetKind, path: Path, limits: CheckLimits) -> Report:
     Raises:
         InvalidInput: the file is malformed, or it takes more time or memory than it may.
         Crashed: the process did not get as far as opening the file.
+        Busy: the server ended meanwhile.
     """
     command = [sys.executable, "-m", "service.uploads.check", kind, str(path), str(limits.memory_bytes)]
     process = subprocess.Popen(
@@ -61,15 +68,26 @@ def check(kind: AssetKind, path: Path, limits: CheckLimits) -> Report:
         env=os.environ | {"TMPDIR": str(limits.scratch)},
     )
     with process:
-        try:
-            output, trace = process.communicate(timeout=limits.seconds)
-        except subprocess.TimeoutExpired:
+        heard = _listen(process, limits)
+        if heard is None:
             os.killpg(process.pid, signal.SIGKILL)
             process.communicate()
-            raise INVALID[kind](
-                kind, expected=f"a file that is read within {limits.seconds:g} s", got="one that takes longer"
-            ) from None
-    return _report(kind, output, process.returncode, trace)
+    if heard is not None:
+        return _report(kind, heard[0], process.returncode, heard[1])
+    if limits.ending.is_set():
+        raise Busy("upload", expected="a running server", got="one that stops", hint="send it again")
+    raise INVALID[kind](
+        kind, expected=f"a file that is read within {limits.seconds:g} s", got="one that takes longer"
+    )
+
+
+def _listen(process: subprocess.Popen[bytes], limits: CheckLimits) -> tuple[bytes, bytes] | None:
+    """What the process says on stdout and stderr until it ends; None when it must be ended."""
+    deadline = time.monotonic() + limits.seconds
+    while not limits.ending.is_set() and (left := deadline - time.monotonic()) > 0:
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            return process.communicate(timeout=min(left, TICK_SECONDS))
+    return None
 
 
 def _report(kind: AssetKind, output: bytes, returncode: int, trace: bytes) -> Report:

@@ -26,11 +26,14 @@ from prometheus_client import REGISTRY
 from prometheus_client.parser import text_string_to_metric_families
 
 from service import request_id
+from service.errors import Busy
 from service.jobs.limits import LiftLimits
 from service.jobs.supervisor import Supervisor
 from service.logs import JsonLines, TextLines
 from service.parts import Parts
 from service.store.store import Store
+from service.uploads.checking import CheckLimits, check
+from service.wire import AssetKind
 from tests.crash.conftest import order, stand_in, until
 from tests.crash.service_process import ServiceProcess, processes_of
 
@@ -335,6 +338,25 @@ def test_stop_refuses_work_ends_streams_puts_jobs_back_and_exits_0(
     found = store.jobs.get(job)
     store.close()
     assert (found.state, found.attempt) == ("queued", 1)
+
+
+def test_stop_ends_a_check_that_would_take_long(tmp_path: Path) -> None:
+    fifo = tmp_path / "never.ply"
+    os.mkfifo(fifo)  # who opens it waits for a writer, for ever
+    ending, ended = threading.Event(), []
+    limits = CheckLimits(tmp_path, 300.0, 1 << 33, ending)
+
+    def run() -> None:
+        with pytest.raises(Busy):
+            check(AssetKind.SPLATS, fifo, limits)
+        ended.append(True)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    assert thread.is_alive()
+    ending.set()
+    thread.join(30)
+    assert ended == [True]
 
 
 def test_log_of_a_server_is_json_lines_and_holds_no_secret(tmp_path: Path, table: Path) -> None:
