@@ -2,7 +2,7 @@
 
 numba's automatic vectorisation stops at aliasing and wrap-around checks inside the blending loop. These
 intrinsics build the same arithmetic as LLVM vectors of eight lanes, which LLVM lowers to AVX2, SSE or NEON.
-A tile row of 16 pixels is two such half rows.
+A tile row of 16 pixels is two such half rows; half row ``16 side + row`` lies left (side 0) or right (1).
 """
 
 from __future__ import annotations
@@ -13,12 +13,15 @@ import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
-from numba.extending import intrinsic
+from numba.core.datamodel import models
+from numba.extending import intrinsic, register_model
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
 LANES = 8
+ROWS = 16  # of a tile
+HALVES = 2 * ROWS  # half rows of a tile
 
 Builder = Any  # llvmlite's IRBuilder; what it infers of its own decorated methods is wrong
 
@@ -29,12 +32,33 @@ INTS = ir.VectorType(INT, LANES)
 FUSE = ("contract",)  # a*b + c may become one fused instruction
 FLOAT_ARRAY = types.Array(types.float32, 1, "C")
 
-# Where a tile's state lies in its one flat float32 array. One array keeps one pointer in a register.
+# Where a tile's state lies in its one flat float32 array. One array keeps one pointer in a register. The 256 rays
+# come half row by half row, those of the left side first.
 PIXELS = 256
 TRANSMITTANCE = 0  # [256], 0 = the ray is done
-WEIGHTS = PIXELS  # [256], of the splat at hand
+WEIGHTS = PIXELS  # [256], of the splat at hand, for who wants them one by one
 PLAIN_TRANSMITTANCE = 2 * PIXELS  # [256], of the rays without opacity gain
-EVIDENCE = 3 * PIXELS  # [8], sums of plain weights of the splat at hand, lane by lane
+STARTS = 3 * PIXELS  # [32], of the splat at hand: from its middle in a half row to the first lane
+BASES = STARTS + HALVES  # [16], of the splat at hand: its quadratic form in the middle of a row
+TABLE = BASES + ROWS  # constants from here on, as liftcore.lanes_blend has them
+
+
+class _Lanes(types.Type):
+    """Eight float32 values that compiled code hands about in one register."""
+
+    def __init__(self) -> None:
+        super().__init__(name="Lanes")
+
+
+EIGHT = _Lanes()
+
+
+@register_model(_Lanes)
+class _LanesModel(models.PrimitiveModel):
+    """What numba makes of it: an LLVM vector."""
+
+    def __init__(self, manager: Any, kind: _Lanes) -> None:
+        super().__init__(manager, kind, FLOATS)
 
 
 def compiled(function: Callable) -> Any:
@@ -72,49 +96,126 @@ def fused(builder: Builder, left: ir.Value, right: ir.Value, term: ir.Value) -> 
 
 
 @compiled
-def add_lanes(typingctx, total, offset, weights, row):
-    """``total[offset + i] += weights[row + i]``."""
-    signature = types.void(FLOAT_ARRAY, types.intp, FLOAT_ARRAY, types.intp)
+def no_lanes(typingctx):
+    """Eight zeros."""
 
     def codegen(context, builder, signature, args):
-        total, offset, weights, row = args
-        place = pointer_to(context, builder, signature.args[0], total, offset)
-        term = load_lanes(builder, pointer_to(context, builder, signature.args[2], weights, row))
-        builder.store(builder.fadd(load_lanes(builder, place), term), place, align=4)
-        return context.get_dummy_value()
+        return constant(0.0)
 
-    return signature, codegen
+    return EIGHT(), codegen
 
 
 @compiled
-def add_product_lanes(typingctx, total, offset, weights, row, factors, tap):
-    """``total[offset + i] += weights[row + i] * factors[tap + i]``."""
-    signature = types.void(FLOAT_ARRAY, types.intp, FLOAT_ARRAY, types.intp, FLOAT_ARRAY, types.intp)
+def lanes_at(typingctx, values, offset):
+    """``values[offset + i]``."""
 
     def codegen(context, builder, signature, args):
-        total, offset, weights, row, factors, tap = args
-        place = pointer_to(context, builder, signature.args[0], total, offset)
-        weight = load_lanes(builder, pointer_to(context, builder, signature.args[2], weights, row))
-        factor = load_lanes(builder, pointer_to(context, builder, signature.args[4], factors, tap))
-        builder.store(fused(builder, weight, factor, load_lanes(builder, place)), place, align=4)
-        return context.get_dummy_value()
+        return load_lanes(builder, pointer_to(context, builder, signature.args[0], *args))
 
-    return signature, codegen
+    return EIGHT(FLOAT_ARRAY, types.intp), codegen
 
 
 @compiled
-def add_scaled_lanes(typingctx, total, offset, weights, row, scale):
-    """``total[offset + i] += weights[row + i] * scale``."""
-    signature = types.void(FLOAT_ARRAY, types.intp, FLOAT_ARRAY, types.intp, types.float32)
+def keep_lanes(typingctx, values, offset, lanes):
+    """``values[offset + i] = lanes[i]``."""
 
     def codegen(context, builder, signature, args):
-        total, offset, weights, row, scale = args
-        place = pointer_to(context, builder, signature.args[0], total, offset)
-        weight = load_lanes(builder, pointer_to(context, builder, signature.args[2], weights, row))
-        builder.store(fused(builder, weight, broadcast(builder, scale), load_lanes(builder, place)), place, align=4)
+        values, offset, lanes = args
+        builder.store(lanes, pointer_to(context, builder, signature.args[0], values, offset), align=4)
         return context.get_dummy_value()
 
-    return signature, codegen
+    return types.void(FLOAT_ARRAY, types.intp, EIGHT), codegen
+
+
+@compiled
+def plus(typingctx, left, right):
+    """``left[i] + right[i]``."""
+
+    def codegen(context, builder, signature, args):
+        return builder.fadd(*args)
+
+    return EIGHT(EIGHT, EIGHT), codegen
+
+
+@compiled
+def times(typingctx, left, right):
+    """``left[i] * right[i]``."""
+
+    def codegen(context, builder, signature, args):
+        return builder.fmul(*args)
+
+    return EIGHT(EIGHT, EIGHT), codegen
+
+
+@compiled
+def plus_product(typingctx, total, left, right):
+    """``total[i] + left[i] * right[i]``."""
+
+    def codegen(context, builder, signature, args):
+        total, left, right = args
+        return fused(builder, left, right, total)
+
+    return EIGHT(EIGHT, EIGHT, EIGHT), codegen
+
+
+@compiled
+def in_all_lanes(typingctx, value):
+    """``value`` eight times."""
+
+    def codegen(context, builder, signature, args):
+        return broadcast(builder, args[0])
+
+    return EIGHT(types.float32), codegen
+
+
+@compiled
+def sum_of_lanes(typingctx, lanes):
+    """The sum of the eight, in a fixed tree."""
+
+    def codegen(context, builder, signature, args):
+        parts = [builder.extract_element(args[0], ir.Constant(INT, lane)) for lane in range(LANES)]
+        while len(parts) > 1:
+            half = len(parts) // 2
+            parts = [builder.fadd(parts[k], parts[k + half]) for k in range(half)]
+        return parts[0]
+
+    return types.float32(EIGHT), codegen
+
+
+_HALF_LIMIT = 0x477FF000  # bits of 65520, from where on float16 is infinite
+_HALF_NORMAL = 113 << 23  # bits of the smallest normal float16
+_HALF_SHIFT = 126 << 23  # bits of 0.5: a float32 near it has a step of 2^-24, as small float16 values have
+
+
+@compiled
+def keep_halves(typingctx, values, offset, lanes):
+    """``values[offset + i] = lanes[i]`` as float16, rounded to nearest, in the bits of u16; no value may be NaN.
+
+    In whole numbers, because not every processor converts, and where it does not a missing function would be called.
+    """
+
+    def codegen(context, builder, signature, args):
+        values, offset, lanes = args
+
+        def whole(value: int) -> ir.Constant:
+            return ir.Constant(INTS, [value] * LANES)
+
+        bits = builder.bitcast(lanes, INTS)
+        size = builder.and_(bits, whole(0x7FFFFFFF))
+        odd = builder.and_(builder.lshr(size, whole(13)), whole(1))  # ties go to even
+        normal = builder.lshr(builder.add(builder.add(size, whole(((15 - 127) << 23) + 0xFFF)), odd), whole(13))
+        shifted = builder.fadd(builder.bitcast(size, FLOATS), constant(0.5))
+        small = builder.sub(builder.bitcast(shifted, INTS), whole(_HALF_SHIFT))
+        half = builder.select(builder.icmp_signed("<", size, whole(_HALF_NORMAL)), small, normal)
+        half = builder.select(builder.icmp_signed(">=", size, whole(_HALF_LIMIT)), whole(0x7C00), half)
+        signed = builder.or_(half, builder.lshr(builder.and_(bits, whole(-(1 << 31))), whole(16)))
+        halves = ir.VectorType(ir.IntType(16), LANES)
+        data = context.make_array(signature.args[0])(context, builder, value=values).data
+        place = builder.bitcast(builder.gep(data, [offset]), halves.as_pointer())
+        builder.store(builder.trunc(signed, halves), place, align=2)
+        return context.get_dummy_value()
+
+    return types.void(types.Array(types.uint16, 1, "C"), types.intp, EIGHT), codegen
 
 
 WIDE = 4 * LANES  # channels that add_weighted_row keeps in registers
@@ -155,3 +256,24 @@ def add_weighted_row(typingctx, target, place, source, entries, sparse, span):
         return context.get_dummy_value()
 
     return signature, codegen
+
+
+@compiled
+def fetch_ahead(typingctx, table, row):
+    """Ask for a row of ``table`` [n, m] f64 before it is needed."""
+    kind = types.Array(types.float64, 2, "C")
+    line = 64  # bytes
+
+    def codegen(context, builder, signature, args):
+        values = context.make_array(signature.args[0])(context, builder, value=args[0])
+        width = builder.extract_value(values.strides, 0)
+        byte = ir.IntType(8).as_pointer()
+        first = builder.gep(builder.bitcast(values.data, byte), [builder.mul(args[1], width)])
+        kinds = ir.FunctionType(ir.VoidType(), [byte, INT, INT, INT])
+        fetch = cgutils.get_or_insert_function(builder.module, kinds, "llvm.prefetch.p0")
+        for ahead in (0, line):
+            place = builder.gep(first, [ir.Constant(ir.IntType(64), ahead)])
+            builder.call(fetch, [place, *(ir.Constant(INT, word) for word in (0, 3, 1))])  # to read, keep, data
+        return context.get_dummy_value()
+
+    return types.void(kind, types.intp), codegen

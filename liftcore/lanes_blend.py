@@ -7,7 +7,7 @@ footprint is there comes as a named tuple, and its class says at compile time wh
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from llvmlite import ir
@@ -16,14 +16,14 @@ from numba.core import cgutils
 
 from liftcore.jit import kernel
 from liftcore.lanes import (
-    EVIDENCE,
+    EIGHT,
     FLOAT_ARRAY,
     FLOATS,
     INTS,
     LANES,
     PLAIN_TRANSMITTANCE,
+    TABLE,
     TRANSMITTANCE,
-    WEIGHTS,
     broadcast,
     compiled,
     constant,
@@ -90,10 +90,10 @@ _ROOT_HALF_BITS = int(np.float32(math.sqrt(0.5)).view(np.int32))
 _MANTISSA_BITS = 23
 _SMALLEST_REST = 2.0**-100  # of 1 - sigma, where its logarithm is taken
 
-_TABLE = EVIDENCE + LANES  # rows of eight equal constants: operands in memory cost no instruction of their own
+# The table's rows are eight equal constants: operands in memory cost no instruction of their own.
 _LANE_ROW, _CLAMP_ROW, _FLOOR_ROW, _CAP_ROW, _STOP_ROW, _EXP2_ROW = range(6)  # then one row a coefficient
 _LOG2_ROW = _EXP2_ROW + _EXP2_DEGREE + 1
-STATE = _TABLE + (_LOG2_ROW + _LOG2_DEGREE + 1) * LANES  # length of a tile's array
+STATE = TABLE + (_LOG2_ROW + _LOG2_DEGREE + 1) * LANES  # length of a tile's array
 
 
 def _nodes(low: float, high: float) -> np.ndarray:
@@ -128,21 +128,21 @@ def new_state(floor, cap, stop):
     """A tile's state [STATE] f32: all rays done, the constants of the walk in place."""
     state = np.zeros(STATE, np.float32)
     for lane in range(LANES):
-        state[_TABLE + _LANE_ROW * LANES + lane] = lane
-        state[_TABLE + _CLAMP_ROW * LANES + lane] = LARGEST_EXPONENT
-        state[_TABLE + _FLOOR_ROW * LANES + lane] = floor
-        state[_TABLE + _CAP_ROW * LANES + lane] = cap
-        state[_TABLE + _STOP_ROW * LANES + lane] = stop
+        state[TABLE + _LANE_ROW * LANES + lane] = lane
+        state[TABLE + _CLAMP_ROW * LANES + lane] = LARGEST_EXPONENT
+        state[TABLE + _FLOOR_ROW * LANES + lane] = floor
+        state[TABLE + _CAP_ROW * LANES + lane] = cap
+        state[TABLE + _STOP_ROW * LANES + lane] = stop
         for k in range(_EXP2_DEGREE + 1):
-            state[_TABLE + (_EXP2_ROW + k) * LANES + lane] = _EXP2[k]
+            state[TABLE + (_EXP2_ROW + k) * LANES + lane] = _EXP2[k]
         for k in range(_LOG2_DEGREE + 1):
-            state[_TABLE + (_LOG2_ROW + k) * LANES + lane] = _LOG2[k]
+            state[TABLE + (_LOG2_ROW + k) * LANES + lane] = _LOG2[k]
     return state
 
 
 def _row(builder: Builder, state: ir.Value, row: int) -> ir.Value:
     """A row of the constant table."""
-    place = builder.gep(state, [ir.Constant(ir.IntType(64), _TABLE + row * LANES)])
+    place = builder.gep(state, [ir.Constant(ir.IntType(64), TABLE + row * LANES)])
     return load_lanes(builder, builder.bitcast(place, FLOATS.as_pointer()))
 
 
@@ -250,51 +250,51 @@ def _composite(builder: Builder, state: ir.Value, falloff: ir.Value, opacity: ir
     return builder.select(alive, builder.fmul(alpha, before), zero)
 
 
-def _blend_code(falloff_code: Callable, power: int) -> Callable:
-    """Code of a blend: weights or their squares; a second opacity gives the evidence plain rays of its own."""
+def _signature(result: Any, shape: Any, opacity: Any) -> Any:
+    """The types of a blend, None for arguments that it does not take."""
+    if not isinstance(shape, types.NamedUniTuple) or shape.dtype != types.float32:
+        return None
+    return result(FLOAT_ARRAY, types.intp, shape, opacity)
+
+
+def _prepared(context, builder, signature, args) -> tuple[ir.Value, ir.Value, Callable[[int], ir.Value]]:
+    """The state's address, the falloff on the lanes, and where the lanes' rays of a part of the state lie."""
+    array, offset, shape, _ = args
+    state = context.make_array(signature.args[0])(context, builder, value=array).data
+    parts = [broadcast(builder, part) for part in cgutils.unpack_tuple(builder, shape)]
+
+    def at(part: int) -> ir.Value:
+        place = builder.gep(state, [builder.add(offset, ir.Constant(offset.type, part))])
+        return builder.bitcast(place, FLOATS.as_pointer())
+
+    return state, _FALLOFFS[signature.args[2].instance_class](builder, state, parts), at
+
+
+@compiled
+def blend_lanes(typingctx, state, offset, shape, opacity):
+    """Composite one splat over the eight pixels from ``offset`` on, and give its weights there.
+
+    ``shape`` is one of the tuples above, in float32.
+    """
 
     def codegen(context, builder, signature, args):
-        array, offset, shape, opacities = args
-        state = context.make_array(signature.args[0])(context, builder, value=array).data
-        parts = [broadcast(builder, part) for part in cgutils.unpack_tuple(builder, shape)]
-        opacity, *plain = [broadcast(builder, part) for part in cgutils.unpack_tuple(builder, opacities)]
+        data, falloff, at = _prepared(context, builder, signature, args)
+        return _composite(builder, data, falloff, broadcast(builder, args[3]), at(TRANSMITTANCE))
 
-        def at(part: int) -> ir.Value:
-            place = builder.gep(state, [builder.add(offset, ir.Constant(offset.type, part))])
-            return builder.bitcast(place, FLOATS.as_pointer())
-
-        falloff = falloff_code(builder, state, parts)
-        weight = _composite(builder, state, falloff, opacity, at(TRANSMITTANCE))
-        builder.store(weight if power == 1 else builder.fmul(weight, weight), at(WEIGHTS), align=4)
-        if plain:
-            weight = _composite(builder, state, falloff, plain[0], at(PLAIN_TRANSMITTANCE))
-        sums = builder.bitcast(builder.gep(state, [ir.Constant(offset.type, EVIDENCE)]), FLOATS.as_pointer())
-        builder.store(builder.fadd(load_lanes(builder, sums), weight), sums, align=4)
-        return context.get_dummy_value()
-
-    return codegen
-
-
-def _blend(state, offset, shape, opacities, power):
-    floats = types.UniTuple(types.float32, len(opacities))
-    if not isinstance(shape, types.NamedUniTuple) or shape.dtype != types.float32 or opacities != floats:
-        return None
-    signature = types.void(FLOAT_ARRAY, types.intp, shape, floats)
-    return signature, _blend_code(_FALLOFFS[shape.instance_class], power)
+    signature = _signature(EIGHT, shape, types.float32)
+    return None if signature is None else (signature, codegen)
 
 
 @compiled
-def blend_lanes(typingctx, state, offset, shape, opacities):
-    """Composite one splat over the eight pixels from ``offset`` on.
+def blend_twice(typingctx, state, offset, shape, opacities):
+    """``blend_lanes`` for two opacities, each with rays of its own: the weights, and those of the plain rays."""
 
-    ``shape`` is one of the tuples above, in float32. The weights lie in ``state[WEIGHTS + offset:]`` afterwards.
-    The evidence lanes grow by them or, with ``opacities = (opacity, plain opacity)`` instead of ``(opacity,)``, by
-    the weights of rays of their own that meet the plain opacities.
-    """
-    return _blend(state, offset, shape, opacities, power=1)
+    def codegen(context, builder, signature, args):
+        data, falloff, at = _prepared(context, builder, signature, args)
+        own, plain = (broadcast(builder, opacity) for opacity in cgutils.unpack_tuple(builder, args[3]))
+        weights = _composite(builder, data, falloff, own, at(TRANSMITTANCE))
+        others = _composite(builder, data, falloff, plain, at(PLAIN_TRANSMITTANCE))
+        return context.make_tuple(builder, signature.return_type, [weights, others])
 
-
-@compiled
-def blend_squared_lanes(typingctx, state, offset, shape, opacities):
-    """``blend_lanes`` that leaves the squares of the weights; the evidence is of the weights themselves."""
-    return _blend(state, offset, shape, opacities, power=2)
+    signature = _signature(types.UniTuple(EIGHT, 2), shape, types.UniTuple(types.float32, 2))
+    return None if signature is None else (signature, codegen)

@@ -9,10 +9,10 @@ from __future__ import annotations
 import numpy as np
 
 from liftcore.jit import inlined, kernel
-from liftcore.lanes import LANES, PIXELS, WEIGHTS, add_product_lanes
+from liftcore.lanes import LANES, PIXELS, keep_lanes, lanes_at, no_lanes, plus_product, sum_of_lanes
+from liftcore.lanes_halves import lowest_half, without_lowest
 from liftcore.raster.constants import TILE
-from liftcore.raster.footprints import footprint, row_of, touches
-from liftcore.raster.walk import CHECK_EVERY, blend, look, new_rays, start_rays
+from liftcore.raster.walk import CHECK_EVERY, blend, look, meets, new_rays, next_splat, place_of, start_rays
 
 
 @kernel
@@ -41,23 +41,18 @@ def gather_tiles(first, last, frame, image):
             if (step - frame.starts[tile]) % CHECK_EVERY == 0 and not look(rays, False):
                 break
             place = frame.items[step]
-            splat = footprint(frame.kernel, frame.records, place, float(x0), float(y0))
-            met = False
-            for row in range(splat.top, splat.bottom + 1):
-                line = row_of(splat, row)
-                for side in range(2):
-                    half = 2 * row + side
-                    if not rays.alive[half] or not touches(splat, line, side):
-                        continue
-                    blend(rays, splat, line, half)
-                    met = True
-                    offset = half * LANES
-                    for channel in range(channels):
-                        add_product_lanes(
-                            lanes, channel * LANES, rays.state, WEIGHTS + offset, pixels, channel * PIXELS + offset
-                        )
-            if not met:
+            splat = next_splat(frame, tile, step, float(x0), float(y0))
+            halves = meets(rays, splat)
+            if not halves:
                 continue
+            while halves:
+                half = lowest_half(halves)
+                halves = without_lowest(halves)
+                weights = blend(rays, splat, half)
+                for channel in range(channels):
+                    own = lanes_at(pixels, channel * PIXELS + half * LANES)
+                    total = lanes_at(lanes, channel * LANES)
+                    keep_lanes(lanes, channel * LANES, plus_product(total, weights, own))
             if rows[place] < 0:
                 if count == places.shape[0]:
                     places, sums = np.concatenate((places, places)), np.concatenate((sums, sums))
@@ -76,18 +71,15 @@ def _read_pixels(pixels, image, x0, y0):
     for y in range(min(TILE, height - y0)):
         for x in range(min(TILE, width - x0)):
             for channel in range(channels):
-                pixels[channel * PIXELS + y * TILE + x] = image[y0 + y, x0 + x, channel]
+                pixels[channel * PIXELS + place_of(y, x)] = image[y0 + y, x0 + x, channel]
 
 
 @inlined
 def _drain(lanes, sums, row):
-    """Add the eight lanes of every channel to the row, in a fixed tree; the lanes are zero afterwards."""
+    """Add the eight lanes of every channel to the row; the lanes are zero afterwards."""
     for channel in range(sums.shape[1]):
-        at = channel * LANES
-        sums[row, channel] += ((lanes[at] + lanes[at + 4]) + (lanes[at + 2] + lanes[at + 6])) + (
-            (lanes[at + 1] + lanes[at + 5]) + (lanes[at + 3] + lanes[at + 7])
-        )
-    lanes[:] = 0
+        sums[row, channel] += sum_of_lanes(lanes_at(lanes, channel * LANES))
+        keep_lanes(lanes, channel * LANES, no_lanes())
 
 
 @kernel

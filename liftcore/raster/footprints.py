@@ -1,13 +1,13 @@
 """One contract for the footprints of all kernels: what a tile's walk asks of a splat.
 
-``footprint(kernel, records, place, x0, y0)`` is a record as a tile sees it; ``row_of(splat, row)`` what the tile's
-pixel rows share of it; ``touches(splat, line, side)`` whether it can reach a half row of eight pixels;
-``lanes_of(splat, line, side)`` what ``liftcore.lanes_blend`` makes weights of; ``alpha_at`` the alpha at one point.
+``footprint(kernel, records, place, x0, y0)`` is a record as a tile sees it; ``halves_of(splat, state)`` the half rows
+of eight pixels that it can reach; ``lanes_of(splat, state, half)``, for one of these, what ``liftcore.lanes_blend``
+makes weights of; ``alpha_at`` the alpha at one point.
 ``circle_of`` is what a record can reach beside its outline, for the tiles.
 
 numba compiles each for the class of its first argument, so a product is compiled once for each kernel that is used
 and pays nothing for the others. Everything that a kernel adds to the walk stands here: a class of its own for the
-view's constants, for its footprint and for its rows, and the six functions.
+view's constants and one for its footprint, and the five functions.
 """
 
 from __future__ import annotations
@@ -19,9 +19,10 @@ import numpy as np
 from numba.extending import overload
 
 from liftcore.jit import inlined
-from liftcore.lanes import LANES
+from liftcore.lanes import BASES, LANES, ROWS, STARTS
 from liftcore.lanes_blend import BetaLanes, DiscLanes, GaussianLanes
-from liftcore.raster.constants import ALPHA_FLOOR, LARGEST_EXPONENT, TILE
+from liftcore.lanes_halves import either, ellipse_halves
+from liftcore.raster.constants import ALPHA_FLOOR, LARGEST_EXPONENT
 from liftcore.raster.records import (
     BETA,
     CENTRE_X,
@@ -29,7 +30,6 @@ from liftcore.raster.records import (
     D_X,
     D_Y,
     D_ZERO,
-    EXTENT_Y,
     KX,
     KY,
     MX,
@@ -71,8 +71,6 @@ class Discs(NamedTuple):
 class GaussianFootprint(NamedTuple):
     """One splat as a tile sees it: the record relative to the tile's first pixel centre."""
 
-    top: int  # first pixel row of the tile that it can reach
-    bottom: int  # last one; before the first when there is none
     mx: float
     my: float
     slope: float
@@ -86,8 +84,6 @@ class GaussianFootprint(NamedTuple):
 class BetaFootprint(NamedTuple):
     """The same, with the exponent of its falloff."""
 
-    top: int
-    bottom: int
     mx: float
     my: float
     slope: float
@@ -102,8 +98,6 @@ class BetaFootprint(NamedTuple):
 class DiscFootprint(NamedTuple):
     """A disc: an outline that holds all its crossings, and a small circle for the low-pass."""
 
-    top: int
-    bottom: int
     mx: float  # the projected centre
     my: float
     outline_x: float  # centre of the outline
@@ -125,39 +119,19 @@ class DiscFootprint(NamedTuple):
     d_y: float
 
 
-class EllipseRow(NamedTuple):
-    """A footprint in one pixel row: its centre in lanes, and e (or sigma) there."""
-
-    centre: float
-    base: float
-
-
-class DiscRow(NamedTuple):
-    """A disc in one pixel row."""
-
-    centre: float  # of the outline, in lanes
-    base: float  # of the outline
-    low_pass: float  # e of the low-pass at the projected centre's column
-    near_lanes: float  # lanes on each side of it that the circle reaches; negative for none
-    s: float  # at lane 0
-    t: float
-    d: float
-
-
 def footprint(kernel, records, place, x0, y0) -> Any:
     """The record of a splat for the tile whose first pixel is (x0, y0)."""
 
 
-def row_of(splat, row) -> Any:
-    """The footprint in one pixel row of the tile."""
+def halves_of(splat, state) -> Any:
+    """The half rows of the tile that can have a weight, as ``liftcore.lanes_halves`` has sets of them.
+
+    What ``lanes_of`` needs of each is left in the tile's state.
+    """
 
 
-def touches(splat, line, side) -> Any:
-    """Whether any lane of half row ``side`` (0 left, 1 right) can have a weight."""
-
-
-def lanes_of(splat, line, side) -> Any:
-    """The footprint on half row ``side``, for ``liftcore.lanes_blend``."""
+def lanes_of(splat, state, half) -> Any:
+    """The footprint on a half row of ``halves_of``, for ``liftcore.lanes_blend``."""
 
 
 def alpha_at(kernel, record, x, y) -> Any:
@@ -168,20 +142,10 @@ def circle_of(kernel, record) -> Any:
     """Centre x, y and radius, px, of a circle that the splat reaches beside its outline; a radius below 0 is none."""
 
 
-@inlined
-def _row_span(middle, extent):
-    """First and last pixel row of the tile within ``extent`` of ``middle``."""
-    return int(max(0.0, np.ceil(middle - extent))), int(min(TILE - 1.0, np.floor(middle + extent)))
-
-
 def _gaussian_footprint(kernel, records, place, x0, y0):
-    my = records[place, MY] - y0 - 0.5
-    top, bottom = _row_span(my, records[place, EXTENT_Y])
     return GaussianFootprint(
-        top,
-        bottom,
         records[place, MX] - x0 - 0.5,
-        my,
+        records[place, MY] - y0 - 0.5,
         records[place, SLOPE],
         records[place, KX],
         records[place, KY],
@@ -192,13 +156,9 @@ def _gaussian_footprint(kernel, records, place, x0, y0):
 
 
 def _beta_footprint(kernel, records, place, x0, y0):
-    my = records[place, MY] - y0 - 0.5
-    top, bottom = _row_span(my, records[place, EXTENT_Y])
     return BetaFootprint(
-        top,
-        bottom,
         records[place, MX] - x0 - 0.5,
-        my,
+        records[place, MY] - y0 - 0.5,
         records[place, SLOPE],
         records[place, KX],
         records[place, KY],
@@ -210,17 +170,11 @@ def _beta_footprint(kernel, records, place, x0, y0):
 
 
 def _disc_footprint(kernel, records, place, x0, y0):
-    outline_y = records[place, MY] - y0 - 0.5
-    my = records[place, CENTRE_Y] - y0 - 0.5
-    top, bottom = _row_span(outline_y, records[place, EXTENT_Y])
-    near_top, near_bottom = _row_span(my, records[place, NEARBY])
     return DiscFootprint(
-        min(top, near_top),
-        max(bottom, near_bottom),
         records[place, CENTRE_X] - x0 - 0.5,
-        my,
+        records[place, CENTRE_Y] - y0 - 0.5,
         records[place, MX] - x0 - 0.5,
-        outline_y,
+        records[place, MY] - y0 - 0.5,
         records[place, SLOPE],
         records[place, KX],
         records[place, KY],
@@ -239,53 +193,24 @@ def _disc_footprint(kernel, records, place, x0, y0):
     )
 
 
-def _ellipse_row(splat, row):
-    dy = row - splat.my
-    return EllipseRow(splat.mx + splat.slope * dy, splat.ky * dy * dy)
+def _ellipse_halves(splat, state):
+    return ellipse_halves(state, (splat.mx, splat.my), splat.slope, (splat.kx, splat.ky), splat.reach)
 
 
-def _disc_row(splat, row):
-    outline_dy = row - splat.outline_y
-    dy = row - splat.my
-    room = splat.nearby * splat.nearby - dy * dy
-    return DiscRow(
-        splat.outline_x + splat.slope * outline_dy,
-        splat.ky * outline_dy * outline_dy,
-        splat.curvature * dy * dy,
-        math.sqrt(room) if room >= 0 else -1.0,
-        splat.s_y * dy - splat.s_x * splat.mx,
-        splat.t_y * dy - splat.t_x * splat.mx,
-        splat.d_zero + splat.d_y * dy - splat.d_x * splat.mx,
-    )
+def _disc_halves(splat, state):
+    outline = (splat.outline_x, splat.outline_y), splat.slope, (splat.kx, splat.ky)
+    within = ellipse_halves(state, *outline, splat.reach)
+    squared = splat.nearby * splat.nearby if splat.nearby >= 0 else -1.0
+    return either(within, ellipse_halves(state, (splat.mx, splat.my), 0.0, (1.0, 1.0), squared))
 
 
-@inlined
-def _distance(centre, side):
-    """Lanes from ``centre`` to the nearest lane of a half row; zero inside."""
-    return max(0.0, side * LANES - centre, centre - (side * LANES + LANES - 1))
+def _gaussian_lanes(splat, state, half):
+    return GaussianLanes(state[STARTS + half], np.float32(splat.kx), state[BASES + half % ROWS])
 
 
-def _ellipse_touches(splat, line, side):
-    near = _distance(line.centre, side)
-    return splat.kx * near * near + line.base <= splat.reach
-
-
-def _disc_touches(splat, line, side):
-    near = _distance(line.centre, side)
-    return splat.kx * near * near + line.base <= splat.reach or _distance(splat.mx, side) <= line.near_lanes
-
-
-def _gaussian_lanes(splat, line, side):
-    return GaussianLanes(np.float32(side * LANES - line.centre), np.float32(splat.kx), np.float32(line.base))
-
-
-def _beta_lanes(splat, line, side):
-    return BetaLanes(
-        np.float32(side * LANES - line.centre),
-        np.float32(splat.kx),
-        np.float32(line.base),
-        np.float32(splat.beta),
-    )
+def _beta_lanes(splat, state, half):
+    start, base = state[STARTS + half], state[BASES + half % ROWS]
+    return BetaLanes(start, np.float32(splat.kx), base, np.float32(splat.beta))
 
 
 @inlined
@@ -295,16 +220,16 @@ def _halved(value):
     return rounded, np.float32(value - rounded)
 
 
-def _disc_lanes(splat, line, side):
-    s, s_rest = _halved(line.s + splat.s_x * (side * LANES))
+def _disc_lanes(splat, state, half):
+    dx, dy = half // ROWS * LANES - splat.mx, half % ROWS - splat.my
+    s, s_rest = _halved(splat.s_x * dx + splat.s_y * dy)
     s_step, s_step_rest = _halved(splat.s_x)
-    t, t_rest = _halved(line.t + splat.t_x * (side * LANES))
+    t, t_rest = _halved(splat.t_x * dx + splat.t_y * dy)
     t_step, t_step_rest = _halved(splat.t_x)
-    d, d_rest = _halved(line.d + splat.d_x * (side * LANES))
+    d, d_rest = _halved(splat.d_zero + splat.d_x * dx + splat.d_y * dy)
     d_step, d_step_rest = _halved(splat.d_x)
-    start, curvature, base = side * LANES - splat.mx, splat.curvature, line.low_pass
     return DiscLanes(
-        np.float32(start), np.float32(curvature), np.float32(base),
+        np.float32(dx), np.float32(splat.curvature), np.float32(splat.curvature * dy * dy),
         s, s_rest, s_step, s_step_rest, t, t_rest, t_step, t_step_rest, d, d_rest, d_step, d_step_rest,
     )  # fmt: skip
 
@@ -350,8 +275,7 @@ def _disc_circle(kernel, record):
 
 _BY_CLASS: dict[str, dict[type, Callable]] = {
     "footprint": {Gaussians: _gaussian_footprint, Betas: _beta_footprint, Discs: _disc_footprint},
-    "row_of": {GaussianFootprint: _ellipse_row, BetaFootprint: _ellipse_row, DiscFootprint: _disc_row},
-    "touches": {GaussianFootprint: _ellipse_touches, BetaFootprint: _ellipse_touches, DiscFootprint: _disc_touches},
+    "halves_of": {GaussianFootprint: _ellipse_halves, BetaFootprint: _ellipse_halves, DiscFootprint: _disc_halves},
     "lanes_of": {GaussianFootprint: _gaussian_lanes, BetaFootprint: _beta_lanes, DiscFootprint: _disc_lanes},
     "alpha_at": {Gaussians: _gaussian_alpha, Betas: _beta_alpha, Discs: _disc_alpha},
     "circle_of": {Gaussians: _no_circle, Betas: _no_circle, Discs: _disc_circle},
@@ -368,18 +292,13 @@ def _overload_footprint(kernel, records, place, x0, y0):
     return _chosen("footprint", kernel)
 
 
-@overload(row_of, inline="always")
-def _overload_row_of(splat, row):
-    return _chosen("row_of", splat)
-
-
-@overload(touches, inline="always")
-def _overload_touches(splat, line, side):
-    return _chosen("touches", splat)
+@overload(halves_of, inline="always")
+def _overload_halves_of(splat, state):
+    return _chosen("halves_of", splat)
 
 
 @overload(lanes_of, inline="always")
-def _overload_lanes_of(splat, line, side):
+def _overload_lanes_of(splat, state, half):
     return _chosen("lanes_of", splat)
 
 

@@ -13,11 +13,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import torch
 
-from liftcore.jit import kernel
-from liftcore.lanes import LANES
+from liftcore.jit import inlined, kernel
+from liftcore.lanes import HALVES, LANES, ROWS
 from liftcore.observe.observation import Observation, RegionMap
 from liftcore.raster.constants import TILE
-from liftcore.raster.walk import HALVES
 
 if TYPE_CHECKING:
     from liftcore.raster.protocol import Walk
@@ -135,47 +134,66 @@ def _slot_of_labels(taps, reading, y, x):
     return known
 
 
+@inlined
+def _reads_only(taps, reading, slot, y, left, last):
+    """Whether pixels ``left..last`` of row ``y`` all have the labels of one slot."""
+    row = reading.label_y[y]
+    different = 0
+    for level in range(reading.levels):
+        label = taps.slot_rows[slot, level]
+        for x in range(left, last + 1):
+            different |= reading.labels[level, row, reading.label_x[x]] ^ label
+    return different == 0
+
+
 @kernel
 def _read_regions(taps, reading, frame, x0, y0):
     slots = np.empty(LANES, np.int32)
     count = 0
     uniform = True
+    guess = NO_SLOT  # what the half row before read: most read the same
     for half in range(HALVES):
         taps.starts[half] = count
         taps.alone[half] = NO_SLOT
-        y = y0 + half // 2
-        left = x0 + (half % 2) * LANES
+        y = y0 + half % ROWS
+        left = x0 + half // ROWS * LANES
         if y >= frame.height or left >= frame.width:
             continue
-        last_x = last_y = -1
+        # Pixels outside the image carry no light; they may read what their neighbour reads.
+        if guess != NO_SLOT and _reads_only(taps, reading, guess, y, left, min(left + LANES, frame.width) - 1):
+            taps.alone[half] = guess
+            uniform &= guess == 0
+            continue
         for lane in range(LANES):
-            # Pixels outside the image carry no light; they may read what their neighbour reads.
-            label_x = reading.label_x[min(left + lane, frame.width - 1)]
-            label_y = reading.label_y[y]
-            if lane > 0 and label_x == last_x and label_y == last_y:
-                slots[lane] = slots[lane - 1]
-            else:
-                slots[lane] = _slot_of_labels(taps, reading, label_y, label_x)
-            last_x, last_y = label_x, label_y
-        first_tap = count
-        for lane in range(LANES):
-            if slots[lane] == NO_SLOT:
-                continue
-            tap = first_tap
-            while tap < count and taps.slots[tap] != slots[lane]:
-                tap += 1
-            if tap == count:
-                taps.slots[tap] = slots[lane]
-                taps.factors[tap * LANES : tap * LANES + LANES] = 0
-                count += 1
-            taps.factors[tap * LANES + lane] = 1
-        if count == first_tap + 1 and taps.factors[first_tap * LANES : count * LANES].min() > 0:
-            taps.alone[half] = taps.slots[first_tap]
-        elif count > first_tap:
+            x = min(left + lane, frame.width - 1)
+            slots[lane] = _slot_of_labels(taps, reading, reading.label_y[y], reading.label_x[x])
+        guess = slots[LANES - 1]
+        if slots.min() == slots.max():
+            taps.alone[half] = guess
+        else:
             taps.alone[half] = SEVERAL
+            count = _add_taps(taps, slots, count)
         uniform &= taps.alone[half] == 0
     taps.starts[HALVES] = count
     taps.sizes[1] = uniform and taps.sizes[0] == 1
+
+
+@inlined
+def _add_taps(taps, slots, first):
+    """A tap for each slot that a half row's lanes read, from tap ``first`` on; the first tap after them."""
+    count = first
+    for lane in range(LANES):
+        if slots[lane] == NO_SLOT:
+            continue
+        tap = first
+        while tap < count and taps.slots[tap] != slots[lane]:
+            tap += 1
+        if tap == count:
+            taps.slots[tap] = slots[lane]
+            taps.factors[tap * LANES : tap * LANES + LANES] = 0
+            count += 1
+        taps.factors[tap * LANES + lane] = 1
+    return count
 
 
 @kernel
@@ -185,8 +203,8 @@ def _read_grid(taps, reading, frame, x0, y0):
     for half in range(HALVES):
         taps.starts[half] = count
         taps.alone[half] = NO_SLOT
-        y = y0 + half // 2
-        left = x0 + (half % 2) * LANES
+        y = y0 + half % ROWS
+        left = x0 + half // ROWS * LANES
         if y >= frame.height or left >= frame.width:
             continue
         first_tap = count

@@ -10,12 +10,12 @@ from __future__ import annotations
 import numpy as np
 
 from liftcore.jit import inlined, kernel
-from liftcore.lanes import EVIDENCE, LANES, WEIGHTS, add_lanes, add_product_lanes
+from liftcore.lanes import LANES, WEIGHTS, keep_lanes, lanes_at, no_lanes, plus, plus_product, sum_of_lanes, times
+from liftcore.lanes_halves import lowest_half, without_lowest
 from liftcore.raster.constants import TILE
-from liftcore.raster.footprints import footprint, row_of, touches
 from liftcore.raster.readings import MAX_SLOTS, NO_SLOT, new_taps, read_tile
 from liftcore.raster.selection import CENTRAL, LARGEST, NO_SPOT, choose, new_marks, rank_tile, spot_of
-from liftcore.raster.walk import CHECK_EVERY, blend_power, look, new_rays, start_rays
+from liftcore.raster.walk import CHECK_EVERY, blend, blend_both, look, meets, new_rays, next_splat, start_rays
 
 
 @kernel
@@ -34,14 +34,16 @@ def weigh_tiles(first, last, frame, reading, choice, with_plain):
     state = rays.state
     taps = new_taps(reading.levels)
     sums = np.zeros(MAX_SLOTS * LANES, np.float32)
-    records, items, starts = frame.records, frame.items, frame.starts
+    items, starts = frame.items, frame.starts
     tap_starts, tap_slots, alone, factors = taps.starts, taps.slots, taps.alone, taps.factors
     gated = choice.gated
-    power = 1 if gated else choice.power  # what the blending leaves
+    squared = not gated and choice.power == 2
     marks = new_marks(choice)
     least, room = marks.least, marks.room
     spot = NO_SPOT
-    reuse = power == 1 and not with_plain and not gated  # then a slot that all pixels read holds just the evidence
+    reuse = (
+        choice.power == 1 and not with_plain and not gated
+    )  # then a slot that all pixels read holds just the evidence
     size = 1 << 15
     places, slots = np.empty(size, np.int32), np.empty(size, np.int32)
     weights, evidence = np.empty(size, np.float32), np.empty(size, np.float32)
@@ -64,35 +66,43 @@ def weigh_tiles(first, last, frame, reading, choice, with_plain):
             if (step - starts[tile]) % CHECK_EVERY == 0 and not look(rays, with_plain):
                 break
             place = items[step]
-            splat = footprint(frame.kernel, records, place, x0, y0)
+            splat = next_splat(frame, tile, step, x0, y0)
             if choice.kind == CENTRAL:
                 spot = spot_of(splat)
-            low, high = MAX_SLOTS, -1
-            for row in range(splat.top, splat.bottom + 1):
-                line = row_of(splat, row)
-                for side in range(2):
-                    half = 2 * row + side
-                    if not rays.alive[half] or not touches(splat, line, side):
+            low, high, seen = MAX_SLOTS, -1, no_lanes()
+            halves = meets(rays, splat)
+            while halves:
+                half = lowest_half(halves)
+                halves = without_lowest(halves)
+                if with_plain:
+                    heavy, plain = blend_both(rays, splat, half)
+                    seen = plus(seen, plain)
+                else:
+                    heavy = blend(rays, splat, half)
+                    seen = plus(seen, heavy)
+                if whole_tile:
+                    continue
+                if gated:
+                    keep_lanes(state, WEIGHTS + half * LANES, heavy)
+                    if not choose(choice, state, least, room, half, spot):
                         continue
-                    blend_power(rays, splat, line, half, power, with_plain)
-                    if gated and not choose(choice, state, least, room, half, spot):
-                        continue
-                    if whole_tile:
-                        continue
-                    offset = WEIGHTS + half * LANES
-                    slot = alone[half]
-                    if slot >= 0:
-                        low, high = min(low, slot), max(high, slot)
-                        add_lanes(sums, slot * LANES, state, offset)
-                        continue
-                    for tap in range(tap_starts[half], tap_starts[half + 1]):
-                        slot = tap_slots[tap]
-                        low, high = min(low, slot), max(high, slot)
-                        add_product_lanes(sums, slot * LANES, state, offset, factors, tap * LANES)
-            total = _drain(state, EVIDENCE)
+                    heavy = lanes_at(state, WEIGHTS + half * LANES)
+                elif squared:
+                    heavy = times(heavy, heavy)
+                slot = alone[half]
+                if slot >= 0:
+                    low, high = min(low, slot), max(high, slot)
+                    keep_lanes(sums, slot * LANES, plus(lanes_at(sums, slot * LANES), heavy))
+                    continue
+                for tap in range(tap_starts[half], tap_starts[half + 1]):
+                    slot = tap_slots[tap]
+                    low, high = min(low, slot), max(high, slot)
+                    before = lanes_at(sums, slot * LANES)
+                    keep_lanes(sums, slot * LANES, plus_product(before, heavy, lanes_at(factors, tap * LANES)))
+            total = sum_of_lanes(seen)
             if count + used + 1 > places.shape[0]:
                 places, slots, weights, evidence = _grown(places, slots, weights, evidence, count + used + 1)
-            before = count
+            begun = count
             if whole_tile and total > 0:
                 slots[count], weights[count] = slot_count, total
                 count += 1
@@ -101,24 +111,21 @@ def weigh_tiles(first, last, frame, reading, choice, with_plain):
                 if part > 0:
                     slots[count], weights[count] = slot_count + slot, part
                     count += 1
-            if count == before and total > 0:
+            if count == begun and total > 0:
                 slots[count], weights[count] = NO_SLOT, 0.0
                 count += 1
-            for entry in range(before, count):
+            for entry in range(begun, count):
                 places[entry] = place
-                evidence[entry] = total if entry == before else 0.0
+                evidence[entry] = total if entry == begun else 0.0
         slot_count += used
     return places[:count], slots[:count], weights[:count], evidence[:count], slot_rows[:slot_count]
 
 
 @inlined
 def _drain(lanes, offset):
-    """The sum of eight lanes, in a fixed tree; the lanes are zero afterwards."""
-    total = ((lanes[offset] + lanes[offset + 4]) + (lanes[offset + 2] + lanes[offset + 6])) + (
-        (lanes[offset + 1] + lanes[offset + 5]) + (lanes[offset + 3] + lanes[offset + 7])
-    )
-    for lane in range(LANES):
-        lanes[offset + lane] = 0
+    """The sum of eight lanes, which are zero afterwards."""
+    total = sum_of_lanes(lanes_at(lanes, offset))
+    keep_lanes(lanes, offset, no_lanes())
     return total
 
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from liftcore.jit import kernel
-from liftcore.lanes import LANES, PIXELS, WEIGHTS, add_scaled_lanes
+from liftcore.lanes import LANES, PIXELS, ROWS, WEIGHTS, in_all_lanes, keep_lanes, lanes_at, plus_product
+from liftcore.lanes_halves import lowest_half, without_lowest
 from liftcore.raster.constants import TILE
-from liftcore.raster.footprints import alpha_at, footprint, row_of, touches
-from liftcore.raster.walk import CHECK_EVERY, blend, look, new_rays, start_rays
+from liftcore.raster.footprints import alpha_at
+from liftcore.raster.walk import CHECK_EVERY, blend, look, meets, new_rays, next_splat, place_of, start_rays
 
 
 @kernel
@@ -26,24 +27,21 @@ def render_tiles(first, last, frame, values, image):
         for step in range(frame.starts[tile], frame.starts[tile + 1]):
             if (step - frame.starts[tile]) % CHECK_EVERY == 0 and not look(rays, False):
                 break
-            place = frame.items[step]
-            splat = footprint(frame.kernel, frame.records, place, float(x0), float(y0))
-            number = frame.ids[place]
-            for row in range(splat.top, splat.bottom + 1):
-                line = row_of(splat, row)
-                for side in range(2):
-                    half = 2 * row + side
-                    if not rays.alive[half] or not touches(splat, line, side):
-                        continue
-                    blend(rays, splat, line, half)
-                    offset = half * LANES
-                    for channel in range(channels):
-                        target = channel * PIXELS + offset
-                        add_scaled_lanes(sums, target, rays.state, WEIGHTS + offset, values[number, channel])
+            splat = next_splat(frame, tile, step, float(x0), float(y0))
+            number = frame.ids[frame.items[step]]
+            halves = meets(rays, splat)
+            while halves:
+                half = lowest_half(halves)
+                halves = without_lowest(halves)
+                weights = blend(rays, splat, half)
+                for channel in range(channels):
+                    at = channel * PIXELS + half * LANES
+                    value = in_all_lanes(values[number, channel])
+                    keep_lanes(sums, at, plus_product(lanes_at(sums, at), weights, value))
         for y in range(min(TILE, frame.height - y0)):
             for x in range(min(TILE, frame.width - x0)):
                 for channel in range(channels):
-                    image[y0 + y, x0 + x, channel] = sums[channel * PIXELS + y * TILE + x]
+                    image[y0 + y, x0 + x, channel] = sums[channel * PIXELS + place_of(y, x)]
         sums[:] = 0
 
 
@@ -63,30 +61,28 @@ def top_tiles(first, last, frame, ids, weights):
         for step in range(frame.starts[tile], frame.starts[tile + 1]):
             if (step - frame.starts[tile]) % CHECK_EVERY == 0 and not look(rays, False):
                 break
-            place = frame.items[step]
-            splat = footprint(frame.kernel, frame.records, place, float(x0), float(y0))
-            number = frame.ids[place]
-            for row in range(splat.top, splat.bottom + 1):
-                line = row_of(splat, row)
-                for side in range(2):
-                    half = 2 * row + side
-                    if not rays.alive[half] or not touches(splat, line, side):
+            splat = next_splat(frame, tile, step, float(x0), float(y0))
+            number = frame.ids[frame.items[step]]
+            halves = meets(rays, splat)
+            while halves:
+                half = lowest_half(halves)
+                halves = without_lowest(halves)
+                keep_lanes(rays.state, WEIGHTS, blend(rays, splat, half))
+                y, left = y0 + half % ROWS, x0 + half // ROWS * LANES
+                for lane in range(LANES):
+                    weight = rays.state[WEIGHTS + lane]
+                    if weight <= 0:
                         continue
-                    blend(rays, splat, line, half)
-                    for lane in range(LANES):
-                        weight = rays.state[WEIGHTS + half * LANES + lane]
-                        if weight <= 0:
-                            continue
-                        y, x = y0 + row, x0 + side * LANES + lane
-                        k = count
-                        while k > 0 and weights[y, x, k - 1] < weight:
-                            if k < count:
-                                weights[y, x, k] = weights[y, x, k - 1]
-                                ids[y, x, k] = ids[y, x, k - 1]
-                            k -= 1
+                    x = left + lane
+                    k = count
+                    while k > 0 and weights[y, x, k - 1] < weight:
                         if k < count:
-                            weights[y, x, k] = weight
-                            ids[y, x, k] = number
+                            weights[y, x, k] = weights[y, x, k - 1]
+                            ids[y, x, k] = ids[y, x, k - 1]
+                        k -= 1
+                    if k < count:
+                        weights[y, x, k] = weight
+                        ids[y, x, k] = number
 
 
 @kernel

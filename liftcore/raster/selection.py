@@ -13,11 +13,11 @@ import numpy as np
 
 from liftcore.errors import InvalidInput
 from liftcore.jit import inlined, kernel
-from liftcore.lanes import EVIDENCE, LANES, PIXELS, TRANSMITTANCE, WEIGHTS
+from liftcore.lanes import LANES, PIXELS, TRANSMITTANCE, WEIGHTS, keep_lanes
+from liftcore.lanes_halves import lowest_half, without_lowest
 from liftcore.raster.constants import TILE
-from liftcore.raster.footprints import footprint, row_of, touches
 from liftcore.raster.protocol import MOST_OF_A_RAY, Selection, Weighting
-from liftcore.raster.walk import CHECK_EVERY, blend, look, start_rays
+from liftcore.raster.walk import CHECK_EVERY, blend, look, meets, next_splat, place_of, start_rays
 
 EVERY, LARGEST, FRONT, CENTRAL = range(4)
 _KINDS = {
@@ -97,19 +97,16 @@ def rank_tile(rays, frame, tile, marks, count):
     for step in range(frame.starts[tile], frame.starts[tile + 1]):
         if (step - frame.starts[tile]) % CHECK_EVERY == 0 and not look(rays, False):
             break
-        splat = footprint(frame.kernel, frame.records, frame.items[step], x0, y0)
-        for row in range(splat.top, splat.bottom + 1):
-            line = row_of(splat, row)
-            for side in range(2):
-                half = 2 * row + side
-                if not rays.alive[half] or not touches(splat, line, side):
-                    continue
-                blend(rays, splat, line, half)
-                for pixel in range(half * LANES, half * LANES + LANES):
-                    weight = state[WEIGHTS + pixel]
-                    if weight > marks.least[pixel]:
-                        _insert(marks, pixel, count, weight)
-    state[EVIDENCE : EVIDENCE + LANES] = 0
+        splat = next_splat(frame, tile, step, x0, y0)
+        halves = meets(rays, splat)
+        while halves:
+            half = lowest_half(halves)
+            halves = without_lowest(halves)
+            keep_lanes(state, WEIGHTS + half * LANES, blend(rays, splat, half))
+            for pixel in range(half * LANES, half * LANES + LANES):
+                weight = state[WEIGHTS + pixel]
+                if weight > marks.least[pixel]:
+                    _insert(marks, pixel, count, weight)
     for pixel in range(PIXELS):
         if marks.least[pixel] > 0:
             own = marks.largest[pixel * count : pixel * count + count]
@@ -136,10 +133,10 @@ def _insert(marks, pixel, count, weight):
 
 @inlined
 def spot_of(splat):
-    """The pixel of the tile that holds the splat's projected centre, row by row; NO_SPOT when none does."""
+    """The ray of the tile at the splat's projected centre; NO_SPOT when there is none."""
     column, row = np.floor(splat.mx + 0.5), np.floor(splat.my + 0.5)
     if 0 <= column < TILE and 0 <= row < TILE:
-        return int(row) * TILE + int(column)
+        return place_of(int(row), int(column))
     return NO_SPOT
 
 

@@ -9,10 +9,10 @@ from __future__ import annotations
 import numpy as np
 
 from liftcore.jit import kernel
-from liftcore.lanes import LANES, PIXELS, WEIGHTS, add_lanes
+from liftcore.lanes import LANES, PIXELS, keep_lanes, lanes_at, plus
+from liftcore.lanes_halves import lowest_half, without_lowest
 from liftcore.raster.constants import TILE
-from liftcore.raster.footprints import footprint, row_of, touches
-from liftcore.raster.walk import CHECK_EVERY, blend, look, new_rays, start_rays
+from liftcore.raster.walk import CHECK_EVERY, blend, look, meets, new_rays, next_splat, place_of, start_rays
 
 _SLOTS = 32  # labels of a tile that there is room for at first
 
@@ -38,9 +38,8 @@ def strongest_tiles(first, last, frame, labels, count, image):
         for step in range(frame.starts[tile], frame.starts[tile + 1]):
             if (step - frame.starts[tile]) % CHECK_EVERY == 0 and not look(rays, False):
                 break
-            place = frame.items[step]
-            splat = footprint(frame.kernel, frame.records, place, float(x0), float(y0))
-            label = labels[frame.ids[place]]
+            splat = next_splat(frame, tile, step, float(x0), float(y0))
+            label = labels[frame.ids[frame.items[step]]]
             slot = slot_of[label + 1]
             if slot < 0:
                 slot = slots
@@ -49,15 +48,12 @@ def strongest_tiles(first, last, frame, labels, count, image):
                 label_of[slot] = label
                 if slots * PIXELS > sums.shape[0]:
                     sums = np.concatenate((sums, np.zeros_like(sums)))
-            for row in range(splat.top, splat.bottom + 1):
-                line = row_of(splat, row)
-                for side in range(2):
-                    half = 2 * row + side
-                    if not rays.alive[half] or not touches(splat, line, side):
-                        continue
-                    blend(rays, splat, line, half)
-                    offset = half * LANES
-                    add_lanes(sums, slot * PIXELS + offset, rays.state, WEIGHTS + offset)
+            halves = meets(rays, splat)
+            while halves:
+                half = lowest_half(halves)
+                halves = without_lowest(halves)
+                at = slot * PIXELS + half * LANES
+                keep_lanes(sums, at, plus(lanes_at(sums, at), blend(rays, splat, half)))
         _read_off(sums, slots, label_of, (x0, y0), image)
         for slot in range(slots):
             slot_of[label_of[slot] + 1] = -1
@@ -72,7 +68,7 @@ def _read_off(sums, slots, label_of, corner, image):
         for x in range(min(TILE, image.shape[1] - x0)):
             best, winner = np.float32(0.0), np.int32(-1)
             for slot in range(slots):
-                total = sums[slot * PIXELS + y * TILE + x]
+                total = sums[slot * PIXELS + place_of(y, x)]
                 if total > best or (total == best and total > 0 and label_of[slot] < winner):
                     best, winner = total, label_of[slot]
             image[y0 + y, x0 + x] = winner

@@ -1,7 +1,7 @@
 """The walk of a tile's rays through its splats: one splat's weights on up to 256 pixels at a time.
 
-A tile is 16 rows of two half rows of eight pixels. Products (region weights, renders, ...) call ``touches`` and
-``blend`` for each half row and use the weights at once, while they are in the cache.
+A tile is 16 rows of two half rows of eight pixels. Products (region weights, renders, ...) take the half rows that a
+splat ``meets`` one by one, ``blend`` it there and use the weights at once, while they are in a register.
 """
 
 from __future__ import annotations
@@ -11,12 +11,13 @@ from typing import NamedTuple
 import numpy as np
 
 from liftcore.jit import inlined, kernel
-from liftcore.lanes import LANES, PLAIN_TRANSMITTANCE, TRANSMITTANCE
-from liftcore.lanes_blend import blend_lanes, blend_squared_lanes, new_state
+from liftcore.lanes import LANES, PLAIN_TRANSMITTANCE, ROWS, TRANSMITTANCE, fetch_ahead
+from liftcore.lanes_blend import blend_lanes, blend_twice, new_state
+from liftcore.lanes_halves import both, either, lit_halves
 from liftcore.raster.constants import TILE
-from liftcore.raster.footprints import Betas, Discs, Gaussians, lanes_of
+from liftcore.raster.footprints import Betas, Discs, Gaussians, footprint, halves_of, lanes_of
 
-HALVES = TILE * TILE // LANES  # half rows of a tile
+AHEAD = 8  # items of a tile's list between asking for a record and reading it: they lie anywhere in memory
 CHECK_EVERY = 16  # splats between two looks at which half rows still let light through
 
 
@@ -40,13 +41,27 @@ class Rays(NamedTuple):
     """The state of a tile's 256 rays."""
 
     state: np.ndarray  # [STATE] f32, laid out as liftcore.lanes and liftcore.lanes_blend say
-    alive: np.ndarray  # [32] u8, half rows that still let light through, with or without the gain
+    lit: np.ndarray  # [1] u32, the half rows that still let light through, with or without the gain
 
 
 @kernel
 def new_rays(frame):
     """Room for one tile's rays."""
-    return Rays(new_state(frame.kernel.floor, frame.cap, frame.stop), np.zeros(HALVES, np.uint8))
+    return Rays(new_state(frame.kernel.floor, frame.cap, frame.stop), np.zeros(1, np.uint32))
+
+
+@inlined
+def place_of(y, x):
+    """Where the ray of a tile's pixel lies among its 256."""
+    return (x // LANES * ROWS + y) * LANES + x % LANES
+
+
+@inlined
+def next_splat(frame, tile, step, x0, y0):
+    """The footprint of an item of a tile's list; one that comes soon is asked for."""
+    if step + AHEAD < frame.starts[tile + 1]:
+        fetch_ahead(frame.records, frame.items[step + AHEAD])
+    return footprint(frame.kernel, frame.records, frame.items[step], x0, y0)
 
 
 @kernel
@@ -57,43 +72,35 @@ def start_rays(rays, frame, tile):
     for y in range(TILE):
         for x in range(TILE):
             light = np.float32(x0 + x < frame.width and y0 + y < frame.height)
-            rays.state[TRANSMITTANCE + y * TILE + x] = light
-            rays.state[PLAIN_TRANSMITTANCE + y * TILE + x] = light
+            rays.state[TRANSMITTANCE + place_of(y, x)] = light
+            rays.state[PLAIN_TRANSMITTANCE + place_of(y, x)] = light
 
 
-@kernel
+@inlined
 def look(rays, with_plain):
     """Note which half rows still let light through, with or without the gain; whether any does."""
-    any_alive = False
-    for half in range(HALVES):
-        light = np.float32(0.0)
-        for lane in range(LANES):
-            light = max(light, rays.state[TRANSMITTANCE + half * LANES + lane])
-        if with_plain:
-            for lane in range(LANES):
-                light = max(light, rays.state[PLAIN_TRANSMITTANCE + half * LANES + lane])
-        rays.alive[half] = light > 0
-        any_alive |= light > 0
-    return any_alive
+    lit = lit_halves(rays.state, TRANSMITTANCE)
+    if with_plain:
+        lit = either(lit, lit_halves(rays.state, PLAIN_TRANSMITTANCE))
+    rays.lit[0] = lit
+    return lit != 0
 
 
 @inlined
-def blend(rays, splat, line, half):
-    """Composite the splat over half row ``half``: its weights are in the state, and in the evidence lanes."""
-    blend_lanes(rays.state, half * LANES, lanes_of(splat, line, half % 2), (np.float32(splat.opacity),))
+def meets(rays, splat):
+    """The half rows where the splat can have a weight and there is light: a set of ``liftcore.lanes_halves``."""
+    return both(halves_of(splat, rays.state), rays.lit[0])
 
 
 @inlined
-def blend_power(rays, splat, line, half, power, with_plain):
-    """``blend`` that leaves weights or squared weights; with the evidence from plain rays if asked."""
-    shape = lanes_of(splat, line, half % 2)
-    alone = (np.float32(splat.opacity),)
-    both = (np.float32(splat.opacity), np.float32(splat.plain))
-    if with_plain and power == 2:
-        blend_squared_lanes(rays.state, half * LANES, shape, both)
-    elif with_plain:
-        blend_lanes(rays.state, half * LANES, shape, both)
-    elif power == 2:
-        blend_squared_lanes(rays.state, half * LANES, shape, alone)
-    else:
-        blend_lanes(rays.state, half * LANES, shape, alone)
+def blend(rays, splat, half):
+    """Composite the splat over a half row: its weights, eight lanes."""
+    shape = lanes_of(splat, rays.state, half)
+    return blend_lanes(rays.state, half * LANES, shape, np.float32(splat.opacity))
+
+
+@inlined
+def blend_both(rays, splat, half):
+    """``blend`` with the gain and, over rays of their own, without it: both weights."""
+    shape = lanes_of(splat, rays.state, half)
+    return blend_twice(rays.state, half * LANES, shape, (np.float32(splat.opacity), np.float32(splat.plain)))

@@ -3,9 +3,6 @@
 X is never held in float32 as a whole. Splats go in blocks and channels in slices, so that a block of X and a slice
 of a view's codebook stay in the cache while all views add to them. Weights are divided by their sum before they meet
 the codebook: a mean cannot overflow where its inputs do not, and faint splats keep their digits.
-
-Sums are float32 over a few hundred terms at most. Longer ones, of a splat behind a million regions or of thousands of
-views, are sums of such parts: added one by one, ten million equal terms would be wrong in their first digit.
 """
 
 from __future__ import annotations
@@ -14,13 +11,16 @@ import math
 import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from numba import types
+from numba.extending import overload
 
-from liftcore.jit import kernel, vectorised
-from liftcore.lanes import WIDE, add_weighted_row
+from liftcore.jit import kernel
+from liftcore.lanes import LANES, WIDE, keep_halves, lanes_at, no_lanes, plus_product, sum_of_lanes
+from liftcore.solve.weight_tables import WeightTables, add_views, books_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -30,10 +30,9 @@ if TYPE_CHECKING:
     from liftcore.progress import Progress
     from liftcore.solve.view_weights import ViewWeights
 
-LONG = 256  # entries of a row that float32 adds up one by one
-VIEWS = 64  # views that add to a block one by one
-BLOCK = 4_096  # splats a block; with a slice of channels two megabytes
-SLICE = 128  # channels a slice, fewer where the codebooks of all views are long
+BLOCK = 64  # splats a block; with a slice of channels an eighth of a megabyte
+BLOCKS = 32  # a call of compiled code
+SLICE = 512  # channels a slice, fewer where the codebooks of all views are long
 SLICE_BYTES = 1 << 28  # of a slice of all codebooks, which dense maps would go far beyond
 FLOAT16_MAX = 65_504.0
 FLOAT16_STEP = 2.0**-25  # the largest rounding error of its small values
@@ -50,66 +49,52 @@ class Solution:
 
 
 @kernel
-def add_weighted_rows(first, last, offset, weights, scale, codebook, block):
-    """``block[splats[r] - offset] += W[r] scale[splats[r]] codebook`` for the CSR rows ``first..last``.
+def finish_rows(block, first, squares, begin, features):
+    """Squared norms of a block's rows, and the rows into X.
 
     Args:
-        weights: (splats [n] i32, row_starts [n + 1] i64, columns [nnz] i32, weights [nnz] f32).
-        scale: [P] f64. codebook: [M, C] f32. block: [B, C] f32. C is a multiple of WIDE.
+        block: [B, C] f32, channels ``begin..`` of the splats from ``first`` on, padded with zeros.
+        squares: [P] f64, grows. features: [P, F] in the bits of f16 (u16), or f32; [0, F] keeps nothing.
     """
-    splats, row_starts, columns, values = weights
-    width = codebook.shape[1]
-    source, target = codebook.reshape(-1), block.reshape(-1)
-    begin = row_starts[first]
-    part, total = np.zeros(width, np.float32), np.zeros(width)
-    shares = np.empty(row_starts[last] - begin, np.float32)
-    own_columns = columns[begin : row_starts[last]]
-    for row in range(first, last):
-        entries = (row_starts[row] - begin, row_starts[row + 1] - begin)
-        for k in range(entries[0], entries[1]):
-            shares[k] = values[begin + k] * scale[splats[row]]
-        place = (splats[row] - offset) * width
-        if entries[1] - entries[0] > LONG:
-            total[:] = 0
-            for start in range(entries[0], entries[1], LONG):
-                chunk = (start, min(start + LONG, entries[1]))
-                part[:] = 0
-                for channel in range(0, width, WIDE):
-                    add_weighted_row(part, channel, source, chunk, (own_columns, shares), (width, channel))
-                total += part
-            for channel in range(width):
-                target[place + channel] += total[channel]
-            continue
-        for channel in range(0, width, WIDE):
-            add_weighted_row(target, place + channel, source, entries, (own_columns, shares), (width, channel))
-
-
-def sum_views(met: Sequence[tuple], offset: int, scale: np.ndarray, block: np.ndarray) -> np.ndarray:
-    """Add the rows of all views to ``block`` [B, C] f32, some views at a time; gives the block.
-
-    Args:
-        met: (first, last, weights, codebook) of every view that met the block, as ``add_weighted_rows`` takes them.
-        offset: the first splat of the block. scale: [P] f64.
-    """
-    part = block if len(met) <= VIEWS else np.empty_like(block)
-    for start in range(0, len(met), VIEWS):
-        if part is not block:
-            part[:] = 0
-        for first, last, weights, codebook in met[start : start + VIEWS]:
-            add_weighted_rows(first, last, offset, weights, scale, codebook, part)
-        if part is not block:
-            block += part
-    return block
-
-
-@vectorised
-def square_norms(block, squares):
-    """The squared norms [B] f64 of the rows of ``block`` [B, C] f32."""
+    source, width = block.reshape(-1), block.shape[1]
     for row in range(block.shape[0]):
-        total = np.float32(0.0)
-        for c in range(block.shape[1]):
-            total += block[row, c] * block[row, c]
-        squares[row] = total
+        total = no_lanes()
+        for c in range(0, width, LANES):
+            values = lanes_at(source, row * width + c)
+            total = plus_product(total, values, values)
+        squares[first + row] += sum_of_lanes(total)
+    if features.shape[0] > 0:
+        _store_rows(source, (block.shape[0], width), first, begin, features)
+
+
+def _store_rows(source, shape, first, begin, features) -> Any:
+    """The block's rows into X, rounded if it is float16."""
+
+
+@overload(_store_rows, inline="always")
+def _overload_store_rows(source, shape, first, begin, features):
+    return _store_halves if features.dtype == types.uint16 else _store_singles
+
+
+def _store_halves(source, shape, first, begin, features):
+    count, width = shape
+    kept = min(width, features.shape[1] - begin)
+    whole = kept // LANES * LANES
+    target, last = features.reshape(-1), np.empty(LANES, np.uint16)
+    for row in range(count):
+        place = (first + row) * features.shape[1] + begin
+        for c in range(0, whole, LANES):
+            keep_halves(target, place + c, lanes_at(source, row * width + c))
+        if whole < kept:
+            keep_halves(last, 0, lanes_at(source, row * width + whole))
+            target[place + whole : place + kept] = last[: kept - whole]
+
+
+def _store_singles(source, shape, first, begin, features):
+    count, width = shape
+    kept = min(width, features.shape[1] - begin)
+    for row in range(count):
+        features[first + row, begin : begin + kept] = source[row * width : row * width + kept]
 
 
 def solve_closed_form(
@@ -137,18 +122,21 @@ def solve_closed_form(
         dtype = torch.float32
     count = denominators.shape[0]
     features = torch.zeros(count, channels, dtype=dtype)
+    kept = features.view(torch.uint16).numpy() if dtype == torch.float16 else features.numpy()
     squares = np.zeros(count)
     scale = np.divide(1.0, denominators, out=np.zeros(count), where=denominators > 0)
     step = slice_width(sum(book.shape[0] for book in books))
     slices = [(begin, min(begin + step, channels)) for begin in range(0, channels, step)]
+    edges = np.minimum(np.arange(0, count + BLOCK, BLOCK), count)
+    tables = WeightTables(store, edges)
     with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
         for number, (begin, end) in enumerate(slices):
             parts = [slice_of(book, begin, end) for book in books]
-            sums = _solve_slice(pool, store, parts, scale, features[:, begin:end])
+            sums = _solve_slice(pool, (tables, edges), parts, scale, (kept, begin))
             if not unit:
                 for part, norm in zip(parts, norms, strict=True):
                     np.divide(part, norm[:, None], out=part, where=norm[:, None] > 0, casting="same_kind")
-                sums = _solve_slice(pool, store, parts, scale, None)
+                sums = _solve_slice(pool, (tables, edges), parts, scale, (kept[:0], begin))
             squares += sums
             progress("solve", number + 1, len(slices), "slices")
     agreement = np.sqrt(squares).clip(0.0, 1.0).astype(np.float32)
@@ -174,33 +162,39 @@ def slice_of(book: Tensor, begin: int, end: int) -> np.ndarray:
     return part
 
 
+@kernel
+def solve_blocks(numbers, edges, tables, scale, width, result):
+    """Some blocks of X, over ``width`` channels, and their squared norms.
+
+    Args:
+        numbers: (first, last), the blocks. edges: [blocks + 1] i64, their first splats.
+        tables: (addresses, bounds, books) as ``add_views`` takes them. scale: [P] f64.
+        result: (squares, begin, features) as ``finish_rows`` takes them.
+    """
+    squares, begin, features = result
+    block, part = np.empty((BLOCK, width), np.float32), np.empty((BLOCK, width), np.float32)
+    for number in range(numbers[0], numbers[1]):
+        offset = edges[number]
+        size = edges[number + 1] - offset
+        add_views(number, offset, tables, scale, block[:size], part[:size])
+        finish_rows(block[:size], offset, squares, begin, features)
+
+
 def _solve_slice(
     pool: ThreadPoolExecutor,
-    store: ViewWeights,
+    blocks: tuple[WeightTables, np.ndarray],
     parts: Sequence[np.ndarray],
     scale: np.ndarray,
-    result: Tensor | None,
+    result: tuple[np.ndarray, int],
 ) -> np.ndarray:
-    """One slice of channels for all splats; written to ``result`` [P, C]. Gives the squared norms [P] f64."""
-    count = scale.shape[0]
-    squares = np.zeros(count)
-    edges = np.arange(0, count + BLOCK, BLOCK)
-    views = [
-        (view.splats.numpy(), view.row_starts.numpy(), view.columns.numpy(), view.weights.numpy()) for view in store
-    ]
-    bounds = [np.searchsorted(view[0], edges.astype(view[0].dtype)) for view in views]
+    """One slice of channels for all splats, into ``result = (X, first channel)``; the squared norms [P] f64."""
+    weights, edges = blocks
+    squares, books, (features, begin) = np.zeros(scale.shape[0]), books_of(parts), result
+    tables, width = (weights.addresses, weights.bounds, books), parts[0].shape[1]
 
-    def solve_block(number: int) -> None:
-        offset, end = edges[number], min(edges[number + 1], count)
-        met = [
-            (rows[number], rows[number + 1], weights, part)
-            for weights, part, rows in zip(views, parts, bounds, strict=True)
-            if rows[number] < rows[number + 1]
-        ]
-        block = sum_views(met, offset, scale, np.zeros((end - offset, parts[0].shape[1]), np.float32))
-        square_norms(block, squares[offset:end])
-        if result is not None:
-            result[offset:end] = torch.from_numpy(block[:, : result.shape[1]]).to(result.dtype)
+    def solve(first: int) -> None:
+        numbers = (first, min(first + BLOCKS, len(edges) - 1))
+        solve_blocks(numbers, edges, tables, scale, width, (squares, begin, features))
 
-    list(pool.map(solve_block, range(len(edges) - 1)))
+    list(pool.map(solve, range(0, len(edges) - 1, BLOCKS)))
     return squares

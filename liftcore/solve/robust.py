@@ -36,9 +36,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from liftcore.jit import vectorised
+from liftcore.jit import kernel, vectorised
 from liftcore.solve.accumulate import row_totals
-from liftcore.solve.closed_form import BLOCK, slice_of, slice_width, sum_views
+from liftcore.solve.closed_form import BLOCK, slice_of, slice_width
+from liftcore.solve.weight_tables import WeightTables, add_views, addresses_of, books_of, floats_at, table_at
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -86,6 +87,28 @@ def judge_rows(rows, weights, scale, codebook, block, agreement, squares):
             for c in range(width):
                 product += own[c] * others[c]
             agreement[k] += product
+
+
+@kernel
+def judge_views(number, offset, tables, sums, scale, block):
+    """``judge_rows`` of a block of splats for all views.
+
+    Args:
+        number: of the block. offset: its first splat.
+        tables: (addresses, bounds, books) as ``add_views`` takes them, the books of e.
+        sums: [V, 2] i64, where agreement [nnz] f32 and squares [n] f32 of each view lie.
+        scale: [P] f64. block: [B, C] f32, the sums over all views.
+    """
+    addresses, bounds, books = tables
+    width = block.shape[1]
+    for view in range(addresses.shape[0]):
+        first, last = bounds[view, number], bounds[view, number + 1]
+        if first < last:
+            weights = table_at(addresses[view], bounds[view, bounds.shape[1] - 1])
+            book = floats_at(books[view, 0], books[view, 1]).reshape(-1, width)
+            agreement = floats_at(sums[view, 0], weights[2].shape[0])
+            squares = floats_at(sums[view, 1], weights[0].shape[0])
+            judge_rows((first, last, offset), weights, scale, book, block, agreement, squares)
 
 
 @dataclass(frozen=True)
@@ -191,25 +214,17 @@ def _judge_slice(
 ) -> None:
     """Some channels of `_judge`, block by block of splats."""
     count, scale = denominators.size, _over(np.ones(denominators.size), denominators)
-    edges = np.arange(0, count + BLOCK, BLOCK)
-    views = [
-        (view.splats.numpy(), view.row_starts.numpy(), view.columns.numpy(), view.weights.numpy()) for view in current
-    ]
-    bounds = [np.searchsorted(view[0], edges.astype(view[0].dtype)) for view in views]
-    agreements, squares = [view.weights.numpy() for view in sums[0]], sums[1]
+    edges = np.minimum(np.arange(0, count + BLOCK, BLOCK), count)
+    tables = WeightTables(current, edges)
+    everything = tables.addresses, tables.bounds, books_of(parts)
+    places = [(view.weights.numpy(), squares) for view, squares in zip(*sums, strict=True)]
+    targets = addresses_of(places)
 
     def judge_block(number: int) -> None:
-        offset, end = edges[number], min(edges[number + 1], count)
-        block = np.zeros((end - offset, parts[0].shape[1]), np.float32)
-        met = [
-            (view, rows[number], rows[number + 1])
-            for view, rows in enumerate(bounds)
-            if rows[number] < rows[number + 1]
-        ]
-        sum_views([(first, last, views[view], parts[view]) for view, first, last in met], offset, scale, block)
-        for view, first, last in met:
-            rows = (first, last, offset)
-            judge_rows(rows, views[view], scale, parts[view], block, agreements[view], squares[view])
+        offset, end = edges[number], edges[number + 1]
+        block, part = (np.empty((end - offset, parts[0].shape[1]), np.float32) for _ in range(2))
+        add_views(number, offset, everything, scale, block, part)
+        judge_views(number, offset, everything, targets, scale, block)
 
     list(pool.map(judge_block, range(len(edges) - 1)))
 

@@ -1,0 +1,174 @@
+"""W of all views for one compiled call: numba takes no list of arrays, so it is given where they lie.
+
+A call for each view and block of splats would cost more than the sums of a small block, and only small blocks stay
+in a core's own cache.
+
+Sums are float32 over a few hundred terms at most. Longer ones, of a splat behind a million regions or of thousands of
+views, are sums of such parts: added one by one, ten million equal terms would be wrong in their first digit.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numba import types
+from numba.np.numpy_support import carray
+
+from liftcore.jit import inlined, kernel
+from liftcore.lanes import WIDE, add_weighted_row, compiled
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from liftcore.raster.protocol import RegionWeights
+
+LONG = 256  # entries of a row that float32 adds up one by one
+VIEWS = 64  # views that add to a block one by one
+
+_SPLATS, _ROW_STARTS, _COLUMNS, _WEIGHTS = range(4)
+
+
+class WeightTables:
+    """Where W of every view lies, and which of its rows belong to which block of splats.
+
+    Args:
+        store: W of every view; they must stay where they are.
+        edges: [blocks + 1] i64, the first splat of every block, then the end.
+    """
+
+    def __init__(self, store: Iterable[RegionWeights], edges: np.ndarray) -> None:
+        self._kept = [
+            (view.splats.numpy(), view.row_starts.numpy(), view.columns.numpy(), view.weights.numpy())
+            for view in store
+        ]
+        self.addresses = addresses_of(self._kept)  # [V, 4] i64
+        bounds = [np.searchsorted(view[0], edges.astype(view[0].dtype)) for view in self._kept]
+        self.bounds = np.array(bounds, np.int64)  # [V, blocks + 1]
+
+
+def addresses_of(tables: Sequence[Sequence[np.ndarray]]) -> np.ndarray:
+    """[n, k] i64: where the arrays of n tuples of k begin. They must be contiguous, and outlive the numbers.
+
+    An empty array has an address too, and nobody may read it.
+    """
+    assert all(array.flags.c_contiguous for table in tables for array in table)
+    return np.array([[array.ctypes.data for array in table] for table in tables], np.int64)
+
+
+def _pointer(kind: types.Type) -> tuple:
+    signature = types.CPointer(kind)(types.int64)
+
+    def codegen(context, builder, signature, args):
+        return builder.inttoptr(args[0], context.get_value_type(signature.return_type))
+
+    return signature, codegen
+
+
+@compiled
+def _integers_at(typingctx, address):
+    """The address of i32 values."""
+    return _pointer(types.int32)
+
+
+@compiled
+def _counts_at(typingctx, address):
+    """The address of i64 values."""
+    return _pointer(types.int64)
+
+
+@compiled
+def _floats_at(typingctx, address):
+    """The address of f32 values."""
+    return _pointer(types.float32)
+
+
+@inlined
+def table_at(addresses, end):
+    """(splats, row_starts, columns, weights) of one view, as far as its row ``end``."""
+    row_starts = carray(_counts_at(addresses[_ROW_STARTS]), (end + 1,))
+    splats = carray(_integers_at(addresses[_SPLATS]), (end,))
+    entries = int(row_starts[end])
+    columns = carray(_integers_at(addresses[_COLUMNS]), (entries,))
+    weights = carray(_floats_at(addresses[_WEIGHTS]), (entries,))
+    return splats, row_starts, columns, weights
+
+
+@inlined
+def floats_at(address, count):
+    """``count`` f32 values at an address."""
+    return carray(_floats_at(address), (count,))
+
+
+@kernel
+def add_weighted_rows(rows, weights, scale, source, target, width):
+    """``block[splats[r] - offset] += W[r] scale[splats[r]] codebook`` for some CSR rows.
+
+    Args:
+        rows: (first, last, offset): the CSR rows ``first..last``, and the splat that the block starts with.
+        weights: (splats [n] i32, row_starts [n + 1] i64, columns [nnz] i32, weights [nnz] f32). scale: [P] f64.
+        source: the codebook [M, C] f32, flat. target: the block [B, C] f32, flat. width: C, a multiple of WIDE.
+    """
+    first, last, offset = rows
+    splats, row_starts, columns, values = weights
+    begin = row_starts[first]
+    shares = np.empty(row_starts[last] - begin, np.float32)
+    own_columns = columns[begin : row_starts[last]]
+    for row in range(first, last):
+        entries = (row_starts[row] - begin, row_starts[row + 1] - begin)
+        for k in range(entries[0], entries[1]):
+            shares[k] = values[begin + k] * scale[splats[row]]
+        place = (splats[row] - offset) * width
+        if entries[1] - entries[0] > LONG:
+            _add_long_row(target[place : place + width], source, entries, (own_columns, shares))
+            continue
+        for channel in range(0, width, WIDE):
+            add_weighted_row(target, place + channel, source, entries, (own_columns, shares), (width, channel))
+
+
+@kernel
+def _add_long_row(target, source, entries, sparse):
+    """One row of the block, of many entries: the sums of LONG of them at a time are added in float64."""
+    width = target.shape[0]
+    part, total = np.empty(width, np.float32), np.zeros(width)
+    for start in range(entries[0], entries[1], LONG):
+        chunk = (start, min(start + LONG, entries[1]))
+        part[:] = 0
+        for channel in range(0, width, WIDE):
+            add_weighted_row(part, channel, source, chunk, sparse, (width, channel))
+        total += part
+    for channel in range(width):
+        target[channel] += total[channel]
+
+
+@kernel
+def add_views(number, offset, tables, scale, block, part):
+    """A block of splats of ``W E``, summed over the views in their order, VIEWS of them at a time.
+
+    Args:
+        number: of the block. offset: its first splat.
+        tables: (addresses, bounds, books): two of WeightTables, and [V, 2] i64, address and length of E_v [M, C] f32.
+        scale: [P] f64. block: [B, C] f32, written. part: room for the same.
+    """
+    addresses, bounds, books = tables
+    width, target, met = block.shape[1], part.reshape(-1), 0
+    block[:] = 0
+    part[:] = 0
+    for view in range(addresses.shape[0]):
+        first, last = bounds[view, number], bounds[view, number + 1]
+        if first == last:
+            continue
+        if met == VIEWS:
+            block += part
+            part[:] = 0
+            met = 0
+        weights = table_at(addresses[view], bounds[view, bounds.shape[1] - 1])
+        book = floats_at(books[view, 0], books[view, 1])
+        add_weighted_rows((first, last, offset), weights, scale, book, target, width)
+        met += 1
+    block += part
+
+
+def books_of(parts: Sequence[np.ndarray]) -> np.ndarray:
+    """``books`` of ``add_views`` for slices [M, C] f32 of every codebook, which must stay where they are."""
+    return np.concatenate([addresses_of([[part] for part in parts]), [[part.size] for part in parts]], axis=1)
