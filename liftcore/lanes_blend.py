@@ -244,10 +244,11 @@ def _composite(builder: Builder, state: ir.Value, falloff: ir.Value, opacity: ir
     raw = minimum(builder, builder.fmul(opacity, falloff), _row(builder, state, _CAP_ROW))
     alpha = builder.select(builder.fcmp_ordered(">=", raw, _row(builder, state, _FLOOR_ROW)), raw, zero)
     before = load_lanes(builder, place)
-    after = builder.fmul(before, builder.fsub(_row(builder, state, _EXP2_ROW), alpha))  # the first coefficient is 1
+    weight = builder.fmul(alpha, before)
+    after = builder.fsub(before, weight)  # T (1 - a) would round 1 - a, and lose a million faint splats
     alive = builder.fcmp_ordered(">", after, _row(builder, state, _STOP_ROW))
     builder.store(builder.select(alive, after, zero), place, align=4)
-    return builder.select(alive, builder.fmul(alpha, before), zero)
+    return builder.select(alive, weight, zero)
 
 
 def _signature(result: Any, shape: Any, opacity: Any) -> Any:

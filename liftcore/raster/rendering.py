@@ -99,25 +99,25 @@ def trace_rays(frame, pixels):
     splats = np.empty(1 << 12, np.int32)
     weights = np.empty(1 << 12, np.float32)
     count = 0
-    one, floor = np.float32(1.0), np.float32(frame.kernel.floor)
-    cap, stop = np.float32(frame.cap), np.float32(frame.stop)
+    floor, cap, stop = np.float32(frame.kernel.floor), np.float32(frame.cap), np.float32(frame.stop)
     for i in range(pixels.shape[0]):
         x, y = pixels[i, 0], pixels[i, 1]
         tile = (y // TILE) * frame.columns + x // TILE
-        light = one
+        light = np.float32(1.0)
         for step in range(frame.starts[tile], frame.starts[tile + 1]):
             place = frame.items[step]
             alpha = min(cap, np.float32(alpha_at(frame.kernel, frame.records[place], x + 0.5, y + 0.5)))
             if alpha < floor or alpha == 0:
                 continue
-            after = light * (one - alpha)
+            weight = alpha * light
+            after = light - weight
             if after <= stop:
                 break
             if count == splats.shape[0]:
                 splats = np.concatenate((splats, np.empty_like(splats)))
                 weights = np.concatenate((weights, np.empty_like(weights)))
             splats[count] = frame.ids[place]
-            weights[count] = alpha * light
+            weights[count] = weight
             light = after
             count += 1
         row_starts[i + 1] = count
