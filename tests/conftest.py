@@ -5,6 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
+
+# The same examples on every machine, however slow it is; a failure prints how to see it again.
+settings.register_profile("everywhere", derandomize=True, deadline=None, print_blob=True)
+settings.load_profile("everywhere")
 
 SHARED_DATA = Path(__file__).parents[2] / "shared" / "data"
 

@@ -9,9 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
 from service.app import assemble
+from service.parts import Parts
 from service.settings import ServiceSettings
 from service.store.store import Store
 
@@ -39,6 +41,17 @@ def serving(data: Path, table: Path, **settings: Any) -> Iterator[TestClient]:
             yield client
     finally:
         store.close()
+
+
+def app_of(client: TestClient) -> FastAPI:
+    """The application that a client asks."""
+    assert isinstance(client.app, FastAPI)
+    return client.app
+
+
+def parts_of(client: TestClient) -> Parts:
+    """What that application was made of."""
+    return app_of(client).state.parts
 
 
 @dataclass(frozen=True)

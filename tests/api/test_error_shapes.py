@@ -5,11 +5,10 @@ The routes come from the application itself, so a new one is held to this too.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
-import socket
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -18,7 +17,7 @@ from fastapi.routing import iter_route_contexts
 from fastapi.testclient import TestClient
 
 from .test_problems import NO_ASSET, NOBODY, assert_problem
-from .test_slow_clients import served
+from .test_slow_clients import answer, client_of, served
 
 METHODS = ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS", "TRACE", "BREW")
 ODD_PARTS = (
@@ -150,8 +149,7 @@ def test_unknown_encodings_are_415(client: TestClient) -> None:
 @pytest.fixture(scope="module")
 def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, int]]:
     """A server behind a socket, in no hurry."""
-    folder: Path = tmp_path_factory.mktemp("live") / "data"
-    with served(folder, header_seconds=30, slow_grace_seconds=30) as found:
+    with served(tmp_path_factory.mktemp("live") / "data") as found:
         yield found
 
 
@@ -191,24 +189,16 @@ BAD_HTTP = {
 @pytest.mark.parametrize("name", BAD_HTTP)
 def test_what_is_no_good_http_is_a_problem_too(live: tuple[str, int], name: str) -> None:
     sent, status = BAD_HTTP[name]
-    head, body = exchange(live, sent)
+    with client_of(live) as connection:
+        with contextlib.suppress(ConnectionError):  # the server may have heard enough before all was sent
+            connection.sendall(sent)
+        head, body = (part.decode() for part in answer(connection))
     assert head.startswith(f"HTTP/1.1 {status} "), head
     assert "content-type: application/problem+json" in head.lower()
     told = json.loads(body)
     assert told["status"] == status and told["title"] and told["detail"]
     assert told["type"].startswith("/problems/")
     assert f"x-request-id: {told['request_id']}" in head.lower()
-
-
-def exchange(where: tuple[str, int], sent: bytes) -> tuple[str, str]:
-    """What comes back over a fresh connection until it closes: head and body."""
-    with socket.create_connection(where, timeout=60) as connection:
-        connection.sendall(sent)
-        received = b""
-        while piece := connection.recv(65_536):
-            received += piece
-    head, _, body = received.decode().partition("\r\n\r\n")
-    return head, body
 
 
 def _query_names(client: TestClient, path: str) -> set[str]:

@@ -6,13 +6,11 @@ import logging
 import re
 import shutil
 import threading
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from fastapi import FastAPI
 
 from service.__main__ import require_keys
 from service.errors import Misconfigured
@@ -22,11 +20,13 @@ from service.settings import ServiceSettings
 from service.store.owners import Owner
 from service.store.store import Store
 from service.wire import JobState
-from tests.crash.conftest import order
+from tests.crash.conftest import order, until
 
+from .conftest import app_of, parts_of
 from .guarded import Guarded, address, bearer, every_route, finish, guarded, make_key
 from .test_problems import assert_problem
 
+PATIENCE_SECONDS = 60.0  # for what takes a quarter of a second
 NOBODY = "e" * 32
 NO_ASSET = "sha256:" + "f" * 64
 OPEN_ROUTES = {"/", "/healthz", "/readyz", "/version", "/openapi.json", "/docs", "/docs/oauth2-redirect", "/redoc"}
@@ -41,20 +41,15 @@ def house(tmp_path: Path) -> Iterator[Guarded]:
         yield made
 
 
-def app_of(house: Guarded) -> FastAPI:
-    assert isinstance(house.client.app, FastAPI)
-    return house.client.app
-
-
 def closed_routes(house: Guarded) -> list[tuple[str, str]]:
-    routes = [(method, path) for method, path in every_route(app_of(house)) if path not in OPEN]
+    routes = [(method, path) for method, path in every_route(app_of(house.client)) if path not in OPEN]
     assert len(routes) >= 20
     return routes
 
 
 def test_every_route_but_the_open_ones_wants_a_key(house: Guarded) -> None:
     seen = set()
-    for method, path in every_route(app_of(house)):
+    for method, path in every_route(app_of(house.client)):
         reply = house.ask(None, method, address(path, house.done, house.order.splats), content=b"{")
         if path in OPEN_ROUTES:
             assert reply.status_code == 200, path
@@ -206,7 +201,7 @@ def test_owner_asks_and_sees_pictures(
 ) -> None:
     shutil.copytree(data, tmp_path / "data", ignore=shutil.ignore_patterns("lock"))  # while nothing is written there
     with start() as client:
-        store: Store = client.app.state.parts.store
+        store = parts_of(client).store
         (owner, secret), (_, other) = make_key(store, "read"), make_key(store, "read write")
         with store.database.write() as connection:
             connection.execute("UPDATE jobs SET owner = ?", (owner,))
@@ -254,12 +249,19 @@ def test_open_until_the_first_key_and_never_again(tmp_path: Path, capsys: pytest
 
 
 def test_revoked_key_loses_its_streams(house: Guarded) -> None:
-    revoking = threading.Timer(0.5, lambda: house.store.keys.revoke(house.ids["alice"]))
-    revoking.start()
-    begin = time.monotonic()
-    reply = house.ask("alice", "GET", f"/jobs/{house.queued}/events")  # its job does not end
+    streams = parts_of(house.client).streams
+    replies: list[Any] = []
+
+    def follow() -> None:
+        replies.append(house.ask("alice", "GET", f"/jobs/{house.queued}/events"))  # its job does not end
+
+    following = threading.Thread(target=follow, daemon=True)
+    following.start()
+    until(lambda: streams.open == 1)
+    house.store.keys.revoke(house.ids["alice"])
+    following.join(PATIENCE_SECONDS)
+    (reply,) = replies
     assert reply.status_code == 200 and '"queued"' in reply.text
-    assert time.monotonic() - begin < 20
     assert house.ask("alice", "GET", "/jobs").status_code == 401
 
 

@@ -5,24 +5,23 @@ from __future__ import annotations
 import os
 import signal
 import threading
-import time
 from collections.abc import Callable
 from typing import Any
 
 import pytest
-from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
 from liftcore.query import ask
 from service import wire
-from service.parts import Parts
 from service.queries import answers
 from service.queries.answers import Answers
 from service.queries.frames import Frame
 from service.queries.kept import Kept
 from service.queries.worker import reply_to
 from service.routes.question import query_request
+from tests.crash.conftest import until
 
+from .conftest import parts_of
 from .tiny_scene import CHANNELS, WORDS
 
 AN_ANSWER = 6 * 60  # bytes, for the splats of the tiny scene
@@ -37,11 +36,6 @@ QUESTIONS: list[dict[str, Any]] = [
     {"like": ["splat:7"]},
     {"text": ["apple"]},  # again
 ]
-
-
-def parts_of(client: TestClient) -> Parts:
-    assert isinstance(client.app, FastAPI)
-    return client.app.state.parts
 
 
 @pytest.fixture
@@ -165,8 +159,7 @@ def test_calls_of_a_worker_that_dies_are_answered_by_the_next(client: TestClient
     threads = [threading.Thread(target=run, args=(number,)) for number in range(4)]
     for thread in threads:
         thread.start()
-    while not worker._taken:
-        time.sleep(0.001)
+    until(lambda: worker._taken)
     os.kill(process.pid, signal.SIGKILL)
     for thread in threads:
         thread.join()

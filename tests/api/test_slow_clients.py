@@ -3,30 +3,38 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
+import anyio
 import httpx
 import pytest
 import uvicorn
+from starlette.exceptions import HTTPException
 
 from service.app import create_app, lift_limits, pace_of
 from service.connection import watched
 from service.jobs.supervisor import Supervisor
+from service.limits import BodyLimit, Pace
 from service.queries.warm import WarmWorker
 from service.settings import ServiceSettings
 from service.store.assets import CheckedUpload
 from service.store.store import Store
 from service.wire import AssetKind
+from tests.crash.conftest import until
 from tests.crash.server import NoQueries
 
-PATIENCE_SECONDS = 30.0  # for what takes half a second; the machine may be busy
+TRIES = 10
+PATIENCE_SECONDS = 60.0  # for what takes half a second; the machine may be busy
+HEALTH = b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n"
 HEAD = b"PUT /assets/splats HTTP/1.1\r\nHost: localhost\r\nContent-Length: 5000\r\n\r\n"
 JSON_HEAD = (
     b"POST /lift HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: 5000\r\n\r\n"
@@ -36,20 +44,27 @@ Served = Callable[..., AbstractContextManager[tuple[str, int]]]
 
 @contextmanager
 def served(data: Path, **settings: Any) -> Iterator[tuple[str, int]]:
-    """A server in a thread: host and port. A body needs 1,000 bytes a second here, over half a second."""
-    quick = {"min_bytes_per_second": 1000, "slow_grace_seconds": 0.5, "header_seconds": 0.5}
-    chosen = ServiceSettings.model_validate({"data": data, "disk_floor_bytes": 0, **quick, **settings})
+    """A server in a thread: host and port. It is in no hurry, unless told to be."""
+    with running(data, **settings) as server:
+        yield server.servers[0].sockets[0].getsockname()
+
+
+@contextmanager
+def running(data: Path, **settings: Any) -> Iterator[uvicorn.Server]:
+    """That server, to look into it."""
+    patient = {"min_bytes_per_second": 1000, "slow_grace_seconds": 30, "header_seconds": 30}
+    chosen = ServiceSettings.model_validate({"data": data, "disk_floor_bytes": 0, **patient, **settings})
     store = Store.open(chosen.data)
     app = create_app(chosen, store, Supervisor(store, lift_limits(chosen)), cast("WarmWorker", NoQueries()))
     listener = socket.create_server(("127.0.0.1", 0))
     connection = watched(pace_of(chosen), chosen.max_connections)
-    server = uvicorn.Server(uvicorn.Config(app, http=connection, log_level="critical"))
+    config = uvicorn.Config(app, http=connection, log_level="critical", timeout_graceful_shutdown=10)
+    server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
     thread.start()
     try:
-        while not server.started:
-            time.sleep(0.01)
-        yield listener.getsockname()
+        until(lambda: server.started)
+        yield server
     finally:
         server.should_exit = True
         thread.join()
@@ -58,14 +73,29 @@ def served(data: Path, **settings: Any) -> Iterator[tuple[str, int]]:
 
 
 @pytest.fixture(scope="module")
-def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, int]]:
-    with served(tmp_path_factory.mktemp("slow") / "data") as address:
+def patient(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, int]]:
+    """A server in no hurry."""
+    with served(tmp_path_factory.mktemp("patient") / "data") as address:
         yield address
 
 
 @pytest.fixture(scope="module")
-def drafts(address: tuple[str, int], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return next(tmp_path_factory.getbasetemp().glob("slow*/data/tmp"))
+def data_of_brisk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("brisk") / "data"
+
+
+@pytest.fixture(scope="module")
+def brisk(data_of_brisk: Path) -> Iterator[tuple[str, int]]:
+    """A server that wants 1,000 bytes of a body a second, over half a second, and takes its time over headers."""
+    with served(data_of_brisk, slow_grace_seconds=0.5) as address:
+        yield address
+
+
+@pytest.fixture(scope="module")
+def curt(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, int]]:
+    """A server that wants headers within half a second."""
+    with served(tmp_path_factory.mktemp("curt") / "data", header_seconds=0.5) as address:
+        yield address
 
 
 @contextmanager
@@ -86,22 +116,13 @@ def answer(client: socket.socket) -> tuple[bytes, bytes]:
     return head, body
 
 
-def ask_for_health(client: socket.socket) -> None:
-    """One request over a connection that stays open."""
-    client.sendall(b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n")
-    said = b""
-    while b"ok" not in said.partition(b"\r\n\r\n")[2]:
-        said += client.recv(1 << 16)
-    assert said.startswith(b"HTTP/1.1 200 ")
-
-
 def trickle(client: socket.socket, begin: bytes, byte: bytes) -> tuple[bytes, bytes]:
     """Send a beginning, then a byte at a time, until the server has had enough; what it says."""
-    client.sendall(begin)
 
     def drip() -> None:
         deadline = time.monotonic() + PATIENCE_SECONDS
         try:
+            client.sendall(begin)
             while time.monotonic() < deadline:
                 client.sendall(byte)
                 time.sleep(0.05)
@@ -113,6 +134,16 @@ def trickle(client: socket.socket, begin: bytes, byte: bytes) -> tuple[bytes, by
     said = answer(client)
     thread.join()
     return said
+
+
+def trickle_anew(address: tuple[str, int], begin: bytes, byte: bytes) -> tuple[bytes, bytes]:
+    """Trickle over a new connection; over another one if the clock ran out before our first byte came."""
+    for _ in range(TRIES):
+        with client_of(address) as client:
+            said = trickle(client, begin, byte)
+        if said != (b"", b""):
+            return said
+    raise AssertionError("closed without a word, again and again")
 
 
 def assert_problem(said: tuple[bytes, bytes], status: int, kind: str) -> None:
@@ -127,60 +158,86 @@ def assert_problem(said: tuple[bytes, bytes], status: int, kind: str) -> None:
 
 @pytest.mark.parametrize("head", [HEAD, JSON_HEAD], ids=["upload", "json"])
 def test_body_that_trickles_is_408_and_closed_and_leaves_no_draft(
-    address: tuple[str, int], drafts: Path, head: bytes
+    brisk: tuple[str, int], data_of_brisk: Path, head: bytes
 ) -> None:
-    with client_of(address) as client:
+    with client_of(brisk) as client:
         assert_problem(trickle(client, head, b" "), 408, "too-slow")
-    deadline = time.monotonic() + PATIENCE_SECONDS
-    while list(drafts.iterdir()):
-        assert time.monotonic() < deadline, "the draft stays"
-        time.sleep(0.01)
+    until(lambda: not list((data_of_brisk / "tmp").iterdir()))
 
 
 @pytest.mark.parametrize("head", [HEAD, JSON_HEAD], ids=["upload", "json"])
-def test_body_that_does_not_come_is_408(address: tuple[str, int], head: bytes) -> None:
-    with client_of(address) as client:
+def test_body_that_does_not_come_is_408(brisk: tuple[str, int], head: bytes) -> None:
+    with client_of(brisk) as client:
         client.sendall(head)
         assert_problem(answer(client), 408, "too-slow")
 
 
-def test_body_that_comes_fast_and_then_trickles_is_408(address: tuple[str, int]) -> None:
-    with client_of(address) as client:
+def test_body_that_comes_fast_and_then_trickles_is_408(brisk: tuple[str, int]) -> None:
+    with client_of(brisk) as client:
         head = HEAD.replace(b"5000", b"500000")
         assert_problem(trickle(client, head + b" " * 200_000, b" "), 408, "too-slow")
 
 
-def test_body_at_five_times_the_least_speed_is_taken(address: tuple[str, int]) -> None:
-    with client_of(address) as client:
+def test_body_in_pieces_is_taken(patient: tuple[str, int]) -> None:
+    with client_of(patient) as client:
         client.sendall(JSON_HEAD.replace(b"Host: localhost\r\n", b"Host: localhost\r\nConnection: close\r\n"))
         for _ in range(20):
             client.sendall(b" " * 250)
-            time.sleep(0.05)
+            time.sleep(0.01)
         head, _ = answer(client)
     assert head.startswith(b"HTTP/1.1 422 ")  # read to its end, and found to be no order
 
 
+@pytest.mark.parametrize(("speed", "taken"), [(5000, True), (1100, True), (900, False)])
+def test_body_may_take_longer_than_the_grace_if_it_keeps_the_least_speed(
+    monkeypatch: pytest.MonkeyPatch, speed: int, taken: bool
+) -> None:
+    pace = Pace(bytes_per_second=1000, grace_seconds=1000.0)
+    clock = itertools.count(0, 25)  # seconds between two looks at it, of which none goes by here
+    monkeypatch.setattr("service.limits.time", SimpleNamespace(monotonic=lambda: next(clock)))
+    pieces = iter([True] * 200 + [False])
+
+    async def receive() -> dict[str, Any]:
+        await anyio.sleep(0)
+        return {"type": "http.request", "body": bytes(25 * speed), "more_body": next(pieces)}
+
+    async def read_all(scope: Any, receive: Any, send: Any) -> None:
+        while (await receive())["more_body"]:
+            pass
+
+    async def send(message: Any) -> None:
+        raise AssertionError(message)
+
+    async def run() -> None:
+        await BodyLimit(read_all, 1 << 30, pace)({"type": "http", "path": "/lift"}, receive, send)
+
+    with nullcontext() if taken else pytest.raises(HTTPException, match="less than 1000 bytes"):
+        anyio.run(run)
+    assert (next(pieces, None) is None) == taken
+
+
 @pytest.mark.parametrize("begin", [b"G", b"GET / HTTP/1.1\r\nHost: localhost\r\n"], ids=["line", "headers"])
-def test_headers_that_trickle_are_408_and_closed(address: tuple[str, int], begin: bytes) -> None:
-    with client_of(address) as client:
-        assert_problem(trickle(client, begin, b"a"), 408, "too-slow")
+def test_headers_that_trickle_are_408_and_closed(curt: tuple[str, int], begin: bytes) -> None:
+    assert_problem(trickle_anew(curt, begin, b"a"), 408, "too-slow")
 
 
-def test_headers_that_trickle_after_an_answer_are_408_and_closed(address: tuple[str, int]) -> None:
-    with client_of(address) as client:
-        ask_for_health(client)
-        assert_problem(trickle(client, b"GET ", b"a"), 408, "too-slow")
+def test_headers_that_trickle_after_an_answer_are_408_and_closed(curt: tuple[str, int]) -> None:
+    said, body = trickle_anew(curt, HEALTH + b"GET ", b"a")
+    assert said.startswith(b"HTTP/1.1 200 ")
+    health, _, refused = body.partition(b"HTTP/1.1 ")
+    assert b"ok" in health
+    head, _, problem = refused.partition(b"\r\n\r\n")
+    assert_problem((b"HTTP/1.1 " + head, problem), 408, "too-slow")
 
 
-def test_connection_without_a_word_is_closed_without_one(address: tuple[str, int]) -> None:
-    with client_of(address) as client:
+def test_connection_without_a_word_is_closed_without_one(curt: tuple[str, int]) -> None:
+    with client_of(curt) as client:
         assert answer(client) == (b"", b"")
 
 
-def test_body_that_trickles_on_after_its_answer_is_cut_off(address: tuple[str, int]) -> None:
-    with client_of(address) as client:
-        head = b"GET /healthz HTTP/1.1\r\nHost: localhost\r\nContent-Length: 5000\r\n\r\n"
-        said, body = trickle(client, head, b" ")
+def test_body_that_trickles_on_after_its_answer_is_cut_off(curt: tuple[str, int]) -> None:
+    head = HEALTH[:-2] + b"Content-Length: 5000\r\n\r\n"
+    said, body = trickle_anew(curt, head, b" ")
     assert said.startswith(b"HTTP/1.1 200 ") and b"ok" in body
 
 
@@ -192,36 +249,31 @@ def test_body_that_trickles_on_after_its_answer_is_cut_off(address: tuple[str, i
     ],
     ids=["no HTTP", "TLS"],
 )
-def test_what_is_no_http_is_400_in_the_one_shape(address: tuple[str, int], nonsense: bytes) -> None:
-    with client_of(address) as client:
+def test_what_is_no_http_is_400_in_the_one_shape(patient: tuple[str, int], nonsense: bytes) -> None:
+    with client_of(patient) as client:
         client.sendall(nonsense)
         assert_problem(answer(client), 400, "malformed-request")
 
 
-def test_headers_without_an_end_are_431(address: tuple[str, int]) -> None:
-    with client_of(address) as client:
-        client.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\nA: " + b"a" * 200_000)
-        assert_problem(answer(client), 431, "headers-too-large")
+def test_headers_without_an_end_are_431(patient: tuple[str, int]) -> None:
+    with client_of(patient) as client:
+        assert_problem(trickle(client, HEALTH[:-2] + b"A: " + b"a" * 200_000, b"a"), 431, "headers-too-large")
 
 
-def test_chunk_without_a_length_is_400_in_the_one_shape(address: tuple[str, int]) -> None:
-    with client_of(address) as client:
+def test_chunk_without_a_length_is_400_in_the_one_shape(patient: tuple[str, int]) -> None:
+    with client_of(patient) as client:
         client.sendall(b"PUT /assets/splats HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\nzz\r\n")
         assert_problem(answer(client), 400, "malformed-request")
 
 
 def test_more_connections_than_allowed_are_503_until_one_ends(tmp_path: Path) -> None:
-    with served(tmp_path / "data", max_connections=2, header_seconds=20) as address:
-        with client_of(address) as first, client_of(address) as second:
-            for client in (first, second):
-                ask_for_health(client)
-            with client_of(address) as third:
-                said = answer(third)
-                assert_problem(said, 503, "busy")
-                assert b"retry-after: " in said[0].lower()
-        deadline = time.monotonic() + PATIENCE_SECONDS
-        while httpx.get(f"http://127.0.0.1:{address[1]}/healthz").status_code != 200:
-            assert time.monotonic() < deadline
+    with served(tmp_path / "data", max_connections=2, header_seconds=60) as address:
+        # They come in the order in which they are made, and stay as long as nothing is asked.
+        with client_of(address), client_of(address), client_of(address) as third:
+            said = answer(third)
+            assert_problem(said, 503, "busy")
+            assert b"retry-after: " in said[0].lower()
+        until(lambda: httpx.get(f"http://127.0.0.1:{address[1]}/healthz").status_code == 200)
 
 
 def test_client_that_does_not_read_is_cut_off(tmp_path: Path) -> None:
@@ -232,11 +284,13 @@ def test_client_that_does_not_read_is_cut_off(tmp_path: Path) -> None:
         draft.write_bytes(content)
         store.assets.add(CheckedUpload(draft, AssetKind.SPLATS, digest, ".ply", {}, []))
     store.close()
-    with served(tmp_path / "data", min_bytes_per_second=1 << 20) as address:
-        path = f"/assets/sha256:{digest}/content"
-        with client_of(address) as client:
+    path = f"/assets/sha256:{digest}/content"
+    with running(tmp_path / "data", min_bytes_per_second=1 << 20, slow_grace_seconds=0.5) as server:
+        with client_of(server.servers[0].sockets[0].getsockname()) as client:
+            until(lambda: server.server_state.connections)
             client.sendall(f"GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
-            time.sleep(2)
+            until(lambda: not server.server_state.connections)
             head, body = answer(client)
         assert head.startswith(b"HTTP/1.1 200 ") and len(body) < len(content)
+    with served(tmp_path / "data") as address:
         assert httpx.get(f"http://127.0.0.1:{address[1]}{path}", timeout=PATIENCE_SECONDS).content == content
