@@ -260,7 +260,7 @@ def add_weighted_row(typingctx, target, place, source, entries, sparse, span):
 
 @compiled
 def fetch_ahead(typingctx, table, row):
-    """Ask for a row of ``table`` [n, m] f64 before it is needed."""
+    """Ask for the first 128 bytes of a row of ``table`` [n, m] f64 before they are needed."""
     kind = types.Array(types.float64, 2, "C")
     line = 64  # bytes
 

@@ -245,7 +245,7 @@ def _composite(builder: Builder, state: ir.Value, falloff: ir.Value, opacity: ir
     alpha = builder.select(builder.fcmp_ordered(">=", raw, _row(builder, state, _FLOOR_ROW)), raw, zero)
     before = load_lanes(builder, place)
     weight = builder.fmul(alpha, before)
-    after = builder.fsub(before, weight)  # T (1 - a) would round 1 - a, and lose a million faint splats
+    after = builder.fsub(before, weight)  # 1 - a would be rounded first, and a million faint splats be lost
     alive = builder.fcmp_ordered(">", after, _row(builder, state, _STOP_ROW))
     builder.store(builder.select(alive, after, zero), place, align=4)
     return builder.select(alive, weight, zero)

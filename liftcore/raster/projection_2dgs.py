@@ -175,9 +175,11 @@ def _write_outline(record, centre, a, b, largest, view):
     half_x, half_y = 0.5 * (right - left), 0.5 * (bottom - top)
     record[MX], record[MY] = left + half_x, top + half_y
     record[EXTENT_X], record[EXTENT_Y] = half_x, half_y
-    record[SLOPE] = record[LEAN] = record[KY] = 0.0
+    record[SLOPE] = record[LEAN] = 0.0
+    # Half of the reach for each side: the ellipse through the corners of the box, of which the tiles know the sides.
     record[KX] = 1.0 / max(_MARGIN, half_x) ** 2
-    record[REACH] = 1.0
+    record[KY] = 1.0 / max(_MARGIN, half_y) ** 2
+    record[REACH] = 2.0
 
 
 @inlined

@@ -1,7 +1,7 @@
 """Which of a ray's weights count, and to which power: a gate between the blending and the sums.
 
-The walk that counts all weights never comes here. For the others, ``blend`` leaves the plain weights of a half row
-in the state, and ``choose`` zeroes the lanes that do not count. The k largest weights of a ray are known only at
+The walk that counts all weights never comes here. For the others, the plain weights of a half row are kept in the
+state, and ``choose`` zeroes the lanes that do not count. The k largest weights of a ray are known only at
 its end, so top-k walks every tile twice: ``rank_tile`` finds what the least of them is, ``choose`` then keeps to it.
 """
 

@@ -127,16 +127,15 @@ def solve_closed_form(
     scale = np.divide(1.0, denominators, out=np.zeros(count), where=denominators > 0)
     step = slice_width(sum(book.shape[0] for book in books))
     slices = [(begin, min(begin + step, channels)) for begin in range(0, channels, step)]
-    edges = np.minimum(np.arange(0, count + BLOCK, BLOCK), count)
-    tables = WeightTables(store, edges)
+    tables = WeightTables(store)
     with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
         for number, (begin, end) in enumerate(slices):
             parts = [slice_of(book, begin, end) for book in books]
-            sums = _solve_slice(pool, (tables, edges), parts, scale, (kept, begin))
+            sums = _solve_slice(pool, tables, parts, scale, (kept, begin))
             if not unit:
                 for part, norm in zip(parts, norms, strict=True):
                     np.divide(part, norm[:, None], out=part, where=norm[:, None] > 0, casting="same_kind")
-                sums = _solve_slice(pool, (tables, edges), parts, scale, (kept[:0], begin))
+                sums = _solve_slice(pool, tables, parts, scale, (kept[:0], begin))
             squares += sums
             progress("solve", number + 1, len(slices), "slices")
     agreement = np.sqrt(squares).clip(0.0, 1.0).astype(np.float32)
@@ -163,38 +162,37 @@ def slice_of(book: Tensor, begin: int, end: int) -> np.ndarray:
 
 
 @kernel
-def solve_blocks(numbers, edges, tables, scale, width, result):
-    """Some blocks of X, over ``width`` channels, and their squared norms.
+def solve_blocks(splats, tables, scale, width, result):
+    """X of some splats, block by block over ``width`` channels, and their squared norms.
 
     Args:
-        numbers: (first, last), the blocks. edges: [blocks + 1] i64, their first splats.
-        tables: (addresses, bounds, books) as ``add_views`` takes them. scale: [P] f64.
+        splats: (first, last). tables: (addresses, rows, books) as ``add_views`` takes them. scale: [P] f64.
         result: (squares, begin, features) as ``finish_rows`` takes them.
     """
     squares, begin, features = result
-    block, part = np.empty((BLOCK, width), np.float32), np.empty((BLOCK, width), np.float32)
-    for number in range(numbers[0], numbers[1]):
-        offset = edges[number]
-        size = edges[number + 1] - offset
-        add_views(number, offset, tables, scale, block[:size], part[:size])
-        finish_rows(block[:size], offset, squares, begin, features)
+    sums, part = np.empty((BLOCK, width), np.float32), np.empty((BLOCK, width), np.float32)
+    for offset in range(splats[0], splats[1], BLOCK):
+        end = min(offset + BLOCK, splats[1])
+        own = sums[: end - offset]
+        add_views((offset, end), tables, scale, own, part[: end - offset])
+        finish_rows(own, offset, squares, begin, features)
 
 
 def _solve_slice(
     pool: ThreadPoolExecutor,
-    blocks: tuple[WeightTables, np.ndarray],
+    weights: WeightTables,
     parts: Sequence[np.ndarray],
     scale: np.ndarray,
     result: tuple[np.ndarray, int],
 ) -> np.ndarray:
     """One slice of channels for all splats, into ``result = (X, first channel)``; the squared norms [P] f64."""
-    weights, edges = blocks
-    squares, books, (features, begin) = np.zeros(scale.shape[0]), books_of(parts), result
-    tables, width = (weights.addresses, weights.bounds, books), parts[0].shape[1]
-
-    def solve(first: int) -> None:
-        numbers = (first, min(first + BLOCKS, len(edges) - 1))
-        solve_blocks(numbers, edges, tables, scale, width, (squares, begin, features))
-
-    list(pool.map(solve, range(0, len(edges) - 1, BLOCKS)))
+    squares, (features, begin) = np.zeros(scale.shape[0]), result
+    tables, width = (weights.addresses, weights.rows, books_of(parts)), parts[0].shape[1]
+    shares = splat_shares(scale.shape[0])
+    list(pool.map(lambda share: solve_blocks(share, tables, scale, width, (squares, begin, features)), shares))
     return squares
+
+
+def splat_shares(count: int) -> list[tuple[int, int]]:
+    """The splats of each call of compiled code, whole blocks but the last."""
+    return [(first, min(first + BLOCK * BLOCKS, count)) for first in range(0, count, BLOCK * BLOCKS)]

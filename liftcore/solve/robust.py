@@ -38,8 +38,16 @@ import numpy as np
 
 from liftcore.jit import kernel, vectorised
 from liftcore.solve.accumulate import row_totals
-from liftcore.solve.closed_form import BLOCK, slice_of, slice_width
-from liftcore.solve.weight_tables import WeightTables, add_views, addresses_of, books_of, floats_at, table_at
+from liftcore.solve.closed_form import BLOCK, slice_of, slice_width, splat_shares
+from liftcore.solve.weight_tables import (
+    WeightTables,
+    add_views,
+    addresses_of,
+    books_of,
+    floats_at,
+    rows_between,
+    table_at,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -90,25 +98,27 @@ def judge_rows(rows, weights, scale, codebook, block, agreement, squares):
 
 
 @kernel
-def judge_views(number, offset, tables, sums, scale, block):
-    """``judge_rows`` of a block of splats for all views.
+def judge_blocks(splats, tables, sums, scale, width):
+    """``judge_rows`` of some splats for all views, block by block over ``width`` channels.
 
     Args:
-        number: of the block. offset: its first splat.
-        tables: (addresses, bounds, books) as ``add_views`` takes them, the books of e.
-        sums: [V, 2] i64, where agreement [nnz] f32 and squares [n] f32 of each view lie.
-        scale: [P] f64. block: [B, C] f32, the sums over all views.
+        splats: (first, last). tables: (addresses, rows, books) as ``add_views`` takes them, the books of e.
+        sums: [V, 2] i64, where agreement [nnz] f32 and squares [n] f32 of each view lie. scale: [P] f64.
     """
-    addresses, bounds, books = tables
-    width = block.shape[1]
-    for view in range(addresses.shape[0]):
-        first, last = bounds[view, number], bounds[view, number + 1]
-        if first < last:
-            weights = table_at(addresses[view], bounds[view, bounds.shape[1] - 1])
-            book = floats_at(books[view, 0], books[view, 1]).reshape(-1, width)
-            agreement = floats_at(sums[view, 0], weights[2].shape[0])
-            squares = floats_at(sums[view, 1], weights[0].shape[0])
-            judge_rows((first, last, offset), weights, scale, book, block, agreement, squares)
+    addresses, rows, books = tables
+    means, part = np.empty((BLOCK, width), np.float32), np.empty((BLOCK, width), np.float32)
+    for offset in range(splats[0], splats[1], BLOCK):
+        block = (offset, min(offset + BLOCK, splats[1]))
+        own = means[: block[1] - offset]
+        add_views(block, tables, scale, own, part[: block[1] - offset])
+        for view in range(addresses.shape[0]):
+            weights = table_at(addresses[view], rows[view])
+            first, last = rows_between(weights[0], block)
+            if first < last:
+                book = floats_at(books[view, 0], books[view, 1]).reshape(-1, width)
+                agreement = floats_at(sums[view, 0], weights[2].shape[0])
+                squares = floats_at(sums[view, 1], weights[0].shape[0])
+                judge_rows((first, last, offset), weights, scale, book, own, agreement, squares)
 
 
 @dataclass(frozen=True)
@@ -198,35 +208,16 @@ def _judge(
         weights.weights.zero_()
     channels = directions.mean.size
     step = slice_width(sum(book.shape[0] for book in directions.books))
+    scale, tables = _over(np.ones(denominators.size), denominators), WeightTables(current)
+    sums = addresses_of([(view.weights.numpy(), square) for view, square in zip(target, squares, strict=True)])
     for begin in range(0, channels, step):
         end = min(begin + step, channels)
         slices = [pool.submit(directions.slice_of, view, begin, end) for view in range(len(current))]
-        _judge_slice(pool, current, [part.result() for part in slices], denominators, (target, squares))
+        parts = [part.result() for part in slices]
+        own, width = (tables.addresses, tables.rows, books_of(parts)), parts[0].shape[1]
+        shares = splat_shares(denominators.size)
+        list(pool.map(lambda share, own=own, width=width: judge_blocks(share, own, sums, scale, width), shares))
     return squares
-
-
-def _judge_slice(
-    pool: ThreadPoolExecutor,
-    current: ViewWeights,
-    parts: Sequence[np.ndarray],
-    denominators: np.ndarray,
-    sums: tuple[ViewWeights, Sequence[np.ndarray]],
-) -> None:
-    """Some channels of `_judge`, block by block of splats."""
-    count, scale = denominators.size, _over(np.ones(denominators.size), denominators)
-    edges = np.minimum(np.arange(0, count + BLOCK, BLOCK), count)
-    tables = WeightTables(current, edges)
-    everything = tables.addresses, tables.bounds, books_of(parts)
-    places = [(view.weights.numpy(), squares) for view, squares in zip(*sums, strict=True)]
-    targets = addresses_of(places)
-
-    def judge_block(number: int) -> None:
-        offset, end = edges[number], edges[number + 1]
-        block, part = (np.empty((end - offset, parts[0].shape[1]), np.float32) for _ in range(2))
-        add_views(number, offset, everything, scale, block, part)
-        judge_views(number, offset, everything, targets, scale, block)
-
-    list(pool.map(judge_block, range(len(edges) - 1)))
 
 
 def _write(

@@ -27,32 +27,33 @@ LONG = 256  # entries of a row that float32 adds up one by one
 VIEWS = 64  # views that add to a block one by one
 
 _SPLATS, _ROW_STARTS, _COLUMNS, _WEIGHTS = range(4)
+_TYPES = (np.int32, np.int64, np.int32, np.float32)
 
 
 class WeightTables:
-    """Where W of every view lies, and which of its rows belong to which block of splats.
+    """Where W of every view lies.
 
     Args:
-        store: W of every view; they must stay where they are.
-        edges: [blocks + 1] i64, the first splat of every block, then the end.
+        store: W of every view; they must stay as they are while the tables are in use.
     """
 
-    def __init__(self, store: Iterable[RegionWeights], edges: np.ndarray) -> None:
-        self._kept = [
-            (view.splats.numpy(), view.row_starts.numpy(), view.columns.numpy(), view.weights.numpy())
-            for view in store
+    def __init__(self, store: Iterable[RegionWeights]) -> None:
+        views = [(view.splats, view.row_starts, view.columns, view.weights) for view in store]
+        self._kept = [  # compiled code takes the types for granted
+            tuple(np.ascontiguousarray(part.numpy(), kind) for part, kind in zip(view, _TYPES, strict=True))
+            for view in views
         ]
         self.addresses = addresses_of(self._kept)  # [V, 4] i64
-        bounds = [np.searchsorted(view[0], edges.astype(view[0].dtype)) for view in self._kept]
-        self.bounds = np.array(bounds, np.int64)  # [V, blocks + 1]
+        self.rows = np.array([view[_SPLATS].size for view in self._kept], np.int64)  # [V]
 
 
 def addresses_of(tables: Sequence[Sequence[np.ndarray]]) -> np.ndarray:
-    """[n, k] i64: where the arrays of n tuples of k begin. They must be contiguous, and outlive the numbers.
+    """[n, k] i64: where the arrays of n tuples of k begin. They must outlive the numbers.
 
     An empty array has an address too, and nobody may read it.
     """
-    assert all(array.flags.c_contiguous for table in tables for array in table)
+    if not all(array.flags.c_contiguous for table in tables for array in table):
+        raise ValueError("an array with gaps has no address that compiled code could walk from")
     return np.array([[array.ctypes.data for array in table] for table in tables], np.int64)
 
 
@@ -84,11 +85,11 @@ def _floats_at(typingctx, address):
 
 
 @inlined
-def table_at(addresses, end):
-    """(splats, row_starts, columns, weights) of one view, as far as its row ``end``."""
-    row_starts = carray(_counts_at(addresses[_ROW_STARTS]), (end + 1,))
-    splats = carray(_integers_at(addresses[_SPLATS]), (end,))
-    entries = int(row_starts[end])
+def table_at(addresses, rows):
+    """(splats, row_starts, columns, weights) of one view that has so many rows."""
+    row_starts = carray(_counts_at(addresses[_ROW_STARTS]), (rows + 1,))
+    splats = carray(_integers_at(addresses[_SPLATS]), (rows,))
+    entries = int(row_starts[rows])
     columns = carray(_integers_at(addresses[_COLUMNS]), (entries,))
     weights = carray(_floats_at(addresses[_WEIGHTS]), (entries,))
     return splats, row_starts, columns, weights
@@ -141,32 +142,42 @@ def _add_long_row(target, source, entries, sparse):
         target[channel] += total[channel]
 
 
+@inlined
+def rows_between(splats, block):
+    """First and last row of the splats ``block[0]..block[1]`` among ``splats`` [n] i32, ascending."""
+    first = np.searchsorted(splats, block[0])
+    last = first
+    while last < splats.shape[0] and splats[last] < block[1]:
+        last += 1
+    return first, last
+
+
 @kernel
-def add_views(number, offset, tables, scale, block, part):
-    """A block of splats of ``W E``, summed over the views in their order, VIEWS of them at a time.
+def add_views(block, tables, scale, sums, part):
+    """``W E`` of a block of splats, summed over the views in their order, VIEWS of them at a time.
 
     Args:
-        number: of the block. offset: its first splat.
-        tables: (addresses, bounds, books): two of WeightTables, and [V, 2] i64, address and length of E_v [M, C] f32.
-        scale: [P] f64. block: [B, C] f32, written. part: room for the same.
+        block: (offset, end), the splats.
+        tables: (addresses, rows, books): two of WeightTables, and [V, 2] i64, address and length of E_v [M, C] f32.
+        scale: [P] f64. sums: [B, C] f32, written. part: room for the same.
     """
-    addresses, bounds, books = tables
-    width, target, met = block.shape[1], part.reshape(-1), 0
-    block[:] = 0
+    addresses, rows, books = tables
+    width, target, met = sums.shape[1], part.reshape(-1), 0
+    sums[:] = 0
     part[:] = 0
     for view in range(addresses.shape[0]):
-        first, last = bounds[view, number], bounds[view, number + 1]
+        weights = table_at(addresses[view], rows[view])
+        first, last = rows_between(weights[0], block)
         if first == last:
             continue
         if met == VIEWS:
-            block += part
+            sums += part
             part[:] = 0
             met = 0
-        weights = table_at(addresses[view], bounds[view, bounds.shape[1] - 1])
         book = floats_at(books[view, 0], books[view, 1])
-        add_weighted_rows((first, last, offset), weights, scale, book, target, width)
+        add_weighted_rows((first, last, block[0]), weights, scale, book, target, width)
         met += 1
-    block += part
+    sums += part
 
 
 def books_of(parts: Sequence[np.ndarray]) -> np.ndarray:

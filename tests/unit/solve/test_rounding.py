@@ -26,12 +26,22 @@ def test_rows_are_rounded_as_numpy_rounds_them_and_nothing_beside_them_is_touche
     rows = everything()
     block = np.zeros((len(rows), 32), np.float32)
     block[:, :CHANNELS] = rows
-    features, squares = torch.zeros(len(rows) + 3, 20, dtype=dtype), np.zeros(len(rows) + 3)
-    kept = features.view(torch.uint16).numpy() if dtype == torch.float16 else features.numpy()
-    finish_rows(block, 3, squares, 7, kept)
-    with np.errstate(over="ignore"):
-        wanted = rows.astype(features.numpy().dtype)
-    assert features.numpy()[3:, 7:].tobytes() == wanted.tobytes()
-    assert not features[:3].any() and not features[:, :7].any()
-    np.testing.assert_allclose(squares[3:], (rows.astype(np.float64) ** 2).sum(axis=1), rtol=1e-5)
-    assert not squares[:3].any()
+    own = slice(3, 3 + len(rows))
+    for channels in (7 + CHANNELS, 60):  # the slice is X's last, and it is not
+        features, squares = torch.zeros(len(rows) + 5, channels, dtype=dtype), np.zeros(len(rows) + 5)
+        kept = features.view(torch.uint16).numpy() if dtype == torch.float16 else features.numpy()
+        finish_rows(block, 3, squares, 7, kept)
+        width = min(32, channels - 7)
+        with np.errstate(over="ignore"):
+            wanted = block[:, :width].astype(features.numpy().dtype)
+        assert features.numpy()[own, 7 : 7 + width].tobytes() == wanted.tobytes()
+        features[own, 7 : 7 + width] = 0
+        assert not features.any()
+        np.testing.assert_allclose(squares[own], (rows.astype(np.float64) ** 2).sum(axis=1), rtol=1e-5)
+        assert not squares[:3].any() and not squares[own.stop :].any()
+
+
+def test_norms_alone_keep_no_row() -> None:
+    squares = np.zeros(2)
+    finish_rows(np.ones((2, 32), np.float32), 0, squares, 0, np.empty((0, 32), np.float32))
+    assert squares.tolist() == [32.0, 32.0]

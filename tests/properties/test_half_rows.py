@@ -1,0 +1,77 @@
+"""Sets of half rows against the plain loop over all lanes."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from liftcore.jit import kernel
+from liftcore.lanes import BASES, HALVES, LANES, ROWS, STARTS
+from liftcore.lanes_blend import STATE
+from liftcore.lanes_halves import both, either, ellipse_halves, lit_halves, lowest_half, without_lowest
+
+places = st.floats(-40, 56)
+curvatures = st.sampled_from([0.0, 1e-6, 1e-3, 1.0, 1e6]) | st.floats(1e-4, 10)
+
+
+@kernel
+def reached(state, centre, slope, curvature, reach):
+    return ellipse_halves(state, centre, slope, curvature, reach)
+
+
+@kernel
+def members(halves):
+    """[n] the half rows of a set, as the walk takes them."""
+    found = []
+    while halves:
+        found.append(lowest_half(halves))
+        halves = without_lowest(halves)
+    return found
+
+
+@kernel
+def lit(state, first):
+    return lit_halves(state, first)
+
+
+@kernel
+def joined(left, right):
+    return both(left, right), either(left, right)
+
+
+@given(mx=places, my=places, slope=st.floats(-8, 8), kx=curvatures, ky=curvatures, reach=st.floats(-1, 8))
+def test_a_set_lacks_no_half_row_with_a_lane_inside_and_holds_none_that_is_far_away(
+    mx: float, my: float, slope: float, kx: float, ky: float, reach: float
+) -> None:
+    state = np.zeros(STATE, np.float32)
+    halves = reached(state, (mx, my), slope, (kx, ky), reach)
+    x = np.arange(2 * LANES)[None, :]
+    dy = np.arange(ROWS)[:, None] - my
+    form = kx * (x - mx - slope * dy) ** 2 + ky * dy**2  # [row, x]
+    surely = reach * (1 - 1e-9) if reach > 0 else reach  # rounding decides about what lies on the edge
+    inside = np.asarray(form <= surely).reshape(ROWS, 2, LANES).any(axis=2)
+    middle = mx + slope * dy[:, 0]
+    for half in range(HALVES):
+        side, row = divmod(half, ROWS)
+        held = bool(halves >> half & 1)
+        assert held or not inside.item(row, side)
+        nearest = np.clip(middle[row], side * LANES, side * LANES + LANES - 1)
+        least = kx * (nearest - middle[row]) ** 2 + ky * dy[row, 0] ** 2
+        assert not held or least <= reach * (1 + 1e-9) + 1e-9
+        assert state[STARTS + half] == np.float32(side * LANES - middle[row])
+        assert state[BASES + row] == np.float32(ky * (dy[row, 0] * dy[row, 0]))
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(0, 2**32 - 1))
+def test_sets_are_taken_apart_from_the_first_to_the_last(left: int, right: int) -> None:
+    assert members(np.uint32(left)) == [half for half in range(HALVES) if left >> half & 1]
+    assert joined(np.uint32(left), np.uint32(right)) == (left & right, left | right)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(0, LANES - 1))
+def test_a_half_row_is_lit_when_any_lane_is(word: int, lane: int) -> None:
+    state = np.zeros(STATE, np.float32)
+    for half in range(HALVES):
+        state[256 + half * LANES + lane] = np.float32(1e-30 if word >> half & 1 else 0.0)
+    assert lit(state, 256) == word
