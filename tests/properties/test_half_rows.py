@@ -50,12 +50,12 @@ def test_a_set_lacks_no_half_row_with_a_lane_inside_and_holds_none_that_is_far_a
     dy = np.arange(ROWS)[:, None] - my
     form = kx * (x - mx - slope * dy) ** 2 + ky * dy**2  # [row, x]
     surely = reach * (1 - 1e-9) if reach > 0 else reach  # rounding decides about what lies on the edge
-    inside = np.asarray(form <= surely).reshape(ROWS, 2, LANES).any(axis=2)
+    inside = np.asarray(form <= surely).reshape(ROWS, 2, LANES).max(axis=2)
     middle = mx + slope * dy[:, 0]
     for half in range(HALVES):
         side, row = divmod(half, ROWS)
         held = bool(halves >> half & 1)
-        assert held or not inside.item(row, side)
+        assert held or not inside[row, side]
         nearest = np.clip(middle[row], side * LANES, side * LANES + LANES - 1)
         least = kx * (nearest - middle[row]) ** 2 + ky * dy[row, 0] ** 2
         assert not held or least <= reach * (1 + 1e-9) + 1e-9
