@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,6 +24,11 @@ ENTRY_BYTES = 8 + 20 / ENTRIES_A_SPLAT  # column and weight, and a splat's ids, 
 TILES_A_SPLAT = 6  # entries of tile lists and tile sums for a splat that a view sees, at full resolution
 TILE_ENTRY_BYTES = 4 + 4 + 2 * 16  # list, item, and an entry before and after it is gathered
 SCENE_BYTES = 9 * 8 + 3 * 8 + 3 * 8 + 4 + 8  # axes, opacities, reach; evidence, denominators, scale; order and ids
+CONTROL_GROUPS = (  # folder, and the files of limit, use and statistics: versions 2 and 1
+    ("/sys/fs/cgroup", ("memory.max", "memory.current", "memory.stat")),
+    ("/sys/fs/cgroup/memory", ("memory.limit_in_bytes", "memory.usage_in_bytes", "memory.stat")),
+)
+FILE_PAGES = ("inactive_file", "active_file")
 SPARE = 0.9  # of the memory that is free: others grow too
 
 
@@ -54,15 +60,30 @@ def memory_parts(
 def free_memory() -> int | None:
     """Bytes that this process may still take: of the machine, or of its control group; None where neither says."""
     found = []
-    try:
+    with suppress(OSError, ValueError):  # not Linux
         lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
         found += [int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")]
-        group = Path("/sys/fs/cgroup")
-        limit, used = ((group / f"memory.{name}").read_text(encoding="ascii") for name in ("max", "current"))
-        found += [max(0, int(limit) - int(used))]
-    except (OSError, ValueError):  # not Linux, or a group without a limit
-        pass
-    return min(found, default=None)
+    for folder, names in CONTROL_GROUPS:
+        with suppress(OSError, ValueError):  # a machine has one of the two, or none
+            limit, used, stat = (Path(folder, name).read_text(encoding="ascii") for name in names)
+            found += [group_memory(limit, used, stat)]
+    return min((room for room in found if room is not None), default=None)
+
+
+def group_memory(limit: str, used: str, stat: str) -> int | None:
+    """Bytes that a control group has left, from the texts of its files; None where it has no limit.
+
+    What is used counts the files that were read, which make room when memory is asked for: they are free.
+
+    Raises:
+        ValueError: the texts are not those of a control group.
+    """
+    if limit.strip() == "max":
+        return None
+    counts = dict(line.split() for line in stat.splitlines())
+    names = [f"total_{name}" if f"total_{name}" in counts else name for name in FILE_PAGES]  # version 1: all below it
+    cached = sum(int(counts.get(name, 0)) for name in names)
+    return max(0, int(limit) - max(0, int(used) - cached))
 
 
 def check_memory(parts: Mapping[str, int], free: int | None) -> list[str]:

@@ -7,7 +7,7 @@ import pytest
 
 from liftcore.errors import InvalidSettings, Unavailable
 from liftcore.observe.pack import open_packs
-from liftcore.plan.memory import check_memory, free_memory
+from liftcore.plan.memory import CONTROL_GROUPS, check_memory, free_memory, group_memory
 from liftcore.plan.rank import ROUNDING, codebook_rank, rank_of
 from liftcore.solve.settings import LiftSettings, Speed
 from tests.unit.solve.test_lift_equals_dense import write_scene
@@ -45,7 +45,33 @@ def test_what_cannot_fit_is_refused_and_what_may_not_is_told():
     with pytest.raises(Unavailable, match=r"7\.0 GiB for features"):
         check_memory(parts, 6 * GIB)
     assert check_memory(parts, None) == []
-    assert (free_memory() or GIB) > 0
+
+
+STAT = f"anon {GIB}\nfile {5 * GIB}\ninactive_file {3 * GIB}\nactive_file {GIB}\n"
+
+
+@pytest.mark.parametrize(
+    ("limit", "used", "stat", "free"),
+    [
+        (f"{8 * GIB}\n", f"{6 * GIB}\n", STAT, 6 * GIB),  # four of the six are files that were read
+        (f"{8 * GIB}\n", f"{6 * GIB}\n", "anon 0\n", 2 * GIB),
+        (f"{GIB}\n", f"{2 * GIB}\n", "", 0),
+        (f"{8 * GIB}\n", f"{GIB}\n", STAT, 8 * GIB),  # the two are not read at one moment
+        (f"{8 * GIB}\n", f"{6 * GIB}\n", STAT + f"total_inactive_file {4 * GIB}\n", 7 * GIB),
+        ("max\n", f"{6 * GIB}\n", STAT, None),
+    ],
+)
+def test_files_that_were_read_take_no_room_of_a_control_group(limit, used, stat, free):
+    assert group_memory(limit, used, stat) == free
+
+
+@pytest.mark.parametrize("version", [0, 1])
+def test_the_limit_of_either_version_of_control_groups_counts(tmp_path, monkeypatch, version):
+    group = CONTROL_GROUPS[version][1]
+    for name, text in zip(group, (str(GIB >> 10), "0", STAT), strict=True):
+        (tmp_path / name).write_text(text)
+    monkeypatch.setattr("liftcore.plan.memory.CONTROL_GROUPS", [(str(tmp_path), group), ("/nowhere", group)])
+    assert free_memory() == GIB >> 10
 
 
 def test_the_dial_sets_what_is_not_set_beside_it():
