@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -41,6 +42,8 @@ if TYPE_CHECKING:
     from liftcore.scene.cameras import Cameras
     from liftcore.scene.splats import Splats
     from liftcore.solve.settings import LiftSettings
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -103,6 +106,8 @@ def lift_sources(run: Run, sources: Sources, inputs: list[InputFile], checkpoint
     with run.timings.stage("plan"):
         plan = planned(sources, settings)
         sources = replace(sources, views=list(plan.views))
+    for warning in plan.warnings:  # of this machine: equal inputs give equal lifts, so none is kept with them
+        log.warning(warning)
     raster = CpuRaster(sources.splats, threads)
     with ViewWeights() as store:
         key = identity([part.sha256 for part in inputs], settings) if checkpoint else ""
@@ -123,8 +128,7 @@ def lift_sources(run: Run, sources: Sources, inputs: list[InputFile], checkpoint
             "views_without_splats": _blind(sources.views, store),
         }
     lifted = [sources.cameras.get(name) for name in sources.views]
-    found = lift_warnings(sources.splats, lifted, geometry.denominators, settings.dtype, X.dtype, facts)
-    facts["warnings"] = [*plan.warnings, *found]
+    facts["warnings"] = lift_warnings(sources.splats, lifted, geometry.denominators, settings.dtype, X.dtype, facts)
     with run.timings.stage("certify"):
         certificate = certify(geometry, X, geometry.codebooks.__getitem__, settings, threads) | notes | facts
     return Lift(

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from liftcore.errors import InvalidSettings, Unavailable
+from liftcore.lift import lift
 from liftcore.observe.pack import open_packs
-from liftcore.plan.memory import CONTROL_GROUPS, check_memory, free_memory, group_memory
+from liftcore.plan.memory import CONTROL_GROUPS, LIBRARIES, check_memory, free_memory, group_memory
 from liftcore.plan.rank import ROUNDING, codebook_rank, rank_of
 from liftcore.solve.settings import LiftSettings, Speed
 from tests.unit.solve.test_lift_equals_dense import write_scene
@@ -72,6 +73,16 @@ def test_the_limit_of_either_version_of_control_groups_counts(tmp_path, monkeypa
         (tmp_path / name).write_text(text)
     monkeypatch.setattr("liftcore.plan.memory.CONTROL_GROUPS", [(str(tmp_path), group), ("/nowhere", group)])
     assert free_memory() == GIB >> 10
+
+
+def test_what_this_machine_has_free_is_told_and_leaves_no_trace_in_the_lift(tmp_path, monkeypatch, caplog):
+    splats, cameras, pack = write_scene(tmp_path, 2)
+    certificates = []
+    for free in (None, LIBRARIES):
+        monkeypatch.setattr("liftcore.plan.plan.free_memory", lambda free=free: free)
+        certificates.append(lift(splats, cameras, [pack], LiftSettings.of()).metadata.certificate)
+        assert ("GiB are free" in caplog.text) is (free is not None)
+    assert certificates[0] == certificates[1]
 
 
 def test_the_dial_sets_what_is_not_set_beside_it():
