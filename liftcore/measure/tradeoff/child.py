@@ -14,8 +14,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import torch
-
 from liftcore.errors import SplatliftError
 from liftcore.input_files import input_file
 from liftcore.lift import Run, lift_sources, open_sources
@@ -27,6 +25,8 @@ from liftcore.solve.settings import LiftSettings
 from liftcore.timings import Timings
 
 if TYPE_CHECKING:
+    import torch
+
     from liftcore.artifact import Lift
 
 APART = ("read", "digest", "compile")  # stages that the seconds of a lift leave out
@@ -44,7 +44,8 @@ def measured(order: Order) -> dict[str, Any]:
     sources = replace(sources, views=[view for view in sources.views if view in wanted])
     read = {"cpu": time.process_time() - cpu, "wall": time.perf_counter() - wall}
     with run.timings.stage("digest"):
-        inputs = [input_file(order.scene.splats)] * (2 + len(order.scene.features))
+        files = (order.scene.splats, order.scene.cameras, *order.scene.features)
+        inputs = [input_file(path) for path in files]
     with run.timings.stage("compile"):
         warm_up(sources.splats.kernel)  # the lift's own then takes no time
     cpu, wall = time.process_time(), time.perf_counter()
@@ -67,14 +68,17 @@ def measured(order: Order) -> dict[str, Any]:
 
 def _reference(order: Order, made: Lift) -> tuple[torch.Tensor, torch.Tensor]:
     """Features [P, F] and evidence [P] of the exact run."""
-    path = order.reference / "exact.pt"
+    from safetensors import safe_open
+    from safetensors.torch import save_file
+
+    path = order.reference / "exact.safetensors"
     if order.exact:
-        torch.save({"features": made.features, "evidence": made.evidence}, path)
+        save_file({"features": made.features, "evidence": made.evidence}, path)
         return made.features, made.evidence
     if not path.is_file():
         return made.features[:0], made.evidence[:0]
-    kept = torch.load(path, weights_only=True, mmap=True)
-    return kept["features"], kept["evidence"]
+    with safe_open(str(path), framework="pt") as kept:
+        return kept.get_tensor("features"), kept.get_tensor("evidence")
 
 
 def peak_memory() -> int:

@@ -5,6 +5,7 @@ Time is processor time: on a machine that others use too it says what a run cost
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -54,4 +55,4 @@ def choose(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 def _value(run: Mapping[str, Any], accuracy: str) -> float:
     value = run[accuracy]
-    return -1.0 if value is None else float(value)
+    return -1.0 if value is None or math.isnan(value) else float(value)

@@ -12,13 +12,14 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from liftcore.errors import InvalidInput
+from liftcore.errors import InvalidInput, Unavailable
 from liftcore.measure.bench import hardware
 from liftcore.measure.tradeoff.choice import choose
 from liftcore.measure.tradeoff.judge import class_vectors, labelled_masks
 from liftcore.measure.tradeoff.order import CANDIDATES, DRAFT, EXACT, HOLD_OUT, Candidate, Order, Scene
 from liftcore.observe.pack import open_packs, pair
 from liftcore.scene.load import load_cameras
+from liftcore.solve.settings import LiftSettings
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -29,6 +30,7 @@ EXACT_OVER_DRAFT = 12.0  # how much longer the exact run takes, at most, as far 
 EXACT_SHARE = 1 / 3  # of the budget, that the exact run may take
 PRESET_OVER_EXACT = 1.5  # top-k walks tiles twice, the robust step goes over W again
 LEAST_VIEWS = 4
+LONGEST = 86_400  # seconds that one run may take: longer, it hangs
 
 
 def compare(
@@ -45,6 +47,7 @@ def compare(
 
     Raises:
         InvalidInput: the scene lacks what is needed; or whatever a lift refuses.
+        Unavailable: a run did not end within a day.
     """
     start = time.monotonic()
     with tempfile.TemporaryDirectory(prefix="splatlift-tradeoff-") as folder:
@@ -54,7 +57,8 @@ def compare(
         runs, skipped = [], []
         for number, candidate in enumerate(CANDIDATES):
             if candidate is EXACT or time.monotonic() - start + _expected(candidate, runs) <= budget:
-                runs.append(_entry(candidate, settings, _run(order, candidate, settings)))
+                runs.append(_entry(candidate, settings, _run(order, candidate)))
+                _check_seen(runs[0])
             else:
                 skipped.append(candidate.name)
             progress("tradeoff", number + 1, len(CANDIDATES), "runs")
@@ -75,7 +79,8 @@ def compare(
 def _order(scene: Scene, settings: Mapping[str, Any], threads: int | None, folder: Path) -> Order:
     """The views of each kind. Every HOLD_OUT-th view is held out, and what has masks is."""
     cameras = load_cameras(scene.cameras)
-    names = pair(open_packs(scene.features), cameras)[0]
+    stride = LiftSettings.of(**settings).view_stride
+    names = pair(open_packs(scene.features), cameras)[0][::stride]
     labelled: list[str] = []
     if scene.labels is not None:
         if scene.table is None or not scene.classes:
@@ -89,12 +94,13 @@ def _order(scene: Scene, settings: Mapping[str, Any], threads: int | None, folde
     lifted = [name for name in free if name not in set(held_out)]
     if not lifted:
         raise InvalidInput("features", expected="views besides those with labels", got=f"{len(names)} views")
-    return Order(scene, {**settings}, tuple(lifted), tuple(held_out), tuple(labelled), threads, folder, False)
+    own = {**settings, "view_stride": 1}  # the views are named
+    return Order(scene, own, tuple(lifted), tuple(held_out), tuple(labelled), threads, folder, False)
 
 
 def _fitting(order: Order, budget: float) -> Order:
     """The order with so few views that the exact run fits the budget, by what the draft takes."""
-    probe = _run(replace(order, held_out=(), labelled=()), DRAFT, order.settings)
+    probe = _run(replace(order, held_out=(), labelled=()), DRAFT)
     keep = EXACT_SHARE * budget / (EXACT_OVER_DRAFT * probe["wall_s"])
     step = 1 if keep >= 1 else min(round(1 / keep), len(order.lifted) // LEAST_VIEWS)
     return replace(order, lifted=order.lifted[:: max(1, step)])
@@ -106,17 +112,30 @@ def _expected(candidate: Candidate, runs: Sequence[Mapping[str, Any]]) -> float:
     return runs[0]["process_s"] * (PRESET_OVER_EXACT if slower else 1.0)
 
 
-def _run(order: Order, candidate: Candidate, settings: Mapping[str, Any]) -> dict[str, Any]:
+def _check_seen(exact: Mapping[str, Any]) -> None:
+    """Raise InvalidInput where no run could be set beside the exact one."""
+    if exact["cosine"] is None:
+        got = "an exact run that gave no splat a feature"
+        hint = "splats and cameras must share their frame, and features must not be zero"
+        raise InvalidInput("features", expected="views that lift", got=got, hint=hint)
+
+
+def _run(order: Order, candidate: Candidate) -> dict[str, Any]:
     """The figures of one candidate, from its own process."""
-    own = replace(order, settings={**settings, **candidate.settings}, exact=candidate is EXACT)
+    own = replace(order, settings={**order.settings, **candidate.settings}, exact=candidate is EXACT)
     start = time.monotonic()
-    done = subprocess.run(
-        [sys.executable, "-m", "liftcore.measure.tradeoff.child"],
-        input=json.dumps(own.document()),
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    try:
+        done = subprocess.run(
+            [sys.executable, "-m", "liftcore.measure.tradeoff.child"],
+            input=json.dumps(own.document()),
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=LONGEST,
+        )
+    except subprocess.TimeoutExpired:
+        hint = "lift fewer views (--set view_stride=n)"
+        raise Unavailable(candidate.name, expected=f"an end within {LONGEST} s", got="none yet", hint=hint) from None
     answer = json.loads(done.stdout.splitlines()[-1]) if done.stdout.strip() else {}
     if "error" in answer:
         raise InvalidInput(candidate.name, expected="a scene that lifts", got=answer["error"])

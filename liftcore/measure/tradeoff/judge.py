@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
+from liftcore.errors import InvalidInput
 from liftcore.measure.accuracy import class_ious, rendered_scores
 from liftcore.measure.experiments.fidelity import view_cosines
 from liftcore.query.encoders.table import TableEncoder
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
 
 LOW_QUANTILE = 0.05
 ROWS = 1 << 16  # compared at a time
+MASK_TYPES = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
 
 
 def judge(order: Order, sources: Sources, reference: tuple[Tensor, Tensor], made: Lift) -> dict[str, Any]:
@@ -36,7 +39,8 @@ def judge(order: Order, sources: Sources, reference: tuple[Tensor, Tensor], made
         view_cosines(raster, sources.cameras.get(view), sources.packs.observation(view), made.features, walk)
         for view in order.held_out
     ]
-    figures["held_out_cosine"] = float(np.concatenate(rows).mean()) if rows else None
+    cosines = np.concatenate(rows) if rows else np.zeros(0)
+    figures["held_out_cosine"] = float(cosines.mean()) if cosines.size else None
     figures["mask_iou"] = None
     if order.scene.labels is not None and order.labelled:
         classes = class_vectors(order.scene)
@@ -50,7 +54,8 @@ def judge(order: Order, sources: Sources, reference: tuple[Tensor, Tensor], made
         ]
         truth = [masks[view].flatten() for view in order.labelled]
         ious = class_ious(torch.cat(found), torch.cat(truth), len(classes))
-        figures["mask_iou"] = float(ious.nanmean())
+        mean = float(ious.nanmean())
+        figures["mask_iou"] = None if math.isnan(mean) else mean  # masks that name no class
     return figures
 
 
@@ -58,10 +63,11 @@ def cosine_figures(features: Tensor, exact: Tensor, evidence: Tensor) -> dict[st
     """How near the features [P, F] are to the exact ones, over the splats that the exact run saw.
 
     The mean weighted by evidence, the plain mean, and the quantile below which LOW_QUANTILE of the splats lie. A
-    splat that this run did not see counts zero.
+    splat that this run did not see counts zero. None where the exact run saw nothing.
     """
+    nothing: dict[str, float | None] = {"cosine": None, "cosine_plain": None, "cosine_q05": None}
     if not exact.shape[0]:
-        return {"cosine": None, "cosine_plain": None, "cosine_q05": None}
+        return nothing
     parts, seen = [], []
     for first in range(0, exact.shape[0], ROWS):
         one, other = features[first : first + ROWS].float(), exact[first : first + ROWS].float()
@@ -69,6 +75,8 @@ def cosine_figures(features: Tensor, exact: Tensor, evidence: Tensor) -> dict[st
         seen.append((other != 0).any(dim=1))
     chosen = torch.cat(seen)
     cosines, weights = torch.cat(parts)[chosen], evidence[chosen].double()
+    if not float(weights.sum()) > 0:
+        return nothing
     return {
         "cosine": float((cosines * weights).sum() / weights.sum()),
         "cosine_plain": float(cosines.mean()),
@@ -84,12 +92,34 @@ def class_vectors(scene: Scene) -> Tensor:
 
 
 def labelled_masks(scene: Scene) -> dict[str, Tensor]:
-    """View -> [h, w] i64 of class numbers."""
-    from safetensors import safe_open
+    """View -> [h, w] i64 of class numbers; what is not named VIEW/mask is left alone.
 
-    with safe_open(str(scene.labels), framework="pt") as handle:
-        names = [name for name in tuple(handle.keys()) if name.endswith("/mask")]
-        return {name.removesuffix("/mask"): handle.get_tensor(name).long() for name in names}
+    Raises:
+        InvalidInput: no such file, not a safetensors file, or a mask that is no image of class numbers.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(str(scene.labels), framework="pt") as handle:
+            names = [name for name in tuple(handle.keys()) if name.endswith("/mask")]
+            stored = {name: handle.get_tensor(name) for name in names}
+    except (SafetensorError, OSError) as error:
+        got = f"a file that does not open as one ({str(error)[:120]})"
+        raise InvalidInput(f"labels {scene.labels}", expected="masks (.safetensors)", got=got) from None
+    return {name.removesuffix("/mask"): _mask(part, name, len(scene.classes)) for name, part in stored.items()}
+
+
+def _mask(stored: Tensor, name: str, classes: int) -> Tensor:
+    """[h, w] i64 of class numbers below ``classes``, -1 for none."""
+    if stored.ndim != 2 or not stored.numel() or stored.dtype not in MASK_TYPES:
+        got = f"{str(stored.dtype).removeprefix('torch.')} {list(stored.shape)}"
+        raise InvalidInput(f"labels {name}", expected="integers [h, w], no side empty", got=got)
+    mask = stored.long()
+    low, high = (int(value) for value in torch.aminmax(mask))
+    if low < -1 or high >= classes:
+        got = f"the number {low if low < -1 else high}"
+        raise InvalidInput(f"labels {name}", expected=f"-1 or classes 0..{classes - 1}", got=got)
+    return mask
 
 
 def _resized(labels: Tensor, mask: Tensor) -> Tensor:

@@ -9,14 +9,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import save, save_file
 
 from liftcore import cli
+from liftcore.errors import InvalidInput
 from liftcore.measure.tradeoff import compare as comparison
+from liftcore.measure.tradeoff import report
 from liftcore.measure.tradeoff.child import measured
 from liftcore.measure.tradeoff.choice import choose, pareto
 from liftcore.measure.tradeoff.judge import cosine_figures
 from liftcore.measure.tradeoff.order import CANDIDATES, Order, Scene
-from liftcore.measure.tradeoff.report import save, table_of
+from liftcore.measure.tradeoff.report import table_of
+from liftcore.progress import silent
 from tests.unit.solve.test_lift_equals_dense import write_scene
 
 
@@ -76,8 +80,6 @@ def test_a_run_is_judged_by_views_that_it_did_not_lift(tmp_path):
 
 
 def test_masks_are_judged_by_the_words_of_their_classes(tmp_path):
-    from safetensors.torch import save_file
-
     vectors = torch.nn.functional.normalize(torch.randn(2, 6, generator=torch.Generator().manual_seed(0)), dim=1)
     save_file({"embeddings": vectors}, tmp_path / "t", metadata={"words": '["cat", "dog"]'})
     masks = {"v2/mask": torch.zeros(7, 9, dtype=torch.int16), "other": torch.zeros(1)}
@@ -94,7 +96,7 @@ def test_masks_are_judged_by_the_words_of_their_classes(tmp_path):
 def test_a_short_budget_takes_fewer_views_and_runs_the_exact_one_alone(tmp_path, monkeypatch):
     calls = []
 
-    def told(order, candidate, settings):
+    def told(order, candidate):
         calls.append((candidate.name, order.lifted))
         return {
             **run_of(candidate.name, 10, 0.9),
@@ -107,13 +109,13 @@ def test_a_short_budget_takes_fewer_views_and_runs_the_exact_one_alone(tmp_path,
     monkeypatch.setattr(comparison, "LEAST_VIEWS", 1)
     paths = write_scene(tmp_path, 2)
     scene = Scene(paths[0], paths[1], (paths[2],))
-    found = comparison.compare(scene, 1.0, {}, 1, lambda *_: None)
+    found = comparison.compare(scene, 1.0, {}, 1, silent)
     assert [name for name, _ in calls] == ["draft", "exact"]
     assert [run["name"] for run in found["runs"]] == ["exact"]
     assert found["skipped"] == [candidate.name for candidate in CANDIDATES[1:]]
     assert (found["views"], calls[1][1]) == ({"lifted": 1, "of": 2, "held_out": 1}, ("v0",))
     calls.clear()
-    found = comparison.compare(scene, 1e6, {}, 1, lambda *_: None)
+    found = comparison.compare(scene, 1e6, {}, 1, silent)
     assert (len(found["runs"]), found["skipped"], found["views"]["lifted"]) == (len(CANDIDATES), [], 2)
 
 
@@ -123,7 +125,7 @@ def test_chart_table_and_json_are_written(tmp_path):
         "views": {"lifted": 2, "of": 4, "held_out": 1}, "labelled_views": 0, "budget_s": 1.0, "seconds": 2.0,
         "date": "2026-11-21", "hardware": {"cpu": "x"},
     }  # fmt: skip
-    paths = save(document, tmp_path / "out")
+    paths = report.save(document, tmp_path / "out")
     assert [path.name for path in paths] == ["tradeoff.json", "tradeoff.png", "tradeoff.md"]
     assert json.loads(paths[0].read_text())["choice"]["name"] == "fast"
     assert paths[1].read_bytes()[:4] == b"\x89PNG"
@@ -152,3 +154,61 @@ def test_bad_orders_are_refused_in_one_line(tmp_path, capsys, wrong):
     paths = write_scene(tmp_path, 2)
     assert cli.main(["tradeoff", *map(str, paths), "-o", str(tmp_path / "out"), *wrong]) == 2
     assert capsys.readouterr().err.count("\n") == 1
+
+
+BAD_MASKS = {
+    "nothing there": None,
+    "foreign": b"hello, world",
+    "truncated": save({"v2/mask": torch.zeros(7, 9, dtype=torch.int16)})[:-5],
+    "three sides": save({"v2/mask": torch.zeros(1, 7, 9, dtype=torch.int16)}),
+    "fractions": save({"v2/mask": torch.zeros(7, 9)}),
+    "empty": save({"v2/mask": torch.zeros(0, 9, dtype=torch.int16)}),
+    "no such class": save({"v2/mask": torch.full((7, 9), 2, dtype=torch.uint8)}),
+    "below none": save({"v2/mask": torch.full((7, 9), -2, dtype=torch.int8)}),
+}
+
+
+@pytest.mark.parametrize("masks", BAD_MASKS.values(), ids=BAD_MASKS)
+def test_bad_masks_are_refused_in_one_line(tmp_path, capsys, masks):
+    paths = write_scene(tmp_path, 2)
+    save_file({"embeddings": torch.eye(2, 6)}, tmp_path / "t", metadata={"words": '["cat", "dog"]'})
+    if masks is not None:
+        (tmp_path / "m").write_bytes(masks)
+    words = ["--labels", str(tmp_path / "m"), "--table", str(tmp_path / "t"), "--classes", "cat", "dog"]
+    assert cli.main(["tradeoff", *map(str, paths), "-o", str(tmp_path / "out"), *words]) == 2
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1
+    assert "labels" in told
+
+
+def test_a_scene_of_which_the_exact_run_sees_nothing_is_refused(tmp_path, monkeypatch):
+    blind = cosine_figures(torch.zeros(3, 2), torch.zeros(3, 2), torch.ones(3))
+    assert set(blind.values()) == {None}
+    monkeypatch.setattr(comparison, "_run", lambda *_: run_of("exact", 10, 0.9) | {"process_s": 1.0} | blind)
+    paths = write_scene(tmp_path, 2)
+    with pytest.raises(InvalidInput, match="gave no splat a feature"):
+        comparison.compare(Scene(paths[0], paths[1], (paths[2],)), 1.0, {}, 1, silent)
+
+
+def test_what_is_no_number_is_the_worst_accuracy():
+    assert choose([run_of("exact", 10, float("nan")), run_of("fast", 2, 0.5)])["name"] == "fast"
+    assert choose([run_of("exact", 10, float("nan"))])["name"] == "exact"
+
+
+def test_every_nth_view_is_compared_when_the_settings_say_so(tmp_path, monkeypatch):
+    orders = []
+
+    def told(order, candidate):
+        orders.append(order)
+        times = dict.fromkeys(("process_s", "wall_with_reading_s", "cpu_with_reading_s"), 1e6)
+        figures = run_of(candidate.name, 10, 0.9) | times
+        del figures["options"]  # a run does not tell them
+        return figures
+
+    monkeypatch.setattr(comparison, "_run", told)
+    paths = write_scene(tmp_path, 2)
+    scene = Scene(paths[0], paths[1], (paths[2],))
+    found = comparison.compare(scene, 1e5, {"view_stride": 2}, 1, silent)
+    assert (orders[-1].lifted, orders[-1].held_out) == (("v0",), ("v2",))
+    assert measured(replace(orders[-1], reference=tmp_path))["views"] == 1
+    assert found["runs"][0]["options"]["view_stride"] == 2
