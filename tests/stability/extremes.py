@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from liftcore.measure.stability.scenes import camera_at_origin, splats_at
-from liftcore.measure.stability.weights import compare, exact_view, traced, weights_of
+from liftcore.measure.stability.weights import compare
 
 if TYPE_CHECKING:
     import numpy as np
@@ -13,16 +12,6 @@ if TYPE_CHECKING:
     from liftcore.raster.protocol import Walk
     from liftcore.scene.cameras import Camera
     from liftcore.scene.splats import Splats
-
-__all__ = [
-    "TOLERANCE",
-    "assert_equals_the_oracle",
-    "camera_at_origin",
-    "exact_view",
-    "splats_at",
-    "traced",
-    "weights_of",
-]
 
 TOLERANCE = 1e-5  # absolute, on weights, away from the cut-offs
 

@@ -7,12 +7,14 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from liftcore.measure.stability.scenes import splats_at
 from liftcore.measure.stability.walks import View
+from liftcore.measure.stability.weights import traced, weights_of
 from liftcore.measure.stability.wide import judgeable
 from liftcore.raster.protocol import Walk
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Kernel
-from tests.stability.extremes import assert_equals_the_oracle, splats_at, traced, weights_of
+from tests.stability.extremes import assert_equals_the_oracle
 
 pytestmark = pytest.mark.usefixtures("every_kernel")
 hypothesis_settings = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])

@@ -8,7 +8,7 @@ import numpy as np
 
 from liftcore.measure.stability.case import FLOORED, GAUSSIAN, Extreme
 from liftcore.measure.stability.scenes import ROW, camera_at_origin, splats_at
-from liftcore.measure.stability.walks import View, walked
+from liftcore.measure.stability.walks import View, exact_weights, walked
 from liftcore.scene.cameras import MAX_FOCAL, MAX_SIDE, MIN_FOCAL, Camera
 from liftcore.scene.splats import Kernel
 
@@ -21,11 +21,25 @@ def _rolled(kernel: Kernel, angle: float) -> View:
     return View(splats_at(ROW, -1.0, kernel=kernel), Camera("v0", 15, 15, 16.0, 16.0, 7.5, 7.5, pose))
 
 
+def _image_rolled(kernel: Kernel) -> np.ndarray:
+    """A of the camera that is not turned, its image turned by a right angle."""
+    image = exact_weights(_rolled(kernel, 0.0)).reshape(15, 15, -1)
+    return np.rot90(image, -1).reshape(225, -1)
+
+
 def _turned_back(kernel: Kernel) -> View:
     """A camera beyond the splats that looks back, upside down."""
     pose = np.diag([1.0, -1.0, -1.0, 1.0])
     pose[2, 3] = 5.0
     return View(splats_at(ROW, -1.0, kernel=kernel), Camera("v0", 16, 12, 16.0, 16.0, 8.5, 6.5, pose))
+
+
+def _last_alone(kernel: Kernel) -> np.ndarray:
+    """The alphas of the last splat of the row, which the camera beyond meets first; nothing of the others."""
+    view = _turned_back(kernel)
+    A = np.full((view.camera.height * view.camera.width, len(ROW)), np.nan)
+    A[:, -1] = exact_weights(View(splats_at(ROW[-1:], -1.0, kernel=kernel), view.camera))[:, 0]
+    return A
 
 
 def _one_ray(kernel: Kernel) -> View:
@@ -81,15 +95,20 @@ VIEWS: tuple[Extreme, ...] = (
         "a camera rolled by a right angle",
         "the image, rolled",
         lambda kernel: _rolled(kernel, math.pi / 2),
-        lambda A: A.max() > 0.1,
+        like=_image_rolled,
     ),
     walked(
         "a camera rolled by 1e-9 of a radian",
         "the image within 1e-8 px",
         lambda kernel: _rolled(kernel, 1e-9),
-        lambda A: A.max() > 0.1,
+        like=lambda kernel: exact_weights(_rolled(kernel, 0.0)),
     ),
-    walked("a camera upside down, looking back", "the order is turned round", _turned_back, lambda A: A.max() > 0.1),
+    walked(
+        "a camera upside down, looking back",
+        "the order is turned round: the last of the row is met first",
+        _turned_back,
+        like=_last_alone,
+    ),
     walked(
         "a view that sees nothing: all behind, or far aside",
         "no weight",

@@ -6,8 +6,10 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from liftcore.measure.stability.case import Extreme, Found
-from liftcore.measure.stability.weights import compare
+import numpy as np
+
+from liftcore.measure.stability.case import WEIGHTS, Extreme, Found
+from liftcore.measure.stability.weights import compare, exact_view
 from liftcore.raster.protocol import Walk
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.inspect import describe_cameras, describe_splats
@@ -15,8 +17,6 @@ from liftcore.solve.lift_warnings import order_warnings
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-
-    import numpy as np
 
     from liftcore.scene.splats import Kernel, Splats
 
@@ -40,6 +40,7 @@ def walked(
     exact: str,
     scene: Callable[[Kernel], View],
     claim: Callable[[np.ndarray], bool] = always,
+    like: Callable[[Kernel], np.ndarray] | None = None,
     **more: Any,
 ) -> Extreme:
     """An extreme whose weights are held to the oracle.
@@ -48,9 +49,10 @@ def walked(
         name: of the row. exact: what exact arithmetic says.
         scene: the view, for a kernel.
         claim: ``exact`` as a function of A [H * W, P], of the oracle's and of the float32 walk's.
+        like: what A equals by ``exact``, from another scene or camera, for a kernel; NaN where it says nothing.
         more: kernels, bound and told of the Extreme.
     """
-    return Extreme(name, exact, partial(_measure, scene, claim), **more)
+    return Extreme(name, exact, partial(_measure, scene, claim, like), **more)
 
 
 def told_of(splats: Splats, camera: Camera) -> tuple[str, ...]:
@@ -59,15 +61,26 @@ def told_of(splats: Splats, camera: Camera) -> tuple[str, ...]:
     return tuple(warnings + order_warnings(splats, [camera]))
 
 
-def _measure(scene: Callable[[Kernel], View], claim: Callable[[np.ndarray], bool], kernel: Kernel) -> Found:
+def exact_weights(view: View) -> np.ndarray:
+    """The oracle's A [H * W, P] f64."""
+    return exact_view(view.splats, view.camera, view.walk).A
+
+
+def _measure(
+    scene: Callable[[Kernel], View],
+    claim: Callable[[np.ndarray], bool],
+    like: Callable[[Kernel], np.ndarray] | None,
+    kernel: Kernel,
+) -> Found:
     view = scene(kernel)
     got = compare(view.splats, view.camera, view.walk)
+    alike = like is None or all(float(np.nanmax(np.abs(A - like(kernel)))) < WEIGHTS for A in (got.A, got.got))
     met = int((got.got > 0).any(axis=0).sum())
     return Found(
         f"{met} of {view.splats.count} met, weights to {got.got.max(initial=0):.3g}",
         got.error,
         told_of(view.splats, view.camera),
-        got.finite and claim(got.A) and claim(got.got),
+        got.finite and alike and claim(got.A) and claim(got.got),
         got.flips,
         got.rays,
     )

@@ -10,12 +10,12 @@ import torch
 
 from liftcore.errors import InvalidSplats
 from liftcore.measure.converted import to_betas, to_discs
+from liftcore.measure.stability.scenes import splats_at
 from liftcore.raster.cpu import CpuRaster
 from liftcore.raster.oracle_footprints import rotation
 from liftcore.raster.protocol import Walk
 from liftcore.scene.splats import Kernel
 from tests.scenes import look_at, random_splats
-from tests.stability.extremes import splats_at
 
 pytestmark = pytest.mark.usefixtures("every_kernel")
 
