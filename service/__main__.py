@@ -41,7 +41,7 @@ class AnnouncingServer(uvicorn.Server):
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """Refuse work and put back what runs while the port still answers, then close it."""
-        await self._stopping.begin()
+        await self._stopping.begin(lambda: self.force_exit)
         await super().shutdown(sockets)
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
@@ -132,7 +132,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         settings = parse(sys.argv[1:] if arguments is None else arguments)
         require_keys(settings)
         listener = bind(settings.host, settings.port)
-        store = Store.open(settings.data, floor_bytes=settings.disk_floor_bytes)
+        try:
+            store = Store.open(settings.data, floor_bytes=settings.disk_floor_bytes)
+        except BaseException:
+            listener.close()
+            raise
     except SplatliftError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

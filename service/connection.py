@@ -61,6 +61,7 @@ class WatchedConnection(H11Protocol):
 
     def on_response_complete(self) -> None:
         """Wait for the next request; for one whose body was answered before its end, no longer than for another."""
+        self._await_reader()  # first, as the next request may be here already and begin to be answered
         super().on_response_complete()
         if self.conn.their_state is h11.SEND_BODY:
             self._watch()
@@ -68,13 +69,15 @@ class WatchedConnection(H11Protocol):
     def pause_writing(self) -> None:
         """The client does not read as fast as we write."""
         super().pause_writing()
-        self._await_reader(self.transport.get_write_buffer_size())
+        self._await_reader()
 
     def resume_writing(self) -> None:
         """It has read."""
         super().resume_writing()
-        if self._reading is not None:
-            self._reading.cancel()
+        if self._answering():
+            self._forget_reader()
+        else:
+            self._await_reader()
 
     def send_400_response(self, msg: str) -> None:
         """Refuse what is no HTTP, in the shape of all our errors. Called while the error is handled."""
@@ -86,7 +89,7 @@ class WatchedConnection(H11Protocol):
 
     def _watch(self) -> None:
         """See that the clock runs while no request is being answered."""
-        if self.cycle is not None and not self.cycle.response_complete:
+        if self._answering():
             if self._request is not None:
                 self._request.cancel()
                 self._request = None
@@ -101,14 +104,26 @@ class WatchedConnection(H11Protocol):
         else:
             self.transport.close()
 
-    def _await_reader(self, unread: int) -> None:
-        seconds = self.pace.grace_seconds + UNREAD_BYTES / self.pace.bytes_per_second
-        self._reading = self.loop.call_later(seconds, self._no_reader, unread)
+    def _answering(self) -> bool:
+        return self.cycle is not None and not self.cycle.response_complete
+
+    def _await_reader(self) -> None:
+        """See that what was written is read: a transport that is closed waits for that without an end."""
+        self._forget_reader()
+        unread = self.transport.get_write_buffer_size()
+        if unread:
+            seconds = self.pace.grace_seconds + UNREAD_BYTES / self.pace.bytes_per_second
+            self._reading = self.loop.call_later(seconds, self._no_reader, unread)
+
+    def _forget_reader(self) -> None:
+        if self._reading is not None:
+            self._reading.cancel()
+            self._reading = None
 
     def _no_reader(self, unread: int) -> None:
-        left = self.transport.get_write_buffer_size()
-        if left < unread:
-            self._await_reader(left)
+        growing = self._answering() and not self.flow.write_paused and not self.transport.is_closing()
+        if growing or self.transport.get_write_buffer_size() < unread:
+            self._await_reader()
         else:
             self.transport.abort()
 
@@ -116,6 +131,7 @@ class WatchedConnection(H11Protocol):
         if self.cycle is None or self.cycle.response_complete or not self.cycle.response_started:
             self.transport.write(_answer(status, slug, title, detail, {}))
         self.transport.close()
+        self._await_reader()
 
 
 def watched(pace: Pace, most: int) -> type[WatchedConnection]:

@@ -31,7 +31,8 @@ class BodyLimit:
     """ASGI middleware: no route reads more than ``limit`` bytes, and no body comes more slowly than ``pace``.
 
     Time counts only while the route waits for the client, so our own slowness is nobody's fault. The errors are
-    the framework's: it turns all others that come up while it reads a JSON body into 400.
+    the framework's: it turns all others that come up while it reads a JSON body into 400. Once an answer has begun
+    nobody waits for the body, and the one who listens for the end of the connection hears no more of this.
     """
 
     def __init__(self, app: ASGIApp, limit: int, pace: Pace) -> None:
@@ -44,9 +45,25 @@ class BodyLimit:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        paced = _paced(receive, self._pace)
-        limit = None if scope["path"].startswith(UPLOADS) else self._limit
-        await self._app(scope, paced if limit is None else _counted(paced, limit), send)
+        limited = _paced(receive, self._pace)
+        if not scope["path"].startswith(UPLOADS):
+            limited = _counted(limited, self._limit)
+        begun = False
+
+        async def heard() -> Message:
+            try:
+                return await (receive() if begun else limited())
+            except HTTPException:
+                if not begun:
+                    raise
+                return await receive()
+
+        async def told(message: Message) -> None:
+            nonlocal begun
+            begun = True
+            await send(message)
+
+        await self._app(scope, heard, told)
 
 
 def _counted(receive: Receive, limit: int) -> Receive:

@@ -1,4 +1,4 @@
-"""What the operator decides. Every field is also an environment variable: SPLATLIFT_ and its name."""
+"""What the operator decides. A field may be an environment variable, SPLATLIFT_ and its name; empty is not set."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ GiB = 1 << 30
 class ServiceSettings(BaseSettings):
     """Settings of the service; nothing here can be changed over HTTP."""
 
-    model_config = SettingsConfigDict(env_prefix="SPLATLIFT_", frozen=True, extra="forbid")
+    model_config = SettingsConfigDict(env_prefix="SPLATLIFT_", env_ignore_empty=True, frozen=True, extra="forbid")
 
     data: Path = Field(Path("splatlift-data"), description="the directory that holds the database and all files")
     host: str = Field("127.0.0.1", description="the address to bind; beyond loopback only with keys")

@@ -16,13 +16,13 @@ from service import problems
 from service.errors import MissingScope, TooMany, Unauthorized
 from service.keys.hosts import Hosts
 from service.keys.scopes import Scope, allows, needed
+from service.limits import UPLOADS
 from service.settings import ServiceSettings
 from service.store.keys import KeyRecord, KeyStore
 from service.store.owners import Owner
 
 CALLER = "caller"  # of the scope's state
 BEARER = re.compile(r"bearer +([A-Za-z0-9._~+/-]+=*)", re.ASCII | re.IGNORECASE)  # RFC 6750, 2.1
-UPLOADS = "/assets/"
 LOOKERS = 4  # threads that look keys up, so that slow routes cannot keep anyone waiting at the gate
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import io
 import json
 import math
@@ -34,6 +35,8 @@ WARM_UP_TEXT = "something"
 PRODUCT_BYTES = 128 << 20  # of the cosines that one pass over a lift's features may give
 COSINE_BYTES = 4  # of a splat and a direction
 ANSWER_BYTES = 6  # of a splat: its score, whether it was seen, whether it was selected
+ENTRY_BYTES = 2 << 10  # of what is kept, beside its tensors and its question
+NUMBER_BYTES = 32  # of a number of a question: a Python float and the place in its tuple
 
 
 class Answers:
@@ -94,8 +97,10 @@ class Answers:
         """Answer the first question, and more to its lift as far as one pass goes; errors wait for their turn."""
         scene = self._scene(requests[0])
         splats = scene.lift.features.shape[0]
-        room = min(PRODUCT_BYTES // (COSINE_BYTES * splats), self._cache.limit // (ANSWER_BYTES * splats))
-        asked: dict[object, Question] = {}
+        room = min(
+            PRODUCT_BYTES // (COSINE_BYTES * splats), self._cache.limit // (ANSWER_BYTES * splats + ENTRY_BYTES)
+        )
+        asked: dict[str, Question] = {}
         for request in requests:
             if request["lift"] != requests[0]["lift"] or "query" not in request or _key(request) in self._cache:
                 continue
@@ -177,16 +182,22 @@ def use_one_library_thread() -> None:
     torch.set_num_threads(1)
 
 
-def _key(request: dict[str, Any]) -> tuple[object, ...]:
+def _key(request: dict[str, Any]) -> str:
+    """What an answer is kept by: a digest, as a question may be as long as a body."""
     names = ("lift", "encoder", "encoder_version", "query")
-    return tuple(json.dumps(request[name]) for name in names)
+    return hashlib.sha256(json.dumps([request[name] for name in names]).encode()).hexdigest()
 
 
 def bytes_of(made: Answer | Look) -> int:
-    """The memory that an answer or a view of one takes."""
+    """The memory that an answer, with its question, or a view of one takes."""
     if isinstance(made, Answer):
-        return made.scores.nbytes + made.seen.nbytes + made.selected.nbytes
-    return made.attention.nbytes + made.row_sums.nbytes + made.mask.nbytes
+        tensors = made.scores.nbytes + made.seen.nbytes + made.selected.nbytes
+        return ENTRY_BYTES + tensors + sum(map(_term_bytes, (*made.query.positives, *made.query.negatives)))
+    return ENTRY_BYTES + made.attention.nbytes + made.row_sums.nbytes + made.mask.nbytes
+
+
+def _term_bytes(term: str | Example) -> int:
+    return NUMBER_BYTES * len(term.values) if isinstance(term, Vector) else len(str(term).encode())
 
 
 def query_of(asked: dict[str, Any]) -> Query:

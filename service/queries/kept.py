@@ -24,12 +24,13 @@ class Kept(Generic[T]):
     def __init__(self, limit: int, size_of: Callable[[T], int] = _one) -> None:
         self.limit = limit
         self._size_of = size_of
-        self._values: OrderedDict[object, T] = OrderedDict()
+        self._values: OrderedDict[object, tuple[T, int]] = OrderedDict()  # with how much each is
+        self._size = 0
 
     @property
     def size(self) -> int:
         """How much is kept."""
-        return sum(map(self._size_of, self._values.values()))
+        return self._size
 
     def __contains__(self, key: object) -> bool:
         return key in self._values
@@ -37,16 +38,21 @@ class Kept(Generic[T]):
     def get(self, key: object, make: Callable[[], T]) -> T:
         """The value of a key, made when it is not here."""
         if key not in self._values:
-            self._make_room(1)  # first, so that the old and the new need no room together
+            self._make_room(1)  # of values that are one each, the old and the new are never here together
             self.put(key, make())
         self._values.move_to_end(key)
-        return self._values[key]
+        return self._values[key][0]
 
     def put(self, key: object, value: T) -> None:
         """Keep a value."""
-        self._make_room(self._size_of(value))
-        self._values[key] = value
+        _, old = self._values.pop(key, (None, 0))
+        self._size -= old
+        size = self._size_of(value)
+        self._make_room(size)
+        self._values[key] = value, size
+        self._size += size
 
     def _make_room(self, coming: int) -> None:
-        while self._values and self.size + coming > self.limit:
-            self._values.popitem(last=False)
+        while self._values and self._size + coming > self.limit:
+            _, (_, size) = self._values.popitem(last=False)
+            self._size -= size

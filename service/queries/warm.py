@@ -29,7 +29,7 @@ class QueryLimits:
     """What queries may take."""
 
     waiting: int  # calls that wait or run
-    seconds: float  # until a call has its turn, and then until the next answer
+    seconds: float  # from a call to its answer, however many are before it
     scenes: int  # lifts kept open
     cache_bytes: int  # of answers and views kept
     encoder: str  # specification of the text encoder that is loaded before it is asked for
@@ -40,6 +40,7 @@ class _Call:
     """A request in the line, and what became of it."""
 
     request: dict[str, Any]
+    deadline: float  # of time.monotonic
     reply: Frame | SplatliftError | None = field(default=None)
 
 
@@ -122,11 +123,11 @@ class WarmWorker:
 
         Raises:
             SplatliftError: the worker's own error, as if raised here.
-            Busy: too many calls are waiting, or this one waited too long.
+            Busy: too many calls are waiting, or this one had no turn in its time.
             TimedOut: the answer took too long.
             Crashed: the worker died twice over this call, or failed with an error that is ours.
         """
-        call = _Call(request)
+        call = _Call(request, time.monotonic() + self._limits.seconds)
         with self._place():
             if not self._answered_by_another(call):
                 with self._turn(taken=True):
@@ -165,6 +166,7 @@ class WarmWorker:
             if not come and call in self._line:
                 self._line.remove(call)
                 raise self._busy()
+            # No longer than its time: the one who has the turn asks for it, and keeps its deadline.
             self._bell.wait_for(lambda: call.reply is not None or not self._taken)
             if call.reply is None:
                 self._taken = True
@@ -205,47 +207,43 @@ class WarmWorker:
                     self._reply(call, Crashed("query", expected="an answer", got=got))
 
     def _exchange(self, calls: Sequence[_Call]) -> None:
-        """Ask the process; a call without a reply is one over which it died."""
+        """Ask the process; a call without a reply is one over which it died, or one behind a call that took too long.
+
+        Calls come in the order of their deadlines, so whoever waits for one has time left for those behind it.
+        """
         if self._stopped:
             stops = Busy("query", expected="a running server", got="one that stops", hint="ask the next one")
             for call in calls:
                 self._reply(call, stops)
             return
+        for call in calls:
+            if call.deadline <= time.monotonic():
+                self._reply(call, self._late())
+        calls = [call for call in calls if call.reply is None]
+        if not calls:
+            return
         if self._process is None or self._process.poll() is not None:
             self._spawn()
         process = self._process
         assert process is not None and process.stdin is not None and process.stdout is not None
-        try:
-            write_frame(process.stdin, Frame({"requests": [call.request for call in calls]}))
-        except BrokenPipeError:
-            return
+        unsent: Frame | None = Frame({"requests": [call.request for call in calls]})
         for call in calls:
-            reply = self._next_reply(process)
+            reply = None
+            with _ended_at(call.deadline, process) as expired, contextlib.suppress(BrokenPipeError):
+                if unsent is not None:
+                    write_frame(process.stdin, unsent)  # a process that is stopped does not read it
+                    unsent = None
+                reply = read_frame(process.stdout)
+            if expired.is_set():
+                self._bury()
+                self._reply(call, self._late())
+                return
             if reply is None:
                 return
             self._reply(call, reply)
-            if self._process is not process:  # it took too long, and was ended
-                return
 
-    def _next_reply(self, process: subprocess.Popen[bytes]) -> Frame | SplatliftError | None:
-        assert process.stdout is not None
-        expired = threading.Event()
-
-        def expire() -> None:
-            expired.set()
-            process.kill()
-
-        timer = threading.Timer(self._limits.seconds, expire)
-        timer.start()
-        try:
-            reply = read_frame(process.stdout)
-        finally:
-            timer.cancel()
-            timer.join()
-        if expired.is_set():
-            self._bury()
-            return TimedOut("query", expected=f"an answer within {self._limits.seconds:g} s", got="none yet")
-        return reply
+    def _late(self) -> TimedOut:
+        return TimedOut("query", expected=f"an answer within {self._limits.seconds:g} s", got="none yet")
 
     def _reply(self, call: _Call, reply: Frame | SplatliftError) -> None:
         with self._bell:
@@ -275,3 +273,21 @@ class WarmWorker:
             assert pipe is not None
             with contextlib.suppress(BrokenPipeError):
                 pipe.close()
+
+
+@contextlib.contextmanager
+def _ended_at(deadline: float, process: subprocess.Popen[bytes]) -> Iterator[threading.Event]:
+    """Kill the process when the block still runs at its deadline; the event says whether that came."""
+    expired = threading.Event()
+
+    def expire() -> None:
+        expired.set()
+        process.kill()
+
+    timer = threading.Timer(max(0.0, deadline - time.monotonic()), expire)
+    timer.start()
+    try:
+        yield expired
+    finally:
+        timer.cancel()
+        timer.join()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import ExitStack, asynccontextmanager
 from pathlib import Path as FilePath
 from typing import Annotated
@@ -17,6 +17,7 @@ from service.errors import DigestMismatch
 from service.parts import Here
 from service.store.assets import AssetRecord, CheckedUpload
 from service.store.files import DataDirectory
+from service.store.store import Store
 from service.uploads.checking import CheckLimits, check
 from service.uploads.decoding import coding_of
 from service.uploads.intake import Intake
@@ -53,8 +54,9 @@ async def upload(kind: Kind, request: Request, here: Here, sha256: Sha256 = None
     here.store.files.require_room()
     await anyio.to_thread.run_sync(here.store.assets.require_quota)
     async with _workspace(here.store.files, kind) as (draft, scratch):
-        with Intake(draft, limit=here.settings.max_upload_bytes(kind), coding=coding) as intake:
-            await _receive(request, intake, here.store.files)
+        limit = here.settings.max_upload_bytes(kind)
+        with Intake(draft, limit=limit, coding=coding, permit=_permit(here.store)) as intake:
+            await _receive(request, intake)
             digest = intake.finish()
         if sha256 is not None and digest != sha256.lower():
             raise DigestMismatch("sha256", expected=sha256, got=digest, hint="upload the file again")
@@ -80,12 +82,21 @@ async def _workspace(files: DataDirectory, kind: wire.AssetKind) -> AsyncIterato
             await anyio.to_thread.run_sync(stack.close)
 
 
-async def _receive(request: Request, intake: Intake, files: DataDirectory) -> None:
+def _permit(store: Store) -> Callable[[int, int], None]:
+    """Looks at the disk and the owner's quota while content comes: compressed, its end is not known before."""
+
+    def permit(whole: int, coming: int) -> None:
+        store.files.require_room(coming)
+        store.assets.require_quota(whole)
+
+    return permit
+
+
+async def _receive(request: Request, intake: Intake) -> None:
     batch = bytearray()
     async for chunk in request.stream():
         batch += chunk
         if len(batch) >= BATCH:
-            files.require_room(len(batch))
             await anyio.to_thread.run_sync(intake.feed, bytes(batch))
             batch.clear()
     await anyio.to_thread.run_sync(intake.feed, bytes(batch))

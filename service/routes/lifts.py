@@ -6,7 +6,7 @@ from fastapi import APIRouter, Request, Response
 
 from service import wire
 from service.content import file_answer
-from service.parts import Here, Parts
+from service.parts import Here
 from service.store.lifts import LiftRecord
 
 router = APIRouter(prefix="/lifts", tags=["lifts"])
@@ -15,13 +15,13 @@ router = APIRouter(prefix="/lifts", tags=["lifts"])
 @router.get("", response_model=wire.Lifts)
 def list_lifts(here: Here) -> wire.Lifts:
     """All lifts, newest first."""
-    return wire.Lifts(lifts=[shape(lift, here) for lift in here.store.lifts.all()])
+    return wire.Lifts(lifts=[shape(lift) for lift in here.store.lifts.all()])
 
 
 @router.get("/{lift}", response_model=wire.Lift)
 def get_lift(lift: str, here: Here) -> wire.Lift:
     """One lift: its settings, certificate and timings."""
-    return shape(here.store.lifts.get(lift), here)
+    return shape(here.store.lifts.get(lift))
 
 
 @router.get("/{lift}/features", response_class=Response)
@@ -31,17 +31,16 @@ def get_features(lift: str, request: Request, here: Here) -> Response:
     return file_answer(request, found.path, sha256=found.sha256, filename=f"lift-{found.id}.safetensors")
 
 
-def shape(lift: LiftRecord, here: Parts) -> wire.Lift:
+def shape(lift: LiftRecord) -> wire.Lift:
     """A lift as the wire has it; paths of this machine stay here."""
-    job = here.store.jobs.get(lift.id)
     metadata = lift.metadata
     return wire.Lift(
         id=lift.id,
         bytes=lift.bytes,
         sha256=lift.sha256,
-        splats=job.splats,
-        cameras=job.cameras,
-        features=list(job.features),
+        splats=lift.splats,
+        cameras=lift.cameras,
+        features=list(lift.features),
         count=lift.count,
         channels=lift.channels,
         version=metadata["version"],

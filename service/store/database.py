@@ -62,10 +62,11 @@ class Database:
             self._writer.execute("BEGIN IMMEDIATE")
             try:
                 yield self._writer
+                self._writer.execute("COMMIT")
             except BaseException:
-                self._writer.execute("ROLLBACK")
+                if self._writer.in_transaction:  # on a full disk SQLite has rolled back by itself
+                    self._writer.execute("ROLLBACK")
                 raise
-            self._writer.execute("COMMIT")
 
     @contextmanager
     def read(self) -> Iterator[sqlite3.Connection]:
@@ -98,6 +99,14 @@ class Database:
             self._writer.close()
         while not self._idle.empty():
             self._idle.get_nowait().close()
+
+
+def unusable(path: Path, error: sqlite3.Error) -> Misconfigured:
+    """What to say of a file that SQLite does not work with."""
+    return Misconfigured(
+        "data", expected="a database of this service", got=f"{path}: {error}",
+        hint="name another data directory, or put a backup in its place",
+    )  # fmt: skip
 
 
 def _statements(script: str) -> Iterator[str]:

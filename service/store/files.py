@@ -6,11 +6,15 @@ import fcntl
 import os
 import secrets
 import shutil
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TextIO
 
 from service.errors import Misconfigured, NoSpace
+
+LOCK_SECONDS = 0.5  # for another process to let go of the directory
 
 
 class DataDirectory:
@@ -31,14 +35,12 @@ class DataDirectory:
         for name in ("blobs", "lifts", "work", "tmp"):
             (self.root / name).mkdir(parents=True, exist_ok=True)
         self._lock = (self.root / "lock").open("w")
-        try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
+        if not _locked(self._lock):
             self._lock.close()
             raise Misconfigured(
                 "data", expected="a directory that no other server uses", got=str(root),
                 hint="stop the other server or name another directory with --data",
-            ) from None  # fmt: skip
+            )  # fmt: skip
         # Nothing below tmp/ was ever acknowledged, and the server that wrote it is gone.
         shutil.rmtree(self.root / "tmp")
         (self.root / "tmp").mkdir()
@@ -129,6 +131,20 @@ class DataDirectory:
     def close(self) -> None:
         """Let another server have the directory."""
         self._lock.close()
+
+
+def _locked(lock: TextIO) -> bool:
+    """Take the lock; whoever only looks whether a server holds it has it for a moment too."""
+    deadline = time.monotonic() + LOCK_SECONDS
+    while True:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            if time.monotonic() > deadline:
+                return False
+            time.sleep(LOCK_SECONDS / 10)
+        else:
+            return True
 
 
 def _sync_directory(path: Path) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from liftcore.errors import NotFound
 from service.keys.scopes import Scope, parse_scopes
-from service.store.database import Database
+from service.store.database import Database, unusable
 
 PREFIX = "splatlift_"  # by which people, and scanners for leaked secrets, know what it is
 SECRET_BYTES = 32
@@ -113,13 +113,19 @@ def digest_of(secret: str) -> str:
 
 
 def any_key(database: Path) -> bool:
-    """Whether a database that nobody has opened yet holds a key; it is left as it is."""
+    """Whether a database that nobody has opened yet holds a key; it is left as it is.
+
+    Raises:
+        Misconfigured: the file is no database.
+    """
     if not database.exists():
         return False
     connection = sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True)
     try:
         known = connection.execute("SELECT 1 FROM sqlite_master WHERE name = 'keys'").fetchone()
         return known is not None and _any(connection)
+    except sqlite3.DatabaseError as error:
+        raise unusable(database, error) from None
     finally:
         connection.close()
 

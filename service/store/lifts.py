@@ -40,9 +40,17 @@ class LiftRecord:
     channels: int
     metadata: dict[str, Any]
     created: float
+    splats: str  # ids of the assets that it was made of
+    cameras: str
+    features: tuple[str, ...]
 
 
-VISIBLE = f"SELECT lifts.* FROM lifts JOIN jobs USING (id) WHERE {SEEN}"  # a lift belongs to whom its job does
+# A lift belongs to whom its job does. One statement, so that no lift is without its job.
+VISIBLE = (
+    "SELECT lifts.*, splats, cameras, (SELECT json_group_array(asset) FROM"
+    " (SELECT asset FROM job_features WHERE job = jobs.id ORDER BY place)) AS features"
+    f" FROM lifts JOIN jobs USING (id) WHERE {SEEN}"
+)
 
 
 class LiftStore(Owned):
@@ -162,4 +170,7 @@ class LiftStore(Owned):
             channels=row["channels"],
             metadata=json.loads(row["metadata"]),
             created=row["created"],
+            splats=row["splats"],
+            cameras=row["cameras"],
+            features=tuple(json.loads(row["features"])),
         )

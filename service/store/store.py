@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import sqlite3
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Self
 
 from service.store.assets import AssetStore
 from service.store.attempts import AttemptStore
-from service.store.database import Database
+from service.store.database import Database, unusable
 from service.store.events import EventStore
 from service.store.files import DataDirectory
 from service.store.jobs import JobStore
@@ -41,11 +42,14 @@ class Store:
             floor_bytes: free disk that new work must leave.
 
         Raises:
-            Misconfigured: another server holds it, or a later release wrote it.
+            Misconfigured: another server holds it, a later release wrote it, or its database is none.
         """
         files = DataDirectory(root, floor_bytes=floor_bytes)
         try:
             database = Database(files.root / DATABASE)
+        except sqlite3.DatabaseError as error:
+            files.close()
+            raise unusable(files.root / DATABASE, error) from None
         except BaseException:
             files.close()
             raise

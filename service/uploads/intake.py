@@ -3,17 +3,30 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Self
 
 from service.errors import TooLarge
 from service.uploads.decoding import Coding, Decoding
 
+STEP = 4 << 20  # bytes of content between two looks at what may still be stored
+
 
 class Intake:
-    """Writes a body to a draft, never more than ``limit`` bytes of it before or after decompression."""
+    """Writes a body to a draft, never more than ``limit`` bytes of it before or after decompression.
 
-    def __init__(self, draft: Path, *, limit: int, coding: Coding | None) -> None:
+    Args:
+        draft: the file.
+        limit: what the operator allows.
+        coding: how the body is compressed.
+        permit: called every few MiB of content with what there will be of it and what comes now, in bytes; raises
+            when that may not be stored.
+    """
+
+    def __init__(self, draft: Path, *, limit: int, coding: Coding | None, permit: Callable[[int, int], None]) -> None:
+        self._permit = permit
+        self._permitted = 0
         self._file = draft.open("wb")
         self._limit = limit
         self._received = 0
@@ -33,6 +46,7 @@ class Intake:
         Raises:
             TooLarge: there are more than may come, or come out.
             InvalidEncoding: they do not decompress.
+            ServiceError: as `permit` does.
         """
         self._received += len(chunk)
         self._check(self._received)
@@ -53,6 +67,9 @@ class Intake:
     def _write(self, content: bytes) -> None:
         self._written += len(content)
         self._check(self._written)
+        if self._written > self._permitted:
+            self._permit(self._written, len(content))
+            self._permitted = self._written + STEP
         self._digest.update(content)
         self._file.write(content)
 

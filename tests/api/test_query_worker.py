@@ -24,8 +24,8 @@ from tests.crash.conftest import until
 from .conftest import parts_of
 from .tiny_scene import CHANNELS, WORDS
 
-AN_ANSWER = 6 * 60  # bytes, for the splats of the tiny scene
-AN_IMAGE = 9 * 32 * 24
+AN_ANSWER = 6 * 60 + (2 << 10)  # bytes, for the splats of the tiny scene
+AN_IMAGE = 9 * 32 * 24 + (2 << 10)
 AXES = [[float(row == channel) for channel in range(CHANNELS)] for row in range(3)]
 QUESTIONS: list[dict[str, Any]] = [
     *({"text": [word]} for word in WORDS),
@@ -93,7 +93,7 @@ def test_one_pass_takes_no_more_questions_than_may_be_kept_or_than_its_memory_al
     request_of: Callable[..., dict[str, Any]], passes: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     requests = [request_of(text=[word], threshold=k / 8) for k in range(4) for word in WORDS]
-    few = Answers(scenes=1, cache_bytes=5 * AN_ANSWER)
+    few = Answers(scenes=1, cache_bytes=5 * (AN_ANSWER + len("apple")))
     for first in range(len(requests)):
         reply_to(requests[first:], few)
     assert passes == [5, 5, 2]

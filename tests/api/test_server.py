@@ -144,3 +144,9 @@ def wait_until(condition: Callable[[], bool]) -> None:
     while not condition():
         assert time.monotonic() < deadline
         time.sleep(0.02)
+
+
+def test_empty_variable_is_one_that_is_not_set(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("COMMIT", "PORT", "ALLOWED_HOSTS", "TEXT_SPACES"):
+        monkeypatch.setenv(f"SPLATLIFT_{name}", "")
+    assert (parse([]).commit, parse([]).port, parse([]).allowed_hosts) == (None, 8787, ())
