@@ -31,14 +31,14 @@ class Rank:
 
 
 def codebook_rank(packs: FeaturePacks, views: Sequence[str]) -> Rank:
-    """The rank of evenly spaced rows of the views' codebooks."""
+    """The rank of what ``sample_rows`` gives of evenly spaced views, above the coarsest rounding among them."""
     places = np.linspace(0, len(views) - 1, min(VIEWS, len(views))).astype(int)
-    parts = [packs.sample_rows(views[int(place)], ROWS // len(places)) for place in places]
+    chosen = [views[int(place)] for place in places]
+    parts = [packs.sample_rows(view, ROWS // len(chosen)) for view in chosen]
     sample = np.concatenate([part.double().numpy() for part in parts])
     sample = np.nan_to_num(sample, nan=0.0, posinf=0.0, neginf=0.0)  # refused when the lift reads them
-    spec = packs.specs(views[0])
-    dtype = spec.get("codebook", spec.get("grid", next(iter(spec.values())))).dtype
-    return rank_of(sample, ROUNDING.get(dtype, ROUNDING["F32"]))
+    dtypes = {spec.dtype for view in chosen for part, spec in packs.specs(view).items() if part != "labels"}
+    return rank_of(sample, max(ROUNDING[dtype] for dtype in dtypes))
 
 
 def rank_of(rows: np.ndarray, rounding: float) -> Rank:

@@ -21,11 +21,9 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 BLOCK_ROWS = 16_384  # rows converted at a time: a few MB, so that memory stays near the file's size
+COLOUR = ("sh", "sb_params")  # fields that a lift has no use for, and most of a file
 
 _SPELLING = {code: name for name, code in reversed(SCALAR_TYPES.items())}  # the C names: "float", "uchar"
-
-
-COLOUR = ("sh", "sb_params")  # fields that a lift has no use for, and most of a file
 
 
 def read_splats(path: Path, kernel: Kernel | None = None, *, colour: bool = True) -> Splats:

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 
 from liftcore.errors import InvalidSettings, Unavailable
 from liftcore.lift import lift
+from liftcore.observe.observation import RegionMap
 from liftcore.observe.pack import open_packs
+from liftcore.observe.write_pack import write_pack
 from liftcore.plan.memory import CONTROL_GROUPS, LIBRARIES, check_memory, free_memory, group_memory
 from liftcore.plan.rank import ROUNDING, codebook_rank, rank_of
 from liftcore.solve.settings import LiftSettings, Speed
@@ -29,6 +32,14 @@ def test_rank_is_that_of_the_vectors_before_they_were_rounded(dtype, rank, shape
 
 def test_nothing_has_no_rank():
     assert rank_of(np.zeros((4, 3)), ROUNDING["F32"]).rank == 0
+
+
+def test_rank_of_packs_of_two_types_is_above_the_coarser_rounding(tmp_path):
+    rows = torch.rand(100, 3, generator=torch.manual_seed(0)) @ torch.rand(3, 40, generator=torch.manual_seed(1))
+    labels = torch.zeros(1, 2, 2, dtype=torch.int32)
+    write_pack(tmp_path / "p", {"v0": RegionMap(labels, rows), "v1": RegionMap(labels, rows.half())}, {})
+    packs = open_packs([tmp_path / "p"])
+    assert codebook_rank(packs, packs.views).rank == 3
 
 
 @pytest.mark.parametrize("grids", [False, True])
