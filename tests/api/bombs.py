@@ -38,9 +38,12 @@ def splats() -> dict[str, bytes]:
 
 def cameras() -> dict[str, bytes]:
     """Bombs for the readers of cameras."""
+    return camera_documents() | camera_archives()
+
+
+def camera_documents() -> dict[str, bytes]:
+    """Those in JSON."""
     document, plain = cameras_document(), cameras_json()
-    model = [("sparse/0/cameras.txt", CAMERA.encode()), ("sparse/0/images.txt", b"x" * 1000)]
-    count = struct.pack("<Q", 2**63)
     return {
         "deep array": b"[" * 100_000,
         "deep object": b'{"a":' * 100_000,
@@ -57,7 +60,15 @@ def cameras() -> dict[str, bytes]:
         "half a surrogate pair as a key": b'{"\\ud800": 1, "frames": []}',
         "not UTF-8": b'{"a": "\xff\xfe"}',
         "a million numbers": b"[" + b"1," * 1_000_000 + b"1]",
-        "zip of 600 MB of zeros": zipped([model[0], ("sparse/0/images.txt", bytes(600 << 20))]),
+    }
+
+
+def camera_archives() -> dict[str, bytes]:
+    """Those in zips."""
+    model = [("sparse/0/cameras.txt", CAMERA.encode()), ("sparse/0/images.txt", b"x" * 1000)]
+    count = struct.pack("<Q", 2**63)
+    return {
+        "zip of 600 MB of zeros": zip_of_zeros(model[0], "sparse/0/images.txt", 600),
         "zip that says too small a size": patched(zipped(model), 24, 10),
         "zip that says too large a size": patched(zipped(model), 24, 0xFFFFFFFE),
         "zip whose members overlap": patched(zipped(model), 42, 0),
@@ -104,6 +115,15 @@ def zipped(members: list[tuple[str, bytes]]) -> bytes:
     with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, member in members:
             archive.writestr(name, member)
+    return content.getvalue()
+
+
+def zip_of_zeros(first: tuple[str, bytes], name: str, megabytes: int) -> bytes:
+    """A zip of a member and so many zeros, made a megabyte at a time."""
+    content = io.BytesIO(zipped([first]))
+    with zipfile.ZipFile(content, "a", zipfile.ZIP_DEFLATED) as archive, archive.open(name, "w") as zeros:
+        for _ in range(megabytes):
+            zeros.write(bytes(1 << 20))
     return content.getvalue()
 
 

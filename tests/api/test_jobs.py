@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shutil
 import sqlite3
-import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
@@ -24,7 +23,7 @@ from service.settings import ServiceSettings
 from service.store.schema import MIGRATIONS
 from service.store.store import Store
 from service.wire import JobState
-from tests.crash.conftest import order, stand_in
+from tests.crash.conftest import order, stand_in, until
 
 from .conftest import ADDRESS, Uploaded
 from .following import ended
@@ -103,8 +102,7 @@ def test_same_key_with_another_order_is_refused(quick: Quick) -> None:
 def test_full_line_is_503_with_retry_after_and_a_known_key_still_finds_its_job(quick: Quick) -> None:
     with quick("hang", max_queued=1) as (client, body):
         location = client.post("/lift", json=body).headers["location"]
-        while client.get(location).json()["state"] == "queued":
-            time.sleep(0.01)
+        until(lambda: client.get(location).json()["state"] != "queued")
         assert client.post("/lift", json=body, headers={"Idempotency-Key": "k"}).status_code == 202
         reply = client.post("/lift", json=body)
         assert (assert_problem(reply)["type"], reply.status_code) == ("/problems/busy", 503)
@@ -115,8 +113,7 @@ def test_full_line_is_503_with_retry_after_and_a_known_key_still_finds_its_job(q
 def test_cancel_over_http(quick: Quick) -> None:
     with quick("hang") as (client, body):
         running = client.post("/lift", json=body).headers["location"]
-        while client.get(running).json()["state"] != "running":
-            time.sleep(0.01)
+        until(lambda: client.get(running).json()["state"] == "running")
         waiting = client.post("/lift", json=body).headers["location"]
         assert client.get(waiting).json()["links"]["cancel"] == f"{waiting}/cancel"
         reply = client.post(f"{waiting}/cancel")
@@ -215,8 +212,7 @@ def test_job_interrupted_by_a_stop_goes_on_where_the_data_directory_is_next(
     with start() as client:
         uploaded = upload(client, scene)
         location = client.post("/lift", json=uploaded.order()).headers["location"]
-        while client.get(location).json()["state"] == "queued":
-            time.sleep(0.01)
+        until(lambda: client.get(location).json()["state"] != "queued")
     (tmp_path / "data").rename(tmp_path / "moved")
     with start("moved") as client:
         job = ended(client, location)

@@ -140,7 +140,7 @@ def test_upload_that_breaks_off_leaves_nothing(tmp_path: Path, table: Path) -> N
 
 def wait_until(condition: Callable[[], bool]) -> None:
     """Wait a little for something that is about to happen."""
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + 60
     while not condition():
         assert time.monotonic() < deadline
         time.sleep(0.02)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import json
 import os
 import signal
 import subprocess
@@ -30,6 +31,7 @@ from service.wire import AssetKind
 ROOT = Path(__file__).parents[2]
 VIEW = (320, 240)  # of the scene that is queried
 LIFTS = 100  # orders that wait in line, so that one is always running
+PATIENCE_SECONDS = 300.0  # for what takes some seconds; the machine may be busy
 
 
 @dataclass(frozen=True)
@@ -44,27 +46,36 @@ class BusyService:
         """Where it listens on 127.0.0.1."""
         return int(self.address.rpartition(":")[2])
 
-    def running(self, *, walking: bool = False) -> bool:
-        """Whether a lift runs now; ``walking``: one that is past its start, and uses the cores."""
-        jobs = httpx.get(f"{self.address}/jobs", timeout=60).json()["jobs"]
-        return any(job["state"] == "running" and (job["progress"] or not walking) for job in jobs)
+    def lifting(self) -> bool:
+        """Whether a lift runs, or the next one is about to."""
+        return bool(self._unfinished())
 
     def await_lift(self) -> None:
-        """Wait until a lift uses the cores."""
-        while not self.running(walking=True):
-            time.sleep(0.2)
+        """Wait until a lift is past its start, and uses the cores."""
+        deadline = time.monotonic() + PATIENCE_SECONDS
+        while jobs := self._unfinished():
+            if any(job["state"] == "running" and job["progress"] for job in jobs):
+                return
+            assert time.monotonic() < deadline, "no lift came to its walk"
+            time.sleep(0.05)
+        raise AssertionError("all lifts have ended")
 
     def cpu_seconds(self) -> float:
         """Processor time of the server and of its query worker, which do not do the lifting."""
-        children = Path(f"/proc/{self.pid}/task/{self.pid}/children").read_text().split()
-        workers = [pid for pid in children if b"service.queries.worker" in Path(f"/proc/{pid}/cmdline").read_bytes()]
-        return sum(_cpu_seconds(int(pid)) for pid in (self.pid, *workers))
+        workers = [pid for pid in _children(self.pid) if b"service.queries.worker" in _command(pid)]
+        assert workers, "there is no query worker"
+        return sum(map(_cpu_seconds, (self.pid, *workers)))
+
+    def _unfinished(self) -> list[dict[str, Any]]:
+        jobs = httpx.get(f"{self.address}/jobs", timeout=PATIENCE_SECONDS).json()["jobs"]
+        return [job for job in jobs if job["state"] in ("queued", "running")]
 
 
 @contextlib.contextmanager
 def serving(data: Path, table: Path | None = None, **settings: Any) -> Iterator[BusyService]:
     """Run the service over a data directory."""
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "SPLATLIFT_DATA": str(data), "SPLATLIFT_PORT": "0"}
+    own = {name: value for name, value in os.environ.items() if not name.startswith("SPLATLIFT_")}
+    environment = own | {"PYTHONPATH": str(ROOT), "SPLATLIFT_DATA": str(data), "SPLATLIFT_PORT": "0"}
     environment |= {f"SPLATLIFT_{name.upper()}": str(value) for name, value in settings.items()}
     if table is not None:
         environment["SPLATLIFT_ENCODER"] = f"table:{table}"
@@ -84,7 +95,7 @@ def serving(data: Path, table: Path | None = None, **settings: Any) -> Iterator[
     finally:
         process.send_signal(signal.SIGTERM)
         try:
-            process.wait(30)
+            process.wait(PATIENCE_SECONDS)
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
@@ -96,7 +107,7 @@ def write_words(path: Path, count: int, channels: int) -> list[str]:
     generator = torch.Generator().manual_seed(1)
     rows = torch.nn.functional.normalize(torch.randn(count, channels, generator=generator), dim=1)
     words = [f"word{number}" for number in range(count)]
-    save_file({"embeddings": rows}, str(path), metadata={"words": str(words).replace("'", '"')})
+    save_file({"embeddings": rows}, str(path), metadata={"words": json.dumps(words)})
     return words
 
 
@@ -157,6 +168,22 @@ def in_threads(work: Any, count: int) -> list[Any]:
     for thread in threads:
         thread.join()
     return results
+
+
+def _children(pid: int) -> list[int]:
+    """Of all its threads: a process is the child of the thread that began it."""
+    found = []
+    for task in Path(f"/proc/{pid}/task").iterdir():
+        with contextlib.suppress(OSError):  # a thread that has ended
+            found += map(int, (task / "children").read_text().split())
+    return found
+
+
+def _command(pid: int) -> bytes:
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_bytes()
+    except OSError:  # it has ended
+        return b""
 
 
 def _cpu_seconds(pid: int) -> float:

@@ -53,12 +53,12 @@ def _rounds(service: BusyService, lift: str, words: Any, queries: int, rounds: i
     before = service.cpu_seconds()
     for _ in range(rounds):
         chosen = list(islice(words, queries))
-        running.append(service.running())
+        running.append(service.lifting())
         load.append(os.getloadavg()[0])
         with _clients(service, queries) as clients:
             pairs = list(zip(clients, chosen, strict=True))
             times = in_threads(lambda number, pairs=pairs: _ask(pairs[number][0], lift, pairs[number][1]), queries)
-        running.append(service.running())
+        running.append(service.lifting())
         slowest.append(max(times))
         every += times
     return {

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import select
 import socket
 import subprocess
 import sys
@@ -18,7 +19,8 @@ import numpy as np
 
 from tests.crash.loops import scene_files, stored
 
-from .busy_service import ROOT, BusyService, lifting, put_blob, serving
+from .busy_service import PATIENCE_SECONDS, ROOT, BusyService, lifting, put_blob, serving
+from .tricklers import ALL_CAME
 
 BETWEEN_SECONDS = 0.02  # probes
 ASK = b"GET /healthz HTTP/1.1\r\nHost: 127.0.0.1\r\nConnection: close\r\n\r\n"
@@ -42,12 +44,11 @@ def slow_loop(*, sockets: int, readers: int, seconds: float, beside: dict[str, i
             service.await_lift()
             quiet = _probe(service, seconds / 4)
             with _tricklers(service, path, sockets, readers) as told:
-                time.sleep(min(2.0, seconds / 4))  # until all have come
-                ran = service.running()
+                ran = service.lifting()
                 load = [os.getloadavg()[0]]
                 slow = _probe(service, seconds)
                 load.append(os.getloadavg()[0])
-                ran = ran and service.running()
+                ran = ran and service.lifting()
         left = len(list((folder / "data" / "tmp").iterdir()))  # now that the lift has ended, too
     return {
         "sockets": sockets,
@@ -63,15 +64,19 @@ def slow_loop(*, sockets: int, readers: int, seconds: float, beside: dict[str, i
 
 @contextlib.contextmanager
 def _tricklers(service: BusyService, path: str, sockets: int, readers: int) -> Iterator[dict[str, Any]]:
-    """Run them; what they tell at their end is in the dict then."""
+    """Run them, from when all have come; what they tell at their end is in the dict then."""
     command = [sys.executable, "-m", "tests.load.tricklers", str(service.port), path, str(sockets), str(readers)]
     process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=ROOT)
     told: dict[str, Any] = {}
+    assert process.stdout is not None
     try:
+        came, _, _ = select.select([process.stdout], [], [], PATIENCE_SECONDS)
+        assert came and process.stdout.readline() == f"{ALL_CAME}\n", "not all clients came"
         yield told
+        told.update(json.loads(process.communicate("", timeout=PATIENCE_SECONDS)[0]))
     finally:
-        out, _ = process.communicate("", timeout=60)
-        told.update(json.loads(out))
+        with process:  # which closes the pipes, and waits
+            process.kill()
 
 
 def _probe(service: BusyService, seconds: float) -> dict[str, Any]:

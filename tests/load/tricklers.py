@@ -4,8 +4,8 @@ Run as ``python -m tests.load.tricklers PORT PATH SOCKETS READERS``.
 
 Half of the sockets trickle uploads: every other one at twice the least speed, the rest a byte at a time. A quarter
 trickles headers and a quarter JSON bodies, a byte at a time. Readers ask for PATH and read a little of it now and
-then. Whoever is cut off comes back at once. Talks to 127.0.0.1 only, and ends when its stdin does, with one line of
-JSON: how many connections are open, and how often each kind was cut off.
+then. Whoever is cut off comes back at once. Talks to 127.0.0.1 only. Says when all have come, and ends when its stdin
+does, with one line of JSON: how many connections are open, and how often each kind was cut off.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from collections import Counter
 from dataclasses import dataclass
 
 HOST = "127.0.0.1"
+ALL_CAME = "all have come"
 PAUSE_SECONDS = 0.5
 UPLOAD = b"PUT /assets/splats HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 50000000\r\n\r\nply\n"
 ORDER = b"POST /lift HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: application/json\r\nContent-Length: 50000\r\n\r\n{"
@@ -48,12 +49,13 @@ def kinds(sockets: int, readers: int, path: str) -> list[Kind]:
     ]
 
 
-async def keep_coming(kind: Kind, port: int, cut: Counter[str], live: Counter[str]) -> None:
-    """One slow client for ever."""
+async def keep_coming(kind: Kind, port: int, cut: Counter[str], live: Counter[str], came: asyncio.Event) -> None:
+    """One slow client for ever; ``came`` is set when it is connected for the first time."""
     while True:
         with contextlib.suppress(OSError):
             reader, writer = await asyncio.open_connection(HOST, port, limit=1 << 12)
             live[kind.name] += 1
+            came.set()
             try:
                 await be_slow(kind, reader, writer)
             finally:
@@ -83,7 +85,15 @@ async def main() -> None:
     port, path, sockets, readers = int(sys.argv[1]), sys.argv[2], int(sys.argv[3]), int(sys.argv[4])
     cut: Counter[str] = Counter()
     live: Counter[str] = Counter()
-    tasks = [asyncio.create_task(keep_coming(kind, port, cut, live)) for kind in kinds(sockets, readers, path)]
+    chosen = kinds(sockets, readers, path)
+    came = [asyncio.Event() for _ in chosen]
+    tasks = [
+        asyncio.create_task(keep_coming(kind, port, cut, live, first))
+        for kind, first in zip(chosen, came, strict=True)
+    ]
+    for first in came:
+        await first.wait()
+    print(ALL_CAME, flush=True)
     await asyncio.to_thread(sys.stdin.read)
     told = {"open": dict(live), "cut_off": dict(cut)}
     for task in tasks:
