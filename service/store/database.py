@@ -102,11 +102,12 @@ class Database:
 
 
 def unusable(path: Path, error: sqlite3.Error) -> Misconfigured:
-    """What to say of a file that SQLite does not work with."""
-    return Misconfigured(
-        "data", expected="a database of this service", got=f"{path}: {error}",
-        hint="name another data directory, or put a backup in its place",
-    )  # fmt: skip
+    """What to say of a file that SQLite does not work with: it is none of its files, or now is not the time."""
+    if isinstance(error, sqlite3.OperationalError):
+        hint = "see that the disk has room, that the file may be written and that nothing else holds it"
+    else:
+        hint = "name another data directory, or put a backup in its place"
+    return Misconfigured("data", expected="a database of this service", got=f"{path}: {error}", hint=hint)
 
 
 def _statements(script: str) -> Iterator[str]:

@@ -288,7 +288,7 @@ def test_migration_that_breaks_off_changes_nothing(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(
         "service.store.database.MIGRATIONS", (*MIGRATIONS, "CREATE TABLE x (a);\nCREATE TABLE x (a);")
     )
-    with pytest.raises(sqlite3.OperationalError):
+    with pytest.raises(Misconfigured, match="already exists"):
         Store.open(tmp_path / "data")
     monkeypatch.undo()
     left = sqlite3.connect(tmp_path / "data" / "service.sqlite")
