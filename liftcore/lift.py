@@ -23,7 +23,7 @@ from liftcore.solve.aggregation import Aggregation, aggregate
 from liftcore.solve.all_rays import AllRays
 from liftcore.solve.certificate import certify
 from liftcore.solve.checkpoint import Checkpoint, identity, resumed
-from liftcore.solve.closed_form import Solution, solve_closed_form
+from liftcore.solve.closed_form import Solution, solve_closed_form, warm_up_solution
 from liftcore.solve.kept_columns import kept_columns
 from liftcore.solve.least_squares import refine
 from liftcore.solve.lift_warnings import lift_warnings
@@ -103,6 +103,7 @@ def lift_sources(run: Run, sources: Sources, inputs: list[InputFile], checkpoint
     settings, threads, progress = run.settings, run.threads, run.progress
     with run.timings.stage("compile"):
         warm_up(sources.splats.kernel)
+        warm_up_solution()
     with run.timings.stage("plan"):
         plan = planned(sources, settings)
         sources = replace(sources, views=list(plan.views))

@@ -21,7 +21,7 @@ from liftcore.progress import silent
 from liftcore.raster.cpu import CpuRaster
 from liftcore.raster.warm_up import warm_up
 from liftcore.solve.accumulate import lift_walk, row_totals, weighting_of
-from liftcore.solve.closed_form import solve_closed_form
+from liftcore.solve.closed_form import solve_closed_form, warm_up_solution
 from liftcore.solve.settings import LiftSettings, Preset
 from liftcore.solve.view_weights import ViewWeights
 
@@ -53,6 +53,7 @@ def run_bench(options: dict[str, Any]) -> dict[str, Any]:
     work = _workload(options)
     start = time.perf_counter()
     warm_up(work.splats.kernel)
+    warm_up_solution()
     compile_seconds = time.perf_counter() - start
     presets = {str(preset): time_lift(work, preset, options.get("threads")) for preset in Preset}
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024

@@ -20,6 +20,8 @@ from numba.extending import overload
 
 from liftcore.jit import kernel
 from liftcore.lanes import LANES, WIDE, keep_halves, lanes_at, no_lanes, plus_product, sum_of_lanes
+from liftcore.progress import silent
+from liftcore.raster.protocol import RegionWeights
 from liftcore.solve.weight_tables import WeightTables, add_views, books_of
 
 if TYPE_CHECKING:
@@ -98,7 +100,7 @@ def _store_singles(source, shape, first, begin, features):
 
 
 def solve_closed_form(
-    store: ViewWeights,
+    store: Sequence[RegionWeights] | ViewWeights,
     codebooks: Callable[[int], Tensor],
     denominators: np.ndarray,
     dtype: torch.dtype,
@@ -191,6 +193,14 @@ def _solve_slice(
     shares = splat_shares(scale.shape[0])
     list(pool.map(lambda share: solve_blocks(share, tables, scale, width, (squares, begin, features)), shares))
     return squares
+
+
+def warm_up_solution() -> None:
+    """Compile the kernels of the solution, or load them from the disk cache, for both ways to store X."""
+    one = torch.zeros(1, dtype=torch.int32)
+    weights = RegionWeights(one, torch.tensor([0, 1]), one, torch.ones(1), one, torch.ones(1))
+    for dtype in (torch.float16, torch.float32):
+        solve_closed_form([weights], lambda _: torch.ones(1, 1), np.ones(1), dtype, silent, threads=1)
 
 
 def splat_shares(count: int) -> list[tuple[int, int]]:
