@@ -123,3 +123,11 @@ def lift(client: TestClient, uploaded: Uploaded) -> dict[str, Any]:
     job = ended(client, reply.headers["location"])
     assert job["state"] == "succeeded", job
     return client.get(job["links"]["lift"]).json()
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[Store]:
+    """An empty store that no application holds."""
+    opened = Store.open(tmp_path / "data")
+    yield opened
+    opened.close()

@@ -34,13 +34,6 @@ Quick = Callable[..., AbstractContextManager[tuple[TestClient, dict[str, Any]]]]
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> Iterator[Store]:
-    opened = Store.open(tmp_path / "data")
-    yield opened
-    opened.close()
-
-
-@pytest.fixture
 def quick(store: Store) -> Quick:
     """The application with stand-ins for lifts, and the body of an order that it takes."""
 

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import gzip
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any, cast
 
 import pytest
@@ -23,13 +22,6 @@ from tests.crash.server import NoQueries
 
 MiB = 1 << 20
 BODY = gzip.compress(bytes(64 * MiB), 1)  # a few hundred kilobytes
-
-
-@pytest.fixture
-def store(tmp_path: Path) -> Iterator[Store]:
-    store = Store.open(tmp_path / "data")
-    yield store
-    store.close()
 
 
 @pytest.fixture

@@ -10,6 +10,7 @@ from liftcore.jit import kernel
 from liftcore.lanes import BASES, HALVES, LANES, ROWS, STARTS
 from liftcore.lanes_blend import STATE
 from liftcore.lanes_halves import both, either, ellipse_halves, lit_halves, lowest_half, without_lowest
+from liftcore.raster.constants import TILE
 
 places = st.floats(-40, 56)
 curvatures = st.sampled_from([0.0, 1e-6, 1e-3, 1.0, 1e6]) | st.floats(1e-4, 10)
@@ -75,3 +76,7 @@ def test_a_half_row_is_lit_when_any_lane_is(word: int, lane: int) -> None:
     for half in range(HALVES):
         state[256 + half * LANES + lane] = np.float32(1e-30 if word >> half & 1 else 0.0)
     assert lit(state, 256) == word
+
+
+def test_half_rows_cover_a_tile() -> None:
+    assert ROWS == TILE == HALVES // ROWS * LANES
