@@ -12,7 +12,7 @@ from fastapi import FastAPI
 
 from liftcore import __version__
 from service import problems
-from service.jobs.limits import LiftLimits
+from service.jobs.limits import JobLimits
 from service.jobs.streams import EventStreams
 from service.jobs.supervisor import Supervisor
 from service.keys.document import describe_keys
@@ -23,7 +23,7 @@ from service.parts import Parts
 from service.queries.warm import QueryLimits, WarmWorker
 from service.readiness import Readiness
 from service.recorder import RecordedApp
-from service.routes import assets, jobs, lifts, operations, queries
+from service.routes import assets, jobs, lifts, operations, queries, tradeoffs
 from service.settings import ServiceSettings
 from service.stopping import RefuseWork, Stopping
 from service.store.garbage import Collector
@@ -75,7 +75,7 @@ def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, work
     app.add_middleware(RefuseWork, stopping=stopping)
     app.add_middleware(Gate, keys=store.keys, settings=settings)  # outside of it: no body of a stranger is read
     problems.install(app)
-    for module in (operations, assets, jobs, lifts, queries):
+    for module in (operations, assets, jobs, lifts, tradeoffs, queries):
         app.include_router(module.router)
     describe_keys(app, store.keys)
     return app
@@ -83,7 +83,7 @@ def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, work
 
 def assemble(settings: ServiceSettings, store: Store) -> FastAPI:
     """The application with the usual runner and query worker."""
-    runner, worker = Supervisor(store, lift_limits(settings)), WarmWorker(query_limits(settings))
+    runner, worker = Supervisor(store, job_limits(settings)), WarmWorker(query_limits(settings))
     return create_app(settings, store, runner, worker)
 
 
@@ -103,10 +103,10 @@ def pace_of(settings: ServiceSettings) -> Pace:
     return Pace(settings.min_bytes_per_second, settings.slow_grace_seconds, settings.header_seconds)
 
 
-def lift_limits(settings: ServiceSettings) -> LiftLimits:
-    """What the settings allow a lift."""
+def job_limits(settings: ServiceSettings) -> JobLimits:
+    """What the settings allow a job."""
     cores = len(os.sched_getaffinity(0))
-    return LiftLimits(
+    return JobLimits(
         parallel=settings.parallel_lifts,
         threads=settings.lift_threads or max(1, cores // settings.parallel_lifts),
         seconds=settings.lift_seconds,

@@ -17,7 +17,7 @@ SplatliftError
     ├── InUse                an asset that a job or a lift needs               409
     ├── Conflict             a job whose state does not allow that             409
     ├── KeyReused            an Idempotency-Key that came with another order   422
-    ├── OverLimit            a lift beyond the operator's time or memory       422
+    ├── OverLimit            a job beyond the operator's time or memory        422
     ├── NoSpace              less free disk than the operator wants to keep    507
     ├── Busy                 too many queries or jobs are waiting              503 + Retry-After
     ├── NotReady             a check of /readyz that failed                    503 + Retry-After
@@ -140,7 +140,7 @@ class KeyReused(ServiceError):
 
 
 class OverLimit(ServiceError):
-    """A lift that needs more time or memory than the operator allows."""
+    """A job that needs more time or memory than the operator allows."""
 
     kind = "over-limit"
 

@@ -115,7 +115,7 @@ class _Looked(Collector):
         yield jobs
         running = counts.get(JobState.RUNNING, 0) + counts.get(JobState.CANCELING, 0)
         yield GaugeMetricFamily("splatlift_queue_length", "Jobs in line.", value=counts.get(JobState.QUEUED, 0))
-        yield GaugeMetricFamily("splatlift_running_lifts", "Lifts whose process is there.", value=running)
+        yield GaugeMetricFamily("splatlift_running_lifts", "Jobs whose process is there.", value=running)
         yield GaugeMetricFamily("splatlift_open_streams", "Clients that follow events.", value=self._streams.open)
         files = self._store.files
         yield GaugeMetricFamily("splatlift_disk_free_bytes", "Free disk below the data.", value=files.free_bytes())

@@ -53,7 +53,7 @@ TABLE: dict[type[SplatliftError], tuple[int, str]] = {
     errors.InUse: (409, "The asset is in use"),
     errors.Conflict: (409, "The job's state does not allow that"),
     errors.KeyReused: (422, "The key belongs to another order"),
-    errors.OverLimit: (422, "The lift needs more than the server allows"),
+    errors.OverLimit: (422, "The job needs more than the server allows"),
     errors.NoSpace: (507, NO_SPACE),
     errors.Busy: (503, "The server is busy"),
     errors.NotReady: (503, "The server is not ready"),

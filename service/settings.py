@@ -27,7 +27,7 @@ class ServiceSettings(BaseSettings):
         (), description="names in Host and Origin beside those of loopback and the bound address, with commas between"
     )
 
-    key_bytes: int = Field(100 * GiB, ge=0, description="bytes of assets and lifts that a key may store")
+    key_bytes: int = Field(100 * GiB, ge=0, description="bytes of assets and results that a key may store")
     key_queued: int = Field(20, ge=0, description="jobs of a key that may wait in line; more are answered 429")
     key_uploads: int = Field(4, ge=0, description="uploads of a key at the same time; more are answered 429")
 
@@ -63,16 +63,19 @@ class ServiceSettings(BaseSettings):
     garbage_grace_seconds: float = Field(3600, ge=0, description="how long a file without an owner is left alone")
 
     lift_threads: int | None = Field(
-        None, ge=1, description="threads of a lift; not set = the cores shared out among the parallel lifts"
+        None, ge=1, description="threads of a job; not set = the cores shared out among the parallel jobs"
     )
-    parallel_lifts: int = Field(1, ge=1, le=64, description="lifts that run at the same time")
+    parallel_lifts: int = Field(1, ge=1, le=64, description="jobs that run at the same time")
     max_queued: int = Field(100, ge=1, description="jobs that may wait in line; more are answered 503")
-    lift_seconds: float = Field(86_400, gt=0, description="wall time that one attempt at a lift may take")
+    lift_seconds: float = Field(86_400, gt=0, description="wall time that one attempt at a job may take")
     lift_memory_bytes: int | None = Field(
-        None, ge=1, description="private memory of a lift's process (Linux); not set = no limit"
+        None, ge=1, description="private memory of a job's processes (Linux); not set = no limit"
+    )
+    tradeoff_seconds: float = Field(
+        3600, ge=10, description="the largest budget of a trade-off; larger ones are answered 422"
     )
     lease_seconds: float = Field(
-        30, ge=3, description="silence after which a lift's process is given up and its job goes back in line"
+        30, ge=3, description="silence after which a job's process is given up and its job goes back in line"
     )
     checkpoint_seconds: float = Field(2, ge=0, description="work that a killed lift may have to do again")
     max_streams: int = Field(32, ge=1, description="clients that may follow events at the same time; more get 503")

@@ -23,6 +23,13 @@ class AssetKind(StrEnum):
     FEATURES = "features"
 
 
+class JobKind(StrEnum):
+    """What a job does."""
+
+    LIFT = "lift"
+    TRADEOFF = "tradeoff"
+
+
 class JobState(StrEnum):
     """Where a job is."""
 
@@ -83,6 +90,17 @@ class LiftRequest(BaseModel):
     )
 
 
+class TradeoffRequest(LiftRequest):
+    """What to compare: lifts of these assets, each with another preset or place of the dial."""
+
+    settings: dict[str, Scalar] = Field(
+        default_factory=dict, description="of all runs: knobs of the lift beside preset and speed, which are compared"
+    )
+    budget_s: float = Field(
+        600, ge=10, le=86_400, description="seconds to plan with; the exact run is made whatever it takes"
+    )
+
+
 class Progress(BaseModel):
     """How far the current stage of a job is."""
 
@@ -94,15 +112,17 @@ class Progress(BaseModel):
 
 
 class Job(BaseModel):
-    """A lift on its way."""
+    """A lift or a trade-off on its way."""
 
     id: JobId
+    kind: JobKind
     state: JobState
     attempt: int
     splats: AssetId
     cameras: AssetId
     features: list[AssetId]
     settings: dict[str, Any]
+    parameters: dict[str, Any] = Field(description="of its kind: budget_s of a trade-off")
     progress: Progress | None
     problem: Problem | None
     created: float
@@ -159,6 +179,25 @@ class Lifts(BaseModel):
     """All lifts, newest first."""
 
     lifts: list[Lift]
+
+
+class Tradeoff(BaseModel):
+    """Speed against accuracy on a scene, as ``splatlift tradeoff --json`` has it. It has the id of its job."""
+
+    model_config = ConfigDict(extra="allow")  # what else the comparison tells
+
+    id: JobId
+    splats: AssetId
+    cameras: AssetId
+    features: list[AssetId]
+    runs: list[dict[str, Any]] = Field(description="one for each preset or place of the dial: seconds and accuracy")
+    skipped: list[str] = Field(description="what did not fit the budget")
+    choice: dict[str, Any] = Field(description="which run to take, and why")
+    views: dict[str, int] = Field(description="how many were lifted, of how many, and held out")
+    budget_s: float
+    seconds: float = Field(description="that it took")
+    created: float = Field(description="seconds since 1970")
+    links: dict[str, str]
 
 
 class Threshold(BaseModel):

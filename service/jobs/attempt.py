@@ -16,17 +16,19 @@ from liftcore.errors import SplatliftError
 from service.errors import OverLimit
 from service.faults import fault_of
 from service.jobs.leftovers import mark
-from service.jobs.limits import LiftLimits
+from service.jobs.limits import JobLimits
 from service.jobs.pace import Pace
 from service.jobs.process import JobProcess
 from service.store.jobs import JobRecord
 from service.store.lifts import FinishedLift
 from service.store.store import Store
-from service.wire import ENDED, JobState
+from service.store.tradeoffs import FinishedTradeoff
+from service.wire import ENDED, JobKind, JobState
 
 TICK_SECONDS = 0.2  # how soon a cancel, a stop or a limit is seen
 RENEWALS = 4  # of a lease, in the time that it lasts
 CHILD = (sys.executable, "-m", "service.jobs.child")
+DRAFTS = {JobKind.LIFT: ".safetensors", JobKind.TRADEOFF: ".png"}  # what a child writes
 
 log = logging.getLogger(__name__)
 
@@ -45,7 +47,7 @@ class _Heard:
 class Attempt:
     """Runs in a thread of the supervisor, which is the only one that changes its job."""
 
-    def __init__(self, job: JobRecord, store: Store, limits: LiftLimits, command: Sequence[str] = CHILD) -> None:
+    def __init__(self, job: JobRecord, store: Store, limits: JobLimits, command: Sequence[str] = CHILD) -> None:
         self._job = job
         self._store = store
         self._limits = limits
@@ -56,7 +58,7 @@ class Attempt:
     def run(self, stopping: threading.Event) -> None:
         """From the start of the child to the end of its process group, and the state that follows from it."""
         files = self._store.files
-        with files.draft(".safetensors") as draft, files.scratch() as scratch:
+        with files.draft(DRAFTS[self._job.kind]) as draft, files.scratch() as scratch:
             order = scratch / "order.json"
             order.write_text(json.dumps(self._order(draft)), encoding="utf-8")
             environment = mark(self._job.id) | {"TMPDIR": str(scratch)}
@@ -96,7 +98,7 @@ class Attempt:
             self._store.attempts.renew(self._job.id, self._job.attempt, self._limits.lease_seconds)
 
     def _why_end(self, process: JobProcess, heard: _Heard) -> str | SplatliftError | None:
-        now, limits = time.monotonic(), self._limits
+        now, limits, kind = time.monotonic(), self._limits, self._job.kind
         if now - heard.looked > limits.lease_seconds / 2:
             heard.lately = now  # it was the server that slept: the child has a lease from now on
         if self._store.attempts.state(self._job.id) is not JobState.RUNNING:
@@ -105,11 +107,11 @@ class Attempt:
             return f"its process was silent for {limits.lease_seconds:g} s"
         if now - heard.begun > limits.seconds:
             return OverLimit(
-                "lift", expected=f"a lift that takes at most {limits.seconds:g} s", got="one that takes more"
+                kind, expected=f"a {kind} that takes at most {limits.seconds:g} s", got="one that takes more"
             )
         if limits.memory_bytes is not None and process.private_bytes() > limits.memory_bytes:
             return OverLimit(
-                "lift", expected=f"a lift that takes at most {limits.memory_bytes} bytes of memory",
+                kind, expected=f"a {kind} that takes at most {limits.memory_bytes} bytes of memory",
                 got="one that takes more", hint="fewer views, channels or splats take less",
             )  # fmt: skip
         return None
@@ -118,8 +120,7 @@ class Attempt:
         """No process of this attempt is left; what becomes true now stays true."""
         job, attempts, answer = self._job, self._store.attempts, heard.answer or {"event": "none"}
         if answer["event"] == "done":
-            made = FinishedLift(draft, answer["sha256"], answer["count"], answer["channels"], answer["metadata"])
-            if not self._store.lifts.finish(job.id, job.attempt, made):
+            if not self._keep(draft, answer):
                 attempts.lose(job.id, job.attempt, "it is canceled")
         elif answer["event"] == "fault":
             attempts.fail(job.id, job.attempt, answer["fault"])
@@ -130,6 +131,15 @@ class Attempt:
         else:
             log.warning("job %s, attempt %d: %s", job.id, job.attempt, why)
             attempts.lose(job.id, job.attempt, why)
+
+    def _keep(self, draft: Path, answer: dict[str, Any]) -> bool:
+        """Make the result true, and the job succeeded with it; False when the attempt may not."""
+        job = self._job
+        if job.kind is JobKind.TRADEOFF:
+            found = FinishedTradeoff(answer["document"], answer["page"], draft.read_bytes())
+            return self._store.tradeoffs.finish(job.id, job.attempt, found)
+        made = FinishedLift(draft, answer["sha256"], answer["count"], answer["channels"], answer["metadata"])
+        return self._store.lifts.finish(job.id, job.attempt, made)
 
     def _log(self, text: str) -> None:
         self._store.attempts.log(self._job.id, self._job.attempt, text)
@@ -145,7 +155,10 @@ class Attempt:
         job, files = self._job, self._store.files
         assets = [self._store.assets.get(name) for name in (job.splats, job.cameras, *job.features)]
         return {
+            "kind": job.kind,
+            "parameters": job.parameters,
             "splats": str(assets[0].path),
+            "kernel": assets[0].counts.get("kernel", "3dgs"),  # to compile for
             "cameras": str(assets[1].path),
             "features": [str(asset.path) for asset in assets[2:]],
             "settings": job.settings,

@@ -1,30 +1,31 @@
-"""The process of one job: reads its order, lifts, and says how it goes in JSON lines on stdout.
+"""The process of one job: reads its order, does it, and says how it goes in JSON lines on stdout.
 
 Run as ``python -m service.jobs.child ORDER``, with a JSON file. Messages are ``{"event": "progress", ...}`` and
 ``{"event": "beat"}``, any number of times, then one ``{"event": "done", ...}`` or ``{"event": "fault", ...}``. It
-writes nothing but its draft and its checkpoint, so whatever ends it leaves no half a result behind. It ends by
-itself when its stdin closes.
+writes nothing but its draft and its checkpoint, so whatever ends it leaves no half a result behind. When its stdin
+closes it ends by itself, with all that it started.
 """
 
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 import os
+import signal
 import sys
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from liftcore.artifact import save_lift
 from liftcore.errors import SplatliftError
-from liftcore.lift import lift
-from liftcore.solve.checkpoint import Checkpoint
-from liftcore.solve.settings import LiftSettings
+from liftcore.progress import Progress
 from service.errors import OverLimit
 from service.faults import fault_of
+from service.wire import JobKind
+
+Work = Callable[[dict[str, Any], Progress], dict[str, Any]]  # an order to what is told of its result
 
 NICENESS = 10  # queries come first: beside one, a lift gets a tenth of a core
 FIRST_TO_GO = 500  # when the machine runs out of memory, this process is ended rather than the server
@@ -62,46 +63,37 @@ class Reporter:
             time.sleep(SECONDS_BETWEEN_BEATS)
 
 
+def work_of(kind: JobKind) -> Work:
+    """What a job of that kind does. Nothing is imported that the other kinds need alone."""
+    if kind is JobKind.TRADEOFF:
+        from service.jobs.comparing import compare_as_ordered
+
+        return compare_as_ordered
+    from service.jobs.lifting import lift_as_ordered
+
+    return lift_as_ordered
+
+
 def run(order: dict[str, Any], report: Reporter) -> dict[str, Any]:
-    """Do the lift of an order and save it.
+    """Do what an order says.
 
     Returns:
         The last message.
     """
+    kind = JobKind(order["kind"])
     try:
-        made = lift(
-            Path(order["splats"]),
-            Path(order["cameras"]),
-            [Path(path) for path in order["features"]],
-            LiftSettings.of(**order["settings"]),
-            threads=order["threads"],
-            progress=report,
-            checkpoint=Checkpoint(Path(order["work"]), order["checkpoint_seconds"]),
-        )
-        output = Path(order["output"])
-        save_lift(made, output)
+        return {"event": "done", **work_of(kind)(order, report)}
     except SplatliftError as error:
         return {"event": "fault", "fault": fault_of(error, order["names"])}
     except MemoryError:
-        error = OverLimit("lift", expected="a lift that fits this machine's memory", got="one that needs more")
+        error = OverLimit(kind, expected=f"a {kind} that fits this machine's memory", got="one that needs more")
         return {"event": "fault", "fault": fault_of(error)}
-    return {
-        "event": "done",
-        "sha256": _sha256(output),
-        "count": made.features.shape[0],
-        "channels": made.features.shape[1],
-        # Through JSON and not model_dump: what is not finite must become null before it reaches a client.
-        "metadata": json.loads(made.metadata.model_dump_json()),
-    }
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as handle:
-        return hashlib.file_digest(handle, "sha256").hexdigest()
 
 
 def _end_with_parent(stdin: BinaryIO) -> None:
     stdin.read()  # returns when the server's end of the pipe closes, however the server ended
+    if os.getpgrp() == os.getpid():  # the server gave us a group of our own: all in it is our doing
+        os.killpg(0, signal.SIGKILL)
     os._exit(3)
 
 

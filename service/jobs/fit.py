@@ -6,6 +6,9 @@ from collections.abc import Sequence
 
 from liftcore.errors import InvalidFeatures
 from service.store.assets import AssetRecord
+from service.wire import JobKind
+
+FLOAT_BYTES = 4  # float16 features take half of it
 
 
 def check_fit(cameras: AssetRecord, features: Sequence[AssetRecord]) -> None:
@@ -33,6 +36,13 @@ def check_fit(cameras: AssetRecord, features: Sequence[AssetRecord]) -> None:
             got=f"views {_examples(owner)} and cameras {_examples(known)}, none in common",
             hint="a view is named after its image, without the extension",
         )
+
+
+def scratch_bytes(kind: JobKind, splats: AssetRecord, features: Sequence[AssetRecord]) -> int:
+    """What a job writes to the disk at least while it runs: a trade-off keeps the features of its exact run."""
+    if kind is not JobKind.TRADEOFF:
+        return 0
+    return splats.counts.get("splats", 0) * (1 + features[0].counts["channels"]) * FLOAT_BYTES
 
 
 def _examples(names: dict[str, str] | set[str]) -> str:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 MARK = "SPLATLIFT_JOB_PROCESS"  # a job's processes carry its id under this name
 GONE_SECONDS = 5.0
+MOST_LOOKS = 10
 
 
 def mark(job: str) -> dict[str, str]:
@@ -23,11 +24,16 @@ def end_leftovers(jobs: Iterable[str]) -> int:
     marks = {f"{MARK}={job}".encode() for job in jobs}
     if not marks or not Path("/proc/self/environ").exists():
         return 0
-    handles = [handle for pid in _processes() if (handle := _killed(pid, marks)) is not None]
-    for handle in handles:
-        select.select([handle], [], [], GONE_SECONDS)  # readable once the process has ended
-        os.close(handle)
-    return len(handles)
+    ended = 0
+    for _ in range(MOST_LOOKS):
+        handles = [handle for pid in _processes() if (handle := _killed(pid, marks)) is not None]
+        for handle in handles:
+            select.select([handle], [], [], GONE_SECONDS)  # readable once the process has ended
+            os.close(handle)
+        ended += len(handles)
+        if not handles:
+            break  # and not before: one that we killed may have started another after we looked
+    return ended
 
 
 def _processes() -> list[int]:

@@ -9,7 +9,7 @@ import select
 import signal
 import subprocess
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -68,12 +68,8 @@ class JobProcess:
         return os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOWAIT | os.WNOHANG) is not None
 
     def private_bytes(self) -> int:
-        """Memory that is the child's own: mapped files, however large, do not count. 0 where Linux does not tell."""
-        with contextlib.suppress(OSError):
-            for line in Path(f"/proc/{self.pid}/status").read_text().splitlines():
-                if line.startswith("RssAnon:"):
-                    return int(line.split()[1]) << 10
-        return 0
+        """Memory of the child and of all that it started, but for mapped files. 0 where Linux does not tell."""
+        return sum(_private_bytes(pid) for pid in _family(self.pid))
 
     def end(self) -> int:
         """End the whole group at once; the child's exit status, negative for a signal. No process is left after this.
@@ -96,3 +92,21 @@ class JobProcess:
             while time.monotonic() < deadline:
                 os.killpg(self.pid, 0)
                 time.sleep(0.005)
+
+
+def _private_bytes(pid: int) -> int:
+    with contextlib.suppress(OSError):
+        for line in Path(f"/proc/{pid}/status").read_text().splitlines():
+            if line.startswith("RssAnon:"):
+                return int(line.split()[1]) << 10
+    return 0
+
+
+def _family(pid: int) -> Iterator[int]:
+    """A process and what it started, as far as Linux tells; whoever ends meanwhile is left out."""
+    yield pid
+    with contextlib.suppress(OSError):
+        for task in Path(f"/proc/{pid}/task").iterdir():  # a process is the child of the thread that began it
+            with contextlib.suppress(OSError):
+                for child in (task / "children").read_text().split():
+                    yield from _family(int(child))

@@ -12,7 +12,7 @@ from service.errors import Crashed
 from service.faults import fault_of
 from service.jobs.attempt import CHILD, Attempt
 from service.jobs.leftovers import end_leftovers
-from service.jobs.limits import LiftLimits
+from service.jobs.limits import JobLimits
 from service.store.jobs import JobRecord
 from service.store.store import Store
 
@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 class Supervisor:
     """Threads that own the running jobs, one each. Only they change a job after it was submitted or canceled."""
 
-    def __init__(self, store: Store, limits: LiftLimits, *, command: Sequence[str] = CHILD) -> None:
+    def __init__(self, store: Store, limits: JobLimits, *, command: Sequence[str] = CHILD) -> None:
         self._store = store
         self._limits = limits
         self._command = command

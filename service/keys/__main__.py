@@ -47,7 +47,7 @@ def build_parser() -> argparse.ArgumentParser:
     create = actions.add_parser("create", help="make a key and show it, once")
     create.add_argument("--name", required=True, help="whose it is, or what for")
     create.add_argument("--scopes", required=True, help="read, write, metrics, admin, with commas between")
-    create.add_argument("--max-bytes", type=_whole, help="of its assets and lifts; else as the server is set")
+    create.add_argument("--max-bytes", type=_whole, help="of its assets and results; else as the server is set")
     create.add_argument("--max-queued", type=_whole, help="jobs of it in line; else as the server is set")
     create.add_argument("--max-uploads", type=_whole, help="at the same time; else as the server is set")
     listing = actions.add_parser("list", help="all keys, without their secrets")

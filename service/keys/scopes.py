@@ -11,7 +11,7 @@ from service.errors import InvalidRequest
 class Scope(StrEnum):
     """A kind of request that a key allows."""
 
-    READ = "read"  # look: assets, jobs, lifts, queries, pictures
+    READ = "read"  # look: assets, jobs, results, queries, pictures
     WRITE = "write"  # upload, order, cancel, delete
     METRICS = "metrics"  # /metrics, which tells of everybody's work together, and nothing else
     ADMIN = "admin"  # all of these, on everybody's things

@@ -1,7 +1,8 @@
-"""/lift and /jobs: work and how far it is."""
+"""/lift and /jobs: work and how far it is. /tradeoff is beside its results, in `service.routes.tradeoffs`."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import Annotated, Any
 
@@ -13,7 +14,7 @@ from liftcore.errors import InvalidSettings
 from liftcore.solve.settings import LiftSettings
 from service import request_id, wire
 from service.faults import error_of
-from service.jobs.fit import check_fit
+from service.jobs.fit import check_fit, scratch_bytes
 from service.parts import Here, Parts
 from service.problems import problem_of
 from service.store.events import Event, EventKind
@@ -31,6 +32,10 @@ Key = Annotated[
 LastEvent = Annotated[
     int, Header(alias="Last-Event-ID", ge=0, le=2**53, description="the last event that the client has")
 ]
+RESULT_LINKS: dict[wire.JobKind, Callable[[str], dict[str, str]]] = {
+    wire.JobKind.LIFT: lambda job: {"lift": f"/lifts/{job}", "features": f"/lifts/{job}/features"},
+    wire.JobKind.TRADEOFF: lambda job: {"tradeoff": f"/tradeoffs/{job}", "chart": f"/tradeoffs/{job}/chart"},
+}
 EVENT = {
     "type": "object",
     "description": "one event",
@@ -50,12 +55,12 @@ EVENTS: dict[int | str, dict[str, Any]] = {
 }
 
 
-@router.post(
-    "/lift",
-    response_model=wire.Job,
-    status_code=202,
-    responses={200: {"model": wire.Job, "description": "The job that the same key made before"}},
-)
+REPEATED: dict[int | str, dict[str, Any]] = {
+    200: {"model": wire.Job, "description": "The job that the same key made before"}
+}
+
+
+@router.post("/lift", response_model=wire.Job, status_code=202, responses=REPEATED)
 def submit(order: wire.LiftRequest, here: Here, key: Key = None) -> Response:
     """Lift features onto splats. The job is on the disk before this answers."""
     settings = parse_settings(order.settings)
@@ -68,13 +73,7 @@ def submit(order: wire.LiftRequest, here: Here, key: Key = None) -> Response:
         fingerprint=None if key is None else fingerprint(order.model_dump(mode="json")),
         request_id=request_id.current(),
     )
-    job, new = here.store.jobs.repeated(wanted), False
-    if job is None:
-        require_fit(wanted, here)
-        job, new = here.store.jobs.submit(wanted, max_queued=here.settings.max_queued)
-        here.runner.wake()
-    shaped = shape(here.store.jobs.get(job)).model_dump(mode="json")
-    return JSONResponse(shaped, 202 if new else 200, headers={"Location": f"/jobs/{job}"})
+    return take(wanted, here)
 
 
 @router.get("/jobs", response_model=wire.Jobs)
@@ -118,18 +117,31 @@ def delete_job(
     job: str,
     here: Here,
     with_lift: Annotated[bool, Query(description="its lift goes too; without this a job with a lift stays")] = False,
+    with_tradeoff: Annotated[bool, Query(description="its trade-off goes too, likewise")] = False,
 ) -> None:
     """Forget a job that has ended."""
-    here.store.jobs.delete(job, with_lift=with_lift)
+    said = {wire.JobKind.LIFT: with_lift, wire.JobKind.TRADEOFF: with_tradeoff}
+    here.store.jobs.delete(job, given_up=[kind for kind, gone in said.items() if gone])
+
+
+def take(order: JobOrder, here: Parts) -> Response:
+    """The answer to an order: the job that it makes, or made before."""
+    job, new = here.store.jobs.repeated(order), False
+    if job is None:
+        require_fit(order, here)
+        job, new = here.store.jobs.submit(order, max_queued=here.settings.max_queued)
+        here.runner.wake()
+    shaped = shape(here.store.jobs.get(job)).model_dump(mode="json")
+    return JSONResponse(shaped, 202 if new else 200, headers={"Location": f"/jobs/{job}"})
 
 
 def require_fit(order: JobOrder, here: Parts) -> None:
-    """Refuse an order that cannot become a lift, or that there is no room for."""
+    """Refuse an order that cannot be lifted, or that there is no room for."""
     cameras = here.store.assets.get(order.cameras, wire.AssetKind.CAMERAS)
     packs = [here.store.assets.get(pack, wire.AssetKind.FEATURES) for pack in order.features]
-    here.store.assets.get(order.splats, wire.AssetKind.SPLATS)
+    splats = here.store.assets.get(order.splats, wire.AssetKind.SPLATS)
     check_fit(cameras, packs)
-    here.store.files.require_room()
+    here.store.files.require_room(scratch_bytes(order.kind, splats, packs))
 
 
 def parse_settings(given: dict[str, wire.Scalar]) -> LiftSettings:
@@ -162,15 +174,17 @@ def shape(job: JobRecord) -> wire.Job:
     if job.state not in wire.ENDED:
         links["cancel"] = f"/jobs/{job.id}/cancel"
     if job.state is wire.JobState.SUCCEEDED:
-        links |= {"lift": f"/lifts/{job.id}", "features": f"/lifts/{job.id}/features"}
+        links |= RESULT_LINKS[job.kind](job.id)
     return wire.Job(
         id=job.id,
+        kind=job.kind,
         state=job.state,
         attempt=job.attempt,
         splats=job.splats,
         cameras=job.cameras,
         features=list(job.features),
         settings=job.settings,
+        parameters=job.parameters,
         progress=None if job.progress is None else wire.Progress.model_validate(job.progress),
         problem=None if job.problem is None else problem_of(error_of(job.problem)),
         created=job.created,

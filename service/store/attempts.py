@@ -142,6 +142,22 @@ class AttemptStore(Owned):
                 _lose(connection, row, why)
 
 
+def succeed(connection: sqlite3.Connection, job: str, attempt: int) -> bool:
+    """Within the transaction that keeps its result: end an attempt well.
+
+    Returns:
+        False when it is no longer the job's running one, or is to be canceled; then nothing changes.
+    """
+    ended = connection.execute(
+        "UPDATE jobs SET state = 'succeeded', ended = ?, leased_until = NULL"
+        " WHERE id = ? AND attempt = ? AND state = 'running' RETURNING *",
+        (time.time(), job, attempt),
+    ).fetchone()
+    if ended is not None:
+        told(connection, ended)
+    return ended is not None
+
+
 def told(connection: sqlite3.Connection, row: sqlite3.Row) -> None:
     """Note the state of a row that was just changed."""
     problem = None if row["problem"] is None else json.loads(row["problem"])

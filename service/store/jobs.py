@@ -7,6 +7,7 @@ import json
 import secrets
 import sqlite3
 import time
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,12 +18,14 @@ from service.store.database import Database
 from service.store.events import EventKind, note
 from service.store.files import DataDirectory
 from service.store.owners import QUEUE_RETRY_SECONDS, SEEN, Owned, Owner, require_quota, require_turn
-from service.wire import ENDED, AssetKind, JobState
+from service.wire import ENDED, AssetKind, JobKind, JobState
+
+RESULTS = {JobKind.LIFT: "lifts", JobKind.TRADEOFF: "tradeoffs"}  # the tables of what jobs make, by their ids
 
 
 @dataclass(frozen=True)
 class JobOrder:
-    """What a client wants to have lifted."""
+    """What a client wants to have done."""
 
     splats: str
     cameras: str
@@ -31,6 +34,8 @@ class JobOrder:
     key: str | None = None  # Idempotency-Key
     fingerprint: str | None = None  # of the order as it was sent, with a key
     request_id: str | None = None  # of the request that brings it
+    kind: JobKind = JobKind.LIFT
+    parameters: dict[str, Any] = field(default_factory=dict)  # what its kind takes beside settings
 
 
 @dataclass(frozen=True)
@@ -51,6 +56,8 @@ class JobRecord:
     ended: float | None
     leased_until: float | None
     request_id: str | None = None
+    kind: JobKind = JobKind.LIFT
+    parameters: dict[str, Any] = field(default_factory=dict)
 
 
 def fingerprint(order: dict[str, Any]) -> str:
@@ -82,19 +89,21 @@ class JobStore(Owned):
             known = _of_key(connection, order, self._owner)
             if known is not None:
                 return known, False
-            _require_place(connection, max_queued)
-            require_turn(connection, self._owner)
+            _require_place(connection, order.kind, max_queued)
+            require_turn(connection, order.kind, self._owner)
             _take_assets(connection, order, self._owner)
             require_quota(connection, self._owner, 1)
             connection.execute(
-                "INSERT INTO jobs (id, owner, state, splats, cameras, settings, created, idempotency_key,"
-                " fingerprint, request_id) VALUES (?, ?, 'queued', ?, ?, ?, ?, ?, ?, ?)",
+                "INSERT INTO jobs (id, owner, kind, state, splats, cameras, settings, parameters, created,"
+                " idempotency_key, fingerprint, request_id) VALUES (?, ?, ?, 'queued', ?, ?, ?, ?, ?, ?, ?, ?)",
                 (
                     job,
                     self._owner.key,
+                    order.kind,
                     order.splats,
                     order.cameras,
                     json.dumps(order.settings),
+                    json.dumps(order.parameters),
                     time.time(),
                     order.key,
                     order.fingerprint,
@@ -143,12 +152,16 @@ class JobStore(Owned):
             ).fetchall()
             return [record(connection, row) for row in rows]
 
-    def delete(self, job: str, *, with_lift: bool) -> None:
-        """Forget a job that has ended, its events and its lift.
+    def delete(self, job: str, *, given_up: Collection[JobKind] = ()) -> None:
+        """Forget a job that has ended, its events and its result.
+
+        Args:
+            job: its id.
+            given_up: the kinds of jobs whose result may go with them.
 
         Raises:
             NotFound: there is none.
-            Conflict: it has not ended, or it has a lift that was not given up.
+            Conflict: it has not ended, or it has a result that was not given up.
         """
         with self._database.write() as connection:
             row = find(connection, job, self._owner)
@@ -159,11 +172,12 @@ class JobStore(Owned):
                     "job", expected="a job that has ended", got=f"one that is {row['state']}",
                     hint=f"POST /jobs/{job}/cancel first",
                 )  # fmt: skip
-            lift = connection.execute("DELETE FROM lifts WHERE id = ? RETURNING file", (job,)).fetchall()
-            if lift and not with_lift:
+            kind = JobKind(row["kind"])
+            result = connection.execute(f"DELETE FROM {RESULTS[kind]} WHERE id = ? RETURNING id", (job,)).fetchall()
+            if result and kind not in given_up:
                 raise Conflict(
-                    "job", expected="a job without a lift", got="one whose lift would go with it",
-                    hint="say with_lift=true if that is meant",
+                    "job", expected=f"a job without a {kind}", got=f"one whose {kind} would go with it",
+                    hint=f"say with_{kind}=true if that is meant",
                 )  # fmt: skip
             connection.execute("DELETE FROM jobs WHERE id = ?", (job,))
         # After the commit: a crash here leaves files that the collection of garbage finds.
@@ -194,6 +208,8 @@ def record(connection: sqlite3.Connection, row: sqlite3.Row) -> JobRecord:
         ended=row["ended"],
         leased_until=row["leased_until"],
         request_id=row["request_id"],
+        kind=JobKind(row["kind"]),
+        parameters=json.loads(row["parameters"]),
     )
 
 
@@ -211,11 +227,11 @@ def _of_key(connection: sqlite3.Connection, order: JobOrder, owner: Owner) -> st
     return None if row is None else row["id"]
 
 
-def _require_place(connection: sqlite3.Connection, max_queued: int) -> None:
+def _require_place(connection: sqlite3.Connection, kind: JobKind, max_queued: int) -> None:
     queued = connection.execute("SELECT count(*) FROM jobs WHERE state = 'queued'").fetchone()[0]
     if queued >= max_queued:
         raise Busy(
-            "lift", expected=f"fewer than {max_queued} jobs in line", got=f"{queued}", hint="try again later",
+            kind, expected=f"fewer than {max_queued} jobs in line", got=f"{queued}", hint="try again later",
             retry_after=QUEUE_RETRY_SECONDS,
         )  # fmt: skip
 

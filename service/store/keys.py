@@ -22,7 +22,7 @@ SECRET_BYTES = 32
 class Quota:
     """What one key may fill; None = as the server's settings have it."""
 
-    max_bytes: int | None = None  # of assets and lifts together
+    max_bytes: int | None = None  # of assets and results together
     max_queued: int | None = None  # jobs in line
     max_uploads: int | None = None  # at the same time
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from liftcore.errors import NotFound
 from service.errors import InvalidRequest
-from service.store.attempts import told
+from service.store.attempts import succeed
 from service.store.database import Database
 from service.store.files import DataDirectory
 from service.store.owners import SEEN, Owned
@@ -64,19 +64,13 @@ class LiftStore(Owned):
         """End an attempt with its lift: the file, the lift and the job's last state become true together.
 
         Returns:
-            False when the attempt is no longer the job's running one, or is to be canceled; then nothing changes.
+            False when the attempt may not (`succeed`); then nothing changes.
         """
         path = self._files.lift(job)
         size = made.draft.stat().st_size
         with self._database.write() as connection:
-            ended = connection.execute(
-                "UPDATE jobs SET state = 'succeeded', ended = ?, leased_until = NULL"
-                " WHERE id = ? AND attempt = ? AND state = 'running' RETURNING *",
-                (time.time(), job, attempt),
-            ).fetchone()
-            if ended is None:
+            if not succeed(connection, job, attempt):
                 return False
-            told(connection, ended)
             self._files.publish(made.draft, path)
             connection.execute(
                 "INSERT INTO lifts (id, bytes, sha256, file, count, channels, metadata, created)"

@@ -24,7 +24,7 @@ class Owner:
 
     key: str = ""  # the id of a key: what is made belongs to it
     sees_all: bool = True
-    max_bytes: int | None = None  # of assets and lifts together; None = no limit
+    max_bytes: int | None = None  # of assets and results together; None = no limit
     max_queued: int | None = None  # jobs in line
 
     def terms(self, **more: Any) -> dict[str, Any]:
@@ -48,10 +48,13 @@ class Owned:
 
 
 def stored_bytes(connection: sqlite3.Connection, owner: Owner) -> int:
-    """What an owner's assets and lifts take; bytes that several have count for each of them."""
+    """What an owner's assets, lifts and trade-offs take; bytes that several have count for each of them."""
     assets = "SELECT total(bytes) FROM assets JOIN asset_owners ON asset = id WHERE owner = :owner"
     lifts = "SELECT total(lifts.bytes) FROM lifts JOIN jobs USING (id) WHERE owner = :owner"
-    return int(connection.execute(f"SELECT ({assets}) + ({lifts})", {"owner": owner.key}).fetchone()[0])
+    tradeoffs = "SELECT total(tradeoffs.bytes) FROM tradeoffs JOIN jobs USING (id) WHERE owner = :owner"
+    return int(
+        connection.execute(f"SELECT ({assets}) + ({lifts}) + ({tradeoffs})", {"owner": owner.key}).fetchone()[0]
+    )
 
 
 def require_quota(connection: sqlite3.Connection, owner: Owner, coming: int) -> None:
@@ -70,13 +73,13 @@ def require_quota(connection: sqlite3.Connection, owner: Owner, coming: int) -> 
     used = stored_bytes(connection, owner)
     if used + coming > owner.max_bytes:
         raise OverQuota(
-            "key", expected=f"at most {owner.max_bytes} bytes of assets and lifts", got=f"{used} and {coming} more",
-            hint="delete assets, or jobs with their lifts, or ask the operator for more",
+            "key", expected=f"at most {owner.max_bytes} bytes of assets and results", got=f"{used} and {coming} more",
+            hint="delete assets, or jobs with their results, or ask the operator for more",
         )  # fmt: skip
 
 
-def require_turn(connection: sqlite3.Connection, owner: Owner) -> None:
-    """See that an owner may put another job in line.
+def require_turn(connection: sqlite3.Connection, kind: str, owner: Owner) -> None:
+    """See that an owner may put another job, of that kind, in line.
 
     Raises:
         TooMany: as many are in line as may be.
@@ -86,6 +89,6 @@ def require_turn(connection: sqlite3.Connection, owner: Owner) -> None:
     row = connection.execute("SELECT count(*) FROM jobs WHERE state = 'queued' AND owner = ?", (owner.key,))
     if (queued := row.fetchone()[0]) >= owner.max_queued:
         raise TooMany(
-            "lift", expected=f"fewer than {owner.max_queued} jobs of this key in line", got=f"{queued}",
+            kind, expected=f"fewer than {owner.max_queued} jobs of this key in line", got=f"{queued}",
             hint="try again later", retry_after=QUEUE_RETRY_SECONDS,
         )  # fmt: skip

@@ -99,4 +99,18 @@ ALTER TABLE jobs ADD COLUMN owner TEXT NOT NULL DEFAULT '';  -- likewise
 DROP INDEX jobs_by_key;
 CREATE UNIQUE INDEX jobs_by_key ON jobs (owner, idempotency_key);
 """,
+    """
+ALTER TABLE jobs ADD COLUMN kind TEXT NOT NULL DEFAULT 'lift';      -- as service.wire.JobKind
+ALTER TABLE jobs ADD COLUMN parameters TEXT NOT NULL DEFAULT '{}';  -- JSON: what its kind takes beside settings
+
+CREATE TABLE tradeoffs (            -- small enough to lie here, so that no file can be without its row
+    id TEXT PRIMARY KEY REFERENCES jobs (id),
+    bytes INTEGER NOT NULL,
+    document TEXT NOT NULL,         -- JSON, as liftcore.measure.tradeoff.compare gives it
+    page TEXT NOT NULL,             -- Markdown
+    chart BLOB NOT NULL,            -- PNG
+    sha256 TEXT NOT NULL,           -- of the chart
+    created REAL NOT NULL
+) STRICT;
+""",
 )

@@ -16,13 +16,14 @@ from service.store.jobs import JobStore
 from service.store.keys import KeyStore
 from service.store.lifts import LiftStore
 from service.store.owners import Owner
+from service.store.tradeoffs import TradeoffStore
 
 DATABASE = "service.sqlite"  # in the data directory
 
 
 @dataclass(frozen=True)
 class Store:
-    """Assets, jobs, lifts and keys, with the files and the database that hold them."""
+    """Assets, jobs, their results and keys, with the files and the database that hold them."""
 
     files: DataDirectory
     database: Database
@@ -31,6 +32,7 @@ class Store:
     attempts: AttemptStore
     events: EventStore
     lifts: LiftStore
+    tradeoffs: TradeoffStore
     keys: KeyStore
 
     @classmethod
@@ -61,6 +63,7 @@ class Store:
             attempts=AttemptStore(database),
             events=EventStore(database),
             lifts=LiftStore(database, files),
+            tradeoffs=TradeoffStore(database),
             keys=KeyStore(database),
         )
 
@@ -73,6 +76,7 @@ class Store:
             attempts=self.attempts.seen_by(owner),
             events=self.events.seen_by(owner),
             lifts=self.lifts.seen_by(owner),
+            tradeoffs=self.tradeoffs.seen_by(owner),
         )
 
     def close(self) -> None:

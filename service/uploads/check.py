@@ -7,7 +7,6 @@ Run as ``python -m service.uploads.check KIND PATH MEMORY_BYTES``. It says ``rea
 from __future__ import annotations
 
 import json
-import math
 import os
 import resource
 import sys
@@ -21,6 +20,7 @@ from liftcore.observe.pack import open_packs
 from liftcore.scene.inspect import describe_cameras, describe_splats
 from liftcore.scene.load import load_cameras, load_splats
 from service.faults import fault_of
+from service.finite import finite
 from service.uploads.checking import INVALID
 from service.wire import AssetKind
 
@@ -56,7 +56,7 @@ def run(kind: AssetKind, path: Path) -> dict[str, Any]:
         return _invalid(error, kind, path)
     except MemoryError:
         return _invalid(_out_of_memory(kind), kind, path)
-    counts = _finite(checked["found"])
+    counts = finite(checked["found"])  # norms of float32 rows may be infinite
     return {
         "event": "valid",
         "suffix": checked["suffix"],
@@ -71,15 +71,6 @@ def _invalid(error: SplatliftError, kind: AssetKind, path: Path) -> dict[str, An
 
 def _out_of_memory(kind: AssetKind) -> InvalidInput:
     return INVALID[kind](kind, expected="a file that fits the memory of a check", got="one that needs more")
-
-
-def _finite(value: Any) -> Any:
-    """The value with null for what JSON cannot say: norms of float32 rows may be infinite."""
-    if isinstance(value, dict):
-        return {name: _finite(inner) for name, inner in value.items()}
-    if isinstance(value, list):
-        return [_finite(inner) for inner in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _say(out: BinaryIO, message: dict[str, Any]) -> None:

@@ -25,7 +25,7 @@ from unittest import mock
 import httpx
 
 from service.__main__ import server_of
-from service.app import create_app, lift_limits, query_limits
+from service.app import create_app, job_limits, query_limits
 from service.jobs.supervisor import Supervisor
 from service.keys.scopes import Scope
 from service.queries.warm import WarmWorker
@@ -51,7 +51,7 @@ def served(data: Path, *, keys: bool, **settings: Any) -> Iterator[tuple[str, st
     chosen = ServiceSettings.model_validate({"data": data, **settings})
     store = Store.open(chosen.data)
     secret = store.keys.create("contract", frozenset({Scope.ADMIN}), Quota())[1] if keys else None
-    runner = Supervisor(store, lift_limits(chosen), command=stand_in("answer"))
+    runner = Supervisor(store, job_limits(chosen), command=stand_in("answer"))
     listener = socket.create_server(("127.0.0.1", 0))
     server = server_of(create_app(chosen, store, runner, WarmWorker(query_limits(chosen))), chosen)
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -23,6 +23,8 @@ from service.store.keys import Quota
 from service.store.lifts import FinishedLift
 from service.store.owners import Owner
 from service.store.store import Store
+from service.store.tradeoffs import FinishedTradeoff
+from service.wire import JobKind
 from tests.crash.conftest import order
 from tests.crash.server import NoQueries
 
@@ -51,6 +53,7 @@ class Guarded:
     ids: Mapping[str, str]  # of keys, by name
     order: JobOrder
     done: str  # a job with a lift
+    compared: str  # one with a trade-off
     queued: str
 
     def ask(self, name: str | None, method: str, path: str, **how: Any) -> Any:
@@ -82,10 +85,12 @@ def guarded(data: Path, **settings: Any) -> Iterator[Guarded]:
     wanted = order(hers)
     done = hers.jobs.submit(wanted)[0]
     finish(store, b"a lift")
+    compared = hers.jobs.submit(replace(wanted, kind=JobKind.TRADEOFF, parameters={"budget_s": 60}))[0]
+    finish_tradeoff(store, b"a chart")
     queued = hers.jobs.submit(wanted)[0]
     try:
         with TestClient(app, ADDRESS, raise_server_exceptions=False) as client:
-            yield Guarded(client, store, secrets, ids, wanted, done, queued)
+            yield Guarded(client, store, secrets, ids, wanted, done, compared, queued)
     finally:
         store.close()
 
@@ -105,6 +110,14 @@ def finish(store: Store, content: bytes) -> None:
         assert store.lifts.finish(claimed.id, claimed.attempt, FinishedLift(draft, "0" * 64, 1, 1, METADATA))
 
 
+def finish_tradeoff(store: Store, chart: bytes) -> None:
+    """Claim the oldest job in line and end it with a trade-off."""
+    claimed = store.attempts.claim(60)
+    assert claimed is not None
+    found = {"runs": [], "skipped": [], "choice": {}, "views": {}, "budget_s": 60, "seconds": 1}
+    assert store.tradeoffs.finish(claimed.id, claimed.attempt, FinishedTradeoff(found, "a table", chart))
+
+
 def every_route(app: FastAPI) -> list[tuple[str, str]]:
     """Method and path of all that the application answers, documented or not."""
     found: list[tuple[str, str]] = []
@@ -121,4 +134,4 @@ def every_route(app: FastAPI) -> list[tuple[str, str]]:
 def address(path: str, job: str, asset: str) -> str:
     """A route's path with the ids in their places."""
     path = path.replace("{kind}", "cameras").replace("{asset}", asset)
-    return re.sub(r"\{(job|lift)\}", job, path)
+    return re.sub(r"\{(job|lift|tradeoff)\}", job, path)

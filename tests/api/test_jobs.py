@@ -16,7 +16,7 @@ from fastapi.testclient import TestClient
 
 from service.app import create_app
 from service.errors import Misconfigured
-from service.jobs.limits import LiftLimits
+from service.jobs.limits import JobLimits
 from service.jobs.supervisor import Supervisor
 from service.queries.warm import QueryLimits, WarmWorker
 from service.settings import ServiceSettings
@@ -41,7 +41,7 @@ def quick(store: Store) -> Quick:
     def serve(behaviour: str, **settings: Any) -> Iterator[tuple[TestClient, dict[str, Any]]]:
         chosen = ServiceSettings.model_validate({"data": store.files.root, **settings})
         worker = WarmWorker(QueryLimits(waiting=1, seconds=1, scenes=1, cache_bytes=0, encoder="minilm"))
-        supervisor = Supervisor(store, LiftLimits(), command=stand_in(behaviour))
+        supervisor = Supervisor(store, JobLimits(), command=stand_in(behaviour))
         known = order(store)
         body = {"splats": known.splats, "cameras": known.cameras, "features": list(known.features)}
         app = create_app(chosen, store, supervisor, worker)

@@ -91,7 +91,7 @@ def test_scopes_are_as_documented(method: str, path: str, scope: str) -> None:
 
 def naming(method: str, path: str, job: str, asset: str, house: Guarded) -> list[dict[str, Any]]:
     """Requests to a route that name a job, a lift or an asset, once for each place that takes a name."""
-    if path == "/lift":
+    if path in ("/lift", "/tradeoff"):
         absent = {"splats": asset, "cameras": asset, "features": [asset]}
         return [{"json": house.body() | {place: name}} for place, name in absent.items()]
     if path.startswith("/query") or path == "/render":
@@ -102,11 +102,12 @@ def naming(method: str, path: str, job: str, asset: str, house: Guarded) -> list
 
 
 def test_what_is_anothers_is_absent_on_every_route(house: Guarded) -> None:
-    job, asset = house.done, house.order.splats
+    asset = house.order.splats
     ids = re.compile("sha256:[0-9a-f]{64}|[0-9a-f]{32}")
     for method, path in closed_routes(house):
         if (method, path) in NAMELESS:
             continue
+        job = house.compared if "{tradeoff}" in path else house.done
         real = naming(method, path, job, asset, house)
         absent = naming(method, path, NOBODY, NO_ASSET, house)
         for how, nothing in zip(real, absent, strict=True):
@@ -120,13 +121,14 @@ def test_what_is_anothers_is_absent_on_every_route(house: Guarded) -> None:
         assert list(house.ask("bob", "GET", path).json().values()) == [[]]
     assert "at least one lift" in house.ask("bob", "GET", "/query", params=ASKING).json()["detail"]
     assert house.ask("alice", "GET", f"/lifts/{house.done}/features").content == b"a lift"
+    assert house.ask("alice", "GET", f"/tradeoffs/{house.compared}/chart").content == b"a chart"
     assert house.store.jobs.get(house.queued).state is JobState.QUEUED
 
 
 def test_admins_see_and_touch_everything(house: Guarded) -> None:
     assert [len(house.ask("boss", "GET", path).json()[path[1:]]) for path in ("/assets", "/jobs", "/lifts")] == [
         3,
-        2,
+        3,
         1,
     ]
     assert house.ask("boss", "GET", f"/assets/{house.order.splats}/content").status_code == 200
@@ -138,9 +140,9 @@ def test_admins_see_and_touch_everything(house: Guarded) -> None:
 def test_admins_job_keeps_what_it_needs(house: Guarded) -> None:
     job = house.ask("boss", "POST", "/lift", json=house.body())
     assert job.status_code == 202
-    for hers in (house.done, house.queued):
+    for hers in (house.done, house.compared, house.queued):
         house.ask("alice", "POST", f"/jobs/{hers}/cancel")
-        assert house.ask("alice", "DELETE", f"/jobs/{hers}?with_lift=true").status_code == 204
+        assert house.ask("alice", "DELETE", f"/jobs/{hers}?with_lift=true&with_tradeoff=true").status_code == 204
     assert house.ask("alice", "GET", f"/jobs/{job.json()['id']}").status_code == 404
     assert house.ask("alice", "DELETE", f"/assets/{house.order.splats}").status_code == 204
     assert house.ask("alice", "GET", f"/assets/{house.order.splats}").status_code == 404
@@ -234,7 +236,7 @@ def test_open_until_the_first_key_and_never_again(tmp_path: Path, capsys: pytest
         mine = house.client.get("/jobs", headers=bearer(secret))
         assert mine.status_code == 200 and mine.json() == {"jobs": []}  # what was before keys is of admins
         _, admin = make_key(house.store, "admin")
-        assert len(house.client.get("/jobs", headers=bearer(admin)).json()["jobs"]) == 2
+        assert len(house.client.get("/jobs", headers=bearer(admin)).json()["jobs"]) == 3
         assert main(["list", *where]) == 0
         line = capsys.readouterr().out.splitlines()[0].split()
         assert secret not in " ".join(line) and "valid" in line
@@ -348,6 +350,10 @@ def test_stored_bytes_have_a_quota(tmp_path: Path) -> None:
             assert (assert_problem(reply)["type"], reply.status_code) == ("/problems/over-quota", 403)
             assert str(used) in reply.json()["expected"]
         assert house.client.delete(f"/jobs/{house.done}?with_lift=true", headers=bearer(secret)).status_code == 204
+        reply = house.client.post("/lift", headers=bearer(secret), json=house.body())
+        assert reply.status_code == 403  # the trade-off counts, too
+        gone = house.client.delete(f"/jobs/{house.compared}?with_tradeoff=true", headers=bearer(secret))
+        assert gone.status_code == 204
         assert house.client.post("/lift", headers=bearer(secret), json=house.body()).status_code == 202
 
 

@@ -26,7 +26,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from service import request_id
 from service.errors import Busy
-from service.jobs.limits import LiftLimits
+from service.jobs.limits import JobLimits
 from service.jobs.supervisor import Supervisor
 from service.logs import JsonLines, TextLines
 from service.store.store import Store
@@ -259,7 +259,7 @@ def test_log_of_a_job_names_the_request_that_made_it(tmp_path: Path) -> None:
     watch, logger = Watch(), logging.getLogger("service.jobs")
     store = Store.open(tmp_path)
     job = store.jobs.submit(replace(order(store), request_id="the-order"))[0]
-    runner = Supervisor(store, LiftLimits(), command=stand_in("answer"))
+    runner = Supervisor(store, JobLimits(), command=stand_in("answer"))
     logger.addHandler(watch)
     logger.setLevel(logging.INFO)
     try:

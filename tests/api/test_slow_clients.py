@@ -20,7 +20,7 @@ import pytest
 import uvicorn
 from starlette.exceptions import HTTPException
 
-from service.app import create_app, lift_limits, pace_of
+from service.app import create_app, job_limits, pace_of
 from service.connection import watched
 from service.jobs.supervisor import Supervisor
 from service.limits import BodyLimit, Pace
@@ -55,7 +55,7 @@ def running(data: Path, **settings: Any) -> Iterator[uvicorn.Server]:
     patient = {"min_bytes_per_second": 1000, "slow_grace_seconds": 30, "header_seconds": 30}
     chosen = ServiceSettings.model_validate({"data": data, "disk_floor_bytes": 0, **patient, **settings})
     store = Store.open(chosen.data)
-    app = create_app(chosen, store, Supervisor(store, lift_limits(chosen)), cast("WarmWorker", NoQueries()))
+    app = create_app(chosen, store, Supervisor(store, job_limits(chosen)), cast("WarmWorker", NoQueries()))
     listener = socket.create_server(("127.0.0.1", 0))
     connection = watched(pace_of(chosen), chosen.max_connections)
     config = uvicorn.Config(app, http=connection, log_level="critical", timeout_graceful_shutdown=10)

@@ -9,7 +9,7 @@ from typing import Any, cast
 import pytest
 from fastapi.testclient import TestClient
 
-from service.app import create_app, lift_limits
+from service.app import create_app, job_limits
 from service.jobs.supervisor import Supervisor
 from service.keys.scopes import parse_scopes
 from service.queries.warm import WarmWorker
@@ -41,7 +41,7 @@ def most(monkeypatch: pytest.MonkeyPatch) -> Callable[[], int]:
 def put(store: Store, headers: dict[str, str]) -> Any:
     """Upload what decompresses to 64 MiB."""
     settings = ServiceSettings.model_validate({"data": store.files.root})
-    app = create_app(settings, store, Supervisor(store, lift_limits(settings)), cast("WarmWorker", NoQueries()))
+    app = create_app(settings, store, Supervisor(store, job_limits(settings)), cast("WarmWorker", NoQueries()))
     with TestClient(app, "http://127.0.0.1", raise_server_exceptions=False) as client:
         return client.put("/assets/splats", content=BODY, headers={"Content-Encoding": "gzip", **headers})
 

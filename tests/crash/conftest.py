@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from service.jobs.limits import LiftLimits
+from service.jobs.limits import JobLimits
 from service.jobs.supervisor import Supervisor
 from service.store.assets import CheckedUpload
 from service.store.jobs import JobOrder, JobRecord
@@ -73,7 +73,7 @@ def supervising(store: Store) -> Supervising:
 
     @contextmanager
     def run(behaviour: str, **limits: Any) -> Iterator[Supervisor]:
-        supervisor = Supervisor(store, LiftLimits(**limits), command=stand_in(behaviour))
+        supervisor = Supervisor(store, JobLimits(**limits), command=stand_in(behaviour))
         supervisor.start()
         try:
             yield supervisor

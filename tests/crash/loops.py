@@ -65,11 +65,11 @@ def stored(data: Path, files: dict[str, bytes]) -> dict[str, Any]:
 
 def insist(service: ServiceProcess, body: dict[str, Any], key: str) -> str:
     """Order a lift as a client does that was cut off: again with the same key, when the server is back."""
-    job = service.lift(body, key)
+    job = service.order(body, key)
     while job is None:
         service.wait()
         service.start()
-        job = service.lift(body, key)
+        job = service.order(body, key)
     return job
 
 
@@ -142,19 +142,21 @@ def fault_points(points: list[str]) -> dict[str, str]:
 
 
 def _at_point(point: str) -> str:
+    compared = "trade-off" in point
+    route, made = ("/tradeoff", "/tradeoffs/{}/chart") if compared else ("/lift", "/lifts/{}/features")
     with tempfile.TemporaryDirectory() as folder:
         body = stored(Path(folder), NOTHING)
         with ServiceProcess(Path(folder), *ANSWERS, "--point", point) as service:
-            first = service.lift(body, "key")
+            first = service.order(body, "key", route)
             assert service.wait() == -9, point
             service.start(*ANSWERS)
-            job = service.lift(body, "key")
+            job = service.order(body, "key", route)
             assert job is not None and first in (None, job)
             state = service.ended(job)["state"]
             jobs, times = len(service.client.get("/jobs").json()["jobs"]), service.times_succeeded(job)
-            lift = service.client.get(f"/lifts/{job}/features").status_code
-    once = (state, jobs, times, lift) == ("succeeded", 1, 1, 200)
-    return "finished once" if once else f"{state}: {jobs} jobs, {times} times, the lift gives {lift}"
+            result = service.client.get(made.format(job)).status_code
+    once = (state, jobs, times, result) == ("succeeded", 1, 1, 200)
+    return "finished once" if once else f"{state}: {jobs} jobs, {times} times, the result gives {result}"
 
 
 def leak_loop(jobs: int) -> dict[str, Any]:
@@ -164,7 +166,7 @@ def leak_loop(jobs: int) -> dict[str, Any]:
         seen = []
         with ServiceProcess(Path(folder), *ANSWERS) as service:
             for number in range(WARM_UP_JOBS + jobs):
-                job = service.lift(body, str(number))
+                job = service.order(body, str(number))
                 assert job is not None
                 assert service.times_succeeded(job) == 1  # the stream ends with the job
                 if number >= WARM_UP_JOBS - 1:

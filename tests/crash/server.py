@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from service.__main__ import server_of
-from service.app import create_app, lift_limits
+from service.app import create_app, job_limits
 from service.jobs.attempt import CHILD
 from service.jobs.process import JobProcess
 from service.jobs.supervisor import Supervisor
@@ -27,6 +27,7 @@ from service.store.files import DataDirectory
 from service.store.jobs import JobStore
 from service.store.lifts import LiftStore
 from service.store.store import Store
+from service.store.tradeoffs import TradeoffStore
 
 from .conftest import stand_in
 
@@ -40,6 +41,8 @@ POINTS: dict[str, tuple[type, str, str]] = {
     "before the lift is published": (DataDirectory, "publish", "before"),
     "after the lift is published, before it has a row": (DataDirectory, "publish", "after"),
     "after the lift has its row": (LiftStore, "finish", "after"),
+    "before the trade-off has its row": (TradeoffStore, "finish", "before"),
+    "after the trade-off has its row": (TradeoffStore, "finish", "after"),
     "before the work is forgotten": (DataDirectory, "forget_work", "before"),
 }
 
@@ -89,7 +92,7 @@ def main() -> None:
     if given.point:
         arm(given.point)
     command = stand_in(given.behaviour) if given.behaviour else CHILD
-    runner = Supervisor(store, lift_limits(settings), command=command)
+    runner = Supervisor(store, job_limits(settings), command=command)
     app = create_app(settings, store, runner, cast("WarmWorker", NoQueries()))
     listener = socket.create_server(("127.0.0.1", 0))
     server_of(app, settings).run(sockets=[listener])

@@ -68,10 +68,10 @@ class ServiceProcess:
         self._process.stdout.close()
         return status
 
-    def lift(self, body: dict[str, Any], key: str) -> str | None:
-        """Order a lift; the job's id, None when the server died over it."""
+    def order(self, body: dict[str, Any], key: str, route: str = "/lift") -> str | None:
+        """Order a lift, or what the route is for; the job's id, None when the server died over it."""
         try:
-            reply = self.client.post("/lift", json=body, headers={"Idempotency-Key": key})
+            reply = self.client.post(route, json=body, headers={"Idempotency-Key": key})
         except httpx.TransportError:
             return None
         assert reply.status_code in (200, 202), reply.text

@@ -26,6 +26,11 @@ def say(**message: Any) -> None:
 
 
 def finish(order: dict[str, Any]) -> None:
+    if order["kind"] == "tradeoff":
+        Path(order["output"]).write_bytes(b"a chart")
+        found = {"runs": [], "skipped": [], "choice": {}, "views": {}, "seconds": 0.0, **order["parameters"]}
+        say(event="done", document=found, page="a table")
+        return
     content = hashlib.sha256(json.dumps([order["splats"], order["settings"]]).encode()).digest()
     Path(order["output"]).write_bytes(content)
     names = {"encoder": "", "text_space": "none", "views": []}
@@ -80,6 +85,15 @@ def eat(order: dict[str, Any]) -> None:
         time.sleep(0.02)
 
 
+def feed(order: dict[str, Any]) -> None:
+    """Eat by a process of our own, as a trade-off does."""
+    code = "import os, time; eaten = bytearray(os.urandom(1 << 20)) * 300; time.sleep(600)"
+    child = subprocess.Popen([sys.executable, "-S", "-c", code])
+    first_time(order)
+    (Path(order["work"]) / "grandchild").write_text(str(child.pid))
+    child.wait()
+
+
 def meet(order: dict[str, Any]) -> None:
     """Wait until another one of us runs."""
     room = Path(order["work"]).parent  # work itself goes when its job ends, perhaps before the other one looked
@@ -96,7 +110,7 @@ def slowly(order: dict[str, Any]) -> None:
 
 
 BEHAVIOURS: dict[str, Callable[[dict[str, Any]], None]] = {
-    function.__name__: function for function in (answer, hang, die, die_once, stop_once, eat, meet, slowly)
+    function.__name__: function for function in (answer, hang, die, die_once, stop_once, eat, feed, meet, slowly)
 }
 
 

@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from service.errors import Conflict
+from service.jobs import leftovers
 from service.jobs.leftovers import mark
 from service.store.attempts import MAX_ATTEMPTS
 from service.store.events import EventKind
@@ -162,9 +163,13 @@ def test_lift_that_is_done_when_its_job_is_canceling_is_dropped(store: Store) ->
 
 @pytest.mark.parametrize(
     ("behaviour", "limit", "word"),
-    [("hang", {"seconds": 0.5}, "0.5 s"), ("eat", {"memory_bytes": 200 << 20}, "memory")],
+    [
+        ("hang", {"seconds": 0.5}, "0.5 s"),
+        ("eat", {"memory_bytes": 200 << 20}, "memory"),
+        ("feed", {"memory_bytes": 200 << 20}, "memory"),
+    ],
 )
-def test_lift_beyond_a_limit_is_ended_once_and_told(
+def test_job_beyond_a_limit_is_ended_once_and_told(
     store: Store, supervising: Supervising, behaviour: str, limit: dict[str, Any], word: str
 ) -> None:
     job = submit(store)
@@ -205,6 +210,37 @@ def test_what_a_dead_server_left_running_is_ended_before_its_job_runs_again(
         bystander.kill()
         left.wait()
         bystander.wait()
+
+
+def test_what_a_job_process_started_ends_when_its_server_does() -> None:
+    code = """if True:
+        import subprocess, sys
+        from service.jobs.child import _end_with_parent
+        own = subprocess.Popen([sys.executable, "-S", "-c", "import time; time.sleep(600)"])
+        print(own.pid, flush=True)
+        _end_with_parent(open(0, "rb", buffering=0))
+    """
+    command = [sys.executable, "-c", code]
+    child = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True)
+    assert child.stdin is not None and child.stdout is not None
+    grandchild = int(child.stdout.readline())
+    assert alive(grandchild)
+    child.stdin.close()  # as when the server is killed
+    child.stdout.close()
+    assert child.wait() == -signal.SIGKILL
+    until(lambda: not alive(grandchild))
+
+
+def test_process_that_a_leftover_started_while_it_was_looked_for_is_ended_too(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    job = "1" * 32
+    command = [sys.executable, "-S", "-c", "import time; time.sleep(600)"]
+    found = [subprocess.Popen(command, env=os.environ | mark(job)) for _ in range(2)]
+    looks = iter([[found[0].pid], [found[1].pid], []])
+    monkeypatch.setattr(leftovers, "_processes", lambda: next(looks))
+    assert leftovers.end_leftovers([job]) == 2
+    assert [process.wait() for process in found] == [-signal.SIGKILL] * 2
 
 
 def test_job_of_a_dead_server_is_queued_again_then_failed(store: Store) -> None:

@@ -13,6 +13,7 @@ IN_SHORT = (
     "after some progress",
     "after the lift is published, before it has a row",
     "after the lift has its row",
+    "before the trade-off has its row",
 )
 
 

@@ -24,7 +24,8 @@ from service.store.jobs import JobOrder
 from service.store.lifts import FinishedLift
 from service.store.owners import Owner, stored_bytes
 from service.store.store import Store
-from service.wire import ENDED, AssetKind, JobState
+from service.store.tradeoffs import FinishedTradeoff
+from service.wire import ENDED, AssetKind, JobKind, JobState
 
 LEASE = 60.0
 MAX_QUEUED = 3
@@ -41,7 +42,7 @@ class Model:
     state: str = "queued"
     attempt: int = 0
     released: int = 0
-    lift: bytes | None = None
+    result: bytes | None = None
     story: list[str] = field(default_factory=lambda: ["queued"])
 
     def move(self, state: str) -> None:
@@ -127,13 +128,14 @@ class StoreMachine(RuleBasedStateMachine):
         print_=st.sampled_from(["x", "x", "y"]),
         mistaken=st.sampled_from([False] * 9 + [True]),
         who=st.sampled_from(["a", "a", *OWNERS]),
+        kind=st.sampled_from(JobKind),
     )
-    def submit(self, data: Any, key: str | None, print_: str, mistaken: bool, who: str) -> None:
+    def submit(self, data: Any, key: str | None, print_: str, mistaken: bool, who: str, kind: JobKind) -> None:
         chosen = []
-        for kind in AssetKind:
-            right = [asset for asset in sorted(self.assets) if self.assets[asset].startswith(kind.encode())]
+        for needed in AssetKind:
+            right = [asset for asset in sorted(self.assets) if self.assets[asset].startswith(needed.encode())]
             chosen.append(data.draw(st.sampled_from(sorted(self.assets) if mistaken or not right else right)))
-        order = JobOrder(chosen[0], chosen[1], (chosen[2],), {}, key, print_)
+        order = JobOrder(chosen[0], chosen[1], (chosen[2],), {}, key, print_, kind=kind)
         known = [
             job
             for job, model in self.jobs.items()
@@ -182,12 +184,15 @@ class StoreMachine(RuleBasedStateMachine):
     @rule(attempt=attempts, content=st.binary(max_size=3))
     def finish(self, attempt: tuple[str, int], content: bytes) -> None:
         model = self.owner(attempt)
-        with self.store.files.draft(".safetensors") as draft:
-            draft.write_bytes(content)
-            done = self.store.lifts.finish(*attempt, FinishedLift(draft, "0" * 64, 1, 1, {}))
+        if attempt[0] in self.jobs and self.jobs[attempt[0]].order.kind is JobKind.TRADEOFF:
+            done = self.store.tradeoffs.finish(*attempt, FinishedTradeoff({}, "", content))
+        else:
+            with self.store.files.draft(".safetensors") as draft:
+                draft.write_bytes(content)
+                done = self.store.lifts.finish(*attempt, FinishedLift(draft, "0" * 64, 1, 1, {}))
         assert done == (model is not None and model.state == "running")
         if done and model is not None:
-            model.lift = content
+            model.result = content
             model.move("succeeded")
 
     @rule(attempt=attempts)
@@ -248,20 +253,20 @@ class StoreMachine(RuleBasedStateMachine):
             model.move("canceled" if model.state == "queued" else "canceling")
 
     @precondition(lambda self: self.jobs)
-    @rule(data=st.data(), with_lift=st.booleans(), who=st.sampled_from([*OWNERS]))
-    def delete_job(self, data: Any, with_lift: bool, who: str) -> None:
+    @rule(data=st.data(), given_up=st.sets(st.sampled_from(JobKind)), who=st.sampled_from([*OWNERS]))
+    def delete_job(self, data: Any, given_up: set[JobKind], who: str) -> None:
         job = self.drawn(data)
         model = self.jobs[job]
         seen = self.store.seen_by(OWNERS[who]).jobs
         if not OWNERS[who].sees_all and model.owner != who:
             with pytest.raises(NotFound):
-                seen.delete(job, with_lift=with_lift)
-        elif model.state in ENDED and (model.lift is None or with_lift):
-            seen.delete(job, with_lift=with_lift)
+                seen.delete(job, given_up=given_up)
+        elif model.state in ENDED and (model.result is None or model.order.kind in given_up):
+            seen.delete(job, given_up=given_up)
             del self.jobs[job]
         else:
             with pytest.raises(Conflict):
-                seen.delete(job, with_lift=with_lift)
+                seen.delete(job, given_up=given_up)
 
     @rule()
     def collect(self) -> None:
@@ -289,7 +294,9 @@ class StoreMachine(RuleBasedStateMachine):
         found = {job.id: (job.state, job.attempt) for job in self.store.jobs.all()}
         assert found == {job: (JobState(model.state), model.attempt) for job, model in self.jobs.items()}
         lifts = {lift.id: lift.path.read_bytes() for lift in self.store.lifts.all()}
-        assert lifts == {job: model.lift for job, model in self.jobs.items() if model.lift is not None}
+        assert lifts == self.results(JobKind.LIFT)
+        for job, chart in self.results(JobKind.TRADEOFF).items():
+            assert self.store.tradeoffs.get(job).chart == chart
         for job, model in self.jobs.items():
             events = self.store.events.after(job, 0)
             assert [event.data["state"] for event in events if event.kind is EventKind.STATE] == model.story
@@ -299,17 +306,26 @@ class StoreMachine(RuleBasedStateMachine):
         files = [path for room in ROOMS for path in (self.store.files.root / room).rglob("*") if path.is_file()]
         assert len(files) == len(self.assets) + len(lifts)
 
+    def results(self, kind: JobKind) -> dict[str, bytes]:
+        made = {job: model.result for job, model in self.jobs.items() if model.order.kind is kind}
+        return {job: content for job, content in made.items() if content is not None}
+
     def sees_its_own(self, who: str) -> None:
         seen, all_ = self.store.seen_by(OWNERS[who]), OWNERS[who].sees_all
         jobs = {job for job, model in self.jobs.items() if all_ or model.owner == who}
         assert {asset.id for asset in seen.assets.all()} == {asset for asset in self.assets if self.sees(who, asset)}
         assert {job.id for job in seen.jobs.all()} == jobs
-        assert {lift.id for lift in seen.lifts.all()} == {job for job in jobs if self.jobs[job].lift is not None}
+        lifts, tradeoffs = (self.results(kind) for kind in JobKind)
+        assert {lift.id for lift in seen.lifts.all()} == jobs & lifts.keys()
         for job in self.jobs:
             assert (seen.attempts.state(job) is not None) == (job in jobs)
-            assert (seen.lifts.find(job) is not None) == (job in jobs and self.jobs[job].lift is not None)
+            assert (seen.lifts.find(job) is not None) == (job in jobs & lifts.keys())
+            if job not in jobs & tradeoffs.keys():
+                with pytest.raises(NotFound):
+                    seen.tradeoffs.get(job)
         stored = sum(len(content) for asset, content in self.assets.items() if who in self.owned[asset])
-        stored += sum(len(model.lift or b"") for model in self.jobs.values() if model.owner == who)
+        stored += sum(len(content) for job, content in lifts.items() if self.jobs[job].owner == who)
+        stored += sum(len(b"{}" + content) for job, content in tradeoffs.items() if self.jobs[job].owner == who)
         with self.store.database.read() as connection:
             assert stored_bytes(connection, OWNERS[who]) == stored
 

@@ -1,0 +1,46 @@
+"""What a job of kind ``tradeoff`` does."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from liftcore.measure.tradeoff.compare import compare
+from liftcore.measure.tradeoff.order import CANDIDATES, Scene
+from liftcore.measure.tradeoff.report import page_of, save
+from liftcore.progress import Progress
+from liftcore.raster.warm_up import warm_up
+from liftcore.scene.splats import Kernel
+from service.finite import finite
+
+SHOWN_DIGITS = 12  # of the splats' digest, by which the chart names the scene
+
+
+def compare_as_ordered(order: dict[str, Any], progress: Progress) -> dict[str, Any]:
+    """Compare, and draw the chart at ``output``. Each run is a process of our group, with our environment.
+
+    Returns:
+        What the job's last message tells of it: ``document`` and ``page``.
+
+    Raises:
+        SplatliftError: as `liftcore.measure.tradeoff.compare.compare` has it.
+    """
+    splats, features = Path(order["splats"]), tuple(Path(path) for path in order["features"])
+    scene = Scene(splats, Path(order["cameras"]), features)
+    settings, budget = order["settings"], order["parameters"]["budget_s"]
+    progress("compile", 0, 1, "kernels")
+    warm_up(Kernel(order["kernel"]))  # for the runs to load: else the first on a machine eats up the budget
+    progress("tradeoff", 0, len(CANDIDATES), "runs")
+    found = compare(scene, budget, settings, order["threads"], progress)
+    named = {
+        "title": "Speed against accuracy",
+        "scene": f"splats {splats.stem[:SHOWN_DIGITS]}",  # a blob is named by its digest
+        "command": f"POST /tradeoff {json.dumps({'budget_s': budget, 'settings': settings})}",
+    }
+    document = finite(named | found)
+    with tempfile.TemporaryDirectory(prefix="splatlift-chart-") as folder:
+        chart = next(file for file in save(document, Path(folder)) if file.suffix == ".png")
+        Path(order["output"]).write_bytes(chart.read_bytes())
+    return {"document": document, "page": "\n".join(page_of(document)) + "\n"}
