@@ -2,19 +2,32 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from liftcore.commands.reply import reply
 
 if TYPE_CHECKING:
     import argparse
+    from collections.abc import Iterator
 
-_OPTIONS = ("scene", "splats", "size", "channels", "levels", "views", "threads")
+_OPTIONS = ("scene", "splats", "size", "channels", "levels", "views", "threads", "stages")
 
 
 def run(options: argparse.Namespace) -> int:
     """Measure, and print the figures with the hardware they were taken on."""
     from liftcore.measure.bench import run_bench
 
-    reply(run_bench({name: getattr(options, name) for name in _OPTIONS}), as_json=options.json)
+    document = run_bench({name: getattr(options, name) for name in _OPTIONS})
+    reply(document, as_json=options.json, lines=_steps(document) if options.stages else None)
     return 0
+
+
+def _steps(document: dict[str, Any]) -> Iterator[str]:
+    """The steps of a view as a table for people."""
+    rest = {key: value for key, value in document.items() if key not in ("presets", "hardware")}
+    yield ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in (rest | document["hardware"]).items())
+    for preset, found in document["presets"].items():
+        yield f"{preset}: seconds a view on one thread, median (smallest); load {found['load']:.1f}"
+        for name, figures in found["stages"].items():
+            wall, cpu = (f"{figures[key]:.4f} ({figures[f'{key}_min']:.4f})" for key in ("wall_s", "cpu_s"))
+            yield f"  {name:<10}  wall {wall}  processor {cpu}"

@@ -45,7 +45,8 @@ def run_bench(options: dict[str, Any]) -> dict[str, Any]:
     """Time the lift of a real scene (``scene``: a folder) or of a synthetic room.
 
     Args:
-        options: scene (folder or None), splats, size ("WxH"), channels, levels, views, threads.
+        options: scene (folder or None), splats, size ("WxH"), channels, levels, views, threads; stages (bool): every
+            step apart, on one thread, as ``liftcore.measure.stages`` has it.
 
     Returns:
         Plain numbers, ready for JSON: hardware, versions, seconds a view by stage (medians), peak memory.
@@ -55,7 +56,12 @@ def run_bench(options: dict[str, Any]) -> dict[str, Any]:
     warm_up(work.splats.kernel)
     warm_up_solution()
     compile_seconds = time.perf_counter() - start
-    presets = {str(preset): time_lift(work, preset, options.get("threads")) for preset in Preset}
+    if options.get("stages"):
+        from liftcore.measure.stages import time_stages
+
+        presets = {str(preset): time_stages(work, preset) for preset in (Preset.ROW_SUM, Preset.TIKHONOV)}
+    else:
+        presets = {str(preset): time_lift(work, preset, options.get("threads")) for preset in Preset}
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
     return {
         "workload": work.name,
