@@ -14,7 +14,7 @@ from service.parts import Here
 from service.readiness import CHECKS
 from service.versions import versions
 
-PAGE = Path(__file__).parents[1] / "web" / "index.html"
+WEB = Path(__file__).parents[1] / "web"
 METRICS_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 METRICS: dict[int | str, dict[str, Any]] = {
     200: {
@@ -56,5 +56,7 @@ async def metrics(here: Here) -> Response:
 
 @router.get("/", response_class=HTMLResponse, include_in_schema=False)
 def page() -> str:
-    """The page."""
-    return PAGE.read_text(encoding="utf-8")
+    """The page, in one piece: it needs no other route, so no key, before it can ask for one."""
+    names = ("index.html", "page.css", "page.js")
+    whole, style, script = ((WEB / name).read_text(encoding="utf-8") for name in names)
+    return whole.replace("/* page.css */\n", style).replace("/* page.js */\n", script)

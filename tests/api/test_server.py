@@ -16,6 +16,7 @@ import httpx
 import pytest
 
 from service.__main__ import main, parse
+from service.routes.operations import WEB, page
 from service.settings import ServiceSettings
 
 from .conftest import Uploaded
@@ -150,3 +151,9 @@ def test_empty_variable_is_one_that_is_not_set(monkeypatch: pytest.MonkeyPatch) 
     for name in ("COMMIT", "PORT", "ALLOWED_HOSTS", "TEXT_SPACES"):
         monkeypatch.setenv(f"SPLATLIFT_{name}", "")
     assert (parse([]).commit, parse([]).port, parse([]).allowed_hosts) == (None, 8787, ())
+
+
+def test_page_comes_in_one_piece_with_its_style_and_script() -> None:
+    whole = page()
+    for name in ("page.css", "page.js"):
+        assert (WEB / name).read_text() in whole and name not in whole
