@@ -41,14 +41,15 @@ def query_loop(*, splats: int, channels: int, queries: int, rounds: int, beside:
             with _clients(service, 1) as (client,):
                 _ask(client, lift, next(words))
             figures: dict[str, Any] = {"first_seconds": round(time.monotonic() - begun, 2)}
-            figures["alone"] = _rounds(service, lift, words, queries, rounds)
+            figures["alone"] = ask_in_rounds(service, lift, words, queries, rounds)
             with lifting(service, other):
                 service.await_lift()
-                figures["beside_a_lift"] = _rounds(service, lift, words, queries, rounds)
+                figures["beside_a_lift"] = ask_in_rounds(service, lift, words, queries, rounds)
     return {"splats": splats, "channels": channels, "queries": queries, **figures}
 
 
-def _rounds(service: BusyService, lift: str, words: Any, queries: int, rounds: int) -> dict[str, Any]:
+def ask_in_rounds(service: BusyService, lift: str, words: Iterator[str], queries: int, rounds: int) -> dict[str, Any]:
+    """Ask rounds of different questions, those of a round at the same moment; how long they took."""
     slowest, every, running, load = [], [], [], []
     before = service.cpu_seconds()
     for _ in range(rounds):

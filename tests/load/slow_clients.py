@@ -42,24 +42,35 @@ def slow_loop(*, sockets: int, readers: int, seconds: float, beside: dict[str, i
         path = put_blob(folder / "data", BLOB_BYTES)
         with serving(folder / "data") as service, lifting(service, other):
             service.await_lift()
-            quiet = _probe(service, seconds / 4)
-            with _tricklers(service, path, sockets, readers) as told:
-                ran = service.lifting()
-                load = [os.getloadavg()[0]]
-                slow = _probe(service, seconds)
-                load.append(os.getloadavg()[0])
-                ran = ran and service.lifting()
-        left = len(list((folder / "data" / "tmp").iterdir()))  # now that the lift has ended, too
+            found = beside_slow_clients(service, path, sockets=sockets, readers=readers, seconds=seconds)
+        return {**found, "drafts_left": drafts_left(folder / "data")}  # now that the lift has ended, too
+
+
+def beside_slow_clients(
+    service: BusyService, path: str, *, sockets: int, readers: int, seconds: float
+) -> dict[str, Any]:
+    """Probe /healthz for a quarter of the time without them, then beside them; a lift runs already."""
+    quiet = _probe(service, seconds / 4)
+    with _tricklers(service, path, sockets, readers) as told:
+        ran = service.lifting()
+        load = [os.getloadavg()[0]]
+        slow = _probe(service, seconds)
+        load.append(os.getloadavg()[0])
+        ran = ran and service.lifting()
     return {
         "sockets": sockets,
         "readers": readers,
         "without_them_ms": quiet,
         "beside_them_ms": slow,
         "clients": told,
-        "drafts_left": left,
         "a_lift_ran": ran,
         "load": [round(value, 1) for value in load],
     }
+
+
+def drafts_left(data: Path) -> int:
+    """What lies in a data directory whose server has ended, and should not."""
+    return len(list((data / "tmp").iterdir()))
 
 
 @contextlib.contextmanager
