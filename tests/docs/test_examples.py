@@ -13,12 +13,12 @@ from pydantic import BaseModel
 
 from liftcore.cli import main
 from service import wire
-from service.routes import assets, jobs, lifts, operations, queries
+from service.routes import assets, jobs, lifts, operations, queries, tradeoffs
 from tests.api.tiny_scene import WIDTH, make_scene
 
 from .readme import blocks, text
 
-ROUTES: tuple[ModuleType, ...] = (operations, assets, jobs, lifts, queries)
+ROUTES: tuple[ModuleType, ...] = (operations, assets, jobs, lifts, tradeoffs, queries)
 SHAPES: dict[str, type[BaseModel]] = {  # a field that no other answer has -> the answer
     "counts": wire.Asset,
     "attempt": wire.Job,
