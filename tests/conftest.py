@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
+import torch
 from hypothesis import settings
+
+# Where no card is, the GPU's kernels run in Triton's interpreter. Triton asks once, when it is imported.
+if not torch.cuda.is_available():
+    os.environ.setdefault("TRITON_INTERPRET", "1")
 
 # The same examples on every machine, however slow it is; a failure prints how to see it again.
 settings.register_profile("everywhere", derandomize=True, deadline=None, print_blob=True)

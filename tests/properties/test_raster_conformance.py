@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
 from liftcore.observe.observation import Observation, RegionMap
@@ -17,6 +17,7 @@ from liftcore.raster.oracle import OracleRaster, dense_view, reading_matrix
 from liftcore.raster.oracle_weights import counted_weights, walked_rays
 from liftcore.raster.protocol import RegionWeights, Selection, Walk, Weighting
 from liftcore.scene.splats import Kernel, Splats
+from tests.backends import every_backend
 from tests.scenes import random_camera, random_grid, random_regions, random_splats, scenes
 
 if TYPE_CHECKING:
@@ -64,74 +65,79 @@ def dense(weights: RegionWeights, splats: int, rows: int) -> np.ndarray:
 
 
 @every_footprint
-@hypothesis_settings
-@given(st.data())
-def test_renders_equal_the_oracle(footprint, data):
-    splats, camera, _, walk = drawn(data, footprint)
-    values = torch.tensor(np.random.default_rng(0).uniform(0, 1, (splats.count, 3)), dtype=torch.float32)
-    view = dense_view(splats, camera, walk)
-    expected = (view.A @ values.double().numpy()).reshape(camera.height, camera.width, 3)
-    image = CpuRaster(splats, threads=2).render(camera, values, walk).numpy()
-    inside = ~view.cut.reshape(camera.height, camera.width)
-    assert np.abs(image - expected)[inside].max(initial=0) < INSIDE
-    assert (np.abs(image - expected).max(axis=2) > INSIDE).mean() <= max(FLIPS, 1 / inside.size)
+@every_backend
+def test_renders_equal_the_oracle(footprint, backend):
+    @backend.holds(st.data())
+    def check(data) -> None:
+        splats, camera, _, walk = drawn(data, footprint)
+        values = torch.tensor(np.random.default_rng(0).uniform(0, 1, (splats.count, 3)), dtype=torch.float32)
+        view = dense_view(splats, camera, walk)
+        expected = (view.A @ values.double().numpy()).reshape(camera.height, camera.width, 3)
+        image = backend.open(splats).render(camera, values, walk).numpy()
+        inside = ~view.cut.reshape(camera.height, camera.width)
+        assert np.abs(image - expected)[inside].max(initial=0) < INSIDE
+        assert (np.abs(image - expected).max(axis=2) > INSIDE).mean() <= max(FLIPS, 1 / inside.size)
 
 
 @every_footprint
-@hypothesis_settings
-@given(st.data(), st.sampled_from([0, 1, 2]))
-def test_region_weights_equal_the_oracle(footprint, data, power):
-    splats, camera, observation, walk = drawn(data, footprint)
-    view = dense_view(splats, camera, walk)
-    S, ray = reading_matrix(observation, camera.width, camera.height)
-    if dense_view(splats, camera, replace(walk, gain=1.0)).cut.any() or view.cut.any():
-        return  # the pooled test counts the flips
-    expected = np.where(view.A > 0, view.A**power, 0.0)[ray].T @ S
-    weights = CpuRaster(splats, threads=2).region_weights(camera, observation, walk, Weighting(power))
-    W = dense(weights, splats.count, observation.codebook.shape[0])
-    assert np.abs(W - expected).max(initial=0) < INSIDE * max(1.0, expected.max(initial=0))
+@every_backend
+def test_region_weights_equal_the_oracle(footprint, backend):
+    @backend.holds(st.data(), st.sampled_from([0, 1, 2]))
+    def check(data, power) -> None:
+        splats, camera, observation, walk = drawn(data, footprint)
+        view = dense_view(splats, camera, walk)
+        S, ray = reading_matrix(observation, camera.width, camera.height)
+        if dense_view(splats, camera, replace(walk, gain=1.0)).cut.any() or view.cut.any():
+            return  # the pooled test counts the flips
+        expected = np.where(view.A > 0, view.A**power, 0.0)[ray].T @ S
+        weights = backend.open(splats).region_weights(camera, observation, walk, Weighting(power))
+        W = dense(weights, splats.count, observation.codebook.shape[0])
+        assert np.abs(W - expected).max(initial=0) < INSIDE * max(1.0, expected.max(initial=0))
 
 
 @every_footprint
-@hypothesis_settings
-@given(st.data())
-def test_evidence_is_the_sum_of_plain_weights_whatever_the_gain(footprint, data):
-    splats, camera, observation, walk = drawn(data, footprint)
-    view = dense_view(splats, camera, replace(walk, gain=1.0))
-    weights = CpuRaster(splats, threads=2).region_weights(camera, observation, walk, Weighting(2))
-    evidence = np.zeros(splats.count)
-    evidence[weights.evidence_splats.numpy()] = weights.evidence.numpy()
-    if not view.cut.any():
-        expected = view.A.sum(axis=0)
-        assert np.abs(evidence - expected).max() < INSIDE * max(1.0, expected.max())
+@every_backend
+def test_evidence_is_the_sum_of_plain_weights_whatever_the_gain(footprint, backend):
+    @backend.holds(st.data())
+    def check(data) -> None:
+        splats, camera, observation, walk = drawn(data, footprint)
+        view = dense_view(splats, camera, replace(walk, gain=1.0))
+        weights = backend.open(splats).region_weights(camera, observation, walk, Weighting(2))
+        evidence = np.zeros(splats.count)
+        evidence[weights.evidence_splats.numpy()] = weights.evidence.numpy()
+        if not view.cut.any():
+            expected = view.A.sum(axis=0)
+            assert np.abs(evidence - expected).max() < INSIDE * max(1.0, expected.max())
 
 
 @every_footprint
-@hypothesis_settings
-@given(st.data(), st.sampled_from(SELECTIONS), st.sampled_from([1, 3]))
-def test_selections_and_strides_equal_the_oracle(footprint, data, weighting, stride):
-    splats, camera, _, walk = drawn(data, footprint)
-    walk = replace(walk, stride=stride)
-    view = dense_view(splats, camera, walk)
-    chosen, hard = counted_weights(view.A, splats, camera, walk, weighting)
-    rays = camera.width * camera.height
-    labels = torch.arange(rays, dtype=torch.int32).reshape(1, camera.height, camera.width)
-    one_a_ray = RegionMap(labels, torch.ones(rays, 1))
-    W = dense(CpuRaster(splats, threads=2).region_weights(camera, one_a_ray, walk, weighting), splats.count, rays)
-    walked = walked_rays(camera, walk)
-    assert W[:, ~walked].max(initial=0) == 0
-    clear = walked & ~view.cut & ~hard
-    assert np.abs(W.T - chosen)[clear].max(initial=0) < INSIDE
+@every_backend
+def test_selections_and_strides_equal_the_oracle(footprint, backend):
+    @backend.holds(st.data(), st.sampled_from(SELECTIONS), st.sampled_from([1, 3]))
+    def check(data, weighting, stride) -> None:
+        splats, camera, _, walk = drawn(data, footprint)
+        walk = replace(walk, stride=stride)
+        view = dense_view(splats, camera, walk)
+        chosen, hard = counted_weights(view.A, splats, camera, walk, weighting)
+        rays = camera.width * camera.height
+        labels = torch.arange(rays, dtype=torch.int32).reshape(1, camera.height, camera.width)
+        one_a_ray = RegionMap(labels, torch.ones(rays, 1))
+        W = dense(backend.open(splats).region_weights(camera, one_a_ray, walk, weighting), splats.count, rays)
+        walked = walked_rays(camera, walk)
+        assert W[:, ~walked].max(initial=0) == 0
+        clear = walked & ~view.cut & ~hard
+        assert np.abs(W.T - chosen)[clear].max(initial=0) < INSIDE
 
 
 @every_footprint
-def test_flips_at_the_cut_offs_are_rare_and_unbiased(footprint):
+@every_backend
+def test_flips_at_the_cut_offs_are_rare_and_unbiased(footprint, backend):
     rays = flips = 0
     drift = 0.0
-    for seed in range(30):
+    for seed in range(backend.seeds):
         (splats, walk), camera = seeded(footprint, seed, 80), random_camera(seed, 64, 48)
         expected = dense_view(splats, camera, walk).A.sum(axis=1)
-        error = CpuRaster(splats).render(camera, torch.ones(splats.count, 1), walk).numpy().ravel() - expected
+        error = backend.open(splats).render(camera, torch.ones(splats.count, 1), walk).numpy().ravel() - expected
         rays += error.size
         flips += int((np.abs(error) > INSIDE).sum())
         drift += float(error.sum())
@@ -140,33 +146,37 @@ def test_flips_at_the_cut_offs_are_rare_and_unbiased(footprint):
 
 
 @every_footprint
-@hypothesis_settings
-@given(st.data(), st.integers(1, 7))
-def test_top_weights_are_the_largest_of_each_ray(footprint, data, count):
-    splats, camera, _, walk = drawn(data, footprint)
-    view = dense_view(splats, camera, walk)
-    ids, weights = CpuRaster(splats).top_weights(camera, walk, count)
-    expected = -np.sort(-view.A, axis=1)[:, :count]
-    expected = np.pad(expected, ((0, 0), (0, count - expected.shape[1])))
-    got = weights.numpy().reshape(-1, count)
-    assert np.abs(got - expected)[~view.cut].max(initial=0) < INSIDE
-    flat = ids.numpy().reshape(-1, count)
-    named = np.where(flat >= 0, np.take_along_axis(view.A, np.maximum(flat, 0), axis=1), 0)
-    assert np.abs(named - got)[~view.cut].max(initial=0) < INSIDE
+@every_backend
+def test_top_weights_are_the_largest_of_each_ray(footprint, backend):
+    @backend.holds(st.data(), st.integers(1, 7))
+    def check(data, count) -> None:
+        splats, camera, _, walk = drawn(data, footprint)
+        view = dense_view(splats, camera, walk)
+        ids, weights = backend.open(splats).top_weights(camera, walk, count)
+        expected = -np.sort(-view.A, axis=1)[:, :count]
+        expected = np.pad(expected, ((0, 0), (0, count - expected.shape[1])))
+        got = weights.numpy().reshape(-1, count)
+        assert np.abs(got - expected)[~view.cut].max(initial=0) < INSIDE
+        flat = ids.numpy().reshape(-1, count)
+        named = np.where(flat >= 0, np.take_along_axis(view.A, np.maximum(flat, 0), axis=1), 0)
+        assert np.abs(named - got)[~view.cut].max(initial=0) < INSIDE
 
 
 @every_footprint
-@hypothesis_settings
-@given(st.data())
-def test_ray_rows_are_rows_of_a(footprint, data):
-    splats, camera, _, walk = drawn(data, footprint)
-    view = dense_view(splats, camera, walk)
-    y, x = np.mgrid[: camera.height, : camera.width]
-    pixels = torch.tensor(np.stack([x.ravel(), y.ravel()], axis=1), dtype=torch.int32)
-    rows = CpuRaster(splats).ray_rows(camera, pixels, walk)
-    A = np.zeros_like(view.A)
-    A[np.repeat(np.arange(A.shape[0]), np.diff(rows.row_starts.numpy())), rows.splats.numpy()] = rows.weights.numpy()
-    assert np.abs(A - view.A)[~view.cut].max(initial=0) < INSIDE
+@every_backend
+def test_ray_rows_are_rows_of_a(footprint, backend):
+    @backend.holds(st.data())
+    def check(data) -> None:
+        splats, camera, _, walk = drawn(data, footprint)
+        view = dense_view(splats, camera, walk)
+        y, x = np.mgrid[: camera.height, : camera.width]
+        pixels = torch.tensor(np.stack([x.ravel(), y.ravel()], axis=1), dtype=torch.int32)
+        rows = backend.open(splats).ray_rows(camera, pixels, walk)
+        A = np.zeros_like(view.A)
+        A[np.repeat(np.arange(A.shape[0]), np.diff(rows.row_starts.numpy())), rows.splats.numpy()] = (
+            rows.weights.numpy()
+        )
+        assert np.abs(A - view.A)[~view.cut].max(initial=0) < INSIDE
 
 
 @every_footprint
@@ -186,12 +196,13 @@ def test_the_number_of_threads_changes_no_bit(footprint, gain):
 
 
 @every_footprint
+@every_backend
 @pytest.mark.parametrize("seed", range(2))
-def test_the_oracle_is_a_backend_that_gives_the_same_products(footprint, seed):
+def test_the_oracle_is_a_backend_that_gives_the_same_products(footprint, backend, seed):
     (splats, walk), camera = seeded(footprint, seed, 30), random_camera(seed)
     if dense_view(splats, camera, walk).cut.any():
         camera = random_camera(seed + 100)
-    fast, plain = CpuRaster(splats), OracleRaster(splats)
+    fast, plain = backend.open(splats), OracleRaster(splats)
     observation = random_regions(seed)
     rows = observation.codebook.shape[0]
     ours, theirs = (raster.region_weights(camera, observation, walk, Weighting(2)) for raster in (fast, plain))

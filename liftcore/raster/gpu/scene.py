@@ -1,0 +1,75 @@
+"""A scene and a view's footprints as they lie on the device."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from liftcore.raster.projection import Scene
+
+# What the walk reads of a splat. PLACES [n, PLACE] f64 holds what is taken at a row's first pixel, where large
+# numbers are subtracted; INKS [n, INK] f32 what every pixel needs. A row a splat that the view may see, near to far.
+MX, MY, SLOPE, KY = range(4)  # 3DGS and DBS, as in liftcore.raster.records
+CENTRE_X, CENTRE_Y, S_X, S_Y, T_X, T_Y, D_ZERO, D_X, D_Y = range(9)  # 2DGS, likewise
+PLACE = 9
+
+OPACITY, PLAIN, KX, BETA = range(4)  # KX is the low-pass's curvature for 2DGS
+S_STEP, S_STEP_REST, T_STEP, T_STEP_REST, D_STEP, D_STEP_REST = range(4, 10)  # 2DGS: forms by pixel
+INK = 10
+
+
+class DeviceScene(NamedTuple):
+    """The splats, activated, on the device: ``liftcore.raster.projection.Scene`` as tensors."""
+
+    means: Tensor  # [P, 3] f32, world
+    axes: Tensor  # [P, 3, 3] f64 ([P, 3, 2] for 2DGS), scaled axes in columns, world
+    opacity: Tensor  # [P] f64, with the gain
+    plain: Tensor  # [P] f64, without it
+    reach: Tensor  # [P] f64, the largest e (or sigma) with a weight; negative for none
+    beta: Tensor  # [P] f64, DBS only ([0] otherwise): the exponent
+
+
+class Outlines(NamedTuple):
+    """What the tile lists need of the footprints, a row a splat, near to far; all f64."""
+
+    mx: Tensor  # [n] the outline ``kx (x - mx - slope dy)^2 + ky dy^2 <= reach``, as in liftcore.raster.records
+    my: Tensor
+    slope: Tensor
+    kx: Tensor
+    ky: Tensor
+    reach: Tensor
+    extent_x: Tensor
+    extent_y: Tensor
+    lean: Tensor
+    circle_x: Tensor  # [n] centre and radius, px, of what is reached beside the outline ([0] where a kernel has none)
+    circle_y: Tensor
+    circle: Tensor
+
+    def at(self, rows: Tensor | slice) -> Outlines:
+        """Some rows, in their order."""
+        return Outlines(*(column[rows] if column.numel() else column for column in self))
+
+
+class Footprints(NamedTuple):
+    """The splats that touch the image, near to far; ties in the order of the file."""
+
+    ids: Tensor  # [n] i32, the splat
+    outlines: Outlines
+    places: Tensor  # [n, PLACE] f64
+    inks: Tensor  # [n, INK] f32
+
+
+def scene_on(device: torch.device, scene: Scene) -> DeviceScene:
+    """The activated splats, moved: the numbers are those of the CPU backend."""
+    return DeviceScene(*(torch.from_numpy(part).to(device) for part in scene))
+
+
+def with_opacity(scene: DeviceScene, changed: Scene) -> DeviceScene:
+    """The same splats with the opacities and reaches of ``changed``."""
+    device = scene.means.device
+    opacity, reach = (torch.from_numpy(part).to(device) for part in (changed.opacity, changed.reach))
+    return scene._replace(opacity=opacity, reach=reach)

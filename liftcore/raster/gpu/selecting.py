@@ -1,0 +1,150 @@
+"""Which weights count, in Triton: ``liftcore.raster.selection`` on a tile's rays, and each ray's largest weights."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+import triton.language as tl
+
+from liftcore.raster.constants import TILE
+from liftcore.raster.gpu import scene
+from liftcore.raster.gpu.launching import jit, lang, launch
+from liftcore.raster.gpu.walk import CHUNK, PART, PARTS, blend, blend_chunk, fill_alphas, start_rays
+from liftcore.raster.selection import CENTRAL, FRONT, LARGEST
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from liftcore.raster.gpu.frame import Frame
+    from liftcore.raster.gpu.tile_lists import Lists
+
+_CHUNK = tl.constexpr(CHUNK)
+_TILE = tl.constexpr(TILE)
+_PIXELS = tl.constexpr(TILE * TILE)
+_SCRATCH = tl.constexpr(PARTS * PART)
+_WEIGHTS, _EVIDENCE = tl.constexpr(PART), tl.constexpr(PARTS * PART)
+_LARGEST, _FRONT, _CENTRAL = tl.constexpr(LARGEST), tl.constexpr(FRONT), tl.constexpr(CENTRAL)
+_PLACE = tl.constexpr(scene.PLACE)
+_LATER = tl.constexpr(1 << 30)  # above every number of an item: a place that is still free
+
+
+@jit
+def blend_chosen(
+    scratch, light, stop, count, least, room, light_in_front, SELECTION: tl.constexpr, PLAIN: tl.constexpr
+):
+    """``blend_chunk`` that leaves only weights that count, and with PLAIN all of them as the evidence's.
+
+    Args:
+        least: [256] f32, of top-k: the k-th largest weight of a ray; room: [256] i32, how many that equal it count.
+        light_in_front: of front-mass: a weight counts while the light before it is above this.
+
+    Returns:
+        The light after the chunk, and the room that is left.
+    """
+    pixel = tl.arange(0, _PIXELS)
+    for number in range(tl.minimum(count, _CHUNK)):
+        own = scratch + number * _PIXELS + pixel
+        before = light
+        weight, light = blend(tl.load(own), light, stop)
+        if PLAIN:
+            tl.store(own + _EVIDENCE + _WEIGHTS, weight)
+        if SELECTION == _LARGEST:  # equal ones near to far, until k are full
+            equal = (weight == least) & (weight > 0.0) & (room > 0)
+            room -= equal.to(tl.int32)
+            tl.store(own + _WEIGHTS, tl.where(equal | (weight > least), weight, 0.0))
+        else:
+            tl.store(own + _WEIGHTS, tl.where(before > light_in_front, weight, 0.0))
+    tl.debug_barrier()
+    return light, room
+
+
+@jit
+def counted(weights, places, items, at, last, tile, columns, smallest, SELECTION: tl.constexpr, POWER: tl.constexpr):
+    """A chunk's weights [CHUNK, 256] without those below ``smallest`` or off their splat's centre, to their power."""
+    weights = tl.where(weights >= smallest, weights, 0.0)
+    if SELECTION == _CENTRAL:
+        number = at + tl.arange(0, _CHUNK)
+        inside = number < last
+        place = places + tl.load(items + number, mask=inside, other=0) * _PLACE
+        column = tl.floor(tl.load(place, mask=inside, other=-1.0)) - (tile % columns * _TILE).to(tl.float64)
+        row = tl.floor(tl.load(place + 1, mask=inside, other=-1.0)) - (tile // columns * _TILE).to(tl.float64)
+        pixel = tl.arange(0, _PIXELS)
+        own = (column[:, None] == (pixel % _TILE).to(tl.float64)[None, :]) & (
+            row[:, None] == (pixel // _TILE).to(tl.float64)[None, :]
+        )
+        weights = tl.where(own, weights, 0.0)
+    if POWER == 0:
+        weights = tl.where(weights > 0.0, 1.0, 0.0)
+    if POWER == 2:
+        weights = weights * weights
+    return weights
+
+
+@jit
+def _rank(
+    places, inks, starts, items, scratch, largest, numbers, band_tile, own_tile, columns, width, height, count,
+    cap, stop, floor, KIND: tl.constexpr, COUNT: tl.constexpr,
+):  # fmt: skip
+    own = own_tile + tl.program_id(0)
+    tile = band_tile + own
+    mine = scratch + tl.program_id(0) * _SCRATCH
+    pixel = tl.arange(0, _PIXELS)
+    rank = tl.arange(0, COUNT)
+    first = tl.load(starts + own)
+    at = first
+    last = tl.load(starts + own + 1)
+    light = start_rays(tile, columns, width, height)
+    # The rest of a power of two is filled with what nothing displaces.
+    held = tl.where((rank < count)[None, :] & (pixel >= 0)[:, None], 0.0, float("inf"))
+    order = _LATER + rank[None, :] + tl.zeros([_PIXELS, COUNT], tl.int32)
+    lit = lang.max(light, 0)
+    while (at < last) & (lit > 0.0):
+        known = (last - at).to(tl.int32)
+        fill_alphas(places, inks, items, at, last, tile, columns, mine, cap, floor, KIND, False)
+        light = blend_chunk(mine, light, stop, known)
+        for number in range(tl.minimum(known, _CHUNK)):
+            weight = tl.load(mine + _WEIGHTS + number * _PIXELS + pixel)
+            least = lang.min(held, 1)
+            # Of equal ones the last that came makes room.
+            latest = lang.max(tl.where(held == least[:, None], order, -1), 1)
+            displaced = (order == latest[:, None]) & (weight > least)[:, None]
+            held = tl.where(displaced, weight[:, None], held)
+            order = tl.where(displaced, (at - first).to(tl.int32) + number, order)
+        lit = lang.max(light, 0)
+        at += _CHUNK
+    to = (tl.program_id(0) * _PIXELS + pixel)[:, None] * count + rank[None, :]
+    tl.store(largest + to, held, mask=(rank < count)[None, :] & (pixel >= 0)[:, None])
+    tl.store(numbers + to, order, mask=(rank < count)[None, :] & (pixel >= 0)[:, None])
+
+
+def largest_weights(frame: Frame, lists: Lists, run: tuple[int, int], count: int) -> tuple[Tensor, Tensor]:
+    """The largest weights of every ray of a run of tiles, descending, equal ones near to far.
+
+    Returns:
+        weights [tiles, 256, count] f32, 0 where there are fewer; and their numbers in the tile's list, i64.
+    """
+    tiles = run[1] - run[0]
+    weights = torch.zeros(tiles, TILE * TILE, count, device=frame.device)
+    numbers = torch.zeros(tiles, TILE * TILE, count, dtype=torch.int32, device=frame.device)
+    launch(
+        _rank, tiles, *frame.splats, lists.starts, lists.items, frame.scratch(tiles), weights, numbers,
+        lists.first_tile, run[0], *frame.size, count, *frame.cuts, KIND=frame.kind,
+        COUNT=1 << (count - 1).bit_length(),
+    )  # fmt: skip
+    near_first = torch.sort(numbers, dim=2)
+    weights = weights.gather(2, near_first.indices)
+    down = torch.sort(weights, dim=2, descending=True, stable=True)
+    return down.values, near_first.values.gather(2, down.indices).long()
+
+
+def marks_of(frame: Frame, lists: Lists, run: tuple[int, int], count: int) -> tuple[Tensor, Tensor]:
+    """What top-k knows of every ray of a run of tiles.
+
+    Returns:
+        least [tiles, 256] f32, the k-th largest weight, 0 when there are fewer; room [tiles, 256] i32, how many
+        weights equal to it are among the k.
+    """
+    weights, _ = largest_weights(frame, lists, run, count)
+    least = weights[:, :, -1]
+    return least.contiguous(), (weights == least[:, :, None]).sum(dim=2).to(torch.int32)

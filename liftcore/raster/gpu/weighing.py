@@ -1,0 +1,251 @@
+"""``W = A'^T S`` and ``A^T Y`` on the device: what the pixels of a tile give to each of its splats.
+
+Both are the product of a chunk's weights [CHUNK, 256] with a matrix of the tile, which says what its pixels read:
+the shares of the slots, or the channels of an image. The pixel loop knows neither labels nor rows of the codebook.
+Item k of a tile's list has row k of the tile's table of sums for its own, so every sum has a place before the first
+weight is known, and none is added to by two programs.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+import triton.language as tl
+
+from liftcore.raster.constants import TILE
+from liftcore.raster.gpu.frame import table_runs, tile_runs
+from liftcore.raster.gpu.launching import jit, lang, launch
+from liftcore.raster.gpu.selecting import blend_chosen, counted, marks_of
+from liftcore.raster.gpu.sums import sums_by_key
+from liftcore.raster.gpu.walk import CHUNK, PART, PARTS, blend_chunk, fill_alphas, start_rays, weights_of
+from liftcore.raster.protocol import RegionWeights
+from liftcore.raster.selection import FRONT, LARGEST
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from liftcore.raster.gpu.frame import Frame
+    from liftcore.raster.gpu.slots import DeviceReading, Slots
+    from liftcore.raster.gpu.tile_lists import Lists
+    from liftcore.raster.selection import Choice
+
+COLUMNS = 16  # of a tile's matrix at a time
+WIDEST = 32  # channels of an image a walk
+
+_CHUNK = tl.constexpr(CHUNK)
+_TILE = tl.constexpr(TILE)
+_PIXELS = tl.constexpr(TILE * TILE)
+_SCRATCH = tl.constexpr(PARTS * PART)
+_COLUMNS = tl.constexpr(COLUMNS)
+_INT32 = 1 << 31
+_LARGEST, _FRONT = tl.constexpr(LARGEST), tl.constexpr(FRONT)
+
+
+@jit
+def _weigh(
+    places, inks, starts, items, scratch, taps, shares, slot_starts, table, table_starts, evidence, least, room,
+    band_tile, own_tile, slots_tile, columns, width, height, light_in_front, smallest, cap, stop, floor,
+    KIND: tl.constexpr, TAPS: tl.constexpr, SELECTION: tl.constexpr, POWER: tl.constexpr, GAIN: tl.constexpr,
+):  # fmt: skip
+    GATED: tl.constexpr = (SELECTION == _LARGEST) | (SELECTION == _FRONT)
+    program = tl.program_id(0)
+    own = own_tile + program
+    tile = band_tile + own
+    mine = scratch + program * (2 if GATED or GAIN else 1) * _SCRATCH
+    others = mine + _SCRATCH
+    pixel = tl.arange(0, _PIXELS)
+    column = tl.arange(0, _COLUMNS)
+    at = tl.load(starts + own)
+    last = tl.load(starts + own + 1)
+    reads = own - slots_tile
+    used = (tl.load(slot_starts + reads + 1) - tl.load(slot_starts + reads)).to(tl.int32)
+    sums = tl.load(table_starts + program)
+    light = start_rays(tile, columns, width, height)
+    plain_light = light
+    fewest = light
+    left = tl.zeros([_PIXELS], tl.int32)
+    if SELECTION == _LARGEST:
+        fewest = tl.load(least + reads * _PIXELS + pixel)
+        left = tl.load(room + reads * _PIXELS + pixel)
+    lit = lang.max(light, 0)
+    while (at < last) & (lit > 0.0):
+        count = (last - at).to(tl.int32)
+        fill_alphas(places, inks, items, at, last, tile, columns, mine, cap, floor, KIND, GAIN)
+        if GATED:
+            light, left = blend_chosen(mine, light, stop, count, fewest, left, light_in_front, SELECTION, not GAIN)
+        else:
+            light = blend_chunk(mine, light, stop, count)
+        lit = lang.max(light, 0)
+        number = at + tl.arange(0, _CHUNK)
+        if GAIN:
+            plain_light = blend_chunk(others, plain_light, stop, count)
+            lit = tl.maximum(lit, lang.max(plain_light, 0))
+        weights = weights_of(mine, count)
+        if GATED or GAIN:
+            tl.store(evidence + number, tl.sum(weights_of(others, count), 1), mask=number < last)
+        else:
+            tl.store(evidence + number, tl.sum(weights, 1), mask=number < last)
+        weights = counted(weights, places, items, at, last, tile, columns, smallest, SELECTION, POWER)
+        for block in range(0, used, _COLUMNS):
+            factors = tl.zeros([_PIXELS, _COLUMNS], tl.float32)
+            for tap in lang.static_range(TAPS):
+                from_here = (reads * TAPS + tap) * _PIXELS + pixel
+                slot = tl.load(taps + from_here)
+                share = tl.full([_PIXELS], 1.0, tl.float32)
+                if TAPS > 1:
+                    share = tl.load(shares + from_here)
+                factors += tl.where(slot[:, None] == (block + column)[None, :], share[:, None], 0.0)
+            product = tl.dot(weights, factors, input_precision="ieee")
+            to = sums + tl.arange(0, _CHUNK)[:, None] * used + block + column[None, :]
+            tl.store(table + to, product, mask=(number < last)[:, None] & (block + column < used)[None, :])
+        sums += _CHUNK * used
+        at += _CHUNK
+
+
+@jit
+def _gather(
+    places, inks, starts, items, scratch, image, table, band_tile, own_tile, columns, width, height, channels,
+    cap, stop, floor, KIND: tl.constexpr, CHANNELS: tl.constexpr,
+):  # fmt: skip
+    own = own_tile + tl.program_id(0)
+    tile = band_tile + own
+    mine = scratch + tl.program_id(0) * _SCRATCH
+    pixel = tl.arange(0, _PIXELS)
+    channel = tl.arange(0, CHANNELS)
+    base = tl.load(starts + own_tile)
+    at = tl.load(starts + own)
+    last = tl.load(starts + own + 1)
+    light = start_rays(tile, columns, width, height)
+    x = tile % columns * _TILE + pixel % _TILE
+    y = tile // columns * _TILE + pixel // _TILE
+    place = (y.to(tl.int64) * width + x)[:, None] * channels + channel[None, :]
+    inside = ((x < width) & (y < height))[:, None] & (channel < channels)[None, :]
+    lit = lang.max(light, 0)
+    while (at < last) & (lit > 0.0):
+        count = (last - at).to(tl.int32)
+        fill_alphas(places, inks, items, at, last, tile, columns, mine, cap, floor, KIND, False)
+        light = blend_chunk(mine, light, stop, count)
+        own_pixels = tl.load(image + place, mask=inside, other=0.0)
+        product = tl.dot(weights_of(mine, count), own_pixels, input_precision="ieee")
+        number = at + tl.arange(0, _CHUNK)
+        to = (number - base)[:, None] * channels + channel[None, :]
+        tl.store(table + to, product, mask=(number < last)[:, None] & (channel < channels)[None, :])
+        lit = lang.max(light, 0)
+        at += _CHUNK
+
+
+class Sums(NamedTuple):
+    """Sums by key, and the keys."""
+
+    keys: Tensor  # [n] i32 or i64, ascending
+    values: Tensor  # [n, C] f64
+
+
+def region_weights(
+    frame: Frame, reading: DeviceReading, choice: Choice, with_plain: bool, splats: int
+) -> RegionWeights:
+    """``A'^T S`` of a view and the evidence of plain weights, on the CPU; with_plain: whether there is a gain."""
+    rows = reading.codebook_rows
+    weights: list[Sums] = []
+    evidence: list[Sums] = []
+    for lists in frame.lists():
+        given = torch.zeros(lists.items.shape[0], 1, device=frame.device)
+        for first, last in tile_runs(lists):
+            slots = reading.slots(lists.first_tile + first, lists.first_tile + last, frame.columns)
+            marks = marks_of(frame, lists, (first, last), choice.k) if choice.kind == LARGEST else None
+            sizes = lists.starts[first : last + 1].diff() * slots.starts.diff()
+            for run in table_runs(first, sizes.tolist()):
+                job = _Run(lists, run, first, slots, sizes[run[0] - first : run[1] - first], marks)
+                table = _weigh_run(frame, job, reading.taps, choice, with_plain, given)
+                weights.append(_by_row(frame, job, table, splats * rows, rows))
+        evidence.append(_positive(frame.ids[lists.items], given))
+    summed, met = _joined(weights), _joined(evidence)
+    # Few keys are left: where each splat's rows begin is quickly found.
+    owners, columns = summed.keys // rows, summed.keys % rows
+    own, counts = torch.unique_consecutive(owners, return_counts=True)
+    row_starts = torch.zeros(own.shape[0] + 1, dtype=torch.int64, device=frame.device)
+    torch.cumsum(counts, 0, out=row_starts[1:])
+    parts = own, row_starts, columns, summed.values[:, 0], met.keys, met.values[:, 0]
+    dtypes = torch.int32, torch.int64, torch.int32, torch.float32, torch.int32, torch.float32
+    return RegionWeights(*(part.to(dtype).cpu() for part, dtype in zip(parts, dtypes, strict=True)))
+
+
+class _Run(NamedTuple):
+    """Tiles whose table is made in one launch."""
+
+    lists: Lists
+    tiles: tuple[int, int]  # first and last + 1, in the band
+    slots_tile: int  # the first tile of the slots and of the marks, in the band
+    slots: Slots
+    sizes: Tensor  # [tiles] i64, floats of each tile's table
+    marks: tuple[Tensor, Tensor] | None  # of top-k
+
+
+def _weigh_run(
+    frame: Frame, job: _Run, taps: int, choice: Choice, with_plain: bool, evidence: Tensor
+) -> tuple[Tensor, Tensor]:
+    """The table of a run and where each tile's part of it begins [tiles + 1] i64; the evidence of its items too."""
+    lists, slots, programs = job.lists, job.slots, job.tiles[1] - job.tiles[0]
+    starts = torch.zeros(programs + 1, dtype=torch.int64, device=frame.device)
+    torch.cumsum(job.sizes, 0, out=starts[1:])
+    table = torch.zeros(int(starts[-1]), device=frame.device)
+    parts = 2 * PARTS if with_plain or choice.kind in (LARGEST, FRONT) else PARTS
+    least, room = job.marks or (slots.shares, slots.taps)  # unread where there are no marks
+    launch(
+        _weigh, programs, *frame.splats, lists.starts, lists.items, frame.scratch(programs, parts), slots.taps,
+        slots.shares, slots.starts, table, starts, evidence, least, room, lists.first_tile, job.tiles[0],
+        job.slots_tile, *frame.size, float(choice.light), float(choice.floor), *frame.cuts, KIND=frame.kind,
+        TAPS=taps, SELECTION=choice.kind, POWER=choice.power, GAIN=with_plain,
+    )  # fmt: skip
+    return table, starts
+
+
+def _by_row(frame: Frame, job: _Run, made: tuple[Tensor, Tensor], largest_key: int, rows: int) -> Sums:
+    """The sums of a run's table by splat and row of the codebook: ``key = splat * rows + row``."""
+    table, starts = made
+    lists, slots = job.lists, job.slots
+    place = table.nonzero()[:, 0]
+    tile = torch.searchsorted(starts[1:], place, right=True)
+    in_slots = tile + (job.tiles[0] - job.slots_tile)
+    used = slots.starts[in_slots + 1] - slots.starts[in_slots]
+    within = place - starts[tile]
+    item = lists.items[lists.starts[tile + job.tiles[0]] + within // used]
+    columns = slots.rows[slots.starts[in_slots] + within % used]  # [n, levels]
+    entry, level = (columns >= 0).nonzero().unbind(1)
+    keys = frame.ids[item].long()[entry] * rows + columns[entry, level]
+    keys = keys.to(torch.int32) if largest_key < _INT32 else keys
+    return Sums(*sums_by_key(keys, table[place][entry][:, None]))
+
+
+def _positive(keys: Tensor, values: Tensor) -> Sums:
+    """Sums of values [n, 1] that are not zero, by key."""
+    kept = values[:, 0].nonzero()[:, 0]
+    return Sums(*sums_by_key(keys[kept], values[kept]))
+
+
+def _joined(parts: list[Sums]) -> Sums:
+    """The sums of all parts by key, added in their order."""
+    if len(parts) == 1:
+        return parts[0]
+    return Sums(*sums_by_key(torch.cat([part.keys for part in parts]), torch.cat([part.values for part in parts])))
+
+
+def adjoint(frame: Frame, image: Tensor, splats: int) -> Tensor:
+    """``A^T Y``: image [H, W, C] f32 on the device, C at most ``WIDEST`` -> [P, C] f64."""
+    channels = image.shape[2]
+    result = torch.zeros(splats, channels, dtype=torch.float64, device=frame.device)
+    for lists in frame.lists():
+        for first, last in tile_runs(lists):
+            sizes = lists.starts[first : last + 1].diff() * channels
+            for run in table_runs(first, sizes.tolist()):
+                begin, end = lists.starts[run[0]], lists.starts[run[1]]
+                table = torch.zeros(int(end - begin), channels, device=frame.device)
+                launch(
+                    _gather, run[1] - run[0], *frame.splats, lists.starts, lists.items,
+                    frame.scratch(run[1] - run[0]), image, table, lists.first_tile, run[0], *frame.size, channels,
+                    *frame.cuts, KIND=frame.kind, CHANNELS=max(COLUMNS, 1 << (channels - 1).bit_length()),
+                )  # fmt: skip
+                keys, sums = sums_by_key(frame.ids[lists.items[begin:end]], table)
+                result[keys.long()] += sums  # each key once
+    return result

@@ -1,0 +1,57 @@
+"""The raster backends that the conformance suite holds to the oracle, and how many examples each is worth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any
+
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+
+from liftcore.raster.cpu import CpuRaster
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from hypothesis.strategies import SearchStrategy
+
+    from liftcore.raster.gpu.raster import GpuRaster
+    from liftcore.raster.protocol import Raster
+    from liftcore.scene.splats import Splats
+
+
+def gpu_raster(splats: Splats) -> GpuRaster:
+    """The GPU backend, on a card where there is one and in Triton's interpreter elsewhere."""
+    from liftcore.raster.gpu.raster import GpuRaster
+
+    return GpuRaster(splats, torch.device("cuda" if torch.cuda.is_available() else "cpu"))
+
+
+@dataclass(frozen=True)
+class Backend:
+    """One implementation of ``liftcore.raster.protocol.Raster``."""
+
+    name: str
+    open: Callable[[Splats], Raster]
+    examples: int  # of a property; interpreted kernels take a second where compiled ones take a millisecond
+    seeds: int  # scenes of a pooled count
+
+    def holds(self, *strategies: SearchStrategy[Any]) -> Callable[[Callable[..., None]], None]:
+        """Run a check on examples of the strategies at once."""
+
+        def run(check: Callable[..., None]) -> None:
+            slow = [HealthCheck.too_slow, HealthCheck.data_too_large]
+            chosen = settings(max_examples=self.examples, deadline=None, suppress_health_check=slow)
+            chosen(given(*strategies)(check))()
+
+        return run
+
+
+CPU = Backend("cpu", lambda splats: CpuRaster(splats, threads=2), examples=20, seeds=30)
+GPU = Backend("gpu", gpu_raster, *((20, 30) if torch.cuda.is_available() else (4, 1)))
+needs_triton = pytest.mark.skipif(find_spec("triton") is None, reason="triton has no wheel for this machine")
+every_backend = pytest.mark.parametrize(
+    "backend", [CPU, pytest.param(GPU, marks=needs_triton)], ids=lambda backend: backend.name
+)

@@ -1,0 +1,48 @@
+"""Kernels that no card here can run are at least machine code of one: a compiler takes less than an interpreter."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.backends import needs_triton
+
+pytestmark = needs_triton
+ROOT = Path(__file__).parents[2]
+SHARED_MEMORY = 99 * 1024  # bytes a block: what consumer cards have, an H100 more than twice as many
+
+
+@pytest.fixture(scope="module")
+def compiled() -> list[dict]:
+    """A report of every kernel that the products launch."""
+    own = {name: value for name, value in os.environ.items() if name != "TRITON_INTERPRET"}
+    done = subprocess.run(
+        [sys.executable, "-m", "tests.gpu.compiling"],
+        cwd=ROOT, env=own | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True, timeout=900, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-4000:]
+    return [json.loads(line) for line in done.stdout.splitlines()]
+
+
+def test_every_kernel_compiles_for_an_h100(compiled):
+    names = {report["kernel"] for report in compiled}
+    assert names == {"_weigh", "_gather", "_render", "_strongest", "_rank", "_trace", "_add_runs"}
+    assert {report["constants"]["KIND"] for report in compiled if report["kernel"] == "_weigh"} == {0, 1, 2}
+    assert all(report["machine_code"] > 0 for report in compiled)
+
+
+def test_no_kernel_adds_by_atomics(compiled):
+    assert not any(report["atomics"] for report in compiled)
+
+
+def test_shared_memory_fits_consumer_cards(compiled):
+    assert max(report["shared"] for report in compiled) <= SHARED_MEMORY
+
+
+def test_logarithms_near_one_keep_their_digits(compiled):
+    assert not any(report["approximate_log"] for report in compiled)

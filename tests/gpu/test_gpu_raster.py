@@ -1,0 +1,208 @@
+"""What the GPU backend promises beyond the conformance suite (tests/properties/test_raster_conformance.py)."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from liftcore.errors import InvalidInput, InvalidSettings, Unavailable
+from liftcore.observe.observation import RegionMap
+from liftcore.raster.cpu import CpuRaster
+from liftcore.raster.oracle import OracleRaster
+from liftcore.raster.protocol import RegionWeights, Selection, Walk, Weighting
+from liftcore.scene.splats import Kernel
+from tests.backends import gpu_raster, needs_triton
+from tests.properties.test_raster_conformance import INSIDE, dense
+from tests.scenes import random_camera, random_grid, random_regions, random_splats
+
+pytestmark = [needs_triton, pytest.mark.usefixtures("every_kernel")]
+WALK = Walk(gain=1.2)
+WEIGHTINGS = (
+    Weighting(),
+    Weighting(0, Selection.TOP_K, count=2, floor=0.02),
+    Weighting(2, Selection.FRONT_MASS, mass=0.6, floor=0.02),
+    Weighting(1, Selection.CENTRE),
+)
+
+
+def as_parts(weights: RegionWeights) -> list[torch.Tensor]:
+    return [getattr(weights, name) for name in RegionWeights.__dataclass_fields__]
+
+
+@pytest.mark.parametrize("kernel", Kernel)
+def test_both_backends_list_the_same_splats_in_every_tile(kernel):
+    splats, camera = random_splats(7, 3_000, kernel=kernel), random_camera(7, 200, 150)
+    ours, theirs = gpu_raster(splats), CpuRaster(splats, threads=2)
+    lists = next(ours._frame(camera, Walk()).lists())
+    frame = theirs._frame(camera, Walk())
+    assert np.array_equal(lists.starts.cpu().numpy(), frame.starts)
+    assert np.array_equal(ours._frame(camera, Walk()).ids[lists.items.long()].cpu().numpy(), frame.ids[frame.items])
+
+
+@pytest.mark.parametrize("weighting", WEIGHTINGS, ids=lambda weighting: str(weighting.selection))
+def test_both_backends_give_the_same_region_weights(weighting):
+    splats, camera = random_splats(5, 50), random_camera(5, 40, 24)
+    for observation, walk in ((random_regions(5), WALK), (random_grid(5), Walk(stride=3, offset=(1, 2)))):
+        ours, theirs = (
+            raster.region_weights(camera, observation, walk, weighting)
+            for raster in (gpu_raster(splats), CpuRaster(splats, threads=1))
+        )
+        rows = observation.codebook.shape[0]
+        mine, reference = dense(ours, splats.count, rows), dense(theirs, splats.count, rows)
+        assert reference.max() > 0
+        assert np.abs(mine - reference).max() < INSIDE * max(1.0, reference.max())
+        assert torch.equal(ours.evidence_splats, theirs.evidence_splats)
+        assert torch.allclose(ours.evidence, theirs.evidence, rtol=1e-5)
+
+
+def test_every_run_gives_the_same_bits():
+    splats, camera = random_splats(6, 30), random_camera(6, 24, 17)
+    image = torch.rand(17, 24, 3, generator=torch.Generator().manual_seed(0))
+    runs = []
+    for _ in range(2):
+        raster = gpu_raster(splats)
+        weights = raster.region_weights(camera, random_regions(6), WALK, Weighting(2))
+        runs.append([*as_parts(weights), raster.row_sums(camera, WALK), raster.adjoint(camera, image, WALK)])
+    assert all(torch.equal(first, second) for first, second in zip(*runs, strict=True))
+
+
+def test_a_view_in_pieces_is_the_view(monkeypatch):
+    """Bands of tile rows, runs of tiles and parts of sums, each far smaller than they are for."""
+    splats, camera = random_splats(8, 24), random_camera(8, 20, 36)
+    image = torch.rand(36, 20, 2, generator=torch.Generator().manual_seed(0))
+    top = Weighting(1, Selection.TOP_K, count=2)
+    pixels = torch.tensor([[0, 0], [19, 35], [10, 20]], dtype=torch.int32)
+
+    def products() -> list[torch.Tensor]:
+        raster = gpu_raster(splats)
+        weights = raster.region_weights(camera, random_grid(8), WALK, top)
+        rows = raster.ray_rows(camera, pixels, WALK)
+        labels = torch.arange(24, dtype=torch.int32) % 20 - 1
+        return [
+            torch.from_numpy(dense(weights, 24, 63)), weights.evidence, raster.row_sums(camera, WALK),
+            raster.adjoint(camera, image, WALK), raster.strongest_labels(camera, labels, WALK),
+            *raster.top_weights(camera, WALK, 3), rows.row_starts, rows.splats, rows.weights,
+        ]  # fmt: skip
+
+    whole = products()
+    monkeypatch.setattr("liftcore.raster.gpu.tile_lists.LIST_ITEMS", 10)
+    monkeypatch.setattr("liftcore.raster.gpu.tile_lists.SPLATS_AT_ONCE", 5)
+    monkeypatch.setattr("liftcore.raster.gpu.projection.SPLATS_AT_ONCE", 10)
+    monkeypatch.setattr("liftcore.raster.gpu.frame.TILES_AT_ONCE", 2)
+    monkeypatch.setattr("liftcore.raster.gpu.frame.TABLE_FLOATS", 60)
+    monkeypatch.setattr("liftcore.raster.gpu.sums.PART", 3)
+    assert len(list(gpu_raster(splats)._frame(camera, WALK).lists())) == 3
+    for first, second in zip(whole, products(), strict=True):
+        assert torch.allclose(first.double(), second.double(), rtol=1e-6, atol=1e-7)
+
+
+def test_depth_ties_keep_the_order_of_the_file():
+    splats, camera = random_splats(2, 20), random_camera(2, 20, 20)
+    alike = replace(splats, means=torch.zeros(20, 3), opacity_logits=torch.linspace(-2, 1, 20))
+    pixel = torch.tensor([[10, 10]], dtype=torch.int32)
+    ours, theirs = (raster.ray_rows(camera, pixel, Walk()) for raster in (gpu_raster(alike), CpuRaster(alike)))
+    assert ours.splats.numel() > 2
+    assert torch.equal(ours.splats, theirs.splats)
+    assert torch.equal(ours.splats, torch.sort(ours.splats).values)
+
+
+@pytest.mark.parametrize("kernel", Kernel)
+def test_a_view_that_sees_nothing_gives_empty_products(kernel):
+    splats, camera = random_splats(1, 5, kernel=kernel), random_camera(1, 20, 18)
+    away = replace(camera, world_to_camera=np.diag([-1.0, 1.0, -1.0, 1.0]) @ camera.world_to_camera)
+    raster = gpu_raster(splats)
+    weights = raster.region_weights(away, random_regions(1), WALK, Weighting(1, Selection.TOP_K))
+    assert [part.numel() for part in as_parts(weights)] == [0, 1, 0, 0, 0, 0]
+    assert not raster.row_sums(away, Walk()).any()
+    assert not raster.adjoint(away, torch.ones(18, 20, 2), Walk()).any()
+    ids, largest = raster.top_weights(away, Walk(), 2)
+    assert (ids == -1).all() and not largest.any()
+    assert (raster.strongest_labels(away, torch.zeros(5, dtype=torch.int32), Walk()) == -1).all()
+    assert raster.ray_rows(away, torch.zeros(2, 2, dtype=torch.int32), Walk()).row_starts.tolist() == [0, 0, 0]
+
+
+def test_an_image_of_one_pixel_and_labels_of_none():
+    splats, camera = random_splats(4, 30), random_camera(4, 1, 1)
+    raster, plain = gpu_raster(splats), OracleRaster(splats)
+    assert torch.allclose(raster.row_sums(camera, Walk()), plain.row_sums(camera, Walk()), atol=INSIDE)
+    nothing = RegionMap(torch.full((2, 1, 1), -1, dtype=torch.int32), torch.ones(3, 1))
+    weights = raster.region_weights(camera, nothing, Walk(), Weighting())
+    assert weights.weights.numel() == 0
+    assert weights.evidence.numel() > 0
+
+
+def test_more_levels_than_one_key_holds_are_told_apart():
+    """Nine levels of 200 rows make 2e20 tuples."""
+    splats, camera = random_splats(3, 20), random_camera(3, 20, 17)
+    regions = random_regions(3, levels=9, rows=200)
+    ours, theirs = (
+        raster.region_weights(camera, regions, Walk(), Weighting())
+        for raster in (gpu_raster(splats), CpuRaster(splats, threads=1))
+    )
+    assert torch.equal(ours.columns, theirs.columns)
+    assert torch.allclose(ours.weights, theirs.weights, rtol=1e-4)
+
+
+def test_strongest_labels_are_those_of_the_oracle_with_more_labels_than_a_block():
+    splats, camera = random_splats(9, 60), random_camera(9, 30, 20)
+    labels = torch.arange(60, dtype=torch.int32) % 35 - 1
+    ours, theirs = (
+        raster.strongest_labels(camera, labels, Walk()) for raster in (gpu_raster(splats), OracleRaster(splats))
+    )
+    assert theirs.unique().numel() > 5
+    assert (ours != theirs).float().mean() < 0.01
+
+
+def test_bad_arguments_are_refused_in_words():
+    splats, camera = random_splats(0, 4, kernel=Kernel.GAUSSIAN_2D), random_camera(0)
+    raster = gpu_raster(splats)
+    with pytest.raises(InvalidInput, match="values"):
+        raster.render(camera, torch.zeros(3, 1), Walk())
+    with pytest.raises(InvalidInput, match="values"):
+        raster.adjoint(camera, torch.zeros(3, 4, 1), Walk())
+    with pytest.raises(InvalidInput, match="labels"):
+        raster.strongest_labels(camera, torch.zeros(3, dtype=torch.int32), Walk())
+    with pytest.raises(InvalidInput, match="stride"):
+        raster.region_weights(camera, random_grid(0), Walk(stride=0), Weighting())
+    with pytest.raises(InvalidSettings, match="antialiased"):
+        raster.row_sums(camera, Walk(antialiased=True))
+
+
+def test_memory_that_runs_out_is_told_in_words(monkeypatch):
+    def full(*_arguments: object) -> None:
+        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.")
+
+    raster = gpu_raster(random_splats(0, 4))
+    monkeypatch.setattr("liftcore.raster.gpu.raster.Frame", full)
+    with pytest.raises(Unavailable, match="free memory on the device"):
+        raster.row_sums(random_camera(0), Walk())
+
+
+def test_without_a_card_or_the_interpreter_the_backend_says_so():
+    code = """if True:
+        import torch
+        from liftcore.raster.gpu.raster import GpuRaster
+        from tests.scenes import random_splats
+        for name in ("cpu", "cuda") if not torch.cuda.is_available() else ("cpu",):
+            try:
+                GpuRaster(random_splats(0, 4), torch.device(name))
+            except Exception as error:
+                print(type(error).__name__, error)
+    """
+    done = subprocess.run(
+        [sys.executable, "-c", code], env={"PATH": "", "HOME": "/nonexistent", "PYTHONPATH": ":".join(sys.path)},
+        capture_output=True, text=True, timeout=300, check=True,
+    )  # fmt: skip
+    lines = done.stdout.splitlines()
+    assert lines and all(line.startswith("Unavailable device: expected a CUDA device") for line in lines)
+
+
+def test_nothing_else_loads_triton():
+    code = "import sys, liftcore.lift, liftcore.raster.cpu, liftcore.cli; print('triton' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=True)
+    assert done.stdout.strip() == "False"
