@@ -39,8 +39,8 @@ def compare(peers: Sequence[Peer], sizes: Sizes, limits: Limits) -> Findings:
     under_way = Comparison(here, threads, limits)
     small = under_way.table("Small", sizes.small, {}, limits.lift_s)
     base = under_way.table("Base", sizes.base, small, limits.lift_s)
-    large = under_way.table("Large", sizes.large, base, LARGE_LIFT_S)
     growth = [(axis, under_way.growth(axis, base)) for axis in sizes.axes]
+    large = under_way.table("Large", sizes.large, base, LARGE_LIFT_S)
     return Findings(
         peers=here,
         absent={peer.name: peer.missing() for peer in peers if peer.missing()},

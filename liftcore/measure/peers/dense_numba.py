@@ -86,21 +86,24 @@ def _add_shares(thread, threads, edges, frame, target, sums):
                 if (step - frame.starts[tile]) % CHECK_EVERY == 0 and light.max() <= 0:
                     break
                 place = frame.items[step]
-                pixels = target[y0 : y0 + height, x0 : x0 + width]
-                _add_splat(frame, frame.records[place], (x0, y0), light, pixels, sums[frame.ids[place]])
+                box = x0, y0, width, height
+                _add_splat(frame, frame.records[place], box, light, target, sums[frame.ids[place]])
 
 
 @njit(nogil=True, cache=True)
-def _add_splat(frame, record, corner, light, pixels, row):
-    """One splat's weights on one tile, times the pixels, onto its row of sums [F + 1]; light ends at 0."""
-    height, width = pixels.shape[:2]
+def _add_splat(frame, record, box, light, target, row):
+    """One splat's weights on one tile, times the pixels, onto its row of sums [F + 1]; light ends at 0.
+
+    box: x, y, width, height of the tile, px. target: [H, W, F + 1] f32, read whole pixels at a time.
+    """
+    x0, y0, width, height = box
     opacity, kx, cap = np.float32(record[OPACITY]), np.float32(record[KX]), np.float32(frame.cap)
     for y in range(height):
-        dy = corner[1] + y + 0.5 - record[MY]
+        dy = y0 + y + 0.5 - record[MY]
         base = record[KY] * dy * dy
         if base > record[REACH]:
             continue
-        centre = record[MX] + record[SLOPE] * dy - corner[0] - 0.5
+        centre = record[MX] + record[SLOPE] * dy - x0 - 0.5
         half = math.sqrt((record[REACH] - base) / record[KX])
         for x in range(max(0, math.ceil(centre - half)), min(width - 1, math.floor(centre + half)) + 1):
             before = light[y, x]
@@ -116,7 +119,7 @@ def _add_splat(frame, record, corner, light, pixels, row):
                 light[y, x] = 0
                 continue
             light[y, x] = after
-            _add_scaled(row, alpha * before, pixels[y, x])
+            _add_scaled(row, alpha * before, target[y0 + y, x0 + x])
 
 
 @njit(nogil=True, cache=True, fastmath={"contract"})
