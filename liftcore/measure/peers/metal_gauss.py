@@ -19,7 +19,7 @@ from liftcore.measure.peers.work import Answer, Work, answer_of, dense_target, t
 if TYPE_CHECKING:
     from torch import Tensor
 
-PACKAGE = "metal-gauss"
+PACKAGE, VERSION = "metal-gauss", "0.2.1"  # that was tried
 CHANNELS = 3  # a call
 
 
@@ -34,7 +34,7 @@ class MetalGauss:
         try:
             version(PACKAGE)
         except PackageNotFoundError:
-            return f"the package {PACKAGE} is not installed"
+            return f"it is not installed (`pip install --no-deps {PACKAGE}=={VERSION}`)"
         return ""
 
     def lift(self, work: Work) -> Answer:

@@ -2,11 +2,13 @@
 
 The renderer is written to be fast on a CPU: tight tile lists, depth slabs of many tiles at a time, alphas composited
 by a cumulative product along depth, tiles without light left out of the next slab. Weights do not depend on x and are
-made once for all channels, which go in chunks, so that memory is bounded by the slab.
+made once for all channels, which go in chunks, so that memory is bounded by the slab. Each thread has tiles and sums
+of its own, and torch one thread in each: its own threads wait for one another at every operation.
 """
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
@@ -42,14 +44,20 @@ class TorchAutograd:
 
     def lift(self, work: Work) -> Answer:
         """View by view, slab by slab, chunk by chunk of channels."""
-        sums = torch.zeros(work.splats.count, work.channels + 1)
-        with torch_threads(work.threads):
+        own = torch.zeros(work.threads, work.splats.count, work.channels + 1)
+        with (
+            torch_threads(1),
+            ThreadPoolExecutor(work.threads, initializer=torch.set_num_threads, initargs=(1,)) as pool,
+        ):
             for camera, regions in work.views:
-                target = by_tile(dense_target(camera, regions))
                 footprints = _project(work.splats, camera)
-                for slab in _slabs(footprints, camera, work.walk):
-                    _add_gradient(slab, target, sums)
-        return answer_of(sums)
+                lists, target = _lists(footprints, camera), by_tile(dense_target(camera, regions))
+                view = _View(camera, work.walk, footprints, lists, target)
+                tiles = torch.arange(len(target))
+                parts = [pool.submit(_add_view, view, tiles[k :: work.threads], sums) for k, sums in enumerate(own)]
+                for part in parts:
+                    part.result()
+        return answer_of(own.sum(dim=0))
 
 
 class _Footprints(NamedTuple):
@@ -60,6 +68,16 @@ class _Footprints(NamedTuple):
     conic: Tensor  # [n, 3] f32: xx, xy, yy of the inverse covariance
     opacity: Tensor  # [n] f32
     extent: Tensor  # [n, 2] f32, px from the mean to where alpha falls below its floor
+
+
+class _View(NamedTuple):
+    """A view to lift from."""
+
+    camera: Camera
+    walk: Walk
+    footprints: _Footprints
+    lists: tuple[Tensor, Tensor]  # starts [tiles + 1] and items of every tile's list of footprints, near to far
+    target: Tensor  # [tiles, TILE * TILE, F + 1] f32
 
 
 class _Slab(NamedTuple):
@@ -123,14 +141,20 @@ def _lists(footprints: _Footprints, camera: Camera) -> tuple[Tensor, Tensor]:
     return pad(lengths.cumsum(0), (1, 0)), items[order]
 
 
-def _slabs(footprints: _Footprints, camera: Camera, walk: Walk) -> Iterator[_Slab]:
-    """The weights of a view, a slab of splats on a batch of tiles at a time, near to far on every tile."""
-    starts, items = _lists(footprints, camera)
+def _add_view(view: _View, tiles: Tensor, sums: Tensor) -> None:
+    """``A^T [B n]`` of some tiles of a view onto ``sums`` [P, F + 1]."""
+    for slab in _slabs(view, tiles):
+        _add_gradient(slab, view.target, sums)
+
+
+def _slabs(view: _View, own: Tensor) -> Iterator[_Slab]:
+    """The weights of a view's tiles ``own``, a slab of splats on a batch of tiles at a time, near to far on each."""
+    camera, walk, footprints, (starts, items), _ = view
     lengths, columns = starts.diff(), -(-camera.width // TILE)
     light = by_tile(torch.ones(camera.height, camera.width, 1))[:, :, 0]
     depth = 0
     while True:
-        left = torch.nonzero((lengths > depth) & (light.amax(dim=1) > walk.transmittance_stop))[:, 0]
+        left = own[(lengths[own] > depth) & (light[own].amax(dim=1) > walk.transmittance_stop)]
         if len(left) == 0:
             return
         left = left[torch.argsort(lengths[left], descending=True)]  # so that few slabs of a batch are padded
