@@ -1,0 +1,236 @@
+"""The closed form on any device of torch: the sums of ``closed_form``, in blocks of splats and slices of channels.
+
+W of a block of splats is gathered from all views into rows of one sparse matrix, whose columns are the rows of all
+codebooks, one after the other. A row is cut into parts of LONG entries. ``embedding_bag`` adds up a part in float32:
+on a card one thread reads the entries of a part in their order, nothing is written between the product and the sum,
+and no sum is shared, so the bits repeat. The parts of a row are added in float64 the same way. A product with a
+sparse tensor would take cuSPARSE's default algorithm, and ``index_add_`` atomic sums: neither has a fixed order.
+
+No bit depends on where splats are cut into blocks, so a block may follow the memory that happens to be free; the
+slices follow the size of the codebooks alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch.nn.functional import embedding_bag
+
+from liftcore.solve.closed_form import UNIT_TOLERANCE, Solution, _fits_float16
+from liftcore.solve.device_blocks import GRAIN, block_room, device_slices, splat_blocks
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+    from torch import Tensor
+
+    from liftcore.progress import Progress
+    from liftcore.raster.protocol import RegionWeights
+    from liftcore.solve.view_weights import ViewWeights
+
+LONG = 256  # entries that float32 adds up one by one
+
+
+@dataclass(frozen=True)
+class BlockRows:
+    """W of a block of splats, its rows divided by their sums: a row a splat, its views in their order."""
+
+    columns: Tensor  # [nnz] i32, rows of all codebooks
+    shares: Tensor  # [nnz] f32
+    part_starts: Tensor  # [parts + 1] i32, entries of each part
+    row_parts: Tensor  # [B + 1] i32, parts of each row
+
+
+def solve_on_device(
+    store: Sequence[RegionWeights] | ViewWeights,
+    codebooks: Callable[[int], Tensor],
+    denominators: np.ndarray,
+    dtype: torch.dtype,
+    progress: Progress,
+    place: torch.device,
+    free: int | None = None,
+) -> Solution:
+    """Solve for X as ``solve_closed_form`` does, which describes the arguments; X comes back to the host.
+
+    Args:
+        place: where the sums are made.
+        free: bytes that may be taken there; None for a device without limits of its own. It changes no bit.
+
+    Raises:
+        torch.OutOfMemoryError: not even a grain of splats fits beside a slice of the codebooks.
+    """
+    books = [codebooks(view) for view in range(len(store))]
+    count, channels = denominators.shape[0], books[0].shape[1]
+    norms = [torch.linalg.vector_norm(book, dim=1, dtype=torch.float64) for book in books]
+    unit = all(bool(((norm - 1).abs() < UNIT_TOLERANCE).all()) for norm in norms)
+    if dtype == torch.float16 and not _fits_float16(books, max(float(norm.max()) for norm in norms)):
+        dtype = torch.float32
+    scale = torch.from_numpy(np.divide(1.0, denominators, out=np.zeros(count), where=denominators > 0))
+    X, squares = torch.zeros(count, channels, dtype=dtype), torch.zeros(count, dtype=torch.float64)
+    work = _Work(store, books, scale, place, X, squares)
+    rows = sum(book.shape[0] for book in books)
+    slices = device_slices(rows, channels)
+    for number, (begin, end) in enumerate(slices):
+        codebook = _all_rows(books, slice(begin, end), place)
+        own = _Slice(slice(begin, end), codebook, None if unit else _units(codebook, norms))
+        room = block_room(free, rows, end - begin, unit)
+        for block in splat_blocks(store, count, end - begin, room):
+            for done in _solve_fitting(work, own, block):
+                progress("solve", number * count + done, len(slices) * count, "splats")
+    return Solution(X, squares.sqrt().clamp(0.0, 1.0).to(torch.float32))
+
+
+@dataclass(frozen=True)
+class _Work:
+    """What all blocks and slices share. X and squares are on the host, and filled."""
+
+    store: Sequence[RegionWeights] | ViewWeights
+    books: Sequence[Tensor]  # E_v [M, F] of every view
+    scale: Tensor  # [P] f64, one by the sums of rows
+    place: torch.device
+    X: Tensor  # [P, F] f16 or f32
+    squares: Tensor  # [P] f64, of the means of unit vectors
+
+
+@dataclass(frozen=True)
+class _Slice:
+    """Channels of all codebooks, one after the other, on the device."""
+
+    channels: slice
+    codebook: Tensor  # [M, C] f32
+    units: Tensor | None  # the same of the unit vectors; None where the codebooks hold such
+
+
+def _solve_fitting(work: _Work, own: _Slice, splats: tuple[int, int]) -> Iterator[int]:
+    """Solve a block, in halves where the device has less room than it said; yields how far it is."""
+    waiting = [splats]
+    while waiting:
+        first, last = waiting.pop()
+        try:
+            _solve_block(work, own, (first, last))
+        except torch.OutOfMemoryError:
+            if last - first <= GRAIN:
+                raise
+            torch.cuda.empty_cache()
+            middle = (first + last) // 2
+            waiting += [(middle, last), (first, middle)]
+        else:
+            yield last
+
+
+def _solve_block(work: _Work, own: _Slice, splats: tuple[int, int]) -> None:
+    block = rows_of(work.store, work.books, splats, work.scale, work.place)
+    if block is None:
+        return
+    sums = weighted_sums(block, own.codebook)
+    lengths = squared_lengths(sums if own.units is None else weighted_sums(block, own.units))
+    rows = slice(*splats)
+    work.X[rows, own.channels] = sums.to(torch.float32).to(work.X.dtype).cpu()
+    work.squares[rows] += lengths.cpu()
+
+
+def rows_of(
+    store: Sequence[RegionWeights] | ViewWeights,
+    books: Sequence[Tensor],
+    splats: tuple[int, int],
+    scale: Tensor,
+    place: torch.device,
+) -> BlockRows | None:
+    """The rows of some splats; None where no view has an entry.
+
+    Args:
+        splats: (first, last). scale: [P] f64, what rows are multiplied with.
+    """
+    offset, base, gathered = splats[0], 0, []
+    for weights, book in zip(store, books, strict=True):
+        first, last = (int(k) for k in torch.searchsorted(weights.splats, torch.tensor(splats, dtype=torch.int32)))
+        begin, end = int(weights.row_starts[first]), int(weights.row_starts[last])
+        if begin < end:
+            lengths = torch.diff(weights.row_starts[first : last + 1])
+            columns = weights.columns[begin:end] + base
+            gathered.append((weights.splats[first:last], lengths, columns, weights.weights[begin:end]))
+        base += book.shape[0]
+    if not gathered:
+        return None
+    owners, lengths, columns, values = (torch.cat(part).to(place) for part in zip(*gathered, strict=True))
+    owners, order = torch.sort(owners - offset, stable=True)  # of equal ones the earlier view stays first
+    taken = _from_zero(lengths)[:-1][order]
+    lengths = lengths[order]
+    starts = _from_zero(lengths)
+    total = columns.shape[0]
+    entries = _repeated(taken - starts[:-1], lengths, total) + torch.arange(total, device=place)
+    every = torch.arange(splats[1] - offset + 1, dtype=owners.dtype, device=place)
+    starts = starts[torch.searchsorted(owners, every)]  # of each splat's entries
+    own_scale = _repeated(scale[offset : splats[1]].to(place), torch.diff(starts), total)
+    shares = (values[entries].to(torch.float64) * own_scale).to(torch.float32)
+    part_starts, row_parts = _parts(starts)
+    return BlockRows(columns[entries], shares, part_starts, row_parts)
+
+
+def _parts(starts: Tensor) -> tuple[Tensor, Tensor]:
+    """Rows [B + 1] i64 cut into parts of LONG entries: the entries of each part, and the parts of each row, i32."""
+    counts = torch.diff(starts).add(LONG - 1).div(LONG, rounding_mode="floor")
+    row_parts = _from_zero(counts)
+    total = int(row_parts[-1])
+    number = torch.arange(total, device=starts.device) - _repeated(row_parts[:-1], counts, total)
+    part_starts = torch.cat([_repeated(starts[:-1], counts, total) + LONG * number, starts[-1:]])
+    return part_starts.to(torch.int32), row_parts.to(torch.int32)
+
+
+def weighted_sums(block: BlockRows, book: Tensor) -> Tensor:
+    """``W E`` of a block: book [M, C] f32 -> [B, C] f64."""
+    parts = _bags(block.columns, book, block.part_starts, block.shares)
+    order = torch.arange(parts.shape[0], dtype=torch.int32, device=parts.device)
+    return _bags(order, parts.to(torch.float64), block.row_parts)
+
+
+def _bags(columns: Tensor, rows: Tensor, starts: Tensor, shares: Tensor | None = None) -> Tensor:
+    """Sums of rows [n, C], those of bag k at ``columns[starts[k]:starts[k + 1]]``, times their shares."""
+    return embedding_bag(columns, rows, starts, mode="sum", per_sample_weights=shares, include_last_offset=True)
+
+
+def squared_lengths(values: Tensor) -> Tensor:
+    """Squared norms of rows: [B, C] f64 -> [B] f64.
+
+    Channels are added half to half. torch's own sum may take another order for another number of rows.
+    """
+    squares = values.square()
+    while squares.shape[1] > 1:
+        half = squares.shape[1] // 2
+        halves = squares[:, :half] + squares[:, half : 2 * half]
+        squares = torch.cat([halves, squares[:, 2 * half :]], dim=1)
+    return squares[:, 0]
+
+
+def _all_rows(books: Sequence[Tensor], channels: slice, place: torch.device) -> Tensor:
+    """Some channels of all codebooks, one after the other, [M, C] f32."""
+    rows = torch.empty(sum(book.shape[0] for book in books), channels.stop - channels.start, device=place)
+    base = 0
+    for book in books:
+        rows[base : base + book.shape[0]] = book[:, channels].to(place)
+        base += book.shape[0]
+    return rows
+
+
+def _units(rows: Tensor, norms: Sequence[Tensor]) -> Tensor:
+    """The rows of all codebooks divided by their norms [M] f64 a view, those of norm zero as they are."""
+    units, base = torch.empty_like(rows), 0
+    for norm in norms:
+        own = slice(base, base + norm.shape[0])
+        divisors = torch.where(norm > 0, norm, 1.0).to(rows.device)
+        units[own] = rows[own].to(torch.float64) / divisors[:, None]
+        base += norm.shape[0]
+    return units
+
+
+def _from_zero(lengths: Tensor) -> Tensor:
+    """[n] -> [n + 1], their sums from the left, from nought."""
+    return torch.cat([lengths.new_zeros(1), lengths.cumsum(0)])
+
+
+def _repeated(values: Tensor, counts: Tensor, total: int) -> Tensor:
+    """Each value so many times, ``total`` in all: told, so that no device must be waited for."""
+    return torch.repeat_interleave(values, counts, output_size=total)
