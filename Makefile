@@ -7,8 +7,9 @@ SHARED := ../shared/data
 SCENE ?=
 OUT ?= demo-output
 TORCH_PIP ?=
+CUDA_TORCH_PIP ?=
 
-.PHONY: demo test soak contract load lint format serve bench setup clean
+.PHONY: demo test soak contract load gpu lint format serve bench setup clean
 
 demo: $(READY)  ## the whole job through the real service; SCENE=DIR takes a scene of your own
 	$(BIN)/splatlift demo --out "$(OUT)" $(if $(SCENE),--scene "$(SCENE)")
@@ -26,6 +27,18 @@ contract: $(READY)  ## every operation against the OpenAPI document, without key
 
 load: $(READY)  ## what clients wait for under load (docs/reliability.md): prints figures, takes some minutes
 	$(BIN)/python -m tests.load.measure
+
+# Another torch than the lock's build brings the triton that it was made with: that one stays.
+gpu:  ## all that a card is for: CUDA's torch, conformance, speed, accuracy, gsplat beside; writes docs/benchmarks_gpu.md
+	@nvidia-smi -L 2>/dev/null | grep -q GPU || { echo "make gpu: nvidia-smi lists no card here, so nothing was run" >&2; exit 2; }
+	@$(MAKE) --no-print-directory setup
+	@$(BIN)/python -c 'import sys, torch; sys.exit(torch.version.cuda is None)' || { echo "installing torch's CUDA build" \
+	&& $(BIN)/python -m pip install --quiet --force-reinstall $(CUDA_TORCH_PIP) $$(grep -E '^torch(vision)?==' requirements.lock) \
+	&& grep -vE '^(torch|torchvision|triton)==' requirements.lock | $(BIN)/python -m pip install --quiet -r /dev/stdin; }
+	@$(BIN)/python -m liftcore.measure.gpu --look
+	@$(BIN)/python -m pip install --quiet gsplat==1.5.3 ninja || echo "gsplat does not install here: the page will say so"
+	env -u TRITON_INTERPRET $(BIN)/python -m pytest -rs tests/gpu tests/properties tests/unit/solve/test_on_device.py tests/unit/solve/test_lift_on_device.py
+	$(BIN)/python -m liftcore.measure.gpu docs/benchmarks_gpu.md --shared $(SHARED)
 
 lint: $(READY)
 	$(BIN)/ruff check .

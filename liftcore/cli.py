@@ -140,7 +140,12 @@ def _add_sources(parser: argparse.ArgumentParser) -> None:
 def _add_settings(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--preset", metavar="NAME", help="a published choice of weights: row-sum, tikhonov")
     parser.add_argument("--speed", metavar="NAME", help="the dial: exact, balanced, fast or draft")
+    _add_device(parser)
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="one setting")
+
+
+def _add_device(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--device", metavar="NAME", help="what walks and solves: auto, cpu or cuda")
 
 
 def _add_tradeoff(parser: argparse.ArgumentParser) -> None:
@@ -235,6 +240,7 @@ def _add_bench(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--views", type=_count, metavar="N")
     parser.add_argument("--threads", type=_count, metavar="N")
     parser.add_argument("--stages", action="store_true", help="every step of a view apart, on one thread")
+    _add_device(parser)
 
 
 def _add_experiment(parser: argparse.ArgumentParser) -> None:

@@ -10,12 +10,13 @@ import torch
 
 from liftcore import __version__
 from liftcore.artifact import Lift, LiftMetadata
+from liftcore.device import Device, choose_device, within_memory
 from liftcore.input_files import input_file
 from liftcore.observe.pack import FeaturePacks, open_packs, pair
 from liftcore.plan.plan import plan_lift
 from liftcore.progress import Progress, silent
 from liftcore.raster.antialiased import check_antialiased
-from liftcore.raster.cpu import CpuRaster
+from liftcore.raster.open_raster import open_raster
 from liftcore.raster.warm_up import warm_up
 from liftcore.scene.load import load_cameras, load_splats
 from liftcore.solve.accumulate import Geometry, accumulate, as_read, lift_walk
@@ -23,12 +24,13 @@ from liftcore.solve.aggregation import Aggregation, aggregate
 from liftcore.solve.all_rays import AllRays
 from liftcore.solve.certificate import certify
 from liftcore.solve.checkpoint import Checkpoint, identity, resumed
-from liftcore.solve.closed_form import Solution, solve_closed_form, warm_up_solution
+from liftcore.solve.closed_form import Solution, warm_up_solution
 from liftcore.solve.kept_columns import kept_columns
 from liftcore.solve.least_squares import refine
 from liftcore.solve.lift_warnings import lift_warnings
 from liftcore.solve.reference import reference
 from liftcore.solve.robust import robust_weights
+from liftcore.solve.solver import closed_form_on
 from liftcore.solve.view_weights import ViewWeights
 from liftcore.timings import Timings
 
@@ -40,7 +42,7 @@ if TYPE_CHECKING:
     from liftcore.plan.plan import Plan
     from liftcore.raster.protocol import Raster
     from liftcore.scene.cameras import Cameras
-    from liftcore.scene.splats import Splats
+    from liftcore.scene.splats import Kernel, Splats
     from liftcore.solve.settings import LiftSettings
 
 log = logging.getLogger(__name__)
@@ -65,6 +67,7 @@ class Run:
     threads: int | None
     progress: Progress
     timings: Timings
+    device: Device  # that the settings ask for
 
 
 def lift(
@@ -88,9 +91,9 @@ def lift(
     Raises:
         InvalidInput: a file is malformed, or the packs do not fit the cameras.
         InvalidSettings: the splats' kernel has no opacity compensation, and the settings ask for it.
-        Unavailable: the machine's free memory cannot hold the result.
+        Unavailable: the free memory cannot hold the result, or there is no such device as the settings ask for.
     """
-    run = Run(settings, threads, progress, Timings())
+    run = Run(settings, threads, progress, Timings(), choose_device(settings.device))
     with run.timings.stage("read"):
         sources = open_sources(splats, cameras, features, settings)
     with run.timings.stage("digest"):
@@ -100,18 +103,32 @@ def lift(
 
 def lift_sources(run: Run, sources: Sources, inputs: list[InputFile], checkpoint: Checkpoint | None = None) -> Lift:
     """The lift of what is open already: ``inputs`` are the files that it came from."""
-    settings, threads, progress = run.settings, run.threads, run.progress
-    with run.timings.stage("compile"):
-        warm_up(sources.splats.kernel)
-        warm_up_solution()
+    _warm_up(run, sources.splats.kernel)
     with run.timings.stage("plan"):
-        plan = planned(sources, settings)
+        plan = planned(sources, run.settings, run.device)
         sources = replace(sources, views=list(plan.views))
     for warning in plan.warnings:  # of this machine: equal inputs give equal lifts, so none is kept with them
         log.warning(warning)
-    raster = CpuRaster(sources.splats, threads)
+    if plan.device != run.device:
+        run = replace(run, device=plan.device)
+        _warm_up(run, sources.splats.kernel)
+    with within_memory(run.device):
+        return _lift_on(run, plan, sources, inputs, checkpoint)
+
+
+def _warm_up(run: Run, kernel: Kernel) -> None:
+    with run.timings.stage("compile"):
+        warm_up(kernel, run.device)
+        if run.device.kind == "cpu":
+            warm_up_solution()
+
+
+def _lift_on(run: Run, plan: Plan, sources: Sources, inputs: list[InputFile], checkpoint: Checkpoint | None) -> Lift:
+    """The lift as planned."""
+    settings, threads, progress = run.settings, run.threads, run.progress
+    raster, device = open_raster(sources.splats, run.device, threads), run.device.facts()
     with ViewWeights() as store:
-        key = identity([part.sha256 for part in inputs], settings) if checkpoint else ""
+        key = identity([part.sha256 for part in inputs], settings, device) if checkpoint else ""
         with run.timings.stage("geometry"), resumed(raster, checkpoint, key) as walked:
             scene = (sources.splats.count, sources.cameras)
             geometry = accumulate(walked, scene, sources.packs, sources.views, settings, store, progress)
@@ -123,6 +140,7 @@ def lift_sources(run: Run, sources: Sources, inputs: list[InputFile], checkpoint
             if settings.aggregation_resolve:
                 notes["aggregation"]["resolved"] = _resolve(run, weights, geometry, aggregation, X)
         facts: dict[str, Any] = {
+            "device": device,
             "weights_entries": sum(len(part.columns) for part in store),
             "views_without_camera": sources.unpaired,
             "plan": plan.facts(),
@@ -152,9 +170,9 @@ def open_sources(splats: Path, cameras: Path, features: Sequence[Path], settings
     return Sources(scene, views, packs, names[:: settings.view_stride], unpaired)
 
 
-def planned(sources: Sources, settings: LiftSettings) -> Plan:
-    """The plan of a lift from these sources."""
-    return plan_lift(sources.splats, sources.cameras, sources.packs, sources.views, settings)
+def planned(sources: Sources, settings: LiftSettings, device: Device) -> Plan:
+    """The plan of a lift from these sources on the device that the settings ask for."""
+    return plan_lift(sources.splats, sources.cameras, sources.packs, sources.views, settings, device)
 
 
 def _blind(views: Sequence[str], store: ViewWeights) -> list[str]:
@@ -170,10 +188,8 @@ def _solve(run: Run, store: ViewWeights, geometry: Geometry) -> tuple[ViewWeight
             store, books, geometry.denominators, settings.robust_steps, run.progress, run.threads
         )
     with run.timings.stage("solve"):
-        dtype = getattr(torch, settings.dtype)
-        return weights, solve_closed_form(
-            weights, books.__getitem__, geometry.denominators, dtype, run.progress, run.threads
-        )
+        closed_form, dtype = closed_form_on(run.device, run.threads), getattr(torch, settings.dtype)
+        return weights, closed_form(weights, books.__getitem__, geometry.denominators, dtype, run.progress)
 
 
 def _refine(
@@ -217,8 +233,8 @@ def _resolve(run: Run, weights: ViewWeights, geometry: Geometry, aggregation: Ag
         return 0.0
     with run.timings.stage("resolve"):
         fewer, denominators = kept_columns(weights, aggregation.kept, X.shape[0])
-        books = geometry.codebooks.__getitem__
-        again = solve_closed_form(fewer, books, denominators, X.dtype, run.progress, run.threads).features
+        books, closed_form = geometry.codebooks.__getitem__, closed_form_on(run.device, run.threads)
+        again = closed_form(fewer, books, denominators, X.dtype, run.progress).features
         chosen = aggregation.own & torch.from_numpy(denominators > 0)
         X[chosen] = again[chosen].to(X.dtype)
         return float(chosen.float().mean())

@@ -12,6 +12,7 @@ from fastapi import FastAPI
 
 from liftcore import __version__
 from service import problems
+from service.jobs.devices import Devices
 from service.jobs.limits import JobLimits
 from service.jobs.streams import EventStreams
 from service.jobs.supervisor import Supervisor
@@ -34,7 +35,7 @@ from service.versions import versions
 def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, worker: WarmWorker) -> FastAPI:
     """The application. It starts and stops the runner and the worker; the store is its caller's to close."""
 
-    streams = EventStreams(settings.max_streams)
+    streams, devices = EventStreams(settings.max_streams), Devices()
     stopping = Stopping(streams, runner, notice_seconds=settings.notice_seconds)
     readiness = Readiness(store, runner, worker, stopping)
     metrics = Metrics(store, worker, streams, build=versions(settings.commit))
@@ -47,7 +48,7 @@ def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, work
         ending = threading.Event()
         checks, scrapes = anyio.CapacityLimiter(settings.parallel_checks), anyio.CapacityLimiter(1)
         app.state.parts = Parts(
-            settings, store, runner, worker, streams, checks, metrics=metrics, scrapes=scrapes,
+            settings, store, runner, devices, worker, streams, checks, metrics=metrics, scrapes=scrapes,
             readiness=readiness, ending=ending,
         )  # fmt: skip
         await anyio.to_thread.run_sync(worker.start)

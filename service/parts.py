@@ -9,6 +9,7 @@ from typing import Annotated
 import anyio
 from fastapi import Depends, Request
 
+from service.jobs.devices import Devices
 from service.jobs.streams import EventStreams
 from service.jobs.supervisor import Supervisor
 from service.keys.gate import CALLER
@@ -26,6 +27,7 @@ class Parts:
     settings: ServiceSettings
     store: Store
     runner: Supervisor
+    devices: Devices
     queries: WarmWorker
     streams: EventStreams
     checks: anyio.CapacityLimiter  # uploads that are validated at the same time

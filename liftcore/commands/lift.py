@@ -47,12 +47,12 @@ def run(options: argparse.Namespace) -> int:
 
 
 def settings_of(options: argparse.Namespace) -> LiftSettings:
-    """Settings of ``--preset``, ``--speed`` and ``--set key=value``.
+    """Settings of ``--preset``, ``--speed``, ``--device`` and ``--set key=value``.
 
     Raises:
         InvalidSettings: a pair without ``=``, an unknown name or a value out of range.
     """
-    named = {"preset": options.preset, "speed": options.speed}
+    named = {"preset": options.preset, "speed": options.speed, "device": options.device}
     given = {name: value for name, value in named.items() if value is not None}
     return LiftSettings.of(**{**given, **pairs_of(options.set)})
 
@@ -77,9 +77,11 @@ def pairs_of(pairs: Sequence[str]) -> dict[str, Any]:
 
 def plan_of(options: argparse.Namespace, settings: LiftSettings) -> Plan:
     """The plan of the lift that the options describe."""
+    from liftcore.device import choose_device
     from liftcore.lift import open_sources, planned
 
-    return planned(open_sources(options.splats, options.cameras, options.features, settings), settings)
+    device = choose_device(settings.device)
+    return planned(open_sources(options.splats, options.cameras, options.features, settings), settings, device)
 
 
 def _summary(result: Lift) -> dict[str, Any]:

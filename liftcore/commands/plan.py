@@ -15,6 +15,8 @@ def run(options: argparse.Namespace) -> int:
     """Print the plan."""
     plan = plan_of(options, settings_of(options))
     views = {"lifted": list(plan.views), "left_out": list(plan.left_out)}
-    document = {**plan.facts(), "views": views, "warnings": list(plan.warnings)}
+    today = plan.on_device.today() if plan.on_device else {}
+    device = {"kind": plan.device.kind, "name": plan.device.name, **today}
+    document = {**plan.facts(), "device": device, "views": views, "warnings": list(plan.warnings)}
     reply(document, as_json=options.json, lines=plan.lines())
     return 0

@@ -14,15 +14,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from liftcore.device import Device, choose_device, processor
 from liftcore.errors import InvalidInput
 from liftcore.measure.synthetic import room_cameras, room_regions, room_splats
 from liftcore.observe.observation import Observation, RegionMap
 from liftcore.progress import silent
-from liftcore.raster.cpu import CpuRaster
+from liftcore.raster.open_raster import open_raster
 from liftcore.raster.warm_up import warm_up
 from liftcore.solve.accumulate import lift_walk, row_totals, weighting_of
-from liftcore.solve.closed_form import solve_closed_form, warm_up_solution
+from liftcore.solve.closed_form import warm_up_solution
 from liftcore.solve.settings import LiftSettings, Preset
+from liftcore.solve.solver import closed_form_on
 from liftcore.solve.view_weights import ViewWeights
 
 if TYPE_CHECKING:
@@ -45,15 +47,20 @@ def run_bench(options: dict[str, Any]) -> dict[str, Any]:
     """Time the lift of a real scene (``scene``: a folder) or of a synthetic room.
 
     Args:
-        options: scene (folder or None), splats, size ("WxH"), channels, levels, views, threads; stages (bool): every
-            step apart, on one thread, as ``liftcore.measure.stages`` has it.
+        options: scene (folder or None), splats, size ("WxH"), channels, levels, views, threads, device ("auto", "cpu"
+            or "cuda"); stages (bool): every step apart, on one thread of the processor, as
+            ``liftcore.measure.stages`` has it.
 
     Returns:
         Plain numbers, ready for JSON: hardware, versions, seconds a view by stage (medians), peak memory.
     """
+    asked = LiftSettings.of(device=options.get("device") or "auto").device
+    if options.get("stages") and asked == "cuda":
+        raise InvalidInput("device", expected="cpu beside stages, which are the processor's", got=asked)
+    device = choose_device("cpu" if options.get("stages") else asked)
     work = _workload(options)
     start = time.perf_counter()
-    warm_up(work.splats.kernel)
+    warm_up(work.splats.kernel, device)
     warm_up_solution()
     compile_seconds = time.perf_counter() - start
     if options.get("stages"):
@@ -61,7 +68,7 @@ def run_bench(options: dict[str, Any]) -> dict[str, Any]:
 
         presets = {str(preset): time_stages(work, preset) for preset in (Preset.ROW_SUM, Preset.TIKHONOV)}
     else:
-        presets = {str(preset): time_lift(work, preset, options.get("threads")) for preset in Preset}
+        presets = {str(preset): time_lift(work, preset, device, options.get("threads")) for preset in Preset}
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
     return {
         "workload": work.name,
@@ -74,21 +81,22 @@ def run_bench(options: dict[str, Any]) -> dict[str, Any]:
         "compile_or_load_s": compile_seconds,
         "presets": presets,
         "peak_memory_bytes": peak,
-        "hardware": hardware(),
+        "hardware": hardware() | ({} if device.kind == "cpu" else {"device": device.facts()}),
     }
 
 
-def time_lift(work: Workload, preset: Preset, threads: int | None = None) -> dict[str, Any]:
+def time_lift(work: Workload, preset: Preset, device: Device, threads: int | None = None) -> dict[str, Any]:
     """Seconds a view of geometry and solution, medians over the views, one after the other."""
     settings = LiftSettings.of(preset=preset)
-    raster = CpuRaster(work.splats, threads)
+    camera, observation = work.views[0]
+    warm = open_raster(work.splats, device, threads)  # for the caches alone: what it keeps of the view is not used
+    warm.region_weights(camera, observation, lift_walk(settings), weighting_of(settings))
+    del warm
+    raster = open_raster(work.splats, device, threads)
     walk, weighting = lift_walk(settings), weighting_of(settings)
     denominators = np.zeros(work.splats.count)
     geometry, entries = [], 0
     with ViewWeights() as store:
-        camera, observation = work.views[0]
-        raster.region_weights(camera, observation, walk, weighting)  # warm caches, not counted
-        raster.forget()
         for camera, observation in work.views:
             start = time.perf_counter()
             weights = raster.region_weights(camera, observation, walk, weighting)
@@ -98,7 +106,7 @@ def time_lift(work: Workload, preset: Preset, threads: int | None = None) -> dic
             entries += len(weights.columns)
         start = time.perf_counter()
         books = [observation.codebook for _, observation in work.views]
-        solve_closed_form(store, books.__getitem__, denominators, torch.float16, silent, threads)
+        closed_form_on(device, threads)(store, books.__getitem__, denominators, torch.float16, silent)
         solve = (time.perf_counter() - start) / len(work.views)
     return {
         "geometry_s_per_view": statistics.median(geometry),
@@ -157,13 +165,8 @@ def hardware() -> dict[str, Any]:
     """The machine and the versions that a figure was taken on."""
     import numba
 
-    model = platform.processor()
-    info = Path("/proc/cpuinfo")
-    if info.is_file():
-        names = [line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if "model name" in line]
-        model = names[0] if names else model
     return {
-        "cpu": model,
+        "cpu": processor(),
         "cores": len(os.sched_getaffinity(0)),
         "python": platform.python_version(),
         "torch": torch.__version__,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,9 +13,9 @@ from liftcore.raster.kernels import RECORDS
 from liftcore.solve.view_weights import MEMORY_LIMIT
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
 
-    from liftcore.observe.pack import FeaturePacks
+    from liftcore.observe.pack import FeaturePacks, TensorSpec
     from liftcore.scene.cameras import Camera
     from liftcore.scene.splats import Splats
 
@@ -44,7 +45,7 @@ def memory_parts(
     """
     inputs = sum(t.nbytes for t in (splats.means, splats.quats, splats.log_scales, splats.opacity_logits))
     largest = max(camera.width * camera.height for camera in cameras.values())
-    levels = max(_levels(packs, view) for view in cameras)
+    levels = most_levels(packs, cameras)
     weights = int(len(cameras) * seen_a_view * ENTRIES_A_SPLAT * ENTRY_BYTES * levels)
     return {
         "libraries": LIBRARIES,
@@ -104,15 +105,22 @@ def check_memory(parts: Mapping[str, int], free: int | None) -> list[str]:
     return []
 
 
-def _levels(packs: FeaturePacks, view: str) -> int:
-    labels = packs.specs(view).get("labels")
-    return labels.shape[0] if labels is not None and len(labels.shape) == 3 else 1
+def most_levels(packs: FeaturePacks, views: Iterable[str]) -> int:
+    """The levels of the view that has most of them."""
+    labels = [packs.specs(view).get("labels") for view in views]
+    return max(spec.shape[0] if spec is not None and len(spec.shape) == 3 else 1 for spec in labels)
+
+
+def codebook_rows(packs: FeaturePacks, view: str) -> int:
+    """Rows of the view's codebook; of a grid, its cells."""
+    return math.prod(_codebook_spec(packs, view).shape[:-1])
 
 
 def _codebook_bytes(packs: FeaturePacks, view: str) -> int:
     """Of the view's codebook as it is kept: float16 stays, all else is float32."""
-    spec = next(spec for part, spec in packs.specs(view).items() if part != "labels")
-    numbers = 1
-    for side in spec.shape:
-        numbers *= side
-    return numbers * (2 if spec.dtype == "F16" else 4)
+    spec = _codebook_spec(packs, view)
+    return math.prod(spec.shape) * (2 if spec.dtype == "F16" else 4)
+
+
+def _codebook_spec(packs: FeaturePacks, view: str) -> TensorSpec:
+    return next(spec for part, spec in packs.specs(view).items() if part != "labels")

@@ -6,8 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from liftcore.device import CPU
 from liftcore.plan.coverage import WELL_COVERED, choose_views, spare_views
 from liftcore.plan.memory import check_memory, free_memory, memory_parts
+from liftcore.plan.on_device import check_device_room, device_plan
 from liftcore.plan.rank import ENOUGH, Rank, codebook_rank
 from liftcore.plan.visibility import visibility
 from liftcore.solve.accumulate import lift_walk
@@ -15,7 +17,9 @@ from liftcore.solve.accumulate import lift_walk
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
+    from liftcore.device import Device
     from liftcore.observe.pack import FeaturePacks
+    from liftcore.plan.on_device import DevicePlan
     from liftcore.scene.cameras import Cameras
     from liftcore.scene.splats import Splats
     from liftcore.solve.settings import LiftSettings
@@ -37,6 +41,8 @@ class Plan:
     rank: Rank
     dtype: str  # that X is stored as, when it can hold the codebooks
     memory: Mapping[str, int]  # bytes a part
+    device: Device  # that will walk and solve
+    on_device: DevicePlan | None  # what it takes of a card, where it is one
     warnings: tuple[str, ...]  # of this machine, today
 
     @property
@@ -61,6 +67,8 @@ class Plan:
             "dtype": self.dtype,
             "memory_bytes": self.memory_bytes,
             "memory": dict(self.memory),
+            "device": self.device.kind,
+            "device_memory": self.on_device.facts() if self.on_device else None,
         }
 
     def lines(self) -> Iterator[str]:
@@ -76,6 +84,7 @@ class Plan:
         )
         parts = ", ".join(f"{name} {size / 2**20:.0f}" for name, size in self.memory.items())
         yield f"  features as {self.dtype}; about {self.memory_bytes / 2**20:.0f} MiB at the peak ({parts})"
+        yield f"  on {self.device.name}" + (f": {self.on_device.line()}" if self.on_device else "")
         yield from (f"warning: {warning}" for warning in self.warnings)
 
     def _spare_line(self) -> str:
@@ -86,25 +95,30 @@ class Plan:
 
 
 def plan_lift(
-    splats: Splats, cameras: Cameras, packs: FeaturePacks, names: Sequence[str], settings: LiftSettings
+    splats: Splats,
+    cameras: Cameras,
+    packs: FeaturePacks,
+    names: Sequence[str],
+    settings: LiftSettings,
+    device: Device,
 ) -> Plan:
     """Plan the lift of the views ``names``; the settings' coverage may choose among them.
 
+    Args:
+        device: where it should run. A card with too little room leaves an ``auto`` lift to the processor.
+
     Raises:
-        Unavailable: not even the features would fit this machine's memory.
+        Unavailable: not even the features would fit this machine's memory, or the lift the card that it was sent to.
     """
     by_name = {name: cameras.get(name) for name in names}
     seen = visibility(splats, list(by_name.values()), lift_walk(settings))
     chosen = choose_views(seen, settings.coverage) if settings.coverage else range(len(names))
     views = [names[k] for k in chosen]
     seen = seen.of(list(chosen))
-    parts = memory_parts(
-        splats,
-        packs,
-        {name: by_name[name] for name in views},
-        seen.splats_a_view,
-        2 if settings.dtype == "float16" else 4,
-    )
+    lifted = {name: by_name[name] for name in views}
+    parts = memory_parts(splats, packs, lifted, seen.splats_a_view, 2 if settings.dtype == "float16" else 4)
+    on_device = device_plan(device, splats, packs, lifted, seen.splats_a_view)
+    short = check_device_room(on_device, settings.device) if on_device else []
     return Plan(
         kernel=str(splats.kernel),
         splats=splats.count,
@@ -116,5 +130,7 @@ def plan_lift(
         rank=codebook_rank(packs, views),
         dtype=settings.dtype,
         memory=parts,
-        warnings=tuple(check_memory(parts, free_memory())),
+        device=CPU if short else device,
+        on_device=None if short else on_device,
+        warnings=(*short, *check_memory(parts, free_memory())),
     )

@@ -1,19 +1,20 @@
-"""Compile the kernels, or load them from the disk cache, before anything is timed."""
+"""Compile a device's kernels, or load them from the disk cache, before anything is timed."""
 
 from __future__ import annotations
 
 import numpy as np
 import torch
 
+from liftcore.device import CPU, Device
 from liftcore.observe.observation import FeatureGrid, RegionMap
-from liftcore.raster.cpu import CpuRaster
+from liftcore.raster.open_raster import open_raster
 from liftcore.raster.protocol import Walk, Weighting
 from liftcore.scene.cameras import Camera
 from liftcore.scene.ply_dialect import scale_count
 from liftcore.scene.splats import Kernel, Splats
 
 
-def warm_up(kernel: Kernel = Kernel.GAUSSIAN_3D) -> None:
+def warm_up(kernel: Kernel = Kernel.GAUSSIAN_3D, device: Device = CPU) -> None:
     """Run every product once on one splat of the kernel. The first run on a machine compiles, later ones load.
 
     Each kernel is compiled for itself, so a scene waits for its own alone.
@@ -27,7 +28,7 @@ def warm_up(kernel: Kernel = Kernel.GAUSSIAN_3D) -> None:
         beta=torch.zeros(1) if kernel is Kernel.BETA else None,
     )
     camera = Camera("warm-up", 16, 16, 16.0, 16.0, 8.0, 8.0, np.eye(4))
-    raster = CpuRaster(splats, threads=1)
+    raster = open_raster(splats, device, threads=1)
     regions = RegionMap(torch.zeros(1, 1, 1, dtype=torch.int32), torch.ones(1, 1))
     for observation in (regions, FeatureGrid(torch.ones(1, 1, 1))):
         raster.region_weights(camera, observation, Walk(), Weighting())

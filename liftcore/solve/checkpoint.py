@@ -25,7 +25,7 @@ from liftcore.raster.protocol import RayRows, RegionWeights
 from liftcore.safetensors_header import safetensors_header, tensor_bytes
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from torch import Tensor
 
@@ -50,9 +50,13 @@ class Checkpoint:
     seconds: float = 2.0  # between blocks, of work
 
 
-def identity(inputs: Sequence[str], settings: LiftSettings) -> str:
-    """What a checkpoint is of, in hex: inputs [sha256, ...], settings, the code and the processor that runs it."""
-    told = [FORMAT, __version__, get_host_cpu_name(), list(inputs), settings.model_dump(mode="json")]
+def identity(inputs: Sequence[str], settings: LiftSettings, device: Mapping[str, Any]) -> str:
+    """What a checkpoint is of, in hex: inputs [sha256, ...], settings, the code, and what runs it.
+
+    Args:
+        device: the facts of the device that walks, whatever the settings ask for: devices agree within rounding only.
+    """
+    told = [FORMAT, __version__, get_host_cpu_name(), device, list(inputs), settings.model_dump(mode="json")]
     digest = hashlib.sha256(json.dumps(told).encode())
     for source in sorted(Path(__file__).parents[1].rglob("*.py")):
         digest.update(source.read_bytes())

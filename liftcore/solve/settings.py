@@ -62,7 +62,7 @@ _SPEEDS: dict[Speed, dict[str, Any]] = {
 
 
 class LiftSettings(BaseModel):
-    """All that decides the result of a lift. Knobs left out take the preset's values."""
+    """All that decides the result of a lift, and where it runs. Knobs left out take the preset's values."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -107,6 +107,9 @@ class LiftSettings(BaseModel):
     cg_basis: int = Field(0, ge=0, le=65_536, description="principal feature directions refined, 0 = all channels")
     reference_channels: int = Field(
         0, ge=0, le=1_024, description="random projections in which the certificate finds L(x^), 0 = off"
+    )
+    device: Literal["auto", "cpu", "cuda"] = Field(
+        "auto", description="what walks and solves: auto takes a card where torch and Triton can use one"
     )
 
     @model_validator(mode="before")

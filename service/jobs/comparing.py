@@ -7,6 +7,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+from liftcore.device import choose_device
 from liftcore.measure.tradeoff.compare import compare
 from liftcore.measure.tradeoff.order import CANDIDATES, Scene
 from liftcore.measure.tradeoff.report import page_of, save
@@ -31,7 +32,8 @@ def compare_as_ordered(order: dict[str, Any], progress: Progress) -> dict[str, A
     scene = Scene(splats, Path(order["cameras"]), features)
     settings, budget = order["settings"], order["parameters"]["budget_s"]
     progress("compile", 0, 1, "kernels")
-    warm_up(Kernel(order["kernel"]))  # for the runs to load: else the first on a machine eats up the budget
+    device = choose_device(settings.get("device", "auto"))
+    warm_up(Kernel(order["kernel"]), device)  # for the runs to load: else the first on a machine eats up the budget
     progress("tradeoff", 0, len(CANDIDATES), "runs")
     found = compare(scene, budget, settings, order["threads"], progress)
     named = {

@@ -129,6 +129,7 @@ def take(order: JobOrder, here: Parts) -> Response:
     job, new = here.store.jobs.repeated(order), False
     if job is None:
         require_fit(order, here)
+        here.devices.require(order.settings.get("device", "auto"))
         job, new = here.store.jobs.submit(order, max_queued=here.settings.max_queued)
         here.runner.wake()
     shaped = shape(here.store.jobs.get(job)).model_dump(mode="json")

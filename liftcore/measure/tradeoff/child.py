@@ -14,6 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from liftcore.device import choose_device
 from liftcore.errors import SplatliftError
 from liftcore.input_files import input_file
 from liftcore.lift import Run, lift_sources, open_sources
@@ -36,7 +37,7 @@ BAD_INPUT = 2
 def measured(order: Order) -> dict[str, Any]:
     """Lift as ordered, and give the figures of the run and of its features."""
     settings = LiftSettings.of(**order.settings)
-    run = Run(settings, order.threads, silent, Timings())
+    run = Run(settings, order.threads, silent, Timings(), choose_device(settings.device))
     cpu, wall = time.process_time(), time.perf_counter()
     with run.timings.stage("read"):
         sources = open_sources(order.scene.splats, order.scene.cameras, order.scene.features, settings)
@@ -47,7 +48,7 @@ def measured(order: Order) -> dict[str, Any]:
         files = (order.scene.splats, order.scene.cameras, *order.scene.features)
         inputs = [input_file(path) for path in files]
     with run.timings.stage("compile"):
-        warm_up(sources.splats.kernel)  # the lift's own then takes no time
+        warm_up(sources.splats.kernel, run.device)  # the lift's own then takes no time
     cpu, wall = time.process_time(), time.perf_counter()
     made = lift_sources(run, sources, inputs)
     seconds = {"cpu": time.process_time() - cpu, "wall": time.perf_counter() - wall}

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from liftcore.artifact import TENSORS, Lift
+from liftcore.device import CPU, Device
 from liftcore.lift import lift
 from liftcore.raster.cpu import CpuRaster
 from liftcore.solve.checkpoint import Checkpoint, identity
@@ -34,6 +35,7 @@ def walks(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         return walk(self, camera, *rest, **named)
 
     monkeypatch.setattr(CpuRaster, "region_weights", counted)
+    monkeypatch.setattr("liftcore.lift.choose_device", lambda _: CPU)  # on machines with a card too
     return walked
 
 
@@ -88,7 +90,22 @@ def test_checkpoint_of_other_settings_or_inputs_is_never_used(tmp_path: Path, wa
     other = lift(scene[0], scene[1], [scene[2]], LiftSettings.of(preset="tikhonov"), checkpoint=checkpoint)
     assert len(walks) == 6
     assert_same(lift(scene[0], scene[1], [scene[2]], LiftSettings.of(preset="tikhonov")), other)
-    assert identity(["a"], LiftSettings.of()) != identity(["b"], LiftSettings.of())
+    assert identity(["a"], LiftSettings.of(), {}) != identity(["b"], LiftSettings.of(), {})
+
+
+def test_checkpoint_of_another_device_is_never_used(
+    tmp_path: Path, walks: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = write_scene(tmp_path, 5)
+    checkpoint = Checkpoint(tmp_path / "kept", seconds=0)
+    lift(scene[0], scene[1], [scene[2]], LiftSettings.of(device="cpu"), checkpoint=checkpoint)
+    lift(scene[0], scene[1], [scene[2]], LiftSettings.of(device="cpu"), checkpoint=checkpoint)
+    assert len(walks) == 3
+    facts = {**CPU.facts(), "name": "another"}
+    monkeypatch.setattr(Device, "facts", lambda _: facts)
+    made = lift(scene[0], scene[1], [scene[2]], LiftSettings.of(device="cpu"), checkpoint=checkpoint)
+    assert len(walks) == 6
+    assert made.metadata.certificate["device"] == facts
 
 
 @pytest.mark.parametrize("length", [0, 7, 200])

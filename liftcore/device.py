@@ -1,0 +1,130 @@
+"""Where a lift's arithmetic runs: on the processor, or on a card that torch and Triton can use."""
+
+from __future__ import annotations
+
+import importlib.util
+import platform
+import re
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import torch
+
+from liftcore.errors import Unavailable
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+OLDEST_CARD = (7, 0)  # the compute capability that Triton makes code for
+DRIVER = Path("/proc/driver/nvidia/version")
+_EXPECTED = "a card that CUDA, torch and Triton can use"
+_OR_CPU = "or take device=cpu"
+
+
+@dataclass(frozen=True)
+class Device:
+    """What runs the raster and the solution.
+
+    ``cuda`` beside a place that is no card is Triton's interpreter, in which tests run the kernels.
+    """
+
+    kind: Literal["cpu", "cuda"]
+    place: torch.device  # of its tensors
+
+    @property
+    def name(self) -> str:
+        """The card's name, or the processor's."""
+        if self.place.type == "cuda":
+            return torch.cuda.get_device_name(self.place)
+        return processor() if self.kind == "cpu" else f"Triton's interpreter on {processor()}"
+
+    def facts(self) -> dict[str, Any]:
+        """Kind, name and the versions of what computes there, as the certificate tells them."""
+        packages = ("torch", "numba", "numpy") if self.kind == "cpu" else ("torch", "triton", "numpy")
+        versions = {"torch": torch.__version__} | {name: version(name) for name in packages[1:]}
+        if self.place.type == "cuda":
+            versions |= {"cuda": str(torch.version.cuda), "driver": driver_version()}
+        return {"kind": self.kind, "name": self.name, "versions": versions}
+
+    def free_bytes(self) -> int | None:
+        """Bytes that may still be taken there, with those that torch holds and does not use; None off a card."""
+        if self.place.type != "cuda":
+            return None
+        held = torch.cuda.memory_reserved(self.place) - torch.cuda.memory_allocated(self.place)
+        return torch.cuda.mem_get_info(self.place)[0] + held
+
+
+CPU = Device("cpu", torch.device("cpu"))
+
+
+@contextmanager
+def within_memory(device: Device) -> Iterator[None]:
+    """Say in words that a card has no room, where work could not be cut any smaller.
+
+    Raises:
+        Unavailable: an allocation failed there.
+    """
+    try:
+        yield
+    except torch.OutOfMemoryError:
+        free = (device.free_bytes() or 0) / 2**30
+        raise Unavailable(
+            "device", expected=f"room for the lift on {device.name}", got=f"too little: {free:.1f} GiB are free now",
+            hint="end what else runs there, take fewer splats, smaller images or fewer channels, or take device=cpu",
+        ) from None  # fmt: skip
+
+
+def choose_device(asked: str) -> Device:
+    """The device that ``auto``, ``cpu`` or ``cuda`` stands for here; ``auto`` takes a card where one can be used.
+
+    Raises:
+        Unavailable: ``cuda`` was asked for and cannot be had.
+    """
+    if asked == "cpu":
+        return CPU
+    missing = _missing()
+    if missing is None:
+        return Device("cuda", torch.device("cuda", torch.cuda.current_device()))
+    if asked == "cuda":
+        got, hint = missing
+        raise Unavailable("device", expected=_EXPECTED, got=got, hint=f"{hint}, {_OR_CPU}")
+    return CPU
+
+
+def _missing() -> tuple[str, str] | None:
+    """What keeps lifts off a card here, and what to do about it; None where nothing does."""
+    if torch.version.cuda is None:
+        return f"torch {torch.__version__}, a build without CUDA", "install a CUDA build of torch"
+    if not torch.cuda.is_available():
+        return "no card that CUDA sees", "see whether nvidia-smi lists one, and a container was given it"
+    if importlib.util.find_spec("triton") is None:
+        return "no triton beside torch", "install the triton that this torch asks for (CUDA builds bring it)"
+    capability = torch.cuda.get_device_capability()
+    if capability < OLDEST_CARD:
+        name, own = torch.cuda.get_device_name(), ".".join(map(str, capability))
+        oldest = ".".join(map(str, OLDEST_CARD))
+        return f"{name} of compute capability {own}", f"Triton needs {oldest}: choose another card"
+    return None
+
+
+@cache
+def processor() -> str:
+    """The processor's name."""
+    with suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    return platform.processor() or platform.machine()
+
+
+def driver_version(told: Path = DRIVER) -> str:
+    """The version of NVIDIA's kernel module, ``unknown`` where Linux does not tell."""
+    with suppress(OSError):
+        found = re.search(r"Kernel Module.*?\b(\d+(?:\.\d+)+)", told.read_text())
+        if found:
+            return found[1]
+    return "unknown"

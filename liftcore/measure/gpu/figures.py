@@ -1,0 +1,121 @@
+"""The figures of a card: whole lifts, and how near the processor's answer they are."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from liftcore.artifact import save_lift
+from liftcore.lift import lift
+from liftcore.measure.gpu.room_files import write_room
+from liftcore.measure.tabletop import CASES, Tabletop
+from liftcore.solve.settings import LiftSettings
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from torch import Tensor
+
+    from liftcore.artifact import Lift
+    from liftcore.device import Device
+    from liftcore.measure.gpu.room_files import RoomSize
+
+SEEN = 0.5  # evidence from which a splat counts
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Two lifts of the same inputs beside each other, over the splats with evidence over SEEN in the first."""
+
+    splats: int
+    least_cosine: float
+    largest_difference: float  # of a channel, over the largest value of any
+    largest_evidence_difference: float  # relative
+    only_one_sees: int  # splats of the scene that one lift has a feature for, and the other has not
+
+
+def whole_lift(size: RoomSize, device: Device) -> dict[str, Any]:
+    """Seconds of a lift from files to a file, by stage, after one of the same scene that is not counted.
+
+    The first lift compiles the card's kernels for these shapes, and leaves the files in the memory of the machine.
+    """
+    with tempfile.TemporaryDirectory(prefix="splatlift-room-") as folder:
+        paths = write_room(Path(folder), size)
+        settings, out = LiftSettings.of(device=device.kind), Path(folder) / "room.lift.safetensors"
+        lift(paths[0], paths[1], [paths[2]], settings)
+        if device.place.type == "cuda":
+            torch.cuda.reset_peak_memory_stats(device.place)
+        start = time.perf_counter()
+        made = lift(paths[0], paths[1], [paths[2]], settings)
+        lifted = time.perf_counter()
+        save_lift(made, out)
+        saved = time.perf_counter()
+    told = made.metadata.certificate
+    return {
+        "total_s": saved - start,
+        "stages_s": {**made.metadata.timings, "save": saved - lifted},
+        "geometry_ms_a_view": 1e3 * made.metadata.timings["geometry"] / len(made.metadata.views),
+        "planned": told["plan"]["device_memory"],
+        "peak_device_bytes": peak_bytes(device),
+        "device": told["device"],
+    }
+
+
+def peak_bytes(device: Device) -> int | None:
+    """The most that torch has taken on the card since it was last asked to forget; None off a card."""
+    return torch.cuda.max_memory_allocated(device.place) if device.place.type == "cuda" else None
+
+
+def both_ways(paths: Sequence[Path], device: Device, **values: Any) -> Agreement:
+    """A scene lifted on the processor and on the device."""
+    lifts = [
+        lift(paths[0], paths[1], list(paths[2:]), LiftSettings.of(device=kind, certificate_rays=0, **values))
+        for kind in ("cpu", device.kind)
+    ]
+    return agreement(lifts[0], lifts[1])
+
+
+def agreement(one: Lift, other: Lift) -> Agreement:
+    """How near the other is to the one."""
+    counted = one.evidence > SEEN
+    first, second = one.features[counted].float(), other.features[counted].float()
+    evidence = one.evidence[counted]
+    return Agreement(
+        splats=int(counted.sum()),
+        least_cosine=_least(torch.nn.functional.cosine_similarity(first, second, dim=1)),
+        largest_difference=_most((first - second).abs()) / max(_most(first.abs()), 1e-30),
+        largest_evidence_difference=_most((evidence - other.evidence[counted]).abs() / evidence),
+        only_one_sees=int((one.seen != other.seen).sum()),
+    )
+
+
+def room_both_ways(size: RoomSize, device: Device) -> Agreement:
+    """The same of a synthetic room."""
+    with tempfile.TemporaryDirectory(prefix="splatlift-room-") as folder:
+        return both_ways(write_room(Path(folder), size), device)
+
+
+def tabletop_accuracy(folder: Path, device: Device) -> list[dict[str, Any]]:
+    """Splat accuracy and mIoU of all of the scene's features, lifted on the device and judged as on the processor."""
+    scene, rows = Tabletop(folder), []
+    for case in CASES:
+        settings = case.settings.model_copy(update={"device": device.kind})
+        paths = [folder / name for name in ("point_cloud.ply", "cameras.json", f"{case.pack}.safetensors")]
+        start = time.perf_counter()
+        features = lift(paths[0], paths[1], paths[2:], settings).features
+        figures = scene.judge(features, settings, time.perf_counter() - start)
+        rows.append({"name": case.name, "base": case.accuracy, "base_miou": case.miou, "figures": figures})
+    return rows
+
+
+def _least(values: Tensor) -> float:
+    return float(values.min()) if values.numel() else 1.0
+
+
+def _most(values: Tensor) -> float:
+    return float(values.max()) if values.numel() else 0.0

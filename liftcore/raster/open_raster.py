@@ -1,0 +1,25 @@
+"""The backend of a device: compiled kernels on the processor, Triton's on a card."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from liftcore.raster.cpu import CpuRaster
+
+if TYPE_CHECKING:
+    from liftcore.device import Device
+    from liftcore.raster.protocol import Raster
+    from liftcore.scene.splats import Splats
+
+
+def open_raster(splats: Splats, device: Device, threads: int | None = None) -> Raster:
+    """A for one scene, on the device.
+
+    Args:
+        threads: of the processor; None takes the cores that this process may use. The number changes no bit.
+    """
+    if device.kind == "cpu":
+        return CpuRaster(splats, threads)
+    from liftcore.raster.gpu.raster import GpuRaster  # loads triton
+
+    return GpuRaster(splats, device.place)

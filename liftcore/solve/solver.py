@@ -1,0 +1,51 @@
+"""Which code makes the closed form: compiled for the processor, or torch's own operations on a card."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING, Protocol
+
+import torch
+
+from liftcore.solve.closed_form import solve_closed_form
+from liftcore.solve.on_device import solve_on_device
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    import numpy as np
+    from torch import Tensor
+
+    from liftcore.device import Device
+    from liftcore.progress import Progress
+    from liftcore.raster.protocol import RegionWeights
+    from liftcore.solve.closed_form import Solution
+    from liftcore.solve.view_weights import ViewWeights
+
+
+class ClosedForm(Protocol):
+    """``X = D^-1 W E`` with W and E of every view, as `solve_closed_form` describes them."""
+
+    def __call__(
+        self,
+        store: Sequence[RegionWeights] | ViewWeights,
+        codebooks: Callable[[int], Tensor],
+        denominators: np.ndarray,
+        dtype: torch.dtype,
+        progress: Progress,
+    ) -> Solution:
+        """X and the agreement of each splat's inputs, on the host."""
+        ...
+
+
+def closed_form_on(device: Device, threads: int | None) -> ClosedForm:
+    """The closed form where the lift runs, cut to the memory that is free there now.
+
+    Args:
+        threads: of the processor; None takes the cores that this process may use.
+    """
+    if device.kind == "cpu":
+        return partial(solve_closed_form, threads=threads)
+    if device.place.type == "cuda":
+        torch.cuda.empty_cache()  # what the walks held, and need no more
+    return partial(solve_on_device, place=device.place, free=device.free_bytes())

@@ -1,0 +1,71 @@
+"""A whole lift by the card's code, on a card where there is one and in Triton's interpreter elsewhere."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+import torch
+
+from liftcore.artifact import TENSORS, Lift
+from liftcore.device import CPU, Device
+from liftcore.errors import Unavailable
+from liftcore.input_files import input_file
+from liftcore.lift import Run, lift_sources, open_sources, planned
+from liftcore.plan import plan
+from liftcore.progress import silent
+from liftcore.solve.settings import LiftSettings
+from liftcore.timings import Timings
+
+from .test_lift_equals_dense import write_scene
+
+pytestmark = pytest.mark.skipif(find_spec("triton") is None, reason="triton has no wheel for this machine")
+
+CARD = Device("cuda", torch.device("cuda", 0) if torch.cuda.is_available() else torch.device("cpu"))
+SETTINGS = LiftSettings.of(certificate_rays=20, view_stride=2, robust_steps=1)  # two views of three
+
+
+def lifted(scene: tuple[Path, Path, Path], device: Device, settings: LiftSettings = SETTINGS) -> Lift:
+    sources = open_sources(scene[0], scene[1], [scene[2]], settings)
+    run = Run(settings, 1, silent, Timings(), device)
+    return lift_sources(run, sources, [input_file(path) for path in scene])
+
+
+def test_lift_of_the_card_is_the_lift_of_the_processor(tmp_path: Path) -> None:
+    scene = write_scene(tmp_path, 3)
+    ours, theirs = lifted(scene, CPU), lifted(scene, CARD)
+    assert torch.equal(theirs.seen, ours.seen)
+    torch.testing.assert_close(theirs.evidence, ours.evidence, rtol=1e-4, atol=1e-4)
+    counted = ours.evidence > 1e-2
+    assert counted.sum() > 10 and theirs.features.dtype == ours.features.dtype == torch.float16
+    torch.testing.assert_close(theirs.features[counted], ours.features[counted], rtol=0, atol=2e-3)
+    torch.testing.assert_close(theirs.agreement[counted], ours.agreement[counted], rtol=0, atol=1e-3)
+    told = theirs.metadata.certificate
+    assert told["device"] == CARD.facts() and "triton" in told["device"]["versions"]
+    assert told["plan"]["device"] == "cuda" and told["plan"]["device_memory"]["least_bytes"] > 0
+    assert told["row_sum_mean"] == pytest.approx(ours.metadata.certificate["row_sum_mean"], rel=1e-4)
+    again = lifted(scene, CARD)
+    for name in TENSORS:
+        first, second = getattr(theirs, name), getattr(again, name)
+        assert torch.equal(first.view(torch.uint8), second.view(torch.uint8)), name
+    assert again.metadata.certificate == told
+
+
+def test_card_without_room_leaves_an_auto_lift_to_the_processor(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = write_scene(tmp_path, 3)
+    sources = open_sources(scene[0], scene[1], [scene[2]], SETTINGS)
+    made = planned(sources, SETTINGS, CARD)
+    assert made.device == CARD and made.on_device is not None and made.on_device.fits
+    assert any(CARD.name in line for line in made.lines())
+    assert "device_memory" in made.facts() and "free_bytes" in made.on_device.today()
+    scarce = replace(made.on_device, free=made.on_device.least - 1, room=0)
+    monkeypatch.setattr(plan, "device_plan", lambda *_: scarce)
+    left = planned(sources, SETTINGS, CARD)
+    assert left.device == CPU and left.on_device is None
+    assert "the processor lifts" in left.warnings[0]
+    with pytest.raises(Unavailable, match="device"):
+        planned(sources, SETTINGS.model_copy(update={"device": "cuda"}), CARD)

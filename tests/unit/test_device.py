@@ -1,0 +1,138 @@
+"""Which device a lift gets, what is said where there is none, and what the certificate tells of it."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+import pytest
+import torch
+
+from liftcore.device import CPU, Device, choose_device, driver_version, processor, within_memory
+from liftcore.errors import InvalidSettings, Unavailable
+from liftcore.lift import lift
+from liftcore.plan.on_device import DevicePlan, check_device_room
+from liftcore.solve.settings import LiftSettings
+from service.jobs import device as device_process
+from tests.unit.solve.test_lift_equals_dense import write_scene
+
+CARD = Device("cuda", torch.device("cuda", 0))
+GIB = 1 << 30
+
+
+@pytest.fixture
+def card(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
+    """A machine that has all that a lift on a card needs, as torch tells it; to take things from."""
+    monkeypatch.setattr(torch.version, "cuda", "13.0")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda *_: "Card")
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda *_: (9, 0))
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda *_: (3 * GIB, 8 * GIB))
+    monkeypatch.setattr(torch.cuda, "memory_reserved", lambda *_: 2 * GIB)
+    monkeypatch.setattr(torch.cuda, "memory_allocated", lambda *_: GIB)
+    return monkeypatch
+
+
+def test_auto_takes_a_card_that_can_be_used_and_cpu_takes_none(card: pytest.MonkeyPatch) -> None:
+    assert choose_device("auto") == choose_device("cuda") == CARD
+    assert choose_device("cpu") == CPU
+
+
+LACKS = {
+    "a build without CUDA": (torch.version, "cuda", None),
+    "no card that CUDA sees": (torch.cuda, "is_available", lambda: False),
+    "no triton": (importlib.util, "find_spec", lambda name: None),
+    "compute capability 6.1": (torch.cuda, "get_device_capability", lambda *_: (6, 1)),
+}
+
+
+@pytest.mark.parametrize("lack", LACKS)
+def test_what_a_card_lacks_is_said_with_a_hint_of_its_own(card: pytest.MonkeyPatch, lack: str) -> None:
+    card.setattr(*LACKS[lack])
+    assert choose_device("auto") == CPU
+    with pytest.raises(Unavailable) as caught:
+        choose_device("cuda")
+    error = caught.value
+    assert (error.argument, lack in error.got, "device=cpu" in error.hint) == ("device", True, True)
+    assert device_process.look("cuda")["event"] == "fault"
+
+
+def test_four_lacks_have_four_hints(card: pytest.MonkeyPatch) -> None:
+    hints = set()
+    for lack in LACKS.values():
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(*lack)
+            with pytest.raises(Unavailable) as caught:
+                choose_device("cuda")
+            hints.add(caught.value.hint)
+    assert len(hints) == len(LACKS)
+
+
+def test_unknown_device_is_an_invalid_setting() -> None:
+    with pytest.raises(InvalidSettings, match="device"):
+        LiftSettings.of(device="gpu")
+
+
+def test_facts_of_a_card_name_it_and_all_versions(card: pytest.MonkeyPatch) -> None:
+    facts = CARD.facts()
+    assert (facts["kind"], facts["name"]) == ("cuda", "Card")
+    assert facts["versions"].keys() == {"torch", "triton", "numpy", "cuda", "driver"}
+    assert CARD.free_bytes() == 4 * GIB  # with what torch holds and does not use
+    interpreter = Device("cuda", torch.device("cpu"))
+    assert interpreter.name.startswith("Triton's interpreter") and interpreter.free_bytes() is None
+
+
+def test_certificate_tells_the_device_that_lifted(tmp_path: Path) -> None:
+    scene = write_scene(tmp_path, 3)
+    made = lift(scene[0], scene[1], [scene[2]], LiftSettings.of(device="cpu", certificate_rays=10))
+    told = made.metadata.certificate["device"]
+    assert (told["kind"], told["name"]) == ("cpu", processor())
+    assert told["versions"]["torch"] == torch.__version__ and told["versions"].keys() == {"torch", "numba", "numpy"}
+    assert made.metadata.certificate["plan"]["device"] == "cpu"
+
+
+@pytest.mark.parametrize(
+    ("text", "version"),
+    [
+        ("NVRM version: NVIDIA UNIX x86_64 Kernel Module  550.54.15  Tue Mar  5 22:23:56 UTC 2024\n", "550.54.15"),
+        ("NVRM version: NVIDIA UNIX Open Kernel Module for x86_64  570.86  Release Build\n", "570.86"),
+        ("something else\n", "unknown"),
+    ],
+)
+def test_driver_is_read_from_either_kernel_module(tmp_path: Path, text: str, version: str) -> None:
+    (tmp_path / "version").write_text(text)
+    assert driver_version(tmp_path / "version") == version
+    assert driver_version(tmp_path / "none") == "unknown"
+
+
+def test_room_that_ends_in_the_middle_is_said_in_words(card: pytest.MonkeyPatch) -> None:
+    with (
+        pytest.raises(Unavailable, match=r"room for the lift on Card, got too little: 4\.0 GiB"),
+        within_memory(CARD),
+    ):
+        raise torch.OutOfMemoryError
+
+
+def device_plan_with(free: int | None) -> DevicePlan:
+    room = None if free is None else int(0.8 * free) - GIB
+    return DevicePlan("Card", 2 * GIB, GIB, 10 * GIB, GIB // 2, 1, room, free)
+
+
+def test_plan_cuts_what_is_larger_than_the_card() -> None:
+    roomy, tight, without = device_plan_with(64 * GIB), device_plan_with(4 * GIB), device_plan_with(None)
+    assert (roomy.fits, roomy.blocks, roomy.peak) == (True, 1, 11 * GIB)
+    assert (without.fits, without.blocks) == (True, 1)
+    assert (tight.fits, tight.blocks) == (True, 5)
+    assert tight.peak == 3 * GIB < 4 * GIB
+    assert "5 blocks" in tight.line() and "4096 MiB free" in tight.line()
+    assert roomy.facts() == tight.facts()  # equal inputs give equal certificates
+
+
+def test_plan_that_cannot_be_cut_to_fit_is_refused_or_left_to_the_processor() -> None:
+    small = device_plan_with(int(1.5 * GIB))
+    assert not small.fits and "too little room" in small.line()
+    with pytest.raises(Unavailable, match=r"2\.0 GiB of free memory on Card, got 1\.5 GiB"):
+        check_device_room(small, "cuda")
+    assert "the processor lifts" in check_device_room(small, "auto")[0]
+    assert check_device_room(device_plan_with(4 * GIB), "cuda") == []
