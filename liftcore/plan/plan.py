@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 from liftcore.device import CPU
-from liftcore.plan.coverage import WELL_COVERED, choose_views, spare_views
+from liftcore.plan.coverage import WELL_COVERED, choose_views, spare_views, view_order
 from liftcore.plan.memory import check_memory, free_memory, memory_parts
 from liftcore.plan.on_device import check_device_room, device_plan
+from liftcore.plan.pilot import FEW_VIEWS, fly_pilot
 from liftcore.plan.rank import ENOUGH, Rank, codebook_rank
 from liftcore.plan.visibility import visibility
 from liftcore.solve.accumulate import lift_walk
@@ -34,7 +36,8 @@ class Plan:
     kernel: str
     splats: int  # P
     views: tuple[str, ...]  # that will be lifted, in the order of the sums
-    left_out: tuple[str, ...]  # that the settings' coverage leaves out
+    left_out: tuple[str, ...]  # that the settings' coverage or view_cosine leaves out
+    view_cosine: float | None  # expected of the views' features against those of all, where a pilot chose them
     spare: tuple[str, ...]  # of those lifted: what they show, WELL_COVERED of the others show too
     seen_share: float  # of the splats, that some view can see, before occlusion
     splats_a_view: float
@@ -59,6 +62,7 @@ class Plan:
             "splats_a_view": self.splats_a_view,
             "views": len(self.views),
             "views_left_out": len(self.left_out),
+            "view_cosine": self.view_cosine,
             "spare_views": list(self.spare),
             "channels": self.rank.channels,
             "rank": self.rank.rank,
@@ -75,7 +79,9 @@ class Plan:
         """The plan for people."""
         yield f"plan: {self.splats} splats ({self.kernel}), {self.seen_share:.1%} in some view's field"
         yield f"  a view shows {self.splats_a_view:.0f} of them, before occlusion"
-        left = f", {len(self.left_out)} left out by coverage" if self.left_out else ""
+        left = f", {len(self.left_out)} left out" if self.left_out else ""
+        if self.view_cosine is not None:
+            left += f" (a pilot expects features with a cosine of {self.view_cosine:.3f} to those of all)"
         yield f"  {len(self.views)} views{left}{self._spare_line()}"
         bound = "at least " if self.rank.rank == self.rank.rows < self.rank.channels else ""
         yield (
@@ -102,7 +108,7 @@ def plan_lift(
     settings: LiftSettings,
     device: Device,
 ) -> Plan:
-    """Plan the lift of the views ``names``; the settings' coverage may choose among them.
+    """Plan the lift of the views ``names``; the settings' coverage and view_cosine may choose among them.
 
     Args:
         device: where it should run. A card with too little room leaves an ``auto`` lift to the processor.
@@ -112,9 +118,16 @@ def plan_lift(
     """
     by_name = {name: cameras.get(name) for name in names}
     seen = visibility(splats, list(by_name.values()), lift_walk(settings))
-    chosen = choose_views(seen, settings.coverage) if settings.coverage else range(len(names))
+    chosen = choose_views(seen, settings.coverage) if settings.coverage else list(range(len(names)))
+    expected = None
+    if settings.view_cosine and len(chosen) > FEW_VIEWS:
+        offered, total = [names[k] for k in chosen], len(chosen)
+        pilot = fly_pilot(splats, cameras, packs, offered, settings)
+        count = pilot.views_for(settings.view_cosine, total)
+        chosen = sorted(chosen[k] for k in islice(view_order(seen.of(chosen)), count))
+        expected = pilot.cosine_of(count, total)
     views = [names[k] for k in chosen]
-    seen = seen.of(list(chosen))
+    seen = seen.of(chosen)
     lifted = {name: by_name[name] for name in views}
     parts = memory_parts(splats, packs, lifted, seen.splats_a_view, 2 if settings.dtype == "float16" else 4)
     on_device = device_plan(device, splats, packs, lifted, seen.splats_a_view)
@@ -124,6 +137,7 @@ def plan_lift(
         splats=splats.count,
         views=tuple(views),
         left_out=tuple(name for name in names if name not in set(views)),
+        view_cosine=expected,
         spare=tuple(views[k] for k in spare_views(seen)),
         seen_share=seen.seen_share,
         splats_a_view=seen.splats_a_view,

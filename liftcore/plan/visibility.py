@@ -57,7 +57,7 @@ class Visibility:
 
 def visibility(splats: Splats, cameras: Sequence[Camera], walk: Walk) -> Visibility:
     """Project evenly spaced splats, SAMPLE at most, into every camera."""
-    sample = _sampled(splats, min(SAMPLE, splats.count))
+    sample = spread_splats(splats, min(SAMPLE, splats.count))
     scene, count = activated(sample, walk.gain), sample.count
     areas = np.zeros((len(cameras), count), np.float32)
     sides = np.stack([side_of(camera.centre - sample.means.numpy()) for camera in cameras])
@@ -76,8 +76,8 @@ def side_of(directions: np.ndarray) -> np.ndarray:
     return (3 * octants + np.abs(directions).argmax(axis=1)).astype(np.uint8)
 
 
-def _sampled(splats: Splats, count: int) -> Splats:
-    """The geometry of evenly spaced splats."""
+def spread_splats(splats: Splats, count: int) -> Splats:
+    """The geometry of so many evenly spaced splats, a copy."""
     rows = torch.from_numpy(np.linspace(0, splats.count - 1, count).astype(np.int64))
     return replace(
         splats,

@@ -56,8 +56,8 @@ class Speed(StrEnum):
 _SPEEDS: dict[Speed, dict[str, Any]] = {
     Speed.EXACT: {},
     Speed.BALANCED: {"stride": 2, "certificate_rays": 2_000},
-    Speed.FAST: {"stride": 4, "certificate_rays": 1_000},
-    Speed.DRAFT: {"stride": 6, "coverage": 12, "transmittance_stop": 0.003, "certificate_rays": 500},
+    Speed.FAST: {"stride": 3, "view_cosine": 0.998, "transmittance_stop": 0.003, "certificate_rays": 500},
+    Speed.DRAFT: {"stride": 6, "view_cosine": 0.98, "transmittance_stop": 0.02, "certificate_rays": 200},
 }
 
 
@@ -81,6 +81,9 @@ class LiftSettings(BaseModel):
     stride: int = Field(1, ge=1, le=64, description="lift from every n-th pixel in x and in y")
     view_stride: int = Field(1, ge=1, description="lift from every n-th view, from the first on")
     coverage: int = Field(0, ge=0, description="views are chosen until they show a splat so often, 0 = all views")
+    view_cosine: float = Field(
+        0.0, ge=0, lt=1, description="the fewest views whose features should come this near to those of all, 0 = all"
+    )
     levels: Literal["rows", "composite"] | Annotated[int, Field(strict=True, ge=0)] = Field(
         "rows", description="levels as rows of their own, summed in composite regions, or one level by its number"
     )

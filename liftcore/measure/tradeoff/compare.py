@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from liftcore.progress import Progress
 
-EXACT_OVER_DRAFT = 12.0  # how much longer the exact run takes, at most, as far as the budget is planned
+EXACT_OVER_DRAFT = 8.0  # how much longer the exact run takes, at most, as far as the budget is planned
 EXACT_SHARE = 1 / 3  # of the budget, that the exact run may take
 PRESET_OVER_EXACT = 1.5  # top-k walks tiles twice, the robust step goes over W again
 LEAST_VIEWS = 4

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from liftcore.lift import lift
-from liftcore.plan.coverage import WELL_COVERED, choose_views, spare_views
+from liftcore.plan.coverage import WELL_COVERED, choose_views, spare_views, view_order
 from liftcore.plan.visibility import SIDES, Visibility, side_of, visibility
 from liftcore.raster.cpu import CpuRaster
 from liftcore.raster.protocol import Walk, Weighting
@@ -63,6 +63,20 @@ def test_views_are_added_until_each_splat_is_shown_often_enough_and_the_choice_r
         shown = seen.in_view[:, seen.in_view.any(axis=0)]
         assert shown[chosen].sum(axis=0).mean() >= times
     assert choose_views(seen, 1_000) == list(range(12))
+
+
+def test_looking_at_gains_lazily_finds_the_order_of_looking_at_all():
+    seen = visibility(random_splats(2, 120, 0.8), [random_camera(k) for k in range(14)], Walk())
+    shares = seen.areas / seen.areas.sum(axis=0).clip(min=1e-30)
+    held, every = np.zeros((shares.shape[1], SIDES)), np.arange(shares.shape[1])
+    left, order = list(range(14)), []
+    while left:
+        before = {view: held[every, seen.sides[view]] for view in left}
+        gains = [float((np.sqrt(before[view] + shares[view]) - np.sqrt(before[view])).sum()) for view in left]
+        best = left.pop(int(np.argmax(gains)))
+        held[every, seen.sides[best]] += shares[best]
+        order.append(best)
+    assert list(view_order(seen)) == order
 
 
 def test_views_that_add_nothing_can_be_left_out_together():
