@@ -14,6 +14,7 @@ from tests.backends import needs_triton
 
 pytestmark = needs_triton
 ROOT = Path(__file__).parents[2]
+STACK = 512  # bytes a thread: what a disc has more than the 255 registers of a thread; others have none
 SHARED_MEMORY = 99 * 1024  # bytes a block: what consumer cards have, an H100 more than twice as many
 
 
@@ -38,6 +39,11 @@ def test_every_kernel_compiles_for_an_h100(compiled):
 
 def test_no_kernel_adds_by_atomics(compiled):
     assert not any(report["atomics"] for report in compiled)
+
+
+def test_a_lifts_kernels_keep_their_values_in_registers(compiled):
+    assert {report["stack"] for report in compiled if report["kernel"] in ("_add_runs", "_trace")} == {0}
+    assert max(report["stack"] for report in compiled if report["kernel"] == "_weigh") <= STACK
 
 
 def test_shared_memory_fits_consumer_cards(compiled):

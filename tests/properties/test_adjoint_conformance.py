@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
 from hypothesis import strategies as st
 
 from liftcore.errors import InvalidInput
 from liftcore.raster.cpu import CpuRaster
 from liftcore.raster.oracle import OracleRaster, dense_view
 from liftcore.raster.protocol import Walk
-from tests.properties.test_raster_conformance import INSIDE, WALKS, hypothesis_settings
+from tests.backends import every_backend
+from tests.properties.test_raster_conformance import INSIDE, WALKS
 from tests.scenes import random_camera, random_splats, scenes
 
 CHANNELS = st.sampled_from([1, 3, 32, 33, 70])  # within a pass of the raster, at its edge, over several
@@ -23,30 +23,32 @@ def random_image(camera, channels: int) -> torch.Tensor:
     return torch.tensor(values, dtype=torch.float32)
 
 
-@hypothesis_settings
-@given(scenes(), st.sampled_from(WALKS), CHANNELS)
-def test_adjoints_equal_the_oracle(scene, walk, channels):
-    splats, camera, _ = scene
-    view = dense_view(splats, camera, walk)
-    Y = random_image(camera, channels)
-    Y[torch.from_numpy(view.cut.reshape(camera.height, camera.width))] = 0  # the render's test counts the flips
-    expected = view.A.T @ Y.double().numpy().reshape(-1, channels)
-    got = CpuRaster(splats, threads=2).adjoint(camera, Y, walk).numpy()
-    assert got.shape == (splats.count, channels)
-    assert np.abs(got - expected).max(initial=0) < INSIDE * max(1.0, view.A.sum(axis=0).max(initial=0))
+@every_backend
+def test_adjoints_equal_the_oracle(backend):
+    @backend.holds(scenes(), st.sampled_from(WALKS), CHANNELS)
+    def check(scene, walk, channels) -> None:
+        splats, camera, _ = scene
+        view = dense_view(splats, camera, walk)
+        Y = random_image(camera, channels)
+        Y[torch.from_numpy(view.cut.reshape(camera.height, camera.width))] = 0  # the render's test counts the flips
+        expected = view.A.T @ Y.double().numpy().reshape(-1, channels)
+        got = backend.open(splats).adjoint(camera, Y, walk).numpy()
+        assert got.shape == (splats.count, channels)
+        assert np.abs(got - expected).max(initial=0) < INSIDE * max(1.0, view.A.sum(axis=0).max(initial=0))
 
 
-@hypothesis_settings
-@given(scenes(), st.sampled_from(WALKS))
-def test_a_render_and_its_adjoint_agree_on_every_inner_product(scene, walk):
-    splats, camera, _ = scene
-    raster = CpuRaster(splats, threads=2)
-    X = torch.tensor(np.random.default_rng(2).normal(0, 1, (splats.count, 4)), dtype=torch.float32)
-    Y = random_image(camera, 4)
-    image, sums = raster.render(camera, X, walk), raster.adjoint(camera, Y, walk)
-    left, right = float((image.double() * Y).sum()), float((X * sums.double()).sum())
-    scale = float((raster.render(camera, X.abs(), walk).double() * Y.abs()).sum())  # no cancellation in it
-    assert abs(left - right) <= 1e-6 * scale + 1e-12
+@every_backend
+def test_a_render_and_its_adjoint_agree_on_every_inner_product(backend):
+    @backend.holds(scenes(), st.sampled_from(WALKS))
+    def check(scene, walk) -> None:
+        splats, camera, _ = scene
+        raster = backend.open(splats)
+        X = torch.tensor(np.random.default_rng(2).normal(0, 1, (splats.count, 4)), dtype=torch.float32)
+        Y = random_image(camera, 4)
+        image, sums = raster.render(camera, X, walk), raster.adjoint(camera, Y, walk)
+        left, right = float((image.double() * Y).sum()), float((X * sums.double()).sum())
+        scale = float((raster.render(camera, X.abs(), walk).double() * Y.abs()).sum())  # no cancellation in it
+        assert abs(left - right) <= 1e-6 * scale + 1e-12
 
 
 @pytest.mark.parametrize("walk", WALKS[:2])

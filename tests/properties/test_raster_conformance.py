@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 import torch
-from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
 from liftcore.observe.observation import Observation, RegionMap
@@ -39,7 +38,6 @@ FOOTPRINTS = {
 }
 
 pytestmark = pytest.mark.usefixtures("every_kernel")
-hypothesis_settings = settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 every_footprint = pytest.mark.parametrize("footprint", FOOTPRINTS)
 
 

@@ -6,6 +6,7 @@ here on. All launches pass through ``launch``, with the same options.
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -62,9 +63,12 @@ def check_device(device: torch.device) -> None:
 def launch(kernel: Any, programs: int, *arguments: object, warps: int = WARPS, **constants: object) -> None:
     """Run ``programs`` programs of a kernel.
 
-    Products are not fused into sums, so that the interpreter's arithmetic is the card's.
+    Products are not fused into sums, so that the interpreter's arithmetic is the card's; loads are not moved into
+    earlier rounds of a loop, for scratch is written there.
     """
     if programs == 0:
         return
-    with np.errstate(all="ignore"):  # the interpreter computes in numpy; infinities are the kernels' own business
-        kernel[(programs,)](*arguments, **constants, num_warps=warps, enable_fp_fusion=False)
+    device = next(argument.device for argument in arguments if isinstance(argument, torch.Tensor))
+    here = torch.cuda.device(device) if device.type == "cuda" else nullcontext()  # Triton starts on the current card
+    with here, np.errstate(all="ignore"):  # the interpreter computes in numpy; infinities are the kernels' business
+        kernel[(programs,)](*arguments, **constants, num_warps=warps, num_stages=1, enable_fp_fusion=False)

@@ -54,7 +54,7 @@ def _render(
         splat = tl.load(ids + item).to(tl.int64)
         given = (number < last)[:, None] & (channel < channels)[None, :]
         rows = tl.load(values + splat[:, None] * channels + channel[None, :], mask=given, other=0.0)
-        sums += tl.dot(tl.trans(weights_of(mine, count)), rows, input_precision="ieee")
+        sums += tl.dot(tl.trans(weights_of(mine, count, pixel)), rows, input_precision="ieee")
         lit = lang.max(light, 0)
         at += _CHUNK
     x = tile % columns * _TILE + pixel % _TILE
@@ -90,7 +90,7 @@ def _strongest(
             number = at + tl.arange(0, _CHUNK)
             slot = tl.load(slots + number, mask=number < last, other=-1)
             onehot = (slot[:, None] == (block + column)[None, :]).to(tl.float32)
-            sums += tl.dot(tl.trans(weights_of(mine, count)), onehot, input_precision="ieee")
+            sums += tl.dot(tl.trans(weights_of(mine, count, pixel)), onehot, input_precision="ieee")
             lit = lang.max(light, 0)
             at += _CHUNK
         largest, place = lang.max(sums, 1, return_indices=True, return_indices_tie_break_left=True)

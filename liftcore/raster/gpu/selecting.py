@@ -60,8 +60,10 @@ def blend_chosen(
 
 
 @jit
-def counted(weights, places, items, at, last, tile, columns, smallest, SELECTION: tl.constexpr, POWER: tl.constexpr):
-    """A chunk's weights [CHUNK, 256] without those below ``smallest`` or off their splat's centre, to their power."""
+def counted(
+    weights, pixel, places, items, at, last, tile, columns, smallest, SELECTION: tl.constexpr, POWER: tl.constexpr
+):
+    """A chunk's weights [CHUNK, n] on pixels [n] to their power; none too small or off the centre."""
     weights = tl.where(weights >= smallest, weights, 0.0)
     if SELECTION == _CENTRAL:
         number = at + tl.arange(0, _CHUNK)
@@ -69,7 +71,6 @@ def counted(weights, places, items, at, last, tile, columns, smallest, SELECTION
         place = places + tl.load(items + number, mask=inside, other=0) * _PLACE
         column = tl.floor(tl.load(place, mask=inside, other=-1.0)) - (tile % columns * _TILE).to(tl.float64)
         row = tl.floor(tl.load(place + 1, mask=inside, other=-1.0)) - (tile // columns * _TILE).to(tl.float64)
-        pixel = tl.arange(0, _PIXELS)
         own = (column[:, None] == (pixel % _TILE).to(tl.float64)[None, :]) & (
             row[:, None] == (pixel // _TILE).to(tl.float64)[None, :]
         )

@@ -90,8 +90,8 @@ def blend_chunk(scratch, light, stop, count):
 
 
 @jit
-def weights_of(scratch, count):
-    """[CHUNK, 256] f32, the weights of a chunk of ``count``."""
+def weights_of(scratch, count, pixel):
+    """[CHUNK, n] f32, the weights of a chunk of ``count`` on some pixels [n]."""
     number = tl.arange(0, _CHUNK)[:, None]
-    own = scratch + _WEIGHTS + number * _PIXELS + tl.arange(0, _PIXELS)[None, :]
+    own = scratch + _WEIGHTS + number * _PIXELS + pixel[None, :]
     return tl.load(own, mask=number < count, other=0.0)

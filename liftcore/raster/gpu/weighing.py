@@ -31,13 +31,14 @@ if TYPE_CHECKING:
     from liftcore.raster.selection import Choice
 
 COLUMNS = 16  # of a tile's matrix at a time
+BLOCK = 64  # of its rows: a thread has what it multiplies in registers, which are few
 WIDEST = 32  # channels of an image a walk
 
 _CHUNK = tl.constexpr(CHUNK)
 _TILE = tl.constexpr(TILE)
 _PIXELS = tl.constexpr(TILE * TILE)
 _SCRATCH = tl.constexpr(PARTS * PART)
-_COLUMNS = tl.constexpr(COLUMNS)
+_COLUMNS, _BLOCK = tl.constexpr(COLUMNS), tl.constexpr(BLOCK)
 _INT32 = 1 << 31
 _LARGEST, _FRONT = tl.constexpr(LARGEST), tl.constexpr(FRONT)
 
@@ -54,7 +55,6 @@ def _weigh(
     tile = band_tile + own
     mine = scratch + program * (2 if GATED or GAIN else 1) * _SCRATCH
     others = mine + _SCRATCH
-    pixel = tl.arange(0, _PIXELS)
     column = tl.arange(0, _COLUMNS)
     at = tl.load(starts + own)
     last = tl.load(starts + own + 1)
@@ -66,8 +66,9 @@ def _weigh(
     fewest = light
     left = tl.zeros([_PIXELS], tl.int32)
     if SELECTION == _LARGEST:
-        fewest = tl.load(least + reads * _PIXELS + pixel)
-        left = tl.load(room + reads * _PIXELS + pixel)
+        mark = reads * _PIXELS + tl.arange(0, _PIXELS)
+        fewest = tl.load(least + mark)
+        left = tl.load(room + mark)
     lit = lang.max(light, 0)
     while (at < last) & (lit > 0.0):
         count = (last - at).to(tl.int32)
@@ -81,22 +82,26 @@ def _weigh(
         if GAIN:
             plain_light = blend_chunk(others, plain_light, stop, count)
             lit = tl.maximum(lit, lang.max(plain_light, 0))
-        weights = weights_of(mine, count)
-        if GATED or GAIN:
-            tl.store(evidence + number, tl.sum(weights_of(others, count), 1), mask=number < last)
-        else:
-            tl.store(evidence + number, tl.sum(weights, 1), mask=number < last)
-        weights = counted(weights, places, items, at, last, tile, columns, smallest, SELECTION, POWER)
+        seen = tl.zeros([_CHUNK], tl.float32)
+        for from_pixel in range(0, _PIXELS, _BLOCK):
+            pixel = from_pixel + tl.arange(0, _BLOCK)
+            seen += tl.sum(weights_of(others if GATED or GAIN else mine, count, pixel), 1)
+        tl.store(evidence + number, seen, mask=number < last)
         for block in range(0, used, _COLUMNS):
-            factors = tl.zeros([_PIXELS, _COLUMNS], tl.float32)
-            for tap in lang.static_range(TAPS):
-                from_here = (reads * TAPS + tap) * _PIXELS + pixel
-                slot = tl.load(taps + from_here)
-                share = tl.full([_PIXELS], 1.0, tl.float32)
-                if TAPS > 1:
-                    share = tl.load(shares + from_here)
-                factors += tl.where(slot[:, None] == (block + column)[None, :], share[:, None], 0.0)
-            product = tl.dot(weights, factors, input_precision="ieee")
+            product = tl.zeros([_CHUNK, _COLUMNS], tl.float32)
+            for from_pixel in range(0, _PIXELS, _BLOCK):
+                pixel = from_pixel + tl.arange(0, _BLOCK)
+                weights = weights_of(mine, count, pixel)
+                weights = counted(weights, pixel, places, items, at, last, tile, columns, smallest, SELECTION, POWER)
+                factors = tl.zeros([_BLOCK, _COLUMNS], tl.float32)
+                for tap in lang.static_range(TAPS):
+                    from_here = (reads * TAPS + tap) * _PIXELS + pixel
+                    slot = tl.load(taps + from_here)
+                    share = tl.full([_BLOCK], 1.0, tl.float32)
+                    if TAPS > 1:
+                        share = tl.load(shares + from_here)
+                    factors += tl.where(slot[:, None] == (block + column)[None, :], share[:, None], 0.0)
+                product += tl.dot(weights, factors, input_precision="ieee")
             to = sums + tl.arange(0, _CHUNK)[:, None] * used + block + column[None, :]
             tl.store(table + to, product, mask=(number < last)[:, None] & (block + column < used)[None, :])
         sums += _CHUNK * used
@@ -111,23 +116,25 @@ def _gather(
     own = own_tile + tl.program_id(0)
     tile = band_tile + own
     mine = scratch + tl.program_id(0) * _SCRATCH
-    pixel = tl.arange(0, _PIXELS)
     channel = tl.arange(0, CHANNELS)
     base = tl.load(starts + own_tile)
     at = tl.load(starts + own)
     last = tl.load(starts + own + 1)
     light = start_rays(tile, columns, width, height)
-    x = tile % columns * _TILE + pixel % _TILE
-    y = tile // columns * _TILE + pixel // _TILE
-    place = (y.to(tl.int64) * width + x)[:, None] * channels + channel[None, :]
-    inside = ((x < width) & (y < height))[:, None] & (channel < channels)[None, :]
     lit = lang.max(light, 0)
     while (at < last) & (lit > 0.0):
         count = (last - at).to(tl.int32)
         fill_alphas(places, inks, items, at, last, tile, columns, mine, cap, floor, KIND, False)
         light = blend_chunk(mine, light, stop, count)
-        own_pixels = tl.load(image + place, mask=inside, other=0.0)
-        product = tl.dot(weights_of(mine, count), own_pixels, input_precision="ieee")
+        product = tl.zeros([_CHUNK, CHANNELS], tl.float32)
+        for from_pixel in range(0, _PIXELS, _BLOCK):
+            pixel = from_pixel + tl.arange(0, _BLOCK)
+            x = tile % columns * _TILE + pixel % _TILE
+            y = tile // columns * _TILE + pixel // _TILE
+            place = (y.to(tl.int64) * width + x)[:, None] * channels + channel[None, :]
+            inside = ((x < width) & (y < height))[:, None] & (channel < channels)[None, :]
+            own_pixels = tl.load(image + place, mask=inside, other=0.0)
+            product += tl.dot(weights_of(mine, count, pixel), own_pixels, input_precision="ieee")
         number = at + tl.arange(0, _CHUNK)
         to = (number - base)[:, None] * channels + channel[None, :]
         tl.store(table + to, product, mask=(number < last)[:, None] & (channel < channels)[None, :])
