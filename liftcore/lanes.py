@@ -218,6 +218,18 @@ def keep_halves(typingctx, values, offset, lanes):
     return types.void(types.Array(types.uint16, 1, "C"), types.intp, EIGHT), codegen
 
 
+_HALF_BITS = 0x0FFFE000 - (1 << 31)  # sign, exponent and mantissa of a float16 where a float32 has them
+_HALF_UNIT = 2.0**112  # what float16 is larger by than its bits moved into a float32
+
+
+def _load_small(builder: Builder, pointer: ir.Value) -> ir.Value:
+    """Eight float16 as float32 that are 2^112 times smaller: their bits, moved, with room for the larger exponent."""
+    halves = ir.VectorType(ir.IntType(16), LANES)
+    signed = builder.sext(builder.load(builder.bitcast(pointer, halves.as_pointer()), align=2), INTS)
+    bits = builder.and_(builder.shl(signed, ir.Constant(INTS, [13] * LANES)), ir.Constant(INTS, [_HALF_BITS] * LANES))
+    return builder.bitcast(bits, FLOATS)
+
+
 WIDE = 4 * LANES  # channels that add_weighted_row keeps in registers
 
 
@@ -226,11 +238,12 @@ def add_weighted_row(typingctx, target, place, source, entries, sparse, span):
     """``target[place + i] += sum_k weights[k] source[columns[k] * stride + channel + i]`` for 32 channels.
 
     ``sparse = (columns i32, weights f32)``, ``entries = (first, last)`` of them, ``span = (stride, channel)`` of the
-    flat source. The sums stay in registers.
+    flat source: f32, or the bits of finite f16 (u16), which give the same sums to the bit. They stay in registers.
     """
     integers = types.UniTuple(types.intp, 2)
     pair = types.Tuple([types.Array(types.int32, 1, "C"), FLOAT_ARRAY])
-    signature = types.void(FLOAT_ARRAY, types.intp, FLOAT_ARRAY, integers, pair, integers)
+    signature = types.void(FLOAT_ARRAY, types.intp, source, integers, pair, integers)
+    halves = source.dtype == types.uint16
 
     def codegen(context, builder, signature, args):
         target, place, source, entries, sparse, span = args
@@ -246,10 +259,12 @@ def add_weighted_row(typingctx, target, place, source, entries, sparse, span):
         sums = [cgutils.alloca_once_value(builder, load_lanes(builder, pointer)) for pointer in places]
         with cgutils.for_range_slice(builder, first, last, ir.Constant(place.type, 1)) as (k, _):
             column = builder.sext(builder.load(builder.gep(column_data, [k])), place.type)
-            weight = broadcast(builder, builder.load(builder.gep(weight_data, [k])))
+            single = builder.load(builder.gep(weight_data, [k]))
+            weight = broadcast(builder, builder.fmul(single, ir.Constant(FLOAT, _HALF_UNIT)) if halves else single)
             base = builder.add(builder.mul(column, stride), channel)
             for step, total in zip(steps, sums, strict=True):
-                row = load_lanes(builder, pointer_to(context, builder, array[2], source, builder.add(base, step)))
+                where = pointer_to(context, builder, array[2], source, builder.add(base, step))
+                row = _load_small(builder, where) if halves else load_lanes(builder, where)
                 builder.store(fused(builder, row, weight, builder.load(total)), total)
         for pointer, total in zip(places, sums, strict=True):
             builder.store(builder.load(total), pointer, align=4)

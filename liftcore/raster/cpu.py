@@ -211,25 +211,38 @@ class CpuRaster:
         slot_rows = np.concatenate([share[4] for share in entries])
         bases = np.cumsum([0, *(share[4].shape[0] for share in entries)])
 
+        ends = self._entry_ends(entries)
+
         def merge(first: int, last: int) -> tuple[np.ndarray, ...]:
-            starts = np.zeros(last - first + 1, np.int64)
-            for share in entries:
-                count_entries(first, last, share[0], starts)
-            np.cumsum(starts, out=starts)
-            total = starts[-1]
-            gathered = np.empty(total, np.int32), np.empty(total, np.float32), np.empty(total, np.float32)
-            cursors = starts[:-1].copy()
+            before = ends[first - 1] if first else 0
+            starts = np.concatenate([[before], ends[first:last]]) - before
+            words = np.empty((starts[-1], 3), np.int32)
+            gathered, cursors = (words, words.view(np.float32)), starts[:-1].copy()
             for share, base in zip(entries, bases[:-1], strict=True):
                 gather_entries(first, last, share[:4], base, cursors, gathered)
             return merge_range(starts, gathered, slot_rows, codebook_rows, frame.ids[first:last])
 
         # A range's rows depend on its own entries only, so their number may follow the threads: fewer reads of all.
-        parts = self._map(merge, _shares(self.splats.count, self.threads))
+        marks = np.searchsorted(ends, np.linspace(0, ends[-1], self.threads + 1)[1:-1], side="right")
+        edges = [0, *marks.tolist(), self.splats.count]
+        parts = self._map(merge, list(pairwise(edges)))
         splats, lengths, columns, weights, met, evidence = (np.concatenate(part) for part in zip(*parts, strict=True))
         row_starts = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
         return RegionWeights(
             *(torch.from_numpy(part) for part in (splats, row_starts, columns, weights, met, evidence))
         )
+
+    def _entry_ends(self, entries: list) -> np.ndarray:
+        """[P] i64: how many entries the records up to each one have."""
+
+        def count(first: int, last: int) -> np.ndarray:
+            counts = np.zeros(self.splats.count, np.int32)
+            for share in entries[first:last]:
+                count_entries(share[0], counts)
+            return counts
+
+        counts = self._map(count, _shares(len(entries), self.threads))
+        return np.cumsum(np.sum(counts, axis=0, dtype=np.int64))
 
     def _activated(self, gain: float) -> Scene:
         if gain != self._gain:

@@ -14,30 +14,30 @@ LONG_ROW = 64  # columns; longer rows are sorted by the library
 
 
 @kernel
-def count_entries(first, last, places, counts):
-    """Add to ``counts`` [last - first + 1] i64, shifted by one, how many entries each record has."""
+def count_entries(places, counts):
+    """Add to ``counts`` [P] i32 how many entries each record has."""
     for place in places:
-        if first <= place < last:
-            counts[place - first + 1] += 1
+        counts[place] += np.int32(1)
 
 
 @kernel
 def gather_entries(first, last, entries, slot_base, cursors, gathered):
     """Scatter the entries of the records ``first..last`` to their places (cursors move on).
 
-    ``entries = (places, slots, weights, evidence)`` of one tile share, its slots counted from ``slot_base``;
-    ``gathered = (slots, weights, evidence)``.
+    ``entries = (places, slots, weights, evidence)`` of one tile share, its slots counted from ``slot_base``.
+    ``gathered = (words, numbers)``: one table [n, 3] of slot, weight and evidence, so that an entry is written at one
+    place in memory, seen as i32 and as f32.
     """
     places, slots, weights, evidence = entries
-    out_slots, out_weights, out_evidence = gathered
+    words, numbers = gathered
     for i in range(places.shape[0]):
         place = places[i]
         if first <= place < last:
             at = cursors[place - first]
             cursors[place - first] = at + 1
-            out_slots[at] = slots[i] + slot_base if slots[i] >= 0 else -1
-            out_weights[at] = weights[i]
-            out_evidence[at] = evidence[i]
+            words[at, 0] = slots[i] + slot_base if slots[i] >= 0 else -1
+            numbers[at, 1] = weights[i]
+            numbers[at, 2] = evidence[i]
 
 
 @kernel
@@ -45,36 +45,37 @@ def merge_range(starts, gathered, slot_rows, codebook_rows, ids):
     """Expand, sum and sort the entries of a range of records.
 
     Args:
-        starts: [n + 1] i64, each record's entries in ``gathered = (slots, weights, evidence)``.
+        starts: [n + 1] i64, each record's entries in ``gathered``, as ``gather_entries`` writes them.
         slot_rows: [S, levels] i32. codebook_rows: M. ids: [n] i32, the splat of each record.
 
     Returns:
         splats [r] i32, lengths [r] i64, columns [nnz] i32, weights [nnz] f32, and the splats [m] i32 and sums [m] f32
         of the evidence.
     """
-    slots, values, plain = gathered
+    words, numbers = gathered
     levels = slot_rows.shape[1]
     records = ids.shape[0]
     sums = np.zeros(codebook_rows)
     touched = np.empty(codebook_rows, np.int32)
     splats, lengths = np.empty(records, np.int32), np.empty(records, np.int64)
     met, evidence = np.empty(records, np.int32), np.empty(records, np.float32)
-    columns = np.empty(max(1024, 2 * slots.shape[0]), np.int32)
+    columns = np.empty(max(1024, 2 * words.shape[0]), np.int32)
     weights = np.empty(columns.shape[0], np.float32)
     rows = count = met_count = 0
     for record in range(records):
         total, length = 0.0, 0
         for i in range(starts[record], starts[record + 1]):
-            total += plain[i]
-            if slots[i] < 0:
+            total += numbers[i, 2]
+            slot = words[i, 0]
+            if slot < 0:
                 continue
             for level in range(levels):
-                column = slot_rows[slots[i], level]
+                column = slot_rows[slot, level]
                 if column >= 0:
                     if sums[column] == 0:
                         touched[length] = column
                         length += 1
-                    sums[column] += values[i]
+                    sums[column] += numbers[i, 1]
         if total > 0:
             met[met_count], evidence[met_count] = ids[record], total
             met_count += 1

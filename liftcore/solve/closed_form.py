@@ -11,6 +11,7 @@ import math
 import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -40,6 +41,12 @@ FLOAT16_MAX = 65_504.0
 FLOAT16_STEP = 2.0**-25  # the largest rounding error of its small values
 FLOAT16_ERROR = 1e-4  # of the longest vector, which float16 must hold
 UNIT_TOLERANCE = 5e-3  # float16 unit vectors are off by less
+
+
+def zeros(splats: int, channels: int, dtype: torch.dtype) -> Tensor:
+    """Zeros [P, F] in memory: numpy's, because it asks for large pages, which come a few hundred at a time."""
+    bits = np.uint16 if dtype == torch.float16 else np.float32
+    return torch.from_numpy(np.zeros((splats, channels), bits)).view(dtype)
 
 
 @dataclass(frozen=True)
@@ -106,6 +113,7 @@ def solve_closed_form(
     dtype: torch.dtype,
     progress: Progress,
     threads: int | None = None,
+    room: Callable[[int, int, torch.dtype], Tensor] = zeros,
 ) -> Solution:
     """Solve for X, slice by slice of channels and block by block of splats.
 
@@ -115,6 +123,7 @@ def solve_closed_form(
         denominators: [P] f64, row sums of W over all views.
         dtype: how X is stored; float16 becomes float32 when the codebooks are too large or too small for it.
         threads: None takes the cores that this process may use. The number changes no bit.
+        room: gives X, zeros [P, F] of a type, wherever it is to lie.
     """
     books = [codebooks(view) for view in range(len(store))]
     channels = books[0].shape[1]
@@ -123,20 +132,20 @@ def solve_closed_form(
     if dtype == torch.float16 and not _fits_float16(books, max(float(norm.max()) for norm in norms)):
         dtype = torch.float32
     count = denominators.shape[0]
-    features = torch.zeros(count, channels, dtype=dtype)
+    features = room(count, channels, dtype)
     kept = features.view(torch.uint16).numpy() if dtype == torch.float16 else features.numpy()
     squares = np.zeros(count)
     scale = np.divide(1.0, denominators, out=np.zeros(count), where=denominators > 0)
+    kind = torch.float16 if all(book.dtype == torch.float16 for book in books) else torch.float32
     step = slice_width(sum(book.shape[0] for book in books))
     slices = [(begin, min(begin + step, channels)) for begin in range(0, channels, step)]
     tables = WeightTables(store)
     with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
         for number, (begin, end) in enumerate(slices):
-            parts = [slice_of(book, begin, end) for book in books]
+            parts = [slice_of(book, begin, end, kind) for book in books]
             sums = _solve_slice(pool, tables, parts, scale, (kept, begin))
             if not unit:
-                for part, norm in zip(parts, norms, strict=True):
-                    np.divide(part, norm[:, None], out=part, where=norm[:, None] > 0, casting="same_kind")
+                parts = [_unit_slice(book, norm, begin, end) for book, norm in zip(books, norms, strict=True)]
                 sums = _solve_slice(pool, tables, parts, scale, (kept[:0], begin))
             squares += sums
             progress("solve", number + 1, len(slices), "slices")
@@ -151,16 +160,28 @@ def _fits_float16(books: Sequence[Tensor], longest: float) -> bool:
     return longest == 0 or FLOAT16_STEP * math.sqrt(books[0].shape[1]) <= FLOAT16_ERROR * longest
 
 
+def _unit_slice(book: Tensor, norms: np.ndarray, begin: int, end: int) -> np.ndarray:
+    """``slice_of`` as f32 with every row divided by its norm, if it has one."""
+    part = slice_of(book[:, begin:end].to(torch.float32, copy=True), 0, end - begin)
+    return np.divide(part, norms[:, None], out=part, where=norms[:, None] > 0, casting="same_kind")
+
+
 def slice_width(rows: int) -> int:
     """Channels a slice, a multiple of WIDE, for codebooks of so many rows together."""
     return min(SLICE, max(WIDE, SLICE_BYTES // (4 * rows) // WIDE * WIDE))
 
 
-def slice_of(book: Tensor, begin: int, end: int) -> np.ndarray:
-    """Channels ``begin..end`` of a codebook as [M, C] f32, C padded with zeros to a multiple of WIDE."""
-    part = np.zeros((book.shape[0], -(-(end - begin) // WIDE) * WIDE), np.float32)
-    part[:, : end - begin] = book[:, begin:end].to(torch.float32).numpy()
-    return part
+def slice_of(book: Tensor, begin: int, end: int, dtype: torch.dtype = torch.float32) -> np.ndarray:
+    """Channels ``begin..end`` of a codebook as [M, C], C padded with zeros to a multiple of WIDE.
+
+    f32, or the bits of f16 as u16. Where they lie as wanted in the codebook already, they are not copied.
+    """
+    whole = -(-(end - begin) // WIDE) * WIDE
+    part = book[:, begin:end]
+    if whole > end - begin or part.dtype != dtype or part.stride(1) != 1:
+        part = torch.zeros(book.shape[0], whole, dtype=dtype)
+        part[:, : end - begin] = book[:, begin:end]
+    return (part.view(torch.uint16) if dtype == torch.float16 else part).numpy()
 
 
 @kernel
@@ -196,11 +217,11 @@ def _solve_slice(
 
 
 def warm_up_solution() -> None:
-    """Compile the kernels of the solution, or load them from the disk cache, for both ways to store X."""
+    """Compile the kernels of the solution, or load them from the disk cache, for both types of X and of codebooks."""
     one = torch.zeros(1, dtype=torch.int32)
     weights = RegionWeights(one, torch.tensor([0, 1]), one, torch.ones(1), one, torch.ones(1))
-    for dtype in (torch.float16, torch.float32):
-        solve_closed_form([weights], lambda _: torch.ones(1, 1), np.ones(1), dtype, silent, threads=1)
+    for dtype, kind in product((torch.float16, torch.float32), repeat=2):
+        solve_closed_form([weights], lambda _, kind=kind: torch.ones(1, 1, dtype=kind), np.ones(1), dtype, silent, 1)
 
 
 def splat_shares(count: int) -> list[tuple[int, int]]:

@@ -35,6 +35,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 
 from liftcore.jit import kernel, vectorised
 from liftcore.solve.accumulate import row_totals
@@ -115,7 +116,7 @@ def judge_blocks(splats, tables, sums, scale, width):
             weights = table_at(addresses[view], rows[view])
             first, last = rows_between(weights[0], block)
             if first < last:
-                book = floats_at(books[view, 0], books[view, 1]).reshape(-1, width)
+                book = floats_at(books.places[view, 0], books.places[view, 1]).reshape(-1, width)
                 agreement = floats_at(sums[view, 0], weights[2].shape[0])
                 squares = floats_at(sums[view, 1], weights[0].shape[0])
                 judge_rows((first, last, offset), weights, scale, book, own, agreement, squares)
@@ -132,7 +133,8 @@ class Directions:
 
     def slice_of(self, view: int, begin: int, end: int) -> np.ndarray:
         """Channels ``begin..end`` of e of one view, [M, C] f32, padded with zeros as the closed form does."""
-        part = slice_of(self.books[view], begin, end)
+        own = self.books[view][:, begin:end].to(torch.float32, copy=True)
+        part = slice_of(own, 0, end - begin)
         unit = _over(part[:, : end - begin].astype(np.float64), self.lengths[view])
         part[:, : end - begin] = _over(unit - self.mean[begin:end], self.distances[view])
         return part
