@@ -23,6 +23,7 @@ from liftcore.jit import kernel
 from liftcore.lanes import LANES, WIDE, keep_halves, lanes_at, no_lanes, plus_product, sum_of_lanes
 from liftcore.progress import silent
 from liftcore.raster.protocol import RegionWeights
+from liftcore.solve.feature_room import in_memory
 from liftcore.solve.weight_tables import WeightTables, add_views, books_of
 
 if TYPE_CHECKING:
@@ -41,12 +42,6 @@ FLOAT16_MAX = 65_504.0
 FLOAT16_STEP = 2.0**-25  # the largest rounding error of its small values
 FLOAT16_ERROR = 1e-4  # of the longest vector, which float16 must hold
 UNIT_TOLERANCE = 5e-3  # float16 unit vectors are off by less
-
-
-def zeros(splats: int, channels: int, dtype: torch.dtype) -> Tensor:
-    """Zeros [P, F] in memory: numpy's, because it asks for large pages, which come a few hundred at a time."""
-    bits = np.uint16 if dtype == torch.float16 else np.float32
-    return torch.from_numpy(np.zeros((splats, channels), bits)).view(dtype)
 
 
 @dataclass(frozen=True)
@@ -113,7 +108,7 @@ def solve_closed_form(
     dtype: torch.dtype,
     progress: Progress,
     threads: int | None = None,
-    room: Callable[[int, int, torch.dtype], Tensor] = zeros,
+    room: Callable[[int, int, torch.dtype], Tensor] = in_memory,
 ) -> Solution:
     """Solve for X, slice by slice of channels and block by block of splats.
 
