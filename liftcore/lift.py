@@ -25,6 +25,7 @@ from liftcore.solve.all_rays import AllRays
 from liftcore.solve.certificate import certify
 from liftcore.solve.checkpoint import Checkpoint, identity, resumed
 from liftcore.solve.closed_form import Solution, warm_up_solution
+from liftcore.solve.feature_room import in_file, in_memory
 from liftcore.solve.kept_columns import kept_columns
 from liftcore.solve.least_squares import refine
 from liftcore.solve.lift_warnings import lift_warnings
@@ -43,6 +44,7 @@ if TYPE_CHECKING:
     from liftcore.raster.protocol import Raster
     from liftcore.scene.cameras import Cameras
     from liftcore.scene.splats import Kernel, Splats
+    from liftcore.solve.feature_room import FeatureRoom
     from liftcore.solve.settings import LiftSettings
 
 log = logging.getLogger(__name__)
@@ -132,7 +134,7 @@ def _lift_on(run: Run, plan: Plan, sources: Sources, inputs: list[InputFile], ch
         with run.timings.stage("geometry"), resumed(raster, checkpoint, key) as walked:
             scene = (sources.splats.count, sources.cameras)
             geometry = accumulate(walked, scene, sources.packs, sources.views, settings, store, progress)
-        weights, solution = _solve(run, store, geometry)
+        weights, solution = _solve(run, store, geometry, in_file if plan.features_in_file else in_memory)
         X, notes = _refine(run, sources, raster, geometry, solution)
         aggregation = _aggregate(run, sources, raster, geometry, X) if settings.aggregation else None
         if aggregation:
@@ -180,7 +182,7 @@ def _blind(views: Sequence[str], store: ViewWeights) -> list[str]:
     return [name for name, part in zip(views, store, strict=True) if not part.evidence_splats.numel()]
 
 
-def _solve(run: Run, store: ViewWeights, geometry: Geometry) -> tuple[ViewWeights, Solution]:
+def _solve(run: Run, store: ViewWeights, geometry: Geometry, room: FeatureRoom) -> tuple[ViewWeights, Solution]:
     """The weights, which the robust steps may have changed, and the closed form of them."""
     settings, books = run.settings, geometry.codebooks
     with run.timings.stage("robust"):
@@ -188,7 +190,7 @@ def _solve(run: Run, store: ViewWeights, geometry: Geometry) -> tuple[ViewWeight
             store, books, geometry.denominators, settings.robust_steps, run.progress, run.threads
         )
     with run.timings.stage("solve"):
-        closed_form, dtype = closed_form_on(run.device, run.threads), getattr(torch, settings.dtype)
+        closed_form, dtype = closed_form_on(run.device, run.threads, room), getattr(torch, settings.dtype)
         return weights, closed_form(weights, books.__getitem__, geometry.denominators, dtype, run.progress)
 
 

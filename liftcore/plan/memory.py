@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from liftcore.errors import Unavailable
 from liftcore.raster.constants import TILE
 from liftcore.raster.kernels import RECORDS
+from liftcore.solve.feature_room import check_disk
 from liftcore.solve.view_weights import MEMORY_LIMIT
 
 if TYPE_CHECKING:
@@ -87,22 +88,32 @@ def group_memory(limit: str, used: str, stat: str) -> int | None:
     return max(0, int(limit) - max(0, int(used) - cached))
 
 
+def features_in_file(parts: Mapping[str, int], free: int | None) -> bool:
+    """Whether X does not fit beside the rest, and is kept in a mapped file."""
+    return free is not None and sum(parts.values()) > SPARE * free
+
+
 def check_memory(parts: Mapping[str, int], free: int | None) -> list[str]:
-    """What to say about the room that there is: nothing, or a warning.
+    """What to say about the room that there is: nothing, or warnings.
 
     Raises:
-        Unavailable: not even the features and codebooks fit.
+        Unavailable: not even the codebooks fit, or there is no disk for features that do not.
     """
     if free is None:
         return []
-    total, least = sum(parts.values()), parts["features"] + parts["codebooks"]
-    hint = "try dtype=float16, fewer views (coverage), fewer splats or fewer channels"
-    if least > free:
-        got = f"{least / 2**30:.1f} GiB for features and codebooks"
-        raise Unavailable("memory", expected=f"at most the {free / 2**30:.1f} GiB that are free", got=got, hint=hint)
-    if total > SPARE * free:
-        return [f"the lift may take {total / 2**30:.1f} GiB and {free / 2**30:.1f} GiB are free: {hint}"]
-    return []
+    there, rest = f"{free / 2**30:.1f} GiB", sum(parts.values()) - parts["features"]
+    hint = "try fewer views (coverage) or fewer channels"
+    if parts["codebooks"] > free:
+        got = f"{parts['codebooks'] / 2**30:.1f} GiB for codebooks"
+        raise Unavailable("memory", expected=f"at most the {there} that are free", got=got, hint=hint)
+    told = []
+    if features_in_file(parts, free):
+        check_disk(parts["features"])
+        size = f"{parts['features'] / 2**30:.1f} GiB"
+        told.append(f"the features, {size}, do not fit into the {there} that are free: they go through a mapped file")
+    if rest > SPARE * free:
+        told.append(f"the rest of the lift may take {rest / 2**30:.1f} GiB and {there} are free: {hint}")
+    return told
 
 
 def most_levels(packs: FeaturePacks, views: Iterable[str]) -> int:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from liftcore.device import CPU
 from liftcore.plan.coverage import WELL_COVERED, choose_views, spare_views, view_order
-from liftcore.plan.memory import check_memory, free_memory, memory_parts
+from liftcore.plan.memory import check_memory, features_in_file, free_memory, memory_parts
 from liftcore.plan.on_device import check_device_room, device_plan
 from liftcore.plan.pilot import FEW_VIEWS, fly_pilot
 from liftcore.plan.rank import ENOUGH, Rank, codebook_rank
@@ -46,6 +46,7 @@ class Plan:
     memory: Mapping[str, int]  # bytes a part
     device: Device  # that will walk and solve
     on_device: DevicePlan | None  # what it takes of a card, where it is one
+    features_in_file: bool  # X does not fit this machine's memory today
     warnings: tuple[str, ...]  # of this machine, today
 
     @property
@@ -114,7 +115,8 @@ def plan_lift(
         device: where it should run. A card with too little room leaves an ``auto`` lift to the processor.
 
     Raises:
-        Unavailable: not even the features would fit this machine's memory, or the lift the card that it was sent to.
+        Unavailable: this machine has no room for the codebooks, or for the features in no place; or the card that the
+                lift was sent to has none.
     """
     by_name = {name: cameras.get(name) for name in names}
     seen = visibility(splats, list(by_name.values()), lift_walk(settings))
@@ -131,6 +133,7 @@ def plan_lift(
     lifted = {name: by_name[name] for name in views}
     parts = memory_parts(splats, packs, lifted, seen.splats_a_view, 2 if settings.dtype == "float16" else 4)
     on_device = device_plan(device, splats, packs, lifted, seen.splats_a_view)
+    free = free_memory()
     short = check_device_room(on_device, settings.device) if on_device else []
     return Plan(
         kernel=str(splats.kernel),
@@ -146,5 +149,6 @@ def plan_lift(
         memory=parts,
         device=CPU if short else device,
         on_device=None if short else on_device,
-        warnings=(*short, *check_memory(parts, free_memory())),
+        features_in_file=features_in_file(parts, free),
+        warnings=(*short, *check_memory(parts, free)),
     )

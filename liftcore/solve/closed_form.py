@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from liftcore.progress import Progress
+    from liftcore.solve.feature_room import FeatureRoom
     from liftcore.solve.view_weights import ViewWeights
 
 BLOCK = 64  # splats a block; with a slice of channels an eighth of a megabyte
@@ -108,7 +109,7 @@ def solve_closed_form(
     dtype: torch.dtype,
     progress: Progress,
     threads: int | None = None,
-    room: Callable[[int, int, torch.dtype], Tensor] = in_memory,
+    room: FeatureRoom = in_memory,
 ) -> Solution:
     """Solve for X, slice by slice of channels and block by block of splats.
 
@@ -118,13 +119,13 @@ def solve_closed_form(
         denominators: [P] f64, row sums of W over all views.
         dtype: how X is stored; float16 becomes float32 when the codebooks are too large or too small for it.
         threads: None takes the cores that this process may use. The number changes no bit.
-        room: gives X, zeros [P, F] of a type, wherever it is to lie.
+        room: where X is to lie.
     """
     books = [codebooks(view) for view in range(len(store))]
     channels = books[0].shape[1]
     norms = [torch.linalg.vector_norm(book, dim=1, dtype=torch.float64).numpy() for book in books]
     unit = all(bool((np.abs(norm - 1) < UNIT_TOLERANCE).all()) for norm in norms)
-    if dtype == torch.float16 and not _fits_float16(books, max(float(norm.max()) for norm in norms)):
+    if dtype == torch.float16 and not fits_float16(books, max(float(norm.max()) for norm in norms)):
         dtype = torch.float32
     count = denominators.shape[0]
     features = room(count, channels, dtype)
@@ -148,7 +149,7 @@ def solve_closed_form(
     return Solution(features, torch.from_numpy(agreement))
 
 
-def _fits_float16(books: Sequence[Tensor], longest: float) -> bool:
+def fits_float16(books: Sequence[Tensor], longest: float) -> bool:
     """Whether float16 holds every value of the codebooks, and the longest of their rows to FLOAT16_ERROR."""
     if any(max(abs(float(end)) for end in torch.aminmax(book)) > FLOAT16_MAX for book in books):
         return False

@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import os
+import shutil
 import tempfile
+from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from liftcore.errors import Unavailable
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+FeatureRoom = Callable[[int, int, torch.dtype], "Tensor"]  # splats, channels, type: zeros [P, F] wherever they lie
 
 
 def in_memory(splats: int, channels: int, dtype: torch.dtype) -> Tensor:
@@ -28,13 +35,28 @@ def in_file(splats: int, channels: int, dtype: torch.dtype) -> Tensor:
         try:
             os.posix_fallocate(file.fileno(), 0, size)
         except OSError as error:
-            raise Unavailable(
-                "features",
-                expected=f"{size / 2**30:.1f} GiB of memory, or of disk in {tempfile.gettempdir()}",
-                got=f"{error.strerror}",
-                hint="set TMPDIR to a folder with more room, or try dtype=float16 or fewer splats",
-            ) from None
+            raise _no_disk(size, str(error.strerror)) from None
         return torch.from_numpy(np.memmap(file, _bits(dtype), "r+", shape=(splats, channels))).view(dtype)
+
+
+def check_disk(size: int) -> None:
+    """See early that the disk has room for ``size`` bytes.
+
+    Raises:
+        Unavailable: it has not.
+    """
+    free = shutil.disk_usage(tempfile.gettempdir()).free
+    if free < size:
+        raise _no_disk(size, f"{free / 2**30:.1f} GiB of disk")
+
+
+def _no_disk(size: int, got: str) -> Unavailable:
+    return Unavailable(
+        "features",
+        expected=f"{size / 2**30:.1f} GiB of memory for them, or of disk in {tempfile.gettempdir()}",
+        got=got,
+        hint="set TMPDIR to a folder with more room, or try dtype=float16, fewer splats or fewer channels",
+    )
 
 
 def _bits(dtype: torch.dtype) -> type[np.generic]:

@@ -19,8 +19,9 @@ import numpy as np
 import torch
 from torch.nn.functional import embedding_bag
 
-from liftcore.solve.closed_form import UNIT_TOLERANCE, Solution, _fits_float16
+from liftcore.solve.closed_form import UNIT_TOLERANCE, Solution, fits_float16
 from liftcore.solve.device_blocks import GRAIN, block_room, device_slices, splat_blocks
+from liftcore.solve.feature_room import in_memory
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 
     from liftcore.progress import Progress
     from liftcore.raster.protocol import RegionWeights
+    from liftcore.solve.feature_room import FeatureRoom
     from liftcore.solve.view_weights import ViewWeights
 
 LONG = 256  # entries that float32 adds up one by one
@@ -52,12 +54,14 @@ def solve_on_device(
     progress: Progress,
     place: torch.device,
     free: int | None = None,
+    room: FeatureRoom = in_memory,
 ) -> Solution:
     """Solve for X as ``solve_closed_form`` does, which describes the arguments; X comes back to the host.
 
     Args:
         place: where the sums are made.
         free: bytes that may be taken there; None for a device without limits of its own. It changes no bit.
+        room: where X is to lie, on the host.
 
     Raises:
         torch.OutOfMemoryError: not even a grain of splats fits beside a slice of the codebooks.
@@ -66,18 +70,18 @@ def solve_on_device(
     count, channels = denominators.shape[0], books[0].shape[1]
     norms = [torch.linalg.vector_norm(book, dim=1, dtype=torch.float64) for book in books]
     unit = all(bool(((norm - 1).abs() < UNIT_TOLERANCE).all()) for norm in norms)
-    if dtype == torch.float16 and not _fits_float16(books, max(float(norm.max()) for norm in norms)):
+    if dtype == torch.float16 and not fits_float16(books, max(float(norm.max()) for norm in norms)):
         dtype = torch.float32
     scale = torch.from_numpy(np.divide(1.0, denominators, out=np.zeros(count), where=denominators > 0))
-    X, squares = torch.zeros(count, channels, dtype=dtype), torch.zeros(count, dtype=torch.float64)
+    X, squares = room(count, channels, dtype), torch.zeros(count, dtype=torch.float64)
     work = _Work(store, books, scale, place, X, squares)
     rows = sum(book.shape[0] for book in books)
     slices = device_slices(rows, channels)
     for number, (begin, end) in enumerate(slices):
         codebook = _all_rows(books, slice(begin, end), place)
         own = _Slice(slice(begin, end), codebook, None if unit else _units(codebook, norms))
-        room = block_room(free, rows, end - begin, unit)
-        for block in splat_blocks(store, count, end - begin, room):
+        most = block_room(free, rows, end - begin, unit)
+        for block in splat_blocks(store, count, end - begin, most):
             for done in _solve_fitting(work, own, block):
                 progress("solve", number * count + done, len(slices) * count, "splats")
     return Solution(X, squares.sqrt().clamp(0.0, 1.0).to(torch.float32))

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Protocol
 import torch
 
 from liftcore.solve.closed_form import solve_closed_form
+from liftcore.solve.feature_room import in_memory
 from liftcore.solve.on_device import solve_on_device
 
 if TYPE_CHECKING:
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from liftcore.progress import Progress
     from liftcore.raster.protocol import RegionWeights
     from liftcore.solve.closed_form import Solution
+    from liftcore.solve.feature_room import FeatureRoom
     from liftcore.solve.view_weights import ViewWeights
 
 
@@ -38,14 +40,15 @@ class ClosedForm(Protocol):
         ...
 
 
-def closed_form_on(device: Device, threads: int | None) -> ClosedForm:
+def closed_form_on(device: Device, threads: int | None, room: FeatureRoom = in_memory) -> ClosedForm:
     """The closed form where the lift runs, cut to the memory that is free there now.
 
     Args:
         threads: of the processor; None takes the cores that this process may use.
+        room: where X is to lie, on the host.
     """
     if device.kind == "cpu":
-        return partial(solve_closed_form, threads=threads)
+        return partial(solve_closed_form, threads=threads, room=room)
     if device.place.type == "cuda":
         torch.cuda.empty_cache()  # what the walks held, and need no more
-    return partial(solve_on_device, place=device.place, free=device.free_bytes())
+    return partial(solve_on_device, place=device.place, free=device.free_bytes(), room=room)

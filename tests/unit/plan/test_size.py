@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import errno
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
 
+from liftcore.artifact import load_lift, save_lift
 from liftcore.errors import InvalidSettings, Unavailable
 from liftcore.lift import lift
 from liftcore.observe.observation import RegionMap
@@ -13,6 +17,7 @@ from liftcore.observe.pack import open_packs
 from liftcore.observe.write_pack import write_pack
 from liftcore.plan.memory import CONTROL_GROUPS, LIBRARIES, check_memory, free_memory, group_memory
 from liftcore.plan.rank import ROUNDING, codebook_rank, rank_of
+from liftcore.solve.feature_room import in_file
 from liftcore.solve.settings import LiftSettings, Speed
 from tests.unit.solve.test_lift_equals_dense import write_scene
 
@@ -50,13 +55,63 @@ def test_rank_of_packs_looks_at_all_their_views(tmp_path, grids):
     assert found.rows >= 6
 
 
-def test_what_cannot_fit_is_refused_and_what_may_not_is_told():
+@pytest.fixture
+def disk(monkeypatch):
+    def has(free):
+        monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=free))
+
+    has(100 * GIB)
+    return has
+
+
+def test_what_cannot_fit_is_refused_and_what_may_not_is_told(disk):
     parts = {"features": 6 * GIB, "codebooks": GIB, "weights": GIB}
     assert check_memory(parts, 20 * GIB) == []
-    assert "8.0 GiB" in check_memory(parts, 8 * GIB)[0]
-    with pytest.raises(Unavailable, match=r"7\.0 GiB for features"):
-        check_memory(parts, 6 * GIB)
     assert check_memory(parts, None) == []
+    (told,) = check_memory(parts, 8 * GIB)
+    assert "6.0 GiB, do not fit into the 8.0 GiB that are free" in told
+    assert "the rest of the lift may take 2.0 GiB" in check_memory(parts, 2 * GIB)[1]
+    with pytest.raises(Unavailable, match=r"1\.0 GiB for codebooks"):
+        check_memory(parts, GIB - 1)
+
+
+def test_features_that_fit_neither_memory_nor_disk_are_refused_before_the_work(disk):
+    parts = {"features": 6 * GIB, "codebooks": GIB}
+    disk(5 * GIB)
+    assert check_memory(parts, 20 * GIB) == []
+    with pytest.raises(Unavailable, match=r"6\.0 GiB of memory for them, or of disk.*got 5\.0 GiB of disk"):
+        check_memory(parts, 7 * GIB)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.float32])
+def test_features_in_a_file_are_zeros_that_keep_what_is_written(dtype):
+    room = in_file(1000, 7, dtype)
+    assert (room.shape, room.dtype, room.any()) == ((1000, 7), dtype, False)
+    room[3] = 2
+    assert room.sum() == 14
+
+
+def test_a_disk_that_is_full_by_then_is_told_and_ends_nothing(monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("os.posix_fallocate", full)
+    with pytest.raises(Unavailable, match="No space left on device"):
+        in_file(1000, 7, torch.float16)
+
+
+def test_a_lift_whose_features_do_not_fit_is_the_same_through_a_file(tmp_path, monkeypatch, disk):
+    scene = write_scene(tmp_path, 2)
+    rooms = []
+    monkeypatch.setattr("liftcore.lift.in_file", lambda *shape: rooms.append(in_file(*shape)) or rooms[-1])
+    inside = lift(scene[0], scene[1], [scene[2]], LiftSettings.of())
+    assert not rooms
+    monkeypatch.setattr("liftcore.plan.plan.free_memory", lambda: LIBRARIES)
+    through = lift(scene[0], scene[1], [scene[2]], LiftSettings.of())
+    assert len(rooms) == 1
+    assert torch.equal(through.features, inside.features)
+    save_lift(through, tmp_path / "through.safetensors")
+    assert torch.equal(load_lift(tmp_path / "through.safetensors").features, inside.features)
 
 
 STAT = f"anon {GIB}\nfile {5 * GIB}\ninactive_file {3 * GIB}\nactive_file {GIB}\n"
