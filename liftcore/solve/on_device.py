@@ -13,7 +13,7 @@ slices follow the size of the codebooks alone.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
@@ -36,6 +36,13 @@ if TYPE_CHECKING:
 LONG = 256  # entries that float32 adds up one by one
 
 
+class Place(NamedTuple):
+    """A device, and what of its memory may be taken."""
+
+    device: torch.device
+    free: int | None = None  # bytes; None for a device without limits of its own
+
+
 @dataclass(frozen=True)
 class BlockRows:
     """W of a block of splats, its rows divided by their sums: a row a splat, its views in their order."""
@@ -52,15 +59,13 @@ def solve_on_device(
     denominators: np.ndarray,
     dtype: torch.dtype,
     progress: Progress,
-    place: torch.device,
-    free: int | None = None,
+    place: Place,
     room: FeatureRoom = in_memory,
 ) -> Solution:
     """Solve for X as ``solve_closed_form`` does, which describes the arguments; X comes back to the host.
 
     Args:
-        place: where the sums are made.
-        free: bytes that may be taken there; None for a device without limits of its own. It changes no bit.
+        place: where the sums are made. What is free there changes no bit.
         room: where X is to lie, on the host.
 
     Raises:
@@ -74,13 +79,13 @@ def solve_on_device(
         dtype = torch.float32
     scale = torch.from_numpy(np.divide(1.0, denominators, out=np.zeros(count), where=denominators > 0))
     X, squares = room(count, channels, dtype), torch.zeros(count, dtype=torch.float64)
-    work = _Work(store, books, scale, place, X, squares)
+    work = _Work(store, books, scale, place.device, X, squares)
     rows = sum(book.shape[0] for book in books)
     slices = device_slices(rows, channels)
     for number, (begin, end) in enumerate(slices):
-        codebook = _all_rows(books, slice(begin, end), place)
+        codebook = _all_rows(books, slice(begin, end), place.device)
         own = _Slice(slice(begin, end), codebook, None if unit else _units(codebook, norms))
-        most = block_room(free, rows, end - begin, unit)
+        most = block_room(place.free, rows, end - begin, unit)
         for block in splat_blocks(store, count, end - begin, most):
             for done in _solve_fitting(work, own, block):
                 progress("solve", number * count + done, len(slices) * count, "splats")

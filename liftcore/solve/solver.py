@@ -9,7 +9,7 @@ import torch
 
 from liftcore.solve.closed_form import solve_closed_form
 from liftcore.solve.feature_room import in_memory
-from liftcore.solve.on_device import solve_on_device
+from liftcore.solve.on_device import Place, solve_on_device
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -51,4 +51,4 @@ def closed_form_on(device: Device, threads: int | None, room: FeatureRoom = in_m
         return partial(solve_closed_form, threads=threads, room=room)
     if device.place.type == "cuda":
         torch.cuda.empty_cache()  # what the walks held, and need no more
-    return partial(solve_on_device, place=device.place, free=device.free_bytes(), room=room)
+    return partial(solve_on_device, place=Place(device.place, device.free_bytes()), room=room)

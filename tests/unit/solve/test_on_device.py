@@ -15,9 +15,9 @@ from liftcore.solve import on_device
 from liftcore.solve.accumulate import row_totals
 from liftcore.solve.closed_form import Solution, solve_closed_form
 from liftcore.solve.device_blocks import GRAIN, SLICE_BYTES, block_bytes, device_slices, splat_blocks
-from liftcore.solve.on_device import solve_on_device, squared_lengths
+from liftcore.solve.on_device import Place, solve_on_device, squared_lengths
 
-PLACE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+HERE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 SPLATS = 700  # three grains, the last not full
 
 
@@ -64,7 +64,7 @@ def dense(store: list[RegionWeights], books: list[Tensor], splats: int = SPLATS)
 
 def both(store, books, dtype, free=None, splats=SPLATS) -> tuple[Solution, Solution]:
     arguments = (store, books.__getitem__, sums_of(store, splats), dtype, silent)
-    return solve_closed_form(*arguments), solve_on_device(*arguments, PLACE, free)
+    return solve_closed_form(*arguments), solve_on_device(*arguments, Place(HERE, free))
 
 
 def assert_same_bits(one: Solution, other: Solution) -> None:
@@ -135,7 +135,7 @@ def test_slices_of_long_codebooks_are_put_together(monkeypatch: pytest.MonkeyPat
     def progress(stage: str, done: int, total: int, unit: str) -> None:
         told.append((done, total))
 
-    cut = solve_on_device(*arguments, progress, PLACE, 1)
+    cut = solve_on_device(*arguments, progress, Place(HERE, 1))
     assert torch.equal(cut.features, whole.features)
     torch.testing.assert_close(cut.agreement, whole.agreement, rtol=0, atol=1e-7)
     assert told[-1] == (5 * SPLATS, 5 * SPLATS) and told == sorted(told)
@@ -146,7 +146,7 @@ def test_sums_of_a_million_entries_and_of_many_views_keep_their_digits() -> None
     long = view_of([0], [1_000_000], np.zeros(1_000_000), np.full(1_000_000, 0.3))
     views = [view_of([0], [1], [0], [0.3]) for _ in range(2_000)]
     for store in ([long], views):
-        solved = solve_on_device(store, lambda _: book, sums_of(store, 1), torch.float32, silent, PLACE)
+        solved = solve_on_device(store, lambda _: book, sums_of(store, 1), torch.float32, silent, Place(HERE))
         error = abs(float(solved.features[0, 0]) / float(book) - 1)
         assert error < 5e-6  # of 256 equal terms; a million added one by one are wrong in the third digit
 
