@@ -115,8 +115,8 @@ def plan_lift(
         device: where it should run. A card with too little room leaves an ``auto`` lift to the processor.
 
     Raises:
-        Unavailable: this machine has no room for the codebooks, or for the features in no place; or the card that the
-                lift was sent to has none.
+        Unavailable: this machine has no room for the codebooks, or for the features in no place; or the card that
+            the lift was sent to has none.
     """
     by_name = {name: cameras.get(name) for name in names}
     seen = visibility(splats, list(by_name.values()), lift_walk(settings))
