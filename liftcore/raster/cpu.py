@@ -145,7 +145,7 @@ class CpuRaster:
             got = f"{list(labels.shape)}, the smallest {int(labels.min())}"
             expected = f"a label of -1 or more for each of {self.splats.count} splats"
             raise InvalidInput("labels", expected=expected, got=got)
-        frame = self._frame(camera, walk)
+        frame = self._frame(camera, every_pixel(walk))
         flat, count = np.ascontiguousarray(labels.to(torch.int32).numpy()), int(labels.max()) + 1
         image = np.full((camera.height, camera.width), -1, np.int32)
         self._over_tiles(frame, lambda first, last: strongest_tiles(first, last, frame, flat, count, image))

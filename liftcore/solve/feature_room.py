@@ -20,8 +20,8 @@ FeatureRoom = Callable[[int, int, torch.dtype], "Tensor"]  # splats, channels, t
 
 
 def in_memory(splats: int, channels: int, dtype: torch.dtype) -> Tensor:
-    """Zeros [P, F]: from numpy, which asks for large pages; small ones take longer to come than to be filled."""
-    return torch.from_numpy(np.zeros((splats, channels), _bits(dtype))).view(dtype)
+    """Zeros [P, F]: torch's, for numpy asks for large pages, and to clear those took longer than to solve."""
+    return torch.zeros(splats, channels, dtype=dtype)
 
 
 def in_file(splats: int, channels: int, dtype: torch.dtype) -> Tensor:
