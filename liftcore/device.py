@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import platform
 import re
+import shutil
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
@@ -19,7 +21,8 @@ from liftcore.errors import Unavailable
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-OLDEST_CARD = (7, 0)  # the compute capability that Triton makes code for
+OLDEST_CARD = (7, 5)  # the compute capability that Triton and today's builds of torch have code for
+COMPILERS = ("gcc", "clang", "cc")
 DRIVER = Path("/proc/driver/nvidia/version")
 _EXPECTED = "a card that CUDA, torch and Triton can use"
 _OR_CPU = "or take device=cpu"
@@ -100,9 +103,13 @@ def _missing() -> tuple[str, str] | None:
     if torch.version.cuda is None:
         return f"torch {torch.__version__}, a build without CUDA", "install a CUDA build of torch"
     if not torch.cuda.is_available():
-        return "no card that CUDA sees", "see whether nvidia-smi lists one, and a container was given it"
+        known = f"the driver knows CUDA {torch.version.cuda}"
+        hint = f"see whether nvidia-smi lists one, a container was given it, and {known}"
+        return "no card that CUDA sees", hint
     if importlib.util.find_spec("triton") is None:
         return "no triton beside torch", "install the triton that this torch asks for (CUDA builds bring it)"
+    if not (os.environ.get("CC") or any(shutil.which(name) for name in COMPILERS)):
+        return "no C compiler, with which Triton makes its link to the driver", "install gcc and the headers of libc"
     capability = torch.cuda.get_device_capability()
     if capability < OLDEST_CARD:
         name, own = torch.cuda.get_device_name(), ".".join(map(str, capability))

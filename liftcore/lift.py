@@ -25,7 +25,7 @@ from liftcore.solve.all_rays import AllRays
 from liftcore.solve.certificate import certify
 from liftcore.solve.checkpoint import Checkpoint, identity, resumed
 from liftcore.solve.closed_form import Solution, warm_up_solution
-from liftcore.solve.feature_room import in_file, in_memory
+from liftcore.solve.feature_room import room_within
 from liftcore.solve.kept_columns import kept_columns
 from liftcore.solve.least_squares import refine
 from liftcore.solve.lift_warnings import lift_warnings
@@ -93,7 +93,7 @@ def lift(
     Raises:
         InvalidInput: a file is malformed, or the packs do not fit the cameras.
         InvalidSettings: the splats' kernel has no opacity compensation, and the settings ask for it.
-        Unavailable: the free memory cannot hold the result, or there is no such device as the settings ask for.
+        Unavailable: neither memory nor disk can hold what the lift needs, or there is no such device as asked for.
     """
     run = Run(settings, threads, progress, Timings(), choose_device(settings.device))
     with run.timings.stage("read"):
@@ -134,13 +134,15 @@ def _lift_on(run: Run, plan: Plan, sources: Sources, inputs: list[InputFile], ch
         with run.timings.stage("geometry"), resumed(raster, checkpoint, key) as walked:
             scene = (sources.splats.count, sources.cameras)
             geometry = accumulate(walked, scene, sources.packs, sources.views, settings, store, progress)
-        weights, solution = _solve(run, store, geometry, in_file if plan.features_in_file else in_memory)
+        weights, solution = _solve(run, store, geometry, room_within(plan.features_room))
         X, notes = _refine(run, sources, raster, geometry, solution)
         aggregation = _aggregate(run, sources, raster, geometry, X) if settings.aggregation else None
         if aggregation:
             notes["aggregation"] = aggregation.facts
             if settings.aggregation_resolve:
-                notes["aggregation"]["resolved"] = _resolve(run, weights, geometry, aggregation, X)
+                notes["aggregation"]["resolved"] = _resolve(
+                    run, weights, geometry, aggregation, X, plan.features_room
+                )
         facts: dict[str, Any] = {
             "device": device,
             "weights_entries": sum(len(part.columns) for part in store),
@@ -229,13 +231,19 @@ def _aggregate(run: Run, sources: Sources, raster: Raster, geometry: Geometry, X
         return aggregate(X, geometry.evidence, lifted, run.settings, run.progress, run.threads)
 
 
-def _resolve(run: Run, weights: ViewWeights, geometry: Geometry, aggregation: Aggregation, X: torch.Tensor) -> float:
-    """Solve again, from the kept regions alone, for splats that took no cluster's feature; their share of all."""
+def _resolve(
+    run: Run, weights: ViewWeights, geometry: Geometry, aggregation: Aggregation, X: torch.Tensor, limit: int | None
+) -> float:
+    """Solve again, from the kept regions alone, for splats that took no cluster's feature; their share of all.
+
+    ``limit``: bytes of memory that X and its like may take together.
+    """
     if all(rows is None for rows in aggregation.kept):
         return 0.0
     with run.timings.stage("resolve"):
         fewer, denominators = kept_columns(weights, aggregation.kept, X.shape[0])
-        books, closed_form = geometry.codebooks.__getitem__, closed_form_on(run.device, run.threads)
+        room = room_within(None if limit is None else limit - X.nbytes)
+        books, closed_form = geometry.codebooks.__getitem__, closed_form_on(run.device, run.threads, room)
         again = closed_form(fewer, books, denominators, X.dtype, run.progress).features
         chosen = aggregation.own & torch.from_numpy(denominators > 0)
         X[chosen] = again[chosen].to(X.dtype)

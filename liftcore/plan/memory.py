@@ -88,9 +88,11 @@ def group_memory(limit: str, used: str, stat: str) -> int | None:
     return max(0, int(limit) - max(0, int(used) - cached))
 
 
-def features_in_file(parts: Mapping[str, int], free: int | None) -> bool:
-    """Whether X does not fit beside the rest, and is kept in a mapped file."""
-    return free is not None and sum(parts.values()) > SPARE * free
+def features_room(parts: Mapping[str, int], free: int | None) -> int | None:
+    """Bytes that X may take beside the rest; None for no limit. Beyond them it is kept in a mapped file."""
+    if free is None:
+        return None
+    return max(0, int(SPARE * free) - sum(parts.values()) + parts["features"])
 
 
 def check_memory(parts: Mapping[str, int], free: int | None) -> list[str]:
@@ -101,13 +103,14 @@ def check_memory(parts: Mapping[str, int], free: int | None) -> list[str]:
     """
     if free is None:
         return []
+    room = features_room(parts, free)
     there, rest = f"{free / 2**30:.1f} GiB", sum(parts.values()) - parts["features"]
     hint = "try fewer views (coverage) or fewer channels"
     if parts["codebooks"] > free:
         got = f"{parts['codebooks'] / 2**30:.1f} GiB for codebooks"
         raise Unavailable("memory", expected=f"at most the {there} that are free", got=got, hint=hint)
     told = []
-    if features_in_file(parts, free):
+    if room is not None and parts["features"] > room:
         check_disk(parts["features"])
         size = f"{parts['features'] / 2**30:.1f} GiB"
         told.append(f"the features, {size}, do not fit into the {there} that are free: they go through a mapped file")

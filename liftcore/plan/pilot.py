@@ -5,8 +5,9 @@ says: where encoders and masks agree, a quarter of the views will do, and where 
 made of it, the last view counts. So PILOT_SPLATS splats, grown to cover what all of them covered, are lifted from
 coarse pixels of PILOT_VIEWS views by the raster itself, with what it says of hiding, and again from half of these.
 
-If every view adds an error of its own, of a relative variance r to the mean of n of N views, then their features have
-the cosine ``c`` with ``1 / c^2 - 1 = r (1 / n - 1 / N)``. The pilot measures r; n follows for the c that is wanted.
+If every view adds an error of its own, of variance v beside a feature of length one, then the features of n of N
+views have the cosine ``c`` to those of all with ``1 / c^2 - 1 = r (1 / n - 1 / N)``, ``r = v / (1 + v / N)``. The
+pilot measures r among its own views, and so v; n follows for the c and the N that are wanted.
 Vectors are compared in PILOT_CHANNELS random projections.
 """
 
@@ -51,18 +52,23 @@ LEAST_COSINE = 0.01  # of the halves, below which their views have nothing in co
 class Pilot:
     """What the small lift says of the views' disagreement."""
 
-    variance: float  # r: of the error that one view has, as a share of the squared feature
+    variance: float  # v: of the error that one view has, as a share of the squared feature; may be infinite
 
     def views_for(self, cosine: float, total: int) -> int:
         """The fewest of ``total`` views whose features have at least this cosine, in the mean, to those of all."""
-        allowed = 1.0 / cosine**2 - 1.0
-        if self.variance <= 0.0:
+        among = self._among(total)
+        if among <= 0.0:
             return 1
-        return min(total, math.ceil(1.0 / (allowed / self.variance + 1.0 / total)))
+        allowed = 1.0 / max(cosine, LEAST_COSINE) ** 2 - 1.0
+        return max(1, min(total, math.ceil(1.0 / (allowed / among + 1.0 / total))))
 
     def cosine_of(self, count: int, total: int) -> float:
         """What is expected of so many views of ``total``."""
-        return 1.0 / math.sqrt(1.0 + self.variance * (1.0 / count - 1.0 / total))
+        return 1.0 / math.sqrt(1.0 + self._among(total) * (1.0 / count - 1.0 / total))
+
+    def _among(self, total: int) -> float:
+        """r: the variance beside the features of ``total`` views, which have a part of the errors themselves."""
+        return total / (1.0 + total / self.variance) if self.variance > 0.0 else 0.0
 
 
 def fly_pilot(
@@ -86,7 +92,8 @@ def fly_pilot(
         half = sorted(islice(order, (len(chosen) + 1) // 2))
         part = _features(store, books, half, thin.count)
     cosine = _mean_cosine(part, whole, torch.from_numpy(geometry.evidence))
-    return Pilot((1.0 / cosine**2 - 1.0) / (1.0 / len(half) - 1.0 / len(chosen)))
+    among = (1.0 / cosine**2 - 1.0) / (1.0 / len(half) - 1.0 / len(chosen))
+    return Pilot(among / (1.0 - among / len(chosen)) if among < len(chosen) else math.inf)
 
 
 def _features(store: ViewWeights, books: Sequence[Tensor], views: Sequence[int], count: int) -> Tensor:
@@ -99,10 +106,11 @@ def _features(store: ViewWeights, books: Sequence[Tensor], views: Sequence[int],
 
 
 def _mean_cosine(some: Tensor, others: Tensor, weights: Tensor) -> float:
-    """The weighted mean cosine of vectors [n, C], LEAST_COSINE at least; one where nothing has a weight."""
+    """The weighted mean cosine of vectors [n, C] where the others are not zero, LEAST_COSINE at least."""
+    weights = weights * (others != 0).any(dim=1)  # no labelled ray met the rest
     total = float(weights.sum())
     if not total > 0:
-        return 1.0
+        return LEAST_COSINE  # nothing was learnt, so nothing is left out
     with one_thread():
         cosines = torch.nn.functional.cosine_similarity(some, others, dim=1).double()
         return min(1.0, max(LEAST_COSINE, float((cosines * weights).sum()) / total))

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from liftcore.device import CPU
 from liftcore.plan.coverage import WELL_COVERED, choose_views, spare_views, view_order
-from liftcore.plan.memory import check_memory, features_in_file, free_memory, memory_parts
+from liftcore.plan.memory import check_memory, features_room, free_memory, memory_parts
 from liftcore.plan.on_device import check_device_room, device_plan
 from liftcore.plan.pilot import FEW_VIEWS, fly_pilot
 from liftcore.plan.rank import ENOUGH, Rank, codebook_rank
@@ -46,7 +46,7 @@ class Plan:
     memory: Mapping[str, int]  # bytes a part
     device: Device  # that will walk and solve
     on_device: DevicePlan | None  # what it takes of a card, where it is one
-    features_in_file: bool  # X does not fit this machine's memory today
+    features_room: int | None  # bytes of this machine's memory that X may take today; None for no limit
     warnings: tuple[str, ...]  # of this machine, today
 
     @property
@@ -149,6 +149,6 @@ def plan_lift(
         memory=parts,
         device=CPU if short else device,
         on_device=None if short else on_device,
-        features_in_file=features_in_file(parts, free),
+        features_room=features_room(parts, free),
         warnings=(*short, *check_memory(parts, free)),
     )

@@ -6,6 +6,8 @@ import os
 import shutil
 import tempfile
 from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,12 +18,25 @@ from liftcore.errors import Unavailable
 if TYPE_CHECKING:
     from torch import Tensor
 
+MOUNTS = Path("/proc/self/mounts")
+IN_MEMORY = ("tmpfs", "ramfs")
+
 FeatureRoom = Callable[[int, int, torch.dtype], "Tensor"]  # splats, channels, type: zeros [P, F] wherever they lie
 
 
 def in_memory(splats: int, channels: int, dtype: torch.dtype) -> Tensor:
     """Zeros [P, F]: torch's, for numpy asks for large pages, and to clear those took longer than to solve."""
     return torch.zeros(splats, channels, dtype=dtype)
+
+
+def room_within(limit: int | None) -> FeatureRoom:
+    """Room in memory for up to ``limit`` bytes, in a file beyond; None for no limit."""
+
+    def room(splats: int, channels: int, dtype: torch.dtype) -> Tensor:
+        fits = limit is None or splats * channels * dtype.itemsize <= limit
+        return in_memory(splats, channels, dtype) if fits else in_file(splats, channels, dtype)
+
+    return room
 
 
 def in_file(splats: int, channels: int, dtype: torch.dtype) -> Tensor:
@@ -31,6 +46,7 @@ def in_file(splats: int, channels: int, dtype: torch.dtype) -> Tensor:
         Unavailable: the disk has no room. It is taken now, for a page without one would end the process later.
     """
     size = splats * channels * dtype.itemsize
+    check_disk(size)
     with tempfile.TemporaryFile(prefix="splatlift-features-") as file:
         try:
             os.posix_fallocate(file.fileno(), 0, size)
@@ -45,9 +61,23 @@ def check_disk(size: int) -> None:
     Raises:
         Unavailable: it has not.
     """
-    free = shutil.disk_usage(tempfile.gettempdir()).free
+    folder = Path(tempfile.gettempdir())
+    if file_system(folder) in IN_MEMORY:
+        raise _no_disk(size, "a temporary folder that lies in memory itself")
+    free = shutil.disk_usage(folder).free
     if free < size:
         raise _no_disk(size, f"{free / 2**30:.1f} GiB of disk")
+
+
+def file_system(folder: Path, mounts: Path = MOUNTS) -> str:
+    """The kind of file system that a folder lies on, as Linux names it; empty where nothing says."""
+    kinds: dict[Path, str] = {}
+    with suppress(OSError):
+        for line in mounts.read_text(encoding="utf-8", errors="replace").splitlines():
+            _, place, kind, *_ = line.split(" ")
+            kinds[Path(place)] = kind  # the last one mounted there is the one seen
+    own = folder.resolve()
+    return next((kinds[place] for place in (own, *own.parents) if place in kinds), "")
 
 
 def _no_disk(size: int, got: str) -> Unavailable:

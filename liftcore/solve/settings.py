@@ -67,7 +67,7 @@ class LiftSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     preset: Preset = Preset.TIKHONOV
-    speed: Speed = Field(Speed.EXACT, description="the dial: sets stride, cut-off, coverage and certificate rays")
+    speed: Speed = Field(Speed.EXACT, description="the dial: sets stride, cut-off, view_cosine and certificate rays")
     selection: Selection = Field(Selection.ALL, description="which of a ray's weights count")
     k: int = Field(40, ge=1, le=MOST_OF_A_RAY, description="how many weights of a ray top-k keeps")
     mass: float = Field(0.75, gt=0, le=1, description="the share of the light within which front-mass keeps weights")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
+from contextlib import contextmanager
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
@@ -10,6 +12,7 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 import torch
 
+from liftcore.errors import Unavailable
 from liftcore.raster.protocol import RegionWeights
 
 if TYPE_CHECKING:
@@ -67,14 +70,18 @@ class ViewWeights:
             return torch.zeros_like(like)
         self.mapped_bytes += like.nbytes
         path = self._path(f"{view}-weights-from-{self.bytes}")
-        mapped = np.lib.format.open_memmap(path, mode="w+", dtype=np.float32, shape=tuple(like.shape))
+        with _written():
+            mapped = np.lib.format.open_memmap(path, mode="w+", dtype=np.float32, shape=tuple(like.shape))
+            with path.open("r+b") as file:  # a page that finds no disk later would end the process
+                os.posix_fallocate(file.fileno(), 0, path.stat().st_size)
         return torch.from_numpy(mapped)
 
     def _to_file(self, weights: RegionWeights) -> RegionWeights:
         mapped = {}
         for field in fields(weights):
             path = self._path(f"{len(self._views)}-{field.name}")
-            np.save(path, _array(weights, field.name))
+            with _written():
+                np.save(path, _array(weights, field.name))
             mapped[field.name] = torch.from_numpy(np.load(path, mmap_mode="c"))
         return RegionWeights(**mapped)
 
@@ -91,6 +98,22 @@ class ViewWeights:
 
     def __iter__(self) -> Iterator[RegionWeights]:
         return iter(self._views)
+
+
+@contextmanager
+def _written() -> Iterator[None]:
+    """Say in words that a file of weights could not be written.
+
+    Raises:
+        Unavailable: the disk is full, or broken.
+    """
+    try:
+        yield
+    except OSError as error:
+        folder = tempfile.gettempdir()
+        hint = "set TMPDIR to a folder with more room, or lift fewer views"
+        got = error.strerror or str(error)
+        raise Unavailable("weights", expected=f"disk for region weights in {folder}", got=got, hint=hint) from None
 
 
 def _array(weights: RegionWeights, name: str) -> np.ndarray:

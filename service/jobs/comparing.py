@@ -14,6 +14,7 @@ from liftcore.measure.tradeoff.report import page_of, save
 from liftcore.progress import Progress
 from liftcore.raster.warm_up import warm_up
 from liftcore.scene.splats import Kernel
+from liftcore.solve.closed_form import warm_up_solution
 from service.finite import finite
 
 SHOWN_DIGITS = 12  # of the splats' digest, by which the chart names the scene
@@ -33,6 +34,7 @@ def compare_as_ordered(order: dict[str, Any], progress: Progress) -> dict[str, A
     settings, budget = order["settings"], order["parameters"]["budget_s"]
     progress("compile", 0, 1, "kernels")
     device = choose_device(settings.get("device", "auto"))
+    warm_up_solution()
     warm_up(Kernel(order["kernel"]), device)  # for the runs to load: else the first on a machine eats up the budget
     progress("tradeoff", 0, len(CANDIDATES), "runs")
     found = compare(scene, budget, settings, order["threads"], progress)

@@ -8,7 +8,7 @@ from liftcore.errors import InvalidFeatures
 from service.store.assets import AssetRecord
 from service.wire import JobKind
 
-FLOAT_BYTES = 4  # float16 features take half of it
+FLOAT_BYTES = 2  # at least: of float16, which features are unless told otherwise
 
 
 def check_fit(cameras: AssetRecord, features: Sequence[AssetRecord]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import shutil
 from pathlib import Path
 
 import pytest
@@ -28,6 +29,7 @@ def card(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
     monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda *_: "Card")
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda *_: (9, 0))
+    monkeypatch.setattr(shutil, "which", lambda name: f"/usr/bin/{name}")
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda *_: (3 * GIB, 8 * GIB))
     monkeypatch.setattr(torch.cuda, "memory_reserved", lambda *_: 2 * GIB)
     monkeypatch.setattr(torch.cuda, "memory_allocated", lambda *_: GIB)
@@ -41,6 +43,7 @@ def test_auto_takes_a_card_that_can_be_used_and_cpu_takes_none(card: pytest.Monk
 
 LACKS = {
     "a build without CUDA": (torch.version, "cuda", None),
+    "no C compiler": (shutil, "which", lambda *_: None),
     "no card that CUDA sees": (torch.cuda, "is_available", lambda: False),
     "no triton": (importlib.util, "find_spec", lambda name: None),
     "compute capability 6.1": (torch.cuda, "get_device_capability", lambda *_: (6, 1)),
@@ -58,7 +61,7 @@ def test_what_a_card_lacks_is_said_with_a_hint_of_its_own(card: pytest.MonkeyPat
     assert device_process.look("cuda")["event"] == "fault"
 
 
-def test_four_lacks_have_four_hints(card: pytest.MonkeyPatch) -> None:
+def test_each_lack_has_a_hint_of_its_own(card: pytest.MonkeyPatch) -> None:
     hints = set()
     for lack in LACKS.values():
         with pytest.MonkeyPatch.context() as patch:

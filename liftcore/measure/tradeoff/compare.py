@@ -138,7 +138,8 @@ def _run(order: Order, candidate: Candidate) -> dict[str, Any]:
         raise Unavailable(candidate.name, expected=f"an end within {LONGEST} s", got="none yet", hint=hint) from None
     answer = json.loads(done.stdout.splitlines()[-1]) if done.stdout.strip() else {}
     if "error" in answer:
-        raise InvalidInput(candidate.name, expected="a scene that lifts", got=answer["error"])
+        fault = Unavailable if answer["kind"] == Unavailable.kind else InvalidInput
+        raise fault(candidate.name, expected="a scene that lifts", got=answer["error"])
     if done.returncode != 0:
         raise RuntimeError(f"{candidate.name} ended with {done.returncode}: {done.stderr.strip()[-300:]}")
     return {**answer, "process_s": time.monotonic() - start}

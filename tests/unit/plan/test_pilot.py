@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 
 import pytest
@@ -13,7 +14,7 @@ from liftcore.measure.tradeoff.judge import cosine_figures
 from liftcore.observe.observation import RegionMap
 from liftcore.observe.pack import open_packs
 from liftcore.observe.write_pack import write_pack
-from liftcore.plan.pilot import FEW_VIEWS, Pilot, fly_pilot
+from liftcore.plan.pilot import FEW_VIEWS, LEAST_COSINE, Pilot, _mean_cosine, fly_pilot
 from liftcore.scene.cameras import Cameras
 from liftcore.scene.inria import write_inria_cameras
 from liftcore.scene.load import load_cameras
@@ -25,11 +26,13 @@ from tests.unit.plan.test_views import ring
 VIEWS, CHANNELS = FEW_VIEWS + 8, 48
 
 
-def disagreeing(folder, error: float):
+def disagreeing(folder, error: float, gap: bool = False):
     """A cloud on a ring of cameras; each view says one vector, with an error of its own of so much of its length."""
     folder.mkdir()
     generator = torch.Generator().manual_seed(3)
     truth, labels = torch.eye(CHANNELS)[:1], torch.zeros(1, 6, 8, dtype=torch.int32)
+    if gap:
+        labels[:, :, 4:] = -1
     errors = torch.randn(VIEWS, CHANNELS, generator=generator)
     errors *= error / CHANNELS**0.5
     cameras = [centred(camera) for camera in ring(VIEWS)]
@@ -71,6 +74,25 @@ def test_views_follow_from_the_variance():
         assert pilot.cosine_of(count, total) >= 0.99 > pilot.cosine_of(count - 1, total)
     assert pilot.views_for(0.999_999, 30) == 30
     assert Pilot(0.0).views_for(0.99, 30) == 1
+
+
+def test_any_cosine_asks_for_a_view_at_least_and_views_that_share_nothing_are_all_needed():
+    assert Pilot(2.0).views_for(1e-200, 100) == 1
+    assert Pilot(math.inf).views_for(0.9, 100) == 81  # n of N have the cosine sqrt(n / N)
+    assert Pilot(0.0).cosine_of(1, 100) == 1.0
+
+
+def test_rays_without_labels_are_no_disagreement(tmp_path):
+    counts = []
+    for gap in (False, True):
+        splats, cameras, pack = disagreeing(tmp_path / str(gap), 0.5, gap)
+        lifted = lift(splats, cameras, [pack], LiftSettings.of(view_cosine=0.98))
+        counts.append(len(lifted.metadata.views))
+    assert abs(counts[0] - counts[1]) <= 3
+
+
+def test_a_pilot_that_learns_nothing_leaves_nothing_out():
+    assert _mean_cosine(torch.zeros(3, 2), torch.zeros(3, 2), torch.ones(3)) == LEAST_COSINE
 
 
 def test_few_views_are_all_taken(tmp_path):

@@ -17,7 +17,7 @@ from liftcore.observe.pack import open_packs
 from liftcore.observe.write_pack import write_pack
 from liftcore.plan.memory import CONTROL_GROUPS, LIBRARIES, check_memory, free_memory, group_memory
 from liftcore.plan.rank import ROUNDING, codebook_rank, rank_of
-from liftcore.solve.feature_room import in_file
+from liftcore.solve.feature_room import file_system, in_file, room_within
 from liftcore.solve.settings import LiftSettings, Speed
 from tests.unit.solve.test_lift_equals_dense import write_scene
 
@@ -83,6 +83,27 @@ def test_features_that_fit_neither_memory_nor_disk_are_refused_before_the_work(d
         check_memory(parts, 7 * GIB)
 
 
+def test_a_temporary_folder_in_memory_is_no_disk(monkeypatch, tmp_path):
+    mounts = tmp_path / "mounts"
+    mounts.write_text(f"disk / ext4 rw 0 0\nnone {tmp_path} tmpfs rw 0 0\n")
+    assert file_system(tmp_path / "below", mounts) == "tmpfs"
+    assert file_system(tmp_path.parent, mounts) == "ext4"
+    assert file_system(tmp_path, tmp_path / "absent") == ""
+    monkeypatch.setattr("liftcore.solve.feature_room.file_system", lambda _: "tmpfs")
+    with pytest.raises(Unavailable, match="lies in memory itself"):
+        in_file(10, 7, torch.float16)
+
+
+def test_features_that_come_out_wider_than_planned_find_their_room_by_what_they_are():
+    limit = 1000 * 7 * 2
+    places = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("liftcore.solve.feature_room.in_file", lambda *shape: places.append(shape))
+        for dtype in (torch.float16, torch.float32):
+            room_within(limit)(1000, 7, dtype)
+    assert places == [(1000, 7, torch.float32)]
+
+
 @pytest.mark.parametrize("dtype", [torch.float16, torch.float32])
 def test_features_in_a_file_are_zeros_that_keep_what_is_written(dtype):
     room = in_file(1000, 7, dtype)
@@ -103,7 +124,9 @@ def test_a_disk_that_is_full_by_then_is_told_and_ends_nothing(monkeypatch):
 def test_a_lift_whose_features_do_not_fit_is_the_same_through_a_file(tmp_path, monkeypatch, disk):
     scene = write_scene(tmp_path, 2)
     rooms = []
-    monkeypatch.setattr("liftcore.lift.in_file", lambda *shape: rooms.append(in_file(*shape)) or rooms[-1])
+    monkeypatch.setattr(
+        "liftcore.solve.feature_room.in_file", lambda *shape: rooms.append(in_file(*shape)) or rooms[-1]
+    )
     inside = lift(scene[0], scene[1], [scene[2]], LiftSettings.of())
     assert not rooms
     monkeypatch.setattr("liftcore.plan.plan.free_memory", lambda: LIBRARIES)
