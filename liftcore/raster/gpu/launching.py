@@ -63,8 +63,8 @@ def check_device(device: torch.device) -> None:
 def launch(kernel: Any, programs: int, *arguments: object, warps: int = WARPS, **constants: object) -> None:
     """Run ``programs`` programs of a kernel.
 
-    Products are not fused into sums, as the interpreter does not; exponentials and quotients are the card's own. Loads
-    are not moved into earlier rounds of a loop, for scratch is written there.
+    Products are not fused into sums, as the interpreter does not; exponentials and quotients are the card's.
+    Loads are not moved into earlier rounds of a loop, for scratch is written there.
     """
     if programs == 0:
         return
