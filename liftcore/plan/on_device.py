@@ -90,11 +90,12 @@ def device_plan(
     from liftcore.raster.gpu.memory import raster_bytes
 
     sizes = {(camera.width, camera.height) for camera in cameras.values()}
-    view = max(raster_bytes(splats.count, width, height, splats.kernel) for width, height in sizes)
+    levels = most_levels(packs, cameras)
+    view = max(raster_bytes(splats.count, width, height, splats.kernel, levels) for width, height in sizes)
     rows = sum(codebook_rows(packs, name) for name in cameras)
     slices = device_slices(rows, packs.channels)
     width = slices[0][1]
-    entries = int(len(cameras) * seen_a_view * ENTRIES_A_SPLAT * most_levels(packs, cameras))
+    entries = int(len(cameras) * seen_a_view * ENTRIES_A_SPLAT * levels)
     free = device.free_bytes()
     return DevicePlan(
         name=device.name,

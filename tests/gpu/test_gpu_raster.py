@@ -96,6 +96,7 @@ def test_a_view_in_pieces_is_the_view(monkeypatch):
     monkeypatch.setattr("liftcore.raster.gpu.frame.TILES_AT_ONCE", 2)
     monkeypatch.setattr("liftcore.raster.gpu.frame.TABLE_FLOATS", 60)
     monkeypatch.setattr("liftcore.raster.gpu.sums.PART", 3)
+    monkeypatch.setattr("liftcore.raster.gpu.weighing.ENTRIES", 7)
     assert len(list(gpu_raster(splats)._frame(camera, WALK).lists())) == 3
     for first, second in zip(whole, products(), strict=True):
         assert torch.allclose(first.double(), second.double(), rtol=1e-6, atol=1e-7)

@@ -23,6 +23,8 @@ from liftcore.raster.protocol import RegionWeights
 from liftcore.raster.selection import FRONT, LARGEST
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from torch import Tensor
 
     from liftcore.raster.gpu.frame import Frame
@@ -33,6 +35,7 @@ if TYPE_CHECKING:
 COLUMNS = 16  # of a tile's matrix at a time
 BLOCK = 64  # of its rows: a thread has what it multiplies in registers, which are few
 WIDEST = 32  # channels of an image a walk
+ENTRIES = 1 << 22  # of a table that become rows of splats at a time
 
 _CHUNK = tl.constexpr(CHUNK)
 _TILE = tl.constexpr(TILE)
@@ -165,7 +168,7 @@ def region_weights(
             for run in table_runs(first, sizes.tolist()):
                 job = _Run(lists, run, first, slots, sizes[run[0] - first : run[1] - first], marks)
                 table = _weigh_run(frame, job, reading.taps, choice, with_plain, given)
-                weights.append(_by_row(frame, job, table, splats * rows, rows))
+                weights.extend(_by_row(frame, job, table, splats * rows, rows))
         evidence.append(_positive(frame.ids[lists.items], given))
     summed, met = _joined(weights), _joined(evidence)
     # Few keys are left: where each splat's rows begin is quickly found.
@@ -208,11 +211,16 @@ def _weigh_run(
     return table, starts
 
 
-def _by_row(frame: Frame, job: _Run, made: tuple[Tensor, Tensor], largest_key: int, rows: int) -> Sums:
-    """The sums of a run's table by splat and row of the codebook: ``key = splat * rows + row``."""
-    table, starts = made
+def _by_row(frame: Frame, job: _Run, made: tuple[Tensor, Tensor], largest_key: int, rows: int) -> Iterator[Sums]:
+    """The sums of a run's table by splat and row of the codebook, ``key = splat * rows + row``, ENTRIES at a time."""
+    for place in made[0].nonzero()[:, 0].split(ENTRIES):
+        yield _sums_of(frame, job, made, place, (largest_key, rows))
+
+
+def _sums_of(frame: Frame, job: _Run, made: tuple[Tensor, Tensor], place: Tensor, span: tuple[int, int]) -> Sums:
+    """The sums of the floats at ``place`` [n] i64 of a run's table."""
+    (table, starts), (largest_key, rows) = made, span
     lists, slots = job.lists, job.slots
-    place = table.nonzero()[:, 0]
     tile = torch.searchsorted(starts[1:], place, right=True)
     in_slots = tile + (job.tiles[0] - job.slots_tile)
     used = slots.starts[in_slots + 1] - slots.starts[in_slots]
