@@ -29,7 +29,8 @@ class ServiceProcess:
     def __init__(self, data: Path, *options: str) -> None:
         self._data = data
         self._process: subprocess.Popen[str] | None = None
-        self.client = httpx.Client(timeout=120)
+        # No connection is used twice: one that lay idle may be closed in the moment in which it is taken up again.
+        self.client = httpx.Client(timeout=120, limits=httpx.Limits(max_keepalive_connections=0))
         self.start(*options)
 
     def __enter__(self) -> Self:

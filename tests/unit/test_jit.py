@@ -24,6 +24,7 @@ def _imported(source: Path) -> set[Path]:
 _NO_PART_OF_KERNELS = {
     "accumulate.py",
     "errors.py",
+    "feature_room.py",
     "readout.py",
     "protocol.py",
     "progress.py",
