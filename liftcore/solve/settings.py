@@ -57,7 +57,7 @@ _SPEEDS: dict[Speed, dict[str, Any]] = {
     Speed.EXACT: {},
     Speed.BALANCED: {"stride": 2, "certificate_rays": 2_000},
     Speed.FAST: {"stride": 3, "view_cosine": 0.998, "transmittance_stop": 0.003, "certificate_rays": 500},
-    Speed.DRAFT: {"stride": 6, "view_cosine": 0.98, "transmittance_stop": 0.02, "certificate_rays": 200},
+    Speed.DRAFT: {"stride": 4, "view_cosine": 0.995, "transmittance_stop": 0.01, "certificate_rays": 200},
 }
 
 

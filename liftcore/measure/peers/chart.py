@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from matplotlib.ticker import LogLocator
+
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
@@ -30,6 +32,7 @@ def draw(figure: Figure, growth: Sequence[tuple[Axis, Mapping[str, Sequence[Run]
         ticks = [axis.of(size) for size in axis.sizes]
         panel.set_xticks(ticks, [f"{tick:,}" for tick in ticks], fontsize="small")
         panel.minorticks_off()
+        panel.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         panel.yaxis.set_major_formatter("{x:g}")
         panel.set_xlabel(axis.name, fontsize="small")
         panel.grid(alpha=0.3)
