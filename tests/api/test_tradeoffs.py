@@ -130,7 +130,7 @@ def test_room_for_the_exact_features_is_asked_for_beforehand(
     client: TestClient, uploaded: Uploaded, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     usage, floor = shutil.disk_usage("/"), parts_of(client).store.files.floor_bytes
-    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=floor + 60 * 9 * 4 - 1))
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=floor + 60 * 9 * 2 - 1))
     reply = client.post("/tradeoff", json=uploaded.order() | {"budget_s": 10})
     assert (assert_problem(reply)["type"], reply.status_code) == ("/problems/no-space", 507)
 
