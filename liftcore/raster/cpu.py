@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from liftcore.errors import InvalidInput
 from liftcore.raster.adjoint import add_sums, gather_tiles
 from liftcore.raster.antialiased import check_antialiased
+from liftcore.raster.arguments import check_image, check_labels, check_rows
 from liftcore.raster.constants import TILE
 from liftcore.raster.depth_order import depth_order
 from liftcore.raster.kernels import RECORDS, activated, kernel_in, project, with_gain
@@ -83,12 +83,7 @@ class CpuRaster:
 
     def render(self, camera: Camera, values: Tensor, walk: Walk) -> Tensor:
         """``A X``: values [P, C] f32 -> [H, W, C] f32. See the protocol."""
-        if values.ndim != 2 or values.shape[0] != self.splats.count:
-            raise InvalidInput(
-                "values",
-                expected=f"one row for each of {self.splats.count} splats",
-                got=f"{list(values.shape)}",
-            )
+        check_rows(values, self.splats.count)
         frame = self._frame(camera, every_pixel(walk))
         channels = values.shape[1]
         image = np.zeros((camera.height, camera.width, channels), np.float32)
@@ -105,12 +100,7 @@ class CpuRaster:
 
     def adjoint(self, camera: Camera, values: Tensor, walk: Walk) -> Tensor:
         """``A^T Y``: values [H, W, C] f32 -> [P, C] f32. See the protocol."""
-        if values.ndim != 3 or values.shape[:2] != (camera.height, camera.width):
-            raise InvalidInput(
-                "values",
-                expected=f"an image of {camera.height} rows of {camera.width} pixels",
-                got=f"{list(values.shape)}",
-            )
+        check_image(values, camera)
         frame = self._frame(camera, every_pixel(walk))
         channels = values.shape[2]
         result = np.zeros((self.splats.count, channels), np.float32)
@@ -141,10 +131,7 @@ class CpuRaster:
 
     def strongest_labels(self, camera: Camera, labels: Tensor, walk: Walk) -> Tensor:
         """``argmax(A onehot(labels))``: labels [P] i32 in -1..K - 1 -> [H, W] i32. See the protocol."""
-        if labels.ndim != 1 or labels.shape[0] != self.splats.count or int(labels.min()) < -1:
-            got = f"{list(labels.shape)}, the smallest {int(labels.min())}"
-            expected = f"a label of -1 or more for each of {self.splats.count} splats"
-            raise InvalidInput("labels", expected=expected, got=got)
+        check_labels(labels, self.splats.count)
         frame = self._frame(camera, every_pixel(walk))
         flat, count = np.ascontiguousarray(labels.to(torch.int32).numpy()), int(labels.max()) + 1
         image = np.full((camera.height, camera.width), -1, np.int32)

@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, ParamSpec, TypeVar
 import numpy as np
 import torch
 
-from liftcore.errors import InvalidInput, Unavailable
+from liftcore.errors import Unavailable
 from liftcore.raster.antialiased import check_antialiased
+from liftcore.raster.arguments import check_image, check_labels, check_rows
 from liftcore.raster.constants import TILE
 from liftcore.raster.gpu import rendering, weighing
 from liftcore.raster.gpu.frame import Frame, tile_runs
@@ -97,9 +98,7 @@ class GpuRaster:
     @_within_memory
     def render(self, camera: Camera, values: Tensor, walk: Walk) -> Tensor:
         """``A X``: values [P, C] f32 -> [H, W, C] f32. See the protocol."""
-        if values.ndim != 2 or values.shape[0] != self.splats.count:
-            expected = f"one row for each of {self.splats.count} splats"
-            raise InvalidInput("values", expected=expected, got=f"{list(values.shape)}")
+        check_rows(values, self.splats.count)
         frame = self._frame(camera, every_pixel(walk))
         image = torch.empty(camera.height, camera.width, values.shape[1])
         for begin in range(0, values.shape[1], rendering.WIDEST):
@@ -110,9 +109,7 @@ class GpuRaster:
     @_within_memory
     def adjoint(self, camera: Camera, values: Tensor, walk: Walk) -> Tensor:
         """``A^T Y``: values [H, W, C] f32 -> [P, C] f32. See the protocol."""
-        if values.ndim != 3 or values.shape[:2] != (camera.height, camera.width):
-            expected = f"an image of {camera.height} rows of {camera.width} pixels"
-            raise InvalidInput("values", expected=expected, got=f"{list(values.shape)}")
+        check_image(values, camera)
         frame = self._frame(camera, every_pixel(walk))
         result = torch.empty(self.splats.count, values.shape[2])
         for begin in range(0, values.shape[2], weighing.WIDEST):
@@ -147,10 +144,7 @@ class GpuRaster:
     @_within_memory
     def strongest_labels(self, camera: Camera, labels: Tensor, walk: Walk) -> Tensor:
         """``argmax(A onehot(labels))``: labels [P] i32 in -1..K - 1 -> [H, W] i32. See the protocol."""
-        if labels.ndim != 1 or labels.shape[0] != self.splats.count or int(labels.min()) < -1:
-            got = f"{list(labels.shape)}, the smallest {int(labels.min())}"
-            expected = f"a label of -1 or more for each of {self.splats.count} splats"
-            raise InvalidInput("labels", expected=expected, got=got)
+        check_labels(labels, self.splats.count)
         frame = self._frame(camera, every_pixel(walk))
         return rendering.strongest_labels(frame, labels.to(self.device, torch.int32)).cpu()
 

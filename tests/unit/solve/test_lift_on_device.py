@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -18,10 +17,11 @@ from liftcore.plan import plan
 from liftcore.progress import silent
 from liftcore.solve.settings import LiftSettings
 from liftcore.timings import Timings
+from tests.backends import needs_triton
 
 from .test_lift_equals_dense import write_scene
 
-pytestmark = pytest.mark.skipif(find_spec("triton") is None, reason="triton has no wheel for this machine")
+pytestmark = needs_triton
 
 CARD = Device("cuda", torch.device("cuda", 0) if torch.cuda.is_available() else torch.device("cpu"))
 SETTINGS = LiftSettings.of(certificate_rays=20, view_stride=2, robust_steps=1)  # two views of three
