@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from liftcore.measure.peers import __main__ as command
-from liftcore.measure.peers import child, side_by_side, torch_autograd
+from liftcore.measure.peers import side_by_side, torch_autograd
 from liftcore.measure.peers.agreement import agreement
 from liftcore.measure.peers.dense_numba import DenseNumba
 from liftcore.measure.peers.everybody import PEERS, SIZES
