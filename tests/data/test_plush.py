@@ -73,9 +73,9 @@ def rendered_cosine(raster: CpuRaster, camera: Camera, features: Tensor, grid: T
 
 
 def test_lifted_cnn_features_render_like_those_of_unseen_photos(plush, cameras, raster):
-    # This encoder's last block is linear: cells side by side have a cosine of 0.06, and 0.08 is what survives the
-    # views. What must hold is that the right cells are met, not their mirror images.
-    settings = LiftSettings.of(preset="row-sum", certificate_rays=0)
+    # This encoder's last block is linear: cells side by side have a cosine of 0.06, and 0.10 is what survives the
+    # views, every fourth of them. What must hold is that the right cells are met, not their mirror images.
+    settings = LiftSettings.of(preset="row-sum", certificate_rays=0, view_stride=4)
     paths = [plush / name for name in ("point_cloud.ply", "cameras.json", "grids.safetensors")]
     features = lift(paths[0], paths[1], paths[2:], settings).features
     held_out = open_packs([plush / "grids_test.safetensors"])
@@ -85,5 +85,5 @@ def test_lifted_cnn_features_render_like_those_of_unseen_photos(plush, cameras, 
         walk, camera = render_walk(settings), cameras.get(name)
         cosine = rendered_cosine(raster, camera, features, observed.grid, walk)
         mirrored = rendered_cosine(raster, camera, features, observed.grid.flip(1), walk)
-        assert cosine > 0.06
-        assert cosine > 3 * mirrored
+        assert cosine > 0.08
+        assert cosine > 5 * mirrored

@@ -172,7 +172,7 @@ class Large:
 
     def lift(self, work: Work) -> Answer:
         self.lifts += 1
-        time.sleep(0.2 if self.lifts == 1 else 0.0)
+        time.sleep(1.0 if self.lifts == 1 else 0.0)
         return Answer(torch.ones(25_000_000)[:1, None], torch.ones(1))
 
 
@@ -191,7 +191,7 @@ def test_a_process_tells_the_memory_of_a_lift_and_what_the_first_one_costs() -> 
     done = subprocess.run([sys.executable, "-c", ALONE], capture_output=True, text=True, check=True)
     found = json.loads(done.stdout)
     assert 90e6 < found["peak_bytes"] - found["before_bytes"] < 200e6
-    assert found["first_s"] - found["again_s"] > 0.1
+    assert found["first_s"] - found["again_s"] > 0.5
 
 
 def test_the_page_has_every_part_and_tells_who_was_cut_off(
