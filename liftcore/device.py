@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 OLDEST_CARD = (7, 5)  # the compute capability that Triton and today's builds of torch have code for
 COMPILERS = ("gcc", "clang", "cc")
 DRIVER = Path("/proc/driver/nvidia/version")
+MEMORY_SIGNS = ("out of memory", "alloc_failed", "memoryallocation")  # CUDA's, cuBLAS's and its kin's, lower case
 _EXPECTED = "a card that CUDA, torch and Triton can use"
 _OR_CPU = "or take device=cpu"
 
@@ -64,6 +65,14 @@ class Device:
 CPU = Device("cpu", torch.device("cpu"))
 
 
+def out_of_memory(error: BaseException) -> bool:
+    """Whether an error says that a device's memory ran out: torch's own, the driver's by Triton, or a library's."""
+    if isinstance(error, torch.OutOfMemoryError):
+        return True
+    told = str(error).lower()
+    return isinstance(error, RuntimeError) and any(sign in told for sign in MEMORY_SIGNS)
+
+
 @contextmanager
 def within_memory(device: Device) -> Iterator[None]:
     """Say in words that a card has no room, where work could not be cut any smaller.
@@ -73,7 +82,9 @@ def within_memory(device: Device) -> Iterator[None]:
     """
     try:
         yield
-    except torch.OutOfMemoryError:
+    except RuntimeError as error:
+        if not out_of_memory(error):
+            raise
         free = (device.free_bytes() or 0) / 2**30
         raise Unavailable(
             "device", expected=f"room for the lift on {device.name}", got=f"too little: {free:.1f} GiB are free now",

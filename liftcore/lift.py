@@ -19,7 +19,7 @@ from liftcore.raster.antialiased import check_antialiased
 from liftcore.raster.open_raster import open_raster
 from liftcore.raster.warm_up import warm_up
 from liftcore.scene.load import load_cameras, load_splats
-from liftcore.solve.accumulate import Geometry, accumulate, as_read, lift_walk
+from liftcore.solve.accumulate import Geometry, accumulate, as_read, lift_walk, weighting_of
 from liftcore.solve.aggregation import Aggregation, aggregate
 from liftcore.solve.all_rays import AllRays
 from liftcore.solve.certificate import certify
@@ -120,7 +120,7 @@ def lift_sources(run: Run, sources: Sources, inputs: list[InputFile], checkpoint
 
 def _warm_up(run: Run, kernel: Kernel) -> None:
     with run.timings.stage("compile"):
-        warm_up(kernel, run.device)
+        warm_up(kernel, run.device, lift_walk(run.settings), weighting_of(run.settings))
         if run.device.kind == "cpu":
             warm_up_solution()
 
@@ -128,12 +128,15 @@ def _warm_up(run: Run, kernel: Kernel) -> None:
 def _lift_on(run: Run, plan: Plan, sources: Sources, inputs: list[InputFile], checkpoint: Checkpoint | None) -> Lift:
     """The lift as planned."""
     settings, threads, progress = run.settings, run.threads, run.progress
-    raster, device = open_raster(sources.splats, run.device, threads), run.device.facts()
-    with ViewWeights() as store:
+    kept = plan.kept_on_card
+    raster, device = open_raster(sources.splats, run.device, threads, kept), run.device.facts()
+    with ViewWeights(card=(run.device.place, kept)) as store:
         key = identity([part.sha256 for part in inputs], settings, device) if checkpoint else ""
         with run.timings.stage("geometry"), resumed(raster, checkpoint, key) as walked:
             scene = (sources.splats.count, sources.cameras)
             geometry = accumulate(walked, scene, sources.packs, sources.views, settings, store, progress)
+        if settings.robust_steps or settings.aggregation_resolve:  # which read the weights on the host
+            store.bring_home()
         weights, solution = _solve(run, store, geometry, room_within(plan.features_room))
         X, notes = _refine(run, sources, raster, geometry, solution)
         aggregation = _aggregate(run, sources, raster, geometry, X) if settings.aggregation else None

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from liftcore.errors import Unavailable
-from liftcore.plan.memory import ENTRIES_A_SPLAT, codebook_rows, most_levels
-from liftcore.solve.device_blocks import GRAIN, SPARE, block_bytes, block_room, book_bytes, device_slices
+from liftcore.plan.memory import ENTRIES_A_SPLAT, ENTRY_BYTES, codebook_rows, most_levels
+from liftcore.solve.device_blocks import GRAIN, SPARE, block_bytes, book_bytes, device_slices
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from liftcore.scene.splats import Splats
 
 MIB = 2**20
+ROOM_SPARE = 0.9  # of the free memory, as liftcore.raster.gpu.room has it (which loads triton)
+FEW_BLOCKS = 8  # of splats: W does not stay where the solution would have to go in more of them for its sake
 
 
 @dataclass(frozen=True)
@@ -26,23 +28,42 @@ class DevicePlan:
     """Bytes on the card at the peaks of the two phases, and the room that there is."""
 
     name: str  # of the card
-    view: int  # the geometry's: scene and the largest view
+    view: int  # the geometry's: scene and the largest view, in one piece
+    least_view: int  # the same in the smallest pieces
+    weights: int  # W of all views
     codebooks: int  # the solution's: a slice of channels of all codebooks
     block: int  # and W and the sums of all splats, were they one block
     grain: int  # of the smallest block
     slices: int  # of channels
-    room: int | None  # for blocks; None on a device without limits of its own
-    free: int | None
+    free: int | None  # on the card; None on a device without limits of its own
 
     @property
     def least(self) -> int:
         """Bytes without which no lift is possible."""
-        return max(self.view, math.ceil((self.codebooks + self.grain) / SPARE))
+        return max(self.least_view, math.ceil((self.codebooks + self.grain) / SPARE))
 
     @property
     def fits(self) -> bool:
         """Whether they are there."""
         return self.free is None or self.least <= self.free
+
+    @property
+    def whole_views(self) -> bool:
+        """Whether views are walked in one piece, with the scene on the card."""
+        return self.free is None or self.view <= ROOM_SPARE * self.free
+
+    @property
+    def kept(self) -> int:
+        """Bytes of W that stay on the card between the phases, where views and many blocks find room beside them."""
+        if self.free is None:
+            return self.weights
+        beside = max(self.view, self.codebooks + max(self.grain, self.block // FEW_BLOCKS))
+        return min(self.weights, max(0, int(SPARE * self.free) - beside))
+
+    @property
+    def room(self) -> int | None:
+        """Bytes for a block of splats; None for no limit."""
+        return None if self.free is None else int(SPARE * self.free) - self.codebooks - self.kept
 
     @property
     def blocks(self) -> int:
@@ -52,25 +73,29 @@ class DevicePlan:
     @property
     def peak(self) -> int:
         """The estimated peak, cut as it will be."""
-        return max(self.view, self.codebooks + self.block // self.blocks)
+        view = self.view if self.whole_views or self.free is None else int(ROOM_SPARE * self.free)
+        return self.kept + max(view, self.codebooks + self.block // self.blocks)
 
     def facts(self) -> dict[str, Any]:
         """What does not depend on what is free today."""
-        parts = {"view": self.view, "codebooks": self.codebooks, "all_splats": self.block}
-        return {"least_bytes": self.least, "parts": parts, "slices": self.slices}
+        parts = {"view": self.view, "region_weights": self.weights, "codebooks": self.codebooks}
+        return {"least_bytes": self.least, "parts": parts | {"all_splats": self.block}, "slices": self.slices}
 
     def today(self) -> dict[str, Any]:
         """What does."""
-        return {"free_bytes": self.free, "fits": self.fits, "blocks": self.blocks, "peak_bytes": self.peak}
+        cut = {"whole_views": self.whole_views, "blocks": self.blocks, "kept_bytes": self.kept}
+        return {"free_bytes": self.free, "fits": self.fits, **cut, "peak_bytes": self.peak}
 
     def line(self) -> str:
         """For people."""
         free = "" if self.free is None else f" of {self.free / MIB:.0f} MiB free"
+        views = "views in one piece" if self.whole_views else "views in strips, the scene in blocks from the host"
         cut = f"{self.blocks} blocks of splats" if self.blocks > 1 else "one block"
         slices = f" and {self.slices} slices of channels" if self.slices > 1 else ""
         parts = f"a view {self.view / MIB:.0f}, codebooks {self.codebooks / MIB:.0f}, W and sums of all splats"
         head = f"about {self.peak / MIB:.0f} MiB at the peak{free}" if self.fits else f"too little room{free}"
-        return f"{head} ({parts} {self.block / MIB:.0f}); solved in {cut}{slices}"
+        stays = f"{self.kept / MIB:.0f} of {self.weights / MIB:.0f} MiB of W stay there"
+        return f"{head} ({parts} {self.block / MIB:.0f}); {views}; {stays}; solved in {cut}{slices}"
 
 
 def device_plan(
@@ -87,25 +112,27 @@ def device_plan(
     """
     if device.kind == "cpu":
         return None
-    from liftcore.raster.gpu.memory import raster_bytes
+    from liftcore.raster.gpu.memory import least_raster_bytes, raster_bytes
 
-    sizes = {(camera.width, camera.height) for camera in cameras.values()}
     levels = most_levels(packs, cameras)
-    view = max(raster_bytes(splats.count, width, height, splats.kernel, levels) for width, height in sizes)
+    views = [
+        (splats.count, camera.width, camera.height, splats.kernel, levels)
+        for camera in {(camera.width, camera.height): camera for camera in cameras.values()}.values()
+    ]
     rows = sum(codebook_rows(packs, name) for name in cameras)
     slices = device_slices(rows, packs.channels)
     width = slices[0][1]
     entries = int(len(cameras) * seen_a_view * ENTRIES_A_SPLAT * levels)
-    free = device.free_bytes()
     return DevicePlan(
         name=device.name,
-        view=view,
+        view=max(raster_bytes(*view) for view in views),
+        least_view=max(least_raster_bytes(*view) for view in views),
+        weights=int(entries * ENTRY_BYTES),
         codebooks=book_bytes(rows, width, unit=False),
         block=block_bytes(splats.count, entries, width),
         grain=block_bytes(min(GRAIN, splats.count), math.ceil(entries * min(1.0, GRAIN / splats.count)), width),
         slices=len(slices),
-        room=None if free is None else block_room(free, rows, width, unit=False),
-        free=free,
+        free=device.free_bytes(),
     )
 
 

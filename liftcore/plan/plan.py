@@ -94,6 +94,11 @@ class Plan:
         yield f"  on {self.device.name}" + (f": {self.on_device.line()}" if self.on_device else "")
         yield from (f"warning: {warning}" for warning in self.warnings)
 
+    @property
+    def kept_on_card(self) -> int:
+        """Bytes of region weights that stay on the card between the walks and the solution."""
+        return self.on_device.kept if self.on_device else 0
+
     def _spare_line(self) -> str:
         if not self.spare:
             return ""

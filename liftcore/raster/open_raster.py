@@ -12,14 +12,16 @@ if TYPE_CHECKING:
     from liftcore.scene.splats import Splats
 
 
-def open_raster(splats: Splats, device: Device, threads: int | None = None) -> Raster:
+def open_raster(splats: Splats, device: Device, threads: int | None = None, kept: int = 0) -> Raster:
     """A for one scene, on the device.
 
     Args:
         threads: of the processor; None takes the cores that this process may use. The number changes no bit.
+        kept: bytes of region weights that stay on a card beside what walks there; 0 brings them back.
     """
     if device.kind == "cpu":
         return CpuRaster(splats, threads)
     from liftcore.raster.gpu.raster import GpuRaster  # loads triton
 
-    return GpuRaster(splats, device.place)
+    free = device.free_bytes()
+    return GpuRaster(splats, device.place, None if free is None else free - kept, stays=kept > 0)

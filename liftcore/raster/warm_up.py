@@ -13,11 +13,21 @@ from liftcore.scene.cameras import Camera
 from liftcore.scene.ply_dialect import scale_count
 from liftcore.scene.splats import Kernel, Splats
 
+PLAIN, ALL = Walk(), Weighting()
 
-def warm_up(kernel: Kernel = Kernel.GAUSSIAN_3D, device: Device = CPU) -> None:
+
+def warm_up(
+    kernel: Kernel = Kernel.GAUSSIAN_3D,
+    device: Device = CPU,
+    walk: Walk = PLAIN,
+    weighting: Weighting = ALL,
+) -> None:
     """Run every product once on one splat of the kernel. The first run on a machine compiles, later ones load.
 
-    Each kernel is compiled for itself, so a scene waits for its own alone.
+    Each kernel is compiled for itself, so a scene waits for its own alone; a card compiles each way of weighing too.
+
+    Args:
+        walk: that will lift. weighting: likewise.
     """
     splats = Splats(
         torch.tensor([[0.0, 0.0, 2.0]]),
@@ -31,7 +41,7 @@ def warm_up(kernel: Kernel = Kernel.GAUSSIAN_3D, device: Device = CPU) -> None:
     raster = open_raster(splats, device, threads=1)
     regions = RegionMap(torch.zeros(1, 1, 1, dtype=torch.int32), torch.ones(1, 1))
     for observation in (regions, FeatureGrid(torch.ones(1, 1, 1))):
-        raster.region_weights(camera, observation, Walk(), Weighting())
+        raster.region_weights(camera, observation, walk, weighting)
     raster.adjoint(camera, torch.ones(16, 16, 1), Walk())
     raster.row_sums(camera, Walk())
     raster.top_weights(camera, Walk(), 1)

@@ -12,6 +12,7 @@ from liftcore.observe.levels import at_levels
 from liftcore.observe.observation import FeatureGrid, Observation, RegionMap
 from liftcore.raster.protocol import RayRows, Walk, Weighting
 from liftcore.solve.readout import Readout, read_pixels, sample_pixels
+from liftcore.solve.totals import Totals, row_totals
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -20,10 +21,22 @@ if TYPE_CHECKING:
 
     from liftcore.observe.pack import FeaturePacks
     from liftcore.progress import Progress
-    from liftcore.raster.protocol import Raster, RegionWeights
+    from liftcore.raster.protocol import Raster
     from liftcore.scene.cameras import Camera, Cameras
     from liftcore.solve.settings import LiftSettings
     from liftcore.solve.view_weights import ViewWeights
+
+__all__ = [
+    "Geometry",
+    "SampledRays",
+    "accumulate",
+    "as_read",
+    "lift_walk",
+    "render_walk",
+    "row_totals",
+    "strided_walk",
+    "weighting_of",
+]
 
 
 @dataclass(frozen=True)
@@ -97,7 +110,7 @@ def accumulate(
         store: receives one RegionWeights a view.
     """
     count, cameras = scene
-    evidence, denominators = np.zeros(count), np.zeros(count)
+    totals = Totals(count, store.place)
     weighting = weighting_of(settings)
     samples, codebooks = [], []
     rays = -(-settings.certificate_rays // len(views))
@@ -105,19 +118,11 @@ def accumulate(
         camera, observation = cameras.get(name), as_read(packs.observation(name), settings, name)
         walk = strided_walk(lift_walk(settings), settings, camera, number)
         weights = raster.region_weights(camera, observation, walk, weighting)
-        evidence[weights.evidence_splats.numpy()] += weights.evidence.numpy() * float(settings.stride**2)
-        denominators[weights.splats.numpy()] += row_totals(weights)
+        totals.add(weights, float(settings.stride**2))
         store.append(weights)
         pixels = sample_pixels(camera, rays, (settings.seed, number), walk)
         readout = read_pixels(observation, camera, pixels)
         samples.append(SampledRays(raster.ray_rows(camera, pixels, walk), readout))
         codebooks.append(observation.codebook)
         progress("geometry", number + 1, len(views), "views")
-    return Geometry(evidence, denominators, tuple(samples), tuple(codebooks))
-
-
-def row_totals(weights: RegionWeights) -> np.ndarray:
-    """[n] f64, ``W 1``: the sum of each row."""
-    if weights.splats.numel() == 0:
-        return np.zeros(0)
-    return np.add.reduceat(weights.weights.numpy().astype(np.float64), weights.row_starts.numpy()[:-1])
+    return Geometry(*totals.found(), tuple(samples), tuple(codebooks))

@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -52,10 +53,7 @@ def splat_blocks(
 ) -> list[tuple[int, int]]:
     """(first, last) of the blocks: whole grains, as many as ``room`` bytes hold, at least one."""
     edges = np.append(np.arange(0, count, GRAIN), count)
-    entries = np.zeros(edges.size - 1, np.int64)
-    for view in store:
-        places = np.searchsorted(view.splats.numpy(), edges)
-        entries += np.diff(view.row_starts.numpy()[places])
+    entries = _entries_between(store, edges)
     blocks, first, held = [], 0, 0
     for grain, own in enumerate(entries.tolist()):
         grown = block_bytes(int(edges[grain + 1] - edges[first]), held + own, width)
@@ -64,3 +62,30 @@ def splat_blocks(
             first, held = grain, 0
         held += own
     return [*blocks, (int(edges[first]), count)]
+
+
+def _entries_between(store: Sequence[RegionWeights] | ViewWeights, edges: np.ndarray) -> np.ndarray:
+    """[n] i64, the entries of W of the splats between edges [n + 1], summed where they lie."""
+    sums: dict[torch.device, tuple[torch.Tensor, torch.Tensor]] = {}
+    for view in store:
+        place = view.splats.device
+        if place not in sums:
+            own = torch.from_numpy(edges).to(place, torch.int32)
+            sums[place] = own, torch.zeros(edges.size - 1, dtype=torch.int64, device=place)
+        own, total = sums[place]
+        total += view.row_starts[torch.searchsorted(view.splats, own)].diff()
+    return sum((total.cpu().numpy() for _, total in sums.values()), np.zeros(edges.size - 1, np.int64))
+
+
+def bounds_of(store: Sequence[RegionWeights] | ViewWeights, splats: tuple[int, int]) -> list[list[int]]:
+    """[V, 4]: first and last + 1 row of some splats in every view, and first and last + 1 entry; one wait a card."""
+    edges: dict[torch.device, torch.Tensor] = {}
+    found: dict[torch.device, list[torch.Tensor]] = {}
+    for view in store:
+        place = view.splats.device
+        if place not in edges:
+            edges[place] = torch.tensor(splats, dtype=torch.int32, device=place)
+        rows = torch.searchsorted(view.splats, edges[place])
+        found.setdefault(place, []).append(torch.cat([rows, view.row_starts[rows]]))
+    told = {place: iter(torch.stack(parts).tolist()) for place, parts in found.items()}
+    return [next(told[view.splats.device]) for view in store]

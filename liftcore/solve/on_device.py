@@ -19,8 +19,9 @@ import numpy as np
 import torch
 from torch.nn.functional import embedding_bag
 
+from liftcore.device import out_of_memory
 from liftcore.solve.closed_form import UNIT_TOLERANCE, Solution, fits_float16
-from liftcore.solve.device_blocks import GRAIN, block_room, device_slices, splat_blocks
+from liftcore.solve.device_blocks import GRAIN, block_room, bounds_of, device_slices, splat_blocks
 from liftcore.solve.feature_room import in_memory
 
 if TYPE_CHECKING:
@@ -69,7 +70,7 @@ def solve_on_device(
         room: where X is to lie, on the host.
 
     Raises:
-        torch.OutOfMemoryError: not even a grain of splats fits beside a slice of the codebooks.
+        RuntimeError: not even a grain of splats fits beside a slice of the codebooks (``device.out_of_memory``).
     """
     books = [codebooks(view) for view in range(len(store))]
     count, channels = denominators.shape[0], books[0].shape[1]
@@ -120,14 +121,15 @@ def _solve_fitting(work: _Work, own: _Slice, splats: tuple[int, int]) -> Iterato
         first, last = waiting.pop()
         try:
             _solve_block(work, own, (first, last))
-        except torch.OutOfMemoryError:
-            if last - first <= GRAIN:
+        except RuntimeError as error:
+            if not out_of_memory(error) or last - first <= GRAIN:
                 raise
-            torch.cuda.empty_cache()
-            middle = (first + last) // 2
-            waiting += [(middle, last), (first, middle)]
         else:
             yield last
+            continue
+        torch.cuda.empty_cache()  # out here the error no longer holds what the block held
+        middle = (first + last) // 2
+        waiting += [(middle, last), (first, middle)]
 
 
 def _solve_block(work: _Work, own: _Slice, splats: tuple[int, int]) -> None:
@@ -154,17 +156,15 @@ def rows_of(
         splats: (first, last). scale: [P] f64, what rows are multiplied with.
     """
     offset, base, gathered = splats[0], 0, []
-    for weights, book in zip(store, books, strict=True):
-        first, last = (int(k) for k in torch.searchsorted(weights.splats, torch.tensor(splats, dtype=torch.int32)))
-        begin, end = int(weights.row_starts[first]), int(weights.row_starts[last])
+    for weights, book, (first, last, begin, end) in zip(store, books, bounds_of(store, splats), strict=True):
         if begin < end:
-            lengths = torch.diff(weights.row_starts[first : last + 1])
-            columns = weights.columns[begin:end] + base
-            gathered.append((weights.splats[first:last], lengths, columns, weights.weights[begin:end]))
+            own = weights.splats[first:last], weights.row_starts[first : last + 1], weights.columns[begin:end]
+            ids, starts, columns, values = (part.to(place) for part in (*own, weights.weights[begin:end]))
+            gathered.append((ids, torch.diff(starts), columns + base, values))
         base += book.shape[0]
     if not gathered:
         return None
-    owners, lengths, columns, values = (torch.cat(part).to(place) for part in zip(*gathered, strict=True))
+    owners, lengths, columns, values = (torch.cat(part) for part in zip(*gathered, strict=True))
     owners, order = torch.sort(owners - offset, stable=True)  # of equal ones the earlier view stays first
     taken = _from_zero(lengths)[:-1][order]
     lengths = lengths[order]

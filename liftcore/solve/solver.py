@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING, Protocol
 
 import torch
 
+from liftcore.device import out_of_memory
 from liftcore.solve.closed_form import solve_closed_form
 from liftcore.solve.feature_room import in_memory
 from liftcore.solve.on_device import Place, solve_on_device
+from liftcore.solve.view_weights import ViewWeights
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -22,7 +24,6 @@ if TYPE_CHECKING:
     from liftcore.raster.protocol import RegionWeights
     from liftcore.solve.closed_form import Solution
     from liftcore.solve.feature_room import FeatureRoom
-    from liftcore.solve.view_weights import ViewWeights
 
 
 class ClosedForm(Protocol):
@@ -49,6 +50,26 @@ def closed_form_on(device: Device, threads: int | None, room: FeatureRoom = in_m
     """
     if device.kind == "cpu":
         return partial(solve_closed_form, threads=threads, room=room)
-    if device.place.type == "cuda":
-        torch.cuda.empty_cache()  # what the walks held, and need no more
-    return partial(solve_on_device, place=Place(device.place, device.free_bytes()), room=room)
+    return partial(_solve_on_card, device, room)
+
+
+def _solve_on_card(
+    device: Device,
+    feature_room: FeatureRoom,
+    store: Sequence[RegionWeights] | ViewWeights,
+    codebooks: Callable[[int], Tensor],
+    denominators: np.ndarray,
+    dtype: torch.dtype,
+    progress: Progress,
+) -> Solution:
+    """``solve_on_device``; weights that lie on the card are brought home when nothing else makes room there."""
+    while True:
+        if device.place.type == "cuda":
+            torch.cuda.empty_cache()  # what the walks held, and need no more
+        place = Place(device.place, device.free_bytes())
+        try:
+            return solve_on_device(store, codebooks, denominators, dtype, progress, place, feature_room)
+        except RuntimeError as error:
+            if not (out_of_memory(error) and isinstance(store, ViewWeights) and store.card_bytes):
+                raise
+        store.bring_home()

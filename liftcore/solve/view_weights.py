@@ -1,4 +1,4 @@
-"""Where W lives between geometry and solution: in memory while it is small, in mapped files beyond that."""
+"""Where W lives between geometry and solution: on the card that made it, in memory, in mapped files beyond that."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ import torch
 
 from liftcore.errors import Unavailable
 from liftcore.raster.protocol import RegionWeights
+from liftcore.raster.weights_home import on_host
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -28,10 +29,15 @@ class ViewWeights:
 
     Args:
         memory_limit: bytes that stay in memory; None takes MEMORY_LIMIT.
+        card: where weights are made, and how many bytes of them may stay there; None brings all of them home.
     """
 
-    def __init__(self, memory_limit: int | None = None) -> None:
+    def __init__(self, memory_limit: int | None = None, card: tuple[torch.device, int] | None = None) -> None:
         self._limit = MEMORY_LIMIT if memory_limit is None else memory_limit
+        self._card_limit = card[1] if card else 0
+        self.place = card[0] if card and card[1] else torch.device("cpu")  # where sums over views are made
+        self._on_card: set[int] = set()  # views
+        self.card_bytes = 0  # of them
         self._views: list[RegionWeights] = []
         self._folder: tempfile.TemporaryDirectory[str] | None = None
         self.bytes = 0  # in memory and in files
@@ -47,12 +53,29 @@ class ViewWeights:
 
     def append(self, weights: RegionWeights) -> None:
         """Keep the weights of the next view."""
-        size = sum(_array(weights, field.name).nbytes for field in fields(weights))
+        size, number = _size(weights), len(self._views)
+        if weights.columns.device == self.place and self.card_bytes + size <= self._card_limit:
+            self.card_bytes += size
+            self._on_card.add(number)
+            self._views.append(weights)
+        else:
+            self._views.append(self._at_home(weights, number))
+
+    def bring_home(self) -> None:
+        """Move what lies on the card to the host, as if it had never stayed."""
+        for number in sorted(self._on_card):
+            self._views[number] = self._at_home(self._views[number], number)
+        self._on_card.clear()
+        self.card_bytes = self._card_limit = 0
+
+    def _at_home(self, weights: RegionWeights, number: int) -> RegionWeights:
+        """In memory, or in files."""
+        weights, size = on_host(weights), _size(weights)
         self.bytes += size
-        if self.bytes > self._limit:
-            self.mapped_bytes += size
-            weights = self._to_file(weights)
-        self._views.append(weights)
+        if self.bytes <= self._limit:
+            return weights
+        self.mapped_bytes += size
+        return self._to_file(weights, number)
 
     def blank(self) -> ViewWeights:
         """The same sparsity with weights of their own, zero until they are written: columns are shared, not copied.
@@ -76,10 +99,10 @@ class ViewWeights:
                 os.posix_fallocate(file.fileno(), 0, path.stat().st_size)
         return torch.from_numpy(mapped)
 
-    def _to_file(self, weights: RegionWeights) -> RegionWeights:
+    def _to_file(self, weights: RegionWeights, number: int) -> RegionWeights:
         mapped = {}
         for field in fields(weights):
-            path = self._path(f"{len(self._views)}-{field.name}")
+            path = self._path(f"{number}-{field.name}")
             with _written():
                 np.save(path, _array(weights, field.name))
             mapped[field.name] = torch.from_numpy(np.load(path, mmap_mode="c"))
@@ -114,6 +137,10 @@ def _written() -> Iterator[None]:
         hint = "set TMPDIR to a folder with more room, or lift fewer views"
         got = error.strerror or str(error)
         raise Unavailable("weights", expected=f"disk for region weights in {folder}", got=got, hint=hint) from None
+
+
+def _size(weights: RegionWeights) -> int:
+    return sum(getattr(weights, field.name).nbytes for field in fields(weights))
 
 
 def _array(weights: RegionWeights, name: str) -> np.ndarray:

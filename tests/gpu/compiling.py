@@ -1,7 +1,9 @@
-"""Compile what the GPU backend launches for a card that is not here: ``python -m tests.gpu.compiling``.
+"""Compile what the GPU backend launches for cards that are not here: ``python -m tests.gpu.compiling``.
 
-The products run on tensors of the CPU as ever, but each launch is compiled from the arguments that it came with, down
-to machine code of an H100, and not run. Prints a line of JSON a kernel.
+The products run on tensors of the CPU as ever, but each launch is compiled from the arguments that it came with and
+the hints that Triton takes from them (which numbers are one, which numbers and addresses are multiples of 16), down
+to machine code, and not run. Prints a line of JSON a kernel and card, and one a kind of splat that says what of a
+lift's launches the warm-up had not.
 """
 
 from __future__ import annotations
@@ -10,49 +12,84 @@ import json
 import re
 import subprocess
 import tempfile
-from dataclasses import replace
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
 import triton
-from triton.backends.compiler import GPUTarget
-from triton.compiler import ASTSource
+from triton._C import libtriton
+from triton.backends.compiler import BaseBackend, GPUTarget
+from triton.compiler import ASTSource, make_backend
 
-from liftcore.raster.gpu import raster, rendering, selecting, sums, tracing, weighing
+from liftcore.device import Device
+from liftcore.raster.gpu import launching, raster, rendering, selecting, sums, tracing, weighing
 from liftcore.raster.protocol import Selection, Walk, Weighting
+from liftcore.raster.warm_up import warm_up
 from liftcore.scene.splats import Kernel
 from tests.scenes import random_camera, random_grid, random_regions, random_splats
 
 if TYPE_CHECKING:
-    from liftcore.scene.splats import Splats
+    from collections.abc import Callable
 
-H100 = GPUTarget("cuda", 90, 32)
+H100 = 90
+OTHERS = (75, 80, 89)  # the oldest, an A100 and Ada: what a lift of 3DGS launches most is compiled for them too
 _compile: Any = triton.compile
-_POINTERS = {torch.float32: "*fp32", torch.float64: "*fp64", torch.int32: "*i32", torch.int64: "*i64"}
-_SCALARS = {int: "i32", float: "fp32"}
+_specialised: Any = libtriton.native_specialize_impl
+_CARD = Device("cuda", torch.device("cpu"))
+TOP = Weighting(2, Selection.TOP_K, count=3)
 
 
-def compiled_launch(kernel: Any, programs: int, *arguments: object, warps: int = 4, **constants: object) -> None:
-    """In place of ``liftcore.raster.gpu.launching.launch``."""
-    del programs
-    signature, values = {}, dict(constants)
-    for name, argument in zip(kernel.arg_names, arguments, strict=False):
-        kind = _POINTERS[argument.dtype] if isinstance(argument, torch.Tensor) else _SCALARS[type(argument)]
-        if isinstance(argument, int) and argument == 1:  # Triton makes a kernel of its own for these
-            kind, values[name] = "constexpr", 1
-        signature[name] = kind
-    signature |= dict.fromkeys(constants, "constexpr")
-    assert list(signature) == list(kernel.arg_names)
-    source = ASTSource(fn=kernel, signature=signature, constexprs=values)
-    binary = _compile(source, target=H100, options={"num_warps": warps, "num_stages": 1, "enable_fp_fusion": False})
+@dataclass(frozen=True)
+class Launch:
+    """A kernel and what Triton would make of its arguments: what it is compiled from, and looked up by."""
+
+    kernel: Any
+    arguments: tuple[tuple[str, Any], ...]  # of each parameter its type, and a hint or its constant value
+    warps: int
+
+    @property
+    def name(self) -> str:
+        """The kernel's."""
+        return self.kernel.__name__
+
+    @property
+    def constants(self) -> dict[str, Any]:
+        """Those that it was given."""
+        named = zip(self.kernel.params, self.arguments, strict=True)
+        return {param.name: value for param, (_, value) in named if param.is_constexpr}
+
+
+def as_launched(kernel: Any, arguments: tuple[object, ...], warps: int, constants: dict[str, object]) -> Launch:
+    """The launch as Triton's own launcher would see it."""
+    found = []
+    for number, param in enumerate(kernel.params):
+        if param.is_constexpr:
+            found.append(("constexpr", constants[param.name]))
+            continue
+        hints = not param.do_not_specialize, not param.do_not_specialize_on_alignment
+        found.append(tuple(_specialised(BaseBackend, arguments[number], param.is_const, *hints)))
+    return Launch(kernel, tuple(found), warps)
+
+
+def compiled(launch: Launch, capability: int) -> dict[str, Any]:
+    """Compile a launch for a card, and say what came of it."""
+    target = GPUTarget("cuda", capability, 32)
+    backend, names = make_backend(target), [param.name for param in launch.kernel.params]
+    types = {name: kind for name, (kind, _) in zip(names, launch.arguments, strict=True)}
+    values = {name: value for name, (kind, value) in zip(names, launch.arguments, strict=True) if kind == "constexpr"}
+    hints = {(number,): backend.parse_attr(hint) for number, (kind, hint) in enumerate(launch.arguments)
+             if kind != "constexpr" and hint}  # fmt: skip
+    source = ASTSource(fn=launch.kernel, signature=types, constexprs=values, attrs=hints)
+    options = {"num_warps": launch.warps, "num_stages": 1, "enable_fp_fusion": False}
+    binary = _compile(source, target=target, options=options)
     code, ptx = binary.asm["cubin"], binary.asm["ptx"]
-    report = {
-        "kernel": kernel.__name__, "constants": constants, "machine_code": len(code), "stack": _stack(code),
-        "shared": binary.metadata.shared, "atomics": bool(re.search(r"\b(?:atom|red)\.", ptx)),
-        "approximate_log": "lg2.approx" in ptx,
+    return {
+        "kernel": launch.name, "card": capability, "constants": launch.constants, "hints": len(hints),
+        "machine_code": len(code), "stack": _stack(code), "shared": binary.metadata.shared,
+        "atomics": bool(re.search(r"\b(?:atom|red)\.", ptx)), "approximate_log": "lg2.approx" in ptx,
     }  # fmt: skip
-    print(json.dumps(report), flush=True)
 
 
 def _stack(machine_code: bytes) -> int:
@@ -65,29 +102,66 @@ def _stack(machine_code: bytes) -> int:
     return int(re.findall(r"STACK:(\d+)", told)[0])
 
 
-def _region_weights(splats: Splats, *, grid: bool, walk: Walk, weighting: Weighting) -> None:
-    observation = random_grid(3) if grid else random_regions(3)
+def launches_of(work: Callable[[], None]) -> dict[Launch, None]:
+    """What the work launches, each once."""
+    found: dict[Launch, None] = {}
+
+    def note(
+        kernel: Any, programs: int, *arguments: object, warps: int = launching.WARPS, **constants: object
+    ) -> None:
+        if programs:
+            found[as_launched(kernel, arguments, warps, constants)] = None
+        for argument in arguments:  # what nothing wrote would be nought, and nothing be summed up
+            if isinstance(argument, torch.Tensor) and argument.dtype == torch.float32:
+                argument.fill_(1.0)
+
+    modules: list[Any] = [rendering, selecting, sums, tracing, weighing]
+    for module in modules:
+        module.launch = note
+    work()
+    return found
+
+
+def _views(kernel: Kernel, walk: Walk, weighting: Weighting) -> None:
+    """A lift's questions about two views that have no size in common; of grids for 3DGS alone."""
+    splats = random_splats(3, kernel=kernel)
     gpu = raster.GpuRaster(splats, torch.device("cpu"))
-    gpu.region_weights(random_camera(3), observation, walk, weighting)
+    for width, height in ((32, 16), (161, 95)):
+        camera = random_camera(3, width, height)
+        for observation in (random_regions(3), random_grid(3))[: 2 if kernel is Kernel.GAUSSIAN_3D else 1]:
+            gpu.region_weights(camera, observation, walk, weighting)
+        gpu.ray_rows(camera, torch.zeros(1, 2, dtype=torch.int32), walk)
+        gpu.ray_rows(camera, torch.zeros(17, 2, dtype=torch.int32), walk)
 
 
-def main() -> None:
-    """The kernels of a lift for every kind of splat and more than one weighting, and all others for 3DGS."""
-    for module in (rendering, selecting, sums, tracing, weighing):
-        vars(module)["launch"] = compiled_launch
-    raster.check_device = lambda _device: None
-    for kernel in (Kernel.GAUSSIAN_2D, Kernel.BETA):
-        _region_weights(random_splats(3, kernel=kernel), grid=False, walk=Walk(), weighting=Weighting())
+def _every_product() -> None:
+    """One of each for 3DGS."""
     splats, camera = random_splats(3), random_camera(3)
-    top = Weighting(2, Selection.TOP_K, count=3)
-    _region_weights(splats, grid=True, walk=Walk(gain=1.2), weighting=top)
-    _region_weights(splats, grid=False, walk=Walk(), weighting=replace(top, selection=Selection.CENTRE))
     gpu = raster.GpuRaster(splats, torch.device("cpu"))
+    gpu.region_weights(camera, random_regions(3), Walk(), Weighting(2, Selection.CENTRE))
     gpu.render(camera, torch.zeros(splats.count, rendering.WIDEST), Walk())
     gpu.adjoint(camera, torch.zeros(camera.height, camera.width, weighing.WIDEST), Walk())
     gpu.strongest_labels(camera, torch.zeros(splats.count, dtype=torch.int32), Walk())
-    gpu.ray_rows(camera, torch.zeros(1, 2, dtype=torch.int32), Walk())
     gpu.row_sums(random_camera(3, 1, 1), Walk())
+
+
+def main() -> None:
+    """The kernels of lifts of every kind of splat and all others on an H100, and some of them on more cards."""
+    raster.check_device = lambda _device: None
+    every: dict[Launch, None] = {}
+    for kernel in Kernel:
+        how = (Walk(gain=1.2), TOP) if kernel is Kernel.GAUSSIAN_3D else (Walk(), Weighting())
+        warm = launches_of(partial(warm_up, kernel, _CARD, *how))
+        lift = launches_of(partial(_views, kernel, *how))
+        later = sorted({launch.name for launch in lift if launch not in warm})
+        print(json.dumps({"kernel": str(kernel), "launches": len(lift), "compiled_in_the_lift": later}), flush=True)
+        every |= lift
+    every |= launches_of(_every_product)
+    names = ("_weigh", "_add_runs", "_trace")
+    everywhere = [next(launch for launch in every if launch.name == name) for name in names]
+    for launch in every:
+        for card in (H100, *OTHERS) if launch in everywhere else (H100,):
+            print(json.dumps(compiled(launch, card)), flush=True)
 
 
 if __name__ == "__main__":

@@ -5,6 +5,8 @@ from __future__ import annotations
 import subprocess
 import sys
 from dataclasses import replace
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -13,12 +15,18 @@ import torch
 from liftcore.errors import InvalidInput, InvalidSettings, Unavailable
 from liftcore.observe.observation import RegionMap
 from liftcore.raster.cpu import CpuRaster
+from liftcore.raster.gpu.frame import Frame
+from liftcore.raster.gpu.sums import Pieces, sums_by_unit
 from liftcore.raster.oracle import OracleRaster
 from liftcore.raster.protocol import RegionWeights, Selection, Walk, Weighting
 from liftcore.scene.splats import Kernel
 from tests.backends import gpu_raster, needs_triton
 from tests.properties.test_raster_conformance import INSIDE, dense
 from tests.scenes import random_camera, random_grid, random_regions, random_splats
+
+if TYPE_CHECKING:
+    from liftcore.raster.gpu.raster import GpuRaster
+    from liftcore.scene.cameras import Camera
 
 pytestmark = [needs_triton, pytest.mark.usefixtures("every_kernel")]
 WALK = Walk(gain=1.2)
@@ -28,6 +36,10 @@ WEIGHTINGS = (
     Weighting(2, Selection.FRONT_MASS, mass=0.6, floor=0.02),
     Weighting(1, Selection.CENTRE),
 )
+
+
+DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+FULL = RuntimeError("Triton Error [CUDA]: out of memory")  # the driver's word for it
 
 
 def as_parts(weights: RegionWeights) -> list[torch.Tensor]:
@@ -41,7 +53,7 @@ def test_both_backends_list_the_same_splats_in_every_tile(kernel):
     lists = next(ours._frame(camera, Walk()).lists())
     frame = theirs._frame(camera, Walk())
     assert np.array_equal(lists.starts.cpu().numpy(), frame.starts)
-    assert np.array_equal(ours._frame(camera, Walk()).ids[lists.items.long()].cpu().numpy(), frame.ids[frame.items])
+    assert np.array_equal(lists.ids[lists.items.long()].cpu().numpy(), frame.ids[frame.items])
 
 
 @pytest.mark.parametrize("weighting", WEIGHTINGS, ids=lambda weighting: str(weighting.selection))
@@ -71,35 +83,88 @@ def test_every_run_gives_the_same_bits():
     assert all(torch.equal(first, second) for first, second in zip(*runs, strict=True))
 
 
-def test_a_view_in_pieces_is_the_view(monkeypatch):
-    """Bands of tile rows, runs of tiles and parts of sums, each far smaller than they are for."""
-    splats, camera = random_splats(8, 24), random_camera(8, 20, 36)
-    image = torch.rand(36, 20, 2, generator=torch.Generator().manual_seed(0))
-    top = Weighting(1, Selection.TOP_K, count=2)
-    pixels = torch.tensor([[0, 0], [19, 35], [10, 20]], dtype=torch.int32)
+def top_two(raster: GpuRaster, camera: Camera) -> list[torch.Tensor]:
+    """Region weights in two walks, of a scene of 16 splats."""
+    choice = Weighting(1, Selection.TOP_K, count=2)
+    return as_parts(raster.region_weights(camera, random_grid(8), WALK, choice))
 
-    def products() -> list[torch.Tensor]:
-        raster = gpu_raster(splats)
-        weights = raster.region_weights(camera, random_grid(8), WALK, top)
-        rows = raster.ray_rows(camera, pixels, WALK)
-        labels = torch.arange(24, dtype=torch.int32) % 20 - 1
-        return [
-            torch.from_numpy(dense(weights, 24, 63)), weights.evidence, raster.row_sums(camera, WALK),
-            raster.adjoint(camera, image, WALK), raster.strongest_labels(camera, labels, WALK),
-            *raster.top_weights(camera, WALK, 3), rows.row_starts, rows.splats, rows.weights,
-        ]  # fmt: skip
 
-    whole = products()
-    monkeypatch.setattr("liftcore.raster.gpu.tile_lists.LIST_ITEMS", 10)
-    monkeypatch.setattr("liftcore.raster.gpu.tile_lists.SPLATS_AT_ONCE", 5)
-    monkeypatch.setattr("liftcore.raster.gpu.projection.SPLATS_AT_ONCE", 10)
-    monkeypatch.setattr("liftcore.raster.gpu.frame.TILES_AT_ONCE", 2)
-    monkeypatch.setattr("liftcore.raster.gpu.frame.TABLE_FLOATS", 60)
+def every_product(raster: GpuRaster, camera: Camera) -> list[torch.Tensor]:
+    """One of each."""
+    image = torch.rand(camera.height, camera.width, 2, generator=torch.Generator().manual_seed(0))
+    pixels = torch.tensor([[16, 35], [0, 0], [10, 20], [1, 0]], dtype=torch.int32)
+    rows = raster.ray_rows(camera, pixels, WALK)
+    labels = torch.arange(16, dtype=torch.int32) - 1
+    return [
+        *top_two(raster, camera), *as_parts(raster.region_weights(camera, random_regions(8), WALK, Weighting(2))),
+        rows.row_starts, rows.splats, rows.weights, raster.row_sums(camera, WALK),
+        raster.adjoint(camera, image, WALK), raster.strongest_labels(camera, labels, WALK),
+        *raster.top_weights(camera, WALK, 3),
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("kernel", [Kernel.GAUSSIAN_3D, Kernel.GAUSSIAN_2D])
+def test_no_bit_depends_on_the_memory_that_is_free(monkeypatch, kernel):
+    """Blocks of the scene, strips of tile rows, runs of tiles and parts of sums, all as small as they go."""
+    splats, camera = random_splats(8, 16, kernel=kernel), random_camera(8, 17, 36)
+    products = every_product if kernel is Kernel.GAUSSIAN_3D else top_two
+    monkeypatch.setattr("liftcore.raster.gpu.frame.UNIT", 1)
     monkeypatch.setattr("liftcore.raster.gpu.sums.PART", 3)
-    monkeypatch.setattr("liftcore.raster.gpu.weighing.ENTRIES", 7)
-    assert len(list(gpu_raster(splats)._frame(camera, WALK).lists())) == 3
-    for first, second in zip(whole, products(), strict=True):
-        assert torch.allclose(first.double(), second.double(), rtol=1e-6, atol=1e-7)
+    whole = products(gpu_raster(splats), camera)
+    for least in ("SPLATS", "ITEMS", "TILES", "TABLE", "ENTRY_BYTES", "KEPT"):
+        monkeypatch.setattr(f"liftcore.raster.gpu.room.LEAST_{least}", 7 if least == "SPLATS" else 1)
+    tight = gpu_raster(splats, free=1)
+    for first, second in zip(whole, products(tight, camera), strict=True):
+        assert first.numel() and torch.equal(first, second)
+    frame = tight._frame(camera, WALK)
+    assert frame.bands == [(0, 1), (1, 2), (2, 3)] and frame.room.splats == 7
+    assert [len(frame.tile_runs(lists)) for lists in frame.lists()] == [2, 2, 2]
+    assert tight._scene_with(WALK.gain).means.device.type == "cpu"  # it comes in blocks
+    assert all(lists.ids.numel() < splats.count for lists in frame.lists())  # a strip's own splats alone
+
+
+def test_sums_do_not_know_in_which_pieces_their_terms_came():
+    """Terms of both signs and thirty orders of magnitude: another order of adding them is another sum."""
+    rng = torch.Generator().manual_seed(0)
+    keys = torch.randint(0, 5, (400,), generator=rng, dtype=torch.int32)
+    units = torch.sort(torch.randint(0, 9, (400,), generator=rng, dtype=torch.int32)).values
+    values = (torch.randn(400, 2, generator=rng) * 10 ** (30 * torch.rand(400, 2, generator=rng) - 15)).to(DEVICE)
+
+    def summed(cuts: list[int], room: int | None) -> list[torch.Tensor]:
+        pieces = Pieces(DEVICE, room)
+        for begin, end in pairwise([0, *cuts, 400]):
+            own = slice(begin, end)
+            pieces.add(sums_by_unit(keys[own].to(DEVICE), units[own].to(DEVICE), values[own]))
+        found = list(pieces.joined(5))
+        assert len(found) == (1 if room is None else 5)
+        return [torch.cat(column) for column in zip(*found, strict=True)]
+
+    whole, begins = summed([], None), (units.diff().nonzero()[:, 0] + 1).tolist()
+    for other in (summed(begins, None), summed(begins[::3], 1), summed(begins, 1)):
+        assert all(torch.equal(first, second) for first, second in zip(whole, other, strict=True))
+    split = summed([begins[0] + 7], None)  # inside a unit
+    assert not torch.equal(whole[1], split[1])
+
+
+def test_memory_that_runs_out_is_made_do_with(monkeypatch):
+    """A card with less room than it said: the same answer from smaller pieces."""
+    splats, camera = random_splats(8, 24), random_camera(8, 20, 36)
+    whole = gpu_raster(splats).row_sums(camera, WALK)
+    tries = []
+
+    def crowded(*arguments: Any) -> Frame:
+        tries.append(arguments[2].footprints)
+        if len(tries) < 3:
+            raise (torch.OutOfMemoryError("CUDA out of memory.") if len(tries) == 1 else FULL)
+        return Frame(*arguments)
+
+    monkeypatch.setattr("liftcore.raster.gpu.raster.Frame", crowded)
+    monkeypatch.setattr("liftcore.raster.gpu.raster.LEAST_FREE", 1)
+    assert torch.equal(gpu_raster(splats, free=1 << 40).row_sums(camera, WALK), whole)
+    assert tries == [None, None, None]  # half of so much is still ample
+    tries.clear()
+    assert torch.equal(gpu_raster(splats, free=1 << 10).row_sums(camera, WALK), whole)
+    assert tries[0] > tries[1] > tries[2] > 0
 
 
 def test_depth_ties_keep_the_order_of_the_file():
@@ -174,14 +239,23 @@ def test_bad_arguments_are_refused_in_words():
         raster.row_sums(camera, Walk(antialiased=True))
 
 
-def test_memory_that_runs_out_is_told_in_words(monkeypatch):
+@pytest.mark.parametrize("error", [torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB."), FULL])
+def test_memory_that_runs_out_for_good_is_told_in_words(monkeypatch, error):
     def full(*_arguments: object) -> None:
-        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.")
+        raise error
 
     raster = gpu_raster(random_splats(0, 4))
     monkeypatch.setattr("liftcore.raster.gpu.raster.Frame", full)
-    with pytest.raises(Unavailable, match="free memory on the device"):
+    with pytest.raises(Unavailable, match="footprints and lists of a row of tiles") as caught:
         raster.row_sums(random_camera(0), Walk())
+    assert caught.value.got == str(error) and caught.value.hint
+    monkeypatch.setattr("liftcore.raster.gpu.raster.Frame", lambda *_: broken())
+    with pytest.raises(RuntimeError, match="illegal"):  # what is no lack of memory is not told as one
+        raster.row_sums(random_camera(0), Walk())
+
+
+def broken() -> None:
+    raise RuntimeError("Triton Error [CUDA]: an illegal memory access was encountered")
 
 
 def test_without_a_card_or_the_interpreter_the_backend_says_so():

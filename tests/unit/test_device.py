@@ -115,27 +115,35 @@ def test_room_that_ends_in_the_middle_is_said_in_words(card: pytest.MonkeyPatch)
         within_memory(CARD),
     ):
         raise torch.OutOfMemoryError
+    with pytest.raises(Unavailable, match="too little"), within_memory(CARD):
+        raise RuntimeError("Triton Error [CUDA]: out of memory")
+    with pytest.raises(ValueError, match="memory"), within_memory(CARD):  # no device's
+        raise ValueError("out of memory")
+    with pytest.raises(RuntimeError, match="illegal"), within_memory(CARD):
+        raise RuntimeError("Triton Error [CUDA]: an illegal memory access was encountered")
 
 
 def device_plan_with(free: int | None) -> DevicePlan:
-    room = None if free is None else int(0.8 * free) - GIB
-    return DevicePlan("Card", 2 * GIB, GIB, 10 * GIB, GIB // 2, 1, room, free)
+    return DevicePlan("Card", 2 * GIB, GIB, 3 * GIB, GIB, 10 * GIB, GIB // 2, 1, free)
 
 
 def test_plan_cuts_what_is_larger_than_the_card() -> None:
     roomy, tight, without = device_plan_with(64 * GIB), device_plan_with(4 * GIB), device_plan_with(None)
-    assert (roomy.fits, roomy.blocks, roomy.peak) == (True, 1, 11 * GIB)
-    assert (without.fits, without.blocks) == (True, 1)
-    assert (tight.fits, tight.blocks) == (True, 5)
-    assert tight.peak == 3 * GIB < 4 * GIB
-    assert "5 blocks" in tight.line() and "4096 MiB free" in tight.line()
+    assert (roomy.fits, roomy.blocks, roomy.kept, roomy.peak) == (True, 1, 3 * GIB, 14 * GIB)
+    assert (without.fits, without.blocks, without.kept) == (True, 1, 3 * GIB)
+    assert (tight.fits, tight.blocks, tight.whole_views) == (True, 8, True)
+    assert 0 < tight.kept < 3 * GIB and tight.peak <= 0.9 * 4 * GIB
+    assert "8 blocks" in tight.line() and "4096 MiB free" in tight.line() and "views in one piece" in tight.line()
+    strips = device_plan_with(2 * GIB)
+    assert (strips.fits, strips.whole_views, strips.kept) == (True, False, 0)
+    assert "views in strips" in strips.line() and strips.peak <= 0.9 * 2 * GIB
     assert roomy.facts() == tight.facts()  # equal inputs give equal certificates
 
 
 def test_plan_that_cannot_be_cut_to_fit_is_refused_or_left_to_the_processor() -> None:
-    small = device_plan_with(int(1.5 * GIB))
+    small = device_plan_with(int(0.9 * GIB))
     assert not small.fits and "too little room" in small.line()
-    with pytest.raises(Unavailable, match=r"2\.0 GiB of free memory on Card, got 1\.5 GiB"):
+    with pytest.raises(Unavailable, match=r"1\.9 GiB of free memory on Card, got 0\.9 GiB"):
         check_device_room(small, "cuda")
     assert "the processor lifts" in check_device_room(small, "auto")[0]
     assert check_device_room(device_plan_with(4 * GIB), "cuda") == []

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from liftcore.raster.gpu.projection import Seen
-    from liftcore.raster.gpu.scene import DeviceScene
+    from liftcore.raster.gpu.scene import Block
     from liftcore.raster.projection import View
 
 _MARGIN = 1e-3  # px that an outline is wider than the crossings, for float32 at its edge
@@ -50,8 +50,8 @@ Ellipse = tuple["Tensor", "Tensor", "Tensor", "Tensor", "Tensor", "Tensor", "Ten
 """mx, my, slope, kx, ky, reach, extent_x, extent_y, lean: the outline of ``Outlines``."""
 
 
-def project_discs(scene: DeviceScene, view: View, seen: Seen) -> tuple[Footprints, Tensor]:
-    """The footprints of the discs that touch the image, and their depths [n] f64, in the order of the file."""
+def project_discs(block: Block, view: View, seen: Seen) -> tuple[Footprints, Tensor]:
+    """The footprints of the discs that touch the image, and their depths [n] f64, in the block's order."""
     fx, fy, cx, cy = view.intrinsics.tolist()
     curvature = 2.0 * HALF_LOG2_E * LOW_PASS / view.low_pass  # of exp(-g / 2), g = 2 |p - mu|^2 in full pixels
     near = torch.sqrt(seen.reach / curvature)
@@ -64,15 +64,15 @@ def project_discs(scene: DeviceScene, view: View, seen: Seen) -> tuple[Footprint
     touches = (right >= 0.5) & (left <= view.width - 0.5) & (bottom >= 0.5) & (top <= view.height - 0.5)
     kept = touches.nonzero()[:, 0]
     outlines = Outlines(*ellipse, mx, my, near).at(kept)
-    ids, mx, my, forms = seen.ids[kept], mx[kept], my[kept], forms[kept]
+    rows, mx, my, forms = seen.rows[kept], mx[kept], my[kept], forms[kept]
     places = mx.new_zeros(mx.shape[0], PLACE)
     places[:, CENTRE_X], places[:, CENTRE_Y] = mx, my
     places[:, [S_X, S_Y, T_X, T_Y, D_ZERO, D_X, D_Y]] = forms
     inks = mx.new_zeros(mx.shape[0], INK, dtype=torch.float32)
-    inks[:, OPACITY], inks[:, PLAIN], inks[:, KX] = scene.opacity[ids], scene.plain[ids], curvature
+    inks[:, OPACITY], inks[:, PLAIN], inks[:, KX] = block.scene.opacity[rows], block.scene.plain[rows], curvature
     for form, step, rest in ((0, S_STEP, S_STEP_REST), (2, T_STEP, T_STEP_REST), (5, D_STEP, D_STEP_REST)):
         inks[:, step], inks[:, rest] = _halved(forms[:, form])
-    return Footprints(ids.to(torch.int32), outlines, places, inks), seen.z[kept]
+    return Footprints(block.ids[rows].to(torch.int32), outlines, places, inks), seen.z[kept]
 
 
 def _halved(values: Tensor) -> tuple[Tensor, Tensor]:

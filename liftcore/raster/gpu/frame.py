@@ -8,72 +8,123 @@ import torch
 
 from liftcore.raster.constants import TILE
 from liftcore.raster.gpu.falloffs import FLOORS, KINDS
-from liftcore.raster.gpu.projection import project
-from liftcore.raster.gpu.tile_lists import bands_of, lists_of, spans_of
+from liftcore.raster.gpu.projection import project, project_again
+from liftcore.raster.gpu.room import footprint_bytes
+from liftcore.raster.gpu.survey import strips_of, survey
+from liftcore.raster.gpu.tile_lists import bands_of, items_by_row, lists_of, spans_of
 from liftcore.raster.gpu.walk import PART, PARTS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     from torch import Tensor
 
-    from liftcore.raster.gpu.scene import DeviceScene
+    from liftcore.raster.gpu.projection import Projection
+    from liftcore.raster.gpu.room import Room
     from liftcore.raster.gpu.tile_lists import Lists
-    from liftcore.raster.projection import View
     from liftcore.raster.protocol import Walk
-    from liftcore.scene.splats import Kernel
 
-TILES_AT_ONCE = 4096  # programs of a launch, each with scratch of its own
-TABLE_FLOATS = 1 << 26  # of a launch's table of sums; a single tile may need more
+UNIT = 16  # tiles in a row whose sums are made together; launches begin and end with them
 
 
 class Frame:
-    """One view, projected. All cuts follow from the scene and the view, never from what memory happens to be free."""
+    """One view, cut as the room asks. Where a cut falls changes no bit of what is made from it.
 
-    def __init__(self, scene: DeviceScene, view: View, kernel: Kernel, walk: Walk) -> None:
-        footprints = project(scene, view, kernel, walk.antialiased)
+    With room for all footprints they are made once and kept, and lists come band by band. Without, the scene is
+    surveyed in blocks, and each strip of tile rows projects its own splats again.
+
+    Args:
+        projection: of the scene. walk: how its rays go. room: for the pieces.
+    """
+
+    def __init__(self, projection: Projection, walk: Walk, room: Room) -> None:
+        view, kernel = projection.view, projection.kernel
+        self.device, self.room = projection.device, room
         self.width, self.height = view.width, view.height
         self.columns, self.rows = -(-view.width // TILE), -(-view.height // TILE)
-        self.ids = footprints.ids  # [n] i32, the splat of a footprint
-        self.splats = footprints.places, footprints.inks  # as the kernels take them
         self.size = self.columns, self.width, self.height
         self.cuts = walk.alpha_cap, walk.transmittance_stop, FLOORS[kernel]
         self.kind = KINDS[kernel]
-        self._spans = spans_of(footprints.outlines, self.rows, self.columns)
-        self._bands = bands_of(self._spans, self.rows)
+        self._projection = projection
         self._lists: Lists | None = None
+        if self.room.footprints is None:
+            self._whole = project(self._projection)
+            self._spans = spans_of(self._whole.outlines, (0, self.rows), self.columns, self.room.spanned)
+            self.bands = bands_of(items_by_row(self._spans, self.rows).tolist(), self.room.items)
+        else:
+            self._whole = None
+            self._survey = survey(self._projection, (self.rows, self.columns), self.room)
+            self.bands = strips_of(self._survey, footprint_bytes(kernel), self.room)
 
-    @property
-    def device(self) -> torch.device:
-        """Where it lies."""
-        return self.ids.device
+    def lists(self, wanted: Sequence[tuple[int, int]] | None = None) -> Iterator[Lists]:
+        """The tile lists, band by band, of all bands or the wanted ones; those of a view of one band are kept."""
+        for band in self.bands if wanted is None else wanted:
+            if self._lists is not None:
+                yield self._lists
+                continue
+            made = self._lists_of(band)
+            if len(self.bands) == 1:
+                self._lists = made
+            yield made
 
-    def lists(self) -> Iterator[Lists]:
-        """The tile lists, band by band; those of a view of one band are kept."""
-        if len(self._bands) > 1:
-            for band in self._bands:
-                yield lists_of(self._spans, band, self.columns)
-            return
-        if self._lists is None:
-            self._lists = lists_of(self._spans, self._bands[0], self.columns)
-        yield self._lists
+    def _lists_of(self, band: tuple[int, int]) -> Lists:
+        if self._whole is not None:
+            return lists_of(self._whole, self._spans, band, self.columns)
+        footprints = project_again(self._projection, self._survey.within(band))
+        spans = spans_of(footprints.outlines, band, self.columns, self.room.spanned)
+        return lists_of(footprints, spans, band, self.columns)
 
     def scratch(self, tiles: int, parts: int = PARTS) -> Tensor:
         """Room for the chunks of ``tiles`` programs."""
         return torch.empty(tiles * parts * PART, dtype=torch.float32, device=self.device)
 
+    def tile_runs(self, lists: Lists) -> list[tuple[int, int]]:
+        """Runs ``(first, last + 1)`` of a band's tiles, whole units, for one launch each."""
+        runs, first = [], 0
+        ends = self.unit_ends(0, lists.tiles)
+        for unit, end in zip([0, *ends], ends, strict=False):
+            if unit > first and end - first > self.room.tiles:
+                runs.append((first, unit))
+                first = unit
+        return [*runs, (first, lists.tiles)]
 
-def tile_runs(lists: Lists) -> list[tuple[int, int]]:
-    """Runs ``(first, last + 1)`` of a band's tiles, for one launch each."""
-    return [(first, min(first + TILES_AT_ONCE, lists.tiles)) for first in range(0, lists.tiles, TILES_AT_ONCE)]
+    def table_runs(self, tiles: tuple[int, int], sizes: Tensor) -> list[tuple[int, int, int]]:
+        """Runs of whole units whose tables stay within the room together, and the floats of each.
 
+        Args:
+            tiles: first and last + 1, whole units. sizes: [tiles] i64, floats of a tile's table.
+        """
+        ends = self.unit_ends(*tiles)
+        firsts = [tiles[0], *ends[:-1]]
+        totals = torch.cumsum(sizes, 0)[torch.tensor(ends, device=sizes.device) - tiles[0] - 1].tolist()
+        runs, begun, before, last = [], tiles[0], 0, 0
+        for unit, total in zip(firsts, totals, strict=True):
+            if unit > begun and total - before > self.room.table:
+                runs.append((begun, unit, last - before))
+                begun, before = unit, last
+            last = total
+        return [*runs, (begun, tiles[1], last - before)]
 
-def table_runs(first: int, sizes: list[int]) -> list[tuple[int, int]]:
-    """Runs of the tiles from ``first`` on whose tables of ``sizes`` floats stay within ``TABLE_FLOATS`` together."""
-    runs, begun, held = [], 0, 0
-    for tile, size in enumerate(sizes):
-        if tile > begun and held + size > TABLE_FLOATS:
-            runs.append((first + begun, first + tile))
-            begun, held = tile, 0
-        held += size
-    return [*runs, (first + begun, first + len(sizes))]
+    def unit_of(self, tiles: Tensor) -> Tensor:
+        """The unit of tiles of the view [n], i32, ascending as they are."""
+        return (tiles // self.columns * -(-self.columns // UNIT) + tiles % self.columns // UNIT).to(torch.int32)
+
+    def unit_ends(self, first: int, last: int) -> list[int]:
+        """Where the units of the tiles ``first..last`` of a band end."""
+        begins = [
+            row + column
+            for row in range(first // self.columns * self.columns, last, self.columns)
+            for column in range(0, self.columns, UNIT)
+        ]
+        return [begin for begin in begins if first < begin < last] + [last]
+
+    def of_band(self, image: Tensor, lists: Lists) -> Tensor:
+        """The rows of an image [H, W, C] f32 of the host that a band shows, on the device."""
+        top = lists.first_row * TILE
+        return image[top : top + lists.tiles // self.columns * TILE].to(self.device, torch.float32).contiguous()
+
+    def of_splats(self, values: Tensor, lists: Lists) -> Tensor:
+        """Rows [P, ...] of splats, on the host, as rows of a band's footprints, on the device."""
+        if self.room.footprints is None:
+            return values.to(self.device)[lists.ids.long()]
+        return values[lists.ids.long().cpu()].to(self.device)

@@ -7,6 +7,7 @@ here on. All launches pass through ``launch``, with the same options.
 from __future__ import annotations
 
 from contextlib import nullcontext
+from inspect import signature
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,9 +26,18 @@ _triton: Any = triton
 WARPS = 4  # of 32 threads, a program: two pixels of a tile a thread
 
 
+# Numbers that change from view to view. A kernel of its own for 1 and for multiples of 16 would be compiled in the
+# middle of a lift.
+COUNTS = frozenset(
+    {"band_tile", "own_tile", "slots_tile", "columns", "width", "height", "count", "runs"}
+)  # fmt: skip
+
+
 def jit(function: Callable) -> Any:
     """A Triton kernel, or a function that kernels call."""
-    return triton.jit(function)
+    return _triton.jit(
+        function, do_not_specialize=[name for name in signature(function).parameters if name in COUNTS]
+    )
 
 
 def interpreted() -> bool:

@@ -12,23 +12,46 @@ import torch
 
 from liftcore.raster.constants import NEAR_PLANE
 from liftcore.raster.gpu.discs import project_discs
-from liftcore.raster.gpu.scene import BETA, INK, KX, KY, MX, MY, OPACITY, PLACE, PLAIN, SLOPE, Footprints, Outlines
+from liftcore.raster.gpu.scene import (
+    BETA,
+    INK,
+    KX,
+    KY,
+    MX,
+    MY,
+    OPACITY,
+    PLACE,
+    PLAIN,
+    SLOPE,
+    Footprints,
+    Outlines,
+    block_of,
+)
 from liftcore.raster.projection import HALF_LOG2_E
 from liftcore.scene.splats import Kernel
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from liftcore.raster.gpu.scene import DeviceScene
+    from liftcore.raster.gpu.scene import Block, DeviceScene
     from liftcore.raster.projection import View
 
-SPLATS_AT_ONCE = 1 << 20  # bounds the memory of what lies between a splat and its footprint
+
+class Projection(NamedTuple):
+    """How a view projects the splats of a scene."""
+
+    scene: DeviceScene  # on the device, or on the host, from where it comes in blocks
+    view: View
+    kernel: Kernel
+    antialiased: bool
+    device: torch.device
+    at_once: int  # splats: bounds the memory of what lies between a splat and its footprint
 
 
 class Seen(NamedTuple):
     """Splats before the camera, their centres and axes in its frame."""
 
-    ids: Tensor  # [n] i64
+    rows: Tensor  # [n] i64, of their block
     x: Tensor  # [n] f64
     y: Tensor
     z: Tensor
@@ -36,39 +59,63 @@ class Seen(NamedTuple):
     reach: Tensor  # [n] f64
 
 
-def project(scene: DeviceScene, view: View, kernel: Kernel, antialiased: bool) -> Footprints:
+def footprints_of(projection: Projection, rows: slice | Tensor) -> tuple[Footprints, Tensor]:
+    """The footprints of the splats among ``rows`` that touch the image, in their order, and their depths [n] f32."""
+    block = block_of(projection.scene, rows, projection.device)
+    seen = _before_the_camera(block, projection.view)
+    if projection.kernel is Kernel.GAUSSIAN_2D:
+        part, z = project_discs(block, projection.view, seen)
+    else:
+        unit = 1.0 if projection.kernel is Kernel.BETA else HALF_LOG2_E
+        part, z = _project_ellipses(block, projection.view, seen, unit, projection.antialiased)
+    return part, z.to(torch.float32)
+
+
+def project(projection: Projection) -> Footprints:
     """The footprints of all splats that touch the image, near to far."""
     parts, depths = [], []
-    for first in range(0, scene.means.shape[0], SPLATS_AT_ONCE):
-        seen = _before_the_camera(scene, view, slice(first, first + SPLATS_AT_ONCE))
-        if kernel is Kernel.GAUSSIAN_2D:
-            part, z = project_discs(scene, view, seen)
-        else:
-            part, z = _project_ellipses(scene, view, seen, 1.0 if kernel is Kernel.BETA else HALF_LOG2_E, antialiased)
+    for rows in blocks(projection.scene.means.shape[0], projection.at_once):
+        part, z = footprints_of(projection, rows)
         parts.append(part)
-        depths.append(z.to(torch.float32))
+        depths.append(z)
     order = torch.sort(torch.cat(depths), stable=True).indices
-    outlines = Outlines(*(torch.cat(columns) for columns in zip(*(part.outlines for part in parts), strict=True)))
-    ids, places, inks = (
-        torch.cat([getattr(part, name) for part in parts])[order] for name in ("ids", "places", "inks")
-    )
-    return Footprints(ids, outlines.at(order), places, inks)
+    return _joined(parts, order)
 
 
-def _before_the_camera(scene: DeviceScene, view: View, rows: slice) -> Seen:
-    pose = view.pose.tolist()
-    px, py, pz = scene.means[rows].double().unbind(1)
+def project_again(projection: Projection, ids: Tensor) -> Footprints:
+    """The footprints of splats [n] i32 that are known to touch the image, in their order."""
+    every = blocks(ids.shape[0], projection.at_once)
+    return _joined([footprints_of(projection, ids[rows])[0] for rows in every], None)
+
+
+def blocks(count: int, at_once: int) -> list[slice]:
+    """``count`` rows in runs, at least one of them."""
+    return [slice(first, first + at_once) for first in range(0, max(count, 1), at_once)]
+
+
+def _joined(parts: list[Footprints], order: Tensor | None) -> Footprints:
+    columns = [torch.cat(column) for column in zip(*(part.outlines for part in parts), strict=True)]
+    rest = [torch.cat([getattr(part, name) for part in parts]) for name in ("ids", "places", "inks")]
+    outlines = Outlines(*columns)
+    if order is None:
+        return Footprints(rest[0], outlines, rest[1], rest[2])
+    return Footprints(rest[0][order], outlines.at(order), rest[1][order], rest[2][order])
+
+
+def _before_the_camera(block: Block, view: View) -> Seen:
+    pose, scene = view.pose.tolist(), block.scene
+    px, py, pz = scene.means.double().unbind(1)
     x, y, z = (own[0] * px + own[1] * py + own[2] * pz + own[3] for own in pose)
-    reach = scene.reach[rows]
-    kept = ((reach >= 0) & (z >= NEAR_PLANE)).nonzero()[:, 0]
-    ax, ay, az = scene.axes[rows][kept].unbind(1)
+    kept = ((scene.reach >= 0) & (z >= NEAR_PLANE)).nonzero()[:, 0]
+    ax, ay, az = scene.axes[kept].unbind(1)
     axes = torch.stack([own[0] * ax + own[1] * ay + own[2] * az for own in pose], dim=1)
-    return Seen(kept + rows.start, x[kept], y[kept], z[kept], axes, reach[kept])
+    return Seen(kept, x[kept], y[kept], z[kept], axes, scene.reach[kept])
 
 
 def _project_ellipses(
-    scene: DeviceScene, view: View, seen: Seen, unit: float, antialiased: bool
+    block: Block, view: View, seen: Seen, unit: float, antialiased: bool
 ) -> tuple[Footprints, Tensor]:
+    scene = block.scene
     fx, fy, cx, cy = view.intrinsics.tolist()
     left, right, top, bottom = view.limits.tolist()
     _, x, y, z, axes, reach = seen
@@ -95,7 +142,7 @@ def _project_ellipses(
     mx, my, xx, xy, yy, det, reach, faded, extent_x, extent_y, z = (
         part[kept] for part in (mx, my, xx, xy, yy, det, reach, faded, extent_x, extent_y, z)
     )
-    ids = seen.ids[kept]
+    rows = seen.rows[kept]
     slope, kx, ky = xy / yy, unit * yy / det, unit / yy
     none = mx[:0]
     outlines = Outlines(
@@ -105,7 +152,7 @@ def _project_ellipses(
     places[:, MX], places[:, MY], places[:, SLOPE], places[:, KY] = mx, my, slope, ky
     inks = mx.new_zeros(mx.shape[0], INK, dtype=torch.float32)
     faded = faded.clamp(max=1.0)
-    inks[:, OPACITY], inks[:, PLAIN], inks[:, KX] = faded * scene.opacity[ids], faded * scene.plain[ids], kx
+    inks[:, OPACITY], inks[:, PLAIN], inks[:, KX] = faded * scene.opacity[rows], faded * scene.plain[rows], kx
     if scene.beta.numel():
-        inks[:, BETA] = scene.beta[ids]
-    return Footprints(ids.to(torch.int32), outlines, places, inks), z
+        inks[:, BETA] = scene.beta[rows]
+    return Footprints(block.ids[rows].to(torch.int32), outlines, places, inks), z

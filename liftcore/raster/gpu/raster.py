@@ -10,18 +10,21 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import wraps
-from typing import TYPE_CHECKING, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Concatenate, ParamSpec, TypeVar
 
-import numpy as np
 import torch
 
+from liftcore.device import out_of_memory
 from liftcore.errors import Unavailable
 from liftcore.raster.antialiased import check_antialiased
 from liftcore.raster.arguments import check_image, check_labels, check_rows
 from liftcore.raster.constants import TILE
 from liftcore.raster.gpu import rendering, weighing
-from liftcore.raster.gpu.frame import Frame, tile_runs
+from liftcore.raster.gpu.frame import Frame
 from liftcore.raster.gpu.launching import check_device
+from liftcore.raster.gpu.memory import USUAL_LEVELS, raster_bytes
+from liftcore.raster.gpu.projection import Projection
+from liftcore.raster.gpu.room import SCENE_SHARE, room_within, scene_bytes
 from liftcore.raster.gpu.scene import scene_on, with_opacity
 from liftcore.raster.gpu.selecting import largest_weights
 from liftcore.raster.gpu.slots import DeviceReading
@@ -31,11 +34,13 @@ from liftcore.raster.projection import view_of
 from liftcore.raster.protocol import RayRows, RegionWeights, Walk, Weighting
 from liftcore.raster.selection import choice_of
 from liftcore.raster.strided import check_stride, every_pixel, places_on, strided
+from liftcore.raster.weights_home import on_host
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from liftcore.observe.observation import Observation
+    from liftcore.raster.gpu.scene import DeviceScene
     from liftcore.scene.cameras import Camera
     from liftcore.scene.splats import Splats
 
@@ -43,20 +48,31 @@ Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
 
-def _within_memory(product: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """A product that says in words when the device's memory is too small for it."""
+LEAST_FREE = 1 << 24  # bytes: a product that does not fit into pieces for so few fits into none
+
+
+def _within_memory(product: Callable[Concatenate[GpuRaster, Arguments], Result]) -> Callable[..., Result]:
+    """A product that is made again in smaller pieces when the device's memory runs out, and at last says so in words.
+
+    No bit depends on the pieces, so it matters to nobody how often that was.
+    """
 
     @wraps(product)
-    def guarded(*arguments: Arguments.args, **named: Arguments.kwargs) -> Result:
-        try:
-            return product(*arguments, **named)
-        except torch.OutOfMemoryError as error:
-            raise Unavailable(
-                "device",
-                expected="a GPU with free memory for the scene, the view's footprints and a band of its tiles",
-                got=str(error).splitlines()[0],
-                hint="free memory on the device, lower the images' resolution, or take the device cpu",
-            ) from error
+    def guarded(self: GpuRaster, *arguments: Arguments.args, **named: Arguments.kwargs) -> Result:
+        while True:
+            try:
+                return product(self, *arguments, **named)
+            except RuntimeError as error:
+                if not out_of_memory(error):
+                    raise
+                told = str(error).splitlines()[0] if str(error) else type(error).__name__
+            if not self.take_less():  # out here the error no longer holds what the product held
+                raise Unavailable(
+                    "device",
+                    expected="a GPU with free memory for the footprints and lists of a row of tiles",
+                    got=told,
+                    hint="free memory on the device, lower the images' resolution, or take the device cpu",
+                )
 
     return guarded
 
@@ -69,21 +85,33 @@ class GpuRaster:
     Args:
         splats: the scene.
         device: a CUDA device; the CPU where Triton's interpreter is on.
+        free: bytes that may be taken there; None for no limit. What does not fit is cut, and no bit depends on it.
+        stays: whether region weights stay on the device where they fit, for a solution there.
 
     Raises:
-        Unavailable: the device cannot run the kernels, or its memory does not hold the scene.
+        Unavailable: the device cannot run the kernels.
     """
 
-    @_within_memory
-    def __init__(self, splats: Splats, device: torch.device) -> None:
+    def __init__(self, splats: Splats, device: torch.device, free: int | None = None, *, stays: bool = False) -> None:
         check_device(device)
         self.splats = splats
         self.device = device
-        scene = activated(splats, 1.0)
-        self._scene = scene_on(device, scene)
-        self._host = scene._replace(means=np.empty((0, 3), np.float32), axes=np.empty((0, 3, 3)))
+        self._free, self._stays = free, stays
+        self._host = activated(splats, 1.0)
+        self._size = scene_bytes(splats.count, splats.kernel)
         self._gain = 1.0  # of the scene
+        self._scene: DeviceScene | None = None
         self._kept: tuple[Camera, Walk, Frame] | None = None
+
+    def take_less(self) -> bool:
+        """Let go of everything and cut the work for half of the memory; False where it cannot be cut any more."""
+        free = self._free or raster_bytes(self.splats.count, 1, 1, self.splats.kernel, 1)
+        if free <= LEAST_FREE:
+            return False
+        self._free, self._scene, self._kept = free // 2, None, None
+        if self.device.type == "cuda":
+            torch.cuda.empty_cache()
+        return True
 
     @_within_memory
     def region_weights(
@@ -93,7 +121,8 @@ class GpuRaster:
         choice = choice_of(weighting)
         frame = self._frame(camera, walk)
         reading = DeviceReading(observation, camera, walk, self.device)
-        return weighing.region_weights(frame, reading, choice, walk.gain != 1.0, self.splats.count)
+        made = weighing.region_weights(frame, reading, choice, walk.gain != 1.0, self.splats.count)
+        return made if self._stays else on_host(made)
 
     @_within_memory
     def render(self, camera: Camera, values: Tensor, walk: Walk) -> Tensor:
@@ -102,8 +131,8 @@ class GpuRaster:
         frame = self._frame(camera, every_pixel(walk))
         image = torch.empty(camera.height, camera.width, values.shape[1])
         for begin in range(0, values.shape[1], rendering.WIDEST):
-            block = values[:, begin : begin + rendering.WIDEST].to(self.device, torch.float32).contiguous()
-            image[:, :, begin : begin + rendering.WIDEST] = rendering.render(frame, block).cpu()
+            block = values[:, begin : begin + rendering.WIDEST].to(torch.float32).contiguous()
+            image[:, :, begin : begin + rendering.WIDEST] = rendering.render(frame, block)
         return image
 
     @_within_memory
@@ -113,8 +142,8 @@ class GpuRaster:
         frame = self._frame(camera, every_pixel(walk))
         result = torch.empty(self.splats.count, values.shape[2])
         for begin in range(0, values.shape[2], weighing.WIDEST):
-            block = values[:, :, begin : begin + weighing.WIDEST].to(self.device, torch.float32).contiguous()
-            result[:, begin : begin + weighing.WIDEST] = weighing.adjoint(frame, block, self.splats.count).cpu()
+            block = values[:, :, begin : begin + weighing.WIDEST]
+            result[:, begin : begin + weighing.WIDEST] = weighing.adjoint(frame, block, self.splats.count)
         return result
 
     def row_sums(self, camera: Camera, walk: Walk) -> Tensor:
@@ -128,11 +157,11 @@ class GpuRaster:
         ids = torch.full((frame.rows * TILE, frame.columns * TILE, count), -1, dtype=torch.int32)
         weights = torch.zeros(frame.rows * TILE, frame.columns * TILE, count)
         for lists in frame.lists():
-            for first, last in tile_runs(lists):
+            for first, last in frame.tile_runs(lists):
                 own, numbers = largest_weights(frame, lists, (first, last), count)
                 met = own > 0
                 items = torch.where(met, lists.starts[first:last, None, None] + numbers, 0)
-                named = torch.where(met, frame.ids[lists.items[items].long()] if lists.items.numel() else -1, -1)
+                named = torch.where(met, lists.ids[lists.items[items].long()] if lists.items.numel() else -1, -1)
                 tile = torch.arange(lists.first_tile + first, lists.first_tile + last)[:, None]
                 pixel = torch.arange(TILE * TILE)[None, :]
                 y, x = tile // frame.columns * TILE + pixel // TILE, tile % frame.columns * TILE + pixel % TILE
@@ -146,7 +175,7 @@ class GpuRaster:
         """``argmax(A onehot(labels))``: labels [P] i32 in -1..K - 1 -> [H, W] i32. See the protocol."""
         check_labels(labels, self.splats.count)
         frame = self._frame(camera, every_pixel(walk))
-        return rendering.strongest_labels(frame, labels.to(self.device, torch.int32)).cpu()
+        return rendering.strongest_labels(frame, labels.to(torch.int32)).cpu()
 
     @_within_memory
     def ray_rows(self, camera: Camera, pixels: Tensor, walk: Walk) -> RayRows:
@@ -154,7 +183,7 @@ class GpuRaster:
         places = places_on(walk, pixels)
         if places is None:  # not all of them are rays of the strided view
             places, walk = pixels, every_pixel(walk)
-        return ray_rows(self._frame(camera, walk), places.to(self.device, torch.int32).contiguous())
+        return ray_rows(self._frame(camera, walk), places)
 
     def forget(self) -> None:
         """Drop the projected view that is kept for the next product."""
@@ -167,11 +196,21 @@ class GpuRaster:
         check_antialiased(self.splats.kernel, walk.antialiased)
         check_stride(walk, camera)
         self._kept = None  # before, so that one frame's memory is the most ever held
-        if walk.gain != self._gain:
-            self._scene, self._gain = (
-                with_opacity(self._scene, with_gain(self._host, self.splats, walk.gain)),
-                walk.gain,
-            )
-        frame = Frame(self._scene, strided(view_of(camera), walk), self.splats.kernel, walk)
+        view = strided(view_of(camera), walk)
+        need = raster_bytes(self.splats.count, view.width, view.height, self.splats.kernel, USUAL_LEVELS)
+        room = room_within(self._free, self.splats.kernel, need)
+        scene = self._scene_with(walk.gain)
+        projection = Projection(scene, view, self.splats.kernel, walk.antialiased, self.device, room.splats)
+        frame = Frame(projection, walk, room)
         self._kept = camera, walk, frame
         return frame
+
+    def _scene_with(self, gain: float) -> DeviceScene:
+        """The splats with that gain on their opacity: on the device, or on the host where they would fill it."""
+        if gain != self._gain:
+            self._host, self._gain = with_gain(self._host, self.splats, gain), gain
+            self._scene = None if self._scene is None else with_opacity(self._scene, self._host)
+        if self._scene is None:
+            staged = self._free is not None and self._size > SCENE_SHARE * self._free
+            self._scene = scene_on(torch.device("cpu") if staged else self.device, self._host)
+        return self._scene

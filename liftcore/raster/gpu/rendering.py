@@ -11,7 +11,6 @@ import torch
 import triton.language as tl
 
 from liftcore.raster.constants import TILE
-from liftcore.raster.gpu.frame import tile_runs
 from liftcore.raster.gpu.launching import WARPS, jit, lang, launch
 from liftcore.raster.gpu.walk import CHUNK, PART, PARTS, blend_chunk, fill_alphas, start_rays, weights_of
 
@@ -32,11 +31,12 @@ _NO_LABEL = tl.constexpr(-1)
 
 @jit
 def _render(
-    places, inks, starts, items, scratch, ids, values, image, band_tile, own_tile, columns, width, height, channels,
+    places, inks, starts, items, scratch, values, image, band_tile, own_tile, columns, width, height, channels,
     cap, stop, floor, KIND: tl.constexpr, CHANNELS: tl.constexpr,
 ):  # fmt: skip
     own = own_tile + tl.program_id(0)
     tile = band_tile + own
+    top = band_tile // columns * _TILE  # the image is the band's
     mine = scratch + tl.program_id(0) * _SCRATCH
     pixel = tl.arange(0, _PIXELS)
     channel = tl.arange(0, CHANNELS)
@@ -50,16 +50,15 @@ def _render(
         fill_alphas(places, inks, items, at, last, tile, columns, mine, cap, floor, KIND, False)
         light = blend_chunk(mine, light, stop, count)
         number = at + tl.arange(0, _CHUNK)
-        item = tl.load(items + number, mask=number < last, other=0)
-        splat = tl.load(ids + item).to(tl.int64)
+        item = tl.load(items + number, mask=number < last, other=0).to(tl.int64)
         given = (number < last)[:, None] & (channel < channels)[None, :]
-        rows = tl.load(values + splat[:, None] * channels + channel[None, :], mask=given, other=0.0)
+        rows = tl.load(values + item[:, None] * channels + channel[None, :], mask=given, other=0.0)
         sums += tl.dot(tl.trans(weights_of(mine, count, pixel)), rows, input_precision="ieee")
         lit = lang.max(light, 0)
         at += _CHUNK
     x = tile % columns * _TILE + pixel % _TILE
     y = tile // columns * _TILE + pixel // _TILE
-    place = (y.to(tl.int64) * width + x)[:, None] * channels + channel[None, :]
+    place = ((y - top).to(tl.int64) * width + x)[:, None] * channels + channel[None, :]
     tl.store(image + place, sums, mask=((x < width) & (y < height))[:, None] & (channel < channels)[None, :])
 
 
@@ -104,37 +103,42 @@ def _strongest(
 
 
 def render(frame: Frame, values: Tensor) -> Tensor:
-    """``A X``: values [P, C] f32 on the device, C at most ``WIDEST`` -> [H, W, C] f32."""
+    """``A X``: values [P, C] f32 on the host, C at most ``WIDEST`` -> [H, W, C] f32 on the host."""
     channels = values.shape[1]
     wide = max(NARROWEST, 1 << (channels - 1).bit_length())
-    image = torch.zeros(frame.height, frame.width, channels, device=frame.device)
+    image = torch.empty(frame.height, frame.width, channels)
     for lists in frame.lists():
-        for first, last in tile_runs(lists):
+        rows = frame.of_splats(values, lists)
+        top = lists.first_row * TILE
+        tall = min(lists.tiles // frame.columns * TILE, frame.height - top)
+        own = torch.zeros(tall, frame.width, channels, device=frame.device)
+        for first, last in frame.tile_runs(lists):
             launch(
-                _render, last - first, *frame.splats, lists.starts, lists.items, frame.scratch(last - first),
-                frame.ids, values, image, lists.first_tile, first, *frame.size, channels, *frame.cuts,
+                _render, last - first, *lists.splats, lists.starts, lists.items, frame.scratch(last - first),
+                rows, own, lists.first_tile, first, *frame.size, channels, *frame.cuts,
                 KIND=frame.kind, CHANNELS=wide, warps=8 if wide == WIDEST else WARPS,
             )  # fmt: skip
+        image[top : top + tall] = own.cpu()
     return image
 
 
 def strongest_labels(frame: Frame, labels: Tensor) -> Tensor:
-    """``argmax(A onehot(labels))``: labels [P] i32 of -1 or more, on the device -> [H, W] i32."""
+    """``argmax(A onehot(labels))``: labels [P] i32 of -1 or more, on the host -> [H, W] i32 on the device."""
     image = torch.full((frame.height, frame.width), -1, dtype=torch.int32, device=frame.device)
     classes = int(labels.max()) + 2
     for lists in frame.lists():
         tiles = torch.arange(lists.tiles, device=frame.device)
         tile_of = torch.repeat_interleave(tiles, lists.starts.diff())
         # The labels that occur in each tile, ascending, and where each item's label stands among them.
-        keys = tile_of * classes + labels[frame.ids[lists.items].long()] + 1
+        keys = tile_of * classes + frame.of_splats(labels, lists)[lists.items.long()] + 1
         known, slots = torch.unique(keys, return_inverse=True)
         edges = torch.arange(lists.tiles + 1, device=frame.device)
         label_starts = torch.searchsorted(known, edges * classes)
         slots = (slots - label_starts[tile_of]).to(torch.int32)
         own_labels = (known % classes - 1).to(torch.int32)
-        for first, last in tile_runs(lists):
+        for first, last in frame.tile_runs(lists):
             launch(
-                _strongest, last - first, *frame.splats, lists.starts, lists.items, frame.scratch(last - first),
+                _strongest, last - first, *lists.splats, lists.starts, lists.items, frame.scratch(last - first),
                 slots, label_starts, own_labels, image, lists.first_tile, first, *frame.size, *frame.cuts,
                 KIND=frame.kind, COLUMNS=NARROWEST,
             )  # fmt: skip

@@ -23,7 +23,7 @@ INK = 10
 
 
 class DeviceScene(NamedTuple):
-    """The splats, activated, on the device: ``liftcore.raster.projection.Scene`` as tensors."""
+    """``liftcore.raster.projection.Scene`` as tensors: on the device, or on the host and brought there in blocks."""
 
     means: Tensor  # [P, 3] f32, world
     axes: Tensor  # [P, 3, 3] f64 ([P, 3, 2] for 2DGS), scaled axes in columns, world
@@ -63,9 +63,26 @@ class Footprints(NamedTuple):
     inks: Tensor  # [n, INK] f32
 
 
+class Block(NamedTuple):
+    """Some splats, on the device where they are projected."""
+
+    ids: Tensor  # [n] i64, of the scene
+    scene: DeviceScene  # their rows
+
+
 def scene_on(device: torch.device, scene: Scene) -> DeviceScene:
     """The activated splats, moved: the numbers are those of the CPU backend."""
     return DeviceScene(*(torch.from_numpy(part).to(device) for part in scene))
+
+
+def block_of(scene: DeviceScene, rows: slice | Tensor, device: torch.device) -> Block:
+    """Some splats of a scene that lies on the device or on the host: a run of them, or ids [n] in any order."""
+    if isinstance(rows, slice):
+        ids = torch.arange(rows.start, min(rows.stop, scene.means.shape[0]), device=device)
+    else:
+        ids, rows = rows.long().to(device), rows.long().to(scene.means.device)
+    parts = (part[rows].to(device) if part.numel() else part.to(device) for part in scene)
+    return Block(ids, DeviceScene(*parts))
 
 
 def with_opacity(scene: DeviceScene, changed: Scene) -> DeviceScene:

@@ -129,7 +129,7 @@ def largest_weights(frame: Frame, lists: Lists, run: tuple[int, int], count: int
     weights = torch.zeros(tiles, TILE * TILE, count, device=frame.device)
     numbers = torch.zeros(tiles, TILE * TILE, count, dtype=torch.int32, device=frame.device)
     launch(
-        _rank, tiles, *frame.splats, lists.starts, lists.items, frame.scratch(tiles), weights, numbers,
+        _rank, tiles, *lists.splats, lists.starts, lists.items, frame.scratch(tiles), weights, numbers,
         lists.first_tile, run[0], *frame.size, count, *frame.cuts, KIND=frame.kind,
         COUNT=1 << (count - 1).bit_length(),
     )  # fmt: skip

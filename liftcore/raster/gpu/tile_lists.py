@@ -2,7 +2,7 @@
 
 Every footprint is cut into spans, one a tile row, by the same bounds as on the CPU. Counts and prefix sums say where
 each span's tiles go, in the order of depth; a stable sort by tile then keeps that order inside a tile. A view whose
-lists would outgrow ``LIST_ITEMS`` is walked in bands of tile rows, with the lists of one band at a time.
+lists would outgrow their room is walked in bands of tile rows, with the lists of one band at a time.
 """
 
 from __future__ import annotations
@@ -16,10 +16,7 @@ from liftcore.raster.constants import TILE
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from liftcore.raster.gpu.scene import Outlines
-
-SPLATS_AT_ONCE = 1 << 18  # whose spans are made at a time, in float64
-LIST_ITEMS = 1 << 24  # of the lists that are held at a time; a single tile row may have more
+    from liftcore.raster.gpu.scene import Footprints, Outlines
 
 
 class Spans(NamedTuple):
@@ -32,23 +29,35 @@ class Spans(NamedTuple):
 
 
 class Lists(NamedTuple):
-    """The lists of the tiles of a band of tile rows."""
+    """The lists of the tiles of a band of tile rows, and the footprints that they name."""
 
-    first_tile: int  # of the band, in the view
+    first_row: int  # of the band, in the view
+    columns: int  # tiles of a row
     starts: Tensor  # [tiles + 1] i64, each tile's list in items
     items: Tensor  # [n] i32, footprints, near to far in each tile
+    ids: Tensor  # [f] i32, the splat of a footprint
+    splats: tuple[Tensor, Tensor]  # places [f, PLACE] f64 and inks [f, INK] f32, as the kernels take them
 
     @property
     def tiles(self) -> int:
         """Of the band."""
         return self.starts.shape[0] - 1
 
+    @property
+    def first_tile(self) -> int:
+        """Of the band, in the view."""
+        return self.first_row * self.columns
 
-def spans_of(outlines: Outlines, rows: int, columns: int) -> Spans:
-    """The spans of all footprints on a view of ``rows`` x ``columns`` tiles."""
+
+def spans_of(outlines: Outlines, rows: tuple[int, int], columns: int, at_once: int) -> Spans:
+    """The spans of all footprints in the tile rows ``rows[0]..rows[1]`` of a view with ``columns`` tiles a row.
+
+    Args:
+        at_once: footprints whose spans are made at a time, in float64.
+    """
     parts = []
-    for first in range(0, outlines.mx.shape[0], SPLATS_AT_ONCE):
-        own = outlines.at(slice(first, first + SPLATS_AT_ONCE))
+    for first in range(0, outlines.mx.shape[0], at_once):
+        own = outlines.at(slice(first, first + at_once))
         parts.append(_spans(own, rows, columns, first))
     if not parts:
         none = torch.empty(0, dtype=torch.int32, device=outlines.mx.device)
@@ -56,33 +65,48 @@ def spans_of(outlines: Outlines, rows: int, columns: int) -> Spans:
     return Spans(*(torch.cat(columns_) for columns_ in zip(*parts, strict=True)))
 
 
-def bands_of(spans: Spans, rows: int) -> list[tuple[int, int]]:
-    """First and last + 1 tile row of every band: as many rows as ``LIST_ITEMS`` leaves room for, at least one.
-
-    Whole numbers are added here, whose sum knows no order.
-    """
+def items_by_row(spans: Spans, rows: int) -> Tensor:
+    """[rows] i64, the length of the lists of every tile row. Whole numbers are added, whose sum knows no order."""
     totals = torch.zeros(rows, dtype=torch.int64, device=spans.rows.device)
-    totals.index_add_(0, spans.rows, spans.counts.long())
+    return totals.index_add_(0, spans.rows, spans.counts.long())
+
+
+def bands_of(items: list[int], most: int) -> list[tuple[int, int]]:
+    """First and last + 1 tile row of every band: as many rows as ``most`` leaves room for, at least one.
+
+    Args:
+        items: of each tile row.
+    """
     bands, first, held = [], 0, 0
-    for row, total in enumerate(totals.tolist()):
-        if row > first and held + total > LIST_ITEMS:
+    for row, total in enumerate(items):
+        if row > first and held + total > most:
             bands.append((first, row))
             first, held = row, 0
         held += total
-    return [*bands, (first, rows)]
+    return [*bands, (first, len(items))]
 
 
-def lists_of(spans: Spans, band: tuple[int, int], columns: int) -> Lists:
+def lists_of(footprints: Footprints, spans: Spans, band: tuple[int, int], columns: int) -> Lists:
     """The lists of the tiles of the rows ``band[0]..band[1]``."""
-    first_tile, tiles = band[0] * columns, (band[1] - band[0]) * columns
+    tiles = (band[1] - band[0]) * columns
     own = ((spans.rows >= band[0]) & (spans.rows < band[1])).nonzero()[:, 0]
     counts = spans.counts[own].long()
     span, step = expanded(counts)
-    first = spans.rows[own] * columns + spans.firsts[own] - first_tile
+    first = (spans.rows[own] - band[0]) * columns + spans.firsts[own]
     by_tile = torch.sort((first[span] + step).to(torch.int32), stable=True)
     items = spans.places[own][span[by_tile.indices]]
     edges = torch.arange(tiles + 1, dtype=torch.int32, device=items.device)
-    return Lists(first_tile, torch.searchsorted(by_tile.values, edges), items)
+    starts = torch.searchsorted(by_tile.values, edges)
+    return Lists(band[0], columns, starts, items, footprints.ids, (footprints.places, footprints.inks))
+
+
+def tile_rows_of(own: Outlines, rows: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """First and last of the rows ``rows[0]..rows[1]`` that footprints can touch, [n] f64; first > last for none."""
+    top, bottom = _tiles_between(own.my - own.extent_y, own.my + own.extent_y)
+    if own.circle.numel():
+        near_top, near_bottom = _tiles_between(own.circle_y - own.circle, own.circle_y + own.circle)
+        top, bottom = torch.minimum(top, near_top), torch.maximum(bottom, near_bottom)
+    return top.clamp(min=rows[0]), bottom.clamp(max=rows[1] - 1.0)
 
 
 def expanded(counts: Tensor) -> tuple[Tensor, Tensor]:
@@ -93,12 +117,8 @@ def expanded(counts: Tensor) -> tuple[Tensor, Tensor]:
     return rows, torch.arange(total, device=counts.device) - (ends - counts)[rows]
 
 
-def _spans(own: Outlines, rows: int, columns: int, base: int) -> Spans:
-    top, bottom = _tiles_between(own.my - own.extent_y, own.my + own.extent_y)
-    if own.circle.numel():
-        near_top, near_bottom = _tiles_between(own.circle_y - own.circle, own.circle_y + own.circle)
-        top, bottom = torch.minimum(top, near_top), torch.maximum(bottom, near_bottom)
-    top, bottom = top.clamp(min=0.0), bottom.clamp(max=rows - 1.0)
+def _spans(own: Outlines, rows: tuple[int, int], columns: int, base: int) -> Spans:
+    top, bottom = tile_rows_of(own, rows)
     place, step = expanded((bottom - top + 1.0).clamp(min=0.0).long())
     tile_row = top[place] + step
     first, last = _tile_columns(own.at(place), tile_row)

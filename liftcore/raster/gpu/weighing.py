@@ -14,10 +14,9 @@ import torch
 import triton.language as tl
 
 from liftcore.raster.constants import TILE
-from liftcore.raster.gpu.frame import table_runs, tile_runs
 from liftcore.raster.gpu.launching import jit, lang, launch
 from liftcore.raster.gpu.selecting import blend_chosen, counted, marks_of
-from liftcore.raster.gpu.sums import sums_by_key
+from liftcore.raster.gpu.sums import Pieces, Sums, sums_by_unit
 from liftcore.raster.gpu.walk import CHUNK, PART, PARTS, blend_chunk, fill_alphas, start_rays, weights_of
 from liftcore.raster.protocol import RegionWeights
 from liftcore.raster.selection import FRONT, LARGEST
@@ -35,7 +34,7 @@ if TYPE_CHECKING:
 COLUMNS = 16  # of a tile's matrix at a time
 BLOCK = 64  # of its rows: a thread has what it multiplies in registers, which are few
 WIDEST = 32  # channels of an image a walk
-ENTRIES = 1 << 22  # of a table that become rows of splats at a time
+AN_ENTRY, A_LEVEL = 48, 72  # bytes of a sum that becomes rows: where it is from; its keys and values, sorted, a level
 
 _CHUNK = tl.constexpr(CHUNK)
 _TILE = tl.constexpr(TILE)
@@ -118,6 +117,7 @@ def _gather(
 ):  # fmt: skip
     own = own_tile + tl.program_id(0)
     tile = band_tile + own
+    top = band_tile // columns * _TILE  # the image is the band's
     mine = scratch + tl.program_id(0) * _SCRATCH
     channel = tl.arange(0, CHANNELS)
     base = tl.load(starts + own_tile)
@@ -134,7 +134,7 @@ def _gather(
             pixel = from_pixel + tl.arange(0, _BLOCK)
             x = tile % columns * _TILE + pixel % _TILE
             y = tile // columns * _TILE + pixel // _TILE
-            place = (y.to(tl.int64) * width + x)[:, None] * channels + channel[None, :]
+            place = ((y - top).to(tl.int64) * width + x)[:, None] * channels + channel[None, :]
             inside = ((x < width) & (y < height))[:, None] & (channel < channels)[None, :]
             own_pixels = tl.load(image + place, mask=inside, other=0.0)
             product += tl.dot(weights_of(mine, count, pixel), own_pixels, input_precision="ieee")
@@ -145,40 +145,60 @@ def _gather(
         at += _CHUNK
 
 
-class Sums(NamedTuple):
-    """Sums by key, and the keys."""
-
-    keys: Tensor  # [n] i32 or i64, ascending
-    values: Tensor  # [n, C] f64
-
-
 def region_weights(
     frame: Frame, reading: DeviceReading, choice: Choice, with_plain: bool, splats: int
 ) -> RegionWeights:
-    """``A'^T S`` of a view and the evidence of plain weights, on the CPU; with_plain: whether there is a gain."""
+    """``A'^T S`` of a view and the evidence of plain weights; with_plain: whether there is a gain.
+
+    On the device where the room holds it all, else on the host.
+    """
     rows = reading.codebook_rows
-    weights: list[Sums] = []
-    evidence: list[Sums] = []
+    weights, evidence = (Pieces(frame.device, frame.room.kept) for _ in range(2))
     for lists in frame.lists():
         given = torch.zeros(lists.items.shape[0], 1, device=frame.device)
-        for first, last in tile_runs(lists):
+        for first, last in frame.tile_runs(lists):
             slots = reading.slots(lists.first_tile + first, lists.first_tile + last, frame.columns)
             marks = marks_of(frame, lists, (first, last), choice.k) if choice.kind == LARGEST else None
             sizes = lists.starts[first : last + 1].diff() * slots.starts.diff()
-            for run in table_runs(first, sizes.tolist()):
-                job = _Run(lists, run, first, slots, sizes[run[0] - first : run[1] - first], marks)
+            for begin, end, floats in frame.table_runs((first, last), sizes):
+                job = _Run(lists, (begin, end), first, slots, sizes[begin - first : end - first], floats, marks)
                 table = _weigh_run(frame, job, reading.taps, choice, with_plain, given)
-                weights.extend(_by_row(frame, job, table, splats * rows, rows))
-        evidence.append(_positive(frame.ids[lists.items], given))
-    summed, met = _joined(weights), _joined(evidence)
-    # Few keys are left: where each splat's rows begin is quickly found.
-    owners, columns = summed.keys // rows, summed.keys % rows
-    own, counts = torch.unique_consecutive(owners, return_counts=True)
-    row_starts = torch.zeros(own.shape[0] + 1, dtype=torch.int64, device=frame.device)
+                for part in _by_row(frame, job, table, splats * rows, rows):
+                    weights.add(part)
+        evidence.add(_of_items(frame, lists, (0, lists.tiles), given))
+    found = [_rows_of(part, rows, frame.room.kept is not None) for part in weights.joined(splats, rows)]
+    met = [(part.keys.to(torch.int32), part.values[:, 0].to(torch.float32)) for part in evidence.joined(splats)]
+    return _put_together(found, met, frame)
+
+
+class _Rows(NamedTuple):
+    """Rows of W of ascending splats."""
+
+    splats: Tensor  # [n] i32
+    counts: Tensor  # [n] i64, entries of each
+    columns: Tensor  # [nnz] i32
+    weights: Tensor  # [nnz] f32
+
+
+def _rows_of(part: Sums, rows: int, home: bool) -> _Rows:
+    """Sums by ``key = splat * rows + row`` as rows; home: whether they go to the host."""
+    own, counts = torch.unique_consecutive(part.keys // rows, return_counts=True)
+    columns, values = (part.keys % rows).to(torch.int32), part.values[:, 0].to(torch.float32)
+    made = _Rows(own.to(torch.int32), counts, columns, values)
+    return _Rows(*(column.cpu() for column in made)) if home else made
+
+
+def _put_together(found: list[_Rows], met: list[tuple[Tensor, Tensor]], frame: Frame) -> RegionWeights:
+    place = frame.device if frame.room.kept is None else torch.device("cpu")
+    ints, floats = torch.empty(0, dtype=torch.int32, device=place), torch.empty(0, device=place)
+    found = found or [_Rows(ints, ints.long(), ints, floats)]
+    splats, counts, columns, weights = (torch.cat(column) for column in zip(*found, strict=True))
+    row_starts = torch.zeros(splats.shape[0] + 1, dtype=torch.int64, device=place)
     torch.cumsum(counts, 0, out=row_starts[1:])
-    parts = own, row_starts, columns, summed.values[:, 0], met.keys, met.values[:, 0]
-    dtypes = torch.int32, torch.int64, torch.int32, torch.float32, torch.int32, torch.float32
-    return RegionWeights(*(part.to(dtype).cpu() for part, dtype in zip(parts, dtypes, strict=True)))
+    ids, evidence = (
+        torch.cat([part.to(place) for part in column]) for column in zip(*met or [(ints, floats)], strict=True)
+    )
+    return RegionWeights(splats, row_starts, columns, weights, ids, evidence)
 
 
 class _Run(NamedTuple):
@@ -189,6 +209,7 @@ class _Run(NamedTuple):
     slots_tile: int  # the first tile of the slots and of the marks, in the band
     slots: Slots
     sizes: Tensor  # [tiles] i64, floats of each tile's table
+    floats: int  # of all of them
     marks: tuple[Tensor, Tensor] | None  # of top-k
 
 
@@ -199,11 +220,11 @@ def _weigh_run(
     lists, slots, programs = job.lists, job.slots, job.tiles[1] - job.tiles[0]
     starts = torch.zeros(programs + 1, dtype=torch.int64, device=frame.device)
     torch.cumsum(job.sizes, 0, out=starts[1:])
-    table = torch.zeros(int(starts[-1]), device=frame.device)
+    table = torch.zeros(job.floats, device=frame.device)
     parts = 2 * PARTS if with_plain or choice.kind in (LARGEST, FRONT) else PARTS
     least, room = job.marks or (slots.shares, slots.taps)  # unread where there are no marks
     launch(
-        _weigh, programs, *frame.splats, lists.starts, lists.items, frame.scratch(programs, parts), slots.taps,
+        _weigh, programs, *lists.splats, lists.starts, lists.items, frame.scratch(programs, parts), slots.taps,
         slots.shares, slots.starts, table, starts, evidence, least, room, lists.first_tile, job.tiles[0],
         job.slots_tile, *frame.size, float(choice.light), float(choice.floor), *frame.cuts, KIND=frame.kind,
         TAPS=taps, SELECTION=choice.kind, POWER=choice.power, GAIN=with_plain,
@@ -212,9 +233,25 @@ def _weigh_run(
 
 
 def _by_row(frame: Frame, job: _Run, made: tuple[Tensor, Tensor], largest_key: int, rows: int) -> Iterator[Sums]:
-    """The sums of a run's table by splat and row of the codebook, ``key = splat * rows + row``, ENTRIES at a time."""
-    for place in made[0].nonzero()[:, 0].split(ENTRIES):
-        yield _sums_of(frame, job, made, place, (largest_key, rows))
+    """The sums of a run's table by splat and row of the codebook, ``key = splat * rows + row``, in runs of units."""
+    places = made[0].nonzero()[:, 0]
+    most = frame.room.entry_bytes // (AN_ENTRY + A_LEVEL * job.slots.rows.shape[1])
+    for part in _whole_units(frame, job, made[1], places, most):
+        yield _sums_of(frame, job, made, part, (largest_key, rows))
+
+
+def _whole_units(frame: Frame, job: _Run, starts: Tensor, places: Tensor, most: int) -> list[Tensor]:
+    """Places [n] of a table in runs of whole units, of at most so many places where a unit does not have more."""
+    if places.shape[0] <= most:
+        return [places]
+    ends = torch.tensor([end - job.tiles[0] for end in frame.unit_ends(*job.tiles)], device=starts.device)
+    cuts, begun = [0], 0
+    by_unit = torch.searchsorted(places, starts[ends]).tolist()
+    for before, end in zip([0, *by_unit], by_unit, strict=False):
+        if before > begun and end - begun > most:
+            cuts.append(before)
+            begun = before
+    return [places[begin:end] for begin, end in zip(cuts, [*cuts[1:], places.shape[0]], strict=True)]
 
 
 def _sums_of(frame: Frame, job: _Run, made: tuple[Tensor, Tensor], place: Tensor, span: tuple[int, int]) -> Sums:
@@ -227,40 +264,39 @@ def _sums_of(frame: Frame, job: _Run, made: tuple[Tensor, Tensor], place: Tensor
     within = place - starts[tile]
     item = lists.items[lists.starts[tile + job.tiles[0]] + within // used]
     columns = slots.rows[slots.starts[in_slots] + within % used]  # [n, levels]
+    units = frame.unit_of(tile + (lists.first_tile + job.tiles[0]))
     entry, level = (columns >= 0).nonzero().unbind(1)
-    keys = frame.ids[item].long()[entry] * rows + columns[entry, level]
+    keys = lists.ids[item].long()[entry] * rows + columns[entry, level]
     keys = keys.to(torch.int32) if largest_key < _INT32 else keys
-    return Sums(*sums_by_key(keys, table[place][entry][:, None]))
+    return sums_by_unit(keys, units[entry], table[place][entry][:, None])
 
 
-def _positive(keys: Tensor, values: Tensor) -> Sums:
-    """Sums of values [n, 1] that are not zero, by key."""
-    kept = values[:, 0].nonzero()[:, 0]
-    return Sums(*sums_by_key(keys[kept], values[kept]))
-
-
-def _joined(parts: list[Sums]) -> Sums:
-    """The sums of all parts by key, added in their order."""
-    if len(parts) == 1:
-        return parts[0]
-    return Sums(*sums_by_key(torch.cat([part.keys for part in parts]), torch.cat([part.values for part in parts])))
+def _of_items(frame: Frame, lists: Lists, tiles: tuple[int, int], values: Tensor) -> Sums:
+    """Sums by splat of values [n, C] of the items of some tiles, whole units; items without any are left out."""
+    first = lists.starts[tiles[0]]
+    kept = (values != 0).any(dim=1).nonzero()[:, 0]
+    items = kept + first
+    tile = torch.searchsorted(lists.starts[1:], items, right=True)
+    return sums_by_unit(lists.ids[lists.items[items]], frame.unit_of(tile + lists.first_tile), values[kept])
 
 
 def adjoint(frame: Frame, image: Tensor, splats: int) -> Tensor:
-    """``A^T Y``: image [H, W, C] f32 on the device, C at most ``WIDEST`` -> [P, C] f64."""
+    """``A^T Y``: image [H, W, C] f32 on the host, C at most ``WIDEST`` -> [P, C] f32 on the host."""
     channels = image.shape[2]
-    result = torch.zeros(splats, channels, dtype=torch.float64, device=frame.device)
+    pieces = Pieces(frame.device, frame.room.kept)
     for lists in frame.lists():
-        for first, last in tile_runs(lists):
+        own = frame.of_band(image, lists)
+        for first, last in frame.tile_runs(lists):
             sizes = lists.starts[first : last + 1].diff() * channels
-            for run in table_runs(first, sizes.tolist()):
-                begin, end = lists.starts[run[0]], lists.starts[run[1]]
-                table = torch.zeros(int(end - begin), channels, device=frame.device)
+            for begin, end, floats in frame.table_runs((first, last), sizes):
+                table = torch.zeros(floats // channels, channels, device=frame.device)
                 launch(
-                    _gather, run[1] - run[0], *frame.splats, lists.starts, lists.items,
-                    frame.scratch(run[1] - run[0]), image, table, lists.first_tile, run[0], *frame.size, channels,
-                    *frame.cuts, KIND=frame.kind, CHANNELS=max(COLUMNS, 1 << (channels - 1).bit_length()),
+                    _gather, end - begin, *lists.splats, lists.starts, lists.items, frame.scratch(end - begin), own,
+                    table, lists.first_tile, begin, *frame.size, channels, *frame.cuts, KIND=frame.kind,
+                    CHANNELS=max(COLUMNS, 1 << (channels - 1).bit_length()),
                 )  # fmt: skip
-                keys, sums = sums_by_key(frame.ids[lists.items[begin:end]], table)
-                result[keys.long()] += sums  # each key once
+                pieces.add(_of_items(frame, lists, (begin, end), table))
+    result = torch.zeros(splats, channels)
+    for part in pieces.joined(splats):
+        result[part.keys.long().cpu()] = part.values.to(torch.float32).cpu()
     return result

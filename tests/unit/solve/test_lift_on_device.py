@@ -62,7 +62,7 @@ def test_card_without_room_leaves_an_auto_lift_to_the_processor(
     assert made.device == CARD and made.on_device is not None and made.on_device.fits
     assert any(CARD.name in line for line in made.lines())
     assert "device_memory" in made.facts() and "free_bytes" in made.on_device.today()
-    scarce = replace(made.on_device, free=made.on_device.least - 1, room=0)
+    scarce = replace(made.on_device, free=made.on_device.least - 1)
     monkeypatch.setattr(plan, "device_plan", lambda *_: scarce)
     left = planned(sources, SETTINGS, CARD)
     assert left.device == CPU and left.on_device is None

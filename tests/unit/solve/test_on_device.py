@@ -9,13 +9,16 @@ import pytest
 import torch
 from torch import Tensor
 
+from liftcore.device import Device
 from liftcore.progress import silent
 from liftcore.raster.protocol import RegionWeights
-from liftcore.solve import on_device
-from liftcore.solve.accumulate import row_totals
+from liftcore.solve import on_device, solver
 from liftcore.solve.closed_form import Solution, solve_closed_form
 from liftcore.solve.device_blocks import GRAIN, SLICE_BYTES, block_bytes, device_slices, splat_blocks
 from liftcore.solve.on_device import Place, solve_on_device, squared_lengths
+from liftcore.solve.solver import closed_form_on
+from liftcore.solve.totals import Totals, row_totals, sums_in_order
+from liftcore.solve.view_weights import ViewWeights
 
 HERE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 SPLATS = 700  # three grains, the last not full
@@ -196,3 +199,63 @@ def test_slices_hold_their_bytes_down_to_a_least_width() -> None:
     rows = SLICE_BYTES // (4 * 100)
     assert device_slices(rows, 250) == [(0, 100), (100, 200), (200, 250)]
     assert device_slices(10**9, 16) == [(0, 8), (8, 16)]
+
+
+def test_weights_stay_on_the_card_while_there_is_room_and_come_home_when_asked() -> None:
+    views = [random_view(k, 9) for k in range(4)]
+    there = [RegionWeights(*(part.to(HERE) for part in vars(view).values())) for view in views]
+    sizes = [sum(part.nbytes for part in vars(view).values()) for view in views]
+    with ViewWeights(memory_limit=sizes[2], card=(HERE, sizes[0] + sizes[1])) as store:
+        for view in there:
+            store.append(view)
+        assert store.place == HERE and store.card_bytes == sizes[0] + sizes[1]
+        assert store.bytes == sizes[2] + sizes[3] and store.mapped_bytes == sizes[3]
+        assert store[0].columns.device == HERE and store[3].columns.device.type == "cpu"
+        books = [torch.randn(9, 5, generator=torch.manual_seed(k)) for k in range(4)]
+        mixed, plain = (
+            solve_on_device(own, books.__getitem__, sums_of(views), torch.float32, silent, Place(HERE))
+            for own in (store, views)
+        )
+        assert_same_bits(mixed, plain)
+        store.bring_home()
+        assert store.card_bytes == 0 and store.bytes == sum(sizes) and store.mapped_bytes == sum(sizes) - sizes[2]
+        for view, kept in zip(views, store, strict=True):
+            assert all(
+                torch.equal(first, second)
+                for first, second in zip(vars(view).values(), vars(kept).values(), strict=True)
+            )
+
+
+def test_solution_without_room_beside_the_weights_brings_them_home(monkeypatch: pytest.MonkeyPatch) -> None:
+    tries = []
+
+    def crowded(store: ViewWeights, *rest: object) -> str:
+        tries.append(store.card_bytes)
+        if store.card_bytes or len(tries) > 2:
+            raise RuntimeError("Triton Error [CUDA]: out of memory")
+        return "solved"
+
+    monkeypatch.setattr(solver, "solve_on_device", crowded)
+    closed_form = closed_form_on(Device("cuda", HERE), None)
+    rest = (lambda _: torch.zeros(1), np.zeros(1), torch.float32, silent)
+    with ViewWeights(card=(HERE, 1 << 20)) as store:
+        store.append(random_view(0, 3))
+        if HERE.type == "cpu":  # a view of the host is no card's
+            assert closed_form(store, *rest) == "solved" and tries[0] > 0 == tries[1]
+        with pytest.raises(RuntimeError, match="out of memory"):
+            [closed_form(store, *rest) for _ in range(3)]
+
+
+@pytest.mark.parametrize("place", {torch.device("cpu"), HERE}, ids=str)
+def test_sums_over_views_are_those_of_the_definition(place: torch.device) -> None:
+    views, found = [random_view(k, 5) for k in range(3)], Totals(SPLATS, place)
+    for view in views:
+        found.add(view, 4.0)
+    evidence, denominators = found.found()
+    np.testing.assert_allclose(denominators, sums_of(views), rtol=1e-12)
+    assert evidence.sum() == 4.0 * sum(view.evidence.numel() for view in views)
+    for view in views:
+        own = sums_in_order(view.weights.double(), view.row_starts).numpy()  # what a card does
+        np.testing.assert_allclose(own, row_totals(view), rtol=1e-12)
+    nothing = view_of([], [], [], [])
+    assert sums_in_order(nothing.weights.double(), nothing.row_starts).shape == (0,)
