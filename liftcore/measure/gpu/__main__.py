@@ -16,7 +16,7 @@ from liftcore.device import Device, choose_device
 from liftcore.errors import SplatliftError
 from liftcore.files import whole_file
 from liftcore.measure.bench import run_bench
-from liftcore.measure.gpu.figures import both_ways, room_both_ways, tabletop_accuracy, whole_lift
+from liftcore.measure.gpu.figures import both_ways, pieces_differing, room_both_ways, tabletop_accuracy, whole_lift
 from liftcore.measure.gpu.gsplat_lift import beside_gsplat
 from liftcore.measure.gpu.page import Findings, page
 from liftcore.measure.gpu.room_files import AGREEING, BAR
@@ -56,6 +56,7 @@ def measure(device: Device, sizes: tuple[RoomSize, RoomSize], shared: Path, comm
         agreements=agreements,
         tabletop=tabletop_accuracy(scenes["tabletop"], device) if "tabletop" in scenes else None,
         peer=beside_gsplat(small, device),
+        pieces=None if device.kind == "cpu" else pieces_differing(large, device),
         command=command,
     )
 
@@ -92,7 +93,10 @@ def main() -> int:
     with whole_file(options.page) as handle:
         handle.write(page(found).encode())
     print(f"wrote {options.page}")
-    return 0
+    broken = [*found.whole["differing"], *(found.pieces or ())]
+    if broken:
+        print(f"the same lift twice differs in {', '.join(broken)}", file=sys.stderr)
+    return 1 if broken else 0
 
 
 if __name__ == "__main__":

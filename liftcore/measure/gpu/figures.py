@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import tempfile
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
 
-from liftcore.artifact import save_lift
+from liftcore.artifact import TENSORS, save_lift
 from liftcore.lift import lift
 from liftcore.measure.gpu.room_files import write_room
+from liftcore.measure.synthetic import room_cameras, room_regions, room_splats
 from liftcore.measure.tabletop import CASES, Tabletop
+from liftcore.raster.protocol import RegionWeights, Walk, Weighting
 from liftcore.solve.settings import LiftSettings
 
 if TYPE_CHECKING:
@@ -42,12 +44,13 @@ class Agreement:
 def whole_lift(size: RoomSize, device: Device) -> dict[str, Any]:
     """Seconds of a lift from files to a file, by stage, after one of the same scene that is not counted.
 
-    The first lift compiles the card's kernels for these shapes, and leaves the files in the memory of the machine.
+    The first lift compiles the card's kernels, and leaves the files in the memory of the machine. The second must be
+    the same to the bit: ``differing`` names the tensors that are not.
     """
     with tempfile.TemporaryDirectory(prefix="splatlift-room-") as folder:
         paths = write_room(Path(folder), size)
         settings, out = LiftSettings.of(device=device.kind), Path(folder) / "room.lift.safetensors"
-        lift(paths[0], paths[1], [paths[2]], settings)
+        first = lift(paths[0], paths[1], [paths[2]], settings)
         if device.place.type == "cuda":
             torch.cuda.reset_peak_memory_stats(device.place)
         start = time.perf_counter()
@@ -63,7 +66,40 @@ def whole_lift(size: RoomSize, device: Device) -> dict[str, Any]:
         "planned": told["plan"]["device_memory"],
         "peak_device_bytes": peak_bytes(device),
         "device": told["device"],
+        "differing": differing(first, made),
     }
+
+
+def differing(one: Lift, other: Lift) -> list[str]:
+    """The tensors of two lifts that are not the same to the bit."""
+    pairs = {name: (getattr(one, name), getattr(other, name)) for name in TENSORS}
+    return [name for name, (first, second) in pairs.items() if not _same_bits(first, second)]
+
+
+def pieces_differing(size: RoomSize, device: Device) -> list[str]:
+    """The parts of a view's region weights that differ between a walk in one piece and one with little memory.
+
+    The little is a tenth of what the plan says of the one piece, or what the smallest pieces take.
+    """
+    from liftcore.raster.gpu.memory import least_raster_bytes, raster_bytes
+    from liftcore.raster.gpu.raster import GpuRaster
+
+    splats, camera = room_splats(size.splats), room_cameras(size.views, size.width, size.height)[0]
+    regions, shape = room_regions(camera, 0, size.levels, size.channels), (size.width, size.height)
+    sizes = [find(size.splats, *shape, splats.kernel, size.levels) for find in (raster_bytes, least_raster_bytes)]
+    whole, cut = (
+        GpuRaster(splats, device.place, free).region_weights(camera, regions, Walk(), Weighting())
+        for free in (None, max(sizes[0] // 10, sizes[1]))
+    )
+    names = [field.name for field in fields(RegionWeights)]
+    return [name for name in names if not _same_bits(getattr(whole, name), getattr(cut, name))]
+
+
+def _same_bits(one: Tensor | None, other: Tensor | None) -> bool:
+    if one is None or other is None:
+        return one is other
+    alike = one.dtype == other.dtype and one.shape == other.shape
+    return alike and torch.equal(one.contiguous().view(torch.uint8), other.contiguous().view(torch.uint8))
 
 
 def peak_bytes(device: Device) -> int | None:

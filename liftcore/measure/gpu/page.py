@@ -31,12 +31,13 @@ class Findings:
     agreements: Mapping[str, Agreement]
     tabletop: Sequence[Mapping[str, Any]] | None  # None where the scene is not here
     peer: SideBySide | str  # in words why not
+    pieces: Sequence[str] | None  # of a view's weights, what differs when it is walked in pieces; None off a card
     command: str
 
 
 def page(found: Findings) -> str:
     """The page as Markdown."""
-    parts = (_head, _whole, _benches, _agreement, _tabletop, _peer)
+    parts = (_head, _whole, _repeated, _benches, _agreement, _tabletop, _peer)
     return "\n".join(line for part in parts for line in part(found)) + "\n"
 
 
@@ -69,6 +70,21 @@ def _whole(found: Findings) -> Iterator[str]:
     yield "| stage | seconds |"
     yield "|---|---|"
     yield from (f"| {name} | {seconds:.2f} |" for name, seconds in whole["stages_s"].items())
+    yield ""
+
+
+def _repeated(found: Findings) -> Iterator[str]:
+    yield "## The same to the bit"
+    yield ""
+    again = found.whole["differing"]
+    yield "Both of these lifts are the same to the bit." if not again else f"**They differ in {', '.join(again)}.**"
+    if found.pieces is not None:
+        cut = found.pieces
+        yield (
+            "So are a view's region weights in one piece and in strips, with a tenth of the memory."
+            if not cut
+            else f"**A view in strips, with a tenth of the memory, differs in {', '.join(cut)}.**"
+        )
     yield ""
 
 

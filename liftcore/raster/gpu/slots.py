@@ -37,18 +37,22 @@ class Slots(NamedTuple):
 
 
 class DeviceReading:
-    """S of one view, by pixel."""
+    """S of one view, by pixel. It is made on the host, by any thread, and comes to the device when first asked."""
 
     def __init__(self, observation: Observation, camera: Camera, walk: Walk, device: torch.device) -> None:
         reading = reading_of(observation, camera.width, camera.height, walk)
         self.codebook_rows = reading.codebook_rows
         self.taps = 4 if reading.is_grid else 1
         self._grid_width = reading.grid_width
-        parts = _parts(reading)
-        self._x, self._y, self._share_x, self._share_y, self._labels = (part.to(device) for part in parts)
+        self._device, parts = device, _parts(reading)
+        self._waiting = [part.pin_memory() for part in parts] if device.type == "cuda" else list(parts)
 
     def slots(self, first: int, last: int, columns: int) -> Slots:
         """The slots of tiles ``first..last`` of a view with ``columns`` tiles a row."""
+        if self._waiting:
+            there = [part.to(self._device, non_blocking=True) for part in self._waiting]
+            self._x, self._y, self._share_x, self._share_y, self._labels = there
+            self._waiting.clear()
         tile = torch.arange(first, last, device=self._x.device)[:, None]
         pixel = torch.arange(PIXELS, device=self._x.device)[None, :]
         x, y = tile % columns * TILE + pixel % TILE, tile // columns * TILE + pixel // TILE

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import subprocess
+from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +13,7 @@ import pytest
 import torch
 
 from liftcore.artifact import Lift
-from liftcore.device import CPU
+from liftcore.device import CPU, Device
 from liftcore.measure.gpu import __main__ as gpu
 from liftcore.measure.gpu import figures, gsplat_lift
 from liftcore.measure.gpu.figures import both_ways
@@ -24,6 +26,7 @@ from liftcore.raster.protocol import Walk
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Splats
 from liftcore.solve.settings import LiftSettings
+from tests.backends import needs_triton
 
 TINY = RoomSize(300, 40, 30, 2, 8)
 ROOT = Path(__file__).parents[3]
@@ -41,9 +44,36 @@ def test_page_holds_every_part_with_what_was_measured(tmp_path: Path) -> None:
     for title in ("whole lift", "A view", "Beside the processor", "tabletop", "gsplat"):
         assert any(title in line for line in text.splitlines() if line.startswith("## "))
     assert text.count("`tikhonov`") >= 2 and "| save |" in text and "The scene is not here" in text
+    assert "are the same to the bit" in text and "strips" not in text
     near = found.agreements["room"]
     assert near.splats > 0 and near.only_one_sees == 0
     assert (near.least_cosine, near.largest_difference) == (pytest.approx(1.0), 0.0)  # the processor beside itself
+
+
+def test_lifts_that_differ_in_a_bit_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made, numbers = figures.lift, count()
+
+    def lift(*given: Any) -> Lift:
+        lifted = made(*given)
+        lifted.features.view(torch.int16)[0, 0] ^= next(numbers)
+        return lifted
+
+    monkeypatch.setattr(figures, "lift", lift)
+    found = replace(gpu.measure(CPU, (TINY, TINY), tmp_path, "the command"), pieces=["columns"])
+    assert found.whole["differing"] == ["features"]
+    assert "**They differ in features.**" in page(found) and "differs in columns" in page(found)
+    monkeypatch.setattr(gpu, "choose_device", lambda _: CPU)
+    monkeypatch.setattr(gpu, "measure", lambda *_: found)
+    monkeypatch.setattr("sys.argv", ["gpu", str(tmp_path / "page.md")])
+    assert gpu.main() == 1
+
+
+@needs_triton
+def test_a_view_in_pieces_is_held_to_the_view() -> None:
+    """The check of a card's run, in the interpreter where there is none."""
+    small = RoomSize(40, 20, 34, 1, 4, levels=1)
+    place = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    assert figures.pieces_differing(small, Device("cuda", place)) == []
 
 
 def test_agreement_tells_lifts_that_differ(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -102,6 +132,13 @@ def test_peer_that_cannot_run_is_told_in_words(monkeypatch: pytest.MonkeyPatch) 
 
     monkeypatch.setattr(gsplat_lift, "import_module", lambda name: Package)
     assert beside_gsplat(TINY, CPU) == "gsplat did not run: RuntimeError: no nvcc here"
+
+    def ours(*_: Any) -> None:
+        raise RuntimeError("a fault of ours")
+
+    monkeypatch.setattr(gsplat_lift, "lift_ours", ours)
+    with pytest.raises(RuntimeError, match="a fault of ours"):
+        beside_gsplat(TINY, CPU)
 
 
 def test_peer_that_runs_is_timed_and_compared(monkeypatch: pytest.MonkeyPatch) -> None:
