@@ -150,6 +150,9 @@ class OracleRaster:
         sums = dense_view(self.splats, camera, walk).A @ onehot
         return torch.from_numpy(sums.argmax(axis=1).astype(np.int32) - 1).reshape(camera.height, camera.width)
 
+    def forget(self) -> None:
+        """Nothing: no view is kept."""
+
     def ray_rows(self, camera: Camera, pixels: Tensor, walk: Walk) -> RayRows:
         """Rows of A, read off the dense matrix (in row order, not in depth order)."""
         A = dense_view(self.splats, camera, walk).A

@@ -88,3 +88,7 @@ class Raster(Protocol):
     def ray_rows(self, camera: Camera, pixels: Tensor, walk: Walk) -> RayRows:
         """Rows of A for the rays of pixels [n, 2] i32 (x, y) of the full view, whatever the walk's stride."""
         ...
+
+    def forget(self) -> None:
+        """Drop what is kept of the last view for its next product."""
+        ...

@@ -41,12 +41,9 @@ def least_raster_bytes(splats: int, width: int, height: int, kernel: Kernel, lev
     rows = -(-height // TILE)
     own = 2 * splats * min(_ROWS_A_SPLAT, rows) // rows
     items = 2 * splats * min(_tiles(width, height), _TILES_A_SPLAT) // rows
-    least = room.room_within(0, kernel, 1)
-    return (
-        own * room.footprint_bytes(kernel)
-        + items * room.AN_ITEM
-        + (room.pieces_bytes(least, kernel) + width * height * levels * _LABEL)
-    )
+    pieces = room.pieces_bytes(room.room_within(0, kernel, 1), kernel) + room.LEAST_KEPT
+    cut = own * room.footprint_bytes(kernel) + items * room.AN_ITEM + pieces + width * height * levels * _LABEL
+    return min(cut, raster_bytes(splats, width, height, kernel, levels))  # small views are no larger than pieces
 
 
 def _tiles(width: int, height: int) -> int:

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 
+from liftcore import lift as lifting
 from liftcore.artifact import TENSORS, Lift
 from liftcore.device import CPU, Device
 from liftcore.errors import Unavailable
 from liftcore.input_files import input_file
 from liftcore.lift import Run, lift_sources, open_sources, planned
 from liftcore.plan import plan
+from liftcore.plan.on_device import ROOM_SPARE
 from liftcore.progress import silent
+from liftcore.scene.splats import Kernel
 from liftcore.solve.settings import LiftSettings
 from liftcore.timings import Timings
 from tests.backends import needs_triton
@@ -53,14 +57,39 @@ def test_lift_of_the_card_is_the_lift_of_the_processor(tmp_path: Path) -> None:
     assert again.metadata.certificate == told
 
 
+def test_solution_has_the_memory_of_the_last_view(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, opened, told = write_scene(tmp_path, 3), [], []
+    open_raster, closed_form_on = lifting.open_raster, lifting.closed_form_on
+
+    def opening(*given: Any) -> Any:
+        opened.append(open_raster(*given))
+        return opened[-1]
+
+    def solving(*given: Any) -> Any:
+        told.append(opened[-1]._kept)
+        return closed_form_on(*given)
+
+    monkeypatch.setattr(lifting, "open_raster", opening)
+    monkeypatch.setattr(lifting, "closed_form_on", solving)
+    lifted(scene, CARD, LiftSettings.of(certificate_rays=2, view_stride=3))
+    assert told == [None]
+
+
 def test_card_without_room_leaves_an_auto_lift_to_the_processor(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    from liftcore.raster.gpu import room
+    from liftcore.raster.gpu.memory import least_raster_bytes, raster_bytes
+
     scene = write_scene(tmp_path, 3)
     sources = open_sources(scene[0], scene[1], [scene[2]], SETTINGS)
     made = planned(sources, SETTINGS, CARD)
     assert made.device == CARD and made.on_device is not None and made.on_device.fits
     assert any(CARD.name in line for line in made.lines())
+    assert ROOM_SPARE == room.SPARE  # what the plan says of views is what the raster does
+    assert made.on_device.view == made.on_device.least_view > 0 and made.kept_on_card == made.on_device.weights > 0
+    large = (10_000_000, 1_600, 1_200, Kernel.GAUSSIAN_3D, 4)
+    assert least_raster_bytes(*large) < raster_bytes(*large) / 5
     assert "device_memory" in made.facts() and "free_bytes" in made.on_device.today()
     scarce = replace(made.on_device, free=made.on_device.least - 1)
     monkeypatch.setattr(plan, "device_plan", lambda *_: scarce)
