@@ -41,5 +41,5 @@ def safetensors_header(specs: Iterable[Spec], metadata: Mapping[str, str]) -> tu
 
 
 def tensor_bytes(tensor: Tensor) -> memoryview:
-    """A tensor's bytes in row order, without a copy where it lies so already."""
-    return tensor.contiguous().flatten().view(torch.uint8).numpy().data
+    """A tensor's bytes in row order, without a copy where it lies so already; from a card, if it lies there."""
+    return tensor.cpu().contiguous().flatten().view(torch.uint8).numpy().data

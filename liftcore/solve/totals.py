@@ -55,5 +55,7 @@ def row_totals(weights: RegionWeights) -> np.ndarray:
 
 def sums_in_order(values: Tensor, starts: Tensor) -> Tensor:
     """Sums [n] f64 of values f64 between ``starts`` [n + 1] i64: one thread each, one value after the other."""
+    if values.numel() == 0:
+        return values.new_zeros(starts.shape[0] - 1)
     every = torch.arange(values.shape[0], device=values.device)
     return embedding_bag(every, values[:, None], starts, mode="sum", include_last_offset=True)[:, 0]
