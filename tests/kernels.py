@@ -1,0 +1,33 @@
+"""Compile what nearly all tests walk with: ``python -m tests.kernels``. `make test` does so beside its lint.
+
+Tests run in two processes, and each would compile the same code for itself. What a few tests alone need is compiled
+there, once.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+from liftcore.lift import lift
+from liftcore.raster.warm_up import warm_up
+from liftcore.scene.splats import Kernel
+from liftcore.solve.settings import LiftSettings
+from tests.api.tiny_scene import make_scene
+
+
+def main() -> None:
+    """Every kernel's products, and a lift."""
+    for kernel in Kernel:
+        warm_up(kernel)
+    scene = make_scene()
+    with tempfile.TemporaryDirectory() as name:
+        files = {"splats.ply": scene.splats, "cameras.json": scene.cameras, "features.safetensors": scene.features}
+        paths = [Path(name) / file for file in files]
+        for path, content in zip(paths, files.values(), strict=True):
+            path.write_bytes(content)
+        lift(paths[0], paths[1], paths[2:], LiftSettings.of())
+
+
+if __name__ == "__main__":
+    main()
