@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING
 from liftcore.errors import Unavailable
 from liftcore.raster.constants import TILE
 from liftcore.raster.kernels import RECORDS
+from liftcore.raster.side_by_side import views_at_a_time
 from liftcore.solve.feature_room import check_disk
 from liftcore.solve.view_weights import MEMORY_LIMIT
 
@@ -25,7 +27,8 @@ ENTRIES_A_SPLAT = 1.5  # of W, for a splat that a view sees and a level of its r
 ENTRY_BYTES = 8 + 20 / ENTRIES_A_SPLAT  # column and weight, and a splat's ids, row start and evidence
 TILES_A_SPLAT = 6  # entries of tile lists and tile sums for a splat that a view sees, at full resolution
 TILE_ENTRY_BYTES = 4 + 4 + 2 * 16  # list, item, and an entry before and after it is gathered
-SCENE_BYTES = 9 * 8 + 3 * 8 + 3 * 8 + 4 + 8  # axes, opacities, reach; evidence, denominators, scale; order and ids
+SCENE_BYTES = 9 * 8 + 3 * 8 + 3 * 8  # axes, opacities, reach; evidence, denominators, scale
+ORDER_BYTES = 4 + 4 + 4  # depth, order and id
 CONTROL_GROUPS = (  # folder, and the files of limit, use and statistics: versions 2 and 1
     ("/sys/fs/cgroup", ("memory.max", "memory.current", "memory.stat")),
     ("/sys/fs/cgroup/memory", ("memory.limit_in_bytes", "memory.usage_in_bytes", "memory.stat")),
@@ -45,14 +48,16 @@ def memory_parts(
         feature_bytes: of a number of X, 2 or 4.
     """
     inputs = sum(t.nbytes for t in (splats.means, splats.quats, splats.log_scales, splats.opacity_logits))
+    view = 8 * RECORDS[splats.kernel] + ORDER_BYTES + TILES_A_SPLAT * TILE_ENTRY_BYTES  # of a splat that is seen
     largest = max(camera.width * camera.height for camera in cameras.values())
     levels = most_levels(packs, cameras)
+    views = min(len(cameras), views_at_a_time(len(os.sched_getaffinity(0))))
     weights = int(len(cameras) * seen_a_view * ENTRIES_A_SPLAT * ENTRY_BYTES * levels)
     return {
         "libraries": LIBRARIES,
         "splats": inputs,
-        "scene": splats.count * (SCENE_BYTES + 8 * RECORDS[splats.kernel]),
-        "view": int(seen_a_view * TILES_A_SPLAT * TILE_ENTRY_BYTES) + 8 * largest // TILE**2,
+        "scene": splats.count * SCENE_BYTES,
+        "views": views * (int(seen_a_view * view) + 8 * largest // TILE**2),
         "weights": min(weights, MEMORY_LIMIT),
         "codebooks": sum(_codebook_bytes(packs, view) for view in cameras),
         "features": splats.count * packs.channels * feature_bytes,

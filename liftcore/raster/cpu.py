@@ -6,10 +6,11 @@ which share. The compiled kernels release the interpreter lock.
 
 from __future__ import annotations
 
+import copy
 import os
 from collections import OrderedDict
 from concurrent.futures import ThreadPoolExecutor
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,18 +24,19 @@ from liftcore.raster.depth_order import depth_order
 from liftcore.raster.kernels import RECORDS, activated, kernel_in, project, with_gain
 from liftcore.raster.merging import count_entries, gather_entries, merge_range
 from liftcore.raster.projection import Targets, view_of
-from liftcore.raster.protocol import RayRows, RegionWeights, Walk, Weighting
+from liftcore.raster.protocol import Look, RayRows, RegionWeights, Walk, Walked, Weighting
 from liftcore.raster.readings import reading_of
 from liftcore.raster.region_weights import weigh_tiles
 from liftcore.raster.rendering import render_tiles, top_tiles, trace_rays
 from liftcore.raster.selection import choice_of
+from liftcore.raster.side_by_side import side_by_side, views_at_a_time
 from liftcore.raster.strided import check_stride, every_pixel, places_on, strided
 from liftcore.raster.strongest import strongest_tiles
 from liftcore.raster.tiles import fill_tiles, list_tiles, tile_places
 from liftcore.raster.walk import Frame
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Generator, Iterable
 
     from torch import Tensor
 
@@ -60,12 +62,16 @@ class CpuRaster:
 
     def __init__(self, splats: Splats, threads: int | None = None) -> None:
         self.splats = splats
-        self.threads = threads or len(os.sched_getaffinity(0))
-        self._pool = ThreadPoolExecutor(self.threads)
         self._scene = activated(splats, 1.0)
         self._gain = 1.0  # of the scene
-        self._records = np.empty((splats.count, RECORDS[splats.kernel]))
-        self._depths = np.empty(splats.count, np.float32)
+        self._make_room(threads or len(os.sched_getaffinity(0)))
+
+    def _make_room(self, threads: int) -> None:
+        """Threads and buffers of its own."""
+        self.threads = threads
+        self._pool = ThreadPoolExecutor(threads)
+        self._records = np.empty((self.splats.count, RECORDS[self.splats.kernel]))
+        self._depths = np.empty(self.splats.count, np.float32)
         self._frames: OrderedDict[tuple[Camera, Walk], Frame] = OrderedDict()
 
     def region_weights(
@@ -80,6 +86,23 @@ class CpuRaster:
             frame, lambda first, last: weigh_tiles(first, last, frame, reading, choice, with_plain)
         )
         return self._merge(frame, entries, reading.codebook_rows)
+
+    def walk_views(self, looks: Iterable[Look]) -> Generator[Walked]:
+        """``region_weights`` and ``ray_rows`` of views, ``views_at_a_time`` side by side."""
+        looks = iter(looks)
+        first = next(looks, None)
+        if first is None:
+            return
+        self._activated(first.walk.gain)  # once for all: the views of a lift have one gain
+        shares = _shares(self.threads, views_at_a_time(self.threads))
+        rasters = [self._beside(end - begin) for begin, end in shares]
+        yield from side_by_side(rasters, chain([first], looks))
+
+    def _beside(self, threads: int) -> CpuRaster:
+        """Another raster of the same scene, which may work at the same time."""
+        other = copy.copy(self)
+        other._make_room(threads)
+        return other
 
     def render(self, camera: Camera, values: Tensor, walk: Walk) -> Tensor:
         """``A X``: values [P, C] f32 -> [H, W, C] f32. See the protocol."""

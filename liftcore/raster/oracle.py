@@ -18,9 +18,12 @@ from liftcore.raster.antialiased import check_antialiased
 from liftcore.raster.constants import NEAR_PLANE
 from liftcore.raster.oracle_footprints import CUT_BAND, alphas
 from liftcore.raster.oracle_weights import counted_weights, walked_rays
-from liftcore.raster.protocol import RayRows, RegionWeights, Walk, Weighting
+from liftcore.raster.protocol import Look, RayRows, RegionWeights, Walk, Walked, Weighting
+from liftcore.raster.side_by_side import one_by_one
 
 if TYPE_CHECKING:
+    from collections.abc import Generator, Iterable
+
     from torch import Tensor
 
     from liftcore.scene.cameras import Camera
@@ -117,6 +120,10 @@ class OracleRaster:
             torch.from_numpy(met.astype(np.int32)),
             torch.from_numpy(plain[met].astype(np.float32)),
         )
+
+    def walk_views(self, looks: Iterable[Look]) -> Generator[Walked]:
+        """``region_weights`` and ``ray_rows`` of views, one at a time."""
+        return one_by_one(self, looks)
 
     def render(self, camera: Camera, values: Tensor, walk: Walk) -> Tensor:
         """``A X`` by a dense product."""

@@ -1,4 +1,4 @@
-"""What a raster backend offers: the four uses of A, one view at a time."""
+"""What a raster backend offers: the uses of A, view by view."""
 
 from __future__ import annotations
 
@@ -8,13 +8,25 @@ from typing import TYPE_CHECKING, Protocol
 from liftcore.raster.weighting import MOST_OF_A_RAY, Selection, Weighting
 
 if TYPE_CHECKING:
+    from collections.abc import Generator, Iterable
+
     from torch import Tensor
 
     from liftcore.observe.observation import Observation
     from liftcore.scene.cameras import Camera
 
 
-__all__ = ["MOST_OF_A_RAY", "Raster", "RayRows", "RegionWeights", "Selection", "Walk", "Weighting"]
+__all__ = [
+    "MOST_OF_A_RAY",
+    "Look",
+    "Raster",
+    "RayRows",
+    "RegionWeights",
+    "Selection",
+    "Walk",
+    "Walked",
+    "Weighting",
+]
 
 
 @dataclass(frozen=True)
@@ -53,6 +65,25 @@ class RayRows:
     weights: Tensor  # [nnz] f32
 
 
+@dataclass(frozen=True)
+class Look:
+    """What a lift asks of one view."""
+
+    camera: Camera
+    observation: Observation
+    walk: Walk
+    weighting: Weighting
+    pixels: Tensor  # [n, 2] i32 (x, y), whose rows of A are asked for
+
+
+@dataclass(frozen=True)
+class Walked:
+    """What a lift learns of one view."""
+
+    weights: RegionWeights
+    rows: RayRows
+
+
 class Raster(Protocol):
     """A for one scene. Every product is deterministic to the bit, whatever the number of threads."""
 
@@ -60,6 +91,14 @@ class Raster(Protocol):
         self, camera: Camera, observation: Observation, walk: Walk, weighting: Weighting
     ) -> RegionWeights:
         """``A'^T S`` of a view and the evidence of plain weights, over the rays that the walk's stride leaves."""
+        ...
+
+    def walk_views(self, looks: Iterable[Look]) -> Generator[Walked]:
+        """``region_weights`` and ``ray_rows`` of many views, in their order.
+
+        A look may be taken before the views ahead of it are done, and several views may be walked at a time. An error
+        of a look or of a walk ends the iterator; no view is kept afterwards.
+        """
         ...
 
     def render(self, camera: Camera, values: Tensor, walk: Walk) -> Tensor:

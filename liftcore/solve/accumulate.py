@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import deque
+from contextlib import closing
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -10,12 +12,12 @@ import torch
 
 from liftcore.observe.levels import at_levels
 from liftcore.observe.observation import FeatureGrid, Observation, RegionMap
-from liftcore.raster.protocol import RayRows, Walk, Weighting
+from liftcore.raster.protocol import Look, RayRows, Walk, Weighting
 from liftcore.solve.readout import Readout, read_pixels, sample_pixels
 from liftcore.solve.totals import Totals, row_totals
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from torch import Tensor
 
@@ -111,18 +113,22 @@ def accumulate(
     """
     count, cameras = scene
     totals = Totals(count, store.place)
-    weighting = weighting_of(settings)
-    samples, codebooks = [], []
-    rays = -(-settings.certificate_rays // len(views))
-    for number, name in enumerate(views):
-        camera, observation = cameras.get(name), as_read(packs.observation(name), settings, name)
-        walk = strided_walk(lift_walk(settings), settings, camera, number)
-        weights = raster.region_weights(camera, observation, walk, weighting)
-        totals.add(weights, float(settings.stride**2))
-        store.append(weights)
-        pixels = sample_pixels(camera, rays, (settings.seed, number), walk)
-        readout = read_pixels(observation, camera, pixels)
-        samples.append(SampledRays(raster.ray_rows(camera, pixels, walk), readout))
-        codebooks.append(observation.codebook)
-        progress("geometry", number + 1, len(views), "views")
+    samples, readouts, codebooks = [], deque[Readout](), []
+
+    def looks() -> Iterator[Look]:
+        rays = -(-settings.certificate_rays // len(views))
+        for number, name in enumerate(views):
+            camera, observation = cameras.get(name), as_read(packs.observation(name), settings, name)
+            walk = strided_walk(lift_walk(settings), settings, camera, number)
+            pixels = sample_pixels(camera, rays, (settings.seed, number), walk)
+            readouts.append(read_pixels(observation, camera, pixels))
+            codebooks.append(observation.codebook)
+            yield Look(camera, observation, walk, weighting_of(settings), pixels)
+
+    with closing(raster.walk_views(looks())) as walked_views:
+        for number, walked in enumerate(walked_views):
+            totals.add(walked.weights, float(settings.stride**2))
+            store.append(walked.weights)
+            samples.append(SampledRays(walked.rows, readouts.popleft()))
+            progress("geometry", number + 1, len(views), "views")
     return Geometry(*totals.found(), tuple(samples), tuple(codebooks))

@@ -11,31 +11,32 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass, fields
+from collections import deque
+from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass, fields, replace
+from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from llvmlite.binding import get_host_cpu_name
 from safetensors import SafetensorError, safe_open
 
 from liftcore import __version__
 from liftcore.files import whole_file
-from liftcore.raster.protocol import RayRows, RegionWeights
+from liftcore.raster.protocol import RayRows, RegionWeights, Walked
+from liftcore.raster.weights_home import on_host
 from liftcore.safetensors_header import safetensors_header, tensor_bytes
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 
     from torch import Tensor
 
-    from liftcore.raster.protocol import Raster
-    from liftcore.scene.cameras import Camera
+    from liftcore.raster.protocol import Look, Raster
     from liftcore.solve.settings import LiftSettings
 
-Kind = TypeVar("Kind")
-
-FORMAT = "splatlift-checkpoint/1"
+FORMAT = "splatlift-checkpoint/2"
+_PARTS = {"weights": RegionWeights, "rows": RayRows}  # of Walked
 BLOCK_BYTES = 1 << 28  # a block is written when so much has come together, however little time went by
 
 
@@ -79,52 +80,74 @@ def resumed(raster: Raster, checkpoint: Checkpoint | None, key: str) -> Iterator
 
 
 class _ResumedRaster:
-    """The two questions of the geometry phase go through the journal, all others straight to the raster."""
+    """The geometry phase's question goes through the journal, all others straight to the raster."""
 
     def __init__(self, raster: Raster, journal: _Journal) -> None:
         self._raster = raster
         self._journal = journal
 
-    def region_weights(self, camera: Camera, *rest: Any, **named: Any) -> RegionWeights:
-        call = f"region_weights {camera.name}"
-        return self._journal.answer(call, RegionWeights, lambda: self._raster.region_weights(camera, *rest, **named))
+    def walk_views(self, looks: Iterable[Look]) -> Generator[Walked]:
+        looks, asked = iter(looks), deque[str]()
 
-    def ray_rows(self, camera: Camera, *rest: Any, **named: Any) -> RayRows:
-        call = f"ray_rows {camera.name}"
-        return self._journal.answer(call, RayRows, lambda: self._raster.ray_rows(camera, *rest, **named))
+        def noted(look: Look) -> Look:
+            asked.append(look.camera.name)
+            return look
+
+        for look in looks:
+            known = self._journal.known(look.camera.name)
+            if known is not None:
+                yield known
+                continue
+            with closing(self._raster.walk_views(map(noted, chain([look], looks)))) as rest:
+                for walked in rest:
+                    self._journal.keep(asked.popleft(), walked)
+                    yield walked
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._raster, name)
 
 
 class _Journal:
-    """Answers in the order of their calls: those read back first, then new ones, written in blocks."""
+    """Views in the order of their walks: those read back first, then new ones, written in blocks."""
 
     def __init__(self, checkpoint: Checkpoint, key: str) -> None:
         self._folder = checkpoint.folder
         self._seconds = checkpoint.seconds
         self._key = key
         self._known = self._read()
-        self._count = 0  # calls so far
+        self._count = 0  # views so far
         self._fresh: list[tuple[str, dict[str, Tensor]]] = []
         self._since = time.monotonic()
         self._keeping = True
 
-    def answer(self, call: str, kind: type[Kind], make: Callable[[], Kind]) -> Kind:
-        """The answer to the next call: a dataclass of tensors, read back or made now."""
-        if self._known:
-            block, number, known = self._known.pop(0)
-            if known == call:
-                self._count += 1
-                return kind(**{name: block.get_tensor(f"{number}/{name}") for name in _names(kind)})
+    def known(self, view: str) -> Walked | None:
+        """What was found in the next view, if it is on the disk."""
+        if not self._known:
+            return None
+        block, number, known = self._known.pop(0)
+        if known != view:
             self._known.clear()  # of another course of work, which the key should have told
-        made = make()
-        self._fresh.append((call, {name: getattr(made, name) for name in _names(kind)}))
+            return None
+        self._count += 1
+        weights, rows = (
+            {name: block.get_tensor(f"{number}/{part}/{name}") for name in _names(kind)}
+            for part, kind in _PARTS.items()
+        )
+        return Walked(RegionWeights(**weights), RayRows(**rows))
+
+    def keep(self, view: str, walked: Walked) -> None:
+        """Note what was found in the next view."""
+        walked = replace(walked, weights=on_host(walked.weights))
+        tensors = {
+            f"{part}/{name}": getattr(getattr(walked, part), name)
+            for part, kind in _PARTS.items()
+            for name in _names(kind)
+        }
+        self._fresh.append((view, tensors))
         self._count += 1
         size = sum(tensor.nbytes for _, tensors in self._fresh for tensor in tensors.values())
         if time.monotonic() - self._since >= self._seconds or size >= BLOCK_BYTES:
             self.flush()
-        return made
 
     def flush(self) -> None:
         """Write what is not on the disk yet. Without room for it the lift goes on, and keeps no more."""

@@ -31,12 +31,15 @@ from liftcore.raster.gpu.slots import DeviceReading
 from liftcore.raster.gpu.tracing import ray_rows
 from liftcore.raster.kernels import activated, with_gain
 from liftcore.raster.projection import view_of
-from liftcore.raster.protocol import RayRows, RegionWeights, Walk, Weighting
+from liftcore.raster.protocol import Look, RayRows, RegionWeights, Walk, Walked, Weighting
 from liftcore.raster.selection import choice_of
+from liftcore.raster.side_by_side import one_by_one
 from liftcore.raster.strided import check_stride, every_pixel, places_on, strided
 from liftcore.raster.weights_home import on_host
 
 if TYPE_CHECKING:
+    from collections.abc import Generator, Iterable
+
     from torch import Tensor
 
     from liftcore.observe.observation import Observation
@@ -123,6 +126,10 @@ class GpuRaster:
         reading = DeviceReading(observation, camera, walk, self.device)
         made = weighing.region_weights(frame, reading, choice, walk.gain != 1.0, self.splats.count)
         return made if self._stays else on_host(made)
+
+    def walk_views(self, looks: Iterable[Look]) -> Generator[Walked]:
+        """``region_weights`` and ``ray_rows`` of views, one at a time."""
+        return one_by_one(self, looks)
 
     @_within_memory
     def render(self, camera: Camera, values: Tensor, walk: Walk) -> Tensor:
