@@ -144,3 +144,39 @@ def either(typingctx, left, right):
         return builder.or_(*args)
 
     return types.uint32(types.uint32, types.uint32), codegen
+
+
+_RANKS = ir.IntType(2 * HALVES)
+
+
+@compiled
+def ranked_halves(typingctx, halves, late):
+    """The half rows of a set in two ranks: bit ``h`` for those outside ``late``, bit ``32 + h`` for those in it."""
+
+    def codegen(context, builder, signature, args):
+        halves, late = args
+        first = builder.zext(builder.and_(halves, builder.not_(late)), _RANKS)
+        last = builder.zext(builder.and_(halves, late), _RANKS)
+        return builder.or_(first, builder.shl(last, ir.Constant(_RANKS, HALVES)))
+
+    return types.uint64(types.uint32, types.uint32), codegen
+
+
+@compiled
+def lowest_rank(typingctx, ranked):
+    """The number of the first bit of a ranked set that is not empty."""
+
+    def codegen(context, builder, signature, args):
+        return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
+
+    return types.intp(types.uint64), codegen
+
+
+@compiled
+def without_lowest_rank(typingctx, ranked):
+    """The ranked set without its first bit."""
+
+    def codegen(context, builder, signature, args):
+        return builder.and_(args[0], builder.sub(args[0], ir.Constant(_RANKS, 1)))
+
+    return types.uint64(types.uint64), codegen

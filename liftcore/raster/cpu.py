@@ -226,8 +226,8 @@ class CpuRaster:
         def merge(first: int, last: int) -> tuple[np.ndarray, ...]:
             before = ends[first - 1] if first else 0
             starts = np.concatenate([[before], ends[first:last]]) - before
-            words = np.empty((starts[-1], 3), np.int32)
-            gathered, cursors = (words, words.view(np.float32)), starts[:-1].copy()
+            words, totals = np.empty((starts[-1], 2), np.int32), np.zeros(last - first)
+            gathered, cursors = (words, words.view(np.float32), totals), starts[:-1].copy()
             for share, base in zip(entries, bases[:-1], strict=True):
                 gather_entries(first, last, share[:4], base, cursors, gathered)
             return merge_range(starts, gathered, slot_rows, codebook_rows, frame.ids[first:last])

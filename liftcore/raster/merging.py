@@ -25,11 +25,11 @@ def gather_entries(first, last, entries, slot_base, cursors, gathered):
     """Scatter the entries of the records ``first..last`` to their places (cursors move on).
 
     ``entries = (places, slots, weights, evidence)`` of one tile share, its slots counted from ``slot_base``.
-    ``gathered = (words, numbers)``: one table [n, 3] of slot, weight and evidence, so that an entry is written at one
-    place in memory, seen as i32 and as f32.
+    ``gathered = (words, numbers, totals)``: one table [n, 2] of slot and weight, so that an entry is written at one
+    place in memory, seen as i32 and as f32; and the evidence of each record, [last - first] f64, which grows.
     """
     places, slots, weights, evidence = entries
-    words, numbers = gathered
+    words, numbers, totals = gathered
     for i in range(places.shape[0]):
         place = places[i]
         if first <= place < last:
@@ -37,7 +37,7 @@ def gather_entries(first, last, entries, slot_base, cursors, gathered):
             cursors[place - first] = at + 1
             words[at, 0] = slots[i] + slot_base if slots[i] >= 0 else -1
             numbers[at, 1] = weights[i]
-            numbers[at, 2] = evidence[i]
+            totals[place - first] += evidence[i]
 
 
 @kernel
@@ -45,14 +45,14 @@ def merge_range(starts, gathered, slot_rows, codebook_rows, ids):
     """Expand, sum and sort the entries of a range of records.
 
     Args:
-        starts: [n + 1] i64, each record's entries in ``gathered``, as ``gather_entries`` writes them.
+        starts: [n + 1] i64, each record's entries in ``gathered``, as ``gather_entries`` writes it.
         slot_rows: [S, levels] i32. codebook_rows: M. ids: [n] i32, the splat of each record.
 
     Returns:
         splats [r] i32, lengths [r] i64, columns [nnz] i32, weights [nnz] f32, and the splats [m] i32 and sums [m] f32
         of the evidence.
     """
-    words, numbers = gathered
+    words, numbers, totals = gathered
     levels = slot_rows.shape[1]
     records = ids.shape[0]
     sums = np.zeros(codebook_rows)
@@ -63,9 +63,8 @@ def merge_range(starts, gathered, slot_rows, codebook_rows, ids):
     weights = np.empty(columns.shape[0], np.float32)
     rows = count = met_count = 0
     for record in range(records):
-        total, length = 0.0, 0
+        total, length = totals[record], 0
         for i in range(starts[record], starts[record + 1]):
-            total += numbers[i, 2]
             slot = words[i, 0]
             if slot < 0:
                 continue

@@ -49,6 +49,7 @@ class TileTaps(NamedTuple):
     starts: np.ndarray  # [33] i32, each half row's taps
     slots: np.ndarray  # [MAX_TAPS] i32
     alone: np.ndarray  # [32] i32, the slot that all pixels of a half row read and nothing else; -1 none, -2 see taps
+    several: np.ndarray  # [1] u32, the set of half rows that read several slots, or none
     factors: np.ndarray  # [MAX_TAPS * 8] f32
     slot_rows: np.ndarray  # [MAX_SLOTS, levels] i32, the codebook rows of a slot, -1 none
     sizes: np.ndarray  # [2] i32: slots in use; 1 when all pixels read slot 0 and nothing else
@@ -94,6 +95,7 @@ def new_taps(levels):
         np.zeros(HALVES + 1, np.int32),
         np.zeros(MAX_TAPS, np.int32),
         np.full(HALVES, NO_SLOT, np.int32),
+        np.zeros(1, np.uint32),
         np.zeros(MAX_TAPS * LANES, np.float32),
         np.zeros((MAX_SLOTS, levels), np.int32),
         np.zeros(2, np.int32),
@@ -110,6 +112,10 @@ def read_tile(taps, reading, frame, tile):
         _read_grid(taps, reading, frame, x0, y0)
     else:
         _read_regions(taps, reading, frame, x0, y0)
+    taps.several[0] = 0
+    for half in range(HALVES):
+        if taps.alone[half] < 0:
+            taps.several[0] |= np.uint32(1) << np.uint32(half)
 
 
 @kernel

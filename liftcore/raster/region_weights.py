@@ -10,8 +10,19 @@ from __future__ import annotations
 import numpy as np
 
 from liftcore.jit import inlined, kernel
-from liftcore.lanes import LANES, WEIGHTS, keep_lanes, lanes_at, no_lanes, plus, plus_product, sum_of_lanes, times
-from liftcore.lanes_halves import lowest_half, without_lowest
+from liftcore.lanes import (
+    HALVES,
+    LANES,
+    WEIGHTS,
+    keep_lanes,
+    lanes_at,
+    no_lanes,
+    plus,
+    plus_product,
+    sum_of_lanes,
+    times,
+)
+from liftcore.lanes_halves import lowest_rank, ranked_halves, without_lowest_rank
 from liftcore.raster.constants import TILE
 from liftcore.raster.readings import MAX_SLOTS, NO_SLOT, new_taps, read_tile
 from liftcore.raster.selection import CENTRAL, LARGEST, NO_SPOT, choose, new_marks, rank_tile, spot_of
@@ -70,10 +81,12 @@ def weigh_tiles(first, last, frame, reading, choice, with_plain):
             if choice.kind == CENTRAL:
                 spot = spot_of(splat)
             low, high, seen = MAX_SLOTS, -1, no_lanes()
-            halves = meets(rays, splat)
-            while halves:
-                half = lowest_half(halves)
-                halves = without_lowest(halves)
+            # Half rows of several slots come last: a branch that changes once a splat is foreseen.
+            ranked = ranked_halves(meets(rays, splat), taps.several[0])
+            while ranked:
+                rank = lowest_rank(ranked)
+                ranked = without_lowest_rank(ranked)
+                half = rank % HALVES
                 if with_plain:
                     heavy, plain = blend_both(rays, splat, half)
                     seen = plus(seen, plain)
@@ -89,8 +102,8 @@ def weigh_tiles(first, last, frame, reading, choice, with_plain):
                     heavy = lanes_at(state, WEIGHTS + half * LANES)
                 elif squared:
                     heavy = times(heavy, heavy)
-                slot = alone[half]
-                if slot >= 0:
+                if rank < HALVES:
+                    slot = alone[half]
                     low, high = min(low, slot), max(high, slot)
                     keep_lanes(sums, slot * LANES, plus(lanes_at(sums, slot * LANES), heavy))
                     continue

@@ -12,9 +12,12 @@ import math
 import numpy as np
 
 from liftcore.jit import inlined, kernel
+from liftcore.lanes import fetch_ahead
 from liftcore.raster.constants import TILE
 from liftcore.raster.footprints import circle_of
 from liftcore.raster.records import EXTENT_X, EXTENT_Y, KX, KY, LEAN, MX, MY, REACH, SLOPE
+
+AHEAD = 8  # footprints between asking for a record and reading it: in the order of depth they lie anywhere
 
 
 @inlined
@@ -84,6 +87,8 @@ def list_tiles(order, kernel, records, rows, columns, counts):
     tiles = np.empty(max(1024, 4 * order.shape[0]), np.int32)
     count = 0
     for i in range(order.shape[0]):
+        if i + AHEAD < order.shape[0]:
+            fetch_ahead(records, order[i + AHEAD])
         record = records[order[i]]
         before = count
         circle = circle_of(kernel, record)

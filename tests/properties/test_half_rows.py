@@ -9,7 +9,17 @@ from hypothesis import strategies as st
 from liftcore.jit import kernel
 from liftcore.lanes import BASES, HALVES, LANES, ROWS, STARTS
 from liftcore.lanes_blend import STATE
-from liftcore.lanes_halves import both, either, ellipse_halves, lit_halves, lowest_half, without_lowest
+from liftcore.lanes_halves import (
+    both,
+    either,
+    ellipse_halves,
+    lit_halves,
+    lowest_half,
+    lowest_rank,
+    ranked_halves,
+    without_lowest,
+    without_lowest_rank,
+)
 from liftcore.raster.constants import TILE
 
 places = st.floats(-40, 56)
@@ -34,6 +44,17 @@ def members(halves):
 @kernel
 def lit(state, first):
     return lit_halves(state, first)
+
+
+@kernel
+def in_ranks(halves, late):
+    """[n] the half rows of a set, those of ``late`` 32 higher, as the walk takes them."""
+    found = []
+    ranked = ranked_halves(halves, late)
+    while ranked:
+        found.append(lowest_rank(ranked))
+        ranked = without_lowest_rank(ranked)
+    return found
 
 
 @kernel
@@ -80,3 +101,12 @@ def test_a_half_row_is_lit_when_any_lane_is(word: int, lane: int) -> None:
 
 def test_half_rows_cover_a_tile() -> None:
     assert ROWS == TILE == HALVES // ROWS * LANES
+
+
+@given(halves=st.integers(0, 2**32 - 1), late=st.integers(0, 2**32 - 1))
+def test_ranks_hold_each_half_row_once_and_the_late_ones_last(halves: int, late: int) -> None:
+    held = [half for half in range(HALVES) if halves >> half & 1]
+    early = [half for half in held if not late >> half & 1]
+    assert in_ranks(np.uint32(halves), np.uint32(late)) == early + [
+        HALVES + half for half in held if late >> half & 1
+    ]
