@@ -135,7 +135,6 @@ def _lift_on(run: Run, plan: Plan, sources: Sources, inputs: list[InputFile], ch
         with run.timings.stage("geometry"), resumed(raster, checkpoint, key) as walked:
             scene = (sources.splats.count, sources.cameras)
             geometry = accumulate(walked, scene, sources.packs, sources.views, settings, store, progress)
-        raster.forget()  # its last view's memory is the solution's
         if settings.robust_steps or settings.aggregation_resolve:  # which read the weights on the host
             store.bring_home()
         weights, solution = _solve(run, store, geometry, room_within(plan.features_room))

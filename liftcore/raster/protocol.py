@@ -97,7 +97,7 @@ class Raster(Protocol):
         """``region_weights`` and ``ray_rows`` of many views, in their order.
 
         A look may be taken before the views ahead of it are done, and several views may be walked at a time. An error
-        of a look or of a walk ends the iterator; no view is kept afterwards.
+        of a look or of a walk ends the iterator. No view is kept at its end: the solution has the memory.
         """
         ...
 

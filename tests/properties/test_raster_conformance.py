@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,7 +14,7 @@ from liftcore.observe.observation import Observation, RegionMap
 from liftcore.raster.cpu import CpuRaster
 from liftcore.raster.oracle import OracleRaster, dense_view, reading_matrix
 from liftcore.raster.oracle_weights import counted_weights, walked_rays
-from liftcore.raster.protocol import RegionWeights, Selection, Walk, Weighting
+from liftcore.raster.protocol import Look, RayRows, RegionWeights, Selection, Walk, Weighting
 from liftcore.scene.splats import Kernel, Splats
 from tests.backends import every_backend
 from tests.scenes import random_camera, random_grid, random_regions, random_splats, scenes
@@ -175,6 +175,37 @@ def test_ray_rows_are_rows_of_a(footprint, backend):
             rows.weights.numpy()
         )
         assert np.abs(A - view.A)[~view.cut].max(initial=0) < INSIDE
+
+
+def same_bits(one: RegionWeights | RayRows, other: RegionWeights | RayRows) -> bool:
+    """Whether all tensors of the two are equal to the bit."""
+    return all(torch.equal(getattr(one, field.name), getattr(other, field.name)) for field in fields(one))
+
+
+@every_footprint
+@every_backend
+def test_views_walked_in_a_row_are_those_walked_alone_to_the_bit(footprint, backend):
+    splats, walk = seeded(footprint, 7, 12)
+    pixels = (torch.tensor([[3, 4], [10, 11]], dtype=torch.int32), torch.empty(0, 2, dtype=torch.int32))
+    looks = [
+        Look(
+            random_camera(k, 14, 13),
+            random_regions(k),
+            replace(walk, gain=1.0 + k % 2 / 5),
+            Weighting(),
+            pixels[k % 2],
+        )
+        for k in range(3)
+    ]
+    walked = list(backend.open(splats).walk_views(iter(looks)))
+    assert len(walked) == len(looks)
+    alone = backend.open(splats)
+    for look, found in zip(looks, walked, strict=True):
+        assert same_bits(found.weights, alone.region_weights(look.camera, look.observation, look.walk, Weighting()))
+        if len(look.pixels):
+            assert same_bits(found.rows, alone.ray_rows(look.camera, look.pixels, look.walk))
+        else:
+            assert found.rows.row_starts.tolist() == [0]
 
 
 @every_footprint
