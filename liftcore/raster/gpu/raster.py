@@ -9,6 +9,7 @@ all of it runs in Triton's interpreter: that is how it is tested where there is 
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import closing
 from functools import wraps
 from typing import TYPE_CHECKING, Concatenate, ParamSpec, TypeVar
 
@@ -20,6 +21,7 @@ from liftcore.raster.antialiased import check_antialiased
 from liftcore.raster.arguments import check_image, check_labels, check_rows
 from liftcore.raster.constants import TILE
 from liftcore.raster.gpu import rendering, weighing
+from liftcore.raster.gpu.ahead import made_ahead
 from liftcore.raster.gpu.frame import Frame
 from liftcore.raster.gpu.launching import check_device
 from liftcore.raster.gpu.memory import USUAL_LEVELS, raster_bytes
@@ -33,7 +35,6 @@ from liftcore.raster.kernels import activated, with_gain
 from liftcore.raster.projection import view_of
 from liftcore.raster.protocol import Look, RayRows, RegionWeights, Walk, Walked, Weighting
 from liftcore.raster.selection import choice_of
-from liftcore.raster.side_by_side import one_by_one
 from liftcore.raster.strided import check_stride, every_pixel, places_on, strided
 from liftcore.raster.weights_home import on_host
 
@@ -116,20 +117,35 @@ class GpuRaster:
             torch.cuda.empty_cache()
         return True
 
-    @_within_memory
     def region_weights(
         self, camera: Camera, observation: Observation, walk: Walk, weighting: Weighting
     ) -> RegionWeights:
         """``A'^T S`` of a view and the evidence of plain weights. See the protocol."""
-        choice = choice_of(weighting)
-        frame = self._frame(camera, walk)
-        reading = DeviceReading(observation, camera, walk, self.device)
+        return self._weighed(self._read(observation, camera, walk), camera, walk, weighting)
+
+    @_within_memory
+    def _weighed(self, reading: DeviceReading, camera: Camera, walk: Walk, weighting: Weighting) -> RegionWeights:
+        choice, frame = choice_of(weighting), self._frame(camera, walk)
         made = weighing.region_weights(frame, reading, choice, walk.gain != 1.0, self.splats.count)
         return made if self._stays else on_host(made)
 
     def walk_views(self, looks: Iterable[Look]) -> Generator[Walked]:
-        """``region_weights`` and ``ray_rows`` of views, one at a time."""
-        return one_by_one(self, looks)
+        """``region_weights`` and ``ray_rows`` of views, one at a time; the next one is read while the card walks."""
+
+        def read(look: Look) -> DeviceReading:
+            return self._read(look.observation, look.camera, look.walk)
+
+        try:
+            with closing(made_ahead(looks, read)) as ahead:
+                for look, reading in ahead:
+                    weights = self._weighed(reading, look.camera, look.walk, look.weighting)
+                    yield Walked(weights, self.ray_rows(look.camera, look.pixels, look.walk))
+        finally:
+            self.forget()
+
+    def _read(self, observation: Observation, camera: Camera, walk: Walk) -> DeviceReading:
+        check_stride(walk, camera)
+        return DeviceReading(observation, camera, walk, self.device)
 
     @_within_memory
     def render(self, camera: Camera, values: Tensor, walk: Walk) -> Tensor:
