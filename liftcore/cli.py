@@ -239,6 +239,7 @@ def _add_bench(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--levels", type=_count, metavar="L", help="label levels")
     parser.add_argument("--views", type=_count, metavar="N")
     parser.add_argument("--threads", type=_count, metavar="N")
+    parser.add_argument("--preset", metavar="NAME", help="this one alone; else all")
     parser.add_argument("--stages", action="store_true", help="every step of a view apart, on one thread")
     _add_device(parser)
 

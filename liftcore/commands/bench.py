@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     import argparse
     from collections.abc import Iterator
 
-_OPTIONS = ("scene", "splats", "size", "channels", "levels", "views", "threads", "stages", "device")
+_OPTIONS = ("scene", "splats", "size", "channels", "levels", "views", "threads", "preset", "stages", "device")
 
 
 def run(options: argparse.Namespace) -> int:

@@ -52,7 +52,7 @@ def run_bench(options: dict[str, Any]) -> dict[str, Any]:
 
     Args:
         options: scene (folder or None), splats, size ("WxH"), channels, levels, views, threads, device ("auto", "cpu"
-            or "cuda"); stages (bool): every step apart, on one thread of the processor, as
+            or "cuda"); preset, one name, else all; stages (bool): every step apart, on one thread of the processor, as
             ``liftcore.measure.stages`` has it.
 
     Returns:
@@ -70,9 +70,11 @@ def run_bench(options: dict[str, Any]) -> dict[str, Any]:
     if options.get("stages"):
         from liftcore.measure.stages import time_stages
 
-        presets = {str(preset): time_stages(work, preset) for preset in (Preset.ROW_SUM, Preset.TIKHONOV)}
+        chosen = _presets(options, (Preset.ROW_SUM, Preset.TIKHONOV))
+        presets = {str(preset): time_stages(work, preset) for preset in chosen}
     else:
-        presets = {str(preset): time_lift(work, preset, device, options.get("threads")) for preset in Preset}
+        chosen = _presets(options, tuple(Preset))
+        presets = {str(preset): time_lift(work, preset, device, options.get("threads")) for preset in chosen}
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
     return {
         "workload": work.name,
@@ -120,6 +122,10 @@ def time_lift(work: Workload, preset: Preset, device: Device, threads: int | Non
         "total_s_per_view": statistics.median(map(sum, zip(geometry, solution, strict=True))),
         "weights_entries_per_view": entries / len(looks),
     }
+
+
+def _presets(options: dict[str, Any], every: Sequence[Preset]) -> Sequence[Preset]:
+    return [LiftSettings.of(preset=options["preset"]).preset] if options.get("preset") else every
 
 
 def _workload(options: dict[str, Any]) -> Workload:

@@ -285,10 +285,11 @@ def test_demo_and_bench_pass_their_options_on(
         monkeypatch.setitem(sys.modules, name, module)
     assert run(capsys, "demo", "--out", tmp_path, "--json")[0] == 0
     assert seen.pop() == (None, tmp_path, True)
-    status, out, _ = run(capsys, "bench", "--size", "986x728", "--splats", 1000, "--json")
+    status, out, _ = run(capsys, "bench", "--size", "986x728", "--splats", 1000, "--preset", "centre", "--json")
     assert (status, json.loads(out)) == (0, {"seconds": 1.0})
     assert seen[0]["size"] == "986x728"
     assert seen[0]["splats"] == 1000
+    assert seen[0]["preset"] == "centre"
     assert seen[0]["scene"] is None
 
 
