@@ -17,13 +17,13 @@ demo: $(READY)  ## the whole job through the real service; SCENE=DIR takes a sce
 # Files of tests are dealt to two processes, in the order in which they lie. A process that dies is not begun anew: it
 # would go on with the test that it died of.
 test: $(READY)  ## everything that must hold
+	@echo "lint, and beside it kernels: compiling them takes some minutes, once"
 	@$(MAKE) --no-print-directory --jobs=2 --output-sync lint kernels
 	@if [ -d $(SHARED) ]; then echo "real scenes: found in $(SHARED)"; \
 	else echo "real scenes: no $(SHARED) here, so the tests on them are skipped"; fi
 	$(BIN)/python -m pytest -rs --numprocesses=2 --dist=loadfile --no-loadscope-reorder --max-worker-restart=0
 
 kernels: $(READY)
-	@echo "compiling kernels: some minutes, once"
 	$(BIN)/python -m tests.kernels
 
 soak: $(READY)  ## the long proofs of docs/reliability.md: prints their figures, takes an hour or so

@@ -129,6 +129,7 @@ def _add_lift(parser: argparse.ArgumentParser) -> None:
 def _add_plan(parser: argparse.ArgumentParser) -> None:
     _add_sources(parser)
     _add_settings(parser)
+    parser.add_argument("--threads", type=_count, metavar="N", help="of the lift; else as many as there are cores")
 
 
 def _add_sources(parser: argparse.ArgumentParser) -> None:

@@ -107,7 +107,7 @@ def lift_sources(run: Run, sources: Sources, inputs: list[InputFile], checkpoint
     """The lift of what is open already: ``inputs`` are the files that it came from."""
     _warm_up(run, sources.splats.kernel)
     with run.timings.stage("plan"):
-        plan = planned(sources, run.settings, run.device)
+        plan = planned(sources, run.settings, run.device, run.threads)
         sources = replace(sources, views=list(plan.views))
     for warning in plan.warnings:  # of this machine: equal inputs give equal lifts, so none is kept with them
         log.warning(warning)
@@ -177,9 +177,9 @@ def open_sources(splats: Path, cameras: Path, features: Sequence[Path], settings
     return Sources(scene, views, packs, names[:: settings.view_stride], unpaired)
 
 
-def planned(sources: Sources, settings: LiftSettings, device: Device) -> Plan:
+def planned(sources: Sources, settings: LiftSettings, device: Device, threads: int | None = None) -> Plan:
     """The plan of a lift from these sources on the device that the settings ask for."""
-    return plan_lift(sources.splats, sources.cameras, sources.packs, sources.views, settings, device)
+    return plan_lift(sources.splats, sources.cameras, sources.packs, sources.views, settings, device, threads)
 
 
 def _blind(views: Sequence[str], store: ViewWeights) -> list[str]:

@@ -81,7 +81,8 @@ def plan_of(options: argparse.Namespace, settings: LiftSettings) -> Plan:
     from liftcore.lift import open_sources, planned
 
     device = choose_device(settings.device)
-    return planned(open_sources(options.splats, options.cameras, options.features, settings), settings, device)
+    sources = open_sources(options.splats, options.cameras, options.features, settings)
+    return planned(sources, settings, device, options.threads)
 
 
 def _summary(result: Lift) -> dict[str, Any]:

@@ -52,7 +52,7 @@ def run_bench(options: dict[str, Any]) -> dict[str, Any]:
 
     Args:
         options: scene (folder or None), splats, size ("WxH"), channels, levels, views, threads, device ("auto", "cpu"
-            or "cuda"); preset, one name, else all; stages (bool): every step apart, on one thread of the processor, as
+            or "cuda"); preset (one alone, else all); stages (bool): every step apart, on one thread, as
             ``liftcore.measure.stages`` has it.
 
     Returns:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,7 +10,6 @@ from typing import TYPE_CHECKING
 from liftcore.errors import Unavailable
 from liftcore.raster.constants import TILE
 from liftcore.raster.kernels import RECORDS
-from liftcore.raster.side_by_side import views_at_a_time
 from liftcore.solve.feature_room import check_disk
 from liftcore.solve.view_weights import MEMORY_LIMIT
 
@@ -28,7 +26,7 @@ ENTRY_BYTES = 8 + 20 / ENTRIES_A_SPLAT  # column and weight, and a splat's ids, 
 TILES_A_SPLAT = 6  # entries of tile lists and tile sums for a splat that a view sees, at full resolution
 TILE_ENTRY_BYTES = 4 + 4 + 2 * 16  # list, item, and an entry before and after it is gathered
 SCENE_BYTES = 9 * 8 + 3 * 8 + 3 * 8  # axes, opacities, reach; evidence, denominators, scale
-ORDER_BYTES = 4 + 4 + 4  # depth, order and id
+WALK_BYTES = 68  # of a splat of the scene in the walk of a view, seen or not: depth, id, counts and sums of the merge
 CONTROL_GROUPS = (  # folder, and the files of limit, use and statistics: versions 2 and 1
     ("/sys/fs/cgroup", ("memory.max", "memory.current", "memory.stat")),
     ("/sys/fs/cgroup/memory", ("memory.limit_in_bytes", "memory.usage_in_bytes", "memory.stat")),
@@ -40,7 +38,7 @@ SPARE = 0.9  # of the memory that is free: others grow too
 def memory_parts(
     splats: Splats, packs: FeaturePacks, cameras: Mapping[str, Camera], seen_a_view: float, feature_bytes: int
 ) -> dict[str, int]:
-    """Bytes of each part of a lift at its peak.
+    """Bytes of each part of a lift at its peak, with one view in work.
 
     Args:
         cameras: the views that are lifted, by name.
@@ -48,17 +46,17 @@ def memory_parts(
         feature_bytes: of a number of X, 2 or 4.
     """
     inputs = sum(t.nbytes for t in (splats.means, splats.quats, splats.log_scales, splats.opacity_logits))
-    view = 8 * RECORDS[splats.kernel] + ORDER_BYTES + TILES_A_SPLAT * TILE_ENTRY_BYTES  # of a splat that is seen
     largest = max(camera.width * camera.height for camera in cameras.values())
-    levels = most_levels(packs, cameras)
-    views = min(len(cameras), views_at_a_time(len(os.sched_getaffinity(0))))
-    weights = int(len(cameras) * seen_a_view * ENTRIES_A_SPLAT * ENTRY_BYTES * levels)
+    weights = int(seen_a_view * ENTRIES_A_SPLAT * ENTRY_BYTES * most_levels(packs, cameras))
+    seen = 8 * RECORDS[splats.kernel] + TILES_A_SPLAT * TILE_ENTRY_BYTES  # of a splat
+    labels = max(_label_bytes(packs, view) for view in cameras)
+    walk = int(seen_a_view * seen) + splats.count * WALK_BYTES + 8 * largest // TILE**2
     return {
         "libraries": LIBRARIES,
         "splats": inputs,
         "scene": splats.count * SCENE_BYTES,
-        "views": views * (int(seen_a_view * view) + 8 * largest // TILE**2),
-        "weights": min(weights, MEMORY_LIMIT),
+        "view": walk + 2 * labels + weights,  # labels of the next one, too, and weights that wait for their turn
+        "weights": min(len(cameras) * weights, MEMORY_LIMIT),
         "codebooks": sum(_codebook_bytes(packs, view) for view in cameras),
         "features": splats.count * packs.channels * feature_bytes,
     }
@@ -133,6 +131,12 @@ def most_levels(packs: FeaturePacks, views: Iterable[str]) -> int:
 def codebook_rows(packs: FeaturePacks, view: str) -> int:
     """Rows of the view's codebook; of a grid, its cells."""
     return math.prod(_codebook_spec(packs, view).shape[:-1])
+
+
+def _label_bytes(packs: FeaturePacks, view: str) -> int:
+    """Of the view's labels as they are walked."""
+    spec = packs.specs(view).get("labels")
+    return 0 if spec is None else 4 * math.prod(spec.shape)
 
 
 def _codebook_bytes(packs: FeaturePacks, view: str) -> int:

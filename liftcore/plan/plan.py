@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import islice
@@ -14,6 +15,7 @@ from liftcore.plan.on_device import check_device_room, device_plan
 from liftcore.plan.pilot import FEW_VIEWS, fly_pilot
 from liftcore.plan.rank import ENOUGH, Rank, codebook_rank
 from liftcore.plan.visibility import visibility
+from liftcore.raster.side_by_side import views_at_a_time
 from liftcore.solve.accumulate import lift_walk
 
 if TYPE_CHECKING:
@@ -43,7 +45,8 @@ class Plan:
     splats_a_view: float
     rank: Rank
     dtype: str  # that X is stored as, when it can hold the codebooks
-    memory: Mapping[str, int]  # bytes a part
+    memory: Mapping[str, int]  # bytes a part, with one view in work
+    at_once: int  # views that this machine has in work
     device: Device  # that will walk and solve
     on_device: DevicePlan | None  # what it takes of a card, where it is one
     features_room: int | None  # bytes of this machine's memory that X may take today; None for no limit
@@ -51,7 +54,7 @@ class Plan:
 
     @property
     def memory_bytes(self) -> int:
-        """The estimated peak."""
+        """The estimated peak with one view in work."""
         return sum(self.memory.values())
 
     def facts(self) -> dict[str, Any]:
@@ -89,8 +92,9 @@ class Plan:
             f"  {self.rank.channels} channels; {self.rank.rows} sampled codebook rows have rank {bound}"
             f"{self.rank.rank}, and {self.rank.enough} directions hold {ENOUGH:.0%} of their squares"
         )
-        parts = ", ".join(f"{name} {size / 2**20:.0f}" for name, size in self.memory.items())
-        yield f"  features as {self.dtype}; about {self.memory_bytes / 2**20:.0f} MiB at the peak ({parts})"
+        sizes = _in_work(self.memory, self.at_once)
+        parts = ", ".join(f"{name} {size / 2**20:.0f}" for name, size in sizes.items())
+        yield f"  features as {self.dtype}; about {sum(sizes.values()) / 2**20:.0f} MiB at the peak ({parts})"
         yield f"  on {self.device.name}" + (f": {self.on_device.line()}" if self.on_device else "")
         yield from (f"warning: {warning}" for warning in self.warnings)
 
@@ -113,11 +117,13 @@ def plan_lift(
     names: Sequence[str],
     settings: LiftSettings,
     device: Device,
+    threads: int | None = None,
 ) -> Plan:
     """Plan the lift of the views ``names``; the settings' coverage and view_cosine may choose among them.
 
     Args:
         device: where it should run. A card with too little room leaves an ``auto`` lift to the processor.
+        threads: that walk on the processor; None takes the cores that this process may use.
 
     Raises:
         Unavailable: this machine has no room for the codebooks, or for the features in no place; or the card that
@@ -138,8 +144,10 @@ def plan_lift(
     lifted = {name: by_name[name] for name in views}
     parts = memory_parts(splats, packs, lifted, seen.splats_a_view, 2 if settings.dtype == "float16" else 4)
     on_device = device_plan(device, splats, packs, lifted, seen.splats_a_view)
-    free = free_memory()
     short = check_device_room(on_device, settings.device) if on_device else []
+    on_card = on_device is not None and not short
+    at_once = 1 if on_card else min(len(views), views_at_a_time(threads or len(os.sched_getaffinity(0))))
+    today, free = _in_work(parts, at_once), free_memory()
     return Plan(
         kernel=str(splats.kernel),
         splats=splats.count,
@@ -152,8 +160,14 @@ def plan_lift(
         rank=codebook_rank(packs, views),
         dtype=settings.dtype,
         memory=parts,
+        at_once=at_once,
         device=CPU if short else device,
-        on_device=None if short else on_device,
-        features_room=features_room(parts, free),
-        warnings=(*short, *check_memory(parts, free)),
+        on_device=on_device if on_card else None,
+        features_room=features_room(today, free),
+        warnings=(*short, *check_memory(today, free)),
     )
+
+
+def _in_work(parts: Mapping[str, int], views: int) -> dict[str, int]:
+    """Bytes a part with so many views in work."""
+    return {name: size * views if name == "view" else size for name, size in parts.items()}

@@ -10,7 +10,7 @@ import copy
 import os
 from collections import OrderedDict
 from concurrent.futures import ThreadPoolExecutor
-from itertools import chain, pairwise
+from itertools import chain, islice, pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -54,6 +54,7 @@ class CpuRaster:
     """A for one scene, of any kernel (``liftcore.raster.protocol.Raster``).
 
     One call at a time: the footprints of the view at hand live in buffers that the next view overwrites.
+    ``walk_views`` works on several views at a time with rasters like this one, each with buffers of its own.
 
     Args:
         splats: the scene.
@@ -90,13 +91,12 @@ class CpuRaster:
     def walk_views(self, looks: Iterable[Look]) -> Generator[Walked]:
         """``region_weights`` and ``ray_rows`` of views, ``views_at_a_time`` side by side."""
         looks = iter(looks)
-        first = next(looks, None)
-        if first is None:
+        first = list(islice(looks, views_at_a_time(self.threads)))  # fewer views than that have more threads each
+        if not first:
             return
-        self._activated(first.walk.gain)  # once for all: the views of a lift have one gain
-        shares = _shares(self.threads, views_at_a_time(self.threads))
-        rasters = [self._beside(end - begin) for begin, end in shares]
-        yield from side_by_side(rasters, chain([first], looks))
+        self._activated(first[0].walk.gain)  # once for all: the views of a lift have one gain
+        rasters = [self._beside(end - begin) for begin, end in _shares(self.threads, len(first))]
+        yield from side_by_side(rasters, chain(first, looks))
 
     def _beside(self, threads: int) -> CpuRaster:
         """Another raster of the same scene, which may work at the same time."""

@@ -1,9 +1,9 @@
 """Checkpoints: what the raster found in walked views outlives the process, so a killed lift goes on from there.
 
-The geometry phase asks the raster the same questions in the same order whenever it lifts the same inputs with the
-same settings. So a checkpoint is a journal of the answers, call by call, and nothing but the raster knows of it: sums
-over views are formed anew from the same numbers in the same order, and a resumed lift is identical to the bit. Calls
-go to the disk in blocks, each one file that is whole or not there.
+The geometry phase asks the raster for the same views in the same order whenever it lifts the same inputs with the
+same settings. So a checkpoint is a journal of the answers, view by view, and nothing but the raster knows of it: sums
+over views are formed anew from the same numbers in the same order, and a resumed lift is identical to the bit. Views
+go to the disk in blocks, each one file that is whole or not there; those in work when a lift ends are walked again.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Checkpoint:
     """
 
     folder: Path
-    seconds: float = 2.0  # between blocks, of work
+    seconds: float = 2.0  # between blocks, of work; views in work may be lost too
 
 
 def identity(inputs: Sequence[str], settings: LiftSettings, device: Mapping[str, Any]) -> str:

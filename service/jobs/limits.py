@@ -14,4 +14,4 @@ class JobLimits:
     seconds: float = 86_400.0  # wall time of an attempt
     memory_bytes: int | None = None  # private memory of a job's processes; None sets no limit
     lease_seconds: float = 30.0  # silence after which an attempt is lost
-    checkpoint_seconds: float = 2.0  # work that a killed lift may lose
+    checkpoint_seconds: float = 2.0  # work that a killed lift may lose, beside the views in work

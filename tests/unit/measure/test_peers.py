@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,8 +29,6 @@ from liftcore.raster.protocol import Walk
 from tests.scenes import random_camera, random_regions, random_splats
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from liftcore.measure.peers.peer import Peer
 
 EXACT = (Ours(), DenseNumba(), TorchAutograd())
@@ -176,6 +175,7 @@ class Large:
         return Answer(torch.ones(25_000_000)[:1, None], torch.ones(1))
 
 
+ROOT = Path(__file__).parents[3]
 ALONE = """
 import json, sys
 from liftcore.measure.peers import child
@@ -188,7 +188,7 @@ print(json.dumps(child.measured("large", vars(TINY))))
 
 def test_a_process_tells_the_memory_of_a_lift_and_what_the_first_one_costs() -> None:
     # In a process of its own, as in use: one that ran other tests may hold 100 MB at hand, and would not grow.
-    done = subprocess.run([sys.executable, "-c", ALONE], capture_output=True, text=True, check=True)
+    done = subprocess.run([sys.executable, "-c", ALONE], cwd=ROOT, capture_output=True, text=True, check=True)
     found = json.loads(done.stdout)
     assert 90e6 < found["peak_bytes"] - found["before_bytes"] < 200e6
     assert found["first_s"] - found["again_s"] > 0.5

@@ -10,8 +10,9 @@ import pytest
 import torch
 
 from liftcore.artifact import load_lift, save_lift
+from liftcore.device import CPU
 from liftcore.errors import InvalidSettings, Unavailable
-from liftcore.lift import lift
+from liftcore.lift import lift, open_sources, planned
 from liftcore.observe.observation import RegionMap
 from liftcore.observe.pack import open_packs
 from liftcore.observe.write_pack import write_pack
@@ -183,3 +184,22 @@ def test_the_dial_sets_what_is_not_set_beside_it():
     assert strides == sorted(strides)
     with pytest.raises(InvalidSettings, match="speed"):
         LiftSettings.of(speed="ludicrous")
+
+
+def test_the_certificate_is_the_same_whatever_the_number_of_threads(tmp_path):
+    splats, cameras, pack = write_scene(tmp_path, 2)
+    settings = LiftSettings.of(device="cpu")
+    told = [lift(splats, cameras, [pack], settings, threads=n).metadata.certificate for n in (1, 3)]
+    assert told[0] == told[1]
+
+
+def test_a_plan_finds_room_for_the_views_that_its_threads_have_in_work(tmp_path, monkeypatch):
+    splats, cameras, pack = write_scene(tmp_path, 2)
+    settings = LiftSettings.of(device="cpu")
+    sources = open_sources(splats, cameras, [pack], settings)
+    monkeypatch.setattr("liftcore.plan.plan.free_memory", lambda: GIB)
+    one, two, many = (planned(sources, settings, CPU, threads) for threads in (1, 2, 64))
+    assert (one.at_once, two.at_once, many.at_once) == (1, 2, len(sources.views))
+    assert one.facts() == many.facts()
+    assert None not in (one.features_room, two.features_room)
+    assert (one.features_room or 0) - (two.features_room or 0) == one.memory["view"]

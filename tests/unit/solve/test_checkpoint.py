@@ -93,7 +93,7 @@ def test_lift_killed_while_it_solves_walks_no_view_again(tmp_path: Path, walks: 
     with pytest.raises(Killed):
         lift(scene[0], scene[1], [scene[2]], settings, progress=killing("solve", 1), checkpoint=checkpoint)
     again = lift(scene[0], scene[1], [scene[2]], settings, checkpoint=checkpoint)
-    assert walks == ["v0", "v1", "v2"]
+    assert sorted(walks) == ["v0", "v1", "v2"]
     assert_same(lift(scene[0], scene[1], [scene[2]], settings), again)
 
 
