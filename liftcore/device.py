@@ -92,6 +92,13 @@ def within_memory(device: Device) -> Iterator[None]:
         ) from None  # fmt: skip
 
 
+def indexed(place: torch.device) -> torch.device:
+    """A place as tensors name theirs: ``cuda`` without a number is the card that is current now."""
+    if place.type == "cuda" and place.index is None:
+        return torch.device("cuda", torch.cuda.current_device())
+    return place
+
+
 def choose_device(asked: str) -> Device:
     """The device that ``auto``, ``cpu`` or ``cuda`` stands for here; ``auto`` takes a card where one can be used.
 

@@ -28,7 +28,7 @@ def gpu_raster(splats: Splats, free: int | None = None) -> GpuRaster:
     """The GPU backend, on a card where there is one and in Triton's interpreter elsewhere."""
     from liftcore.raster.gpu.raster import GpuRaster
 
-    return GpuRaster(splats, torch.device("cuda" if torch.cuda.is_available() else "cpu"), free)
+    return GpuRaster(splats, torch.device("cuda:0" if torch.cuda.is_available() else "cpu"), free)
 
 
 @dataclass(frozen=True)

@@ -21,25 +21,30 @@ class Totals:
 
     Args:
         count: P. place: where they are added; weights from elsewhere are brought there, whatever they cost.
+        by_torch: whether rows are summed as on a card; None asks the place.
     """
 
-    def __init__(self, count: int, place: torch.device) -> None:
+    def __init__(self, count: int, place: torch.device, by_torch: bool | None = None) -> None:
+        self._by_torch = place.type != "cpu" if by_torch is None else by_torch
         self._evidence, self._denominators = (torch.zeros(count, dtype=torch.float64, device=place) for _ in range(2))
 
     def add(self, weights: RegionWeights, rays: float) -> None:
-        """Add a view.
+        """Add a view: all of it, or nothing where the place has no room for what that takes.
 
         Args:
             rays: of the full view that each walked ray stands for.
         """
-        place = self._evidence.device
-        if place.type == "cpu":
-            self._evidence.numpy()[weights.evidence_splats.numpy()] += weights.evidence.numpy() * rays
+        if not self._by_torch:
+            self._evidence.numpy()[weights.evidence_splats.numpy()] += weights.evidence.numpy().astype(float) * rays
             self._denominators.numpy()[weights.splats.numpy()] += row_totals(weights)
             return
-        self._evidence[weights.evidence_splats.to(place).long()] += weights.evidence.to(place).double() * rays
+        place = self._evidence.device
+        met, seen = weights.evidence_splats.to(place).long(), weights.splats.to(place).long()
+        evidence = self._evidence[met] + weights.evidence.to(place).double() * rays
         values, starts = weights.weights.to(place).double(), weights.row_starts.to(place)
-        self._denominators[weights.splats.to(place).long()] += sums_in_order(values, starts)
+        denominators = self._denominators[seen] + sums_in_order(values, starts)
+        self._evidence[met] = evidence  # from here on nothing is allocated
+        self._denominators[seen] = denominators
 
     def found(self) -> tuple[np.ndarray, np.ndarray]:
         """Evidence and denominators, on the host."""

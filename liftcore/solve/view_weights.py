@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 import torch
 
+from liftcore.device import indexed
 from liftcore.errors import Unavailable
 from liftcore.raster.protocol import RegionWeights
 from liftcore.raster.weights_home import on_host
@@ -29,13 +30,14 @@ class ViewWeights:
 
     Args:
         memory_limit: bytes that stay in memory; None takes MEMORY_LIMIT.
-        card: where weights are made, and how many bytes of them may stay there; None brings all of them home.
+        card: where weights are made, and how many bytes of them may stay there; None for the host alone.
     """
 
     def __init__(self, memory_limit: int | None = None, card: tuple[torch.device, int] | None = None) -> None:
         self._limit = MEMORY_LIMIT if memory_limit is None else memory_limit
         self._card_limit = card[1] if card else 0
-        self.place = card[0] if card and card[1] else torch.device("cpu")  # where sums over views are made
+        # Where sums over views are made: never a matter of the memory that is free, which would choose their bits.
+        self.place = indexed(card[0]) if card else torch.device("cpu")
         self._on_card: set[int] = set()  # views
         self.card_bytes = 0  # of them
         self._views: list[RegionWeights] = []

@@ -38,7 +38,7 @@ WEIGHTINGS = (
 )
 
 
-DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+DEVICE = torch.device("cuda:0" if torch.cuda.is_available() else "cpu")
 FULL = RuntimeError("Triton Error [CUDA]: out of memory")  # the driver's word for it
 
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Concatenate, ParamSpec, TypeVar
 
 import torch
 
-from liftcore.device import out_of_memory
+from liftcore.device import indexed, out_of_memory
 from liftcore.errors import Unavailable
 from liftcore.raster.antialiased import check_antialiased
 from liftcore.raster.arguments import check_image, check_labels, check_rows
@@ -99,7 +99,7 @@ class GpuRaster:
     def __init__(self, splats: Splats, device: torch.device, free: int | None = None, *, stays: bool = False) -> None:
         check_device(device)
         self.splats = splats
-        self.device = device
+        self.device = indexed(device)
         self._free, self._stays = free, stays
         self._host = activated(splats, 1.0)
         self._size = scene_bytes(splats.count, splats.kernel)

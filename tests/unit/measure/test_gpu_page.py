@@ -72,7 +72,7 @@ def test_lifts_that_differ_in_a_bit_are_told(tmp_path: Path, monkeypatch: pytest
 def test_a_view_in_pieces_is_held_to_the_view() -> None:
     """The check of a card's run, in the interpreter where there is none."""
     small = RoomSize(40, 20, 34, 1, 4, levels=1)
-    place = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    place = torch.device("cuda:0" if torch.cuda.is_available() else "cpu")
     assert figures.pieces_differing(small, Device("cuda", place)) == []
 
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from liftcore.device import Device
+from liftcore.device import CPU, Device, indexed
 from liftcore.progress import silent
 from liftcore.raster.protocol import RegionWeights
 from liftcore.solve import on_device, solver
@@ -20,7 +20,7 @@ from liftcore.solve.solver import closed_form_on
 from liftcore.solve.totals import Totals, row_totals, sums_in_order
 from liftcore.solve.view_weights import ViewWeights
 
-HERE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+HERE = torch.device("cuda:0" if torch.cuda.is_available() else "cpu")
 SPLATS = 700  # three grains, the last not full
 
 
@@ -244,6 +244,27 @@ def test_solution_without_room_beside_the_weights_brings_them_home(monkeypatch: 
             assert closed_form(store, *rest) == "solved" and tries[0] > 0 == tries[1]
         with pytest.raises(RuntimeError, match="out of memory"):
             [closed_form(store, *rest) for _ in range(3)]
+
+
+def test_a_card_without_a_number_is_the_one_that_tensors_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 1)
+    assert indexed(torch.device("cuda")) == torch.device("cuda", 1)
+    assert indexed(torch.device("cuda", 0)) == torch.device("cuda", 0) and indexed(CPU.place) == CPU.place
+    for free in (0, 1 << 20):  # the place of the sums knows nothing of the room for W
+        assert ViewWeights(card=(torch.device("cuda"), free)).place == torch.device("cuda", 1)
+
+
+def test_both_ways_to_sum_over_views_are_one_sum() -> None:
+    """With a stride of 3, whose 9 rays for one a float32 cannot multiply without rounding."""
+    views = [random_view(k, 90) for k in range(4)]
+    views = [replace(view, evidence=view.weights[: len(view.splats)].clone()) for view in views]
+    host, card = Totals(SPLATS, CPU.place, by_torch=False), Totals(SPLATS, HERE, by_torch=True)
+    for view in views:
+        host.add(view, 9.0)
+        card.add(view, 9.0)
+    for (ours, theirs), rtol in zip(zip(host.found(), card.found(), strict=True), (0, 1e-14), strict=True):
+        assert np.count_nonzero(ours) > SPLATS / 2
+        np.testing.assert_allclose(theirs, ours, rtol=rtol, atol=0)
 
 
 @pytest.mark.parametrize("place", {torch.device("cpu"), HERE}, ids=str)
