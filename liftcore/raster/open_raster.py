@@ -24,4 +24,4 @@ def open_raster(splats: Splats, device: Device, threads: int | None = None, kept
     from liftcore.raster.gpu.raster import GpuRaster  # loads triton
 
     free = device.free_bytes()
-    return GpuRaster(splats, device.place, None if free is None else free - kept, stays=kept > 0)
+    return GpuRaster(splats, device.place, None if free is None else max(0, free - kept), stays=kept > 0)

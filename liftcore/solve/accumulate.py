@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from liftcore.device import out_of_memory
 from liftcore.observe.levels import at_levels
 from liftcore.observe.observation import FeatureGrid, Observation, RegionMap
 from liftcore.raster.protocol import Look, RayRows, Walk, Weighting
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 
     from liftcore.observe.pack import FeaturePacks
     from liftcore.progress import Progress
-    from liftcore.raster.protocol import Raster
+    from liftcore.raster.protocol import Raster, RegionWeights
     from liftcore.scene.cameras import Camera, Cameras
     from liftcore.solve.settings import LiftSettings
     from liftcore.solve.view_weights import ViewWeights
@@ -126,9 +127,23 @@ def accumulate(
             yield Look(camera, observation, walk, weighting_of(settings), pixels)
 
     with closing(raster.walk_views(looks())) as walked_views:
-        for number, walked in enumerate(walked_views):
-            totals.add(walked.weights, float(settings.stride**2))
+        for walked in walked_views:
+            _add(totals, walked.weights, float(settings.stride**2), store)
             store.append(walked.weights)
             samples.append(SampledRays(walked.rows, readouts.popleft()))
-            progress("geometry", number + 1, len(views), "views")
+            del walked  # before the next one is made beside it
+            progress("geometry", len(samples), len(views), "views")
     return Geometry(*totals.found(), tuple(samples), tuple(codebooks))
+
+
+def _add(totals: Totals, weights: RegionWeights, rays: float, store: ViewWeights) -> None:
+    """``totals.add``; earlier weights that lie on the card are brought home when nothing else makes room there."""
+    try:
+        totals.add(weights, rays)
+    except RuntimeError as error:
+        if not (out_of_memory(error) and store.card_bytes):
+            raise
+    else:
+        return
+    store.bring_home()
+    totals.add(weights, rays)

@@ -102,6 +102,7 @@ class _ResumedRaster:
                 for walked in rest:
                     self._journal.keep(asked.popleft(), walked)
                     yield walked
+                    del walked  # before the next one is made beside it
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._raster, name)

@@ -167,6 +167,22 @@ def test_memory_that_runs_out_is_made_do_with(monkeypatch):
     assert tries[0] > tries[1] > tries[2] > 0
 
 
+def test_no_memory_is_not_memory_without_limit(monkeypatch):
+    monkeypatch.setattr("liftcore.raster.gpu.raster.LEAST_FREE", 1)
+    splats, camera = random_splats(8, 24), random_camera(8, 20, 36)
+    whole, tight = gpu_raster(splats), gpu_raster(splats, free=0)
+    assert torch.equal(tight.row_sums(camera, WALK), whole.row_sums(camera, WALK))
+    assert tight._frame(camera, WALK).room.footprints == 0
+    assert not tight.take_less() and whole.take_less()
+
+
+def test_a_view_has_room_for_the_levels_that_it_has(monkeypatch):
+    asked = []
+    monkeypatch.setattr("liftcore.raster.gpu.raster.raster_bytes", lambda *given: asked.append(given[-1]) or 1)
+    gpu_raster(random_splats(3, 5)).region_weights(random_camera(3), random_regions(3, levels=9), WALK, Weighting())
+    assert asked == [9]
+
+
 def test_depth_ties_keep_the_order_of_the_file():
     splats, camera = random_splats(2, 20), random_camera(2, 20, 20)
     alike = replace(splats, means=torch.zeros(20, 3), opacity_logits=torch.linspace(-2, 1, 20))

@@ -7,7 +7,7 @@ from liftcore.raster.gpu import room
 from liftcore.raster.gpu.weighing import A_LEVEL, AN_ENTRY
 from liftcore.scene.splats import Kernel
 
-USUAL_LEVELS = 4  # of labels, where they are not known yet
+USUAL_LEVELS = 4  # of labels, for products that read none
 _LABEL = 12  # bytes, of a pixel and level: as it came, and as a key
 _TILES_A_SPLAT = 12  # that a splat touches, taken as many as scenes of photographs have
 _ROWS_A_SPLAT = 4  # of tiles, likewise

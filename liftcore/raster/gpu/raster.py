@@ -109,7 +109,7 @@ class GpuRaster:
 
     def take_less(self) -> bool:
         """Let go of everything and cut the work for half of the memory; False where it cannot be cut any more."""
-        free = self._free or raster_bytes(self.splats.count, 1, 1, self.splats.kernel, 1)
+        free = raster_bytes(self.splats.count, 1, 1, self.splats.kernel, 1) if self._free is None else self._free
         if free <= LEAST_FREE:
             return False
         self._free, self._scene, self._kept = free // 2, None, None
@@ -121,13 +121,16 @@ class GpuRaster:
         self, camera: Camera, observation: Observation, walk: Walk, weighting: Weighting
     ) -> RegionWeights:
         """``A'^T S`` of a view and the evidence of plain weights. See the protocol."""
-        return self._weighed(self._read(observation, camera, walk), camera, walk, weighting)
+        return self._brought(self._weighed(self._read(observation, camera, walk), camera, walk, weighting))
 
     @_within_memory
     def _weighed(self, reading: DeviceReading, camera: Camera, walk: Walk, weighting: Weighting) -> RegionWeights:
-        choice, frame = choice_of(weighting), self._frame(camera, walk)
-        made = weighing.region_weights(frame, reading, choice, walk.gain != 1.0, self.splats.count)
-        return made if self._stays else on_host(made)
+        choice, frame = choice_of(weighting), self._frame(camera, walk, reading.levels)
+        return weighing.region_weights(frame, reading, choice, walk.gain != 1.0, self.splats.count)
+
+    def _brought(self, weights: RegionWeights) -> RegionWeights:
+        """Where they are wanted. A host without room for them is no reason for smaller pieces on the device."""
+        return weights if self._stays else on_host(weights)
 
     def walk_views(self, looks: Iterable[Look]) -> Generator[Walked]:
         """``region_weights`` and ``ray_rows`` of views, one at a time; the next one is read while the card walks."""
@@ -138,8 +141,10 @@ class GpuRaster:
         try:
             with closing(made_ahead(looks, read)) as ahead:
                 for look, reading in ahead:
-                    weights = self._weighed(reading, look.camera, look.walk, look.weighting)
-                    yield Walked(weights, self.ray_rows(look.camera, look.pixels, look.walk))
+                    yield Walked(  # without a name, which would hold it beside the next one
+                        self._brought(self._weighed(reading, look.camera, look.walk, look.weighting)),
+                        self.ray_rows(look.camera, look.pixels, look.walk),
+                    )
         finally:
             self.forget()
 
@@ -212,15 +217,15 @@ class GpuRaster:
         """Drop the projected view that is kept for the next product."""
         self._kept = None
 
-    def _frame(self, camera: Camera, walk: Walk) -> Frame:
-        """The view projected; the last one is kept."""
+    def _frame(self, camera: Camera, walk: Walk, levels: int = USUAL_LEVELS) -> Frame:
+        """The view projected, with room for labels of so many levels; the last one is kept."""
         if self._kept is not None and self._kept[0] is camera and self._kept[1] == walk:
             return self._kept[2]
         check_antialiased(self.splats.kernel, walk.antialiased)
         check_stride(walk, camera)
         self._kept = None  # before, so that one frame's memory is the most ever held
         view = strided(view_of(camera), walk)
-        need = raster_bytes(self.splats.count, view.width, view.height, self.splats.kernel, USUAL_LEVELS)
+        need = raster_bytes(self.splats.count, view.width, view.height, self.splats.kernel, levels)
         room = room_within(self._free, self.splats.kernel, need)
         scene = self._scene_with(walk.gain)
         projection = Projection(scene, view, self.splats.kernel, walk.antialiased, self.device, room.splats)

@@ -41,7 +41,7 @@ class DeviceReading:
 
     def __init__(self, observation: Observation, camera: Camera, walk: Walk, device: torch.device) -> None:
         reading = reading_of(observation, camera.width, camera.height, walk)
-        self.codebook_rows = reading.codebook_rows
+        self.codebook_rows, self.levels = reading.codebook_rows, reading.levels
         self.taps = 4 if reading.is_grid else 1
         self._grid_width = reading.grid_width
         self._device, parts = device, _parts(reading)

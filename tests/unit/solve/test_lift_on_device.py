@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import weakref
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 import torch
@@ -18,12 +19,22 @@ from liftcore.lift import Run, lift_sources, open_sources, planned
 from liftcore.plan import plan
 from liftcore.plan.on_device import ROOM_SPARE
 from liftcore.progress import silent
+from liftcore.raster.cpu import CpuRaster
+from liftcore.scene.load import load_splats
 from liftcore.scene.splats import Kernel
+from liftcore.solve.accumulate import Geometry, accumulate
 from liftcore.solve.settings import LiftSettings
+from liftcore.solve.totals import Totals
+from liftcore.solve.view_weights import ViewWeights
 from liftcore.timings import Timings
 from tests.backends import needs_triton
 
 from .test_lift_equals_dense import write_scene
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+    from liftcore.raster.protocol import Look, Walked
 
 pytestmark = needs_triton
 
@@ -73,6 +84,55 @@ def test_solution_has_the_memory_of_the_last_view(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr(lifting, "closed_form_on", solving)
     lifted(scene, CARD, LiftSettings.of(certificate_rays=2, view_stride=3))
     assert told == [None]
+
+
+def geometry_of(scene: tuple[Path, Path, Path], store: ViewWeights, raster: Any = None) -> Geometry:
+    """Walked on the processor."""
+    sources = open_sources(scene[0], scene[1], [scene[2]], SETTINGS)
+    seen = sources.splats.count, sources.cameras
+    raster = raster or CpuRaster(sources.splats, threads=1)
+    return accumulate(raster, seen, sources.packs, sources.views, SETTINGS, store, silent)
+
+
+def test_sums_without_room_beside_the_weights_bring_them_home(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = write_scene(tmp_path, 3)
+    with ViewWeights() as plain:
+        ours = geometry_of(scene, plain)
+    add = Totals.add
+
+    def crowded(self: Totals, *given: Any) -> None:
+        if store.card_bytes > enough:
+            raise torch.OutOfMemoryError
+        add(self, *given)
+
+    monkeypatch.setattr(Totals, "add", crowded)
+    with ViewWeights(card=(CPU.place, 1 << 40)) as store:
+        enough = 0
+        theirs = geometry_of(scene, store)
+        assert store.card_bytes == 0 < store.bytes
+    assert (theirs.denominators == ours.denominators).all() and (theirs.evidence == ours.evidence).all()
+    with ViewWeights(card=(CPU.place, 1 << 40)) as store, pytest.raises(torch.OutOfMemoryError):
+        enough = -1  # nothing is left to bring home
+        geometry_of(scene, store)
+
+
+def test_a_views_weights_are_let_go_before_the_next_view_is_walked(tmp_path: Path) -> None:
+    scene, gone = write_scene(tmp_path, 3), []
+
+    class Watching:
+        def walk_views(self, looks: Iterable[Look]) -> Iterator[Walked]:
+            for walked in CpuRaster(load_splats(scene[0]), threads=1).walk_views(looks):
+                own = replace(walked, weights=replace(walked.weights))
+                known = weakref.ref(own.weights)
+                yield own
+                del own
+                gone.append(known() is None)
+
+    with ViewWeights(memory_limit=0) as store:  # all of them go to files
+        geometry_of(scene, store, Watching())
+    assert gone == [True, True]
 
 
 def test_card_without_room_leaves_an_auto_lift_to_the_processor(
