@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import weakref
 from dataclasses import replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
@@ -26,6 +27,7 @@ from tests.scenes import random_camera, random_grid, random_regions, random_spla
 
 if TYPE_CHECKING:
     from liftcore.raster.gpu.raster import GpuRaster
+    from liftcore.raster.gpu.tile_lists import Lists
     from liftcore.scene.cameras import Camera
 
 pytestmark = [needs_triton, pytest.mark.usefixtures("every_kernel")]
@@ -50,7 +52,8 @@ def as_parts(weights: RegionWeights) -> list[torch.Tensor]:
 def test_both_backends_list_the_same_splats_in_every_tile(kernel):
     splats, camera = random_splats(7, 3_000, kernel=kernel), random_camera(7, 200, 150)
     ours, theirs = gpu_raster(splats), CpuRaster(splats, threads=2)
-    lists = next(ours._frame(camera, Walk()).lists())
+    own = ours._frame(camera, Walk())
+    lists = own.lists_of(own.bands[0])
     frame = theirs._frame(camera, Walk())
     assert np.array_equal(lists.starts.cpu().numpy(), frame.starts)
     assert np.array_equal(lists.ids[lists.items.long()].cpu().numpy(), frame.ids[frame.items])
@@ -118,9 +121,10 @@ def test_no_bit_depends_on_the_memory_that_is_free(monkeypatch, kernel):
         assert first.numel() and torch.equal(first, second)
     frame = tight._frame(camera, WALK)
     assert frame.bands == [(0, 1), (1, 2), (2, 3)] and frame.room.splats == 7
-    assert [len(frame.tile_runs(lists)) for lists in frame.lists()] == [2, 2, 2]
+    every = [frame.lists_of(band) for band in frame.bands]
+    assert [len(frame.tile_runs(lists)) for lists in every] == [2, 2, 2]
     assert tight._scene_with(WALK.gain).means.device.type == "cpu"  # it comes in blocks
-    assert all(lists.ids.numel() < splats.count for lists in frame.lists())  # a strip's own splats alone
+    assert all(lists.ids.numel() < splats.count for lists in every)  # a strip's own splats alone
 
 
 def test_sums_do_not_know_in_which_pieces_their_terms_came():
@@ -165,6 +169,22 @@ def test_memory_that_runs_out_is_made_do_with(monkeypatch):
     tries.clear()
     assert torch.equal(gpu_raster(splats, free=1 << 10).row_sums(camera, WALK), whole)
     assert tries[0] > tries[1] > tries[2] > 0
+
+
+def test_the_lists_of_a_band_are_let_go_before_those_of_the_next_are_made(monkeypatch):
+    splats, camera = random_splats(8, 16), random_camera(8, 17, 36)
+    made, known = Frame._made, []
+
+    def watched(self: Frame, band: tuple[int, int]) -> Lists:
+        assert all(own() is None for own in known)
+        lists = made(self, band)
+        known.extend(weakref.ref(part) for part in (lists.items, lists.ids, *lists.splats))
+        return lists
+
+    monkeypatch.setattr("liftcore.raster.gpu.room.LEAST_ITEMS", 1)
+    monkeypatch.setattr(Frame, "_made", watched)
+    every_product(gpu_raster(splats, free=1), camera)
+    assert len(known) > 4 * 3
 
 
 def test_no_memory_is_not_memory_without_limit(monkeypatch):

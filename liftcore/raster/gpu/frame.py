@@ -15,8 +15,6 @@ from liftcore.raster.gpu.tile_lists import bands_of, items_by_row, lists_of, spa
 from liftcore.raster.gpu.walk import PART, PARTS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
     from torch import Tensor
 
     from liftcore.raster.gpu.projection import Projection
@@ -56,18 +54,18 @@ class Frame:
             self._survey = survey(self._projection, (self.rows, self.columns), self.room)
             self.bands = strips_of(self._survey, footprint_bytes(kernel), self.room)
 
-    def lists(self, wanted: Sequence[tuple[int, int]] | None = None) -> Iterator[Lists]:
-        """The tile lists, band by band, of all bands or the wanted ones; those of a view of one band are kept."""
-        for band in self.bands if wanted is None else wanted:
-            if self._lists is not None:
-                yield self._lists
-                continue
-            made = self._lists_of(band)
-            if len(self.bands) == 1:
-                self._lists = made
-            yield made
+    def lists_of(self, band: tuple[int, int]) -> Lists:
+        """The tile lists of a band; those of a view of one band are kept.
 
-    def _lists_of(self, band: tuple[int, int]) -> Lists:
+        They are a strip's footprints too, so whoever asks holds them in a function that ends before the next band's.
+        """
+        if len(self.bands) > 1:
+            return self._made(band)
+        if self._lists is None:
+            self._lists = self._made(band)
+        return self._lists
+
+    def _made(self, band: tuple[int, int]) -> Lists:
         if self._whole is not None:
             return lists_of(self._whole, self._spans, band, self.columns)
         footprints = project_again(self._projection, self._survey.within(band))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from liftcore.raster.constants import TILE
 from liftcore.raster.gpu import room
+from liftcore.raster.gpu.sums import A_KEY, A_SUM
 from liftcore.raster.gpu.weighing import A_LEVEL, AN_ENTRY
 from liftcore.scene.splats import Kernel
 
@@ -11,6 +12,7 @@ USUAL_LEVELS = 4  # of labels, for products that read none
 _LABEL = 12  # bytes, of a pixel and level: as it came, and as a key
 _TILES_A_SPLAT = 12  # that a splat touches, taken as many as scenes of photographs have
 _ROWS_A_SPLAT = 4  # of tiles, likewise
+_UNITS_A_SPLAT = 4  # of tiles, each with a sum of a splat and label of its own: about one a row
 _SUMS_AN_ITEM = 4  # columns of sums of an item: label tuples, or cells, that a tile's pixels read
 
 
@@ -30,7 +32,8 @@ def raster_bytes(splats: int, width: int, height: int, kernel: Kernel, levels: i
     entries = min(table * (AN_ENTRY + A_LEVEL * levels), ample.entry_bytes)
     pieces = made + items * room.AN_ITEM + min(tiles, ample.tiles) * room.A_TILE + table * room.A_FLOAT + entries
     held = room.scene_bytes(splats, kernel) + splats * room.footprint_bytes(kernel)
-    return held + pieces + width * height * levels * _LABEL
+    joined = splats * levels * _UNITS_A_SPLAT * (A_KEY + A_SUM)  # of all units at once, where there is room for it
+    return held + pieces + joined + width * height * levels * _LABEL
 
 
 def least_raster_bytes(splats: int, width: int, height: int, kernel: Kernel, levels: int) -> int:

@@ -45,6 +45,7 @@ if TYPE_CHECKING:
 
     from liftcore.observe.observation import Observation
     from liftcore.raster.gpu.scene import DeviceScene
+    from liftcore.raster.gpu.tile_lists import Lists
     from liftcore.scene.cameras import Camera
     from liftcore.scene.splats import Splats
 
@@ -184,16 +185,8 @@ class GpuRaster:
         frame = self._frame(camera, every_pixel(walk))
         ids = torch.full((frame.rows * TILE, frame.columns * TILE, count), -1, dtype=torch.int32)
         weights = torch.zeros(frame.rows * TILE, frame.columns * TILE, count)
-        for lists in frame.lists():
-            for first, last in frame.tile_runs(lists):
-                own, numbers = largest_weights(frame, lists, (first, last), count)
-                met = own > 0
-                items = torch.where(met, lists.starts[first:last, None, None] + numbers, 0)
-                named = torch.where(met, lists.ids[lists.items[items].long()] if lists.items.numel() else -1, -1)
-                tile = torch.arange(lists.first_tile + first, lists.first_tile + last)[:, None]
-                pixel = torch.arange(TILE * TILE)[None, :]
-                y, x = tile // frame.columns * TILE + pixel // TILE, tile % frame.columns * TILE + pixel % TILE
-                ids[y, x], weights[y, x] = named.to(torch.int32).cpu(), own.cpu()
+        for band in frame.bands:
+            _fill_largest(frame, frame.lists_of(band), ids, weights)
         return ids[: camera.height, : camera.width].contiguous(), weights[
             : camera.height, : camera.width
         ].contiguous()
@@ -242,3 +235,16 @@ class GpuRaster:
             staged = self._free is not None and self._size > SCENE_SHARE * self._free
             self._scene = scene_on(torch.device("cpu") if staged else self.device, self._host)
         return self._scene
+
+
+def _fill_largest(frame: Frame, lists: Lists, ids: Tensor, weights: Tensor) -> None:
+    """Write a band's part of ``top_weights`` into ids and weights [rows of tiles, columns of tiles, count]."""
+    for first, last in frame.tile_runs(lists):
+        own, numbers = largest_weights(frame, lists, (first, last), ids.shape[2])
+        met = own > 0
+        items = torch.where(met, lists.starts[first:last, None, None] + numbers, 0)
+        named = torch.where(met, lists.ids[lists.items[items].long()] if lists.items.numel() else -1, -1)
+        tile = torch.arange(lists.first_tile + first, lists.first_tile + last)[:, None]
+        pixel = torch.arange(TILE * TILE)[None, :]
+        y, x = tile // frame.columns * TILE + pixel // TILE, tile % frame.columns * TILE + pixel % TILE
+        ids[y, x], weights[y, x] = named.to(torch.int32).cpu(), own.cpu()

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from liftcore.raster.gpu.frame import Frame
+    from liftcore.raster.gpu.tile_lists import Lists
 
 WIDEST = 64  # channels a walk
 NARROWEST = 16  # columns of a matrix product
@@ -104,42 +105,51 @@ def _strongest(
 
 def render(frame: Frame, values: Tensor) -> Tensor:
     """``A X``: values [P, C] f32 on the host, C at most ``WIDEST`` -> [H, W, C] f32 on the host."""
-    channels = values.shape[1]
-    wide = max(NARROWEST, 1 << (channels - 1).bit_length())
-    image = torch.empty(frame.height, frame.width, channels)
-    for lists in frame.lists():
-        rows = frame.of_splats(values, lists)
-        top = lists.first_row * TILE
-        tall = min(lists.tiles // frame.columns * TILE, frame.height - top)
-        own = torch.zeros(tall, frame.width, channels, device=frame.device)
-        for first, last in frame.tile_runs(lists):
-            launch(
-                _render, last - first, *lists.splats, lists.starts, lists.items, frame.scratch(last - first),
-                rows, own, lists.first_tile, first, *frame.size, channels, *frame.cuts,
-                KIND=frame.kind, CHANNELS=wide, warps=8 if wide == WIDEST else WARPS,
-            )  # fmt: skip
-        image[top : top + tall] = own.cpu()
+    image = torch.empty(frame.height, frame.width, values.shape[1])
+    for band in frame.bands:
+        _render_band(frame, frame.lists_of(band), values, image)
     return image
+
+
+def _render_band(frame: Frame, lists: Lists, values: Tensor, image: Tensor) -> None:
+    channels = values.shape[1]
+    rows = frame.of_splats(values, lists)
+    top = lists.first_row * TILE
+    tall = min(lists.tiles // frame.columns * TILE, frame.height - top)
+    own = torch.zeros(tall, frame.width, channels, device=frame.device)
+    wide = max(NARROWEST, 1 << (channels - 1).bit_length())
+    for first, last in frame.tile_runs(lists):
+        launch(
+            _render, last - first, *lists.splats, lists.starts, lists.items, frame.scratch(last - first),
+            rows, own, lists.first_tile, first, *frame.size, channels, *frame.cuts,
+            KIND=frame.kind, CHANNELS=wide, warps=8 if wide == WIDEST else WARPS,
+        )  # fmt: skip
+    image[top : top + tall] = own.cpu()
 
 
 def strongest_labels(frame: Frame, labels: Tensor) -> Tensor:
     """``argmax(A onehot(labels))``: labels [P] i32 of -1 or more, on the host -> [H, W] i32 on the device."""
     image = torch.full((frame.height, frame.width), -1, dtype=torch.int32, device=frame.device)
     classes = int(labels.max()) + 2
-    for lists in frame.lists():
-        tiles = torch.arange(lists.tiles, device=frame.device)
-        tile_of = torch.repeat_interleave(tiles, lists.starts.diff())
-        # The labels that occur in each tile, ascending, and where each item's label stands among them.
-        keys = tile_of * classes + frame.of_splats(labels, lists)[lists.items.long()] + 1
-        known, slots = torch.unique(keys, return_inverse=True)
-        edges = torch.arange(lists.tiles + 1, device=frame.device)
-        label_starts = torch.searchsorted(known, edges * classes)
-        slots = (slots - label_starts[tile_of]).to(torch.int32)
-        own_labels = (known % classes - 1).to(torch.int32)
-        for first, last in frame.tile_runs(lists):
-            launch(
-                _strongest, last - first, *lists.splats, lists.starts, lists.items, frame.scratch(last - first),
-                slots, label_starts, own_labels, image, lists.first_tile, first, *frame.size, *frame.cuts,
-                KIND=frame.kind, COLUMNS=NARROWEST,
-            )  # fmt: skip
+    for band in frame.bands:
+        _strongest_in(frame, frame.lists_of(band), (labels, classes), image)
     return image
+
+
+def _strongest_in(frame: Frame, lists: Lists, given: tuple[Tensor, int], image: Tensor) -> None:
+    labels, classes = given
+    tiles = torch.arange(lists.tiles, device=frame.device)
+    tile_of = torch.repeat_interleave(tiles, lists.starts.diff())
+    # The labels that occur in each tile, ascending, and where each item's label stands among them.
+    keys = tile_of * classes + frame.of_splats(labels, lists)[lists.items.long()] + 1
+    known, slots = torch.unique(keys, return_inverse=True)
+    edges = torch.arange(lists.tiles + 1, device=frame.device)
+    label_starts = torch.searchsorted(known, edges * classes)
+    slots = (slots - label_starts[tile_of]).to(torch.int32)
+    own_labels = (known % classes - 1).to(torch.int32)
+    for first, last in frame.tile_runs(lists):
+        launch(
+            _strongest, last - first, *lists.splats, lists.starts, lists.items, frame.scratch(last - first),
+            slots, label_starts, own_labels, image, lists.first_tile, first, *frame.size, *frame.cuts,
+            KIND=frame.kind, COLUMNS=NARROWEST,
+        )  # fmt: skip

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 PART = 32  # terms that one thread adds
 _RUNS = 128  # runs a program
-_A_KEY, _A_SUM = 64, 24  # bytes of a key and of each of its values while sums are joined
+A_KEY, A_SUM = 64, 24  # bytes of a key and of each of its values while sums are joined
 
 
 class Sums(NamedTuple):
@@ -105,7 +105,7 @@ class Pieces:
             cuts = [_between(part.keys, first * rows, last * rows) for part in self._parts]
             total = sum(end - begin for begin, end in cuts)
             width = self._parts[0].values.shape[1] if self._parts else 0
-            if self._room is not None and last - first > 1 and total * (_A_KEY + _A_SUM * width) > self._room:
+            if self._room is not None and last - first > 1 and total * (A_KEY + A_SUM * width) > self._room:
                 middle = (first + last) // 2
                 waiting += [(middle, last), (first, middle)]
             elif total:

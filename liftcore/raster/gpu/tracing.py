@@ -60,10 +60,10 @@ def ray_rows(frame: Frame, pixels: Tensor) -> RayRows:
     tile_rows = pixels[:, 1].long() // TILE
     bands = [band for band in frame.bands if bool(((tile_rows >= band[0]) & (tile_rows < band[1])).any())]
     numbers, parts = [torch.empty(0, dtype=torch.int64)], []
-    for band, lists in zip(bands, frame.lists(bands), strict=True):
+    for band in bands:
         own = ((tile_rows >= band[0]) & (tile_rows < band[1])).nonzero()[:, 0]
         numbers.append(own)
-        parts += _rows_in(frame, lists, pixels[own].long())
+        parts += _rows_in(frame, frame.lists_of(band), pixels[own].long())
     found = [torch.cat(column) for column in zip(*parts, strict=True)] if parts else _nothing()
     return _in_order(torch.cat(numbers), *found)
 

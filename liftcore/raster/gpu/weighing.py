@@ -154,21 +154,29 @@ def region_weights(
     """
     rows = reading.codebook_rows
     weights, evidence = (Pieces(frame.device, frame.room.kept) for _ in range(2))
-    for lists in frame.lists():
-        given = torch.zeros(lists.items.shape[0], 1, device=frame.device)
-        for first, last in frame.tile_runs(lists):
-            slots = reading.slots(lists.first_tile + first, lists.first_tile + last, frame.columns)
-            marks = marks_of(frame, lists, (first, last), choice.k) if choice.kind == LARGEST else None
-            sizes = lists.starts[first : last + 1].diff() * slots.starts.diff()
-            for begin, end, floats in frame.table_runs((first, last), sizes):
-                job = _Run(lists, (begin, end), first, slots, sizes[begin - first : end - first], floats, marks)
-                table = _weigh_run(frame, job, reading.taps, choice, with_plain, given)
-                for part in _by_row(frame, job, table, splats * rows, rows):
-                    weights.add(part)
-        evidence.add(_of_items(frame, lists, (0, lists.tiles), given))
+    for band in frame.bands:
+        _weigh_band(frame, frame.lists_of(band), (reading, choice, with_plain, splats), (weights, evidence))
     found = [_rows_of(part, rows, frame.room.kept is not None) for part in weights.joined(splats, rows)]
     met = [(part.keys.to(torch.int32), part.values[:, 0].to(torch.float32)) for part in evidence.joined(splats)]
     return _put_together(found, met, frame)
+
+
+def _weigh_band(
+    frame: Frame, lists: Lists, how: tuple[DeviceReading, Choice, bool, int], sums: tuple[Pieces, Pieces]
+) -> None:
+    """Add a band's sums to those of the weights and of the evidence."""
+    (reading, choice, with_plain, splats), rows = how, how[0].codebook_rows
+    given = torch.zeros(lists.items.shape[0], 1, device=frame.device)
+    for first, last in frame.tile_runs(lists):
+        slots = reading.slots(lists.first_tile + first, lists.first_tile + last, frame.columns)
+        marks = marks_of(frame, lists, (first, last), choice.k) if choice.kind == LARGEST else None
+        sizes = lists.starts[first : last + 1].diff() * slots.starts.diff()
+        for begin, end, floats in frame.table_runs((first, last), sizes):
+            job = _Run(lists, (begin, end), first, slots, sizes[begin - first : end - first], floats, marks)
+            table = _weigh_run(frame, job, reading.taps, choice, with_plain, given)
+            for part in _by_row(frame, job, table, splats * rows, rows):
+                sums[0].add(part)
+    sums[1].add(_of_items(frame, lists, (0, lists.tiles), given))
 
 
 class _Rows(NamedTuple):
@@ -284,19 +292,23 @@ def adjoint(frame: Frame, image: Tensor, splats: int) -> Tensor:
     """``A^T Y``: image [H, W, C] f32 on the host, C at most ``WIDEST`` -> [P, C] f32 on the host."""
     channels = image.shape[2]
     pieces = Pieces(frame.device, frame.room.kept)
-    for lists in frame.lists():
-        own = frame.of_band(image, lists)
-        for first, last in frame.tile_runs(lists):
-            sizes = lists.starts[first : last + 1].diff() * channels
-            for begin, end, floats in frame.table_runs((first, last), sizes):
-                table = torch.zeros(floats // channels, channels, device=frame.device)
-                launch(
-                    _gather, end - begin, *lists.splats, lists.starts, lists.items, frame.scratch(end - begin), own,
-                    table, lists.first_tile, begin, *frame.size, channels, *frame.cuts, KIND=frame.kind,
-                    CHANNELS=max(COLUMNS, 1 << (channels - 1).bit_length()),
-                )  # fmt: skip
-                pieces.add(_of_items(frame, lists, (begin, end), table))
+    for band in frame.bands:
+        _gather_band(frame, frame.lists_of(band), image, pieces)
     result = torch.zeros(splats, channels)
     for part in pieces.joined(splats):
         result[part.keys.long().cpu()] = part.values.to(torch.float32).cpu()
     return result
+
+
+def _gather_band(frame: Frame, lists: Lists, image: Tensor, pieces: Pieces) -> None:
+    own, channels = frame.of_band(image, lists), image.shape[2]
+    for first, last in frame.tile_runs(lists):
+        sizes = lists.starts[first : last + 1].diff() * channels
+        for begin, end, floats in frame.table_runs((first, last), sizes):
+            table = torch.zeros(floats // channels, channels, device=frame.device)
+            launch(
+                _gather, end - begin, *lists.splats, lists.starts, lists.items, frame.scratch(end - begin), own,
+                table, lists.first_tile, begin, *frame.size, channels, *frame.cuts, KIND=frame.kind,
+                CHANNELS=max(COLUMNS, 1 << (channels - 1).bit_length()),
+            )  # fmt: skip
+            pieces.add(_of_items(frame, lists, (begin, end), table))
