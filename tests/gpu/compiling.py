@@ -38,7 +38,7 @@ OTHERS = (75, 80, 89)  # the oldest, an A100 and Ada: what a lift of 3DGS launch
 _compile: Any = triton.compile
 _specialised: Any = libtriton.native_specialize_impl
 _CARD = Device("cuda", torch.device("cpu"))
-TOP = Weighting(2, Selection.TOP_K, count=3)
+TOP = Weighting(2, Selection.TOP_K, count=40)  # the preset's
 
 
 @dataclass(frozen=True)

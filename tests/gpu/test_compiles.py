@@ -66,7 +66,8 @@ def test_no_kernel_adds_by_atomics(compiled):
 
 
 def test_a_lifts_kernels_keep_their_values_in_registers(compiled):
-    assert {report["stack"] for report in compiled if report["kernel"] in ("_add_runs", "_trace")} == {0}
+    assert {report["stack"] for report in compiled if report["kernel"] in ("_add_runs", "_trace", "_rank")} == {0}
+    assert 64 in {report["constants"]["COUNT"] for report in compiled if report["kernel"] == "_rank"}
     assert max(report["stack"] for report in compiled if report["kernel"] == "_weigh") <= STACK
 
 

@@ -16,6 +16,7 @@ import torch
 from liftcore.errors import InvalidInput, InvalidSettings, Unavailable
 from liftcore.observe.observation import RegionMap
 from liftcore.raster.cpu import CpuRaster
+from liftcore.raster.gpu import selecting
 from liftcore.raster.gpu.frame import Frame
 from liftcore.raster.gpu.sums import Pieces, sums_by_unit
 from liftcore.raster.oracle import OracleRaster
@@ -185,6 +186,22 @@ def test_the_lists_of_a_band_are_let_go_before_those_of_the_next_are_made(monkey
     monkeypatch.setattr(Frame, "_made", watched)
     every_product(gpu_raster(splats, free=1), camera)
     assert len(known) > 4 * 3
+
+
+def test_ranks_in_parts_of_a_run_are_those_of_the_run(monkeypatch):
+    splats, camera = random_splats(8, 16), random_camera(8, 17, 36)
+    launched, ranks = [], selecting.launch
+
+    def counting(kernel: Any, programs: int, *rest: Any, **named: Any) -> None:
+        launched.append(programs)
+        ranks(kernel, programs, *rest, **named)
+
+    monkeypatch.setattr(selecting, "launch", counting)
+    whole = [*top_two(gpu_raster(splats), camera), *gpu_raster(splats).top_weights(camera, WALK, 3)]
+    monkeypatch.setattr(selecting, "A_PIXEL", 0)
+    cut = [*top_two(gpu_raster(splats), camera), *gpu_raster(splats).top_weights(camera, WALK, 3)]
+    assert launched == [6, 6] + [1] * 12
+    assert all(torch.equal(first, second) for first, second in zip(whole, cut, strict=True))
 
 
 def test_no_memory_is_not_memory_without_limit(monkeypatch):

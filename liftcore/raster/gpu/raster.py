@@ -28,7 +28,7 @@ from liftcore.raster.gpu.memory import USUAL_LEVELS, raster_bytes
 from liftcore.raster.gpu.projection import Projection
 from liftcore.raster.gpu.room import SCENE_SHARE, room_within, scene_bytes
 from liftcore.raster.gpu.scene import scene_on, with_opacity
-from liftcore.raster.gpu.selecting import largest_weights
+from liftcore.raster.gpu.selecting import A_RANK, largest_weights, ranked_runs
 from liftcore.raster.gpu.slots import DeviceReading
 from liftcore.raster.gpu.tracing import ray_rows
 from liftcore.raster.kernels import activated, with_gain
@@ -239,7 +239,8 @@ class GpuRaster:
 
 def _fill_largest(frame: Frame, lists: Lists, ids: Tensor, weights: Tensor) -> None:
     """Write a band's part of ``top_weights`` into ids and weights [rows of tiles, columns of tiles, count]."""
-    for first, last in frame.tile_runs(lists):
+    runs = [part for run in frame.tile_runs(lists) for part in ranked_runs(frame, run, A_RANK * ids.shape[2])]
+    for first, last in runs:
         own, numbers = largest_weights(frame, lists, (first, last), ids.shape[2])
         met = own > 0
         items = torch.where(met, lists.starts[first:last, None, None] + numbers, 0)

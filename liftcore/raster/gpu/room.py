@@ -23,7 +23,8 @@ ENTRY_BYTES = 1 << 30  # of sums that become rows of splats at a time; likewise
 LEAST_SPLATS, LEAST_ITEMS, LEAST_TILES, LEAST_TABLE = 1 << 12, 1 << 14, 32, 1 << 16
 LEAST_ENTRY_BYTES = LEAST_KEPT = 1 << 22
 
-A_TILE = 2 * PARTS * PART * _FLOAT + TILE * TILE * 100  # scratch; keys of four taps a pixel, sorted, and their origin
+A_PIXEL = 100  # keys of four taps, sorted, and their origin; or its largest weights, in as many tiles as that holds
+A_TILE = 2 * PARTS * PART * _FLOAT + TILE * TILE * A_PIXEL  # scratch, and its pixels
 AN_ITEM = 90  # of the lists while they are made: tiles and places, sorted, and where they came from
 A_SPAN = 32  # of a footprint's tiles in a tile row, twice while they are put together
 A_SPANNED = 1100  # of a splat while its spans are made, in three or four tile rows

@@ -9,7 +9,8 @@ import triton.language as tl
 
 from liftcore.raster.constants import TILE
 from liftcore.raster.gpu import scene
-from liftcore.raster.gpu.launching import jit, lang, launch
+from liftcore.raster.gpu.launching import WARPS, jit, lang, launch
+from liftcore.raster.gpu.room import A_PIXEL
 from liftcore.raster.gpu.walk import CHUNK, PART, PARTS, blend, blend_chunk, fill_alphas, start_rays
 from liftcore.raster.selection import CENTRAL, FRONT, LARGEST
 
@@ -18,6 +19,9 @@ if TYPE_CHECKING:
 
     from liftcore.raster.gpu.frame import Frame
     from liftcore.raster.gpu.tile_lists import Lists
+
+A_MARK, A_RANK = 12, 80  # bytes of one of a ray's largest weights: where marks are made, where they are put in order
+_WIDE = 32  # ranks a ray that more warps share, or the registers of a thread would not hold its part
 
 _CHUNK = tl.constexpr(CHUNK)
 _TILE = tl.constexpr(TILE)
@@ -119,24 +123,41 @@ def _rank(
     tl.store(numbers + to, order, mask=(rank < count)[None, :] & (pixel >= 0)[:, None])
 
 
+def ranked_runs(frame: Frame, run: tuple[int, int], place_bytes: int) -> list[tuple[int, int]]:
+    """Parts of a run of tiles whose ranks take no more than ``room.A_PIXEL`` has for the pixels of all of the run.
+
+    Args:
+        place_bytes: what is held of a ray's ranks, all of them together.
+    """
+    step = max(1, frame.room.tiles * A_PIXEL // place_bytes)
+    return [(first, min(first + step, run[1])) for first in range(run[0], run[1], step)]
+
+
 def largest_weights(frame: Frame, lists: Lists, run: tuple[int, int], count: int) -> tuple[Tensor, Tensor]:
     """The largest weights of every ray of a run of tiles, descending, equal ones near to far.
 
     Returns:
         weights [tiles, 256, count] f32, 0 where there are fewer; and their numbers in the tile's list, i64.
     """
-    tiles = run[1] - run[0]
-    weights = torch.zeros(tiles, TILE * TILE, count, device=frame.device)
-    numbers = torch.zeros(tiles, TILE * TILE, count, dtype=torch.int32, device=frame.device)
-    launch(
-        _rank, tiles, *lists.splats, lists.starts, lists.items, frame.scratch(tiles), weights, numbers,
-        lists.first_tile, run[0], *frame.size, count, *frame.cuts, KIND=frame.kind,
-        COUNT=1 << (count - 1).bit_length(),
-    )  # fmt: skip
+    weights, numbers = _ranks(frame, lists, run, count)
     near_first = torch.sort(numbers, dim=2)
     weights = weights.gather(2, near_first.indices)
     down = torch.sort(weights, dim=2, descending=True, stable=True)
     return down.values, near_first.values.gather(2, down.indices).long()
+
+
+def _ranks(frame: Frame, lists: Lists, run: tuple[int, int], count: int) -> tuple[Tensor, Tensor]:
+    """The same in no order, the numbers in i32."""
+    tiles = run[1] - run[0]
+    weights = torch.zeros(tiles, TILE * TILE, count, device=frame.device)
+    numbers = torch.zeros(tiles, TILE * TILE, count, dtype=torch.int32, device=frame.device)
+    wide = 1 << (count - 1).bit_length()
+    launch(
+        _rank, tiles, *lists.splats, lists.starts, lists.items, frame.scratch(tiles), weights, numbers,
+        lists.first_tile, run[0], *frame.size, count, *frame.cuts, KIND=frame.kind,
+        COUNT=wide, warps=8 if wide >= _WIDE else WARPS,
+    )  # fmt: skip
+    return weights, numbers
 
 
 def marks_of(frame: Frame, lists: Lists, run: tuple[int, int], count: int) -> tuple[Tensor, Tensor]:
@@ -146,6 +167,11 @@ def marks_of(frame: Frame, lists: Lists, run: tuple[int, int], count: int) -> tu
         least [tiles, 256] f32, the k-th largest weight, 0 when there are fewer; room [tiles, 256] i32, how many
         weights equal to it are among the k.
     """
-    weights, _ = largest_weights(frame, lists, run, count)
-    least = weights[:, :, -1]
-    return least.contiguous(), (weights == least[:, :, None]).sum(dim=2).to(torch.int32)
+    parts = [_marks(_ranks(frame, lists, part, count)[0]) for part in ranked_runs(frame, run, A_MARK * count)]
+    least, room = (torch.cat(column) for column in zip(*parts, strict=True))
+    return least, room
+
+
+def _marks(weights: Tensor) -> tuple[Tensor, Tensor]:
+    least = weights.amin(dim=2)
+    return least, (weights == least[:, :, None]).sum(dim=2).to(torch.int32)
