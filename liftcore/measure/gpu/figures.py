@@ -51,8 +51,7 @@ def whole_lift(size: RoomSize, device: Device) -> dict[str, Any]:
         paths = write_room(Path(folder), size)
         settings, out = LiftSettings.of(device=device.kind), Path(folder) / "room.lift.safetensors"
         first = lift(paths[0], paths[1], [paths[2]], settings)
-        if device.place.type == "cuda":
-            torch.cuda.reset_peak_memory_stats(device.place)
+        _forget_peak(device)
         start = time.perf_counter()
         made = lift(paths[0], paths[1], [paths[2]], settings)
         lifted = time.perf_counter()
@@ -76,23 +75,50 @@ def differing(one: Lift, other: Lift) -> list[str]:
     return [name for name, (first, second) in pairs.items() if not _same_bits(first, second)]
 
 
-def pieces_differing(size: RoomSize, device: Device) -> list[str]:
-    """The parts of a view's region weights that differ between a walk in one piece and one with little memory.
+@dataclass(frozen=True)
+class Pieces:
+    """A view walked in one piece, and again with little memory."""
 
-    The little is a tenth of what the plan says of the one piece, or what the smallest pieces take.
-    """
+    differing: list[str]  # parts of its region weights that are not the same to the bit
+    whole: int  # bytes that the plan says of the one piece
+    free: int  # bytes that the other walk was given: a tenth of that, or what the smallest pieces take
+    peak: int | None  # bytes that it took at its peak by torch's count; None off a card
+
+    @property
+    def broken(self) -> list[str]:
+        """What is not as promised, in words for people."""
+        over = self.peak is not None and self.peak > self.free
+        return self.differing + (["the memory of a view in strips, which is more than it was given"] if over else [])
+
+
+def view_in_pieces(size: RoomSize, device: Device) -> Pieces:
+    """Walk a view in one piece and with little memory."""
     from liftcore.raster.gpu.memory import least_raster_bytes, raster_bytes
     from liftcore.raster.gpu.raster import GpuRaster
 
     splats, camera = room_splats(size.splats), room_cameras(size.views, size.width, size.height)[0]
     regions, shape = room_regions(camera, 0, size.levels, size.channels), (size.width, size.height)
     sizes = [find(size.splats, *shape, splats.kernel, size.levels) for find in (raster_bytes, least_raster_bytes)]
-    whole, cut = (
-        GpuRaster(splats, device.place, free).region_weights(camera, regions, Walk(), Weighting())
-        for free in (None, max(sizes[0] // 10, sizes[1]))
-    )
+    least = max(sizes[0] // 10, sizes[1])
+
+    def walked(free: int | None) -> tuple[RegionWeights, int | None]:
+        before = _forget_peak(device)
+        made = GpuRaster(splats, device.place, free).region_weights(camera, regions, Walk(), Weighting())
+        peak = peak_bytes(device)
+        return made, None if peak is None else peak - before
+
+    (whole, _), (cut, peak) = walked(None), walked(least)
     names = [field.name for field in fields(RegionWeights)]
-    return [name for name in names if not _same_bits(getattr(whole, name), getattr(cut, name))]
+    parts = [name for name in names if not _same_bits(getattr(whole, name), getattr(cut, name))]
+    return Pieces(parts, sizes[0], least, peak)
+
+
+def _forget_peak(device: Device) -> int:
+    """Forget what `peak_bytes` tells; the bytes that are taken now."""
+    if device.place.type != "cuda":
+        return 0
+    torch.cuda.reset_peak_memory_stats(device.place)
+    return torch.cuda.memory_allocated(device.place)
 
 
 def _same_bits(one: Tensor | None, other: Tensor | None) -> bool:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from liftcore.device import Device
-    from liftcore.measure.gpu.figures import Agreement
+    from liftcore.measure.gpu.figures import Agreement, Pieces
     from liftcore.measure.gpu.gsplat_lift import SideBySide
     from liftcore.measure.gpu.room_files import RoomSize
 
@@ -31,7 +31,7 @@ class Findings:
     agreements: Mapping[str, Agreement]
     tabletop: Sequence[Mapping[str, Any]] | None  # None where the scene is not here
     peer: SideBySide | str  # in words why not
-    pieces: Sequence[str] | None  # of a view's weights, what differs when it is walked in pieces; None off a card
+    pieces: Pieces | None  # None off a card
     command: str
 
 
@@ -80,11 +80,10 @@ def _repeated(found: Findings) -> Iterator[str]:
     yield "Both of these lifts are the same to the bit." if not again else f"**They differ in {', '.join(again)}.**"
     if found.pieces is not None:
         cut = found.pieces
-        yield (
-            "So are a view's region weights in one piece and in strips, with a tenth of the memory."
-            if not cut
-            else f"**A view in strips, with a tenth of the memory, differs in {', '.join(cut)}.**"
-        )
+        given = f"a view in strips, given {_mib(cut.free)} MiB where one piece is planned at {_mib(cut.whole)} MiB"
+        yield f"**Not as promised, of {given}: {', '.join(cut.broken)}.**" if cut.broken else f"So is {given}."
+        if cut.peak is not None:
+            yield f"It took {_mib(cut.peak)} MiB at its peak by torch's count."
     yield ""
 
 

@@ -59,9 +59,14 @@ def test_lifts_that_differ_in_a_bit_are_told(tmp_path: Path, monkeypatch: pytest
         return lifted
 
     monkeypatch.setattr(figures, "lift", lift)
-    found = replace(gpu.measure(CPU, (TINY, TINY), tmp_path, "the command"), pieces=["columns"])
+    found = replace(
+        gpu.measure(CPU, (TINY, TINY), tmp_path, "the command"),
+        pieces=figures.Pieces(["columns"], 10 << 20, 2 << 20, 3 << 20),
+    )
     assert found.whole["differing"] == ["features"]
-    assert "**They differ in features.**" in page(found) and "differs in columns" in page(found)
+    assert "**They differ in features.**" in page(
+        found
+    ) and "2 MiB where one piece is planned at 10 MiB: columns, the memory" in page(found)
     monkeypatch.setattr(gpu, "choose_device", lambda _: CPU)
     monkeypatch.setattr(gpu, "measure", lambda *_: found)
     monkeypatch.setattr("sys.argv", ["gpu", str(tmp_path / "page.md")])
@@ -73,7 +78,9 @@ def test_a_view_in_pieces_is_held_to_the_view() -> None:
     """The check of a card's run, in the interpreter where there is none."""
     small = RoomSize(40, 20, 34, 1, 4, levels=1)
     place = torch.device("cuda:0" if torch.cuda.is_available() else "cpu")
-    assert figures.pieces_differing(small, Device("cuda", place)) == []
+    pieces = figures.view_in_pieces(small, Device("cuda", place))
+    assert pieces.broken == [] and 0 < pieces.free <= pieces.whole
+    assert replace(pieces, peak=pieces.free).broken == [] != replace(pieces, peak=pieces.free + 1).broken
 
 
 def test_agreement_tells_lifts_that_differ(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
