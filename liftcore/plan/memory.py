@@ -134,9 +134,9 @@ def codebook_rows(packs: FeaturePacks, view: str) -> int:
 
 
 def _label_bytes(packs: FeaturePacks, view: str) -> int:
-    """Of the view's labels as they are walked."""
+    """Of the view's labels as they are walked; a grid's cells are labels where the nearest one is read."""
     spec = packs.specs(view).get("labels")
-    return 0 if spec is None else 4 * math.prod(spec.shape)
+    return 4 * (codebook_rows(packs, view) if spec is None else math.prod(spec.shape))
 
 
 def _codebook_bytes(packs: FeaturePacks, view: str) -> int:
