@@ -40,9 +40,11 @@ def _no_rows() -> RayRows:
 
 def one_by_one(raster: Raster, looks: Iterable[Look]) -> Generator[Walked]:
     """``Raster.walk_views`` with one view at a time."""
-    for look in looks:
-        yield walk_view(raster, look)
-    raster.forget()
+    try:
+        for look in looks:
+            yield walk_view(raster, look)
+    finally:
+        raster.forget()
 
 
 def side_by_side(rasters: Sequence[Raster], looks: Iterable[Look]) -> Generator[Walked]:
