@@ -5,9 +5,11 @@
     │   ├── InvalidSplats
     │   ├── InvalidCameras
     │   ├── InvalidFeatures
+    │   ├── InvalidMasks
     │   ├── InvalidLift
     │   ├── InvalidSettings
     │   └── InvalidQuery           (an unknown word, a view that is not there)
+    │       └── InvalidTable       (the words themselves)
     ├── NotFound                   a named thing does not exist      -> exit 2, HTTP 404
     └── Unavailable                a capability is missing here      -> exit 2, HTTP 422 (weights, encoders)
 
@@ -75,6 +77,12 @@ class InvalidFeatures(InvalidInput):
     kind = "invalid-features"
 
 
+class InvalidMasks(InvalidInput):
+    """Masks to judge by, or their content, are malformed."""
+
+    kind = "invalid-masks"
+
+
 class InvalidLift(InvalidInput):
     """A lift file is malformed, or what it was made from moved or changed."""
 
@@ -91,6 +99,12 @@ class InvalidQuery(InvalidInput):
     """A query cannot be answered as asked."""
 
     kind = "invalid-query"
+
+
+class InvalidTable(InvalidQuery):
+    """A table of text embeddings is malformed."""
+
+    kind = "invalid-table"
 
 
 class NotFound(SplatliftError):

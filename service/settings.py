@@ -41,6 +41,8 @@ class ServiceSettings(BaseSettings):
     max_splats_bytes: int = Field(4 * GiB, gt=0, description="the largest splat file, compressed or not")
     max_cameras_bytes: int = Field(256 * MiB, gt=0, description="the largest camera file, compressed or not")
     max_features_bytes: int = Field(16 * GiB, gt=0, description="the largest feature pack, compressed or not")
+    max_masks_bytes: int = Field(256 * MiB, gt=0, description="the largest file of masks, compressed or not")
+    max_table_bytes: int = Field(64 * MiB, gt=0, description="the largest text table, compressed or not")
     max_body_bytes: int = Field(MiB, gt=0, description="the largest body of any request that is not an upload")
 
     min_bytes_per_second: int = Field(
@@ -105,6 +107,8 @@ class ServiceSettings(BaseSettings):
             "splats": self.max_splats_bytes,
             "cameras": self.max_cameras_bytes,
             "features": self.max_features_bytes,
+            "masks": self.max_masks_bytes,
+            "table": self.max_table_bytes,
         }
         return limits[kind]
 

@@ -12,6 +12,7 @@ JOB_ID = r"^[0-9a-f]{32}$"
 
 AssetId = Annotated[str, Field(pattern=ASSET_ID, description="sha256: and the digest of the bytes, in hex")]
 JobId = Annotated[str, Field(pattern=JOB_ID)]
+Text = Annotated[str, Field(min_length=1, max_length=1000)]
 Scalar = bool | int | float | str
 
 
@@ -21,6 +22,8 @@ class AssetKind(StrEnum):
     SPLATS = "splats"
     CAMERAS = "cameras"
     FEATURES = "features"
+    MASKS = "masks"  # of views, to judge by
+    TABLE = "table"  # of text embeddings
 
 
 class JobKind(StrEnum):
@@ -90,6 +93,18 @@ class LiftRequest(BaseModel):
     )
 
 
+class Labels(BaseModel):
+    """Masks of views, and the words that they mean: views with masks are not lifted, and say how good a lift is."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    masks: AssetId
+    table: AssetId
+    classes: Annotated[list[Text], Field(min_length=1, max_length=1000)] = Field(
+        description="words of the table; the first is what masks call 0"
+    )
+
+
 class TradeoffRequest(LiftRequest):
     """What to compare: lifts of these assets, each with another preset or place of the dial."""
 
@@ -99,6 +114,7 @@ class TradeoffRequest(LiftRequest):
     budget_s: float = Field(
         600, ge=10, le=86_400, description="seconds to plan with; the exact run is made whatever it takes"
     )
+    labels: Labels | None = Field(None, description="masks to judge by; without them held-out views are judged by")
 
 
 class Progress(BaseModel):
@@ -122,7 +138,7 @@ class Job(BaseModel):
     cameras: AssetId
     features: list[AssetId]
     settings: dict[str, Any]
-    parameters: dict[str, Any] = Field(description="of its kind: budget_s of a trade-off")
+    parameters: dict[str, Any] = Field(description="of its kind: budget_s of a trade-off, and its labels")
     progress: Progress | None
     problem: Problem | None
     created: float
@@ -190,6 +206,7 @@ class Tradeoff(BaseModel):
     splats: AssetId
     cameras: AssetId
     features: list[AssetId]
+    labels: Labels | None = Field(description="the masks that it was judged by")
     runs: list[dict[str, Any]] = Field(description="one for each preset or place of the dial: seconds and accuracy")
     skipped: list[str] = Field(description="what did not fit the budget")
     choice: dict[str, Any] = Field(description="which run to take, and why")
@@ -223,7 +240,6 @@ class Box(BaseModel):
     high: list[float]
 
 
-Text = Annotated[str, Field(min_length=1, max_length=1000)]
 Notation = Annotated[
     str, Field(min_length=1, max_length=600, description="VIEW:x,y, region:VIEW:LEVEL:ID or splat:J")
 ]

@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from liftcore.errors import InvalidInput
+from liftcore.errors import InvalidInput, InvalidTable
+from liftcore.observe.masks import describe_masks
 from liftcore.observe.observation import NO_LABEL, RegionMap
 from liftcore.observe.pack import open_packs
+from liftcore.query.encoders.words import plain
 from liftcore.scene.inspect import inspect_file as inspect_scene
 from liftcore.scene.inspect import is_splats
 from liftcore.solve.lift_warnings import UNSEEN
@@ -25,7 +27,7 @@ LIFT_KEY = "splatlift"  # of the metadata of a lift
 
 
 def inspect_file(path: Path) -> dict[str, Any]:
-    """Describe a file of splats, cameras, features, a lift or a table of text embeddings.
+    """Describe a file of splats, cameras, features, masks, a lift or a table of text embeddings.
 
     Returns:
         ``kind``, ``bytes``, counts and ranges of the kind, and ``warnings``: what looks wrong.
@@ -44,7 +46,9 @@ def inspect_file(path: Path) -> dict[str, Any]:
 
         return {"kind": "lift", "bytes": size, **describe_lift(load_lift(path))}
     if keys == {"embeddings"}:
-        return {"kind": "table", "bytes": size, **_describe_table(path, metadata)}
+        return {"kind": "table", "bytes": size, **describe_table(path)}
+    if any(key.endswith("/mask") for key in keys):
+        return {"kind": "masks", "bytes": size, **describe_masks(path)}
     return {"kind": "features", "bytes": size, **describe_packs(open_packs([path]))}
 
 
@@ -171,16 +175,26 @@ def _lift_warnings(lift: Lift, metadata: LiftMetadata) -> list[str]:
     return list(dict.fromkeys(warnings))
 
 
-def _describe_table(path: Path, metadata: dict[str, str]) -> dict[str, Any]:
+def describe_table(path: Path) -> dict[str, Any]:
+    """Counts, ranges and warnings of a table of text embeddings that opens, be it fit for use or not.
+
+    Raises:
+        InvalidTable: there is more in the file, so that it may be of another kind too.
+    """
     from safetensors import safe_open
 
     with safe_open(str(path), framework="pt") as handle:
-        embeddings = handle.get_tensor("embeddings")
+        more = sorted({*handle.keys()} - {"embeddings"})
+        if more:
+            raise InvalidTable(str(path), expected="embeddings alone", got=f"{more[0][:80]!r} beside them")
+        embeddings, metadata = handle.get_tensor("embeddings"), handle.metadata() or {}
     norms = torch.linalg.vector_norm(embeddings.float().reshape(len(embeddings), -1), dim=1)
     words = _words(metadata)
     warnings = [] if len(words) == len(embeddings) else [f"{len(words)} words for {len(embeddings)} rows"]
     if int((norms == 0).sum()):
         warnings.append(f"{int((norms == 0).sum())} rows are zero")
+    if twice := len(words) - len(set(map(plain, words))):
+        warnings.append(f"{twice} of {len(words)} words come again, and only their first row is read")
     return {
         "rows": len(embeddings),
         "channels": embeddings.shape[-1],

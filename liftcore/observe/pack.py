@@ -6,9 +6,6 @@ none, i16 or i32 with -1) with ``V/codebook`` [M, F], or a grid, ``V/grid`` [h, 
 
 from __future__ import annotations
 
-import json
-import struct
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +13,7 @@ import torch
 
 from liftcore.errors import InvalidFeatures
 from liftcore.observe.finite import check_finite
+from liftcore.observe.header import check_header
 from liftcore.observe.observation import NO_LABEL, FeatureGrid, Observation, RegionMap
 
 if TYPE_CHECKING:
@@ -26,7 +24,6 @@ if TYPE_CHECKING:
 
     from liftcore.scene.cameras import Cameras
 
-MAX_HEADER_BYTES = 32 * 1024 * 1024
 MAX_CHANNELS = 1 << 16
 U8_NO_LABEL = 255
 LABEL_TYPES = ("U8", "I16", "I32")
@@ -169,7 +166,10 @@ def _examples(names: Iterable[str]) -> str:
 def _open(path: Path) -> _PackFile:
     from safetensors import SafetensorError, safe_open
 
-    _check_start(path)
+    check_header(
+        path, str(path), InvalidFeatures, expected="a feature pack (.safetensors)",
+        hint="make packs with 'splatlift pack'",
+    )  # fmt: skip
     try:
         handle: Any = safe_open(str(path), framework="pt")
         slices = {name: handle.get_slice(name) for name in tuple(handle.keys())}
@@ -178,45 +178,6 @@ def _open(path: Path) -> _PackFile:
     except (SafetensorError, OSError) as error:
         got = f"a file that does not open as one ({str(error)[:120]})"
         raise InvalidFeatures(str(path), expected="a feature pack (.safetensors)", got=got) from None
-
-
-def _check_start(path: Path) -> None:
-    """Refuse what is no safetensors file, and headers of absurd length, before they are parsed."""
-    try:
-        with path.open("rb") as handle:
-            start = handle.read(9)
-    except OSError as error:
-        got = f"a file that does not open ({error.strerror})"
-        raise InvalidFeatures(str(path), expected="a feature pack (.safetensors)", got=got) from None
-    if start[:2] in (b"PK", b"\x80\x02") or path.suffix.lower() in (".pt", ".pth", ".pkl"):
-        raise InvalidFeatures(
-            str(path),
-            expected="a feature pack (.safetensors)",
-            got="a Python pickle or a zip, which may run code when it is opened",
-            hint="save the features as .npy files and run 'splatlift pack npy'",
-        )
-    if len(start) < 9 or start[8:] != b"{":
-        got = f"a file that begins with {start!r}" if start else "an empty file"
-        hint = "make packs with 'splatlift pack'"
-        raise InvalidFeatures(str(path), expected="a feature pack (.safetensors)", got=got, hint=hint)
-    (length,) = struct.unpack("<Q", start[:8])
-    if length > MAX_HEADER_BYTES:
-        got = f"{length} bytes"
-        raise InvalidFeatures(str(path), expected=f"a header of at most {MAX_HEADER_BYTES} bytes", got=got)
-    _check_names(path, length)
-
-
-def _check_names(path: Path, length: int) -> None:
-    """Refuse headers that say a name twice, of which each reader believes another; safetensors refuses bad JSON."""
-
-    def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        if len(dict(pairs)) < len(pairs):
-            raise InvalidFeatures(str(path), expected="a header that says each name once", got="one twice")
-        return dict(pairs)
-
-    with path.open("rb") as handle, suppress(ValueError, RecursionError):
-        handle.seek(8)
-        json.loads(handle.read(length), object_pairs_hook=once)
 
 
 def _views(pack: _PackFile) -> list[str]:

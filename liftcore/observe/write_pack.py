@@ -9,8 +9,8 @@ import torch
 from liftcore.errors import InvalidFeatures
 from liftcore.files import whole_file
 from liftcore.observe.finite import check_finite
+from liftcore.observe.header import MAX_HEADER_BYTES
 from liftcore.observe.observation import Observation, RegionMap
-from liftcore.observe.pack import MAX_HEADER_BYTES
 from liftcore.progress import Progress, silent
 from liftcore.safetensors_header import safetensors_header, tensor_bytes
 

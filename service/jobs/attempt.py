@@ -19,7 +19,7 @@ from service.jobs.leftovers import mark
 from service.jobs.limits import JobLimits
 from service.jobs.pace import Pace
 from service.jobs.process import JobProcess
-from service.store.jobs import JobRecord
+from service.store.jobs import JobRecord, labels_of
 from service.store.lifts import FinishedLift
 from service.store.store import Store
 from service.store.tradeoffs import FinishedTradeoff
@@ -154,6 +154,7 @@ class Attempt:
     def _order(self, draft: Path) -> dict[str, Any]:
         job, files = self._job, self._store.files
         assets = [self._store.assets.get(name) for name in (job.splats, job.cameras, *job.features)]
+        labels = [self._store.assets.get(*named) for named in labels_of(job.parameters)]
         return {
             "kind": job.kind,
             "parameters": job.parameters,
@@ -161,12 +162,13 @@ class Attempt:
             "kernel": assets[0].counts.get("kernel", "3dgs"),  # to compile for
             "cameras": str(assets[1].path),
             "features": [str(asset.path) for asset in assets[2:]],
+            "labels": {str(asset.kind): str(asset.path) for asset in labels},
             "settings": job.settings,
             "threads": self._limits.threads,
             "work": str(files.work(job.id)),
             "checkpoint_seconds": self._limits.checkpoint_seconds,
             "output": str(draft),
-            "names": {str(asset.path): f"{asset.kind} {asset.id}" for asset in assets},
+            "names": {str(asset.path): f"{asset.kind} {asset.id}" for asset in (*assets, *labels)},
         }
 
 

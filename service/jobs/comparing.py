@@ -29,22 +29,30 @@ def compare_as_ordered(order: dict[str, Any], progress: Progress) -> dict[str, A
     Raises:
         SplatliftError: as `liftcore.measure.tradeoff.compare.compare` has it.
     """
-    splats, features = Path(order["splats"]), tuple(Path(path) for path in order["features"])
-    scene = Scene(splats, Path(order["cameras"]), features)
-    settings, budget = order["settings"], order["parameters"]["budget_s"]
+    scene, settings, parameters = _scene(order), order["settings"], order["parameters"]
     progress("compile", 0, 1, "kernels")
     device = choose_device(settings.get("device", "auto"))
     warm_up_solution()
     warm_up(Kernel(order["kernel"]), device)  # for the runs to load: else the first on a machine eats up the budget
     progress("tradeoff", 0, len(CANDIDATES), "runs")
-    found = compare(scene, budget, settings, order["threads"], progress)
+    found = compare(scene, parameters["budget_s"], settings, order["threads"], progress)
     named = {
         "title": "Speed against accuracy",
-        "scene": f"splats {splats.stem[:SHOWN_DIGITS]}",  # a blob is named by its digest
-        "command": f"POST /tradeoff {json.dumps({'budget_s': budget, 'settings': settings})}",
+        "scene": f"splats {scene.splats.stem[:SHOWN_DIGITS]}",  # a blob is named by its digest
+        "command": f"POST /tradeoff {json.dumps(parameters | {'settings': settings})}",
     }
     document = finite(named | found)
     with tempfile.TemporaryDirectory(prefix="splatlift-chart-") as folder:
         chart = next(file for file in save(document, Path(folder)) if file.suffix == ".png")
         Path(order["output"]).write_bytes(chart.read_bytes())
     return {"document": document, "page": "\n".join(page_of(document)) + "\n"}
+
+
+def _scene(order: dict[str, Any]) -> Scene:
+    files = Path(order["splats"]), Path(order["cameras"]), tuple(Path(path) for path in order["features"])
+    labels = order["labels"]
+    if not labels:
+        return Scene(*files)
+    return Scene(
+        *files, Path(labels["masks"]), Path(labels["table"]), tuple(order["parameters"]["labels"]["classes"])
+    )

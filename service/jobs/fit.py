@@ -5,7 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from liftcore.errors import InvalidFeatures
+from liftcore.query.encoders.words import nearest, plain
+from liftcore.solve.settings import LiftSettings
+from service.errors import InvalidRequest
 from service.store.assets import AssetRecord
+from service.store.jobs import JobOrder
 from service.wire import JobKind
 
 FLOAT_BYTES = 2  # at least: of float16, which features are unless told otherwise
@@ -36,6 +40,44 @@ def check_fit(cameras: AssetRecord, features: Sequence[AssetRecord]) -> None:
             got=f"views {_examples(owner)} and cameras {_examples(known)}, none in common",
             hint="a view is named after its image, without the extension",
         )
+
+
+def check_labels(
+    order: JobOrder, cameras: AssetRecord, features: Sequence[AssetRecord], masks: AssetRecord, table: AssetRecord
+) -> None:
+    """Refuse labels that cannot judge lifts of these features.
+
+    Raises:
+        InvalidRequest: a class that the table lacks, too few classes, a table of other channels, masks of no camera,
+            or no view with features besides those with masks.
+    """
+    classes = order.parameters["labels"]["classes"]
+    words = dict.fromkeys(map(plain, table.counts["words"]))
+    for place, word in enumerate(classes):
+        if plain(word) not in words:
+            raise InvalidRequest(
+                f"labels.classes.{place}", expected=f"one of the {len(words)} words of {table.id}",
+                got=repr(word[:80]), hint=nearest(word, words),
+            )  # fmt: skip
+    if masks.counts["classes"] > len(classes):
+        expected = f"{masks.counts['classes']} words, as the masks name classes 0..{masks.counts['classes'] - 1}"
+        raise InvalidRequest("labels.classes", expected=expected, got=f"{len(classes)}")
+    channels = features[0].counts["channels"]
+    if table.counts["channels"] != channels:
+        expected, got = f"a table with {channels} channels, as the features", f"{table.counts['channels']}"
+        raise InvalidRequest("labels.table", expected=expected, got=got)
+    known = set(cameras.counts["names"])
+    masked = known.intersection(masks.counts["names"])
+    if not masked:
+        raise InvalidRequest(
+            "labels.masks",
+            expected="masks of views named like the cameras",
+            got=f"masks of {_examples(set(masks.counts['names']))} and cameras {_examples(known)}, none in common",
+        )
+    views = sorted(known.intersection(view for pack in features for view in pack.counts["names"]))
+    if masked.issuperset(views[:: LiftSettings.of(**order.settings).view_stride]):
+        expected = "features of views besides those with masks, which are not lifted"
+        raise InvalidRequest("labels.masks", expected=expected, got="masks of all of them")
 
 
 def scratch_bytes(kind: JobKind, splats: AssetRecord, features: Sequence[AssetRecord]) -> int:

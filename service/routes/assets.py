@@ -49,7 +49,7 @@ RAW_BODY = {
     openapi_extra=RAW_BODY,
 )
 async def upload(kind: Kind, request: Request, here: Here, sha256: Sha256 = None) -> Response:
-    """Upload splats (PLY), cameras (JSON or a zip of a COLMAP model) or a feature pack (safetensors)."""
+    """Upload splats (PLY), cameras (JSON or a zip of a COLMAP model), a feature pack, masks or a text table."""
     coding = coding_of(", ".join(request.headers.getlist("content-encoding")))
     here.store.files.require_room()
     await anyio.to_thread.run_sync(here.store.assets.require_quota)

@@ -14,11 +14,11 @@ from liftcore.errors import InvalidSettings
 from liftcore.solve.settings import LiftSettings
 from service import request_id, wire
 from service.faults import error_of
-from service.jobs.fit import check_fit, scratch_bytes
+from service.jobs.fit import check_fit, check_labels, scratch_bytes
 from service.parts import Here, Parts
 from service.problems import problem_of
 from service.store.events import Event, EventKind
-from service.store.jobs import JobOrder, JobRecord, fingerprint
+from service.store.jobs import JobOrder, JobRecord, fingerprint, labels_of
 
 router = APIRouter(tags=["jobs"])
 
@@ -142,6 +142,9 @@ def require_fit(order: JobOrder, here: Parts) -> None:
     packs = [here.store.assets.get(pack, wire.AssetKind.FEATURES) for pack in order.features]
     splats = here.store.assets.get(order.splats, wire.AssetKind.SPLATS)
     check_fit(cameras, packs)
+    judges = [here.store.assets.get(*named) for named in labels_of(order.parameters)]
+    if judges:
+        check_labels(order, cameras, packs, *judges)
     here.store.files.require_room(scratch_bytes(order.kind, splats, packs))
 
 

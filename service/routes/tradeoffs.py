@@ -33,16 +33,17 @@ def submit(order: wire.TradeoffRequest, here: Here, key: Key = None) -> Response
     if order.budget_s > here.settings.tradeoff_seconds:
         most = f"at most {here.settings.tradeoff_seconds:g} s, as the operator allows"
         raise InvalidRequest("budget_s", expected=most, got=f"{order.budget_s:g}")
+    sent = order.model_dump(mode="json", exclude_none=True)  # an order without labels reads as before there were any
     wanted = JobOrder(
         splats=order.splats,
         cameras=order.cameras,
         features=tuple(order.features),
         settings=order.settings,
         key=key,
-        fingerprint=None if key is None else fingerprint(order.model_dump(mode="json")),  # with a budget: of no lift
+        fingerprint=None if key is None else fingerprint(sent),  # with a budget: of no lift
         request_id=request_id.current(),
         kind=wire.JobKind.TRADEOFF,
-        parameters={"budget_s": order.budget_s},
+        parameters={name: sent[name] for name in ("budget_s", "labels") if name in sent},
     )
     return take(wanted, here)
 
@@ -75,6 +76,7 @@ def shape(tradeoff: TradeoffRecord) -> wire.Tradeoff:
         "splats": tradeoff.splats,
         "cameras": tradeoff.cameras,
         "features": list(tradeoff.features),
+        "labels": tradeoff.labels,
         "created": tradeoff.created,
         "links": {"self": own, "job": f"/jobs/{tradeoff.id}", "chart": f"{own}/chart", "table": f"{own}/table"},
     }

@@ -150,7 +150,8 @@ class AssetStore(Owned):
             with self._database.write() as connection:
                 users = connection.execute(
                     f"SELECT id FROM jobs WHERE {SEEN} AND (splats = :asset OR cameras = :asset OR EXISTS"
-                    " (SELECT 1 FROM job_features WHERE job = id AND asset = :asset)) LIMIT 4",
+                    " (SELECT 1 FROM job_features WHERE job = id AND asset = :asset) OR EXISTS"
+                    " (SELECT 1 FROM job_labels WHERE job = id AND asset = :asset)) LIMIT 4",
                     terms,
                 ).fetchall()
                 if users:

@@ -7,7 +7,7 @@ import json
 import secrets
 import sqlite3
 import time
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -37,6 +37,11 @@ class JobOrder:
     kind: JobKind = JobKind.LIFT
     parameters: dict[str, Any] = field(default_factory=dict)  # what its kind takes beside settings
 
+    def assets(self) -> list[tuple[str, AssetKind]]:
+        """What it needs: ids, and the kind that each must be."""
+        wanted = [(self.splats, AssetKind.SPLATS), (self.cameras, AssetKind.CAMERAS)]
+        return [*wanted, *((asset, AssetKind.FEATURES) for asset in self.features), *labels_of(self.parameters)]
+
 
 @dataclass(frozen=True)
 class JobRecord:
@@ -58,6 +63,12 @@ class JobRecord:
     request_id: str | None = None
     kind: JobKind = JobKind.LIFT
     parameters: dict[str, Any] = field(default_factory=dict)
+
+
+def labels_of(parameters: Mapping[str, Any]) -> list[tuple[str, AssetKind]]:
+    """The assets that a job's parameters name, with their kinds: what a trade-off is judged by."""
+    named = parameters.get("labels")
+    return [] if named is None else [(named[str(kind)], kind) for kind in (AssetKind.MASKS, AssetKind.TABLE)]
 
 
 def fingerprint(order: dict[str, Any]) -> str:
@@ -113,6 +124,10 @@ class JobStore(Owned):
             connection.executemany(
                 "INSERT INTO job_features (job, place, asset) VALUES (?, ?, ?)",
                 [(job, place, asset) for place, asset in enumerate(order.features)],
+            )
+            connection.executemany(
+                "INSERT INTO job_labels (job, asset) VALUES (?, ?)",
+                [(job, asset) for asset, _ in labels_of(order.parameters)],
             )
             note(connection, job, EventKind.STATE, {"state": JobState.QUEUED, "attempt": 0, "problem": None})
         return job, True
@@ -238,9 +253,7 @@ def _require_place(connection: sqlite3.Connection, kind: JobKind, max_queued: in
 
 def _take_assets(connection: sqlite3.Connection, order: JobOrder, owner: Owner) -> None:
     """See that the assets are there; what the job of an admin needs of others, the admin has from now on."""
-    wanted = [(order.splats, AssetKind.SPLATS), (order.cameras, AssetKind.CAMERAS)]
-    wanted += [(asset, AssetKind.FEATURES) for asset in order.features]
-    for asset, kind in wanted:
+    for asset, kind in order.assets():
         seen = connection.execute(
             f"SELECT 1 FROM assets JOIN asset_owners ON asset = id WHERE id = :asset AND kind = :kind AND {SEEN}",
             owner.terms(asset=asset, kind=kind),

@@ -113,4 +113,12 @@ CREATE TABLE tradeoffs (            -- small enough to lie here, so that no file
     created REAL NOT NULL
 ) STRICT;
 """,
+    """
+CREATE TABLE job_labels (           -- what the labels of a job's parameters name, so that it stays as long as the job
+    job TEXT NOT NULL REFERENCES jobs (id) ON DELETE CASCADE,
+    asset TEXT NOT NULL REFERENCES assets (id),
+    PRIMARY KEY (job, asset)
+) STRICT, WITHOUT ROWID;
+CREATE INDEX job_labels_of_asset ON job_labels (asset);
+""",
 )

@@ -37,11 +37,13 @@ class TradeoffRecord:
     splats: str  # ids of the assets that were lifted
     cameras: str
     features: tuple[str, ...]
+    labels: dict[str, Any] | None  # of the order
 
 
 # A trade-off belongs to whom its job does.
 VISIBLE = (
-    "SELECT tradeoffs.*, splats, cameras, (SELECT json_group_array(asset) FROM"
+    "SELECT tradeoffs.*, splats, cameras, json_extract(parameters, '$.labels') AS labels,"
+    " (SELECT json_group_array(asset) FROM"
     " (SELECT asset FROM job_features WHERE job = jobs.id ORDER BY place)) AS features"
     f" FROM tradeoffs JOIN jobs USING (id) WHERE {SEEN}"
 )
@@ -99,4 +101,5 @@ def _record(row: sqlite3.Row) -> TradeoffRecord:
         splats=row["splats"],
         cameras=row["cameras"],
         features=tuple(json.loads(row["features"])),
+        labels=None if row["labels"] is None else json.loads(row["labels"]),
     )

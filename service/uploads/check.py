@@ -15,8 +15,10 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from liftcore.errors import InvalidInput, SplatliftError
-from liftcore.observe.inspect import describe_packs
+from liftcore.observe.inspect import describe_packs, describe_table
+from liftcore.observe.masks import describe_masks
 from liftcore.observe.pack import open_packs
+from liftcore.query.encoders.table import TableEncoder
 from liftcore.scene.inspect import describe_cameras, describe_splats
 from liftcore.scene.load import load_cameras, load_splats
 from service.faults import fault_of
@@ -41,10 +43,23 @@ def check_features(path: Path) -> dict[str, Any]:
     return {"suffix": ".safetensors", "found": describe_packs(open_packs([path]))}
 
 
+def check_masks(path: Path) -> dict[str, Any]:
+    """Read and describe every mask."""
+    return {"suffix": ".safetensors", "found": describe_masks(path)}
+
+
+def check_table(path: Path) -> dict[str, Any]:
+    """Read every row, and keep all words: orders are held to them."""
+    words = list(TableEncoder.open(path).words)
+    return {"suffix": ".safetensors", "found": describe_table(path) | {"words": words}}
+
+
 CHECKS = {
     AssetKind.SPLATS: check_splats,
     AssetKind.CAMERAS: check_cameras,
     AssetKind.FEATURES: check_features,
+    AssetKind.MASKS: check_masks,
+    AssetKind.TABLE: check_table,
 }
 
 
@@ -66,7 +81,7 @@ def run(kind: AssetKind, path: Path) -> dict[str, Any]:
 
 
 def _invalid(error: SplatliftError, kind: AssetKind, path: Path) -> dict[str, Any]:
-    return {"event": "invalid", "fault": fault_of(error, {str(path): kind})}
+    return {"event": "invalid", "fault": fault_of(error, {str(path): kind, f"text table {path.name}": kind})}
 
 
 def _out_of_memory(kind: AssetKind) -> InvalidInput:

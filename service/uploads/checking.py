@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from liftcore.errors import InvalidCameras, InvalidFeatures, InvalidInput, InvalidSplats
+from liftcore.errors import InvalidCameras, InvalidFeatures, InvalidInput, InvalidMasks, InvalidSplats, InvalidTable
 from service.errors import Busy, Crashed
 from service.faults import error_of
 from service.wire import AssetKind
@@ -26,6 +26,8 @@ INVALID: dict[AssetKind, type[InvalidInput]] = {
     AssetKind.SPLATS: InvalidSplats,
     AssetKind.CAMERAS: InvalidCameras,
     AssetKind.FEATURES: InvalidFeatures,
+    AssetKind.MASKS: InvalidMasks,
+    AssetKind.TABLE: InvalidTable,
 }
 
 log = logging.getLogger(__name__)

@@ -106,7 +106,43 @@ def features() -> dict[str, bytes]:
     }
 
 
-CORPUS = {"splats": splats, "cameras": cameras, "features": features}
+def masks() -> dict[str, bytes]:
+    """Bombs for the reader of masks: those of packs, which hold none, and some of its own."""
+    return features() | {
+        "no sides": pack({"v/mask": tensor([], 0, 4)}, 4),
+        "an empty side": pack({"v/mask": tensor([10**9, 0], 0, 0)}, 0),
+        "100,000 sides": pack({"v/mask": tensor([1] * 100_000, 0, 4)}, 4),
+        "floats": pack({"v/mask": tensor([1, 1], 0, 4)}, 4),
+    }
+
+
+def table() -> dict[str, bytes]:
+    """Bombs for the reader of text tables, likewise."""
+    row = {"embeddings": tensor([1, 1], 0, 4)}
+    worded = {name: {**row, "__metadata__": {"words": words}} for name, words in WORDS.items()}
+    return (
+        features()
+        | {name: safetensors(json.dumps(header).encode()) + struct.pack("<f", 1) for name, header in worded.items()}
+        | {
+            "no words": pack(row, 4),
+            "a long word without a direction": pack({**row, "__metadata__": {"words": json.dumps(["x" * 10**6])}}, 4),
+            "100,000 sides": pack(
+                {"embeddings": tensor([1] * 100_000, 0, 4), "__metadata__": {"words": '["apple"]'}}, 4
+            ),
+        }
+    )
+
+
+WORDS = {
+    "deep words": "[" * 100_000,
+    "a word that is a number of 5,000 digits": "[" + "9" * 5000 + "]",
+    "half a surrogate pair as a word": '["\\ud800"]',
+    "words in an object": '{"apple": 0}',
+    "a word that is none": "[null]",
+}
+
+
+CORPUS = {"splats": splats, "cameras": cameras, "features": features, "masks": masks, "table": table}
 
 
 def zipped(members: list[tuple[str, bytes]]) -> bytes:

@@ -55,7 +55,7 @@ def served(data: Path, *, keys: bool, **settings: Any) -> Iterator[tuple[str, st
     listener = socket.create_server(("127.0.0.1", 0))
     server = server_of(create_app(chosen, store, runner, WarmWorker(query_limits(chosen))), chosen)
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
-    report = Report(".bin", {"names": ["v"], "channels": 1}, [])
+    report = Report(".bin", {"names": ["v"], "channels": 1, "classes": 1, "words": ["apple"]}, [])
     with mock.patch("service.routes.assets.check", lambda *given: report):
         thread.start()
         try:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import zstandard
 from fastapi.testclient import TestClient
+from safetensors.numpy import save
 
 from service.errors import InvalidEncoding
 from service.faults import error_of
@@ -22,13 +23,16 @@ from service.wire import AssetKind
 
 from .tiny_scene import (
     PROPERTIES,
+    WORDS,
     TinyScene,
     cameras_document,
     codebook,
     labels,
+    masks,
     pack,
     ply,
     splat_rows,
+    text_table,
 )
 
 
@@ -92,6 +96,35 @@ def codebook_with_nan() -> bytes:
     return pack(labels(), rows)
 
 
+def mask_below_none() -> bytes:
+    return masks({"left": np.full((2, 3), -2)})
+
+
+def mask_of_fractions() -> bytes:
+    return save({"left/mask": np.zeros((2, 3), np.float32)})
+
+
+def no_masks() -> bytes:
+    return save({"left": np.zeros((2, 3), np.int16)})
+
+
+def table_with_a_word_too_many() -> bytes:
+    return text_table(words=(*WORDS, "zeppelin"))
+
+
+def table_of_zeros() -> bytes:
+    return save({"embeddings": np.zeros((1, 8), np.float32)}, metadata={"words": '["apple"]'})
+
+
+def table_that_is_masks_too() -> bytes:
+    both = {"embeddings": codebook(), "left/mask": np.zeros((2, 3), np.int16)}
+    return save(both, metadata={"words": json.dumps(WORDS)})
+
+
+def half_a_surrogate_pair_in_a_word() -> bytes:
+    return save({"embeddings": codebook()[:1]}, metadata={"words": '["\\ud800"]'})
+
+
 def no_bytes() -> bytes:
     return b""
 
@@ -115,11 +148,26 @@ BAD: list[tuple[str, Callable[[], bytes]]] = [
     ("features", label_out_of_the_codebook),
     ("features", codebook_with_nan),
     ("features", garbage),
+    ("masks", mask_below_none),
+    ("masks", mask_of_fractions),
+    ("masks", no_masks),
+    ("masks", garbage),
+    ("table", table_with_a_word_too_many),
+    ("table", table_of_zeros),
+    ("table", table_that_is_masks_too),
+    ("table", half_a_surrogate_pair_in_a_word),
+    ("table", garbage),
 ]
 
 
 # Each reader once through HTTP, which starts a process; the whole table goes through what that process runs.
-OVER_HTTP = [("splats", truncated_ply), ("cameras", camera_without_pose), ("features", label_out_of_the_codebook)]
+OVER_HTTP = [
+    ("splats", truncated_ply),
+    ("cameras", camera_without_pose),
+    ("features", label_out_of_the_codebook),
+    ("masks", mask_below_none),
+    ("table", half_a_surrogate_pair_in_a_word),
+]
 
 
 @pytest.mark.parametrize(("kind", "make"), OVER_HTTP, ids=[f"{kind}-{make.__name__}" for kind, make in OVER_HTTP])

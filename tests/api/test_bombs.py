@@ -20,10 +20,10 @@ from service.uploads import check
 from service.wire import AssetKind
 
 from .bombs import camera_documents, features
-from .tiny_scene import TinyScene, colmap_zip, make_scene
+from .tiny_scene import TinyScene, colmap_zip, labels, make_scene, masks
 
 ROOT = Path(__file__).parents[2]
-BOMBS = {"splats": 10, "cameras": 23, "features": 18}  # how many there are
+BOMBS = {"splats": 10, "cameras": 23, "features": 18, "masks": 22, "table": 26}  # how many there are
 MEMORY_BYTES = 1 << 30  # private memory for the whole corpus of a kind, made and read in one process
 SECONDS = 300  # for the same; it takes a few, and the machine may be busy
 ALL_IN_ONE_PROCESS = """
@@ -81,6 +81,8 @@ FILES = [
     (AssetKind.CAMERAS, REAL.cameras),
     (AssetKind.CAMERAS, colmap_zip()),
     (AssetKind.FEATURES, REAL.features),
+    (AssetKind.MASKS, masks({"left": labels()["left"][0]})),
+    (AssetKind.TABLE, REAL.table),
 ]
 CHANGES = st.lists(
     st.tuples(

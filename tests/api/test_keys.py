@@ -95,7 +95,10 @@ def naming(method: str, path: str, job: str, asset: str, house: Guarded) -> list
     """Requests to a route that name a job, a lift or an asset, once for each place that takes a name."""
     if path in ("/lift", "/tradeoff"):
         absent = {"splats": asset, "cameras": asset, "features": [asset]}
-        return [{"json": house.body() | {place: name}} for place, name in absent.items()]
+        wrong = [{place: name} for place, name in absent.items()]
+        if path == "/tradeoff":
+            wrong.append({"labels": {"masks": asset, "table": asset, "classes": ["apple"]}})
+        return [{"json": house.body() | place} for place in wrong]
     if path.startswith("/query") or path == "/render":
         asked = ASKING | {"lift": job}
         return [{"json": asked | {"text": ["apple"]}} if method == "POST" else {"params": asked}]

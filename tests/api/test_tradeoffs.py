@@ -58,6 +58,7 @@ def test_what_was_found_is_looked_at_in_three_ways_and_is_no_lift(quick: Quick, 
         found = client.get(links["tradeoff"])
         assert found.status_code == 200 and found.json()["budget_s"] == 60
         assert [found.json()[name] for name in ("splats", "cameras", "features")] == [*body.values()]
+        assert found.json()["labels"] is None
         for link in found.json()["links"].values():
             assert client.get(link).status_code == 200, link
         chart = client.get(links["chart"])
@@ -170,7 +171,7 @@ def test_what_a_comparison_refuses_is_the_users_problem_and_names_no_path(
     Path(paths["cameras"]).write_bytes(b"of no format")
     order = {
         "kind": "tradeoff", "kernel": "3dgs", "threads": 1, "settings": {}, "parameters": {"budget_s": 10},
-        "splats": paths["splats"], "cameras": paths["cameras"], "features": [paths["features"]],
+        "splats": paths["splats"], "cameras": paths["cameras"], "features": [paths["features"]], "labels": {},
         "names": {path: f"{kind} sha256:x" for kind, path in paths.items()},
     }  # fmt: skip
     fault = child.run(order, child.Reporter(io.BytesIO()))["fault"]

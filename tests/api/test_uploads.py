@@ -24,7 +24,18 @@ from service.uploads.decoding import GZIP, ZSTD, Coding, Decoding
 from service.wire import AssetKind
 
 from .conftest import Uploaded
-from .tiny_scene import CHANNELS, TinyScene, cameras_document, codebook, labels, pack, ply, splat_rows
+from .tiny_scene import (
+    CHANNELS,
+    TinyScene,
+    cameras_document,
+    codebook,
+    labels,
+    masks,
+    pack,
+    ply,
+    splat_rows,
+    text_table,
+)
 
 
 def test_same_bytes_are_the_same_asset(client: TestClient, uploaded: Uploaded, scene: TinyScene) -> None:
@@ -79,7 +90,13 @@ def worth_a_warning() -> dict[str, bytes]:
     assert isinstance(frames, list)
     frames[1]["transform_matrix"] = frames[0]["transform_matrix"]
     unread = np.concatenate([codebook(), np.zeros((1, CHANNELS), np.float32)])
-    return {"splats": ply(rows), "cameras": json.dumps(document).encode(), "features": pack(labels(), unread)}
+    return {
+        "splats": ply(rows),
+        "cameras": json.dumps(document).encode(),
+        "features": pack(labels(), unread),
+        "masks": masks({"left": np.full((2, 3), -1)}),  # of no class
+        "table": text_table(words=("apple", "book", "the Apple")),
+    }
 
 
 @pytest.mark.parametrize("kind", list(AssetKind))

@@ -119,6 +119,11 @@ def pack(by_view: dict[str, np.ndarray], rows: np.ndarray | None = None) -> byte
     return save(tensors, metadata={"encoder": "by hand", "text_space": "tiny", "normalised": "true"})
 
 
-def text_table(channels: int = CHANNELS) -> bytes:
-    """A text table with the three words."""
-    return save({"embeddings": codebook(channels)}, metadata={"words": json.dumps(WORDS)})
+def text_table(channels: int = CHANNELS, words: tuple[str, ...] = WORDS) -> bytes:
+    """A text table with the three words, or others."""
+    return save({"embeddings": codebook(channels)}, metadata={"words": json.dumps(words)})
+
+
+def masks(by_view: dict[str, np.ndarray]) -> bytes:
+    """Masks [h, w] of class numbers."""
+    return save({f"{view}/mask": np.ascontiguousarray(mask.astype(np.int16)) for view, mask in by_view.items()})

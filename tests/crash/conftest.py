@@ -28,14 +28,23 @@ def stand_in(behaviour: str) -> list[str]:
 
 def order(store: Store, **settings: Any) -> JobOrder:
     """An order over assets whose content nobody looks at."""
-    ids = []
-    for kind in AssetKind:
-        with store.files.draft(".bin") as draft:
-            draft.write_bytes(kind.encode())
-            digest = kind.encode().hex().ljust(64, "0")
-            checked = CheckedUpload(draft, kind, digest, ".bin", {"names": ["v"], "channels": 1}, [])
-            ids.append(store.assets.add(checked)[0].id)
+    ids = [asset_of(store, kind, {"names": ["v", "w"], "channels": 1}) for kind in [*AssetKind][:3]]
     return JobOrder(ids[0], ids[1], (ids[2],), settings)
+
+
+def labels(store: Store) -> dict[str, Any]:
+    """What a trade-off of that order may be judged by: masks of one of its two views."""
+    masks = asset_of(store, AssetKind.MASKS, {"names": ["v"], "classes": 1})
+    table = asset_of(store, AssetKind.TABLE, {"words": ["apple"], "channels": 1})
+    return {"masks": masks, "table": table, "classes": ["apple"]}
+
+
+def asset_of(store: Store, kind: AssetKind, counts: dict[str, Any]) -> str:
+    """An asset whose content nobody looks at; its id."""
+    with store.files.draft(".bin") as draft:
+        draft.write_bytes(kind.encode())
+        checked = CheckedUpload(draft, kind, kind.encode().hex().ljust(64, "0"), ".bin", counts, [])
+        return store.assets.add(checked)[0].id
 
 
 def until(condition: Callable[[], Any], seconds: float = 60.0) -> None:

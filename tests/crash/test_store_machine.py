@@ -105,8 +105,7 @@ class StoreMachine(RuleBasedStateMachine):
         used = [
             job
             for job, model in self.jobs.items()
-            if asset in (model.order.splats, model.order.cameras, *model.order.features)
-            and (OWNERS[who].sees_all or model.owner == who)
+            if asset in (named for named, _ in model.order.assets()) and (OWNERS[who].sees_all or model.owner == who)
         ]
         seen = self.store.seen_by(OWNERS[who]).assets
         if not self.sees(who, asset):
@@ -129,13 +128,18 @@ class StoreMachine(RuleBasedStateMachine):
         mistaken=st.sampled_from([False] * 9 + [True]),
         who=st.sampled_from(["a", "a", *OWNERS]),
         kind=st.sampled_from(JobKind),
+        labelled=st.booleans(),
     )
-    def submit(self, data: Any, key: str | None, print_: str, mistaken: bool, who: str, kind: JobKind) -> None:
+    def submit(
+        self, data: Any, key: str | None, print_: str, mistaken: bool, who: str, kind: JobKind, labelled: bool
+    ) -> None:
         chosen = []
-        for needed in AssetKind:
+        wanted = [*AssetKind] if labelled and kind is JobKind.TRADEOFF else [*AssetKind][:3]
+        for needed in wanted:
             right = [asset for asset in sorted(self.assets) if self.assets[asset].startswith(needed.encode())]
             chosen.append(data.draw(st.sampled_from(sorted(self.assets) if mistaken or not right else right)))
-        order = JobOrder(chosen[0], chosen[1], (chosen[2],), {}, key, print_, kind=kind)
+        parameters = {"labels": {"masks": chosen[3], "table": chosen[4]}} if len(chosen) > 3 else {}
+        order = JobOrder(chosen[0], chosen[1], (chosen[2],), {}, key, print_, kind=kind, parameters=parameters)
         known = [
             job
             for job, model in self.jobs.items()
@@ -147,7 +151,7 @@ class StoreMachine(RuleBasedStateMachine):
             expected: type[Exception] | None = KeyReused
         elif not known and sum(model.state == "queued" for model in self.jobs.values()) >= MAX_QUEUED:
             expected = Busy
-        elif not known and kinds != list(AssetKind):
+        elif not known and kinds != wanted:
             expected = NotFound
         else:
             expected = None

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from liftcore.errors import InvalidInput
 from liftcore.measure.accuracy import class_ious, rendered_scores
 from liftcore.measure.experiments.fidelity import view_cosines
+from liftcore.observe.masks import read_masks
 from liftcore.query.encoders.table import TableEncoder
 from liftcore.raster.cpu import CpuRaster
 from liftcore.solve.accumulate import render_walk
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
 LOW_QUANTILE = 0.05
 ROWS = 1 << 16  # compared at a time
-MASK_TYPES = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
 
 
 def judge(order: Order, sources: Sources, reference: tuple[Tensor, Tensor], made: Lift) -> dict[str, Any]:
@@ -92,34 +91,10 @@ def class_vectors(scene: Scene) -> Tensor:
 
 
 def labelled_masks(scene: Scene) -> dict[str, Tensor]:
-    """View -> [h, w] i64 of class numbers; what is not named VIEW/mask is left alone.
-
-    Raises:
-        InvalidInput: no such file, not a safetensors file, or a mask that is no image of class numbers.
-    """
-    from safetensors import SafetensorError, safe_open
-
-    try:
-        with safe_open(str(scene.labels), framework="pt") as handle:
-            names = [name for name in tuple(handle.keys()) if name.endswith("/mask")]
-            stored = {name: handle.get_tensor(name) for name in names}
-    except (SafetensorError, OSError) as error:
-        got = f"a file that does not open as one ({str(error)[:120]})"
-        raise InvalidInput(f"labels {scene.labels}", expected="masks (.safetensors)", got=got) from None
-    return {name.removesuffix("/mask"): _mask(part, name, len(scene.classes)) for name, part in stored.items()}
-
-
-def _mask(stored: Tensor, name: str, classes: int) -> Tensor:
-    """[h, w] i64 of class numbers below ``classes``, -1 for none."""
-    if stored.ndim != 2 or not stored.numel() or stored.dtype not in MASK_TYPES:
-        got = f"{str(stored.dtype).removeprefix('torch.')} {list(stored.shape)}"
-        raise InvalidInput(f"labels {name}", expected="integers [h, w], no side empty", got=got)
-    mask = stored.long()
-    low, high = (int(value) for value in torch.aminmax(mask))
-    if low < -1 or high >= classes:
-        got = f"the number {low if low < -1 else high}"
-        raise InvalidInput(f"labels {name}", expected=f"-1 or classes 0..{classes - 1}", got=got)
-    return mask
+    """View -> [h, w] i64 of class numbers, as `liftcore.observe.masks.read_masks` has it."""
+    if scene.labels is None:
+        raise ValueError("there are no labels")
+    return read_masks(scene.labels, len(scene.classes))
 
 
 def _resized(labels: Tensor, mask: Tensor) -> Tensor:

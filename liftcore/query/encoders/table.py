@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
 from typing import TYPE_CHECKING, Self
 
 import torch
 
-from liftcore.errors import InvalidQuery
+from liftcore.errors import InvalidQuery, InvalidTable
+from liftcore.observe.header import check_header
+from liftcore.query.encoders.words import nearest, plain
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -15,8 +18,7 @@ if TYPE_CHECKING:
 
     from torch import Tensor
 
-_ARTICLES = frozenset({"a", "an", "the"})
-_NEAREST = 5  # words named when one is unknown
+_HALF = re.compile("[\ud800-\udfff]")  # half a surrogate pair, which UTF-8 cannot carry
 
 
 class TableEncoder:
@@ -28,55 +30,55 @@ class TableEncoder:
         embeddings: [n, F] f16 or f32, finite rows of any length above zero.
 
     Raises:
-        InvalidQuery: shapes that do not fit, rows that are zero or not finite, no words.
+        InvalidTable: shapes that do not fit, rows that are zero or not finite, no words.
     """
 
     def __init__(self, name: str, words: Sequence[str], embeddings: Tensor) -> None:
         if embeddings.ndim != 2 or not words or embeddings.shape[0] != len(words) or embeddings.shape[1] == 0:
-            raise InvalidQuery(
+            raise InvalidTable(
                 name,
                 expected="embeddings [n, F] with n words",
-                got=f"shape {list(embeddings.shape)} with {len(words)} words",
+                got=f"shape {str(list(embeddings.shape))[:80]} with {len(words)} words",
             )
         wide = embeddings.to(torch.float32)
         lengths = torch.linalg.vector_norm(wide, dim=1, keepdim=True)
         bad = (~torch.isfinite(lengths[:, 0])) | (lengths[:, 0] == 0)
         if bool(bad.any()):
             row = int(bad.nonzero()[0, 0])
-            raise InvalidQuery(
-                name, expected="finite rows with a direction", got=f"row {row} ({words[row]!r}) has none"
+            raise InvalidTable(
+                name, expected="finite rows with a direction", got=f"row {row} ({words[row][:80]!r}) has none"
             )
         self.name = name
         self.words = tuple(words)
         self.channels = int(embeddings.shape[1])
         self._unit = wide / lengths
         # The first of two equal words wins: reversed, so that it is written last.
-        self._rows = {_plain(word): row for row, word in reversed(list(enumerate(words)))}
+        self._rows = {plain(word): row for row, word in reversed(list(enumerate(words)))}
 
     @classmethod
     def open(cls, path: Path) -> Self:
         """Open ``embeddings`` [n, F] f16 or f32 with metadata ``words`` (a JSON list of n strings).
 
         Raises:
-            InvalidQuery: no such file, or not a table.
+            InvalidTable: no such file, or not a table.
         """
         from safetensors import SafetensorError, safe_open
 
         name = f"text table {path.name}"
         if not path.is_file():
-            raise InvalidQuery(name, expected="a file", got=f"nothing at {path}")
+            raise InvalidTable(name, expected="a file", got=f"nothing at {path}")
+        expected = "a safetensors file with embeddings and words"
+        check_header(path, name, InvalidTable, expected=expected)
         try:
             with safe_open(str(path), framework="pt") as handle:
                 embeddings = handle.get_tensor("embeddings")
                 words = json.loads((handle.metadata() or {}).get("words", "null"))
-        except (SafetensorError, OSError, json.JSONDecodeError) as error:
-            raise InvalidQuery(
-                name, expected="a safetensors file with embeddings and words", got=str(error)
-            ) from None
-        if not isinstance(words, list) or not all(isinstance(word, str) for word in words):
-            raise InvalidQuery(name, expected="metadata words, a JSON list of strings", got="none")
+        except (SafetensorError, OSError, ValueError, RecursionError) as error:
+            raise InvalidTable(name, expected=expected, got=str(error)[:120]) from None
+        if not isinstance(words, list) or not all(isinstance(word, str) and not _HALF.search(word) for word in words):
+            raise InvalidTable(name, expected="metadata words, a JSON list of strings", got="none")
         if embeddings.dtype not in (torch.float16, torch.float32):
-            raise InvalidQuery(name, expected="float16 or float32", got=str(embeddings.dtype).removeprefix("torch."))
+            raise InvalidTable(name, expected="float16 or float32", got=str(embeddings.dtype).removeprefix("torch."))
         return cls(name, words, embeddings)
 
     def encode(self, texts: Sequence[str]) -> Tensor:
@@ -88,22 +90,12 @@ class TableEncoder:
         return self._unit[[self._row(text) for text in texts]]
 
     def _row(self, text: str) -> int:
-        row = self._rows.get(_plain(text))
+        row = self._rows.get(plain(text))
         if row is None:
-            from rapidfuzz import process
-
-            near = [match[0] for match in process.extract(_plain(text), list(self._rows), limit=_NEAREST)]
             raise InvalidQuery(
                 "text",
                 expected=f"one of the {len(self.words)} words of {self.name}",
                 got=repr(text),
-                hint=f"nearest: {', '.join(near)}",
+                hint=nearest(text, self._rows),
             )
         return row
-
-
-def _plain(text: str) -> str:
-    parts = text.casefold().replace("_", " ").split()
-    if len(parts) > 1 and parts[0] in _ARTICLES:
-        parts = parts[1:]
-    return " ".join(parts)

@@ -181,6 +181,15 @@ def test_bad_masks_are_refused_in_one_line(tmp_path, capsys, masks):
     assert "labels" in told
 
 
+def test_a_table_of_other_channels_is_refused_in_one_line(tmp_path, capsys):
+    paths = write_scene(tmp_path, 2)
+    save_file({"embeddings": torch.eye(2, 5)}, tmp_path / "t", metadata={"words": '["cat", "dog"]'})
+    save_file({"v2/mask": torch.zeros(7, 9, dtype=torch.int16)}, tmp_path / "m")
+    words = ["--labels", str(tmp_path / "m"), "--table", str(tmp_path / "t"), "--classes", "cat", "dog"]
+    assert cli.main(["tradeoff", *map(str, paths), "-o", str(tmp_path / "out"), *words]) == 2
+    assert capsys.readouterr().err == "splatlift: table: expected 6 channels, as the features, got 5\n"
+
+
 def test_a_scene_of_which_the_exact_run_sees_nothing_is_refused(tmp_path, monkeypatch):
     blind = cosine_figures(torch.zeros(3, 2), torch.zeros(3, 2), torch.ones(3))
     assert set(blind.values()) == {None}
