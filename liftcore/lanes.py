@@ -29,6 +29,7 @@ FLOAT = ir.FloatType()
 INT = ir.IntType(32)
 FLOATS = ir.VectorType(FLOAT, LANES)
 INTS = ir.VectorType(INT, LANES)
+_SHORTS = ir.VectorType(ir.IntType(16), LANES)
 FUSE = ("contract",)  # a*b + c may become one fused instruction
 FLOAT_ARRAY = types.Array(types.float32, 1, "C")
 
@@ -70,8 +71,8 @@ def constant(value: float) -> ir.Constant:
     return ir.Constant(FLOATS, [float(np.float32(value))] * LANES)
 
 
-def broadcast(builder: Builder, scalar: ir.Value) -> ir.Value:
-    undefined = ir.Constant(FLOATS, ir.Undefined)
+def broadcast(builder: Builder, scalar: ir.Value, kind: ir.VectorType = FLOATS) -> ir.Value:
+    undefined = ir.Constant(kind, ir.Undefined)
     first = builder.insert_element(undefined, scalar, ir.Constant(INT, 0))
     mask = ir.Constant(ir.VectorType(INT, LANES), [0] * LANES)
     return builder.shuffle_vector(first, undefined, mask)
@@ -209,10 +210,9 @@ def keep_halves(typingctx, values, offset, lanes):
         half = builder.select(builder.icmp_signed("<", size, whole(_HALF_NORMAL)), small, normal)
         half = builder.select(builder.icmp_signed(">=", size, whole(_HALF_LIMIT)), whole(0x7C00), half)
         signed = builder.or_(half, builder.lshr(builder.and_(bits, whole(-(1 << 31))), whole(16)))
-        halves = ir.VectorType(ir.IntType(16), LANES)
         data = context.make_array(signature.args[0])(context, builder, value=values).data
-        place = builder.bitcast(builder.gep(data, [offset]), halves.as_pointer())
-        builder.store(builder.trunc(signed, halves), place, align=2)
+        place = builder.bitcast(builder.gep(data, [offset]), _SHORTS.as_pointer())
+        builder.store(builder.trunc(signed, _SHORTS), place, align=2)
         return context.get_dummy_value()
 
     return types.void(types.Array(types.uint16, 1, "C"), types.intp, EIGHT), codegen
@@ -222,22 +222,34 @@ _HALF_BITS = 0x0FFFE000 - (1 << 31)  # sign, exponent and mantissa of a float16 
 _HALF_UNIT = 2.0**112  # what float16 is larger by than its bits moved into a float32
 
 
+def _converts(context) -> bool:
+    """Whether the processor that is compiled for is an x86 that turns float16 into float32 by itself."""
+    return "+f16c" in context.codegen().magic_tuple()[2]
+
+
 def _load_small(builder: Builder, pointer: ir.Value) -> ir.Value:
     """Eight float16 as float32 that are 2^112 times smaller: their bits, moved, with room for the larger exponent."""
-    halves = ir.VectorType(ir.IntType(16), LANES)
-    signed = builder.sext(builder.load(builder.bitcast(pointer, halves.as_pointer()), align=2), INTS)
+    signed = builder.sext(builder.load(builder.bitcast(pointer, _SHORTS.as_pointer()), align=2), INTS)
     bits = builder.and_(builder.shl(signed, ir.Constant(INTS, [13] * LANES)), ir.Constant(INTS, [_HALF_BITS] * LANES))
     return builder.bitcast(bits, FLOATS)
 
 
+def _load_halves(builder: Builder, pointer: ir.Value) -> ir.Value:
+    """Eight float16 as float32, on a processor that converts."""
+    halves = ir.VectorType(ir.HalfType(), LANES)
+    return builder.fpext(builder.load(builder.bitcast(pointer, halves.as_pointer()), align=2), FLOATS)
+
+
 WIDE = 4 * LANES  # channels that add_weighted_row keeps in registers
+AHEAD = 16  # entries between asking for a row and reading it; so many more columns have to be there to be read
+_LINE = 64  # bytes of the processor's cache
 
 
 @compiled
 def add_weighted_row(typingctx, target, place, source, entries, sparse, span):
-    """``target[place + i] += sum_k weights[k] source[columns[k] * stride + channel + i]`` for 32 channels.
+    """``target[place + i] += sum_k weights[k] source[columns[k] * stride + offset + i]`` for 32 channels.
 
-    ``sparse = (columns i32, weights f32)``, ``entries = (first, last)`` of them, ``span = (stride, channel)`` of the
+    ``sparse = (columns i32, weights f32)``, ``entries = (first, last)`` of them, ``span = (stride, offset)`` of the
     flat source: f32, or the bits of finite f16 (u16), which give the same sums to the bit. They stay in registers.
     """
     integers = types.UniTuple(types.intp, 2)
@@ -249,22 +261,29 @@ def add_weighted_row(typingctx, target, place, source, entries, sparse, span):
         target, place, source, entries, sparse, span = args
         array = signature.args
         first, last = cgutils.unpack_tuple(builder, entries)
-        stride, channel = cgutils.unpack_tuple(builder, span)
-        column_data, weight_data = (
+        stride, offset = cgutils.unpack_tuple(builder, span)
+        columns, weights = (
             context.make_array(kind)(context, builder, value=part).data
             for kind, part in zip(pair.types, cgutils.unpack_tuple(builder, sparse), strict=True)
         )
+        smaller = halves and not _converts(context)
+        load = load_lanes if not halves else _load_small if smaller else _load_halves
         steps = [ir.Constant(place.type, LANES * part) for part in range(WIDE // LANES)]
         places = [pointer_to(context, builder, array[0], target, builder.add(place, step)) for step in steps]
         sums = [cgutils.alloca_once_value(builder, load_lanes(builder, pointer)) for pointer in places]
+
+        def row_at(entry: ir.Value) -> ir.Value:
+            column = builder.sext(builder.load(builder.gep(columns, [entry])), stride.type)
+            return builder.add(builder.mul(column, stride), offset)
+
         with cgutils.for_range_slice(builder, first, last, ir.Constant(place.type, 1)) as (k, _):
-            column = builder.sext(builder.load(builder.gep(column_data, [k])), place.type)
-            single = builder.load(builder.gep(weight_data, [k]))
-            weight = broadcast(builder, builder.fmul(single, ir.Constant(FLOAT, _HALF_UNIT)) if halves else single)
-            base = builder.add(builder.mul(column, stride), channel)
+            soon = row_at(builder.add(k, ir.Constant(k.type, AHEAD)))
+            fetch(builder, pointer_to(context, builder, array[2], source, soon), WIDE * (2 if halves else 4))
+            single = builder.load(builder.gep(weights, [k]))
+            weight = broadcast(builder, builder.fmul(single, ir.Constant(FLOAT, _HALF_UNIT)) if smaller else single)
+            base = row_at(k)
             for step, total in zip(steps, sums, strict=True):
-                where = pointer_to(context, builder, array[2], source, builder.add(base, step))
-                row = _load_small(builder, where) if halves else load_lanes(builder, where)
+                row = load(builder, pointer_to(context, builder, array[2], source, builder.add(base, step)))
                 builder.store(fused(builder, row, weight, builder.load(total)), total)
         for pointer, total in zip(places, sums, strict=True):
             builder.store(builder.load(total), pointer, align=4)
@@ -273,22 +292,27 @@ def add_weighted_row(typingctx, target, place, source, entries, sparse, span):
     return signature, codegen
 
 
+def fetch(builder: Builder, pointer: ir.Value, size: int) -> None:
+    """Ask for the bytes from a pointer on before they are needed."""
+    byte = ir.IntType(8).as_pointer()
+    kinds = ir.FunctionType(ir.VoidType(), [byte, INT, INT, INT])
+    ask = cgutils.get_or_insert_function(builder.module, kinds, "llvm.prefetch.p0")
+    first = builder.bitcast(pointer, byte)
+    for ahead in range(0, size, _LINE):
+        place = builder.gep(first, [ir.Constant(INT, ahead)])
+        builder.call(ask, [place, *(ir.Constant(INT, number) for number in (0, 3, 1))])  # to read, to keep, data
+
+
 @compiled
 def fetch_ahead(typingctx, table, row):
     """Ask for the first 128 bytes of a row of ``table`` [n, m] f64 before they are needed."""
     kind = types.Array(types.float64, 2, "C")
-    line = 64  # bytes
 
     def codegen(context, builder, signature, args):
         values = context.make_array(signature.args[0])(context, builder, value=args[0])
         width = builder.extract_value(values.strides, 0)
-        byte = ir.IntType(8).as_pointer()
-        first = builder.gep(builder.bitcast(values.data, byte), [builder.mul(args[1], width)])
-        kinds = ir.FunctionType(ir.VoidType(), [byte, INT, INT, INT])
-        fetch = cgutils.get_or_insert_function(builder.module, kinds, "llvm.prefetch.p0")
-        for ahead in (0, line):
-            place = builder.gep(first, [ir.Constant(ir.IntType(64), ahead)])
-            builder.call(fetch, [place, *(ir.Constant(INT, word) for word in (0, 3, 1))])  # to read, keep, data
+        first = builder.bitcast(values.data, ir.IntType(8).as_pointer())
+        fetch(builder, builder.gep(first, [builder.mul(args[1], width)]), 2 * _LINE)
         return context.get_dummy_value()
 
     return types.void(kind, types.intp), codegen

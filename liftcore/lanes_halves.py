@@ -14,12 +14,15 @@ from numba import types
 
 from liftcore.lanes import (
     BASES,
+    FLOAT,
     FLOAT_ARRAY,
     HALVES,
     INT,
+    INTS,
     LANES,
     ROWS,
     STARTS,
+    broadcast,
     compiled,
     constant,
     load_lanes,
@@ -30,16 +33,18 @@ if TYPE_CHECKING:
     from liftcore.lanes import Builder
 
 _SET = ir.IntType(HALVES)
+_WHOLE = ir.IntType(32 * LANES)
 _DOUBLES = ir.VectorType(ir.DoubleType(), ROWS)  # a value for each row
-_SINGLES = ir.VectorType(ir.FloatType(), ROWS)
+_SINGLES = ir.VectorType(FLOAT, ROWS)
+_SLACK = 1.0 + 2.0**-19  # of the reach: a set lacks no half row for the rounding of float32
 
 
-def _each(values: list[float]) -> ir.Constant:
-    return ir.Constant(_DOUBLES, values)
+def _each(kind: ir.VectorType, values: list[float]) -> ir.Constant:
+    return ir.Constant(kind, values)
 
 
-def _all(builder: Builder, value: ir.Value) -> ir.Value:
-    first = builder.insert_element(ir.Constant(_DOUBLES, ir.Undefined), value, ir.Constant(INT, 0))
+def _all(builder: Builder, kind: ir.VectorType, value: ir.Value) -> ir.Value:
+    first = builder.insert_element(ir.Constant(kind, ir.Undefined), value, ir.Constant(INT, 0))
     return builder.shuffle_vector(first, first, ir.Constant(ir.VectorType(INT, ROWS), [0] * ROWS))
 
 
@@ -50,35 +55,42 @@ def ellipse_halves(typingctx, state, centre, slope, curvature, reach):
     The footprint's ``centre = (mx, my)`` counts from the tile's first pixel centre, ``curvature = (kx, ky)``. Lanes
     are met between their centres too: a set may hold a half row that has no weight, and lacks none that has. Left in
     ``state``: how far right of the footprint's middle each half row begins, and ``ky dy^2`` of each row.
+
+    The middles are made in float64: along a needle they are small differences of large numbers.
     """
     pair = types.UniTuple(types.float64, 2)
 
     def codegen(context, builder, signature, args):
         state, centre, slope, curvature, reach = args
-        mx, my = (_all(builder, builder.extract_value(centre, k)) for k in range(2))
-        kx, ky = (_all(builder, builder.extract_value(curvature, k)) for k in range(2))
+        mx, my = (builder.extract_value(centre, k) for k in range(2))
+        numbers, none = [float(row) for row in range(ROWS)], _each(_SINGLES, [0.0] * ROWS)
+
+        def single(value: ir.Value) -> ir.Value:
+            return _all(builder, _SINGLES, builder.fptrunc(value, FLOAT))
 
         def keep(first: int, values: ir.Value) -> None:
             place = ir.Constant(ir.IntType(64), first)
             pointer = pointer_to(context, builder, signature.args[0], state, place)
-            rounded = builder.fptrunc(values, _SINGLES)
-            builder.store(rounded, builder.bitcast(pointer, _SINGLES.as_pointer()), align=4)
+            builder.store(values, builder.bitcast(pointer, _SINGLES.as_pointer()), align=4)
 
-        dy = builder.fsub(_each([float(row) for row in range(ROWS)]), my)
-        middle = builder.fadd(mx, builder.fmul(_all(builder, slope), dy))
-        base = builder.fmul(ky, builder.fmul(dy, dy))
+        kx, ky = (single(builder.extract_value(curvature, k)) for k in range(2))
+        below = builder.fsub(_all(builder, _DOUBLES, my), _each(_DOUBLES, numbers))
+        across = builder.fsub(builder.fmul(_all(builder, _DOUBLES, slope), below), _all(builder, _DOUBLES, mx))
+        left = builder.fptrunc(across, _SINGLES)
+        dy = builder.fsub(_each(_SINGLES, numbers), single(my))
+        base = builder.fmul(builder.fmul(ky, dy), dy)
         keep(BASES, base)
-        room = builder.fsub(_all(builder, reach), base)
+        room = builder.fsub(single(builder.fmul(reach, ir.Constant(ir.DoubleType(), _SLACK))), base)
         halves = ir.Constant(_SET, 0)
         for side in range(2):
-            first, last = (_each([side * LANES + lane] * ROWS) for lane in (0.0, LANES - 1.0))
-            start = builder.fsub(first, middle)
+            start = builder.fadd(left, _each(_SINGLES, [float(LANES)] * ROWS)) if side else left
             keep(STARTS + side * ROWS, start)
-            before = builder.fcmp_ordered(">", start, _each([0.0] * ROWS))
-            end = builder.fsub(last, middle)
-            beyond = builder.fcmp_ordered("<", end, _each([0.0] * ROWS))
-            away = builder.select(before, start, builder.select(beyond, end, _each([0.0] * ROWS)))
-            met = builder.fcmp_ordered("<=", builder.fmul(kx, builder.fmul(away, away)), room)
+            end = builder.fadd(start, _each(_SINGLES, [LANES - 1.0] * ROWS))
+            # Right of the middle counts the first lane, left of it the last, and around it the middle itself.
+            right_of = builder.select(builder.fcmp_ordered(">", start, none), start, none)
+            left_of = builder.select(builder.fcmp_ordered("<", end, none), end, none)
+            away = builder.fadd(right_of, left_of)
+            met = builder.fcmp_ordered("<=", builder.fmul(builder.fmul(kx, away), away), room)
             bits = builder.zext(builder.bitcast(met, ir.IntType(ROWS)), _SET)
             halves = builder.or_(halves, builder.shl(bits, ir.Constant(_SET, side * ROWS)))
         return halves
@@ -103,6 +115,20 @@ def lit_halves(typingctx, state, first):
         return word
 
     return types.uint32(FLOAT_ARRAY, types.intp), codegen
+
+
+@compiled
+def all_are(typingctx, values, offset, value):
+    """Whether the eight i32 from ``values[offset]`` on are all ``value``."""
+
+    def codegen(context, builder, signature, args):
+        values, offset, value = args
+        data = context.make_array(signature.args[0])(context, builder, value=values).data
+        place = builder.bitcast(builder.gep(data, [offset]), INTS.as_pointer())
+        different = builder.xor(builder.load(place, align=4), broadcast(builder, value, INTS))
+        return builder.icmp_unsigned("==", builder.bitcast(different, _WHOLE), ir.Constant(_WHOLE, 0))
+
+    return types.boolean(types.Array(types.int32, 1, "C"), types.intp, types.int32), codegen
 
 
 @compiled

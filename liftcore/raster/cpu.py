@@ -82,9 +82,10 @@ class CpuRaster:
         choice = choice_of(weighting)
         frame = self._frame(camera, walk)
         reading = reading_of(observation, camera.width, camera.height, walk)
-        with_plain = walk.gain != 1.0
+        squared, gate = choice.power == 2, choice if choice.gated else None
+        plain = True if walk.gain != 1.0 else None
         entries = self._over_tiles(
-            frame, lambda first, last: weigh_tiles(first, last, frame, reading, choice, with_plain)
+            frame, lambda first, last: weigh_tiles(first, last, frame, reading, squared, gate, plain)
         )
         return self._merge(frame, entries, reading.codebook_rows)
 

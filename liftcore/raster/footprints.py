@@ -205,11 +205,11 @@ def _disc_halves(splat, state):
 
 
 def _gaussian_lanes(splat, state, half):
-    return GaussianLanes(state[STARTS + half], np.float32(splat.kx), state[BASES + half % ROWS])
+    return GaussianLanes(state[STARTS + half], np.float32(splat.kx), state[BASES + (half & (ROWS - 1))])
 
 
 def _beta_lanes(splat, state, half):
-    start, base = state[STARTS + half], state[BASES + half % ROWS]
+    start, base = state[STARTS + half], state[BASES + (half & (ROWS - 1))]
     return BetaLanes(start, np.float32(splat.kx), base, np.float32(splat.beta))
 
 

@@ -15,6 +15,7 @@ import torch
 
 from liftcore.jit import inlined, kernel
 from liftcore.lanes import HALVES, LANES, ROWS
+from liftcore.lanes_halves import all_are
 from liftcore.observe.observation import Observation, RegionMap
 from liftcore.raster.constants import TILE
 
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 MAX_SLOTS = 4 * TILE * TILE  # every pixel reads four cells of its own at worst
 MAX_TAPS = HALVES * 4 * LANES  # every lane of a half row reads four cells of its own at worst
 NO_SLOT = -1
+LAST_BIT = 63
 SEVERAL = -2  # a half row whose pixels read several slots, or parts of one
 
 
@@ -50,6 +52,7 @@ class TileTaps(NamedTuple):
     slots: np.ndarray  # [MAX_TAPS] i32
     alone: np.ndarray  # [32] i32, the slot that all pixels of a half row read and nothing else; -1 none, -2 see taps
     several: np.ndarray  # [1] u32, the set of half rows that read several slots, or none
+    slot_sets: np.ndarray  # [32] u64, the slots that a half row reads, as ``slot_bit`` has sets of them
     factors: np.ndarray  # [MAX_TAPS * 8] f32
     slot_rows: np.ndarray  # [MAX_SLOTS, levels] i32, the codebook rows of a slot, -1 none
     sizes: np.ndarray  # [2] i32: slots in use; 1 when all pixels read slot 0 and nothing else
@@ -96,6 +99,7 @@ def new_taps(levels):
         np.zeros(MAX_TAPS, np.int32),
         np.full(HALVES, NO_SLOT, np.int32),
         np.zeros(1, np.uint32),
+        np.zeros(HALVES, np.uint64),
         np.zeros(MAX_TAPS * LANES, np.float32),
         np.zeros((MAX_SLOTS, levels), np.int32),
         np.zeros(2, np.int32),
@@ -114,8 +118,19 @@ def read_tile(taps, reading, frame, tile):
         _read_regions(taps, reading, frame, x0, y0)
     taps.several[0] = 0
     for half in range(HALVES):
-        if taps.alone[half] < 0:
-            taps.several[0] |= np.uint32(1) << np.uint32(half)
+        if taps.alone[half] >= 0:
+            taps.slot_sets[half] = slot_bit(taps.alone[half])
+            continue
+        taps.several[0] |= np.uint32(1) << np.uint32(half)
+        taps.slot_sets[half] = 0
+        for tap in range(taps.starts[half], taps.starts[half + 1]):
+            taps.slot_sets[half] |= slot_bit(taps.slots[tap])
+
+
+@inlined
+def slot_bit(slot):
+    """A set of one slot; the last bit stands for slot LAST_BIT and all beyond."""
+    return np.uint64(1) << np.uint64(min(slot, LAST_BIT))
 
 
 @kernel
@@ -141,20 +156,28 @@ def _slot_of_labels(taps, reading, y, x):
 
 
 @inlined
-def _reads_only(taps, reading, slot, y, left, last):
-    """Whether pixels ``left..last`` of row ``y`` all have the labels of one slot."""
-    row = reading.label_y[y]
-    different = 0
+def _same_labels(reading, y, x, other):
+    """Whether the label pixels (y, x) and (y, other) have the same labels on all levels."""
+    same = True
     for level in range(reading.levels):
-        label = taps.slot_rows[slot, level]
-        for x in range(left, last + 1):
-            different |= reading.labels[level, row, reading.label_x[x]] ^ label
-    return different == 0
+        same &= reading.labels[level, y, x] == reading.labels[level, y, other]
+    return same
+
+
+@inlined
+def _reads_only(taps, reading, flat, slot, y, first):
+    """Whether the eight label pixels from (y, first) on all have the labels of one slot."""
+    _, rows, columns = reading.labels.shape
+    only = True
+    for level in range(reading.levels):
+        only &= all_are(flat, (level * rows + y) * columns + first, taps.slot_rows[slot, level])
+    return only
 
 
 @kernel
 def _read_regions(taps, reading, frame, x0, y0):
     slots = np.empty(LANES, np.int32)
+    flat = reading.labels.reshape(-1)
     count = 0
     uniform = True
     guess = NO_SLOT  # what the half row before read: most read the same
@@ -165,14 +188,20 @@ def _read_regions(taps, reading, frame, x0, y0):
         left = x0 + half // ROWS * LANES
         if y >= frame.height or left >= frame.width:
             continue
-        # Pixels outside the image carry no light; they may read what their neighbour reads.
-        if guess != NO_SLOT and _reads_only(taps, reading, guess, y, left, min(left + LANES, frame.width) - 1):
+        row, first = reading.label_y[y], reading.label_x[left]
+        last = min(left + LANES, frame.width) - 1
+        in_line = reading.label_x[last] - first == LANES - 1  # label pixels side by side, as the pixels are
+        if guess != NO_SLOT and in_line and _reads_only(taps, reading, flat, guess, row, first):
             taps.alone[half] = guess
             uniform &= guess == 0
             continue
         for lane in range(LANES):
-            x = min(left + lane, frame.width - 1)
-            slots[lane] = _slot_of_labels(taps, reading, reading.label_y[y], reading.label_x[x])
+            # Pixels outside the image carry no light; they may read what their neighbour reads.
+            x, before = reading.label_x[min(left + lane, last)], reading.label_x[min(left + max(lane, 1) - 1, last)]
+            if lane > 0 and _same_labels(reading, row, x, before):
+                slots[lane] = slots[lane - 1]
+            else:
+                slots[lane] = _slot_of_labels(taps, reading, row, x)
         guess = slots[LANES - 1]
         if slots.min() == slots.max():
             taps.alone[half] = guess

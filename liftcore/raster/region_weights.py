@@ -24,18 +24,21 @@ from liftcore.lanes import (
 )
 from liftcore.lanes_halves import lowest_rank, ranked_halves, without_lowest_rank
 from liftcore.raster.constants import TILE
-from liftcore.raster.readings import MAX_SLOTS, NO_SLOT, new_taps, read_tile
+from liftcore.raster.readings import LAST_BIT, MAX_SLOTS, NO_SLOT, new_taps, read_tile
 from liftcore.raster.selection import CENTRAL, LARGEST, NO_SPOT, choose, new_marks, rank_tile, spot_of
 from liftcore.raster.walk import CHECK_EVERY, blend, blend_both, look, meets, new_rays, next_splat, start_rays
 
 
 @kernel
-def weigh_tiles(first, last, frame, reading, choice, with_plain):
+def weigh_tiles(first, last, frame, reading, squared, gate, plain):
     """Entries of tiles ``first..last``.
 
+    What a lift does not ask for is not compiled into its walk: it costs a tenth there even where it is passed over.
+
     Args:
-        frame: Frame. reading: Reading. choice: Choice, what counts as a weight.
-        with_plain: whether the evidence needs rays of its own, without the opacity gain.
+        frame: Frame. reading: Reading. squared: whether a weight counts by its square; a gate sees to that itself.
+        gate: Choice of the weights that count; None for all of them.
+        plain: True when the evidence needs rays of its own, without the opacity gain; else None.
 
     Returns:
         places [n] i32 (records), slots [n] i32 (-1 none), weights [n] f32, evidence [n] f32, near to far tile by
@@ -46,15 +49,11 @@ def weigh_tiles(first, last, frame, reading, choice, with_plain):
     taps = new_taps(reading.levels)
     sums = np.zeros(MAX_SLOTS * LANES, np.float32)
     items, starts = frame.items, frame.starts
-    tap_starts, tap_slots, alone, factors = taps.starts, taps.slots, taps.alone, taps.factors
-    gated = choice.gated
-    squared = not gated and choice.power == 2
-    marks = new_marks(choice)
-    least, room = marks.least, marks.room
-    spot = NO_SPOT
-    reuse = (
-        choice.power == 1 and not with_plain and not gated
-    )  # then a slot that all pixels read holds just the evidence
+    tap_starts, tap_slots, factors = taps.starts, taps.slots, taps.factors
+    alone, slot_sets = taps.alone, taps.slot_sets
+    marks, spot = new_marks(gate), NO_SPOT
+    # A slot that all pixels read holds just the evidence.
+    reuse = plain is None and gate is None and not squared
     size = 1 << 15
     places, slots = np.empty(size, np.int32), np.empty(size, np.int32)
     weights, evidence = np.empty(size, np.float32), np.empty(size, np.float32)
@@ -65,71 +64,77 @@ def weigh_tiles(first, last, frame, reading, choice, with_plain):
             continue
         x0 = float((tile % frame.columns) * TILE)
         y0 = float((tile // frame.columns) * TILE)
-        if choice.kind == LARGEST:
-            rank_tile(rays, frame, tile, marks, choice.k)
+        if gate is not None and gate.kind == LARGEST:
+            rank_tile(rays, frame, tile, marks, gate.k)
         start_rays(rays, frame, tile)
         read_tile(taps, reading, frame, tile)
         used, whole_tile = taps.sizes[0], reuse and taps.sizes[1] == 1
         if slot_count + used > slot_rows.shape[0]:
             slot_rows = _grown_rows(slot_rows, slot_count + used)
         slot_rows[slot_count : slot_count + used] = taps.slot_rows[:used]
-        for step in range(starts[tile], starts[tile + 1]):
-            if (step - starts[tile]) % CHECK_EVERY == 0 and not look(rays, with_plain):
+        for near in range(starts[tile], starts[tile + 1], CHECK_EVERY):
+            if not look(rays, plain is not None):
                 break
-            place = items[step]
-            splat = next_splat(frame, tile, step, x0, y0)
-            if choice.kind == CENTRAL:
-                spot = spot_of(splat)
-            low, high, seen = MAX_SLOTS, -1, no_lanes()
-            # Half rows of several slots come last: a branch that changes once a splat is foreseen.
-            ranked = ranked_halves(meets(rays, splat), taps.several[0])
-            while ranked:
-                rank = lowest_rank(ranked)
-                ranked = without_lowest_rank(ranked)
-                half = rank % HALVES
-                if with_plain:
-                    heavy, plain = blend_both(rays, splat, half)
-                    seen = plus(seen, plain)
-                else:
-                    heavy = blend(rays, splat, half)
-                    seen = plus(seen, heavy)
-                if whole_tile:
-                    continue
-                if gated:
-                    keep_lanes(state, WEIGHTS + half * LANES, heavy)
-                    if not choose(choice, state, least, room, half, spot):
+            # Here, not where an entry is written: arrays that may be replaced are counted at each use.
+            needed = count + CHECK_EVERY * (used + 1)
+            if needed > places.shape[0]:
+                places, slots, weights, evidence = _grown(places, slots, weights, evidence, needed)
+            for step in range(near, min(near + CHECK_EVERY, starts[tile + 1])):
+                splat = next_splat(frame, tile, step, x0, y0)
+                if gate is not None and gate.kind == CENTRAL:
+                    spot = spot_of(splat)
+                met, seen = np.uint64(0), no_lanes()
+                # Half rows of several slots come last: a branch that changes once a splat is foreseen.
+                ranked = ranked_halves(meets(rays, splat), taps.several[0])
+                while ranked:
+                    rank = lowest_rank(ranked)
+                    ranked = without_lowest_rank(ranked)
+                    half = rank & (HALVES - 1)
+                    if plain is not None:
+                        heavy, light = blend_both(rays, splat, half)
+                        seen = plus(seen, light)
+                    else:
+                        heavy = blend(rays, splat, half)
+                        seen = plus(seen, heavy)
+                    if whole_tile:
                         continue
-                    heavy = lanes_at(state, WEIGHTS + half * LANES)
-                elif squared:
-                    heavy = times(heavy, heavy)
-                if rank < HALVES:
-                    slot = alone[half]
-                    low, high = min(low, slot), max(high, slot)
-                    keep_lanes(sums, slot * LANES, plus(lanes_at(sums, slot * LANES), heavy))
-                    continue
-                for tap in range(tap_starts[half], tap_starts[half + 1]):
-                    slot = tap_slots[tap]
-                    low, high = min(low, slot), max(high, slot)
-                    before = lanes_at(sums, slot * LANES)
-                    keep_lanes(sums, slot * LANES, plus_product(before, heavy, lanes_at(factors, tap * LANES)))
-            total = sum_of_lanes(seen)
-            if count + used + 1 > places.shape[0]:
-                places, slots, weights, evidence = _grown(places, slots, weights, evidence, count + used + 1)
-            begun = count
-            if whole_tile and total > 0:
-                slots[count], weights[count] = slot_count, total
-                count += 1
-            for slot in range(low, high + 1):
-                part = _drain(sums, slot * LANES)
-                if part > 0:
-                    slots[count], weights[count] = slot_count + slot, part
+                    if gate is not None:
+                        keep_lanes(state, WEIGHTS + half * LANES, heavy)
+                        if not choose(gate, state, marks.least, marks.room, half, spot):
+                            continue
+                        heavy = lanes_at(state, WEIGHTS + half * LANES)
+                    elif squared:
+                        heavy = times(heavy, heavy)
+                    met |= slot_sets[half]
+                    if rank < HALVES:
+                        slot = alone[half]
+                        keep_lanes(sums, slot * LANES, plus(lanes_at(sums, slot * LANES), heavy))
+                        continue
+                    for tap in range(tap_starts[half], tap_starts[half + 1]):
+                        slot = tap_slots[tap]
+                        before = lanes_at(sums, slot * LANES)
+                        keep_lanes(sums, slot * LANES, plus_product(before, heavy, lanes_at(factors, tap * LANES)))
+                total = sum_of_lanes(seen)
+                begun = count
+                if whole_tile and total > 0:
+                    slots[count], weights[count] = slot_count, total
                     count += 1
-            if count == begun and total > 0:
-                slots[count], weights[count] = NO_SLOT, 0.0
-                count += 1
-            for entry in range(begun, count):
-                places[entry] = place
-                evidence[entry] = total if entry == begun else 0.0
+                while met:
+                    slot = lowest_rank(met)
+                    met = without_lowest_rank(met)
+                    beyond = used if slot == LAST_BIT else slot + 1
+                    while slot < beyond:
+                        part = _drain(sums, slot * LANES)
+                        if part > 0:
+                            slots[count], weights[count] = slot_count + slot, part
+                            count += 1
+                        slot += 1
+                if count == begun and total > 0:
+                    slots[count], weights[count] = NO_SLOT, 0.0
+                    count += 1
+                for entry in range(begun, count):
+                    places[entry] = items[step]
+                    evidence[entry] = total if entry == begun else 0.0
         slot_count += used
     return places[:count], slots[:count], weights[:count], evidence[:count], slot_rows[:slot_count]
 

@@ -7,7 +7,7 @@ its end, so top-k walks every tile twice: ``rank_tile`` finds what the least of 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -74,8 +74,10 @@ def _check(weighting: Weighting) -> None:
 
 
 @kernel
-def new_marks(choice):
-    """Room for one tile's marks; empty unless the choice is top-k."""
+def new_marks(choice) -> Any:
+    """Room for one tile's marks; empty unless the choice is top-k, none where all weights count (None)."""
+    if choice is None:
+        return None
     pixels = PIXELS if choice.kind == LARGEST else 0
     return Marks(
         np.zeros(pixels * choice.k, np.float32),

@@ -1,8 +1,8 @@
 """The closed form: ``x_j = sum_v W_v[j] E_v / sum W[j]`` (paper Eq. 6, App. Tikhonov for squared weights).
 
-X is never held in float32 as a whole. Splats go in blocks and channels in slices, so that a block of X and a slice
-of a view's codebook stay in the cache while all views add to them. Weights are divided by their sum before they meet
-the codebook: a mean cannot overflow where its inputs do not, and faint splats keep their digits.
+X is never held in float32 as a whole. Splats go in blocks and channels in strips (`weighted_sums`), so that a block's
+entries and a strip of all codebooks stay in the cache. Weights are divided by their sum before they meet the
+codebook: a mean cannot overflow where its inputs do not, and faint splats keep their digits.
 """
 
 from __future__ import annotations
@@ -24,7 +24,17 @@ from liftcore.lanes import LANES, WIDE, keep_halves, lanes_at, no_lanes, plus_pr
 from liftcore.progress import silent
 from liftcore.raster.protocol import RegionWeights
 from liftcore.solve.feature_room import in_memory
-from liftcore.solve.weight_tables import WeightTables, add_views, books_of
+from liftcore.solve.weight_tables import WeightTables
+from liftcore.solve.weighted_sums import (
+    block_end,
+    block_entries,
+    channel_slices,
+    entries_before,
+    most_entries,
+    splat_shares,
+    strips_of,
+    sum_strip,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -34,11 +44,8 @@ if TYPE_CHECKING:
     from liftcore.progress import Progress
     from liftcore.solve.feature_room import FeatureRoom
     from liftcore.solve.view_weights import ViewWeights
+    from liftcore.solve.weighted_sums import Strips
 
-BLOCK = 64  # splats a block; with a slice of channels an eighth of a megabyte
-BLOCKS = 32  # a call of compiled code
-SLICE = 512  # channels a slice, fewer where the codebooks of all views are long
-SLICE_BYTES = 1 << 28  # of a slice of all codebooks, which dense maps would go far beyond
 FLOAT16_MAX = 65_504.0
 FLOAT16_STEP = 2.0**-25  # the largest rounding error of its small values
 FLOAT16_ERROR = 1e-4  # of the longest vector, which float16 must hold
@@ -130,20 +137,20 @@ def solve_closed_form(
     count = denominators.shape[0]
     features = room(count, channels, dtype)
     kept = features.view(torch.uint16).numpy() if dtype == torch.float16 else features.numpy()
-    squares = np.zeros(count)
+    squares, nothing = np.zeros(count), kept[:0]
     scale = np.divide(1.0, denominators, out=np.zeros(count), where=denominators > 0)
-    kind = torch.float16 if all(book.dtype == torch.float16 for book in books) else torch.float32
-    step = slice_width(sum(book.shape[0] for book in books))
-    slices = [(begin, min(begin + step, channels)) for begin in range(0, channels, step)]
-    tables = WeightTables(store)
+    halves = all(book.dtype == torch.float16 for book in books)
+    counts, tables = [book.shape[0] for book in books], WeightTables(store)
+    slices = channel_slices(sum(counts), channels, 2 if halves and unit else 4)
     with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
         for number, (begin, end) in enumerate(slices):
-            parts = [slice_of(book, begin, end, kind) for book in books]
-            sums = _solve_slice(pool, tables, parts, scale, (kept, begin))
+            own = (book[:, begin:end] for book in books)
+            strips = strips_of(own, counts, end - begin, torch.float16 if halves else torch.float32)
+            _solve_strips(pool, tables, strips, scale, (squares if unit else np.zeros(count), begin, kept))
             if not unit:
-                parts = [_unit_slice(book, norm, begin, end) for book, norm in zip(books, norms, strict=True)]
-                sums = _solve_slice(pool, tables, parts, scale, (kept[:0], begin))
-            squares += sums
+                own = (_unit_rows(book[:, begin:end], norm) for book, norm in zip(books, norms, strict=True))
+                strips = strips_of(own, counts, end - begin, torch.float32)
+                _solve_strips(pool, tables, strips, scale, (squares, begin, nothing))
             progress("solve", number + 1, len(slices), "slices")
     agreement = np.sqrt(squares).clip(0.0, 1.0).astype(np.float32)
     return Solution(features, torch.from_numpy(agreement))
@@ -156,60 +163,45 @@ def fits_float16(books: Sequence[Tensor], longest: float) -> bool:
     return longest == 0 or FLOAT16_STEP * math.sqrt(books[0].shape[1]) <= FLOAT16_ERROR * longest
 
 
-def _unit_slice(book: Tensor, norms: np.ndarray, begin: int, end: int) -> np.ndarray:
-    """``slice_of`` as f32 with every row divided by its norm, if it has one."""
-    part = slice_of(book[:, begin:end].to(torch.float32, copy=True), 0, end - begin)
-    return np.divide(part, norms[:, None], out=part, where=norms[:, None] > 0, casting="same_kind")
-
-
-def slice_width(rows: int) -> int:
-    """Channels a slice, a multiple of WIDE, for codebooks of so many rows together."""
-    return min(SLICE, max(WIDE, SLICE_BYTES // (4 * rows) // WIDE * WIDE))
-
-
-def slice_of(book: Tensor, begin: int, end: int, dtype: torch.dtype = torch.float32) -> np.ndarray:
-    """Channels ``begin..end`` of a codebook as [M, C], C padded with zeros to a multiple of WIDE.
-
-    f32, or the bits of f16 as u16. Where they lie as wanted in the codebook already, they are not copied.
-    """
-    whole = -(-(end - begin) // WIDE) * WIDE
-    part = book[:, begin:end]
-    if whole > end - begin or part.dtype != dtype or part.stride(1) != 1:
-        part = torch.zeros(book.shape[0], whole, dtype=dtype)
-        part[:, : end - begin] = book[:, begin:end]
-    return (part.view(torch.uint16) if dtype == torch.float16 else part).numpy()
+def _unit_rows(part: Tensor, norms: np.ndarray) -> Tensor:
+    """Some channels of a codebook as f32, every row divided by its norm, if it has one."""
+    rows = part.to(torch.float32, copy=True).numpy()
+    return torch.from_numpy(np.divide(rows, norms[:, None], out=rows, where=norms[:, None] > 0, casting="same_kind"))
 
 
 @kernel
-def solve_blocks(splats, tables, scale, width, result):
-    """X of some splats, block by block over ``width`` channels, and their squared norms.
+def solve_share(splats, tables, strips, scale, result):
+    """X of a share of splats over the channels of the strips, and their squared norms.
 
     Args:
-        splats: (first, last). tables: (addresses, rows, books) as ``add_views`` takes them. scale: [P] f64.
+        splats: (first, last). tables: (addresses, rows) of WeightTables. strips: Strips. scale: [P] f64.
         result: (squares, begin, features) as ``finish_rows`` takes them.
     """
     squares, begin, features = result
-    sums, part = np.empty((BLOCK, width), np.float32), np.empty((BLOCK, width), np.float32)
-    for offset in range(splats[0], splats[1], BLOCK):
-        end = min(offset + BLOCK, splats[1])
-        own = sums[: end - offset]
-        add_views((offset, end), tables, scale, own, part[: end - offset])
-        finish_rows(own, offset, squares, begin, features)
+    starts, most = entries_before(splats, tables), most_entries(strips.rows)
+    count = strips.values.shape[0] // (strips.rows * WIDE)
+    first = 0
+    while first < starts.shape[0] - 1:
+        last = block_end(starts, first, most)
+        block = (splats[0] + first, splats[0] + last)
+        entries = block_entries(block, starts[first : last + 1], tables, strips.bases, scale)
+        sums = np.empty((last - first, WIDE), np.float32)
+        for strip in range(count):
+            sum_strip(entries, strips, strip, sums)
+            finish_rows(sums, block[0], squares, begin + strip * WIDE, features)
+        first = last
 
 
-def _solve_slice(
+def _solve_strips(
     pool: ThreadPoolExecutor,
     weights: WeightTables,
-    parts: Sequence[np.ndarray],
+    strips: Strips,
     scale: np.ndarray,
-    result: tuple[np.ndarray, int],
-) -> np.ndarray:
-    """One slice of channels for all splats, into ``result = (X, first channel)``; the squared norms [P] f64."""
-    squares, (features, begin) = np.zeros(scale.shape[0]), result
-    tables, width = (weights.addresses, weights.rows, books_of(parts)), parts[0].shape[1]
-    shares = splat_shares(scale.shape[0])
-    list(pool.map(lambda share: solve_blocks(share, tables, scale, width, (squares, begin, features)), shares))
-    return squares
+    result: tuple[np.ndarray, int, np.ndarray],
+) -> None:
+    """The strips for all splats, into ``result = (squares, first channel, X)``."""
+    tables = (weights.addresses, weights.rows)
+    list(pool.map(lambda share: solve_share(share, tables, strips, scale, result), splat_shares(scale.shape[0])))
 
 
 def warm_up_solution() -> None:
@@ -218,8 +210,3 @@ def warm_up_solution() -> None:
     weights = RegionWeights(one, torch.tensor([0, 1]), one, torch.ones(1), one, torch.ones(1))
     for dtype, kind in product((torch.float16, torch.float32), repeat=2):
         solve_closed_form([weights], lambda _, kind=kind: torch.ones(1, 1, dtype=kind), np.ones(1), dtype, silent, 1)
-
-
-def splat_shares(count: int) -> list[tuple[int, int]]:
-    """The splats of each call of compiled code, whole blocks but the last."""
-    return [(first, min(first + BLOCK * BLOCKS, count)) for first in range(0, count, BLOCK * BLOCKS)]

@@ -38,16 +38,18 @@ import numpy as np
 import torch
 
 from liftcore.jit import kernel, vectorised
+from liftcore.lanes import WIDE
 from liftcore.solve.accumulate import row_totals
-from liftcore.solve.closed_form import BLOCK, slice_of, slice_width, splat_shares
-from liftcore.solve.weight_tables import (
-    WeightTables,
-    add_views,
-    addresses_of,
-    books_of,
-    floats_at,
-    rows_between,
-    table_at,
+from liftcore.solve.weight_tables import WeightTables, addresses_of, floats_at, rows_between, table_at
+from liftcore.solve.weighted_sums import (
+    block_end,
+    block_entries,
+    channel_slices,
+    entries_before,
+    most_entries,
+    splat_shares,
+    strips_of,
+    sum_strip,
 )
 
 if TYPE_CHECKING:
@@ -99,27 +101,33 @@ def judge_rows(rows, weights, scale, codebook, block, agreement, squares):
 
 
 @kernel
-def judge_blocks(splats, tables, sums, scale, width):
-    """``judge_rows`` of some splats for all views, block by block over ``width`` channels.
+def judge_share(splats, tables, strips, sums, scale):
+    """``judge_rows`` of a share of splats for all views, block by block over the channels of the strips.
 
     Args:
-        splats: (first, last). tables: (addresses, rows, books) as ``add_views`` takes them, the books of e.
+        splats: (first, last). tables: (addresses, rows) of WeightTables. strips: Strips, of e.
         sums: [V, 2] i64, where agreement [nnz] f32 and squares [n] f32 of each view lie. scale: [P] f64.
     """
-    addresses, rows, books = tables
-    means, part = np.empty((BLOCK, width), np.float32), np.empty((BLOCK, width), np.float32)
-    for offset in range(splats[0], splats[1], BLOCK):
-        block = (offset, min(offset + BLOCK, splats[1]))
-        own = means[: block[1] - offset]
-        add_views(block, tables, scale, own, part[: block[1] - offset])
-        for view in range(addresses.shape[0]):
-            weights = table_at(addresses[view], rows[view])
-            first, last = rows_between(weights[0], block)
-            if first < last:
-                book = floats_at(books.places[view, 0], books.places[view, 1]).reshape(-1, width)
-                agreement = floats_at(sums[view, 0], weights[2].shape[0])
-                squares = floats_at(sums[view, 1], weights[0].shape[0])
-                judge_rows((first, last, offset), weights, scale, book, own, agreement, squares)
+    addresses, rows = tables
+    starts, most = entries_before(splats, tables), most_entries(strips.rows)
+    pieces = strips.values.reshape(-1, strips.rows, WIDE)
+    first = 0
+    while first < starts.shape[0] - 1:
+        last = block_end(starts, first, most)
+        block = (splats[0] + first, splats[0] + last)
+        entries = block_entries(block, starts[first : last + 1], tables, strips.bases, scale)
+        means = np.empty((last - first, WIDE), np.float32)
+        for strip in range(pieces.shape[0]):
+            sum_strip(entries, strips, strip, means)
+            for view in range(addresses.shape[0]):
+                weights = table_at(addresses[view], rows[view])
+                own = rows_between(weights[0], block)
+                if own[0] < own[1]:
+                    book = pieces[strip, strips.bases[view] :]
+                    agreement = floats_at(sums[view, 0], weights[2].shape[0])
+                    squares = floats_at(sums[view, 1], weights[0].shape[0])
+                    judge_rows((own[0], own[1], block[0]), weights, scale, book, means, agreement, squares)
+        first = last
 
 
 @dataclass(frozen=True)
@@ -131,13 +139,11 @@ class Directions:
     mean: np.ndarray  # [F] f64, mu
     distances: tuple[np.ndarray, ...]  # [M] f64 a view, |u_m - mu|
 
-    def slice_of(self, view: int, begin: int, end: int) -> np.ndarray:
-        """Channels ``begin..end`` of e of one view, [M, C] f32, padded with zeros as the closed form does."""
-        own = self.books[view][:, begin:end].to(torch.float32, copy=True)
-        part = slice_of(own, 0, end - begin)
-        unit = _over(part[:, : end - begin].astype(np.float64), self.lengths[view])
-        part[:, : end - begin] = _over(unit - self.mean[begin:end], self.distances[view])
-        return part
+    def slice_of(self, view: int, begin: int, end: int) -> Tensor:
+        """Channels ``begin..end`` of e of one view, [M, C] f32."""
+        part = self.books[view][:, begin:end].double().numpy()
+        unit = _over(part, self.lengths[view])
+        return torch.from_numpy(_over(unit - self.mean[begin:end], self.distances[view])).float()
 
 
 def directions_of(pool: ThreadPoolExecutor, store: ViewWeights, books: Sequence[Tensor]) -> Directions:
@@ -208,17 +214,14 @@ def _judge(
     squares = [np.zeros(weights.splats.numel(), np.float32) for weights in current]
     for weights in target:
         weights.weights.zero_()
-    channels = directions.mean.size
-    step = slice_width(sum(book.shape[0] for book in directions.books))
-    scale, tables = _over(np.ones(denominators.size), denominators), WeightTables(current)
+    counts = [book.shape[0] for book in directions.books]
+    scale, weights = _over(np.ones(denominators.size), denominators), WeightTables(current)
+    tables, shares = (weights.addresses, weights.rows), splat_shares(denominators.size)
     sums = addresses_of([(view.weights.numpy(), square) for view, square in zip(target, squares, strict=True)])
-    for begin in range(0, channels, step):
-        end = min(begin + step, channels)
-        slices = [pool.submit(directions.slice_of, view, begin, end) for view in range(len(current))]
-        parts = [part.result() for part in slices]
-        own, width = (tables.addresses, tables.rows, books_of(parts)), parts[0].shape[1]
-        shares = splat_shares(denominators.size)
-        list(pool.map(lambda share, own=own, width=width: judge_blocks(share, own, sums, scale, width), shares))
+    for begin, end in channel_slices(sum(counts), directions.mean.size, 4):
+        parts = pool.map(lambda view, ends=(begin, end): directions.slice_of(view, *ends), range(len(counts)))
+        own = strips_of(parts, counts, end - begin, torch.float32)
+        list(pool.map(lambda share, own=own: judge_share(share, tables, own, sums, scale), shares))
     return squares
 
 

@@ -93,6 +93,24 @@ def test_region_weights_equal_the_oracle(footprint, backend):
         assert np.abs(W - expected).max(initial=0) < INSIDE * max(1.0, expected.max(initial=0))
 
 
+@pytest.mark.parametrize("reading", ["regions", "grid"])
+@every_backend
+def test_a_region_or_a_cell_for_every_pixel_is_weighed_as_the_oracle_weighs_it(reading, backend):
+    camera, splats = random_camera(3), random_splats(3, 60)
+    pixels = camera.width * camera.height
+    labels = torch.arange(pixels, dtype=torch.int32).reshape(1, camera.height, camera.width)
+    if reading == "grid":
+        observation = random_grid(3, (camera.height + 4, camera.width - 4))
+    else:
+        observation = RegionMap(torch.cat([labels, labels // 200]), torch.ones(pixels, 1))
+    view = dense_view(splats, camera, Walk())
+    S, ray = reading_matrix(observation, camera.width, camera.height)
+    weights = backend.open(splats).region_weights(camera, observation, Walk(), Weighting())
+    W = dense(weights, splats.count, observation.codebook.shape[0])
+    assert not view.cut.any() and (W > 0).sum() > 2 * pixels
+    assert np.abs(W - view.A[ray].T @ S).max() < INSIDE
+
+
 @every_footprint
 @every_backend
 def test_evidence_is_the_sum_of_plain_weights_whatever_the_gain(footprint, backend):

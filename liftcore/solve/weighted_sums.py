@@ -1,0 +1,174 @@
+"""``W E`` of a block of splats over all views, strip by strip of channels.
+
+A block's entries are gathered from W of every view first, splat by splat, so that a splat's sum over all its views
+stays in registers. The channels of all codebooks lie in strips: a strip's piece of a row is a line of the processor's
+cache or two, and the pieces of all rows stay in a core's own cache while a block is summed.
+
+Sums are float32 over a few hundred terms at most. Longer ones, of a splat behind a million regions or of thousands of
+views, are sums of such parts in float64: added one by one, ten million equal terms would be wrong in their first
+digit.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import torch
+
+from liftcore.jit import kernel
+from liftcore.lanes import AHEAD, WIDE, add_weighted_row
+from liftcore.solve.weight_tables import table_at
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from torch import Tensor
+
+LONG = 256  # entries of a splat that float32 adds up one by one
+SHARE = 2048  # splats a call of compiled code
+LEAST_ENTRIES, MOST_ENTRIES = 1 << 16, 1 << 22  # of a block, unless a splat alone has more
+REUSE = 12  # entries of a block for each row of the codebooks: so often a piece is read from the nearer cache
+STRIP_BYTES = 1 << 27  # of the strips of all codebooks at a time
+_LINE = 64  # bytes of the processor's cache
+
+
+class Strips(NamedTuple):
+    """Some channels of all codebooks, WIDE of them a strip."""
+
+    values: np.ndarray  # [strips * rows * WIDE] f32, or the bits of f16 as u16; zeros beyond the last channel
+    bases: np.ndarray  # [V] i64, where a view's rows begin among those of all
+    rows: int  # of all codebooks together
+
+
+class Entries(NamedTuple):
+    """W of a block, splat by splat, each in the order of the views."""
+
+    starts: np.ndarray  # [B + 1] i64
+    rows: np.ndarray  # [n + AHEAD] i32, among those of all codebooks; zeros at the end, which are only asked for
+    shares: np.ndarray  # [n] f32, weights times the splat's scale
+
+
+def strips_of(parts: Iterable[Tensor], counts: Sequence[int], channels: int, dtype: torch.dtype) -> Strips:
+    """Strips of the same channels of all codebooks.
+
+    Args:
+        parts: [M, channels] of every view, taken one after the other.
+        counts: M of every view.
+        dtype: f16 or f32.
+    """
+    bases = np.cumsum([0, *counts])
+    rows, count = int(bases[-1]), -(-channels // WIDE)
+    values = _in_lines(count * rows * WIDE, dtype)
+    strips = values.view(count, rows, WIDE)
+    for base, part in zip(bases[:-1].tolist(), parts, strict=True):
+        for strip in range(count):
+            own = part[:, strip * WIDE : (strip + 1) * WIDE]
+            strips[strip, base : base + own.shape[0], : own.shape[1]] = own
+    bits = values.view(torch.uint16) if dtype == torch.float16 else values
+    return Strips(bits.numpy(), bases[:-1].astype(np.int64), rows)
+
+
+def _in_lines(count: int, dtype: torch.dtype) -> Tensor:
+    """Zeros [count] that begin with a line of the cache: numpy's, which asks for large pages."""
+    spare = _LINE // dtype.itemsize
+    room = torch.from_numpy(np.zeros(count + spare, np.float16 if dtype == torch.float16 else np.float32))
+    first = -room.data_ptr() % _LINE // dtype.itemsize
+    return room[first : first + count]
+
+
+def channel_slices(rows: int, channels: int, size: int) -> list[tuple[int, int]]:
+    """Channels whose strips lie in memory at a time, of so many rows in all and ``size`` bytes a number."""
+    step = max(WIDE, STRIP_BYTES // (size * max(rows, 1)) // WIDE * WIDE)
+    return [(begin, min(begin + step, channels)) for begin in range(0, channels, step)]
+
+
+def splat_shares(count: int) -> list[tuple[int, int]]:
+    """The splats of each call of compiled code."""
+    return [(first, min(first + SHARE, count)) for first in range(0, count, SHARE)]
+
+
+@kernel
+def entries_before(splats, tables):
+    """[n + 1] i64: how many entries the first splats of a share have, over all views.
+
+    Args:
+        splats: (first, last). tables: (addresses, rows) of WeightTables.
+    """
+    addresses, rows = tables
+    first, last = splats
+    starts = np.zeros(last - first + 1, np.int64)
+    for view in range(addresses.shape[0]):
+        ids, row_starts, _, _ = table_at(addresses[view], rows[view])
+        row = np.searchsorted(ids, first)
+        while row < ids.shape[0] and ids[row] < last:
+            starts[ids[row] - first + 1] += row_starts[row + 1] - row_starts[row]
+            row += 1
+    return np.cumsum(starts)
+
+
+@kernel
+def block_end(starts, begin, most):
+    """The end of the block of a share that begins at splat ``begin``: ``most`` entries, or one splat."""
+    end = begin + 1
+    while end < starts.shape[0] - 1 and starts[end + 1] - starts[begin] <= most:
+        end += 1
+    return end
+
+
+@kernel
+def most_entries(rows):
+    """Of a block, for codebooks of so many rows together."""
+    return min(max(REUSE * rows, LEAST_ENTRIES), MOST_ENTRIES)
+
+
+@kernel
+def block_entries(block, starts, tables, bases, scale):
+    """The Entries of the splats ``block[0]..block[1]``, as ``starts`` [B + 1] of ``entries_before`` counts them."""
+    addresses, rows = tables
+    first, last = block
+    count = starts[-1] - starts[0]
+    places, cursors = starts - starts[0], starts - starts[0]
+    columns, shares = np.zeros(count + AHEAD, np.int32), np.empty(count, np.float32)
+    for view in range(addresses.shape[0]):
+        ids, row_starts, own, weights = table_at(addresses[view], rows[view])
+        row = np.searchsorted(ids, first)
+        while row < ids.shape[0] and ids[row] < last:
+            splat = ids[row]
+            at = cursors[splat - first]
+            for k in range(row_starts[row], row_starts[row + 1]):
+                columns[at] = bases[view] + own[k]
+                shares[at] = weights[k] * scale[splat]
+                at += 1
+            cursors[splat - first] = at
+            row += 1
+    return Entries(places, columns, shares)
+
+
+@kernel
+def sum_strip(entries, strips, strip, sums):
+    """``sums[b] = sum_k shares[k] E[rows[k]]`` over the channels of a strip, of every splat of a block.
+
+    Args:
+        sums: [B, WIDE] f32, written.
+    """
+    values, target, sparse = strips.values, sums.reshape(-1), (entries.rows, entries.shares)
+    span = (WIDE, strip * strips.rows * WIDE)
+    sums[:] = 0
+    for splat in range(sums.shape[0]):
+        first, last = entries.starts[splat], entries.starts[splat + 1]
+        if last - first > LONG:
+            _sum_parts(target[splat * WIDE : splat * WIDE + WIDE], values, (first, last), sparse, span)
+        elif first < last:
+            add_weighted_row(target, splat * WIDE, values, (first, last), sparse, span)
+
+
+@kernel
+def _sum_parts(target, values, entries, sparse, span):
+    """One splat's sum, of many entries: the sums of LONG of them at a time are added in float64."""
+    part, total = np.empty(WIDE, np.float32), np.zeros(WIDE)
+    for first in range(entries[0], entries[1], LONG):
+        part[:] = 0
+        add_weighted_row(part, 0, values, (first, min(first + LONG, entries[1])), sparse, span)
+        total += part
+    target[:] = total
