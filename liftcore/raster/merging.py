@@ -59,8 +59,8 @@ def merge_range(starts, gathered, slot_rows, codebook_rows, ids):
     touched = np.empty(codebook_rows, np.int32)
     splats, lengths = np.empty(records, np.int32), np.empty(records, np.int64)
     met, evidence = np.empty(records, np.int32), np.empty(records, np.float32)
-    columns = np.empty(max(1024, 2 * words.shape[0]), np.int32)
-    weights = np.empty(columns.shape[0], np.float32)
+    most = words.shape[0] * levels  # known before: arrays that may be replaced in a loop are counted at each use
+    columns, weights = np.empty(most, np.int32), np.empty(most, np.float32)
     rows = count = met_count = 0
     for record in range(records):
         total, length = totals[record], 0
@@ -81,8 +81,6 @@ def merge_range(starts, gathered, slot_rows, codebook_rows, ids):
         if length == 0:
             continue
         _sort(touched, length)
-        if count + length > columns.shape[0]:
-            columns, weights = _grown(columns, weights, count + length)
         for k in range(length):
             columns[count + k] = touched[k]
             weights[count + k] = sums[touched[k]]
@@ -106,12 +104,3 @@ def _sort(values, length):
             values[k + 1] = values[k]
             k -= 1
         values[k + 1] = value
-
-
-@kernel
-def _grown(columns, weights, needed):
-    size = max(2 * columns.shape[0], needed)
-    new_columns, new_weights = np.empty(size, np.int32), np.empty(size, np.float32)
-    new_columns[: columns.shape[0]] = columns
-    new_weights[: weights.shape[0]] = weights
-    return new_columns, new_weights
