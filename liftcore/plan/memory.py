@@ -12,6 +12,7 @@ from liftcore.raster.constants import TILE
 from liftcore.raster.kernels import RECORDS
 from liftcore.solve.feature_room import check_disk
 from liftcore.solve.view_weights import MEMORY_LIMIT
+from liftcore.solve.weighted_sums import strip_bytes
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -57,7 +58,7 @@ def memory_parts(
         "scene": splats.count * SCENE_BYTES,
         "view": walk + 2 * labels + weights,  # labels of the next one, too, and weights that wait for their turn
         "weights": min(len(cameras) * weights, MEMORY_LIMIT),
-        "codebooks": sum(_codebook_bytes(packs, view) for view in cameras),
+        "codebooks": _all_codebook_bytes(packs, cameras),
         "features": splats.count * packs.channels * feature_bytes,
     }
 
@@ -137,6 +138,14 @@ def _label_bytes(packs: FeaturePacks, view: str) -> int:
     """Of the view's labels as they are walked; a grid's cells are labels where the nearest one is read."""
     spec = packs.specs(view).get("labels")
     return 4 * (codebook_rows(packs, view) if spec is None else math.prod(spec.shape))
+
+
+def _all_codebook_bytes(packs: FeaturePacks, views: Iterable[str]) -> int:
+    """Of the codebooks, and of the strips of them that the solution has beside."""
+    names = list(views)
+    size = 2 if all(_codebook_spec(packs, view).dtype == "F16" for view in names) else 4
+    rows = sum(codebook_rows(packs, view) for view in names)
+    return sum(_codebook_bytes(packs, view) for view in names) + strip_bytes(rows, packs.channels, size)
 
 
 def _codebook_bytes(packs: FeaturePacks, view: str) -> int:

@@ -179,14 +179,13 @@ def solve_share(splats, tables, strips, scale, result):
     """
     squares, begin, features = result
     starts, most = entries_before(splats, tables), most_entries(strips.rows)
-    count = strips.values.shape[0] // (strips.rows * WIDE)
     first = 0
     while first < starts.shape[0] - 1:
         last = block_end(starts, first, most)
         block = (splats[0] + first, splats[0] + last)
         entries = block_entries(block, starts[first : last + 1], tables, strips.bases, scale)
         sums = np.empty((last - first, WIDE), np.float32)
-        for strip in range(count):
+        for strip in range(strips.number):
             sum_strip(entries, strips, strip, sums)
             finish_rows(sums, block[0], squares, begin + strip * WIDE, features)
         first = last

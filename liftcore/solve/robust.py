@@ -110,14 +110,14 @@ def judge_share(splats, tables, strips, sums, scale):
     """
     addresses, rows = tables
     starts, most = entries_before(splats, tables), most_entries(strips.rows)
-    pieces = strips.values.reshape(-1, strips.rows, WIDE)
+    pieces = strips.values.reshape(strips.number, strips.rows, WIDE)
     first = 0
     while first < starts.shape[0] - 1:
         last = block_end(starts, first, most)
         block = (splats[0] + first, splats[0] + last)
         entries = block_entries(block, starts[first : last + 1], tables, strips.bases, scale)
         means = np.empty((last - first, WIDE), np.float32)
-        for strip in range(pieces.shape[0]):
+        for strip in range(strips.number):
             sum_strip(entries, strips, strip, means)
             for view in range(addresses.shape[0]):
                 weights = table_at(addresses[view], rows[view])

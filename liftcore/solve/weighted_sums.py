@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import torch
 
+from liftcore.errors import Unavailable
 from liftcore.jit import kernel
 from liftcore.lanes import AHEAD, WIDE, add_weighted_row
 from liftcore.solve.weight_tables import table_at
@@ -30,6 +31,7 @@ SHARE = 2048  # splats a call of compiled code
 LEAST_ENTRIES, MOST_ENTRIES = 1 << 16, 1 << 22  # of a block, unless a splat alone has more
 REUSE = 12  # entries of a block for each row of the codebooks: so often a piece is read from the nearer cache
 STRIP_BYTES = 1 << 27  # of the strips of all codebooks at a time
+MOST_ROWS = 2**31 - 1  # of all codebooks: an entry of a block names its row in four bytes
 _LINE = 64  # bytes of the processor's cache
 
 
@@ -39,6 +41,7 @@ class Strips(NamedTuple):
     values: np.ndarray  # [strips * rows * WIDE] f32, or the bits of f16 as u16; zeros beyond the last channel
     bases: np.ndarray  # [V] i64, where a view's rows begin among those of all
     rows: int  # of all codebooks together
+    number: int  # of strips
 
 
 class Entries(NamedTuple):
@@ -56,9 +59,19 @@ def strips_of(parts: Iterable[Tensor], counts: Sequence[int], channels: int, dty
         parts: [M, channels] of every view, taken one after the other.
         counts: M of every view.
         dtype: f16 or f32.
+
+    Raises:
+        Unavailable: all codebooks together have more rows than an entry can name.
     """
     bases = np.cumsum([0, *counts])
     rows, count = int(bases[-1]), -(-channels // WIDE)
+    if rows > MOST_ROWS:
+        raise Unavailable(
+            "features",
+            expected=f"at most {MOST_ROWS} rows of codebooks",
+            got=f"{rows} in {len(counts)} views",
+            hint="lift fewer views, or smaller maps",
+        )
     values = _in_lines(count * rows * WIDE, dtype)
     strips = values.view(count, rows, WIDE)
     for base, part in zip(bases[:-1].tolist(), parts, strict=True):
@@ -66,7 +79,7 @@ def strips_of(parts: Iterable[Tensor], counts: Sequence[int], channels: int, dty
             own = part[:, strip * WIDE : (strip + 1) * WIDE]
             strips[strip, base : base + own.shape[0], : own.shape[1]] = own
     bits = values.view(torch.uint16) if dtype == torch.float16 else values
-    return Strips(bits.numpy(), bases[:-1].astype(np.int64), rows)
+    return Strips(bits.numpy(), bases[:-1].astype(np.int64), rows, count)
 
 
 def _in_lines(count: int, dtype: torch.dtype) -> Tensor:
@@ -81,6 +94,12 @@ def channel_slices(rows: int, channels: int, size: int) -> list[tuple[int, int]]
     """Channels whose strips lie in memory at a time, of so many rows in all and ``size`` bytes a number."""
     step = max(WIDE, STRIP_BYTES // (size * max(rows, 1)) // WIDE * WIDE)
     return [(begin, min(begin + step, channels)) for begin in range(0, channels, step)]
+
+
+def strip_bytes(rows: int, channels: int, size: int) -> int:
+    """Of the strips that lie in memory at a time."""
+    begin, end = channel_slices(rows, channels, size)[0]
+    return rows * size * (-(-(end - begin) // WIDE) * WIDE)
 
 
 def splat_shares(count: int) -> list[tuple[int, int]]:
