@@ -1,6 +1,6 @@
 """Masks to judge lifts by: in a ``.safetensors`` file, ``VIEW/mask`` [h, w] of numbers of classes, -1 for none.
 
-What else is in the file is left alone. Masks need not have the image's size.
+In u8 none is 255. What else is in the file is left alone. Masks need not have the image's size.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import torch
 
 from liftcore.errors import InvalidMasks
 from liftcore.observe.header import check_header
+from liftcore.observe.pack import U8_NO_LABEL
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -69,6 +70,8 @@ def _masks(path: Path, classes: int | None) -> Iterator[tuple[str, Tensor, int]]
                 where, part = f"{path} {name[:80]!r}", handle.get_slice(name)
                 _check_kind(where, part.get_dtype(), part.get_shape())
                 mask = handle.get_tensor(name).long()
+                if part.get_dtype() == "U8":  # as in the labels of feature packs: it has no -1
+                    mask[mask == U8_NO_LABEL] = NO_CLASS
                 yield name.removesuffix("/mask"), mask, _highest(where, mask, classes)
     except (SafetensorError, OSError) as error:
         got = f"a file that does not open as one ({str(error)[:120]})"
