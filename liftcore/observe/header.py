@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from liftcore.errors import InvalidInput
 
 MAX_HEADER_BYTES = 32 * 1024 * 1024
+_START = 9  # bytes: the header's length, and the brace that it begins with
 
 
 def check_header(path: Path, name: str, fault: type[InvalidInput], *, expected: str, hint: str = "") -> None:
@@ -27,20 +28,22 @@ def check_header(path: Path, name: str, fault: type[InvalidInput], *, expected: 
     """
     try:
         with path.open("rb") as handle:
-            start = handle.read(9)
+            start = handle.read(_START)
     except OSError as error:
         raise fault(name, expected=expected, got=f"a file that does not open ({error.strerror})") from None
-    if start[:2] in (b"PK", b"\x80\x02") or path.suffix.lower() in (".pt", ".pth", ".pkl"):
+    length = struct.unpack("<Q", start[:8])[0] if len(start) == _START else 0
+    # A header may be as long as such a signature reads as a number: 640 bytes are b"\x80\x02". Then it is JSON.
+    signed = start[:2] in (b"PK", b"\x80\x02") and not (start[8:] == b"{" and length <= MAX_HEADER_BYTES)
+    if signed or path.suffix.lower() in (".pt", ".pth", ".pkl"):
         raise fault(
             name,
             expected=expected,
             got="a Python pickle or a zip, which may run code when it is opened",
             hint="save its arrays as .npy files ('splatlift pack npy' makes packs of those), or as safetensors",
         )
-    if len(start) < 9 or start[8:] != b"{":
+    if len(start) < _START or start[8:] != b"{":
         got = f"a file that begins with {start!r}" if start else "an empty file"
         raise fault(name, expected=expected, got=got, hint=hint)
-    (length,) = struct.unpack("<Q", start[:8])
     if length > MAX_HEADER_BYTES:
         raise fault(name, expected=f"a header of at most {MAX_HEADER_BYTES} bytes", got=f"{length} bytes")
     _check_names(path, name, fault, length)

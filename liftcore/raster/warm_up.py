@@ -24,7 +24,8 @@ def warm_up(
 ) -> None:
     """Run every product once on one splat of the kernel. The first run on a machine compiles, later ones load.
 
-    Each kernel is compiled for itself, so a scene waits for its own alone; a card compiles each way of weighing too.
+    Each kernel is compiled for itself, so a scene waits for its own alone; so is the walk without a gain, and of all
+    weights; a card compiles each way of weighing.
 
     Args:
         walk: that will lift. weighting: likewise.

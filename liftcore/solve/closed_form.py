@@ -147,10 +147,12 @@ def solve_closed_form(
             own = (book[:, begin:end] for book in books)
             strips = strips_of(own, counts, end - begin, torch.float16 if halves else torch.float32)
             _solve_strips(pool, tables, strips, scale, (squares if unit else np.zeros(count), begin, kept))
+            del strips  # before others are made
             if not unit:
                 own = (_unit_rows(book[:, begin:end], norm) for book, norm in zip(books, norms, strict=True))
                 strips = strips_of(own, counts, end - begin, torch.float32)
                 _solve_strips(pool, tables, strips, scale, (squares, begin, nothing))
+                del strips
             progress("solve", number + 1, len(slices), "slices")
     agreement = np.sqrt(squares).clip(0.0, 1.0).astype(np.float32)
     return Solution(features, torch.from_numpy(agreement))

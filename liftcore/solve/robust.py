@@ -222,6 +222,7 @@ def _judge(
         parts = pool.map(lambda view, ends=(begin, end): directions.slice_of(view, *ends), range(len(counts)))
         own = strips_of(parts, counts, end - begin, torch.float32)
         list(pool.map(lambda share, own=own: judge_share(share, tables, own, sums, scale), shares))
+        del own  # before others are made
     return squares
 
 

@@ -7,14 +7,16 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from liftcore.device import choose_device
+from liftcore.device import Device, choose_device
 from liftcore.measure.tradeoff.compare import compare
-from liftcore.measure.tradeoff.order import CANDIDATES, Scene
+from liftcore.measure.tradeoff.order import CANDIDATES, EXACT, Scene
 from liftcore.measure.tradeoff.report import page_of, save
 from liftcore.progress import Progress
 from liftcore.raster.warm_up import warm_up
 from liftcore.scene.splats import Kernel
+from liftcore.solve.accumulate import lift_walk, weighting_of
 from liftcore.solve.closed_form import warm_up_solution
+from liftcore.solve.settings import LiftSettings
 from service.finite import finite
 
 SHOWN_DIGITS = 12  # of the splats' digest, by which the chart names the scene
@@ -32,8 +34,7 @@ def compare_as_ordered(order: dict[str, Any], progress: Progress) -> dict[str, A
     scene, settings, parameters = _scene(order), order["settings"], order["parameters"]
     progress("compile", 0, 1, "kernels")
     device = choose_device(settings.get("device", "auto"))
-    warm_up_solution()
-    warm_up(Kernel(order["kernel"]), device)  # for the runs to load: else the first on a machine eats up the budget
+    _compile(Kernel(order["kernel"]), device, settings)
     progress("tradeoff", 0, len(CANDIDATES), "runs")
     found = compare(scene, parameters["budget_s"], settings, order["threads"], progress)
     named = {
@@ -46,6 +47,15 @@ def compare_as_ordered(order: dict[str, Any], progress: Progress) -> dict[str, A
         chart = next(file for file in save(document, Path(folder)) if file.suffix == ".png")
         Path(order["output"]).write_bytes(chart.read_bytes())
     return {"document": document, "page": "\n".join(page_of(document)) + "\n"}
+
+
+def _compile(kernel: Kernel, device: Device, settings: dict[str, Any]) -> None:
+    """What the runs load: else the first of a kind on a machine eats up the budget."""
+    warm_up_solution()
+    runs = [LiftSettings.of(**settings | candidate.settings) for candidate in (EXACT, *CANDIDATES)]
+    ways = {(lift_walk(run), weighting_of(run)) for run in runs}
+    for walk, weighting in sorted(ways, key=repr):
+        warm_up(kernel, device, walk, weighting)
 
 
 def _scene(order: dict[str, Any]) -> Scene:

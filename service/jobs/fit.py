@@ -59,6 +59,9 @@ def check_labels(
                 f"labels.classes.{place}", expected=f"one of the {len(words)} words of {table.id}",
                 got=repr(word[:80]), hint=nearest(word, words),
             )  # fmt: skip
+    if len(set(map(plain, classes))) < len(classes):
+        got = f"{len(classes)} words, some of them the same"
+        raise InvalidRequest("labels.classes", expected="each class once", got=got)
     if masks.counts["classes"] > len(classes):
         expected = f"{masks.counts['classes']} words, as the masks name classes 0..{masks.counts['classes'] - 1}"
         raise InvalidRequest("labels.classes", expected=expected, got=f"{len(classes)}")

@@ -98,6 +98,7 @@ def test_masks_judge_over_http_as_they_do_on_the_command_line(
     ("wrong", "argument", "told"),
     [
         ({"classes": ["lamp", "bok", "apple"]}, "labels.classes.1", "nearest: book"),
+        ({"classes": ["lamp", "book", "The_Book"]}, "labels.classes", "each class once"),
         ({"classes": ["lamp", "book"]}, "labels.classes", "classes 0..2"),
         ({"classes": []}, "labels.classes", "at least 1 item"),
         ({"classes": ["\ud800", "book", "apple"]}, "labels.classes.0", ""),
