@@ -52,11 +52,10 @@ def scene() -> tuple[list[RegionWeights], list[torch.Tensor], np.ndarray]:
     assert many.sum() > LEAST_ENTRIES
     store = [view(1, np.maximum(few, many), rows[0]), view(2, rng.integers(0, 3, splats), rows[1])]
     books = [torch.randn(count, CHANNELS, generator=torch.manual_seed(count)) for count in rows]
-    return (
-        store,
-        books,
-        sum(dense(weights, splats, count).sum(axis=1) for weights, count in zip(store, rows, strict=True)),
-    )
+    totals = np.zeros(splats)
+    for weights, count in zip(store, rows, strict=True):
+        totals += dense(weights, splats, count).sum(axis=1)
+    return store, books, totals
 
 
 def solved(scene, threads: int = 1) -> torch.Tensor:
