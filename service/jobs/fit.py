@@ -48,8 +48,8 @@ def check_labels(
     """Refuse labels that cannot judge lifts of these features.
 
     Raises:
-        InvalidRequest: a class that the table lacks, too few classes, a table of other channels, masks of no camera,
-            or no view with features besides those with masks.
+        InvalidRequest: a class that the table lacks or that is named twice, too few classes, a table of other
+            channels, masks of no camera, or no view with features besides those with masks.
     """
     classes = order.parameters["labels"]["classes"]
     words = dict.fromkeys(map(plain, table.counts["words"]))

@@ -256,9 +256,7 @@ def test_open_until_the_first_key_and_never_again(tmp_path: Path, capsys: pytest
 
 
 def test_revoked_key_loses_its_streams(house: Guarded, monkeypatch: pytest.MonkeyPatch) -> None:
-    streams = parts_of(house.client).streams
-    replies: list[Any] = []
-    sent = threading.Event()
+    replies, sent = list[Any](), threading.Event()
 
     def noted(event: Event) -> bool:  # asked when the event is on its way
         sent.set()
@@ -271,7 +269,7 @@ def test_revoked_key_loses_its_streams(house: Guarded, monkeypatch: pytest.Monke
 
     following = threading.Thread(target=follow, daemon=True)
     following.start()
-    assert sent.wait(PATIENCE_SECONDS) and streams.open == 1
+    assert sent.wait(PATIENCE_SECONDS) and parts_of(house.client).streams.open == 1
     house.store.keys.revoke(house.ids["alice"])
     following.join(PATIENCE_SECONDS)
     (reply,) = replies
