@@ -189,14 +189,14 @@ def _blind(views: Sequence[str], store: ViewWeights) -> list[str]:
 
 def _solve(run: Run, store: ViewWeights, geometry: Geometry, room: FeatureRoom) -> tuple[ViewWeights, Solution]:
     """The weights, which the robust steps may have changed, and the closed form of them."""
-    settings, books = run.settings, geometry.codebooks
+    settings, sums = run.settings, geometry.denominators
     with run.timings.stage("robust"):
         weights = robust_weights(
-            store, books, geometry.denominators, settings.robust_steps, run.progress, run.threads
+            store, geometry.codebooks, sums, settings.robust_steps, run.progress, run.threads
         )
     with run.timings.stage("solve"):
         closed_form, dtype = closed_form_on(run.device, run.threads, room), getattr(torch, settings.dtype)
-        return weights, closed_form(weights, books.__getitem__, geometry.denominators, dtype, run.progress)
+        return weights, closed_form(weights, geometry.columns.__getitem__, sums, dtype, run.progress)
 
 
 def _refine(
@@ -246,8 +246,8 @@ def _resolve(
     with run.timings.stage("resolve"):
         fewer, denominators = kept_columns(weights, aggregation.kept, X.shape[0])
         room = room_within(None if limit is None else limit - X.nbytes)
-        books, closed_form = geometry.codebooks.__getitem__, closed_form_on(run.device, run.threads, room)
-        again = closed_form(fewer, books, denominators, X.dtype, run.progress).features
+        columns, closed_form = geometry.columns.__getitem__, closed_form_on(run.device, run.threads, room)
+        again = closed_form(fewer, columns, denominators, X.dtype, run.progress).features
         chosen = aggregation.own & torch.from_numpy(denominators > 0)
         X[chosen] = again[chosen].to(X.dtype)
         return float(chosen.float().mean())

@@ -16,13 +16,13 @@ import torch
 
 from liftcore.device import Device, choose_device, processor
 from liftcore.errors import InvalidInput
+from liftcore.measure.region_walk import walk_regions
 from liftcore.measure.synthetic import room_cameras, room_regions, room_splats
 from liftcore.observe.observation import Observation, RegionMap
 from liftcore.progress import silent
 from liftcore.raster.open_raster import open_raster
-from liftcore.raster.protocol import Look
 from liftcore.raster.warm_up import warm_up
-from liftcore.solve.accumulate import lift_walk, row_totals, weighting_of
+from liftcore.solve.accumulate import lift_walk, weighting_of
 from liftcore.solve.closed_form import warm_up_solution
 from liftcore.solve.settings import LiftSettings, Preset
 from liftcore.solve.solver import closed_form_on
@@ -96,31 +96,26 @@ def time_lift(work: Workload, preset: Preset, device: Device, threads: int | Non
 
     ``geometry_s_per_view_min`` is that of the shortest pass.
     """
-    settings = LiftSettings.of(preset=preset)
-    walk, weighting, nowhere = lift_walk(settings), weighting_of(settings), torch.empty(0, 2, dtype=torch.int32)
-    looks = [Look(camera, observation, walk, weighting, nowhere) for camera, observation in work.views]
-    raster, books = open_raster(work.splats, device, threads), [look.observation.codebook for look in looks]
-    for _ in raster.walk_views(looks[:1]):  # for the caches alone
-        pass
+    settings, count = LiftSettings.of(preset=preset), work.splats.count
+    looking, raster = (lift_walk(settings), weighting_of(settings)), open_raster(work.splats, device, threads)
+    with ViewWeights() as store:  # for the caches alone
+        walk_regions(raster, work.views[:1], looking, count, store)
     geometry, solution, entries = [], [], 0
     for _ in range(PASSES):
-        denominators = np.zeros(work.splats.count)
         with ViewWeights() as store:
             start = time.perf_counter()
-            for walked in raster.walk_views(looks):
-                denominators[walked.weights.splats.numpy()] += row_totals(walked.weights)
-                store.append(walked.weights)
+            denominators, columns = walk_regions(raster, work.views, looking, count, store)
             middle = time.perf_counter()
-            closed_form_on(device, threads)(store, books.__getitem__, denominators, torch.float16, silent)
-            geometry.append((middle - start) / len(looks))
-            solution.append((time.perf_counter() - middle) / len(looks))
+            closed_form_on(device, threads)(store, columns.__getitem__, denominators, torch.float16, silent)
+            geometry.append((middle - start) / len(work.views))
+            solution.append((time.perf_counter() - middle) / len(work.views))
             entries = sum(len(part.columns) for part in store)
     return {
         "geometry_s_per_view": statistics.median(geometry),
         "geometry_s_per_view_min": min(geometry),
         "solve_s_per_view": statistics.median(solution),
         "total_s_per_view": statistics.median(map(sum, zip(geometry, solution, strict=True))),
-        "weights_entries_per_view": entries / len(looks),
+        "weights_entries_per_view": entries / len(work.views),
     }
 
 

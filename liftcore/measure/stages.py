@@ -21,6 +21,7 @@ from liftcore.progress import silent
 from liftcore.raster.cpu import CpuRaster
 from liftcore.solve.accumulate import lift_walk, row_totals, weighting_of
 from liftcore.solve.closed_form import solve_closed_form
+from liftcore.solve.columns import by_tuples
 from liftcore.solve.settings import LiftSettings
 from liftcore.solve.view_weights import ViewWeights
 
@@ -95,24 +96,26 @@ class TimedRaster(CpuRaster):
 def time_stages(work: Workload, preset: Preset) -> dict[str, Any]:
     """Seconds a view of each of STAGES on one thread: medians and minima over the views; the solution once for all.
 
-    ``rest`` is what a view takes beside the named steps: preparing its reading, row totals, keeping its weights.
+    ``rest`` is what a view takes beside the named steps: its tuples of labels, its reading, row totals, keeping its weights.
     """
     settings = LiftSettings.of(preset=preset)
     raster, walk, weighting = TimedRaster(work.splats), lift_walk(settings), weighting_of(settings)
-    denominators, views = np.zeros(work.splats.count), []
+    denominators, views, columns = np.zeros(work.splats.count), [], []
     with ViewWeights() as store:
         raster.region_weights(*work.views[0], walk, weighting)  # warm caches, not counted
         for camera, observation in work.views:
             raster.forget()
             raster.clock = Clock()
             with raster.clock.stage("rest"):
-                weights = raster.region_weights(camera, observation, walk, weighting)
+                tuples, own = by_tuples(observation)
+                weights = own.weighted(raster.region_weights(camera, tuples, walk, weighting))
                 denominators[weights.splats.numpy()] += row_totals(weights)
                 store.append(weights)
+            columns.append(own)
             views.append(raster.clock)
-        clock, books = Clock(), [observation.codebook for _, observation in work.views]
+        clock = Clock()
         with clock.stage("solution"):
-            solve_closed_form(store, books.__getitem__, denominators, torch.float16, silent, threads=1)
+            solve_closed_form(store, columns.__getitem__, denominators, torch.float16, silent, threads=1)
     share = 1 / len(views)
     solution = Clock({"solution": clock.wall["solution"] * share}, {"solution": clock.cpu["solution"] * share})
     return {

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from liftcore.errors import InvalidFeatures
+from liftcore.observe.label_tuples import label_tuples
 from liftcore.observe.observation import NO_LABEL, Observation, RegionMap
 
 Levels = Literal["rows", "composite"] | int
@@ -37,14 +38,13 @@ def at_levels(observation: Observation, levels: Levels, view: str) -> Observatio
 
 def composite(regions: RegionMap) -> RegionMap:
     """One level whose regions are the distinct tuples of labels, in the order of their labels."""
-    _, rows, columns = regions.labels.shape
-    tuples, region = _distinct(regions.labels.numpy().reshape(regions.labels.shape[0], -1))
-    labelled = (tuples != NO_LABEL).any(axis=0)
-    if not labelled.any():
+    labels = regions.labels.to(torch.int32).contiguous().numpy()
+    numbers, tuples = label_tuples(labels, labels[0].size)
+    if not tuples.size:
         return RegionMap(regions.labels[:1], regions.codebook)
-    number = np.where(labelled, np.cumsum(labelled) - 1, NO_LABEL).astype(np.int32)
-    labels = torch.from_numpy(number[region].reshape(1, rows, columns))
-    return RegionMap(labels, _summed(tuples[:, labelled], regions.codebook))
+    order = np.lexsort(tuples.T[::-1])
+    place = np.append(np.argsort(order), NO_LABEL).astype(np.int32)  # of each tuple; of none, which is -1, the last
+    return RegionMap(torch.from_numpy(place[numbers][None]), _summed(tuples[order].T, regions.codebook))
 
 
 def _one_level(observation: Observation, level: int, view: str) -> Observation:
@@ -56,15 +56,6 @@ def _one_level(observation: Observation, level: int, view: str) -> Observation:
     if not isinstance(observation, RegionMap):
         return observation
     return RegionMap(observation.labels[level : level + 1], observation.codebook)
-
-
-def _distinct(labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The distinct columns [L, n] of labels [L, pixels], and which of them each pixel [pixels] has."""
-    choices = int(labels.max()) + 2  # labels and none
-    key, first = np.zeros(labels.shape[1], np.int64), np.zeros(1, np.int64)
-    for level in labels:  # numbered anew at each level, so that keys stay below pixels * choices
-        _, first, key = np.unique(key * choices + level + 1, return_index=True, return_inverse=True)
-    return labels[:, first], key
 
 
 def _summed(tuples: np.ndarray, codebook: torch.Tensor) -> torch.Tensor:

@@ -14,7 +14,7 @@ Vectors are compared in PILOT_CHANNELS random projections.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from typing import TYPE_CHECKING
 
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from liftcore.observe.pack import FeaturePacks
     from liftcore.scene.cameras import Cameras
     from liftcore.scene.splats import Splats
+    from liftcore.solve.columns import Columns
     from liftcore.solve.settings import LiftSettings
 
 PILOT_SPLATS = 4_096
@@ -86,22 +87,22 @@ def fly_pilot(
         raster = CpuRaster(thin, threads=1)
         geometry = accumulate(raster, (thin.count, cameras), packs, chosen, own, store, silent)
         with one_thread():
-            books = [book.float() @ axes for book in geometry.codebooks]
-        whole = _features(store, books, range(len(chosen)), thin.count)
+            columns = [replace(own, codebook=own.codebook.float() @ axes) for own in geometry.columns]
+        whole = _features(store, columns, range(len(chosen)), thin.count)
         order = view_order(visibility(thin, views, lift_walk(own)))
         half = sorted(islice(order, (len(chosen) + 1) // 2))
-        part = _features(store, books, half, thin.count)
+        part = _features(store, columns, half, thin.count)
     cosine = _mean_cosine(part, whole, torch.from_numpy(geometry.evidence))
     among = (1.0 / cosine**2 - 1.0) / (1.0 / len(half) - 1.0 / len(chosen))
     return Pilot(among / (1.0 - among / len(chosen)) if among < len(chosen) else math.inf)
 
 
-def _features(store: ViewWeights, books: Sequence[Tensor], views: Sequence[int], count: int) -> Tensor:
+def _features(store: ViewWeights, columns: Sequence[Columns], views: Sequence[int], count: int) -> Tensor:
     """[count, C] f32, the closed form from some views alone."""
     weights, denominators = [store[view] for view in views], np.zeros(count)
     for part in weights:
         denominators[part.splats.numpy()] += row_totals(part)
-    own = [books[view] for view in views]
+    own = [columns[view] for view in views]
     return solve_closed_form(weights, own.__getitem__, denominators, torch.float32, silent, threads=1).features
 
 

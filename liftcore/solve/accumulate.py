@@ -14,6 +14,7 @@ from liftcore.device import out_of_memory
 from liftcore.observe.levels import at_levels
 from liftcore.observe.observation import FeatureGrid, Observation, RegionMap
 from liftcore.raster.protocol import Look, RayRows, Walk, Weighting
+from liftcore.solve.columns import Columns, by_rows, by_tuples
 from liftcore.solve.readout import Readout, read_pixels, sample_pixels
 from liftcore.solve.totals import Totals, row_totals
 
@@ -57,7 +58,12 @@ class Geometry:
     evidence: np.ndarray  # [P] f64, sum of plain weights, each ray once; a strided walk's times stride^2
     denominators: np.ndarray  # [P] f64, sum of w^p over labelled rays and levels
     samples: tuple[SampledRays, ...]  # for the certificate, one a view
-    codebooks: tuple[Tensor, ...]  # E [M, F] of every view, as its observation was read
+    columns: tuple[Columns, ...]  # of W of every view, over E as its observation was read
+
+    @property
+    def codebooks(self) -> tuple[Tensor, ...]:
+        """E [M, F] of every view."""
+        return tuple(columns.codebook for columns in self.columns)
 
 
 def lift_walk(settings: LiftSettings) -> Walk:
@@ -114,7 +120,7 @@ def accumulate(
     """
     count, cameras = scene
     totals = Totals(count, store.place)
-    samples, readouts, codebooks = [], deque[Readout](), []
+    samples, readouts, columns = [], deque[Readout](), []
 
     def looks() -> Iterator[Look]:
         rays = -(-settings.certificate_rays // len(views))
@@ -123,17 +129,19 @@ def accumulate(
             walk = strided_walk(lift_walk(settings), settings, camera, number)
             pixels = sample_pixels(camera, rays, (settings.seed, number), walk)
             readouts.append(read_pixels(observation, camera, pixels))
-            codebooks.append(observation.codebook)
-            yield Look(camera, observation, walk, weighting_of(settings), pixels)
+            walked, own = (observation, Columns(observation.codebook)) if by_rows(settings) else by_tuples(observation)
+            columns.append(own)
+            yield Look(camera, walked, walk, weighting_of(settings), pixels)
 
     with closing(raster.walk_views(looks())) as walked_views:
         for walked in walked_views:
-            _add(totals, walked.weights, float(settings.stride**2), store)
-            store.append(walked.weights)
+            weights = columns[len(samples)].weighted(walked.weights)
+            _add(totals, weights, float(settings.stride**2), store)
+            store.append(weights)
             samples.append(SampledRays(walked.rows, readouts.popleft()))
-            del walked  # before the next one is made beside it
+            del walked, weights  # before the next one is made beside it
             progress("geometry", len(samples), len(views), "views")
-    return Geometry(*totals.found(), tuple(samples), tuple(codebooks))
+    return Geometry(*totals.found(), tuple(samples), tuple(columns))
 
 
 def _add(totals: Totals, weights: RegionWeights, rays: float, store: ViewWeights) -> None:

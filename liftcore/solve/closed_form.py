@@ -23,6 +23,7 @@ from liftcore.jit import kernel
 from liftcore.lanes import LANES, WIDE, keep_halves, lanes_at, no_lanes, plus_product, sum_of_lanes
 from liftcore.progress import silent
 from liftcore.raster.protocol import RegionWeights
+from liftcore.solve.columns import Columns, rows_of
 from liftcore.solve.feature_room import in_memory
 from liftcore.solve.weight_tables import WeightTables
 from liftcore.solve.weighted_sums import (
@@ -111,7 +112,7 @@ def _store_singles(source, shape, first, begin, features):
 
 def solve_closed_form(
     store: Sequence[RegionWeights] | ViewWeights,
-    codebooks: Callable[[int], Tensor],
+    columns: Callable[[int], Columns],
     denominators: np.ndarray,
     dtype: torch.dtype,
     progress: Progress,
@@ -122,40 +123,49 @@ def solve_closed_form(
 
     Args:
         store: W of every view.
-        codebooks: view number -> E_v [M, F] f16 or f32.
+        columns: view number -> what the columns of its W stand for.
         denominators: [P] f64, row sums of W over all views.
         dtype: how X is stored; float16 becomes float32 when the codebooks are too large or too small for it.
         threads: None takes the cores that this process may use. The number changes no bit.
         room: where X is to lie.
     """
-    books = [codebooks(view) for view in range(len(store))]
+    own = [columns(view) for view in range(len(store))]
+    books = [part.codebook for part in own]
     channels = books[0].shape[1]
     norms = [torch.linalg.vector_norm(book, dim=1, dtype=torch.float64).numpy() for book in books]
     unit = all(bool((np.abs(norm - 1) < UNIT_TOLERANCE).all()) for norm in norms)
     if dtype == torch.float16 and not fits_float16(books, max(float(norm.max()) for norm in norms)):
         dtype = torch.float32
     count = denominators.shape[0]
-    features = room(count, channels, dtype)
+    features = room(count, channels, dtype)  # every share of splats fills its rows
     kept = features.view(torch.uint16).numpy() if dtype == torch.float16 else features.numpy()
     squares, nothing = np.zeros(count), kept[:0]
     scale = np.divide(1.0, denominators, out=np.zeros(count), where=denominators > 0)
-    halves = all(book.dtype == torch.float16 for book in books)
-    counts, tables = [book.shape[0] for book in books], WeightTables(store)
+    halves = all(_in_halves(part, dtype) for part in own)
+    counts, tables = [part.count for part in own], WeightTables(store)
     slices = channel_slices(sum(counts), channels, 2 if halves and unit else 4)
     with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
         for number, (begin, end) in enumerate(slices):
-            own = (book[:, begin:end] for book in books)
-            strips = strips_of(own, counts, end - begin, torch.float16 if halves else torch.float32)
+            parts = (part.means(part.codebook[:, begin:end]) for part in own)
+            strips = strips_of(parts, counts, end - begin, torch.float16 if halves else torch.float32)
             _solve_strips(pool, tables, strips, scale, (squares if unit else np.zeros(count), begin, kept))
             del strips  # before others are made
             if not unit:
-                own = (_unit_rows(book[:, begin:end], norm) for book, norm in zip(books, norms, strict=True))
-                strips = strips_of(own, counts, end - begin, torch.float32)
+                parts = (
+                    part.means(_unit_rows(part.codebook[:, begin:end], norm))
+                    for part, norm in zip(own, norms, strict=True)
+                )
+                strips = strips_of(parts, counts, end - begin, torch.float32)
                 _solve_strips(pool, tables, strips, scale, (squares, begin, nothing))
                 del strips
             progress("solve", number + 1, len(slices), "slices")
     agreement = np.sqrt(squares).clip(0.0, 1.0).astype(np.float32)
     return Solution(features, torch.from_numpy(agreement))
+
+
+def _in_halves(columns: Columns, dtype: torch.dtype) -> bool:
+    """Whether strips of f16 hold the columns: rows as they are, means of rows rounded as X is."""
+    return columns.codebook.dtype == torch.float16 and (columns.tuples is None or dtype == torch.float16)
 
 
 def fits_float16(books: Sequence[Tensor], longest: float) -> bool:
@@ -210,4 +220,5 @@ def warm_up_solution() -> None:
     one = torch.zeros(1, dtype=torch.int32)
     weights = RegionWeights(one, torch.tensor([0, 1]), one, torch.ones(1), one, torch.ones(1))
     for dtype, kind in product((torch.float16, torch.float32), repeat=2):
-        solve_closed_form([weights], lambda _, kind=kind: torch.ones(1, 1, dtype=kind), np.ones(1), dtype, silent, 1)
+        columns = rows_of([torch.ones(1, 1, dtype=kind)])
+        solve_closed_form([weights], columns, np.ones(1), dtype, silent, 1)

@@ -21,12 +21,15 @@ if TYPE_CHECKING:
 MOUNTS = Path("/proc/self/mounts")
 IN_MEMORY = ("tmpfs", "ramfs")
 
-FeatureRoom = Callable[[int, int, torch.dtype], "Tensor"]  # splats, channels, type: zeros [P, F] wherever they lie
+FeatureRoom = Callable[[int, int, torch.dtype], "Tensor"]  # splats, channels, type: [P, F] not filled yet, wherever it lies
 
 
 def in_memory(splats: int, channels: int, dtype: torch.dtype) -> Tensor:
-    """Zeros [P, F]: torch's, for numpy asks for large pages, and to clear those took longer than to solve."""
-    return torch.zeros(splats, channels, dtype=dtype)
+    """Room [P, F]: torch's, for numpy asks for large pages, and to clear those took longer than to solve.
+
+    Not zeros: one thread would touch every page where all threads write them soon.
+    """
+    return torch.empty(splats, channels, dtype=dtype)
 
 
 def room_within(limit: int | None) -> FeatureRoom:
@@ -40,7 +43,7 @@ def room_within(limit: int | None) -> FeatureRoom:
 
 
 def in_file(splats: int, channels: int, dtype: torch.dtype) -> Tensor:
-    """Zeros [P, F] mapped from a file without a name in the temporary folder: the system writes and drops its pages.
+    """Room [P, F] mapped from a file without a name in the temporary folder: the system writes and drops its pages.
 
     Raises:
         Unavailable: the disk has no room. It is taken now, for a page without one would end the process later.

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
     from liftcore.progress import Progress
     from liftcore.raster.protocol import RegionWeights
+    from liftcore.solve.columns import Columns
     from liftcore.solve.feature_room import FeatureRoom
     from liftcore.solve.view_weights import ViewWeights
 
@@ -48,7 +49,7 @@ class Place(NamedTuple):
 class BlockRows:
     """W of a block of splats, its rows divided by their sums: a row a splat, its views in their order."""
 
-    columns: Tensor  # [nnz] i32, rows of all codebooks
+    columns: Tensor  # [nnz] i32, among those of all views
     shares: Tensor  # [nnz] f32
     part_starts: Tensor  # [parts + 1] i32, entries of each part
     row_parts: Tensor  # [B + 1] i32, parts of each row
@@ -56,7 +57,7 @@ class BlockRows:
 
 def solve_on_device(
     store: Sequence[RegionWeights] | ViewWeights,
-    codebooks: Callable[[int], Tensor],
+    columns: Callable[[int], Columns],
     denominators: np.ndarray,
     dtype: torch.dtype,
     progress: Progress,
@@ -72,7 +73,8 @@ def solve_on_device(
     Raises:
         RuntimeError: not even a grain of splats fits beside a slice of the codebooks (``device.out_of_memory``).
     """
-    books = [codebooks(view) for view in range(len(store))]
+    own = [columns(view) for view in range(len(store))]
+    books = [part.codebook for part in own]
     count, channels = denominators.shape[0], books[0].shape[1]
     norms = [torch.linalg.vector_norm(book, dim=1, dtype=torch.float64) for book in books]
     unit = all(bool(((norm - 1).abs() < UNIT_TOLERANCE).all()) for norm in norms)
@@ -80,25 +82,26 @@ def solve_on_device(
         dtype = torch.float32
     scale = torch.from_numpy(np.divide(1.0, denominators, out=np.zeros(count), where=denominators > 0))
     X, squares = room(count, channels, dtype), torch.zeros(count, dtype=torch.float64)
-    work = _Work(store, books, scale, place.device, X, squares)
-    rows = sum(book.shape[0] for book in books)
+    counts = [part.count for part in own]
+    work, rows = _Work(store, counts, scale, place.device, X, squares), sum(counts)
     slices = device_slices(rows, channels)
     for number, (begin, end) in enumerate(slices):
-        codebook = _all_rows(books, slice(begin, end), place.device)
-        own = _Slice(slice(begin, end), codebook, None if unit else _units(codebook, norms))
+        chosen = slice(begin, end)
+        values = _all_columns(own, chosen, place.device)
+        units = None if unit else _all_columns(own, chosen, place.device, norms)
         most = block_room(place.free, rows, end - begin, unit)
         for block in splat_blocks(store, count, end - begin, most):
-            for done in _solve_fitting(work, own, block):
+            for done in _solve_fitting(work, _Slice(chosen, values, units), block):
                 progress("solve", number * count + done, len(slices) * count, "splats")
     return Solution(X, squares.sqrt().clamp(0.0, 1.0).to(torch.float32))
 
 
 @dataclass(frozen=True)
 class _Work:
-    """What all blocks and slices share. X and squares are on the host, and filled."""
+    """What all blocks and slices share. X and squares are on the host; each block and slice fills its part."""
 
     store: Sequence[RegionWeights] | ViewWeights
-    books: Sequence[Tensor]  # E_v [M, F] of every view
+    counts: Sequence[int]  # columns of every view's W
     scale: Tensor  # [P] f64, one by the sums of rows
     place: torch.device
     X: Tensor  # [P, F] f16 or f32
@@ -107,10 +110,10 @@ class _Work:
 
 @dataclass(frozen=True)
 class _Slice:
-    """Channels of all codebooks, one after the other, on the device."""
+    """Channels of what all columns stand for, view by view, on the device."""
 
     channels: slice
-    codebook: Tensor  # [M, C] f32
+    values: Tensor  # [M, C] f32
     units: Tensor | None  # the same of the unit vectors; None where the codebooks hold such
 
 
@@ -133,19 +136,20 @@ def _solve_fitting(work: _Work, own: _Slice, splats: tuple[int, int]) -> Iterato
 
 
 def _solve_block(work: _Work, own: _Slice, splats: tuple[int, int]) -> None:
-    block = rows_of(work.store, work.books, splats, work.scale, work.place)
-    if block is None:
-        return
-    sums = weighted_sums(block, own.codebook)
-    lengths = squared_lengths(sums if own.units is None else weighted_sums(block, own.units))
+    block = block_rows(work.store, work.counts, splats, work.scale, work.place)
     rows = slice(*splats)
+    if block is None:
+        work.X[rows, own.channels] = 0
+        return
+    sums = weighted_sums(block, own.values)
+    lengths = squared_lengths(sums if own.units is None else weighted_sums(block, own.units))
     work.X[rows, own.channels] = sums.to(torch.float32).to(work.X.dtype).cpu()
     work.squares[rows] += lengths.cpu()
 
 
-def rows_of(
+def block_rows(
     store: Sequence[RegionWeights] | ViewWeights,
-    books: Sequence[Tensor],
+    counts: Sequence[int],
     splats: tuple[int, int],
     scale: Tensor,
     place: torch.device,
@@ -153,15 +157,15 @@ def rows_of(
     """The rows of some splats; None where no view has an entry.
 
     Args:
-        splats: (first, last). scale: [P] f64, what rows are multiplied with.
+        counts: columns of every view. splats: (first, last). scale: [P] f64, what rows are multiplied with.
     """
     offset, base, gathered = splats[0], 0, []
-    for weights, book, (first, last, begin, end) in zip(store, books, bounds_of(store, splats), strict=True):
+    for weights, count, (first, last, begin, end) in zip(store, counts, bounds_of(store, splats), strict=True):
         if begin < end:
             own = weights.splats[first:last], weights.row_starts[first : last + 1], weights.columns[begin:end]
             ids, starts, columns, values = (part.to(place) for part in (*own, weights.weights[begin:end]))
             gathered.append((ids, torch.diff(starts), columns + base, values))
-        base += book.shape[0]
+        base += count
     if not gathered:
         return None
     owners, lengths, columns, values = (torch.cat(part) for part in zip(*gathered, strict=True))
@@ -214,25 +218,24 @@ def squared_lengths(values: Tensor) -> Tensor:
     return squares[:, 0]
 
 
-def _all_rows(books: Sequence[Tensor], channels: slice, place: torch.device) -> Tensor:
-    """Some channels of all codebooks, one after the other, [M, C] f32."""
-    rows = torch.empty(sum(book.shape[0] for book in books), channels.stop - channels.start, device=place)
+def _all_columns(
+    columns: Sequence[Columns], channels: slice, place: torch.device, norms: Sequence[Tensor] | None = None
+) -> Tensor:
+    """Some channels of what all columns stand for, view by view, [M, C] f32.
+
+    Args:
+        norms: [M] f64 of every codebook, which rows are divided by, those of norm zero left as they are.
+    """
+    values = torch.empty(sum(own.count for own in columns), channels.stop - channels.start, device=place)
     base = 0
-    for book in books:
-        rows[base : base + book.shape[0]] = book[:, channels].to(place)
-        base += book.shape[0]
-    return rows
-
-
-def _units(rows: Tensor, norms: Sequence[Tensor]) -> Tensor:
-    """The rows of all codebooks divided by their norms [M] f64 a view, those of norm zero as they are."""
-    units, base = torch.empty_like(rows), 0
-    for norm in norms:
-        own = slice(base, base + norm.shape[0])
-        divisors = torch.where(norm > 0, norm, 1.0).to(rows.device)
-        units[own] = rows[own].to(torch.float64) / divisors[:, None]
-        base += norm.shape[0]
-    return units
+    for view, own in enumerate(columns):
+        rows = own.codebook[:, channels].to(place)
+        if norms is not None:
+            divisors = torch.where(norms[view] > 0, norms[view], 1.0).to(place)
+            rows = (rows.to(torch.float64) / divisors[:, None]).to(torch.float32)
+        values[base : base + own.count] = own.means(rows)
+        base += own.count
+    return values
 
 
 def _from_zero(lengths: Tensor) -> Tensor:

@@ -17,12 +17,12 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     import numpy as np
-    from torch import Tensor
 
     from liftcore.device import Device
     from liftcore.progress import Progress
     from liftcore.raster.protocol import RegionWeights
     from liftcore.solve.closed_form import Solution
+    from liftcore.solve.columns import Columns
     from liftcore.solve.feature_room import FeatureRoom
 
 
@@ -32,7 +32,7 @@ class ClosedForm(Protocol):
     def __call__(
         self,
         store: Sequence[RegionWeights] | ViewWeights,
-        codebooks: Callable[[int], Tensor],
+        columns: Callable[[int], Columns],
         denominators: np.ndarray,
         dtype: torch.dtype,
         progress: Progress,
@@ -57,7 +57,7 @@ def _solve_on_card(
     device: Device,
     feature_room: FeatureRoom,
     store: Sequence[RegionWeights] | ViewWeights,
-    codebooks: Callable[[int], Tensor],
+    columns: Callable[[int], Columns],
     denominators: np.ndarray,
     dtype: torch.dtype,
     progress: Progress,
@@ -68,7 +68,7 @@ def _solve_on_card(
             torch.cuda.empty_cache()  # what the walks held, and need no more
         place = Place(device.place, device.free_bytes())
         try:
-            return solve_on_device(store, codebooks, denominators, dtype, progress, place, feature_room)
+            return solve_on_device(store, columns, denominators, dtype, progress, place, feature_room)
         except RuntimeError as error:
             if not (out_of_memory(error) and isinstance(store, ViewWeights) and store.card_bytes):
                 raise

@@ -23,6 +23,7 @@ def _imported(source: Path) -> set[Path]:
 # What kernel modules import for their plain Python code; kernels take no value from them.
 _NO_PART_OF_KERNELS = {
     "accumulate.py",
+    "columns.py",
     "errors.py",
     "feature_room.py",
     "readout.py",

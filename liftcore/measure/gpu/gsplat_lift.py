@@ -16,17 +16,16 @@ from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import torch
 
 from liftcore.device import choose_device
 from liftcore.errors import Unavailable
+from liftcore.measure.region_walk import walk_regions
 from liftcore.measure.synthetic import room_cameras, room_regions, room_splats
 from liftcore.observe.observation import RegionMap
 from liftcore.progress import silent
 from liftcore.raster.open_raster import open_raster
 from liftcore.raster.protocol import Walk, Weighting
-from liftcore.solve.accumulate import row_totals
 from liftcore.solve.solver import closed_form_on
 from liftcore.solve.view_weights import ViewWeights
 
@@ -93,14 +92,10 @@ def beside_gsplat(size: RoomSize, device: Device) -> SideBySide | str:
 
 def lift_ours(splats: Splats, views: Views, device: Device) -> tuple[Tensor, Tensor]:
     """X [P, F] f32 and the totals [P] f64 of plain weights, by region weights and the closed form."""
-    raster, totals = open_raster(splats, device), np.zeros(splats.count)
     with ViewWeights() as store:
-        for camera, regions in views:
-            weights = raster.region_weights(camera, regions, Walk(), Weighting())
-            totals[weights.splats.numpy()] += row_totals(weights)
-            store.append(weights)
-        books = [regions.codebook for _, regions in views]
-        X = closed_form_on(device, None)(store, books.__getitem__, totals, torch.float32, silent).features
+        looking = Walk(), Weighting()
+        totals, columns = walk_regions(open_raster(splats, device), views, looking, splats.count, store)
+        X = closed_form_on(device, None)(store, columns.__getitem__, totals, torch.float32, silent).features
     return X, torch.from_numpy(totals)
 
 

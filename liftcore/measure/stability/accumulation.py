@@ -19,6 +19,7 @@ from liftcore.raster.protocol import RegionWeights, Walk, Weighting
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Splats
 from liftcore.solve.closed_form import solve_closed_form
+from liftcore.solve.columns import Columns
 from liftcore.solve.view_weights import ViewWeights
 
 SIDES = (32, 100, 316, 1_000, 3_162)  # pixels of square images: 10^3 .. 10^7 rays
@@ -100,5 +101,5 @@ def _solved(views: list[RegionWeights], equal: bool) -> float:
             weights = view.weights.double()
             total += float(weights.sum())
             value += float(weights @ book[view.columns.long(), 0].double())
-        solved = solve_closed_form(store, lambda _: book, np.array([total]), torch.float32, silent, threads=1)
+        solved = solve_closed_form(store, lambda _: Columns(book), np.array([total]), torch.float32, silent, threads=1)
     return abs(float(solved.features[0, 0]) * total / value - 1)

@@ -14,6 +14,7 @@ from liftcore.progress import silent
 from liftcore.raster.protocol import RegionWeights
 from liftcore.solve import on_device, solver
 from liftcore.solve.closed_form import Solution, solve_closed_form
+from liftcore.solve.columns import Columns, rows_of
 from liftcore.solve.device_blocks import GRAIN, SLICE_BYTES, block_bytes, device_slices, splat_blocks
 from liftcore.solve.on_device import Place, solve_on_device, squared_lengths
 from liftcore.solve.solver import closed_form_on
@@ -66,7 +67,7 @@ def dense(store: list[RegionWeights], books: list[Tensor], splats: int = SPLATS)
 
 
 def both(store, books, dtype, free=None, splats=SPLATS) -> tuple[Solution, Solution]:
-    arguments = (store, books.__getitem__, sums_of(store, splats), dtype, silent)
+    arguments = (store, rows_of(books), sums_of(store, splats), dtype, silent)
     return solve_closed_form(*arguments), solve_on_device(*arguments, Place(HERE, free))
 
 
@@ -111,7 +112,7 @@ def test_no_bit_depends_on_the_memory_that_is_free(monkeypatch: pytest.MonkeyPat
     whole, grains = both(store, books, torch.float32)[1], both(store, books, torch.float32, free=1)[1]
     assert_same_bits(whole, grains)
     calls = []
-    gather = on_device.rows_of
+    gather = on_device.block_rows
 
     def crowded(store, books, splats, scale, place):
         calls.append(splats)
@@ -119,7 +120,7 @@ def test_no_bit_depends_on_the_memory_that_is_free(monkeypatch: pytest.MonkeyPat
             raise torch.OutOfMemoryError
         return gather(store, books, splats, scale, place)
 
-    monkeypatch.setattr(on_device, "rows_of", crowded)
+    monkeypatch.setattr(on_device, "block_rows", crowded)
     assert_same_bits(whole, both(store, books, torch.float32)[1])
     assert calls[0] == (0, SPLATS) and len(calls) > 3
     monkeypatch.setattr(on_device, "GRAIN", SPLATS)  # no smaller block may be tried
@@ -133,7 +134,7 @@ def test_slices_of_long_codebooks_are_put_together(monkeypatch: pytest.MonkeyPat
     whole = both(store, books, torch.float32)[1]
     monkeypatch.setattr("liftcore.solve.device_blocks.SLICE", 8)
     told: list[tuple[int, int]] = []
-    arguments = (store, books.__getitem__, sums_of(store), torch.float32)
+    arguments = (store, rows_of(books), sums_of(store), torch.float32)
 
     def progress(stage: str, done: int, total: int, unit: str) -> None:
         told.append((done, total))
@@ -149,7 +150,7 @@ def test_sums_of_a_million_entries_and_of_many_views_keep_their_digits() -> None
     long = view_of([0], [1_000_000], np.zeros(1_000_000), np.full(1_000_000, 0.3))
     views = [view_of([0], [1], [0], [0.3]) for _ in range(2_000)]
     for store in ([long], views):
-        solved = solve_on_device(store, lambda _: book, sums_of(store, 1), torch.float32, silent, Place(HERE))
+        solved = solve_on_device(store, lambda _: Columns(book), sums_of(store, 1), torch.float32, silent, Place(HERE))
         error = abs(float(solved.features[0, 0]) / float(book) - 1)
         assert error < 5e-6  # of 256 equal terms; a million added one by one are wrong in the third digit
 
@@ -213,7 +214,7 @@ def test_weights_stay_on_the_card_while_there_is_room_and_come_home_when_asked()
         assert store[0].columns.device == HERE and store[3].columns.device.type == "cpu"
         books = [torch.randn(9, 5, generator=torch.manual_seed(k)) for k in range(4)]
         mixed, plain = (
-            solve_on_device(own, books.__getitem__, sums_of(views), torch.float32, silent, Place(HERE))
+            solve_on_device(own, rows_of(books), sums_of(views), torch.float32, silent, Place(HERE))
             for own in (store, views)
         )
         assert_same_bits(mixed, plain)

@@ -12,6 +12,7 @@ from liftcore.progress import silent
 from liftcore.raster.protocol import RegionWeights
 from liftcore.solve import weighted_sums
 from liftcore.solve.closed_form import solve_closed_form
+from liftcore.solve.columns import rows_of
 from liftcore.solve.weighted_sums import LEAST_ENTRIES, LONG, SHARE, channel_slices, strip_bytes, strips_of
 
 CHANNELS = 2 * WIDE + 9
@@ -60,7 +61,7 @@ def scene() -> tuple[list[RegionWeights], list[torch.Tensor], np.ndarray]:
 
 def solved(scene, threads: int = 1) -> torch.Tensor:
     store, books, totals = scene
-    return solve_closed_form(store, books.__getitem__, totals, torch.float32, silent, threads).features
+    return solve_closed_form(store, rows_of(books), totals, torch.float32, silent, threads).features
 
 
 def test_every_entry_of_every_view_counts_once(scene):

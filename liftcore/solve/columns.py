@@ -1,0 +1,86 @@
+"""What the columns of W stand for: rows of a codebook, or tuples of them.
+
+A ray with labels on several levels gives each of its rows the same weight, so rays of one tuple of labels need one
+column and not one a level: with ``c`` labelled levels it has c times the weight, and the mean of the c rows. That is
+the same closed form, with half of the entries on real masks of four levels. Where a single region of a tuple counts for
+itself (the robust steps, regions that the aggregation drops), columns are rows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch.nn.functional import embedding_bag
+
+from liftcore.observe.label_tuples import label_tuples
+from liftcore.observe.observation import NO_LABEL, Observation, RegionMap
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from torch import Tensor
+
+    from liftcore.raster.protocol import RegionWeights
+    from liftcore.solve.settings import LiftSettings
+
+
+@dataclass(frozen=True)
+class Columns:
+    """The columns of one view's W."""
+
+    codebook: Tensor  # E [M, F] f16 or f32
+    tuples: Tensor | None = None  # [T, L] i64, the rows of each column, -1 none, one at least; None: column m is row m
+
+    @property
+    def count(self) -> int:
+        """T, or M."""
+        return (self.codebook if self.tuples is None else self.tuples).shape[0]
+
+    def means(self, rows: Tensor) -> Tensor:
+        """What the columns read: of some numbers of each row [M, C], the means [T, C] f32 over each tuple.
+
+        Rows are divided before they are added: a mean cannot overflow where its inputs do not.
+        """
+        if self.tuples is None:
+            return rows
+        named = self.tuples != NO_LABEL
+        shares = (named / named.sum(dim=1, keepdim=True)).to(rows.device)
+        places = self.tuples.clamp_min(0).to(rows.device)  # of share zero where there is none
+        return embedding_bag(places, rows.float(), mode="sum", per_sample_weights=shares)
+
+    def weighted(self, weights: RegionWeights) -> RegionWeights:
+        """W by rays, whose columns are these, with each entry as often as its column has rows."""
+        if self.tuples is None:
+            return weights
+        counts = (self.tuples != NO_LABEL).sum(dim=1).float().to(weights.weights.device)
+        return replace(weights, weights=weights.weights * counts[weights.columns])
+
+
+def rows_of(codebooks: Sequence[Tensor]) -> Callable[[int], Columns]:
+    """Columns that are the rows of every view's codebook."""
+    return lambda view: Columns(codebooks[view])
+
+
+def by_rows(settings: LiftSettings) -> bool:
+    """Whether single regions count for themselves."""
+    return bool(settings.robust_steps or settings.aggregation_resolve)
+
+
+def by_tuples(observation: Observation) -> tuple[Observation, Columns]:
+    """The observation for a walk, one level of tuples in place of several of rows, and its columns.
+
+    Left as it is where that saves nothing: grids, single levels, and maps with more tuples than their rows and levels
+    could have entries for. The walk meets no channel, so what it is given has none.
+    """
+    columns = Columns(observation.codebook)
+    if not isinstance(observation, RegionMap) or observation.labels.shape[0] == 1:
+        return observation, columns
+    most = observation.labels.shape[0] * columns.count
+    labels = observation.labels.to(torch.int32).contiguous().numpy()
+    numbers, tuples = label_tuples(labels, min(most, labels[0].size))
+    if not 0 < tuples.shape[0] <= most:
+        return observation, columns
+    regions = RegionMap(torch.from_numpy(numbers)[None], observation.codebook.new_empty(tuples.shape[0], 0))
+    return regions, replace(columns, tuples=torch.from_numpy(tuples).long())
