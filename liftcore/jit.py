@@ -24,7 +24,8 @@ def _kernel_sources() -> list[Path]:
     root = Path(__file__).parent
     named = [root / "raster" / name for name in ("constants.py", "records.py")]
     own = [Path(__file__), *sorted(root.glob("lanes*.py")), *named]
-    rooms = [source for package in ("observe", "raster", "solve", "query") for source in sorted((root / package).rglob("*.py"))]
+    packages = [root / package for package in ("observe", "raster", "solve", "query")]
+    rooms = [source for package in packages for source in sorted(package.rglob("*.py"))]
     return own + [source for source in rooms if b"from liftcore.jit import" in source.read_bytes()]
 
 

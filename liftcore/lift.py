@@ -191,9 +191,7 @@ def _solve(run: Run, store: ViewWeights, geometry: Geometry, room: FeatureRoom) 
     """The weights, which the robust steps may have changed, and the closed form of them."""
     settings, sums = run.settings, geometry.denominators
     with run.timings.stage("robust"):
-        weights = robust_weights(
-            store, geometry.codebooks, sums, settings.robust_steps, run.progress, run.threads
-        )
+        weights = robust_weights(store, geometry.codebooks, sums, settings.robust_steps, run.progress, run.threads)
     with run.timings.stage("solve"):
         closed_form, dtype = closed_form_on(run.device, run.threads, room), getattr(torch, settings.dtype)
         return weights, closed_form(weights, geometry.columns.__getitem__, sums, dtype, run.progress)

@@ -96,7 +96,7 @@ class TimedRaster(CpuRaster):
 def time_stages(work: Workload, preset: Preset) -> dict[str, Any]:
     """Seconds a view of each of STAGES on one thread: medians and minima over the views; the solution once for all.
 
-    ``rest`` is what a view takes beside the named steps: its tuples of labels, its reading, row totals, keeping its weights.
+    ``rest`` is what a view takes beside the named steps: its tuples of labels, its reading, row totals, keeping W.
     """
     settings = LiftSettings.of(preset=preset)
     raster, walk, weighting = TimedRaster(work.splats), lift_walk(settings), weighting_of(settings)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from liftcore.errors import Unavailable
 from liftcore.raster.constants import TILE
 from liftcore.raster.kernels import RECORDS
+from liftcore.solve.columns import by_rows
 from liftcore.solve.feature_room import check_disk
 from liftcore.solve.view_weights import MEMORY_LIMIT
 from liftcore.solve.weighted_sums import strip_bytes
@@ -20,10 +21,12 @@ if TYPE_CHECKING:
     from liftcore.observe.pack import FeaturePacks, TensorSpec
     from liftcore.scene.cameras import Camera
     from liftcore.scene.splats import Splats
+    from liftcore.solve.settings import LiftSettings
 
 LIBRARIES = 450_000_000  # of torch, numba, numpy and the compiled kernels, before anything is read
-ENTRIES_A_SPLAT = 1.5  # of W, for a splat that a view sees and a level of its regions; measured on real scenes
-ENTRY_BYTES = 8 + 20 / ENTRIES_A_SPLAT  # column and weight, and a splat's ids, row start and evidence
+ENTRIES_A_SPLAT = 1.5  # of W, for a splat that a view sees, with one level of regions; measured on real scenes
+MORE_ENTRIES = 0.6  # of it for each further level, where columns are tuples; ENTRIES_A_SPLAT where they are rows
+ENTRY_BYTES, ROW_BYTES = 8, 20  # column and weight; a splat's ids, row start and evidence
 TILES_A_SPLAT = 6  # entries of tile lists and tile sums for a splat that a view sees, at full resolution
 TILE_ENTRY_BYTES = 4 + 4 + 2 * 16  # list, item, and an entry before and after it is gathered
 SCENE_BYTES = 9 * 8 + 3 * 8 + 3 * 8  # axes, opacities, reach; evidence, denominators, scale
@@ -37,18 +40,17 @@ SPARE = 0.9  # of the memory that is free: others grow too
 
 
 def memory_parts(
-    splats: Splats, packs: FeaturePacks, cameras: Mapping[str, Camera], seen_a_view: float, feature_bytes: int
+    splats: Splats, packs: FeaturePacks, cameras: Mapping[str, Camera], seen_a_view: float, settings: LiftSettings
 ) -> dict[str, int]:
     """Bytes of each part of a lift at its peak, with one view in work.
 
     Args:
         cameras: the views that are lifted, by name.
         seen_a_view: how many splats a view can see, in the mean.
-        feature_bytes: of a number of X, 2 or 4.
     """
     inputs = sum(t.nbytes for t in (splats.means, splats.quats, splats.log_scales, splats.opacity_logits))
     largest = max(camera.width * camera.height for camera in cameras.values())
-    weights = int(seen_a_view * ENTRIES_A_SPLAT * ENTRY_BYTES * most_levels(packs, cameras))
+    weights = weight_bytes(seen_a_view, entries_a_splat(packs, cameras, settings))
     seen = 8 * RECORDS[splats.kernel] + TILES_A_SPLAT * TILE_ENTRY_BYTES  # of a splat
     labels = max(_label_bytes(packs, view) for view in cameras)
     walk = int(seen_a_view * seen) + splats.count * WALK_BYTES + 8 * largest // TILE**2
@@ -58,8 +60,8 @@ def memory_parts(
         "scene": splats.count * SCENE_BYTES,
         "view": walk + 2 * labels + weights,  # labels of the next one, too, and weights that wait for their turn
         "weights": min(len(cameras) * weights, MEMORY_LIMIT),
-        "codebooks": _all_codebook_bytes(packs, cameras),
-        "features": splats.count * packs.channels * feature_bytes,
+        "codebooks": _all_codebook_bytes(packs, cameras, settings),
+        "features": splats.count * packs.channels * (2 if settings.dtype == "float16" else 4),
     }
 
 
@@ -123,6 +125,24 @@ def check_memory(parts: Mapping[str, int], free: int | None) -> list[str]:
     return told
 
 
+def entries_a_splat(packs: FeaturePacks, views: Iterable[str], settings: LiftSettings) -> float:
+    """Entries of W for a splat that a view sees."""
+    more = ENTRIES_A_SPLAT if by_rows(settings) else MORE_ENTRIES
+    return ENTRIES_A_SPLAT + more * (most_levels(packs, views) - 1)
+
+
+def weight_bytes(rows: float, entries: float) -> int:
+    """Of W with so many rows of so many entries."""
+    return int(rows * (ROW_BYTES + ENTRY_BYTES * entries))
+
+
+def all_columns(packs: FeaturePacks, views: Iterable[str], settings: LiftSettings) -> int:
+    """Columns of W of all views, at most."""
+    names = list(views)
+    most = 1 if by_rows(settings) else most_levels(packs, names)  # tuples of a view for each row of its codebook
+    return most * sum(codebook_rows(packs, view) for view in names)
+
+
 def most_levels(packs: FeaturePacks, views: Iterable[str]) -> int:
     """The levels of the view that has most of them."""
     labels = [packs.specs(view).get("labels") for view in views]
@@ -140,12 +160,13 @@ def _label_bytes(packs: FeaturePacks, view: str) -> int:
     return 4 * (codebook_rows(packs, view) if spec is None else math.prod(spec.shape))
 
 
-def _all_codebook_bytes(packs: FeaturePacks, views: Iterable[str]) -> int:
-    """Of the codebooks, and of the strips of them that the solution has beside."""
+def _all_codebook_bytes(packs: FeaturePacks, views: Iterable[str], settings: LiftSettings) -> int:
+    """Of the codebooks, and of the strips of what W's columns stand for that the solution has beside."""
     names = list(views)
-    size = 2 if all(_codebook_spec(packs, view).dtype == "F16" for view in names) else 4
-    rows = sum(codebook_rows(packs, view) for view in names)
-    return sum(_codebook_bytes(packs, view) for view in names) + strip_bytes(rows, packs.channels, size)
+    halves = all(_codebook_spec(packs, view).dtype == "F16" for view in names)
+    size = 2 if halves and (by_rows(settings) or settings.dtype == "float16") else 4
+    strips = strip_bytes(all_columns(packs, names, settings), packs.channels, size)
+    return sum(_codebook_bytes(packs, view) for view in names) + strips
 
 
 def _codebook_bytes(packs: FeaturePacks, view: str) -> int:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from liftcore.errors import Unavailable
-from liftcore.plan.memory import ENTRIES_A_SPLAT, ENTRY_BYTES, codebook_rows, most_levels
+from liftcore.plan.memory import all_columns, entries_a_splat, most_levels, weight_bytes
 from liftcore.solve.device_blocks import GRAIN, SPARE, block_bytes, book_bytes, device_slices
 
 if TYPE_CHECKING:
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from liftcore.observe.pack import FeaturePacks
     from liftcore.scene.cameras import Camera
     from liftcore.scene.splats import Splats
+    from liftcore.solve.settings import LiftSettings
 
 MIB = 2**20
 ROOM_SPARE = 0.9  # of the free memory, as liftcore.raster.gpu.room has it (which loads triton)
@@ -104,6 +105,7 @@ def device_plan(
     packs: FeaturePacks,
     cameras: Mapping[str, Camera],
     seen_a_view: float,
+    settings: LiftSettings,
 ) -> DevicePlan | None:
     """The plan of a lift on that device; None on the processor.
 
@@ -119,15 +121,16 @@ def device_plan(
         (splats.count, camera.width, camera.height, splats.kernel, levels)
         for camera in {(camera.width, camera.height): camera for camera in cameras.values()}.values()
     ]
-    rows = sum(codebook_rows(packs, name) for name in cameras)
+    rows = all_columns(packs, cameras, settings)
     slices = device_slices(rows, packs.channels)
     width = slices[0][1]
-    entries = int(len(cameras) * seen_a_view * ENTRIES_A_SPLAT * levels)
+    each = entries_a_splat(packs, cameras, settings)
+    entries = int(len(cameras) * seen_a_view * each)
     return DevicePlan(
         name=device.name,
         view=max(raster_bytes(*view) for view in views),
         least_view=max(least_raster_bytes(*view) for view in views),
-        weights=int(entries * ENTRY_BYTES),
+        weights=weight_bytes(len(cameras) * seen_a_view, each),
         codebooks=book_bytes(rows, width, unit=False),
         block=block_bytes(splats.count, entries, width),
         grain=block_bytes(min(GRAIN, splats.count), math.ceil(entries * min(1.0, GRAIN / splats.count)), width),

@@ -142,8 +142,8 @@ def plan_lift(
     views = [names[k] for k in chosen]
     seen = seen.of(chosen)
     lifted = {name: by_name[name] for name in views}
-    parts = memory_parts(splats, packs, lifted, seen.splats_a_view, 2 if settings.dtype == "float16" else 4)
-    on_device = device_plan(device, splats, packs, lifted, seen.splats_a_view)
+    parts = memory_parts(splats, packs, lifted, seen.splats_a_view, settings)
+    on_device = device_plan(device, splats, packs, lifted, seen.splats_a_view, settings)
     short = check_device_room(on_device, settings.device) if on_device else []
     on_card = on_device is not None and not short
     at_once = 1 if on_card else min(len(views), views_at_a_time(threads or len(os.sched_getaffinity(0))))

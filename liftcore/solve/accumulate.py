@@ -14,7 +14,7 @@ from liftcore.device import out_of_memory
 from liftcore.observe.levels import at_levels
 from liftcore.observe.observation import FeatureGrid, Observation, RegionMap
 from liftcore.raster.protocol import Look, RayRows, Walk, Weighting
-from liftcore.solve.columns import Columns, by_rows, by_tuples
+from liftcore.solve.columns import Columns, as_walked
 from liftcore.solve.readout import Readout, read_pixels, sample_pixels
 from liftcore.solve.totals import Totals, row_totals
 
@@ -129,7 +129,7 @@ def accumulate(
             walk = strided_walk(lift_walk(settings), settings, camera, number)
             pixels = sample_pixels(camera, rays, (settings.seed, number), walk)
             readouts.append(read_pixels(observation, camera, pixels))
-            walked, own = (observation, Columns(observation.codebook)) if by_rows(settings) else by_tuples(observation)
+            walked, own = as_walked(observation, settings)
             columns.append(own)
             yield Look(camera, walked, walk, weighting_of(settings), pixels)
 

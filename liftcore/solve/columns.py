@@ -2,8 +2,8 @@
 
 A ray with labels on several levels gives each of its rows the same weight, so rays of one tuple of labels need one
 column and not one a level: with ``c`` labelled levels it has c times the weight, and the mean of the c rows. That is
-the same closed form, with half of the entries on real masks of four levels. Where a single region of a tuple counts for
-itself (the robust steps, regions that the aggregation drops), columns are rows.
+the same closed form, with half of the entries on real masks of four levels. Where a single region of a tuple counts
+for itself (the robust steps, regions that the aggregation drops), columns are rows.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Columns:
     """The columns of one view's W."""
 
     codebook: Tensor  # E [M, F] f16 or f32
-    tuples: Tensor | None = None  # [T, L] i64, the rows of each column, -1 none, one at least; None: column m is row m
+    tuples: Tensor | None = None  # [T, L] i64, the rows of a column, -1 none, at least one; None: column m is row m
 
     @property
     def count(self) -> int:
@@ -66,6 +66,11 @@ def rows_of(codebooks: Sequence[Tensor]) -> Callable[[int], Columns]:
 def by_rows(settings: LiftSettings) -> bool:
     """Whether single regions count for themselves."""
     return bool(settings.robust_steps or settings.aggregation_resolve)
+
+
+def as_walked(observation: Observation, settings: LiftSettings) -> tuple[Observation, Columns]:
+    """The observation for a walk, and the columns that its W has then."""
+    return (observation, Columns(observation.codebook)) if by_rows(settings) else by_tuples(observation)
 
 
 def by_tuples(observation: Observation) -> tuple[Observation, Columns]:

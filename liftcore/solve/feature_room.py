@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 MOUNTS = Path("/proc/self/mounts")
 IN_MEMORY = ("tmpfs", "ramfs")
 
-FeatureRoom = Callable[[int, int, torch.dtype], "Tensor"]  # splats, channels, type: [P, F] not filled yet, wherever it lies
+# Splats, channels, type: [P, F], not filled, wherever it lies.
+FeatureRoom = Callable[[int, int, torch.dtype], "Tensor"]
 
 
 def in_memory(splats: int, channels: int, dtype: torch.dtype) -> Tensor:

@@ -101,5 +101,7 @@ def _solved(views: list[RegionWeights], equal: bool) -> float:
             weights = view.weights.double()
             total += float(weights.sum())
             value += float(weights @ book[view.columns.long(), 0].double())
-        solved = solve_closed_form(store, lambda _: Columns(book), np.array([total]), torch.float32, silent, threads=1)
+        solved = solve_closed_form(
+            store, lambda _: Columns(book), np.array([total]), torch.float32, silent, threads=1
+        )
     return abs(float(solved.features[0, 0]) * total / value - 1)

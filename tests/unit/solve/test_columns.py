@@ -26,7 +26,7 @@ CAMERA = random_camera(3, SIZE, SIZE)
 
 
 def region_map(seed: int, levels: int, size: float = 1.0, kind: torch.dtype = torch.float32) -> RegionMap:
-    """Blobs, each level coarser than the one before; some have no label on some or on all levels; rows of many lengths."""
+    """Blobs, each level coarser than the one before; some lack labels. Rows of many lengths."""
     rng = np.random.default_rng(seed)
     blobs = np.repeat(np.repeat(rng.integers(0, 9, (6, 6)), 4, axis=0), 4, axis=1)
     named = [np.where(rng.random(9) < 0.8, np.arange(9) // (level + 1), NO_LABEL) for level in range(levels)]

@@ -150,7 +150,9 @@ def test_sums_of_a_million_entries_and_of_many_views_keep_their_digits() -> None
     long = view_of([0], [1_000_000], np.zeros(1_000_000), np.full(1_000_000, 0.3))
     views = [view_of([0], [1], [0], [0.3]) for _ in range(2_000)]
     for store in ([long], views):
-        solved = solve_on_device(store, lambda _: Columns(book), sums_of(store, 1), torch.float32, silent, Place(HERE))
+        solved = solve_on_device(
+            store, lambda _: Columns(book), sums_of(store, 1), torch.float32, silent, Place(HERE)
+        )
         error = abs(float(solved.features[0, 0]) / float(book) - 1)
         assert error < 5e-6  # of 256 equal terms; a million added one by one are wrong in the third digit
 
@@ -238,7 +240,7 @@ def test_solution_without_room_beside_the_weights_brings_them_home(monkeypatch: 
 
     monkeypatch.setattr(solver, "solve_on_device", crowded)
     closed_form = closed_form_on(Device("cuda", HERE), None)
-    rest = (lambda _: torch.zeros(1), np.zeros(1), torch.float32, silent)
+    rest = (rows_of([torch.zeros(1, 1)]), np.zeros(1), torch.float32, silent)
     with ViewWeights(card=(HERE, 1 << 20)) as store:
         store.append(random_view(0, 3))
         if HERE.type == "cpu":  # a view of the host is no card's
