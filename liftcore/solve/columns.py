@@ -16,6 +16,7 @@ from torch.nn.functional import embedding_bag
 
 from liftcore.observe.label_tuples import label_tuples
 from liftcore.observe.observation import NO_LABEL, Observation, RegionMap
+from liftcore.solve.channels import one_thread
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -48,14 +49,19 @@ class Columns:
         named = self.tuples != NO_LABEL
         shares = (named / named.sum(dim=1, keepdim=True)).to(rows.device)
         places = self.tuples.clamp_min(0).to(rows.device)  # of share zero where there is none
-        return embedding_bag(places, rows.float(), mode="sum", per_sample_weights=shares)
+        with one_thread():  # else torch's threads keep spinning beside those that solve
+            return embedding_bag(places, rows.float(), mode="sum", per_sample_weights=shares)
 
     def weighted(self, weights: RegionWeights) -> RegionWeights:
         """W by rays, whose columns are these, with each entry as often as its column has rows."""
         if self.tuples is None:
             return weights
-        counts = (self.tuples != NO_LABEL).sum(dim=1).float().to(weights.weights.device)
-        return replace(weights, weights=weights.weights * counts[weights.columns])
+        counts, place = (self.tuples != NO_LABEL).sum(dim=1).float(), weights.weights.device
+        if place.type != "cpu":
+            return replace(weights, weights=weights.weights * counts.to(place)[weights.columns])
+        # By numpy: the threads that torch would take for this, and keep spinning, walk the next views.
+        values = weights.weights.numpy() * counts.numpy()[weights.columns.numpy()]
+        return replace(weights, weights=torch.from_numpy(values))
 
 
 def rows_of(codebooks: Sequence[Tensor]) -> Callable[[int], Columns]:
