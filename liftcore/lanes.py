@@ -316,3 +316,15 @@ def fetch_ahead(typingctx, table, row):
         return context.get_dummy_value()
 
     return types.void(kind, types.intp), codegen
+
+
+@compiled
+def fetch_place(typingctx, array, place):
+    """Ask for the line of the cache where an element of ``array`` [n] lies before it is needed."""
+
+    def codegen(context, builder, signature, args):
+        values = context.make_array(signature.args[0])(context, builder, value=args[0])
+        fetch(builder, builder.gep(values.data, [args[1]]), 1)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp), codegen

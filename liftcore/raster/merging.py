@@ -9,8 +9,10 @@ from __future__ import annotations
 import numpy as np
 
 from liftcore.jit import kernel
+from liftcore.lanes import fetch_place
 
 LONG_ROW = 64  # columns; longer rows are sorted by the library
+NEAR, FAR = 12, 24  # entries ahead whose places in memory are asked for, and whose cursors, by which they are known
 
 
 @kernel
@@ -30,8 +32,14 @@ def gather_entries(first, last, entries, slot_base, cursors, gathered):
     """
     places, slots, weights, evidence = entries
     words, numbers, totals = gathered
+    flat, end = words.reshape(-1), places.shape[0] - 1
     for i in range(places.shape[0]):
-        place = places[i]
+        far, near, place = places[min(i + FAR, end)], places[min(i + NEAR, end)], places[i]
+        if first <= far < last:
+            fetch_place(cursors, far - first)
+            fetch_place(totals, far - first)
+        if first <= near < last:
+            fetch_place(flat, 2 * cursors[near - first])
         if first <= place < last:
             at = cursors[place - first]
             cursors[place - first] = at + 1
