@@ -4,7 +4,8 @@ python -m liftcore.measure.room_scene FOLDER --splats 500000 --views 160
 
 Every view has regions on four levels, from walls and balls to their parts, seen with occlusion. A part has a random
 unit vector; what a view says of it has noise of norm NOISE. Of all regions a tenth say another part's vector, and of
-three tenths the vector is mixed with another's, unless ``--clean`` leaves the noise alone.
+three tenths the vector is mixed with another's, unless ``--clean`` leaves the noise alone. With ``--alike C`` the
+vectors of parts have the cosine C to one another in the mean, as those of an encoder lie in a narrow cone.
 """
 
 from __future__ import annotations
@@ -85,6 +86,7 @@ class Room:
     size: tuple[int, int]  # width and height of the views, pixels
     channels: int
     clean: bool = False
+    alike: float = 0.0  # cosine of two parts' vectors, in the mean
     seed: int = 0
 
 
@@ -94,12 +96,18 @@ def write_room(folder: Path, room: Room) -> None:
     scene, cameras = room_splats(room.splats, room.seed), room_cameras(room.views, *room.size)
     parts = room_parts(room.splats, room.seed)
     total = int((parts.max(axis=0) + 1).sum())
-    vectors = _unit(np.random.default_rng((room.seed, 1)).standard_normal((total, room.channels)))
+    vectors = _vectors(total, room)
     named = {camera.name: camera for camera in cameras}
     observed = RoomViews(named, CpuRaster(scene), parts, vectors, room.seed, room.clean)
     write_splats(scene, folder / "point_cloud.ply")
     write_inria_cameras(Cameras(tuple(cameras)), folder / "cameras.json")
     write_pack(folder / "features.safetensors", observed, {"encoder": "random parts", "normalised": "true"})
+
+
+def _vectors(count: int, room: Room) -> np.ndarray:
+    rng = np.random.default_rng((room.seed, 1))
+    own, common = _unit(rng.standard_normal((count, room.channels))), _unit(rng.standard_normal((1, room.channels)))
+    return _unit(np.sqrt(1.0 - room.alike) * own + np.sqrt(room.alike) * common)
 
 
 def _mistaken(book: np.ndarray, vectors: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -132,9 +140,10 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--height", type=int, default=728)
     parser.add_argument("--channels", type=int, default=512)
     parser.add_argument("--clean", action="store_true")
+    parser.add_argument("--alike", type=float, default=0.0, metavar="C")
     given = parser.parse_args(arguments)
     size = given.width, given.height
-    write_room(given.folder, Room(given.splats, given.views, size, given.channels, given.clean))
+    write_room(given.folder, Room(given.splats, given.views, size, given.channels, given.clean, given.alike))
     return 0
 
 

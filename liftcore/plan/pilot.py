@@ -1,117 +1,182 @@
-"""How many views a lift needs: a small lift of a thinned scene, once from some views and once from half of them.
+"""How many views a lift needs: a few views are walked by coarse pixels, and compared splat by splat.
 
 How near the features of some views come to those of all depends on how much the views disagree, which no footprint
-says: where encoders and masks agree, a quarter of the views will do, and where a feature is mostly what one view
-made of it, the last view counts. So PILOT_SPLATS splats, grown to cover what all of them covered, are lifted from
-coarse pixels of PILOT_VIEWS views by the raster itself, with what it says of hiding, and again from half of these.
+says: where encoders and masks agree, a part of the views will do, and where a feature is mostly what one view made of
+it, the last view counts. Say that every view adds an error of its own, of variance v beside a feature of length one,
+and that the share q_i of a splat's weight lies in view i. Then the squared length of its feature is ``1 + v B`` with
+``B = sum_i q_i^2`` (one over the number of views, where they weigh alike), of which ``d = v B / (1 + v B)`` is error,
+and views that hold the share s of its weight give a feature whose cosine c to that of all views is expected at
 
-If every view adds an error of its own, of variance v beside a feature of length one, then the features of n of N
-views have the cosine ``c`` to those of all with ``1 / c^2 - 1 = r (1 / n - 1 / N)``, ``r = v / (1 + v / N)``. The
-pilot measures r among its own views, and so v; n follows for the c and the N that are wanted.
-Vectors are compared in PILOT_CHANNELS random projections.
+    c^2 = s / (s + d (1 - s)).
+
+A splat that none of them shows has s = 0 and counts zero, so that coverage is no matter of its own.
+
+Before a lift, s and B are known by footprints alone: their areas stand for weights. v is not, nor what is hidden.
+Both come from PILOT_VIEWS views, spread evenly, of the whole scene at coarse pixels, by three means over the sampled
+splats, weighted by evidence: S of the squared length of what one view says of a splat, M of the squared length of
+what the pilot's views say together, and b, the B of the pilot's views alone. As ``S = m + e`` and ``M = m + e b`` for
+features of squared length m and errors of variance e, ``e = (S - M) / (1 - b)`` and ``v = e / (S - e)``. And b, the
+chance that two looks at a splat are from one view, goes up as views are left out: of K of V views it is
+``B / (B + (1 - B) (K - 1) / (V - 1))``. Solved for B, this says how many fewer views there are in truth than by their
+areas. Vectors are compared in PILOT_CHANNELS random projections.
 """
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, replace
-from itertools import islice
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from torch.nn.functional import embedding_bag
 
-from liftcore.plan.coverage import view_order
-from liftcore.plan.visibility import spread_splats, visibility
+from liftcore.plan.visibility import spread
 from liftcore.progress import silent
 from liftcore.raster.cpu import CpuRaster
-from liftcore.solve.accumulate import accumulate, lift_walk, row_totals
+from liftcore.solve.accumulate import accumulate
 from liftcore.solve.channels import one_thread, random_axes
-from liftcore.solve.closed_form import solve_closed_form
+from liftcore.solve.totals import sums_in_order
 from liftcore.solve.view_weights import ViewWeights
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from torch import Tensor
 
     from liftcore.observe.pack import FeaturePacks
+    from liftcore.plan.visibility import Visibility
+    from liftcore.raster.protocol import RegionWeights
     from liftcore.scene.cameras import Cameras
     from liftcore.scene.splats import Splats
-    from liftcore.solve.columns import Columns
     from liftcore.solve.settings import LiftSettings
 
-PILOT_SPLATS = 4_096
-PILOT_SIDE = 80  # pixels of an image's longer side, about
+PILOT_SIDE = 160  # pixels of an image's longer side, about
 PILOT_CHANNELS = 64
-PILOT_VIEWS = 24
-FEW_VIEWS = 32  # and below, all are taken: a pilot would cost what it saves
-LEAST_COSINE = 0.01  # of the halves, below which their views have nothing in common
+PILOT_VIEWS = 12
 
 
 @dataclass(frozen=True)
 class Pilot:
-    """What the small lift says of the views' disagreement."""
+    """What is expected of some of the views."""
 
-    variance: float  # v: of the error that one view has, as a share of the squared feature; may be infinite
+    areas: np.ndarray  # [V, n] f32, of the sampled splats in all views
+    errors: np.ndarray  # [n] f64, d: the share of errors in the squared lengths of the features of all views
+    weights: np.ndarray  # [n] f64, the evidence of all views, in any unit
 
-    def views_for(self, cosine: float, total: int) -> int:
-        """The fewest of ``total`` views whose features have at least this cosine, in the mean, to those of all."""
-        among = self._among(total)
-        if among <= 0.0:
-            return 1
-        allowed = 1.0 / max(cosine, LEAST_COSINE) ** 2 - 1.0
-        return max(1, min(total, math.ceil(1.0 / (allowed / among + 1.0 / total))))
+    def cosines(self, order: Sequence[int]) -> Iterator[float]:
+        """Of the first view of the order, of the first two, and so on: the expected mean cosine to all views."""
+        totals, held = self.areas.sum(axis=0, dtype=np.float64), np.zeros(self.areas.shape[1])
+        weights = self.weights / self.weights.sum()
+        for view in order:
+            held += self.areas[view]
+            share = _ratio(held, totals).clip(max=1.0)
+            yield float(weights @ np.sqrt(_ratio(share, share + self.errors * (1.0 - share))))
 
-    def cosine_of(self, count: int, total: int) -> float:
-        """What is expected of so many views of ``total``."""
-        return 1.0 / math.sqrt(1.0 + self._among(total) * (1.0 / count - 1.0 / total))
+    def views_for(self, cosine: float, order: Sequence[int], least: int = 1) -> tuple[int, float]:
+        """How many views of the order, ``least`` or more, come to this mean cosine, and what is expected of them.
 
-    def _among(self, total: int) -> float:
-        """r: the variance beside the features of ``total`` views, which have a part of the errors themselves."""
-        return total / (1.0 + total / self.variance) if self.variance > 0.0 else 0.0
+        All of them, where no fewer do.
+        """
+        expected = 1.0
+        for count, expected in enumerate(self.cosines(order), start=1):
+            if count >= least and expected >= cosine:
+                return count, expected
+        return len(order), expected
 
 
 def fly_pilot(
-    splats: Splats, cameras: Cameras, packs: FeaturePacks, names: Sequence[str], settings: LiftSettings
+    splats: Splats,
+    cameras: Cameras,
+    packs: FeaturePacks,
+    names: Sequence[str],
+    settings: LiftSettings,
+    seen: Visibility,
+    threads: int | None = None,
 ) -> Pilot:
-    """Lift the thinned scene from evenly spaced views of ``names``, three at least, and from half of them."""
-    chosen = [names[int(k)] for k in np.linspace(0, len(names) - 1, min(PILOT_VIEWS, len(names)))]
-    views = [cameras.get(name) for name in chosen]
-    thin = spread_splats(splats, min(PILOT_SPLATS, splats.count))
-    thin.log_scales.add_(0.5 * math.log(splats.count / thin.count))
-    coarse = max(1, max(max(view.width, view.height) for view in views) // PILOT_SIDE)
-    own = settings.model_copy(update={"stride": coarse, "certificate_rays": 0})
+    """Walk evenly spaced views of ``names``, of which ``seen`` tells, two at least."""
+    total, count = len(names), min(PILOT_VIEWS, len(names))
+    flown: list[int] = spread(total, count).tolist()
+    chosen = [names[view] for view in flown]
+    longest = max(max(camera.width, camera.height) for camera in map(cameras.get, chosen))
+    coarse = {"stride": max(1, longest // PILOT_SIDE), "certificate_rays": 0, "robust_steps": 0}
+    own = settings.model_copy(update=coarse)
     axes = random_axes(packs.channels, min(PILOT_CHANNELS, packs.channels), settings.seed)
-    with ViewWeights() as store:
-        raster = CpuRaster(thin, threads=1)
-        geometry = accumulate(raster, (thin.count, cameras), packs, chosen, own, store, silent)
-        with one_thread():
-            columns = [replace(own, codebook=own.codebook.float() @ axes) for own in geometry.columns]
-        whole = _features(store, columns, range(len(chosen)), thin.count)
-        order = view_order(visibility(thin, views, lift_walk(own)))
-        half = sorted(islice(order, (len(chosen) + 1) // 2))
-        part = _features(store, columns, half, thin.count)
-    cosine = _mean_cosine(part, whole, torch.from_numpy(geometry.evidence))
-    among = (1.0 / cosine**2 - 1.0) / (1.0 / len(half) - 1.0 / len(chosen))
-    return Pilot(among / (1.0 - among / len(chosen)) if among < len(chosen) else math.inf)
+    said = _Said(spread(splats.count, seen.areas.shape[1]), splats.count, axes.shape[1])
+    with ViewWeights() as store, one_thread():
+        raster = CpuRaster(splats, threads)
+        geometry = accumulate(raster, (splats.count, cameras), packs, chosen, own, store, silent)
+        for weights, columns in zip(store, geometry.columns, strict=True):
+            said.add(weights, columns.means(columns.codebook.float() @ axes))
+    evidence = _evidence(geometry.evidence[said.rows], seen.areas, seen.areas[flown])
+    variance, together = said.disagreement(evidence)
+    share = together / (together + (1.0 - together) * (total - 1) / (count - 1))  # B, in the mean
+    by_area = _ratio((seen.areas.astype(np.float64) ** 2).sum(axis=0), seen.areas.sum(axis=0, dtype=np.float64) ** 2)
+    return Pilot(seen.areas, _errors(variance, by_area * share / _mean(by_area, evidence)), evidence)
 
 
-def _features(store: ViewWeights, columns: Sequence[Columns], views: Sequence[int], count: int) -> Tensor:
-    """[count, C] f32, the closed form from some views alone."""
-    weights, denominators = [store[view] for view in views], np.zeros(count)
-    for part in weights:
-        denominators[part.splats.numpy()] += row_totals(part)
-    own = [columns[view] for view in views]
-    return solve_closed_form(weights, own.__getitem__, denominators, torch.float32, silent, threads=1).features
+class _Said:
+    """What the pilot's views say of the sampled splats, in sums over the views added."""
+
+    def __init__(self, rows: np.ndarray, splats: int, channels: int) -> None:
+        self.rows = rows  # [n] i64, of all splats
+        self._places = np.full(splats, -1)
+        self._places[self.rows] = np.arange(len(self.rows))
+        self._weights, self._squared_weights, self._squares = np.zeros((3, len(self.rows)))
+        self._vectors = np.zeros((len(self.rows), channels))
+
+    def add(self, weights: RegionWeights, codebook: Tensor) -> None:
+        """Add a view: its W, and what its columns read [T, C] f32."""
+        places = torch.from_numpy(self._places[weights.splats.numpy()])
+        lengths = weights.row_starts.diff()
+        sampled, entries = places >= 0, torch.repeat_interleave(places >= 0, lengths)
+        starts = torch.cat([lengths.new_zeros(1), lengths[sampled].cumsum(0)])
+        columns, values = weights.columns[entries].long(), weights.weights[entries]
+        sums = embedding_bag(
+            columns, codebook, starts, mode="sum", per_sample_weights=values, include_last_offset=True
+        )
+        totals = sums_in_order(values.double(), starts)
+        own, total, vectors = places[sampled].numpy(), totals.numpy(), sums.double().numpy()
+        self._weights[own] += total
+        self._squared_weights[own] += total**2
+        self._squares[own] += _ratio((vectors**2).sum(axis=1), total)
+        self._vectors[own] += vectors
+
+    def disagreement(self, evidence: np.ndarray) -> tuple[float, float]:
+        """v, infinite where the views have nothing in common, and b, over the splats that a labelled ray met."""
+        met = self._weights > 0
+        if not (evidence[met] > 0).any():
+            return np.inf, 1.0
+        means = (
+            _ratio(self._squares, self._weights),
+            _ratio((self._vectors**2).sum(axis=1), self._weights**2),
+            _ratio(self._squared_weights, self._weights**2),
+        )
+        alone, mean, together = (_mean(values[met], evidence[met]) for values in means)
+        if together >= 1.0:
+            return np.inf, 1.0
+        error = max(0.0, alone - mean) / (1.0 - together)
+        return (error / (alone - error) if error < alone else np.inf), together
 
 
-def _mean_cosine(some: Tensor, others: Tensor, weights: Tensor) -> float:
-    """The weighted mean cosine of vectors [n, C] where the others are not zero, LEAST_COSINE at least."""
-    weights = weights * (others != 0).any(dim=1)  # no labelled ray met the rest
-    total = float(weights.sum())
-    if not total > 0:
-        return LEAST_COSINE  # nothing was learnt, so nothing is left out
-    with one_thread():
-        cosines = torch.nn.functional.cosine_similarity(some, others, dim=1).double()
-        return min(1.0, max(LEAST_COSINE, float((cosines * weights).sum()) / total))
+def _evidence(found: np.ndarray, areas: np.ndarray, flown: np.ndarray) -> np.ndarray:
+    """[n] f64, of all views, from what the flown ones found: in the same proportion to a splat's areas.
+
+    Splats that they do not show get the mean proportion.
+    """
+    shown = flown.sum(axis=0, dtype=np.float64)
+    light = np.divide(found, shown, out=np.full(len(found), found.sum() / max(shown.sum(), 1.0)), where=shown > 0)
+    return light * areas.sum(axis=0, dtype=np.float64)
+
+
+def _errors(variance: float, shares: np.ndarray) -> np.ndarray:
+    """d of the splats, from v and their B."""
+    return variance * shares / (1.0 + variance * shares) if np.isfinite(variance) else np.ones(len(shares))
+
+
+def _mean(values: np.ndarray, weights: np.ndarray) -> float:
+    return float((values * weights).sum() / weights.sum())
+
+
+def _ratio(values: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Nought where the others are nought."""
+    return np.divide(values, others, out=np.zeros(np.shape(values)), where=others > 0)

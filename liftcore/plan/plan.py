@@ -5,14 +5,13 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 from liftcore.device import CPU
-from liftcore.plan.coverage import WELL_COVERED, choose_views, spare_views, view_order
+from liftcore.plan.coverage import WELL_COVERED, spare_views, view_order, views_to_show
 from liftcore.plan.memory import check_memory, features_room, free_memory, memory_parts
 from liftcore.plan.on_device import check_device_room, device_plan
-from liftcore.plan.pilot import FEW_VIEWS, fly_pilot
+from liftcore.plan.pilot import PILOT_VIEWS, fly_pilot
 from liftcore.plan.rank import ENOUGH, Rank, codebook_rank
 from liftcore.plan.visibility import visibility
 from liftcore.raster.side_by_side import views_at_a_time
@@ -24,10 +23,12 @@ if TYPE_CHECKING:
     from liftcore.device import Device
     from liftcore.observe.pack import FeaturePacks
     from liftcore.plan.on_device import DevicePlan
+    from liftcore.plan.visibility import Visibility
     from liftcore.scene.cameras import Cameras
     from liftcore.scene.splats import Splats
     from liftcore.solve.settings import LiftSettings
 
+FEW_VIEWS = 32  # and below, view_cosine takes all: a pilot would cost what it saves
 SHOWN_VIEWS = 6  # names in a line for people
 
 
@@ -131,14 +132,7 @@ def plan_lift(
     """
     by_name = {name: cameras.get(name) for name in names}
     seen = visibility(splats, list(by_name.values()), lift_walk(settings))
-    chosen = choose_views(seen, settings.coverage) if settings.coverage else list(range(len(names)))
-    expected = None
-    if settings.view_cosine and len(chosen) > FEW_VIEWS:
-        offered, total = [names[k] for k in chosen], len(chosen)
-        pilot = fly_pilot(splats, cameras, packs, offered, settings)
-        count = pilot.views_for(settings.view_cosine, total)
-        chosen = sorted(chosen[k] for k in islice(view_order(seen.of(chosen)), count))
-        expected = pilot.cosine_of(count, total)
+    chosen, expected = _choose_views(splats, cameras, packs, names, settings, seen, threads)
     views = [names[k] for k in chosen]
     seen = seen.of(chosen)
     lifted = {name: by_name[name] for name in views}
@@ -166,6 +160,34 @@ def plan_lift(
         features_room=features_room(today, free),
         warnings=(*short, *check_memory(today, free)),
     )
+
+
+def _choose_views(
+    splats: Splats,
+    cameras: Cameras,
+    packs: FeaturePacks,
+    names: Sequence[str],
+    settings: LiftSettings,
+    seen: Visibility,
+    threads: int | None,
+) -> tuple[list[int], float | None]:
+    """The views to lift, ascending, and the cosine that a pilot expects of them, where one was flown.
+
+    They show each splat ``coverage`` times and come to ``view_cosine``, whatever takes more of the same order. Where
+    a pilot could spare no more views than it looks at, none is flown and all are taken.
+    """
+    every = list(range(len(names)))
+    if not settings.coverage and not (settings.view_cosine and len(names) > FEW_VIEWS):
+        return every, None
+    order = list(view_order(seen))
+    least = views_to_show(seen, order, settings.coverage)
+    if not settings.view_cosine:
+        return sorted(order[:least]), None
+    if len(names) <= max(FEW_VIEWS, least + PILOT_VIEWS):
+        return every, None
+    pilot = fly_pilot(splats, cameras, packs, names, settings, seen, threads)
+    count, expected = pilot.views_for(settings.view_cosine, order, least)
+    return sorted(order[:count]), expected
 
 
 def _in_work(parts: Mapping[str, int], views: int) -> dict[str, int]:

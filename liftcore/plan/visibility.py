@@ -76,9 +76,14 @@ def side_of(directions: np.ndarray) -> np.ndarray:
     return (3 * octants + np.abs(directions).argmax(axis=1)).astype(np.uint8)
 
 
+def spread(total: int, count: int) -> np.ndarray:
+    """[count] i64, evenly spaced numbers below ``total``, with the first and the last."""
+    return np.linspace(0, total - 1, count).astype(np.int64)
+
+
 def spread_splats(splats: Splats, count: int) -> Splats:
     """The geometry of so many evenly spaced splats, a copy."""
-    rows = torch.from_numpy(np.linspace(0, splats.count - 1, count).astype(np.int64))
+    rows = torch.from_numpy(spread(splats.count, count))
     return replace(
         splats,
         means=splats.means[rows],

@@ -56,8 +56,20 @@ class Speed(StrEnum):
 _SPEEDS: dict[Speed, dict[str, Any]] = {
     Speed.EXACT: {},
     Speed.BALANCED: {"stride": 2, "certificate_rays": 2_000},
-    Speed.FAST: {"stride": 3, "view_cosine": 0.998, "transmittance_stop": 0.003, "certificate_rays": 500},
-    Speed.DRAFT: {"stride": 4, "view_cosine": 0.995, "transmittance_stop": 0.01, "certificate_rays": 200},
+    Speed.FAST: {
+        "stride": 3,
+        "view_cosine": 0.992,
+        "coverage": 40,
+        "transmittance_stop": 0.003,
+        "certificate_rays": 500,
+    },
+    Speed.DRAFT: {
+        "stride": 4,
+        "view_cosine": 0.98,
+        "coverage": 20,
+        "transmittance_stop": 0.01,
+        "certificate_rays": 200,
+    },
 }
 
 
@@ -67,7 +79,7 @@ class LiftSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     preset: Preset = Preset.TIKHONOV
-    speed: Speed = Field(Speed.EXACT, description="the dial: sets stride, cut-off, view_cosine and certificate rays")
+    speed: Speed = Field(Speed.EXACT, description="the dial: sets stride, cut-off, views and certificate rays")
     selection: Selection = Field(Selection.ALL, description="which of a ray's weights count")
     k: int = Field(40, ge=1, le=MOST_OF_A_RAY, description="how many weights of a ray top-k keeps")
     mass: float = Field(0.75, gt=0, le=1, description="the share of the light within which front-mass keeps weights")
@@ -80,7 +92,9 @@ class LiftSettings(BaseModel):
     antialiased: bool = Field(False, description="opacities compensated for the low-pass (mip filter), 3DGS only")
     stride: int = Field(1, ge=1, le=64, description="lift from every n-th pixel in x and in y")
     view_stride: int = Field(1, ge=1, description="lift from every n-th view, from the first on")
-    coverage: int = Field(0, ge=0, description="views are chosen until they show a splat so often, 0 = all views")
+    coverage: int = Field(
+        0, ge=0, description="views are chosen until they show a splat so often; with view_cosine, so often at least"
+    )
     view_cosine: float = Field(
         0.0, ge=0, lt=1, description="the fewest views whose features should come this near to those of all, 0 = all"
     )

@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
-import math
 from itertools import pairwise
 
+import numpy as np
 import pytest
 import torch
 
-from liftcore.lift import lift
+from liftcore.lift import lift, open_sources
 from liftcore.measure.room_scene import Room, write_room
 from liftcore.measure.tradeoff.judge import cosine_figures
 from liftcore.observe.observation import RegionMap
 from liftcore.observe.pack import open_packs
 from liftcore.observe.write_pack import write_pack
-from liftcore.plan.pilot import FEW_VIEWS, LEAST_COSINE, Pilot, _mean_cosine, fly_pilot
+from liftcore.plan.pilot import PILOT_VIEWS, Pilot, fly_pilot
+from liftcore.plan.plan import FEW_VIEWS
+from liftcore.plan.visibility import visibility
 from liftcore.scene.cameras import Cameras
 from liftcore.scene.inria import write_inria_cameras
 from liftcore.scene.load import load_cameras
 from liftcore.scene.ply import write_splats
+from liftcore.solve.accumulate import lift_walk
 from liftcore.solve.settings import LiftSettings
 from tests.scenes import centred, random_splats
 from tests.unit.plan.test_views import ring
@@ -26,13 +29,14 @@ from tests.unit.plan.test_views import ring
 VIEWS, CHANNELS = FEW_VIEWS + 8, 48
 
 
-def disagreeing(folder, error: float, gap: bool = False):
+def disagreeing(folder, error: float, gap: bool = False, labelled: bool = True):
     """A cloud on a ring of cameras; each view says one vector, with an error of its own of so much of its length."""
     folder.mkdir()
     generator = torch.Generator().manual_seed(3)
     truth, labels = torch.eye(CHANNELS)[:1], torch.zeros(1, 6, 8, dtype=torch.int32)
-    if gap:
-        labels[:, :, 4:] = -1
+    labels[:, :, 4 if gap else 8 :] = -1
+    if not labelled:
+        labels[:] = -1
     errors = torch.randn(VIEWS, CHANNELS, generator=generator)
     errors *= error / CHANNELS**0.5
     cameras = [centred(camera) for camera in ring(VIEWS)]
@@ -67,19 +71,37 @@ def test_the_more_views_disagree_the_more_are_lifted(tmp_path):
     assert counts[-1] > 0.9 * VIEWS
 
 
-def test_views_follow_from_the_variance():
-    pilot = Pilot(2.0)
-    for total in (30, 100, 1_000):
-        count = pilot.views_for(0.99, total)
-        assert pilot.cosine_of(count, total) >= 0.99 > pilot.cosine_of(count - 1, total)
-    assert pilot.views_for(0.999_999, 30) == 30
-    assert Pilot(0.0).views_for(0.99, 30) == 1
+def pilot_of(areas: list[list[float]], errors: list[float], weights: list[float]) -> Pilot:
+    return Pilot(np.array(areas, np.float32), np.array(errors), np.array(weights))
 
 
-def test_any_cosine_asks_for_a_view_at_least_and_views_that_share_nothing_are_all_needed():
-    assert Pilot(2.0).views_for(1e-200, 100) == 1
-    assert Pilot(math.inf).views_for(0.9, 100) == 81  # n of N have the cosine sqrt(n / N)
-    assert Pilot(0.0).cosine_of(1, 100) == 1.0
+def test_views_that_weigh_alike_have_the_cosine_of_their_variance():
+    views, variance = 20, 2.0
+    pilot = pilot_of([[1.0]] * views, [variance / (variance + views)], [1.0])
+    among = variance / (1 + variance / views)
+    for count, cosine in enumerate(pilot.cosines(range(views)), start=1):
+        assert 1 / cosine**2 - 1 == pytest.approx(among * (1 / count - 1 / views), abs=1e-9)
+
+
+def test_a_splat_that_no_chosen_view_shows_counts_nothing_and_evidence_weighs_splats():
+    pilot = pilot_of([[1.0, 0.0], [0.0, 1.0]], [0.0, 0.0], [3.0, 1.0])
+    assert list(pilot.cosines([0, 1])) == pytest.approx([0.75, 1.0])
+    assert list(pilot.cosines([1, 0])) == pytest.approx([0.25, 1.0])
+
+
+def test_features_that_are_all_error_need_the_square_of_the_cosine_of_their_weight():
+    pilot = pilot_of([[1.0]] * 100, [1.0], [1.0])
+    assert pilot.views_for(0.9, range(100)) == (81, pytest.approx(0.9))
+
+
+def test_the_fewest_views_that_come_to_the_cosine_are_taken_but_never_fewer_than_told():
+    pilot = pilot_of([[1.0]] * 40, [0.05], [1.0])
+    cosines = list(pilot.cosines(range(40)))
+    count, expected = pilot.views_for(0.99, range(40))
+    assert cosines[count - 2] < 0.99 <= cosines[count - 1] == expected
+    assert pilot.views_for(0.99, range(40), least=count + 7) == (count + 7, cosines[count + 6])
+    assert pilot.views_for(1e-200, range(40)) == (1, cosines[0])
+    assert pilot.views_for(0.999_999_999_999, range(40))[0] == 40
 
 
 def test_rays_without_labels_are_no_disagreement(tmp_path):
@@ -91,8 +113,37 @@ def test_rays_without_labels_are_no_disagreement(tmp_path):
     assert abs(counts[0] - counts[1]) <= 3
 
 
-def test_a_pilot_that_learns_nothing_leaves_nothing_out():
-    assert _mean_cosine(torch.zeros(3, 2), torch.zeros(3, 2), torch.ones(3)) == LEAST_COSINE
+def test_a_pilot_that_learns_nothing_expects_nothing_but_errors(tmp_path):
+    splats, cameras, pack = disagreeing(tmp_path / "scene", 0.5, labelled=False)
+    pilot = flown(splats, cameras, pack)
+    assert (pilot.errors == 1).all()
+    assert pilot.views_for(0.9, range(VIEWS))[0] > 0.7 * VIEWS
+
+
+def test_in_a_room_where_views_share_few_splats_a_pilot_is_right_too(tmp_path):
+    write_room(tmp_path, Room(splats=6_000, views=72, size=(160, 120), channels=32))
+    paths = tmp_path / "point_cloud.ply", tmp_path / "cameras.json", tmp_path / "features.safetensors"
+    whole = lift(*paths[:2], [paths[2]], LiftSettings.of())
+    for wanted in (0.9, 0.97):
+        fewer = lift(*paths[:2], [paths[2]], LiftSettings.of(view_cosine=wanted))
+        plan = fewer.metadata.certificate["plan"]
+        found = cosine_figures(fewer.features, whole.features, whole.evidence)["cosine"]
+        assert found is not None
+        assert plan["views_left_out"] > 0
+        assert 0.4 < (1 - found) / (1 - plan["view_cosine"]) < 1.2
+
+
+def test_with_coverage_beside_it_a_cosine_takes_no_fewer_views_and_no_pilot_flies_for_few(tmp_path):
+    paths = disagreeing(tmp_path / "scene", 0.3)
+    counts, expected = [], []
+    for coverage in (0, 12, 20, VIEWS - PILOT_VIEWS):
+        made = lift(*paths[:2], [paths[2]], LiftSettings.of(view_cosine=0.95, coverage=coverage))
+        counts.append(len(made.metadata.views))
+        expected.append(made.metadata.certificate["plan"]["view_cosine"])
+    assert counts[0] < 12
+    assert counts[1:] == [12, 20, VIEWS]
+    assert expected[0] < expected[1] < expected[2]
+    assert expected[3] is None
 
 
 def test_few_views_are_all_taken(tmp_path):
@@ -121,12 +172,15 @@ def test_a_room_is_written_the_same_twice_and_its_views_disagree_as_told(tmp_pat
             assert pairs.shape[1] == len(fine.unique())  # a part lies in one whole
 
 
-def test_a_pilot_repeats(tmp_path):
-    from liftcore.lift import open_sources
+def flown(splats, cameras, pack, threads=1) -> Pilot:
+    settings = LiftSettings.of()
+    sources = open_sources(splats, cameras, [pack], settings)
+    seen = visibility(sources.splats, [sources.cameras.get(view) for view in sources.views], lift_walk(settings))
+    return fly_pilot(sources.splats, sources.cameras, sources.packs, sources.views, settings, seen, threads)
 
-    splats, cameras, pack = disagreeing(tmp_path / "scene", 1.0)
-    sources = open_sources(splats, cameras, [pack], LiftSettings.of())
-    opened = sources.splats, sources.cameras, sources.packs, sources.views
-    before = sources.splats.log_scales.clone()
-    assert fly_pilot(*opened, LiftSettings.of()) == fly_pilot(*opened, LiftSettings.of())
-    assert torch.equal(before, sources.splats.log_scales)
+
+def test_a_pilot_repeats_on_any_number_of_threads(tmp_path):
+    paths = disagreeing(tmp_path / "scene", 1.0)
+    one, two = flown(*paths), flown(*paths, threads=2)
+    assert (one.errors == two.errors).all()
+    assert (one.weights == two.weights).all()

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from liftcore.lift import lift
-from liftcore.plan.coverage import WELL_COVERED, choose_views, spare_views, view_order
+from liftcore.plan.coverage import ORDER_SPLATS, WELL_COVERED, spare_views, view_order, views_to_show
 from liftcore.plan.visibility import SIDES, Visibility, side_of, visibility
 from liftcore.raster.cpu import CpuRaster
 from liftcore.raster.protocol import Walk, Weighting
@@ -49,7 +49,9 @@ def test_every_direction_has_one_of_the_sides():
 
 
 def test_chosen_views_look_from_all_sides():
-    chosen = choose_views(visibility(random_splats(0, 80, 0.3), ring(24), Walk()), 6)
+    seen = visibility(random_splats(0, 80, 0.3), ring(24), Walk())
+    order = list(view_order(seen))
+    chosen = sorted(order[: views_to_show(seen, order, 6)])
     gaps = np.diff([*chosen, chosen[0] + 24])
     assert len(chosen) == 6
     assert gaps.max() <= 8  # of 24; the first six in order would leave one of 19
@@ -57,12 +59,14 @@ def test_chosen_views_look_from_all_sides():
 
 def test_views_are_added_until_each_splat_is_shown_often_enough_and_the_choice_repeats():
     seen = visibility(random_splats(1, 80, 1.0), [random_camera(k) for k in range(12)], Walk())
+    order = list(view_order(seen))
+    assert order == list(view_order(seen))
+    shown = seen.in_view[:, seen.in_view.any(axis=0)]
     for times in (1, 3, 5):
-        chosen = choose_views(seen, times)
-        assert chosen == sorted(set(chosen)) == choose_views(seen, times)
-        shown = seen.in_view[:, seen.in_view.any(axis=0)]
-        assert shown[chosen].sum(axis=0).mean() >= times
-    assert choose_views(seen, 1_000) == list(range(12))
+        count = views_to_show(seen, order, times)
+        assert shown[order[:count]].sum(axis=0).mean() >= times > shown[order[: count - 1]].sum(axis=0).mean()
+    assert views_to_show(seen, order, 0) == 1
+    assert views_to_show(seen, order, 1_000) == 12
 
 
 def test_looking_at_gains_lazily_finds_the_order_of_looking_at_all():
@@ -77,6 +81,14 @@ def test_looking_at_gains_lazily_finds_the_order_of_looking_at_all():
         held[every, seen.sides[best]] += shares[best]
         order.append(best)
     assert list(view_order(seen)) == order
+
+
+def test_of_many_splats_a_part_makes_the_order():
+    rng = np.random.default_rng(0)
+    areas = rng.uniform(size=(5, 2 * ORDER_SPLATS)).astype(np.float32)
+    sides = rng.integers(SIDES, size=areas.shape).astype(np.uint8)
+    some = Visibility(areas[:, ::2], sides[:, ::2], ORDER_SPLATS)
+    assert list(view_order(Visibility(areas, sides, 2 * ORDER_SPLATS))) == list(view_order(some))
 
 
 def test_views_that_add_nothing_can_be_left_out_together():
