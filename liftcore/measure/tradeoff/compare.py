@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from liftcore.progress import Progress
 
-EXACT_OVER_DRAFT = 8.0  # how much longer the exact run takes, at most, as far as the budget is planned
+EXACT_OVER_DRAFT = 5.0  # how much longer an exact view takes, at most, as far as the budget is planned
 EXACT_SHARE = 1 / 3  # of the budget, that the exact run may take
 PRESET_OVER_EXACT = 1.5  # top-k walks tiles twice, the robust step goes over W again
 LEAST_VIEWS = 4
@@ -104,7 +104,8 @@ def _order(scene: Scene, settings: Mapping[str, Any], threads: int | None, folde
 def _fitting(order: Order, budget: float) -> Order:
     """The order with so few views that the exact run fits the budget, by what the draft takes."""
     probe = _run(replace(order, held_out=(), labelled=()), DRAFT)
-    keep = EXACT_SHARE * budget / (EXACT_OVER_DRAFT * probe["wall_s"])
+    exact = EXACT_OVER_DRAFT * probe["wall_s"] * len(order.lifted) / probe["views"]
+    keep = EXACT_SHARE * budget / exact
     step = 1 if keep >= 1 else min(round(1 / keep), len(order.lifted) // LEAST_VIEWS)
     return replace(order, lifted=order.lifted[:: max(1, step)])
 
