@@ -25,6 +25,7 @@ from liftcore.solve.all_rays import AllRays
 from liftcore.solve.certificate import certify
 from liftcore.solve.checkpoint import Checkpoint, identity, resumed
 from liftcore.solve.closed_form import Solution, warm_up_solution
+from liftcore.solve.columns import warm_up_tuples
 from liftcore.solve.feature_room import room_within
 from liftcore.solve.kept_columns import kept_columns
 from liftcore.solve.least_squares import refine
@@ -121,6 +122,7 @@ def lift_sources(run: Run, sources: Sources, inputs: list[InputFile], checkpoint
 def _warm_up(run: Run, kernel: Kernel) -> None:
     with run.timings.stage("compile"):
         warm_up(kernel, run.device, lift_walk(run.settings), weighting_of(run.settings))
+        warm_up_tuples()
         if run.device.kind == "cpu":
             warm_up_solution()
 

@@ -59,6 +59,13 @@ def random_regions(
     return RegionMap(torch.tensor(labels.copy(), dtype=torch.int32), torch.tensor(codebook, dtype=torch.float32))
 
 
+def observed(seed: int, view: int, grids: bool = False) -> Observation:
+    """What a view of a scene observes: a grid, or regions, which W takes by tuples of labels in every second view."""
+    if grids:
+        return random_grid(seed + view)
+    return random_regions(seed + view, levels=4, rows=9) if view % 2 else random_regions(seed + view)
+
+
 def random_grid(seed: int, size: tuple[int, int] = (7, 9), F: int = 6) -> FeatureGrid:
     """A grid of random vectors."""
     rng = np.random.default_rng(seed + 3_000)

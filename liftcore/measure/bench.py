@@ -24,6 +24,7 @@ from liftcore.raster.open_raster import open_raster
 from liftcore.raster.warm_up import warm_up
 from liftcore.solve.accumulate import lift_walk, weighting_of
 from liftcore.solve.closed_form import warm_up_solution
+from liftcore.solve.columns import warm_up_tuples
 from liftcore.solve.settings import LiftSettings, Preset
 from liftcore.solve.solver import closed_form_on
 from liftcore.solve.view_weights import ViewWeights
@@ -66,6 +67,7 @@ def run_bench(options: dict[str, Any]) -> dict[str, Any]:
     start = time.perf_counter()
     warm_up(work.splats.kernel, device)
     warm_up_solution()
+    warm_up_tuples()
     compile_seconds = time.perf_counter() - start
     if options.get("stages"):
         from liftcore.measure.stages import time_stages

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from liftcore.errors import Unavailable
-from liftcore.plan.memory import all_columns, entries_a_splat, most_levels, weight_bytes
+from liftcore.plan.memory import all_columns, codebook_rows, entries_a_splat, most_levels, weight_bytes
 from liftcore.solve.device_blocks import GRAIN, SPARE, block_bytes, book_bytes, device_slices
 
 if TYPE_CHECKING:
@@ -122,7 +122,8 @@ def device_plan(
         for camera in {(camera.width, camera.height): camera for camera in cameras.values()}.values()
     ]
     rows = all_columns(packs, cameras, settings)
-    slices = device_slices(rows, packs.channels)
+    least = sum(codebook_rows(packs, name) for name in cameras)  # columns, for which slices are widest
+    slices = device_slices(least, packs.channels)
     width = slices[0][1]
     each = entries_a_splat(packs, cameras, settings)
     entries = int(len(cameras) * seen_a_view * each)

@@ -135,8 +135,7 @@ def accumulate(
 
     with closing(raster.walk_views(looks())) as walked_views:
         for walked in walked_views:
-            weights = columns[len(samples)].weighted(walked.weights)
-            _add(totals, weights, float(settings.stride**2), store)
+            weights = _add(totals, walked.weights, columns[len(samples)], float(settings.stride**2), store)
             store.append(weights)
             samples.append(SampledRays(walked.rows, readouts.popleft()))
             del walked, weights  # before the next one is made beside it
@@ -144,14 +143,17 @@ def accumulate(
     return Geometry(*totals.found(), tuple(samples), tuple(columns))
 
 
-def _add(totals: Totals, weights: RegionWeights, rays: float, store: ViewWeights) -> None:
-    """``totals.add``; earlier weights that lie on the card are brought home when nothing else makes room there."""
+def _add(totals: Totals, walked: RegionWeights, columns: Columns, rays: float, store: ViewWeights) -> RegionWeights:
+    """The view's W, added to the totals; earlier W on the card is brought home when nothing else makes room there."""
     try:
+        weights = columns.weighted(walked)
         totals.add(weights, rays)
     except RuntimeError as error:
         if not (out_of_memory(error) and store.card_bytes):
             raise
     else:
-        return
+        return weights
     store.bring_home()
+    weights = columns.weighted(walked)
     totals.add(weights, rays)
+    return weights

@@ -21,10 +21,9 @@ from numba.extending import overload
 
 from liftcore.jit import kernel
 from liftcore.lanes import LANES, WIDE, keep_halves, lanes_at, no_lanes, plus_product, sum_of_lanes
-from liftcore.observe.observation import RegionMap
 from liftcore.progress import silent
 from liftcore.raster.protocol import RegionWeights
-from liftcore.solve.columns import Columns, by_tuples, rows_of
+from liftcore.solve.columns import Columns, rows_of
 from liftcore.solve.feature_room import in_memory
 from liftcore.solve.weight_tables import WeightTables
 from liftcore.solve.weighted_sums import (
@@ -217,11 +216,7 @@ def _solve_strips(
 
 
 def warm_up_solution() -> None:
-    """Compile the kernels of the solution, or load them from the disk cache, for both types of X and of codebooks.
-
-    That of the tuples, which its columns are, among them.
-    """
-    by_tuples(RegionMap(torch.zeros(2, 1, 1, dtype=torch.int32), torch.zeros(1, 1)))
+    """Compile the kernels of the solution, or load them from the disk cache, for both types of X and of codebooks."""
     one = torch.zeros(1, dtype=torch.int32)
     weights = RegionWeights(one, torch.tensor([0, 1]), one, torch.ones(1), one, torch.ones(1))
     for dtype, kind in product((torch.float16, torch.float32), repeat=2):

@@ -32,7 +32,7 @@ class Columns:
     """The columns of one view's W."""
 
     codebook: Tensor  # E [M, F] f16 or f32
-    tuples: Tensor | None = None  # [T, L] i64, the rows of a column, -1 none, at least one; None: column m is row m
+    tuples: Tensor | None = None  # [T, L] i32, the rows of a column, -1 none, at least one; None: column m is row m
 
     @property
     def count(self) -> int:
@@ -50,7 +50,9 @@ class Columns:
         shares = (named / named.sum(dim=1, keepdim=True)).to(rows.device)
         places = self.tuples.clamp_min(0).to(rows.device)  # of share zero where there is none
         with one_thread():  # else torch's threads keep spinning beside those that solve
-            return embedding_bag(places, rows.float(), mode="sum", per_sample_weights=shares)
+            means = embedding_bag(places, rows.float(), mode="sum", per_sample_weights=shares)
+        largest = torch.finfo(torch.float32).max
+        return means.clamp_(-largest, largest)  # six thirds of a sixth may be rounded beyond it
 
     def weighted(self, weights: RegionWeights) -> RegionWeights:
         """W by rays, whose columns are these, with each entry as often as its column has rows."""
@@ -79,11 +81,16 @@ def as_walked(observation: Observation, settings: LiftSettings) -> tuple[Observa
     return (observation, Columns(observation.codebook)) if by_rows(settings) else by_tuples(observation)
 
 
+def warm_up_tuples() -> None:
+    """Compile what numbers them, or load it from the disk cache."""
+    by_tuples(RegionMap(torch.zeros(2, 1, 1, dtype=torch.int32), torch.zeros(1, 1)))
+
+
 def by_tuples(observation: Observation) -> tuple[Observation, Columns]:
     """The observation for a walk, one level of tuples in place of several of rows, and its columns.
 
-    Left as it is where that saves nothing: grids, single levels, and maps with more tuples than their rows and levels
-    could have entries for. The walk meets no channel, so what it is given has none.
+    Grids and single levels stay as they are, and maps of more than L tuples for each row of the codebook: strips of
+    those would grow too much. The walk meets no channel, so what it is given has none.
     """
     columns = Columns(observation.codebook)
     if not isinstance(observation, RegionMap) or observation.labels.shape[0] == 1:
@@ -94,4 +101,4 @@ def by_tuples(observation: Observation) -> tuple[Observation, Columns]:
     if not 0 < tuples.shape[0] <= most:
         return observation, columns
     regions = RegionMap(torch.from_numpy(numbers)[None], observation.codebook.new_empty(tuples.shape[0], 0))
-    return regions, replace(columns, tuples=torch.from_numpy(tuples).long())
+    return regions, replace(columns, tuples=torch.from_numpy(tuples))

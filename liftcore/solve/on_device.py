@@ -1,7 +1,7 @@
 """The closed form on any device of torch: the sums of ``closed_form``, in blocks of splats and slices of channels.
 
-W of a block of splats is gathered from all views into rows of one sparse matrix, whose columns are the rows of all
-codebooks, one after the other. A row is cut into parts of LONG entries. ``embedding_bag`` adds up a part in float32:
+W of a block of splats is gathered from all views into rows of one sparse matrix, whose columns are those of all
+views, one after the other. A row is cut into parts of LONG entries. ``embedding_bag`` adds up a part in float32:
 on a card one thread reads the entries of a part in their order, nothing is written between the product and the sum,
 and no sum is shared, so the bits repeat. The parts of a row are added in float64 the same way. A product with a
 sparse tensor would take cuSPARSE's default algorithm, and ``index_add_`` atomic sums: neither has a fixed order.

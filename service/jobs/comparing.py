@@ -16,6 +16,7 @@ from liftcore.raster.warm_up import warm_up
 from liftcore.scene.splats import Kernel
 from liftcore.solve.accumulate import lift_walk, weighting_of
 from liftcore.solve.closed_form import warm_up_solution
+from liftcore.solve.columns import warm_up_tuples
 from liftcore.solve.settings import LiftSettings
 from service.finite import finite
 
@@ -52,6 +53,7 @@ def compare_as_ordered(order: dict[str, Any], progress: Progress) -> dict[str, A
 def _compile(kernel: Kernel, device: Device, settings: dict[str, Any]) -> None:
     """What the runs load: else the first of a kind on a machine eats up the budget."""
     warm_up_solution()
+    warm_up_tuples()
     runs = [LiftSettings.of(**settings | candidate.settings) for candidate in (EXACT, *CANDIDATES)]
     ways = {(lift_walk(run), weighting_of(run)) for run in runs}
     for walk, weighting in sorted(ways, key=repr):

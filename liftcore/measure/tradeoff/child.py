@@ -24,6 +24,7 @@ from liftcore.progress import silent
 from liftcore.raster.warm_up import warm_up
 from liftcore.solve.accumulate import lift_walk, weighting_of
 from liftcore.solve.closed_form import warm_up_solution
+from liftcore.solve.columns import warm_up_tuples
 from liftcore.solve.settings import LiftSettings
 from liftcore.timings import Timings
 
@@ -51,6 +52,7 @@ def measured(order: Order) -> dict[str, Any]:
         inputs = [input_file(path) for path in files]
     with run.timings.stage("compile"):
         warm_up_solution()
+        warm_up_tuples()
         # The lift's own then takes no time.
         warm_up(sources.splats.kernel, run.device, lift_walk(settings), weighting_of(settings))
     cpu, wall = time.process_time(), time.perf_counter()

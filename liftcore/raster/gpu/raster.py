@@ -218,6 +218,7 @@ class GpuRaster:
         check_stride(walk, camera)
         self._kept = None  # before, so that one frame's memory is the most ever held
         view = strided(view_of(camera), walk)
+        levels = max(levels, USUAL_LEVELS)  # one level may stand for tuples of several, and has as many sums
         need = raster_bytes(self.splats.count, view.width, view.height, self.splats.kernel, levels)
         room = room_within(self._free, self.splats.kernel, need)
         scene = self._scene_with(walk.gain)

@@ -16,10 +16,20 @@ from liftcore.lift import lift, open_sources, planned
 from liftcore.observe.observation import RegionMap
 from liftcore.observe.pack import open_packs
 from liftcore.observe.write_pack import write_pack
-from liftcore.plan.memory import CONTROL_GROUPS, LIBRARIES, check_memory, free_memory, group_memory
+from liftcore.plan.memory import (
+    CONTROL_GROUPS,
+    LIBRARIES,
+    all_columns,
+    check_memory,
+    entries_a_splat,
+    free_memory,
+    group_memory,
+)
 from liftcore.plan.rank import ROUNDING, codebook_rank, rank_of
+from liftcore.solve.columns import as_walked
 from liftcore.solve.feature_room import file_system, in_file, room_within
 from liftcore.solve.settings import LiftSettings, Speed
+from tests.scenes import observed
 from tests.unit.solve.test_lift_equals_dense import write_scene
 
 GIB = 1 << 30
@@ -54,6 +64,17 @@ def test_rank_of_packs_looks_at_all_their_views(tmp_path, grids):
     found = codebook_rank(packs, packs.views)
     assert (found.channels, found.rank) == (6, 6)
     assert found.rows >= 6
+
+
+def test_tuples_of_labels_are_planned_with_fewer_entries_and_with_no_fewer_columns_than_there_are(tmp_path):
+    maps = {f"v{k}": observed(2, k) for k in (1, 3)}
+    write_pack(tmp_path / "p", maps, {})
+    packs, tuples, rows = open_packs([tmp_path / "p"]), LiftSettings.of(), LiftSettings.of(robust_steps=1)
+    made = [as_walked(own, tuples)[1] for own in maps.values()]
+    assert all(columns.tuples is not None for columns in made)
+    assert all_columns(packs, maps, rows) == sum(own.codebook.shape[0] for own in maps.values())
+    assert all_columns(packs, maps, tuples) >= sum(columns.count for columns in made)
+    assert 1.0 < entries_a_splat(packs, maps, tuples) < entries_a_splat(packs, maps, rows)
 
 
 @pytest.fixture

@@ -9,8 +9,11 @@ import pytest
 import torch
 
 from liftcore.artifact import load_lift, save_lift
-from liftcore.lift import lift
+from liftcore.lift import lift, open_sources
+from liftcore.observe.observation import RegionMap
 from liftcore.observe.write_pack import write_pack
+from liftcore.progress import silent
+from liftcore.raster.cpu import CpuRaster
 from liftcore.raster.oracle import dense_view, reading_matrix
 from liftcore.raster.oracle_weights import counted_weights
 from liftcore.raster.protocol import Selection, Walk, Weighting
@@ -18,8 +21,10 @@ from liftcore.scene.cameras import Cameras
 from liftcore.scene.inria import write_inria_cameras
 from liftcore.scene.load import load_cameras
 from liftcore.scene.ply import write_splats
+from liftcore.solve.accumulate import accumulate
 from liftcore.solve.settings import LiftSettings
-from tests.scenes import centred, random_camera, random_grid, random_regions, random_splats
+from liftcore.solve.view_weights import ViewWeights
+from tests.scenes import centred, observed, random_camera, random_splats
 
 PRESETS = {  # lambda, and what counts as a weight
     "row-sum": (1.0, Weighting(1)),
@@ -35,9 +40,7 @@ PRESETS = {  # lambda, and what counts as a weight
 def write_scene(folder: Path, seed: int, grids: bool = False) -> tuple[Path, Path, Path]:
     """A random scene of three views on disk: splats, cameras, features."""
     views = tuple(centred(random_camera(seed + k, 32 + 5 * k, 24 + 3 * k, name=f"v{k}")) for k in range(3))
-    observations = {
-        camera.name: random_grid(seed + k) if grids else random_regions(seed + k) for k, camera in enumerate(views)
-    }
+    observations = {camera.name: observed(seed, k, grids) for k, camera in enumerate(views)}
     paths = folder / "splats.ply", folder / "cameras.json", folder / "features.safetensors"
     write_splats(random_splats(seed, 50), paths[0])
     write_inria_cameras(Cameras(views), paths[1])
@@ -53,7 +56,7 @@ def dense_lift(
     splats, walk = random_splats(seed, 50), Walk(gain)
     numerator, denominator, evidence, undecided = np.zeros((50, 6)), np.zeros(50), np.zeros(50), np.zeros(50, bool)
     for k, camera in enumerate(cameras):
-        observation = random_grid(seed + k) if grids else random_regions(seed + k)
+        observation = observed(seed, k, grids)
         S, ray = reading_matrix(observation, camera.width, camera.height)
         B = S @ observation.codebook.double().numpy()
         A = dense_view(splats, camera, walk).A
@@ -87,16 +90,28 @@ def test_a_lift_equals_the_dense_definition(tmp_path, preset, grids, seed):
 def test_agreement_is_the_norm_of_the_mean_of_unit_inputs(tmp_path, preset):
     splats, cameras, features = write_scene(tmp_path, 5)
     got = lift(splats, cameras, [features], LiftSettings.of(preset=preset, dtype="float32"))
-    norms = torch.linalg.vector_norm(got.features, dim=1)  # the codebooks of random_regions are unit vectors
+    norms = torch.linalg.vector_norm(got.features, dim=1)  # the codebooks are unit vectors
     assert torch.allclose(got.agreement, norms, atol=1e-5)
     assert float(got.agreement.max()) <= 1.0
+
+
+def test_a_lift_has_views_by_tuples_of_labels_and_views_by_rows(tmp_path):
+    paths, settings = write_scene(tmp_path, 5), LiftSettings.of()
+    sources = open_sources(paths[0], paths[1], [paths[2]], settings)
+    for robust, expected in ((0, [False, True, False]), (1, [False] * 3)):
+        with ViewWeights() as store:
+            scene = sources.splats.count, sources.cameras
+            raster, own = CpuRaster(sources.splats, threads=1), LiftSettings.of(robust_steps=robust)
+            geometry = accumulate(raster, scene, sources.packs, sources.views, own, store, silent)
+        assert [columns.tuples is not None for columns in geometry.columns] == expected
 
 
 def test_agreement_does_not_depend_on_the_length_of_inputs(tmp_path):
     splats, cameras, features = write_scene(tmp_path, 6)
     plain = lift(splats, cameras, [features], LiftSettings.of(preset="row-sum"))
-    longer = {f"v{k}": random_regions(6 + k) for k in range(3)}
-    longer = {name: type(o)(o.labels, o.codebook * 7.0) for name, o in longer.items()}
+    maps = [observed(6, k) for k in range(3)]
+    regions = [own for own in maps if isinstance(own, RegionMap)]
+    longer = {f"v{k}": RegionMap(own.labels, own.codebook * 7.0) for k, own in enumerate(regions)}
     write_pack(tmp_path / "longer.safetensors", longer, {})
     scaled = lift(splats, cameras, [tmp_path / "longer.safetensors"], LiftSettings.of(preset="row-sum"))
     assert torch.allclose(plain.agreement, scaled.agreement, atol=1e-4)

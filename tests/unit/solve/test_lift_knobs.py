@@ -17,7 +17,7 @@ from liftcore.raster.oracle_weights import walked_rays
 from liftcore.scene.load import load_cameras
 from liftcore.solve.accumulate import lift_walk, strided_walk
 from liftcore.solve.settings import LiftSettings, Preset
-from tests.scenes import random_camera, random_grid, random_regions, random_splats
+from tests.scenes import observed, random_camera, random_splats
 from tests.unit.observe.test_levels import dense_sums
 from tests.unit.solve.test_lift_equals_dense import write_scene
 
@@ -36,7 +36,7 @@ def test_a_strided_lift_is_that_of_its_rays_and_its_evidence_speaks_for_all_of_t
     settings, splats = LiftSettings.of(**ROW_SUM, stride=stride), random_splats(2, 50)
     numerator, denominator, evidence, cut = np.zeros((50, 6)), np.zeros(50), np.zeros(50), np.zeros(50, bool)
     for k, camera in enumerate(load_cameras(paths[1])):
-        observation = random_grid(2 + k) if grids else random_regions(2 + k)
+        observation = observed(2, k, grids)
         walk = strided_walk(lift_walk(settings), settings, camera, k)
         view, walked = dense_view(splats, camera, walk), walked_rays(camera, walk)
         S, ray = reading_matrix(observation, camera.width, camera.height)
@@ -69,7 +69,7 @@ def test_every_nth_view_is_lifted_from_the_first_on(tmp_path):
     paths = write_scene(tmp_path, 4)
     got = lifted(paths, view_stride=2)
     assert got.metadata.views == ("v0", "v2")
-    write_pack(tmp_path / "two.safetensors", {name: random_regions(4 + int(name[1])) for name in ("v0", "v2")}, {})
+    write_pack(tmp_path / "two.safetensors", {name: observed(4, int(name[1])) for name in ("v0", "v2")}, {})
     two = lift(paths[0], paths[1], [tmp_path / "two.safetensors"], LiftSettings.of(**ROW_SUM))
     assert torch.equal(got.features, two.features)
 
@@ -83,13 +83,13 @@ def per_pixel(regions: RegionMap) -> RegionMap:
 
 
 def one_level(regions: RegionMap) -> RegionMap:
-    return RegionMap(regions.labels[1:], regions.codebook)
+    return RegionMap(regions.labels[1:2], regions.codebook)
 
 
 @pytest.mark.parametrize(("levels", "reference"), [("composite", per_pixel), (1, one_level)])
 def test_levels_lift_and_certify_as_the_maps_that_they_stand_for(tmp_path, levels, reference):
     paths = write_scene(tmp_path, 6)
-    write_pack(tmp_path / "other.safetensors", {f"v{k}": reference(random_regions(6 + k)) for k in range(3)}, {})
+    write_pack(tmp_path / "other.safetensors", {f"v{k}": reference(observed(6, k)) for k in range(3)}, {})
     other = lift(paths[0], paths[1], [tmp_path / "other.safetensors"], LiftSettings.of(**ROW_SUM))
     got = lifted(paths, levels=levels)
     assert torch.equal(got.seen, other.seen)

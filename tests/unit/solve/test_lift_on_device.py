@@ -68,6 +68,15 @@ def test_lift_of_the_card_is_the_lift_of_the_processor(tmp_path: Path) -> None:
     assert again.metadata.certificate == told
 
 
+def test_tuples_of_labels_on_the_card_give_what_they_give_on_the_processor(tmp_path: Path) -> None:
+    scene, settings = write_scene(tmp_path, 3), LiftSettings.of(certificate_rays=2, levels="rows")
+    ours, theirs = lifted(scene, CPU, settings), lifted(scene, CARD, settings)
+    entries = "weights_entries"
+    assert theirs.metadata.certificate[entries] == ours.metadata.certificate[entries]
+    counted = ours.evidence > 1e-2
+    torch.testing.assert_close(theirs.features[counted], ours.features[counted], rtol=0, atol=2e-3)
+
+
 def test_solution_has_the_memory_of_the_last_view(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scene, opened, told = write_scene(tmp_path, 3), [], []
     open_raster, closed_form_on = lifting.open_raster, lifting.closed_form_on
