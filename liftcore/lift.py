@@ -17,15 +17,13 @@ from liftcore.plan.plan import plan_lift
 from liftcore.progress import Progress, silent
 from liftcore.raster.antialiased import check_antialiased
 from liftcore.raster.open_raster import open_raster
-from liftcore.raster.warm_up import warm_up
 from liftcore.scene.load import load_cameras, load_splats
-from liftcore.solve.accumulate import Geometry, accumulate, as_read, lift_walk, weighting_of
+from liftcore.solve.accumulate import Geometry, accumulate, as_read, lift_walk
 from liftcore.solve.aggregation import Aggregation, aggregate
 from liftcore.solve.all_rays import AllRays
 from liftcore.solve.certificate import certify
 from liftcore.solve.checkpoint import Checkpoint, identity, resumed
-from liftcore.solve.closed_form import Solution, warm_up_solution
-from liftcore.solve.columns import warm_up_tuples
+from liftcore.solve.closed_form import Solution
 from liftcore.solve.feature_room import room_within
 from liftcore.solve.kept_columns import kept_columns
 from liftcore.solve.least_squares import refine
@@ -35,6 +33,7 @@ from liftcore.solve.robust import robust_weights
 from liftcore.solve.solver import closed_form_on
 from liftcore.solve.view_weights import ViewWeights
 from liftcore.timings import Timings
+from liftcore.warm_up import warm_up_lift
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -121,10 +120,7 @@ def lift_sources(run: Run, sources: Sources, inputs: list[InputFile], checkpoint
 
 def _warm_up(run: Run, kernel: Kernel) -> None:
     with run.timings.stage("compile"):
-        warm_up(kernel, run.device, lift_walk(run.settings), weighting_of(run.settings))
-        warm_up_tuples()
-        if run.device.kind == "cpu":
-            warm_up_solution()
+        warm_up_lift(kernel, run.device, run.settings)
 
 
 def _lift_on(run: Run, plan: Plan, sources: Sources, inputs: list[InputFile], checkpoint: Checkpoint | None) -> Lift:

@@ -21,13 +21,11 @@ from liftcore.measure.synthetic import room_cameras, room_regions, room_splats
 from liftcore.observe.observation import Observation, RegionMap
 from liftcore.progress import silent
 from liftcore.raster.open_raster import open_raster
-from liftcore.raster.warm_up import warm_up
 from liftcore.solve.accumulate import lift_walk, weighting_of
-from liftcore.solve.closed_form import warm_up_solution
-from liftcore.solve.columns import warm_up_tuples
 from liftcore.solve.settings import LiftSettings, Preset
 from liftcore.solve.solver import closed_form_on
 from liftcore.solve.view_weights import ViewWeights
+from liftcore.warm_up import warm_up_lift
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -65,9 +63,7 @@ def run_bench(options: dict[str, Any]) -> dict[str, Any]:
     device = choose_device("cpu" if options.get("stages") else asked)
     work = _workload(options)
     start = time.perf_counter()
-    warm_up(work.splats.kernel, device)
-    warm_up_solution()
-    warm_up_tuples()
+    warm_up_lift(work.splats.kernel, device, LiftSettings.of(preset=Preset.ROW_SUM))
     compile_seconds = time.perf_counter() - start
     if options.get("stages"):
         from liftcore.measure.stages import time_stages

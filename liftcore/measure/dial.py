@@ -21,11 +21,9 @@ from liftcore.lift import Run, lift_sources, open_sources
 from liftcore.measure.bench import hardware
 from liftcore.measure.tradeoff.judge import cosine_figures
 from liftcore.progress import silent
-from liftcore.raster.warm_up import warm_up
-from liftcore.solve.accumulate import lift_walk, weighting_of
-from liftcore.solve.closed_form import warm_up_solution
 from liftcore.solve.settings import LiftSettings, Preset, Speed
 from liftcore.timings import Timings
+from liftcore.warm_up import warm_up_lift
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -48,8 +46,7 @@ def measure_dial(
         for speed in chosen:
             settings = LiftSettings.of(preset=preset, speed=speed, device="cpu")
             sources = open_sources(splats, cameras, [features], settings)
-            warm_up(sources.splats.kernel, CPU, lift_walk(settings), weighting_of(settings))
-            warm_up_solution()
+            warm_up_lift(sources.splats.kernel, CPU, settings)
             begin = time.process_time()
             made[speed] = lift_sources(Run(settings, 1, silent, Timings(), CPU), sources, inputs)
             seconds[speed] = min(seconds.get(speed, float("inf")), time.process_time() - begin)

@@ -12,12 +12,9 @@ from liftcore.measure.tradeoff.compare import compare
 from liftcore.measure.tradeoff.order import CANDIDATES, EXACT, Scene
 from liftcore.measure.tradeoff.report import page_of, save
 from liftcore.progress import Progress
-from liftcore.raster.warm_up import warm_up
 from liftcore.scene.splats import Kernel
-from liftcore.solve.accumulate import lift_walk, weighting_of
-from liftcore.solve.closed_form import warm_up_solution
-from liftcore.solve.columns import warm_up_tuples
 from liftcore.solve.settings import LiftSettings
+from liftcore.warm_up import warm_up_lift
 from service.finite import finite
 
 SHOWN_DIGITS = 12  # of the splats' digest, by which the chart names the scene
@@ -52,12 +49,8 @@ def compare_as_ordered(order: dict[str, Any], progress: Progress) -> dict[str, A
 
 def _compile(kernel: Kernel, device: Device, settings: dict[str, Any]) -> None:
     """What the runs load: else the first of a kind on a machine eats up the budget."""
-    warm_up_solution()
-    warm_up_tuples()
-    runs = [LiftSettings.of(**settings | candidate.settings) for candidate in (EXACT, *CANDIDATES)]
-    ways = {(lift_walk(run), weighting_of(run)) for run in runs}
-    for walk, weighting in sorted(ways, key=repr):
-        warm_up(kernel, device, walk, weighting)
+    for candidate in (EXACT, *CANDIDATES):
+        warm_up_lift(kernel, device, LiftSettings.of(**settings | candidate.settings))
 
 
 def _scene(order: dict[str, Any]) -> Scene:

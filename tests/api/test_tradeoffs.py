@@ -166,7 +166,7 @@ def test_canceled_tradeoff_leaves_no_process_of_its_runs(client: TestClient, upl
 def test_what_a_comparison_refuses_is_the_users_problem_and_names_no_path(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(comparing, "warm_up", lambda *way: None)
+    monkeypatch.setattr(comparing, "warm_up_lift", lambda *lift: None)
     paths = {kind: str(tmp_path / kind) for kind in ("splats", "cameras", "features")}
     Path(paths["cameras"]).write_bytes(b"of no format")
     order = {

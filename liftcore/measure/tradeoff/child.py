@@ -21,12 +21,9 @@ from liftcore.lift import Run, lift_sources, open_sources
 from liftcore.measure.tradeoff.judge import judge
 from liftcore.measure.tradeoff.order import Order
 from liftcore.progress import silent
-from liftcore.raster.warm_up import warm_up
-from liftcore.solve.accumulate import lift_walk, weighting_of
-from liftcore.solve.closed_form import warm_up_solution
-from liftcore.solve.columns import warm_up_tuples
 from liftcore.solve.settings import LiftSettings
 from liftcore.timings import Timings
+from liftcore.warm_up import warm_up_lift
 
 if TYPE_CHECKING:
     import torch
@@ -51,10 +48,7 @@ def measured(order: Order) -> dict[str, Any]:
         files = (order.scene.splats, order.scene.cameras, *order.scene.features)
         inputs = [input_file(path) for path in files]
     with run.timings.stage("compile"):
-        warm_up_solution()
-        warm_up_tuples()
-        # The lift's own then takes no time.
-        warm_up(sources.splats.kernel, run.device, lift_walk(settings), weighting_of(settings))
+        warm_up_lift(sources.splats.kernel, run.device, settings)  # the lift's own then takes no time
     cpu, wall = time.process_time(), time.perf_counter()
     made = lift_sources(run, sources, inputs)
     seconds = {"cpu": time.process_time() - cpu, "wall": time.perf_counter() - wall}
