@@ -108,6 +108,8 @@ def fly_pilot(
         for weights, columns in zip(store, geometry.columns, strict=True):
             said.add(weights, columns.means(columns.codebook.float() @ axes))
     evidence = _evidence(geometry.evidence[said.rows], seen.areas, seen.areas[flown])
+    if not evidence.any():  # no ray met a splat, so nothing is known of any view
+        return Pilot(seen.areas, np.ones(len(evidence)), np.ones(len(evidence)))
     variance, together = said.disagreement(evidence)
     share = together / (together + (1.0 - together) * (total - 1) / (count - 1))  # B, in the mean
     by_area = _ratio((seen.areas.astype(np.float64) ** 2).sum(axis=0), seen.areas.sum(axis=0, dtype=np.float64) ** 2)

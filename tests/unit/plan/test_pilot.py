@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -118,6 +119,15 @@ def test_a_pilot_that_learns_nothing_expects_nothing_but_errors(tmp_path):
     pilot = flown(splats, cameras, pack)
     assert (pilot.errors == 1).all()
     assert pilot.views_for(0.9, range(VIEWS))[0] > 0.7 * VIEWS
+
+
+def test_where_no_ray_meets_a_splat_all_views_are_taken_and_nothing_is_expected_of_them(tmp_path):
+    _, cameras, pack = disagreeing(tmp_path / "scene", 0.5)
+    away = random_splats(1, 80, 0.01)
+    write_splats(replace(away, means=away.means + 1e4), tmp_path / "away.ply")
+    pilot = flown(tmp_path / "away.ply", cameras, pack)
+    assert not pilot.areas.any()
+    assert pilot.views_for(0.9, range(VIEWS)) == (VIEWS, 0.0)
 
 
 def test_in_a_room_where_views_share_few_splats_a_pilot_is_right_too(tmp_path):
