@@ -40,7 +40,8 @@ class Columns:
         return (self.codebook if self.tuples is None else self.tuples).shape[0]
 
     def means(self, rows: Tensor) -> Tensor:
-        """What the columns read: of some numbers of each row [M, C], the means [T, C] f32 over each tuple.
+        """What the columns read: of some numbers of each row [M, C], the means [T, C] f32 over each tuple; without
+        tuples the rows themselves, of their own type.
 
         Rows are divided before they are added: a mean cannot overflow where its inputs do not.
         """
@@ -52,7 +53,7 @@ class Columns:
         with one_thread():  # else torch's threads keep spinning beside those that solve
             means = embedding_bag(places, rows.float(), mode="sum", per_sample_weights=shares)
         largest = torch.finfo(torch.float32).max
-        return means.clamp_(-largest, largest)  # six thirds of a sixth may be rounded beyond it
+        return means.clamp_(-largest, largest)  # the rounded shares of six rows add up to more than one
 
     def weighted(self, weights: RegionWeights) -> RegionWeights:
         """W by rays, whose columns are these, with each entry as often as its column has rows."""

@@ -116,3 +116,10 @@ def test_columns_are_fewer_and_entries_too():
     assert columns.count == walked.codebook.shape[0] == columns.means(own.codebook).shape[0]
     assert len(by_tuple.columns) < len(by_row.columns)
     assert torch.equal(by_tuple.evidence, by_row.evidence)
+
+
+def test_the_mean_of_the_largest_numbers_is_one_of_them():
+    largest = torch.finfo(torch.float32).max
+    for levels in range(2, 20):
+        same = Columns(torch.full((3, 2), largest), torch.ones(1, levels, dtype=torch.int32))
+        torch.testing.assert_close(same.means(same.codebook), torch.full((1, 2), largest))
