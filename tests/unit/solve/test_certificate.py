@@ -10,7 +10,7 @@ from liftcore.raster.oracle import dense_view, reading_matrix
 from liftcore.raster.protocol import Walk
 from liftcore.scene.load import load_cameras
 from liftcore.solve.settings import LiftSettings
-from tests.scenes import random_grid, random_regions, random_splats
+from tests.scenes import observed, random_splats
 from tests.unit.solve.test_lift_equals_dense import write_scene
 
 ALL_RAYS = 1_000_000
@@ -20,7 +20,7 @@ def dense_measures(X: np.ndarray, seed: int, cameras, gain: float, grids: bool) 
     """Row sums, L, J and beta over every labelled row of every view, in float64."""
     sums, residuals, surrogates, betas = [], [], [], []
     for k, camera in enumerate(cameras):
-        observation = random_grid(seed + k) if grids else random_regions(seed + k)
+        observation = observed(seed, k, grids)
         S, ray = reading_matrix(observation, camera.width, camera.height)
         B = S @ observation.codebook.double().numpy()
         A = dense_view(random_splats(seed, 50), camera, Walk(gain)).A
