@@ -87,6 +87,8 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--rounds", type=int, default=2)
     parser.add_argument("--preset", type=Preset, default=Preset.TIKHONOV, choices=list(Preset), metavar="NAME")
     given = parser.parse_args(arguments)
+    if given.rounds < 1:
+        parser.error(f"--rounds: expected one at least, got {given.rounds}")
     print(table_of(measure_dial(given.folder, given.speeds, given.rounds, given.preset, given.features)))
     return 0
 

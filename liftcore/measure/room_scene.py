@@ -142,6 +142,8 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--clean", action="store_true")
     parser.add_argument("--alike", type=float, default=0.0, metavar="C")
     given = parser.parse_args(arguments)
+    if not 0.0 <= given.alike < 1.0:
+        parser.error(f"--alike: expected a cosine from 0 to below 1, got {given.alike}")
     size = given.width, given.height
     write_room(given.folder, Room(given.splats, given.views, size, given.channels, given.clean, given.alike))
     return 0

@@ -18,11 +18,12 @@ from liftcore.raster.side_by_side import views_at_a_time
 from liftcore.solve.accumulate import lift_walk
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from liftcore.device import Device
     from liftcore.observe.pack import FeaturePacks
     from liftcore.plan.on_device import DevicePlan
+    from liftcore.plan.pilot import Pilot
     from liftcore.plan.visibility import Visibility
     from liftcore.scene.cameras import Cameras
     from liftcore.scene.splats import Splats
@@ -132,7 +133,9 @@ def plan_lift(
     """
     by_name = {name: cameras.get(name) for name in names}
     seen = visibility(splats, list(by_name.values()), lift_walk(settings))
-    chosen, expected = _choose_views(splats, cameras, packs, names, settings, seen, threads)
+    chosen, expected = _choose_views(
+        seen, settings, lambda: fly_pilot(splats, cameras, packs, names, settings, seen, threads)
+    )
     views = [names[k] for k in chosen]
     seen = seen.of(chosen)
     lifted = {name: by_name[name] for name in views}
@@ -163,30 +166,23 @@ def plan_lift(
 
 
 def _choose_views(
-    splats: Splats,
-    cameras: Cameras,
-    packs: FeaturePacks,
-    names: Sequence[str],
-    settings: LiftSettings,
-    seen: Visibility,
-    threads: int | None,
+    seen: Visibility, settings: LiftSettings, fly: Callable[[], Pilot]
 ) -> tuple[list[int], float | None]:
     """The views to lift, ascending, and the cosine that a pilot expects of them, where one was flown.
 
     They show each splat ``coverage`` times and come to ``view_cosine``, whatever takes more of the same order. Where
     a pilot could spare no more views than it looks at, none is flown and all are taken.
     """
-    every = list(range(len(names)))
-    if not settings.coverage and not (settings.view_cosine and len(names) > FEW_VIEWS):
+    every = list(range(seen.areas.shape[0]))
+    if not settings.coverage and not (settings.view_cosine and len(every) > FEW_VIEWS):
         return every, None
     order = list(view_order(seen))
     least = views_to_show(seen, order, settings.coverage)
     if not settings.view_cosine:
         return sorted(order[:least]), None
-    if len(names) <= max(FEW_VIEWS, least + PILOT_VIEWS):
+    if len(every) <= max(FEW_VIEWS, least + PILOT_VIEWS):
         return every, None
-    pilot = fly_pilot(splats, cameras, packs, names, settings, seen, threads)
-    count, expected = pilot.views_for(settings.view_cosine, order, least)
+    count, expected = fly().views_for(settings.view_cosine, order, least)
     return sorted(order[:count]), expected
 
 

@@ -36,11 +36,11 @@ _LINE = 64  # bytes of the processor's cache
 
 
 class Strips(NamedTuple):
-    """Some channels of all codebooks, WIDE of them a strip."""
+    """Some channels of what all columns of W stand for (`solve.columns`), a row each, WIDE channels a strip."""
 
     values: np.ndarray  # [strips * rows * WIDE] f32, or the bits of f16 as u16; zeros beyond the last channel
-    bases: np.ndarray  # [V] i64, where a view's rows begin among those of all
-    rows: int  # of all codebooks together
+    bases: np.ndarray  # [V] i64, where a view's columns begin among those of all
+    rows: int  # columns of W of all views together
     number: int  # of strips
 
 
@@ -48,16 +48,16 @@ class Entries(NamedTuple):
     """W of a block, splat by splat, each in the order of the views."""
 
     starts: np.ndarray  # [B + 1] i64
-    rows: np.ndarray  # [n + AHEAD] i32, among those of all codebooks; zeros at the end, which are only asked for
+    rows: np.ndarray  # [n + AHEAD] i32, of the strips; zeros at the end, which are only asked for
     shares: np.ndarray  # [n] f32, weights times the splat's scale
 
 
 def strips_of(parts: Iterable[Tensor], counts: Sequence[int], channels: int, dtype: torch.dtype) -> Strips:
-    """Strips of the same channels of all codebooks.
+    """Strips of the same channels of what the columns of all views stand for.
 
     Args:
-        parts: [M, channels] of every view, taken one after the other.
-        counts: M of every view.
+        parts: [T, channels] of every view, taken one after the other.
+        counts: T of every view.
         dtype: f16 or f32.
 
     Raises:

@@ -6,6 +6,7 @@ import pytest
 
 from liftcore.measure.dial import main, measure_dial
 from liftcore.measure.room_scene import Room, write_room
+from liftcore.measure.room_scene import main as room_main
 from liftcore.solve.settings import Preset, Speed
 
 
@@ -29,3 +30,17 @@ def test_the_table_has_a_line_for_each_speed(room, capsys):
     assert main([str(room), "--speeds", "draft", "--rounds", "1"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines[:3]] == ["dial", "exact", "draft"]
+
+
+@pytest.mark.parametrize(
+    ("command", "given", "told"),
+    [
+        (main, ["--rounds", "0"], "--rounds: expected one at least, got 0"),
+        (room_main, ["--alike", "1.5"], "--alike: expected a cosine from 0 to below 1, got 1.5"),
+    ],
+)
+def test_what_can_be_neither_counted_nor_made_is_refused_in_words(tmp_path, capsys, command, given, told):
+    with pytest.raises(SystemExit, match="2"):
+        command([str(tmp_path), *given])
+    assert told in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
