@@ -91,6 +91,10 @@ def minimum(builder: Builder, left: ir.Value, right: ir.Value) -> ir.Value:
     return builder.select(builder.fcmp_ordered("<", left, right), left, right)
 
 
+def maximum(builder: Builder, left: ir.Value, right: ir.Value) -> ir.Value:
+    return builder.select(builder.fcmp_ordered(">", left, right), left, right)
+
+
 def fused(builder: Builder, left: ir.Value, right: ir.Value, term: ir.Value) -> ir.Value:
     """``left * right + term``, one instruction where the machine has it."""
     return builder.fadd(builder.fmul(left, right, flags=FUSE), term, flags=FUSE)

@@ -40,24 +40,24 @@ if TYPE_CHECKING:
 
 
 class GaussianLanes(NamedTuple):
-    """``e = base + curvature (start + i)^2``."""
+    """``e = base + (start + root i)^2``."""
 
     start: np.float32
-    curvature: np.float32
+    root: np.float32
     base: np.float32
 
 
 class BetaLanes(NamedTuple):
-    """``sigma = base + curvature (start + i)^2``, ``2^-e = (1 - sigma)^beta``, zero from ``sigma = 1`` on."""
+    """``sigma = base + (start + root i)^2``, ``2^-e = (1 - sigma)^beta``, zero from ``sigma = 1`` on."""
 
     start: np.float32
-    curvature: np.float32
+    root: np.float32
     base: np.float32
     beta: np.float32
 
 
 class DiscLanes(NamedTuple):
-    """``e = min((s^2 + t^2) / d^2, base + curvature (start + i)^2)``, the first where ``d > 0`` only.
+    """``e = min((s^2 + t^2) / d^2, base + (start + root i)^2)``, the first where ``d > 0`` only.
 
     s, t and d are affine in the lane: each has its value at lane 0 and its step, both as a float32 and the rest that
     the float32 leaves out. So a disc that is seen nearly edge-on, whose s changes by thousands a pixel, keeps its
@@ -65,7 +65,7 @@ class DiscLanes(NamedTuple):
     """
 
     start: np.float32
-    curvature: np.float32
+    root: np.float32
     base: np.float32
     s: np.float32
     s_rest: np.float32
@@ -88,10 +88,13 @@ _LOG2_DEGREE = 9
 _LOG2_E = 1.0 / math.log(2.0)
 _ROOT_HALF_BITS = int(np.float32(math.sqrt(0.5)).view(np.int32))
 _MANTISSA_BITS = 23
+_ROUND_DOWN = f"llvm.floor.v{LANES}f32"
+_LANE_NUMBERS = ir.Constant(FLOATS, [float(lane) for lane in range(LANES)])
+_BOTH = (TRANSMITTANCE, PLAIN_TRANSMITTANCE)
 _SMALLEST_REST = 2.0**-100  # of 1 - sigma, where its logarithm is taken
 
 # The table's rows are eight equal constants: operands in memory cost no instruction of their own.
-_LANE_ROW, _CLAMP_ROW, _FLOOR_ROW, _CAP_ROW, _STOP_ROW, _EXP2_ROW = range(6)  # then one row a coefficient
+_LIMIT_ROW, _LARGEST_ROW, _FLOOR_ROW, _CAP_ROW, _STOP_ROW, _EXP2_ROW = range(6)  # then one row a coefficient
 _LOG2_ROW = _EXP2_ROW + _EXP2_DEGREE + 1
 STATE = TABLE + (_LOG2_ROW + _LOG2_DEGREE + 1) * LANES  # length of a tile's array
 
@@ -127,9 +130,10 @@ _LOG2 = _log2_coefficients()
 def new_state(floor, cap, stop):
     """A tile's state [STATE] f32: all rays done, the constants of the walk in place."""
     state = np.zeros(STATE, np.float32)
+    limit = -math.log2(floor) if floor > 0 else LARGEST_EXPONENT
     for lane in range(LANES):
-        state[TABLE + _LANE_ROW * LANES + lane] = lane
-        state[TABLE + _CLAMP_ROW * LANES + lane] = LARGEST_EXPONENT
+        state[TABLE + _LIMIT_ROW * LANES + lane] = limit
+        state[TABLE + _LARGEST_ROW * LANES + lane] = LARGEST_EXPONENT
         state[TABLE + _FLOOR_ROW * LANES + lane] = floor
         state[TABLE + _CAP_ROW * LANES + lane] = cap
         state[TABLE + _STOP_ROW * LANES + lane] = stop
@@ -150,11 +154,15 @@ def _integers(value: int) -> ir.Constant:
     return ir.Constant(INTS, [value] * LANES)
 
 
-def _exp2_negative(builder: Builder, state: ir.Value, exponent: ir.Value) -> ir.Value:
-    """``2^-e`` for e >= 0: the fraction by polynomial, the whole part subtracted from the exponent bits."""
-    clamped = minimum(builder, exponent, _row(builder, state, _CLAMP_ROW))
-    whole = builder.fptosi(clamped, INTS)
-    rest = builder.fsub(clamped, builder.sitofp(whole, FLOATS))
+def _falloff(builder: Builder, state: ir.Value, exponent: ir.Value) -> ir.Value:
+    """``2^-e`` for e >= 0: the fraction by polynomial, the whole part subtracted from the exponent bits.
+
+    Finite for any e, infinity and no number too, so that it may be multiplied by zero.
+    """
+    kind = ir.FunctionType(FLOATS, [FLOATS])
+    below = builder.call(cgutils.get_or_insert_function(builder.module, kind, _ROUND_DOWN), [exponent])
+    rest = builder.fsub(exponent, below)
+    whole = builder.fptosi(minimum(builder, exponent, _row(builder, state, _LARGEST_ROW)), INTS)
     square = builder.fmul(rest, rest)
     pairs = [  # Estrin's scheme: three short chains instead of one long one
         fused(builder, _row(builder, state, _EXP2_ROW + k + 1), rest, _row(builder, state, _EXP2_ROW + k))
@@ -183,21 +191,25 @@ def _log2(builder: Builder, state: ir.Value, value: ir.Value) -> ir.Value:
     return fused(builder, total, f, builder.sitofp(whole, FLOATS))
 
 
-def _quadratic(builder: Builder, state: ir.Value, parts: list[ir.Value]) -> ir.Value:
-    """``base + curvature (start + i)^2`` of ``parts = (start, curvature, base)``."""
-    start, curvature, base = parts
-    u = builder.fadd(start, _row(builder, state, _LANE_ROW))
-    return fused(builder, builder.fmul(curvature, u), u, base)
+def _faded(builder: Builder, exponent: ir.Value, fade: ir.Value | None) -> ir.Value:
+    return exponent if fade is None else builder.fadd(exponent, fade)
 
 
-def _gaussian_falloff(builder: Builder, state: ir.Value, parts: list[ir.Value]) -> ir.Value:
-    return _exp2_negative(builder, state, _quadratic(builder, state, parts))
+def _quadratic(builder: Builder, parts: list[ir.Value], fade: ir.Value | None = None) -> ir.Value:
+    """``base + (start + root i)^2`` of ``parts = (start, root, base)``, and the fade."""
+    start, root, base = parts
+    u = builder.fadd(start, builder.fmul(root, _LANE_NUMBERS))
+    return fused(builder, u, u, _faded(builder, base, fade))
 
 
-def _beta_falloff(builder: Builder, state: ir.Value, parts: list[ir.Value]) -> ir.Value:
-    """``(1 - sigma)^beta``: ``1 - sigma`` is rounded for the logarithm, and what that lost is put back."""
+def _gaussian_exponent(builder: Builder, state: ir.Value, parts: list[ir.Value], fade: ir.Value | None) -> ir.Value:
+    return _quadratic(builder, parts, fade)
+
+
+def _beta_exponent(builder: Builder, state: ir.Value, parts: list[ir.Value], fade: ir.Value | None) -> ir.Value:
+    """Of ``(1 - sigma)^beta``: ``1 - sigma`` is rounded for the logarithm, and what that lost is put back."""
     one, zero = _row(builder, state, _EXP2_ROW), constant(0.0)
-    sigma = _quadratic(builder, state, parts[:3])
+    sigma = _quadratic(builder, parts[:3])
     inside = builder.fcmp_ordered("<", sigma, one)
     rest = builder.select(inside, builder.fsub(one, sigma), one)
     smallest = constant(_SMALLEST_REST)
@@ -205,48 +217,49 @@ def _beta_falloff(builder: Builder, state: ir.Value, parts: list[ir.Value]) -> i
     lost = builder.fsub(builder.fsub(one, rest), sigma)
     logarithm = fused(builder, lost, constant(_LOG2_E), _log2(builder, state, rest))
     exponent = builder.fmul(parts[3], builder.fsub(zero, logarithm))
-    met = builder.and_(inside, builder.fcmp_ordered("<", exponent, _row(builder, state, _CLAMP_ROW)))
-    kept = builder.select(met, exponent, zero)
-    return builder.select(met, _exp2_negative(builder, state, kept), zero)
+    return builder.select(inside, _faded(builder, exponent, fade), constant(math.inf))
 
 
-def _disc_falloff(builder: Builder, state: ir.Value, parts: list[ir.Value]) -> ir.Value:
-    lane, zero = _row(builder, state, _LANE_ROW), constant(0.0)
-    nearby = _quadratic(builder, state, parts[:3])
-    s, t, d = (_affine(builder, lane, parts[at : at + 4]) for at in (3, 7, 11))
+def _disc_exponent(builder: Builder, state: ir.Value, parts: list[ir.Value], fade: ir.Value | None) -> ir.Value:
+    zero = constant(0.0)
+    nearby = _quadratic(builder, parts[:3])
+    s, t, d = (_affine(builder, parts[at : at + 4]) for at in (3, 7, 11))
     square = fused(builder, s, s, builder.fmul(t, t))
     crossing = builder.fdiv(square, builder.fmul(d, d))
     # Ordered comparisons: where the ray misses the plane, the quotient is no number and the low-pass counts.
     met = builder.and_(builder.fcmp_ordered(">", d, zero), builder.fcmp_ordered("<", crossing, nearby))
-    return _exp2_negative(builder, state, builder.select(met, crossing, nearby))
+    return _faded(builder, builder.select(met, crossing, nearby), fade)
 
 
-def _affine(builder: Builder, lane: ir.Value, parts: list[ir.Value]) -> ir.Value:
+def _affine(builder: Builder, parts: list[ir.Value]) -> ir.Value:
     """``value + step i``, with the rests of both added last."""
     value, value_rest, step, step_rest = parts
-    return builder.fadd(fused(builder, step, lane, value), fused(builder, step_rest, lane, value_rest))
+    return builder.fadd(
+        fused(builder, step, _LANE_NUMBERS, value), fused(builder, step_rest, _LANE_NUMBERS, value_rest)
+    )
 
 
-_FALLOFFS: dict[type, Callable[[Builder, ir.Value, list[ir.Value]], ir.Value]] = {
-    GaussianLanes: _gaussian_falloff,
-    BetaLanes: _beta_falloff,
-    DiscLanes: _disc_falloff,
+_EXPONENTS: dict[type, Callable[[Builder, ir.Value, list[ir.Value], ir.Value | None], ir.Value]] = {
+    GaussianLanes: _gaussian_exponent,
+    BetaLanes: _beta_exponent,
+    DiscLanes: _disc_exponent,
 }
 
 
-def _composite(builder: Builder, state: ir.Value, falloff: ir.Value, opacity: ir.Value, place: ir.Value) -> ir.Value:
+def _composite(builder: Builder, state: ir.Value, alpha: ir.Value, met: ir.Value, place: ir.Value) -> ir.Value:
     """Weights of one splat on eight rays whose T lies at ``place`` (paper Eq. 1); T moves on.
 
-    ``a = min(cap, opacity falloff)``, nothing below the floor; ``w = a T``; a ray whose next T would be at or below
-    the stop takes nothing and is done (T = 0).
+    ``w = a T`` where the splat is met, a at most the cap. A ray whose next T would be at or below the stop takes
+    nothing and is done, T = 0. The walk waits for the chain from the exponent to T: what needs no alpha, T of the
+    rays that are met and how much of it may go, is made beside it.
     """
     zero = constant(0.0)
-    raw = minimum(builder, builder.fmul(opacity, falloff), _row(builder, state, _CAP_ROW))
-    alpha = builder.select(builder.fcmp_ordered(">=", raw, _row(builder, state, _FLOOR_ROW)), raw, zero)
     before = load_lanes(builder, place)
-    weight = builder.fmul(alpha, before)
+    room = builder.fsub(before, _row(builder, state, _STOP_ROW))
+    lit = builder.select(met, before, zero)
+    weight = builder.fmul(minimum(builder, alpha, _row(builder, state, _CAP_ROW)), lit)
     after = builder.fsub(before, weight)  # 1 - a would be rounded first, and a million faint splats be lost
-    alive = builder.fcmp_ordered(">", after, _row(builder, state, _STOP_ROW))
+    alive = builder.fcmp_ordered("<", weight, room)
     builder.store(builder.select(alive, after, zero), place, align=4)
     return builder.select(alive, weight, zero)
 
@@ -258,8 +271,8 @@ def _signature(result: Any, shape: Any, opacity: Any) -> Any:
     return result(FLOAT_ARRAY, types.intp, shape, opacity)
 
 
-def _prepared(context, builder, signature, args) -> tuple[ir.Value, ir.Value, Callable[[int], ir.Value]]:
-    """The state's address, the falloff on the lanes, and where the lanes' rays of a part of the state lie."""
+def _prepared(context, builder, signature, args) -> tuple[ir.Value, Callable, Callable[[int], ir.Value]]:
+    """The state's address, the exponent on the lanes for a fade, and where the lanes' rays of a part lie."""
     array, offset, shape, _ = args
     state = context.make_array(signature.args[0])(context, builder, value=array).data
     parts = [broadcast(builder, part) for part in cgutils.unpack_tuple(builder, shape)]
@@ -268,19 +281,24 @@ def _prepared(context, builder, signature, args) -> tuple[ir.Value, ir.Value, Ca
         place = builder.gep(state, [builder.add(offset, ir.Constant(offset.type, part))])
         return builder.bitcast(place, FLOATS.as_pointer())
 
-    return state, _FALLOFFS[signature.args[2].instance_class](builder, state, parts), at
+    def exponent(fade: ir.Value | None) -> ir.Value:
+        return _EXPONENTS[signature.args[2].instance_class](builder, state, parts, fade)
+
+    return state, exponent, at
 
 
 @compiled
-def blend_lanes(typingctx, state, offset, shape, opacity):
+def blend_lanes(typingctx, state, offset, shape, fade):
     """Composite one splat over the eight pixels from ``offset`` on, and give its weights there.
 
-    ``shape`` is one of the tuples above, in float32.
+    ``shape`` is one of the tuples above, in float32; ``a = 2^-(e + fade)``, zero below the floor.
     """
 
     def codegen(context, builder, signature, args):
-        data, falloff, at = _prepared(context, builder, signature, args)
-        return _composite(builder, data, falloff, broadcast(builder, args[3]), at(TRANSMITTANCE))
+        data, exponent, at = _prepared(context, builder, signature, args)
+        faded = exponent(broadcast(builder, args[3]))
+        met = builder.fcmp_ordered("<=", faded, _row(builder, data, _LIMIT_ROW))
+        return _composite(builder, data, _falloff(builder, data, faded), met, at(TRANSMITTANCE))
 
     signature = _signature(EIGHT, shape, types.float32)
     return None if signature is None else (signature, codegen)
@@ -288,14 +306,22 @@ def blend_lanes(typingctx, state, offset, shape, opacity):
 
 @compiled
 def blend_twice(typingctx, state, offset, shape, opacities):
-    """``blend_lanes`` for two opacities, each with rays of its own: the weights, and those of the plain rays."""
+    """``blend_lanes`` for two opacities, each with rays of its own: the weights, and those of the plain rays.
+
+    ``a = opacity 2^-e``: one power for both.
+    """
 
     def codegen(context, builder, signature, args):
-        data, falloff, at = _prepared(context, builder, signature, args)
-        own, plain = (broadcast(builder, opacity) for opacity in cgutils.unpack_tuple(builder, args[3]))
-        weights = _composite(builder, data, falloff, own, at(TRANSMITTANCE))
-        others = _composite(builder, data, falloff, plain, at(PLAIN_TRANSMITTANCE))
-        return context.make_tuple(builder, signature.return_type, [weights, others])
+        data, exponent, at = _prepared(context, builder, signature, args)
+        alone, zero = exponent(None), constant(0.0)
+        within = builder.fcmp_ordered("<=", alone, _row(builder, data, _LARGEST_ROW))
+        falloff = builder.select(within, _falloff(builder, data, alone), zero)
+        weights = []
+        for opacity, part in zip(cgutils.unpack_tuple(builder, args[3]), _BOTH, strict=True):
+            alpha = builder.fmul(broadcast(builder, opacity), falloff)
+            met = builder.fcmp_ordered(">=", alpha, _row(builder, data, _FLOOR_ROW))
+            weights.append(_composite(builder, data, alpha, met, at(part)))
+        return context.make_tuple(builder, signature.return_type, weights)
 
     signature = _signature(types.UniTuple(EIGHT, 2), shape, types.UniTuple(types.float32, 2))
     return None if signature is None else (signature, codegen)

@@ -16,8 +16,8 @@ from liftcore.lanes import (
     BASES,
     FLOAT,
     FLOAT_ARRAY,
+    FLOATS,
     HALVES,
-    INT,
     INTS,
     LANES,
     ROWS,
@@ -26,6 +26,8 @@ from liftcore.lanes import (
     compiled,
     constant,
     load_lanes,
+    maximum,
+    minimum,
     pointer_to,
 )
 
@@ -34,27 +36,21 @@ if TYPE_CHECKING:
 
 _SET = ir.IntType(HALVES)
 _WHOLE = ir.IntType(32 * LANES)
-_DOUBLES = ir.VectorType(ir.DoubleType(), ROWS)  # a value for each row
-_SINGLES = ir.VectorType(FLOAT, ROWS)
+_DOUBLES = ir.VectorType(ir.DoubleType(), LANES)  # a value for each of eight rows
 _SLACK = 1.0 + 2.0**-19  # of the reach: a set lacks no half row for the rounding of float32
 
 
-def _each(kind: ir.VectorType, values: list[float]) -> ir.Constant:
-    return ir.Constant(kind, values)
-
-
-def _all(builder: Builder, kind: ir.VectorType, value: ir.Value) -> ir.Value:
-    first = builder.insert_element(ir.Constant(kind, ir.Undefined), value, ir.Constant(INT, 0))
-    return builder.shuffle_vector(first, first, ir.Constant(ir.VectorType(INT, ROWS), [0] * ROWS))
+def _all(builder: Builder, value: ir.Value) -> ir.Value:
+    return broadcast(builder, value, _DOUBLES)
 
 
 @compiled
 def ellipse_halves(typingctx, state, centre, slope, curvature, reach):
-    """The half rows with a lane where ``kx (x - mx - slope dy)^2 + ky dy^2 <= reach``, ``dy = row - my``.
+    """The half rows with a lane where ``(root (x - mx - slope dy))^2 + ky dy^2 <= reach``, ``dy = row - my``.
 
-    The footprint's ``centre = (mx, my)`` counts from the tile's first pixel centre, ``curvature = (kx, ky)``. Lanes
+    The footprint's ``centre = (mx, my)`` counts from the tile's first pixel centre, ``curvature = (root, ky)``. Lanes
     are met between their centres too: a set may hold a half row that has no weight, and lacks none that has. Left in
-    ``state``: how far right of the footprint's middle each half row begins, and ``ky dy^2`` of each row.
+    ``state``: how far right of the footprint's middle each half row begins, times root, and ``ky dy^2`` of each row.
 
     The middles are made in float64: along a needle they are small differences of large numbers.
     """
@@ -63,36 +59,37 @@ def ellipse_halves(typingctx, state, centre, slope, curvature, reach):
     def codegen(context, builder, signature, args):
         state, centre, slope, curvature, reach = args
         mx, my = (builder.extract_value(centre, k) for k in range(2))
-        numbers, none = [float(row) for row in range(ROWS)], _each(_SINGLES, [0.0] * ROWS)
-
-        def single(value: ir.Value) -> ir.Value:
-            return _all(builder, _SINGLES, builder.fptrunc(value, FLOAT))
+        slack = builder.fmul(reach, ir.Constant(ir.DoubleType(), _SLACK))
+        root, ky, top, room = (
+            broadcast(builder, builder.fptrunc(value, FLOAT))
+            for value in (*(builder.extract_value(curvature, k) for k in range(2)), my, slack)
+        )
+        width, zero = builder.fmul(root, constant(LANES - 1.0)), constant(0.0)
 
         def keep(first: int, values: ir.Value) -> None:
             place = ir.Constant(ir.IntType(64), first)
-            pointer = pointer_to(context, builder, signature.args[0], state, place)
-            builder.store(values, builder.bitcast(pointer, _SINGLES.as_pointer()), align=4)
+            builder.store(values, pointer_to(context, builder, signature.args[0], state, place), align=4)
 
-        kx, ky = (single(builder.extract_value(curvature, k)) for k in range(2))
-        below = builder.fsub(_all(builder, _DOUBLES, my), _each(_DOUBLES, numbers))
-        across = builder.fsub(builder.fmul(_all(builder, _DOUBLES, slope), below), _all(builder, _DOUBLES, mx))
-        left = builder.fptrunc(across, _SINGLES)
-        dy = builder.fsub(_each(_SINGLES, numbers), single(my))
-        base = builder.fmul(builder.fmul(ky, dy), dy)
-        keep(BASES, base)
-        room = builder.fsub(single(builder.fmul(reach, ir.Constant(ir.DoubleType(), _SLACK))), base)
         halves = ir.Constant(_SET, 0)
-        for side in range(2):
-            start = builder.fadd(left, _each(_SINGLES, [float(LANES)] * ROWS)) if side else left
-            keep(STARTS + side * ROWS, start)
-            end = builder.fadd(start, _each(_SINGLES, [LANES - 1.0] * ROWS))
-            # Right of the middle counts the first lane, left of it the last, and around it the middle itself.
-            right_of = builder.select(builder.fcmp_ordered(">", start, none), start, none)
-            left_of = builder.select(builder.fcmp_ordered("<", end, none), end, none)
-            away = builder.fadd(right_of, left_of)
-            met = builder.fcmp_ordered("<=", builder.fmul(builder.fmul(kx, away), away), room)
-            bits = builder.zext(builder.bitcast(met, ir.IntType(ROWS)), _SET)
-            halves = builder.or_(halves, builder.shl(bits, ir.Constant(_SET, side * ROWS)))
+        for first in range(0, ROWS, LANES):
+            numbers = [float(row) for row in range(first, first + LANES)]
+            below = builder.fsub(_all(builder, my), ir.Constant(_DOUBLES, numbers))
+            across = builder.fsub(builder.fmul(_all(builder, slope), below), _all(builder, mx))
+            left = builder.fptrunc(across, FLOATS)
+            dy = builder.fsub(ir.Constant(FLOATS, numbers), top)
+            base = builder.fmul(builder.fmul(ky, dy), dy)
+            keep(BASES + first, base)
+            rest = builder.fsub(room, base)
+            for side in range(2):
+                start = builder.fmul(builder.fadd(left, constant(LANES)) if side else left, root)
+                keep(STARTS + side * ROWS + first, start)
+                # Right of the middle counts the first lane, left of it the last, and around it the middle itself.
+                right_of = maximum(builder, start, zero)
+                left_of = minimum(builder, builder.fadd(start, width), zero)
+                away = builder.fadd(right_of, left_of)
+                met = builder.fcmp_ordered("<=", builder.fmul(away, away), rest)
+                bits = builder.zext(builder.bitcast(met, ir.IntType(LANES)), _SET)
+                halves = builder.or_(halves, builder.shl(bits, ir.Constant(_SET, side * ROWS + first)))
         return halves
 
     return types.uint32(FLOAT_ARRAY, pair, types.float64, pair, types.float64), codegen

@@ -30,7 +30,7 @@ from liftcore.raster.records import (
     D_X,
     D_Y,
     D_ZERO,
-    KX,
+    FADE,
     KY,
     MX,
     MY,
@@ -38,6 +38,7 @@ from liftcore.raster.records import (
     OPACITY,
     PLAIN,
     REACH,
+    ROOT_X,
     S_X,
     S_Y,
     SLOPE,
@@ -74,11 +75,12 @@ class GaussianFootprint(NamedTuple):
     mx: float
     my: float
     slope: float
-    kx: float
+    root_x: float
     ky: float
     reach: float
     opacity: float
     plain: float  # opacity without the gain
+    fade: float
 
 
 class BetaFootprint(NamedTuple):
@@ -87,11 +89,12 @@ class BetaFootprint(NamedTuple):
     mx: float
     my: float
     slope: float
-    kx: float
+    root_x: float
     ky: float
     reach: float
     opacity: float
     plain: float
+    fade: float
     beta: float
 
 
@@ -103,13 +106,14 @@ class DiscFootprint(NamedTuple):
     outline_x: float  # centre of the outline
     outline_y: float
     slope: float
-    kx: float
+    root_x: float
     ky: float
     reach: float
     opacity: float
     plain: float
+    fade: float
     nearby: float  # px, radius of the circle
-    curvature: float  # of the low-pass
+    root: float  # of the low-pass's curvature
     s_x: float  # s, t and d by pixel, from the projected centre on
     s_y: float
     t_x: float
@@ -147,11 +151,12 @@ def _gaussian_footprint(kernel, records, place, x0, y0):
         records[place, MX] - x0 - 0.5,
         records[place, MY] - y0 - 0.5,
         records[place, SLOPE],
-        records[place, KX],
+        records[place, ROOT_X],
         records[place, KY],
         records[place, REACH],
         records[place, OPACITY],
         records[place, PLAIN],
+        records[place, FADE],
     )
 
 
@@ -160,11 +165,12 @@ def _beta_footprint(kernel, records, place, x0, y0):
         records[place, MX] - x0 - 0.5,
         records[place, MY] - y0 - 0.5,
         records[place, SLOPE],
-        records[place, KX],
+        records[place, ROOT_X],
         records[place, KY],
         records[place, REACH],
         records[place, OPACITY],
         records[place, PLAIN],
+        records[place, FADE],
         records[place, BETA],
     )
 
@@ -176,13 +182,14 @@ def _disc_footprint(kernel, records, place, x0, y0):
         records[place, MX] - x0 - 0.5,
         records[place, MY] - y0 - 0.5,
         records[place, SLOPE],
-        records[place, KX],
+        records[place, ROOT_X],
         records[place, KY],
         records[place, REACH],
         records[place, OPACITY],
         records[place, PLAIN],
+        records[place, FADE],
         records[place, NEARBY],
-        kernel.curvature,
+        math.sqrt(kernel.curvature),
         records[place, S_X],
         records[place, S_Y],
         records[place, T_X],
@@ -194,23 +201,23 @@ def _disc_footprint(kernel, records, place, x0, y0):
 
 
 def _ellipse_halves(splat, state):
-    return ellipse_halves(state, (splat.mx, splat.my), splat.slope, (splat.kx, splat.ky), splat.reach)
+    return ellipse_halves(state, (splat.mx, splat.my), splat.slope, (splat.root_x, splat.ky), splat.reach)
 
 
 def _disc_halves(splat, state):
-    outline = (splat.outline_x, splat.outline_y), splat.slope, (splat.kx, splat.ky)
+    outline = (splat.outline_x, splat.outline_y), splat.slope, (splat.root_x, splat.ky)
     within = ellipse_halves(state, *outline, splat.reach)
     squared = splat.nearby * splat.nearby if splat.nearby >= 0 else -1.0
     return either(within, ellipse_halves(state, (splat.mx, splat.my), 0.0, (1.0, 1.0), squared))
 
 
 def _gaussian_lanes(splat, state, half):
-    return GaussianLanes(state[STARTS + half], np.float32(splat.kx), state[BASES + (half & (ROWS - 1))])
+    return GaussianLanes(state[STARTS + half], np.float32(splat.root_x), state[BASES + (half & (ROWS - 1))])
 
 
 def _beta_lanes(splat, state, half):
     start, base = state[STARTS + half], state[BASES + (half & (ROWS - 1))]
-    return BetaLanes(start, np.float32(splat.kx), base, np.float32(splat.beta))
+    return BetaLanes(start, np.float32(splat.root_x), base, np.float32(splat.beta))
 
 
 @inlined
@@ -229,7 +236,7 @@ def _disc_lanes(splat, state, half):
     d, d_rest = _halved(splat.d_zero + splat.d_x * dx + splat.d_y * dy)
     d_step, d_step_rest = _halved(splat.d_x)
     return DiscLanes(
-        np.float32(dx), np.float32(splat.curvature), np.float32(splat.curvature * dy * dy),
+        np.float32(splat.root * dx), np.float32(splat.root), np.float32(splat.root * splat.root * dy * dy),
         s, s_rest, s_step, s_step_rest, t, t_rest, t_step, t_step_rest, d, d_rest, d_step, d_step_rest,
     )  # fmt: skip
 
@@ -238,8 +245,8 @@ def _disc_lanes(splat, state, half):
 def _ellipse_at(record, x, y):
     """The quadratic form of a record at a point."""
     dy = y - record[MY]
-    dx = x - record[MX] - record[SLOPE] * dy
-    return record[KX] * dx * dx + record[KY] * dy * dy
+    across = record[ROOT_X] * (x - record[MX] - record[SLOPE] * dy)
+    return across * across + record[KY] * dy * dy
 
 
 def _gaussian_alpha(kernel, record, x, y):

@@ -22,7 +22,7 @@ from liftcore.raster.records import (
     BETA,
     EXTENT_X,
     EXTENT_Y,
-    KX,
+    FADE,
     KY,
     LEAN,
     MX,
@@ -30,6 +30,7 @@ from liftcore.raster.records import (
     OPACITY,
     PLAIN,
     REACH,
+    ROOT_X,
     SLOPE,
 )
 
@@ -134,6 +135,12 @@ def turned(pose, axes, j, k):
     return x, y, z
 
 
+@inlined
+def fade_of(opacity):
+    """``-log2 o``: what the exponent of a falloff grows by, so that it is the alpha's."""
+    return -math.log2(opacity) if opacity > 0 else math.inf
+
+
 @kernel
 def project_ellipses(first, last, scene, view, unit, antialiased, targets):
     """Footprints of the splats ``first..last`` that touch the image, packed from row ``first`` on.
@@ -199,13 +206,14 @@ def project_ellipses(first, last, scene, view, unit, antialiased, targets):
         records[row, MX] = mx
         records[row, MY] = my
         records[row, SLOPE] = xy / yy
-        records[row, KX] = unit * yy / det
+        records[row, ROOT_X] = math.sqrt(unit * yy / det)
         records[row, KY] = unit / yy
         records[row, REACH] = reach
         records[row, EXTENT_X] = extent_x
         records[row, EXTENT_Y] = extent_y
         records[row, LEAN] = xy / xx * extent_x
         records[row, OPACITY] = faded * scene.opacity[j]
+        records[row, FADE] = fade_of(faded * scene.opacity[j])
         records[row, PLAIN] = faded * scene.plain[j]
         if has_beta:
             records[row, BETA] = scene.beta[j]

@@ -17,7 +17,7 @@ import math
 
 from liftcore.jit import inlined, kernel
 from liftcore.raster.constants import EDGE_ON, NEAR_PLANE
-from liftcore.raster.projection import HALF_LOG2_E, to_camera, turned
+from liftcore.raster.projection import HALF_LOG2_E, fade_of, to_camera, turned
 from liftcore.raster.records import (
     CENTRE_X,
     CENTRE_Y,
@@ -26,7 +26,7 @@ from liftcore.raster.records import (
     D_ZERO,
     EXTENT_X,
     EXTENT_Y,
-    KX,
+    FADE,
     KY,
     LEAN,
     MX,
@@ -35,6 +35,7 @@ from liftcore.raster.records import (
     OPACITY,
     PLAIN,
     REACH,
+    ROOT_X,
     S_X,
     S_Y,
     SLOPE,
@@ -86,6 +87,7 @@ def project_discs(first, last, scene, view, curvature, targets):
         if not (right >= 0.5 and left <= view.width - 0.5 and bottom >= 0.5 and top <= view.height - 0.5):
             continue
         record[OPACITY] = scene.opacity[j]
+        record[FADE] = fade_of(scene.opacity[j])
         record[PLAIN] = scene.plain[j]
         targets.depths[row] = centre[2]
         targets.ids[row] = j
@@ -128,7 +130,7 @@ def _write_ellipse(record, middle, covariance, det):
     xx, xy, yy = covariance
     record[MX], record[MY] = middle
     record[SLOPE] = xy / yy
-    record[KX] = yy / det
+    record[ROOT_X] = math.sqrt(yy / det)
     record[KY] = 1.0 / yy
     record[REACH] = 1.0
     record[EXTENT_X] = math.sqrt(xx)
@@ -177,7 +179,7 @@ def _write_outline(record, centre, a, b, largest, view):
     record[EXTENT_X], record[EXTENT_Y] = half_x, half_y
     record[SLOPE] = record[LEAN] = 0.0
     # Half of the reach for each side: the ellipse through the corners of the box, of which the tiles know the sides.
-    record[KX] = 1.0 / max(_MARGIN, half_x) ** 2
+    record[ROOT_X] = 1.0 / max(_MARGIN, half_x)
     record[KY] = 1.0 / max(_MARGIN, half_y) ** 2
     record[REACH] = 2.0
 

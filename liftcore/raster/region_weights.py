@@ -26,7 +26,7 @@ from liftcore.lanes_halves import lowest_rank, ranked_halves, without_lowest_ran
 from liftcore.raster.constants import TILE
 from liftcore.raster.readings import LAST_BIT, MAX_SLOTS, NO_SLOT, new_taps, read_tile
 from liftcore.raster.selection import CENTRAL, LARGEST, NO_SPOT, choose, new_marks, rank_tile, spot_of
-from liftcore.raster.walk import CHECK_EVERY, blend, blend_both, look, meets, new_rays, next_splat, start_rays
+from liftcore.raster.walk import CHECK_EVERY, blend_both, look, meets, new_rays, next_splat, start_rays
 
 
 @kernel
@@ -65,7 +65,7 @@ def weigh_tiles(first, last, frame, reading, squared, gate, plain):
         x0 = float((tile % frame.columns) * TILE)
         y0 = float((tile // frame.columns) * TILE)
         if gate is not None and gate.kind == LARGEST:
-            rank_tile(rays, frame, tile, marks, gate.k)
+            rank_tile(rays, frame, tile, marks, gate.k, plain)
         start_rays(rays, frame, tile)
         read_tile(taps, reading, frame, tile)
         used, whole_tile = taps.sizes[0], reuse and taps.sizes[1] == 1
@@ -90,12 +90,8 @@ def weigh_tiles(first, last, frame, reading, squared, gate, plain):
                     rank = lowest_rank(ranked)
                     ranked = without_lowest_rank(ranked)
                     half = rank & (HALVES - 1)
-                    if plain is not None:
-                        heavy, light = blend_both(rays, splat, half)
-                        seen = plus(seen, light)
-                    else:
-                        heavy = blend(rays, splat, half)
-                        seen = plus(seen, heavy)
+                    heavy, light = blend_both(rays, splat, half, plain)
+                    seen = plus(seen, light)
                     if whole_tile:
                         continue
                     if gate is not None:

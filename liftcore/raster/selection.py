@@ -17,7 +17,7 @@ from liftcore.lanes import LANES, PIXELS, TRANSMITTANCE, WEIGHTS, keep_lanes
 from liftcore.lanes_halves import lowest_half, without_lowest
 from liftcore.raster.constants import TILE
 from liftcore.raster.protocol import MOST_OF_A_RAY, Selection, Weighting
-from liftcore.raster.walk import CHECK_EVERY, blend, look, meets, next_splat, place_of, start_rays
+from liftcore.raster.walk import CHECK_EVERY, blend_both, look, meets, next_splat, place_of, start_rays
 
 EVERY, LARGEST, FRONT, CENTRAL = range(4)
 _KINDS = {
@@ -88,8 +88,8 @@ def new_marks(choice) -> Any:
 
 
 @kernel
-def rank_tile(rays, frame, tile, marks, count):
-    """Walk a tile once for the ``count`` largest weights of every ray; the rays are spent afterwards."""
+def rank_tile(rays, frame, tile, marks, count, plain):
+    """Walk a tile once, as ``weigh_tiles`` will, for the ``count`` largest weights of a ray; the rays are spent."""
     x0 = float((tile % frame.columns) * TILE)
     y0 = float((tile // frame.columns) * TILE)
     state = rays.state
@@ -104,7 +104,7 @@ def rank_tile(rays, frame, tile, marks, count):
         while halves:
             half = lowest_half(halves)
             halves = without_lowest(halves)
-            keep_lanes(state, WEIGHTS + half * LANES, blend(rays, splat, half))
+            keep_lanes(state, WEIGHTS + half * LANES, blend_both(rays, splat, half, plain)[0])
             for pixel in range(half * LANES, half * LANES + LANES):
                 weight = state[WEIGHTS + pixel]
                 if weight > marks.least[pixel]:

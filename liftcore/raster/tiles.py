@@ -15,7 +15,7 @@ from liftcore.jit import inlined, kernel
 from liftcore.lanes import fetch_ahead
 from liftcore.raster.constants import TILE
 from liftcore.raster.footprints import circle_of
-from liftcore.raster.records import EXTENT_X, EXTENT_Y, KX, KY, LEAN, MX, MY, REACH, SLOPE
+from liftcore.raster.records import EXTENT_X, EXTENT_Y, KY, LEAN, MX, MY, REACH, ROOT_X, SLOPE
 
 AHEAD = 8  # footprints between asking for a record and reading it: in the order of depth they lie anywhere
 
@@ -40,7 +40,7 @@ def _tile_rows(record, circle, rows):
 def _edge(record, dy, side):
     """x of the footprint's left (-1) or right (+1) edge at dy, relative to its centre."""
     room = max(0.0, record[REACH] - record[KY] * dy * dy)
-    return record[SLOPE] * dy + side * math.sqrt(room / record[KX])
+    return record[SLOPE] * dy + side * math.sqrt(room) / record[ROOT_X]
 
 
 @inlined

@@ -96,11 +96,17 @@ def meets(rays, splat):
 def blend(rays, splat, half):
     """Composite the splat over a half row: its weights, eight lanes."""
     shape = lanes_of(splat, rays.state, half)
-    return blend_lanes(rays.state, half * LANES, shape, np.float32(splat.opacity))
+    return blend_lanes(rays.state, half * LANES, shape, np.float32(splat.fade))
 
 
 @inlined
-def blend_both(rays, splat, half):
-    """``blend`` with the gain and, over rays of their own, without it: both weights."""
+def blend_both(rays, splat, half, plain):
+    """``blend``, and the weights without the opacity gain: on rays of their own, or the same where ``plain`` is None.
+
+    The two ways differ in the last digits, so who compares weights for equality has to go one way.
+    """
+    if plain is None:
+        heavy = blend(rays, splat, half)
+        return heavy, heavy
     shape = lanes_of(splat, rays.state, half)
     return blend_twice(rays.state, half * LANES, shape, (np.float32(splat.opacity), np.float32(splat.plain)))

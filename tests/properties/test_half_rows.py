@@ -24,6 +24,7 @@ from liftcore.raster.constants import TILE
 
 places = st.floats(-40, 56)
 curvatures = st.sampled_from([0.0, 1e-6, 1e-3, 1.0, 1e6]) | st.floats(1e-4, 10)
+roots = st.sampled_from([0.0, 1e-3, 0.03, 1.0, 1e3]) | st.floats(1e-2, 3)
 
 
 @kernel
@@ -62,26 +63,28 @@ def joined(left, right):
     return both(left, right), either(left, right)
 
 
-@given(mx=places, my=places, slope=st.floats(-8, 8), kx=curvatures, ky=curvatures, reach=st.floats(-1, 8))
+@given(mx=places, my=places, slope=st.floats(-8, 8), root=roots, ky=curvatures, reach=st.floats(-1, 8))
 def test_a_set_lacks_no_half_row_with_a_lane_inside_and_holds_none_that_is_far_away(
-    mx: float, my: float, slope: float, kx: float, ky: float, reach: float
+    mx: float, my: float, slope: float, root: float, ky: float, reach: float
 ) -> None:
     state = np.zeros(STATE, np.float32)
-    halves = reached(state, (mx, my), slope, (kx, ky), reach)
+    halves = reached(state, (mx, my), slope, (root, ky), reach)
     starts, bases = state[STARTS:][:HALVES].astype(np.float64), state[BASES:][:ROWS].astype(np.float64)
     dy = np.arange(ROWS) - my
     middle = mx + slope * dy
     begin = np.repeat([0, LANES], ROWS)
-    np.testing.assert_allclose(starts, begin - np.tile(middle, 2), rtol=2.0**-23, atol=LANES * 2.0**-23)
+    np.testing.assert_allclose(
+        starts, root * (begin - np.tile(middle, 2)), rtol=3 * 2.0**-24, atol=root * LANES * 2.0**-23
+    )
     np.testing.assert_allclose(bases, ky * dy**2, rtol=1e-6, atol=ky * 40 * 2.0**-22)
     for half in range(HALVES):
         # What the lanes are blended with, so the set has to go by the same numbers.
-        base, start, curvature = bases[half % ROWS], starts[half], float(np.float32(kx))
-        form = base + curvature * (start + np.arange(LANES)) ** 2
+        base, start, step = bases[half % ROWS], starts[half], float(np.float32(root))
+        form = base + (start + step * np.arange(LANES)) ** 2
         held = bool(halves >> half & 1)
         assert held or not (form <= reach).any()
-        away = max(start, 0.0) + min(start + LANES - 1, 0.0)
-        assert not held or base + curvature * away**2 <= reach + 1e-5 * abs(reach) + 1e-30
+        away = max(start, 0.0) + min(start + step * (LANES - 1), 0.0)
+        assert not held or base + away**2 <= reach + 1e-5 * abs(reach) + 1e-30
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(0, 2**32 - 1))

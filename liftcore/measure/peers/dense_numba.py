@@ -18,7 +18,7 @@ from numba import njit
 from liftcore.measure.peers.work import Answer, Work, answer_of, dense_target
 from liftcore.raster.constants import ALPHA_FLOOR, TILE
 from liftcore.raster.cpu import CpuRaster
-from liftcore.raster.records import KX, KY, MX, MY, OPACITY, REACH, SLOPE
+from liftcore.raster.records import KY, MX, MY, OPACITY, REACH, ROOT_X, SLOPE
 
 if TYPE_CHECKING:
     from liftcore.raster.protocol import Walk
@@ -97,14 +97,14 @@ def _add_splat(frame, record, box, light, target, row):
     box: x, y, width, height of the tile, px. target: [H, W, F + 1] f32, read whole pixels at a time.
     """
     x0, y0, width, height = box
-    opacity, kx, cap = np.float32(record[OPACITY]), np.float32(record[KX]), np.float32(frame.cap)
+    opacity, kx, cap = np.float32(record[OPACITY]), np.float32(record[ROOT_X] ** 2), np.float32(frame.cap)
     for y in range(height):
         dy = y0 + y + 0.5 - record[MY]
         base = record[KY] * dy * dy
         if base > record[REACH]:
             continue
         centre = record[MX] + record[SLOPE] * dy - x0 - 0.5
-        half = math.sqrt((record[REACH] - base) / record[KX])
+        half = math.sqrt(record[REACH] - base) / record[ROOT_X]
         for x in range(max(0, math.ceil(centre - half)), min(width - 1, math.floor(centre + half)) + 1):
             before = light[y, x]
             if before <= 0:

@@ -47,7 +47,7 @@ _HORIZON = 1e-9  # a disc that comes this near to the camera's plane, in its dep
 _COARSE = -32  # a float32 without its last five bits: 19 are left, so its product with a lane below 16 is exact
 
 Ellipse = tuple["Tensor", "Tensor", "Tensor", "Tensor", "Tensor", "Tensor", "Tensor", "Tensor", "Tensor"]
-"""mx, my, slope, kx, ky, reach, extent_x, extent_y, lean: the outline of ``Outlines``."""
+"""mx, my, slope, root_x, ky, reach, extent_x, extent_y, lean: the outline of ``Outlines``."""
 
 
 def project_discs(block: Block, view: View, seen: Seen) -> tuple[Footprints, Tensor]:
@@ -108,7 +108,7 @@ def _ellipse(middle: tuple[Tensor, Tensor], covariance: tuple[Tensor, Tensor, Te
     """``(p - middle)^T covariance^-1 (p - middle) <= 1``; the determinant has digits of its own."""
     xx, xy, yy = covariance
     root = torch.sqrt(xx)
-    return *middle, xy / yy, yy / det, 1.0 / yy, torch.ones_like(xx), root, torch.sqrt(yy), xy / root
+    return *middle, xy / yy, torch.sqrt(yy / det), 1.0 / yy, torch.ones_like(xx), root, torch.sqrt(yy), xy / root
 
 
 def _circle(mx: Tensor, my: Tensor, near: Tensor) -> Ellipse:
@@ -145,8 +145,8 @@ def _box(left: Tensor, right: Tensor, top: Tensor, bottom: Tensor) -> Ellipse:
     """Half of the reach for each side: the ellipse through the corners, of which the tiles know the sides."""
     half_x, half_y = 0.5 * (right - left), 0.5 * (bottom - top)
     zero = torch.zeros_like(left)
-    kx, ky = 1.0 / half_x.clamp(min=_MARGIN) ** 2, 1.0 / half_y.clamp(min=_MARGIN) ** 2
-    return left + half_x, top + half_y, zero, kx, ky, torch.full_like(left, 2.0), half_x, half_y, zero
+    root_x, ky = 1.0 / half_x.clamp(min=_MARGIN), 1.0 / half_y.clamp(min=_MARGIN) ** 2
+    return left + half_x, top + half_y, zero, root_x, ky, torch.full_like(left, 2.0), half_x, half_y, zero
 
 
 def _reached(origin: Tensor, p: Tensor, q: Tensor, room: Tensor, size: int) -> tuple[Tensor, Tensor]:

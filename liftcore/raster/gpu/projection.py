@@ -146,7 +146,7 @@ def _project_ellipses(
     slope, kx, ky = xy / yy, unit * yy / det, unit / yy
     none = mx[:0]
     outlines = Outlines(
-        mx, my, slope, kx, ky, reach, extent_x, extent_y, xy / xx * extent_x, none, none, none
+        mx, my, slope, torch.sqrt(kx), ky, reach, extent_x, extent_y, xy / xx * extent_x, none, none, none
     )  # fmt: skip
     places = mx.new_zeros(mx.shape[0], PLACE)
     places[:, MX], places[:, MY], places[:, SLOPE], places[:, KY] = mx, my, slope, ky

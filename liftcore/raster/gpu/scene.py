@@ -36,10 +36,10 @@ class DeviceScene(NamedTuple):
 class Outlines(NamedTuple):
     """What the tile lists need of the footprints, a row a splat, near to far; all f64."""
 
-    mx: Tensor  # [n] the outline ``kx (x - mx - slope dy)^2 + ky dy^2 <= reach``, as in liftcore.raster.records
+    mx: Tensor  # [n] the outline ``(root_x (x - mx - slope dy))^2 + ky dy^2 <= reach``, as in liftcore.raster.records
     my: Tensor
     slope: Tensor
-    kx: Tensor
+    root_x: Tensor
     ky: Tensor
     reach: Tensor
     extent_x: Tensor
