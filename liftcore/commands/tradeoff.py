@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from typing import TYPE_CHECKING
 
 from liftcore.commands.bars import progress_bars
@@ -52,8 +53,13 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _command(options: argparse.Namespace) -> str:
-    parts = ["splatlift tradeoff", str(options.splats), str(options.cameras), *map(str, options.features)]
-    parts += [f"--budget {options.budget:g}", *(f"--set {pair}" for pair in options.set)]
+    """The command that makes this comparison again."""
+    parts = ["splatlift", "tradeoff", str(options.splats), str(options.cameras), *map(str, options.features)]
+    parts += ["--budget", f"{options.budget:g}"]
+    for pair in options.set:
+        parts += ["--set", pair]
+    if options.threads:
+        parts += ["--threads", str(options.threads)]
     if options.labels:
-        parts += [f"--labels {options.labels} --table {options.table} --classes {' '.join(options.classes)}"]
-    return " ".join(parts)
+        parts += ["--labels", str(options.labels), "--table", str(options.table), "--classes", *options.classes]
+    return shlex.join(parts)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from dataclasses import replace
 from pathlib import Path
 
@@ -147,6 +148,9 @@ def test_command_compares_in_processes_of_their_own(tmp_path, capsys):
     assert document["runs"][0]["cosine"] == pytest.approx(1.0)
     assert all(Path(file).is_file() for file in document["files"])
     assert np.isfinite(document["runs"][0]["wall_with_reading_ratio"])
+    again = vars(cli.build_parser().parse_args(shlex.split(document["command"])[1:]))
+    given = vars(cli.build_parser().parse_args([*command, "--set", "certificate_rays=0", "--threads", "1"]))
+    assert {key for key, value in given.items() if again[key] != value} == {"out", "json"}
 
 
 @pytest.mark.parametrize("wrong", [["--set", "speed=fast"], ["--set", "stride=0"], ["--labels", "nowhere"]])
