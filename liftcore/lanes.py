@@ -39,7 +39,7 @@ PIXELS = 256
 TRANSMITTANCE = 0  # [256], 0 = the ray is done
 WEIGHTS = PIXELS  # [256], of the splat at hand, for who wants them one by one
 PLAIN_TRANSMITTANCE = 2 * PIXELS  # [256], of the rays without opacity gain
-STARTS = 3 * PIXELS  # [32], of the splat at hand: from its middle in a half row to the first lane
+STARTS = 3 * PIXELS  # [32], of the splat at hand: from its middle in a half row to the first lane, times a root
 BASES = STARTS + HALVES  # [16], of the splat at hand: its quadratic form in the middle of a row
 TABLE = BASES + ROWS  # constants from here on, as liftcore.lanes_blend has them
 

@@ -90,11 +90,12 @@ _ROOT_HALF_BITS = int(np.float32(math.sqrt(0.5)).view(np.int32))
 _MANTISSA_BITS = 23
 _ROUND_DOWN = f"llvm.floor.v{LANES}f32"
 _LANE_NUMBERS = ir.Constant(FLOATS, [float(lane) for lane in range(LANES)])
-_BOTH = (TRANSMITTANCE, PLAIN_TRANSMITTANCE)
+_OWN_AND_PLAIN = (TRANSMITTANCE, PLAIN_TRANSMITTANCE)
+_LARGEST_FADED = LARGEST_EXPONENT + 6.0  # where no alpha is too small: float32 has 2^-126
 _SMALLEST_REST = 2.0**-100  # of 1 - sigma, where its logarithm is taken
 
 # The table's rows are eight equal constants: operands in memory cost no instruction of their own.
-_LIMIT_ROW, _LARGEST_ROW, _FLOOR_ROW, _CAP_ROW, _STOP_ROW, _EXP2_ROW = range(6)  # then one row a coefficient
+_CUT_ROW, _LARGEST_ROW, _LAST_ROW, _FLOOR_ROW, _CAP_ROW, _STOP_ROW, _EXP2_ROW = range(7)  # then one row a coefficient
 _LOG2_ROW = _EXP2_ROW + _EXP2_DEGREE + 1
 STATE = TABLE + (_LOG2_ROW + _LOG2_DEGREE + 1) * LANES  # length of a tile's array
 
@@ -130,10 +131,11 @@ _LOG2 = _log2_coefficients()
 def new_state(floor, cap, stop):
     """A tile's state [STATE] f32: all rays done, the constants of the walk in place."""
     state = np.zeros(STATE, np.float32)
-    limit = -math.log2(floor) if floor > 0 else LARGEST_EXPONENT
+    cut = -math.log2(floor) if floor > 0 else _LARGEST_FADED
     for lane in range(LANES):
-        state[TABLE + _LIMIT_ROW * LANES + lane] = limit
+        state[TABLE + _CUT_ROW * LANES + lane] = cut
         state[TABLE + _LARGEST_ROW * LANES + lane] = LARGEST_EXPONENT
+        state[TABLE + _LAST_ROW * LANES + lane] = _LARGEST_FADED
         state[TABLE + _FLOOR_ROW * LANES + lane] = floor
         state[TABLE + _CAP_ROW * LANES + lane] = cap
         state[TABLE + _STOP_ROW * LANES + lane] = stop
@@ -157,12 +159,13 @@ def _integers(value: int) -> ir.Constant:
 def _falloff(builder: Builder, state: ir.Value, exponent: ir.Value) -> ir.Value:
     """``2^-e`` for e >= 0: the fraction by polynomial, the whole part subtracted from the exponent bits.
 
-    Finite for any e, infinity and no number too, so that it may be multiplied by zero.
+    Finite for any e, infinity and no number too, so that it may be multiplied by zero; but e may not be below zero by
+    even a rounding.
     """
     kind = ir.FunctionType(FLOATS, [FLOATS])
     below = builder.call(cgutils.get_or_insert_function(builder.module, kind, _ROUND_DOWN), [exponent])
     rest = builder.fsub(exponent, below)
-    whole = builder.fptosi(minimum(builder, exponent, _row(builder, state, _LARGEST_ROW)), INTS)
+    whole = builder.fptosi(minimum(builder, exponent, _row(builder, state, _LAST_ROW)), INTS)
     square = builder.fmul(rest, rest)
     pairs = [  # Estrin's scheme: three short chains instead of one long one
         fused(builder, _row(builder, state, _EXP2_ROW + k + 1), rest, _row(builder, state, _EXP2_ROW + k))
@@ -217,7 +220,8 @@ def _beta_exponent(builder: Builder, state: ir.Value, parts: list[ir.Value], fad
     lost = builder.fsub(builder.fsub(one, rest), sigma)
     logarithm = fused(builder, lost, constant(_LOG2_E), _log2(builder, state, rest))
     exponent = builder.fmul(parts[3], builder.fsub(zero, logarithm))
-    return builder.select(inside, _faded(builder, exponent, fade), constant(math.inf))
+    met = builder.and_(inside, builder.fcmp_ordered("<", exponent, _row(builder, state, _LARGEST_ROW)))
+    return builder.select(met, _faded(builder, exponent, fade), constant(math.inf))
 
 
 def _disc_exponent(builder: Builder, state: ir.Value, parts: list[ir.Value], fade: ir.Value | None) -> ir.Value:
@@ -264,11 +268,11 @@ def _composite(builder: Builder, state: ir.Value, alpha: ir.Value, met: ir.Value
     return builder.select(alive, weight, zero)
 
 
-def _signature(result: Any, shape: Any, opacity: Any) -> Any:
+def _signature(result: Any, shape: Any, strength: Any) -> Any:
     """The types of a blend, None for arguments that it does not take."""
     if not isinstance(shape, types.NamedUniTuple) or shape.dtype != types.float32:
         return None
-    return result(FLOAT_ARRAY, types.intp, shape, opacity)
+    return result(FLOAT_ARRAY, types.intp, shape, strength)
 
 
 def _prepared(context, builder, signature, args) -> tuple[ir.Value, Callable, Callable[[int], ir.Value]]:
@@ -297,7 +301,7 @@ def blend_lanes(typingctx, state, offset, shape, fade):
     def codegen(context, builder, signature, args):
         data, exponent, at = _prepared(context, builder, signature, args)
         faded = exponent(broadcast(builder, args[3]))
-        met = builder.fcmp_ordered("<=", faded, _row(builder, data, _LIMIT_ROW))
+        met = builder.fcmp_ordered("<=", faded, _row(builder, data, _CUT_ROW))
         return _composite(builder, data, _falloff(builder, data, faded), met, at(TRANSMITTANCE))
 
     signature = _signature(EIGHT, shape, types.float32)
@@ -317,7 +321,7 @@ def blend_twice(typingctx, state, offset, shape, opacities):
         within = builder.fcmp_ordered("<=", alone, _row(builder, data, _LARGEST_ROW))
         falloff = builder.select(within, _falloff(builder, data, alone), zero)
         weights = []
-        for opacity, part in zip(cgutils.unpack_tuple(builder, args[3]), _BOTH, strict=True):
+        for opacity, part in zip(cgutils.unpack_tuple(builder, args[3]), _OWN_AND_PLAIN, strict=True):
             alpha = builder.fmul(broadcast(builder, opacity), falloff)
             met = builder.fcmp_ordered(">=", alpha, _row(builder, data, _FLOOR_ROW))
             weights.append(_composite(builder, data, alpha, met, at(part)))

@@ -45,10 +45,10 @@ def _all(builder: Builder, value: ir.Value) -> ir.Value:
 
 
 @compiled
-def ellipse_halves(typingctx, state, centre, slope, curvature, reach):
+def ellipse_halves(typingctx, state, centre, slope, form, reach):
     """The half rows with a lane where ``(root (x - mx - slope dy))^2 + ky dy^2 <= reach``, ``dy = row - my``.
 
-    The footprint's ``centre = (mx, my)`` counts from the tile's first pixel centre, ``curvature = (root, ky)``. Lanes
+    The footprint's ``centre = (mx, my)`` counts from the tile's first pixel centre, ``form = (root, ky)``. Lanes
     are met between their centres too: a set may hold a half row that has no weight, and lacks none that has. Left in
     ``state``: how far right of the footprint's middle each half row begins, times root, and ``ky dy^2`` of each row.
 
@@ -57,12 +57,12 @@ def ellipse_halves(typingctx, state, centre, slope, curvature, reach):
     pair = types.UniTuple(types.float64, 2)
 
     def codegen(context, builder, signature, args):
-        state, centre, slope, curvature, reach = args
+        state, centre, slope, form, reach = args
         mx, my = (builder.extract_value(centre, k) for k in range(2))
         slack = builder.fmul(reach, ir.Constant(ir.DoubleType(), _SLACK))
         root, ky, top, room = (
             broadcast(builder, builder.fptrunc(value, FLOAT))
-            for value in (*(builder.extract_value(curvature, k) for k in range(2)), my, slack)
+            for value in (*(builder.extract_value(form, k) for k in range(2)), my, slack)
         )
         width, zero = builder.fmul(root, constant(LANES - 1.0)), constant(0.0)
 

@@ -80,7 +80,7 @@ class GaussianFootprint(NamedTuple):
     reach: float
     opacity: float
     plain: float  # opacity without the gain
-    fade: float
+    fade: float  # -log2 of the opacity
 
 
 class BetaFootprint(NamedTuple):
@@ -113,7 +113,7 @@ class DiscFootprint(NamedTuple):
     plain: float
     fade: float
     nearby: float  # px, radius of the circle
-    root: float  # of the low-pass's curvature
+    near_root: float  # of the low-pass's curvature
     s_x: float  # s, t and d by pixel, from the projected centre on
     s_y: float
     t_x: float
@@ -236,7 +236,7 @@ def _disc_lanes(splat, state, half):
     d, d_rest = _halved(splat.d_zero + splat.d_x * dx + splat.d_y * dy)
     d_step, d_step_rest = _halved(splat.d_x)
     return DiscLanes(
-        np.float32(splat.root * dx), np.float32(splat.root), np.float32(splat.root * splat.root * dy * dy),
+        np.float32(splat.near_root * dx), np.float32(splat.near_root), np.float32((splat.near_root * dy) ** 2),
         s, s_rest, s_step, s_step_rest, t, t_rest, t_step, t_step_rest, d, d_rest, d_step, d_step_rest,
     )  # fmt: skip
 

@@ -5,8 +5,8 @@ Every footprint is an ellipse written row by row, which needs no subtraction of 
     e(x, y) = kx (x - mx - slope dy)^2 + ky dy^2,   dy = y - my
 
 ``kx = unit cov_yy / det``, ``ky = unit / cov_yy``, ``slope = cov_xy / cov_yy``. For 3DGS the unit is log2(e) / 2, so
-that ``alpha = opacity 2^-e``; for DBS it is one, and e is sigma. The determinant is a sum of squares (Cauchy-Binet
-over the three axes), so needles a thousand pixels long keep all their digits.
+that ``alpha = opacity 2^-e``; for DBS it is one, and e is sigma. A record has the root of kx. The determinant is a
+sum of squares (Cauchy-Binet over the three axes), so needles a thousand pixels long keep all their digits.
 """
 
 from __future__ import annotations

@@ -106,19 +106,18 @@ def trace_rays(frame, pixels):
         light = np.float32(1.0)
         for step in range(frame.starts[tile], frame.starts[tile + 1]):
             place = frame.items[step]
-            alpha = min(cap, np.float32(alpha_at(frame.kernel, frame.records[place], x + 0.5, y + 0.5)))
+            alpha = np.float32(alpha_at(frame.kernel, frame.records[place], x + 0.5, y + 0.5))
             if alpha < floor or alpha == 0:
                 continue
-            weight = alpha * light
-            after = light - weight
-            if after <= stop:
+            weight = min(cap, alpha) * light
+            if not weight < light - stop:
                 break
             if count == splats.shape[0]:
                 splats = np.concatenate((splats, np.empty_like(splats)))
                 weights = np.concatenate((weights, np.empty_like(weights)))
             splats[count] = frame.ids[place]
             weights[count] = weight
-            light = after
+            light -= weight
             count += 1
         row_starts[i + 1] = count
     return row_starts, splats[:count], weights[:count]

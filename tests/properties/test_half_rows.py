@@ -28,8 +28,8 @@ roots = st.sampled_from([0.0, 1e-3, 0.03, 1.0, 1e3]) | st.floats(1e-2, 3)
 
 
 @kernel
-def reached(state, centre, slope, curvature, reach):
-    return ellipse_halves(state, centre, slope, curvature, reach)
+def reached(state, centre, slope, form, reach):
+    return ellipse_halves(state, centre, slope, form, reach)
 
 
 @kernel

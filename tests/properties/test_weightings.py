@@ -139,10 +139,11 @@ def test_the_evidence_is_the_same_in_every_weighting(weighting):
 
 
 @pytest.mark.parametrize("count", [1, 2, 5, 64])
-def test_exactly_k_weights_of_a_ray_count(count):
+@pytest.mark.parametrize("walk", [Walk(), Walk(gain=1.2)], ids=["plain", "gain"])
+def test_exactly_k_weights_of_a_ray_count(count, walk):
     splats, camera = random_splats(11, 500), random_camera(11, 90, 70)
-    every = chosen_of(splats, camera, Walk(), Weighting(0)).sum(axis=1)
-    kept = chosen_of(splats, camera, Walk(), Weighting(0, Selection.TOP_K, count=count)).sum(axis=1)
+    every = chosen_of(splats, camera, walk, Weighting(0)).sum(axis=1)
+    kept = chosen_of(splats, camera, walk, Weighting(0, Selection.TOP_K, count=count)).sum(axis=1)
     assert every.max() > 5
     assert np.array_equal(kept, np.minimum(every, count))
 

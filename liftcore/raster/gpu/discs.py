@@ -107,8 +107,9 @@ def _crossing(seen: Seen, fx: float, fy: float) -> tuple[Tensor, Tensor]:
 def _ellipse(middle: tuple[Tensor, Tensor], covariance: tuple[Tensor, Tensor, Tensor], det: Tensor) -> Ellipse:
     """``(p - middle)^T covariance^-1 (p - middle) <= 1``; the determinant has digits of its own."""
     xx, xy, yy = covariance
-    root = torch.sqrt(xx)
-    return *middle, xy / yy, torch.sqrt(yy / det), 1.0 / yy, torch.ones_like(xx), root, torch.sqrt(yy), xy / root
+    slope, root_x, ky = xy / yy, torch.sqrt(yy / det), 1.0 / yy
+    half_width = torch.sqrt(xx)
+    return *middle, slope, root_x, ky, torch.ones_like(xx), half_width, torch.sqrt(yy), xy / half_width
 
 
 def _circle(mx: Tensor, my: Tensor, near: Tensor) -> Ellipse:

@@ -56,12 +56,12 @@ def fill_alphas(
     falloff = falloff_at(places, inks, item, inside, y, x, column.to(tl.float32), KIND)
     own = scratch + number * _PIXELS + row * _TILE + column
     opacity = tl.load(inks + item * _INK + _OPACITY, mask=inside, other=0.0)
-    alpha = tl.minimum(opacity * falloff, cap)
-    tl.store(own, tl.where(alpha >= floor, alpha, 0.0))
+    alpha = opacity * falloff
+    tl.store(own, tl.where(alpha >= floor, tl.minimum(alpha, cap), 0.0))
     if PLAIN:
         opacity = tl.load(inks + item * _INK + _PLAIN, mask=inside, other=0.0)
-        alpha = tl.minimum(opacity * falloff, cap)
-        tl.store(own + _PLAIN_ALPHAS, tl.where(alpha >= floor, alpha, 0.0))
+        alpha = opacity * falloff
+        tl.store(own + _PLAIN_ALPHAS, tl.where(alpha >= floor, tl.minimum(alpha, cap), 0.0))
     tl.debug_barrier()
 
 
@@ -73,7 +73,7 @@ def blend(alpha, light, stop):
     """
     weight = alpha * light
     after = light - weight  # 1 - alpha would be rounded first, and a million faint splats be lost
-    lit = after > stop
+    lit = weight < light - stop  # to the bit what the CPU's lanes ask: opaque splats often leave just the stop
     return tl.where(lit, weight, 0.0), tl.where(lit, after, 0.0)
 
 
