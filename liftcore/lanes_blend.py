@@ -95,7 +95,7 @@ _LARGEST_FADED = LARGEST_EXPONENT + 6.0  # where no alpha is too small: float32 
 _SMALLEST_REST = 2.0**-100  # of 1 - sigma, where its logarithm is taken
 
 # The table's rows are eight equal constants: operands in memory cost no instruction of their own.
-_CUT_ROW, _LARGEST_ROW, _LAST_ROW, _FLOOR_ROW, _CAP_ROW, _STOP_ROW, _EXP2_ROW = range(7)  # then one row a coefficient
+_CUT_ROW, _LARGEST_ROW, _FADED_ROW, _FLOOR_ROW, _CAP_ROW, _STOP_ROW, _EXP2_ROW = range(7)  # then a row a coefficient
 _LOG2_ROW = _EXP2_ROW + _EXP2_DEGREE + 1
 STATE = TABLE + (_LOG2_ROW + _LOG2_DEGREE + 1) * LANES  # length of a tile's array
 
@@ -135,7 +135,7 @@ def new_state(floor, cap, stop):
     for lane in range(LANES):
         state[TABLE + _CUT_ROW * LANES + lane] = cut
         state[TABLE + _LARGEST_ROW * LANES + lane] = LARGEST_EXPONENT
-        state[TABLE + _LAST_ROW * LANES + lane] = _LARGEST_FADED
+        state[TABLE + _FADED_ROW * LANES + lane] = _LARGEST_FADED
         state[TABLE + _FLOOR_ROW * LANES + lane] = floor
         state[TABLE + _CAP_ROW * LANES + lane] = cap
         state[TABLE + _STOP_ROW * LANES + lane] = stop
@@ -165,7 +165,7 @@ def _falloff(builder: Builder, state: ir.Value, exponent: ir.Value) -> ir.Value:
     kind = ir.FunctionType(FLOATS, [FLOATS])
     below = builder.call(cgutils.get_or_insert_function(builder.module, kind, _ROUND_DOWN), [exponent])
     rest = builder.fsub(exponent, below)
-    whole = builder.fptosi(minimum(builder, exponent, _row(builder, state, _LAST_ROW)), INTS)
+    whole = builder.fptosi(minimum(builder, exponent, _row(builder, state, _FADED_ROW)), INTS)
     square = builder.fmul(rest, rest)
     pairs = [  # Estrin's scheme: three short chains instead of one long one
         fused(builder, _row(builder, state, _EXP2_ROW + k + 1), rest, _row(builder, state, _EXP2_ROW + k))
