@@ -30,6 +30,7 @@ INT = ir.IntType(32)
 FLOATS = ir.VectorType(FLOAT, LANES)
 INTS = ir.VectorType(INT, LANES)
 _SHORTS = ir.VectorType(ir.IntType(16), LANES)
+_HALVES = ir.VectorType(ir.HalfType(), LANES)
 FUSE = ("contract",)  # a*b + c may become one fused instruction
 FLOAT_ARRAY = types.Array(types.float32, 1, "C")
 
@@ -74,7 +75,7 @@ def constant(value: float) -> ir.Constant:
 def broadcast(builder: Builder, scalar: ir.Value, kind: ir.VectorType = FLOATS) -> ir.Value:
     undefined = ir.Constant(kind, ir.Undefined)
     first = builder.insert_element(undefined, scalar, ir.Constant(INT, 0))
-    mask = ir.Constant(ir.VectorType(INT, LANES), [0] * LANES)
+    mask = ir.Constant(ir.VectorType(INT, kind.count), [0] * kind.count)
     return builder.shuffle_vector(first, undefined, mask)
 
 
@@ -194,32 +195,55 @@ _HALF_SHIFT = 126 << 23  # bits of 0.5: a float32 near it has a step of 2^-24, a
 
 @compiled
 def keep_halves(typingctx, values, offset, lanes):
-    """``values[offset + i] = lanes[i]`` as float16, rounded to nearest, in the bits of u16; no value may be NaN.
-
-    In whole numbers, because not every processor converts, and where it does not a missing function would be called.
-    """
+    """``values[offset + i] = lanes[i]`` as float16, rounded to nearest, in the bits of u16; no value may be NaN."""
 
     def codegen(context, builder, signature, args):
         values, offset, lanes = args
-
-        def whole(value: int) -> ir.Constant:
-            return ir.Constant(INTS, [value] * LANES)
-
-        bits = builder.bitcast(lanes, INTS)
-        size = builder.and_(bits, whole(0x7FFFFFFF))
-        odd = builder.and_(builder.lshr(size, whole(13)), whole(1))  # ties go to even
-        normal = builder.lshr(builder.add(builder.add(size, whole(((15 - 127) << 23) + 0xFFF)), odd), whole(13))
-        shifted = builder.fadd(builder.bitcast(size, FLOATS), constant(0.5))
-        small = builder.sub(builder.bitcast(shifted, INTS), whole(_HALF_SHIFT))
-        half = builder.select(builder.icmp_signed("<", size, whole(_HALF_NORMAL)), small, normal)
-        half = builder.select(builder.icmp_signed(">=", size, whole(_HALF_LIMIT)), whole(0x7C00), half)
-        signed = builder.or_(half, builder.lshr(builder.and_(bits, whole(-(1 << 31))), whole(16)))
+        if _converts(context):
+            rounded = builder.bitcast(builder.fptrunc(lanes, _HALVES), _SHORTS)
+        else:
+            rounded = _rounded_halves(builder, lanes)
         data = context.make_array(signature.args[0])(context, builder, value=values).data
         place = builder.bitcast(builder.gep(data, [offset]), _SHORTS.as_pointer())
-        builder.store(builder.trunc(signed, _SHORTS), place, align=2)
+        builder.store(rounded, place, align=2)
         return context.get_dummy_value()
 
     return types.void(types.Array(types.uint16, 1, "C"), types.intp, EIGHT), codegen
+
+
+def _rounded_halves(builder: Builder, lanes: ir.Value) -> ir.Value:
+    """The bits of float16, in whole numbers: where no processor converts, a missing function would be called."""
+
+    def whole(value: int) -> ir.Constant:
+        return ir.Constant(INTS, [value] * LANES)
+
+    bits = builder.bitcast(lanes, INTS)
+    size = builder.and_(bits, whole(0x7FFFFFFF))
+    odd = builder.and_(builder.lshr(size, whole(13)), whole(1))  # ties go to even
+    normal = builder.lshr(builder.add(builder.add(size, whole(((15 - 127) << 23) + 0xFFF)), odd), whole(13))
+    shifted = builder.fadd(builder.bitcast(size, FLOATS), constant(0.5))
+    small = builder.sub(builder.bitcast(shifted, INTS), whole(_HALF_SHIFT))
+    half = builder.select(builder.icmp_signed("<", size, whole(_HALF_NORMAL)), small, normal)
+    half = builder.select(builder.icmp_signed(">=", size, whole(_HALF_LIMIT)), whole(0x7C00), half)
+    signed = builder.or_(half, builder.lshr(builder.and_(bits, whole(-(1 << 31))), whole(16)))
+    return builder.trunc(signed, _SHORTS)
+
+
+@compiled
+def copy_values(typingctx, target, place, source, offset, count):
+    """``target[place : place + count] = source[offset : offset + count]`` of two arrays that share no memory."""
+
+    def codegen(context, builder, signature, args):
+        target, place, source, offset, count = args
+        ends = ((signature.args[0], target, place), (signature.args[2], source, offset))
+        to, of = (
+            builder.gep(context.make_array(kind)(context, builder, value=array).data, [first])
+            for kind, array, first in ends
+        )
+        cgutils.raw_memcpy(builder, to, of, count, signature.args[0].dtype.bitwidth // 8)
+        return context.get_dummy_value()
+
+    return types.void(target, types.intp, target, types.intp, types.intp), codegen
 
 
 _HALF_BITS = 0x0FFFE000 - (1 << 31)  # sign, exponent and mantissa of a float16 where a float32 has them
@@ -231,27 +255,36 @@ def _converts(context) -> bool:
     return "+f16c" in context.codegen().magic_tuple()[2]
 
 
+_BROAD = 2 * LANES  # values of a row at a time: one register where there are such, two elsewhere
+_FLOATS, _INTS, _BROAD_SHORTS, _BROAD_HALVES = (
+    ir.VectorType(kind, _BROAD) for kind in (FLOAT, INT, ir.IntType(16), ir.HalfType())
+)
+
+
 def _load_small(builder: Builder, pointer: ir.Value) -> ir.Value:
-    """Eight float16 as float32 that are 2^112 times smaller: their bits, moved, with room for the larger exponent."""
-    signed = builder.sext(builder.load(builder.bitcast(pointer, _SHORTS.as_pointer()), align=2), INTS)
-    bits = builder.and_(builder.shl(signed, ir.Constant(INTS, [13] * LANES)), ir.Constant(INTS, [_HALF_BITS] * LANES))
-    return builder.bitcast(bits, FLOATS)
+    """Float16 as float32 that are 2^112 times smaller: their bits, moved, with room for the larger exponent."""
+    signed = builder.sext(builder.load(builder.bitcast(pointer, _BROAD_SHORTS.as_pointer()), align=2), _INTS)
+    moved = builder.shl(signed, ir.Constant(_INTS, [13] * _BROAD))
+    return builder.bitcast(builder.and_(moved, ir.Constant(_INTS, [_HALF_BITS] * _BROAD)), _FLOATS)
 
 
 def _load_halves(builder: Builder, pointer: ir.Value) -> ir.Value:
-    """Eight float16 as float32, on a processor that converts."""
-    halves = ir.VectorType(ir.HalfType(), LANES)
-    return builder.fpext(builder.load(builder.bitcast(pointer, halves.as_pointer()), align=2), FLOATS)
+    """Float16 as float32, on a processor that converts."""
+    return builder.fpext(builder.load(builder.bitcast(pointer, _BROAD_HALVES.as_pointer()), align=2), _FLOATS)
 
 
-WIDE = 4 * LANES  # channels that add_weighted_row keeps in registers
+def _load_singles(builder: Builder, pointer: ir.Value) -> ir.Value:
+    return builder.load(builder.bitcast(pointer, _FLOATS.as_pointer()), align=4)
+
+
+WIDE = 4 * _BROAD  # channels that add_weighted_row keeps in registers
 AHEAD = 16  # entries between asking for a row and reading it; so many more columns have to be there to be read
 _LINE = 64  # bytes of the processor's cache
 
 
 @compiled
 def add_weighted_row(typingctx, target, place, source, entries, sparse, span):
-    """``target[place + i] += sum_k weights[k] source[columns[k] * stride + offset + i]`` for 32 channels.
+    """``target[place + i] += sum_k weights[k] source[columns[k] * stride + offset + i]`` for WIDE channels.
 
     ``sparse = (columns i32, weights f32)``, ``entries = (first, last)`` of them, ``span = (stride, offset)`` of the
     flat source: f32, or the bits of finite f16 (u16), which give the same sums to the bit. They stay in registers.
@@ -271,10 +304,10 @@ def add_weighted_row(typingctx, target, place, source, entries, sparse, span):
             for kind, part in zip(pair.types, cgutils.unpack_tuple(builder, sparse), strict=True)
         )
         smaller = halves and not _converts(context)
-        load = load_lanes if not halves else _load_small if smaller else _load_halves
-        steps = [ir.Constant(place.type, LANES * part) for part in range(WIDE // LANES)]
+        load = _load_singles if not halves else _load_small if smaller else _load_halves
+        steps = [ir.Constant(place.type, part) for part in range(0, WIDE, _BROAD)]
         places = [pointer_to(context, builder, array[0], target, builder.add(place, step)) for step in steps]
-        sums = [cgutils.alloca_once_value(builder, load_lanes(builder, pointer)) for pointer in places]
+        sums = [cgutils.alloca_once_value(builder, _load_singles(builder, pointer)) for pointer in places]
 
         def row_at(entry: ir.Value) -> ir.Value:
             column = builder.sext(builder.load(builder.gep(columns, [entry])), stride.type)
@@ -284,13 +317,14 @@ def add_weighted_row(typingctx, target, place, source, entries, sparse, span):
             soon = row_at(builder.add(k, ir.Constant(k.type, AHEAD)))
             fetch(builder, pointer_to(context, builder, array[2], source, soon), WIDE * (2 if halves else 4))
             single = builder.load(builder.gep(weights, [k]))
-            weight = broadcast(builder, builder.fmul(single, ir.Constant(FLOAT, _HALF_UNIT)) if smaller else single)
+            unit = builder.fmul(single, ir.Constant(FLOAT, _HALF_UNIT)) if smaller else single
+            weight = broadcast(builder, unit, _FLOATS)
             base = row_at(k)
             for step, total in zip(steps, sums, strict=True):
                 row = load(builder, pointer_to(context, builder, array[2], source, builder.add(base, step)))
                 builder.store(fused(builder, row, weight, builder.load(total)), total)
         for pointer, total in zip(places, sums, strict=True):
-            builder.store(builder.load(total), pointer, align=4)
+            builder.store(builder.load(total), builder.bitcast(pointer, _FLOATS.as_pointer()), align=4)
         return context.get_dummy_value()
 
     return signature, codegen

@@ -23,7 +23,7 @@ from liftcore.solve.aggregation import Aggregation, aggregate
 from liftcore.solve.all_rays import AllRays
 from liftcore.solve.certificate import certify
 from liftcore.solve.checkpoint import Checkpoint, identity, resumed
-from liftcore.solve.closed_form import Solution
+from liftcore.solve.closed_form import Host, Solution
 from liftcore.solve.feature_room import room_within
 from liftcore.solve.kept_columns import kept_columns
 from liftcore.solve.least_squares import refine
@@ -44,7 +44,6 @@ if TYPE_CHECKING:
     from liftcore.raster.protocol import Raster
     from liftcore.scene.cameras import Cameras
     from liftcore.scene.splats import Kernel, Splats
-    from liftcore.solve.feature_room import FeatureRoom
     from liftcore.solve.settings import LiftSettings
 
 log = logging.getLogger(__name__)
@@ -135,15 +134,14 @@ def _lift_on(run: Run, plan: Plan, sources: Sources, inputs: list[InputFile], ch
             geometry = accumulate(walked, scene, sources.packs, sources.views, settings, store, progress)
         if settings.robust_steps or settings.aggregation_resolve:  # which read the weights on the host
             store.bring_home()
-        weights, solution = _solve(run, store, geometry, room_within(plan.features_room))
+        weights, solution = _solve(run, store, geometry, _host(run, plan, sources))
         X, notes = _refine(run, sources, raster, geometry, solution)
         aggregation = _aggregate(run, sources, raster, geometry, X) if settings.aggregation else None
         if aggregation:
             notes["aggregation"] = aggregation.facts
             if settings.aggregation_resolve:
-                notes["aggregation"]["resolved"] = _resolve(
-                    run, weights, geometry, aggregation, X, plan.features_room
-                )
+                host = _host(run, plan, sources, X.nbytes)
+                notes["aggregation"]["resolved"] = _resolve(run, weights, geometry, aggregation, X, host)
         facts: dict[str, Any] = {
             "device": device,
             "weights_entries": sum(len(part.columns) for part in store),
@@ -185,13 +183,13 @@ def _blind(views: Sequence[str], store: ViewWeights) -> list[str]:
     return [name for name, part in zip(views, store, strict=True) if not part.evidence_splats.numel()]
 
 
-def _solve(run: Run, store: ViewWeights, geometry: Geometry, room: FeatureRoom) -> tuple[ViewWeights, Solution]:
+def _solve(run: Run, store: ViewWeights, geometry: Geometry, host: Host) -> tuple[ViewWeights, Solution]:
     """The weights, which the robust steps may have changed, and the closed form of them."""
     settings, sums = run.settings, geometry.denominators
     with run.timings.stage("robust"):
         weights = robust_weights(store, geometry.codebooks, sums, settings.robust_steps, run.progress, run.threads)
     with run.timings.stage("solve"):
-        closed_form, dtype = closed_form_on(run.device, run.threads, room), getattr(torch, settings.dtype)
+        closed_form, dtype = closed_form_on(run.device, host), getattr(torch, settings.dtype)
         return weights, closed_form(weights, geometry.columns.__getitem__, sums, dtype, run.progress)
 
 
@@ -230,19 +228,21 @@ def _aggregate(run: Run, sources: Sources, raster: Raster, geometry: Geometry, X
         return aggregate(X, geometry.evidence, lifted, run.settings, run.progress, run.threads)
 
 
-def _resolve(
-    run: Run, weights: ViewWeights, geometry: Geometry, aggregation: Aggregation, X: torch.Tensor, limit: int | None
-) -> float:
-    """Solve again, from the kept regions alone, for splats that took no cluster's feature; their share of all.
+def _host(run: Run, plan: Plan, sources: Sources, taken: int = 0) -> Host:
+    """What the closed form has of this machine, beside so many bytes of features that there are already."""
+    limit = plan.features_room
+    return Host(run.threads, room_within(None if limit is None else limit - taken), sources.splats.means)
 
-    ``limit``: bytes of memory that X and its like may take together.
-    """
+
+def _resolve(
+    run: Run, weights: ViewWeights, geometry: Geometry, aggregation: Aggregation, X: torch.Tensor, host: Host
+) -> float:
+    """Solve again, from the kept regions alone, for splats that took no cluster's feature; their share of all."""
     if all(rows is None for rows in aggregation.kept):
         return 0.0
     with run.timings.stage("resolve"):
         fewer, denominators = kept_columns(weights, aggregation.kept, X.shape[0])
-        room = room_within(None if limit is None else limit - X.nbytes)
-        columns, closed_form = geometry.columns.__getitem__, closed_form_on(run.device, run.threads, room)
+        columns, closed_form = geometry.columns.__getitem__, closed_form_on(run.device, host)
         again = closed_form(fewer, columns, denominators, X.dtype, run.progress).features
         chosen = aggregation.own & torch.from_numpy(denominators > 0)
         X[chosen] = again[chosen].to(X.dtype)

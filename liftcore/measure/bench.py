@@ -22,6 +22,7 @@ from liftcore.observe.observation import Observation, RegionMap
 from liftcore.progress import silent
 from liftcore.raster.open_raster import open_raster
 from liftcore.solve.accumulate import lift_walk, weighting_of
+from liftcore.solve.closed_form import Host
 from liftcore.solve.settings import LiftSettings, Preset
 from liftcore.solve.solver import closed_form_on
 from liftcore.solve.view_weights import ViewWeights
@@ -104,7 +105,8 @@ def time_lift(work: Workload, preset: Preset, device: Device, threads: int | Non
             start = time.perf_counter()
             denominators, columns = walk_regions(raster, work.views, looking, count, store)
             middle = time.perf_counter()
-            closed_form_on(device, threads)(store, columns.__getitem__, denominators, torch.float16, silent)
+            closed_form = closed_form_on(device, Host(threads, means=work.splats.means))
+            closed_form(store, columns.__getitem__, denominators, torch.float16, silent)
             geometry.append((middle - start) / len(work.views))
             solution.append((time.perf_counter() - middle) / len(work.views))
             entries = sum(len(part.columns) for part in store)

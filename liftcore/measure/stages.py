@@ -20,7 +20,7 @@ import torch
 from liftcore.progress import silent
 from liftcore.raster.cpu import CpuRaster
 from liftcore.solve.accumulate import lift_walk, row_totals, weighting_of
-from liftcore.solve.closed_form import solve_closed_form
+from liftcore.solve.closed_form import Host, solve_closed_form
 from liftcore.solve.columns import by_tuples
 from liftcore.solve.settings import LiftSettings
 from liftcore.solve.view_weights import ViewWeights
@@ -115,7 +115,8 @@ def time_stages(work: Workload, preset: Preset) -> dict[str, Any]:
             views.append(raster.clock)
         clock = Clock()
         with clock.stage("solution"):
-            solve_closed_form(store, columns.__getitem__, denominators, torch.float16, silent, threads=1)
+            host = Host(1, means=work.splats.means)
+            solve_closed_form(store, columns.__getitem__, denominators, torch.float16, silent, host)
     share = 1 / len(views)
     solution = Clock({"solution": clock.wall["solution"] * share}, {"solution": clock.cpu["solution"] * share})
     return {

@@ -12,6 +12,7 @@ from liftcore.raster.constants import TILE
 from liftcore.raster.kernels import RECORDS
 from liftcore.solve.columns import by_rows
 from liftcore.solve.feature_room import check_disk
+from liftcore.solve.gathering import CHUNK_ENTRIES
 from liftcore.solve.view_weights import MEMORY_LIMIT
 from liftcore.solve.weighted_sums import strip_bytes
 
@@ -50,7 +51,8 @@ def memory_parts(
     """
     inputs = sum(t.nbytes for t in (splats.means, splats.quats, splats.log_scales, splats.opacity_logits))
     largest = max(camera.width * camera.height for camera in cameras.values())
-    weights = weight_bytes(seen_a_view, entries_a_splat(packs, cameras, settings))
+    entries = entries_a_splat(packs, cameras, settings)
+    weights = weight_bytes(seen_a_view, entries)
     seen = 8 * RECORDS[splats.kernel] + TILES_A_SPLAT * TILE_ENTRY_BYTES  # of a splat
     labels = max(_label_bytes(packs, view) for view in cameras)
     walk = int(seen_a_view * seen) + splats.count * WALK_BYTES + 8 * largest // TILE**2
@@ -60,6 +62,7 @@ def memory_parts(
         "scene": splats.count * SCENE_BYTES,
         "view": walk + 2 * labels + weights,  # labels of the next one, too, and weights that wait for their turn
         "weights": min(len(cameras) * weights, MEMORY_LIMIT),
+        "gathered": ENTRY_BYTES * min(int(len(cameras) * seen_a_view * entries), CHUNK_ENTRIES),
         "codebooks": _all_codebook_bytes(packs, cameras, settings),
         "features": splats.count * packs.channels * (2 if settings.dtype == "float16" else 4),
     }

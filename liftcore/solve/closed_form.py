@@ -1,8 +1,9 @@
 """The closed form: ``x_j = sum_v W_v[j] E_v / sum W[j]`` (paper Eq. 6, App. Tikhonov for squared weights).
 
-X is never held in float32 as a whole. Splats go in blocks and channels in strips (`weighted_sums`), so that a block's
-entries and a strip of all codebooks stay in the cache. Weights are divided by their sum before they meet the
-codebook: a mean cannot overflow where its inputs do not, and faint splats keep their digits.
+X is never held in float32 as a whole. Splats go in blocks of neighbours (`gathering`) and channels in strips
+(`weighted_sums`), so that a block's entries and the rows of a strip that it reads stay in the cache.
+Weights are divided by their sum before they meet the codebook: a mean cannot overflow where its inputs do not, and
+faint splats keep their digits.
 """
 
 from __future__ import annotations
@@ -20,18 +21,19 @@ from numba import types
 from numba.extending import overload
 
 from liftcore.jit import kernel
-from liftcore.lanes import LANES, WIDE, keep_halves, lanes_at, no_lanes, plus_product, sum_of_lanes
+from liftcore.lanes import LANES, WIDE, copy_values, keep_halves, lanes_at, no_lanes, plus_product, sum_of_lanes
 from liftcore.progress import silent
 from liftcore.raster.protocol import RegionWeights
 from liftcore.solve.columns import Columns, rows_of
+from liftcore.solve.curve import places_along_curve
 from liftcore.solve.feature_room import in_memory
+from liftcore.solve.gathering import Gathering
 from liftcore.solve.weight_tables import WeightTables
 from liftcore.solve.weighted_sums import (
+    Entries,
     block_end,
-    block_entries,
     channel_slices,
-    entries_before,
-    most_entries,
+    first_columns,
     splat_shares,
     strips_of,
     sum_strip,
@@ -39,6 +41,7 @@ from liftcore.solve.weighted_sums import (
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
+    from concurrent.futures import Executor
 
     from torch import Tensor
 
@@ -47,6 +50,7 @@ if TYPE_CHECKING:
     from liftcore.solve.view_weights import ViewWeights
     from liftcore.solve.weighted_sums import Strips
 
+BLOCK_ENTRIES = 1 << 12  # whose splats' rows of X stay in the core's own cache while strips go by
 FLOAT16_MAX = 65_504.0
 FLOAT16_STEP = 2.0**-25  # the largest rounding error of its small values
 FLOAT16_ERROR = 1e-4  # of the longest vector, which float16 must hold
@@ -61,13 +65,22 @@ class Solution:
     agreement: Tensor  # [P] f32, norm of the weighted mean of unit codebook rows
 
 
+@dataclass(frozen=True)
+class Host:
+    """What the closed form has of this machine. Threads and means change no bit of it, only its time."""
+
+    threads: int | None = None  # None takes the cores that this process may use
+    room: FeatureRoom = in_memory  # for X
+    means: Tensor | None = None  # [P, 3] f32, of the splats: neighbours are solved together; None for no order
+
+
 @kernel
-def finish_rows(block, first, squares, begin, features):
-    """Squared norms of a block's rows, and the rows into X.
+def finish_rows(block, squares, begin, features):
+    """Squared norms of a block's rows, and the rows as X has them.
 
     Args:
-        block: [B, C] f32, channels ``begin..`` of the splats from ``first`` on, padded with zeros.
-        squares: [P] f64, grows. features: [P, F] in the bits of f16 (u16), or f32; [0, F] keeps nothing.
+        block: [B, C] f32, channels ``begin..`` of the rows, padded with zeros.
+        squares: [B] f64, grows. features: [B, F] in the bits of f16 (u16), or f32; [0, F] keeps nothing.
     """
     source, width = block.reshape(-1), block.shape[1]
     for row in range(block.shape[0]):
@@ -75,27 +88,26 @@ def finish_rows(block, first, squares, begin, features):
         for c in range(0, width, LANES):
             values = lanes_at(source, row * width + c)
             total = plus_product(total, values, values)
-        squares[first + row] += sum_of_lanes(total)
+        squares[row] += sum_of_lanes(total)
     if features.shape[0] > 0:
-        _store_rows(source, (block.shape[0], width), first, begin, features)
+        _store_rows(source, width, begin, features)
 
 
-def _store_rows(source, shape, first, begin, features) -> Any:
+def _store_rows(source, width, begin, features) -> Any:
     """The block's rows into X, rounded if it is float16."""
 
 
 @overload(_store_rows, inline="always")
-def _overload_store_rows(source, shape, first, begin, features):
+def _overload_store_rows(source, width, begin, features):
     return _store_halves if features.dtype == types.uint16 else _store_singles
 
 
-def _store_halves(source, shape, first, begin, features):
-    count, width = shape
+def _store_halves(source, width, begin, features):
     kept = min(width, features.shape[1] - begin)
     whole = kept // LANES * LANES
     target, last = features.reshape(-1), np.empty(LANES, np.uint16)
-    for row in range(count):
-        place = (first + row) * features.shape[1] + begin
+    for row in range(features.shape[0]):
+        place = row * features.shape[1] + begin
         for c in range(0, whole, LANES):
             keep_halves(target, place + c, lanes_at(source, row * width + c))
         if whole < kept:
@@ -103,11 +115,10 @@ def _store_halves(source, shape, first, begin, features):
             target[place + whole : place + kept] = last[: kept - whole]
 
 
-def _store_singles(source, shape, first, begin, features):
-    count, width = shape
+def _store_singles(source, width, begin, features):
     kept = min(width, features.shape[1] - begin)
-    for row in range(count):
-        features[first + row, begin : begin + kept] = source[row * width : row * width + kept]
+    for row in range(features.shape[0]):
+        features[row, begin : begin + kept] = source[row * width : row * width + kept]
 
 
 def solve_closed_form(
@@ -116,8 +127,7 @@ def solve_closed_form(
     denominators: np.ndarray,
     dtype: torch.dtype,
     progress: Progress,
-    threads: int | None = None,
-    room: FeatureRoom = in_memory,
+    host: Host = Host(),
 ) -> Solution:
     """Solve for X, slice by slice of channels and block by block of splats.
 
@@ -126,8 +136,7 @@ def solve_closed_form(
         columns: view number -> what the columns of its W stand for.
         denominators: [P] f64, row sums of W over all views.
         dtype: how X is stored; float16 becomes float32 when the codebooks are too large or too small for it.
-        threads: None takes the cores that this process may use. The number changes no bit.
-        room: where X is to lie.
+        host: what there is to solve with, and where X is to lie.
     """
     own = [columns(view) for view in range(len(store))]
     books = [part.codebook for part in own]
@@ -137,18 +146,20 @@ def solve_closed_form(
     if dtype == torch.float16 and not fits_float16(books, max(float(norm.max()) for norm in norms)):
         dtype = torch.float32
     count = denominators.shape[0]
-    features = room(count, channels, dtype)  # every share of splats fills its rows
+    features = host.room(count, channels, dtype)  # every share of splats fills its rows
     kept = features.view(torch.uint16).numpy() if dtype == torch.float16 else features.numpy()
     squares, nothing = np.zeros(count), kept[:0]
     scale = np.divide(1.0, denominators, out=np.zeros(count), where=denominators > 0)
     halves = all(_in_halves(part, dtype) for part in own)
     counts, tables = [part.count for part in own], WeightTables(store)
     slices = channel_slices(sum(counts), channels, 2 if halves and unit else 4)
-    with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
+    row_bytes, curve = channels * dtype.itemsize, None if host.means is None else places_along_curve(host.means)
+    with ThreadPoolExecutor(host.threads or len(os.sched_getaffinity(0))) as pool:
+        gathering = Gathering(pool, tables, (first_columns(counts), scale), curve, row_bytes)
         for number, (begin, end) in enumerate(slices):
             parts = (part.means(part.codebook[:, begin:end]) for part in own)
             strips = strips_of(parts, counts, end - begin, torch.float16 if halves else torch.float32)
-            _solve_strips(pool, tables, strips, scale, (squares if unit else np.zeros(count), begin, kept))
+            _solve_strips(pool, gathering, strips, (squares if unit else np.zeros(count), begin, kept))
             del strips  # before others are made
             if not unit:
                 parts = (
@@ -156,7 +167,7 @@ def solve_closed_form(
                     for part, norm in zip(own, norms, strict=True)
                 )
                 strips = strips_of(parts, counts, end - begin, torch.float32)
-                _solve_strips(pool, tables, strips, scale, (squares, begin, nothing))
+                _solve_strips(pool, gathering, strips, (squares, begin, nothing))
                 del strips
             progress("solve", number + 1, len(slices), "slices")
     agreement = np.sqrt(squares).clip(0.0, 1.0).astype(np.float32)
@@ -182,37 +193,39 @@ def _unit_rows(part: Tensor, norms: np.ndarray) -> Tensor:
 
 
 @kernel
-def solve_share(splats, tables, strips, scale, result):
-    """X of a share of splats over the channels of the strips, and their squared norms.
+def solve_share(share, splats, entries, strips, result):
+    """X of a share of a chunk over the channels of the strips, and the squared norms of its rows.
 
     Args:
-        splats: (first, last). tables: (addresses, rows) of WeightTables. strips: Strips. scale: [P] f64.
-        result: (squares, begin, features) as ``finish_rows`` takes them.
+        share: (first, last) of the chunk's ``splats`` [B] i64. entries: theirs. strips: Strips.
+        result: (squares [P] f64, which grow; the first channel; X [P, F] in the bits of f16 (u16), or f32, [0, F] to
+            keep nothing).
     """
     squares, begin, features = result
-    starts, most = entries_before(splats, tables), most_entries(strips.rows)
-    first = 0
-    while first < starts.shape[0] - 1:
-        last = block_end(starts, first, most)
-        block = (splats[0] + first, splats[0] + last)
-        entries = block_entries(block, starts[first : last + 1], tables, strips.bases, scale)
-        sums = np.empty((last - first, WIDE), np.float32)
+    starts, last = entries.starts[: share[1] + 1], share[0]
+    width, target = min(strips.number * WIDE, features.shape[1] - begin), features.reshape(-1)
+    while last < share[1]:
+        first, last = last, block_end(starts, last, BLOCK_ENTRIES)
+        count, own = last - first, Entries(starts[first : last + 1], entries.rows, entries.shares)
+        sums, norms = np.empty((count, WIDE), np.float32), np.zeros(count)
+        rows = np.empty((min(count, features.shape[0]), width), features.dtype)
         for strip in range(strips.number):
-            sum_strip(entries, strips, strip, sums)
-            finish_rows(sums, block[0], squares, begin + strip * WIDE, features)
-        first = last
+            sum_strip(own, strips, strip, sums)
+            finish_rows(sums, norms, strip * WIDE, rows)
+        for row in range(count):
+            squares[splats[first + row]] += norms[row]
+        source = rows.reshape(-1)
+        for row in range(rows.shape[0]):  # whole, so that a page of X is written while it is there
+            copy_values(target, splats[first + row] * features.shape[1] + begin, source, row * width, width)
 
 
 def _solve_strips(
-    pool: ThreadPoolExecutor,
-    weights: WeightTables,
-    strips: Strips,
-    scale: np.ndarray,
-    result: tuple[np.ndarray, int, np.ndarray],
+    pool: Executor, gathering: Gathering, strips: Strips, result: tuple[np.ndarray, int, np.ndarray]
 ) -> None:
     """The strips for all splats, into ``result = (squares, first channel, X)``."""
-    tables = (weights.addresses, weights.rows)
-    list(pool.map(lambda share: solve_share(share, tables, strips, scale, result), splat_shares(scale.shape[0])))
+    for chunk in gathering:
+        shares = splat_shares(0, chunk.splats.size)
+        list(pool.map(lambda share, own=chunk: solve_share(share, *own, strips, result), shares))
 
 
 def warm_up_solution() -> None:
@@ -221,4 +234,4 @@ def warm_up_solution() -> None:
     weights = RegionWeights(one, torch.tensor([0, 1]), one, torch.ones(1), one, torch.ones(1))
     for dtype, kind in product((torch.float16, torch.float32), repeat=2):
         columns = rows_of([torch.ones(1, 1, dtype=kind)])
-        solve_closed_form([weights], columns, np.ones(1), dtype, silent, 1)
+        solve_closed_form([weights], columns, np.ones(1), dtype, silent, Host(1, means=torch.zeros(1, 3)))

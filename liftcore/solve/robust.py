@@ -216,7 +216,7 @@ def _judge(
         weights.weights.zero_()
     counts = [book.shape[0] for book in directions.books]
     scale, weights = _over(np.ones(denominators.size), denominators), WeightTables(current)
-    tables, shares = (weights.addresses, weights.rows), splat_shares(denominators.size)
+    tables, shares = (weights.addresses, weights.rows), splat_shares(0, denominators.size)
     sums = addresses_of([(view.weights.numpy(), square) for view, square in zip(target, squares, strict=True)])
     for begin, end in channel_slices(sum(counts), directions.mean.size, 4):
         parts = pool.map(lambda view, ends=(begin, end): directions.slice_of(view, *ends), range(len(counts)))

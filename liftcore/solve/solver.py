@@ -9,7 +9,6 @@ import torch
 
 from liftcore.device import out_of_memory
 from liftcore.solve.closed_form import solve_closed_form
-from liftcore.solve.feature_room import in_memory
 from liftcore.solve.on_device import Place, solve_on_device
 from liftcore.solve.view_weights import ViewWeights
 
@@ -21,7 +20,7 @@ if TYPE_CHECKING:
     from liftcore.device import Device
     from liftcore.progress import Progress
     from liftcore.raster.protocol import RegionWeights
-    from liftcore.solve.closed_form import Solution
+    from liftcore.solve.closed_form import Host, Solution
     from liftcore.solve.columns import Columns
     from liftcore.solve.feature_room import FeatureRoom
 
@@ -41,16 +40,15 @@ class ClosedForm(Protocol):
         ...
 
 
-def closed_form_on(device: Device, threads: int | None, room: FeatureRoom = in_memory) -> ClosedForm:
+def closed_form_on(device: Device, host: Host) -> ClosedForm:
     """The closed form where the lift runs, cut to the memory that is free there now.
 
     Args:
-        threads: of the processor; None takes the cores that this process may use.
-        room: where X is to lie, on the host.
+        host: where X is to lie in any case; what solves, if it is the processor.
     """
     if device.kind == "cpu":
-        return partial(solve_closed_form, threads=threads, room=room)
-    return partial(_solve_on_card, device, room)
+        return partial(solve_closed_form, host=host)
+    return partial(_solve_on_card, device, host.room)
 
 
 def _solve_on_card(

@@ -1,8 +1,8 @@
 """``W E`` of a block of splats over all views, strip by strip of channels.
 
-A block's entries are gathered from W of every view first, splat by splat, so that a splat's sum over all its views
-stays in registers. The channels of all codebooks lie in strips: a strip's piece of a row is a line of the processor's
-cache or two, and the pieces of all rows stay in a core's own cache while a block is summed.
+Entries are gathered from W of every view first, splat by splat, so that a splat's sum over all its views stays in
+registers. The channels of all codebooks lie in strips: a strip's piece of a row is a line of the processor's cache or
+a few, and the pieces that a block of splats reads stay in a core's own cache while it is summed.
 
 Sums are float32 over a few hundred terms at most. Longer ones, of a splat behind a million regions or of thousands of
 views, are sums of such parts in float64: added one by one, ten million equal terms would be wrong in their first
@@ -18,8 +18,8 @@ import torch
 
 from liftcore.errors import Unavailable
 from liftcore.jit import kernel
-from liftcore.lanes import AHEAD, WIDE, add_weighted_row
-from liftcore.solve.weight_tables import table_at
+from liftcore.lanes import AHEAD, WIDE, add_weighted_row, fetch_place
+from liftcore.solve.weight_tables import rows_between, table_at
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 LONG = 256  # entries of a splat that float32 adds up one by one
+PLACES = 12  # rows of W between asking for their places among the gathered entries and writing there
 SHARE = 2048  # splats a call of compiled code
 LEAST_ENTRIES, MOST_ENTRIES = 1 << 16, 1 << 22  # of a block, unless a splat alone has more
 REUSE = 12  # entries of a block for each row of the codebooks: so often a piece is read from the nearer cache
@@ -63,8 +64,7 @@ def strips_of(parts: Iterable[Tensor], counts: Sequence[int], channels: int, dty
     Raises:
         Unavailable: all codebooks together have more rows than an entry can name.
     """
-    bases = np.cumsum([0, *counts])
-    rows, count = int(bases[-1]), -(-channels // WIDE)
+    bases, rows, count = first_columns(counts), sum(counts), -(-channels // WIDE)
     if rows > MOST_ROWS:
         raise Unavailable(
             "features",
@@ -74,12 +74,17 @@ def strips_of(parts: Iterable[Tensor], counts: Sequence[int], channels: int, dty
         )
     values = _in_lines(count * rows * WIDE, dtype)
     strips = values.view(count, rows, WIDE)
-    for base, part in zip(bases[:-1].tolist(), parts, strict=True):
+    for base, part in zip(bases.tolist(), parts, strict=True):
         for strip in range(count):
             own = part[:, strip * WIDE : (strip + 1) * WIDE]
             strips[strip, base : base + own.shape[0], : own.shape[1]] = own
     bits = values.view(torch.uint16) if dtype == torch.float16 else values
-    return Strips(bits.numpy(), bases[:-1].astype(np.int64), rows, count)
+    return Strips(bits.numpy(), bases, rows, count)
+
+
+def first_columns(counts: Sequence[int]) -> np.ndarray:
+    """[V] i64: where the columns of each view begin among those of all."""
+    return np.concatenate([[0], np.cumsum(counts)])[:-1].astype(np.int64)
 
 
 def _in_lines(count: int, dtype: torch.dtype) -> Tensor:
@@ -102,9 +107,9 @@ def strip_bytes(rows: int, channels: int, size: int) -> int:
     return rows * size * (-(-(end - begin) // WIDE) * WIDE)
 
 
-def splat_shares(count: int) -> list[tuple[int, int]]:
+def splat_shares(first: int, last: int) -> list[tuple[int, int]]:
     """The splats of each call of compiled code."""
-    return [(first, min(first + SHARE, count)) for first in range(0, count, SHARE)]
+    return [(begin, min(begin + SHARE, last)) for begin in range(first, last, SHARE)]
 
 
 @kernel
@@ -142,26 +147,41 @@ def most_entries(rows):
 
 
 @kernel
-def block_entries(block, starts, tables, bases, scale):
-    """The Entries of the splats ``block[0]..block[1]``, as ``starts`` [B + 1] of ``entries_before`` counts them."""
+def gather_entries(splats, cursors, tables, columns, entries):
+    """Put the entries of the splats ``splats[0]..splats[1]`` of all views to their places.
+
+    Args:
+        cursors: [n] i64, where the entries of each of the splats begin; they move to their ends.
+        columns: (bases [V] i64, where a view's columns begin among those of all; scale [P] f64).
+        entries: Entries whose rows and shares are written.
+    """
     addresses, rows = tables
-    first, last = block
-    count = starts[-1] - starts[0]
-    places, cursors = starts - starts[0], starts - starts[0]
-    columns, shares = np.zeros(count + AHEAD, np.int32), np.empty(count, np.float32)
+    bases, scale = columns
+    first = splats[0]
     for view in range(addresses.shape[0]):
         ids, row_starts, own, weights = table_at(addresses[view], rows[view])
-        row = np.searchsorted(ids, first)
-        while row < ids.shape[0] and ids[row] < last:
+        begin, end = rows_between(ids, splats)
+        for row in range(begin, end):
             splat = ids[row]
+            if row + PLACES < end:
+                soon = cursors[ids[row + PLACES] - first]
+                fetch_place(entries.rows, soon)
+                fetch_place(entries.shares, soon)
             at = cursors[splat - first]
             for k in range(row_starts[row], row_starts[row + 1]):
-                columns[at] = bases[view] + own[k]
-                shares[at] = weights[k] * scale[splat]
+                entries.rows[at] = bases[view] + own[k]
+                entries.shares[at] = weights[k] * scale[splat]
                 at += 1
             cursors[splat - first] = at
-            row += 1
-    return Entries(places, columns, shares)
+
+
+@kernel
+def block_entries(block, starts, tables, bases, scale):
+    """The Entries of the splats ``block[0]..block[1]``, as ``starts`` [B + 1] of ``entries_before`` counts them."""
+    count = starts[-1] - starts[0]
+    entries = Entries(starts - starts[0], np.zeros(count + AHEAD, np.int32), np.empty(count, np.float32))
+    gather_entries(block, entries.starts[:-1].copy(), tables, (bases, scale), entries)
+    return entries
 
 
 @kernel

@@ -26,6 +26,7 @@ _NO_PART_OF_KERNELS = {
     "columns.py",
     "errors.py",
     "feature_room.py",
+    "gathering.py",
     "readout.py",
     "protocol.py",
     "progress.py",

@@ -9,7 +9,7 @@ from liftcore.measure.region_walk import walk_regions
 from liftcore.progress import silent
 from liftcore.raster.cpu import CpuRaster
 from liftcore.raster.protocol import Weighting
-from liftcore.solve.closed_form import solve_closed_form
+from liftcore.solve.closed_form import Host, solve_closed_form
 from liftcore.solve.view_weights import ViewWeights
 
 
@@ -28,5 +28,6 @@ class Ours:
         raster, looking = CpuRaster(work.splats, work.threads), (work.walk, Weighting())
         with ViewWeights() as store:
             totals, columns = walk_regions(raster, work.views, looking, work.splats.count, store)
-            solution = solve_closed_form(store, columns.__getitem__, totals, torch.float32, silent, work.threads)
+            host = Host(work.threads, means=work.splats.means)
+            solution = solve_closed_form(store, columns.__getitem__, totals, torch.float32, silent, host)
         return Answer(solution.features, torch.from_numpy(totals))

@@ -18,7 +18,7 @@ from liftcore.raster.oracle_footprints import alphas
 from liftcore.raster.protocol import RegionWeights, Walk, Weighting
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Splats
-from liftcore.solve.closed_form import solve_closed_form
+from liftcore.solve.closed_form import Host, solve_closed_form
 from liftcore.solve.columns import Columns
 from liftcore.solve.view_weights import ViewWeights
 
@@ -101,7 +101,5 @@ def _solved(views: list[RegionWeights], equal: bool) -> float:
             weights = view.weights.double()
             total += float(weights.sum())
             value += float(weights @ book[view.columns.long(), 0].double())
-        solved = solve_closed_form(
-            store, lambda _: Columns(book), np.array([total]), torch.float32, silent, threads=1
-        )
+        solved = solve_closed_form(store, lambda _: Columns(book), np.array([total]), torch.float32, silent, Host(1))
     return abs(float(solved.features[0, 0]) * total / value - 1)

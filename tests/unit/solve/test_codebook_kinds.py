@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from liftcore.lanes import WIDE
 from liftcore.progress import silent
 from liftcore.raster.protocol import RegionWeights
-from liftcore.solve.closed_form import solve_closed_form
+from liftcore.solve.closed_form import Host, solve_closed_form
 from liftcore.solve.columns import rows_of
 
 ROWS = 5
@@ -28,7 +28,7 @@ def sparse(seed: int, splats: int) -> RegionWeights:
 
 
 def solved(store, books, splats: int) -> torch.Tensor:
-    return solve_closed_form(store, rows_of(books), np.full(splats, 3.0), torch.float32, silent, 1).features
+    return solve_closed_form(store, rows_of(books), np.full(splats, 3.0), torch.float32, silent, Host(1)).features
 
 
 @given(st.integers(0, 2**31), st.sampled_from([1, 7, WIDE, 50, 3 * WIDE]), st.sampled_from([1e-7, 1e-5, 1.0, 6e4]))

@@ -14,7 +14,7 @@ from liftcore.progress import silent
 from liftcore.raster.cpu import CpuRaster
 from liftcore.raster.protocol import Walk, Weighting
 from liftcore.solve.accumulate import row_totals
-from liftcore.solve.closed_form import Solution, solve_closed_form
+from liftcore.solve.closed_form import Host, Solution, solve_closed_form
 from liftcore.solve.columns import Columns, by_rows, by_tuples
 from liftcore.solve.on_device import Place, solve_on_device
 from liftcore.solve.settings import LiftSettings
@@ -44,7 +44,7 @@ def solved(views, weighting: Weighting, dtype: torch.dtype, on_device: bool = Fa
     arguments = (store, own.__getitem__, totals, dtype, silent)
     if on_device:
         return solve_on_device(*arguments, Place(torch.device("cpu"))), totals
-    return solve_closed_form(*arguments, threads=1), totals
+    return solve_closed_form(*arguments, Host(1)), totals
 
 
 @given(st.integers(0, 2**31), st.integers(2, 4), st.sampled_from([1, 2]), st.sampled_from([1e-30, 1.0, 1e37]))
@@ -78,7 +78,7 @@ def test_splats_that_no_view_labels_have_zeros_wherever_x_lies():
         return torch.full((splats, channels), 7.0, dtype=dtype)
 
     arguments = ([weights], lambda _: Columns(own.codebook), np.zeros(RASTER.splats.count), torch.float16, silent)
-    assert not solve_closed_form(*arguments, 1, used).features.any()
+    assert not solve_closed_form(*arguments, Host(1, used)).features.any()
     assert not solve_on_device(*arguments, Place(torch.device("cpu")), used).features.any()
 
 

@@ -13,7 +13,7 @@ from liftcore.device import CPU, Device, indexed
 from liftcore.progress import silent
 from liftcore.raster.protocol import RegionWeights
 from liftcore.solve import on_device, solver
-from liftcore.solve.closed_form import Solution, solve_closed_form
+from liftcore.solve.closed_form import Host, Solution, solve_closed_form
 from liftcore.solve.columns import Columns, rows_of
 from liftcore.solve.device_blocks import GRAIN, SLICE_BYTES, block_bytes, device_slices, splat_blocks
 from liftcore.solve.on_device import Place, solve_on_device, squared_lengths
@@ -239,7 +239,7 @@ def test_solution_without_room_beside_the_weights_brings_them_home(monkeypatch: 
         return "solved"
 
     monkeypatch.setattr(solver, "solve_on_device", crowded)
-    closed_form = closed_form_on(Device("cuda", HERE), None)
+    closed_form = closed_form_on(Device("cuda", HERE), Host())
     rest = (rows_of([torch.zeros(1, 1)]), np.zeros(1), torch.float32, silent)
     with ViewWeights(card=(HERE, 1 << 20)) as store:
         store.append(random_view(0, 3))

@@ -30,7 +30,7 @@ def test_rows_are_rounded_as_numpy_rounds_them_and_nothing_beside_them_is_touche
     for channels in (7 + CHANNELS, 60):  # the slice is X's last, and it is not
         features, squares = torch.zeros(len(rows) + 5, channels, dtype=dtype), np.zeros(len(rows) + 5)
         kept = features.view(torch.uint16).numpy() if dtype == torch.float16 else features.numpy()
-        finish_rows(block, 3, squares, 7, kept)
+        finish_rows(block, squares[own], 7, kept[own])
         width = min(32, channels - 7)
         with np.errstate(over="ignore"):
             wanted = block[:, :width].astype(features.numpy().dtype)
@@ -43,5 +43,5 @@ def test_rows_are_rounded_as_numpy_rounds_them_and_nothing_beside_them_is_touche
 
 def test_norms_alone_keep_no_row() -> None:
     squares = np.zeros(2)
-    finish_rows(np.ones((2, 32), np.float32), 0, squares, 0, np.empty((0, 32), np.float32))
+    finish_rows(np.ones((2, 32), np.float32), squares, 0, np.empty((0, 32), np.float32))
     assert squares.tolist() == [32.0, 32.0]

@@ -11,7 +11,7 @@ from liftcore.lanes import WIDE
 from liftcore.progress import silent
 from liftcore.raster.protocol import RegionWeights
 from liftcore.solve import weighted_sums
-from liftcore.solve.closed_form import solve_closed_form
+from liftcore.solve.closed_form import Host, solve_closed_form
 from liftcore.solve.columns import rows_of
 from liftcore.solve.weighted_sums import LEAST_ENTRIES, LONG, SHARE, channel_slices, strip_bytes, strips_of
 
@@ -59,9 +59,9 @@ def scene() -> tuple[list[RegionWeights], list[torch.Tensor], np.ndarray]:
     return store, books, totals
 
 
-def solved(scene, threads: int = 1) -> torch.Tensor:
+def solved(scene, host: Host | None = None) -> torch.Tensor:
     store, books, totals = scene
-    return solve_closed_form(store, rows_of(books), totals, torch.float32, silent, threads).features
+    return solve_closed_form(store, rows_of(books), totals, torch.float32, silent, host or Host(1)).features
 
 
 def test_every_entry_of_every_view_counts_once(scene):
@@ -77,21 +77,22 @@ def test_every_entry_of_every_view_counts_once(scene):
 
 def test_slices_of_channels_and_threads_change_no_bit(scene, monkeypatch):
     whole = solved(scene)
-    assert torch.equal(whole, solved(scene, threads=3))
+    assert torch.equal(whole, solved(scene, Host(3)))
     monkeypatch.setattr(weighted_sums, "STRIP_BYTES", 1)
     assert len(channel_slices(1000, CHANNELS, 4)) == 3
     assert torch.equal(whole, solved(scene))
 
 
 def test_strips_hold_every_row_and_zeros_beyond_the_last_channel():
-    books = [torch.arange(rows * 40.0).reshape(rows, 40) + 1 for rows in (3, 5)]
-    strips = strips_of(books, [3, 5], 40, torch.float32)
+    channels = WIDE + 8
+    books = [torch.arange(1.0 * rows * channels).reshape(rows, channels) + 1 for rows in (3, 5)]
+    strips = strips_of(books, [3, 5], channels, torch.float32)
     assert (strips.rows, strips.number, strips.bases.tolist()) == (8, 2, [0, 3])
     assert strips.values.ctypes.data % 64 == 0
-    assert strips.values.nbytes == strip_bytes(8, 40, 4)
+    assert strips.values.nbytes == strip_bytes(8, channels, 4)
     rows = strips.values.reshape(2, 8, WIDE).transpose(1, 0, 2).reshape(8, 2 * WIDE)
-    np.testing.assert_array_equal(rows[:, :40], torch.cat(books).numpy())
-    assert not rows[:, 40:].any()
+    np.testing.assert_array_equal(rows[:, :channels], torch.cat(books).numpy())
+    assert not rows[:, channels:].any()
 
 
 def test_more_rows_than_an_entry_can_name_are_refused():

@@ -1,0 +1,104 @@
+"""W of some splats at a time, gathered from all views in the order of a curve through space.
+
+Splats near to one another are seen in the same regions of the same views, so they read the same rows of the
+codebooks. A trained file has its splats in the order in which training made them: summed in that order, nearly each
+entry waits for a row that others have driven out of the cache.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from liftcore.lanes import AHEAD
+from liftcore.solve.weighted_sums import Entries, entries_before, gather_entries, splat_shares
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from concurrent.futures import Executor
+
+    from liftcore.solve.weight_tables import WeightTables
+
+CHUNK_ENTRIES = 1 << 24  # gathered at a time, unless a splat alone has more
+CHUNK_BYTES = 1 << 28  # of X at a time: where it is a mapped file, more might not stay in memory
+
+
+class Chunk(NamedTuple):
+    """Some splats that follow one another in the file, in the order of the curve."""
+
+    splats: np.ndarray  # [B] i64
+    entries: Entries  # of each
+
+
+class Gathering:
+    """W of all views, chunk by chunk; to be gone through as often as there are slices of channels.
+
+    Args:
+        pool: does the work of a chunk in shares.
+        columns: where each view's columns begin among those of all, [V] i64, and the scale of each splat, [P] f64.
+        curve: [P] places along the curve; None keeps the order of the file.
+        row_bytes: of a row of X.
+    """
+
+    def __init__(
+        self,
+        pool: Executor,
+        weights: WeightTables,
+        columns: tuple[np.ndarray, np.ndarray],
+        curve: np.ndarray | None,
+        row_bytes: int,
+    ) -> None:
+        self._pool, self._columns, self._curve = pool, columns, curve
+        self._weights, self._tables = weights, (weights.addresses, weights.rows)
+        self._counts = self._entry_counts(columns[1].size)
+        self._ranges = chunk_ranges(self._counts, row_bytes)
+        most = max((int(self._counts[first:last].sum()) for first, last in self._ranges), default=0)
+        self._rows, self._shares = (
+            np.zeros(most + AHEAD, np.int32),
+            np.empty(most, np.float32),
+        )  # of a chunk at a time
+
+    def __iter__(self) -> Iterator[Chunk]:
+        """The chunks; each is gone when the next one is asked for."""
+        return (self._gathered(*splats) for splats in self._ranges)
+
+    def _entry_counts(self, splats: int) -> np.ndarray:
+        """[P] i64: how many entries each splat has, over all views."""
+        counts = np.empty(splats, np.int64)
+
+        def count(share: tuple[int, int]) -> None:
+            counts[share[0] : share[1]] = np.diff(entries_before(share, self._tables))
+
+        list(self._pool.map(count, splat_shares(0, splats)))
+        return counts
+
+    def _gathered(self, first: int, last: int) -> Chunk:
+        """The splats ``first..last``."""
+        own = np.arange(last - first) if self._curve is None else np.argsort(self._curve[first:last])
+        starts = np.concatenate([[0], np.cumsum(self._counts[first:last][own])])
+        places = np.empty(last - first, np.int64)
+        places[own] = starts[:-1]
+        entries = Entries(starts, self._rows, self._shares)
+
+        def gather(share: tuple[int, int]) -> None:
+            cursors = places[share[0] - first : share[1] - first]
+            gather_entries(share, cursors, self._tables, self._columns, entries)
+
+        list(self._pool.map(gather, splat_shares(first, last)))
+        return Chunk(own + first, entries)
+
+
+def chunk_ranges(counts: np.ndarray, row_bytes: int) -> list[tuple[int, int]]:
+    """The splats of each chunk, first and last: of about the same size, within both limits but for a splat.
+
+    Args:
+        counts: [P] of entries. row_bytes: of a row of X.
+    """
+    before = np.concatenate([[0], np.cumsum(counts / CHUNK_ENTRIES + row_bytes / CHUNK_BYTES)])  # of a full chunk
+    number = max(math.ceil(before[-1]), 1)
+    ends = np.searchsorted(before, before[-1] * np.arange(1, number) / number)
+    edges = np.unique([0, *ends, counts.size]).tolist()
+    return list(pairwise(edges))
