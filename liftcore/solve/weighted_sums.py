@@ -31,7 +31,7 @@ PLACES = 12  # rows of W between asking for their places among the gathered entr
 SHARE = 2048  # splats a call of compiled code
 LEAST_ENTRIES, MOST_ENTRIES = 1 << 16, 1 << 22  # of a block, unless a splat alone has more
 REUSE = 12  # entries of a block for each row of the codebooks: so often a piece is read from the nearer cache
-STRIP_BYTES = 1 << 27  # of the strips of all codebooks at a time
+STRIP_BYTES = 1 << 28  # of the strips of all codebooks at a time
 MOST_ROWS = 2**31 - 1  # of all codebooks: an entry of a block names its row in four bytes
 _LINE = 64  # bytes of the processor's cache
 
