@@ -164,11 +164,14 @@ def _label_bytes(packs: FeaturePacks, view: str) -> int:
 
 
 def _all_codebook_bytes(packs: FeaturePacks, views: Iterable[str], settings: LiftSettings) -> int:
-    """Of the codebooks, and of the strips of what W's columns stand for that the solution has beside."""
+    """Of the codebooks, and of the strips of what W's columns stand for that the solution has beside.
+
+    Codebooks that are no unit vectors have strips of those, too. Which are, nobody knows before they are read.
+    """
     names = list(views)
     halves = all(_codebook_spec(packs, view).dtype == "F16" for view in names)
     size = 2 if halves and (by_rows(settings) or settings.dtype == "float16") else 4
-    strips = strip_bytes(all_columns(packs, names, settings), packs.channels, size)
+    strips = strip_bytes(all_columns(packs, names, settings), packs.channels, size + 4)
     return sum(_codebook_bytes(packs, view) for view in names) + strips
 
 

@@ -152,23 +152,22 @@ def solve_closed_form(
     scale = np.divide(1.0, denominators, out=np.zeros(count), where=denominators > 0)
     halves = all(_in_halves(part, dtype) for part in own)
     counts, tables = [part.count for part in own], WeightTables(store)
-    slices = channel_slices(sum(counts), channels, 2 if halves and unit else 4)
+    slices = channel_slices(sum(counts), channels, (2 if halves else 4) + (0 if unit else 4))
     row_bytes, curve = channels * dtype.itemsize, None if host.means is None else places_along_curve(host.means)
     with ThreadPoolExecutor(host.threads or len(os.sched_getaffinity(0))) as pool:
         gathering = Gathering(pool, tables, (first_columns(counts), scale), curve, row_bytes)
         for number, (begin, end) in enumerate(slices):
             parts = (part.means(part.codebook[:, begin:end]) for part in own)
             strips = strips_of(parts, counts, end - begin, torch.float16 if halves else torch.float32)
-            _solve_strips(pool, gathering, strips, (squares if unit else np.zeros(count), begin, kept))
-            del strips  # before others are made
+            sums = [(strips, (squares if unit else np.zeros(count), begin, kept))]
             if not unit:
                 parts = (
                     part.means(_unit_rows(part.codebook[:, begin:end], norm))
                     for part, norm in zip(own, norms, strict=True)
                 )
-                strips = strips_of(parts, counts, end - begin, torch.float32)
-                _solve_strips(pool, gathering, strips, (squares, begin, nothing))
-                del strips
+                sums.append((strips_of(parts, counts, end - begin, torch.float32), (squares, begin, nothing)))
+            _solve_strips(pool, gathering, sums)
+            del strips, sums  # before others are made
             progress("solve", number + 1, len(slices), "slices")
     agreement = np.sqrt(squares).clip(0.0, 1.0).astype(np.float32)
     return Solution(features, torch.from_numpy(agreement))
@@ -220,12 +219,13 @@ def solve_share(share, splats, entries, strips, result):
 
 
 def _solve_strips(
-    pool: Executor, gathering: Gathering, strips: Strips, result: tuple[np.ndarray, int, np.ndarray]
+    pool: Executor, gathering: Gathering, sums: Sequence[tuple[Strips, tuple[np.ndarray, int, np.ndarray]]]
 ) -> None:
-    """The strips for all splats, into ``result = (squares, first channel, X)``."""
+    """Each of the strips for all splats, into its ``(squares, first channel, X)``; W is gathered once for all."""
     for chunk in gathering:
         shares = splat_shares(0, chunk.splats.size)
-        list(pool.map(lambda share, own=chunk: solve_share(share, *own, strips, result), shares))
+        for given in sums:
+            list(pool.map(lambda share, own=(*chunk, *given): solve_share(share, *own), shares))
 
 
 def warm_up_solution() -> None:
