@@ -1,7 +1,8 @@
-"""Eight float32 lanes at a time: the vector instructions of the pixel loop and of the solution.
+"""Eight float32 lanes at a time, or sixteen: the vector instructions of the pixel loop and of the solution.
 
 numba's automatic vectorisation stops at aliasing and wrap-around checks inside the blending loop. These
-intrinsics build the same arithmetic as LLVM vectors of eight lanes, which LLVM lowers to AVX2, SSE or NEON.
+intrinsics build the same arithmetic as LLVM vectors of eight lanes, which LLVM lowers to AVX2, SSE or NEON. The
+sums of codebook rows take sixteen, which are one register with AVX-512.
 A tile row of 16 pixels is two such half rows; half row ``16 side + row`` lies left (side 0) or right (1).
 """
 
@@ -251,11 +252,11 @@ _HALF_UNIT = 2.0**112  # what float16 is larger by than its bits moved into a fl
 
 
 def _converts(context) -> bool:
-    """Whether the processor that is compiled for is an x86 that turns float16 into float32 by itself."""
+    """Whether the processor that is compiled for is an x86 that turns float16 into float32 and back by itself."""
     return "+f16c" in context.codegen().magic_tuple()[2]
 
 
-_BROAD = 2 * LANES  # values of a row at a time: one register where there are such, two elsewhere
+_BROAD = 2 * LANES  # values of a row at a time: one register with AVX-512, two with AVX2, four with SSE and NEON
 _FLOATS, _INTS, _BROAD_SHORTS, _BROAD_HALVES = (
     ir.VectorType(kind, _BROAD) for kind in (FLOAT, INT, ir.IntType(16), ir.HalfType())
 )

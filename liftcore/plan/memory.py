@@ -30,7 +30,7 @@ MORE_ENTRIES = 0.6  # of it for each further level, where columns are tuples; EN
 ENTRY_BYTES, ROW_BYTES = 8, 20  # column and weight; a splat's ids, row start and evidence
 TILES_A_SPLAT = 6  # entries of tile lists and tile sums for a splat that a view sees, at full resolution
 TILE_ENTRY_BYTES = 4 + 4 + 2 * 16  # list, item, and an entry before and after it is gathered
-SCENE_BYTES = 9 * 8 + 3 * 8 + 3 * 8  # axes, opacities, reach; evidence, denominators, scale
+SCENE_BYTES = 9 * 8 + 3 * 8 + 8 * 8  # axes, opacities, reach; evidence, denominators, scale, order of the solution
 WALK_BYTES = 68  # of a splat of the scene in the walk of a view, seen or not: depth, id, counts and sums of the merge
 CONTROL_GROUPS = (  # folder, and the files of limit, use and statistics: versions 2 and 1
     ("/sys/fs/cgroup", ("memory.max", "memory.current", "memory.stat")),

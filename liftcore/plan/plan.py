@@ -144,6 +144,8 @@ def plan_lift(
     short = check_device_room(on_device, settings.device) if on_device else []
     on_card = on_device is not None and not short
     at_once = 1 if on_card else min(len(views), views_at_a_time(threads or len(os.sched_getaffinity(0))))
+    if on_card:
+        parts["gathered"] = 0  # there W goes to the card block by block
     today, free = _in_work(parts, at_once), free_memory()
     return Plan(
         kernel=str(splats.kernel),

@@ -41,16 +41,17 @@ from liftcore.solve.weighted_sums import (
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
-    from concurrent.futures import Executor
 
     from torch import Tensor
 
     from liftcore.progress import Progress
     from liftcore.solve.feature_room import FeatureRoom
+    from liftcore.solve.gathering import EachShare
     from liftcore.solve.view_weights import ViewWeights
     from liftcore.solve.weighted_sums import Strips
 
-BLOCK_ENTRIES = 1 << 12  # whose splats' rows of X stay in the core's own cache while strips go by
+BLOCK_ENTRIES = 1 << 12  # summed strip by strip, before their splats' rows are copied to X
+FEW_CHANNELS = 128  # that are summed sooner than put into another order
 FLOAT16_MAX = 65_504.0
 FLOAT16_STEP = 2.0**-25  # the largest rounding error of its small values
 FLOAT16_ERROR = 1e-4  # of the longest vector, which float16 must hold
@@ -71,7 +72,7 @@ class Host:
 
     threads: int | None = None  # None takes the cores that this process may use
     room: FeatureRoom = in_memory  # for X
-    means: Tensor | None = None  # [P, 3] f32, of the splats: neighbours are solved together; None for no order
+    means: Tensor | None = None  # [P, 3] f32, of the splats: neighbours are solved together; None: in their order
 
 
 @kernel
@@ -153,9 +154,14 @@ def solve_closed_form(
     halves = all(_in_halves(part, dtype) for part in own)
     counts, tables = [part.count for part in own], WeightTables(store)
     slices = channel_slices(sum(counts), channels, (2 if halves else 4) + (0 if unit else 4))
-    row_bytes, curve = channels * dtype.itemsize, None if host.means is None else places_along_curve(host.means)
-    with ThreadPoolExecutor(host.threads or len(os.sched_getaffinity(0))) as pool:
-        gathering = Gathering(pool, tables, (first_columns(counts), scale), curve, row_bytes)
+    curve = None if host.means is None or channels <= FEW_CHANNELS else places_along_curve(host.means)
+    threads = host.threads or len(os.sched_getaffinity(0))
+    with ThreadPoolExecutor(threads) as pool:
+
+        def each_share(work: Callable[[tuple[int, int]], None], first: int, last: int) -> None:
+            list(pool.map(work, splat_shares(first, last, threads)))
+
+        gathering = Gathering(each_share, tables, (first_columns(counts), scale), curve, channels * dtype.itemsize)
         for number, (begin, end) in enumerate(slices):
             parts = (part.means(part.codebook[:, begin:end]) for part in own)
             strips = strips_of(parts, counts, end - begin, torch.float16 if halves else torch.float32)
@@ -166,7 +172,7 @@ def solve_closed_form(
                     for part, norm in zip(own, norms, strict=True)
                 )
                 sums.append((strips_of(parts, counts, end - begin, torch.float32), (squares, begin, nothing)))
-            _solve_strips(pool, gathering, sums)
+            _solve_strips(each_share, gathering, sums)
             del strips, sums  # before others are made
             progress("solve", number + 1, len(slices), "slices")
     agreement = np.sqrt(squares).clip(0.0, 1.0).astype(np.float32)
@@ -219,13 +225,13 @@ def solve_share(share, splats, entries, strips, result):
 
 
 def _solve_strips(
-    pool: Executor, gathering: Gathering, sums: Sequence[tuple[Strips, tuple[np.ndarray, int, np.ndarray]]]
+    each_share: EachShare, gathering: Gathering, sums: Sequence[tuple[Strips, tuple[np.ndarray, int, np.ndarray]]]
 ) -> None:
     """Each of the strips for all splats, into its ``(squares, first channel, X)``; W is gathered once for all."""
     for chunk in gathering:
-        shares = splat_shares(0, chunk.splats.size)
-        for given in sums:
-            list(pool.map(lambda share, own=(*chunk, *given): solve_share(share, *own), shares))
+        for strips, result in sums:
+            given = (chunk.splats, chunk.entries, strips, result)
+            each_share(lambda share, given=given: solve_share(share, *given), 0, chunk.splats.size)
 
 
 def warm_up_solution() -> None:

@@ -8,22 +8,25 @@ entry waits for a row that others have driven out of the cache.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from liftcore.lanes import AHEAD
-from liftcore.solve.weighted_sums import Entries, entries_before, gather_entries, splat_shares
+from liftcore.solve.weighted_sums import Entries, entries_before, gather_entries
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from concurrent.futures import Executor
 
     from liftcore.solve.weight_tables import WeightTables
 
 CHUNK_ENTRIES = 1 << 24  # gathered at a time, unless a splat alone has more
-CHUNK_BYTES = 1 << 28  # of X at a time: where it is a mapped file, more might not stay in memory
+CHUNK_BYTES = 1 << 29  # of X at a time: where it is a mapped file, more might not stay in memory
+
+# Does some work for each share of the splats from the first to the last.
+EachShare = Callable[[Callable[[tuple[int, int]], None], int, int], None]
 
 
 class Chunk(NamedTuple):
@@ -37,7 +40,7 @@ class Gathering:
     """W of all views, chunk by chunk; to be gone through as often as there are slices of channels.
 
     Args:
-        pool: does the work of a chunk in shares.
+        each_share: does the work on a chunk.
         columns: where each view's columns begin among those of all, [V] i64, and the scale of each splat, [P] f64.
         curve: [P] places along the curve; None keeps the order of the file.
         row_bytes: of a row of X.
@@ -45,13 +48,13 @@ class Gathering:
 
     def __init__(
         self,
-        pool: Executor,
+        each_share: EachShare,
         weights: WeightTables,
         columns: tuple[np.ndarray, np.ndarray],
         curve: np.ndarray | None,
         row_bytes: int,
     ) -> None:
-        self._pool, self._columns, self._curve = pool, columns, curve
+        self._each_share, self._columns, self._curve = each_share, columns, curve
         self._weights, self._tables = weights, (weights.addresses, weights.rows)
         self._counts = self._entry_counts(columns[1].size)
         self._ranges = chunk_ranges(self._counts, row_bytes)
@@ -72,7 +75,7 @@ class Gathering:
         def count(share: tuple[int, int]) -> None:
             counts[share[0] : share[1]] = np.diff(entries_before(share, self._tables))
 
-        list(self._pool.map(count, splat_shares(0, splats)))
+        self._each_share(count, 0, splats)
         return counts
 
     def _gathered(self, first: int, last: int) -> Chunk:
@@ -87,7 +90,7 @@ class Gathering:
             cursors = places[share[0] - first : share[1] - first]
             gather_entries(share, cursors, self._tables, self._columns, entries)
 
-        list(self._pool.map(gather, splat_shares(first, last)))
+        self._each_share(gather, first, last)
         return Chunk(own + first, entries)
 
 

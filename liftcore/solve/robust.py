@@ -23,8 +23,8 @@ before, and starts from the first W again. Nothing is tuned; each part has its r
   keeps part of its weight, and one that points away from the others loses it.
 
 A splat of one view does not change. A region without direction (a zero vector, or the mean itself) has c_jm = 0, and
-where nothing in the scene has a direction nothing changes. A step goes over the same blocks of splats and slices of
-channels as the closed form, and does about three times its work.
+where nothing in the scene has a direction nothing changes. A step goes over blocks of splats as the file
+has them and the slices of channels of the closed form, and does some three times its work.
 """
 
 from __future__ import annotations
@@ -216,7 +216,7 @@ def _judge(
         weights.weights.zero_()
     counts = [book.shape[0] for book in directions.books]
     scale, weights = _over(np.ones(denominators.size), denominators), WeightTables(current)
-    tables, shares = (weights.addresses, weights.rows), splat_shares(0, denominators.size)
+    tables, shares = (weights.addresses, weights.rows), splat_shares(0, denominators.size, 1)
     sums = addresses_of([(view.weights.numpy(), square) for view, square in zip(target, squares, strict=True)])
     for begin, end in channel_slices(sum(counts), directions.mean.size, 4):
         parts = pool.map(lambda view, ends=(begin, end): directions.slice_of(view, *ends), range(len(counts)))

@@ -28,10 +28,11 @@ if TYPE_CHECKING:
 
 LONG = 256  # entries of a splat that float32 adds up one by one
 PLACES = 12  # rows of W between asking for their places among the gathered entries and writing there
-SHARE = 2048  # splats a call of compiled code
-LEAST_ENTRIES, MOST_ENTRIES = 1 << 16, 1 << 22  # of a block, unless a splat alone has more
-REUSE = 12  # entries of a block for each row of the codebooks: so often a piece is read from the nearer cache
-STRIP_BYTES = 1 << 28  # of the strips of all codebooks at a time
+LEAST_SHARE, SHARE = 128, 2048  # splats a call of compiled code
+SHARES = 8  # of each thread, so that none waits long for another
+LEAST_ENTRIES, MOST_ENTRIES = 1 << 16, 1 << 22  # of a block in the order of the file, unless a splat alone has more
+REUSE = 12  # entries of such a block for each row of the codebooks: so often a piece is read from the nearer cache
+STRIP_BYTES = 1 << 28  # of the strips of all codebooks at a time, unless a single one has more
 MOST_ROWS = 2**31 - 1  # of all codebooks: an entry of a block names its row in four bytes
 _LINE = 64  # bytes of the processor's cache
 
@@ -49,8 +50,8 @@ class Entries(NamedTuple):
     """W of a block, splat by splat, each in the order of the views."""
 
     starts: np.ndarray  # [B + 1] i64
-    rows: np.ndarray  # [n + AHEAD] i32, of the strips; zeros at the end, which are only asked for
-    shares: np.ndarray  # [n] f32, weights times the splat's scale
+    rows: np.ndarray  # [n + AHEAD] i32 at least, of the strips; beyond n some that are asked for and not read
+    shares: np.ndarray  # [n] f32 at least, weights times the splat's scale
 
 
 def strips_of(parts: Iterable[Tensor], counts: Sequence[int], channels: int, dtype: torch.dtype) -> Strips:
@@ -107,9 +108,10 @@ def strip_bytes(rows: int, channels: int, size: int) -> int:
     return rows * size * (-(-(end - begin) // WIDE) * WIDE)
 
 
-def splat_shares(first: int, last: int) -> list[tuple[int, int]]:
+def splat_shares(first: int, last: int, threads: int) -> list[tuple[int, int]]:
     """The splats of each call of compiled code."""
-    return [(begin, min(begin + SHARE, last)) for begin in range(first, last, SHARE)]
+    step = max(LEAST_SHARE, min(SHARE, -(-(last - first) // (SHARES * threads))))
+    return [(begin, min(begin + step, last)) for begin in range(first, last, step)]
 
 
 @kernel

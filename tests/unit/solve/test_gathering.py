@@ -14,15 +14,17 @@ from hypothesis import strategies as st
 
 from liftcore.progress import silent
 from liftcore.solve import closed_form, gathering
-from liftcore.solve.closed_form import Host, solve_closed_form
+from liftcore.solve.closed_form import FEW_CHANNELS, Host, solve_closed_form
 from liftcore.solve.columns import rows_of
 from liftcore.solve.curve import places_along_curve
 from liftcore.solve.gathering import Gathering, chunk_ranges
 from liftcore.solve.weight_tables import WeightTables
-from liftcore.solve.weighted_sums import SHARE
+from liftcore.solve.weighted_sums import LEAST_SHARE, SHARE, splat_shares
 from tests.unit.solve.test_on_device import dense, random_view, sums_of
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from liftcore.solve.gathering import Chunk
 
 SPLATS, ROWS = SHARE + 300, 40  # more than a call of compiled code takes
@@ -42,7 +44,11 @@ def means() -> torch.Tensor:
 def chunks_of(store: list, curve: np.ndarray | None, row_bytes: int = 1) -> list[Chunk]:
     """Copies, as each chunk is gone when the next one is asked for."""
     with ThreadPoolExecutor(2) as pool:
-        found = Gathering(pool, WeightTables(store), (BASES, np.ones(SPLATS)), curve, row_bytes)
+
+        def each_share(work: Callable[[tuple[int, int]], None], first: int, last: int) -> None:
+            list(pool.map(work, splat_shares(first, last, 2)))
+
+        found = Gathering(each_share, WeightTables(store), (BASES, np.ones(SPLATS)), curve, row_bytes)
         copies = []
         for splats, entries in found:
             last = entries.starts[-1]
@@ -80,20 +86,53 @@ def test_without_places_the_order_is_that_of_the_file(store) -> None:
     assert np.array_equal(chunk.splats, np.arange(SPLATS))
 
 
-def test_order_chunks_blocks_and_threads_change_no_bit_of_the_features(store, means, monkeypatch) -> None:
+def test_order_chunks_shares_and_threads_change_no_bit(store, means, monkeypatch) -> None:
+    monkeypatch.setattr(closed_form, "FEW_CHANNELS", 0)
     books = [torch.randn(ROWS, 70, generator=torch.Generator().manual_seed(view)) for view in range(3)]
+    totals = sums_of(store, SPLATS)
 
-    def features(host: Host) -> torch.Tensor:
-        return solve_closed_form(store, rows_of(books), sums_of(store, SPLATS), torch.float16, silent, host).features
+    def solved(host: Host) -> closed_form.Solution:
+        return solve_closed_form(store, rows_of(books), totals, torch.float16, silent, host)
 
-    whole = features(Host(1))
-    np.testing.assert_allclose(whole.double(), dense(store, books, SPLATS), atol=2e-3)
-    assert torch.equal(whole, features(Host(1, means=means)))
+    def assert_same(other: closed_form.Solution) -> None:
+        assert torch.equal(whole.features, other.features)
+        assert torch.equal(whole.agreement, other.agreement)
+
+    whole = solved(Host(1))
+    np.testing.assert_allclose(whole.features.double(), dense(store, books, SPLATS), atol=2e-3)
+    units = [book / book.norm(dim=1, keepdim=True) for book in books]
+    agreement = np.linalg.norm(dense(store, units, SPLATS), axis=1)
+    np.testing.assert_allclose(whole.agreement, agreement, atol=1e-6)
+    assert_same(solved(Host(1, means=means)))
     monkeypatch.setattr(gathering, "CHUNK_ENTRIES", 700)
-    assert torch.equal(whole, features(Host(3, means=means)))
+    assert_same(solved(Host(3, means=means)))
     monkeypatch.setattr(gathering, "CHUNK_BYTES", 10_000)
-    monkeypatch.setattr(closed_form, "BLOCK_ENTRIES", 9)
-    assert torch.equal(whole, features(Host(2, means=means)))
+    assert_same(solved(Host(40, means=means)))
+
+
+def test_few_channels_keep_the_order_of_the_file(store, means, monkeypatch) -> None:
+    asked = []
+
+    def places(points: torch.Tensor) -> np.ndarray:
+        asked.append(len(points))
+        return places_along_curve(points)
+
+    monkeypatch.setattr(closed_form, "places_along_curve", places)
+    for channels in (FEW_CHANNELS, FEW_CHANNELS + 1):
+        books = [torch.ones(ROWS, channels) for _ in range(3)]
+        solve_closed_form(store, rows_of(books), sums_of(store, SPLATS), torch.float16, silent, Host(1, means=means))
+    assert asked == [SPLATS]
+
+
+@pytest.mark.parametrize("threads", [1, 2, 64])
+@pytest.mark.parametrize("ends", [(0, 0), (5, 6), (7, 100_000), (0, 3_000_000)])
+def test_shares_are_enough_for_all_threads_and_hold_each_splat_once(threads: int, ends: tuple[int, int]) -> None:
+    shares = splat_shares(*ends, threads)
+    sizes = [last - first for first, last in shares]
+    assert all(one[1] == other[0] for one, other in pairwise([(0, ends[0]), *shares, (ends[1], 0)]))
+    assert sum(sizes) == ends[1] - ends[0]
+    assert all(0 < size <= SHARE for size in sizes)
+    assert len(shares) >= min(threads, sum(sizes) // LEAST_SHARE)
 
 
 @given(st.lists(st.integers(0, 50), min_size=1, max_size=60), st.integers(1, 200), st.integers(1, 400))

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from liftcore.lanes import WIDE
 from liftcore.solve.closed_form import finish_rows
 
 CHANNELS = 13  # one whole set of lanes, and a rest
@@ -24,14 +25,14 @@ def everything() -> np.ndarray:
 @pytest.mark.parametrize("dtype", [torch.float16, torch.float32])
 def test_rows_are_rounded_as_numpy_rounds_them_and_nothing_beside_them_is_touched(dtype: torch.dtype) -> None:
     rows = everything()
-    block = np.zeros((len(rows), 32), np.float32)
+    block = np.zeros((len(rows), WIDE), np.float32)
     block[:, :CHANNELS] = rows
     own = slice(3, 3 + len(rows))
-    for channels in (7 + CHANNELS, 60):  # the slice is X's last, and it is not
+    for channels in (7 + CHANNELS, 2 * WIDE):  # the slice is X's last, and it is not
         features, squares = torch.zeros(len(rows) + 5, channels, dtype=dtype), np.zeros(len(rows) + 5)
         kept = features.view(torch.uint16).numpy() if dtype == torch.float16 else features.numpy()
         finish_rows(block, squares[own], 7, kept[own])
-        width = min(32, channels - 7)
+        width = min(WIDE, channels - 7)
         with np.errstate(over="ignore"):
             wanted = block[:, :width].astype(features.numpy().dtype)
         assert features.numpy()[own, 7 : 7 + width].tobytes() == wanted.tobytes()
@@ -43,5 +44,5 @@ def test_rows_are_rounded_as_numpy_rounds_them_and_nothing_beside_them_is_touche
 
 def test_norms_alone_keep_no_row() -> None:
     squares = np.zeros(2)
-    finish_rows(np.ones((2, 32), np.float32), squares, 0, np.empty((0, 32), np.float32))
-    assert squares.tolist() == [32.0, 32.0]
+    finish_rows(np.ones((2, WIDE), np.float32), squares, 0, np.empty((0, WIDE), np.float32))
+    assert squares.tolist() == [WIDE, WIDE]

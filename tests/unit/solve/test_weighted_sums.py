@@ -11,9 +11,9 @@ from liftcore.lanes import WIDE
 from liftcore.progress import silent
 from liftcore.raster.protocol import RegionWeights
 from liftcore.solve import weighted_sums
-from liftcore.solve.closed_form import Host, solve_closed_form
+from liftcore.solve.closed_form import BLOCK_ENTRIES, Host, solve_closed_form
 from liftcore.solve.columns import rows_of
-from liftcore.solve.weighted_sums import LEAST_ENTRIES, LONG, SHARE, channel_slices, strip_bytes, strips_of
+from liftcore.solve.weighted_sums import LONG, SHARE, channel_slices, strip_bytes, strips_of
 
 CHANNELS = 2 * WIDE + 9
 
@@ -50,7 +50,7 @@ def scene() -> tuple[list[RegionWeights], list[torch.Tensor], np.ndarray]:
     rng = np.random.default_rng(0)
     few, many = rng.integers(0, 4, splats), np.zeros(splats, np.int64)
     many[100:300] = 2 * LONG + 30
-    assert many.sum() > LEAST_ENTRIES
+    assert many.sum() > BLOCK_ENTRIES
     store = [view(1, np.maximum(few, many), rows[0]), view(2, rng.integers(0, 3, splats), rows[1])]
     books = [torch.randn(count, CHANNELS, generator=torch.manual_seed(count)) for count in rows]
     totals = np.zeros(splats)
