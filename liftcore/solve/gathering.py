@@ -59,10 +59,7 @@ class Gathering:
         self._counts = self._entry_counts(columns[1].size)
         self._ranges = chunk_ranges(self._counts, row_bytes)
         most = max((int(self._counts[first:last].sum()) for first, last in self._ranges), default=0)
-        self._rows, self._shares = (
-            np.zeros(most + AHEAD, np.int32),
-            np.empty(most, np.float32),
-        )  # of a chunk at a time
+        self._rows, self._shares = np.zeros(most + AHEAD, np.int32), np.empty(most, np.float32)  # of one chunk
 
     def __iter__(self) -> Iterator[Chunk]:
         """The chunks; each is gone when the next one is asked for."""
