@@ -240,4 +240,5 @@ def warm_up_solution() -> None:
     weights = RegionWeights(one, torch.tensor([0, 1]), one, torch.ones(1), one, torch.ones(1))
     for dtype, kind in product((torch.float16, torch.float32), repeat=2):
         columns = rows_of([torch.ones(1, 1, dtype=kind)])
-        solve_closed_form([weights], columns, np.ones(1), dtype, silent, Host(1, means=torch.zeros(1, 3)))
+        solve_closed_form([weights], columns, np.ones(1), dtype, silent, Host(1))
+    places_along_curve(torch.zeros(1, 3))  # which more channels than one ask for
