@@ -257,25 +257,25 @@ def _converts(context) -> bool:
 
 
 _BROAD = 2 * LANES  # values of a row at a time: one register with AVX-512, two with AVX2, four with SSE and NEON
-_FLOATS, _INTS, _BROAD_SHORTS, _BROAD_HALVES = (
+_BROAD_FLOATS, _BROAD_INTS, _BROAD_SHORTS, _BROAD_HALVES = (
     ir.VectorType(kind, _BROAD) for kind in (FLOAT, INT, ir.IntType(16), ir.HalfType())
 )
 
 
 def _load_small(builder: Builder, pointer: ir.Value) -> ir.Value:
     """Float16 as float32 that are 2^112 times smaller: their bits, moved, with room for the larger exponent."""
-    signed = builder.sext(builder.load(builder.bitcast(pointer, _BROAD_SHORTS.as_pointer()), align=2), _INTS)
-    moved = builder.shl(signed, ir.Constant(_INTS, [13] * _BROAD))
-    return builder.bitcast(builder.and_(moved, ir.Constant(_INTS, [_HALF_BITS] * _BROAD)), _FLOATS)
+    signed = builder.sext(builder.load(builder.bitcast(pointer, _BROAD_SHORTS.as_pointer()), align=2), _BROAD_INTS)
+    moved = builder.shl(signed, ir.Constant(_BROAD_INTS, [13] * _BROAD))
+    return builder.bitcast(builder.and_(moved, ir.Constant(_BROAD_INTS, [_HALF_BITS] * _BROAD)), _BROAD_FLOATS)
 
 
 def _load_halves(builder: Builder, pointer: ir.Value) -> ir.Value:
     """Float16 as float32, on a processor that converts."""
-    return builder.fpext(builder.load(builder.bitcast(pointer, _BROAD_HALVES.as_pointer()), align=2), _FLOATS)
+    return builder.fpext(builder.load(builder.bitcast(pointer, _BROAD_HALVES.as_pointer()), align=2), _BROAD_FLOATS)
 
 
 def _load_singles(builder: Builder, pointer: ir.Value) -> ir.Value:
-    return builder.load(builder.bitcast(pointer, _FLOATS.as_pointer()), align=4)
+    return builder.load(builder.bitcast(pointer, _BROAD_FLOATS.as_pointer()), align=4)
 
 
 WIDE = 4 * _BROAD  # channels that add_weighted_row keeps in registers
@@ -319,13 +319,13 @@ def add_weighted_row(typingctx, target, place, source, entries, sparse, span):
             fetch(builder, pointer_to(context, builder, array[2], source, soon), WIDE * (2 if halves else 4))
             single = builder.load(builder.gep(weights, [k]))
             unit = builder.fmul(single, ir.Constant(FLOAT, _HALF_UNIT)) if smaller else single
-            weight = broadcast(builder, unit, _FLOATS)
+            weight = broadcast(builder, unit, _BROAD_FLOATS)
             base = row_at(k)
             for step, total in zip(steps, sums, strict=True):
                 row = load(builder, pointer_to(context, builder, array[2], source, builder.add(base, step)))
                 builder.store(fused(builder, row, weight, builder.load(total)), total)
         for pointer, total in zip(places, sums, strict=True):
-            builder.store(builder.load(total), builder.bitcast(pointer, _FLOATS.as_pointer()), align=4)
+            builder.store(builder.load(total), builder.bitcast(pointer, _BROAD_FLOATS.as_pointer()), align=4)
         return context.get_dummy_value()
 
     return signature, codegen

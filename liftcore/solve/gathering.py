@@ -41,6 +41,7 @@ class Gathering:
 
     Args:
         each_share: does the work on a chunk.
+        weights: W of all views.
         columns: where each view's columns begin among those of all, [V] i64, and the scale of each splat, [P] f64.
         curve: [P] places along the curve; None keeps the order of the file.
         row_bytes: of a row of X.
@@ -55,7 +56,7 @@ class Gathering:
         row_bytes: int,
     ) -> None:
         self._each_share, self._columns, self._curve = each_share, columns, curve
-        self._weights, self._tables = weights, (weights.addresses, weights.rows)
+        self._weights, self._tables = weights, (weights.addresses, weights.rows)  # addresses of what weights keeps
         self._counts = self._entry_counts(columns[1].size)
         self._ranges = chunk_ranges(self._counts, row_bytes)
         most = max((int(self._counts[first:last].sum()) for first, last in self._ranges), default=0)
