@@ -60,7 +60,7 @@ class Lift:
 
     features: Tensor  # [P, F] f16 or f32; zero rows where not seen
     evidence: Tensor  # [P] f32, sum of plain weights w over the feature views, each ray once
-    agreement: Tensor  # [P] f32 in 0..1, norm of the weighted mean of unit inputs
+    agreement: Tensor  # [P] f32 in 0..1, norm of the weighted mean of unit regions, or of unit cells of grids
     seen: Tensor  # [P] bool, whether any labelled ray reached the splat
     metadata: LiftMetadata
     cluster: Tensor | None = None  # [P] i32, -1 = in no cluster; None without aggregation

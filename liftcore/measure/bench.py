@@ -168,11 +168,16 @@ def _size(text: str) -> tuple[int, int]:
 
 
 def hardware() -> dict[str, Any]:
-    """The machine and the versions that a figure was taken on."""
+    """The machine and the versions that a figure was taken on.
+
+    The processor has LLVM's name too, for which code is compiled: a virtual one's own name may be no more than its
+    maker's, of generations a factor of two apart.
+    """
     import numba
+    from llvmlite.binding import get_host_cpu_name
 
     return {
-        "cpu": processor(),
+        "cpu": f"{processor()} ({get_host_cpu_name()})",
         "cores": len(os.sched_getaffinity(0)),
         "python": platform.python_version(),
         "torch": torch.__version__,
