@@ -42,4 +42,6 @@ def safetensors_header(specs: Iterable[Spec], metadata: Mapping[str, str]) -> tu
 
 def tensor_bytes(tensor: Tensor) -> memoryview:
     """A tensor's bytes in row order, without a copy where it lies so already; from a card, if it lies there."""
+    if not tensor.numel():  # an empty one of numpy's may have strides of zero, of which torch makes no bytes
+        return memoryview(b"")
     return tensor.cpu().contiguous().flatten().view(torch.uint8).numpy().data

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +13,14 @@ import torch
 from liftcore.artifact import TENSORS, Lift
 from liftcore.device import CPU, Device
 from liftcore.lift import lift
+from liftcore.observe.observation import NO_LABEL
+from liftcore.observe.write_pack import write_pack
 from liftcore.raster.cpu import CpuRaster
+from liftcore.scene.load import load_cameras
 from liftcore.solve.checkpoint import Checkpoint, identity
 from liftcore.solve.settings import LiftSettings
 
-from .test_lift_equals_dense import write_scene
+from .test_lift_equals_dense import observed, write_scene
 
 
 class Killed(Exception):
@@ -70,6 +74,35 @@ def test_killed_lift_goes_on_from_its_last_block_to_the_same_bits(
             lift(*inputs, settings, threads=1, progress=killing("geometry", at), checkpoint=checkpoint)
     again = lift(*inputs, settings, threads=1, checkpoint=checkpoint)
     assert walks == ["v0", "v1", "v2"]  # none twice
+    assert_same(whole, again)
+
+
+@pytest.mark.parametrize("blank", [("v1",), ("v0", "v1", "v2")])
+def test_views_that_meet_no_label_are_kept_and_not_walked_again(
+    tmp_path: Path, walks: list[str], blank: tuple[str, ...]
+) -> None:
+    splats, cameras, _ = write_scene(tmp_path, 3)
+    features = tmp_path / "blank.safetensors"
+    views = {camera.name: observed(3, k, grids=False) for k, camera in enumerate(load_cameras(cameras))}
+    for name in blank:
+        views[name] = replace(views[name], labels=torch.full_like(views[name].labels, NO_LABEL))
+    write_pack(features, views, {"encoder": "random"})
+    settings, checkpoint = LiftSettings.of(certificate_rays=50), Checkpoint(tmp_path / "kept", seconds=0)
+    whole = lift(splats, cameras, [features], settings, threads=1)
+    walks.clear()
+    for at in (1, 2):
+        with pytest.raises(Killed):
+            lift(
+                splats,
+                cameras,
+                [features],
+                settings,
+                threads=1,
+                progress=killing("geometry", at),
+                checkpoint=checkpoint,
+            )
+    again = lift(splats, cameras, [features], settings, threads=1, checkpoint=checkpoint)
+    assert walks == ["v0", "v1", "v2"]
     assert_same(whole, again)
 
 
