@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -12,6 +13,7 @@ from service.errors import InvalidRequest
 
 MiB = 1 << 20
 GiB = 1 << 30
+NO_WORDS = "none"  # the text space of features that no text encoder shares
 
 
 class ServiceSettings(BaseSettings):
@@ -84,7 +86,8 @@ class ServiceSettings(BaseSettings):
 
     encoder: str = Field(
         "minilm",
-        description="text encoder of lifts whose text space has none: minilm, table:FILE, open_clip:MODEL...",
+        description="text encoder of its own space and, if you set it, of lifts whose text space has none: "
+        "minilm, table:FILE, open_clip:MODEL...",
     )
     text_spaces: dict[str, str] = Field(
         default_factory=dict, description="text space -> text encoder, in the same notation (JSON object)"
@@ -113,12 +116,17 @@ class ServiceSettings(BaseSettings):
         return limits[kind]
 
     def encoder_spec(self, text_space: str, asked: str | None) -> str:
-        """The text encoder of a query: the one of the space asked for, else of the lift's, else the default.
+        """The text encoder of a query: the one of the space asked for, else of the lift's.
+
+        The default stands in for a space that has none only where the operator chose it: scores of an encoder of
+        another space look like any others, and mean nothing.
 
         Raises:
-            InvalidRequest: no encoder was set up under the name asked for, or the lift has no text space.
+            InvalidRequest: no encoder was set up under the name asked for, or for the lift's text space.
         """
-        if asked is not None and asked != "default":
+        if asked == "default":
+            return self.encoder
+        if asked is not None:
             if asked not in self.text_spaces:
                 known = ", ".join(["default", *sorted(self.text_spaces)])
                 raise InvalidRequest(
@@ -126,14 +134,30 @@ class ServiceSettings(BaseSettings):
                     hint=f"known here: {known}",
                 )  # fmt: skip
             return self.text_spaces[asked]
-        if asked is None and text_space == "none" and "none" not in self.text_spaces:
-            raise InvalidRequest(
-                "lift", expected="features that share a space with a text encoder", got="text space 'none'",
-                hint="name an encoder with encoder= if you know better",
-            )  # fmt: skip
-        if asked is None and text_space in self.text_spaces:
+        if text_space in self.text_spaces:
             return self.text_spaces[text_space]
-        return self.encoder
+        if text_space == self.encoder or (text_space != NO_WORDS and "encoder" in self.model_fields_set):
+            return self.encoder
+        raise self._no_encoder(text_space)
+
+    def _no_encoder(self, text_space: str) -> InvalidRequest:
+        if text_space == NO_WORDS:
+            return InvalidRequest(
+                "lift", expected="features that share a space with a text encoder", got="text space 'none'",
+                hint="ask by example, with like=; or name an encoder with encoder= if you know better",
+            )  # fmt: skip
+        example = json.dumps({text_space or "NAME": "table:FILE"})
+        return InvalidRequest(
+            "lift", expected="features of a text space that this server has an encoder for",
+            got=f"text space {text_space!r}" if text_space else "features that name no text space",
+            hint=f"ask by example, with like=; or the operator sets SPLATLIFT_TEXT_SPACES='{example}' or"
+            f" SPLATLIFT_ENCODER; encoder=default asks {encoder_label(self.encoder)} all the same",
+        )  # fmt: skip
+
+
+def encoder_label(spec: str) -> str:
+    """An encoder as clients may know it: its specification without a file of the server."""
+    return "table" if spec.startswith("table:") or spec.endswith(".safetensors") else spec.partition("@")[0]
 
 
 def encoder_file(spec: str) -> Path | None:

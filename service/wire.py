@@ -300,7 +300,8 @@ class QueryAnswer(BaseModel):
     like: list[str] = Field(description="the examples, in their notation; vectors by their length")
     lift: JobId
     view: str | None
-    text_space: str
+    text_space: str = Field(description="of the lift's features")
+    encoder: str | None = Field(description="the text encoder that was asked, without its file; null without a text")
     statistics: dict[str, Any] = Field(description="of the scores over the seen splats")
     threshold: Threshold
     count: int = Field(description="splats at or above the threshold")

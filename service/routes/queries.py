@@ -11,6 +11,7 @@ from service.content import tagged, unchanged
 from service.errors import InvalidRequest
 from service.parts import Here, Parts
 from service.routes.question import answer_links, entity_tag, find_lift, query_request, scene_request, shown
+from service.settings import encoder_label
 from service.store.lifts import LiftRecord
 
 router = APIRouter(tags=["queries"])
@@ -109,6 +110,7 @@ def _answer(asked: wire.AskedWhere | wire.AskedInBody, here: Parts) -> wire.Quer
         lift=lift.id,
         view=view,
         text_space=lift.metadata["text_space"],
+        encoder=None if request["encoder"] is None else encoder_label(request["encoder"]),
         links=answer_links(asked, lift, view),
         **found,
     )

@@ -16,8 +16,9 @@ import httpx
 import pytest
 
 from service.__main__ import main, parse
+from service.errors import InvalidRequest
 from service.routes.operations import WEB, page
-from service.settings import ServiceSettings
+from service.settings import ServiceSettings, encoder_label
 
 from .conftest import Uploaded
 from .following import ended
@@ -110,11 +111,35 @@ def test_every_setting_is_described() -> None:
 def test_encoder_is_chosen_by_text_space_and_never_by_the_client(tmp_path: Path) -> None:
     settings = ServiceSettings.model_validate({"data": tmp_path, "text_spaces": {"clip": "open_clip:X@w.pt"}})
     assert settings.encoder_spec("clip", None) == "open_clip:X@w.pt"
-    assert settings.encoder_spec("unknown", None) == settings.encoder_spec("clip", "default") == "minilm"
+    assert settings.encoder_spec("minilm", None) == settings.encoder_spec("clip", "default") == "minilm"
     assert settings.encoder_spec("none", "clip") == "open_clip:X@w.pt"
     for space, asked in (("clip", "table:secret"), ("none", None)):
-        with pytest.raises(Exception, match="expected"):
+        with pytest.raises(InvalidRequest, match="expected"):
             settings.encoder_spec(space, asked)
+
+
+def test_default_encoder_stands_in_for_other_spaces_only_where_the_operator_chose_it(tmp_path: Path) -> None:
+    untouched = ServiceSettings.model_validate({"data": tmp_path})
+    for space in ("dino", ""):
+        with pytest.raises(InvalidRequest, match="SPLATLIFT_TEXT_SPACES"):
+            untouched.encoder_spec(space, None)
+        assert untouched.encoder_spec(space, "default") == "minilm"
+    chosen = ServiceSettings.model_validate({"data": tmp_path, "encoder": "minilm"})
+    assert chosen.encoder_spec("dino", None) == chosen.encoder_spec("", None) == "minilm"
+    with pytest.raises(InvalidRequest, match="none"):
+        chosen.encoder_spec("none", None)
+
+
+@pytest.mark.parametrize(
+    ("spec", "told"),
+    [
+        ("minilm", "minilm"), ("table:/private/words.safetensors", "table"), ("/private/w.safetensors", "table"),
+        ("open_clip:ViT-B-32/laion2b", "open_clip:ViT-B-32/laion2b"),
+        ("open_clip:RN50@/private/w.pt", "open_clip:RN50"),
+    ],
+)  # fmt: skip
+def test_encoder_is_told_without_its_file(spec: str, told: str) -> None:
+    assert encoder_label(spec) == told
 
 
 def test_taken_port_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
