@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from pathlib import Path
 
 from fastapi import Request
@@ -11,6 +12,7 @@ from starlette.types import Receive, Scope, Send
 
 from liftcore.errors import NotFound
 from service.errors import RangeNotSatisfiable
+from service.store.files import is_whole
 
 ONE_RANGE = re.compile(r"bytes=\s*(?:(\d+)-(\d*)|-(\d+))\s*", re.ASCII)
 MAX_DIGITS = 18  # longer numbers are beyond every file
@@ -30,23 +32,34 @@ def tagged(content: bytes, media_type: str, etag: str) -> Response:
     return Response(content, media_type=media_type, headers={"ETag": etag, "Cache-Control": "private, no-cache"})
 
 
-def file_answer(request: Request, path: Path, *, sha256: str, filename: str) -> Response:
-    """A file whose bytes never change: 200, 206 for one range, 304 when the client has it.
+@dataclass(frozen=True)
+class StoredFile:
+    """A file whose bytes never change."""
+
+    path: Path
+    bytes: int  # when it was stored
+    sha256: str
+    name: str  # for who saves it
+
+
+def file_answer(request: Request, file: StoredFile) -> Response:
+    """The file: 200, 206 for one range, 304 when the client has it.
 
     Raises:
         RangeNotSatisfiable: the range begins beyond the end.
-        NotFound: the file was deleted since it was looked up.
+        NotFound: the file is not there, or no longer what was stored.
     """
-    etag = f'"{sha256}"'
+    etag = f'"{file.sha256}"'
     same = unchanged(request, etag)
     if same is not None:
         return same
-    try:
-        size = path.stat().st_size
-    except FileNotFoundError:
-        raise NotFound("content", expected="a file that is here", got="one that was just deleted") from None
-    keep_range = _keeps_range(request, size, etag)
-    return _StoredFile(path, etag=etag, filename=filename, keep_range=keep_range)
+    if not is_whole(file.path, file.bytes):
+        there = "one of another size" if file.path.exists() else "none"
+        raise NotFound(
+            "content", expected=f"a file of {file.bytes} bytes in the data directory", got=there,
+            hint="it was deleted a moment ago, or something else wrote there: upload it again, or lift again",
+        )  # fmt: skip
+    return _FileAnswer(file, etag=etag, keep_range=_keeps_range(request, file.bytes, etag))
 
 
 def _keeps_range(request: Request, size: int, etag: str) -> bool:
@@ -67,12 +80,12 @@ def _number(digits: str) -> int:
     return int(digits) if len(digits) <= MAX_DIGITS else 10**MAX_DIGITS
 
 
-class _StoredFile(FileResponse):
+class _FileAnswer(FileResponse):
     """Starlette's file response with our entity tag, blind to Range headers that do not count."""
 
-    def __init__(self, path: Path, *, etag: str, filename: str, keep_range: bool) -> None:
+    def __init__(self, file: StoredFile, *, etag: str, keep_range: bool) -> None:
         headers = {"ETag": etag, "Cache-Control": "private, no-cache"}
-        super().__init__(path, headers=headers, filename=filename, media_type="application/octet-stream")
+        super().__init__(file.path, headers=headers, filename=file.name, media_type="application/octet-stream")
         self._keep_range = keep_range
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:

@@ -168,6 +168,7 @@ class Attempt:
             "work": str(files.work(job.id)),
             "checkpoint_seconds": self._limits.checkpoint_seconds,
             "output": str(draft),
+            "file_names": {str(asset.path): asset.file_name for asset in assets},
             "names": {str(asset.path): f"{asset.kind} {asset.id}" for asset in (*assets, *labels)},
         }
 

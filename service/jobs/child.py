@@ -9,6 +9,7 @@ closes it ends by itself, with all that it started.
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
 import signal
@@ -21,7 +22,7 @@ from typing import Any, BinaryIO
 
 from liftcore.errors import SplatliftError
 from liftcore.progress import Progress
-from service.errors import OverLimit
+from service.errors import NoSpace, OverLimit
 from service.faults import fault_of
 from service.wire import JobKind
 
@@ -85,6 +86,14 @@ def run(order: dict[str, Any], report: Reporter) -> dict[str, Any]:
         return {"event": "done", **work_of(kind)(order, report)}
     except SplatliftError as error:
         return {"event": "fault", "fault": fault_of(error, order["names"])}
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            raise
+        full = NoSpace(
+            kind, expected=f"room on the server's disk for a {kind}", got="a full disk",
+            hint="delete assets, or jobs with their lifts, or ask the operator for room; then order it again",
+        )  # fmt: skip
+        return {"event": "fault", "fault": fault_of(full)}
     except MemoryError:
         error = OverLimit(kind, expected=f"a {kind} that fits this machine's memory", got="one that needs more")
         return {"event": "fault", "fault": fault_of(error)}

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from liftcore.artifact import save_lift
+from liftcore.artifact import InputFile, LiftMetadata, save_lift
 from liftcore.lift import lift
 from liftcore.progress import Progress
 from liftcore.solve.checkpoint import Checkpoint
@@ -32,6 +34,7 @@ def lift_as_ordered(order: dict[str, Any], progress: Progress) -> dict[str, Any]
         progress=progress,
         checkpoint=Checkpoint(Path(order["work"]), order["checkpoint_seconds"]),
     )
+    made = replace(made, metadata=_as_clients_know(made.metadata, order["file_names"]))
     output = Path(order["output"])
     save_lift(made, output)
     return {
@@ -41,6 +44,19 @@ def lift_as_ordered(order: dict[str, Any], progress: Progress) -> dict[str, Any]
         # Through JSON and not model_dump: what is not finite must become null before it reaches a client.
         "metadata": json.loads(made.metadata.model_dump_json()),
     }
+
+
+def _as_clients_know(metadata: LiftMetadata, names: Mapping[str, str]) -> LiftMetadata:
+    """The inputs by the names under which clients download them: whoever has the lift may have them beside it, and
+    paths of this machine are nobody's business.
+    """
+
+    def named(file: InputFile) -> InputFile:
+        return file.model_copy(update={"path": resolved[file.path]})
+
+    resolved = {str(Path(path).resolve()): name for path, name in names.items()}  # as lifts remember paths
+    inputs = {"splats": named(metadata.splats), "cameras": named(metadata.cameras)}
+    return metadata.model_copy(update={**inputs, "features": tuple(map(named, metadata.features))})
 
 
 def _sha256(path: Path) -> str:

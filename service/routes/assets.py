@@ -12,7 +12,7 @@ from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.responses import JSONResponse
 
 from service import wire
-from service.content import file_answer
+from service.content import StoredFile, file_answer
 from service.errors import DigestMismatch
 from service.parts import Here
 from service.store.assets import AssetRecord, CheckedUpload
@@ -61,7 +61,7 @@ async def upload(kind: Kind, request: Request, here: Here, sha256: Sha256 = None
         if sha256 is not None and digest != sha256.lower():
             raise DigestMismatch("sha256", expected=sha256, got=digest, hint="upload the file again")
         known = await anyio.to_thread.run_sync(here.store.assets.find, f"sha256:{digest}")
-        if known is not None and known.kind is kind:
+        if known is not None and known.kind is kind and known.whole:
             return _reply(known, 200)
         allowed = here.settings
         limits = CheckLimits(scratch, allowed.check_seconds, allowed.check_memory_bytes, here.ending)
@@ -119,7 +119,7 @@ def get_content(asset: AssetId, request: Request, here: Here) -> Response:
     """The bytes of an asset, or a range of them."""
     found = here.store.assets.get(asset)
     digest = found.id.removeprefix("sha256:")
-    return file_answer(request, found.path, sha256=digest, filename=f"{found.kind}-{digest[:12]}{found.path.suffix}")
+    return file_answer(request, StoredFile(found.path, found.bytes, digest, found.file_name))
 
 
 @router.delete("/{asset}", status_code=204)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from fastapi import APIRouter, Request, Response
 
 from service import wire
-from service.content import file_answer
+from service.content import StoredFile, file_answer
 from service.parts import Here
 from service.store.lifts import LiftRecord
 
@@ -28,7 +28,7 @@ def get_lift(lift: str, here: Here) -> wire.Lift:
 def get_features(lift: str, request: Request, here: Here) -> Response:
     """The lift file (safetensors), or a range of it."""
     found = here.store.lifts.get(lift)
-    return file_answer(request, found.path, sha256=found.sha256, filename=f"lift-{found.id}.safetensors")
+    return file_answer(request, StoredFile(found.path, found.bytes, found.sha256, f"lift-{found.id}.safetensors"))
 
 
 def shape(lift: LiftRecord) -> wire.Lift:

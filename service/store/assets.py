@@ -13,7 +13,7 @@ from typing import Any
 from liftcore.errors import NotFound
 from service.errors import InUse
 from service.store.database import Database
-from service.store.files import DataDirectory
+from service.store.files import DataDirectory, is_whole
 from service.store.owners import SEEN, Owned, require_quota
 from service.wire import AssetKind
 
@@ -29,6 +29,16 @@ class AssetRecord:
     counts: dict[str, Any] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
     created: float = 0.0  # seconds since 1970
+
+    @property
+    def file_name(self) -> str:
+        """What its bytes are called where somebody saves them, and in lifts that are made of them."""
+        return f"{self.kind}-{self.id.removeprefix('sha256:')[:12]}{self.path.suffix}"
+
+    @property
+    def whole(self) -> bool:
+        """Whether its bytes are here, all of them: somebody may have been at the data directory."""
+        return is_whole(self.path, self.bytes)
 
 
 @dataclass(frozen=True)
@@ -78,6 +88,8 @@ class AssetStore(Owned):
                 require_quota(connection, self._owner, upload.draft.stat().st_size)
                 self._publish(connection, asset, upload)
                 own(connection, asset, self._owner.key)
+            elif not self.get(asset).whole:
+                self._publish(connection, asset, upload)
         return self.get(asset), owned is None
 
     def _publish(self, connection: sqlite3.Connection, asset: str, upload: CheckedUpload) -> None:

@@ -133,6 +133,14 @@ class DataDirectory:
         self._lock.close()
 
 
+def is_whole(path: Path, size: int) -> bool:
+    """Whether a file that was stored with so many bytes still has them."""
+    try:
+        return path.stat().st_size == size
+    except OSError:
+        return False
+
+
 def _locked(lock: TextIO) -> bool:
     """Take the lock; whoever only looks whether a server holds it has it for a moment too."""
     deadline = time.monotonic() + LOCK_SECONDS

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
 
 from liftcore.device import choose_device
 from liftcore.errors import Unavailable
+from liftcore.progress import Progress
 from service.faults import fault_of
 from service.jobs import child, devices
 from service.jobs.devices import Devices
@@ -79,3 +82,12 @@ def test_job_that_meets_no_card_fails_in_words(tmp_path: Path, monkeypatch: pyte
     }  # fmt: skip
     told = child.run(order, child.Reporter(io.BytesIO()))
     assert told == {"event": "fault", "fault": fault_of(LACK)}
+
+
+def test_job_on_a_full_disk_fails_at_once_and_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(order: dict[str, Any], progress: Progress) -> dict[str, Any]:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("service.jobs.lifting.lift_as_ordered", full)
+    fault = child.run({"kind": "lift", "names": {}}, child.Reporter(io.BytesIO()))["fault"]
+    assert fault["kind"] == "no-space" and "delete" in fault["hint"]

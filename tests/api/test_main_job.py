@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import io
+import json
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,8 +13,23 @@ import pytest
 from fastapi.testclient import TestClient
 from PIL import Image
 
+from liftcore.query.scene import QueryScene
+
 from .conftest import Uploaded
-from .tiny_scene import CHANNELS, HEIGHT, SPLATS_A_CLUSTER, VIEWS, WIDTH, WORDS, colmap_zip
+from .following import ended
+from .tiny_scene import (
+    CHANNELS,
+    HEIGHT,
+    SPLATS_A_CLUSTER,
+    VIEWS,
+    WIDTH,
+    WORDS,
+    TinyScene,
+    cameras_document,
+    colmap_zip,
+    labels,
+    pack,
+)
 
 COUNT = 3 * SPLATS_A_CLUSTER
 
@@ -62,6 +80,41 @@ def test_lift_file_is_downloaded_whole_and_in_parts(client: TestClient, lift: di
     assert part.status_code == 206 and part.content == whole.content[8:16]
     tag = {"If-None-Match": whole.headers["etag"]}
     assert client.get(lift["links"]["features"], headers=tag).status_code == 304
+
+
+def test_lift_and_its_files_are_found_where_they_were_downloaded(
+    client: TestClient, data: Path, lift: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    files = [f"/assets/{asset}/content" for asset in (lift["splats"], lift["cameras"], *lift["features"])]
+    for link in (lift["links"]["features"], *files):
+        reply = client.get(link)
+        name = reply.headers["content-disposition"].partition('filename="')[2].rstrip('"')
+        (tmp_path / name).write_bytes(reply.content)
+    [made] = tmp_path.glob("lift-*.safetensors")
+    assert str(data).encode() not in made.read_bytes()  # paths of the server are nobody's business
+    monkeypatch.chdir(tmp_path)
+    scene = QueryScene.open(made)
+    assert scene.splats.count == COUNT and {camera.name for camera in scene.cameras} == set(VIEWS)
+    assert set(scene.packs.views) == set(VIEWS)
+
+
+def test_views_that_meet_no_label_or_no_splat_do_not_end_a_lift(start: Callable[..., Any], scene: TinyScene) -> None:
+    away = cameras_document()
+    turned = np.array(away["frames"][0]["transform_matrix"]) @ np.diag([-1.0, 1.0, -1.0, 1.0])
+    away["frames"][0]["transform_matrix"] = turned.tolist()  # it looks along +z, where nothing is
+    blank = labels()
+    blank["right"] = np.full_like(blank["right"], -1)
+    with start() as client:
+        ids = [
+            client.put(f"/assets/{kind}", content=content).json()["id"]
+            for kind, content in (
+                ("splats", scene.splats), ("cameras", json.dumps(away).encode()), ("features", pack(blank)),
+            )
+        ]  # fmt: skip
+        job = ended(client, client.post("/lift", json=Uploaded(*ids).order()).headers["location"])
+        assert (job["state"], job["attempt"]) == ("succeeded", 1), job
+        found = client.get(job["links"]["lift"]).json()
+        assert any("meet no splat" in warning for warning in found["certificate"]["warnings"])
 
 
 @pytest.mark.parametrize("cluster", range(3))

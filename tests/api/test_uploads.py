@@ -19,11 +19,12 @@ from hypothesis import strategies as st
 
 from liftcore.errors import NotFound
 from liftcore.observe.inspect import inspect_file
-from service.content import file_answer
+from service.content import StoredFile, file_answer
 from service.uploads.decoding import GZIP, ZSTD, Coding, Decoding
 from service.wire import AssetKind
 
 from .conftest import Uploaded
+from .test_problems import assert_problem
 from .tiny_scene import (
     CHANNELS,
     TinyScene,
@@ -195,4 +196,20 @@ def test_deleted_asset_is_gone_and_may_come_back(client: TestClient) -> None:
 def test_content_that_goes_while_it_is_asked_for_is_404(tmp_path: Path) -> None:
     request = Request({"type": "http", "headers": []})
     with pytest.raises(NotFound, match="deleted"):
-        file_answer(request, tmp_path / "gone", sha256="0" * 64, filename="x")
+        file_answer(request, StoredFile(tmp_path / "gone", 1, "0" * 64, "x"))
+
+
+@pytest.mark.parametrize("left", [None, b"", b"another"])
+def test_file_that_somebody_damaged_is_told_and_an_upload_mends_it(
+    client: TestClient, data: Path, left: bytes | None
+) -> None:
+    rows = splat_rows()
+    rows[:, 1] += 0.5
+    content = ply(rows)
+    path = client.put("/assets/splats", content=content).headers["location"]
+    [blob] = (data / "blobs").glob(f"*/{path.removeprefix('/assets/sha256:')}*")
+    blob.unlink() if left is None else blob.write_bytes(left)
+    assert assert_problem(client.get(f"{path}/content"))["status"] == 404
+    assert client.put("/assets/splats", content=content).status_code == 200
+    assert client.get(f"{path}/content").content == content
+    assert client.delete(path).status_code == 204

@@ -11,6 +11,7 @@ import io
 import json
 import zipfile
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from safetensors.numpy import save
@@ -64,7 +65,7 @@ def ply(rows: np.ndarray, properties: list[str] = PROPERTIES) -> bytes:
     return ("\n".join([*lines, "end_header"]) + "\n").encode() + rows.astype("<f4").tobytes()
 
 
-def cameras_document() -> dict[str, object]:
+def cameras_document() -> dict[str, Any]:
     """A transforms.json with the three views."""
     frames = []
     for name, x in VIEWS.items():
