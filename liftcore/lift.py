@@ -28,6 +28,7 @@ from liftcore.solve.feature_room import room_within
 from liftcore.solve.kept_columns import kept_columns
 from liftcore.solve.least_squares import refine
 from liftcore.solve.lift_warnings import lift_warnings
+from liftcore.solve.map_shapes import shape_warnings
 from liftcore.solve.reference import reference
 from liftcore.solve.robust import robust_weights
 from liftcore.solve.solver import closed_form_on
@@ -150,7 +151,8 @@ def _lift_on(run: Run, plan: Plan, sources: Sources, inputs: list[InputFile], ch
             "views_without_splats": _blind(sources.views, store),
         }
     lifted = [sources.cameras.get(name) for name in sources.views]
-    facts["warnings"] = lift_warnings(sources.splats, lifted, geometry.denominators, settings.dtype, X.dtype, facts)
+    told = lift_warnings(sources.splats, lifted, geometry.denominators, settings.dtype, X.dtype, facts)
+    facts["warnings"] = [*told, *shape_warnings(sources.packs, lifted)]
     with run.timings.stage("certify"):
         certificate = certify(geometry, X, geometry.codebooks.__getitem__, settings, threads) | notes | facts
     return Lift(

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from liftcore.observe.observation import Observation
     from liftcore.observe.pack import FeaturePacks
 
+NARROW = 4  # times longer than wide, or wider: photos are not
 UNIT_TOLERANCE = 0.01  # a float16 unit vector of 512 channels is within it
 LIFT_KEY = "splatlift"  # of the metadata of a lift
 
@@ -103,9 +104,15 @@ def _describe_view(observation: Observation, regions: bool) -> dict[str, Any]:
         unused = int((uses[1:] == 0).sum())
         levels, height, width = observation.labels.shape
         size = f"{levels} levels of {width}x{height}"
-        return {**view, "size": size, "unlabelled": float(empty.float().mean()), "unused": unused}
+        return {
+            **view,
+            "sides": (width, height),
+            "size": size,
+            "unlabelled": float(empty.float().mean()),
+            "unused": unused,
+        }
     height, width, _ = observation.grid.shape
-    return {**view, "size": f"{width}x{height} cells", "unused": 0}
+    return {**view, "sides": (width, height), "size": f"{width}x{height} cells", "unused": 0}
 
 
 def _pack_warnings(packs: FeaturePacks, found: list[dict[str, Any]], low: float, high: float) -> list[str]:
@@ -127,6 +134,10 @@ def _pack_warnings(packs: FeaturePacks, found: list[dict[str, Any]], low: float,
         warnings.append(f"{empty} views have no label at all")
     if not packs.encoder:
         warnings.append("the pack does not name its encoder")
+    narrow = next((view for view in found if max(view["sides"]) > NARROW * min(view["sides"])), None)
+    if narrow is not None:
+        shape = f"maps of {narrow['size']}, which few images are like"
+        warnings.append(f"{shape}: where channels come first, pack them with --layout chw")
     return warnings
 
 

@@ -68,6 +68,12 @@ class FeaturePacks:
         specs = self._file(view).specs
         return {part: specs[f"{view}/{part}"] for part in PARTS if f"{view}/{part}" in specs}
 
+    def map_size(self, view: str) -> tuple[int, int]:
+        """Width and height of a view's labels or grid, from the header alone."""
+        specs = self.specs(view)
+        height, width = specs["labels"].shape[1:] if "labels" in specs else specs["grid"].shape[:2]
+        return width, height
+
     def observation(self, view: str) -> Observation:
         """Read and check one view.
 

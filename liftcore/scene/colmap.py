@@ -197,7 +197,10 @@ def _text_images(path: Path) -> Iterator[_Image]:
             yield _Image(name, int(camera), pose[:4], pose[4:])
         except ValueError:
             raise _bad_line(path, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", line) from None
-        next(lines, None)  # its points, a line that may be empty
+        points = next(lines, "").split()  # of the image before: X Y POINT3D_ID, any number of times
+        if len(points) % 3 or (points and not points[-1].lstrip("-").isdigit()):
+            expected = "X Y POINT3D_ID of each point of an image after its line, or an empty line"
+            raise InvalidCameras(str(path), expected=expected, got=repr(" ".join(points)[:80]), hint=RE_EXPORT)
 
 
 def _bad_line(path: Path, expected: str, line: str) -> InvalidCameras:

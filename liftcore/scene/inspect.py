@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from liftcore.scene.load import camera_files, load_cameras, load_splats
+from liftcore.scene.load import camera_files, load_cameras, load_splats, other_models
 from liftcore.scene.ply_dialect import nearest_dialect
 from liftcore.scene.splats import Kernel
 
@@ -25,6 +25,7 @@ FAR = 1e5  # scene units; float32 resolves only a hundredth there
 TINY = 1e-7  # scene units
 LARGEST = 1e300  # shown in place of what overflows, which JSON cannot hold
 OFF_CENTRE = 0.1  # of the image's side
+SHOWN = 3  # names in a warning
 
 
 def inspect_file(path: Path) -> dict[str, Any]:
@@ -39,7 +40,7 @@ def inspect_file(path: Path) -> dict[str, Any]:
     if is_splats(path):
         return {"kind": "splats", "bytes": path.stat().st_size, **describe_splats(load_splats(path))}
     size = sum(file.stat().st_size for file in ([path] if path.is_file() else camera_files(path)))
-    return {"kind": "cameras", "bytes": size, **describe_cameras(load_cameras(path))}
+    return {"kind": "cameras", "bytes": size, **describe_camera_file(path)}
 
 
 def is_splats(path: Path) -> bool:
@@ -68,6 +69,18 @@ def describe_splats(splats: Splats) -> dict[str, Any]:
         "opacities": _quantiles(opacities),
         "warnings": _splat_warnings(splats, scales, opacities),
     }
+
+
+def describe_camera_file(path: Path) -> dict[str, Any]:
+    """The same of a camera file or folder, with a warning of what in it was not read.
+
+    Raises:
+        InvalidCameras: the file is malformed.
+    """
+    found, others = describe_cameras(load_cameras(path)), other_models(path)
+    if others:
+        found["warnings"].append(f"{len(others)} more COLMAP models were not read: {', '.join(others[:SHOWN])}")
+    return found
 
 
 def describe_cameras(cameras: Cameras) -> dict[str, Any]:

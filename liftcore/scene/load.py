@@ -15,14 +15,14 @@ from liftcore.scene.json_file import read_json
 from liftcore.scene.transforms import parse_transforms
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
 
     from liftcore.scene.cameras import Cameras
     from liftcore.scene.splats import Kernel, Splats
 
 MAX_UNZIPPED_BYTES = 512 * 1024 * 1024
 MAX_ZIP_MEMBERS = 100_000
-MODEL_FOLDERS = (".", "sparse/0", "sparse", "colmap/sparse/0")
+MODEL_FOLDERS = (".", "sparse/0", "sparse", "colmap/sparse/0", "0")
 JSON_FILES = ("transforms.json", "cameras.json")
 CAMERA_FORMATS = "a COLMAP sparse model (folder or .zip), a transforms.json or a cameras.json"
 PICKLED = (".pt", ".pth", ".ckpt", ".pkl")
@@ -80,6 +80,23 @@ def camera_files(folder: Path) -> list[Path]:
     return [folder / name for name in JSON_FILES if (folder / name).is_file()][:1]
 
 
+def other_models(path: Path) -> list[str]:
+    """COLMAP models in a folder or a zip beside the one that its cameras are read from, by their folders.
+
+    COLMAP writes several where photos did not all hang together, each in a frame of its own.
+    """
+    if path.is_dir():
+        files = camera_files(path)
+        read = files[0].parent if len(files) > 1 else None
+        beside = [] if read is None or read == path else sorted(read.parent.iterdir())
+        return [str(folder.relative_to(path)) for folder in beside if folder != read and has_model(folder)]
+    if not zipfile.is_zipfile(path):
+        return []
+    with zipfile.ZipFile(path) as archive:
+        roots = list(dict.fromkeys(root for root, _ in _model_roots(archive.namelist())))
+        return [str(root) for root in roots[1:]]
+
+
 def _from_folder(folder: Path) -> Cameras:
     files = camera_files(folder)
     if len(files) == 1:
@@ -130,15 +147,25 @@ def _model_members(archive: zipfile.ZipFile, path: Path) -> Iterator[zipfile.Zip
     if len(members) > MAX_ZIP_MEMBERS:
         raise InvalidCameras(str(path), expected=f"at most {MAX_ZIP_MEMBERS} files", got=str(len(members)))
     files = {member.filename: member for member in members if not member.is_dir()}
-    for kind in ("bin", "txt"):
-        roots = [PurePosixPath(name).parent for name in files if PurePosixPath(name).name == f"cameras.{kind}"]
-        for root in sorted(roots, key=lambda root: (len(root.parts), str(root))):
-            names = [str(root / f"{part}.{kind}") for part in ("cameras", "images")]
-            if all(name in files for name in names):
-                yield from (files[name] for name in names)
-                return
+    for root, kind in _model_roots(files):
+        yield from (files[name] for name in _model_names(root, kind))
+        return
     expected = "a COLMAP model (cameras and images, .bin or .txt) in the zip"
     raise InvalidCameras(str(path), expected=expected, got="none")
+
+
+def _model_roots(names: Iterable[str]) -> Iterator[tuple[PurePosixPath, str]]:
+    """Folders that hold a whole model and of which kind, binary ones first, the one nearest the root first."""
+    known = set(names)
+    for kind in ("bin", "txt"):
+        roots = {PurePosixPath(name).parent for name in known if PurePosixPath(name).name == f"cameras.{kind}"}
+        for root in sorted(roots, key=lambda root: (len(root.parts), str(root))):
+            if known.issuperset(_model_names(root, kind)):
+                yield root, kind
+
+
+def _model_names(root: PurePosixPath, kind: str) -> list[str]:
+    return [str(root / f"{part}.{kind}") for part in ("cameras", "images")]
 
 
 def _unzip(archive: zipfile.ZipFile, member: zipfile.ZipInfo, target: Path, budget: int) -> int:

@@ -19,8 +19,8 @@ from liftcore.observe.inspect import describe_packs, describe_table
 from liftcore.observe.masks import describe_masks
 from liftcore.observe.pack import open_packs
 from liftcore.query.encoders.table import TableEncoder
-from liftcore.scene.inspect import describe_cameras, describe_splats
-from liftcore.scene.load import load_cameras, load_splats
+from liftcore.scene.inspect import describe_camera_file, describe_splats
+from liftcore.scene.load import load_splats
 from service.faults import fault_of
 from service.finite import finite
 from service.uploads.checking import INVALID
@@ -34,8 +34,7 @@ def check_splats(path: Path) -> dict[str, Any]:
 
 def check_cameras(path: Path) -> dict[str, Any]:
     """Read and describe every camera."""
-    cameras = load_cameras(path)
-    return {"suffix": ".zip" if zipfile.is_zipfile(path) else ".json", "found": describe_cameras(cameras)}
+    return {"suffix": ".zip" if zipfile.is_zipfile(path) else ".json", "found": describe_camera_file(path)}
 
 
 def check_features(path: Path) -> dict[str, Any]:

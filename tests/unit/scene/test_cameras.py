@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 import struct
 import zipfile
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,11 +18,9 @@ from liftcore.errors import InvalidCameras, InvalidSplats, NotFound
 from liftcore.scene import json_file, load
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.inria import write_inria_cameras
-from liftcore.scene.load import load_cameras, load_splats
+from liftcore.scene.inspect import describe_camera_file
+from liftcore.scene.load import load_cameras, load_splats, other_models
 from liftcore.scene.view_names import view_names
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -69,7 +69,7 @@ def test_colmap_poses_are_world_to_camera(model: Path) -> None:
     assert np.allclose(third.world_to_camera[:3, :3], np.diag([-1, 1, -1]))  # the quaternion is normalised
 
 
-@pytest.mark.parametrize("place", [".", "sparse/0", "sparse"])
+@pytest.mark.parametrize("place", [".", "sparse/0", "sparse", "0"])
 def test_model_is_found_in_a_scene_folder(place: str, tmp_path: Path, model: Path) -> None:
     write_files(tmp_path / "scene" / place, binary_files())
     assert_same(load_cameras(tmp_path / "scene"), load_cameras(model))
@@ -86,6 +86,18 @@ def test_zipped_model_is_read_at_any_depth(root: str, files: Any, tmp_path: Path
     before = sorted(tmp_path.rglob("*"))
     assert_same(load_cameras(path), load_cameras(model))
     assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_models_that_are_not_read_are_told(packed: bool, tmp_path: Path) -> None:
+    scene = tmp_path / "scene"
+    for place in ("sparse/0", "sparse/1"):
+        write_files(scene / place, binary_files())
+    write_files(scene / "sparse/0", text_files())  # the same model once more
+    write_files(scene / "sparse/2", {"points3D.bin": b"of no whole model"})
+    path = Path(shutil.make_archive(str(scene), "zip", scene)) if packed else scene
+    assert describe_camera_file(path)["warnings"] == ["1 more COLMAP models were not read: sparse/1"]
+    assert other_models(scene / "sparse/1") == []
 
 
 def test_zip_bomb_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -176,6 +188,8 @@ def test_damaged_binary_model_is_refused(case: str, tmp_path: Path) -> None:
         ("cameras.txt", b"1 CROOKED 640 480 1 1 1\n", "CROOKED"),
         ("images.txt", b"0 1 0 0 0 0 0 2\n", "IMAGE_ID QW"),
         ("images.txt", b"0 1 0 0 0 0 0 zwei 1 a.jpg\n\n", "IMAGE_ID QW"),
+        ("images.txt", b"0 1 0 0 0 0 0 2 1 a.jpg\n1 1 0 0 0 0 0 2 1 b.jpg\n", "or an empty line, got '1 1 0"),
+        ("images.txt", b"0 1 0 0 0 0 0 2 1 a.jpg\n1 1 0 0 0 0 0 2 1 b of c.jpg\n", "or an empty line"),
     ],
 )
 def test_damaged_text_model_is_refused(name: str, content: bytes, message: str, tmp_path: Path) -> None:

@@ -1,0 +1,66 @@
+"""Maps that do not have their images' shape are told; no lift is refused for them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from liftcore.lift import lift
+from liftcore.observe.inspect import inspect_file
+from liftcore.observe.observation import FeatureGrid, Observation, RegionMap
+from liftcore.observe.pack import open_packs
+from liftcore.observe.write_pack import write_pack
+from liftcore.scene.cameras import Camera
+from liftcore.solve.map_shapes import shape_warnings
+from liftcore.solve.settings import LiftSettings
+
+from .test_lift_equals_dense import write_scene
+
+
+def told(tmp_path: Path, observation: Observation, size: tuple[int, int]) -> list[str]:
+    """What is said of a view of that width and height."""
+    path = tmp_path / "pack.safetensors"
+    write_pack(path, {"v": observation}, {"encoder": "e"})
+    return shape_warnings(open_packs([path]), [Camera("v", *size, 500.0, 500.0, 1.0, 1.0, world_to_camera=np.eye(4))])
+
+
+def grid(height: int, width: int, channels: int = 3) -> FeatureGrid:
+    return FeatureGrid(torch.ones(height, width, channels))
+
+
+@pytest.mark.parametrize(
+    ("cells", "size"),
+    [((30, 40), (640, 480)), ((24, 24), (640, 480)), ((24, 24), (1280, 720)), ((23, 31), (990, 742)),
+     ((1, 3), (64, 48)), ((16, 16), (480, 640)), ((9, 12), (500, 500))],
+)  # fmt: skip
+def test_maps_as_encoders_make_them_are_not_told(
+    tmp_path: Path, cells: tuple[int, int], size: tuple[int, int]
+) -> None:
+    assert told(tmp_path, grid(*cells), size) == []
+
+
+@pytest.mark.parametrize(("cells", "size"), [((40, 30), (640, 480)), ((512, 30), (640, 480)), ((6, 30), (400, 400))])
+def test_maps_of_another_shape_are_told(tmp_path: Path, cells: tuple[int, int], size: tuple[int, int]) -> None:
+    [warning] = told(tmp_path, grid(*cells), size)
+    assert f"{cells[1]}x{cells[0]} for {size[0]}x{size[1]}" in warning
+
+
+def test_turned_labels_are_told_by_the_lift(tmp_path: Path) -> None:
+    splats, cameras, _ = write_scene(tmp_path, 3)
+    labels = RegionMap(torch.zeros(1, 32, 24, dtype=torch.int32), torch.ones(1, 4))
+    write_pack(tmp_path / "turned.safetensors", {"v0": labels}, {"encoder": "e"})
+    made = lift(splats, cameras, [tmp_path / "turned.safetensors"], LiftSettings.of(certificate_rays=10))
+    assert any(
+        "another shape than their images (v0: 24x32 for" in one for one in made.metadata.certificate["warnings"]
+    )
+
+
+def test_channels_that_come_first_are_told_of_the_pack(tmp_path: Path) -> None:
+    path = tmp_path / "first.safetensors"
+    write_pack(path, {"v": grid(512, 30, 40)}, {"encoder": "e", "normalised": "false"})
+    assert any("--layout chw" in warning for warning in inspect_file(path)["warnings"])
+    write_pack(path, {"v": grid(30, 40, 512)}, {"encoder": "e", "normalised": "false"})
+    assert not any("--layout chw" in warning for warning in inspect_file(path)["warnings"])
