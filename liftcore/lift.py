@@ -17,7 +17,7 @@ from liftcore.plan.plan import plan_lift
 from liftcore.progress import Progress, silent
 from liftcore.raster.antialiased import check_antialiased
 from liftcore.raster.open_raster import open_raster
-from liftcore.scene.load import load_cameras, load_splats
+from liftcore.scene.load import kernel_named, load_cameras, load_splats
 from liftcore.solve.accumulate import Geometry, accumulate, as_read, lift_walk
 from liftcore.solve.aggregation import Aggregation, aggregate
 from liftcore.solve.all_rays import AllRays
@@ -168,7 +168,7 @@ def _lift_on(run: Run, plan: Plan, sources: Sources, inputs: list[InputFile], ch
 
 def open_sources(splats: Path, cameras: Path, features: Sequence[Path], settings: LiftSettings) -> Sources:
     """Open what a lift is made from; views are paired by name, and every ``view_stride``-th is taken."""
-    scene, views = load_splats(splats, colour=False), load_cameras(cameras)
+    scene, views = load_splats(splats, kernel_named(settings.kernel), colour=False), load_cameras(cameras)
     check_antialiased(scene.kernel, settings.antialiased)
     packs = open_packs(features)
     names, unpaired = pair(packs, views)

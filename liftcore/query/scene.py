@@ -88,9 +88,12 @@ class QueryScene:
         Raises:
             InvalidLift: their file moved, or is another than the one that was lifted.
         """
-        from liftcore.scene.load import load_splats
+        from liftcore.scene.load import kernel_named, load_splats
 
-        return load_splats(unchanged("splats", self.lift.metadata.splats, self.path))
+        remembered = self.lift.metadata
+        return load_splats(
+            unchanged("splats", remembered.splats, self.path), kernel_named(remembered.settings.kernel)
+        )
 
     @cached_property
     def axes(self) -> Tensor:

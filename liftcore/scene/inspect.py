@@ -26,6 +26,7 @@ TINY = 1e-7  # scene units
 LARGEST = 1e300  # shown in place of what overflows, which JSON cannot hold
 OFF_CENTRE = 0.1  # of the image's side
 SHOWN = 3  # names in a warning
+FLAT = 100  # times thinner than wide: what converters make of discs
 
 
 def inspect_file(path: Path) -> dict[str, Any]:
@@ -122,6 +123,8 @@ def _splat_warnings(splats: Splats, scales: Tensor, opacities: Tensor) -> list[s
     warnings = [f"{count} of {splats.count} splats {what}" for what, count in counted.items() if count]
     if splats.sh is None:
         warnings.append("no colour: renders in RGB are not possible")
+    if splats.kernel is Kernel.GAUSSIAN_3D and bool((scales[:, 2] * FLAT < scales[:, :2].amin(dim=1)).all()):
+        warnings.append("every splat is flat along its third axis: if they are discs of 2DGS, lift with kernel=2dgs")
     return warnings
 
 

@@ -28,6 +28,13 @@ CAMERA_FORMATS = "a COLMAP sparse model (folder or .zip), a transforms.json or a
 PICKLED = (".pt", ".pth", ".ckpt", ".pkl")
 
 
+def kernel_named(name: str) -> Kernel | None:
+    """The kernel that the setting ``kernel`` names, None for ``auto``: the file tells."""
+    from liftcore.scene.splats import Kernel
+
+    return None if name == "auto" else Kernel(name)
+
+
 def load_splats(path: Path, kernel: Kernel | None = None, *, colour: bool = True) -> Splats:
     """Read trained splats from a PLY of any dialect (``liftcore.scene.ply``), with or without their colours.
 

@@ -93,6 +93,9 @@ class Splats:
 
 
 def _check_column(name: str, tensor: Tensor, shape: tuple[int, ...]) -> None:
+    if not isinstance(tensor, torch.Tensor):
+        hint = "torch.from_numpy makes one of a NumPy array"
+        raise InvalidSplats(name, expected="a tensor of torch", got=str(type(tensor).__name__), hint=hint)
     if tuple(tensor.shape) != shape or tensor.dtype != torch.float32:
         wanted = f"float32 {list(shape)}" if shape else "three axes"
         raise InvalidSplats(

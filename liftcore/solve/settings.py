@@ -125,6 +125,10 @@ class LiftSettings(BaseModel):
     reference_channels: int = Field(
         0, ge=0, le=1_024, description="random projections in which the certificate finds L(x^), 0 = off"
     )
+    kernel: Literal["auto", "3dgs", "2dgs", "dbs"] = Field(
+        "auto",
+        description="what the splats are: auto tells by their properties; name 2dgs where discs have three scales",
+    )
     device: Literal["auto", "cpu", "cuda"] = Field(
         "auto", description="what walks and solves: auto takes a card where torch and Triton can use one"
     )

@@ -19,6 +19,7 @@ from service.jobs.leftovers import mark
 from service.jobs.limits import JobLimits
 from service.jobs.pace import Pace
 from service.jobs.process import JobProcess
+from service.store.assets import kernel_of
 from service.store.jobs import JobRecord, labels_of
 from service.store.lifts import FinishedLift
 from service.store.store import Store
@@ -159,7 +160,7 @@ class Attempt:
             "kind": job.kind,
             "parameters": job.parameters,
             "splats": str(assets[0].path),
-            "kernel": assets[0].counts.get("kernel", "3dgs"),  # to compile for
+            "kernel": kernel_of(assets[0], job.settings),  # to compile for
             "cameras": str(assets[1].path),
             "features": [str(asset.path) for asset in assets[2:]],
             "labels": {str(asset.kind): str(asset.path) for asset in labels},

@@ -11,6 +11,7 @@ from liftcore import __version__
 from service import wire
 from service.parts import Parts
 from service.settings import encoder_file, encoder_version
+from service.store.assets import kernel_of
 from service.store.lifts import LiftRecord
 
 Question = wire.Asked | wire.AskedInBody
@@ -31,7 +32,7 @@ def scene_request(operation: str, lift: LiftRecord, here: Parts) -> dict[str, An
         "lift": str(lift.path),
         "splats": str(splats.path),
         "cameras": str(cameras.path),
-        "kernel": splats.counts["kernel"],
+        "kernel": kernel_of(splats, lift.metadata["settings"]),
         "names": {
             str(lift.path): f"lift {lift.id}",
             str(splats.path): f"splats {splats.id}",

@@ -6,6 +6,7 @@ import json
 import sqlite3
 import threading
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -210,6 +211,12 @@ class AssetStore(Owned):
             warnings=json.loads(row["warnings"]),
             created=row["created"],
         )
+
+
+def kernel_of(splats: AssetRecord, settings: Mapping[str, Any]) -> str:
+    """The kernel that a lift of those settings takes the splats for."""
+    asked = settings.get("kernel", "auto")
+    return splats.counts.get("kernel", "3dgs") if asked == "auto" else asked
 
 
 def own(connection: sqlite3.Connection, asset: str, owner: str) -> None:

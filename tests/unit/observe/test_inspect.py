@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -52,6 +53,15 @@ def test_splats_are_described_and_their_faults_counted(tmp_path: Path) -> None:
         "below 1/255",
     ):
         assert words in text
+
+
+def test_discs_with_a_third_scale_are_noticed(tmp_path: Path) -> None:
+    flat = torch.tensor([[0.0, -1.0, -13.8], [1.0, 0.5, -13.8]])
+    splats = Splats(torch.zeros(2, 3), torch.ones(2, 4), flat, torch.zeros(2))
+    write_splats(splats, tmp_path / "discs.ply")
+    assert any("kernel=2dgs" in warning for warning in inspected(tmp_path / "discs.ply")["warnings"])
+    write_splats(replace(splats, log_scales=flat.clamp(min=-4.0)), tmp_path / "one_is_not.ply")
+    assert not any("kernel=2dgs" in warning for warning in inspected(tmp_path / "one_is_not.ply")["warnings"])
 
 
 def test_cameras_are_described(tmp_path: Path) -> None:

@@ -293,3 +293,9 @@ def test_a_lift_reads_no_colours_and_no_extras(tmp_path, kernel):
     assert (bare.sh, bare.sb_params, dict(bare.extras), bare.kernel) == (None, None, {}, kernel)
     for name in ("means", "quats", "log_scales", "opacity_logits"):
         assert torch.equal(getattr(bare, name), getattr(whole, name))
+
+
+def test_arrays_of_numpy_are_refused_in_words() -> None:
+    means = np.zeros((5, 3), np.float32)
+    with pytest.raises(InvalidSplats, match="a tensor of torch, got ndarray"):
+        Splats(means, torch.ones(5, 4), torch.zeros(5, 3), torch.zeros(5))  # pyright: ignore[reportArgumentType]

@@ -13,7 +13,7 @@ import torch
 from liftcore.artifact import TENSORS, Lift
 from liftcore.device import CPU, Device
 from liftcore.lift import lift
-from liftcore.observe.observation import NO_LABEL
+from liftcore.observe.observation import NO_LABEL, RegionMap
 from liftcore.observe.write_pack import write_pack
 from liftcore.raster.cpu import CpuRaster
 from liftcore.scene.load import load_cameras
@@ -85,7 +85,9 @@ def test_views_that_meet_no_label_are_kept_and_not_walked_again(
     features = tmp_path / "blank.safetensors"
     views = {camera.name: observed(3, k, grids=False) for k, camera in enumerate(load_cameras(cameras))}
     for name in blank:
-        views[name] = replace(views[name], labels=torch.full_like(views[name].labels, NO_LABEL))
+        regions = views[name]
+        assert isinstance(regions, RegionMap)
+        views[name] = replace(regions, labels=torch.full_like(regions.labels, NO_LABEL))
     write_pack(features, views, {"encoder": "random"})
     settings, checkpoint = LiftSettings.of(certificate_rays=50), Checkpoint(tmp_path / "kept", seconds=0)
     whole = lift(splats, cameras, [features], settings, threads=1)

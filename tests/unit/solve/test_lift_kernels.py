@@ -8,16 +8,18 @@ import numpy as np
 import pytest
 import torch
 
-from liftcore.errors import InvalidSettings
+from liftcore.artifact import save_lift
+from liftcore.errors import InvalidSettings, InvalidSplats
 from liftcore.lift import lift
 from liftcore.observe.write_pack import write_pack
+from liftcore.query.scene import QueryScene
 from liftcore.raster.oracle import dense_view, reading_matrix
 from liftcore.raster.protocol import Walk
 from liftcore.scene.cameras import Cameras
 from liftcore.scene.inria import write_inria_cameras
 from liftcore.scene.load import load_cameras, load_splats
 from liftcore.scene.ply import write_splats
-from liftcore.scene.splats import Kernel
+from liftcore.scene.splats import Kernel, Splats
 from liftcore.solve.settings import LiftSettings
 from tests.scenes import centred, random_camera, random_regions, random_splats
 
@@ -35,6 +37,23 @@ def write_scene(folder: Path, kernel: Kernel) -> tuple[Path, Path, Path]:
     write_inria_cameras(Cameras(views), paths[1])
     write_pack(paths[2], {camera.name: random_regions(k) for k, camera in enumerate(views)}, {})
     return paths
+
+
+def test_discs_written_with_three_scales_are_discs_where_the_settings_say_so(tmp_path):
+    discs, cameras, features = write_scene(tmp_path, Kernel.GAUSSIAN_2D)
+    flat, solid = load_splats(discs), tmp_path / "three.ply"
+    scales = torch.cat([flat.log_scales, torch.full((flat.count, 1), -1.0)], dim=1)  # of no account
+    write_splats(Splats(flat.means, flat.quats, scales, flat.opacity_logits, sh=flat.sh), solid)
+    settings = LiftSettings.of(kernel="2dgs")
+    wanted = lift(discs, cameras, [features], LiftSettings.of())
+    got = lift(solid, cameras, [features], settings)
+    assert got.metadata.certificate["plan"]["kernel"] == "2dgs"
+    assert torch.equal(got.features, wanted.features)
+    assert not torch.equal(lift(solid, cameras, [features], LiftSettings.of()).features, wanted.features)
+    save_lift(got, tmp_path / "made.safetensors")
+    assert QueryScene.open(tmp_path / "made.safetensors").splats.kernel is Kernel.GAUSSIAN_2D  # in pictures too
+    with pytest.raises(InvalidSplats, match="'beta' of a dbs splat"):
+        lift(solid, cameras, [features], LiftSettings.of(kernel="dbs"))
 
 
 @pytest.mark.parametrize(
