@@ -10,7 +10,7 @@ from PIL import Image
 
 from liftcore.errors import InvalidQuery
 from liftcore.files import whole_file
-from liftcore.query.colours import cluster_colours, colour_map, seen_colours
+from liftcore.query.colours import cluster_colours, heat_colours, seen_colours
 from liftcore.raster.protocol import Walk
 
 if TYPE_CHECKING:
@@ -19,10 +19,6 @@ if TYPE_CHECKING:
     from liftcore.query.ask import Look
     from liftcore.query.scene import QueryScene
 
-_HEAT_RANGE = (
-    0.01,
-    0.999,
-)  # quantiles of the attention that the colour map spans: one hot pixel dims no picture
 _DIM = 0.35  # brightness that an overlay leaves to what was not found
 _OUTLINE = np.array([255, 209, 64], dtype=np.uint8)  # sRGB of the line around what was found
 
@@ -108,16 +104,7 @@ def _mask(look: Look) -> np.ndarray:
 
 
 def _heat(look: Look) -> np.ndarray:
-    attention = look.attention.numpy()
-    met = look.row_sums.numpy() > 0
-    if not met.any():
-        return np.zeros((*attention.shape, 3), dtype=np.uint8)
-    low, high = np.quantile(attention[met], _HEAT_RANGE)
-    colours = colour_map()
-    level = (attention - low) / (high - low) if high > low else np.zeros_like(attention)
-    picture = colours[np.round(level.clip(0.0, 1.0) * (len(colours) - 1)).astype(np.int64)]
-    picture[~met] = 0
-    return picture
+    return heat_colours(look.attention.numpy(), look.row_sums.numpy() > 0)
 
 
 def overlay(image: np.ndarray, mask: np.ndarray) -> np.ndarray:

@@ -82,6 +82,15 @@ class QueryScene:
         return int(self.lift.features.shape[1])
 
     @cached_property
+    def splat_file(self) -> Path:
+        """The file of the splats that were lifted.
+
+        Raises:
+            InvalidLift: it moved, or is another than the one that was lifted.
+        """
+        return unchanged("splats", self.lift.metadata.splats, self.path)
+
+    @cached_property
     def splats(self) -> Splats:
         """The splats that were lifted.
 
@@ -90,7 +99,7 @@ class QueryScene:
         """
         from liftcore.scene.load import load_splats
 
-        return load_splats(unchanged("splats", self.lift.metadata.splats, self.path))
+        return load_splats(self.splat_file)
 
     @cached_property
     def axes(self) -> Tensor:
