@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, Query, Request, Response
 
 from service import wire
-from service.content import tagged, unchanged
+from service.content import draft_answer, tagged, unchanged
 from service.errors import InvalidRequest
 from service.parts import Here, Parts
 from service.routes.question import answer_links, entity_tag, find_lift, query_request, scene_request, shown
@@ -20,6 +20,9 @@ PNG: dict[int | str, dict[str, Any]] = {
 }
 NPY: dict[int | str, dict[str, Any]] = {
     200: {"content": {"application/x-npy": {"schema": {"type": "string", "format": "binary"}}}}
+}
+PLY: dict[int | str, dict[str, Any]] = {
+    200: {"content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}}
 }
 MEDIA_TYPES = {"scores": "application/x-npy", "mask": "image/png", "attention": "image/png", "render": "image/png"}
 
@@ -62,6 +65,15 @@ def attention(asked: Annotated[wire.AskedInView, Query()], request: Request, her
     return _entity(request, here, query_request("attention", asked, lift, here) | {"view": asked.view}, lift)
 
 
+@router.get("/query/splats", responses=PLY, response_class=Response)
+def splats(asked: Annotated[wire.AskedForSplats, Query()], request: Request, here: Here) -> Response:
+    """What was found, or the scene in the colours of its scores, as splats: a PLY of the dialect that was lifted."""
+    lift = find_lift(asked.lift, here)
+    wanted = query_request("splats", asked, lift, here) | {"what": asked.what}
+    etag = entity_tag(wanted, lift)
+    return unchanged(request, etag) or _splat_file(here, wanted, lift, etag)
+
+
 @router.post("/query/scores", responses=NPY, response_class=Response)
 def scores_by_body(asked: wire.AskedInBody, here: Here) -> Response:
     """The score of every splat, for a query in a body."""
@@ -80,6 +92,15 @@ def attention_by_body(asked: wire.AskedInBody, here: Here) -> Response:
     """How well each pixel of a view answers to it, for a query in a body with a view."""
     lift = find_lift(asked.lift, here)
     return _content(here, query_request("attention", asked, lift, here) | {"view": _view(asked)})
+
+
+@router.post("/query/splats", responses=PLY, response_class=Response)
+def splats_by_body(
+    asked: wire.AskedInBody, here: Here, what: Annotated[wire.SplatsOf, Query(description=wire.SPLATS_OF)] = "object"
+) -> Response:
+    """What was found, or the scene in the colours of its scores, as splats, for a query in a body."""
+    lift = find_lift(asked.lift, here)
+    return _splat_file(here, query_request("splats", asked, lift, here) | {"what": what}, lift)
 
 
 @router.get("/render", responses=PNG, response_class=Response)
@@ -109,7 +130,7 @@ def _answer(asked: wire.AskedWhere | wire.AskedInBody, here: Parts) -> wire.Quer
         lift=lift.id,
         view=view,
         text_space=lift.metadata["text_space"],
-        links=answer_links(asked, lift, view),
+        links=answer_links(asked, lift, view, found=found["count"] > 0),
         **found,
     )
 
@@ -126,6 +147,15 @@ def _entity(request: Request, here: Parts, asked: dict[str, Any], lift: LiftReco
     etag = entity_tag(asked, lift)
     same = unchanged(request, etag)
     return same or tagged(here.queries.call(asked).body, MEDIA_TYPES[asked["operation"]], etag)
+
+
+def _splat_file(here: Parts, asked: dict[str, Any], lift: LiftRecord, etag: str | None = None) -> Response:
+    """The query process writes a draft, as a scene is more than a pipe should carry or this process should hold."""
+    files = here.store.files
+    files.require_room(here.store.assets.get(lift.splats).bytes)
+    with files.draft(".ply") as draft:
+        here.queries.call(asked | {"draft": str(draft)})
+        return draft_answer(draft, filename=f"{asked['what']}-{lift.id}.ply", etag=etag)
 
 
 def _content(here: Parts, asked: dict[str, Any]) -> Response:
