@@ -7,13 +7,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from liftcore.errors import InvalidQuery
 from liftcore.files import whole_file
 from liftcore.query.colours import cluster_colours, heat_colours, seen_colours
+from liftcore.query.depth import shown_depth
 from liftcore.raster.protocol import Walk
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
     from liftcore.query.ask import Look
@@ -36,11 +39,16 @@ def attention_png(look: Look) -> bytes:
 def render_png(scene: QueryScene, view: str, what: str = "rgb") -> bytes:
     """The scene as a camera sees it, RGB [H, W, 3] on black: its colours, features (``pca``) or clusters.
 
+    Its ``depth`` is one 8-bit channel [H, W], near bright, whose PNG tells its range as text (`ShownDepth`).
+
     Raises:
         NotFound: no camera has this name.
         InvalidQuery: clusters are asked for, and the lift has none.
         InvalidLift: the splats or the cameras moved or changed since the lift.
     """
+    if what == "depth":
+        depth = shown_depth(scene, view)
+        return _png(depth.levels, depth.text())
     return _png(render(scene, view, what))
 
 
@@ -125,9 +133,12 @@ def _border(mask: np.ndarray) -> np.ndarray:
     return near & ~mask
 
 
-def _png(pixels: np.ndarray) -> bytes:
-    buffer = io.BytesIO()
-    Image.fromarray(np.ascontiguousarray(pixels)).save(buffer, format="PNG")
+def _png(pixels: np.ndarray, text: Mapping[str, str] | None = None) -> bytes:
+    """A picture [H, W] or [H, W, 3] u8 with text chunks."""
+    buffer, chunks = io.BytesIO(), PngInfo()
+    for name, value in (text or {}).items():
+        chunks.add_text(name, value)
+    Image.fromarray(np.ascontiguousarray(pixels)).save(buffer, format="PNG", pnginfo=chunks)
     return buffer.getvalue()
 
 

@@ -110,11 +110,15 @@ def render(
     here: Here,
     lift: LiftParameter = None,
     what: Annotated[
-        Literal["rgb", "pca", "cluster"],
-        Query(description="the splats' colours, three principal components of features, or clusters"),
+        Literal["rgb", "depth", "pca", "cluster"],
+        Query(description="the splats' colours, expected depth, three principal components of features, or clusters"),
     ] = "rgb",
 ) -> Response:
-    """The splats from a view, in their colours or in those of their features or clusters: a PNG."""
+    """The splats from a view, in their colours or in those of their features or clusters, or their depth: a PNG.
+
+    Depths are grey, near bright. The PNG's texts `depth-near` and `depth-far` tell the depths of its levels 255 and
+    1, in scene units, with even steps between; what lies beyond has these levels too. 0 is where no splat is.
+    """
     found = find_lift(lift, here)
     return _entity(request, here, scene_request("render", found, here) | {"view": view, "what": what}, found)
 
