@@ -179,6 +179,8 @@ def _add_query(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--mask", type=Path, metavar="PNG", help="write the mask of the view")
     parser.add_argument("--attention", type=Path, metavar="PNG", help="write the attention map of the view")
     parser.add_argument("--scores", type=Path, metavar="NPY", help="write the scores [P], float32")
+    parser.add_argument("--object", type=Path, metavar="PLY", help="write the splats that were found, and no others")
+    parser.add_argument("--coloured", type=Path, metavar="PLY", help="write all splats, coloured by their scores")
 
 
 def _add_pack(parser: argparse.ArgumentParser, shared: _Parser) -> None:

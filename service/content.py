@@ -1,13 +1,15 @@
-"""Answers with an entity tag: files with ranges, and pictures."""
+"""Answers with an entity tag: files with ranges, pictures, and files that are made to be sent."""
 
 from __future__ import annotations
 
+import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 from fastapi import Request
-from fastapi.responses import FileResponse, Response
+from fastapi.responses import FileResponse, Response, StreamingResponse
 from starlette.types import Receive, Scope, Send
 
 from liftcore.errors import NotFound
@@ -16,6 +18,7 @@ from service.store.files import is_whole
 
 ONE_RANGE = re.compile(r"bytes=\s*(?:(\d+)-(\d*)|-(\d+))\s*", re.ASCII)
 MAX_DIGITS = 18  # longer numbers are beyond every file
+BLOCK_BYTES = 256 << 10  # of a draft that is read and sent at a time
 
 
 def unchanged(request: Request, etag: str) -> Response | None:
@@ -62,6 +65,14 @@ def file_answer(request: Request, file: StoredFile) -> Response:
     return _FileAnswer(file, etag=etag, keep_range=_keeps_range(request, file.bytes, etag))
 
 
+def draft_answer(draft: Path, *, filename: str, etag: str | None) -> Response:
+    """A file that was made for this answer alone, to be saved under a name.
+
+    The answer holds the file open, so its entry may go as soon as this returns; its room goes with the answer.
+    """
+    return Draft(draft.open("rb"), {"ETag": etag} if etag else {}, filename)
+
+
 def _keeps_range(request: Request, size: int, etag: str) -> bool:
     """Whether the Range header counts: one range, well-formed, of the entity that the client thinks of."""
     header = request.headers.get("range", "")
@@ -93,3 +104,22 @@ class _FileAnswer(FileResponse):
             headers = [pair for pair in scope["headers"] if pair[0] not in (b"range", b"if-range")]
             scope = {**scope, "headers": headers}
         await super().__call__(scope, receive, send)
+
+
+class Draft(StreamingResponse):
+    """An open file, read in blocks by threads of the pool, and closed however the answer ends."""
+
+    def __init__(self, file: BinaryIO, headers: dict[str, str], filename: str) -> None:
+        headers |= {
+            "Content-Length": str(os.fstat(file.fileno()).st_size),
+            "Content-Disposition": f'attachment; filename="{filename}"',
+            "Cache-Control": "private, no-cache",
+        }
+        super().__init__(iter(lambda: file.read(BLOCK_BYTES), b""), 200, headers, "application/octet-stream")
+        self.file = file
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        try:
+            await super().__call__(scope, receive, send)
+        finally:
+            self.file.close()

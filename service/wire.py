@@ -248,6 +248,10 @@ ViewName = Annotated[str, Field(min_length=1, max_length=500, description="the n
 Number = Annotated[float, Field(ge=-1e6, le=1e6)]  # which NaN is not
 
 
+SplatsOf = Literal["object", "scores"]
+SPLATS_OF = "the splats that were found and no others, or all splats in the colours of their scores"
+
+
 class Question(BaseModel):
     """What all queries share: the words, and how to find what they mean."""
 
@@ -280,6 +284,12 @@ class AskedInView(Asked):
     """Where something is in a view."""
 
     view: ViewName
+
+
+class AskedForSplats(Asked):
+    """Splats of an answer."""
+
+    what: SplatsOf = Field("object", description=SPLATS_OF)
 
 
 class AskedInBody(Question):

@@ -11,7 +11,7 @@ from liftcore.files import whole_file
 
 if TYPE_CHECKING:
     import argparse
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable
 
     from liftcore.query.ask import Answer, Look
     from liftcore.query.encoders import TextEncoder
@@ -20,13 +20,16 @@ if TYPE_CHECKING:
     from liftcore.query.scene import QueryScene
 
 
+OUTPUTS = ("object", "coloured", "scores", "mask", "attention")  # options that name a file to write
+
+
 def run(options: argparse.Namespace) -> int:
     """Ask, look where a view is named, write what was asked for, and say what was found."""
     if (options.mask or options.attention) and not options.view:
         raise InvalidQuery("--mask and --attention", expected="a view to see them from", got="no --view")
-    outputs = [path.absolute() for path in (options.mask, options.attention, options.scores) if path is not None]
+    outputs = [path.absolute() for kind in OUTPUTS if (path := getattr(options, kind)) is not None]
     if len(set(outputs)) < len(outputs):
-        raise InvalidQuery("--mask, --attention and --scores", expected="a file each", got="the same file twice")
+        raise InvalidQuery(f"--{', --'.join(OUTPUTS)}", expected="a file each", got="the same file twice")
     for path in outputs:
         free_output(path, [options.lift, *([options.table] if options.table else [])])
     from liftcore.query.ask import ask, look, top
@@ -35,6 +38,9 @@ def run(options: argparse.Namespace) -> int:
 
     query = _query(options)
     scene = QueryScene.open(options.lift)
+    made_from = scene.lift.metadata
+    for path in outputs:
+        free_output(path, [Path(file.path) for file in (made_from.splats, made_from.cameras, *made_from.features)])
     encoder = _encoder(options, scene) if texts_of(query.terms) else None
     answer = ask(scene, query, encoder)
     seen = look(scene, answer, options.view) if options.view else None
@@ -45,7 +51,7 @@ def run(options: argparse.Namespace) -> int:
             {"splat": best.splat, "score": best.score, "position": best.position} for best in found.best
         ]
         document["box"] = found.box
-    document["files"] = _write(options, answer, seen)
+    document["files"] = _write(options, scene, answer, seen)
     reply(document, as_json=options.json, lines=_lines(document))
     return 0
 
@@ -116,25 +122,30 @@ def _document(answer: Answer, seen: Look | None, encoder: TextEncoder | None) ->
     return document
 
 
-def _write(options: argparse.Namespace, answer: Answer, seen: Look | None) -> dict[str, str]:
+def _write(options: argparse.Namespace, scene: QueryScene, answer: Answer, seen: Look | None) -> dict[str, str]:
+    """Write what was asked for, the object first: when nothing was found, nothing is written."""
     from liftcore.query.pictures import save_attention, save_mask
+    from liftcore.query.splat_files import save_coloured, save_object
 
-    files: dict[str, Path] = {}
-    if options.scores:
-        import numpy as np
-
-        with writing(options.scores), whole_file(options.scores) as handle:
-            np.save(handle, answer.scores.numpy())
-        files["scores"] = options.scores
-    if seen is not None and options.mask:
-        with writing(options.mask):
-            save_mask(seen, options.mask)
-        files["mask"] = options.mask
-    if seen is not None and options.attention:
-        with writing(options.attention):
-            save_attention(seen, options.attention)
-        files["attention"] = options.attention
+    save: dict[str, Callable[[Path], None]] = {
+        "object": lambda path: save_object(scene, answer, path),
+        "coloured": lambda path: save_coloured(scene, answer, path),
+        "scores": lambda path: _save_scores(answer, path),
+    }
+    if seen is not None:
+        save |= {"mask": lambda path: save_mask(seen, path), "attention": lambda path: save_attention(seen, path)}
+    files = {kind: path for kind in OUTPUTS if (path := getattr(options, kind)) is not None}
+    for kind, path in files.items():
+        with writing(path):
+            save[kind](path)
     return {kind: str(path) for kind, path in files.items()}
+
+
+def _save_scores(answer: Answer, path: Path) -> None:
+    import numpy as np
+
+    with whole_file(path) as handle:
+        np.save(handle, answer.scores.numpy())
 
 
 def _lines(document: dict[str, Any]) -> Iterable[str]:

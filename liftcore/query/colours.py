@@ -30,6 +30,7 @@ SH_C3 = (
     math.sqrt(105 / (16 * math.pi)),
 )
 NO_CLUSTER_COLOUR = (90, 90, 90)  # sRGB of splats in no cluster
+NOT_SEEN_COLOUR = (90, 90, 90)  # sRGB of splats without a score
 _LOBE_SHARPNESS = 10 * math.log(2)
 _LARGEST_POWER = 1e30
 NO_COLOUR = 0.6  # grey of splats whose file holds no colours
@@ -40,6 +41,7 @@ _MAP_STEPS = 256
 _MAP_LIGHTNESS = (0.18, 0.93)
 _MAP_HUE = (math.radians(300), math.radians(105))
 _MAP_CHROMA = (0.10, 0.17)
+_HEAT_RANGE = (0.01, 0.999)  # quantiles that the map spans: one hot pixel dims no picture
 
 _CLUSTER_LIGHTNESS = (0.72, 0.86, 0.58)
 _CLUSTER_CHROMA = 0.13
@@ -118,6 +120,30 @@ def colour_map() -> np.ndarray:
     hue = np.interp(step, (0, 1), _MAP_HUE)
     chroma = np.interp(step, (0, 1), _MAP_CHROMA)
     return _srgb(lightness, chroma * np.cos(hue), chroma * np.sin(hue))
+
+
+def heat_colours(values: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Scores through the colour map, which spans the known ones from their 1st to their 99.9th percentile.
+
+    Args:
+        values: [...] f32. known: [...] bool.
+
+    Returns:
+        [..., 3] u8 sRGB, black where not known.
+    """
+    if not known.any():
+        return np.zeros((*values.shape, 3), dtype=np.uint8)
+    low, high = np.quantile(values[known], _HEAT_RANGE)
+    colours = colour_map()
+    level = (values - low) / (high - low) if high > low else np.zeros_like(values)
+    picture = colours[np.round(level.clip(0.0, 1.0) * (len(colours) - 1)).astype(np.int64)]
+    picture[~known] = 0
+    return picture
+
+
+def constant_terms(colours: np.ndarray) -> np.ndarray:
+    """The terms [..., 3] f32 of the spherical harmonics that show colours [..., 3] u8 sRGB, alike from everywhere."""
+    return ((colours.astype(np.float32) / 255 - 0.5) / SH_C0).astype(np.float32)
 
 
 def cluster_colours(count: int) -> np.ndarray:

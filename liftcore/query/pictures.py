@@ -7,22 +7,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from liftcore.errors import InvalidQuery
 from liftcore.files import whole_file
-from liftcore.query.colours import cluster_colours, colour_map, seen_colours
+from liftcore.query.colours import cluster_colours, heat_colours, seen_colours
+from liftcore.query.depth import shown_depth
 from liftcore.raster.protocol import Walk
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
     from liftcore.query.ask import Look
     from liftcore.query.scene import QueryScene
 
-_HEAT_RANGE = (
-    0.01,
-    0.999,
-)  # quantiles of the attention that the colour map spans: one hot pixel dims no picture
 _DIM = 0.35  # brightness that an overlay leaves to what was not found
 _OUTLINE = np.array([255, 209, 64], dtype=np.uint8)  # sRGB of the line around what was found
 
@@ -40,11 +39,16 @@ def attention_png(look: Look) -> bytes:
 def render_png(scene: QueryScene, view: str, what: str = "rgb") -> bytes:
     """The scene as a camera sees it, RGB [H, W, 3] on black: its colours, features (``pca``) or clusters.
 
+    Its ``depth`` is one 8-bit channel [H, W], near bright, whose PNG tells its range as text (`ShownDepth`).
+
     Raises:
         NotFound: no camera has this name.
         InvalidQuery: clusters are asked for, and the lift has none.
         InvalidLift: the splats or the cameras moved or changed since the lift.
     """
+    if what == "depth":
+        depth = shown_depth(scene, view)
+        return _png(depth.levels, depth.text())
     return _png(render(scene, view, what))
 
 
@@ -108,16 +112,7 @@ def _mask(look: Look) -> np.ndarray:
 
 
 def _heat(look: Look) -> np.ndarray:
-    attention = look.attention.numpy()
-    met = look.row_sums.numpy() > 0
-    if not met.any():
-        return np.zeros((*attention.shape, 3), dtype=np.uint8)
-    low, high = np.quantile(attention[met], _HEAT_RANGE)
-    colours = colour_map()
-    level = (attention - low) / (high - low) if high > low else np.zeros_like(attention)
-    picture = colours[np.round(level.clip(0.0, 1.0) * (len(colours) - 1)).astype(np.int64)]
-    picture[~met] = 0
-    return picture
+    return heat_colours(look.attention.numpy(), look.row_sums.numpy() > 0)
 
 
 def overlay(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
@@ -138,9 +133,12 @@ def _border(mask: np.ndarray) -> np.ndarray:
     return near & ~mask
 
 
-def _png(pixels: np.ndarray) -> bytes:
-    buffer = io.BytesIO()
-    Image.fromarray(np.ascontiguousarray(pixels)).save(buffer, format="PNG")
+def _png(pixels: np.ndarray, text: Mapping[str, str] | None = None) -> bytes:
+    """A picture [H, W] or [H, W, 3] u8 with text chunks."""
+    buffer, chunks = io.BytesIO(), PngInfo()
+    for name, value in (text or {}).items():
+        chunks.add_text(name, value)
+    Image.fromarray(np.ascontiguousarray(pixels)).save(buffer, format="PNG", pnginfo=chunks)
     return buffer.getvalue()
 
 

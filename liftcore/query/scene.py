@@ -82,6 +82,15 @@ class QueryScene:
         return int(self.lift.features.shape[1])
 
     @cached_property
+    def splat_file(self) -> Path:
+        """The file of the splats that were lifted.
+
+        Raises:
+            InvalidLift: it moved, or is another than the one that was lifted.
+        """
+        return unchanged("splats", self.lift.metadata.splats, self.path)
+
+    @cached_property
     def splats(self) -> Splats:
         """The splats that were lifted.
 
@@ -90,10 +99,7 @@ class QueryScene:
         """
         from liftcore.scene.load import kernel_named, load_splats
 
-        remembered = self.lift.metadata
-        return load_splats(
-            unchanged("splats", remembered.splats, self.path), kernel_named(remembered.settings.kernel)
-        )
+        return load_splats(self.splat_file, kernel_named(self.lift.metadata.settings.kernel))
 
     @cached_property
     def axes(self) -> Tensor:

@@ -173,12 +173,9 @@ def _codes(splats: Splats, layout: Sequence[str]) -> dict[str, str]:
 
 
 def _header_lines(splats: Splats, codes: Mapping[str, str]) -> list[str]:
-    element = f"element vertex {splats.count}"
     source = _source_header(splats)
     if source is not None and {column.name: column.code for column in source.properties} == codes:
-        if source.count == splats.count:
-            return list(source.lines)
-        end = "\r" if source.lines[0].endswith("\r") else ""
-        return [element + end if line.split()[:1] == ["element"] else line for line in source.lines]
+        return list(source.lines_for(splats.count))
+    element = f"element vertex {splats.count}"
     columns = [f"property {_SPELLING[code]} {name}" for name, code in codes.items()]
     return ["ply", "format binary_little_endian 1.0", element, *columns, "end_header"]

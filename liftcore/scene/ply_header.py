@@ -67,6 +67,14 @@ class PlyHeader:
         """Bytes a row."""
         return sum(column.width for column in self.properties)
 
+    def lines_for(self, count: int) -> tuple[str, ...]:
+        """The lines of a file with ``count`` rows of these columns; all but that number stays as it is."""
+        if count == self.count:
+            return self.lines
+        end = "\r" if self.lines[0].endswith("\r") else ""
+        element = f"element vertex {count}{end}"
+        return tuple(element if line.split()[:1] == ["element"] else line for line in self.lines)
+
 
 def read_header(path: Path) -> PlyHeader:
     """Read and check the header of a splat PLY, at most 64 KiB of the file.

@@ -1,14 +1,15 @@
-"""What the query process computes: answers, scores, masks, maps and renders, over open scenes."""
+"""What the query process computes: answers, scores, masks, maps, renders and splats, over open scenes."""
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import io
 import json
 import math
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -26,8 +27,10 @@ from liftcore.query.pictures import attention_png, mask_png, render_png
 from liftcore.query.products import cosines_of, norms_of
 from liftcore.query.query import Query
 from liftcore.query.scene import QueryScene
+from liftcore.query.splat_files import coloured_ply, object_ply
 from liftcore.raster.warm_up import warm_up
 from liftcore.scene.splats import Kernel
+from service.errors import NoSpace
 from service.queries.frames import Frame
 from service.queries.kept import Kept
 
@@ -59,6 +62,7 @@ class Answers:
             "mask": self._mask,
             "attention": self._attention,
             "render": self._render,
+            "splats": self._splats,
         }
 
     @property
@@ -171,6 +175,27 @@ class Answers:
 
     def _render(self, request: dict[str, Any]) -> Frame:
         return Frame({}, render_png(self._scene(request), request["view"], request["what"]))
+
+    def _splats(self, request: dict[str, Any]) -> Frame:
+        make = {"object": object_ply, "scores": coloured_ply}[request["what"]]
+        write_draft(make(self._scene(request), self._answer(request)), Path(request["draft"]))
+        return Frame({})
+
+
+def write_draft(blocks: Iterable[bytes], draft: Path) -> None:
+    """Write what is too much for a pipe where the HTTP process finds it, and removes it.
+
+    Raises:
+        NoSpace: the disk is full.
+    """
+    try:
+        with draft.open("wb") as file:
+            file.writelines(blocks)
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            raise
+        expected, hint = "room on the disk for the answer", "ask again later, or tell the operator"
+        raise NoSpace("splats", expected=expected, got="a full disk", hint=hint) from None
 
 
 def use_one_library_thread() -> None:

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, Query, Request, Response
 
 from service import wire
-from service.content import tagged, unchanged
+from service.content import draft_answer, tagged, unchanged
 from service.errors import InvalidRequest
 from service.parts import Here, Parts
 from service.routes.question import answer_links, entity_tag, find_lift, query_request, scene_request, shown
@@ -21,6 +21,9 @@ PNG: dict[int | str, dict[str, Any]] = {
 }
 NPY: dict[int | str, dict[str, Any]] = {
     200: {"content": {"application/x-npy": {"schema": {"type": "string", "format": "binary"}}}}
+}
+PLY: dict[int | str, dict[str, Any]] = {
+    200: {"content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}}
 }
 MEDIA_TYPES = {"scores": "application/x-npy", "mask": "image/png", "attention": "image/png", "render": "image/png"}
 
@@ -63,6 +66,15 @@ def attention(asked: Annotated[wire.AskedInView, Query()], request: Request, her
     return _entity(request, here, query_request("attention", asked, lift, here) | {"view": asked.view}, lift)
 
 
+@router.get("/query/splats", responses=PLY, response_class=Response)
+def splats(asked: Annotated[wire.AskedForSplats, Query()], request: Request, here: Here) -> Response:
+    """What was found, or the scene in the colours of its scores, as splats: a PLY of the dialect that was lifted."""
+    lift = find_lift(asked.lift, here)
+    wanted = query_request("splats", asked, lift, here) | {"what": asked.what}
+    etag = entity_tag(wanted, lift)
+    return unchanged(request, etag) or _splat_file(here, wanted, lift, etag)
+
+
 @router.post("/query/scores", responses=NPY, response_class=Response)
 def scores_by_body(asked: wire.AskedInBody, here: Here) -> Response:
     """The score of every splat, for a query in a body."""
@@ -83,6 +95,15 @@ def attention_by_body(asked: wire.AskedInBody, here: Here) -> Response:
     return _content(here, query_request("attention", asked, lift, here) | {"view": _view(asked)})
 
 
+@router.post("/query/splats", responses=PLY, response_class=Response)
+def splats_by_body(
+    asked: wire.AskedInBody, here: Here, what: Annotated[wire.SplatsOf, Query(description=wire.SPLATS_OF)] = "object"
+) -> Response:
+    """What was found, or the scene in the colours of its scores, as splats, for a query in a body."""
+    lift = find_lift(asked.lift, here)
+    return _splat_file(here, query_request("splats", asked, lift, here) | {"what": what}, lift)
+
+
 @router.get("/render", responses=PNG, response_class=Response)
 def render(
     view: View,
@@ -90,11 +111,15 @@ def render(
     here: Here,
     lift: LiftParameter = None,
     what: Annotated[
-        Literal["rgb", "pca", "cluster"],
-        Query(description="the splats' colours, three principal components of features, or clusters"),
+        Literal["rgb", "depth", "pca", "cluster"],
+        Query(description="the splats' colours, expected depth, three principal components of features, or clusters"),
     ] = "rgb",
 ) -> Response:
-    """The splats from a view, in their colours or in those of their features or clusters: a PNG."""
+    """The splats from a view, in their colours or in those of their features or clusters, or their depth: a PNG.
+
+    Depths are grey, near bright. The PNG's texts `depth-near` and `depth-far` tell the depths of its levels 255 and
+    1, in scene units, with even steps between; what lies beyond has these levels too. 0 is where no splat is.
+    """
     found = find_lift(lift, here)
     return _entity(request, here, scene_request("render", found, here) | {"view": view, "what": what}, found)
 
@@ -111,7 +136,7 @@ def _answer(asked: wire.AskedWhere | wire.AskedInBody, here: Parts) -> wire.Quer
         view=view,
         text_space=lift.metadata["text_space"],
         encoder=None if request["encoder"] is None else encoder_label(request["encoder"]),
-        links=answer_links(asked, lift, view),
+        links=answer_links(asked, lift, view, found=found["count"] > 0),
         **found,
     )
 
@@ -128,6 +153,15 @@ def _entity(request: Request, here: Parts, asked: dict[str, Any], lift: LiftReco
     etag = entity_tag(asked, lift)
     same = unchanged(request, etag)
     return same or tagged(here.queries.call(asked).body, MEDIA_TYPES[asked["operation"]], etag)
+
+
+def _splat_file(here: Parts, asked: dict[str, Any], lift: LiftRecord, etag: str | None = None) -> Response:
+    """The query process writes a draft, as a scene is more than a pipe should carry or this process should hold."""
+    files = here.store.files
+    files.require_room(here.store.assets.get(lift.splats).bytes)
+    with files.draft(".ply") as draft:
+        here.queries.call(asked | {"draft": str(draft)})
+        return draft_answer(draft, filename=f"{asked['what']}-{lift.id}.ply", etag=etag)
 
 
 def _content(here: Parts, asked: dict[str, Any]) -> Response:

@@ -69,9 +69,14 @@ def entity_tag(asked: dict[str, Any], lift: LiftRecord) -> str:
     return f'"{hashlib.sha256(json.dumps(decides, sort_keys=True).encode()).hexdigest()}"'
 
 
-def answer_links(asked: Question, lift: LiftRecord, view: str | None) -> dict[str, str]:
-    """The URLs of other looks at the same query; vectors do not fit in one, and are sent there again."""
+def answer_links(asked: Question, lift: LiftRecord, view: str | None, *, found: bool) -> dict[str, str]:
+    """The URLs of other looks at the same query; vectors do not fit in one, and are sent there again.
+
+    Where nothing was ``found`` there is no object.
+    """
     links = {"lift": f"/lifts/{lift.id}", "scores": _link("/query/scores", asked, lift=lift.id)}
+    links |= {"object": _link("/query/splats?what=object", asked, lift=lift.id)} if found else {}
+    links["coloured"] = _link("/query/splats?what=scores", asked, lift=lift.id)
     if view is not None:
         links["mask"] = _link("/query/mask", asked, lift=lift.id, view=view)
         links["attention"] = _link("/query/attention", asked, lift=lift.id, view=view)
@@ -95,4 +100,4 @@ def _link(path: str, asked: Question, **more: str) -> str:
     pairs += [("instances", str(asked.instances))] if asked.instances is not None else []
     pairs += [("keep", asked.keep)] if asked.keep != "all" else []
     pairs += [("encoder", asked.encoder)] if asked.encoder is not None else []
-    return f"{path}?{urlencode(pairs + list(more.items()))}"
+    return f"{path}{'&' if '?' in path else '?'}{urlencode(pairs + list(more.items()))}"

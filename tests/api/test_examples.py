@@ -18,7 +18,7 @@ from .test_problems import assert_problem
 from .tiny_scene import CHANNELS, HEIGHT, SPLATS_A_CLUSTER, WIDTH, TinyScene, codebook
 
 LAMP = (26, HEIGHT // 2)  # a pixel of the lamp in view "middle"
-ROUTES = ("/query", "/query/scores", "/query/mask", "/query/attention")
+ROUTES = ("/query", "/query/scores", "/query/mask", "/query/attention", "/query/splats")
 
 
 def of_lamp(answer: dict[str, Any]) -> bool:
@@ -145,8 +145,8 @@ def test_examples_that_lead_nowhere_are_problems(
     ],
 )  # fmt: skip
 def test_no_body_makes_a_query_our_fault(client: TestClient, lift: dict[str, Any], path: str, body: bytes) -> None:
-    if body == b'{"like": ["splat:1"], "view": "behind"}' and path == "/query/scores":
-        return  # scores need no view
+    if body == b'{"like": ["splat:1"], "view": "behind"}' and path in ("/query/scores", "/query/splats"):
+        return  # these need no view
     reply = client.post(path, content=body, headers={"Content-Type": "application/json"})
     assert 400 <= assert_problem(reply)["status"] < 500
 

@@ -19,6 +19,7 @@ from .conftest import Uploaded
 from .following import ended
 from .tiny_scene import (
     CHANNELS,
+    DISTANCE,
     HEIGHT,
     SPLATS_A_CLUSTER,
     VIEWS,
@@ -173,6 +174,16 @@ def test_features_are_shown_as_colours(client: TestClient, lift: dict[str, Any])
     shown = picture(features.content)
     assert features.status_code == 200 and shown.shape == plain.shape == (HEIGHT, WIDTH, 3)
     assert (shown != plain).any() and shown.max() > 128
+
+
+def test_depth_is_grey_and_tells_its_range(client: TestClient, lift: dict[str, Any]) -> None:
+    reply = client.get("/render", params={"lift": lift["id"], "view": "middle", "what": "depth"})
+    with Image.open(io.BytesIO(reply.content)) as shown:
+        assert (shown.size, shown.mode) == ((WIDTH, HEIGHT), "L")
+        near, far = (float(shown.info[name]) for name in ("depth-near", "depth-far"))
+    assert DISTANCE - 0.5 < near < far < DISTANCE + 0.5
+    plain = client.get("/render", params={"lift": lift["id"], "view": "middle"})
+    assert plain.headers["etag"] != reply.headers["etag"]
 
 
 def test_clusters_of_a_lift_without_aggregation_are_a_problem_that_says_so(

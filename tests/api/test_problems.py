@@ -44,6 +44,7 @@ ROUTES = {
     "/query/scores",
     "/query/mask",
     "/query/attention",
+    "/query/splats",
     "/render",
 }
 TAKES_NOTHING = {"/healthz", "/readyz", "/version", "/metrics", "/assets", "/jobs", "/lifts"}
@@ -160,6 +161,8 @@ def test_long_body_is_413(client: TestClient) -> None:
         ("/query/mask", {"view": "behind"}, 404, "not-found"),
         ("/query/mask", {}, 422, "invalid-request"),
         ("/query/scores", {"lift": "../../etc/passwd"}, 422, "invalid-request"),
+        ("/query/splats", {"threshold": "2"}, 422, "invalid-query"),  # nothing was found, so there is no object
+        ("/query/splats", {"what": "mesh"}, 422, "invalid-request"),
         ("/render", {"view": "behind"}, 404, "not-found"),
         ("/render", {"view": "left", "what": "x-rays"}, 422, "invalid-request"),
     ],

@@ -12,6 +12,7 @@ from fastapi.routing import APIRoute
 from pydantic import BaseModel
 
 from liftcore.cli import main
+from liftcore.scene.load import load_splats
 from service import wire
 from service.routes import assets, jobs, lifts, operations, queries, tradeoffs
 from tests.api.tiny_scene import WIDTH, make_scene
@@ -57,6 +58,9 @@ def test_command_line_example_writes_its_files(scene_folder: Path) -> None:
     commands = [line.split()[1:] for line in lines if line.startswith("splatlift ")]
     assert [main(command) for command in commands] == [0] * len(commands)
     assert (scene_folder / "apple.png").is_file()
+    apple, scores = (load_splats(scene_folder / name) for name in ("apple.ply", "scores.ply"))
+    assert 0 < apple.count < scores.count == load_splats(scene_folder / "scene.ply").count
+    assert float(apple.means[:, 0].max()) < 0  # the apple is the cluster on the left
 
 
 def test_json_examples_show_fields_that_the_service_sends() -> None:

@@ -22,7 +22,7 @@ from liftcore.observe.pack import open_packs
 from liftcore.observe.write_pack import write_pack
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.inria import write_inria_cameras
-from liftcore.scene.ply import write_splats
+from liftcore.scene.ply import read_splats, write_splats
 from liftcore.scene.splats import Splats
 from liftcore.solve.settings import LiftSettings
 
@@ -160,6 +160,42 @@ def test_picture_without_a_view_is_refused(scene: Path, capsys: pytest.CaptureFi
     status, _, err = run(capsys, "query", scene / "l", "cat", "--mask", scene / "m.png")
     assert status == 2
     assert "no --view" in err
+
+
+def test_what_a_query_found_is_written_as_splats(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(capsys, *lift_arguments(scene))[0] == 0
+    question = ["query", scene / "lift.safetensors", "--like", "splat:1", "--json"]
+    files = {kind: scene / f"{kind}.ply" for kind in ("object", "coloured")}
+    written = [part for kind, path in files.items() for part in (f"--{kind}", path)]
+    status, out, err = run(capsys, *question, "--threshold", "0.5", *written)
+    assert (status, err) == (0, "")
+    assert json.loads(out)["files"] == {kind: str(path) for kind, path in files.items()}
+    whole = read_splats(scene / "splats.ply")
+    assert torch.equal(read_splats(files["object"]).means, whole.means[1:])
+    assert torch.equal(read_splats(files["coloured"]).means, whole.means)
+
+
+def test_nothing_found_is_no_file_and_a_word_on_what_to_try(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(capsys, *lift_arguments(scene))[0] == 0
+    before = sorted(scene.iterdir())
+    question = ["query", scene / "lift.safetensors", "--like", "splat:1", "--threshold", "2"]
+    status, out, err = run(capsys, *question, "--scores", scene / "s.npy", "--object", scene / "o.ply")
+    assert (status, out) == (2, "")
+    assert "nothing stands out" in err
+    assert "lower threshold" in err
+    assert_one_line(err)
+    assert sorted(scene.iterdir()) == before
+
+
+def test_an_answer_is_never_written_over_what_was_lifted(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(capsys, *lift_arguments(scene))[0] == 0
+    before = {path: path.read_bytes() for path in scene.iterdir()}
+    for name in ("splats.ply", "cameras.json", "pack.safetensors", "lift.safetensors"):
+        question = ["query", scene / "lift.safetensors", "--like", "splat:1"]
+        status, _, err = run(capsys, *question, "--object", scene / name)
+        assert status == 2
+        assert "another file than the inputs" in err
+    assert {path: path.read_bytes() for path in scene.iterdir()} == before
 
 
 def test_settings_are_json_or_words() -> None:

@@ -1,0 +1,70 @@
+"""Answers as splat files: what was found alone, or the whole scene in the colours of its scores.
+
+Both are copies of the file that was lifted, in its dialect and in the order of its rows: whatever opens that file
+opens them, and they can be lifted again.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from liftcore.errors import InvalidQuery
+from liftcore.files import whole_file
+from liftcore.query.colours import NOT_SEEN_COLOUR, constant_terms, heat_colours
+from liftcore.scene.ply_copy import recoloured, some_rows
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from pathlib import Path
+
+    from liftcore.query.ask import Answer
+    from liftcore.query.scene import QueryScene
+
+
+def object_ply(scene: QueryScene, answer: Answer) -> Iterable[bytes]:
+    """The splats that were selected, as a file in blocks; every property of theirs to the byte.
+
+    Raises:
+        InvalidQuery: none was selected: most viewers open no file without splats.
+        InvalidLift: the splats moved or changed since the lift.
+    """
+    if answer.count == 0:
+        raise InvalidQuery(
+            "object",
+            expected="splats at or above the threshold",
+            got=f"none of {len(answer.scores)}: nothing stands out",
+            hint="name a lower threshold, or ask in other words or by example",
+        )
+    return some_rows(scene.splat_file, answer.selected.numpy())
+
+
+def coloured_ply(scene: QueryScene, answer: Answer) -> Iterable[bytes]:
+    """All splats in the colours of their scores, as a file in blocks.
+
+    The colour map spans the scores of the seen splats as a picture of the attention spans its pixels; splats without
+    a score are grey. Colours are the same from everywhere; all else is kept to the byte.
+
+    Raises:
+        InvalidLift: the splats moved or changed since the lift.
+        InvalidSplats: their file holds no colours; told when the first block is asked for.
+    """
+    seen = answer.seen.numpy()
+    colours = heat_colours(answer.scores.numpy(), seen)
+    colours[~seen] = NOT_SEEN_COLOUR
+    return recoloured(scene.splat_file, constant_terms(colours))
+
+
+def save_object(scene: QueryScene, answer: Answer, path: Path) -> None:
+    """Write `object_ply` to a file."""
+    _save(object_ply(scene, answer), path)
+
+
+def save_coloured(scene: QueryScene, answer: Answer, path: Path) -> None:
+    """Write `coloured_ply` to a file."""
+    _save(coloured_ply(scene, answer), path)
+
+
+def _save(blocks: Iterable[bytes], path: Path) -> None:
+    with whole_file(path) as handle:
+        for block in blocks:
+            handle.write(block)

@@ -1,0 +1,114 @@
+"""Answers as splat files: the object alone, and the scene in the colours of its scores."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from liftcore.artifact import save_lift
+from liftcore.errors import InvalidLift, InvalidQuery
+from liftcore.lift import lift
+from liftcore.query.ask import Answer, ask, look
+from liftcore.query.colours import NOT_SEEN_COLOUR, SH_C0, colour_map
+from liftcore.query.example import Region
+from liftcore.query.pictures import attention_png, render
+from liftcore.query.query import Query
+from liftcore.query.scene import QueryScene
+from liftcore.query.splat_files import coloured_ply, object_ply, save_coloured, save_object
+from liftcore.raster.cpu import CpuRaster
+from liftcore.scene.load import load_splats
+from liftcore.solve.settings import LiftSettings
+from tests.api.tiny_scene import SPLATS_A_CLUSTER, WIDTH, make_scene, ply, splat_rows
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> QueryScene:
+    """The tiny scene lifted: three clusters side by side, and one splat more that no camera sees."""
+    tiny = make_scene()
+    hidden = splat_rows()[:1].copy()
+    hidden[0, 2] = 40.0
+    (tmp_path / "s.ply").write_bytes(ply(np.concatenate([splat_rows(), hidden])))
+    (tmp_path / "c.json").write_bytes(tiny.cameras)
+    (tmp_path / "f.safetensors").write_bytes(tiny.features)
+    files = tmp_path / "s.ply", tmp_path / "c.json", [tmp_path / "f.safetensors"]
+    save_lift(lift(*files, LiftSettings.of(preset="row-sum")), tmp_path / "scene.lift")
+    return QueryScene.open(tmp_path / "scene.lift")
+
+
+def of_lamp(scene: QueryScene, threshold: float = 0.5) -> Answer:
+    return ask(scene, Query((Region("left", 0, 2),), threshold=threshold))
+
+
+def test_the_object_is_what_was_selected_and_can_be_lifted_again(scene: QueryScene, tmp_path: Path) -> None:
+    answer = of_lamp(scene)
+    save_object(scene, answer, tmp_path / "lamp.ply")
+    rows = splat_rows()[answer.selected[:-1].numpy()]
+    assert SPLATS_A_CLUSTER * 0.8 <= len(rows) <= SPLATS_A_CLUSTER * 1.2
+    assert (tmp_path / "lamp.ply").read_bytes() == ply(rows)
+    files = tmp_path / "lamp.ply", tmp_path / "c.json", [tmp_path / "f.safetensors"]
+    again = lift(*files, LiftSettings.of(preset="row-sum"))
+    assert again.features.shape[0] == len(rows)
+
+
+def test_the_object_rendered_alone_lies_where_the_object_is(scene: QueryScene, tmp_path: Path) -> None:
+    save_object(scene, of_lamp(scene), tmp_path / "lamp.ply")
+    alone = CpuRaster(load_splats(tmp_path / "lamp.ply"))
+    columns = (alone.row_sums(scene.cameras.get("middle"), scene.walk) > 0.5).nonzero()[:, 1]
+    assert len(columns) > 0 and int(columns.min()) >= WIDTH // 2
+
+
+def test_every_selected_row_is_in_the_object_whatever_the_threshold(scene: QueryScene, tmp_path: Path) -> None:
+    answer = of_lamp(scene, -1.0)
+    save_object(scene, answer, tmp_path / "all.ply")
+    assert (tmp_path / "all.ply").read_bytes() == ply(splat_rows())
+    assert torch.equal(answer.selected, answer.seen)
+
+
+def test_nothing_selected_is_no_file(scene: QueryScene, tmp_path: Path) -> None:
+    with pytest.raises(InvalidQuery, match=r"none of 61.*lower threshold"):
+        save_object(scene, of_lamp(scene, 2.0), tmp_path / "lamp.ply")
+    assert not (tmp_path / "lamp.ply").exists()
+
+
+def test_scores_have_the_colours_of_the_map_and_what_was_not_seen_is_grey(scene: QueryScene, tmp_path: Path) -> None:
+    answer = of_lamp(scene)
+    assert not answer.seen[-1]
+    save_coloured(scene, answer, tmp_path / "scores.ply")
+    sh = load_splats(tmp_path / "scores.ply").sh
+    assert sh is not None
+    colours = np.round(255 * (0.5 + SH_C0 * sh[:, 0].double().numpy())).astype(int)
+    assert tuple(colours[-1]) == NOT_SEEN_COLOUR
+    best, worst = int(answer.scores[:-1].argmax()), int(answer.scores[:-1].argmin())
+    assert np.array_equal(colours[best], colour_map()[-1]) and np.array_equal(colours[worst], colour_map()[0])
+    known = {tuple(colour) for colour in colour_map().tolist()}
+    assert {tuple(colour) for colour in colours[:-1].tolist()} <= known
+
+
+def test_the_coloured_scene_looks_like_the_attention(scene: QueryScene, tmp_path: Path) -> None:
+    answer = of_lamp(scene)
+    seen = look(scene, answer, "middle")
+    save_coloured(scene, answer, tmp_path / "scores.ply")
+    coloured = QueryScene(scene.lift, scene.path)
+    coloured.__dict__["splats"] = load_splats(tmp_path / "scores.ply")
+    shown = render(coloured, "middle").astype(int)
+    heat = np.asarray(Image.open(io.BytesIO(attention_png(seen)))).astype(int)
+    met = seen.row_sums.numpy() > 0.95
+    assert met.sum() > 50
+    assert np.median(np.abs(shown - heat)[met]) < 16
+
+
+def test_exports_load_no_splats_and_know_when_their_file_changed(scene: QueryScene, tmp_path: Path) -> None:
+    answer = of_lamp(scene)
+    for make in (object_ply, coloured_ply):
+        assert list(make(scene, answer))
+    assert "splats" not in scene.__dict__ and "raster" not in scene.__dict__
+    (tmp_path / "s.ply").write_bytes(ply(splat_rows()))
+    other = QueryScene.open(scene.path)
+    for make in (object_ply, coloured_ply):
+        with pytest.raises(InvalidLift, match="splats changed since the lift"):
+            make(other, answer)
