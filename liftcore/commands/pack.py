@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from liftcore.commands.bars import progress_bars
 from liftcore.commands.reply import free_output, reply, writing
 
 if TYPE_CHECKING:
     import argparse
+    from collections.abc import Iterator
 
     from liftcore.observe.folder import ViewFolder
 
 
 def run(options: argparse.Namespace) -> int:
     """Write the pack whole or not at all, and say what is in it."""
+    from liftcore.observe.inspect import describe_packs
     from liftcore.observe.pack import open_packs
     from liftcore.observe.write_pack import write_pack
 
@@ -31,10 +33,23 @@ def run(options: argparse.Namespace) -> int:
         "encoder": packs.encoder,
         "text_space": packs.text_space,
         "normalised": packs.normalised,
+        "renamed": _renamed(views) if options.format == "npy" else {},
+        "warnings": describe_packs(packs)["warnings"],
     }
-    line = f"{out}: {len(packs.views)} views, {packs.channels} channels, {document['bytes']} bytes"
-    reply(document, as_json=options.json, lines=[line])
+    reply(document, as_json=options.json, lines=_lines(document))
     return 0
+
+
+def _renamed(views: ViewFolder) -> dict[str, str]:
+    """The views that lost the suffix of an image, by their files."""
+    return {path.name: view for view, path in views.files.items() if path.name != f"{view}.npy"}
+
+
+def _lines(document: dict[str, Any]) -> Iterator[str]:
+    yield f"{document['out']}: {document['views']} views, {document['channels']} channels, {document['bytes']} bytes"
+    for name, view in list(document["renamed"].items())[:1]:
+        yield f"  views are named without the suffix of their images, as cameras are: {name} is {view!r}"
+    yield from (f"warning: {warning}" for warning in document["warnings"])
 
 
 def _views(options: argparse.Namespace) -> ViewFolder:

@@ -11,6 +11,7 @@ from liftcore.errors import InvalidFeatures
 from liftcore.observe.folder import ViewFolder, npy_files
 from liftcore.observe.npy import open_npy
 from liftcore.observe.observation import FeatureGrid
+from liftcore.scene.view_names import without_image_suffix
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -47,7 +48,16 @@ class ArrayViews(ViewFolder):
 def array_views(folder: Path, layout: Layout = "hwc") -> ArrayViews:
     """The views of a folder of ``IMG.npy`` files [h, w, F], or [F, h, w] with the layout ``chw``.
 
+    ``IMG.jpg.npy`` is of the view ``IMG``, as the camera of ``IMG.jpg`` is.
+
     Raises:
-        InvalidFeatures: the folder has no such files.
+        InvalidFeatures: the folder has no such files, or two of one view.
     """
-    return ArrayViews(npy_files(folder, ".npy"), layout)
+    files: dict[str, Path] = {}
+    for path in npy_files(folder, ".npy").values():
+        view = without_image_suffix(path.name.removesuffix(".npy"))
+        if view in files:
+            got = f"{files[view].name} and {path.name}, both of the view {view!r}"
+            raise InvalidFeatures(str(folder), expected="one file a view", got=got)
+        files[view] = path
+    return ArrayViews(files, layout)

@@ -42,12 +42,13 @@ def view_names(images: Sequence[str]) -> list[str]:
     for image in images:
         if UNSAYABLE.search(image):
             raise InvalidCameras("image name", expected="one of printable characters", got=ascii(image)[:60])
-    paths = [_without_suffix(image) for image in images]
+    paths = [without_image_suffix(image) for image in images]
     stems = [PurePosixPath(path).name for path in paths]
     uses = Counter(stems)
     return [stem if uses[stem] == 1 else path for stem, path in zip(stems, paths, strict=True)]
 
 
-def _without_suffix(image: str) -> str:
+def without_image_suffix(image: str) -> str:
+    """The relative path of an image without its extension, if that is one of images."""
     path = PurePosixPath(image.replace("\\", "/").removeprefix("./"))
     return str(path.with_suffix("")) if path.suffix.lower() in IMAGE_SUFFIXES else str(path)

@@ -253,6 +253,34 @@ def test_arrays_are_packed_in_either_layout(tmp_path: Path, capsys: pytest.Captu
         assert open_packs([out]).channels == channels
 
 
+def test_maps_named_after_whole_images_are_packed_under_their_cameras_names(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "maps").mkdir()
+    for name in ("a.jpg.npy", "b.PNG.npy", "frame.0001.npy"):
+        np.save(tmp_path / "maps" / name, np.full((3, 4, 5), 2.0, np.float16))
+    arguments = ["pack", "npy", tmp_path / "maps", "-o", tmp_path / "p.safetensors", "--encoder-name", "toy"]
+    status, out, _ = run(capsys, *arguments)
+    assert status == 0
+    assert "a.jpg.npy is 'a'" in out
+    assert "warning: unnormalised vectors" in out
+    status, out, _ = run(capsys, *arguments, "--json")
+    document = json.loads(out)
+    assert document["renamed"] == {"a.jpg.npy": "a", "b.PNG.npy": "b"}
+    assert [text.split(":")[0] for text in document["warnings"]] == ["unnormalised vectors"]
+    assert open_packs([tmp_path / "p.safetensors"]).views == ("a", "b", "frame.0001")
+
+
+def test_two_maps_of_one_view_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "maps").mkdir()
+    for name in ("a.npy", "a.jpg.npy"):
+        np.save(tmp_path / "maps" / name, np.ones((3, 4, 5), np.float16))
+    status, out, err = run(capsys, "pack", "npy", tmp_path / "maps", "-o", tmp_path / "p.safetensors")
+    assert (status, out) == (2, "")
+    assert_one_line(err)
+    assert "a.jpg.npy and a.npy, both of the view 'a'" in err
+
+
 def test_inspect_speaks_to_people_and_programs(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
     status, out, _ = run(capsys, "inspect", scene / "splats.ply")
     assert status == 0
