@@ -24,6 +24,8 @@ EXPERIMENTS = (
     "row_sums",
 )  # fmt: skip
 
+PRESETS = "row-sum, tikhonov (default), argmax, top-k, front-mass, centre or mean"
+
 BAD_INPUT = 2
 OUR_FAULT = 1
 INTERRUPTED = 130
@@ -92,8 +94,12 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def _add_demo(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--scene", type=Path, metavar="DIR", help="a scene of your own; else a small still life")
-    parser.add_argument("--out", type=Path, default=Path("demo-output"), metavar="DIR", help="for the pictures")
+    holds = "its .ply, cameras.json, transforms.json or sparse/0, a feature pack; text_table.safetensors if any"
+    parser.add_argument("--scene", type=Path, metavar="DIR", help=f"a scene of your own ({holds}); else a still life")
+    parser.add_argument(
+        "--ask", action="append", default=[], metavar="TEXT", help="what to look for; may be given several times"
+    )
+    parser.add_argument("--out", type=Path, default=Path("demo-output"), metavar="DIR", help="of pictures and lift")
 
 
 def _add_serve(parser: argparse.ArgumentParser) -> None:
@@ -139,7 +145,7 @@ def _add_sources(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_settings(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--preset", metavar="NAME", help="a published choice of weights: row-sum, tikhonov")
+    parser.add_argument("--preset", metavar="NAME", help=f"a published choice of weights: {PRESETS}")
     parser.add_argument("--speed", metavar="NAME", help="the dial: exact, balanced, fast or draft")
     _add_device(parser)
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="one setting")
@@ -188,11 +194,17 @@ def _add_pack(parser: argparse.ArgumentParser, shared: _Parser) -> None:
     langsplat = formats.add_parser("langsplat", parents=[shared], help="IMG_s.npy and IMG_f.npy")
     arrays = formats.add_parser("npy", parents=[shared], help="IMG.npy, a dense map a view")
     arrays.add_argument("--layout", choices=("hwc", "chw"), default="hwc", help="the order of the axes")
+    space = (
+        "the text encoder whose words lie in the space of the features, as query's --encoder names it "
+        "(open_clip:ViT-B-32/openai): query opens it where no encoder is given, and a service takes the one that it "
+        "has under that name; 'none': no text encoder shares it, so a lift is asked by example. Packs of one lift "
+        "must agree"
+    )
     for command in (langsplat, arrays):
         command.add_argument("folder", type=Path, help="the folder of the files")
         command.add_argument("-o", "--output", type=Path, required=True, metavar="PACK", help="the pack to write")
         command.add_argument("--encoder-name", metavar="NAME", help="the 2D encoder that made the features")
-        command.add_argument("--text-space", metavar="NAME", help="the text encoder that shares the space")
+        command.add_argument("--text-space", metavar="NAME", help=space)
         command.add_argument("--normalised", action=argparse.BooleanOptionalAction, help="unit vectors or not")
 
 
@@ -242,7 +254,7 @@ def _add_bench(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--levels", type=_count, metavar="L", help="label levels")
     parser.add_argument("--views", type=_count, metavar="N")
     parser.add_argument("--threads", type=_count, metavar="N")
-    parser.add_argument("--preset", metavar="NAME", help="this one alone; else all")
+    parser.add_argument("--preset", metavar="NAME", help="one of lift's presets alone; else all")
     parser.add_argument("--stages", action="store_true", help="every step of a view apart, on one thread")
     _add_device(parser)
 

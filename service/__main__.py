@@ -138,7 +138,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             listener.close()
             raise
     except SplatliftError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"splatlift: {error}", file=sys.stderr)
         return 2
     start_logging(settings.log_format)
     try:

@@ -12,4 +12,4 @@ def run(options: argparse.Namespace) -> int:
     """Run the demo; it prints its own answers."""
     from liftcore.demo.run import run_demo
 
-    return run_demo(options.scene, options.out, options.json)
+    return run_demo(options.scene, options.out, options.json, options.ask)

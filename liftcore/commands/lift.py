@@ -105,8 +105,9 @@ def _lines(document: dict[str, Any]) -> Iterable[str]:
         f"{document['out']}: {document['splats']} splats x {document['channels']} channels "
         f"from {document['views']} views, {document['seen_share']:.1%} of the splats seen"
     )
-    for part in ("certificate", "timings"):
-        for key, value in document[part].items():
-            if part == "timings" or key not in ("plan", "warnings"):  # the plan in full is what --explain prints
-                yield f"  {key}: {shown(value)}"
+    for key, value in document["certificate"].items():
+        if key not in ("plan", "warnings"):  # the plan in full is what --explain prints
+            yield f"  {key}: {shown(value)}"
+    yield "timings:"
+    yield from (f"  {stage}: {seconds:.3f} s" for stage, seconds in document["timings"].items())
     yield from (f"warning: {warning}" for warning in document["warnings"])

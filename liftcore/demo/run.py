@@ -55,7 +55,7 @@ def run_demo(
 
     Args:
         scene: a scene folder; None = the still life, generated.
-        out: where the pictures go, and the service's data while it runs.
+        out: where the pictures go, and the service's data with the lift.
         as_json: print one JSON object on stdout and nothing else.
         phrases: what to look for; empty = three phrases that suit the scene, none if its features have no words.
         generated: the still life to take in place of the usual one.
@@ -75,7 +75,8 @@ def run_demo(
         subject = write_still_life(out / "scene", phrases, generated)
     else:
         subject = find_scene(scene, phrases, out / "scene")
-    with Server(out / "service", subject.encoder) as server:
+    data = out / "service"
+    with Server(data, subject.encoder) as server:
         try:
             report = _converse(subject, server.url, out, say)
         except BaseException:
@@ -83,10 +84,12 @@ def run_demo(
             raise
     report["seconds"] = round(time.perf_counter() - begin, 1)
     report["out"] = str(out.resolve())
+    report["lift_file"] = str((data / "lifts" / f"{report['lift']}.safetensors").resolve())
     if as_json:
         print(json.dumps(report))
     else:
         say.line(f"Pictures are in {report['out']}. All of it took {report['seconds']:.0f} s.")
+        say.line(f"The lift is {report['lift_file']}")
     return 0
 
 
@@ -119,6 +122,7 @@ def _converse(subject: DemoScene, url: str, out: Path, say: _Voice) -> dict[str,
         client.close()
     return {
         "scene": subject.name,
+        "lift": lift["id"],
         "splats": lift["count"],
         "channels": lift["channels"],
         "views": len(lift["views"]),
@@ -145,7 +149,7 @@ def _silence(subject: DemoScene, pictures: dict[str, str]) -> str:
     if subject.text_space == NO_WORDS:
         why = "Its features share a space with no text encoder: they have no words, so no phrase is asked."
     else:
-        why = "Nothing says what this scene shows, so no phrase is asked; `splatlift query` asks yours."
+        why = "Nothing says what this scene shows, so no phrase is asked; `--ask TEXT` asks yours."
     return f"  {why}\n      {pictures['pca']} shows three principal components of the features as colours."
 
 

@@ -19,6 +19,7 @@ _CAMERA_FILES = ("cameras.json", "transforms.json", "cameras.zip")
 _MODEL_FOLDERS = ("sparse/0", "sparse")
 _TABLE = "text_table.safetensors"
 NO_WORDS = "none"  # the text space of features that no text encoder shares
+_BUILT_IN = "minilm"  # the text encoder that needs no files
 _PHRASES = 3  # asked when nobody says which
 
 
@@ -63,7 +64,7 @@ def find_scene(folder: Path, phrases: Sequence[str], scratch: Path) -> DemoScene
         scratch: where to put the zipped model.
 
     Raises:
-        InvalidInput: something is missing; the error says what.
+        InvalidInput: something is missing, or there are no words to ask the phrases with; the error says what.
     """
     if not folder.is_dir():
         raise InvalidInput("--scene", expected="a folder", got=f"nothing at {folder}")
@@ -71,13 +72,19 @@ def find_scene(folder: Path, phrases: Sequence[str], scratch: Path) -> DemoScene
     cameras = _cameras(folder, scratch)
     table, features = folder / _TABLE, _features(folder)
     text_space = _text_space(features, table)
+    if phrases and not (table.is_file() or text_space == _BUILT_IN):
+        raise InvalidInput(
+            "--ask", expected=f"words in the space of the features, as {_TABLE} in {folder.name}",
+            got=f"none, and features of the text space {text_space!r}",
+            hint="or use 'splatlift lift' and 'splatlift query --encoder', which take any text encoder",
+        )  # fmt: skip
     asked = tuple(phrases) or (_phrases_of(truth) if text_space != NO_WORDS else ())
     return DemoScene(
         name=folder.name,
         splats=_first(folder, "*.ply", "splats"),
         cameras=cameras,
         features=features,
-        encoder=f"table:{table}" if table.is_file() else "minilm",
+        encoder=f"table:{table}" if table.is_file() else _BUILT_IN,
         text_space=text_space,
         phrases=asked,
         views=tuple(truth.masks) if truth else _some_views(cameras),

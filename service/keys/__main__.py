@@ -32,10 +32,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with opened(data, make=given.action == "create") as keys:
             {"create": _create, "list": _list, "revoke": _revoke}[given.action](keys, given)
     except SplatliftError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"splatlift: {error}", file=sys.stderr)
         return 2
     except (OSError, sqlite3.Error) as error:
-        print(f"error: data: expected a directory to write to, got {error}", file=sys.stderr)
+        print(f"splatlift: data: expected a directory to write to, got {error}", file=sys.stderr)
         return 2
     return 0
 

@@ -324,7 +324,8 @@ def test_bad_commands_about_keys_are_one_line(
 ) -> None:
     Store.open(tmp_path).close()
     assert main([*arguments, "--data", str(tmp_path)]) == 2
-    assert capsys.readouterr().err.count("\n") == 1
+    err = capsys.readouterr().err
+    assert err.startswith("splatlift: ") and err.count("\n") == 1
     assert main(["list", "--data", str(tmp_path / "nowhere")]) == 2
     assert not (tmp_path / "nowhere").exists()
 

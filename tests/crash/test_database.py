@@ -68,7 +68,7 @@ def test_server_over_no_database_ends_with_one_line(
 ) -> None:
     assert server.main(["--data", str(no_database), "--host", host, "--port", "0"]) == 2
     said = capsys.readouterr().err
-    assert said.startswith("error: data: expected a database") and said.count("\n") <= 2
+    assert said.startswith("splatlift: data: expected a database") and said.count("\n") <= 2
 
 
 def test_a_look_at_the_lock_does_not_keep_a_server_from_starting(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from typing import TYPE_CHECKING, Any
@@ -24,7 +25,7 @@ from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.inria import write_inria_cameras
 from liftcore.scene.ply import read_splats, write_splats
 from liftcore.scene.splats import Splats
-from liftcore.solve.settings import LiftSettings
+from liftcore.solve.settings import LiftSettings, Preset
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -105,6 +106,10 @@ def test_scene_is_lifted_inspected_and_queried(scene: Path, capsys: pytest.Captu
     assert "'left': 1 of 2 splats" in out
     status, out, err = run(capsys, "inspect", scene / "lift.safetensors", "--json")
     assert json.loads(out)["kind"] == "lift"
+    certificate, timings = run(capsys, *lift_arguments(scene))[1].split("timings:\n")
+    assert "row_sum_mean: " in certificate
+    stages = [line for line in timings.splitlines() if not line.startswith("warning: ")]
+    assert stages and all(re.fullmatch(r"  [a-z]+: \d+\.\d{3} s", line) for line in stages)
     status, out, err = run(capsys, *question[:3])
     assert status == 2
     assert "--table FILE or --encoder NAME" in err
@@ -290,6 +295,12 @@ def test_inspect_speaks_to_people_and_programs(scene: Path, capsys: pytest.Captu
     assert out.count("\n") == 1
 
 
+def test_help_names_every_preset(capsys: pytest.CaptureFixture[str]) -> None:
+    for command in ("lift", "plan"):
+        out = " ".join(run(capsys, command, "--help")[1].split())
+        assert all(preset in out for preset in Preset)
+
+
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_has_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     status, out, err = run(capsys, command, "--help")
@@ -348,7 +359,9 @@ def test_demo_and_bench_pass_their_options_on(
         vars(module).update(functions)
         monkeypatch.setitem(sys.modules, name, module)
     assert run(capsys, "demo", "--out", tmp_path, "--json")[0] == 0
-    assert seen.pop() == (None, tmp_path, True)
+    assert seen.pop() == (None, tmp_path, True, [])
+    assert run(capsys, "demo", "--out", tmp_path, "--ask", "a mug", "--ask", "a lamp")[0] == 0
+    assert seen.pop() == (None, tmp_path, False, ["a mug", "a lamp"])
     status, out, _ = run(capsys, "bench", "--size", "986x728", "--splats", 1000, "--preset", "centre", "--json")
     assert (status, json.loads(out)) == (0, {"seconds": 1.0})
     assert seen[0]["size"] == "986x728"

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
+from liftcore.artifact import load_lift
 from liftcore.demo.run import run_demo
 from liftcore.demo.still_life import still_life
 
@@ -22,6 +23,7 @@ def test_the_demo_finds_what_it_asks_for(tmp_path: Path, capsys: pytest.CaptureF
         assert found["object"] == thing
         assert found["iou"] > 0.7
         assert found["splats"] > 0 and found["threshold"] is not None
+    assert load_lift(Path(report["lift_file"])).features.shape[0] == scene.splats.count
     names = [
         *report["pictures"].values(),
         *(name for found in report["phrases"] for name in found["pictures"].values()),

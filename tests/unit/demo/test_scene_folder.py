@@ -89,6 +89,13 @@ def test_features_without_words_are_asked_nothing(folder: Path, tmp_path: Path) 
     assert (scene.phrases, scene.text_space) == ((), "none")
 
 
+@pytest.mark.parametrize("space", ["none", "animals"])
+def test_phrases_without_an_encoder_for_them_are_refused(folder: Path, tmp_path: Path, space: str) -> None:
+    save_file({"v/grid": torch.ones(1, 1, 2)}, str(folder / "grids.safetensors"), metadata={"text_space": space})
+    with pytest.raises(InvalidInput, match=rf"--ask: expected words .* as text_table.safetensors in .*'{space}'"):
+        find_scene(folder, ["a whale"], tmp_path)
+
+
 def test_a_pack_that_names_no_text_space_has_the_words_of_the_table_beside_it(folder: Path, tmp_path: Path) -> None:
     save_file({"v/grid": torch.ones(1, 1, 2)}, str(folder / "grids.safetensors"))
     assert find_scene(folder, (), tmp_path / "bare").phrases == ()
