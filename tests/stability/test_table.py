@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from liftcore.measure.stability.case import Extreme
+from liftcore.measure.stability.case import Extreme, Found
 from liftcore.measure.stability.page import EXTREMES, TABLES, table_of
 from liftcore.measure.stability.wide import survey
 from liftcore.scene.splats import Kernel
@@ -35,6 +35,14 @@ def test_a_row_says_what_was_measured():
     head, rule, row = table_of(TABLES["Refused"][:1])
     assert head.count("|") == rule.count("|") == row.count("|")
     assert "refused | - | opacity_logits: expected finite values" in row
+
+
+def test_a_row_names_who_tells_what_not_all_kernels_tell():
+    def measure(kernel: Kernel) -> Found:
+        return Found("3 of 4", 0.0, ("unused",) if kernel == Kernel.GAUSSIAN_3D else ("unused", "nothing seen"))
+
+    row = [*table_of([Extreme("a mask", "less", measure)])][2]
+    assert row.endswith("| unused; 2dgs, dbs: nothing seen |")
 
 
 @pytest.mark.parametrize("kernel", list(Kernel))

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from liftcore.measure.stability.case import Extreme, Found
+    from liftcore.scene.splats import Kernel
 
 TABLES: dict[str, tuple[Extreme, ...]] = {
     "Opacities": OPACITIES,
@@ -49,7 +50,7 @@ their squares, the row sums and the evidence, on all rays of the view and over t
 how many rays float32 decided otherwise at a cut-off, if any did. The error of features is the largest difference from
 the dense closed form in float64, over the largest value of the codebook. What float32 gives is shown for the first
 kernel named. "Told" are the words of `splatlift inspect` and of the lift's own warnings, where something is lost or
-taken by convention.
+taken by convention; where not all kernels tell the same, the ones that do are named before it.
 """
 
 
@@ -70,9 +71,18 @@ def table_of(extremes: Sequence[Extreme]) -> Iterator[str]:
         found = [extreme.measure(kernel) for kernel in extreme.kernels]
         kernels = "all" if extreme.kernels == KERNELS else ", ".join(extreme.kernels)
         first = found[0]
-        told = "; ".join(dict.fromkeys(told for part in found for told in part.told)) or "-"
-        cells = (extreme.name, kernels, extreme.exact, first.gives, _error(found), told)
+        cells = (extreme.name, kernels, extreme.exact, first.gives, _error(found), _told(extreme.kernels, found))
         yield f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |"
+
+
+def _told(kernels: Sequence[Kernel], found: Sequence[Found]) -> str:
+    """What was told, each after the kernels that tell it where not all do."""
+    tellers: dict[str, list[Kernel]] = {}
+    for kernel, part in zip(kernels, found, strict=True):
+        for told in dict.fromkeys(part.told):
+            tellers.setdefault(told, []).append(kernel)
+    lines = [told if len(by) == len(kernels) else f"{', '.join(by)}: {told}" for told, by in tellers.items()]
+    return "; ".join(lines) or "-"
 
 
 def _error(found: Sequence[Found]) -> str:
