@@ -87,9 +87,7 @@ def build_parser() -> argparse.ArgumentParser:
     _add_evaluate(commands.add_parser("evaluate", parents=[shared], help="lifts against the field's labels"))
     _add_bench(commands.add_parser("bench", parents=[shared], help="how fast this machine lifts"))
     _add_tradeoff(commands.add_parser("tradeoff", parents=[shared], help="speed against accuracy on your scene"))
-    _add_experiment(
-        commands.add_parser("experiment", parents=[shared], help="what the paper measured, on a scene of yours")
-    )
+    _add_experiment(commands.add_parser("experiment", parents=[shared], help="what the paper measured, on a scene"))
     return parser
 
 
@@ -247,7 +245,12 @@ def _add_evaluate(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_bench(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--scene", type=Path, metavar="DIR", help="a real scene; else a synthetic one")
+    parser.add_argument(
+        "--scene",
+        type=Path,
+        metavar="DIR",
+        help="point_cloud.ply, cameras and regions or features (.safetensors); else a synthetic room",
+    )
     parser.add_argument("--splats", type=_count, metavar="N", help="splats of the synthetic scene")
     parser.add_argument("--size", metavar="WxH", help="image size of the synthetic scene")
     parser.add_argument("--channels", type=_count, metavar="F")
@@ -260,8 +263,16 @@ def _add_bench(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_experiment(parser: argparse.ArgumentParser) -> None:
+    parser.epilog = (
+        "row_sums needs splats and cameras alone; conditioning too, and measures beta where features, regions or "
+        "features_clean (.safetensors) are; fidelity one of those, features_hard or grids. The others need truth in "
+        "the layout of tabletop (truth.json, truth.safetensors, text_table.safetensors; the README's section "
+        "Experiments) and features; lambda_sweep and overfitting features_hard beside it, mask_noise features_clean."
+    )
     parser.add_argument("name", choices=EXPERIMENTS, metavar="NAME", help=", ".join(EXPERIMENTS))
-    parser.add_argument("scene", type=Path, metavar="SCENE", help="point_cloud.ply, cameras.json and feature packs")
+    parser.add_argument(
+        "scene", type=Path, metavar="SCENE", help="a folder: point_cloud.ply, cameras and feature packs"
+    )
     parser.add_argument("-o", "--out", type=Path, default=Path("experiments"), metavar="DIR", help="of JSON and plot")
     parser.add_argument("--every", type=_count, default=1, metavar="N", help="take every n-th feature view only")
 

@@ -136,7 +136,8 @@ def _workload(options: dict[str, Any]) -> Workload:
 
 
 def _real(folder: Path, channels: int, levels: int, count: int) -> Workload:
-    """A scene folder with point_cloud.ply, cameras.json and regions.safetensors or features.safetensors."""
+    """A scene folder with point_cloud.ply, cameras and regions.safetensors or features.safetensors."""
+    from liftcore.measure.scene_files import cameras_of
     from liftcore.observe.pack import open_packs, pair
     from liftcore.scene.load import load_cameras, load_splats
 
@@ -144,7 +145,7 @@ def _real(folder: Path, channels: int, levels: int, count: int) -> Workload:
     if not packs:
         raise InvalidInput("scene", expected="a folder with regions.safetensors", got=str(folder))
     features = open_packs(packs[:1])
-    cameras = load_cameras(folder / "cameras.json")
+    cameras = load_cameras(cameras_of(folder))
     names = pair(features, cameras)[0][:count]
     views = []
     for number, name in enumerate(names):

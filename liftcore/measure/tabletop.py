@@ -25,6 +25,7 @@ from liftcore.errors import InvalidInput
 from liftcore.lift import lift
 from liftcore.measure.accuracy import class_ious, class_scores, rendered_scores, splat_accuracy
 from liftcore.measure.bench import hardware
+from liftcore.measure.scene_files import cameras_of
 from liftcore.observe.observation import NO_LABEL, RegionMap
 from liftcore.observe.pack import open_packs
 from liftcore.raster.cpu import CpuRaster
@@ -44,6 +45,7 @@ if TYPE_CHECKING:
 EVIDENCE_PACK = "features"  # its views say which splats count
 EVIDENCE_OVER = 0.5
 WEIGHT_OVER = 0.1
+TRUTH_FILES = ("truth.json", "truth.safetensors", "text_table.safetensors")
 LARGE_A_RAY = 9  # weights over 0.1 that a ray can have, as they sum to one at most
 
 
@@ -154,9 +156,12 @@ class Tabletop:
     """The scene and its truth, opened once for many lifts."""
 
     def __init__(self, folder: Path) -> None:
-        from safetensors import safe_open
+        from safetensors import SafetensorError, safe_open
 
         self.folder = folder
+        missing = [name for name in TRUTH_FILES if not (folder / name).is_file()]
+        if missing:
+            raise _no_truth(folder, f"no {' and no '.join(missing)}")
         try:
             document = json.loads((folder / "truth.json").read_text())
             with safe_open(str(folder / "truth.safetensors"), framework="pt") as truth:
@@ -164,10 +169,10 @@ class Tabletop:
                 self.held_out = {view: truth.get_tensor(f"{view}/mask") for view in document["held_out_views"]}
             with safe_open(str(folder / "text_table.safetensors"), framework="pt") as table:
                 vectors = table.get_tensor("embeddings")[[thing["lvis_row"] for thing in document["objects"]]]
-        except OSError as error:
-            raise InvalidInput(str(folder), expected="the tabletop scene with its truth", got=str(error)) from None
+        except (OSError, ValueError, LookupError, TypeError, SafetensorError) as error:
+            raise _no_truth(folder, f"files that do not hold that ({type(error).__name__}: {error})") from None
         self.classes: Tensor = torch.nn.functional.normalize(vectors.float(), dim=1)  # [K, F]
-        self.cameras: Cameras = load_cameras(folder / "cameras.json")
+        self.cameras: Cameras = load_cameras(cameras_of(folder))
         self.raster = CpuRaster(load_splats(folder / "point_cloud.ply"))
         self.counted, self.visible = self._counted_splats()
 
@@ -187,8 +192,8 @@ class Tabletop:
     def measure(self, case: Case) -> Figures:
         """Lift, classify the splats, and look from the held-out views."""
         start = time.perf_counter()
-        paths = [self.folder / name for name in ("point_cloud.ply", "cameras.json", f"{case.pack}.safetensors")]
-        features = lift(paths[0], paths[1], paths[2:], case.settings).features
+        splats, pack = self.folder / "point_cloud.ply", self.folder / f"{case.pack}.safetensors"
+        features = lift(splats, cameras_of(self.folder), [pack], case.settings).features
         return self.judge(features, case.settings, time.perf_counter() - start)
 
     def judge(
@@ -215,6 +220,13 @@ class Tabletop:
         for view in self.held_out:
             camera = self.cameras.get(view)
             yield rendered_scores(raster, camera, features, self.classes, render_walk(settings))
+
+
+def _no_truth(folder: Path, got: str) -> InvalidInput:
+    return InvalidInput(
+        str(folder), expected=f"truth in the layout of tabletop ({', '.join(TRUTH_FILES)})", got=got,
+        hint="the README's section Experiments says what they hold, and which experiments need none",
+    )  # fmt: skip
 
 
 def measure_all(folder: Path, cases: Sequence[Case] = CASES) -> dict[str, Any]:

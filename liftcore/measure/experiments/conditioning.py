@@ -50,7 +50,7 @@ COLUMNS = (
 def measure(subject: Subject) -> dict[str, Any]:
     """The figures of the scene, over every n-th camera, and of the room, for every gain."""
     splats = load_splats(subject.folder / "point_cloud.ply")
-    cameras = list(load_cameras(subject.folder / "cameras.json"))[:: subject.every]
+    cameras = list(load_cameras(subject.cameras))[:: subject.every]
     betas = _betas(subject)
     rows = [
         *_rows(subject.folder.resolve().name, splats, cameras, betas),

@@ -44,7 +44,7 @@ COLUMNS = ("pack", "preset", "views", "cosine", "held_out_views", "held_out_cosi
 
 def measure(subject: Subject) -> dict[str, Any]:
     """The mean cosine for every pack of the scene and every preset."""
-    cameras = load_cameras(subject.folder / "cameras.json")
+    cameras = load_cameras(subject.cameras)
     raster = CpuRaster(load_splats(subject.folder / "point_cloud.ply"))
     rows = []
     for pack in subject.packs(*PACKS):

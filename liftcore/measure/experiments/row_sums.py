@@ -33,7 +33,7 @@ COLUMNS = ("gain", "views", "mean", "std", "lowest_view_mean", "below_0.9", "min
 def measure(subject: Subject) -> dict[str, Any]:
     """Statistics of the row sums over every pixel of every n-th camera, without and with the opacity gain."""
     raster = CpuRaster(load_splats(subject.folder / "point_cloud.ply"))
-    cameras = list(load_cameras(subject.folder / "cameras.json"))[:: subject.every]
+    cameras = list(load_cameras(subject.cameras))[:: subject.every]
     rows, counts = [], {}
     for gain in GAINS:
         sums = [raster.row_sums(camera, Walk(gain)).numpy().ravel() for camera in cameras]

@@ -20,17 +20,20 @@ def run_experiment(name: str, scene: Path, out: Path, every: int = 1) -> dict[st
 
     Args:
         name: a module of this package: ``fidelity`` for ``fidelity.py``.
-        scene: a folder with ``point_cloud.ply``, ``cameras.json`` and feature packs.
+        scene: a folder with ``point_cloud.ply``, cameras and feature packs.
         every: take every n-th feature view only.
 
     Raises:
         InvalidInput: the scene lacks what the experiment needs.
     """
     if not (scene / "point_cloud.ply").is_file():
-        raise InvalidInput("scene", expected="a folder with point_cloud.ply and cameras.json", got=str(scene))
+        raise InvalidInput("scene", expected="a folder with point_cloud.ply and cameras", got=str(scene))
     module = importlib.import_module(f"liftcore.measure.experiments.{name}")
     start = time.perf_counter()
     found = module.measure(Subject(scene, every))
+    if not found["rows"]:
+        wanted = ", ".join(f"{pack}.safetensors" for pack in module.PACKS)
+        raise InvalidInput("scene", expected=f"a folder with one of {wanted}", got=f"{scene} with none of them")
     document = {
         "experiment": name,
         "title": module.TITLE,

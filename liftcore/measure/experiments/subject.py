@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from liftcore.errors import InvalidInput
 from liftcore.lift import lift
+from liftcore.measure.scene_files import cameras_of
 from liftcore.observe.observation import Observation
 from liftcore.observe.write_pack import write_pack
 from liftcore.scene.inria import write_inria_cameras
@@ -24,13 +25,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Subject:
-    """A scene folder: ``point_cloud.ply``, ``cameras.json`` and feature packs.
+    """A scene folder: ``point_cloud.ply``, cameras and feature packs.
 
     ``every`` takes every n-th feature view only: an experiment in a fraction of the time, said in its document.
     """
 
     folder: Path
     every: int = 1
+
+    @property
+    def cameras(self) -> Path:
+        """What the cameras are read from."""
+        return cameras_of(self.folder)
 
     def pack(self, name: str) -> Path:
         """The path of a pack of the scene, by its name without extension.
@@ -49,7 +55,7 @@ class Subject:
 
     def lift(self, pack: str | Path, **settings: Any) -> Lift:
         """A lift of one pack, with a small certificate unless the settings ask for more."""
-        return self._lift(self.folder / "point_cloud.ply", self.folder / "cameras.json", pack, settings)
+        return self._lift(self.folder / "point_cloud.ply", self.cameras, pack, settings)
 
     def lift_from(self, cameras: Cameras, pack: str, **settings: Any) -> Lift:
         """The same from other cameras."""
@@ -65,7 +71,7 @@ class Subject:
         with tempfile.TemporaryDirectory(prefix="splatlift-experiment-") as folder:
             path = Path(folder) / "splats.ply"
             write_splats(splats, path)
-            return self._lift(path, self.folder / "cameras.json", pack, settings)
+            return self._lift(path, self.cameras, pack, settings)
 
     def lift_seeing(self, observations: Mapping[str, Observation], **settings: Any) -> Lift:
         """The same with other observations."""

@@ -7,9 +7,11 @@ from pathlib import Path
 
 import pytest
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from liftcore.cli import EXPERIMENTS, main
 from liftcore.measure.experiments.report import page_of
+from liftcore.scene.load import load_cameras
 from tests.truth_scene import write_truth_scene
 
 
@@ -94,6 +96,49 @@ def test_the_report_holds_every_table_and_plot(scene, tmp_path):
     assert "## Row sums of A" in page
     assert f"(found/row_sums-{scene.name}.png)" in page
     assert page.count("\n| ") >= 3
+
+
+def test_cameras_are_read_in_any_format(scene, tmp_path):
+    folder = tmp_path / "colmap"
+    (folder / "sparse" / "0").mkdir(parents=True)
+    (folder / "point_cloud.ply").symlink_to(scene / "point_cloud.ply")
+    lines, cameras = [], list(load_cameras(scene / "cameras.json"))
+    for number, camera in enumerate(cameras, start=1):
+        x, y, z, w = Rotation.from_matrix(camera.world_to_camera[:3, :3]).as_quat()
+        place = " ".join(map(str, (w, x, y, z, *camera.world_to_camera[:3, 3])))
+        lines += [f"{number} {place} 1 {camera.name}.jpg", ""]
+    lens = cameras[0]
+    sides = (lens.width, lens.height, lens.fx, lens.fy, lens.cx, lens.cy)
+    (folder / "sparse" / "0" / "cameras.txt").write_text(f"1 PINHOLE {' '.join(map(str, sides))}\n")
+    (folder / "sparse" / "0" / "images.txt").write_text("\n".join(lines) + "\n")
+    ours, theirs = run("row_sums", folder, tmp_path)["rows"], run("row_sums", scene, tmp_path)["rows"]
+    assert [row["mean"] for row in ours] == pytest.approx([row["mean"] for row in theirs], abs=1e-6)
+
+
+@pytest.mark.parametrize("name", ["ablation", "kernels", "lambda_sweep", "mask_noise", "overfitting", "pose_noise"])
+def test_a_scene_without_truth_is_told_what_truth_is(scene, tmp_path, capsys, name):
+    for file in ("point_cloud.ply", "cameras.json", "features.safetensors", "truth.json"):
+        (tmp_path / file).symlink_to(scene / file)
+    assert main(["experiment", name, str(tmp_path)]) == 2
+    err = capsys.readouterr().err
+    assert "truth in the layout of tabletop" in err and "no truth.safetensors and no text_table.safetensors" in err
+    assert "Errno" not in err and err.count("\n") == 1
+
+
+def test_truth_of_another_layout_is_bad_input(scene, tmp_path, capsys):
+    for file in scene.iterdir():
+        (tmp_path / file.name).symlink_to(file)
+    (tmp_path / "truth.json").unlink()
+    (tmp_path / "truth.json").write_text("{}")
+    assert main(["experiment", "ablation", str(tmp_path)]) == 2
+    assert "truth in the layout of tabletop" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["fidelity", "ablation"])
+def test_a_scene_without_any_of_the_packs_is_told_which(scene, tmp_path, capsys, monkeypatch, name):
+    monkeypatch.setattr(f"liftcore.measure.experiments.{name}.PACKS", ("other", "more"))
+    assert main(["experiment", name, str(scene), "-o", str(tmp_path)]) == 2
+    assert "one of other.safetensors, more.safetensors" in capsys.readouterr().err
 
 
 def test_a_folder_that_is_no_scene_is_bad_input(tmp_path, capsys):
