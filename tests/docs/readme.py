@@ -7,6 +7,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = ("README.md", "ARCHITECTURE.md")
+PAGES = (*DOCUMENTS, *sorted(str(page.relative_to(ROOT)) for page in ROOT.glob("docs/*.md")))
 
 
 def text(name: str) -> str:
@@ -17,6 +18,20 @@ def text(name: str) -> str:
 def blocks(name: str, language: str) -> list[str]:
     """The fenced blocks of a language."""
     return re.findall(rf"^```{language}\n(.*?)^```", text(name), flags=re.MULTILINE | re.DOTALL)
+
+
+def inline_code(name: str) -> list[str]:
+    """What stands in backticks outside of the fenced blocks, each on one line."""
+    prose = re.sub(r"^```.*?^```", "", text(name), flags=re.MULTILINE | re.DOTALL)
+    return [" ".join(code.split()) for code in re.findall(r"`([^`]+)`", prose)]
+
+
+def shell_commands(name: str) -> list[str]:
+    """What lines of the shell blocks give to ``splatlift``, whatever stands before it."""
+    lines = "\n".join(blocks(name, "sh")).splitlines()
+    # Not the first of `run splatlift splatlift keys`, which names a service of the compose file.
+    found = [re.search(r"(?:^|[ (])(?:\.venv/bin/)?splatlift (?!splatlift )([^#()]+)", line) for line in lines]
+    return [match[1].strip() for match in found if match]
 
 
 def table_heads(name: str) -> list[str]:

@@ -6,6 +6,7 @@ import argparse
 import json
 import re
 import shlex
+from importlib.util import find_spec
 
 import pytest
 
@@ -13,23 +14,35 @@ from liftcore.cli import build_parser
 from liftcore.solve.settings import LiftSettings, Preset
 from service.settings import ServiceSettings
 
-from .readme import DOCUMENTS, ROOT, blocks, table_heads, text
+from .readme import DOCUMENTS, PAGES, ROOT, blocks, inline_code, shell_commands, table_heads, text
 
 
-@pytest.mark.parametrize("document", DOCUMENTS)
+@pytest.mark.parametrize("document", PAGES)
 def test_relative_links_lead_somewhere(document: str) -> None:
     links = re.findall(r"\]\(([^)#]+)", text(document))
-    missing = [link for link in links if "://" not in link and not (ROOT / link).exists()]
+    missing = [link for link in links if "://" not in link and not (ROOT / document).parent.joinpath(link).exists()]
     assert not missing
 
 
-def test_named_sources_exist() -> None:
-    named = set(re.findall(r"`([a-z_/]+\.py)`", text("ARCHITECTURE.md")))
-    missing = [
-        name for name in named if not any((ROOT / room / name).is_file() for room in ("", "liftcore", "service"))
-    ]
-    assert named
+def test_links_within_the_readme_lead_to_its_headings() -> None:
+    headings = re.findall(r"^#+ (.*)$", text("README.md"), flags=re.MULTILINE)
+    places = {re.sub(r"[^a-z0-9 -]", "", heading.lower()).replace(" ", "-") for heading in headings}
+    assert set(re.findall(r"\]\(#([^)]+)\)", text("README.md"))) <= places
+
+
+@pytest.mark.parametrize("document", PAGES)
+def test_named_sources_exist(document: str) -> None:
+    named = {code for code in inline_code(document) if re.fullmatch(r"[\w/*]+\.py", code)}
+    rooms = [ROOT / room for room in ("", "liftcore", "service")]
+    missing = [name for name in named if not any([*room.glob(name)] for room in rooms)]
+    assert named or document != "ARCHITECTURE.md"
     assert not missing
+
+
+@pytest.mark.parametrize("document", PAGES)
+def test_named_modules_exist(document: str) -> None:
+    named = set(re.findall(r"python -m ([a-z_]+(?:\.[a-z_]+)*)", text(document)))
+    assert not [name for name in named if find_spec(name) is None]
 
 
 @pytest.mark.parametrize("document", DOCUMENTS)
@@ -51,20 +64,35 @@ def test_ci_runs_the_readmes_test_command() -> None:
 
 
 def test_commands_of_the_readme_parse() -> None:
-    lines = [line for block in blocks("README.md", "sh") for line in block.splitlines()]
-    commands = [shlex.split(line)[1:] for line in lines if line.startswith("splatlift ")]
-    assert commands
+    commands = [shlex.split(command) for command in shell_commands("README.md")]
+    assert {"pack", "lift", "query", "serve", "keys", "tradeoff"} <= {command[0] for command in commands}
     for command in commands:
         assert build_parser().parse_args(command).command == command[0]
 
 
-def test_every_command_is_in_the_readme_with_its_options() -> None:
+@pytest.mark.parametrize("document", PAGES)
+def test_commands_within_sentences_and_tables_parse(document: str, capsys: pytest.CaptureFixture[str]) -> None:
+    codes = [code.removeprefix(".venv/bin/") for code in inline_code(document)]
+    for command in (shlex.split(code)[1:] for code in codes if code.startswith("splatlift ")):
+        known = {option for action in _actions(_commands()[command[0]]) for option in action.option_strings}
+        assert {word for word in command if word.startswith("--")} <= known, command
+        try:
+            build_parser().parse_args(command)
+        except SystemExit:  # it names a command and no more, or has NAME for one of its words
+            said = capsys.readouterr().err
+            assert "arguments are required" in said or "choice: 'NAME'" in said, said
+
+
+def test_every_command_is_in_the_readme_with_all_its_options() -> None:
     parsers = _commands()
     rows = {head.strip("`"): row for head, row in _command_rows().items()}
     assert rows.keys() == {f"splatlift {name}" for name in parsers}
     for name, parser in parsers.items():
-        known = {option for action in parser._actions for option in action.option_strings}
-        assert set(re.findall(r"--[a-z-]+", rows[f"splatlift {name}"])) <= known | _pack_options(parser)
+        told = set(re.findall(r"(?<![\w-])--?[a-z][a-z-]*", rows[f"splatlift {name}"]))
+        actions = [action for action in _actions(parser) if action.option_strings]
+        assert told <= {option for action in actions for option in action.option_strings}, name
+        for action in actions:
+            assert action.dest in ("help", "json", "debug") or _is_told(action, told), (name, action.dest)
 
 
 def test_every_setting_of_a_lift_is_in_the_readme_with_its_default() -> None:
@@ -79,9 +107,13 @@ def test_every_preset_is_in_the_readme() -> None:
     assert all(f"`{preset}`" in heads for preset in Preset)
 
 
-def test_every_setting_of_the_service_is_in_the_readme() -> None:
-    named = {head.strip("`") for head in table_heads("README.md") if head.startswith("`SPLATLIFT_")}
-    assert named == {f"SPLATLIFT_{field.upper()}" for field in ServiceSettings.model_fields}
+def test_every_setting_of_the_service_is_in_the_readme_with_its_default() -> None:
+    rows = dict(re.findall(r"^\| `SPLATLIFT_([A-Z_]+)` \| (.*?) \|", text("README.md"), flags=re.MULTILINE))
+    assert rows.keys() == {field.upper() for field in ServiceSettings.model_fields}
+    for name, field in ServiceSettings.model_fields.items():
+        default = field.get_default(call_default_factory=True)
+        shown = rows[name.upper()].split(" (")[0].strip("`")
+        assert shown == ("-" if default in (None, ()) else str(default)), name
 
 
 def _commands() -> dict[str, argparse.ArgumentParser]:
@@ -93,7 +125,16 @@ def _command_rows() -> dict[str, str]:
     return dict(re.findall(r"^\| (`splatlift [a-z]+`) \| (.*) \|$", text("README.md"), flags=re.MULTILINE))
 
 
-def _pack_options(parser: argparse.ArgumentParser) -> set[str]:
+def _actions(parser: argparse.ArgumentParser) -> list[argparse.Action]:
+    """The options and arguments of a command, with those of its formats or actions."""
     nested = [action.choices for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
-    formats = [child for choices in nested for child in choices.values()]
-    return {option for child in formats for action in child._actions for option in action.option_strings}
+    children = [child for choices in nested for child in choices.values()]
+    return [action for each in (parser, *children) for action in each._actions]
+
+
+def _is_told(action: argparse.Action, told: set[str]) -> bool:
+    """Under one of its names; a switch with both ways where both change something."""
+    if isinstance(action, argparse.BooleanOptionalAction):
+        ways = [way for way in action.option_strings if action.default is None or way.startswith("--no-")]
+        return told.issuperset(ways)
+    return not told.isdisjoint(action.option_strings)

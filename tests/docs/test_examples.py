@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import io
 import json
 import re
+import shlex
+import zipfile
 from pathlib import Path
 from types import ModuleType
 
+import numpy as np
 import pytest
 from fastapi.routing import APIRoute
+from PIL import Image
 from pydantic import BaseModel
 
 from liftcore.cli import main
 from liftcore.scene.load import load_splats
 from service import wire
 from service.routes import assets, jobs, lifts, operations, queries, tradeoffs
-from tests.api.tiny_scene import WIDTH, make_scene
+from tests.api.tiny_scene import WIDTH, codebook, colmap_zip, labels, make_scene
 
 from .readme import blocks, text
 
@@ -61,6 +66,24 @@ def test_command_line_example_writes_its_files(scene_folder: Path) -> None:
     apple, scores = (load_splats(scene_folder / name) for name in ("apple.ply", "scores.ply"))
     assert 0 < apple.count < scores.count == load_splats(scene_folder / "scene.ply").count
     assert float(apple.means[:, 0].max()) < 0  # the apple is the cluster on the left
+
+
+def test_the_way_from_own_maps_to_a_mask_leads_there(scene_folder: Path) -> None:
+    (scene_folder / "maps").mkdir()
+    for view, clusters in labels().items():
+        grid = codebook()[clusters[0]].transpose(2, 0, 1)  # [F, h, w], as PyTorch has it
+        np.save(scene_folder / "maps" / f"{view}.png.npy", grid.astype(np.float16))
+    with zipfile.ZipFile(io.BytesIO(colmap_zip())) as archive:
+        archive.extractall(scene_folder)
+    (scene_folder / "features.safetensors").unlink()
+    section = text("README.md").partition("## Your own scene")[2].partition("The same over HTTP")[0]
+    lines = [line for line in section.splitlines() if line.startswith(".venv/bin/splatlift ")]
+    commands = [shlex.split(line)[1:] for line in lines]
+    assert [command[0] for command in commands] == ["inspect", "inspect", "pack", "lift", "query"]
+    assert [main(command) for command in commands] == [0] * len(commands)
+    with Image.open(scene_folder / "apple.png") as mask:
+        columns = np.asarray(mask).nonzero()[1]
+    assert len(columns) > 0 and columns.max() < WIDTH // 2
 
 
 def test_json_examples_show_fields_that_the_service_sends() -> None:
