@@ -16,13 +16,14 @@ def input_file(path: Path) -> InputFile:
     """
     resolved = path.resolve()
     if not resolved.is_dir():
-        return InputFile(path=str(resolved), sha256=_digest(resolved))
+        return InputFile(path=str(resolved), sha256=sha256_of(resolved))
     total = hashlib.sha256()
     for part in camera_files(resolved):
-        total.update(f"{part.relative_to(resolved)} {_digest(part)}\n".encode())
+        total.update(f"{part.relative_to(resolved)} {sha256_of(part)}\n".encode())
     return InputFile(path=str(resolved), sha256=total.hexdigest())
 
 
-def _digest(path: Path) -> str:
+def sha256_of(path: Path) -> str:
+    """The digest of a file, in hexadecimal digits."""
     with path.open("rb") as handle:
         return hashlib.file_digest(handle, "sha256").hexdigest()

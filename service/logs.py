@@ -12,7 +12,6 @@ from typing import Any
 
 from service import request_id
 
-FORMATS = ("json", "text")
 SECRET = re.compile(r"(?i)\b(bearer|basic)\s+[^\s\"',;]+")
 
 

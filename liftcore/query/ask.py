@@ -51,11 +51,6 @@ class Answer:
     statistics: Mapping[str, float]  # min, max, mean and quantiles q01..q99 of the seen scores
 
     @property
-    def relevancy(self) -> bool:
-        """Whether the scores weigh positives against negatives, instead of being cosines."""
-        return bool(self.query.negatives)
-
-    @property
     def count(self) -> int:
         """How many splats were selected."""
         return int(self.selected.sum())

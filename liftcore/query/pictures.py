@@ -52,11 +52,6 @@ def render_png(scene: QueryScene, view: str, what: str = "rgb") -> bytes:
     return _png(render(scene, view, what))
 
 
-def overlay_png(image: np.ndarray, look: Look) -> bytes:
-    """An image [H, W, 3] u8 with what was found bright and outlined, and the rest dimmed."""
-    return _png(overlay(image, look.mask.numpy()))
-
-
 def save_mask(look: Look, path: Path) -> None:
     """Write `mask_png` to a file."""
     _save(mask_png(look), path)

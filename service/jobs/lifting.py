@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import replace
@@ -10,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from liftcore.artifact import InputFile, LiftMetadata, save_lift
+from liftcore.input_files import sha256_of
 from liftcore.lift import lift
 from liftcore.progress import Progress
 from liftcore.solve.checkpoint import Checkpoint
@@ -38,7 +38,7 @@ def lift_as_ordered(order: dict[str, Any], progress: Progress) -> dict[str, Any]
     output = Path(order["output"])
     save_lift(made, output)
     return {
-        "sha256": _sha256(output),
+        "sha256": sha256_of(output),
         "count": made.features.shape[0],
         "channels": made.features.shape[1],
         # Through JSON and not model_dump: what is not finite must become null before it reaches a client.
@@ -57,8 +57,3 @@ def _as_clients_know(metadata: LiftMetadata, names: Mapping[str, str]) -> LiftMe
     resolved = {str(Path(path).resolve()): name for path, name in names.items()}  # as lifts remember paths
     inputs = {"splats": named(metadata.splats), "cameras": named(metadata.cameras)}
     return metadata.model_copy(update={**inputs, "features": tuple(map(named, metadata.features))})
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as handle:
-        return hashlib.file_digest(handle, "sha256").hexdigest()

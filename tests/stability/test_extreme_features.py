@@ -10,6 +10,7 @@ import torch
 
 from liftcore.artifact import Lift, load_lift, save_lift
 from liftcore.lift import lift
+from liftcore.measure.stability.of_features import checkerboard
 from liftcore.measure.stability.scenes import splats_at
 from liftcore.measure.stability.weights import exact_view
 from liftcore.observe.observation import FeatureGrid, Observation, RegionMap
@@ -65,14 +66,6 @@ def assert_sound(got: Lift, observation: Observation, splats: Splats = SCENE, st
     assert not got.features[~got.seen].any()
     certificate = got.metadata.certificate
     assert all(np.isfinite(certificate[key]) for key in ("row_sum_mean", "residual", "surrogate", "bound"))
-
-
-def checkerboard(rows: int, channels: int, scale: float = 1.0, dtype: torch.dtype = torch.float32) -> RegionMap:
-    """Regions of 4x4 pixels that read ``rows`` random vectors."""
-    y, x = np.mgrid[:HEIGHT, :WIDTH]
-    labels = torch.tensor((y // 4 * 4 + x // 4) % rows, dtype=torch.int32)[None]
-    vectors = np.random.default_rng(rows).uniform(-1, 1, (rows, channels))
-    return RegionMap(labels, torch.tensor(vectors / np.abs(vectors).max() * scale).to(dtype))
 
 
 @pytest.mark.parametrize("channels", [2, 31, 33])

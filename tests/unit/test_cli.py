@@ -27,6 +27,8 @@ from liftcore.scene.ply import read_splats, write_splats
 from liftcore.scene.splats import Splats
 from liftcore.solve.settings import LiftSettings, Preset
 
+from .command_line import run
+
 if TYPE_CHECKING:
     from pathlib import Path
 
@@ -52,12 +54,6 @@ def scene(tmp_path: Path) -> Path:
     metadata = {"encoder": "toy", "text_space": "none"}
     write_pack(tmp_path / "pack.safetensors", {"front": regions, "lost": regions}, metadata)
     return tmp_path
-
-
-def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
-    status = cli.main([str(argument) for argument in arguments])
-    captured = capsys.readouterr()
-    return status, captured.out, captured.err
 
 
 def lift_arguments(scene: Path, *more: object) -> list[object]:

@@ -9,9 +9,10 @@ import pytest
 import torch
 from PIL import Image
 
-from liftcore import cli
 from liftcore.observe.observation import FeatureGrid
 from liftcore.observe.pack import open_packs
+
+from .command_line import run
 
 
 @pytest.fixture
@@ -31,12 +32,6 @@ def weights(tmp_path: Path) -> Path:
     path = tmp_path / "clip.pt"
     torch.save(create_model("ViT-S-32-alt", None).state_dict(), path)
     return path
-
-
-def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
-    status = cli.main([str(argument) for argument in arguments])
-    captured = capsys.readouterr()
-    return status, captured.out, captured.err
 
 
 def test_encoded_photos_are_lifted_and_asked_in_the_text_space_of_their_pack(

@@ -11,8 +11,9 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from liftcore import cli
 from tests.labelled_scene import FRAMES, LIFTED, isat, rectangle, write_3d_ovs_labels, write_lerf_labels, write_lift
+
+from .command_line import run
 
 
 @pytest.fixture(scope="module")
@@ -24,12 +25,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_3d_ovs_labels(made)
     save_file({"embeddings": torch.eye(4)}, str(made / "other.table"), metadata={"words": '["a", "b", "c", "d"]'})
     return made
-
-
-def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
-    status = cli.main([str(argument) for argument in arguments])
-    captured = capsys.readouterr()
-    return status, captured.out, captured.err
 
 
 def evaluate(capsys: pytest.CaptureFixture[str], *arguments: object) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from liftcore.errors import InvalidLift, InvalidQuery, NotFound
 from liftcore.input_files import input_file
 from liftcore.query.ask import ask, look, top
 from liftcore.query.colours import NO_CLUSTER_COLOUR, SH_C0, cluster_colours, seen_colours
-from liftcore.query.pictures import attention_png, mask_png, overlay_png, render, render_png
+from liftcore.query.pictures import attention_png, mask_png, overlay, render, render_png
 from liftcore.query.query import Query
 from liftcore.query.scene import QueryScene
 from liftcore.scene.cameras import Cameras
@@ -98,7 +98,7 @@ def test_splats_that_hardly_a_ray_met_do_not_decide_the_threshold(lift_file: Pat
 
 def test_negatives_make_it_relevancy(lift_file: Path) -> None:
     answer = ask(QueryScene.open(lift_file), Query(("x",), ("y", "z"), threshold=0.5), Axes())
-    assert answer.relevancy and answer.threshold_method == "fixed"
+    assert answer.statistics["min"] >= 0 and answer.threshold_method == "fixed"
     assert answer.selected.nonzero()[:, 0].tolist() == list(range(0, COUNT - 1, 3))
 
 
@@ -150,10 +150,10 @@ def test_a_scene_that_changed_is_not_taken_for_the_old_one(lift_file: Path) -> N
 def test_pictures_have_the_size_of_the_view(lift_file: Path) -> None:
     scene = QueryScene.open(lift_file)
     seen = look(scene, ask(scene, "x", Axes()), "front")
-    image = render(scene, "front")
+    assert overlay(render(scene, "front"), seen.mask.numpy()).shape == (30, 40, 3)
     contents = {
         "L": [mask_png(seen)],
-        "RGB": [attention_png(seen), render_png(scene, "front"), overlay_png(image, seen)],
+        "RGB": [attention_png(seen), render_png(scene, "front")],
     }
     for mode, pictures in contents.items():
         for content in pictures:
