@@ -70,30 +70,36 @@ def compiled(function: Callable) -> Any:
 
 
 def constant(value: float) -> ir.Constant:
+    """``value``, rounded to float32, eight times."""
     return ir.Constant(FLOATS, [float(np.float32(value))] * LANES)
 
 
 def broadcast(builder: Builder, scalar: ir.Value, kind: ir.VectorType = FLOATS) -> ir.Value:
+    """The scalar in every lane of a vector of that kind."""
     undefined = ir.Constant(kind, ir.Undefined)
     first = builder.insert_element(undefined, scalar, ir.Constant(INT, 0))
     mask = ir.Constant(ir.VectorType(INT, kind.count), [0] * kind.count)
     return builder.shuffle_vector(first, undefined, mask)
 
 
-def pointer_to(context, builder, array_type, array, offset) -> ir.Value:
-    data = context.make_array(array_type)(context, builder, value=array).data
+def pointer_to(context: Any, builder: Builder, kind: types.Array, array: ir.Value, offset: ir.Value) -> ir.Value:
+    """Where eight lanes begin, so many elements into an array."""
+    data = context.make_array(kind)(context, builder, value=array).data
     return builder.bitcast(builder.gep(data, [offset]), FLOATS.as_pointer())
 
 
 def load_lanes(builder: Builder, pointer: ir.Value) -> ir.Value:
+    """The eight values there, which need not be aligned to more than one of them."""
     return builder.load(pointer, align=4)
 
 
 def minimum(builder: Builder, left: ir.Value, right: ir.Value) -> ir.Value:
+    """The smaller of each pair of lanes, the right one where either is NaN."""
     return builder.select(builder.fcmp_ordered("<", left, right), left, right)
 
 
 def maximum(builder: Builder, left: ir.Value, right: ir.Value) -> ir.Value:
+    """The larger of each pair of lanes, the right one where either is NaN."""
     return builder.select(builder.fcmp_ordered(">", left, right), left, right)
 
 
