@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 from fastapi import Request
 from fastapi.responses import FileResponse, Response
@@ -11,18 +12,35 @@ from starlette.types import Receive, Scope, Send
 
 from liftcore.errors import NotFound
 from service.errors import RangeNotSatisfiable
+from service.problems import PROBLEM
 
 ONE_RANGE = re.compile(r"bytes=\s*(?:(\d+)-(\d*)|-(\d+))\s*", re.ASCII)
 MAX_DIGITS = 18  # longer numbers are beyond every file
+BYTES = {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}
+
+# For OpenAPI: what a route answers beside 200 when its answers have tags, and all that one that gives a file does.
+TAGGED: dict[int | str, dict[str, Any]] = {304: {"description": "The client has it already (If-None-Match)"}}
+FILE: dict[int | str, dict[str, Any]] = TAGGED | {
+    200: {"description": "The whole of it", "content": BYTES},
+    206: {"description": "The range that was asked for", "content": BYTES},
+    416: {**PROBLEM, "description": "A range beyond the end"},
+}
 
 
-def unchanged(request: Request, etag: str) -> Response | None:
-    """304 when the client has this entity already, else None."""
+def unchanged(request: Request, etag: str, *, found: bool = True) -> Response | None:
+    """304 when the client has this entity already, else None.
+
+    Args:
+        request: what may have an If-None-Match.
+        etag: of the entity.
+        found: whether it is known to exist; ``*`` means any entity that does.
+    """
     header = request.headers.get("if-none-match")
     if header is None:
         return None
     tags = {tag.strip().removeprefix("W/") for tag in header.split(",")}
-    return Response(status_code=304, headers={"ETag": etag}) if etag in tags or "*" in tags else None
+    same = etag in tags or (found and "*" in tags)
+    return Response(status_code=304, headers={"ETag": etag}) if same else None
 
 
 def tagged(content: bytes, media_type: str, etag: str) -> Response:
@@ -38,13 +56,13 @@ def file_answer(request: Request, path: Path, *, sha256: str, filename: str) -> 
         NotFound: the file was deleted since it was looked up.
     """
     etag = f'"{sha256}"'
-    same = unchanged(request, etag)
-    if same is not None:
-        return same
     try:
         size = path.stat().st_size
     except FileNotFoundError:
         raise NotFound("content", expected="a file that is here", got="one that was just deleted") from None
+    same = unchanged(request, etag)
+    if same is not None:
+        return same
     keep_range = _keeps_range(request, size, etag)
     return _StoredFile(path, etag=etag, filename=filename, keep_range=keep_range)
 

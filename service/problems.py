@@ -74,13 +74,11 @@ FRAMEWORK: dict[int, tuple[str, str]] = {
 }
 
 # For OpenAPI: every route may answer with a problem.
-RESPONSES: dict[int | str, dict[str, Any]] = {
-    code: {
-        "description": "A problem (RFC 9457)",
-        "content": {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}},
-    }
-    for code in ("4XX", "5XX")
+PROBLEM: dict[str, Any] = {
+    "description": "A problem (RFC 9457)",
+    "content": {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}},
 }
+RESPONSES: dict[int | str, dict[str, Any]] = {code: PROBLEM for code in ("4XX", "5XX")}
 
 log = logging.getLogger(__name__)
 

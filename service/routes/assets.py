@@ -12,7 +12,7 @@ from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.responses import JSONResponse
 
 from service import wire
-from service.content import file_answer
+from service.content import FILE, file_answer
 from service.errors import DigestMismatch
 from service.parts import Here
 from service.store.assets import AssetRecord, CheckedUpload
@@ -114,7 +114,7 @@ def get_asset(asset: AssetId, here: Here) -> wire.Asset:
     return shape(here.store.assets.get(asset))
 
 
-@router.get("/{asset}/content", response_class=Response)
+@router.get("/{asset}/content", response_class=Response, responses=FILE)
 def get_content(asset: AssetId, request: Request, here: Here) -> Response:
     """The bytes of an asset, or a range of them."""
     found = here.store.assets.get(asset)

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, Query, Request, Response
 
 from service import wire
-from service.content import tagged, unchanged
+from service.content import TAGGED, tagged, unchanged
 from service.errors import InvalidRequest
 from service.parts import Here, Parts
 from service.routes.question import answer_links, entity_tag, find_lift, query_request, scene_request, shown
@@ -41,21 +41,21 @@ def query_by_body(asked: wire.AskedInBody, here: Here) -> wire.QueryAnswer:
     return _answer(asked, here)
 
 
-@router.get("/query/scores", responses=NPY, response_class=Response)
+@router.get("/query/scores", responses=NPY | TAGGED, response_class=Response)
 def scores(asked: Annotated[wire.Asked, Query()], request: Request, here: Here) -> Response:
     """The score of every splat: .npy, float32 [P]."""
     lift = find_lift(asked.lift, here)
     return _entity(request, here, query_request("scores", asked, lift, here), lift)
 
 
-@router.get("/query/mask", responses=PNG, response_class=Response)
+@router.get("/query/mask", responses=PNG | TAGGED, response_class=Response)
 def mask(asked: Annotated[wire.AskedInView, Query()], request: Request, here: Here) -> Response:
     """Where it is in a view: a PNG, white where it is."""
     lift = find_lift(asked.lift, here)
     return _entity(request, here, query_request("mask", asked, lift, here) | {"view": asked.view}, lift)
 
 
-@router.get("/query/attention", responses=PNG, response_class=Response)
+@router.get("/query/attention", responses=PNG | TAGGED, response_class=Response)
 def attention(asked: Annotated[wire.AskedInView, Query()], request: Request, here: Here) -> Response:
     """How well each pixel of a view answers to it: a PNG."""
     lift = find_lift(asked.lift, here)
@@ -82,7 +82,7 @@ def attention_by_body(asked: wire.AskedInBody, here: Here) -> Response:
     return _content(here, query_request("attention", asked, lift, here) | {"view": _view(asked)})
 
 
-@router.get("/render", responses=PNG, response_class=Response)
+@router.get("/render", responses=PNG | TAGGED, response_class=Response)
 def render(
     view: View,
     request: Request,
@@ -124,8 +124,11 @@ def _view(asked: wire.AskedInBody) -> str:
 
 def _entity(request: Request, here: Parts, asked: dict[str, Any], lift: LiftRecord) -> Response:
     etag = entity_tag(asked, lift)
-    same = unchanged(request, etag)
-    return same or tagged(here.queries.call(asked).body, MEDIA_TYPES[asked["operation"]], etag)
+    same = unchanged(request, etag, found=False)  # the tag is made before anybody looks for the view
+    if same is not None:
+        return same
+    content = here.queries.call(asked).body
+    return unchanged(request, etag) or tagged(content, MEDIA_TYPES[asked["operation"]], etag)
 
 
 def _content(here: Parts, asked: dict[str, Any]) -> Response:
