@@ -20,6 +20,7 @@ from service.keys.document import describe_keys
 from service.keys.gate import Gate
 from service.limits import BodyLimit, Pace
 from service.metrics import Metrics
+from service.parameters import KnownParameters
 from service.parts import Parts
 from service.queries.warm import QueryLimits, WarmWorker
 from service.readiness import Readiness
@@ -76,8 +77,9 @@ def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, work
     app.add_middleware(RefuseWork, stopping=stopping)
     app.add_middleware(Gate, keys=store.keys, settings=settings)  # outside of it: no body of a stranger is read
     problems.install(app)
-    for module in (operations, assets, jobs, lifts, tradeoffs, queries):
-        app.include_router(module.router)
+    app.include_router(operations.router)  # probes and links to the page may carry what they like
+    for module in (assets, jobs, lifts, tradeoffs, queries):
+        app.include_router(module.router, dependencies=[KnownParameters])
     describe_keys(app, store.keys)
     return app
 

@@ -78,7 +78,7 @@ PROBLEM: dict[str, Any] = {
     "description": "A problem (RFC 9457)",
     "content": {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}},
 }
-RESPONSES: dict[int | str, dict[str, Any]] = {code: PROBLEM for code in ("4XX", "5XX")}
+RESPONSES: dict[int | str, dict[str, Any]] = dict.fromkeys(("4XX", "5XX"), PROBLEM)
 
 log = logging.getLogger(__name__)
 
