@@ -12,6 +12,7 @@ from fastapi import FastAPI
 
 from liftcore import __version__
 from service import problems
+from service.head import AnswerHead
 from service.jobs.devices import Devices
 from service.jobs.limits import JobLimits
 from service.jobs.streams import EventStreams
@@ -73,6 +74,7 @@ def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, work
         redirect_slashes=False,
     )
     app.state.stopping, app.state.metrics = stopping, metrics
+    app.add_middleware(AnswerHead)
     app.add_middleware(BodyLimit, limit=settings.max_body_bytes, pace=pace_of(settings))
     app.add_middleware(RefuseWork, stopping=stopping)
     app.add_middleware(Gate, keys=store.keys, settings=settings)  # outside of it: no body of a stranger is read

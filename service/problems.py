@@ -22,7 +22,7 @@ from service import errors, request_id
 from service.wire import Problem
 
 MEDIA_TYPE = "application/problem+json"
-METHODS = ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS")
+METHODS = ("GET", "POST", "PUT", "PATCH", "DELETE", "OPTIONS")  # and HEAD, where there is GET
 PATH_CHARACTERS = 200  # of what a client asked for, told back
 NO_SPACE = "There is no room left"
 
@@ -154,11 +154,16 @@ async def _on_framework(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, HTTPException)
     phrase = HTTPStatus(error.status_code).phrase
     slug, title = FRAMEWORK.get(error.status_code, (phrase.lower().replace(" ", "-"), phrase))
-    detail = f"{request.method[:PATH_CHARACTERS]} {request.url.path[:PATH_CHARACTERS]}: {error.detail}"
-    problem = Problem(type=f"/problems/{slug}", title=title, status=error.status_code, detail=detail)
-    headers = dict(error.headers or {})
+    method = request.method[:PATH_CHARACTERS]
+    asked = f"{method} {request.url.path[:PATH_CHARACTERS]}"
+    headers, told, detail = dict(error.headers or {}), {}, error.detail
     if error.status_code == HTTPStatus.METHOD_NOT_ALLOWED:
         headers["Allow"] = ", ".join(_methods_of(request))
+        told = {"argument": "method", "expected": f"one of {headers['Allow']}", "got": method}
+        detail = f"expected {told['expected']}, got {method}"
+    problem = Problem(
+        type=f"/problems/{slug}", title=title, status=error.status_code, detail=f"{asked}: {detail}", **told
+    )
     return answer(problem, headers)
 
 
@@ -188,11 +193,12 @@ def _methods_of(request: Request) -> list[str]:
     """What the path takes, by all of its routes: the framework tells of the first one only."""
     scopes = {method: {**request.scope, "method": method} for method in METHODS}
     routes = request.app.routes
-    return [
+    taken = [
         method
         for method, scope in scopes.items()
         if any(route.matches(dict(scope))[0] is Match.FULL for route in routes)
     ]
+    return [*taken, "HEAD"] if "GET" in taken else taken
 
 
 def _plain(value: Any) -> Any:
