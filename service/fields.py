@@ -38,7 +38,7 @@ def takes(expected: str) -> WrapValidator:
 
 def _no_boolean(value: Any) -> Any:
     if isinstance(value, bool):
-        raise PydanticCustomError("no_number", "a number")
+        raise PydanticCustomError("no_number", "{expected}", {"expected": "a number"})
     return value
 
 
@@ -55,6 +55,8 @@ class Body(BaseModel):
     def _knows(cls, given: Any) -> Any:
         for name in given if isinstance(given, dict) else ():
             if name not in cls.model_fields:
-                told = {"field": name[:NAME_CHARACTERS], "expected": one_of(cls.model_fields)}
+                # Half a surrogate pair, which JSON can name, would break pydantic's own report.
+                shown = name[:NAME_CHARACTERS].encode("utf-8", "backslashreplace").decode()
+                told = {"field": shown, "expected": one_of(cls.model_fields)}
                 raise PydanticCustomError("unknown_field", "{expected}", told)
         return given

@@ -19,6 +19,7 @@ from starlette.routing import Match
 from liftcore import errors as core
 from liftcore.errors import SplatliftError
 from service import errors, request_id
+from service.validation import refusal
 from service.wire import Problem
 
 MEDIA_TYPE = "application/problem+json"
@@ -139,15 +140,7 @@ def answer_to(error: SplatliftError) -> JSONResponse:
 
 async def _on_validation(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, RequestValidationError)
-    first = error.errors()[0]
-    place = [str(part) for part in first["loc"]]
-    known = errors.InvalidRequest(
-        ".".join(place[1:]) or place[0],
-        expected=first["msg"][0].lower() + first["msg"][1:],
-        got="nothing" if first["type"] == "missing" else _short(first.get("input")),
-        hint=f"in the {place[0]} of the request",
-    )
-    return answer(problem_of(known))
+    return answer(problem_of(refusal(request, error)))
 
 
 async def _on_framework(request: Request, error: Exception) -> JSONResponse:
@@ -206,8 +199,3 @@ def _plain(value: Any) -> Any:
     if not isinstance(value, str):
         return value
     return " ".join(value.encode("utf-8", "backslashreplace").decode().split())
-
-
-def _short(value: object, limit: int = 120) -> str:
-    text = repr(value)
-    return text if len(text) <= limit else f"{text[:limit]}..."
