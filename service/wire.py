@@ -11,6 +11,7 @@ from service.fields import Body, NoBoolean, takes
 
 ASSET_ID = r"^sha256:[0-9a-f]{64}$"
 JOB_ID = r"^[0-9a-f]{32}$"
+VIEW_CHARACTERS = 500  # of a camera's name that can be asked for
 
 AssetId = Annotated[str, Field(pattern=ASSET_ID, description="sha256: and the digest of the bytes, in hex")]
 JobId = Annotated[str, Field(pattern=JOB_ID)]
@@ -248,7 +249,7 @@ Example = Annotated[
     Notation | Vector,
     takes("VIEW:x,y, region:VIEW:LEVEL:ID, splat:J, or a vector of 1 to 65536 finite numbers"),
 ]
-ViewName = Annotated[str, Field(min_length=1, max_length=500, description="the name of a camera")]
+ViewName = Annotated[str, Field(min_length=1, max_length=VIEW_CHARACTERS, description="the name of a camera")]
 Number = Annotated[float, Field(ge=-1e6, le=1e6), NoBoolean]  # which NaN is not
 Method = Literal["auto", "valley", "paper", "otsu", "stability"]
 Cut = Annotated[Method | Number, takes(f"{', '.join(get_args(Method))}, or a number from -1e6 to 1e6")]

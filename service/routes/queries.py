@@ -26,7 +26,7 @@ MEDIA_TYPES = {"scores": "application/x-npy", "mask": "image/png", "attention": 
 LiftParameter = Annotated[
     str | None, Query(pattern=wire.JOB_ID, description="the lift; may be left out when there is exactly one")
 ]
-View = Annotated[str, Query(min_length=1, max_length=500, description="the name of a camera")]
+View = Annotated[str, Query(min_length=1, max_length=wire.VIEW_CHARACTERS, description="the name of a camera")]
 
 
 @router.get("/query", response_model=wire.QueryAnswer)

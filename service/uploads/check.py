@@ -14,7 +14,7 @@ import zipfile
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from liftcore.errors import InvalidInput, SplatliftError
+from liftcore.errors import InvalidCameras, InvalidInput, SplatliftError
 from liftcore.observe.inspect import describe_packs, describe_table
 from liftcore.observe.masks import describe_masks
 from liftcore.observe.pack import open_packs
@@ -24,7 +24,7 @@ from liftcore.scene.load import load_cameras, load_splats
 from service.faults import fault_of
 from service.finite import finite
 from service.uploads.checking import INVALID
-from service.wire import AssetKind
+from service.wire import VIEW_CHARACTERS, AssetKind
 
 
 def check_splats(path: Path) -> dict[str, Any]:
@@ -33,8 +33,15 @@ def check_splats(path: Path) -> dict[str, Any]:
 
 
 def check_cameras(path: Path) -> dict[str, Any]:
-    """Read and describe every camera."""
+    """Read and describe every camera; each must have a name that a query can say."""
     cameras = load_cameras(path)
+    for camera in cameras:
+        if not 1 <= len(camera.name) <= VIEW_CHARACTERS:
+            raise InvalidCameras(
+                "camera name", expected=f"1 to {VIEW_CHARACTERS} characters",
+                got=f"{len(camera.name)}: {camera.name[:40]!r}..." if camera.name else "an empty one",
+                hint="name each image, without folders where that is enough",
+            )  # fmt: skip
     return {"suffix": ".zip" if zipfile.is_zipfile(path) else ".json", "found": describe_cameras(cameras)}
 
 
