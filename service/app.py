@@ -12,6 +12,7 @@ from fastapi import FastAPI
 
 from liftcore import __version__
 from service import problems
+from service.head import AnswerHead
 from service.jobs.devices import Devices
 from service.jobs.limits import JobLimits
 from service.jobs.streams import EventStreams
@@ -20,6 +21,7 @@ from service.keys.document import describe_keys
 from service.keys.gate import Gate
 from service.limits import BodyLimit, Pace
 from service.metrics import Metrics
+from service.parameters import KnownParameters
 from service.parts import Parts
 from service.queries.warm import QueryLimits, WarmWorker
 from service.readiness import Readiness
@@ -72,12 +74,14 @@ def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, work
         redirect_slashes=False,
     )
     app.state.stopping, app.state.metrics = stopping, metrics
+    app.add_middleware(AnswerHead)
     app.add_middleware(BodyLimit, limit=settings.max_body_bytes, pace=pace_of(settings))
     app.add_middleware(RefuseWork, stopping=stopping)
     app.add_middleware(Gate, keys=store.keys, settings=settings)  # outside of it: no body of a stranger is read
     problems.install(app)
-    for module in (operations, assets, jobs, lifts, tradeoffs, queries):
-        app.include_router(module.router)
+    app.include_router(operations.router)  # probes and links to the page may carry what they like
+    for module in (assets, jobs, lifts, tradeoffs, queries):
+        app.include_router(module.router, dependencies=[KnownParameters])
     describe_keys(app, store.keys)
     return app
 

@@ -6,7 +6,7 @@ import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from fastapi import Request
 from fastapi.responses import FileResponse, Response, StreamingResponse
@@ -14,20 +14,37 @@ from starlette.types import Receive, Scope, Send
 
 from liftcore.errors import NotFound
 from service.errors import RangeNotSatisfiable
+from service.problems import PROBLEM
 from service.store.files import is_whole
 
 ONE_RANGE = re.compile(r"bytes=\s*(?:(\d+)-(\d*)|-(\d+))\s*", re.ASCII)
 MAX_DIGITS = 18  # longer numbers are beyond every file
 BLOCK_BYTES = 256 << 10  # of a draft that is read and sent at a time
+BYTES = {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}
+
+# For OpenAPI: what a route answers beside 200 when its answers have tags, and all that one that gives a file does.
+TAGGED: dict[int | str, dict[str, Any]] = {304: {"description": "The client has it already (If-None-Match)"}}
+FILE: dict[int | str, dict[str, Any]] = TAGGED | {
+    200: {"description": "The whole of it", "content": BYTES},
+    206: {"description": "The range that was asked for", "content": BYTES},
+    416: {**PROBLEM, "description": "A range beyond the end"},
+}
 
 
-def unchanged(request: Request, etag: str) -> Response | None:
-    """304 when the client has this entity already, else None."""
+def unchanged(request: Request, etag: str, *, found: bool = True) -> Response | None:
+    """304 when the client has this entity already, else None.
+
+    Args:
+        request: what may have an If-None-Match.
+        etag: of the entity.
+        found: whether it is known to exist; ``*`` means any entity that does.
+    """
     header = request.headers.get("if-none-match")
     if header is None:
         return None
     tags = {tag.strip().removeprefix("W/") for tag in header.split(",")}
-    return Response(status_code=304, headers={"ETag": etag}) if etag in tags or "*" in tags else None
+    same = etag in tags or (found and "*" in tags)
+    return Response(status_code=304, headers={"ETag": etag}) if same else None
 
 
 def tagged(content: bytes, media_type: str, etag: str) -> Response:
@@ -53,15 +70,15 @@ def file_answer(request: Request, file: StoredFile) -> Response:
         NotFound: the file is not there, or no longer what was stored.
     """
     etag = f'"{file.sha256}"'
-    same = unchanged(request, etag)
-    if same is not None:
-        return same
     if not is_whole(file.path, file.bytes):
         there = "one of another size" if file.path.exists() else "none"
         raise NotFound(
             "content", expected=f"a file of {file.bytes} bytes in the data directory", got=there,
             hint="it was deleted a moment ago, or something else wrote there: upload it again, or lift again",
         )  # fmt: skip
+    same = unchanged(request, etag)
+    if same is not None:
+        return same
     return _FileAnswer(file, etag=etag, keep_range=_keeps_range(request, file.bytes, etag))
 
 

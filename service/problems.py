@@ -19,10 +19,11 @@ from starlette.routing import Match
 from liftcore import errors as core
 from liftcore.errors import SplatliftError
 from service import errors, request_id
+from service.validation import refusal
 from service.wire import Problem
 
 MEDIA_TYPE = "application/problem+json"
-METHODS = ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS")
+METHODS = ("GET", "POST", "PUT", "PATCH", "DELETE", "OPTIONS")  # and HEAD, where there is GET
 PATH_CHARACTERS = 200  # of what a client asked for, told back
 NO_SPACE = "There is no room left"
 
@@ -74,13 +75,11 @@ FRAMEWORK: dict[int, tuple[str, str]] = {
 }
 
 # For OpenAPI: every route may answer with a problem.
-RESPONSES: dict[int | str, dict[str, Any]] = {
-    code: {
-        "description": "A problem (RFC 9457)",
-        "content": {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}},
-    }
-    for code in ("4XX", "5XX")
+PROBLEM: dict[str, Any] = {
+    "description": "A problem (RFC 9457)",
+    "content": {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}},
 }
+RESPONSES: dict[int | str, dict[str, Any]] = dict.fromkeys(("4XX", "5XX"), PROBLEM)
 
 log = logging.getLogger(__name__)
 
@@ -141,26 +140,23 @@ def answer_to(error: SplatliftError) -> JSONResponse:
 
 async def _on_validation(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, RequestValidationError)
-    first = error.errors()[0]
-    place = [str(part) for part in first["loc"]]
-    known = errors.InvalidRequest(
-        ".".join(place[1:]) or place[0],
-        expected=first["msg"][0].lower() + first["msg"][1:],
-        got="nothing" if first["type"] == "missing" else _short(first.get("input")),
-        hint=f"in the {place[0]} of the request",
-    )
-    return answer(problem_of(known))
+    return answer(problem_of(refusal(request, error)))
 
 
 async def _on_framework(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, HTTPException)
     phrase = HTTPStatus(error.status_code).phrase
     slug, title = FRAMEWORK.get(error.status_code, (phrase.lower().replace(" ", "-"), phrase))
-    detail = f"{request.method[:PATH_CHARACTERS]} {request.url.path[:PATH_CHARACTERS]}: {error.detail}"
-    problem = Problem(type=f"/problems/{slug}", title=title, status=error.status_code, detail=detail)
-    headers = dict(error.headers or {})
+    method = request.method[:PATH_CHARACTERS]
+    asked = f"{method} {request.url.path[:PATH_CHARACTERS]}"
+    headers, told, detail = dict(error.headers or {}), {}, error.detail
     if error.status_code == HTTPStatus.METHOD_NOT_ALLOWED:
         headers["Allow"] = ", ".join(_methods_of(request))
+        told = {"argument": "method", "expected": f"one of {headers['Allow']}", "got": method}
+        detail = f"expected {told['expected']}, got {method}"
+    problem = Problem(
+        type=f"/problems/{slug}", title=title, status=error.status_code, detail=f"{asked}: {detail}", **told
+    )
     return answer(problem, headers)
 
 
@@ -190,11 +186,12 @@ def _methods_of(request: Request) -> list[str]:
     """What the path takes, by all of its routes: the framework tells of the first one only."""
     scopes = {method: {**request.scope, "method": method} for method in METHODS}
     routes = request.app.routes
-    return [
+    taken = [
         method
         for method, scope in scopes.items()
         if any(route.matches(dict(scope))[0] is Match.FULL for route in routes)
     ]
+    return [*taken, "HEAD"] if "GET" in taken else taken
 
 
 def _plain(value: Any) -> Any:
@@ -202,8 +199,3 @@ def _plain(value: Any) -> Any:
     if not isinstance(value, str):
         return value
     return " ".join(value.encode("utf-8", "backslashreplace").decode().split())
-
-
-def _short(value: object, limit: int = 120) -> str:
-    text = repr(value)
-    return text if len(text) <= limit else f"{text[:limit]}..."

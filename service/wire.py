@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from service.fields import Body, NoBoolean, takes
+
 ASSET_ID = r"^sha256:[0-9a-f]{64}$"
 JOB_ID = r"^[0-9a-f]{32}$"
+VIEW_CHARACTERS = 500  # of a camera's name that can be asked for
 
 AssetId = Annotated[str, Field(pattern=ASSET_ID, description="sha256: and the digest of the bytes, in hex")]
 JobId = Annotated[str, Field(pattern=JOB_ID)]
 Text = Annotated[str, Field(min_length=1, max_length=1000)]
-Scalar = bool | int | float | str
+Scalar = Annotated[bool | int | float | str, takes("a boolean, a number or a text")]
 
 
 class AssetKind(StrEnum):
@@ -79,10 +82,8 @@ class Assets(BaseModel):
     assets: list[Asset]
 
 
-class LiftRequest(BaseModel):
+class LiftRequest(Body):
     """What to lift. The assets must be here already."""
-
-    model_config = ConfigDict(extra="forbid")
 
     splats: AssetId
     cameras: AssetId
@@ -93,10 +94,8 @@ class LiftRequest(BaseModel):
     )
 
 
-class Labels(BaseModel):
+class Labels(Body):
     """Masks of views, and the words that they mean: views with masks are not lifted, and say how good a lift is."""
-
-    model_config = ConfigDict(extra="forbid")
 
     masks: AssetId
     table: AssetId
@@ -111,8 +110,8 @@ class TradeoffRequest(LiftRequest):
     settings: dict[str, Scalar] = Field(
         default_factory=dict, description="of all runs: knobs of the lift beside preset and speed, which are compared"
     )
-    budget_s: float = Field(
-        600, ge=10, le=86_400, description="seconds to plan with; the exact run is made whatever it takes"
+    budget_s: Annotated[float, Field(ge=10, le=86_400), NoBoolean] = Field(
+        600, description="seconds to plan with; the exact run is made whatever it takes"
     )
     labels: Labels | None = Field(None, description="masks to judge by; without them held-out views are judged by")
 
@@ -243,9 +242,19 @@ class Box(BaseModel):
 Notation = Annotated[
     str, Field(min_length=1, max_length=600, description="VIEW:x,y, region:VIEW:LEVEL:ID or splat:J")
 ]
-Vector = Annotated[list[Annotated[float, Field(allow_inf_nan=False)]], Field(min_length=1, max_length=65_536)]
-ViewName = Annotated[str, Field(min_length=1, max_length=500, description="the name of a camera")]
-Number = Annotated[float, Field(ge=-1e6, le=1e6)]  # which NaN is not
+Vector = Annotated[
+    list[Annotated[float, Field(allow_inf_nan=False, strict=True)]], Field(min_length=1, max_length=65_536)
+]
+Example = Annotated[
+    Notation | Vector,
+    takes("VIEW:x,y, region:VIEW:LEVEL:ID, splat:J, or a vector of 1 to 65536 finite numbers"),
+]
+ViewName = Annotated[str, Field(min_length=1, max_length=VIEW_CHARACTERS, description="the name of a camera")]
+Number = Annotated[float, Field(ge=-1e6, le=1e6), NoBoolean]  # which NaN is not
+Method = Literal["auto", "valley", "paper", "otsu", "stability"]
+Cut = Annotated[Method | Number, takes(f"{', '.join(get_args(Method))}, or a number from -1e6 to 1e6")]
+Count = Annotated[int, Field(ge=1, le=100), NoBoolean]
+Top = Annotated[int, Field(ge=0, le=1000), NoBoolean]
 
 
 SplatsOf = Literal["object", "scores"]
@@ -258,10 +267,8 @@ class Question(BaseModel):
     lift: JobId | None = Field(None, description="the lift; may be left out when there is exactly one")
     text: list[Text] = Field([], max_length=32, description="what to look for; may be given several times")
     negatives: list[Text] = Field([], max_length=32, description="what it is not; may be given several times")
-    threshold: Literal["auto", "valley", "paper", "otsu", "stability"] | Number = Field(
-        "auto", description="how to find it, or the score from which a splat counts as found"
-    )
-    instances: int | None = Field(None, ge=1, le=100, description="how many there are, if you know")
+    threshold: Cut = Field("auto", description="how to find it, or the score from which a splat counts as found")
+    instances: Count | None = Field(None, description="how many there are, if you know")
     keep: Literal["all", "largest"] = Field("all", description="components of a mask")
     encoder: str | None = Field(None, max_length=200, description="a text space that the operator set up, or default")
 
@@ -277,7 +284,7 @@ class AskedWhere(Asked):
     """Where something is."""
 
     view: ViewName | None = Field(None, description="for the links")
-    top: int = Field(10, ge=0, le=1000, description="how many of the best splats to list")
+    top: Top = Field(10, description="how many of the best splats to list")
 
 
 class AskedInView(Asked):
@@ -292,15 +299,13 @@ class AskedForSplats(Asked):
     what: SplatsOf = Field("object", description=SPLATS_OF)
 
 
-class AskedInBody(Question):
+class AskedInBody(Question, Body):
     """A query in a body, where an example may also be a vector [F]."""
 
-    model_config = ConfigDict(extra="forbid")
-
-    like: list[Notation | Vector] = Field([], max_length=32, description="examples of it, or vectors")
-    unlike: list[Notation | Vector] = Field([], max_length=32, description="examples of what it is not, likewise")
+    like: list[Example] = Field([], max_length=32, description="examples of it, or vectors")
+    unlike: list[Example] = Field([], max_length=32, description="examples of what it is not, likewise")
     view: ViewName | None = Field(None, description="for pictures, and for the links")
-    top: int = Field(10, ge=0, le=1000, description="how many of the best splats to list")
+    top: Top = Field(10, description="how many of the best splats to list")
 
 
 class QueryAnswer(BaseModel):

@@ -108,7 +108,7 @@ def ask(scene: QueryScene, query: Query | str, encoder: TextEncoder | None = Non
 
 def question(scene: QueryScene, query: Query, encoder: TextEncoder | None) -> Question:
     """A query with the directions of its terms; what can be wrong with a query is found here (see `ask`)."""
-    return Question(query, directions(scene, query.terms, encoder))
+    return Question(query, directions(scene, query, encoder))
 
 
 def answers(scene: QueryScene, questions: Sequence[Question]) -> list[Answer]:

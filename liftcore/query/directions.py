@@ -2,29 +2,29 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import torch
 
 from liftcore.errors import InvalidQuery, NotFound
 from liftcore.observe.observation import RegionMap
-from liftcore.query.example import Example, OneSplat, Pixel, Region
-from liftcore.query.query import texts_of
+from liftcore.query.example import Example, OneSplat, Pixel, Region, Vector
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator
 
     from torch import Tensor
 
     from liftcore.query.encoders import TextEncoder
-    from liftcore.query.query import Term
+    from liftcore.query.query import Query, Term
     from liftcore.query.scene import QueryScene
 
 MINIMUM_ROW_SUM = 0.5  # below it a ray mostly misses the scene: no histogram, no mask and no example takes it
 
 
-def directions(scene: QueryScene, terms: Sequence[Term], encoder: TextEncoder | None) -> Tensor:
-    """The unit vector of every term, [n, F] f32.
+def directions(scene: QueryScene, query: Query, encoder: TextEncoder | None) -> Tensor:
+    """The unit vector of every term, [n, F] f32; errors name a term as the query does.
 
     Raises:
         InvalidQuery: a text without an encoder or with one of another space, a text that it cannot read, or an
@@ -32,12 +32,32 @@ def directions(scene: QueryScene, terms: Sequence[Term], encoder: TextEncoder | 
         NotFound: an example names a view or a region that is not there.
         InvalidLift: the splats, the cameras or the packs that an example needs moved or changed.
     """
-    texts = texts_of(terms)
-    words = iter(_encode(scene, texts, encoder) if texts else ())
-    return torch.stack([next(words) if isinstance(term, str) else _of_example(scene, term) for term in terms])
+    words = _encode(scene, query, encoder)
+    rows: list[Tensor] = []
+    for place, term in enumerate(query.terms):
+        with _named(query, place):
+            rows.append(words[place] if isinstance(term, str) else _of_example(scene, term))
+    return torch.stack(rows)
 
 
-def _encode(scene: QueryScene, texts: list[str], encoder: TextEncoder | None) -> Tensor:
+@contextmanager
+def _named(query: Query, place: int) -> Iterator[None]:
+    """What is wrong with a term is told under its name, if it has one."""
+    try:
+        yield
+    except (InvalidQuery, NotFound) as error:
+        if not query.names:
+            raise
+        term: Term = query.terms[place]
+        got = error.got if isinstance(term, str | Vector) else f"{error.got} in {term}"
+        raise type(error)(query.names[place], expected=error.expected, got=got, hint=error.hint) from None
+
+
+def _encode(scene: QueryScene, query: Query, encoder: TextEncoder | None) -> dict[int, Tensor]:
+    """The unit vector of each text, by its place among the terms."""
+    texts = {place: term for place, term in enumerate(query.terms) if isinstance(term, str)}
+    if not texts:
+        return {}
     space = scene.lift.metadata.text_space or "none"
     if encoder is None:
         hint = "name a text encoder of the lift's space, or ask by example"
@@ -49,7 +69,14 @@ def _encode(scene: QueryScene, texts: list[str], encoder: TextEncoder | None) ->
             got=f"{encoder.name} with {encoder.channels}",
             hint="query with the text encoder that belongs to the features' image encoder",
         )
-    return torch.stack([_unit(row, text) for row, text in zip(encoder.encode(texts), texts, strict=True)])
+    try:
+        rows = encoder.encode(list(texts.values()))
+    except InvalidQuery:
+        for place, text in texts.items():  # together they do not tell which of them it is
+            with _named(query, place):
+                encoder.encode([text])
+        raise
+    return {place: _unit(row, text) for row, (place, text) in zip(rows, texts.items(), strict=True)}
 
 
 def _of_example(scene: QueryScene, example: Example) -> Tensor:

@@ -30,10 +30,15 @@ class Query:
     threshold: str | float = "auto"  # a method of liftcore.query.threshold, or a number on the scores
     instances: int | None = None  # how many there are, where the user knows
     keep: str = "all"  # components of a view's mask: all, or the largest alone (8-connected)
+    names: tuple[str, ...] = ()  # what errors call each of the terms; () = what they are themselves
 
     def __post_init__(self) -> None:
         if not self.positives:
-            raise InvalidQuery("query", expected="a text or an example", got="neither")
+            raise InvalidQuery(
+                "query", expected="a text or an example of what to look for",
+                got="only what it is not" if self.negatives else "neither",
+                hint="say what to look for, too" if self.negatives else "",
+            )  # fmt: skip
         count = len(self.positives) + len(self.negatives)
         if count > MOST_TERMS:
             raise InvalidQuery("query", expected=f"at most {MOST_TERMS} texts and examples", got=str(count))

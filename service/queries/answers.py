@@ -6,6 +6,7 @@ import contextlib
 import errno
 import hashlib
 import io
+import itertools
 import json
 import math
 import threading
@@ -34,6 +35,7 @@ from service.errors import NoSpace
 from service.queries.frames import Frame
 from service.queries.kept import Kept
 
+TERMS = ("text", "like", "negatives", "unlike")  # in the order in which a query has them
 WARM_UP_TEXT = "something"
 PRODUCT_BYTES = 128 << 20  # of the cosines that one pass over a lift's features may give
 COSINE_BYTES = 4  # of a splat and a direction
@@ -231,13 +233,15 @@ def query_of(asked: dict[str, Any]) -> Query:
     Raises:
         InvalidQuery: it asks for nothing, or an example has no known notation.
     """
-    like, unlike = ([_example(example, name) for example in asked[name]] for name in ("like", "unlike"))
+    names = {name: [f"{name}.{place}" for place in range(len(asked[name]))] for name in TERMS}
+    like, unlike = (list(map(_example, asked[name], names[name])) for name in ("like", "unlike"))
     return Query(
         positives=(*asked["text"], *like),
         negatives=(*asked["negatives"], *unlike),
         threshold=asked["threshold"],
         instances=asked["instances"],
         keep=asked["keep"],
+        names=tuple(itertools.chain.from_iterable(names.values())),
     )
 
 

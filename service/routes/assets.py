@@ -12,7 +12,7 @@ from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.responses import JSONResponse
 
 from service import wire
-from service.content import StoredFile, file_answer
+from service.content import FILE, StoredFile, file_answer
 from service.errors import DigestMismatch
 from service.parts import Here
 from service.store.assets import AssetRecord, CheckedUpload
@@ -20,9 +20,10 @@ from service.store.files import DataDirectory
 from service.store.store import Store
 from service.uploads.checking import CheckLimits, check
 from service.uploads.decoding import coding_of
-from service.uploads.intake import Intake
+from service.uploads.intake import Intake, require_size
 
 BATCH = 1 << 20  # bytes gathered before a thread writes them
+MAX_DIGITS = 20  # of a Content-Length: h11 takes no more
 
 router = APIRouter(prefix="/assets", tags=["assets"])
 # By the name of the other routes' part: to OpenAPI, two templates that match the same paths are one path twice.
@@ -51,11 +52,12 @@ RAW_BODY = {
 async def upload(kind: Kind, request: Request, here: Here, sha256: Sha256 = None) -> Response:
     """Upload splats (PLY), cameras (JSON or a zip of a COLMAP model), a feature pack, masks or a text table."""
     coding = coding_of(", ".join(request.headers.getlist("content-encoding")))
+    limit = here.settings.max_upload_bytes(kind)
+    require_size(kind, _announced(request), limit)  # before a byte of it is asked for with 100 Continue
     here.store.files.require_room()
     await anyio.to_thread.run_sync(here.store.assets.require_quota)
     async with _workspace(here.store.files, kind) as (draft, scratch):
-        limit = here.settings.max_upload_bytes(kind)
-        with Intake(draft, limit=limit, coding=coding, permit=_permit(here.store)) as intake:
+        with Intake(draft, kind, limit=limit, coding=coding, permit=_permit(here.store)) as intake:
             await _receive(request, intake)
             digest = intake.finish()
         if sha256 is not None and digest != sha256.lower():
@@ -69,6 +71,12 @@ async def upload(kind: Kind, request: Request, here: Here, sha256: Sha256 = None
         checked = CheckedUpload(draft, kind, digest, report.suffix, report.counts, report.warnings)
         asset, new = await anyio.to_thread.run_sync(here.store.assets.add, checked)
     return _reply(asset, 201 if new else 200)
+
+
+def _announced(request: Request) -> int:
+    """The bytes that a body is said to have, 0 when nothing is said."""
+    length = request.headers.get("content-length", "")
+    return int(length[:MAX_DIGITS]) if length.isascii() and length.isdigit() else 0
 
 
 @asynccontextmanager
@@ -114,7 +122,7 @@ def get_asset(asset: AssetId, here: Here) -> wire.Asset:
     return shape(here.store.assets.get(asset))
 
 
-@router.get("/{asset}/content", response_class=Response)
+@router.get("/{asset}/content", response_class=Response, responses=FILE)
 def get_content(asset: AssetId, request: Request, here: Here) -> Response:
     """The bytes of an asset, or a range of them."""
     found = here.store.assets.get(asset)

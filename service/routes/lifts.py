@@ -5,7 +5,7 @@ from __future__ import annotations
 from fastapi import APIRouter, Request, Response
 
 from service import wire
-from service.content import StoredFile, file_answer
+from service.content import FILE, StoredFile, file_answer
 from service.parts import Here
 from service.store.lifts import LiftRecord
 
@@ -24,7 +24,7 @@ def get_lift(lift: str, here: Here) -> wire.Lift:
     return shape(here.store.lifts.get(lift))
 
 
-@router.get("/{lift}/features", response_class=Response)
+@router.get("/{lift}/features", response_class=Response, responses=FILE)
 def get_features(lift: str, request: Request, here: Here) -> Response:
     """The lift file (safetensors), or a range of it."""
     found = here.store.lifts.get(lift)

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, Query, Request, Response
 
 from service import wire
-from service.content import draft_answer, tagged, unchanged
+from service.content import TAGGED, draft_answer, tagged, unchanged
 from service.errors import InvalidRequest
 from service.parts import Here, Parts
 from service.routes.question import answer_links, entity_tag, find_lift, query_request, scene_request, shown
@@ -30,7 +30,7 @@ MEDIA_TYPES = {"scores": "application/x-npy", "mask": "image/png", "attention": 
 LiftParameter = Annotated[
     str | None, Query(pattern=wire.JOB_ID, description="the lift; may be left out when there is exactly one")
 ]
-View = Annotated[str, Query(min_length=1, max_length=500, description="the name of a camera")]
+View = Annotated[str, Query(min_length=1, max_length=wire.VIEW_CHARACTERS, description="the name of a camera")]
 
 
 @router.get("/query", response_model=wire.QueryAnswer)
@@ -45,34 +45,34 @@ def query_by_body(asked: wire.AskedInBody, here: Here) -> wire.QueryAnswer:
     return _answer(asked, here)
 
 
-@router.get("/query/scores", responses=NPY, response_class=Response)
+@router.get("/query/scores", responses=NPY | TAGGED, response_class=Response)
 def scores(asked: Annotated[wire.Asked, Query()], request: Request, here: Here) -> Response:
     """The score of every splat: .npy, float32 [P]."""
     lift = find_lift(asked.lift, here)
     return _entity(request, here, query_request("scores", asked, lift, here), lift)
 
 
-@router.get("/query/mask", responses=PNG, response_class=Response)
+@router.get("/query/mask", responses=PNG | TAGGED, response_class=Response)
 def mask(asked: Annotated[wire.AskedInView, Query()], request: Request, here: Here) -> Response:
     """Where it is in a view: a PNG, white where it is."""
     lift = find_lift(asked.lift, here)
     return _entity(request, here, query_request("mask", asked, lift, here) | {"view": asked.view}, lift)
 
 
-@router.get("/query/attention", responses=PNG, response_class=Response)
+@router.get("/query/attention", responses=PNG | TAGGED, response_class=Response)
 def attention(asked: Annotated[wire.AskedInView, Query()], request: Request, here: Here) -> Response:
     """How well each pixel of a view answers to it: a PNG."""
     lift = find_lift(asked.lift, here)
     return _entity(request, here, query_request("attention", asked, lift, here) | {"view": asked.view}, lift)
 
 
-@router.get("/query/splats", responses=PLY, response_class=Response)
+@router.get("/query/splats", responses=PLY | TAGGED, response_class=Response)
 def splats(asked: Annotated[wire.AskedForSplats, Query()], request: Request, here: Here) -> Response:
     """What was found, or the scene in the colours of its scores, as splats: a PLY of the dialect that was lifted."""
     lift = find_lift(asked.lift, here)
     wanted = query_request("splats", asked, lift, here) | {"what": asked.what}
     etag = entity_tag(wanted, lift)
-    return unchanged(request, etag) or _splat_file(here, wanted, lift, etag)
+    return unchanged(request, etag, found=False) or _splat_file(here, wanted, lift, etag)
 
 
 @router.post("/query/scores", responses=NPY, response_class=Response)
@@ -104,7 +104,7 @@ def splats_by_body(
     return _splat_file(here, query_request("splats", asked, lift, here) | {"what": what}, lift)
 
 
-@router.get("/render", responses=PNG, response_class=Response)
+@router.get("/render", responses=PNG | TAGGED, response_class=Response)
 def render(
     view: View,
     request: Request,
@@ -151,8 +151,11 @@ def _view(asked: wire.AskedInBody) -> str:
 
 def _entity(request: Request, here: Parts, asked: dict[str, Any], lift: LiftRecord) -> Response:
     etag = entity_tag(asked, lift)
-    same = unchanged(request, etag)
-    return same or tagged(here.queries.call(asked).body, MEDIA_TYPES[asked["operation"]], etag)
+    same = unchanged(request, etag, found=False)  # the tag is made before anybody looks for the view
+    if same is not None:
+        return same
+    content = here.queries.call(asked).body
+    return unchanged(request, etag) or tagged(content, MEDIA_TYPES[asked["operation"]], etag)
 
 
 def _splat_file(here: Parts, asked: dict[str, Any], lift: LiftRecord, etag: str | None = None) -> Response:

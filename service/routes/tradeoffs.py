@@ -8,7 +8,7 @@ from fastapi import APIRouter, Request, Response
 
 from liftcore.errors import InvalidSettings
 from service import request_id, wire
-from service.content import tagged, unchanged
+from service.content import TAGGED, tagged, unchanged
 from service.errors import InvalidRequest
 from service.parts import Here
 from service.routes.jobs import REPEATED, Key, parse_settings, take
@@ -54,7 +54,7 @@ def get_tradeoff(tradeoff: str, here: Here) -> wire.Tradeoff:
     return shape(here.store.tradeoffs.get(tradeoff))
 
 
-@router.get("/tradeoffs/{tradeoff}/chart", response_class=Response, responses=PNG)
+@router.get("/tradeoffs/{tradeoff}/chart", response_class=Response, responses=PNG | TAGGED)
 def get_chart(tradeoff: str, request: Request, here: Here) -> Response:
     """Accuracy over time, and how near the dial stays to the exact lift, as a picture."""
     found = here.store.tradeoffs.get(tradeoff)

@@ -14,7 +14,7 @@ import zipfile
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from liftcore.errors import InvalidInput, SplatliftError
+from liftcore.errors import InvalidCameras, InvalidInput, SplatliftError
 from liftcore.observe.inspect import describe_packs, describe_table
 from liftcore.observe.masks import describe_masks
 from liftcore.observe.pack import open_packs
@@ -24,7 +24,7 @@ from liftcore.scene.load import load_splats
 from service.faults import fault_of
 from service.finite import finite
 from service.uploads.checking import INVALID
-from service.wire import AssetKind
+from service.wire import VIEW_CHARACTERS, AssetKind
 
 
 def check_splats(path: Path) -> dict[str, Any]:
@@ -33,8 +33,16 @@ def check_splats(path: Path) -> dict[str, Any]:
 
 
 def check_cameras(path: Path) -> dict[str, Any]:
-    """Read and describe every camera."""
-    return {"suffix": ".zip" if zipfile.is_zipfile(path) else ".json", "found": describe_camera_file(path)}
+    """Read and describe every camera; each must have a name that a query can say."""
+    found = describe_camera_file(path)
+    for name in found["names"]:
+        if not 1 <= len(name) <= VIEW_CHARACTERS:
+            raise InvalidCameras(
+                "camera name", expected=f"1 to {VIEW_CHARACTERS} characters",
+                got=f"{len(name)}: {name[:40]!r}..." if name else "an empty one",
+                hint="name each image, without folders where that is enough",
+            )  # fmt: skip
+    return {"suffix": ".zip" if zipfile.is_zipfile(path) else ".json", "found": found}
 
 
 def check_features(path: Path) -> dict[str, Any]:

@@ -9,8 +9,22 @@ from typing import Self
 
 from service.errors import TooLarge
 from service.uploads.decoding import Coding, Decoding
+from service.wire import AssetKind
 
 STEP = 4 << 20  # bytes of content between two looks at what may still be stored
+HINTS = {AssetKind.FEATURES: "several feature packs may make one lift, so features can be cut"}
+
+
+def require_size(kind: AssetKind, count: int, limit: int) -> None:
+    """See that a body of so many bytes may come.
+
+    Raises:
+        TooLarge: it may not.
+    """
+    if count > limit:
+        raise TooLarge(
+            "body", expected=f"at most {limit} bytes, compressed or not", got="more", hint=HINTS.get(kind, "")
+        )
 
 
 class Intake:
@@ -18,13 +32,17 @@ class Intake:
 
     Args:
         draft: the file.
+        kind: what it is to be.
         limit: what the operator allows.
         coding: how the body is compressed.
         permit: called every few MiB of content with what there will be of it and what comes now, in bytes; raises
             when that may not be stored.
     """
 
-    def __init__(self, draft: Path, *, limit: int, coding: Coding | None, permit: Callable[[int, int], None]) -> None:
+    def __init__(
+        self, draft: Path, kind: AssetKind, *, limit: int, coding: Coding | None, permit: Callable[[int, int], None]
+    ) -> None:
+        self._kind = kind
         self._permit = permit
         self._permitted = 0
         self._file = draft.open("wb")
@@ -49,7 +67,7 @@ class Intake:
             ServiceError: as `permit` does.
         """
         self._received += len(chunk)
-        self._check(self._received)
+        require_size(self._kind, self._received, self._limit)
         for content in (chunk,) if self._decoding is None else self._decoding.feed(chunk):
             self._write(content)
 
@@ -66,16 +84,9 @@ class Intake:
 
     def _write(self, content: bytes) -> None:
         self._written += len(content)
-        self._check(self._written)
+        require_size(self._kind, self._written, self._limit)
         if self._written > self._permitted:
             self._permit(self._written, len(content))
             self._permitted = self._written + STEP
         self._digest.update(content)
         self._file.write(content)
-
-    def _check(self, count: int) -> None:
-        if count > self._limit:
-            raise TooLarge(
-                "body", expected=f"at most {self._limit} bytes, compressed or not", got="more",
-                hint="several feature packs may make one lift, so features can be cut",
-            )  # fmt: skip

@@ -290,7 +290,9 @@ async function look() {
     if (mine !== turn) return;
     clear();
     trouble(problem);
-    picks = picks.filter(known => known.example !== problem.argument); // a pixel beside the scene is no example
+    const [kind, place] = String(problem.argument).split("."); // like.1 is the second that was sent as like
+    const wrong = picks.filter(known => (known.unlike ? "unlike" : "like") === kind)[place];
+    picks = picks.filter(known => known !== wrong); // a pixel beside the scene is no example
     showPicks();
   }
 }

@@ -76,6 +76,22 @@ def camera_without_pose() -> bytes:
     return json.dumps(document).encode()
 
 
+def camera_of(image: str) -> bytes:
+    document = cameras_document()
+    frames = document["frames"]
+    assert isinstance(frames, list)
+    frames[1]["file_path"] = image
+    return json.dumps(document).encode()
+
+
+def nameless_camera() -> bytes:
+    return camera_of("")
+
+
+def camera_that_no_query_can_name() -> bytes:
+    return camera_of("a" * 501)
+
+
 def no_views() -> bytes:
     return json.dumps(cameras_document() | {"frames": []}).encode()
 
@@ -142,6 +158,8 @@ BAD: list[tuple[str, Callable[[], bytes]]] = [
     ("splats", empty_scene),
     ("splats", no_bytes),
     ("cameras", camera_without_pose),
+    ("cameras", nameless_camera),
+    ("cameras", camera_that_no_query_can_name),
     ("cameras", no_views),
     ("cameras", distorted),
     ("cameras", garbage),
@@ -197,6 +215,18 @@ def test_every_malformed_file_is_told_in_one_line(tmp_path: Path, kind: str, mak
     assert (problem.status, problem.type) == (422, f"/problems/invalid-{kind}")
     assert problem.expected and problem.got and "\n" not in problem.detail
     assert str(tmp_path) not in problem.model_dump_json()
+
+
+def test_names_of_cameras_are_as_long_as_a_query_may_say(tmp_path: Path) -> None:
+    for image, said in (("a" * 500, None), ("a" * 501, "501: 'aaa"), ("", "an empty one")):
+        path = tmp_path / "draft.cameras"
+        path.write_bytes(camera_of(image))
+        told = check.run(AssetKind.CAMERAS, path)
+        assert told["event"] == ("valid" if said is None else "invalid")
+        if said is not None:
+            fault = told["fault"]
+            assert (fault["argument"], fault["expected"]) == ("camera name", "1 to 500 characters")
+            assert fault["got"].startswith(said) and len(fault["got"]) < 60
 
 
 def test_upload_beyond_the_limit_is_413(client: TestClient, data: Path) -> None:

@@ -102,18 +102,24 @@ def test_features_without_words_are_asked_by_example_only(start: Callable[..., A
     ("change", "status", "argument"),
     [
         ({}, 422, "query"),
-        ({"like": "behind:1,1"}, 404, "view"),
-        ({"like": "middle:32,0"}, 422, "middle:32,0"),
-        ({"like": "middle:0,0"}, 422, "middle:0,0"),
-        ({"like": "middle"}, 422, "like"),
-        ({"unlike": "nowhere", "like": "splat:1"}, 422, "unlike"),
-        ({"like": "splat:60"}, 422, "splat:60"),
-        ({"like": "splat:" + "9" * 500}, 422, "like"),
-        ({"like": "region:left:0:9"}, 404, "region:left:0:9"),
-        ({"like": "region:left:7:0"}, 404, "region:left:7:0"),
-        ({"like": "region:behind:0:0"}, 404, "region:behind:0:0"),
+        ({"unlike": "splat:1"}, 422, "query"),
+        ({"negatives": "apple"}, 422, "query"),
+        ({"like": "behind:1,1"}, 404, "like.0"),
+        ({"like": "middle:32,0"}, 422, "like.0"),
+        ({"like": "middle:0,0"}, 422, "like.0"),
+        ({"like": "middle"}, 422, "like.0"),
+        ({"unlike": "nowhere", "like": "splat:1"}, 422, "unlike.0"),
+        ({"unlike": ["splat:2", "behind:1,1"], "like": "splat:1"}, 404, "unlike.1"),
+        ({"like": ["splat:1", "splat:60"], "text": "apple", "negatives": "lamp"}, 422, "like.1"),
+        ({"like": "splat:" + "9" * 500}, 422, "like.0"),
+        ({"like": "region:left:0:9"}, 404, "like.0"),
+        ({"like": "region:left:7:0"}, 404, "like.0"),
+        ({"like": "region:behind:0:0"}, 404, "like.0"),
         ({"like": ""}, 422, "like.0"),
-        ({"like": "a\ud800:1,1"}, 404, "view"),
+        ({"like": "a\ud800:1,1"}, 404, "like.0"),
+        ({"text": "apple", "negatives": " "}, 422, "negatives.0"),
+        ({"text": ["apple", "zeppelin"], "negatives": "lamp"}, 422, "text.1"),
+        ({"text": "apple", "negatives": ["lamp", "zeppelin"], "like": "splat:1"}, 422, "negatives.1"),
         ({"like": ["splat:1"] * 33}, 422, "like"),
         ({"like": "splat:1", "instances": 0}, 422, "instances"),
         ({"like": "splat:1", "instances": 2, "threshold": "otsu"}, 422, "instances"),
@@ -129,6 +135,17 @@ def test_examples_that_lead_nowhere_are_problems(
     }
     body = assert_problem(client.get("/query", params={"lift": lift["id"]} | known))
     assert (body["status"], body["argument"]) == (status, argument), body
+
+
+def test_what_an_example_lacks_is_told_beside_it(client: TestClient, lift: dict[str, Any]) -> None:
+    def told(**asked: Any) -> str:
+        return client.get("/query", params={"lift": lift["id"]} | asked).json()["detail"]
+
+    assert told(like="splat:60") == "like.0: expected a splat in 0..59, got 60 in splat:60"
+    assert told(unlike="splat:1") == (
+        "query: expected a text or an example of what to look for, got only what it is not; say what to look for, too"
+    )
+    assert told(like="behind:1,1").startswith("like.0: expected the name of a camera, got 'behind' in behind:1,1")
 
 
 @pytest.mark.parametrize("path", ROUTES)

@@ -1,0 +1,99 @@
+"""What is told of a request that does not have the form of its route: where, what was expected, what came."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from fastapi.testclient import TestClient
+
+from .test_problems import NO_ASSET, assert_problem
+
+JSON = {"Content-Type": "application/json"}
+THRESHOLD = "auto, valley, paper, otsu, stability, or a number from -1e6 to 1e6"
+EXAMPLE = "VIEW:x,y, region:VIEW:LEVEL:ID, splat:J, or a vector of 1 to 65536 finite numbers"
+
+
+@pytest.mark.parametrize("media", [None, "application/x-www-form-urlencoded", "text/plain"])
+def test_json_that_nothing_calls_json_is_told_of_the_header(client: TestClient, media: str | None) -> None:
+    headers = {} if media is None else {"Content-Type": media}
+    told = assert_problem(client.post("/query", content=b'{"text": ["apple"]}', headers=headers))
+    assert (told["status"], told["argument"], told["expected"]) == (422, "Content-Type", "application/json")
+    assert told["got"] == ("nothing" if media is None else repr(media))
+    assert "Content-Type: application/json" in told["hint"]
+
+
+@pytest.mark.parametrize(
+    ("body", "got"),
+    [(b"{", "its end at character 2"), (b'{"text": x}', "'x}' at character 10"), (b"{} {}", "'{}' at character 4")],
+)
+def test_what_is_no_json_says_where(client: TestClient, body: bytes, got: str) -> None:
+    told = assert_problem(client.post("/query", content=body, headers=JSON))
+    assert (told["status"], told["argument"], told["expected"]) == (422, "body", "JSON")
+    assert told["got"].startswith(got), told
+
+
+@pytest.mark.parametrize("body", [b"", b"[]", b"null", b'"text"'])
+def test_what_is_no_object_is_the_body(client: TestClient, body: bytes) -> None:
+    told = assert_problem(client.post("/query", content=body, headers=JSON))
+    assert (told["argument"], told["expected"]) == ("body", "a JSON object")
+
+
+@pytest.mark.parametrize("value", ["2e6", "-2e6", "nan", "inf", "high", ""])
+def test_threshold_is_a_word_or_a_number(client: TestClient, value: str) -> None:
+    told = assert_problem(client.get("/query", params={"text": "apple", "threshold": value}))
+    assert (told["argument"], told["expected"], told["got"]) == ("threshold", THRESHOLD, repr(value))
+
+
+@pytest.mark.parametrize(
+    ("body", "argument", "expected"),
+    [
+        ('{"like": [[NaN]]}', "like.0", EXAMPLE),
+        ('{"like": [[]]}', "like.0", EXAMPLE),
+        ('{"like": ["splat:1", [1, "x"]]}', "like.1", EXAMPLE),
+        ('{"unlike": [[true]]}', "unlike.0", EXAMPLE),
+        ('{"like": [[' + "0," * 65_536 + "0]]}", "like.0", EXAMPLE),
+        ('{"like": "splat:1"}', "like", "a valid list"),
+        ('{"threshold": true}', "threshold", THRESHOLD),
+        ('{"threshold": NaN}', "threshold", THRESHOLD),
+        ('{"top": true}', "top", "a number"),
+        ('{"instances": false}', "instances", "a number"),
+        ('{"keep": "some"}', "keep", "'all' or 'largest'"),
+    ],
+)
+def test_field_of_a_query_says_what_it_takes(client: TestClient, body: str, argument: str, expected: str) -> None:
+    told = assert_problem(client.post("/query", content=body, headers=JSON))
+    assert (told["status"], told["argument"], told["expected"]) == (422, argument, expected)
+    assert len(told["got"]) < 200
+
+
+@pytest.mark.parametrize(
+    ("path", "body", "argument", "known"),
+    [
+        ("/query", {"negative": ["x"]}, "negative", "negatives"),
+        ("/query", {"x" * 500: 1}, "x" * 80, "text"),
+        ("/lift", {"knobs": {}}, "knobs", "settings"),
+        ("/tradeoff", {"labels": {"mask": 1}}, "labels.mask", "masks, table, classes"),
+    ],
+)
+def test_unknown_field_is_refused_with_the_known_ones(
+    client: TestClient, path: str, body: dict[str, Any], argument: str, known: str
+) -> None:
+    order = {} if path == "/query" else {"splats": NO_ASSET, "cameras": NO_ASSET, "features": [NO_ASSET]}
+    told = assert_problem(client.post(path, json=order | body))
+    assert (told["status"], told["argument"]) == (422, argument)
+    assert told["expected"].startswith("one of ") and known in told["expected"]
+    assert told["got"] == repr(argument.rpartition(".")[2])
+
+
+def test_booleans_are_no_budget_and_nothing_is_no_setting(client: TestClient) -> None:
+    order = {"splats": NO_ASSET, "cameras": NO_ASSET, "features": [NO_ASSET]}
+    told = assert_problem(client.post("/tradeoff", json=order | {"budget_s": True}))
+    assert (told["argument"], told["expected"], told["got"]) == ("budget_s", "a number", "True")
+    told = assert_problem(client.post("/lift", json=order | {"settings": {"power": None}}))
+    assert (told["argument"], told["expected"]) == ("settings.power", "a boolean, a number or a text")
+
+
+def test_missing_parameter_is_a_value_that_nobody_gave(client: TestClient) -> None:
+    told = assert_problem(client.get("/render"))
+    assert (told["argument"], told["expected"], told["got"]) == ("view", "a value", "nothing")
