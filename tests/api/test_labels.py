@@ -104,7 +104,7 @@ def test_masks_judge_over_http_as_they_do_on_the_command_line(
         ({"classes": ["\ud800", "book", "apple"]}, "labels.classes.0", ""),
         ({"classes": None}, "labels.classes", "valid list"),
         ({"table": "words.safetensors"}, "labels.table", "sha256"),
-        ({"words": ["lamp"]}, "labels.words", "not permitted"),
+        ({"words": ["lamp"]}, "labels.words", "one of masks, table, classes"),
     ],
 )
 def test_labels_that_do_not_fit_are_refused_at_once(
