@@ -5,14 +5,15 @@ BIN := .venv/bin
 READY := .venv/.ready
 SHARED := ../shared/data
 SCENE ?=
+ASK ?=
 OUT ?= demo-output
 TORCH_PIP ?=
 CUDA_TORCH_PIP ?=
 
 .PHONY: demo test kernels soak contract load gpu lint format serve bench setup clean
 
-demo: $(READY)  ## the whole job through the real service; SCENE=DIR takes a scene of your own
-	$(BIN)/splatlift demo --out "$(OUT)" $(if $(SCENE),--scene "$(SCENE)")
+demo: $(READY)  ## the whole job through the real service; SCENE=DIR takes a scene of your own, ASK=TEXT a question
+	$(BIN)/splatlift demo --out "$(OUT)" $(if $(SCENE),--scene "$(SCENE)") $(if $(ASK),--ask "$(ASK)")
 
 # Files of tests are dealt to two processes, in the order in which they lie. A process that dies is not begun anew: it
 # would go on with the test that it died of.
