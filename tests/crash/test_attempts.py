@@ -238,6 +238,8 @@ def test_process_that_a_leftover_started_while_it_was_looked_for_is_ended_too(
     job = "1" * 32
     command = [sys.executable, "-S", "-c", "import time; time.sleep(600)"]
     found = [subprocess.Popen(command, env=os.environ | mark(job)) for _ in range(2)]
+    for process in found:  # for a moment after its start the system tells an empty environment
+        until(lambda at=Path(f"/proc/{process.pid}/environ"): job.encode() in at.read_bytes())
     looks = iter([[found[0].pid], [found[1].pid], []])
     monkeypatch.setattr(leftovers, "_processes", lambda: next(looks))
     assert leftovers.end_leftovers([job]) == 2
