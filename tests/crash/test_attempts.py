@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -232,14 +233,18 @@ def test_what_a_job_process_started_ends_when_its_server_does() -> None:
     until(lambda: not alive(grandchild))
 
 
+def environment(pid: int) -> bytes:
+    """Of a process, as the system tells it: nothing for a moment after its start."""
+    return Path(f"/proc/{pid}/environ").read_bytes()
+
+
 def test_process_that_a_leftover_started_while_it_was_looked_for_is_ended_too(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     job = "1" * 32
     command = [sys.executable, "-S", "-c", "import time; time.sleep(600)"]
     found = [subprocess.Popen(command, env=os.environ | mark(job)) for _ in range(2)]
-    for process in found:  # for a moment after its start the system tells an empty environment
-        until(lambda at=Path(f"/proc/{process.pid}/environ"): job.encode() in at.read_bytes())
+    until(lambda: all(job.encode() in environment(process.pid) for process in found))
     looks = iter([[found[0].pid], [found[1].pid], []])
     monkeypatch.setattr(leftovers, "_processes", lambda: next(looks))
     assert leftovers.end_leftovers([job]) == 2
