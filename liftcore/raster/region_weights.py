@@ -13,7 +13,8 @@ from liftcore.jit import inlined, kernel
 from liftcore.lanes import (
     HALVES,
     LANES,
-    WEIGHTS,
+    PIXELS,
+    TRANSMITTANCE,
     keep_lanes,
     lanes_at,
     no_lanes,
@@ -23,9 +24,10 @@ from liftcore.lanes import (
     times,
 )
 from liftcore.lanes_halves import lowest_rank, ranked_halves, without_lowest_rank
+from liftcore.lanes_select import any_above
 from liftcore.raster.constants import TILE
 from liftcore.raster.readings import LAST_BIT, MAX_SLOTS, NO_SLOT, new_taps, read_tile
-from liftcore.raster.selection import CENTRAL, LARGEST, NO_SPOT, choose, new_marks, rank_tile, spot_of
+from liftcore.raster.selection import CENTRAL, LARGEST, NO_SPOT, chosen, new_marks, rank_tile, spot_of
 from liftcore.raster.walk import CHECK_EVERY, blend_both, look, meets, new_rays, next_splat, start_rays
 
 
@@ -34,6 +36,7 @@ def weigh_tiles(first, last, frame, reading, squared, gate, plain):
     """Entries of tiles ``first..last``.
 
     What a lift does not ask for is not compiled into its walk: it costs a tenth there even where it is passed over.
+    One long function, as an array that a callee takes from a tuple is counted, by a locked instruction, at each call.
 
     Args:
         frame: Frame. reading: Reading. squared: whether a weight counts by its square; a gate sees to that itself.
@@ -65,7 +68,7 @@ def weigh_tiles(first, last, frame, reading, squared, gate, plain):
         x0 = float((tile % frame.columns) * TILE)
         y0 = float((tile // frame.columns) * TILE)
         if gate is not None and gate.kind == LARGEST:
-            rank_tile(rays, frame, tile, marks, gate.k, plain)
+            rank_tile(rays, frame, tile, marks, plain)
         start_rays(rays, frame, tile)
         read_tile(taps, reading, frame, tile)
         used, whole_tile = taps.sizes[0], reuse and taps.sizes[1] == 1
@@ -95,10 +98,13 @@ def weigh_tiles(first, last, frame, reading, squared, gate, plain):
                     if whole_tile:
                         continue
                     if gate is not None:
-                        keep_lanes(state, WEIGHTS + half * LANES, heavy)
-                        if not choose(gate, state, marks.least, marks.room, half, spot):
+                        first_ray, rooms = half * LANES, gate.k * PIXELS + half * LANES
+                        behind = lanes_at(state, TRANSMITTANCE + first_ray)
+                        known = lanes_at(marks, rooms - PIXELS), lanes_at(marks, rooms)
+                        heavy, room = chosen(gate, heavy, behind, known, spot - first_ray)
+                        keep_lanes(marks, rooms, room)
+                        if not any_above(heavy, no_lanes()):
                             continue
-                        heavy = lanes_at(state, WEIGHTS + half * LANES)
                     elif squared:
                         heavy = times(heavy, heavy)
                     met |= slot_sets[half]

@@ -1,8 +1,8 @@
 """Which of a ray's weights count, and to which power: a gate between the blending and the sums.
 
-The walk that counts all weights never comes here. For the others, the plain weights of a half row are kept in the
-state, and ``choose`` zeroes the lanes that do not count. The k largest weights of a ray are known only at
-its end, so top-k walks every tile twice: ``rank_tile`` finds what the least of them is, ``choose`` then keeps to it.
+The walk that counts all weights never comes here. For the others, ``chosen`` zeroes the lanes of a half row that do
+not count. The k largest weights of a ray are known only at its end, so top-k walks every tile twice: ``rank_tile``
+finds what the least of them is, ``chosen`` then keeps to it.
 """
 
 from __future__ import annotations
@@ -13,8 +13,19 @@ import numpy as np
 
 from liftcore.errors import InvalidInput
 from liftcore.jit import inlined, kernel
-from liftcore.lanes import LANES, PIXELS, TRANSMITTANCE, WEIGHTS, keep_lanes
+from liftcore.lanes import (
+    HALVES,
+    LANES,
+    PIXELS,
+    in_all_lanes,
+    keep_lanes,
+    lanes_at,
+    no_lanes,
+    plus,
+    times,
+)
 from liftcore.lanes_halves import lowest_half, without_lowest
+from liftcore.lanes_select import any_above, larger, only_lane, smaller, where_above, where_equal, where_reached
 from liftcore.raster.constants import TILE
 from liftcore.raster.protocol import MOST_OF_A_RAY, Selection, Weighting
 from liftcore.raster.walk import CHECK_EVERY, blend_both, look, meets, next_splat, place_of, start_rays
@@ -38,15 +49,6 @@ class Choice(NamedTuple):
     k: int  # of top-k
     light: np.float32  # of front-mass: a weight counts while T before it is above this
     floor: np.float32
-
-
-class Marks(NamedTuple):
-    """What top-k knows of a tile's 256 rays after its first walk."""
-
-    largest: np.ndarray  # [256 * k] f32, each ray's largest weights, descending
-    known: np.ndarray  # [256] i32, how many of them it has
-    least: np.ndarray  # [256] f32, the k-th of them; 0 when there are fewer
-    room: np.ndarray  # [256] i32, how many weights equal to the least belong to the k
 
 
 def choice_of(weighting: Weighting) -> Choice:
@@ -75,27 +77,23 @@ def _check(weighting: Weighting) -> None:
 
 @kernel
 def new_marks(choice) -> Any:
-    """Room for one tile's marks; empty unless the choice is top-k, none where all weights count (None)."""
-    if choice is None:
-        return None
-    pixels = PIXELS if choice.kind == LARGEST else 0
-    return Marks(
-        np.zeros(pixels * choice.k, np.float32),
-        np.zeros(pixels, np.int32),
-        np.zeros(pixels, np.float32),
-        np.zeros(pixels, np.int32),
-    )
+    """What top-k knows of a tile's 256 rays after its first walk: [(k + 1) * 256] f32, of no use to other choices.
+
+    The rays' largest weights, then their second largest, and so on to the k-th, 0 for none; at last how many weights
+    equal to a ray's k-th belong to the k. None where all weights count (None).
+    """
+    return None if choice is None else np.zeros((choice.k + 1) * PIXELS, np.float32)
 
 
 @kernel
-def rank_tile(rays, frame, tile, marks, count, plain):
-    """Walk a tile once, as ``weigh_tiles`` will, for the ``count`` largest weights of a ray; the rays are spent."""
+def rank_tile(rays, frame, tile, marks, plain):
+    """Walk a tile once, as ``weigh_tiles`` will, for the largest weights of its rays; the rays are spent."""
     x0 = float((tile % frame.columns) * TILE)
     y0 = float((tile // frame.columns) * TILE)
-    state = rays.state
     start_rays(rays, frame, tile)
-    marks.known[:] = 0
-    marks.least[:] = 0
+    marks[:] = 0
+    met = np.zeros(HALVES, np.int64)  # splats of each half row: it has no more weights than that
+    last = marks.shape[0] // PIXELS - 2
     for step in range(frame.starts[tile], frame.starts[tile + 1]):
         if (step - frame.starts[tile]) % CHECK_EVERY == 0 and not look(rays, False):
             break
@@ -104,33 +102,19 @@ def rank_tile(rays, frame, tile, marks, count, plain):
         while halves:
             half = lowest_half(halves)
             halves = without_lowest(halves)
-            keep_lanes(state, WEIGHTS + half * LANES, blend_both(rays, splat, half, plain)[0])
-            for pixel in range(half * LANES, half * LANES + LANES):
-                weight = state[WEIGHTS + pixel]
-                if weight > marks.least[pixel]:
-                    _insert(marks, pixel, count, weight)
-    for pixel in range(PIXELS):
-        if marks.least[pixel] > 0:
-            own = marks.largest[pixel * count : pixel * count + count]
-            marks.room[pixel] = (own == marks.least[pixel]).sum()
-
-
-@inlined
-def _insert(marks, pixel, count, weight):
-    """Put a weight above the least in its place among the pixel's largest."""
-    largest, first = marks.largest, pixel * count
-    known = marks.known[pixel]
-    place = first + known
-    if known < count:
-        marks.known[pixel] = known + 1
-    else:
-        place -= 1
-    while place > first and largest[place - 1] < weight:
-        largest[place] = largest[place - 1]
-        place -= 1
-    largest[place] = weight
-    if known >= count - 1:
-        marks.least[pixel] = largest[first + count - 1]
+            weights = blend_both(rays, splat, half, plain)[0]
+            at = min(met[half], last) * PIXELS + half * LANES
+            met[half] += 1
+            while at >= PIXELS and any_above(weights, lanes_at(marks, at)):
+                above = lanes_at(marks, at - PIXELS)
+                keep_lanes(marks, at, larger(lanes_at(marks, at), smaller(above, weights)))
+                at -= PIXELS
+            if at < PIXELS:
+                keep_lanes(marks, at, larger(lanes_at(marks, at), weights))
+    least = last * PIXELS
+    for place in range(least + PIXELS):
+        ray = place % PIXELS
+        marks[least + PIXELS + ray] += np.float32(marks[place] == marks[least + ray])
 
 
 @inlined
@@ -143,38 +127,28 @@ def spot_of(splat):
 
 
 @inlined
-def choose(choice, state, least, room, half, spot):
-    """Zero the lanes of a half row that do not count, and raise the others to the power; whether any counts."""
-    first = half * LANES
-    if choice.kind == CENTRAL and not first <= spot < first + LANES:
-        return False
-    largest = np.float32(0.0)
-    for lane in range(first, first + LANES):
-        weight = state[WEIGHTS + lane]
-        lit = choice.kind != FRONT or state[TRANSMITTANCE + lane] + weight > choice.light
-        weight = weight if lit and weight >= choice.floor else np.float32(0.0)
-        state[WEIGHTS + lane] = weight
-        largest = max(largest, weight)
-    if largest == 0:
-        return False
+def chosen(choice, weights, behind, marks, lane):
+    """A half row's weights as they count: zero in the lanes that do not, raised to the power in the others.
+
+    Args:
+        weights: eight lanes. behind: the transmittance behind them. marks: (the k-th weights of their rays; how many
+            equal to those still belong to the k). lane: that of the splat's centre, if it is one of the eight.
+
+    Returns:
+        The weights, and the second of the marks.
+    """
+    none, (least, room) = no_lanes(), marks
+    weights = where_reached(weights, in_all_lanes(choice.floor), weights)
     if choice.kind == CENTRAL:
-        for lane in range(first, first + LANES):
-            if lane != spot:
-                state[WEIGHTS + lane] = 0
+        weights = only_lane(weights, lane)
+    elif choice.kind == FRONT:
+        weights = where_above(plus(behind, weights), in_all_lanes(choice.light), weights)
     elif choice.kind == LARGEST:
-        for lane in range(first, first + LANES):
-            weight = state[WEIGHTS + lane]
-            if weight == least[lane] and weight > 0 and room[lane] > 0:  # equal ones near to far, until k are full
-                room[lane] -= 1
-            elif weight <= least[lane]:
-                state[WEIGHTS + lane] = 0
-    largest = np.float32(0.0)
-    for lane in range(first, first + LANES):
-        weight = state[WEIGHTS + lane]
-        largest = max(largest, weight)
-        if choice.power == 0:
-            weight = np.float32(weight > 0)
-        elif choice.power == 2:
-            weight *= weight
-        state[WEIGHTS + lane] = weight
-    return largest > 0
+        equal = where_equal(weights, least, where_above(room, none, weights))  # near to far, until k are full
+        room = plus(room, where_above(equal, none, in_all_lanes(np.float32(-1.0))))
+        weights = plus(where_above(weights, least, weights), equal)
+    if choice.power == 0:
+        weights = where_above(weights, none, in_all_lanes(np.float32(1.0)))
+    elif choice.power == 2:
+        weights = times(weights, weights)
+    return weights, room
