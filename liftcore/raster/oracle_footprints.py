@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from liftcore.raster.constants import ALPHA_FLOOR, EDGE_ON, FIELD_MARGIN, LARGEST_EXPONENT, LOW_PASS
+from liftcore.raster.constants import ALPHA_FLOOR, EDGE_ON, FIELD_MARGIN, LARGEST_EXPONENT, LOW_PASS, MAX_LOG_SCALE
 from liftcore.scene.splats import Kernel
 
 if TYPE_CHECKING:
@@ -34,8 +34,11 @@ def rotation(quat: np.ndarray) -> np.ndarray:
 
 
 def camera_axes(splats: Splats, j: int, camera: Camera) -> np.ndarray:
-    """[3, K] f64, the scaled axes of splat j in the camera's frame: three, or two for 2DGS."""
-    scales = np.exp(splats.log_scales[j].double().numpy())
+    """[3, K] f64, the scaled axes of splat j in the camera's frame: three, or two for 2DGS.
+
+    A scale of zero is the limit of small ones: a disc that has become a line keeps its plane.
+    """
+    scales = np.exp(splats.log_scales[j].double().numpy().clip(min=-MAX_LOG_SCALE))
     return camera.world_to_camera[:3, :3] @ rotation(splats.quats[j].double().numpy())[:, : len(scales)] * scales
 
 

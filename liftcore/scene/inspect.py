@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from liftcore.scene.foreign import SUFFIXES
 from liftcore.scene.load import camera_files, load_cameras, load_splats, other_models
 from liftcore.scene.ply_dialect import nearest_dialect
 from liftcore.scene.splats import Kernel
@@ -26,6 +27,8 @@ TINY = 1e-7  # scene units
 LARGEST = 1e300  # shown in place of what overflows, which JSON cannot hold
 OFF_CENTRE = 0.1  # of the image's side
 SHOWN = 3  # names in a warning
+MANY = 100  # splats: what all of so many have in common is no accident
+MOVING = ("motion_", "trbf_", "omega_")  # what spacetime splats add
 FLAT = 100  # times thinner than wide: what converters make of discs
 
 
@@ -45,13 +48,13 @@ def inspect_file(path: Path) -> dict[str, Any]:
 
 
 def is_splats(path: Path) -> bool:
-    """Whether the file begins like a PLY, or is named like one or like a checkpoint."""
-    if path.suffix.lower() in (".ply", ".pt", ".pth", ".ckpt"):
+    """Whether the file begins like splats, or is named like them or like a checkpoint, if only to be refused."""
+    if path.suffix.lower() in (".ply", ".pt", ".pth", ".ckpt", *SUFFIXES):
         return True
     if not path.is_file():
         return False
     with path.open("rb") as handle:
-        return handle.read(3) == b"ply"
+        return handle.read(4) in (b"ply\n", b"ply\r", b"NGSP")
 
 
 def describe_splats(splats: Splats) -> dict[str, Any]:
@@ -121,10 +124,27 @@ def _splat_warnings(splats: Splats, scales: Tensor, opacities: Tensor) -> list[s
         "have an opacity below 1/255 and are never seen": faint,
     }
     warnings = [f"{count} of {splats.count} splats {what}" for what, count in counted.items() if count]
+    warnings += _reading_warnings(splats)
     if splats.sh is None:
         warnings.append("no colour: renders in RGB are not possible")
     if splats.kernel is Kernel.GAUSSIAN_3D and bool((scales[:, 2] * FLAT < scales[:, :2].amin(dim=1)).all()):
         warnings.append("every splat is flat along its third axis: if they are discs of 2DGS, lift with kernel=2dgs")
+    return warnings
+
+
+def _reading_warnings(splats: Splats) -> list[str]:
+    """Files that may mean something else than they say."""
+    warnings, many = [], splats.count >= MANY
+    logits = splats.opacity_logits
+    if many and bool(((logits >= 0) & (logits <= 1)).all()):
+        warnings.append(
+            "all opacities lie between 0 and 1, as if they were no logits: sigmoid makes them 0.5 to 0.73"
+        )
+    if many and bool((splats.log_scales > 0).all()):
+        warnings.append("all scales are above 0, as if they were no logarithms: exp makes them larger than 1")
+    moving = sorted(name for name in splats.extras if name.startswith(MOVING))
+    if moving:
+        warnings.append(f"properties of moving splats ({moving[0]}, ...) are not read: the scene stands still")
     return warnings
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from liftcore.errors import InvalidCameras, InvalidSplats
 from liftcore.scene.colmap import has_model, model_files, read_colmap
+from liftcore.scene.foreign import LFS_POINTER
 from liftcore.scene.inria import parse_inria
 from liftcore.scene.json_file import read_json
 from liftcore.scene.transforms import parse_transforms
@@ -43,7 +44,7 @@ def load_splats(path: Path, kernel: Kernel | None = None, *, colour: bool = True
     """
     from liftcore.scene.ply import read_splats
 
-    if path.suffix.lower() in PICKLED:
+    if path.suffix.lower() in PICKLED and not _begins(path, LFS_POINTER):
         raise InvalidSplats(
             str(path),
             expected="a PLY file",
@@ -51,6 +52,14 @@ def load_splats(path: Path, kernel: Kernel | None = None, *, colour: bool = True
             hint="export the splats as PLY from the program that trained them",
         )
     return read_splats(path, kernel, colour=colour)
+
+
+def _begins(path: Path, first: bytes) -> bool:
+    try:
+        with path.open("rb") as handle:
+            return handle.read(len(first)) == first
+    except OSError:
+        return False
 
 
 def load_cameras(path: Path) -> Cameras:

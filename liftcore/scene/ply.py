@@ -10,6 +10,7 @@ import torch
 
 from liftcore.errors import InvalidSplats
 from liftcore.files import whole_file
+from liftcore.scene.mip_filter import FILTER, filtered
 from liftcore.scene.ply_dialect import NORMALS, Slot, model_slots, recognise_kernel, usual_layout
 from liftcore.scene.ply_header import SCALAR_TYPES, PlyHeader, PlyProperty, parse_header, read_header
 from liftcore.scene.splats import Kernel, Splats
@@ -31,7 +32,9 @@ def read_splats(path: Path, kernel: Kernel | None = None, *, colour: bool = True
 
     The kernel is recognised from the properties unless it is given. Columns that the model does not know are
     kept as extras in their own type; ``double`` columns of the model become float32. Without ``colour`` neither
-    colours nor extras are read or allocated, and what comes cannot be written back.
+    colours nor extras are read or allocated, and what comes cannot be written back. A ``filter_3D`` becomes part of
+    scales and opacities (`mip_filter`), which are then written as plain splats; elements behind the vertices are
+    neither read nor written.
 
     Raises:
         InvalidSplats: the file is malformed, lacks a property of the kernel, or holds NaN or no splats.
@@ -50,15 +53,17 @@ def read_splats(path: Path, kernel: Kernel | None = None, *, colour: bool = True
             )
     if header.count == 0:
         raise InvalidSplats(str(path), expected="at least one splat", got="an empty scene")
-    if not colour:
-        geometry = {name: slot for name, slot in slots.items() if slot.field not in COLOUR}
-        fields, extras = _read_columns(path, header, geometry, [])
-        with _named(path):
-            return Splats(**fields, kernel=kernel, extras=extras, layout=(), header=())
     others = [column for column in header.properties if column.name not in slots]
+    if not colour:
+        slots = {name: slot for name, slot in slots.items() if slot.field not in COLOUR}
+        others = [column for column in others if column.name == FILTER]
     fields, extras = _read_columns(path, header, slots, others)
+    layout, lines = (tuple(names), header.lines) if colour else ((), ())
     with _named(path):
-        return Splats(**fields, kernel=kernel, extras=extras, layout=tuple(names), header=header.lines)
+        if FILTER in extras:
+            lines, layout = (), tuple(name for name in layout if name != FILTER)
+            fields |= _filtered(fields, extras.pop(FILTER))
+        return Splats(**fields, kernel=kernel, extras=extras, layout=layout, header=lines)
 
 
 def write_splats(splats: Splats, path: Path) -> None:
@@ -93,6 +98,11 @@ def _read_columns(
             for name, target in targets.items():
                 target[start : start + BLOCK_ROWS] = rows[name]
     return _tensors(fields), _tensors(extras)
+
+
+def _filtered(fields: Mapping[str, Tensor], deviations: Tensor) -> dict[str, Tensor]:
+    scales, logits = filtered(fields["log_scales"].numpy(), fields["opacity_logits"].numpy(), deviations.numpy())
+    return _tensors({"log_scales": scales, "opacity_logits": logits})
 
 
 def _field_shapes(slots: Mapping[str, Slot]) -> dict[str, tuple[int, ...]]:

@@ -21,6 +21,16 @@ MAX_SH_DEGREE = 4
 LOBE_CHANNELS = 6  # of a spherical beta lobe: r g b theta phi beta
 NORMALS = ("nx", "ny", "nz")
 
+# Files of other models, which share names with splats: (a property of theirs, what it is, what to do).
+_OTHER_MODELS = (
+    (
+        "f_anchor_feat_0",
+        "anchors of Scaffold-GS, which its networks turn into splats",
+        "export the splats themselves",
+    ),
+    ("f_offset_0", "anchors of Scaffold-GS, which its networks turn into splats", "export the splats themselves"),
+)
+
 _SIGNATURES = {
     "Inria 3DGS": {
         "x",
@@ -63,8 +73,11 @@ def model_slots(names: Sequence[str], kernel: Kernel, source: str) -> dict[str, 
     """The columns that the model knows; the others are extras.
 
     Raises:
-        InvalidSplats: a column of the kernel is missing, or there is an odd number of them.
+        InvalidSplats: a column of the kernel is missing, there is an odd number of them, or the model is another.
     """
+    for name, what, hint in _OTHER_MODELS:
+        if name in names:
+            raise InvalidSplats(source, expected="splats", got=f"{what} (property {name!r})", hint=hint)
     slots = _required(kernel)
     for name in slots:
         if name not in names:

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from liftcore.errors import InvalidSplats
+from liftcore.scene.foreign import CONVERT, foreign_format
 
-if TYPE_CHECKING:
-    from pathlib import Path
-
-MAX_HEADER_BYTES = 64 * 1024
-MAX_HEADER_LINES = 1024
+MAX_HEADER_BYTES = 256 * 1024
+MAX_HEADER_LINES = 4096
 
 # Both spellings of the eight scalar types of PLY 1.0, and their NumPy names.
 SCALAR_TYPES = {
@@ -37,7 +35,13 @@ SCALAR_TYPES = {
 _END = re.compile(rb"(?:^|\n)end_header(\r?\n)")
 _COUNT = re.compile(r"[0-9]{1,18}")
 _FORMAT = ["format", "binary_little_endian", "1.0"]
+_OTHER_FORMATS = {"ascii", "binary_big_endian"}
 _EXPORT = "export the splats again as binary little-endian PLY"
+_REWRITE = (
+    "rewrite it with Python: from plyfile import PlyData; p = PlyData.read('IN.ply'); p.text = False; "
+    "p.byte_order = '<'; p.write('OUT.ply')"
+)
+_SPLAT_PROPERTIES = ("opacity", "scale_0", "rot_0", "f_dc_0", "sh0_0", "packed_position")  # one at least
 
 
 @dataclass(frozen=True)
@@ -55,12 +59,13 @@ class PlyProperty:
 
 @dataclass(frozen=True)
 class PlyHeader:
-    """A header that fits its file: one vertex element of scalar columns, little-endian."""
+    """A header that fits its file: a vertex element of scalar columns before any other, little-endian."""
 
-    lines: tuple[str, ...]  # verbatim, with end_header, without the line feeds
+    lines: tuple[str, ...]  # verbatim, with end_header, without the line feeds and what describes other elements
     count: int  # rows
     properties: tuple[PlyProperty, ...]
     data_offset: int  # bytes before the first row
+    after: int | None = 0  # bytes behind the last row, of other elements; None when their lists make it unknown
 
     @property
     def stride(self) -> int:
@@ -77,11 +82,11 @@ class PlyHeader:
 
 
 def read_header(path: Path) -> PlyHeader:
-    """Read and check the header of a splat PLY, at most 64 KiB of the file.
+    """Read and check the header of a splat PLY, at most 256 KiB of the file.
 
     Raises:
-        InvalidSplats: the file cannot be opened, is not a binary little-endian PLY with one vertex element of
-            scalar properties, or has another size than the header says.
+        InvalidSplats: the file cannot be opened, is not a binary little-endian PLY that begins with a vertex element
+            of scalar properties, or has another size than the header says.
     """
     try:
         with path.open("rb") as handle:
@@ -93,15 +98,17 @@ def read_header(path: Path) -> PlyHeader:
         ) from None
     header = parse_header(head, str(path))
     rows = size - header.data_offset
-    expected = header.count * header.stride
-    if rows != expected:
+    expected = header.count * header.stride + (header.after or 0)
+    if rows < expected or (header.after is not None and rows > expected):
         if rows < expected:
             hint = "the file is truncated: copy or export it again"
         else:
             hint = "the file has bytes that its header does not describe: export it again"
         raise InvalidSplats(
             str(path),
-            expected=f"{header.count} rows of {header.stride} bytes = {expected} bytes after the header",
+            expected=f"{header.count} rows of {header.stride} bytes"
+            + (f" and {header.after} bytes of other elements" if header.after else "")
+            + f" = {expected} bytes after the header",
             got=f"{rows} bytes",
             hint=hint,
         )
@@ -115,20 +122,44 @@ def parse_header(head: bytes, source: str) -> PlyHeader:
         InvalidSplats: the bytes are not the header of a splat PLY.
     """
     if head[:4] not in (b"ply\n", b"ply\r"):
-        raise InvalidSplats(source, expected="a PLY file (first line 'ply')", got=_first_bytes(head), hint=_EXPORT)
+        foreign = foreign_format(head, Path(source).suffix)
+        got, hint = foreign or (_first_bytes(head), _EXPORT)
+        raise InvalidSplats(source, expected="a PLY file (first line 'ply')", got=got, hint=hint)
     end = _END.search(head)
     if end is None:
         limit = f"'end_header' within the first {MAX_HEADER_BYTES} bytes"
         raise InvalidSplats(source, expected=limit, got=f"none in {len(head)} bytes", hint=_EXPORT)
     text = head[: end.end() - 1]
     if not text.isascii():
-        raise InvalidSplats(source, expected="an ASCII header", got="other characters in it", hint=_EXPORT)
+        hint = "take the comments with other characters out of it"
+        raise InvalidSplats(source, expected="an ASCII header", got="other characters in it", hint=hint)
     lines = tuple(text.decode("ascii").split("\n"))
     if len(lines) > MAX_HEADER_LINES:
-        limit = f"at most {MAX_HEADER_LINES} header lines"
-        raise InvalidSplats(source, expected=limit, got=str(len(lines)), hint=_EXPORT)
-    count, properties = _HeaderLines(source).walk(lines[1:-1])
-    return PlyHeader(lines, count, properties, data_offset=end.end())
+        limit, hint = f"at most {MAX_HEADER_LINES} header lines", "leave out properties that are no splat's"
+        raise InvalidSplats(source, expected=limit, got=str(len(lines)), hint=hint)
+    _refuse_clouds(lines, source)
+    found = _HeaderLines(source)
+    found.walk(lines[1:-1])
+    own = (*lines[: found.own_lines + 1], lines[-1])
+    return PlyHeader(own, found.count or 0, tuple(found.properties.values()), end.end(), found.after)
+
+
+def _refuse_clouds(lines: tuple[str, ...], source: str) -> None:
+    """Point clouds and meshes: what is wrong with them is not how they are written."""
+    words = [line.split() for line in lines]
+    names = {line[-1] for line in words if line[:1] == ["property"]}
+    if not names.issuperset("xyz") or names.intersection(_SPLAT_PROPERTIES):
+        return
+    is_mesh = any(line[:2] == ["element", "face"] for line in words)
+    hint = "give the trained splats; the 3DGS trainers keep them in point_cloud/iteration_N/point_cloud.ply"
+    if any(name.startswith("scalar_") for name in names):
+        hint = "CloudCompare renames properties (scalar_opacity): give the file that it was opened from"
+    raise InvalidSplats(
+        source,
+        expected="splats (properties such as 'opacity', 'scale_0', 'rot_0')",
+        got=f"a {'mesh' if is_mesh else 'point cloud'} without any of them",
+        hint=hint,
+    )
 
 
 def _first_bytes(head: bytes) -> str:
@@ -143,44 +174,64 @@ class _HeaderLines:
         self.has_format = False
         self.count: int | None = None
         self.properties: dict[str, PlyProperty] = {}
+        self.own_lines = 0  # up to the elements behind the vertices
+        self.after: int | None = 0
+        self._other = 0  # rows of the element behind the vertices that is being read
+        self._is_behind = False
 
-    def walk(self, lines: tuple[str, ...]) -> tuple[int, tuple[PlyProperty, ...]]:
+    def walk(self, lines: tuple[str, ...]) -> None:
         keywords = {"format": self._format, "element": self._element, "property": self._property}
         for line in lines:
             words = line.split()
-            if not words or words[0] in ("comment", "obj_info"):
-                continue
-            if words[0] not in keywords:
-                raise self._refuse("format, element, property or comment lines", f"{line.strip()[:60]!r}")
-            keywords[words[0]](words)
+            if words and words[0] not in ("comment", "obj_info"):
+                if words[0] not in keywords:
+                    raise self._refuse("format, element, property or comment lines", f"{line.strip()[:60]!r}")
+                keywords[words[0]](words)
+            self.own_lines += not self._is_behind
         if self.count is None or not self.properties:
             raise self._refuse("an element 'vertex' with properties", "a header without one")
-        return self.count, tuple(self.properties.values())
 
     def _format(self, words: list[str]) -> None:
-        if words != _FORMAT or self.has_format:
+        if self.has_format or words[2:] != _FORMAT[2:] or words[1] not in _OTHER_FORMATS | {_FORMAT[1]}:
             raise self._refuse(f"{' '.join(_FORMAT)!r}, once", repr(" ".join(words)[:60]))
+        if words[1] in _OTHER_FORMATS:
+            raise self._refuse(repr(" ".join(_FORMAT)), repr(" ".join(words)), _REWRITE)
         self.has_format = True
 
     def _element(self, words: list[str]) -> None:
         if not self.has_format:
             raise self._refuse("the format before the elements", repr(" ".join(words)[:60]))
-        if self.count is not None or len(words) != 3 or words[1] != "vertex":
-            hint = "compressed splats and meshes have other elements: export plain splats"
-            raise self._refuse("'vertex' as the only element", repr(" ".join(words)[:60]), hint)
-        if not _COUNT.fullmatch(words[2]):
-            raise self._refuse("a count of splats of zero or more", repr(words[2][:40]))
-        self.count = int(words[2])
+        if len(words) != 3 or not _COUNT.fullmatch(words[2]):
+            raise self._refuse("the name of an element and a count of zero or more", repr(" ".join(words)[:60]))
+        if self.count is not None:
+            self._is_behind, self._other = True, int(words[2])
+        elif words[1] == "vertex":
+            self.count = int(words[2])
+        elif words[1] == "chunk":
+            raise self._refuse("plain splats", "SuperSplat's compressed PLY", CONVERT)
+        else:
+            raise self._refuse("'vertex' as the first element", repr(" ".join(words)[:60]))
 
     def _property(self, words: list[str]) -> None:
         if self.count is None:
             raise self._refuse("'element vertex' before its properties", repr(" ".join(words)[:60]))
-        if len(words) != 3 or words[1] not in SCALAR_TYPES:
+        is_list = len(words) == 5 and words[1] == "list" and self._is_behind
+        if not is_list and (len(words) != 3 or words[1] not in SCALAR_TYPES):
             raise self._refuse("scalar properties ('property float x')", repr(" ".join(words)[:60]))
+        if self._is_behind:
+            self._pass_over(None if is_list else int(SCALAR_TYPES[words[1]][1:]))
+            return
         name = words[2]
         if name in self.properties:
             raise self._refuse("each property once", f"{name!r} twice")
         self.properties[name] = PlyProperty(name, SCALAR_TYPES[words[1]])
+
+    def _pass_over(self, width: int | None) -> None:
+        """A column of an element that is not read, of so many bytes a row: None for lists."""
+        if width is not None and self.after is not None:
+            self.after += self._other * width
+        elif self._other:
+            self.after = None
 
     def _refuse(self, expected: str, got: str, hint: str = _EXPORT) -> InvalidSplats:
         return InvalidSplats(f"{self.source} header", expected=expected, got=got, hint=hint)

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 
 SH_ROWS = (1, 4, 9, 16, 25)  # (degree + 1)^2
+_BEYOND = {"opacity_logits": (True, True), "log_scales": (True, False)}  # whether -inf and +inf have a meaning
 
 
 class Kernel(StrEnum):
@@ -30,6 +31,9 @@ class Kernel(StrEnum):
 @dataclass(frozen=True)
 class Splats:
     """P trained splats. Scales are logs and opacities logits, as in the files; the raster activates them.
+
+    A logit may be infinite (an opacity of 1 or 0, as converters of quantised splats write it), and a log scale minus
+    infinity (flat); all else is finite.
 
     ``layout``, ``extras`` and ``header`` keep what the file had beyond the model (normals, SAGA's ``mask``,
     comments), so that writing gives back what was read.
@@ -103,8 +107,10 @@ def _check_column(name: str, tensor: Tensor, shape: tuple[int, ...]) -> None:
         )
     # The extremes carry NaN and infinity along, and need no memory of the tensor's size.
     low, high = torch.aminmax(tensor) if tensor.numel() else (torch.zeros(()), torch.zeros(()))
-    if not bool(torch.isfinite(low) & torch.isfinite(high)):
-        bad = ~torch.isfinite(tensor)
+    least, most = _BEYOND.get(name, (False, False))
+    below, above = (torch.isfinite(low) | (low < 0) & least), (torch.isfinite(high) | (high > 0) & most)
+    if not bool(below & above):
+        bad = ~torch.isfinite(tensor) & ~(torch.isneginf(tensor) & least) & ~(torch.isposinf(tensor) & most)
         row = int(bad.reshape(shape[0], -1).any(dim=1).nonzero()[0, 0])
         total = int(bad.sum())
         raise InvalidSplats(

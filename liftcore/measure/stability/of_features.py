@@ -246,13 +246,17 @@ MAPS: tuple[Extreme, ...] = (
 REFUSALS: tuple[Extreme, ...] = (
     *(
         refused(
-            f"an opacity logit of {value}",
-            "no opacity",
-            lambda value=value: splats_at([(0.0, 0.0, 2.0)], logits=value),
+            name,
+            "no splat",
+            lambda more=more: splats_at(**{"means": [(0.0, 0.0, 2.0)], **more}),
             "finite values",
             kernels=GAUSSIAN,
         )
-        for value in (math.nan, math.inf)
+        for name, more in (
+            ("an opacity logit of nan", {"logits": math.nan}),
+            ("a log scale of inf", {"log_scales": math.inf}),
+            ("a place of inf", {"means": [(0.0, math.inf, 2.0)]}),
+        )
     ),
     refused("no splats (P = 0)", "no X", lambda: splats_at(np.zeros((0, 3))), "empty scene", kernels=GAUSSIAN),
     refused("no views", "no rays", lambda: Cameras(()), "at least one view", kernels=GAUSSIAN),

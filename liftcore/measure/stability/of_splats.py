@@ -95,6 +95,12 @@ OPACITIES: tuple[Extreme, ...] = (
         _opaque_or_absent,
     ),
     walked(
+        "opacity logits of +-infinity, as converters of quantised splats write them",
+        "opaque to the cap of 0.99, or absent",
+        lambda kernel: _row(kernel, logits=[math.inf, -math.inf, 0.5, math.inf, -math.inf]),
+        _opaque_or_absent,
+    ),
+    walked(
         "every splat transparent (logits of -20)",
         "alphas of 2e-9: below the floor of 1/255, so no weight",
         lambda kernel: _row(kernel, logits=-20.0),
@@ -144,6 +150,12 @@ OPACITIES: tuple[Extreme, ...] = (
 )
 
 SHAPES: tuple[Extreme, ...] = (
+    walked(
+        "a log scale of minus infinity on one axis",
+        "as flat as with a scale of 1e-12",
+        lambda kernel: _row(kernel, log_scales=[-1.0, -math.inf, -2.0]),
+        like=lambda kernel: exact_weights(_row(kernel, log_scales=[-1.0, math.log(1e-12), -2.0])),
+    ),
     walked(
         "scales of 1e-12",
         "points: footprints of the low-pass alone",

@@ -12,7 +12,7 @@ import torch
 from safetensors.torch import save_file
 
 from liftcore.artifact import InputFile, Lift, LiftMetadata, save_lift
-from liftcore.errors import InvalidInput, SplatliftError
+from liftcore.errors import InvalidInput, InvalidSplats, SplatliftError
 from liftcore.observe.inspect import inspect_file
 from liftcore.observe.observation import FeatureGrid, RegionMap
 from liftcore.observe.write_pack import write_pack
@@ -53,6 +53,42 @@ def test_splats_are_described_and_their_faults_counted(tmp_path: Path) -> None:
         "below 1/255",
     ):
         assert words in text
+
+
+def test_values_that_are_no_logits_and_no_logarithms_are_noticed(tmp_path: Path) -> None:
+    opacities = torch.linspace(0.05, 1, 100)
+    splats = Splats(torch.rand(100, 3), torch.ones(100, 4), torch.full((100, 3), 0.01), opacities)
+    write_splats(splats, tmp_path / "activated.ply")
+    text = " | ".join(inspected(tmp_path / "activated.ply")["warnings"])
+    assert "as if they were no logits" in text
+    assert "as if they were no logarithms" in text
+    opacities[7], splats.log_scales[7, 1] = 1.5, -0.5
+    write_splats(splats, tmp_path / "stored.ply")
+    assert "as if" not in " | ".join(inspected(tmp_path / "stored.ply")["warnings"])
+
+
+def test_moving_splats_are_said_to_stand_still(tmp_path: Path) -> None:
+    splats = Splats(torch.rand(2, 3), torch.ones(2, 4), torch.zeros(2, 3), torch.zeros(2))
+    write_splats(replace(splats, extras={"motion_0": torch.zeros(2)}), tmp_path / "moving.ply")
+    assert any("motion_0" in warning for warning in inspected(tmp_path / "moving.ply")["warnings"])
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("scene.splat", b"\0" * 64, "splat-transform"),
+        ("scene.ksplat", b"\0" * 64, "splat-transform"),
+        ("scene.sog", b"PK\x03\x04", r"\.sog format.*splat-transform"),
+        ("scene.spz", b"\x1f\x8b\x08", r"\.spz format.*splat-transform"),
+        ("unnamed", b"NGSP\x04\0\0\0", r"\.spz format.*splat-transform"),
+        ("step.ckpt", b"version https://git-lfs.github.com/spec/v1\n", "git lfs pull"),
+        ("step.ckpt", b"PK\x03\x04", "a Python pickle"),
+    ],
+)
+def test_splats_in_another_format_are_named(name: str, content: bytes, message: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(InvalidSplats, match=message):
+        inspect_file(tmp_path / name)
 
 
 def test_discs_with_a_third_scale_are_noticed(tmp_path: Path) -> None:

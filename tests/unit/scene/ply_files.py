@@ -38,6 +38,13 @@ def ply_bytes(names: list[str], count: int = 5, types: dict[str, str] | None = N
     return header.encode() + b"\nend_header\n" + rows.tobytes()
 
 
+def ply_rows(names: list[str], count: int = 5) -> np.ndarray:
+    """The rows of ``ply_bytes`` of float columns, to be changed."""
+    content = ply_bytes(names, count)
+    dtype = np.dtype([(name, "<f4") for name in names])
+    return np.frombuffer(content[-count * dtype.itemsize :], dtype).copy()
+
+
 def with_ply(tmp_path: Path, content: bytes) -> Path:
     path = tmp_path / "splats.ply"
     path.write_bytes(content)

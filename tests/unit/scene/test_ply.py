@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 import torch
-from ply_files import DIALECTS, INRIA, ply_bytes, with_ply
+from ply_files import DIALECTS, INRIA, ply_bytes, ply_rows, with_ply
 
 from liftcore.errors import InvalidSplats
 from liftcore.scene.ply import read_splats, write_splats
@@ -157,11 +157,12 @@ def test_failed_write_leaves_nothing_behind(tmp_path: Path) -> None:
 HEADER = "ply\nformat binary_little_endian 1.0\n"
 MALFORMED = {
     "empty file": (b"", "an empty file"),
-    "not a PLY": (b"PK\x03\x04zip", "expected a PLY file"),
-    "header bomb": (b"ply\n" + b"comment bomb\n" * 9000, "'end_header' within the first 65536 bytes"),
-    "too many lines": (HEADER.encode() + b"comment\n" * 2000 + b"end_header\n", "at most 1024 header lines"),
-    "ascii": (b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n", "format ascii 1.0"),
-    "big-endian": (b"ply\nformat binary_big_endian 1.0\nend_header\n", "binary little-endian"),
+    "not a PLY": (b"PLY?", "expected a PLY file"),
+    "zip": (b"PK\x03\x04zip", "got a zip"),
+    "header bomb": (b"ply\n" + b"comment bomb\n" * 40000, "'end_header' within the first 262144 bytes"),
+    "too many lines": (HEADER.encode() + b"comment\n" * 5000 + b"end_header\n", "at most 4096 header lines"),
+    "ascii": (b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n", "format ascii 1.0.*PlyData"),
+    "big-endian": (b"ply\nformat binary_big_endian 1.0\nend_header\n", "binary_little_endian"),
     "list property": (
         f"{HEADER}element vertex 1\nproperty list uchar int a\nend_header\n".encode(),
         "scalar properties",
@@ -170,16 +171,16 @@ MALFORMED = {
         f"{HEADER}element vertex 1\nproperty half a\nend_header\n".encode(),
         "scalar properties",
     ),
-    "negative count": (f"{HEADER}element vertex -5\nproperty float x\nend_header\n".encode(), "got '-5'"),
+    "negative count": (f"{HEADER}element vertex -5\nproperty float x\nend_header\n".encode(), "vertex -5"),
     "huge count": (
         f"{HEADER}element vertex 999999999999999\nproperty float x\nend_header\n".encode(),
         "the file is truncated",
     ),
-    "count bomb": (f"{HEADER}element vertex {'9' * 5000}\nend_header\n".encode(), "a count of splats"),
-    "other element first": (f"{HEADER}element chunk 1\nproperty float x\nend_header\n".encode(), "'vertex'"),
-    "second element": (
-        f"{HEADER}element vertex 1\nproperty float x\nelement face 1\nend_header\n".encode(),
-        "'vertex' as the only element",
+    "count bomb": (f"{HEADER}element vertex {'9' * 5000}\nend_header\n".encode(), "a count of zero or more"),
+    "other element first": (f"{HEADER}element camera 1\nproperty float x\nend_header\n".encode(), "'vertex' as the"),
+    "compressed": (
+        f"{HEADER}element chunk 1\nproperty float x\nend_header\n".encode(),
+        "SuperSplat's.*splat-transform",
     ),
     "same property twice": (
         f"{HEADER}element vertex 1\nproperty float x\nproperty float x\nend_header\n".encode(),
@@ -192,7 +193,20 @@ MALFORMED = {
     "trailing bytes": (ply_bytes(INRIA) + b"x", "does not describe"),
     "empty scene": (ply_bytes(INRIA, count=0), "an empty scene"),
     "missing opacity": (ply_bytes([n for n in INRIA if n != "opacity"]), r"'opacity'.*dialect is Inria 3DGS"),
-    "point cloud": (ply_bytes([*"xyz", "red", "green", "blue"]), "a point cloud, which has no splats"),
+    "point cloud": (ply_bytes([*"xyz", "red", "green", "blue"]), "a point cloud without.*point_cloud/iteration_N"),
+    "mesh": (
+        ply_bytes([*"xyz"], head="comment a\n").replace(
+            b"end_header", b"element face 0\nproperty list uchar int a\nend_header"
+        ),
+        "got a mesh",
+    ),
+    "cloudcompare": (ply_bytes([*"xyz", *(f"scalar_{name}" for name in INRIA[3:])]), "CloudCompare renames"),
+    "scaffold": (ply_bytes([*INRIA, "f_offset_0"]), "anchors of Scaffold-GS"),
+    "git lfs": (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n", "git lfs pull"),
+    "web page": (b"<!DOCTYPE html>\n<html>", "a web page"),
+    "spz": (b"NGSP\x04\0\0\0", ".spz format.*splat-transform"),
+    "gzip": (b"\x1f\x8b\x08", "a gzip file.*Content-Encoding"),
+    "NumPy": (b"\x93NUMPY\x01", "a NumPy array"),
     "odd number of f_rest": (ply_bytes([*INRIA, "f_rest_0"]), r"0, 9, 24, 45, 72 properties f_rest"),
     "gap in f_rest": (ply_bytes([*INRIA, "f_rest_1"]), r"'f_rest_0'.*'f_rest_1' without it"),
     "odd number of lobes": (ply_bytes([*DIALECTS["dbs"], "sb_params_12"]), "multiple of 6"),
@@ -267,3 +281,65 @@ def test_arrays_of_numpy_are_refused_in_words() -> None:
     means = np.zeros((5, 3), np.float32)
     with pytest.raises(InvalidSplats, match="a tensor of torch, got ndarray"):
         Splats(means, torch.ones(5, 4), torch.zeros(5, 3), torch.zeros(5))  # pyright: ignore[reportArgumentType]
+
+
+def test_elements_behind_the_vertices_are_passed_over(tmp_path: Path) -> None:
+    plain = ply_bytes(INRIA, head="comment kept\n")
+    others = b"element camera 2\nproperty float focal\nproperty uchar id\nelement version 3\nproperty uchar number\n"
+    content = plain.replace(b"end_header", others + b"end_header") + bytes(2 * 5 + 3)
+    write_splats(read_splats(with_ply(tmp_path, content)), tmp_path / "again.ply")
+    assert (tmp_path / "again.ply").read_bytes() == plain
+    with pytest.raises(InvalidSplats, match=r"and 13 bytes of other elements = 353 bytes.*got 352 bytes.*truncated"):
+        read_splats(with_ply(tmp_path, content[:-1]))
+    with pytest.raises(InvalidSplats, match="does not describe"):
+        read_splats(with_ply(tmp_path, content + b"x"))
+
+
+def test_lists_behind_the_vertices_are_passed_over(tmp_path: Path) -> None:
+    faces = b"element face 1\nproperty list uchar int vertex_indices\nend_header"
+    content = ply_bytes(INRIA).replace(b"end_header", faces) + b"\x03" + bytes(12)
+    assert torch.equal(
+        read_splats(with_ply(tmp_path, content)).means, read_splats(with_ply(tmp_path, ply_bytes(INRIA))).means
+    )
+
+
+def test_opacity_may_be_whole_and_a_splat_flat(tmp_path: Path) -> None:
+    rows = ply_rows(INRIA)
+    rows["opacity"][:2], rows["scale_1"][3] = (np.inf, -np.inf), -np.inf
+    path = with_ply(tmp_path, ply_bytes(INRIA)[: -rows.nbytes] + rows.tobytes())
+    splats = read_splats(path)
+    assert torch.sigmoid(splats.opacity_logits[:2]).tolist() == [1, 0]
+    write_splats(splats, tmp_path / "again.ply")
+    assert (tmp_path / "again.ply").read_bytes() == path.read_bytes()
+    rows["scale_1"][3] = np.inf
+    with pytest.raises(InvalidSplats, match=r"log_scales: expected finite values, got 1 .*splat 3"):
+        read_splats(with_ply(tmp_path, ply_bytes(INRIA)[: -rows.nbytes] + rows.tobytes()))
+
+
+@pytest.mark.parametrize("colour", [True, False])
+def test_filter_of_mip_splatting_is_applied(colour: bool, tmp_path: Path) -> None:
+    names = [*INRIA, "filter_3D"]
+    rows = ply_rows(names)
+    rows["filter_3D"] = [0.0, 0.5, 1e-3, 20.0, 1.0]
+    path = with_ply(tmp_path, ply_bytes(names)[: -rows.nbytes] + rows.tobytes())
+    splats = read_splats(path, colour=colour)
+    scales = np.exp(np.stack([rows[f"scale_{i}"] for i in range(3)], axis=1).astype(np.float64))
+    squares, wider = scales**2, scales**2 + rows["filter_3D"].astype(np.float64)[:, None] ** 2
+    opacity = 1 / (1 + np.exp(-rows["opacity"].astype(np.float64))) * np.sqrt(squares.prod(1) / wider.prod(1))
+    np.testing.assert_allclose(torch.exp(splats.log_scales.double()), np.sqrt(wider), rtol=1e-6)
+    np.testing.assert_allclose(torch.sigmoid(splats.opacity_logits.double()), opacity, rtol=1e-6)
+    if colour:  # what is written has the filter in it, and is not filtered again
+        write_splats(splats, tmp_path / "plain.ply")
+        again = read_splats(tmp_path / "plain.ply")
+        assert "filter_3D" not in again.layout
+        assert torch.equal(again.opacity_logits, splats.opacity_logits)
+
+
+def test_filter_of_mip_splatting_must_be_a_width(tmp_path: Path) -> None:
+    names = [*INRIA, "filter_3D"]
+    rows = ply_rows(names)
+    rows["filter_3D"] = [0.0, 0.5, -1e-3, 20.0, 1.0]
+    with pytest.raises(
+        InvalidSplats, match=r"filter_3D: expected finite values of zero or more, got -0\.001 in splat 2"
+    ):
+        read_splats(with_ply(tmp_path, ply_bytes(names)[: -rows.nbytes] + rows.tobytes()))
