@@ -17,6 +17,10 @@ MAX_SIDE = 32_768  # pixels; larger images are a broken header, not a photo
 MIN_FOCAL, MAX_FOCAL = 1e-3, 1e9  # pixels; float64 squares of what they project stay finite
 MAX_OFF_CENTRE = 1e9  # pixels of the principal point
 MAX_REACH = 1e12  # scene units from the origin; float32 has no detail left long before
+SAME_NAMES = (
+    "a view is known by its photo's name without the suffix: rename photos, or, where training and test photos share "
+    "names (Blender's scenes; Inria's cameras.json has the test views first), take one of both out"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +57,7 @@ class Camera:
         if error <= 2:
             error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
         if error > 1e-3 or np.linalg.det(rotation) < 0:
-            self._refuse("pose", "a proper rotation", f"a matrix off by {error:.2g}")
+            self._refuse("pose", "a proper rotation", _what_it_is(rotation, error))
         reach = float(np.abs(pose[:3, 3]).max())
         if reach > MAX_REACH:
             self._refuse("pose", f"a translation within {MAX_REACH:g}", f"{reach:.2g}")
@@ -65,6 +69,13 @@ class Camera:
     def centre(self) -> np.ndarray:
         """[3] f64, the camera's centre in the world frame."""
         return -self.world_to_camera[:3, :3].T @ self.world_to_camera[:3, 3]
+
+
+def _what_it_is(matrix: np.ndarray, error: float) -> str:
+    scale = float(np.cbrt(np.linalg.det(matrix))) if np.abs(matrix).max() < MAX_REACH else 0.0
+    if scale > 0 and np.abs(matrix @ matrix.T / scale**2 - np.eye(3)).max() < 1e-3:
+        return f"a rotation scaled by {scale:.3g}"
+    return f"a matrix off by {error:.2g}"
 
 
 def world_to_camera(camera_to_world: np.ndarray, centre: np.ndarray) -> np.ndarray:
@@ -88,7 +99,9 @@ class Cameras:
         seen: set[str] = set()
         for camera in self.views:
             if camera.name in seen:
-                raise InvalidCameras("cameras", expected="one view a name", got=f"{camera.name!r} twice")
+                raise InvalidCameras(
+                    "cameras", expected="one view a name", got=f"{camera.name!r} twice", hint=SAME_NAMES
+                )
             seen.add(camera.name)
 
     @property

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from liftcore.errors import InvalidCameras
-from liftcore.scene.camera_models import COLMAP_MODELS, MODELS_BY_NAME, UNDISTORT, Intrinsics, pinhole
+from liftcore.scene.camera_models import COLMAP_MODELS, MODELS_BY_NAME, UNDISTORT, CameraModel, pinhole
 from liftcore.scene.cameras import Camera, Cameras
+from liftcore.scene.foreign import refuse_pointer
 from liftcore.scene.view_names import view_names
 
 if TYPE_CHECKING:
@@ -29,7 +30,8 @@ RE_EXPORT = "export the sparse model again"
 class _Sensor:
     width: int
     height: int
-    intrinsics: Intrinsics
+    model: CameraModel
+    parameters: tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -46,8 +48,10 @@ def has_model(folder: Path) -> bool:
 
 
 def model_files(folder: Path) -> list[Path]:
-    """Its cameras and its images; binary files are preferred, as in COLMAP. They need not be there."""
-    kind = "bin" if (folder / "cameras.bin").is_file() else "txt"
+    """Its cameras and its images: of a whole model, and binary files before text, as in COLMAP, if there are any."""
+    kinds = [kind for kind in ("bin", "txt") if (folder / f"cameras.{kind}").is_file()]
+    whole = [kind for kind in kinds if (folder / f"images.{kind}").is_file()]
+    kind = (whole or kinds or ["txt"])[0]
     return [folder / f"cameras.{kind}", folder / f"images.{kind}"]
 
 
@@ -67,17 +71,19 @@ def read_colmap(folder: Path) -> Cameras:
         sensors, images = dict(_text_sensors(camera_file)), list(_text_images(image_file))
     names = view_names([image.name for image in images])
     pairs = zip(names, images, strict=True)
-    return Cameras(tuple(_camera(name, image, sensors, str(image_file)) for name, image in pairs))
+    return Cameras(tuple(_camera(name, image, sensors, (camera_file, image_file)) for name, image in pairs))
 
 
-def _camera(name: str, image: _Image, sensors: Mapping[int, _Sensor], source: str) -> Camera:
-    sensor = sensors.get(image.camera)
+def _camera(name: str, image: _Image, sensors: Mapping[int, _Sensor], files: tuple[Path, Path]) -> Camera:
+    """The view of an image; only a camera that an image uses has to be a pinhole."""
+    sensor, source = sensors.get(image.camera), str(files[1])
     if sensor is None:
         raise InvalidCameras(source, expected="images of known cameras", got=f"{name!r} of camera {image.camera}")
+    intrinsics = pinhole(sensor.model, sensor.parameters, f"{files[0]} camera {image.camera}")
     pose = np.eye(4)
     pose[:3, :3] = _rotation(np.array(image.quaternion), f"{source} image {name!r}")
     pose[:3, 3] = image.translation
-    return Camera(name, sensor.width, sensor.height, *sensor.intrinsics, world_to_camera=pose)
+    return Camera(name, sensor.width, sensor.height, *intrinsics, world_to_camera=pose)
 
 
 def _rotation(quaternion: np.ndarray, source: str) -> np.ndarray:
@@ -104,6 +110,7 @@ class _Bytes:
             size = handle.seek(0, 2)
             # An empty file cannot be mapped.
             self.data: Any = mmap.mmap(handle.fileno(), 0, access=mmap.ACCESS_READ) if size else b""
+        refuse_pointer(self.source, bytes(self.data[:64]))
         self.offset = 0
 
     def take(self, layout: str) -> tuple[Any, ...]:
@@ -117,7 +124,10 @@ class _Bytes:
         if count * least_bytes > len(self.data) - self.offset:
             rest = len(self.data) - self.offset
             raise InvalidCameras(
-                self.source, expected=f"room for {count} {what}", got=f"{rest} bytes", hint=RE_EXPORT
+                self.source,
+                expected=f"{count} {what}",
+                got=f"a file that ends {rest} bytes after their number",
+                hint=RE_EXPORT,
             )
         return count
 
@@ -150,8 +160,7 @@ def _binary_sensor(data: _Bytes) -> tuple[int, _Sensor]:
         got = f"camera model id {model}"
         raise InvalidCameras(data.source, expected="a pinhole camera", got=got, hint=UNDISTORT)
     parameters = data.take(f"<{COLMAP_MODELS[model].parameters}d")
-    intrinsics = pinhole(COLMAP_MODELS[model], parameters, f"{data.source} camera {number}")
-    return number, _Sensor(width, height, intrinsics)
+    return number, _Sensor(width, height, COLMAP_MODELS[model], parameters)
 
 
 def _binary_image(data: _Bytes) -> _Image:
@@ -163,10 +172,12 @@ def _binary_image(data: _Bytes) -> _Image:
 
 def _text_lines(path: Path) -> Iterator[str]:
     with path.open("rb") as handle:
+        refuse_pointer(str(path), handle.read(64))
+        handle.seek(0)
         while line := handle.readline(MAX_TEXT_LINE):
             if len(line) == MAX_TEXT_LINE:
                 raise InvalidCameras(str(path), expected=f"lines under {MAX_TEXT_LINE} bytes", got="a longer one")
-            yield line.decode("utf-8", errors="replace").strip()
+            yield line.decode("utf-8", errors="replace").strip().lstrip("\ufeff")
 
 
 def _text_sensors(path: Path) -> Iterator[tuple[int, _Sensor]]:
@@ -175,13 +186,13 @@ def _text_sensors(path: Path) -> Iterator[tuple[int, _Sensor]]:
             continue
         try:
             number, model, width, height, *values = line.split()
-            parameters = [float(value) for value in values]
+            parameters = tuple(float(value) for value in values)
             camera, size = int(number), (int(width), int(height))
         except ValueError:
             raise _bad_line(path, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]", line) from None
         if model not in MODELS_BY_NAME:
             raise InvalidCameras(str(path), expected="a pinhole camera", got=model[:60], hint=UNDISTORT)
-        yield camera, _Sensor(*size, pinhole(MODELS_BY_NAME[model], parameters, f"{path} camera {camera}"))
+        yield camera, _Sensor(*size, MODELS_BY_NAME[model], parameters)
 
 
 def _text_images(path: Path) -> Iterator[_Image]:

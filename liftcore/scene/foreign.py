@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from liftcore.errors import InvalidCameras
+
 LFS_POINTER = b"version https://git-lfs.github.com/spec/"
 CONVERT = "convert it with PlayCanvas's splat-transform: npx @playcanvas/splat-transform IN OUT.ply"
 SUFFIXES = {
@@ -34,6 +36,17 @@ _BY_FIRST_BYTES = {
     b"<!doctype": _WEB_PAGE,
     b"<html": _WEB_PAGE,
 }
+
+
+def refuse_pointer(source: str, head: bytes) -> None:
+    """Refuse a Git LFS pointer in a camera file's place.
+
+    Raises:
+        InvalidCameras: the first bytes are one's.
+    """
+    if head.startswith(LFS_POINTER):
+        pointer = _BY_FIRST_BYTES[LFS_POINTER]
+        raise InvalidCameras(source, expected="a camera file", got=pointer.what, hint=pointer.hint)
 
 
 def foreign_format(head: bytes, suffix: str) -> Foreign | None:

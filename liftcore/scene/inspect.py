@@ -43,8 +43,9 @@ def inspect_file(path: Path) -> dict[str, Any]:
     """
     if is_splats(path):
         return {"kind": "splats", "bytes": path.stat().st_size, **describe_splats(load_splats(path))}
+    found = describe_camera_file(path)  # first: which of its files are there is told better by who reads them
     size = sum(file.stat().st_size for file in ([path] if path.is_file() else camera_files(path)))
-    return {"kind": "cameras", "bytes": size, **describe_camera_file(path)}
+    return {"kind": "cameras", "bytes": size, **found}
 
 
 def is_splats(path: Path) -> bool:

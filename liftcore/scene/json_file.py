@@ -9,11 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from liftcore.errors import InvalidCameras
+from liftcore.scene.foreign import refuse_pointer
 
 if TYPE_CHECKING:
     from pathlib import Path
 
 MAX_JSON_BYTES = 64 * 1024 * 1024
+FORMATS = "an object with 'frames' (nerfstudio) or a list of cameras with 'img_name' (Inria)"
 
 
 def read_json(path: Path) -> Any:
@@ -27,6 +29,7 @@ def read_json(path: Path) -> Any:
             content = handle.read(MAX_JSON_BYTES + 1)
         if len(content) > MAX_JSON_BYTES:
             raise InvalidCameras(str(path), expected=f"JSON of at most {MAX_JSON_BYTES} bytes", got="a larger file")
+        refuse_pointer(str(path), content)
         return json.loads(content)
     except OSError as error:
         got = f"one that does not open ({error.strerror})"

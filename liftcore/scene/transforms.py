@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from liftcore.errors import InvalidCameras
-from liftcore.scene.camera_models import UNDISTORT, Intrinsics
+from liftcore.scene.camera_models import Intrinsics
 from liftcore.scene.cameras import Camera, Cameras, world_to_camera
-from liftcore.scene.json_file import entry, matrix, number, pixels
+from liftcore.scene.json_file import FORMATS, entry, matrix, number, pixels
 from liftcore.scene.view_names import view_names
 
 if TYPE_CHECKING:
@@ -19,6 +19,22 @@ if TYPE_CHECKING:
 
 PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4")
+NO_PINHOLE = (
+    "is_fisheye",
+    "latlong",
+    "equirectangular",
+    "ftheta_p0",
+    "ftheta_p1",
+    "ftheta_p2",
+    "ftheta_p3",
+    "ftheta_p4",
+)
+OTHER_FOCALS = ("fx", "fy", "focal", "focal_length", "K", "intrinsics")  # of other programs' files
+UNDISTORT = (
+    "undistort the photos first (OpenCV does it, or 'colmap image_undistorter' where there is a COLMAP model), train "
+    "and lift on them, and write their fl_x, fl_y, cx and cy without distortion"
+)
+LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])  # of a rigid pose
 OPENGL_TO_OPENCV = np.array([1.0, -1.0, -1.0])  # a camera's y up and z back become down and ahead
 
 
@@ -31,7 +47,12 @@ def parse_transforms(document: Any, source: str) -> Cameras:
     Raises:
         InvalidCameras: a key is missing or malformed, or a camera is distorted.
     """
-    frames = entry(document, "frames", source)
+    if not isinstance(document, dict) or "frames" not in document:
+        some = ", ".join(list(document)[:5]) if isinstance(document, dict) else type(document).__name__
+        raise InvalidCameras(
+            source, expected=FORMATS, got=f"an object with {some}" if document else "an empty object"
+        )
+    frames = document["frames"]
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
         raise InvalidCameras(f"{source} frames", expected="a list of objects", got=repr(frames)[:60])
     files = [str(entry(frame, "file_path", f"{source} frame {i}")) for i, frame in enumerate(frames)]
@@ -43,10 +64,13 @@ def _camera(name: str, keys: Mapping[str, Any], source: str) -> Camera:
     where = f"{source} frame {name!r}"
     _refuse_distortion(keys, where)
     if "w" not in keys or "h" not in keys:
-        hint = 'add the image size as "w" and "h"'
+        hint = 'add the size of the photos as "w" and "h" at the top level of the file'
         raise InvalidCameras(where, expected="an image size, w and h", got="none", hint=hint)
     width, height = pixels(keys["w"], f"{where} w"), pixels(keys["h"], f"{where} h")
     given = matrix(keys.get("transform_matrix"), (3, 4), 4, f"{where} transform_matrix")
+    if len(given) == 4 and np.abs(given[3] - LAST_ROW).max() > 1e-6:
+        got = " ".join(f"{value:g}" for value in given[3])
+        raise InvalidCameras(f"{where} transform_matrix", expected="0 0 0 1 as the last row", got=got)
     pose = world_to_camera(given[:3, :3] * OPENGL_TO_OPENCV, given[:3, 3])
     intrinsics = _intrinsics(keys, width, height, where)
     return Camera(name, width, height, *intrinsics, world_to_camera=pose)
@@ -58,7 +82,10 @@ def _intrinsics(keys: Mapping[str, Any], width: int, height: int, where: str) ->
     fx = fy if fx is None else fx
     fy = fx if fy is None else fy
     if fx is None or fy is None:
-        raise InvalidCameras(where, expected="fl_x or camera_angle_x", got="neither", hint="add a focal length")
+        found = next((key for key in OTHER_FOCALS if key in keys), None)
+        got = "neither" if found is None else f"neither, but {found!r}"
+        hint = "add the focal length in pixels as fl_x and fl_y"
+        raise InvalidCameras(where, expected="fl_x or camera_angle_x", got=got, hint=hint)
     cx = number(keys.get("cx", width / 2), f"{where} cx")
     cy = number(keys.get("cy", height / 2), f"{where} cy")
     return Intrinsics(fx, fy, cx, cy)
@@ -77,10 +104,16 @@ def _focal(keys: Mapping[str, Any], axis: str, side: int, where: str) -> float |
 
 def _refuse_distortion(keys: Mapping[str, Any], where: str) -> None:
     model = keys.get("camera_model", "PINHOLE")
-    if model not in PERSPECTIVE or keys.get("is_fisheye"):
-        got = repr(model)[:60] if model not in PERSPECTIVE else "is_fisheye"
+    other = next((key for key in NO_PINHOLE if keys.get(key)), None)
+    if model not in PERSPECTIVE or other:
+        got = repr(model)[:60] if model not in PERSPECTIVE else f"{other}"
         raise InvalidCameras(where, expected="a perspective camera", got=got, hint=UNDISTORT)
-    for key in DISTORTION:
-        if number(keys.get(key, 0), f"{where} {key}") != 0:
-            got = f"{key} = {keys[key]:g}"
+    listed = keys.get("distortion_params") or []
+    if not isinstance(listed, list):
+        raise InvalidCameras(f"{where} distortion_params", expected="a list of numbers", got=repr(listed)[:60])
+    given = {key: keys.get(key, 0) for key in DISTORTION}
+    given |= {f"distortion_params[{i}]": value for i, value in enumerate(listed)}
+    for key, value in given.items():
+        if number(value, f"{where} {key}") != 0:
+            got = f"{key} = {value:g}"
             raise InvalidCameras(where, expected="a camera without distortion", got=got, hint=UNDISTORT)

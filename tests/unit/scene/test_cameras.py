@@ -15,7 +15,7 @@ import pytest
 from colmap_files import CAMERAS, IMAGES, binary_files, text_files, write_files
 
 from liftcore.errors import InvalidCameras, InvalidSplats, NotFound
-from liftcore.scene import json_file, load
+from liftcore.scene import json_file, model_zip
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.inria import write_inria_cameras
 from liftcore.scene.inspect import describe_camera_file
@@ -101,7 +101,7 @@ def test_models_that_are_not_read_are_told(packed: bool, tmp_path: Path) -> None
 
 
 def test_zip_bomb_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(load, "MAX_UNZIPPED_BYTES", 1000)
+    monkeypatch.setattr(model_zip, "MAX_UNZIPPED_BYTES", 1000)
     path = tmp_path / "bomb.zip"
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("cameras.bin", bytes(100_000))
@@ -157,8 +157,11 @@ def test_fisheye_is_refused(tmp_path: Path) -> None:
 
 
 DAMAGED = {
-    "count bomb": ({"images.bin": struct.pack("<Q", 2**62)}, "room for 4611686018427387904 images"),
-    "camera count bomb": ({"cameras.bin": struct.pack("<Q", 2**40)}, "room for"),
+    "count bomb": (
+        {"images.bin": struct.pack("<Q", 2**62)},
+        "4611686018427387904 images, got a file that ends 0 bytes after",
+    ),
+    "camera count bomb": ({"cameras.bin": struct.pack("<Q", 2**40)}, "1099511627776 cameras, got a file that ends"),
     "empty": ({"images.bin": b""}, "ends after 0"),
     "cut": ({"images.bin": binary_files()["images.bin"][:-9]}, "bytes"),
     "unknown model": (binary_files({1: (99, "", (1.0, 1.0, 1.0, 1.0))}), "model id 99"),
@@ -235,8 +238,8 @@ BAD_TRANSFORMS = {
     "no focal length": ({"w": 9, "h": 9, "frames": [GOOD_FRAME]}, "fl_x or camera_angle_x"),
     "distortion": ({"fl_x": 5, "w": 9, "h": 9, "k1": 0.1, "frames": [GOOD_FRAME]}, r"k1 = 0\.1.*undistorter"),
     "fisheye": ({"camera_model": "OPENCV_FISHEYE", "frames": [GOOD_FRAME]}, "OPENCV_FISHEYE"),
-    "no frames": ({"w": 9}, "an object with 'frames'"),
-    "empty frames": ({"frames": []}, "at least one view"),
+    "no frames": ({"w": 9}, r"'frames' \(nerfstudio\) or a list of cameras.*got an object with w"),
+    "empty frames": ({"frames": []}, "document.json cameras: expected at least one view"),
     "frames of numbers": ({"frames": [1]}, "list of objects"),
     "no path": ({"frames": [{}]}, "'file_path'"),
     "no matrix": ({"fl_x": 5, "w": 9, "h": 9, "frames": [{"file_path": "a"}]}, "matrix"),
@@ -251,9 +254,31 @@ BAD_TRANSFORMS = {
             "fl_x": 5,
             "w": 9,
             "h": 9,
-            "frames": [{"file_path": "a", "transform_matrix": (2 * np.eye(4)).tolist()}],
+            "frames": [{"file_path": "a", "transform_matrix": np.diag([2.0, 2, 2, 1]).tolist()}],
         },
-        "a proper rotation",
+        "document.json camera 'a' pose: expected a proper rotation, got a rotation scaled by 2",
+    ),
+    "homogeneous": (
+        {"fl_x": 5, "w": 9, "h": 9, "frames": [{**GOOD_FRAME, "transform_matrix": (2 * np.eye(4)).tolist()}]},
+        "0 0 0 1 as the last row, got 0 0 0 2",
+    ),
+    "listed distortion": (
+        {"fl_x": 5, "w": 9, "h": 9, "distortion_params": [0, 0.02], "frames": [GOOD_FRAME]},
+        r"distortion_params\[1\] = 0\.02.*OpenCV",
+    ),
+    "a frame's listed distortion": (
+        {"fl_x": 5, "w": 9, "h": 9, "frames": [{**GOOD_FRAME, "distortion_params": [0.1]}]},
+        r"distortion_params\[0\] = 0\.1",
+    ),
+    "distortion that is no list": (
+        {"fl_x": 5, "w": 9, "h": 9, "distortion_params": "k1", "frames": [GOOD_FRAME]},
+        "a list of numbers, got 'k1'",
+    ),
+    "f-theta": ({"fl_x": 5, "w": 9, "h": 9, "ftheta_p0": 1.5, "frames": [GOOD_FRAME]}, "got ftheta_p0"),
+    "panorama": ({"fl_x": 5, "w": 9, "h": 9, "equirectangular": True, "frames": [GOOD_FRAME]}, "equirectangular"),
+    "another name of the focal length": (
+        {"fx": 5, "w": 9, "h": 9, "frames": [GOOD_FRAME]},
+        "neither, but 'fx'; add the focal length in pixels as fl_x",
     ),
 }
 
@@ -288,7 +313,9 @@ def test_inria_format_refuses_a_principal_point_off_the_centre(model: Path, tmp_
     [
         (b"[{}]", "'img_name'"),
         (b'[{"img_name": "a"}]', "'width'"),
-        (b"[3]", "an object with 'img_name', got int"),
+        (b"[3]", r"'img_name' \(Inria\), got a list of int"),
+        (b'[{"file_path": "a"}]', "got a list of objects with file_path"),
+        (b"version https://git-lfs.github.com/spec/v1\n", "a Git LFS pointer.*git lfs pull"),
         (b"[]", "at least one view"),
         (b"[" * 100_000, "does not parse"),
         (b"{broken", "does not parse"),

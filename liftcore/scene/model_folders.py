@@ -1,0 +1,61 @@
+"""Where COLMAP models lie in a folder or in a zip, and which of several is read."""
+
+from __future__ import annotations
+
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING
+
+from liftcore.scene.colmap import has_model, model_files
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+# As trainers, COLMAP's reconstructor and its undistorter lay them out; the first that is there is read.
+MODEL_FOLDERS = (".", "sparse/0", "sparse", "colmap/sparse/0", "0", "dense/0/sparse", "dense/sparse")
+DEPTH = 4  # folders down that models are looked for, if only to be named
+
+
+def model_folder(folder: Path) -> Path | None:
+    """The folder whose model is read: a usual one, whole models first; None when there is none."""
+    found = [folder / name for name in MODEL_FOLDERS if has_model(folder / name)]
+    whole = [model for model in found if all(file.is_file() for file in model_files(model))]
+    return next(iter(whole + found), None)
+
+
+def models_below(folder: Path) -> list[PurePosixPath]:
+    """Folders with models below one, relative to it, in the order of ``preference``."""
+    found = {
+        PurePosixPath(file.parent.relative_to(folder).as_posix())
+        for depth in range(DEPTH + 1)
+        for kind in ("bin", "txt")
+        for file in folder.glob("*/" * depth + f"cameras.{kind}")
+    }
+    return sorted((model for model in found if has_model(folder / model)), key=preference)
+
+
+def preference(model: PurePosixPath) -> tuple[int, int, str]:
+    """What models are sorted by: the place of the end of their path among MODEL_FOLDERS, then how deep they lie.
+
+    What lies in a folder ``distorted`` comes last: 3DGS's ``convert.py`` keeps there what it has undistorted.
+    """
+    ends = {"/".join(model.parts[first:]) for first in range(len(model.parts))} or {"."}
+    known = sorted((name for name in MODEL_FOLDERS if name in ends), key=len)
+    place = MODEL_FOLDERS.index(known[-1]) if known and "distorted" not in model.parts else len(MODEL_FOLDERS)
+    return place, len(model.parts), str(model)
+
+
+def whole_models(names: Iterable[str]) -> Iterator[tuple[PurePosixPath, str]]:
+    """The folders with both files of a model among such names of a zip, and of which kind, the preferred first."""
+    known = set(names)
+    found: dict[PurePosixPath, str] = {}
+    for kind in ("txt", "bin"):  # of two kinds in a folder the binary one
+        for name in known:
+            path = PurePosixPath(name)
+            if path.name == f"cameras.{kind}" and known.issuperset(model_names(path.parent, kind)):
+                found[path.parent] = kind
+    yield from sorted(found.items(), key=lambda item: preference(item[0]))
+
+
+def model_names(root: PurePosixPath, kind: str) -> list[str]:
+    """The names of a model's files in a zip."""
+    return [str(root / f"{part}.{kind}") for part in ("cameras", "images")]

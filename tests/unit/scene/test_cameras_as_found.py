@@ -1,0 +1,137 @@
+"""Camera files as public repositories have them: what is meant is read, or the next step is said."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import zipfile
+from typing import TYPE_CHECKING
+
+import pytest
+from colmap_files import CAMERAS, binary_files, text_files, write_files
+
+from liftcore.errors import InvalidCameras
+from liftcore.scene.inspect import inspect_file
+from liftcore.scene.load import load_cameras, other_models
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+LENS = {2: (2, "SIMPLE_RADIAL", (500.0, 320.0, 240.0, 0.1))}  # distorted
+DISTORTED = {**CAMERAS, 1: LENS[2]}
+POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 8322710\n"
+
+
+def names(path: Path) -> list[str]:
+    return [view.name for view in load_cameras(path)]
+
+
+@pytest.mark.parametrize("place", ["dense/0/sparse", "dense/sparse"])
+@pytest.mark.parametrize("packed", [False, True])
+def test_undistorted_model_of_colmap_is_found(place: str, packed: bool, tmp_path: Path) -> None:
+    scene = tmp_path / "scene"
+    write_files(scene / place, binary_files())
+    write_files(scene / "distorted/sparse/0", binary_files(DISTORTED))
+    path = tmp_path / shutil.make_archive(str(scene), "zip", scene) if packed else scene
+    assert len(names(path)) == 3
+    assert other_models(path) == ["distorted/sparse/0"]
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_sparse_0_comes_first_in_folders_and_zips(packed: bool, tmp_path: Path) -> None:
+    scene = tmp_path / "scene"
+    write_files(scene / "sparse/0", text_files())
+    write_files(scene / "dense/sparse", binary_files(DISTORTED))
+    path = tmp_path / shutil.make_archive(str(scene), "zip", scene) if packed else scene
+    assert len(names(path)) == 3
+    assert inspect_file(path)["warnings"] == ["1 more COLMAP models were not read: dense/sparse"]
+
+
+def test_refusal_of_distortion_names_what_else_is_there(tmp_path: Path) -> None:
+    scene = tmp_path / "scene"
+    write_files(scene / "sparse/0", binary_files(DISTORTED))
+    with pytest.raises(InvalidCameras, match=r"distortion 0\.1; undistort the photos first"):
+        load_cameras(scene)
+    write_files(scene / "dense/0/sparse", binary_files())
+    (scene / "transforms.json").write_text("{}")
+    with pytest.raises(InvalidCameras, match=r"such as .*/dense/0/sparse or .*/transforms\.json; else undistort"):
+        load_cameras(scene)
+    with pytest.raises(InvalidCameras, match=r"by itself, if it is, such as dense/0/sparse; else undistort"):
+        load_cameras(tmp_path / shutil.make_archive(str(scene), "zip", scene))
+
+
+def test_whole_model_is_preferred_to_half_a_binary_one(tmp_path: Path) -> None:
+    folder = write_files(tmp_path / "model", {"cameras.bin": binary_files()["cameras.bin"], **text_files()})
+    assert len(names(folder)) == 3
+
+
+def test_half_a_model_is_inspected_with_a_clear_word(tmp_path: Path) -> None:
+    folder = write_files(tmp_path / "model", {"cameras.bin": binary_files()["cameras.bin"]})
+    with pytest.raises(InvalidCameras, match=r"the file images\.bin"):
+        inspect_file(folder)
+
+
+def test_folder_without_a_usual_name_says_what_can_be_named(tmp_path: Path) -> None:
+    (tmp_path / "transforms_train.json").write_text("{}")
+    with pytest.raises(InvalidCameras, match=r"name what is meant, such as .*transforms_train\.json"):
+        load_cameras(tmp_path)
+    with pytest.raises(InvalidCameras, match=r"a folder without any of them$"):
+        load_cameras(write_files(tmp_path / "empty", {}))
+
+
+def test_camera_that_no_image_uses_may_be_distorted(tmp_path: Path) -> None:
+    for files in (binary_files, text_files):
+        assert len(names(write_files(tmp_path / files.__name__, files({**CAMERAS, **LENS})))) == 3
+
+
+def test_byte_order_mark_in_a_text_model_is_no_camera(tmp_path: Path) -> None:
+    files = {name: b"\xef\xbb\xbf" + content for name, content in text_files().items()}
+    assert len(names(write_files(tmp_path / "model", files))) == 3
+
+
+@pytest.mark.parametrize("kind", ["bin", "txt"])
+@pytest.mark.parametrize("part", ["cameras", "images"])
+def test_pointers_of_git_lfs_are_told(kind: str, part: str, tmp_path: Path) -> None:
+    files = binary_files() if kind == "bin" else text_files()
+    folder = write_files(tmp_path / "model", {**files, f"{part}.{kind}": POINTER})
+    with pytest.raises(InvalidCameras, match=rf"{part}\.{kind}: .*Git LFS pointer.*git lfs pull"):
+        load_cameras(folder)
+
+
+def test_zip_of_windows_is_read(tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "scene.zip", "w") as archive:
+        for name, content in binary_files().items():
+            member = zipfile.ZipInfo("x")
+            member.filename = f"sparse\\0\\{name}"  # as Compress-Archive of PowerShell 5 writes them
+            archive.writestr(member, content)
+    assert len(names(tmp_path / "scene.zip")) == 3
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("sparse/0/cameras.bin", r"got 'sparse/0/cameras\.bin' without 'images\.bin'; zip both"),
+        ("data/transforms.json", r"got 'data/transforms\.json'; give the JSON file itself"),
+        ("photo.jpg", r"got none; zip the folder that has cameras\.bin"),
+    ],
+)
+def test_zip_without_a_model_says_what_it_has(name: str, message: str, tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "scene.zip", "w") as archive:
+        archive.writestr(name, b"")
+    with pytest.raises(InvalidCameras, match=message):
+        load_cameras(tmp_path / "scene.zip")
+
+
+def test_one_file_of_a_model_is_told_to_come_with_the_other(tmp_path: Path) -> None:
+    path = tmp_path / "upload"
+    path.write_bytes(binary_files()["cameras.bin"])
+    with pytest.raises(InvalidCameras, match=r"a zip of its cameras\.\* and images\.\* together"):
+        load_cameras(path)
+
+
+def test_views_of_one_name_say_what_to_do(tmp_path: Path) -> None:
+    record = {"img_name": "r_0", "width": 9, "height": 9, "fx": 5, "fy": 5, "position": [0, 0, 0]}
+    record["rotation"] = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
+    (tmp_path / "cameras.json").write_text(json.dumps([record, record]))
+    with pytest.raises(InvalidCameras, match=r"cameras\.json cameras: expected one view a name.*test views first"):
+        load_cameras(tmp_path)
