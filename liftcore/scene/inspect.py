@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from liftcore.scene.foreign import SUFFIXES
-from liftcore.scene.load import camera_files, load_cameras, load_splats, other_models
+from liftcore.scene.load import camera_files, is_of_nerfstudio, load_cameras, load_splats, other_models
 from liftcore.scene.ply_dialect import nearest_dialect
 from liftcore.scene.splats import Kernel
 
@@ -26,6 +26,10 @@ FAR = 1e5  # scene units; float32 resolves only a hundredth there
 TINY = 1e-7  # scene units
 LARGEST = 1e300  # shown in place of what overflows, which JSON cannot hold
 OFF_CENTRE = 0.1  # of the image's side
+OWN_FRAME = (
+    "poses of nerfstudio's own files: it trains in another frame than they are in, unless it was told "
+    "--orientation-method none --center-method none --auto-scale-poses False, and the splats must lie in this one"
+)
 SHOWN = 3  # names in a warning
 MANY = 100  # splats: what all of so many have in common is no accident
 MOVING = ("motion_", "trbf_", "omega_")  # what spacetime splats add
@@ -85,6 +89,8 @@ def describe_camera_file(path: Path) -> dict[str, Any]:
     found, others = describe_cameras(load_cameras(path)), other_models(path)
     if others:
         found["warnings"].append(f"{len(others)} more COLMAP models were not read: {', '.join(others[:SHOWN])}")
+    if is_of_nerfstudio(path):
+        found["warnings"].append(OWN_FRAME)
     return found
 
 

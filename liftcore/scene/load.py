@@ -108,6 +108,15 @@ def other_models(path: Path) -> list[str]:
     return models_in_zip(path)[1:] if zipfile.is_zipfile(path) else []
 
 
+def is_of_nerfstudio(path: Path) -> bool:
+    """Whether cameras are read from a transforms.json that nerfstudio's own converter wrote."""
+    files = camera_files(path) if path.is_dir() else [path]
+    if len(files) != 1 or zipfile.is_zipfile(files[0]):
+        return False
+    document = read_json(files[0])
+    return isinstance(document, dict) and ("applied_transform" in document or "ply_file_path" in document)
+
+
 def _from_folder(folder: Path) -> Cameras:
     files = camera_files(folder)
     if len(files) == 1:

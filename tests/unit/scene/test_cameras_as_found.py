@@ -60,6 +60,17 @@ def test_refusal_of_distortion_names_what_else_is_there(tmp_path: Path) -> None:
         load_cameras(tmp_path / shutil.make_archive(str(scene), "zip", scene))
 
 
+@pytest.mark.parametrize("key", ["applied_transform", "ply_file_path"])
+def test_the_frame_of_nerfstudio_is_told(key: str, tmp_path: Path) -> None:
+    frame = {"file_path": "a.png", "transform_matrix": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}
+    document = {"fl_x": 5, "w": 9, "h": 9, "frames": [frame]}
+    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    assert inspect_file(tmp_path)["warnings"] == []
+    (tmp_path / "transforms.json").write_text(json.dumps({**document, key: "sparse_pc.ply"}))
+    for path in (tmp_path, tmp_path / "transforms.json"):
+        assert any("--orientation-method none" in warning for warning in inspect_file(path)["warnings"])
+
+
 def test_whole_model_is_preferred_to_half_a_binary_one(tmp_path: Path) -> None:
     folder = write_files(tmp_path / "model", {"cameras.bin": binary_files()["cameras.bin"], **text_files()})
     assert len(names(folder)) == 3
