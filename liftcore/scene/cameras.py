@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -19,7 +20,8 @@ MAX_OFF_CENTRE = 1e9  # pixels of the principal point
 MAX_REACH = 1e12  # scene units from the origin; float32 has no detail left long before
 SAME_NAMES = (
     "a view is known by its photo's name without the suffix: rename photos, or, where training and test photos share "
-    "names (Blender's scenes; Inria's cameras.json has the test views first), take one of both out"
+    "names (Blender's scenes; Inria's cameras.json has the test views first), take one of both out or put "
+    "their folders before them (train/r_0)"
 )
 
 
@@ -85,6 +87,18 @@ def world_to_camera(camera_to_world: np.ndarray, centre: np.ndarray) -> np.ndarr
     with np.errstate(over="ignore", invalid="ignore"):  # what overflows is not finite, and is refused as such
         pose[:3, 3] = -camera_to_world.T @ centre
     return pose
+
+
+@contextmanager
+def told_of(source: str) -> Iterator[None]:
+    """Name the file in what its cameras themselves find wrong, where the error does not name it."""
+    try:
+        yield
+    except InvalidCameras as error:
+        if source in error.argument:
+            raise
+        argument = f"{source} {error.argument}"
+        raise InvalidCameras(argument, expected=error.expected, got=error.got, hint=error.hint) from None
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ import numpy as np
 
 from liftcore.errors import InvalidCameras
 from liftcore.scene.camera_models import COLMAP_MODELS, MODELS_BY_NAME, UNDISTORT, CameraModel, pinhole
-from liftcore.scene.cameras import Camera, Cameras
+from liftcore.scene.cameras import Camera, Cameras, told_of
 from liftcore.scene.foreign import refuse_pointer
 from liftcore.scene.view_names import view_names
 
@@ -69,9 +69,10 @@ def read_colmap(folder: Path) -> Cameras:
         sensors, images = _read_binary(camera_file, image_file)
     else:
         sensors, images = dict(_text_sensors(camera_file)), list(_text_images(image_file))
-    names = view_names([image.name for image in images])
-    pairs = zip(names, images, strict=True)
-    return Cameras(tuple(_camera(name, image, sensors, (camera_file, image_file)) for name, image in pairs))
+    with told_of(str(folder)):
+        names = view_names([image.name for image in images])
+        pairs = zip(names, images, strict=True)
+        return Cameras(tuple(_camera(name, image, sensors, (camera_file, image_file)) for name, image in pairs))
 
 
 def _camera(name: str, image: _Image, sensors: Mapping[int, _Sensor], files: tuple[Path, Path]) -> Camera:

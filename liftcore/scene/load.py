@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import zipfile
-from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from liftcore.errors import InvalidCameras, InvalidSplats
 from liftcore.scene.camera_models import UNDISTORT
+from liftcore.scene.cameras import told_of
 from liftcore.scene.colmap import has_model, model_files, read_colmap
 from liftcore.scene.foreign import LFS_POINTER, refuse_pointer
 from liftcore.scene.inria import parse_inria
@@ -17,7 +17,6 @@ from liftcore.scene.model_zip import models_in_zip, read_model_zip
 from liftcore.scene.transforms import parse_transforms
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
     from pathlib import Path
 
     from liftcore.scene.cameras import Cameras
@@ -142,19 +141,5 @@ def _some(folder: Path, names: list[str]) -> str:
 
 def _from_json(path: Path) -> Cameras:
     document = read_json(path)
-    with _named(path):
-        return (
-            parse_inria(document, str(path)) if isinstance(document, list) else parse_transforms(document, str(path))
-        )
-
-
-@contextmanager
-def _named(path: Path) -> Iterator[None]:
-    """Name the file in what its cameras themselves find wrong."""
-    try:
-        yield
-    except InvalidCameras as error:
-        if str(path) in error.argument:
-            raise
-        argument = f"{path} {error.argument}"
-        raise InvalidCameras(argument, expected=error.expected, got=error.got, hint=error.hint) from None
+    with told_of(str(path)):
+        return (parse_inria if isinstance(document, list) else parse_transforms)(document, str(path))

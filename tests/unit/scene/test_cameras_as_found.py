@@ -146,3 +146,10 @@ def test_views_of_one_name_say_what_to_do(tmp_path: Path) -> None:
     (tmp_path / "cameras.json").write_text(json.dumps([record, record]))
     with pytest.raises(InvalidCameras, match=r"cameras\.json cameras: expected one view a name.*test views first"):
         load_cameras(tmp_path)
+
+
+def test_what_is_wrong_with_a_view_of_a_model_names_the_model(tmp_path: Path) -> None:
+    images = [(1, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, place), "a.jpg") for place in (1.0, 2.0)]
+    folder = write_files(tmp_path / "model", binary_files(images=images))
+    with pytest.raises(InvalidCameras, match=r"model cameras: expected one view a name, got 'a' twice; .*train/r_0"):
+        load_cameras(folder)
