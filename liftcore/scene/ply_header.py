@@ -123,7 +123,7 @@ def parse_header(head: bytes, source: str) -> PlyHeader:
     """
     if head[:4] not in (b"ply\n", b"ply\r"):
         foreign = foreign_format(head, Path(source).suffix)
-        got, hint = foreign or (_first_bytes(head), _EXPORT)
+        got, hint = foreign or (_first_bytes(head), f"{_EXPORT}; if it is a .splat or a .ksplat, {CONVERT}")
         raise InvalidSplats(source, expected="a PLY file (first line 'ply')", got=got, hint=hint)
     end = _END.search(head)
     if end is None:

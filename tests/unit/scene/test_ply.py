@@ -157,7 +157,7 @@ def test_failed_write_leaves_nothing_behind(tmp_path: Path) -> None:
 HEADER = "ply\nformat binary_little_endian 1.0\n"
 MALFORMED = {
     "empty file": (b"", "an empty file"),
-    "not a PLY": (b"PLY?", "expected a PLY file"),
+    "not a PLY": (b"PLY?", r"expected a PLY file.*if it is a \.splat"),
     "zip": (b"PK\x03\x04zip", "got a zip"),
     "header bomb": (b"ply\n" + b"comment bomb\n" * 40000, "'end_header' within the first 262144 bytes"),
     "too many lines": (HEADER.encode() + b"comment\n" * 5000 + b"end_header\n", "at most 4096 header lines"),
