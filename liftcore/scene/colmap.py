@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 MAX_TEXT_LINE = 64 * 1024 * 1024  # bytes; a line of an image's points runs to a few MB
 MAX_NAME_BYTES = 4096
 POINT_BYTES = 24  # x, y and the id of its 3D point
+MODEL_FILES = ("cameras.bin", "cameras.txt", "images.bin", "images.txt")
 RE_EXPORT = "export the sparse model again"
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from liftcore.errors import InvalidCameras, InvalidSplats
 from liftcore.scene.camera_models import UNDISTORT
 from liftcore.scene.cameras import told_of
-from liftcore.scene.colmap import has_model, model_files, read_colmap
+from liftcore.scene.colmap import MODEL_FILES, has_model, model_files, read_colmap
 from liftcore.scene.foreign import LFS_POINTER, refuse_pointer
 from liftcore.scene.inria import parse_inria
 from liftcore.scene.json_file import read_json
@@ -78,7 +78,7 @@ def load_cameras(path: Path) -> Cameras:
     except OSError as error:
         got = f"a file that does not open ({error.strerror})"
         raise InvalidCameras(str(path), expected=CAMERA_FORMATS, got=got) from None
-    if path.name in ("cameras.bin", "cameras.txt", "images.bin", "images.txt") and has_model(path.parent):
+    if path.name in MODEL_FILES and has_model(path.parent):
         return read_colmap(path.parent)
     if start[:1] not in (b"[", b"{"):
         refuse_pointer(str(path), start)
@@ -110,7 +110,7 @@ def other_models(path: Path) -> list[str]:
 def is_of_nerfstudio(path: Path) -> bool:
     """Whether cameras are read from a transforms.json that nerfstudio's own converter wrote."""
     files = camera_files(path) if path.is_dir() else [path]
-    if len(files) != 1 or zipfile.is_zipfile(files[0]):
+    if len(files) != 1 or files[0].name in MODEL_FILES or zipfile.is_zipfile(files[0]):
         return False
     document = read_json(files[0])
     return isinstance(document, dict) and ("applied_transform" in document or "ply_file_path" in document)

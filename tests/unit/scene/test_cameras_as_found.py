@@ -15,6 +15,7 @@ from liftcore.scene.inspect import inspect_file
 from liftcore.scene.load import load_cameras, other_models
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
 LENS = {2: (2, "SIMPLE_RADIAL", (500.0, 320.0, 240.0, 0.1))}  # distorted
@@ -74,6 +75,13 @@ def test_the_frame_of_nerfstudio_is_told(key: str, tmp_path: Path) -> None:
 def test_whole_model_is_preferred_to_half_a_binary_one(tmp_path: Path) -> None:
     folder = write_files(tmp_path / "model", {"cameras.bin": binary_files()["cameras.bin"], **text_files()})
     assert len(names(folder)) == 3
+
+
+@pytest.mark.parametrize("files", [binary_files, text_files])
+def test_model_is_inspected_by_either_of_its_files(files: Callable[[], dict[str, bytes]], tmp_path: Path) -> None:
+    write_files(tmp_path, files())
+    for name in files():
+        assert inspect_file(tmp_path / name)["views"] == 3
 
 
 def test_half_a_model_is_inspected_with_a_clear_word(tmp_path: Path) -> None:
