@@ -33,15 +33,22 @@ def models_below(folder: Path) -> list[PurePosixPath]:
     return sorted((model for model in found if has_model(folder / model)), key=preference)
 
 
-def preference(model: PurePosixPath) -> tuple[int, int, str]:
-    """What models are sorted by: the place of the end of their path among MODEL_FOLDERS, then how deep they lie.
+def preference(model: PurePosixPath) -> tuple[bool, int, str, int]:
+    """What models are sorted by: as if folders were opened as scenes one by one, the outermost first.
 
-    What lies in a folder ``distorted`` comes last: 3DGS's ``convert.py`` keeps there what it has undistorted.
+    So the first model of a zip is the one that is read from the same files in a folder. What lies in a folder
+    ``distorted`` comes last: 3DGS's ``convert.py`` keeps there what it has undistorted.
     """
-    ends = {"/".join(model.parts[first:]) for first in range(len(model.parts))} or {"."}
-    known = sorted((name for name in MODEL_FOLDERS if name in ends), key=len)
-    place = MODEL_FOLDERS.index(known[-1]) if known and "distorted" not in model.parts else len(MODEL_FOLDERS)
-    return place, len(model.parts), str(model)
+    scene = scene_of(model)
+    place = MODEL_FOLDERS.index(str(model.relative_to(scene)))
+    return "distorted" in model.parts, len(scene.parts), str(scene), place
+
+
+def scene_of(model: PurePosixPath) -> PurePosixPath:
+    """The outermost folder in which a model has one of the usual places; its own folder at least."""
+    parts = [PurePosixPath(place).parts for place in MODEL_FOLDERS]
+    cut = max(len(place) for place in parts if model.parts[len(model.parts) - len(place) :] == place)
+    return PurePosixPath(*model.parts[: len(model.parts) - cut])
 
 
 def whole_models(names: Iterable[str]) -> Iterator[tuple[PurePosixPath, str]]:

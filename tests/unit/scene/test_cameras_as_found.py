@@ -5,22 +5,28 @@ from __future__ import annotations
 import json
 import shutil
 import zipfile
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-from colmap_files import CAMERAS, binary_files, text_files, write_files
+from colmap_files import CAMERAS, IMAGES, binary_files, text_files, write_files
 
 from liftcore.errors import InvalidCameras
 from liftcore.scene.inspect import inspect_file
 from liftcore.scene.load import load_cameras, other_models
+from liftcore.scene.model_folders import MODEL_FOLDERS
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from pathlib import Path
 
 LENS = {2: (2, "SIMPLE_RADIAL", (500.0, 320.0, 240.0, 0.1))}  # distorted
 DISTORTED = {**CAMERAS, 1: LENS[2]}
 POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 8322710\n"
+
+
+def zipped(root: Path, folder: str) -> Path:
+    """A zip beside a folder, of one folder in it."""
+    return Path(shutil.make_archive(f"{root}-zipped", "zip", root, folder))
 
 
 def names(path: Path) -> list[str]:
@@ -46,6 +52,32 @@ def test_sparse_0_comes_first_in_folders_and_zips(packed: bool, tmp_path: Path) 
     path = tmp_path / shutil.make_archive(str(scene), "zip", scene) if packed else scene
     assert len(names(path)) == 3
     assert inspect_file(path)["warnings"] == ["1 more COLMAP models were not read: dense/sparse"]
+
+
+def one_view(place: str) -> dict[str, bytes]:
+    """A model of one image, named after where it lies."""
+    return binary_files(images=[(*IMAGES[0][:3], f"{place.replace('/', '-').replace('.', 'here')}.jpg")])
+
+
+@pytest.mark.parametrize(
+    "places",
+    [MODEL_FOLDERS[first:] for first in range(len(MODEL_FOLDERS))]
+    + [
+        ("sparse", "old/sparse/0"),
+        (".", "a/sparse/0"),
+        ("dense/sparse", "a/sparse/0"),
+        ("0", "a/sparse", "a/sparse/0"),
+    ],
+)
+def test_folder_and_zip_read_the_same_model(places: tuple[str, ...], tmp_path: Path) -> None:
+    scene = tmp_path / "scene"
+    for place in places:
+        write_files(scene / place, one_view(place))
+    expected = [places[0].replace("/", "-").replace(".", "here")]
+    for path in (scene, zipped(scene, "."), zipped(tmp_path, "scene")):
+        assert names(path) == expected
+    assert other_models(zipped(scene, ".")) == other_models(scene)
+    assert sorted(other_models(scene)) == sorted(places[1:])
 
 
 def test_refusal_of_distortion_names_what_else_is_there(tmp_path: Path) -> None:
