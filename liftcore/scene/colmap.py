@@ -44,16 +44,19 @@ class _Image:
 
 
 def has_model(folder: Path) -> bool:
-    """Whether the folder itself holds cameras and images of a sparse model."""
-    return any((folder / f"cameras.{kind}").is_file() for kind in ("bin", "txt"))
+    """Whether the folder itself holds a file of a sparse model."""
+    return any((folder / name).is_file() for name in MODEL_FILES)
+
+
+def is_whole(folder: Path) -> bool:
+    """Whether the folder itself holds both files of a sparse model."""
+    return all(path.is_file() for path in model_files(folder))
 
 
 def model_files(folder: Path) -> list[Path]:
     """Its cameras and its images: of a whole model, and binary files before text, as in COLMAP, if there are any."""
-    kinds = [kind for kind in ("bin", "txt") if (folder / f"cameras.{kind}").is_file()]
-    whole = [kind for kind in kinds if (folder / f"images.{kind}").is_file()]
-    kind = (whole or kinds or ["txt"])[0]
-    return [folder / f"cameras.{kind}", folder / f"images.{kind}"]
+    kinds = [[folder / f"cameras.{kind}", folder / f"images.{kind}"] for kind in ("bin", "txt")]
+    return max(kinds, key=lambda files: sum(path.is_file() for path in files))
 
 
 def read_colmap(folder: Path) -> Cameras:

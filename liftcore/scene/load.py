@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 from liftcore.errors import InvalidCameras, InvalidSplats
 from liftcore.scene.camera_models import UNDISTORT
 from liftcore.scene.cameras import told_of
-from liftcore.scene.colmap import MODEL_FILES, has_model, model_files, read_colmap
+from liftcore.scene.colmap import MODEL_FILES, has_model, is_whole, model_files, read_colmap
 from liftcore.scene.foreign import LFS_POINTER, refuse_pointer
 from liftcore.scene.inria import parse_inria
 from liftcore.scene.json_file import read_json
-from liftcore.scene.model_folders import model_folder, models_below
+from liftcore.scene.model_folders import model_folder, models_below, scene_of
 from liftcore.scene.model_zip import models_in_zip, read_model_zip
 from liftcore.scene.transforms import parse_transforms
 
@@ -89,11 +89,12 @@ def load_cameras(path: Path) -> Cameras:
 
 
 def camera_files(folder: Path) -> list[Path]:
-    """The files of a folder that its cameras are read from."""
+    """The files of a folder that its cameras are read from: a whole model, else a JSON file, else half a model."""
     model = model_folder(folder)
-    if model is not None:
+    documents = [folder / name for name in JSON_FILES if (folder / name).is_file()]
+    if model is not None and (is_whole(model) or not documents):
         return model_files(model)
-    return [folder / name for name in JSON_FILES if (folder / name).is_file()][:1]
+    return documents[:1]
 
 
 def other_models(path: Path) -> list[str]:
@@ -102,8 +103,8 @@ def other_models(path: Path) -> list[str]:
     COLMAP writes several where photos did not all hang together, each in a frame of its own.
     """
     if path.is_dir():
-        read = model_folder(path)
-        return [str(model) for model in models_below(path) if read is not None and path / model != read]
+        files = camera_files(path)
+        return [str(model) for model in models_below(path) if len(files) > 1 and path / model != files[0].parent]
     return models_in_zip(path)[1:] if zipfile.is_zipfile(path) else []
 
 
@@ -120,23 +121,27 @@ def _from_folder(folder: Path) -> Cameras:
     files = camera_files(folder)
     if len(files) == 1:
         return _from_json(files[0])
-    others = [str(model) for model in models_below(folder) if folder / model != (files[0].parent if files else None)]
-    others += [file.name for file in sorted(folder.glob("transforms*.json"))]
     if not files:
-        hint = f"name what is meant, such as {_some(folder, others)}" if others else ""
+        others = _cameras_below(folder)
+        hint = f"name what is meant, such as {_some(others)}" if others else ""
         got = "a folder without any of them" + (" at the usual places" if others else "")
         raise InvalidCameras(str(folder), expected=CAMERA_FORMATS, got=got, hint=hint)
     try:
         return read_colmap(files[0].parent)
     except InvalidCameras as error:
+        others = [path for path in _cameras_below(scene_of(folder)) if path != files[0].parent]
         if error.hint != UNDISTORT or not others:
             raise
-        hint = f"name what is undistorted already, if it is, such as {_some(folder, others)}; else {UNDISTORT}"
+        hint = f"name what is undistorted already, if it is, such as {_some(others)}; else {UNDISTORT}"
         raise InvalidCameras(error.argument, expected=error.expected, got=error.got, hint=hint) from None
 
 
-def _some(folder: Path, names: list[str]) -> str:
-    return " or ".join(str(folder / name) for name in names[:2])
+def _cameras_below(scene: Path) -> list[Path]:
+    return [scene / model for model in models_below(scene)] + sorted(scene.glob("transforms*.json"))
+
+
+def _some(paths: list[Path]) -> str:
+    return " or ".join(str(path) for path in paths[:2])
 
 
 def _from_json(path: Path) -> Cameras:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING
+import os
+from itertools import islice
+from pathlib import Path, PurePath, PurePosixPath
+from typing import TYPE_CHECKING, TypeVar
 
-from liftcore.scene.colmap import has_model, model_files
+from liftcore.scene.colmap import MODEL_FILES, has_model, is_whole
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -13,24 +15,27 @@ if TYPE_CHECKING:
 # As trainers, COLMAP's reconstructor and its undistorter lay them out; the first that is there is read.
 MODEL_FOLDERS = (".", "sparse/0", "sparse", "colmap/sparse/0", "0", "dense/0/sparse", "dense/sparse")
 DEPTH = 4  # folders down that models are looked for, if only to be named
+MAX_FOLDERS = 10_000  # that are looked into for it
+P = TypeVar("P", bound=PurePath)
 
 
 def model_folder(folder: Path) -> Path | None:
     """The folder whose model is read: a usual one, whole models first; None when there is none."""
     found = [folder / name for name in MODEL_FOLDERS if has_model(folder / name)]
-    whole = [model for model in found if all(file.is_file() for file in model_files(model))]
-    return next(iter(whole + found), None)
+    return next(iter([model for model in found if is_whole(model)] + found), None)
 
 
 def models_below(folder: Path) -> list[PurePosixPath]:
-    """Folders with models below one, relative to it, in the order of ``preference``."""
-    found = {
-        PurePosixPath(file.parent.relative_to(folder).as_posix())
-        for depth in range(DEPTH + 1)
-        for kind in ("bin", "txt")
-        for file in folder.glob("*/" * depth + f"cameras.{kind}")
-    }
-    return sorted((model for model in found if has_model(folder / model)), key=preference)
+    """Folders with whole models below one, relative to it, in the order of ``preference``.
+
+    Hidden folders, links and what lies deep down are left out, so that a folder of many scenes costs little.
+    """
+    names: list[str] = []
+    for parent, inner, files in islice(os.walk(folder), MAX_FOLDERS):
+        here = Path(parent).relative_to(folder)
+        names += [(here / name).as_posix() for name in files if name in MODEL_FILES]
+        inner[:] = [name for name in sorted(inner) if not name.startswith(".") and len(here.parts) < DEPTH]
+    return [root for root, _ in whole_models(names)]
 
 
 def preference(model: PurePosixPath) -> tuple[bool, int, str, int]:
@@ -44,11 +49,11 @@ def preference(model: PurePosixPath) -> tuple[bool, int, str, int]:
     return "distorted" in model.parts, len(scene.parts), str(scene), place
 
 
-def scene_of(model: PurePosixPath) -> PurePosixPath:
+def scene_of(model: P) -> P:
     """The outermost folder in which a model has one of the usual places; its own folder at least."""
     parts = [PurePosixPath(place).parts for place in MODEL_FOLDERS]
     cut = max(len(place) for place in parts if model.parts[len(model.parts) - len(place) :] == place)
-    return PurePosixPath(*model.parts[: len(model.parts) - cut])
+    return type(model)(*model.parts[: len(model.parts) - cut])
 
 
 def whole_models(names: Iterable[str]) -> Iterator[tuple[PurePosixPath, str]]:

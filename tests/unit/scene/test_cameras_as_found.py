@@ -21,6 +21,12 @@ if TYPE_CHECKING:
 
 LENS = {2: (2, "SIMPLE_RADIAL", (500.0, 320.0, 240.0, 0.1))}  # distorted
 DISTORTED = {**CAMERAS, 1: LENS[2]}
+TRANSFORMS = {
+    "fl_x": 5,
+    "w": 9,
+    "h": 9,
+    "frames": [{"file_path": "a.png", "transform_matrix": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]}],
+}
 POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 8322710\n"
 
 
@@ -89,17 +95,17 @@ def test_refusal_of_distortion_names_what_else_is_there(tmp_path: Path) -> None:
     (scene / "transforms.json").write_text("{}")
     with pytest.raises(InvalidCameras, match=r"such as .*/dense/0/sparse or .*/transforms\.json; else undistort"):
         load_cameras(scene)
+    with pytest.raises(InvalidCameras, match=r"such as .*/dense/0/sparse or .*/transforms\.json; else undistort"):
+        load_cameras(scene / "sparse/0")
     with pytest.raises(InvalidCameras, match=r"by itself, if it is, such as dense/0/sparse; else undistort"):
         load_cameras(tmp_path / shutil.make_archive(str(scene), "zip", scene))
 
 
 @pytest.mark.parametrize("key", ["applied_transform", "ply_file_path"])
 def test_the_frame_of_nerfstudio_is_told(key: str, tmp_path: Path) -> None:
-    frame = {"file_path": "a.png", "transform_matrix": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}
-    document = {"fl_x": 5, "w": 9, "h": 9, "frames": [frame]}
-    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    (tmp_path / "transforms.json").write_text(json.dumps(TRANSFORMS))
     assert inspect_file(tmp_path)["warnings"] == []
-    (tmp_path / "transforms.json").write_text(json.dumps({**document, key: "sparse_pc.ply"}))
+    (tmp_path / "transforms.json").write_text(json.dumps({**TRANSFORMS, key: "sparse_pc.ply"}))
     for path in (tmp_path, tmp_path / "transforms.json"):
         assert any("--orientation-method none" in warning for warning in inspect_file(path)["warnings"])
 
@@ -114,6 +120,27 @@ def test_model_is_inspected_by_either_of_its_files(files: Callable[[], dict[str,
     write_files(tmp_path, files())
     for name in files():
         assert inspect_file(tmp_path / name)["views"] == 3
+
+
+def test_json_is_preferred_to_half_a_model(tmp_path: Path) -> None:
+    write_files(tmp_path, {"cameras.txt": text_files()["cameras.txt"]})
+    (tmp_path / "transforms.json").write_text(json.dumps(TRANSFORMS))
+    assert names(tmp_path) == ["a"]
+
+
+@pytest.mark.parametrize(("there", "missing"), [("cameras.bin", "images.bin"), ("images.bin", "cameras.bin")])
+@pytest.mark.parametrize("named", [False, True])
+def test_missing_half_of_a_model_is_told(there: str, missing: str, named: bool, tmp_path: Path) -> None:
+    write_files(tmp_path, {there: binary_files()[there]})
+    with pytest.raises(InvalidCameras, match=f"the file {missing}, got a folder without it"):
+        load_cameras(tmp_path / there if named else tmp_path)
+
+
+def test_hidden_and_broken_models_are_not_told(tmp_path: Path) -> None:
+    for place in ("sparse/0", ".cache/sparse/0", "a/b/c/d/e"):
+        write_files(tmp_path / place, binary_files())
+    write_files(tmp_path / "sparse/1", {"cameras.bin": binary_files()["cameras.bin"]})
+    assert other_models(tmp_path) == []
 
 
 def test_half_a_model_is_inspected_with_a_clear_word(tmp_path: Path) -> None:
