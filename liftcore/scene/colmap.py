@@ -195,9 +195,8 @@ def _text_sensors(path: Path) -> Iterator[tuple[int, _Sensor]]:
             camera, size = int(number), (int(width), int(height))
         except ValueError:
             raise _bad_line(path, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]", line) from None
-        if model not in MODELS_BY_NAME:
-            raise InvalidCameras(str(path), expected="a pinhole camera", got=model[:60], hint=UNDISTORT)
-        yield camera, _Sensor(*size, MODELS_BY_NAME[model], parameters)
+        unknown = CameraModel(model[:60], len(parameters), 0, perspective=False)
+        yield camera, _Sensor(*size, MODELS_BY_NAME.get(model, unknown), parameters)
 
 
 def _text_images(path: Path) -> Iterator[_Image]:

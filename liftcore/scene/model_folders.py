@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
 # As trainers, COLMAP's reconstructor and its undistorter lay them out; the first that is there is read.
 MODEL_FOLDERS = (".", "sparse/0", "sparse", "colmap/sparse/0", "0", "dense/0/sparse", "dense/sparse")
+PLACE_PARTS = tuple(PurePosixPath(place).parts for place in MODEL_FOLDERS)
 DEPTH = 4  # folders down that models are looked for, if only to be named
 MAX_FOLDERS = 10_000  # that are looked into for it
 P = TypeVar("P", bound=PurePath)
@@ -51,8 +52,7 @@ def preference(model: PurePosixPath) -> tuple[bool, int, str, int]:
 
 def scene_of(model: P) -> P:
     """The outermost folder in which a model has one of the usual places; its own folder at least."""
-    parts = [PurePosixPath(place).parts for place in MODEL_FOLDERS]
-    cut = max(len(place) for place in parts if model.parts[len(model.parts) - len(place) :] == place)
+    cut = max(len(place) for place in PLACE_PARTS if model.parts[len(model.parts) - len(place) :] == place)
     return type(model)(*model.parts[: len(model.parts) - cut])
 
 

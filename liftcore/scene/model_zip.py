@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from liftcore.errors import InvalidCameras
 from liftcore.scene.camera_models import UNDISTORT
-from liftcore.scene.colmap import read_colmap
+from liftcore.scene.colmap import MODEL_FILES, read_colmap
 from liftcore.scene.model_folders import model_names, whole_models
 
 if TYPE_CHECKING:
@@ -61,8 +61,9 @@ def models_in_zip(path: Path) -> list[str]:
 
 
 def _files(archive: zipfile.ZipFile) -> Mapping[str, zipfile.ZipInfo]:
-    """The files by their names, with slashes: Windows' own programs write backslashes."""
-    return {member.filename.replace("\\", "/"): member for member in archive.infolist() if not member.is_dir()}
+    """The files by their names, with slashes: Windows' own programs write backslashes, others ``./`` before all."""
+    members = [member for member in archive.infolist() if not member.is_dir()]
+    return {str(PurePosixPath(member.filename.replace("\\", "/"))): member for member in members}
 
 
 def _model_members(archive: zipfile.ZipFile, path: Path) -> Mapping[str, zipfile.ZipInfo]:
@@ -82,8 +83,9 @@ def _what_else(names: Iterable[str]) -> tuple[str, str]:
     """What a zip without a whole model has, and what to do."""
     for name in sorted(names):
         file = PurePosixPath(name).name
-        if file in ("cameras.bin", "cameras.txt"):
-            return f"{name!r} without {file.replace('cameras', 'images')!r}", "zip both files together"
+        if file in MODEL_FILES:
+            parts = ("cameras", "images") if file.startswith("cameras") else ("images", "cameras")
+            return f"{name!r} without {file.replace(*parts)!r}", "zip both files together"
         if file == "cameras.json" or (file.startswith("transforms") and file.endswith(".json")):
             return f"{name!r}", "give the JSON file itself, without a zip"
     return "none", "zip the folder that has cameras.bin and images.bin"

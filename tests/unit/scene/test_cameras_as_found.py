@@ -160,6 +160,8 @@ def test_folder_without_a_usual_name_says_what_can_be_named(tmp_path: Path) -> N
 def test_camera_that_no_image_uses_may_be_distorted(tmp_path: Path) -> None:
     for files in (binary_files, text_files):
         assert len(names(write_files(tmp_path / files.__name__, files({**CAMERAS, **LENS})))) == 3
+    unknown = text_files({**CAMERAS, 3: (99, "CROOKED", (1.0, 2.0))})  # of a binary one nobody knows the length
+    assert len(names(write_files(tmp_path / "unknown", unknown))) == 3
 
 
 def test_byte_order_mark_in_a_text_model_is_no_camera(tmp_path: Path) -> None:
@@ -176,19 +178,22 @@ def test_pointers_of_git_lfs_are_told(kind: str, part: str, tmp_path: Path) -> N
         load_cameras(folder)
 
 
-def test_zip_of_windows_is_read(tmp_path: Path) -> None:
+@pytest.mark.parametrize("root", ["sparse\\0\\", "./sparse/0/", ".\\sparse\\0\\"])
+def test_zip_with_other_separators_is_read(root: str, tmp_path: Path) -> None:
     with zipfile.ZipFile(tmp_path / "scene.zip", "w") as archive:
         for name, content in binary_files().items():
             member = zipfile.ZipInfo("x")
-            member.filename = f"sparse\\0\\{name}"  # as Compress-Archive of PowerShell 5 writes them
+            member.filename = f"{root}{name}"  # as Compress-Archive of PowerShell 5 writes them
             archive.writestr(member, content)
     assert len(names(tmp_path / "scene.zip")) == 3
+    assert other_models(tmp_path / "scene.zip") == []
 
 
 @pytest.mark.parametrize(
     ("name", "message"),
     [
         ("sparse/0/cameras.bin", r"got 'sparse/0/cameras\.bin' without 'images\.bin'; zip both"),
+        ("images.txt", r"got 'images\.txt' without 'cameras\.txt'; zip both"),
         ("data/transforms.json", r"got 'data/transforms\.json'; give the JSON file itself"),
         ("photo.jpg", r"got none; zip the folder that has cameras\.bin"),
     ],
