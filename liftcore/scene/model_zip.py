@@ -48,8 +48,9 @@ def read_model_zip(path: Path) -> Cameras:
             return read_colmap(Path(folder))
         except InvalidCameras as error:
             argument = error.argument.replace(folder, str(path))
-            got, hint, others = error.got.replace(folder, str(path)), error.hint, models_in_zip(path)[1:]
-            if hint == UNDISTORT and others:
+            got, hint = error.got.replace(folder, str(path)), error.hint
+            others = models_in_zip(path)[1:] if hint == UNDISTORT else []
+            if others:
                 hint = f"zip what is undistorted already by itself, if it is, such as {others[0]}; else {UNDISTORT}"
             raise InvalidCameras(argument, expected=error.expected, got=got, hint=hint) from None
 
