@@ -133,110 +133,118 @@ def slot_bit(slot):
     return np.uint64(1) << np.uint64(min(slot, LAST_BIT))
 
 
+# Functions that are called for a pixel take the arrays that they read, no tuples of them: each array of a tuple is
+# counted when it is handed on, there and back, by a locked instruction.
+
+
 @kernel
-def _slot_of_labels(taps, reading, y, x):
+def _slot_of_labels(labels, slot_rows, sizes, y, x):
     """The slot of the label tuple at label pixel (y, x); NO_SLOT when no level labels it."""
-    levels = reading.levels
+    levels = labels.shape[0]
     labelled = False
     for level in range(levels):
-        labelled |= reading.labels[level, y, x] >= 0
+        labelled |= labels[level, y, x] >= 0
     if not labelled:
         return NO_SLOT
-    known = taps.sizes[0]
+    known = sizes[0]
     for slot in range(known - 1, -1, -1):
         same = True
         for level in range(levels):
-            same &= taps.slot_rows[slot, level] == reading.labels[level, y, x]
+            same &= slot_rows[slot, level] == labels[level, y, x]
         if same:
             return slot
     for level in range(levels):
-        taps.slot_rows[known, level] = reading.labels[level, y, x]
-    taps.sizes[0] = known + 1
+        slot_rows[known, level] = labels[level, y, x]
+    sizes[0] = known + 1
     return known
 
 
-@inlined
-def _same_labels(reading, y, x, other):
+@kernel
+def _same_labels(labels, y, x, other):
     """Whether the label pixels (y, x) and (y, other) have the same labels on all levels."""
     same = True
-    for level in range(reading.levels):
-        same &= reading.labels[level, y, x] == reading.labels[level, y, other]
+    for level in range(labels.shape[0]):
+        same &= labels[level, y, x] == labels[level, y, other]
     return same
 
 
-@inlined
-def _reads_only(taps, reading, flat, slot, y, first):
-    """Whether the eight label pixels from (y, first) on all have the labels of one slot."""
-    _, rows, columns = reading.labels.shape
+@kernel
+def _reads_only(labels, flat, rows, y, first):
+    """Whether the eight label pixels from (y, first) on all have the labels ``rows`` [levels] of one slot."""
+    levels, height, width = labels.shape
     only = True
-    for level in range(reading.levels):
-        only &= all_are(flat, (level * rows + y) * columns + first, taps.slot_rows[slot, level])
+    for level in range(levels):
+        only &= all_are(flat, (level * height + y) * width + first, rows[level])
     return only
 
 
 @kernel
 def _read_regions(taps, reading, frame, x0, y0):
     slots = np.empty(LANES, np.int32)
-    flat = reading.labels.reshape(-1)
+    labels, label_x, label_y, flat = reading.labels, reading.label_x, reading.label_y, reading.labels.reshape(-1)
+    slot_rows, sizes, starts, alone = taps.slot_rows, taps.sizes, taps.starts, taps.alone
+    tap_slots, factors = taps.slots, taps.factors
     count = 0
     uniform = True
     guess = NO_SLOT  # what the half row before read: most read the same
     for half in range(HALVES):
-        taps.starts[half] = count
-        taps.alone[half] = NO_SLOT
+        starts[half] = count
+        alone[half] = NO_SLOT
         y = y0 + half % ROWS
         left = x0 + half // ROWS * LANES
         if y >= frame.height or left >= frame.width:
             continue
-        row, first = reading.label_y[y], reading.label_x[left]
+        row, first = label_y[y], label_x[left]
         last = min(left + LANES, frame.width) - 1
-        in_line = reading.label_x[last] - first == LANES - 1  # label pixels side by side, as the pixels are
-        if guess != NO_SLOT and in_line and _reads_only(taps, reading, flat, guess, row, first):
-            taps.alone[half] = guess
+        in_line = label_x[last] - first == LANES - 1  # label pixels side by side, as the pixels are
+        if guess != NO_SLOT and in_line and _reads_only(labels, flat, slot_rows[guess], row, first):
+            alone[half] = guess
             uniform &= guess == 0
             continue
         for lane in range(LANES):
             # Pixels outside the image carry no light; they may read what their neighbour reads.
-            x, before = reading.label_x[min(left + lane, last)], reading.label_x[min(left + max(lane, 1) - 1, last)]
-            if lane > 0 and _same_labels(reading, row, x, before):
+            x, before = label_x[min(left + lane, last)], label_x[min(left + max(lane, 1) - 1, last)]
+            if lane > 0 and _same_labels(labels, row, x, before):
                 slots[lane] = slots[lane - 1]
             else:
-                slots[lane] = _slot_of_labels(taps, reading, row, x)
+                slots[lane] = _slot_of_labels(labels, slot_rows, sizes, row, x)
         guess = slots[LANES - 1]
         if slots.min() == slots.max():
-            taps.alone[half] = guess
+            alone[half] = guess
         else:
-            taps.alone[half] = SEVERAL
-            count = _add_taps(taps, slots, count)
-        uniform &= taps.alone[half] == 0
-    taps.starts[HALVES] = count
-    taps.sizes[1] = uniform and taps.sizes[0] == 1
+            alone[half] = SEVERAL
+            count = _add_taps(tap_slots, factors, slots, count)
+        uniform &= alone[half] == 0
+    starts[HALVES] = count
+    sizes[1] = uniform and sizes[0] == 1
 
 
-@inlined
-def _add_taps(taps, slots, first):
+@kernel
+def _add_taps(tap_slots, factors, slots, first):
     """A tap for each slot that a half row's lanes read, from tap ``first`` on; the first tap after them."""
     count = first
     for lane in range(LANES):
         if slots[lane] == NO_SLOT:
             continue
         tap = first
-        while tap < count and taps.slots[tap] != slots[lane]:
+        while tap < count and tap_slots[tap] != slots[lane]:
             tap += 1
         if tap == count:
-            taps.slots[tap] = slots[lane]
-            taps.factors[tap * LANES : tap * LANES + LANES] = 0
+            tap_slots[tap] = slots[lane]
+            factors[tap * LANES : tap * LANES + LANES] = 0
             count += 1
-        taps.factors[tap * LANES + lane] = 1
+        factors[tap * LANES + lane] = 1
     return count
 
 
 @kernel
 def _read_grid(taps, reading, frame, x0, y0):
     known = np.empty(MAX_SLOTS, np.int32)  # the grid cell of each slot
+    slot_rows, sizes, starts, tap_slots, factors = taps.slot_rows, taps.sizes, taps.starts, taps.slots, taps.factors
+    shares_x, shares_y, cell_x, cell_y = reading.share_x, reading.share_y, reading.cell_x, reading.cell_y
     count = 0
     for half in range(HALVES):
-        taps.starts[half] = count
+        starts[half] = count
         taps.alone[half] = NO_SLOT
         y = y0 + half % ROWS
         left = x0 + half // ROWS * LANES
@@ -247,31 +255,31 @@ def _read_grid(taps, reading, frame, x0, y0):
             x = min(left + lane, frame.width - 1)
             for corner in range(4):
                 right, below = corner % 2, corner // 2
-                share_x = reading.share_x[x] if right else 1 - reading.share_x[x]
-                share_y = reading.share_y[y] if below else 1 - reading.share_y[y]
+                share_x = shares_x[x] if right else 1 - shares_x[x]
+                share_y = shares_y[y] if below else 1 - shares_y[y]
                 if share_x == 0 or share_y == 0:
                     continue
-                cell = (reading.cell_y[y] + below) * reading.grid_width + reading.cell_x[x] + right
-                slot = _slot_of_cell(taps, known, cell)
+                cell = (cell_y[y] + below) * reading.grid_width + cell_x[x] + right
+                slot = _slot_of_cell(slot_rows, sizes, known, cell)
                 tap = first_tap
-                while tap < count and taps.slots[tap] != slot:
+                while tap < count and tap_slots[tap] != slot:
                     tap += 1
                 if tap == count:
-                    taps.slots[tap] = slot
-                    taps.factors[tap * LANES : tap * LANES + LANES] = 0
+                    tap_slots[tap] = slot
+                    factors[tap * LANES : tap * LANES + LANES] = 0
                     count += 1
-                taps.factors[tap * LANES + lane] += share_x * share_y
+                factors[tap * LANES + lane] += share_x * share_y
         taps.alone[half] = SEVERAL
-    taps.starts[HALVES] = count
+    starts[HALVES] = count
 
 
 @kernel
-def _slot_of_cell(taps, known, cell):
-    slots = taps.sizes[0]
+def _slot_of_cell(slot_rows, sizes, known, cell):
+    slots = sizes[0]
     for slot in range(slots - 1, -1, -1):
         if known[slot] == cell:
             return slot
     known[slots] = cell
-    taps.slot_rows[slots, 0] = cell
-    taps.sizes[0] = slots + 1
+    slot_rows[slots, 0] = cell
+    sizes[0] = slots + 1
     return slots

@@ -8,6 +8,7 @@ tile is the depth order, so the result does not depend on the number of threads.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,10 +27,32 @@ def _tiles_between(low, high):
     return np.floor(np.ceil(low - 0.5) / TILE), np.floor(np.floor(high - 0.5) / TILE)
 
 
+class Outline(NamedTuple):
+    """What a record says of its footprint's outline, as numbers: an array would be counted at each use."""
+
+    mx: float
+    my: float
+    extent_x: float
+    extent_y: float
+    slope: float
+    root_x: float
+    ky: float
+    reach: float
+    lean: float
+
+
 @inlined
-def _tile_rows(record, circle, rows):
+def _outline(record):
+    return Outline(
+        record[MX], record[MY], record[EXTENT_X], record[EXTENT_Y], record[SLOPE],
+        record[ROOT_X], record[KY], record[REACH], record[LEAN],
+    )  # fmt: skip
+
+
+@inlined
+def _tile_rows(outline, circle, rows):
     """First and last tile row whose pixel centres the footprint can reach."""
-    top, bottom = _tiles_between(record[MY] - record[EXTENT_Y], record[MY] + record[EXTENT_Y])
+    top, bottom = _tiles_between(outline.my - outline.extent_y, outline.my + outline.extent_y)
     if circle[2] >= 0:
         near_top, near_bottom = _tiles_between(circle[1] - circle[2], circle[1] + circle[2])
         top, bottom = min(top, near_top), max(bottom, near_bottom)
@@ -37,32 +60,32 @@ def _tile_rows(record, circle, rows):
 
 
 @inlined
-def _edge(record, dy, side):
+def _edge(outline, dy, side):
     """x of the footprint's left (-1) or right (+1) edge at dy, relative to its centre."""
-    room = max(0.0, record[REACH] - record[KY] * dy * dy)
-    return record[SLOPE] * dy + side * math.sqrt(room) / record[ROOT_X]
+    room = max(0.0, outline.reach - outline.ky * dy * dy)
+    return outline.slope * dy + side * math.sqrt(room) / outline.root_x
 
 
 @inlined
-def _outline_columns(record, tile_row):
+def _outline_columns(outline, tile_row):
     """First and last tile column that the outline touches between a tile row's first and last pixel centres."""
-    narrow, wide = _tiles_between(record[MX] - record[EXTENT_X], record[MX] + record[EXTENT_X])
+    narrow, wide = _tiles_between(outline.mx - outline.extent_x, outline.mx + outline.extent_x)
     if narrow == wide:  # one column at most: no need to look closer
         return narrow, wide
-    low = max(tile_row * TILE + 0.5 - record[MY], -record[EXTENT_Y])
-    high = min(tile_row * TILE + TILE - 0.5 - record[MY], record[EXTENT_Y])
+    low = max(tile_row * TILE + 0.5 - outline.my, -outline.extent_y)
+    high = min(tile_row * TILE + TILE - 0.5 - outline.my, outline.extent_y)
     if low > high:
         return 0.0, -1.0
-    lean = record[LEAN]
-    right = record[EXTENT_X] if low <= lean <= high else _edge(record, low if lean < low else high, 1.0)
-    left = -record[EXTENT_X] if low <= -lean <= high else _edge(record, low if -lean < low else high, -1.0)
-    return _tiles_between(record[MX] + left, record[MX] + right)
+    lean = outline.lean
+    right = outline.extent_x if low <= lean <= high else _edge(outline, low if lean < low else high, 1.0)
+    left = -outline.extent_x if low <= -lean <= high else _edge(outline, low if -lean < low else high, -1.0)
+    return _tiles_between(outline.mx + left, outline.mx + right)
 
 
 @inlined
-def _tile_columns(record, circle, tile_row, columns):
+def _tile_columns(outline, circle, tile_row, columns):
     """First and last tile column that the footprint touches in a tile row."""
-    first, last = _outline_columns(record, tile_row)
+    first, last = _outline_columns(outline, tile_row)
     if circle[2] >= 0 and abs(tile_row * TILE + 0.5 * TILE - circle[1]) <= circle[2] + 0.5 * TILE:
         near_first, near_last = _tiles_between(circle[0] - circle[2], circle[0] + circle[2])
         if first > last:
@@ -84,26 +107,45 @@ def list_tiles(order, kernel, records, rows, columns, counts):
         lengths [n] i32, how many tiles each footprint touches; tiles [sum] i32, row by row.
     """
     lengths = np.zeros(order.shape[0], np.int32)
-    tiles = np.empty(max(1024, 4 * order.shape[0]), np.int32)
-    count = 0
-    for i in range(order.shape[0]):
-        if i + AHEAD < order.shape[0]:
-            fetch_ahead(records, order[i + AHEAD])
-        record = records[order[i]]
-        before = count
-        circle = circle_of(kernel, record)
-        top, bottom = _tile_rows(record, circle, rows)
+    tiles = np.empty(4 * order.shape[0] + rows * columns, np.int32)
+    done, count = _list_while_room(order, (0, 0), kernel, records, (rows, columns), counts, (lengths, tiles))
+    while done < order.shape[0]:
+        tiles = np.concatenate((tiles, np.empty_like(tiles), np.empty(rows * columns, np.int32)))
+        done, count = _list_while_room(
+            order, (done, count), kernel, records, (rows, columns), counts, (lengths, tiles)
+        )
+    return lengths, tiles[:count]
+
+
+@kernel
+def _list_while_room(order, begin, kernel, records, size, counts, lists):
+    """``list_tiles`` from ``begin = (footprint, tile of the list)`` on, while one that touches all tiles has room.
+
+    A function of its own, as arrays that are replaced in a loop are counted at each use in it.
+
+    Args:
+        size: (rows, columns) of tiles. lists: (lengths, tiles), written.
+
+    Returns:
+        Where it ended, like ``begin``.
+    """
+    (first_one, count), (rows, columns), (lengths, tiles) = begin, size, lists
+    for i in range(first_one, order.shape[0]):
+        if count + rows * columns > tiles.shape[0]:
+            return i, count
+        fetch_ahead(records, order[min(i + AHEAD, order.shape[0] - 1)])
+        before, record = count, records[order[i]]
+        outline, circle = _outline(record), circle_of(kernel, record)
+        top, bottom = _tile_rows(outline, circle, rows)
         for tile_row in range(int(top), int(bottom) + 1):
-            first, last = _tile_columns(record, circle, tile_row, columns)
-            if count + columns > tiles.shape[0]:
-                tiles = np.concatenate((tiles, np.empty_like(tiles), np.empty(columns, np.int32)))
+            first, last = _tile_columns(outline, circle, tile_row, columns)
             for column in range(int(first), int(last) + 1):
                 tile = tile_row * columns + column
                 tiles[count] = tile
                 counts[tile] += 1
                 count += 1
         lengths[i] = count - before
-    return lengths, tiles[:count]
+    return order.shape[0], count
 
 
 @kernel
