@@ -60,9 +60,10 @@ def parse_transforms(document: Any, source: str) -> Cameras:
     return Cameras(tuple(_camera(name, ChainMap(frame, document), source) for name, frame in views))
 
 
-def _camera(name: str, keys: Mapping[str, Any], source: str) -> Camera:
+def _camera(name: str, keys: ChainMap[str, Any], source: str) -> Camera:
     where = f"{source} frame {name!r}"
-    _refuse_distortion(keys, where)
+    for scope in keys.maps:  # the frame's own and the shared ones: programs differ in which of them counts
+        _refuse_distortion(scope, where)
     if "w" not in keys or "h" not in keys:
         hint = 'add the size of the photos as "w" and "h" at the top level of the file'
         raise InvalidCameras(where, expected="an image size, w and h", got="none", hint=hint)

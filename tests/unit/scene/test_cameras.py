@@ -270,6 +270,10 @@ BAD_TRANSFORMS = {
         {"fl_x": 5, "w": 9, "h": 9, "frames": [{**GOOD_FRAME, "distortion_params": [0.1]}]},
         r"distortion_params\[0\] = 0\.1",
     ),
+    "shared distortion beside a frame's zero": (
+        {"fl_x": 5, "w": 9, "h": 9, "k1": 0.1, "frames": [{**GOOD_FRAME, "k1": 0}]},
+        r"k1 = 0\.1",
+    ),
     "distortion that is no list": (
         {"fl_x": 5, "w": 9, "h": 9, "distortion_params": "k1", "frames": [GOOD_FRAME]},
         "a list of numbers, got 'k1'",
