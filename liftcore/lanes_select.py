@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from llvmlite import ir
 from numba import types
@@ -10,6 +10,8 @@ from numba import types
 from liftcore.lanes import EIGHT, FLOATS, INT, INTS, LANES, broadcast, compiled, maximum, minimum
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from liftcore.lanes import Builder
 
 _BITS = ir.IntType(LANES)
@@ -17,6 +19,16 @@ _BITS = ir.IntType(LANES)
 
 def _select(builder: Builder, condition: ir.Value, values: ir.Value) -> ir.Value:
     return builder.select(condition, values, ir.Constant(FLOATS, [0.0] * LANES))
+
+
+def _where(comparison: str) -> tuple[Any, Callable]:
+    """What an intrinsic of (left, right, values) gives: the values where the first two compare so, else 0."""
+
+    def codegen(context, builder, signature, args):
+        left, right, values = args
+        return _select(builder, builder.fcmp_ordered(comparison, left, right), values)
+
+    return EIGHT(EIGHT, EIGHT, EIGHT), codegen
 
 
 @compiled
@@ -42,39 +54,24 @@ def smaller(typingctx, left, right):
 @compiled
 def where_above(typingctx, left, right, values):
     """``values[i]`` where ``left[i] > right[i]``, else 0."""
-
-    def codegen(context, builder, signature, args):
-        left, right, values = args
-        return _select(builder, builder.fcmp_ordered(">", left, right), values)
-
-    return EIGHT(EIGHT, EIGHT, EIGHT), codegen
+    return _where(">")
 
 
 @compiled
 def where_reached(typingctx, left, right, values):
     """``values[i]`` where ``left[i] >= right[i]``, else 0."""
-
-    def codegen(context, builder, signature, args):
-        left, right, values = args
-        return _select(builder, builder.fcmp_ordered(">=", left, right), values)
-
-    return EIGHT(EIGHT, EIGHT, EIGHT), codegen
+    return _where(">=")
 
 
 @compiled
 def where_equal(typingctx, left, right, values):
     """``values[i]`` where ``left[i] == right[i]``, else 0."""
-
-    def codegen(context, builder, signature, args):
-        left, right, values = args
-        return _select(builder, builder.fcmp_ordered("==", left, right), values)
-
-    return EIGHT(EIGHT, EIGHT, EIGHT), codegen
+    return _where("==")
 
 
 @compiled
 def only_lane(typingctx, values, lane):
-    """``values[i]`` of that lane, 0 in all others; all of them for a number that is no lane's."""
+    """``values[i]`` of that lane and 0 in all others; eight zeros for a number that is no lane's."""
 
     def codegen(context, builder, signature, args):
         values, lane = args

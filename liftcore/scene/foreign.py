@@ -1,4 +1,4 @@
-"""What a file is that should have been a splat PLY and is none, and the way from it to one."""
+"""What a file is that should have been a splat PLY (or a camera file) and is none, and the way from it to one."""
 
 from __future__ import annotations
 

@@ -21,15 +21,7 @@ MAX_SH_DEGREE = 4
 LOBE_CHANNELS = 6  # of a spherical beta lobe: r g b theta phi beta
 NORMALS = ("nx", "ny", "nz")
 
-# Files of other models, which share names with splats: (a property of theirs, what it is, what to do).
-_OTHER_MODELS = (
-    (
-        "f_anchor_feat_0",
-        "anchors of Scaffold-GS, which its networks turn into splats",
-        "export the splats themselves",
-    ),
-    ("f_offset_0", "anchors of Scaffold-GS, which its networks turn into splats", "export the splats themselves"),
-)
+SCAFFOLD = ("f_anchor_feat_0", "f_offset_0")  # of Scaffold-GS, whose networks turn anchors into splats
 
 _SIGNATURES = {
     "Inria 3DGS": {
@@ -75,9 +67,10 @@ def model_slots(names: Sequence[str], kernel: Kernel, source: str) -> dict[str, 
     Raises:
         InvalidSplats: a column of the kernel is missing, there is an odd number of them, or the model is another.
     """
-    for name, what, hint in _OTHER_MODELS:
+    for name in SCAFFOLD:
         if name in names:
-            raise InvalidSplats(source, expected="splats", got=f"{what} (property {name!r})", hint=hint)
+            got = f"anchors of Scaffold-GS, which its networks turn into splats (property {name!r})"
+            raise InvalidSplats(source, expected="splats", got=got, hint="export the splats themselves")
     slots = _required(kernel)
     for name in slots:
         if name not in names:

@@ -15,3 +15,9 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, st
     status = cli.main([str(argument) for argument in arguments])
     captured = capsys.readouterr()
     return status, captured.out, captured.err
+
+
+def assert_one_line(err: str) -> None:
+    """What went to stderr is one line, and ends."""
+    assert err.endswith("\n")
+    assert err.count("\n") == 1

@@ -19,7 +19,6 @@ from liftcore.commands import bars, reply
 from liftcore.commands.lift import pairs_of
 from liftcore.errors import InvalidSettings, SplatliftError
 from liftcore.observe.observation import RegionMap
-from liftcore.observe.pack import open_packs
 from liftcore.observe.write_pack import write_pack
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.inria import write_inria_cameras
@@ -27,7 +26,7 @@ from liftcore.scene.ply import read_splats, write_splats
 from liftcore.scene.splats import Splats
 from liftcore.solve.settings import LiftSettings, Preset
 
-from .command_line import run
+from .command_line import assert_one_line, run
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -59,11 +58,6 @@ def scene(tmp_path: Path) -> Path:
 def lift_arguments(scene: Path, *more: object) -> list[object]:
     files = [scene / name for name in ("splats.ply", "cameras.json", "pack.safetensors")]
     return ["lift", *files, "-o", scene / "lift.safetensors", *more]
-
-
-def assert_one_line(err: str) -> None:
-    assert err.endswith("\n")
-    assert err.count("\n") == 1
 
 
 def test_scene_is_lifted_inspected_and_queried(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -223,63 +217,6 @@ def test_plan_is_printed_alone_and_before_a_lift_and_kept_with_it(
     made = load_lift(scene / "lift.safetensors").metadata
     assert (made.settings.speed, made.settings.stride, made.settings.view_cosine) == ("draft", 1, 0.98)
     assert made.certificate["plan"]["memory_bytes"] == plan["memory_bytes"]
-
-
-def test_langsplat_folder_is_packed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder = tmp_path / "language_features"
-    folder.mkdir()
-    np.save(folder / "a_s.npy", np.zeros((4, 2, 2), np.float32))
-    np.save(folder / "a_f.npy", np.ones((1, 5), np.float32))
-    options = ["--encoder-name", "clip", "--text-space", "open_clip:ViT-B-16", "--normalised", "--json"]
-    status, out, err = run(capsys, "pack", "langsplat", folder, "-o", tmp_path / "p.safetensors", *options)
-    assert (status, err) == (0, "")
-    document = json.loads(out)
-    assert (document["views"], document["channels"], document["normalised"]) == (1, 5, True)
-    assert document["text_space"] == "open_clip:ViT-B-16"
-    (folder / "a_f.npy").unlink()
-    status, out, err = run(capsys, "pack", "langsplat", folder, "-o", tmp_path / "q.safetensors")
-    assert (status, out) == (2, "")
-    assert_one_line(err)
-    assert not (tmp_path / "q.safetensors").exists()
-
-
-def test_arrays_are_packed_in_either_layout(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "maps").mkdir()
-    np.save(tmp_path / "maps" / "a.npy", np.ones((3, 4, 5), np.float16))
-    for layout, channels in (("hwc", 5), ("chw", 3)):
-        out = tmp_path / f"{layout}.safetensors"
-        status, text, _ = run(capsys, "pack", "npy", tmp_path / "maps", "-o", out, "--layout", layout)
-        assert status == 0
-        assert f"1 views, {channels} channels" in text
-        assert open_packs([out]).channels == channels
-
-
-def test_maps_named_after_whole_images_are_packed_under_their_cameras_names(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "maps").mkdir()
-    for name in ("a.jpg.npy", "b.PNG.npy", "frame.0001.npy"):
-        np.save(tmp_path / "maps" / name, np.full((3, 4, 5), 2.0, np.float16))
-    arguments = ["pack", "npy", tmp_path / "maps", "-o", tmp_path / "p.safetensors", "--encoder-name", "toy"]
-    status, out, _ = run(capsys, *arguments)
-    assert status == 0
-    assert "a.jpg.npy is 'a'" in out
-    assert "warning: unnormalised vectors" in out
-    status, out, _ = run(capsys, *arguments, "--json")
-    document = json.loads(out)
-    assert document["renamed"] == {"a.jpg.npy": "a", "b.PNG.npy": "b"}
-    assert [text.split(":")[0] for text in document["warnings"]] == ["unnormalised vectors"]
-    assert open_packs([tmp_path / "p.safetensors"]).views == ("a", "b", "frame.0001")
-
-
-def test_two_maps_of_one_view_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "maps").mkdir()
-    for name in ("a.npy", "a.jpg.npy"):
-        np.save(tmp_path / "maps" / name, np.ones((3, 4, 5), np.float16))
-    status, out, err = run(capsys, "pack", "npy", tmp_path / "maps", "-o", tmp_path / "p.safetensors")
-    assert (status, out) == (2, "")
-    assert_one_line(err)
-    assert "a.jpg.npy and a.npy, both of the view 'a'" in err
 
 
 def test_inspect_speaks_to_people_and_programs(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
