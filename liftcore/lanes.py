@@ -1,8 +1,7 @@
-"""Eight float32 lanes at a time, or sixteen: the vector instructions of the pixel loop and of the solution.
+"""Eight float32 lanes at a time: the vector instructions of the pixel loop and of the solution.
 
 numba's automatic vectorisation stops at aliasing and wrap-around checks inside the blending loop. These
-intrinsics build the same arithmetic as LLVM vectors of eight lanes, which LLVM lowers to AVX2, SSE or NEON. The
-sums of codebook rows take sixteen, which are one register with AVX-512.
+intrinsics build the same arithmetic as LLVM vectors of eight lanes, which LLVM lowers to AVX2, SSE or NEON.
 A tile row of 16 pixels is two such half rows; half row ``16 side + row`` lies left (side 0) or right (1).
 """
 
@@ -195,6 +194,11 @@ def sum_of_lanes(typingctx, lanes):
     return types.float32(EIGHT), codegen
 
 
+def converts(context) -> bool:
+    """Whether the processor that is compiled for is an x86 that turns float16 into float32 and back by itself."""
+    return "+f16c" in context.codegen().magic_tuple()[2]
+
+
 _HALF_LIMIT = 0x477FF000  # bits of 65520, from where on float16 is infinite
 _HALF_NORMAL = 113 << 23  # bits of the smallest normal float16
 _HALF_SHIFT = 126 << 23  # bits of 0.5: a float32 near it has a step of 2^-24, as small float16 values have
@@ -206,7 +210,7 @@ def keep_halves(typingctx, values, offset, lanes):
 
     def codegen(context, builder, signature, args):
         values, offset, lanes = args
-        if _converts(context):
+        if converts(context):
             rounded = builder.bitcast(builder.fptrunc(lanes, _HALVES), _SHORTS)
         else:
             rounded = _rounded_halves(builder, lanes)
@@ -253,88 +257,7 @@ def copy_values(typingctx, target, place, source, offset, count):
     return types.void(target, types.intp, target, types.intp, types.intp), codegen
 
 
-_HALF_BITS = 0x0FFFE000 - (1 << 31)  # sign, exponent and mantissa of a float16 where a float32 has them
-_HALF_UNIT = 2.0**112  # what float16 is larger by than its bits moved into a float32
-
-
-def _converts(context) -> bool:
-    """Whether the processor that is compiled for is an x86 that turns float16 into float32 and back by itself."""
-    return "+f16c" in context.codegen().magic_tuple()[2]
-
-
-_BROAD = 2 * LANES  # values of a row at a time: one register with AVX-512, two with AVX2, four with SSE and NEON
-_BROAD_FLOATS, _BROAD_INTS, _BROAD_SHORTS, _BROAD_HALVES = (
-    ir.VectorType(kind, _BROAD) for kind in (FLOAT, INT, ir.IntType(16), ir.HalfType())
-)
-
-
-def _load_small(builder: Builder, pointer: ir.Value) -> ir.Value:
-    """Float16 as float32 that are 2^112 times smaller: their bits, moved, with room for the larger exponent."""
-    signed = builder.sext(builder.load(builder.bitcast(pointer, _BROAD_SHORTS.as_pointer()), align=2), _BROAD_INTS)
-    moved = builder.shl(signed, ir.Constant(_BROAD_INTS, [13] * _BROAD))
-    return builder.bitcast(builder.and_(moved, ir.Constant(_BROAD_INTS, [_HALF_BITS] * _BROAD)), _BROAD_FLOATS)
-
-
-def _load_halves(builder: Builder, pointer: ir.Value) -> ir.Value:
-    """Float16 as float32, on a processor that converts."""
-    return builder.fpext(builder.load(builder.bitcast(pointer, _BROAD_HALVES.as_pointer()), align=2), _BROAD_FLOATS)
-
-
-def _load_singles(builder: Builder, pointer: ir.Value) -> ir.Value:
-    return builder.load(builder.bitcast(pointer, _BROAD_FLOATS.as_pointer()), align=4)
-
-
-WIDE = 4 * _BROAD  # channels that add_weighted_row keeps in registers
-AHEAD = 16  # entries between asking for a row and reading it; so many more columns have to be there to be read
 _LINE = 64  # bytes of the processor's cache
-
-
-@compiled
-def add_weighted_row(typingctx, target, place, source, entries, sparse, span):
-    """``target[place + i] += sum_k weights[k] source[columns[k] * stride + offset + i]`` for WIDE channels.
-
-    ``sparse = (columns i32, weights f32)``, ``entries = (first, last)`` of them, ``span = (stride, offset)`` of the
-    flat source: f32, or the bits of finite f16 (u16), which give the same sums to the bit. They stay in registers.
-    """
-    integers = types.UniTuple(types.intp, 2)
-    pair = types.Tuple([types.Array(types.int32, 1, "C"), FLOAT_ARRAY])
-    signature = types.void(FLOAT_ARRAY, types.intp, source, integers, pair, integers)
-    halves = source.dtype == types.uint16
-
-    def codegen(context, builder, signature, args):
-        target, place, source, entries, sparse, span = args
-        array = signature.args
-        first, last = cgutils.unpack_tuple(builder, entries)
-        stride, offset = cgutils.unpack_tuple(builder, span)
-        columns, weights = (
-            context.make_array(kind)(context, builder, value=part).data
-            for kind, part in zip(pair.types, cgutils.unpack_tuple(builder, sparse), strict=True)
-        )
-        smaller = halves and not _converts(context)
-        load = _load_singles if not halves else _load_small if smaller else _load_halves
-        steps = [ir.Constant(place.type, part) for part in range(0, WIDE, _BROAD)]
-        places = [pointer_to(context, builder, array[0], target, builder.add(place, step)) for step in steps]
-        sums = [cgutils.alloca_once_value(builder, _load_singles(builder, pointer)) for pointer in places]
-
-        def row_at(entry: ir.Value) -> ir.Value:
-            column = builder.sext(builder.load(builder.gep(columns, [entry])), stride.type)
-            return builder.add(builder.mul(column, stride), offset)
-
-        with cgutils.for_range_slice(builder, first, last, ir.Constant(place.type, 1)) as (k, _):
-            soon = row_at(builder.add(k, ir.Constant(k.type, AHEAD)))
-            fetch(builder, pointer_to(context, builder, array[2], source, soon), WIDE * (2 if halves else 4))
-            single = builder.load(builder.gep(weights, [k]))
-            unit = builder.fmul(single, ir.Constant(FLOAT, _HALF_UNIT)) if smaller else single
-            weight = broadcast(builder, unit, _BROAD_FLOATS)
-            base = row_at(k)
-            for step, total in zip(steps, sums, strict=True):
-                row = load(builder, pointer_to(context, builder, array[2], source, builder.add(base, step)))
-                builder.store(fused(builder, row, weight, builder.load(total)), total)
-        for pointer, total in zip(places, sums, strict=True):
-            builder.store(builder.load(total), builder.bitcast(pointer, _BROAD_FLOATS.as_pointer()), align=4)
-        return context.get_dummy_value()
-
-    return signature, codegen
 
 
 def fetch(builder: Builder, pointer: ir.Value, size: int) -> None:

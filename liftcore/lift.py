@@ -23,8 +23,8 @@ from liftcore.solve.aggregation import Aggregation, aggregate
 from liftcore.solve.all_rays import AllRays
 from liftcore.solve.certificate import certify
 from liftcore.solve.checkpoint import Checkpoint, identity, resumed
-from liftcore.solve.closed_form import Host, Solution
 from liftcore.solve.feature_room import room_within
+from liftcore.solve.host import Host
 from liftcore.solve.kept_columns import kept_columns
 from liftcore.solve.least_squares import refine
 from liftcore.solve.lift_warnings import lift_warnings
@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from liftcore.raster.protocol import Raster
     from liftcore.scene.cameras import Cameras
     from liftcore.scene.splats import Kernel, Splats
+    from liftcore.solve.closed_form import Solution
     from liftcore.solve.settings import LiftSettings
 
 log = logging.getLogger(__name__)
@@ -189,7 +190,7 @@ def _solve(run: Run, store: ViewWeights, geometry: Geometry, host: Host) -> tupl
     """The weights, which the robust steps may have changed, and the closed form of them."""
     settings, sums = run.settings, geometry.denominators
     with run.timings.stage("robust"):
-        weights = robust_weights(store, geometry.codebooks, sums, settings.robust_steps, run.progress, run.threads)
+        weights = robust_weights(store, geometry.codebooks, sums, settings.robust_steps, run.progress, host)
     with run.timings.stage("solve"):
         closed_form, dtype = closed_form_on(run.device, host), getattr(torch, settings.dtype)
         return weights, closed_form(weights, geometry.columns.__getitem__, sums, dtype, run.progress)

@@ -13,6 +13,7 @@ from liftcore.raster.warm_up import warm_up
 from liftcore.solve.accumulate import lift_walk, weighting_of
 from liftcore.solve.closed_form import warm_up_solution
 from liftcore.solve.columns import warm_up_tuples
+from liftcore.solve.host import Host
 from liftcore.solve.robust import robust_weights
 from liftcore.solve.view_weights import ViewWeights
 
@@ -36,4 +37,4 @@ def _warm_up_robust() -> None:
     one = torch.zeros(1, dtype=torch.int32)
     with ViewWeights() as store:
         store.append(RegionWeights(one, torch.tensor([0, 1]), one, torch.ones(1), one, torch.ones(1)))
-        robust_weights(store, [torch.ones(1, 1)], np.ones(1), 1, silent, 1)
+        robust_weights(store, [torch.ones(1, 1)], np.ones(1), 1, silent, Host(1))

@@ -22,7 +22,7 @@ from liftcore.observe.observation import Observation, RegionMap
 from liftcore.progress import silent
 from liftcore.raster.open_raster import open_raster
 from liftcore.solve.accumulate import lift_walk, weighting_of
-from liftcore.solve.closed_form import Host
+from liftcore.solve.host import Host
 from liftcore.solve.settings import LiftSettings, Preset
 from liftcore.solve.solver import closed_form_on
 from liftcore.solve.view_weights import ViewWeights

@@ -28,6 +28,7 @@ LIBRARIES = 450_000_000  # of torch, numba, numpy and the compiled kernels, befo
 ENTRIES_A_SPLAT = 1.5  # of W, for a splat that a view sees, with one level of regions; measured on real scenes
 MORE_ENTRIES = 0.6  # of it for each further level, where columns are tuples; ENTRIES_A_SPLAT where they are rows
 ENTRY_BYTES, ROW_BYTES = 8, 20  # column and weight; a splat's ids, row start and evidence
+JUDGED_BYTES = 8  # what the robust step finds of a gathered entry
 TILES_A_SPLAT = 6  # entries of tile lists and tile sums for a splat that a view sees, at full resolution
 TILE_ENTRY_BYTES = 4 + 4 + 2 * 16  # list, item, and an entry before and after it is gathered
 SCENE_BYTES = 9 * 8 + 3 * 8 + 8 * 8  # axes, opacities, reach; evidence, denominators, scale, order of the solution
@@ -52,6 +53,7 @@ def memory_parts(
     inputs = sum(t.nbytes for t in (splats.means, splats.quats, splats.log_scales, splats.opacity_logits))
     largest = max(camera.width * camera.height for camera in cameras.values())
     entries = entries_a_splat(packs, cameras, settings)
+    gathered = min(int(len(cameras) * seen_a_view * entries), CHUNK_ENTRIES)
     weights = weight_bytes(seen_a_view, entries)
     seen = 8 * RECORDS[splats.kernel] + TILES_A_SPLAT * TILE_ENTRY_BYTES  # of a splat
     labels = max(_label_bytes(packs, view) for view in cameras)
@@ -62,7 +64,7 @@ def memory_parts(
         "scene": splats.count * SCENE_BYTES,
         "view": walk + 2 * labels + weights,  # labels of the next one, too, and weights that wait for their turn
         "weights": min(len(cameras) * weights, MEMORY_LIMIT),
-        "gathered": ENTRY_BYTES * min(int(len(cameras) * seen_a_view * entries), CHUNK_ENTRIES),
+        "gathered": gathered * (ENTRY_BYTES + (JUDGED_BYTES if settings.robust_steps else 0)),
         "codebooks": _all_codebook_bytes(packs, cameras, settings),
         "features": splats.count * packs.channels * (2 if settings.dtype == "float16" else 4),
     }

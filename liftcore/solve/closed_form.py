@@ -9,8 +9,6 @@ faint splats keep their digits.
 from __future__ import annotations
 
 import math
-import os
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import product
 from typing import TYPE_CHECKING, Any
@@ -21,20 +19,20 @@ from numba import types
 from numba.extending import overload
 
 from liftcore.jit import kernel
-from liftcore.lanes import LANES, WIDE, copy_values, keep_halves, lanes_at, no_lanes, plus_product, sum_of_lanes
+from liftcore.lanes import LANES, copy_values, keep_halves, lanes_at, no_lanes, plus_product, sum_of_lanes
+from liftcore.lanes_rows import WIDE
 from liftcore.progress import silent
 from liftcore.raster.protocol import RegionWeights
 from liftcore.solve.columns import Columns, rows_of
 from liftcore.solve.curve import places_along_curve
-from liftcore.solve.feature_room import in_memory
 from liftcore.solve.gathering import Gathering
+from liftcore.solve.host import ALL_CORES, Host
 from liftcore.solve.weight_tables import WeightTables
 from liftcore.solve.weighted_sums import (
     Entries,
     block_end,
     channel_slices,
     first_columns,
-    splat_shares,
     strips_of,
     sum_strip,
 )
@@ -45,13 +43,11 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from liftcore.progress import Progress
-    from liftcore.solve.feature_room import FeatureRoom
-    from liftcore.solve.gathering import EachShare
+    from liftcore.solve.host import EachShare
     from liftcore.solve.view_weights import ViewWeights
     from liftcore.solve.weighted_sums import Strips
 
 BLOCK_ENTRIES = 1 << 12  # summed strip by strip, before their splats' rows are copied to X
-FEW_CHANNELS = 128  # that are summed sooner than put into another order
 FLOAT16_MAX = 65_504.0
 FLOAT16_STEP = 2.0**-25  # the largest rounding error of its small values
 FLOAT16_ERROR = 1e-4  # of the longest vector, which float16 must hold
@@ -64,15 +60,6 @@ class Solution:
 
     features: Tensor  # [P, F] f16 or f32, zero rows where nothing was seen
     agreement: Tensor  # [P] f32, norm of the weighted mean of unit codebook rows
-
-
-@dataclass(frozen=True)
-class Host:
-    """What the closed form has of this machine. Threads and means change no bit of it, only its time."""
-
-    threads: int | None = None  # None takes the cores that this process may use
-    room: FeatureRoom = in_memory  # for X
-    means: Tensor | None = None  # [P, 3] f32, of the splats: neighbours are solved together; None: in their order
 
 
 @kernel
@@ -128,7 +115,7 @@ def solve_closed_form(
     denominators: np.ndarray,
     dtype: torch.dtype,
     progress: Progress,
-    host: Host = Host(),
+    host: Host = ALL_CORES,
 ) -> Solution:
     """Solve for X, slice by slice of channels and block by block of splats.
 
@@ -154,14 +141,9 @@ def solve_closed_form(
     halves = all(_in_halves(part, dtype) for part in own)
     counts, tables = [part.count for part in own], WeightTables(store)
     slices = channel_slices(sum(counts), channels, (2 if halves else 4) + (0 if unit else 4))
-    curve = None if host.means is None or channels <= FEW_CHANNELS else places_along_curve(host.means)
-    threads = host.threads or len(os.sched_getaffinity(0))
-    with ThreadPoolExecutor(threads) as pool:
-
-        def each_share(work: Callable[[tuple[int, int]], None], first: int, last: int) -> None:
-            list(pool.map(work, splat_shares(first, last, threads)))
-
-        gathering = Gathering(each_share, tables, (first_columns(counts), scale), curve, channels * dtype.itemsize)
+    with host.workers() as (_, each_share):
+        own_columns = (first_columns(counts), scale)
+        gathering = Gathering(each_share, tables, own_columns, host.places(channels), channels * dtype.itemsize)
         for number, (begin, end) in enumerate(slices):
             parts = (part.means(part.codebook[:, begin:end]) for part in own)
             strips = strips_of(parts, counts, end - begin, torch.float16 if halves else torch.float32)

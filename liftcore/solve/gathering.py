@@ -8,25 +8,22 @@ entry waits for a row that others have driven out of the cache.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from liftcore.lanes import AHEAD
+from liftcore.lanes_rows import AHEAD
 from liftcore.solve.weighted_sums import Entries, entries_before, gather_entries
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
+    from liftcore.solve.host import EachShare
     from liftcore.solve.weight_tables import WeightTables
 
 CHUNK_ENTRIES = 1 << 24  # gathered at a time, unless a splat alone has more
 CHUNK_BYTES = 1 << 29  # of X at a time: where it is a mapped file, more might not stay in memory
-
-# Does some work for each share of the splats from the first to the last.
-EachShare = Callable[[Callable[[tuple[int, int]], None], int, int], None]
 
 
 class Chunk(NamedTuple):
@@ -44,7 +41,7 @@ class Gathering:
         weights: W of all views.
         columns: where each view's columns begin among those of all, [V] i64, and the scale of each splat, [P] f64.
         curve: [P] places along the curve; None keeps the order of the file.
-        row_bytes: of a row of X.
+        row_bytes: of a row of X, which is written chunk by chunk too.
     """
 
     def __init__(
@@ -80,16 +77,24 @@ class Gathering:
         """The splats ``first..last``."""
         own = np.arange(last - first) if self._curve is None else np.argsort(self._curve[first:last])
         starts = np.concatenate([[0], np.cumsum(self._counts[first:last][own])])
-        places = np.empty(last - first, np.int64)
-        places[own] = starts[:-1]
-        entries = Entries(starts, self._rows, self._shares)
+        chunk = Chunk(own + first, Entries(starts, self._rows, self._shares))
 
-        def gather(share: tuple[int, int]) -> None:
-            cursors = places[share[0] - first : share[1] - first]
-            gather_entries(share, cursors, self._tables, self._columns, entries)
+        def gather(share: tuple[int, int], cursors: np.ndarray) -> None:
+            gather_entries(share, cursors, self._tables, self._columns, chunk.entries)
 
-        self._each_share(gather, first, last)
-        return Chunk(own + first, entries)
+        self.in_file_order(chunk, gather)
+        return chunk
+
+    def in_file_order(self, chunk: Chunk, work: Callable[[tuple[int, int], np.ndarray], None]) -> None:
+        """Do some work for shares of a chunk's splats as the file has them.
+
+        Args:
+            work: given a share, and where the entries of each of its splats begin [n] i64, which it may change.
+        """
+        first, count = int(chunk.splats.min()), chunk.splats.size
+        places = np.empty(count, np.int64)
+        places[chunk.splats - first] = chunk.entries.starts[:-1]
+        self._each_share(lambda share: work(share, places[share[0] - first : share[1] - first]), first, first + count)
 
 
 def chunk_ranges(counts: np.ndarray, row_bytes: int) -> list[tuple[int, int]]:

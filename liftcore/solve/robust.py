@@ -23,111 +23,38 @@ before, and starts from the first W again. Nothing is tuned; each part has its r
   keeps part of its weight, and one that points away from the others loses it.
 
 A splat of one view does not change. A region without direction (a zero vector, or the mean itself) has c_jm = 0, and
-where nothing in the scene has a direction nothing changes. A step goes over blocks of splats as the file
-has them and the slices of channels of the closed form, and does some three times its work.
+where nothing in the scene has a direction nothing changes. A step goes along the curve and over the slices of
+channels as the closed form does, and reads each row twice where that reads it once.
 """
 
 from __future__ import annotations
 
-import os
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
-from liftcore.jit import kernel, vectorised
-from liftcore.lanes import WIDE
 from liftcore.solve.accumulate import row_totals
-from liftcore.solve.weight_tables import WeightTables, addresses_of, floats_at, rows_between, table_at
-from liftcore.solve.weighted_sums import (
-    block_end,
-    block_entries,
-    channel_slices,
-    entries_before,
-    most_entries,
-    splat_shares,
-    strips_of,
-    sum_strip,
-)
+from liftcore.solve.gathering import Gathering
+from liftcore.solve.host import ALL_CORES, Host
+from liftcore.solve.judging import Judged, judge_share, scatter_judged, to_cosines, to_old_sums, to_weights
+from liftcore.solve.weight_tables import WeightTables, addresses_of
+from liftcore.solve.weighted_sums import channel_slices, first_columns, strips_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
+    from concurrent.futures import ThreadPoolExecutor
 
     from torch import Tensor
 
     from liftcore.progress import Progress
-    from liftcore.raster.protocol import RegionWeights
+    from liftcore.solve.host import EachShare
     from liftcore.solve.view_weights import ViewWeights
 
 CHUNK_VALUES = 1 << 20  # of a codebook in float64 at a time
 NO_CONSENSUS = 1e-6  # of a splat's weight: a shorter r is what rounding leaves of inputs that cancel
 NO_DIRECTION = 1e-6  # a unit vector nearer to the mean than that is the mean
-
-
-@vectorised
-def judge_rows(rows, weights, scale, codebook, block, agreement, squares):
-    """Add to ``e_m . r`` of the entries and to ``|r|^2`` of some CSR rows, over these channels.
-
-    Args:
-        rows: (first, last, offset): the CSR rows ``first..last``, and the splat that the block starts with.
-        weights: (splats [n] i32, row_starts [n + 1] i64, columns [nnz] i32, weights [nnz] f32).
-        scale: [P] f64. codebook: [M, C] f32, of e. block: [B, C] f32, the sums over all views.
-        agreement: [nnz] f32. squares: [n] f32.
-    """
-    first, last, offset = rows
-    splats, row_starts, columns, values = weights
-    width = codebook.shape[1]
-    others = np.empty(width, np.float32)
-    for row in range(first, last):
-        splat = splats[row]
-        others[:] = block[splat - offset]
-        for k in range(row_starts[row], row_starts[row + 1]):
-            share = np.float32(values[k] * scale[splat])
-            own = codebook[columns[k]]
-            for c in range(width):
-                others[c] -= share * own[c]
-        square = np.float32(0.0)
-        for c in range(width):
-            square += others[c] * others[c]
-        squares[row] += square
-        for k in range(row_starts[row], row_starts[row + 1]):
-            own = codebook[columns[k]]
-            product = np.float32(0.0)
-            for c in range(width):
-                product += own[c] * others[c]
-            agreement[k] += product
-
-
-@kernel
-def judge_share(splats, tables, strips, sums, scale):
-    """``judge_rows`` of a share of splats for all views, block by block over the channels of the strips.
-
-    Args:
-        splats: (first, last). tables: (addresses, rows) of WeightTables. strips: Strips, of e.
-        sums: [V, 2] i64, where agreement [nnz] f32 and squares [n] f32 of each view lie. scale: [P] f64.
-    """
-    addresses, rows = tables
-    starts, most = entries_before(splats, tables), most_entries(strips.rows)
-    pieces = strips.values.reshape(strips.number, strips.rows, WIDE)
-    first = 0
-    while first < starts.shape[0] - 1:
-        last = block_end(starts, first, most)
-        block = (splats[0] + first, splats[0] + last)
-        entries = block_entries(block, starts[first : last + 1], tables, strips.bases, scale)
-        means = np.empty((last - first, WIDE), np.float32)
-        for strip in range(strips.number):
-            sum_strip(entries, strips, strip, means)
-            for view in range(addresses.shape[0]):
-                weights = table_at(addresses[view], rows[view])
-                own = rows_between(weights[0], block)
-                if own[0] < own[1]:
-                    book = pieces[strip, strips.bases[view] :]
-                    agreement = floats_at(sums[view, 0], weights[2].shape[0])
-                    squares = floats_at(sums[view, 1], weights[0].shape[0])
-                    judge_rows((own[0], own[1], block[0]), weights, scale, book, means, agreement, squares)
-        first = last
 
 
 @dataclass(frozen=True)
@@ -179,7 +106,7 @@ def robust_weights(
     denominators: np.ndarray,
     steps: int,
     progress: Progress,
-    threads: int | None = None,
+    host: Host = ALL_CORES,
 ) -> ViewWeights:
     """W after so many robust steps: the store itself for none, else new weights on its sparsity.
 
@@ -187,16 +114,17 @@ def robust_weights(
         store: W of every view. It stays as it is; the result shares its columns, so it must stay open.
         codebooks: E_v [M, F] of every view, f16 or f32.
         denominators: [P] f64, row sums of W over all views. They are those of the result too.
-        threads: None takes the cores that this process may use. The number changes no bit.
+        host: what there is to judge with. Neither threads nor means change a bit.
     """
     if steps == 0:
         return store
     current, written = store, [store.blank() for _ in range(min(steps, 2))]
-    with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
+    curve = host.places(codebooks[0].shape[1])
+    with host.workers() as (pool, each_share):
         directions = directions_of(pool, store, codebooks)
         for step in range(steps):
             target = written[step % 2]
-            squares = _judge(pool, current, directions, denominators, target)
+            squares = _judge((pool, each_share), current, directions, (denominators, curve), target)
             _write(pool, (store, current), target, squares, denominators)
             current = target
             progress("robust", step + 1, steps, "steps")
@@ -204,25 +132,35 @@ def robust_weights(
 
 
 def _judge(
-    pool: ThreadPoolExecutor,
+    workers: tuple[ThreadPoolExecutor, EachShare],
     current: ViewWeights,
     directions: Directions,
-    denominators: np.ndarray,
+    splats: tuple[np.ndarray, np.ndarray | None],
     target: ViewWeights,
 ) -> list[np.ndarray]:
-    """``e_m . r_jv`` of every entry into the weights of the target; gives ``|r_jv|^2`` [n] f32 of every view."""
+    """``e_m . r_jv`` of every entry into the weights of the target; gives ``|r_jv|^2`` [n] f32 of every view.
+
+    Args:
+        splats: the denominators and the places along a curve of each.
+    """
+    (pool, each_share), (denominators, curve) = workers, splats
     squares = [np.zeros(weights.splats.numel(), np.float32) for weights in current]
     for weights in target:
         weights.weights.zero_()
     counts = [book.shape[0] for book in directions.books]
-    scale, weights = _over(np.ones(denominators.size), denominators), WeightTables(current)
-    tables, shares = (weights.addresses, weights.rows), splat_shares(0, denominators.size, 1)
-    sums = addresses_of([(view.weights.numpy(), square) for view, square in zip(target, squares, strict=True)])
+    scale, tables = _over(np.ones(denominators.size), denominators), WeightTables(current)
+    targets = addresses_of([(view.weights.numpy(), square) for view, square in zip(target, squares, strict=True)])
+    gathering = Gathering(each_share, tables, (first_columns(counts), scale), curve, 0)
     for begin, end in channel_slices(sum(counts), directions.mean.size, 4):
         parts = pool.map(lambda view, ends=(begin, end): directions.slice_of(view, *ends), range(len(counts)))
-        own = strips_of(parts, counts, end - begin, torch.float32)
-        list(pool.map(lambda share, own=own: judge_share(share, tables, own, sums, scale), shares))
-        del own  # before others are made
+        strips = strips_of(parts, counts, end - begin, torch.float32)
+        for chunk in gathering:
+            judged = Judged(*(np.empty(chunk.entries.starts[-1], np.float32) for _ in Judged._fields))
+            given = (chunk.entries, strips, judged)
+            each_share(lambda share, given=given: judge_share(share, *given), 0, chunk.splats.size)
+            kept = ((tables.addresses, tables.rows), targets, judged)
+            gathering.in_file_order(chunk, lambda *given, kept=kept: scatter_judged(*given, *kept))
+        del strips  # before others are made
     return squares
 
 
@@ -241,40 +179,28 @@ def _write(
     """
     first, current = sources
     scale, views = _over(np.ones(denominators.size), denominators), range(len(target))
+    starts, splats = ([getattr(view, name).numpy() for view in target] for name in ("row_starts", "splats"))
+    before, values = ([view.weights.numpy() for view in store] for store in (first, target))
 
-    def to_cosines(view: int) -> np.ndarray:
-        lengths = np.sqrt(squares[view].astype(np.float64))
-        lengths[lengths <= NO_CONSENSUS] = 0
-        values, weights = target[view].weights.numpy(), first[view].weights.numpy()
-        values[:] = _over(values.astype(np.float64), _by_entry(target[view], lengths)).clip(0.0, 1.0)
-        return np.array([np.dot(weights.astype(np.float64), values), weights.sum(dtype=np.float64)])
+    def find(view: int) -> tuple[float, float]:
+        return to_cosines(starts[view], squares[view], NO_CONSENSUS, before[view], values[view])
 
-    agreeing, everything = np.sum(list(pool.map(to_cosines, views)), axis=0)
+    agreeing, everything = np.sum(list(pool.map(find, views)), axis=0)
     usual = agreeing / (everything or 1.0)
 
-    def to_weights(view: int) -> np.ndarray:
-        share = (row_totals(current[view]) * scale[target[view].splats.numpy()]).clip(0.0, 1.0)
-        values = target[view].weights.numpy()
-        agreement = _by_entry(target[view], 1.0 - share) * values + _by_entry(target[view], share * usual)
-        values[:] = first[view].weights.numpy() * agreement
-        return row_totals(target[view])
+    def weigh(view: int) -> np.ndarray:
+        shares = row_totals(current[view]) * scale[splats[view]]
+        return to_weights(starts[view], shares, usual, before[view], values[view])
 
     totals = np.zeros(denominators.size)
-    for weights, added in zip(target, pool.map(to_weights, views), strict=True):
-        totals[weights.splats.numpy()] += added
+    for own, added in zip(splats, pool.map(weigh, views), strict=True):
+        totals[own] += added
     gain = _over(denominators, totals)
 
-    def to_old_sums(view: int) -> None:
-        gains = _by_entry(target[view], gain[target[view].splats.numpy()])
-        values = target[view].weights.numpy()
-        values[:] = np.where(gains > 0, values * gains, first[view].weights.numpy())
+    def scale_back(view: int) -> None:
+        to_old_sums(starts[view], gain[splats[view]], before[view], values[view])
 
-    list(pool.map(to_old_sums, views))
-
-
-def _by_entry(weights: RegionWeights, rows: np.ndarray) -> np.ndarray:
-    """The value of its row [n] for each entry [nnz]."""
-    return np.repeat(rows, np.diff(weights.row_starts.numpy()))
+    list(pool.map(scale_back, views))
 
 
 def _row_chunks(book: Tensor) -> Iterator[slice]:

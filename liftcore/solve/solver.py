@@ -20,9 +20,10 @@ if TYPE_CHECKING:
     from liftcore.device import Device
     from liftcore.progress import Progress
     from liftcore.raster.protocol import RegionWeights
-    from liftcore.solve.closed_form import Host, Solution
+    from liftcore.solve.closed_form import Solution
     from liftcore.solve.columns import Columns
     from liftcore.solve.feature_room import FeatureRoom
+    from liftcore.solve.host import Host
 
 
 class ClosedForm(Protocol):

@@ -18,7 +18,8 @@ import torch
 
 from liftcore.errors import Unavailable
 from liftcore.jit import kernel
-from liftcore.lanes import AHEAD, WIDE, add_weighted_row, fetch_place
+from liftcore.lanes import fetch_place
+from liftcore.lanes_rows import WIDE, add_weighted_row
 from liftcore.solve.weight_tables import rows_between, table_at
 
 if TYPE_CHECKING:
@@ -30,8 +31,6 @@ LONG = 256  # entries of a splat that float32 adds up one by one
 PLACES = 12  # rows of W between asking for their places among the gathered entries and writing there
 LEAST_SHARE, SHARE = 128, 2048  # splats a call of compiled code
 SHARES = 8  # of each thread, so that none waits long for another
-LEAST_ENTRIES, MOST_ENTRIES = 1 << 16, 1 << 22  # of a block in the order of the file, unless a splat alone has more
-REUSE = 12  # entries of such a block for each row of the codebooks: so often a piece is read from the nearer cache
 STRIP_BYTES = 1 << 28  # of the strips of all codebooks at a time, unless a single one has more
 MOST_ROWS = 2**31 - 1  # of all codebooks: an entry of a block names its row in four bytes
 _LINE = 64  # bytes of the processor's cache
@@ -135,17 +134,11 @@ def entries_before(splats, tables):
 
 @kernel
 def block_end(starts, begin, most):
-    """The end of the block of a share that begins at splat ``begin``: ``most`` entries, or one splat."""
+    """The end of the block that begins at splat ``begin``: at most so many entries, or one splat."""
     end = begin + 1
     while end < starts.shape[0] - 1 and starts[end + 1] - starts[begin] <= most:
         end += 1
     return end
-
-
-@kernel
-def most_entries(rows):
-    """Of a block, for codebooks of so many rows together."""
-    return min(max(REUSE * rows, LEAST_ENTRIES), MOST_ENTRIES)
 
 
 @kernel
@@ -175,15 +168,6 @@ def gather_entries(splats, cursors, tables, columns, entries):
                 entries.shares[at] = weights[k] * scale[splat]
                 at += 1
             cursors[splat - first] = at
-
-
-@kernel
-def block_entries(block, starts, tables, bases, scale):
-    """The Entries of the splats ``block[0]..block[1]``, as ``starts`` [B + 1] of ``entries_before`` counts them."""
-    count = starts[-1] - starts[0]
-    entries = Entries(starts - starts[0], np.zeros(count + AHEAD, np.int32), np.empty(count, np.float32))
-    gather_entries(block, entries.starts[:-1].copy(), tables, (bases, scale), entries)
-    return entries
 
 
 @kernel

@@ -6,14 +6,16 @@ import numpy as np
 import pytest
 from numba import njit
 
-from liftcore import lanes
-from liftcore.lanes import LANES, WIDE, add_weighted_row, copy_values, keep_halves, lanes_at
+from liftcore import lanes, lanes_rows
+from liftcore.lanes import LANES, copy_values, keep_halves, lanes_at
+from liftcore.lanes_rows import AHEAD, WIDE, add_row_products, add_weighted_row
 
 
 @pytest.fixture(params=["as it is", "does not convert"])
 def processor(request, monkeypatch: pytest.MonkeyPatch) -> None:
     if request.param != "as it is":
-        monkeypatch.setattr(lanes, "_converts", lambda _context: False)
+        for module in (lanes, lanes_rows):
+            monkeypatch.setattr(module, "converts", lambda _context: False)
 
 
 def every_half() -> np.ndarray:
@@ -34,9 +36,9 @@ def test_every_float16_is_summed_as_the_float32_that_it_is() -> None:
 
     halves = every_half()
     count = halves.size // WIDE
-    columns = np.zeros(count + lanes.AHEAD, np.int32)
+    columns = np.zeros(count + AHEAD, np.int32)
     columns[:count] = np.arange(count)
-    weights = np.full(count + lanes.AHEAD, 0.375, np.float32)
+    weights = np.full(count + AHEAD, 0.375, np.float32)
     found = weighted(halves.view(np.uint16), columns, weights)[: halves.size]
     assert np.array_equal(found, halves.astype(np.float32) * np.float32(0.375))
 
@@ -64,3 +66,18 @@ def test_values_are_copied_to_their_place_alone(kind: type) -> None:
     source, target = np.arange(20).astype(kind), np.zeros(15, kind)
     copy(target, source)
     assert target.tolist() == [0] * 3 + list(range(5, 12)) + [0] * 5
+
+
+def test_products_of_rows_are_added_to_what_there_is_and_the_square_is_given() -> None:
+    @njit
+    def multiplied(other, source, entries, columns, products):
+        return add_row_products(other, 3, source, entries, (columns, products), (2 * WIDE, 5))
+
+    rng = np.random.default_rng(0)
+    source, other = (rng.normal(0, 1, count).astype(np.float32) for count in (20 * WIDE, WIDE + 3))
+    columns, before = rng.integers(0, 9, 6).astype(np.int32), rng.normal(0, 1, 6)
+    products, row = before.copy(), other[3:].astype(np.float64)
+    square = multiplied(other, source, (1, 5), columns, products)
+    wanted = [float(source[2 * WIDE * k + 5 :][:WIDE].astype(np.float64) @ row) for k in columns[1:5]]
+    np.testing.assert_allclose(products - before, np.array([0.0, *wanted, 0.0]), atol=1e-4 * WIDE**0.5)
+    assert square == pytest.approx(row @ row, rel=1e-6)

@@ -26,7 +26,7 @@ from liftcore.observe.observation import RegionMap
 from liftcore.progress import silent
 from liftcore.raster.open_raster import open_raster
 from liftcore.raster.protocol import Walk, Weighting
-from liftcore.solve.closed_form import Host
+from liftcore.solve.host import Host
 from liftcore.solve.solver import closed_form_on
 from liftcore.solve.view_weights import ViewWeights
 

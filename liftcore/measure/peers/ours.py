@@ -9,7 +9,8 @@ from liftcore.measure.region_walk import walk_regions
 from liftcore.progress import silent
 from liftcore.raster.cpu import CpuRaster
 from liftcore.raster.protocol import Weighting
-from liftcore.solve.closed_form import Host, solve_closed_form
+from liftcore.solve.closed_form import solve_closed_form
+from liftcore.solve.host import Host
 from liftcore.solve.view_weights import ViewWeights
 
 

@@ -18,8 +18,9 @@ from liftcore.raster.oracle_footprints import alphas
 from liftcore.raster.protocol import RegionWeights, Walk, Weighting
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Splats
-from liftcore.solve.closed_form import Host, solve_closed_form
+from liftcore.solve.closed_form import solve_closed_form
 from liftcore.solve.columns import Columns
+from liftcore.solve.host import Host
 from liftcore.solve.view_weights import ViewWeights
 
 SIDES = (32, 100, 316, 1_000, 3_162)  # pixels of square images: 10^3 .. 10^7 rays

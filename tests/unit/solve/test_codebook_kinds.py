@@ -8,7 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from liftcore.lanes import WIDE
+from liftcore.lanes_rows import WIDE
 from liftcore.progress import silent
 from liftcore.raster.protocol import RegionWeights
 from liftcore.solve.closed_form import Host, solve_closed_form

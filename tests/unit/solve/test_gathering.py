@@ -13,11 +13,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from liftcore.progress import silent
-from liftcore.solve import closed_form, gathering
-from liftcore.solve.closed_form import FEW_CHANNELS, Host, solve_closed_form
+from liftcore.solve import closed_form, gathering, host
+from liftcore.solve.closed_form import solve_closed_form
 from liftcore.solve.columns import rows_of
 from liftcore.solve.curve import places_along_curve
 from liftcore.solve.gathering import Gathering, chunk_ranges
+from liftcore.solve.host import FEW_CHANNELS, Host
 from liftcore.solve.weight_tables import WeightTables
 from liftcore.solve.weighted_sums import LEAST_SHARE, SHARE, splat_shares
 from tests.unit.solve.test_on_device import dense, random_view, sums_of
@@ -87,12 +88,12 @@ def test_without_places_the_order_is_that_of_the_file(store) -> None:
 
 
 def test_order_chunks_shares_and_threads_change_no_bit(store, means, monkeypatch) -> None:
-    monkeypatch.setattr(closed_form, "FEW_CHANNELS", 0)
+    monkeypatch.setattr(host, "FEW_CHANNELS", 0)
     books = [torch.randn(ROWS, 70, generator=torch.Generator().manual_seed(view)) for view in range(3)]
     totals = sums_of(store, SPLATS)
 
-    def solved(host: Host) -> closed_form.Solution:
-        return solve_closed_form(store, rows_of(books), totals, torch.float16, silent, host)
+    def solved(machine: Host) -> closed_form.Solution:
+        return solve_closed_form(store, rows_of(books), totals, torch.float16, silent, machine)
 
     def assert_same(other: closed_form.Solution) -> None:
         assert torch.equal(whole.features, other.features)
@@ -117,7 +118,7 @@ def test_few_channels_keep_the_order_of_the_file(store, means, monkeypatch) -> N
         asked.append(len(points))
         return places_along_curve(points)
 
-    monkeypatch.setattr(closed_form, "places_along_curve", places)
+    monkeypatch.setattr(host, "places_along_curve", places)
     for channels in (FEW_CHANNELS, FEW_CHANNELS + 1):
         books = [torch.ones(ROWS, channels) for _ in range(3)]
         solve_closed_form(store, rows_of(books), sums_of(store, SPLATS), torch.float16, silent, Host(1, means=means))

@@ -13,9 +13,12 @@ from hypothesis import strategies as st
 from liftcore.lift import lift
 from liftcore.progress import silent
 from liftcore.raster.protocol import RegionWeights
+from liftcore.solve import gathering, host, weighted_sums
+from liftcore.solve.host import ALL_CORES, Host
 from liftcore.solve.robust import NO_CONSENSUS, robust_weights
 from liftcore.solve.settings import LiftSettings
 from liftcore.solve.view_weights import ViewWeights
+from liftcore.solve.weighted_sums import LONG
 from tests.unit.solve.test_lift_equals_dense import write_scene
 
 
@@ -36,10 +39,10 @@ class Scene:
             store.append(sparse(view))
         return store
 
-    def after(self, steps: int, threads: int = 2, memory_limit: int | None = None) -> list[np.ndarray]:
+    def after(self, steps: int, machine: Host = ALL_CORES, memory_limit: int | None = None) -> list[np.ndarray]:
         """The weights of every view after so many steps, dense."""
         with self.store(memory_limit) as store:
-            result = robust_weights(store, self.books, self.denominators, steps, silent, threads)
+            result = robust_weights(store, self.books, self.denominators, steps, silent, machine)
             return [dense(view, like) for view, like in zip(result, self.weights, strict=True)]
 
 
@@ -120,22 +123,47 @@ def test_the_steps_equal_their_definition_and_keep_every_splats_sum(scene, steps
 
 
 def random_scene(seed: int, count: int = 9_000, views: int = 4, rows: int = 7, channels: int = 150) -> Scene:
-    """More than two blocks of splats, more than one slice of channels."""
+    """More than a share and a block of splats, more than a strip of channels."""
     rng = np.random.default_rng(seed)
     kept = [rng.random((count, rows)) * (rng.random((count, rows)) < 0.3) for _ in range(views)]
     books = [torch.tensor(rng.normal(0, 1, (rows, channels)), dtype=torch.float32) for _ in range(views)]
     return Scene([view.astype(np.float32) for view in kept], books)
 
 
-def test_neither_threads_nor_files_change_a_bit_and_the_first_weights_stay():
+def test_neither_threads_nor_files_nor_order_nor_slices_change_a_bit_and_the_first_weights_stay(monkeypatch):
     scene = random_scene(0)
-    expected = scene.after(3, threads=1)
-    for other in (scene.after(3, threads=5), scene.after(3, memory_limit=0)):
-        assert all(np.array_equal(a, b) for a, b in zip(expected, other, strict=True))
+    expected = scene.after(3, Host(1))
+
+    def assert_same(*how) -> None:
+        assert all(np.array_equal(a, b) for a, b in zip(expected, scene.after(3, *how), strict=True))
+
+    assert_same(Host(5))
+    assert_same(Host(2), 0)
+    monkeypatch.setattr(host, "FEW_CHANNELS", 0)
+    monkeypatch.setattr(gathering, "CHUNK_ENTRIES", 5_000)
+    assert_same(Host(2, means=torch.rand(9_000, 3, generator=torch.Generator().manual_seed(0))))
     with scene.store() as store:
         assert robust_weights(store, scene.books, scene.denominators, 0, silent) is store
         robust_weights(store, scene.books, scene.denominators, 2, silent)
         assert all(np.array_equal(dense(a, b), b) for a, b in zip(store, scene.weights, strict=True))
+
+
+def test_slices_of_channels_are_judged_together(monkeypatch):
+    scene = random_scene(3, count=500)
+    whole = scene.after(2)
+    monkeypatch.setattr(weighted_sums, "STRIP_BYTES", 1)
+    for sliced, expected in zip(scene.after(2), whole, strict=True):
+        np.testing.assert_allclose(sliced, expected, rtol=1e-4, atol=1e-6)
+
+
+def test_splats_of_many_views_and_of_many_regions_equal_the_definition():
+    scene = random_scene(4, count=3, views=LONG + 40, rows=3)
+    rng = np.random.default_rng(5)
+    scene.weights.append(rng.random((3, 2 * LONG + 30)).astype(np.float32))
+    scene.books.append(torch.tensor(rng.normal(0, 1, (2 * LONG + 30, 150)), dtype=torch.float32))
+    D = scene.denominators[:, None]
+    for mine, real in zip(scene.after(1), defined(scene, 1), strict=True):
+        np.testing.assert_allclose(mine / D, real / D, atol=1e-6)
 
 
 def things(noise: float, views: int = 8, seed: int = 0) -> tuple[Scene, np.random.Generator]:

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from liftcore.errors import Unavailable
-from liftcore.lanes import WIDE
+from liftcore.lanes_rows import WIDE
 from liftcore.progress import silent
 from liftcore.raster.protocol import RegionWeights
 from liftcore.solve import weighted_sums
