@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from liftcore.solve.accumulate import Geometry, SampledRays
     from liftcore.solve.settings import LiftSettings
 
-_CHUNK_VALUES = 1 << 24  # float32 values gathered at a time: 64 MB, however long the rays and the vectors are
+_CHUNK_VALUES = 1 << 21  # float32 values gathered at a time: 8 MB, as larger ones are fresh pages every time
 _READS_A_RAY = 8  # levels or taps of a ray; few scenes have more
 _MU_FLOOR = 1e-6  # a row whose splats all equal what it observed has no dispersion to speak of
 
