@@ -16,14 +16,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from liftcore.plan.visibility import SIDES
-
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from liftcore.plan.visibility import Visibility
 
 ORDER_SPLATS = 4_096  # at most: 300 views are in order after .3 s, where 16,384 take 1 s
+SIDES = 24  # directions that a splat is looked at from: the three of each octant
 WELL_COVERED = 8  # views that show a splat well enough to spare another one
 
 
@@ -33,16 +32,17 @@ def view_order(seen: Visibility) -> Iterator[int]:
     Of equal views the first is taken.
     """
     step = -(-seen.areas.shape[1] // ORDER_SPLATS)
-    areas, sides = seen.areas[:, ::step], seen.sides[:, ::step]
+    areas, means = seen.areas[:, ::step], seen.means[::step]
     totals = areas.sum(axis=0, dtype=np.float64)
     shares = np.divide(areas, totals, out=np.zeros(areas.shape, np.float32), where=totals > 0)
-    held = np.zeros((shares.shape[1], SIDES), np.float32)
     shown = [np.flatnonzero(row) for row in shares]
+    added = [row[own] for row, own in zip(shares, shown, strict=True)]
+    places = [SIDES * own + side_of(centre - means[own]) for centre, own in zip(seen.centres, shown, strict=True)]
+    held, roots = np.zeros((2, len(means) * SIDES), np.float32)
 
     def gain(view: int) -> float:
-        own = shown[view]
-        before, added = held[own, sides[view, own]], shares[view, own]
-        return float((np.sqrt(before + added) - np.sqrt(before)).sum(dtype=np.float64))
+        before = places[view]
+        return float((np.sqrt(held[before] + added[view]) - roots[before]).sum(dtype=np.float64))
 
     queue = [(-gain(view), view) for view in range(len(shown))]
     heapq.heapify(queue)
@@ -53,9 +53,15 @@ def view_order(seen: Visibility) -> Iterator[int]:
             heapq.heapreplace(queue, now)
             continue
         heapq.heappop(queue)
-        own = shown[view]
-        held[own, sides[view, own]] += shares[view, own]
+        held[places[view]] += added[view]
+        roots[places[view]] = np.sqrt(held[places[view]])
         yield view
+
+
+def side_of(directions: np.ndarray) -> np.ndarray:
+    """Directions [n, 3] -> [n] i64, below SIDES: the octant, and the longest component in it."""
+    octants = (directions > 0) @ np.array([1, 2, 4])
+    return 3 * octants + np.abs(directions).argmax(axis=1)
 
 
 def views_to_show(seen: Visibility, order: Sequence[int], times: int) -> int:

@@ -30,11 +30,12 @@ import numpy as np
 import torch
 from torch.nn.functional import embedding_bag
 
+from liftcore.one_thread import one_thread
 from liftcore.plan.visibility import spread
 from liftcore.progress import silent
 from liftcore.raster.cpu import CpuRaster
 from liftcore.solve.accumulate import accumulate
-from liftcore.solve.channels import one_thread, random_axes
+from liftcore.solve.channels import random_axes
 from liftcore.solve.totals import sums_in_order
 from liftcore.solve.view_weights import ViewWeights
 

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from liftcore.scene.splats import Splats
 
 SAMPLE = 16_384  # splats at most; a view of them takes a millisecond
-SIDES = 24  # directions that a splat is looked at from: the three of each octant
 
 
 @dataclass(frozen=True)
@@ -32,7 +31,8 @@ class Visibility:
     """How large the sampled splats are in each view."""
 
     areas: np.ndarray  # [V, n] f32, px^2 of the footprint's outline, at most the image's; 0 where it is not in it
-    sides: np.ndarray  # [V, n] u8, from which of SIDES directions the view looks at the splat
+    centres: np.ndarray  # [V, 3] f64, of the cameras
+    means: np.ndarray  # [n, 3] f32, of the splats
     splats: int  # P, of which n are sampled evenly
 
     @property
@@ -42,7 +42,7 @@ class Visibility:
 
     def of(self, views: Sequence[int]) -> Visibility:
         """The same of some views alone."""
-        return Visibility(self.areas[views], self.sides[views], self.splats)
+        return Visibility(self.areas[views], self.centres[views], self.means, self.splats)
 
     @property
     def seen_share(self) -> float:
@@ -60,20 +60,14 @@ def visibility(splats: Splats, cameras: Sequence[Camera], walk: Walk) -> Visibil
     sample = spread_splats(splats, min(SAMPLE, splats.count))
     scene, count = activated(sample, walk.gain), sample.count
     areas = np.zeros((len(cameras), count), np.float32)
-    sides = np.stack([side_of(camera.centre - sample.means.numpy()) for camera in cameras])
     records = np.empty((count, RECORDS[splats.kernel]))
     targets = Targets(records, np.empty(count, np.float32), np.empty(count, np.int32))
     for row, camera in zip(areas, cameras, strict=True):
         found = project((0, count), scene, view_of(camera), splats.kernel, walk.antialiased, targets)
         outline = math.pi * records[:found, EXTENT_X] * records[:found, EXTENT_Y]
         row[targets.ids[:found]] = outline.clip(np.finfo(np.float32).tiny, camera.width * camera.height)
-    return Visibility(areas, sides, splats.count)
-
-
-def side_of(directions: np.ndarray) -> np.ndarray:
-    """Directions [n, 3] -> [n] u8: the octant, and the longest component in it."""
-    octants = (directions > 0) @ np.array([1, 2, 4])
-    return (3 * octants + np.abs(directions).argmax(axis=1)).astype(np.uint8)
+    centres = np.array([camera.centre for camera in cameras], np.float64).reshape(-1, 3)
+    return Visibility(areas, centres, sample.means.numpy(), splats.count)
 
 
 def spread(total: int, count: int) -> np.ndarray:

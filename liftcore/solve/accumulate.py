@@ -13,6 +13,7 @@ import torch
 from liftcore.device import out_of_memory
 from liftcore.observe.levels import at_levels
 from liftcore.observe.observation import FeatureGrid, Observation, RegionMap
+from liftcore.one_thread import one_thread
 from liftcore.raster.protocol import Look, RayRows, Walk, Weighting
 from liftcore.solve.columns import Columns, as_walked
 from liftcore.solve.readout import Readout, read_pixels, sample_pixels
@@ -102,6 +103,7 @@ def as_read(observation: Observation, settings: LiftSettings, view: str) -> Obse
     return RegionMap(cells, observation.codebook)
 
 
+@one_thread()
 def accumulate(
     raster: Raster,
     scene: tuple[int, Cameras],

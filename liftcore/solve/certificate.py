@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from liftcore.jit import vectorised
+from liftcore.one_thread import one_thread
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -85,6 +86,7 @@ def certify(
     }
 
 
+@one_thread()
 def measure_samples(
     samples: Sequence[SampledRays], features: Tensor, codebooks: Sequence[Tensor], threads: int | None = None
 ) -> ViewMeasures:

@@ -5,15 +5,16 @@ All three are linear maps of feature vectors, so a least-squares solution in the
 
 from __future__ import annotations
 
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
+from liftcore.one_thread import one_thread
+
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Sequence
 
     from torch import Tensor
 
@@ -101,14 +102,3 @@ def _gram_times(codebooks: Sequence[Tensor], axes: Tensor, scale: float) -> Tens
             rows = book[first : first + _ROWS].double() / scale
             total += rows.T @ (rows @ axes)
     return total
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Matrix products whose last bits do not depend on how many threads torch was given."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)

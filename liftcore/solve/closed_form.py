@@ -21,6 +21,7 @@ from numba.extending import overload
 from liftcore.jit import kernel
 from liftcore.lanes import LANES, copy_values, keep_halves, lanes_at, no_lanes, plus_product, sum_of_lanes
 from liftcore.lanes_rows import WIDE
+from liftcore.one_thread import one_thread
 from liftcore.progress import silent
 from liftcore.raster.protocol import RegionWeights
 from liftcore.solve.columns import Columns, rows_of
@@ -109,6 +110,7 @@ def _store_singles(source, width, begin, features):
         features[row, begin : begin + kept] = source[row * width : row * width + kept]
 
 
+@one_thread()
 def solve_closed_form(
     store: Sequence[RegionWeights] | ViewWeights,
     columns: Callable[[int], Columns],

@@ -16,7 +16,6 @@ from torch.nn.functional import embedding_bag
 
 from liftcore.observe.label_tuples import label_tuples
 from liftcore.observe.observation import NO_LABEL, Observation, RegionMap
-from liftcore.solve.channels import one_thread
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -50,8 +49,7 @@ class Columns:
         named = self.tuples != NO_LABEL
         shares = (named / named.sum(dim=1, keepdim=True)).to(rows.device)
         places = self.tuples.clamp_min(0).to(rows.device)  # of share zero where there is none
-        with one_thread():  # else torch's threads keep spinning beside those that solve
-            means = embedding_bag(places, rows.float(), mode="sum", per_sample_weights=shares)
+        means = embedding_bag(places, rows.float(), mode="sum", per_sample_weights=shares)
         largest = torch.finfo(torch.float32).max
         return means.clamp_(-largest, largest)  # the rounded shares of six rows add up to more than one
 

@@ -35,6 +35,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from liftcore.one_thread import one_thread
 from liftcore.solve.accumulate import row_totals
 from liftcore.solve.gathering import Gathering
 from liftcore.solve.host import ALL_CORES, Host
@@ -100,6 +101,7 @@ def directions_of(pool: ThreadPoolExecutor, store: ViewWeights, books: Sequence[
     return Directions(books, lengths, mean, tuple(pool.map(distance, range(len(store)))))
 
 
+@one_thread()
 def robust_weights(
     store: ViewWeights,
     codebooks: Sequence[Tensor],

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from liftcore.lift import lift
-from liftcore.plan.coverage import ORDER_SPLATS, WELL_COVERED, spare_views, view_order, views_to_show
-from liftcore.plan.visibility import SIDES, Visibility, side_of, visibility
+from liftcore.plan.coverage import ORDER_SPLATS, SIDES, WELL_COVERED, side_of, spare_views, view_order, views_to_show
+from liftcore.plan.visibility import Visibility, visibility
 from liftcore.raster.cpu import CpuRaster
 from liftcore.raster.protocol import Walk, Weighting
 from liftcore.scene.splats import Kernel
@@ -24,9 +24,10 @@ def ring(count: int) -> list:
     return [look_at(f"v{k}", place, 40, 30, 40.0) for k, place in enumerate(places)]
 
 
-def seen_as(in_view: list[list[int]], sides: list[int]) -> Visibility:
+def seen_as(in_view: list[list[int]]) -> Visibility:
     areas = np.array(in_view, np.float32)
-    return Visibility(areas, np.repeat(np.array(sides, np.uint8)[:, None], areas.shape[1], axis=1), areas.shape[1])
+    views, splats = areas.shape
+    return Visibility(areas, np.zeros((views, 3)), np.ones((splats, 3), np.float32), splats)
 
 
 @pytest.mark.parametrize("kernel", list(Kernel))
@@ -72,13 +73,14 @@ def test_views_are_added_until_each_splat_is_shown_often_enough_and_the_choice_r
 def test_looking_at_gains_lazily_finds_the_order_of_looking_at_all():
     seen = visibility(random_splats(2, 120, 0.8), [random_camera(k) for k in range(14)], Walk())
     shares = seen.areas / seen.areas.sum(axis=0).clip(min=1e-30)
+    sides = [side_of(centre - seen.means) for centre in seen.centres]
     held, every = np.zeros((shares.shape[1], SIDES)), np.arange(shares.shape[1])
     left, order = list(range(14)), []
     while left:
-        before = {view: held[every, seen.sides[view]] for view in left}
+        before = {view: held[every, sides[view]] for view in left}
         gains = [float((np.sqrt(before[view] + shares[view]) - np.sqrt(before[view])).sum()) for view in left]
         best = left.pop(int(np.argmax(gains)))
-        held[every, seen.sides[best]] += shares[best]
+        held[every, sides[best]] += shares[best]
         order.append(best)
     assert list(view_order(seen)) == order
 
@@ -86,14 +88,14 @@ def test_looking_at_gains_lazily_finds_the_order_of_looking_at_all():
 def test_of_many_splats_a_part_makes_the_order():
     rng = np.random.default_rng(0)
     areas = rng.uniform(size=(5, 2 * ORDER_SPLATS)).astype(np.float32)
-    sides = rng.integers(SIDES, size=areas.shape).astype(np.uint8)
-    some = Visibility(areas[:, ::2], sides[:, ::2], ORDER_SPLATS)
-    assert list(view_order(Visibility(areas, sides, 2 * ORDER_SPLATS))) == list(view_order(some))
+    centres, means = rng.normal(size=(5, 3)), rng.normal(size=(2 * ORDER_SPLATS, 3)).astype(np.float32)
+    some = Visibility(areas[:, ::2], centres, means[::2], ORDER_SPLATS)
+    assert list(view_order(Visibility(areas, centres, means, 2 * ORDER_SPLATS))) == list(view_order(some))
 
 
 def test_views_that_add_nothing_can_be_left_out_together():
     alike, own = [[1, 1, 0]] * (WELL_COVERED + 3), [[0, 1, 1]]
-    spare = spare_views(seen_as(alike + own, [0] * (WELL_COVERED + 4)))
+    spare = spare_views(seen_as(alike + own))
     assert WELL_COVERED + 3 not in spare  # it alone shows the third splat
     stay = [k for k in range(WELL_COVERED + 4) if k not in spare]
     assert spare
@@ -101,7 +103,7 @@ def test_views_that_add_nothing_can_be_left_out_together():
 
 
 def test_a_view_that_sees_nothing_is_spare():
-    assert spare_views(seen_as([[1, 1], [0, 0]], [0, 0])) == [1]
+    assert spare_views(seen_as([[1, 1], [0, 0]])) == [1]
 
 
 def test_a_lift_with_coverage_is_the_lift_of_the_chosen_views(tmp_path):
