@@ -74,6 +74,9 @@ def _faithful(axes: Axes, runs: Sequence[Mapping[str, Any]]) -> None:
 
 def _label(axes: Axes, runs: Sequence[Mapping[str, Any]], accuracy: str) -> None:
     """Names beside their points, moved apart where they would meet."""
+    from matplotlib.patheffects import withStroke
+
+    halo = withStroke(linewidth=2.5, foreground="white")  # so that lines do not strike names out
     low, high = axes.get_ylim()
     least, most = axes.get_xlim()
     placed: list[tuple[float, float]] = []
@@ -87,7 +90,8 @@ def _label(axes: Axes, runs: Sequence[Mapping[str, Any]], accuracy: str) -> None
         place = {"xycoords": "axes fraction", "textcoords": "axes fraction", "va": "center", "fontsize": 8}
         line = {"arrowstyle": "-", "color": "#bbbbbb", "lw": 0.6} if height < at else None
         spot = (across + 0.02, height)
-        axes.annotate(run["name"], (across, at), spot, color=COLOURS[run["kind"]], arrowprops=line, **place)
+        name = axes.annotate(run["name"], (across, at), spot, color=COLOURS[run["kind"]], arrowprops=line, **place)
+        name.set_path_effects([halo])
 
 
 def _few_ticks(value: float, _: float) -> str:
