@@ -27,14 +27,14 @@ from liftcore.lanes import (
 if TYPE_CHECKING:
     from liftcore.lanes import Builder
 
-_HALF_BITS = 0x0FFFE000 - (1 << 31)  # sign, exponent and mantissa of a float16 where a float32 has them
-_HALF_UNIT = 2.0**112  # what float16 is larger by than its bits moved into a float32
-
-
-_BROAD = 2 * LANES  # values of a row at a time: one register with AVX-512, two with AVX2, four with SSE and NEON
+_BROAD = 2 * LANES  # values of a row at a time
 _BROAD_FLOATS, _BROAD_INTS, _BROAD_SHORTS, _BROAD_HALVES = (
     ir.VectorType(kind, _BROAD) for kind in (FLOAT, INT, ir.IntType(16), ir.HalfType())
 )
+WIDE = 4 * _BROAD  # channels that are kept in registers
+AHEAD = 16  # entries between asking for a row and reading it; so many more columns have to be there to be read
+_HALF_BITS = 0x0FFFE000 - (1 << 31)  # sign, exponent and mantissa of a float16 where a float32 has them
+_HALF_UNIT = 2.0**112  # what float16 is larger by than its bits moved into a float32
 
 
 def _load_small(builder: Builder, pointer: ir.Value) -> ir.Value:
@@ -51,10 +51,6 @@ def _load_halves(builder: Builder, pointer: ir.Value) -> ir.Value:
 
 def _load_singles(builder: Builder, pointer: ir.Value) -> ir.Value:
     return builder.load(builder.bitcast(pointer, _BROAD_FLOATS.as_pointer()), align=4)
-
-
-WIDE = 4 * _BROAD  # channels that add_weighted_row keeps in registers
-AHEAD = 16  # entries between asking for a row and reading it; so many more columns have to be there to be read
 
 
 @compiled
