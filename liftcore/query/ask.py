@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from liftcore.query.scene import QueryScene
 
 _QUANTILES = (0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
-_NO_RELEVANCY = 0.0  # what a splat without a feature scores in relevancy
 
 
 @dataclass(frozen=True)
@@ -42,7 +41,7 @@ class Answer:
     """How a scene answers a query."""
 
     query: Query
-    scores: Tensor  # [P] f32, cosine in -1..1 or relevancy in 0..1; the minimum where not seen
+    scores: Tensor  # [P] f32, in -1..1 (`scores.combine`); the minimum where not seen
     seen: Tensor  # [P] bool, whether the splat has a feature
     threshold: float  # on the scores
     threshold_method: str  # what was asked for: auto, valley, paper, otsu, stability or fixed
@@ -186,7 +185,7 @@ def _answer(scene: QueryScene, asked: Question, similarities: Tensor) -> Answer:
     query, seen = asked.query, scene.seen
     scores = combine(similarities, len(query.positives))
     if not scene.all_seen:
-        scores = torch.where(seen, scores, _NO_RELEVANCY if query.negatives else LOWEST_COSINE)
+        scores = torch.where(seen, scores, LOWEST_COSINE)
     known = scores if scene.all_seen else scores[seen]
     found = find_threshold(known, query.threshold, scene.weights, query.instances)
     return Answer(

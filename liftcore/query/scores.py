@@ -1,4 +1,4 @@
-"""How well every splat answers a query: cosine to its positives, or relevancy against its negatives.
+"""How well every splat answers a query: cosine to its positives, less where a negative is as near.
 
 Lifted rows are sums of unit vectors and not unit themselves, so their norms divide every score. The norms
 belong to the lift and not to the text: they are computed once and passed in.
@@ -113,16 +113,15 @@ def cosines_about(features: Tensor, norms: Tensor, mean: Tensor, examples: Tenso
 def combine(similarities: Tensor, positives: int) -> Tensor:
     """One score a splat from its cosines to all terms of a query.
 
-    Without negatives it is the cosine to the nearest positive, and with negatives a softmax between the nearest
-    positive and the nearest negative:
+    Without negatives it is the cosine to the nearest positive, and with negatives that cosine times the relevancy:
 
         s_j = max_p cos(x_j, p)
-        s_j = sigmoid(10 (max_p cos(x_j, p) - max_n cos(x_j, n)))
+        s_j = max_p cos(x_j, p) sigmoid(10 (max_p cos(x_j, p) - max_n cos(x_j, n)))
 
-    The latter is LangSplat's relevancy ``min_n softmax(10 [cos p, cos n])_0`` where there is one positive. Above 0.5
-    a splat is nearer to what is wanted than to anything unwanted. The largest and not the mean cosine counts, so that
-    positives may be different things; cosines to words and to examples differ in scale (CLIP's words lie apart from
-    its images), so among both the examples decide.
+    Relevancy alone asks which of the two a splat is nearer to, and a wall may be nearer to an apple than to a table
+    without being like either: negatives must take away from what is found, not add to it. The largest and not the
+    mean cosine counts, so that positives may be different things; cosines to words and to examples differ in scale
+    (CLIP's words lie apart from its images), so among both the examples decide.
 
     Args:
         similarities: [P, n] f32, cosines to the positives, then to the negatives; plain for words, and about the
@@ -130,12 +129,23 @@ def combine(similarities: Tensor, positives: int) -> Tensor:
         positives: how many of the n are positives, at least one.
 
     Returns:
-        [P] f32, in -1..1 without negatives, else in 0..1.
+        [P] f32 in -1..1.
     """
     nearest = similarities[:, :positives].amax(dim=1)
-    if similarities.shape[1] == positives:
-        return nearest
-    return torch.sigmoid(RELEVANCY_SHARPNESS * (nearest - similarities[:, positives:].amax(dim=1)))
+    return nearest if similarities.shape[1] == positives else nearest * relevancy(similarities, positives)
+
+
+def relevancy(similarities: Tensor, positives: int) -> Tensor:
+    """LERF's and LangSplat's ``min_n softmax(10 [cos p, cos n])_0``, p the nearest positive: [P] f32 in 0..1.
+
+    Above 0.5 a splat is nearer to what is wanted than to anything unwanted.
+
+    Args:
+        similarities: [P, n] f32, cosines to the positives, then to the negatives, at least one of either.
+        positives: how many of the n are positives.
+    """
+    nearest, against = similarities[:, :positives].amax(dim=1), similarities[:, positives:].amax(dim=1)
+    return torch.sigmoid(RELEVANCY_SHARPNESS * (nearest - against))
 
 
 def _unit_rows(texts: Tensor, channels: int) -> Tensor:

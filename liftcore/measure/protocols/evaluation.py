@@ -27,7 +27,7 @@ class EvaluationSettings:
 
     protocols: tuple[EvaluationProtocol, ...] = tuple(EvaluationProtocol)
     threshold: str | float = "auto"  # of P2's splats and P3's maps; P1 has its own
-    negatives: tuple[str, ...] = ()  # P1: instead of LangSplat's four; P2 and P3: relevancy instead of cosines
+    negatives: tuple[str, ...] = ()  # P1: instead of LangSplat's four; P2 and P3: of each question
     held_out: frozenset[str] | None = None  # the only frames to judge; None = all that are labelled
 
 

@@ -9,7 +9,7 @@ import torch
 from scipy.ndimage import uniform_filter
 
 from liftcore.measure.protocols import Prediction
-from liftcore.query.scores import DEFAULT_NEGATIVES, combine
+from liftcore.query.scores import DEFAULT_NEGATIVES, relevancy
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -56,7 +56,7 @@ class RenderedFeatures:
         found = {}
         for k, text in enumerate(self._texts):
             against = torch.cat([flat[:, k : k + 1], flat[:, count:]], dim=1)
-            found[text] = segment(combine(against, 1).reshape(shape).numpy())
+            found[text] = segment(relevancy(against, 1).reshape(shape).numpy())
         return found
 
     def cosines(self, view: str) -> Tensor:

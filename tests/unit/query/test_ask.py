@@ -96,9 +96,10 @@ def test_splats_that_hardly_a_ray_met_do_not_decide_the_threshold(lift_file: Pat
     assert answer.selected[COUNT] and answer.count > plain.count  # they are selected all the same
 
 
-def test_negatives_make_it_relevancy(lift_file: Path) -> None:
-    answer = ask(QueryScene.open(lift_file), Query(("x",), ("y", "z"), threshold=0.5), Axes())
-    assert answer.statistics["min"] >= 0 and answer.threshold_method == "fixed"
+def test_negatives_take_away_from_the_cosines(lift_file: Path) -> None:
+    scene = QueryScene.open(lift_file)
+    answer = ask(scene, Query(("x",), ("y", "z"), threshold=0.5), Axes())
+    assert (answer.scores <= ask(scene, "x", Axes()).scores).all() and answer.threshold_method == "fixed"
     assert answer.selected.nonzero()[:, 0].tolist() == list(range(0, COUNT - 1, 3))
 
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from liftcore.errors import InvalidQuery
-from liftcore.query.scores import combine, cosine, cosines, cosines_about, feature_norms, mean_direction
+from liftcore.query.scores import combine, cosine, cosines, cosines_about, feature_norms, mean_direction, relevancy
 
 
 @given(
@@ -46,11 +46,20 @@ def test_several_texts_in_one_pass_equal_one_by_one() -> None:
 def test_relevancy_is_the_least_softmax_over_negatives() -> None:
     similarities = torch.rand(100, 5, dtype=torch.float64) - 0.5
     pairs = [torch.softmax(10 * similarities[:, [0, n]], dim=1)[:, 0] for n in range(1, 5)]
-    torch.testing.assert_close(combine(similarities, 1), torch.stack(pairs).amin(dim=0))
+    torch.testing.assert_close(relevancy(similarities, 1), torch.stack(pairs).amin(dim=0))
 
 
 def test_relevancy_of_a_half_means_as_near_as_the_nearest_negative() -> None:
-    assert combine(torch.tensor([[0.3, 0.3, 0.1]]), 1).item() == pytest.approx(0.5)
+    assert relevancy(torch.tensor([[0.3, 0.3, 0.1]]), 1).item() == pytest.approx(0.5)
+
+
+def test_negatives_take_away_from_what_is_found_and_add_nothing() -> None:
+    apple, table, wall = [0.9, 0.1], [0.1, 0.9], [0.0, -0.6]  # cosines to an apple and to a table
+    scores = combine(torch.tensor([apple, table, wall]), 1)
+    assert scores[0] > 0.89 and scores[1] < 0.01 and scores[2] == 0.0
+    assert relevancy(torch.tensor([wall]), 1) > 0.99  # which alone would find the wall
+    similarities = torch.rand(100, 5)
+    assert (combine(similarities, 2) <= combine(similarities[:, :2], 2)).all()
 
 
 @given(
@@ -90,7 +99,7 @@ def test_several_positives_are_as_good_as_the_nearest_one() -> None:
     against = torch.softmax(
         10 * torch.stack([similarities[:, :3].amax(1), similarities[:, 3:].amax(1)], dim=1), dim=1
     )
-    torch.testing.assert_close(combine(similarities, 3), against[:, 0])
+    torch.testing.assert_close(relevancy(similarities, 3), against[:, 0])
 
 
 @pytest.mark.parametrize("text", [torch.zeros(8), torch.full((8,), torch.nan), torch.ones(7)])
