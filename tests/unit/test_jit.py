@@ -27,6 +27,8 @@ _NO_PART_OF_KERNELS = {
     "errors.py",
     "feature_room.py",
     "gathering.py",
+    "host.py",
+    "one_thread.py",
     "readout.py",
     "protocol.py",
     "progress.py",
