@@ -17,7 +17,11 @@ if TYPE_CHECKING:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Torch works in the thread that calls it alone, and so it does in threads that begin meanwhile."""
+    """Torch works in the thread that calls it alone.
+
+    So it does in threads that begin meanwhile, for as long as they live: two of these in two threads of a process at
+    once may leave it so for threads of later.
+    """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

@@ -105,9 +105,9 @@ def measure_view(sample: SampledRays, features: Tensor, codebook: Tensor) -> Vie
     weights = sample.rows.weights.numpy().astype(np.float64)
     row_sums = np.bincount(ray_of_entry, weights, minlength=lengths.size)
     readout, splats = sample.readout, sample.rows.splats.long()
-    measures = np.zeros((readout.rays.size, 3))
+    measures, by_ray = np.zeros((readout.rays.size, 3)), np.argsort(readout.rays, kind="stable")
     for first, last in _ray_chunks(starts, _CHUNK_VALUES // features.shape[1]):
-        chosen = (readout.rays >= first) & (readout.rays < last)
+        chosen = by_ray[slice(*np.searchsorted(readout.rays, [first, last], sorter=by_ray))]
         X = features[splats[starts[first] : starts[last]]].float().numpy()  # [entries, F]
         B = readout.rows(chosen).observed(codebook).numpy()  # [rows, F]
         own_starts, own_weights = starts[first : last + 1] - starts[first], weights[starts[first] : starts[last]]

@@ -78,7 +78,7 @@ def runs_of(starts, rows, bases):
 
 @kernel
 def leave_out_own(sums, firsts):
-    """The sums [R, WIDE] f32 of a splat's runs become r: what all its others add up to.
+    """The sums [R, WIDE] f32 of a splat's runs become r: what all its others add up to, in float32, by parts of LONG.
 
     Args:
         firsts: [B + 1] i64, the first run of each splat.
@@ -119,7 +119,7 @@ def scatter_judged(splats, cursors, tables, targets, judged):
 
     Args:
         cursors: [n] i64, where the entries of each of the splats begin; they move to their ends.
-        tables: (addresses, rows) of WeightTables, of the views that the entries were gathered from.
+        tables: (addresses, rows) of WeightTables, of the views that the entries were gathered from; no row is empty.
         targets: [V, 2] i64, where products [nnz] f32 and squares [rows] f32 of each view lie.
     """
     addresses, rows = tables

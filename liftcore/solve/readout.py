@@ -26,7 +26,7 @@ class Readout:
     shares: np.ndarray  # [rows, taps] f64, sum to one
 
     def rows(self, chosen: np.ndarray) -> Readout:
-        """Only the chosen rows [rows] bool; rays keep their numbers."""
+        """Only the chosen rows, by their numbers [n] i64; rays keep theirs."""
         return Readout(self.rays[chosen], self.columns[chosen], self.shares[chosen])
 
     def observed(self, codebook: Tensor) -> Tensor:

@@ -50,8 +50,10 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from liftcore.progress import Progress
+    from liftcore.solve.gathering import Chunk
     from liftcore.solve.host import EachShare
     from liftcore.solve.view_weights import ViewWeights
+    from liftcore.solve.weighted_sums import Strips
 
 CHUNK_VALUES = 1 << 20  # of a codebook in float64 at a time
 NO_CONSENSUS = 1e-6  # of a splat's weight: a shorter r is what rounding leaves of inputs that cancel
@@ -69,9 +71,12 @@ class Directions:
 
     def slice_of(self, view: int, begin: int, end: int) -> Tensor:
         """Channels ``begin..end`` of e of one view, [M, C] f32."""
-        part = self.books[view][:, begin:end].double().numpy()
-        unit = _over(part, self.lengths[view])
-        return torch.from_numpy(_over(unit - self.mean[begin:end], self.distances[view])).float()
+        book = self.books[view]
+        found = np.empty((book.shape[0], end - begin), np.float32)
+        for rows in _row_chunks(found):
+            unit = _over(book[rows, begin:end].double().numpy(), self.lengths[view][rows])
+            found[rows] = _over(unit - self.mean[begin:end], self.distances[view][rows])
+        return torch.from_numpy(found)
 
 
 def directions_of(pool: ThreadPoolExecutor, store: ViewWeights, books: Sequence[Tensor]) -> Directions:
@@ -157,13 +162,24 @@ def _judge(
         parts = pool.map(lambda view, ends=(begin, end): directions.slice_of(view, *ends), range(len(counts)))
         strips = strips_of(parts, counts, end - begin, torch.float32)
         for chunk in gathering:
-            judged = Judged(*(np.empty(chunk.entries.starts[-1], np.float32) for _ in Judged._fields))
-            given = (chunk.entries, strips, judged)
-            each_share(lambda share, given=given: judge_share(share, *given), 0, chunk.splats.size)
-            kept = ((tables.addresses, tables.rows), targets, judged)
-            gathering.in_file_order(chunk, lambda *given, kept=kept: scatter_judged(*given, *kept))
+            _judge_chunk(each_share, gathering, chunk, strips, (tables, targets))
         del strips  # before others are made
     return squares
+
+
+def _judge_chunk(
+    each_share: EachShare,
+    gathering: Gathering,
+    chunk: Chunk,
+    strips: Strips,
+    views: tuple[WeightTables, np.ndarray],
+) -> None:
+    """Judge a chunk over the channels of the strips; what is found goes to the targets [V, 2] beside the tables."""
+    tables, targets = views
+    judged = Judged(*(np.empty(chunk.entries.starts[-1], np.float32) for _ in Judged._fields))
+    each_share(lambda share: judge_share(share, chunk.entries, strips, judged), 0, chunk.splats.size)
+    places = tables.addresses, tables.rows
+    gathering.in_file_order(chunk, lambda share, cursors: scatter_judged(share, cursors, places, targets, judged))
 
 
 def _write(
@@ -205,7 +221,7 @@ def _write(
     list(pool.map(scale_back, views))
 
 
-def _row_chunks(book: Tensor) -> Iterator[slice]:
+def _row_chunks(book: Tensor | np.ndarray) -> Iterator[slice]:
     """The rows of a codebook, a few megabytes at a time: dense maps have a row a pixel."""
     step = max(CHUNK_VALUES // book.shape[1], 1)
     for begin in range(0, book.shape[0], step):

@@ -77,6 +77,16 @@ def test_tuples_of_labels_are_planned_with_fewer_entries_and_with_no_fewer_colum
     assert 1.0 < entries_a_splat(packs, maps, tuples) < entries_a_splat(packs, maps, rows)
 
 
+def test_a_robust_step_holds_as_much_again_of_each_gathered_entry(tmp_path):
+    paths = write_scene(tmp_path, 2)
+
+    def gathered(**own) -> int:
+        settings = LiftSettings.of(aggregation=True, aggregation_resolve=True, **own)  # columns are rows for both
+        return planned(open_sources(paths[0], paths[1], [paths[2]], settings), settings, CPU).memory["gathered"]
+
+    assert gathered(robust_steps=1) == 2 * gathered() > 0
+
+
 @pytest.fixture
 def disk(monkeypatch):
     def has(free):

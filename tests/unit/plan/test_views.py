@@ -87,10 +87,22 @@ def test_looking_at_gains_lazily_finds_the_order_of_looking_at_all():
 
 def test_of_many_splats_a_part_makes_the_order():
     rng = np.random.default_rng(0)
-    areas = rng.uniform(size=(5, 2 * ORDER_SPLATS)).astype(np.float32)
-    centres, means = rng.normal(size=(5, 3)), rng.normal(size=(2 * ORDER_SPLATS, 3)).astype(np.float32)
-    some = Visibility(areas[:, ::2], centres, means[::2], ORDER_SPLATS)
-    assert list(view_order(Visibility(areas, centres, means, 2 * ORDER_SPLATS))) == list(view_order(some))
+    areas = np.ones((12, 2 * ORDER_SPLATS), np.float32)
+    centres, means = rng.normal(size=(12, 3)), rng.normal(size=(2 * ORDER_SPLATS, 3)).astype(np.float32)
+    means[: len(means) // 2] *= 0.1  # near the middle, where all views are on the same side of many
+    seen, some = (
+        Visibility(areas, centres, means, 2 * ORDER_SPLATS),
+        Visibility(areas[:, ::2], centres, means[::2], 9),
+    )
+    first = Visibility(areas[:, ::2], centres, means[: len(means) // 2], 9)
+    assert list(view_order(seen)) == list(view_order(some)) != list(view_order(first))
+
+
+def test_some_views_alone_are_what_they_were_among_all():
+    seen = visibility(random_splats(4, 60, 1.0), [random_camera(k) for k in range(5)], Walk())
+    some = seen.of([3, 1])
+    again = visibility(random_splats(4, 60, 1.0), [random_camera(k) for k in (3, 1)], Walk())
+    assert all(np.array_equal(getattr(some, name), getattr(again, name)) for name in ("areas", "centres", "means"))
 
 
 def test_views_that_add_nothing_can_be_left_out_together():

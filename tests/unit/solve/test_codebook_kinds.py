@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 from liftcore.lanes_rows import WIDE
 from liftcore.progress import silent
 from liftcore.raster.protocol import RegionWeights
-from liftcore.solve.closed_form import Host, solve_closed_form
+from liftcore.solve.closed_form import solve_closed_form
 from liftcore.solve.columns import rows_of
+from liftcore.solve.host import Host
 
 ROWS = 5
 

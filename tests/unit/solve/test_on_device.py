@@ -13,9 +13,10 @@ from liftcore.device import CPU, Device, indexed
 from liftcore.progress import silent
 from liftcore.raster.protocol import RegionWeights
 from liftcore.solve import on_device, solver
-from liftcore.solve.closed_form import Host, Solution, solve_closed_form
+from liftcore.solve.closed_form import Solution, solve_closed_form
 from liftcore.solve.columns import Columns, rows_of
 from liftcore.solve.device_blocks import GRAIN, SLICE_BYTES, block_bytes, device_slices, splat_blocks
+from liftcore.solve.host import Host
 from liftcore.solve.on_device import Place, solve_on_device, squared_lengths
 from liftcore.solve.solver import closed_form_on
 from liftcore.solve.totals import Totals, row_totals, sums_in_order

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +14,7 @@ from hypothesis import strategies as st
 from liftcore.lift import lift
 from liftcore.progress import silent
 from liftcore.raster.protocol import RegionWeights
-from liftcore.solve import gathering, host, weighted_sums
+from liftcore.solve import gathering, host, judging, robust, weighted_sums
 from liftcore.solve.host import ALL_CORES, Host
 from liftcore.solve.robust import NO_CONSENSUS, robust_weights
 from liftcore.solve.settings import LiftSettings
@@ -130,7 +131,7 @@ def random_scene(seed: int, count: int = 9_000, views: int = 4, rows: int = 7, c
     return Scene([view.astype(np.float32) for view in kept], books)
 
 
-def test_neither_threads_nor_files_nor_order_nor_slices_change_a_bit_and_the_first_weights_stay(monkeypatch):
+def test_neither_threads_nor_files_nor_order_nor_chunks_change_a_bit_and_the_first_weights_stay(monkeypatch):
     scene = random_scene(0)
     expected = scene.after(3, Host(1))
 
@@ -148,6 +149,43 @@ def test_neither_threads_nor_files_nor_order_nor_slices_change_a_bit_and_the_fir
         assert all(np.array_equal(dense(a, b), b) for a, b in zip(store, scene.weights, strict=True))
 
 
+@pytest.mark.parametrize("steps", [1, 2, 3])
+@pytest.mark.parametrize("seed", range(6))
+def test_steps_that_change_much_equal_their_definition_to_the_last_digits(seed, steps):
+    scene = random_scene(seed, count=20, views=2 + seed, channels=33)
+    scene.books[0][0] = 0
+    scene.books[1] = scene.books[1].half()
+    scene.weights[1][3] = 0
+    D, moved = scene.denominators[:, None], 0.0
+    for mine, real, first in zip(scene.after(steps), defined(scene, steps), scene.weights, strict=True):
+        np.testing.assert_allclose(over(mine, D), over(real, D), atol=1e-5)
+        moved = max(moved, np.abs(over(real - first, D)).max())
+    assert moved > 0.05
+
+
+def test_what_is_used_no_more_is_freed_before_more_is_made(monkeypatch):
+    strips, products = [], []
+
+    def only(known: list, found: np.ndarray) -> None:
+        """Of those known, none but this one is alive."""
+        alive = [other() for other in known if other() is not None]
+        assert all(other is found for other in alive)
+        known.extend([] if alive else [weakref.ref(found)])
+
+    def judge(share, entries, own, judged):
+        only(strips, own.values)
+        only(products, judged.products)
+        judging.judge_share(share, entries, own, judged)
+
+    monkeypatch.setattr(robust, "judge_share", judge)
+    monkeypatch.setattr(weighted_sums, "STRIP_BYTES", 1)
+    monkeypatch.setattr(gathering, "CHUNK_ENTRIES", 1_000)
+    scene = random_scene(6, count=400)
+    scene.after(1, Host(1))
+    assert len(strips) == 3
+    assert len(products) > 2 * len(strips)
+
+
 def test_slices_of_channels_are_judged_together(monkeypatch):
     scene = random_scene(3, count=500)
     whole = scene.after(2)
@@ -157,7 +195,9 @@ def test_slices_of_channels_are_judged_together(monkeypatch):
 
 
 def test_splats_of_many_views_and_of_many_regions_equal_the_definition():
-    scene = random_scene(4, count=3, views=LONG + 40, rows=3)
+    scene = random_scene(4, count=3, views=2 * LONG, rows=3)
+    seen = np.sum([view.any(axis=1) for view in scene.weights], axis=0)
+    assert (seen > LONG).all()
     rng = np.random.default_rng(5)
     scene.weights.append(rng.random((3, 2 * LONG + 30)).astype(np.float32))
     scene.books.append(torch.tensor(rng.normal(0, 1, (2 * LONG + 30, 150)), dtype=torch.float32))

@@ -11,8 +11,9 @@ from liftcore.lanes_rows import WIDE
 from liftcore.progress import silent
 from liftcore.raster.protocol import RegionWeights
 from liftcore.solve import weighted_sums
-from liftcore.solve.closed_form import BLOCK_ENTRIES, Host, solve_closed_form
+from liftcore.solve.closed_form import BLOCK_ENTRIES, solve_closed_form
 from liftcore.solve.columns import rows_of
+from liftcore.solve.host import Host
 from liftcore.solve.weighted_sums import LONG, SHARE, channel_slices, strip_bytes, strips_of
 
 CHANNELS = 2 * WIDE + 9

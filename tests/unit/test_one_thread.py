@@ -1,0 +1,57 @@
+"""Torch keeps to the thread that calls it, as long as it is told to."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+import torch
+
+from liftcore.lift import lift
+from liftcore.one_thread import one_thread
+from liftcore.solve import accumulate, robust
+from liftcore.solve.settings import LiftSettings
+from tests.unit.solve.test_lift_equals_dense import write_scene
+
+
+@pytest.fixture(autouse=True)
+def three_threads():
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    yield
+    torch.set_num_threads(before)
+
+
+def test_it_is_one_thread_within_and_as_many_as_before_after_it():
+    with one_thread():
+        assert torch.get_num_threads() == 1
+        with one_thread():
+            assert torch.get_num_threads() == 1
+        assert torch.get_num_threads() == 1
+        with ThreadPoolExecutor(1) as pool:
+            assert pool.submit(torch.get_num_threads).result() == 1
+    assert torch.get_num_threads() == 3
+    with pytest.raises(ValueError, match="no"), one_thread():
+        raise ValueError("no")
+    assert torch.get_num_threads() == 3
+
+
+def test_a_lift_has_no_threads_of_torch(tmp_path, monkeypatch):
+    seen = {}
+
+    def watch(module, name: str) -> None:
+        work = getattr(module, name)
+
+        def watched(*given):
+            seen[name] = torch.get_num_threads()
+            return work(*given)
+
+        monkeypatch.setattr(module, name, watched)
+
+    watch(accumulate, "as_walked")
+    watch(robust, "directions_of")
+    watch(robust, "judge_share")
+    splats, cameras, features = write_scene(tmp_path, 3)[:3]
+    lift(splats, cameras, [features], LiftSettings.of(robust_steps=1))
+    assert seen == {"as_walked": 1, "directions_of": 1, "judge_share": 1}
+    assert torch.get_num_threads() == 3
