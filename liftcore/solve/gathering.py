@@ -41,7 +41,7 @@ class Gathering:
         weights: W of all views.
         columns: where each view's columns begin among those of all, [V] i64, and the scale of each splat, [P] f64.
         curve: [P] places along the curve; None keeps the order of the file.
-        row_bytes: of a row of X, which is written chunk by chunk too.
+        row_bytes: of a row of X, which is written chunk by chunk too; 0 where none is.
     """
 
     def __init__(
