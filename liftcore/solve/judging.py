@@ -15,7 +15,7 @@ from liftcore.jit import kernel
 from liftcore.lanes import LANES, in_all_lanes, keep_lanes, lanes_at, no_lanes, plus, plus_product
 from liftcore.lanes_rows import AHEAD, WIDE, add_row_products
 from liftcore.solve.weight_tables import floats_at, rows_between, table_at
-from liftcore.solve.weighted_sums import LONG, Entries, block_end, sum_strip
+from liftcore.solve.weighted_sums import LONG, MOST_ROWS, Entries, block_end, sum_strip
 
 BLOCK_ENTRIES = 1 << 10  # judged strip by strip: the sums of their runs stay in the cache
 
@@ -69,7 +69,7 @@ def runs_of(starts, rows, bases):
             if rows[k] >= end:
                 while view < bases.shape[0] and bases[view] <= rows[k]:
                     view += 1
-                end = bases[view] if view < bases.shape[0] else np.int64(1) << 31
+                end = bases[view] if view < bases.shape[0] else MOST_ROWS + 1
                 runs[number] = k
                 number += 1
     firsts[-1], runs[number] = number, starts[-1]

@@ -13,6 +13,7 @@ from liftcore.query.ask import ask
 from liftcore.query.example import OneSplat
 from liftcore.query.query import Query
 from liftcore.query.scene import QueryScene
+from liftcore.query.scores import relevancy
 from liftcore.solve.settings import LiftSettings
 
 if TYPE_CHECKING:
@@ -55,3 +56,8 @@ def test_a_thing_stays_found_when_something_else_is_not_wanted(asked: Asked, unl
     against = np.array([asked.iou(thing, *(unlike or ((thing + 1) % len(THINGS),))) for thing in THINGS])
     assert plain.mean() > 0.9
     assert (against > plain - 0.01).all()
+
+
+def test_relevancy_alone_finds_nearly_all_that_is_unlike_the_cloth(asked: Asked, monkeypatch) -> None:
+    monkeypatch.setattr("liftcore.query.ask.combine", relevancy)
+    assert max(asked.iou(thing, CLOTH) for thing in THINGS) < 0.2
