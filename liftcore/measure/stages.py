@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from liftcore.measure.bench import Workload
+    from liftcore.raster.bands import Bands
     from liftcore.raster.projection import View
     from liftcore.raster.protocol import RegionWeights, Walk
     from liftcore.raster.walk import Frame
@@ -81,7 +82,7 @@ class TimedRaster(CpuRaster):
         with self.clock.stage("projection"):
             return super()._map(work, shares)
 
-    def _bin(self, view: View, walk: Walk, ids: np.ndarray, order: np.ndarray) -> Frame:
+    def _bin(self, view: View, walk: Walk, ids: np.ndarray, order: np.ndarray) -> Bands:
         with self.clock.stage("lists"):
             return super()._bin(view, walk, ids, order)
 

@@ -9,7 +9,7 @@ Mip-Splatting) are to be walked so.
 from __future__ import annotations
 
 from liftcore.errors import InvalidSettings
-from liftcore.scene.splats import Kernel
+from liftcore.scene.kernel import Kernel
 
 
 def check_antialiased(kernel: Kernel, antialiased: bool) -> None:

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import copy
 import os
-from collections import OrderedDict
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from itertools import chain, islice, pairwise
 from typing import TYPE_CHECKING
 
@@ -19,6 +19,7 @@ import torch
 from liftcore.raster.adjoint import add_sums, gather_tiles
 from liftcore.raster.antialiased import check_antialiased
 from liftcore.raster.arguments import check_image, check_labels, check_rows
+from liftcore.raster.bands import Bands, entries_of, in_order, no_lists
 from liftcore.raster.constants import TILE
 from liftcore.raster.depth_order import depth_order
 from liftcore.raster.kernels import RECORDS, activated, kernel_in, project, with_gain
@@ -32,7 +33,6 @@ from liftcore.raster.selection import choice_of
 from liftcore.raster.side_by_side import side_by_side, views_at_a_time
 from liftcore.raster.strided import check_stride, every_pixel, places_on, strided
 from liftcore.raster.strongest import strongest_tiles
-from liftcore.raster.tiles import fill_tiles, list_tiles, tile_places
 from liftcore.raster.walk import Frame
 
 if TYPE_CHECKING:
@@ -73,21 +73,28 @@ class CpuRaster:
         self._pool = ThreadPoolExecutor(threads)
         self._records = np.empty((self.splats.count, RECORDS[self.splats.kernel]))
         self._depths = np.empty(self.splats.count, np.float32)
-        self._frames: OrderedDict[tuple[Camera, Walk], Frame] = OrderedDict()
+        self._kept: tuple[tuple[Camera, Walk], Bands] | None = None
 
     def region_weights(
         self, camera: Camera, observation: Observation, walk: Walk, weighting: Weighting
     ) -> RegionWeights:
         """``A'^T S`` of a view and the evidence of plain weights. See the protocol."""
         choice = choice_of(weighting)
-        frame = self._frame(camera, walk)
+        bands = self._bands(camera, walk)
         reading = reading_of(observation, camera.width, camera.height, walk)
         squared, gate = choice.power == 2, choice if choice.gated else None
         plain = True if walk.gain != 1.0 else None
-        entries = self._over_tiles(
-            frame, lambda first, last: weigh_tiles(first, last, frame, reading, squared, gate, plain)
-        )
-        return self._merge(frame, entries, reading.codebook_rows)
+
+        def weigh(frame: Frame, first: int, last: int) -> tuple[np.ndarray, ...]:
+            return weigh_tiles(first, last, frame, reading, squared, gate, plain)
+
+        frames = iter(bands)
+        frame = next(frames)
+        found = self._merge(frame, self._over_tiles(frame, weigh), reading.codebook_rows)
+        for frame in frames:
+            before = entries_of(found, frame.ids, reading.codebook_rows, reading.levels)
+            found = self._merge(frame, [before, *self._over_tiles(frame, weigh)], reading.codebook_rows)
+        return found
 
     def walk_views(self, looks: Iterable[Look]) -> Generator[Walked]:
         """``region_weights`` and ``ray_rows`` of views, ``views_at_a_time`` side by side."""
@@ -108,38 +115,39 @@ class CpuRaster:
     def render(self, camera: Camera, values: Tensor, walk: Walk) -> Tensor:
         """``A X``: values [P, C] f32 -> [H, W, C] f32. See the protocol."""
         check_rows(values, self.splats.count)
-        frame = self._frame(camera, every_pixel(walk))
-        channels = values.shape[1]
+        bands, channels = self._bands(camera, every_pixel(walk)), values.shape[1]
         image = np.zeros((camera.height, camera.width, channels), np.float32)
         for begin in range(0, channels, RENDER_CHANNELS):
             end = min(begin + RENDER_CHANNELS, channels)
             block = np.ascontiguousarray(values[:, begin:end].to(torch.float32).numpy())
             target = np.zeros((camera.height, camera.width, end - begin), np.float32)
-            self._over_tiles(
-                frame,
-                lambda first, last, block=block, target=target: render_tiles(first, last, frame, block, target),
-            )
+
+            for frame in bands:
+                self._over_tiles(frame, partial(_render, block, target))
             image[:, :, begin:end] = target
         return torch.from_numpy(image)
 
     def adjoint(self, camera: Camera, values: Tensor, walk: Walk) -> Tensor:
-        """``A^T Y``: values [H, W, C] f32 -> [P, C] f32. See the protocol."""
+        """``A^T Y``: values [H, W, C] f32 -> [P, C] f32, the transpose of the render. See the protocol."""
         check_image(values, camera)
-        frame = self._frame(camera, every_pixel(walk))
-        channels = values.shape[2]
+        bands, channels = self._bands(camera, every_pixel(walk)), values.shape[2]
         result = np.zeros((self.splats.count, channels), np.float32)
         for begin in range(0, channels, RENDER_CHANNELS):
-            end = min(begin + RENDER_CHANNELS, channels)
-            image = np.ascontiguousarray(values[:, :, begin:end].to(torch.float32).numpy())
-            shares = self._over_tiles(frame, lambda first, last, image=image: gather_tiles(first, last, frame, image))
-
-            def merge(first: int, last: int, shares: list = shares, begin: int = begin) -> None:
-                for share in shares:
-                    add_sums(first, last, share, frame.ids, result, begin)
-
-            # Each record is in one range and its shares come in order, so the number of ranges changes no sum.
-            self._map(merge, _shares(self.splats.count, self.threads))
+            image = values[:, :, begin : begin + RENDER_CHANNELS].to(torch.float32).numpy()
+            for frame in bands:
+                self._add_adjoint(frame, np.ascontiguousarray(image), result, begin)
         return torch.from_numpy(result)
+
+    def _add_adjoint(self, frame: Frame, image: np.ndarray, result: np.ndarray, begin: int) -> None:
+        """Add what the frame's tiles give back of a few channels of the image to ``result``, from ``begin`` on."""
+        shares = self._over_tiles(frame, lambda frame, first, last: gather_tiles(first, last, frame, image))
+
+        def merge(first: int, last: int) -> None:
+            for share in shares:
+                add_sums(first, last, share, frame.ids, result, begin)
+
+        # Each record is in one range and its shares come in order, so the number of ranges changes no sum.
+        self._map(merge, _shares(self.splats.count, self.threads))
 
     def row_sums(self, camera: Camera, walk: Walk) -> Tensor:
         """``A 1``: [H, W] f32."""
@@ -147,19 +155,21 @@ class CpuRaster:
 
     def top_weights(self, camera: Camera, walk: Walk, count: int) -> tuple[Tensor, Tensor]:
         """The largest weights of every ray, descending. See the protocol."""
-        frame = self._frame(camera, every_pixel(walk))
         ids = np.full((camera.height, camera.width, count), -1, np.int32)
         weights = np.zeros((camera.height, camera.width, count), np.float32)
-        self._over_tiles(frame, lambda first, last: top_tiles(first, last, frame, ids, weights))
+        for frame in self._bands(camera, every_pixel(walk)):
+            self._over_tiles(frame, lambda frame, first, last: top_tiles(first, last, frame, ids, weights))
         return torch.from_numpy(ids), torch.from_numpy(weights)
 
     def strongest_labels(self, camera: Camera, labels: Tensor, walk: Walk) -> Tensor:
         """``argmax(A onehot(labels))``: labels [P] i32 in -1..K - 1 -> [H, W] i32. See the protocol."""
         check_labels(labels, self.splats.count)
-        frame = self._frame(camera, every_pixel(walk))
         flat, count = np.ascontiguousarray(labels.to(torch.int32).numpy()), int(labels.max()) + 1
         image = np.full((camera.height, camera.width), -1, np.int32)
-        self._over_tiles(frame, lambda first, last: strongest_tiles(first, last, frame, flat, count, image))
+        for frame in self._bands(camera, every_pixel(walk)):
+            self._over_tiles(
+                frame, lambda frame, first, last: strongest_tiles(first, last, frame, flat, count, image)
+            )
         return torch.from_numpy(image)
 
     def ray_rows(self, camera: Camera, pixels: Tensor, walk: Walk) -> RayRows:
@@ -167,26 +177,24 @@ class CpuRaster:
         places = places_on(walk, pixels)
         if places is None:  # not all of them are rays of the strided view
             places, walk = pixels, every_pixel(walk)
-        frame = self._frame(camera, walk)
-        starts, splats, weights = trace_rays(frame, np.ascontiguousarray(places.to(torch.int32).numpy()))
-        return RayRows(torch.from_numpy(starts), torch.from_numpy(splats), torch.from_numpy(weights))
+        rays = np.ascontiguousarray(places.to(torch.int32).numpy())
+        rows = in_order([trace_rays(frame, rays) for frame in self._bands(camera, walk)])
+        return RayRows(*map(torch.from_numpy, rows))
 
     def forget(self) -> None:
         """Drop the projected view that is kept for the next product."""
-        self._frames.clear()
+        self._kept = None
 
-    def _frame(self, camera: Camera, walk: Walk) -> Frame:
+    def _bands(self, camera: Camera, walk: Walk) -> Bands:
         """The view projected and binned; the last one is kept."""
         key = (camera, walk)
-        frame = self._frames.pop(key, None)
-        if frame is None:
+        if self._kept is None or self._kept[0] != key:
             check_antialiased(self.splats.kernel, walk.antialiased)
-            self._frames.clear()  # before, so that one frame's memory is the most ever held
             check_stride(walk, camera)
+            self.forget()  # before the next, so that one view's memory is the most ever held
             view = strided(view_of(camera), walk)
-            frame = self._bin(view, walk, *self._project(view, walk))
-        self._frames[key] = frame
-        return frame
+            self._kept = key, self._bin(view, walk, *self._project(view, walk))
+        return self._kept[1]
 
     def _project(self, view: View, walk: Walk) -> tuple[np.ndarray, np.ndarray]:
         """Fill the records; give the splat of every record [P] i32 and the depth order [n] i32."""
@@ -202,20 +210,14 @@ class CpuRaster:
         places = np.concatenate(used) if used else np.empty(0, np.int32)
         return targets.ids, depth_order(self._depths[places].view(np.uint32), places)
 
-    def _bin(self, view: View, walk: Walk, ids: np.ndarray, order: np.ndarray) -> Frame:
+    def _bin(self, view: View, walk: Walk, ids: np.ndarray, order: np.ndarray) -> Bands:
         columns, rows = -(-view.width // TILE), -(-view.height // TILE)
-        kernel, records = kernel_in(view, self.splats.kernel), self._records
-        bounds = _shares(order.shape[0], SPLAT_SHARES)
-        counts = np.zeros((len(bounds), rows * columns), np.int64)
-        parts = [order[first:last] for first, last in bounds]
-        lists = self._map(lambda k: list_tiles(parts[k], kernel, records, rows, columns, counts[k]), _numbers(parts))
-        starts, cursors = tile_places(counts)
-        items = np.empty(starts[-1], np.int32)
-        self._map(lambda k: fill_tiles(parts[k], lists[k][0], lists[k][1], cursors[k], items), _numbers(parts))
-        return Frame(
-            kernel, records, ids, starts, items, columns, rows, view.width, view.height,
-            walk.alpha_cap, walk.transmittance_stop,
+        frame = Frame(
+            kernel_in(view, self.splats.kernel), self._records, ids, *no_lists(rows * columns),
+            columns, rows, view.width, view.height, walk.alpha_cap, walk.transmittance_stop,
         )  # fmt: skip
+        parts = [order[first:last] for first, last in _shares(order.shape[0], SPLAT_SHARES)]
+        return Bands(frame, parts, self._map)
 
     def _merge(self, frame: Frame, entries: list, codebook_rows: int) -> RegionWeights:
         """Entries of all tile shares -> one row a splat."""
@@ -261,11 +263,11 @@ class CpuRaster:
         return self._scene
 
     def _over_tiles(self, frame: Frame, work: Callable) -> list:
-        """Run ``work(first, last)`` over tile shares of about equal length in list items."""
+        """Run ``work(frame, first, last)`` over tile shares of about equal length in list items."""
         tiles = frame.columns * frame.rows
         marks = np.linspace(0, frame.starts[-1], TILE_SHARES + 1)
         edges = np.unique(np.concatenate([[0], np.searchsorted(frame.starts, marks[1:-1]), [tiles]]))
-        return self._map(work, [(int(a), int(b)) for a, b in pairwise(edges)])
+        return self._map(work, [(frame, int(a), int(b)) for a, b in pairwise(edges)])
 
     def _map(self, work: Callable, shares: list) -> list:
         if self.threads == 1:
@@ -273,9 +275,8 @@ class CpuRaster:
         return list(self._pool.map(lambda share: work(*share), shares))
 
 
-def _numbers(parts: list) -> list[tuple[int]]:
-    """(0,), (1,), ... for ``_map``."""
-    return [(k,) for k in range(len(parts))]
+def _render(values: np.ndarray, image: np.ndarray, frame: Frame, first: int, last: int) -> None:
+    render_tiles(first, last, frame, values, image)
 
 
 def _shares(total: int, count: int) -> list[tuple[int, int]]:

@@ -96,51 +96,54 @@ def _tile_columns(outline, circle, tile_row, columns):
 
 
 @kernel
-def list_tiles(order, kernel, records, rows, columns, counts):
+def list_tiles(order, kernel, records, size, span, most, counts):
     """The tiles that each of ``order``'s footprints touches, one footprint after the other.
 
     Args:
         order: [n] i32, places of records. kernel: of the frame, as liftcore.raster.footprints says.
+        size: (rows, columns) of tiles. span: (first, last), the tiles that are listed, others are passed over.
+        most: where more tiles than that are found, the list may end there.
         counts: [rows * columns] i64, zeros; receives how many footprints touch each tile.
 
     Returns:
         lengths [n] i32, how many tiles each footprint touches; tiles [sum] i32, row by row.
     """
     lengths = np.zeros(order.shape[0], np.int32)
-    tiles = np.empty(4 * order.shape[0] + rows * columns, np.int32)
-    done, count = _list_while_room(order, (0, 0), kernel, records, (rows, columns), counts, (lengths, tiles))
-    while done < order.shape[0]:
-        tiles = np.concatenate((tiles, np.empty_like(tiles), np.empty(rows * columns, np.int32)))
-        done, count = _list_while_room(
-            order, (done, count), kernel, records, (rows, columns), counts, (lengths, tiles)
-        )
+    tiles = np.empty(4 * order.shape[0] + span[1] - span[0], np.int32)
+    lists = lengths, tiles
+    done, count = _list_while_room(order, (0, 0), kernel, records, (size, span), counts, lists)
+    while done < order.shape[0] and count <= most:
+        tiles = np.concatenate((tiles, np.empty(tiles.shape[0] + span[1] - span[0], np.int32)))
+        lists = lengths, tiles
+        done, count = _list_while_room(order, (done, count), kernel, records, (size, span), counts, lists)
     return lengths, tiles[:count]
 
 
 @kernel
-def _list_while_room(order, begin, kernel, records, size, counts, lists):
+def _list_while_room(order, begin, kernel, records, window, counts, lists):
     """``list_tiles`` from ``begin = (footprint, tile of the list)`` on, while one that touches all tiles has room.
 
     A function of its own, as arrays that are replaced in a loop are counted at each use in it.
 
     Args:
-        size: (rows, columns) of tiles. lists: (lengths, tiles), written.
+        window: (size, span). lists: (lengths, tiles), written.
 
     Returns:
         Where it ended, like ``begin``.
     """
-    (first_one, count), (rows, columns), (lengths, tiles) = begin, size, lists
+    (first_one, count), ((rows, columns), (start, end)), (lengths, tiles) = begin, window, lists
+    first_row, last_row = start // columns, (end - 1) // columns
     for i in range(first_one, order.shape[0]):
-        if count + rows * columns > tiles.shape[0]:
+        if count + end - start > tiles.shape[0]:
             return i, count
         fetch_ahead(records, order[min(i + AHEAD, order.shape[0] - 1)])
         before, record = count, records[order[i]]
         outline, circle = _outline(record), circle_of(kernel, record)
         top, bottom = _tile_rows(outline, circle, rows)
-        for tile_row in range(int(top), int(bottom) + 1):
+        for tile_row in range(max(int(top), first_row), min(int(bottom), last_row) + 1):
             first, last = _tile_columns(outline, circle, tile_row, columns)
-            for column in range(int(first), int(last) + 1):
-                tile = tile_row * columns + column
+            tile_0 = tile_row * columns
+            for tile in range(max(tile_0 + int(first), start), min(tile_0 + int(last) + 1, end)):
                 tiles[count] = tile
                 counts[tile] += 1
                 count += 1

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from liftcore.errors import InvalidSplats
-from liftcore.scene.splats import Kernel
+from liftcore.scene.kernel import Kernel
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from enum import StrEnum
 from typing import TYPE_CHECKING
 
 import torch
 
 from liftcore.errors import InvalidSplats
+from liftcore.scene.kernel import Kernel as Kernel  # noqa: PLC0414  # who has splats has their kernels
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -18,14 +18,6 @@ if TYPE_CHECKING:
 
 SH_ROWS = (1, 4, 9, 16, 25)  # (degree + 1)^2
 _BEYOND = {"opacity_logits": (True, True), "log_scales": (True, False)}  # whether -inf and +inf have a meaning
-
-
-class Kernel(StrEnum):
-    """The footprint that a splat leaves on a ray."""
-
-    GAUSSIAN_3D = "3dgs"
-    GAUSSIAN_2D = "2dgs"
-    BETA = "dbs"
 
 
 @dataclass(frozen=True)

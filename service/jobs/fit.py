@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
-from liftcore.errors import InvalidFeatures
+from liftcore.errors import InvalidFeatures, InvalidSettings, InvalidSplats
 from liftcore.query.encoders.words import nearest, plain
+from liftcore.raster.antialiased import check_antialiased
+from liftcore.scene.kernel import Kernel
+from liftcore.scene.ply_dialect import model_slots
+from liftcore.scene.ply_header import read_header
 from liftcore.solve.settings import LiftSettings
 from service.errors import InvalidRequest
-from service.store.assets import AssetRecord
+from service.store.assets import AssetRecord, kernel_of
 from service.store.jobs import JobOrder
 from service.wire import JobKind
 
@@ -40,6 +45,22 @@ def check_fit(cameras: AssetRecord, features: Sequence[AssetRecord]) -> None:
             got=f"views {_examples(owner)} and cameras {_examples(known)}, none in common",
             hint="a view is named after its image, without the extension",
         )
+
+
+def check_kernel(splats: AssetRecord, settings: Mapping[str, Any]) -> None:
+    """Refuse a kernel that the splats lack a property of, and what the kernel has no meaning for.
+
+    Raises:
+        InvalidSettings: ``kernel`` or ``antialiased`` does not fit the file, of which the header is read.
+    """
+    kernel = Kernel(kernel_of(splats, settings))
+    check_antialiased(kernel, LiftSettings.of(**settings).antialiased)
+    try:
+        model_slots([column.name for column in read_header(splats.path).properties], kernel, splats.id)
+    except InvalidSplats as error:
+        hint = f"leave it out: the file speaks of {kernel_of(splats, {})}"
+        got = f"{kernel} for {splats.id}, which has {error.got}"
+        raise InvalidSettings("kernel", expected=f"a kernel with {error.expected}", got=got, hint=hint) from None
 
 
 def check_labels(

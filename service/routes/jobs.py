@@ -14,7 +14,7 @@ from liftcore.errors import InvalidSettings
 from liftcore.solve.settings import LiftSettings
 from service import request_id, wire
 from service.faults import error_of
-from service.jobs.fit import check_fit, check_labels, scratch_bytes
+from service.jobs.fit import check_fit, check_kernel, check_labels, scratch_bytes
 from service.parts import Here, Parts
 from service.problems import problem_of
 from service.store.events import Event, EventKind
@@ -141,6 +141,7 @@ def require_fit(order: JobOrder, here: Parts) -> None:
     cameras = here.store.assets.get(order.cameras, wire.AssetKind.CAMERAS)
     packs = [here.store.assets.get(pack, wire.AssetKind.FEATURES) for pack in order.features]
     splats = here.store.assets.get(order.splats, wire.AssetKind.SPLATS)
+    check_kernel(splats, order.settings)
     check_fit(cameras, packs)
     judges = [here.store.assets.get(*named) for named in labels_of(order.parameters)]
     if judges:

@@ -53,3 +53,25 @@ def test_scene_of_the_kernel_is_uploaded_lifted_and_asked(
     assert picture.headers["content-type"] == "image/png"
     assert client.delete(job["links"]["self"], params={"with_lift": True}).status_code == 204
     assert client.delete(asset.json()["links"]["self"]).status_code == 204
+
+
+@pytest.mark.parametrize(
+    ("content", "settings", "argument", "said"),
+    [
+        (discs(), {"kernel": "3dgs"}, "kernel", "'scale_2'"),
+        (discs(), {"kernel": "dbs"}, "kernel", "leave it out: the file speaks of 2dgs"),
+        (betas(), {"antialiased": True}, "antialiased", "dbs"),
+    ],
+)
+def test_a_kernel_that_does_not_fit_the_splats_is_refused_with_the_order(
+    client: TestClient, uploaded: Uploaded, content: bytes, settings: dict, argument: str, said: str
+) -> None:
+    asset = client.put("/assets/splats", content=content).json()["id"]
+    answer = client.post("/lift", json=uploaded.order(**settings) | {"splats": asset})
+    assert answer.status_code == 422, answer.text
+    assert argument in answer.json()["detail"] and said in answer.text
+    assert client.get("/jobs").json()["jobs"] == []
+
+
+def test_flat_splats_may_be_lifted_as_discs(client: TestClient, uploaded: Uploaded) -> None:
+    assert client.post("/lift", json=uploaded.order(kernel="2dgs")).status_code == 202

@@ -59,7 +59,8 @@ class _Lists(CpuRaster):
 
     def frame(self, camera: Camera, walk: Walk) -> Frame:
         """The view projected, ordered and binned."""
-        return self._frame(camera, walk)
+        (frame,) = self._bands(camera, walk)
+        return frame
 
 
 def _tile_shares(frame: Frame) -> np.ndarray:

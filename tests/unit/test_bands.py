@@ -1,0 +1,91 @@
+"""Views whose tile lists would be long are walked a band of tiles at a time, and nothing else changes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from liftcore.raster import bands
+from liftcore.raster.cpu import CpuRaster
+from liftcore.raster.protocol import Selection, Walk, Weighting
+from liftcore.scene.splats import Kernel
+from tests.scenes import random_camera, random_grid, random_regions, random_splats
+
+MOST = 120  # items of a band
+CAMERA = random_camera(3, 100, 70)
+PIXELS = torch.tensor([[x, y] for x in range(0, 100, 7) for y in range(0, 70, 5)], dtype=torch.int32)
+
+
+@pytest.fixture
+def cut(monkeypatch):
+    """Every view is cut."""
+    monkeypatch.setattr(bands, "MOST_LISTED", 4)
+    monkeypatch.setattr(bands, "BAND_ITEMS", MOST)
+
+
+def products(raster: CpuRaster) -> dict[str, tuple[torch.Tensor, ...]]:
+    """All that tiles give by themselves."""
+    rng = np.random.default_rng(0)
+    count, walk = raster.splats.count, Walk(gain=1.2)
+    values = torch.tensor(rng.normal(0, 1, (count, 35)), dtype=torch.float32)
+    labels = torch.tensor(rng.integers(-1, 4, count), dtype=torch.int32)
+    rows = raster.ray_rows(CAMERA, PIXELS, walk)
+    return {
+        "render": (raster.render(CAMERA, values, walk),),
+        "top": raster.top_weights(CAMERA, walk, 3),
+        "labels": (raster.strongest_labels(CAMERA, labels, walk),),
+        "rows": (rows.row_starts, rows.splats, rows.weights),
+    }
+
+
+def weights_of(raster: CpuRaster, weighting: Weighting) -> list[tuple[torch.Tensor, ...]]:
+    """Region weights of labels on two levels and of a grid, strided."""
+    looks = ((random_regions(3), Walk(gain=1.2)), (random_grid(3), Walk(stride=2, offset=(1, 0))))
+    found = [raster.region_weights(CAMERA, observation, walk, weighting) for observation, walk in looks]
+    return [
+        (w.splats, w.row_starts, w.columns, w.evidence_splats, w.weights, w.evidence) for w in found
+    ]  # what is the same, then what is summed in another order
+
+
+@pytest.mark.parametrize("kernel", Kernel)
+def test_what_tiles_give_by_themselves_is_the_same_to_the_bit(kernel, cut, monkeypatch):
+    splats = random_splats(3, 300, kernel=kernel)
+    banded = CpuRaster(splats, threads=2)
+    assert len(list(banded._bands(CAMERA, Walk()))) > 2
+    own = products(banded)
+    monkeypatch.undo()
+    whole = products(CpuRaster(splats, threads=2))
+    assert whole["rows"][2].numel() > 400
+    for name, parts in whole.items():
+        assert all(torch.equal(mine, theirs) for mine, theirs in zip(own[name], parts, strict=True)), name
+
+
+@pytest.mark.parametrize("selection", [Selection.ALL, Selection.TOP_K])
+def test_weights_and_the_adjoint_are_summed_over_bands(selection, cut, monkeypatch):
+    splats, weighting = random_splats(4, 300), Weighting(1, selection)
+    image = torch.tensor(np.random.default_rng(1).normal(0, 1, (70, 100, 35)), dtype=torch.float32)
+    own, back = weights_of(CpuRaster(splats, 2), weighting), CpuRaster(splats, 2).adjoint(CAMERA, image, Walk())
+    again = weights_of(CpuRaster(splats, 1), weighting)
+    monkeypatch.undo()
+    whole = weights_of(CpuRaster(splats, 2), weighting)
+    for mine, repeated, theirs in zip(own, again, whole, strict=True):
+        assert all(torch.equal(a, b) for a, b in zip(mine, repeated, strict=True))  # whatever the threads
+        assert all(torch.equal(a, b) for a, b in zip(mine[:4], theirs[:4], strict=True))
+        for a, b in zip(mine[4:], theirs[4:], strict=True):
+            torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-7)
+    torch.testing.assert_close(back, CpuRaster(splats, 2).adjoint(CAMERA, image, Walk()), rtol=1e-4, atol=1e-4)
+
+
+def test_a_band_holds_no_more_than_it_may(cut):
+    frames = list(CpuRaster(random_splats(5, 300), threads=1)._bands(CAMERA, Walk()))
+    lengths = np.array([np.diff(frame.starts) for frame in frames])
+    assert ((lengths > 0).sum(axis=0) <= 1).all()  # each tile in one band
+    assert all(own.sum() <= MOST or np.count_nonzero(own) == 1 for own in lengths)
+    assert len(frames) < lengths.shape[1]  # and not each by itself
+
+
+def test_a_view_of_usual_lists_is_one_band():
+    raster = CpuRaster(random_splats(5, 300), threads=1)
+    (first,), (again,) = raster._bands(CAMERA, Walk()), raster._bands(CAMERA, Walk())
+    assert first is again
