@@ -28,6 +28,7 @@ from service.wire import ENDED, JobKind, JobState
 
 TICK_SECONDS = 0.2  # how soon a cancel, a stop or a limit is seen
 RENEWALS = 4  # of a lease, in the time that it lasts
+BUSY_SECONDS = 0.5  # of a processor: a silent child that takes so much in its lease is alive
 CHILD = (sys.executable, "-m", "service.jobs.child")
 DRAFTS = {JobKind.LIFT: ".safetensors", JobKind.TRADEOFF: ".png"}  # what a child writes
 
@@ -42,6 +43,7 @@ class _Heard:
     stage: str = ""
     begun: float = field(default_factory=time.monotonic)
     lately: float = field(default_factory=time.monotonic)  # the last sign of life
+    spent: float | None = None  # processor seconds when it was found silent
     looked: float = field(default_factory=time.monotonic)  # when we last listened
 
 
@@ -86,7 +88,7 @@ class Attempt:
             heard.looked = time.monotonic()
 
     def _take(self, message: dict[str, Any], heard: _Heard) -> None:
-        heard.lately = time.monotonic()
+        self._alive(heard)
         if message["event"] == "progress":
             if message["stage"] != heard.stage:
                 heard.stage = message["stage"]
@@ -94,6 +96,9 @@ class Attempt:
             self._store.attempts.advance(self._job.id, self._job.attempt, self._pace.progress(message))
         elif message["event"] != "beat":
             heard.answer = message
+
+    def _alive(self, heard: _Heard) -> None:
+        heard.lately, heard.spent = time.monotonic(), None
         if heard.lately - self._renewed > self._limits.lease_seconds / RENEWALS:
             self._renewed = heard.lately
             self._store.attempts.renew(self._job.id, self._job.attempt, self._limits.lease_seconds)
@@ -102,6 +107,8 @@ class Attempt:
         now, limits, kind = time.monotonic(), self._limits, self._job.kind
         if now - heard.looked > limits.lease_seconds / 2:
             heard.lately = now  # it was the server that slept: the child has a lease from now on
+        if now - heard.lately > limits.lease_seconds / RENEWALS:
+            self._see_whether_it_works(process, heard)
         if self._store.attempts.state(self._job.id) is not JobState.RUNNING:
             return "it is canceled"
         if now - heard.lately > limits.lease_seconds:
@@ -116,6 +123,14 @@ class Attempt:
                 got="one that takes more", hint="fewer views, channels or splats take less",
             )  # fmt: skip
         return None
+
+    def _see_whether_it_works(self, process: JobProcess, heard: _Heard) -> None:
+        """One call into a library (HDBSCAN on many splats) may keep all threads of a child from speaking."""
+        spent = process.processor_seconds()
+        if heard.spent is None or spent < heard.spent:  # less when one that it had started has ended
+            heard.spent = spent
+        elif spent - heard.spent > BUSY_SECONDS:
+            self._alive(heard)
 
     def _settle(self, draft: Path, heard: _Heard, why: str | SplatliftError, stopping: threading.Event) -> None:
         """No process of this attempt is left; what becomes true now stays true."""

@@ -71,6 +71,10 @@ class JobProcess:
         """Memory of the child and of all that it started, but for mapped files. 0 where Linux does not tell."""
         return sum(_private_bytes(pid) for pid in _family(self.pid))
 
+    def processor_seconds(self) -> float:
+        """Of the child and of all that it started and that runs still. 0 where Linux does not tell."""
+        return sum(_processor_seconds(pid) for pid in _family(self.pid))
+
     def end(self) -> int:
         """End the whole group at once; the child's exit status, negative for a signal. No process is left after this.
 
@@ -100,6 +104,13 @@ def _private_bytes(pid: int) -> int:
             if line.startswith("RssAnon:"):
                 return int(line.split()[1]) << 10
     return 0
+
+
+def _processor_seconds(pid: int) -> float:
+    with contextlib.suppress(OSError):
+        behind_its_name = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        return sum(map(int, behind_its_name[11:13])) / os.sysconf("SC_CLK_TCK")
+    return 0.0
 
 
 def _family(pid: int) -> Iterator[int]:

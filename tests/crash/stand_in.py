@@ -109,8 +109,17 @@ def slowly(order: dict[str, Any]) -> None:
     answer(order)
 
 
+def toil(order: dict[str, Any]) -> None:
+    """Compute for some leases without a word."""
+    ends = time.process_time() + 6
+    while time.process_time() < ends:
+        pass
+    answer(order)
+
+
 BEHAVIOURS: dict[str, Callable[[dict[str, Any]], None]] = {
-    function.__name__: function for function in (answer, hang, die, die_once, stop_once, eat, feed, meet, slowly)
+    function.__name__: function
+    for function in (answer, hang, die, die_once, stop_once, eat, feed, meet, slowly, toil)
 }
 
 

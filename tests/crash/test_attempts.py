@@ -80,6 +80,13 @@ def test_child_that_is_stopped_past_its_lease_is_fenced(store: Store, supervisin
     assert "silent" in log_of(store, job)
 
 
+def test_silent_child_that_computes_keeps_its_lease(store: Store, supervising: Supervising) -> None:
+    job = submit(store)
+    with supervising("toil", lease_seconds=SHORT_LEASE):
+        found = ended(store, job)
+    assert (found.state, found.attempt) == (JobState.SUCCEEDED, 1)
+
+
 def test_draft_of_a_stale_attempt_never_becomes_the_lift(store: Store) -> None:
     job = submit(store)
     for attempt in (1, 2):
