@@ -127,12 +127,13 @@ def look(scene: QueryScene, answer: Answer, view: str) -> Look:
 
     Raises:
         NotFound: no camera has this name.
+        InvalidQuery: the view's image is larger than pictures may be.
         InvalidLift: the splats or the cameras moved or changed since the lift.
     """
     # A splat without a feature adds nothing to a ray; its score of -1 would count against its neighbours.
     rendered = torch.where(answer.seen, answer.scores, 0.0)
     values = torch.stack([rendered, torch.ones_like(rendered)], dim=1)
-    image = scene.raster.render(scene.cameras.get(view), values, scene.walk)
+    image = scene.raster.render(scene.camera(view), values, scene.walk)
     attention, row_sums = image[..., 0].contiguous(), image[..., 1].contiguous()
     met = row_sums >= MINIMUM_ROW_SUM
     query = answer.query

@@ -45,9 +45,10 @@ def expected_depth(scene: QueryScene, view: str) -> tuple[Tensor, Tensor]:
 
     Raises:
         NotFound: no camera has this name.
+        InvalidQuery: its image is larger than pictures may be.
         InvalidLift: the splats or the cameras moved or changed since the lift.
     """
-    camera = scene.cameras.get(view)
+    camera = scene.camera(view)
     pose = torch.from_numpy(camera.world_to_camera[2].copy())
     depths = (scene.splats.means.double() @ pose[:3] + pose[3]).to(torch.float32)
     values = torch.stack([depths, torch.ones_like(depths)], dim=1)
@@ -61,6 +62,7 @@ def shown_depth(scene: QueryScene, view: str) -> ShownDepth:
 
     Raises:
         NotFound: no camera has this name.
+        InvalidQuery: its image is larger than pictures may be.
         InvalidLift: the splats or the cameras moved or changed since the lift.
     """
     depths, covered = (tensor.numpy() for tensor in expected_depth(scene, view))

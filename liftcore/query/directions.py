@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from contextlib import contextmanager
+from itertools import groupby
+from operator import itemgetter
 from typing import TYPE_CHECKING
 
 import torch
 
 from liftcore.errors import InvalidQuery, NotFound
 from liftcore.observe.observation import RegionMap
-from liftcore.query.example import Example, OneSplat, Pixel, Region, Vector
+from liftcore.query.example import OneSplat, Pixel, Region, Vector
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -32,12 +34,12 @@ def directions(scene: QueryScene, query: Query, encoder: TextEncoder | None) -> 
         NotFound: an example names a view or a region that is not there.
         InvalidLift: the splats, the cameras or the packs that an example needs moved or changed.
     """
-    words = _encode(scene, query, encoder)
-    rows: list[Tensor] = []
+    rows = _encode(scene, query, encoder) | _regions(scene, query)
     for place, term in enumerate(query.terms):
-        with _named(query, place):
-            rows.append(words[place] if isinstance(term, str) else _of_example(scene, term))
-    return torch.stack(rows)
+        if isinstance(term, Pixel | OneSplat | Vector):
+            with _named(query, place):
+                rows[place] = _of_example(scene, term)
+    return torch.stack([rows[place] for place in range(len(query.terms))])
 
 
 @contextmanager
@@ -79,11 +81,22 @@ def _encode(scene: QueryScene, query: Query, encoder: TextEncoder | None) -> dic
     return {place: _unit(row, text) for row, (place, text) in zip(rows, texts.items(), strict=True)}
 
 
-def _of_example(scene: QueryScene, example: Example) -> Tensor:
+def _regions(scene: QueryScene, query: Query) -> dict[int, Tensor]:
+    """The unit row of each region, by its place among the terms; a view is read once for all that are of it."""
+    asked = [(term.view, place, term) for place, term in enumerate(query.terms) if isinstance(term, Region)]
+    rows: dict[int, Tensor] = {}
+    for _, of_view in groupby(sorted(asked, key=itemgetter(0, 1)), key=itemgetter(0)):
+        observation = None  # one view at a time: maps are large
+        for _, place, term in of_view:
+            with _named(query, place):
+                observation = observation or _observation(scene, term)
+                rows[place] = _unit(_codebook_row(observation, term), str(term))
+    return rows
+
+
+def _of_example(scene: QueryScene, example: Pixel | OneSplat | Vector) -> Tensor:
     if isinstance(example, Pixel):
         return _unit(_rendered(scene, example), str(example))
-    if isinstance(example, Region):
-        return _unit(_codebook_row(scene, example), str(example))
     if isinstance(example, OneSplat):
         return _unit(_splat_row(scene, example), str(example))
     if len(example.values) != scene.channels:
@@ -107,7 +120,7 @@ def _rendered(scene: QueryScene, pixel: Pixel) -> Tensor:
     return row.weights.double() @ scene.lift.features[row.splats.long()].double()
 
 
-def _codebook_row(scene: QueryScene, example: Region) -> Tensor:
+def _observation(scene: QueryScene, example: Region) -> RegionMap:
     packs = scene.packs
     if example.view not in packs.views:
         raise NotFound(str(example), expected="a view of the lift's feature packs", got=repr(example.view))
@@ -115,6 +128,10 @@ def _codebook_row(scene: QueryScene, example: Region) -> Tensor:
     if not isinstance(observation, RegionMap):
         hint = "ask by a pixel, VIEW:x,y"
         raise InvalidQuery(str(example), expected="a view with regions", got="a feature grid", hint=hint)
+    return observation
+
+
+def _codebook_row(observation: RegionMap, example: Region) -> Tensor:
     levels = observation.labels.shape[0]
     if example.level >= levels:
         raise NotFound(str(example), expected=f"a level in 0..{levels - 1}", got=str(example.level))

@@ -43,7 +43,7 @@ def render_png(scene: QueryScene, view: str, what: str = "rgb") -> bytes:
 
     Raises:
         NotFound: no camera has this name.
-        InvalidQuery: clusters are asked for, and the lift has none.
+        InvalidQuery: clusters are asked for, and the lift has none; or the image is larger than pictures may be.
         InvalidLift: the splats or the cameras moved or changed since the lift.
     """
     if what == "depth":
@@ -70,15 +70,18 @@ def render(scene: QueryScene, view: str, what: str = "rgb") -> np.ndarray:
 
     Raises:
         NotFound: no camera has this name.
-        InvalidQuery: clusters are asked for, and the lift has none.
+        InvalidQuery: clusters are asked for, and the lift has none; or the image is larger than pictures may be.
         InvalidLift: the splats or the cameras moved or changed since the lift.
     """
     if what == "cluster":
         return render_clusters(scene, view)
-    camera = scene.cameras.get(view)
+    camera = scene.camera(view)
     colours = scene.principal if what == "pca" else seen_colours(scene.splats, camera)
     image = scene.raster.render(camera, colours, Walk(antialiased=scene.walk.antialiased))
-    return np.round(255 * image.numpy().clip(0.0, 1.0)).astype(np.uint8)
+    levels = image.numpy()  # in place: an image of floats is large
+    np.clip(levels, 0.0, 1.0, out=levels)
+    levels *= 255
+    return np.round(levels, out=levels).astype(np.uint8)
 
 
 def render_clusters(scene: QueryScene, view: str) -> np.ndarray:
@@ -88,14 +91,14 @@ def render_clusters(scene: QueryScene, view: str) -> np.ndarray:
 
     Raises:
         NotFound: no camera has this name.
-        InvalidQuery: the lift has no clusters.
+        InvalidQuery: the lift has no clusters, or the view's image is larger than pictures may be.
         InvalidLift: the splats or the cameras moved or changed since the lift.
     """
     clusters, means = scene.lift.cluster, scene.lift.cluster_features
     if clusters is None or means is None:
         hint = "lift again with the setting aggregation=true"
         raise InvalidQuery("what", expected="a lift with clusters", got="a lift without aggregation", hint=hint)
-    camera = scene.cameras.get(view)
+    camera = scene.camera(view)
     shown = scene.raster.strongest_labels(camera, clusters, scene.walk).numpy()
     picture = cluster_colours(means.shape[0])[shown]  # the last colour is that of label -1
     picture[scene.raster.row_sums(camera, scene.walk).numpy() <= 0] = 0

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 from liftcore.artifact import Lift, load_lift
+from liftcore.errors import InvalidQuery
 from liftcore.query.scores import feature_norms, mean_direction
 from liftcore.query.unchanged import unchanged
 from liftcore.raster.protocol import Walk
@@ -18,8 +19,11 @@ if TYPE_CHECKING:
 
     from liftcore.observe.pack import FeaturePacks
     from liftcore.raster.protocol import Raster
-    from liftcore.scene.cameras import Cameras
+    from liftcore.scene.cameras import Camera, Cameras
     from liftcore.scene.splats import Splats
+
+
+MOST_PIXELS = 1 << 26  # of a picture: 67 million take a minute of one core and 2 GB
 
 
 class QueryScene:
@@ -116,6 +120,23 @@ class QueryScene:
         from liftcore.scene.load import load_cameras
 
         return load_cameras(unchanged("cameras", self.lift.metadata.cameras, self.path))
+
+    def camera(self, view: str) -> Camera:
+        """The camera that draws a view.
+
+        Raises:
+            NotFound: no camera has this name.
+            InvalidQuery: its image is larger than pictures may be.
+            InvalidLift: the cameras moved or changed since the lift.
+        """
+        camera = self.cameras.get(view)
+        if camera.width * camera.height > MOST_PIXELS:
+            raise InvalidQuery(
+                "view", expected=f"an image of at most {MOST_PIXELS} pixels to draw",
+                got=f"{camera.width}x{camera.height} in {view!r}",
+                hint="give the scene a camera of the same pose with width, height, fx, fy, cx and cy divided alike",
+            )  # fmt: skip
+        return camera
 
     @cached_property
     def packs(self) -> FeaturePacks:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 DEFAULT_NEGATIVES = ("object", "things", "stuff", "texture")  # LangSplat's canonical phrases
-_BLOCK = 16_384  # rows widened at once
+_BLOCK, _BLOCK_FLOATS = 16_384, 1 << 25  # rows widened at once, and numbers in them
 LEAST_OFFSET = 1e-3  # from the mean, of unit features: what is nearer has no direction that float16 could tell
 RELEVANCY_SHARPNESS = 10.0  # the softmax's inverse temperature in LERF and LangSplat
 
@@ -68,6 +68,11 @@ def cosines(features: Tensor, norms: Tensor, texts: Tensor) -> Tensor:
     return cosines_of(features, norms, _unit_rows(texts, features.shape[1]))
 
 
+def rows_at_a_time(channels: int) -> int:
+    """How many rows of features are widened to float32 at once."""
+    return max(1, min(_BLOCK, _BLOCK_FLOATS // channels))
+
+
 def mean_direction(features: Tensor, norms: Tensor, weights: Tensor) -> Tensor:
     """The weighted mean of the unit rows, [F] f32; of zero rows and weights nothing but zeros.
 
@@ -76,8 +81,9 @@ def mean_direction(features: Tensor, norms: Tensor, weights: Tensor) -> Tensor:
     """
     shares = torch.where(norms > 0, weights.double() / norms.clamp_min(1e-30).double(), 0.0)
     total = torch.zeros(features.shape[1], dtype=torch.float64)
-    for first in range(0, features.shape[0], _BLOCK):
-        block = slice(first, first + _BLOCK)
+    at_a_time = rows_at_a_time(features.shape[1])
+    for first in range(0, features.shape[0], at_a_time):
+        block = slice(first, first + at_a_time)
         total += (features[block].to(torch.float32) * shares[block, None].to(torch.float32)).sum(dim=0).double()
     weight = float(weights[norms > 0].double().sum())
     return (total / weight if weight > 0 else total).to(torch.float32)

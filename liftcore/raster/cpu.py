@@ -120,11 +120,12 @@ class CpuRaster:
         for begin in range(0, channels, RENDER_CHANNELS):
             end = min(begin + RENDER_CHANNELS, channels)
             block = np.ascontiguousarray(values[:, begin:end].to(torch.float32).numpy())
-            target = np.zeros((camera.height, camera.width, end - begin), np.float32)
-
+            alone = end - begin == channels
+            target = image if alone else np.zeros((camera.height, camera.width, end - begin), np.float32)
             for frame in bands:
                 self._over_tiles(frame, partial(_render, block, target))
-            image[:, :, begin:end] = target
+            if not alone:
+                image[:, :, begin:end] = target
         return torch.from_numpy(image)
 
     def adjoint(self, camera: Camera, values: Tensor, walk: Walk) -> Tensor:

@@ -171,3 +171,15 @@ def test_only_the_largest_part_of_a_mask_is_kept_when_asked(scene: QueryScene) -
     whole = look(scene, ask(scene, both), "middle").mask
     kept = look(scene, ask(scene, replace(both, keep="largest")), "middle").mask
     assert 0 < int(kept.sum()) < int(whole.sum()) and not (kept & ~whole).any()
+
+
+def test_a_view_is_read_once_for_all_regions_of_it(scene: QueryScene, monkeypatch: pytest.MonkeyPatch) -> None:
+    read, packs = [], scene.packs
+    views = sorted(packs.views)[:2]
+    asked = [Region(view, 0, region) for region in (0, 1, 0) for view in views]
+    alone = [directions(scene, Query((region,)), None)[0] for region in asked]
+    observation = packs.observation
+    monkeypatch.setattr(type(packs), "observation", lambda _, view: read.append(view) or observation(view))
+    together = directions(scene, Query((asked[0], OneSplat(0), *asked[1:])), None)
+    assert read == views
+    assert torch.equal(together[[0, 2, 3, 4, 5, 6]], torch.stack(alone))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 
+from liftcore.query import principal
 from liftcore.query.principal import principal_colours
 
 
@@ -22,3 +23,12 @@ def test_groups_of_features_get_colours_of_their_own_the_same_at_every_run() -> 
 def test_fewer_than_three_channels_and_no_evidence_are_fine() -> None:
     assert principal_colours(torch.rand(10, 2), torch.ones(10)).shape == (10, 3)
     assert not principal_colours(torch.rand(10, 4), torch.zeros(10)).any()
+
+
+def test_very_many_channels_take_a_smaller_sample(monkeypatch) -> None:
+    drawn, draw = [], principal._draw
+    monkeypatch.setattr(principal, "SAMPLE_FLOATS", 6400)
+    monkeypatch.setattr(principal, "_draw", lambda odds, count: drawn.append(count) or draw(odds, count))
+    assert principal_colours(torch.rand(50, 640), torch.ones(50)).max() > 0
+    assert principal_colours(torch.rand(50, 6401), torch.ones(50)).shape == (50, 3)
+    assert drawn == [10, 3]
