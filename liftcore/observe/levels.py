@@ -16,6 +16,9 @@ from liftcore.errors import InvalidFeatures
 from liftcore.observe.label_tuples import label_tuples
 from liftcore.observe.observation import NO_LABEL, Observation, RegionMap
 
+COMPOSITE_BYTES = 1 << 28  # of a view's codebook of tuples; real maps have some thousands of them
+_BLOCK_FLOATS = 1 << 22  # summed at once
+
 Levels = Literal["rows", "composite"] | int
 
 
@@ -27,21 +30,32 @@ def at_levels(observation: Observation, levels: Levels, view: str) -> Observatio
         view: named in an error.
 
     Raises:
-        InvalidFeatures: the view lacks the level.
+        InvalidFeatures: the view lacks the level, or has more tuples of labels than there is room for.
     """
     if levels == "rows":
         return observation
     if levels != "composite":
         return _one_level(observation, levels, view)
-    return composite(observation) if isinstance(observation, RegionMap) else observation
+    return composite(observation, view) if isinstance(observation, RegionMap) else observation
 
 
-def composite(regions: RegionMap) -> RegionMap:
-    """One level whose regions are the distinct tuples of labels, in the order of their labels."""
+def composite(regions: RegionMap, view: str) -> RegionMap:
+    """One level whose regions are the distinct tuples of labels, in the order of their labels.
+
+    Raises:
+        InvalidFeatures: their codebook would take more than COMPOSITE_BYTES.
+    """
     labels = regions.labels.to(torch.int32).contiguous().numpy()
     numbers, tuples = label_tuples(labels, labels[0].size)
     if not tuples.size:
         return RegionMap(regions.labels[:1], regions.codebook)
+    size = tuples.shape[0] * regions.codebook[0].nbytes
+    if size > COMPOSITE_BYTES:
+        raise InvalidFeatures(
+            f"view {view!r}", expected=f"tuples of labels whose sums take at most {COMPOSITE_BYTES >> 20} MiB",
+            got=f"{tuples.shape[0]} tuples of {regions.codebook.shape[1]} channels, {size >> 20} MiB",
+            hint="set levels to rows, which takes no room for tuples, or smooth the label maps",
+        )  # fmt: skip
     order = np.lexsort(tuples.T[::-1])
     place = np.append(np.argsort(order), NO_LABEL).astype(np.int32)  # of each tuple; of none, which is -1, the last
     return RegionMap(torch.from_numpy(place[numbers][None]), _summed(tuples[order].T, regions.codebook))
@@ -61,10 +75,19 @@ def _one_level(observation: Observation, level: int, view: str) -> Observation:
 def _summed(tuples: np.ndarray, codebook: torch.Tensor) -> torch.Tensor:
     """[n, F]: the unit sums of the embeddings of each tuple [L, n], zero where they cancel; the codebook's dtype."""
     largest = codebook.abs().amax().double().clamp_min(torch.finfo(torch.float64).tiny)  # squares cannot overflow
+    sums = torch.empty(tuples.shape[1], codebook.shape[1], dtype=codebook.dtype)
+    at_a_time = max(1, _BLOCK_FLOATS // codebook.shape[1])
+    for first in range(0, sums.shape[0], at_a_time):
+        block = slice(first, first + at_a_time)
+        sums[block] = _unit_sums(tuples[:, block], codebook, largest)
+    return sums
+
+
+def _unit_sums(tuples: np.ndarray, codebook: torch.Tensor, largest: torch.Tensor) -> torch.Tensor:
     sums = torch.zeros(tuples.shape[1], codebook.shape[1], dtype=torch.float32)
     for level in tuples:
         labelled = torch.from_numpy(np.flatnonzero(level != NO_LABEL))
         rows = codebook[torch.from_numpy(level.astype(np.int64))[labelled]]
         sums[labelled] += (rows.double() / largest).float()
     norms = torch.linalg.vector_norm(sums.double(), dim=1, keepdim=True).clamp_min(torch.finfo(torch.float32).tiny)
-    return (sums / norms).to(codebook.dtype)
+    return sums / norms

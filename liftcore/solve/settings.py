@@ -117,7 +117,7 @@ class LiftSettings(BaseModel):
         False, description="splats without a cluster's feature are solved for again from the kept regions alone"
     )
     aggregation_channels: int = Field(50, ge=1, le=1_024, description="principal components that it sees")
-    certificate_rays: int = Field(10_000, ge=0, le=10_000_000, description="rays sampled for the certificate")
+    certificate_rays: int = Field(10_000, ge=0, le=1_000_000, description="rays sampled for the certificate")
     seed: int = Field(0, ge=0, lt=2**31, description="of samples, random projections and strides")
     cg_steps: int = Field(0, ge=0, le=10_000, description="least-squares steps from the closed form on, 0 = none")
     damping: float = Field(1.0, ge=0, le=1e6, description="mu, pulls least squares towards the closed form")

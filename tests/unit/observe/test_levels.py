@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from liftcore.errors import InvalidFeatures
+from liftcore.observe import levels
 from liftcore.observe.levels import at_levels, composite
 from liftcore.observe.observation import NO_LABEL, RegionMap
 from tests.scenes import random_grid, random_regions
@@ -37,7 +38,7 @@ def read(regions: RegionMap) -> np.ndarray:
 @pytest.mark.parametrize("seed", range(3))
 def test_composite_regions_are_normalised_sums_pixel_by_pixel(seed, levels):
     regions = random_regions(seed, levels, rows=7)
-    merged = composite(regions)
+    merged = composite(regions, "v0")
     assert merged.labels.shape == (1, *regions.labels.shape[1:])
     assert np.abs(read(merged) - dense_sums(regions)).max() < 1e-6
 
@@ -45,7 +46,7 @@ def test_composite_regions_are_normalised_sums_pixel_by_pixel(seed, levels):
 def test_a_composite_codebook_has_a_row_for_each_distinct_tuple():
     regions = random_regions(3, 3, rows=4)
     tuples = {tuple(labels) for labels in regions.labels.reshape(3, -1).T.tolist()} - {(NO_LABEL,) * 3}
-    merged = composite(regions)
+    merged = composite(regions, "v0")
     assert merged.codebook.shape[0] == len(tuples)
     assert merged.labels.unique().tolist() in ([*range(len(tuples))], [NO_LABEL, *range(len(tuples))])
 
@@ -53,7 +54,7 @@ def test_a_composite_codebook_has_a_row_for_each_distinct_tuple():
 def test_many_levels_and_rows_do_not_overflow_the_numbering():
     labels = torch.randint(-1, 30_000, (8, 20, 20), dtype=torch.int32, generator=torch.Generator().manual_seed(0))
     regions = RegionMap(labels, torch.nn.functional.normalize(torch.randn(30_000, 3), dim=1))
-    assert np.abs(read(composite(regions)) - dense_sums(regions)).max() < 1e-5
+    assert np.abs(read(composite(regions, "v0")) - dense_sums(regions)).max() < 1e-5
 
 
 @pytest.mark.parametrize(("dtype", "size"), [(torch.float16, 6e4), (torch.float32, 3e38), (torch.float32, 1e-38)])
@@ -61,12 +62,28 @@ def test_huge_and_tiny_embeddings_keep_their_direction(dtype, size):
     codebook = torch.tensor([[size, 0.0], [size, size], [0.0, 0.0]]).to(dtype)
     regions = RegionMap(torch.tensor([[[0, 2]], [[1, -1]]], dtype=torch.int32), codebook)
     expected = np.array([[2, 1] / np.sqrt(5), [0, 0]])
-    assert np.abs(read(composite(regions)) - expected).max() < 1e-3
+    assert np.abs(read(composite(regions, "v0")) - expected).max() < 1e-3
 
 
 def test_a_map_without_any_label_stays_one():
     regions = RegionMap(torch.full((2, 3, 4), NO_LABEL, dtype=torch.int32), torch.ones(2, 5))
-    assert (composite(regions).labels == NO_LABEL).all()
+    assert (composite(regions, "v0").labels == NO_LABEL).all()
+
+
+def test_tuples_are_summed_in_pieces_and_refused_where_their_codebook_would_be_huge(monkeypatch):
+    generator = torch.Generator().manual_seed(2)
+    labels = torch.randint(-1, 9, (3, 20, 20), dtype=torch.int32, generator=generator)
+    regions = RegionMap(labels, torch.nn.functional.normalize(torch.randn(9, 7, generator=generator), dim=1))
+    whole = composite(regions, "v0")
+    monkeypatch.setattr(levels, "_BLOCK_FLOATS", 21)
+    assert torch.equal(composite(regions, "v0").codebook, whole.codebook)
+    monkeypatch.setattr(levels, "COMPOSITE_BYTES", whole.codebook.nbytes)
+    assert torch.equal(composite(regions, "v0").labels, whole.labels)
+    monkeypatch.setattr(levels, "COMPOSITE_BYTES", whole.codebook.nbytes - 1)
+    with pytest.raises(
+        InvalidFeatures, match=f"IMG_7.*{whole.codebook.shape[0]} tuples of 7 channels.*levels to rows"
+    ):
+        composite(regions, "IMG_7")
 
 
 def test_one_level_is_that_level_alone():
