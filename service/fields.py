@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from pydantic import (
+    AfterValidator,
     BaseModel,
     BeforeValidator,
     ConfigDict,
@@ -34,6 +35,18 @@ def takes(expected: str) -> WrapValidator:
             raise PydanticCustomError("takes", "{expected}", {"expected": expected}) from None
 
     return WrapValidator(check)
+
+
+def at_most(characters: int) -> AfterValidator:
+    """Bounds a list of texts by what they have together."""
+
+    def check(texts: list[str]) -> list[str]:
+        if (got := sum(map(len, texts))) > characters:
+            told = {"expected": f"texts of at most {characters} characters together, which are {got}"}
+            raise PydanticCustomError("too_long_together", "{expected}", told)
+        return texts
+
+    return AfterValidator(check)
 
 
 def _no_boolean(value: Any) -> Any:

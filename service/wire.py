@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from service.fields import Body, NoBoolean, takes
+from service.fields import Body, NoBoolean, at_most, takes
 
 ASSET_ID = r"^sha256:[0-9a-f]{64}$"
 JOB_ID = r"^[0-9a-f]{32}$"
@@ -16,6 +16,7 @@ VIEW_CHARACTERS = 500  # of a camera's name that can be asked for
 AssetId = Annotated[str, Field(pattern=ASSET_ID, description="sha256: and the digest of the bytes, in hex")]
 JobId = Annotated[str, Field(pattern=JOB_ID)]
 Text = Annotated[str, Field(min_length=1, max_length=1000)]
+Texts = Annotated[list[Text], Field(max_length=32), at_most(4000)]  # an encoder takes seconds for more
 Scalar = Annotated[bool | int | float | str, takes("a boolean, a number or a text")]
 
 
@@ -265,8 +266,8 @@ class Question(BaseModel):
     """What all queries share: the words, and how to find what they mean."""
 
     lift: JobId | None = Field(None, description="the lift; may be left out when there is exactly one")
-    text: list[Text] = Field([], max_length=32, description="what to look for; may be given several times")
-    negatives: list[Text] = Field([], max_length=32, description="what it is not; may be given several times")
+    text: Texts = Field([], description="what to look for; may be given several times, 4000 characters in all")
+    negatives: Texts = Field([], description="what it is not; likewise")
     threshold: Cut = Field("auto", description="how to find it, or the score from which a splat counts as found")
     instances: Count | None = Field(None, description="how many there are, if you know")
     keep: Literal["all", "largest"] = Field("all", description="components of a mask")

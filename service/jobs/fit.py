@@ -53,13 +53,14 @@ def check_kernel(splats: AssetRecord, settings: Mapping[str, Any]) -> None:
     Raises:
         InvalidSettings: ``kernel`` or ``antialiased`` does not fit the file, of which the header is read.
     """
-    kernel = Kernel(kernel_of(splats, settings))
-    check_antialiased(kernel, LiftSettings.of(**settings).antialiased)
+    own, kernel = kernel_of(splats, {}), kernel_of(splats, settings)
+    check_antialiased(Kernel(kernel), LiftSettings.of(**settings).antialiased)
+    if kernel == own:
+        return
     try:
-        model_slots([column.name for column in read_header(splats.path).properties], kernel, splats.id)
+        model_slots([column.name for column in read_header(splats.path).properties], Kernel(kernel), splats.id)
     except InvalidSplats as error:
-        hint = f"leave it out: the file speaks of {kernel_of(splats, {})}"
-        got = f"{kernel} for {splats.id}, which has {error.got}"
+        got, hint = f"{kernel} for {splats.id}, which has {error.got}", f"leave it out: the file speaks of {own}"
         raise InvalidSettings("kernel", expected=f"a kernel with {error.expected}", got=got, hint=hint) from None
 
 

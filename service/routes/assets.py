@@ -112,7 +112,7 @@ async def _receive(request: Request, intake: Intake) -> None:
 
 @router.get("", response_model=wire.Assets)
 def list_assets(here: Here) -> wire.Assets:
-    """All assets, newest first."""
+    """All assets, newest first. Lists of names and words are told with each asset alone."""
     return wire.Assets(assets=[shape(asset) for asset in here.store.assets.all()])
 
 

@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -27,9 +28,14 @@ class AssetRecord:
     kind: AssetKind
     bytes: int
     path: Path
-    counts: dict[str, Any] = field(default_factory=dict)
+    counted: str = "{}"  # counts as JSON: names of a hundred thousand views are parsed by who asks for them
     warnings: list[str] = field(default_factory=list)
     created: float = 0.0  # seconds since 1970
+
+    @cached_property
+    def counts(self) -> dict[str, Any]:
+        """What its check found in it: splats, views, channels, names and so on."""
+        return json.loads(self.counted)
 
     @property
     def file_name(self) -> str:
@@ -59,6 +65,7 @@ VISIBLE = (
     "SELECT id, kind, bytes, file, counts, warnings, min(created) AS created"
     f" FROM assets JOIN asset_owners ON asset = id WHERE {SEEN}"
 )
+IN_BRIEF = VISIBLE.replace("counts", "json_remove(counts, '$.names', '$.words') AS counts")
 
 
 class AssetStore(Owned):
@@ -143,10 +150,10 @@ class AssetStore(Owned):
         return found
 
     def all(self) -> list[AssetRecord]:
-        """Every asset, newest first."""
+        """Every asset, newest first, without the names and words that it holds."""
         with self._database.read() as connection:
             rows = connection.execute(
-                f"{VISIBLE} GROUP BY id ORDER BY min(created) DESC, id", self._owner.terms()
+                f"{IN_BRIEF} GROUP BY id ORDER BY min(created) DESC, id", self._owner.terms()
             ).fetchall()
         return [self._record(row) for row in rows]
 
@@ -207,7 +214,7 @@ class AssetStore(Owned):
             kind=AssetKind(row["kind"]),
             bytes=row["bytes"],
             path=self._files.root / row["file"],
-            counts=json.loads(row["counts"]),
+            counted=row["counts"],
             warnings=json.loads(row["warnings"]),
             created=row["created"],
         )

@@ -160,23 +160,32 @@ const settings = job => {
   return `${asked}, attempt ${job.attempt}`;
 };
 let lifts = [];
-let cameras = [];
+const named = new Map(); // names of a cameras asset's views; an asset never changes
 
-function fillViews() {
+async function viewsOf(lift) {
+  try {
+    if (!named.has(lift.cameras)) named.set(lift.cameras, (await json(`/assets/${lift.cameras}`)).counts.names);
+    return named.get(lift.cameras);
+  } catch {
+    return lift.views;
+  }
+}
+
+async function fillViews() {
   const lift = lifts.find(found => found.id === at("lift").value);
-  const asset = lift && cameras.find(found => found.id === lift.cameras);
-  const names = asset && Array.isArray(asset.counts.names) ? asset.counts.names : lift ? lift.views : [];
+  const names = lift ? await viewsOf(lift) : [];
+  if (lift && lift.id !== at("lift").value) return; // another one was chosen meanwhile
   const wordless = Boolean(lift) && lift.text_space === "none";
   at("wordless").hidden = !wordless;
   at("text").disabled = wordless;
   fill(at("view"), names.map(name => [name, lift.views.includes(name) ? name : `${name} (not lifted)`]));
 }
 
-function newLifts(found) {
+async function newLifts(found) {
   lifts = found;
   at("none").hidden = lifts.length > 0;
   fill(at("lift"), lifts.map(l => [l.id, `${l.id.slice(0, 8)}: ${l.count.toLocaleString()} splats, ${l.channels} channels`]));
-  fillViews();
+  await fillViews();
   table("lifts", lifts.map(l => row([
     link(l.links.self, l.id.slice(0, 8)), l.count.toLocaleString(), String(l.channels), String(l.views.length),
     l.text_space || "none", link(l.links.features, `${(l.bytes / 1e6).toFixed(1)} MB`),
@@ -188,11 +197,10 @@ let first = true;
 async function refresh() {
   try {
     const [assets, jobs, done] = await Promise.all([json("/assets"), json("/jobs"), json("/lifts")]);
-    cameras = assets.assets.filter(asset => asset.kind === "cameras");
     table("assets", assets.assets.map(a =>
       row([a.kind, brief(a.counts), a.bytes.toLocaleString(), a.warnings.join("; ")])), "none yet");
     table("jobs", jobs.jobs.map(j => row([link(j.links.self, j.id.slice(0, 8)), j.state, progress(j), settings(j)])), "none yet");
-    if (first || String(done.lifts.map(l => l.id)) !== String(lifts.map(l => l.id))) newLifts(done.lifts);
+    if (first || String(done.lifts.map(l => l.id)) !== String(lifts.map(l => l.id))) await newLifts(done.lifts);
     if (first) await begin();
     first = false;
   } catch (problem) {
@@ -300,7 +308,7 @@ async function look() {
 async function begin() {
   for (const name of ["lift", "view", "what", "text", "threshold"]) {
     if (started.has(name)) at(name).value = started.get(name);
-    if (name === "lift") fillViews();
+    if (name === "lift") await fillViews();
   }
   for (const name of ["like", "unlike"]) {
     picks.push(...started.getAll(name).map(example => ({ example, unlike: name === "unlike" })));
@@ -312,7 +320,7 @@ async function begin() {
 
 at("host").textContent = location.origin;
 at("query").addEventListener("submit", event => { event.preventDefault(); look(); });
-at("lift").addEventListener("change", () => { picks = []; fillViews(); look(); });
+at("lift").addEventListener("change", async () => { picks = []; await fillViews(); look(); });
 at("stage").addEventListener("click", clicked);
 at("render").addEventListener("load", showPicks);
 at("more").addEventListener("click", () => typed(false));

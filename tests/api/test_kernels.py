@@ -66,12 +66,17 @@ def test_scene_of_the_kernel_is_uploaded_lifted_and_asked(
 def test_a_kernel_that_does_not_fit_the_splats_is_refused_with_the_order(
     client: TestClient, uploaded: Uploaded, content: bytes, settings: dict, argument: str, said: str
 ) -> None:
+    before = client.get("/jobs").json()
     asset = client.put("/assets/splats", content=content).json()["id"]
     answer = client.post("/lift", json=uploaded.order(**settings) | {"splats": asset})
     assert answer.status_code == 422, answer.text
     assert argument in answer.json()["detail"] and said in answer.text
-    assert client.get("/jobs").json()["jobs"] == []
+    assert client.get("/jobs").json() == before
+    assert client.delete(f"/assets/{asset}").status_code == 204
 
 
-def test_flat_splats_may_be_lifted_as_discs(client: TestClient, uploaded: Uploaded) -> None:
-    assert client.post("/lift", json=uploaded.order(kernel="2dgs")).status_code == 202
+def test_splats_of_three_scales_may_be_lifted_as_discs(client: TestClient, uploaded: Uploaded) -> None:
+    warm_up(Kernel.GAUSSIAN_2D)
+    job = ended(client, client.post("/lift", json=uploaded.order(kernel="2dgs")).headers["location"])
+    assert job["state"] == "succeeded", job
+    assert client.delete(job["links"]["self"], params={"with_lift": True}).status_code == 204

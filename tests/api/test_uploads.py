@@ -213,3 +213,11 @@ def test_file_that_somebody_damaged_is_told_and_an_upload_mends_it(
     assert client.put("/assets/splats", content=content).status_code == 200
     assert client.get(f"{path}/content").content == content
     assert client.delete(path).status_code == 204
+
+
+def test_lists_of_names_are_told_with_an_asset_alone(client: TestClient, uploaded: Uploaded) -> None:
+    listed = {asset["id"]: asset["counts"] for asset in client.get("/assets").json()["assets"]}
+    for asset in (uploaded.cameras, uploaded.features):
+        counts = client.get(f"/assets/{asset}").json()["counts"]
+        names = counts.pop("names")
+        assert "middle" in names and listed[asset] == counts

@@ -97,3 +97,12 @@ def test_booleans_are_no_budget_and_nothing_is_no_setting(client: TestClient) ->
 def test_missing_parameter_is_a_value_that_nobody_gave(client: TestClient) -> None:
     told = assert_problem(client.get("/render"))
     assert (told["argument"], told["expected"], told["got"]) == ("view", "a value", "nothing")
+
+
+@pytest.mark.parametrize("name", ["text", "negatives"])
+def test_texts_have_a_length_together(client: TestClient, name: str) -> None:
+    for texts in (["a" * 1000] * 4 + ["b"], ["a" * 126] * 32):
+        told = assert_problem(client.post("/query", json={"text": ["apple"], name: texts}))
+        assert (told["status"], told["argument"]) == (422, name)
+        assert told["expected"] == f"texts of at most 4000 characters together, which are {len(''.join(texts))}"
+    assert "4000" not in client.post("/query", json={"text": ["apple"], name: ["a" * 125] * 32}).text
