@@ -17,11 +17,12 @@ if TYPE_CHECKING:
 READERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 # What NumPy raises over a header that is no Python literal, besides its own ValueError.
 PARSE_ERRORS = (ValueError, TypeError, SyntaxError, EOFError, RecursionError, MemoryError, TokenError)
+NUMBERS = "fiu"  # kinds of NumPy: floats, integers, unsigned integers
 HINT = "save plain arrays with numpy.save"
 
 
-def open_npy(path: Path) -> np.ndarray:
-    """Map a ``.npy`` file of numbers.
+def open_npy(path: Path, kinds: str = NUMBERS) -> np.ndarray:
+    """Map a ``.npy`` file of numbers, or of what else ``kinds`` allows, in NumPy's letters.
 
     Raises:
         InvalidFeatures: the file is no ``.npy`` file, holds Python objects, or has another size than it says.
@@ -33,7 +34,7 @@ def open_npy(path: Path) -> np.ndarray:
                 raise ValueError(f"format version {version}")
             shape, _, dtype = READERS[version](handle)
             offset, size = handle.tell(), handle.seek(0, 2)
-        if dtype.hasobject or dtype.kind not in "fiu":
+        if dtype.hasobject or dtype.kind not in kinds:
             got = "Python objects, which may run code" if dtype.hasobject else str(dtype)
             raise InvalidFeatures(str(path), expected="an array of numbers", got=got, hint=HINT)
         if any(side < 1 for side in shape) or offset + math.prod(shape) * dtype.itemsize != size:
