@@ -1,0 +1,42 @@
+"""Masks as COCO writes them, made pixel by pixel: the twin of what `liftcore.observe.rle` reads."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import numpy as np
+
+
+def sam_records(masks: np.ndarray, *, as_string: bool = False) -> list[dict[str, Any]]:
+    """What segment-anything returns for masks [K, H, W]: as uncompressed_rle, or as coco_rle."""
+    found = []
+    for mask in masks:
+        lengths = lengths_of(mask)
+        counts = compressed(lengths) if as_string else lengths
+        found.append({"segmentation": {"size": [*mask.shape], "counts": counts}, "area": int(mask.sum())})
+    return found
+
+
+def lengths_of(mask: np.ndarray) -> list[int]:
+    """The run lengths of a mask, pixel by pixel."""
+    lengths, inside = [0], False
+    for pixel in mask.T.flatten().tolist():
+        if pixel != inside:
+            lengths.append(0)
+            inside = pixel
+        lengths[-1] += 1
+    return lengths
+
+
+def compressed(lengths: list[int]) -> str:
+    """Lengths as COCO's string: from the fourth on, differences to the one two before."""
+    numbers = [length - (lengths[place - 2] if place > 2 else 0) for place, length in enumerate(lengths)]
+    return "".join(map(_characters, numbers))
+
+
+def _characters(number: int) -> str:
+    groups = next(n for n in range(1, 9) if -(1 << (5 * n - 1)) <= number < 1 << (5 * n - 1))
+    bits = number % (1 << 5 * groups)
+    parts = [bits >> 5 * group & 31 for group in range(groups)]
+    return "".join(chr(48 + part + 32 * (place < groups - 1)) for place, part in enumerate(parts))
