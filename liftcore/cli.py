@@ -26,6 +26,8 @@ EXPERIMENTS = (
 
 PRESETS = "row-sum, tikhonov (default), argmax, top-k, front-mass, centre or mean"
 
+LARGEST_GREY = 65_535  # of a picture of 16 bits
+
 BAD_INPUT = 2
 OUR_FAULT = 1
 INTERRUPTED = 130
@@ -192,13 +194,24 @@ def _add_pack(parser: argparse.ArgumentParser, shared: _Parser) -> None:
     langsplat = formats.add_parser("langsplat", parents=[shared], help="IMG_s.npy and IMG_f.npy")
     arrays = formats.add_parser("npy", parents=[shared], help="IMG.npy, a dense map a view")
     arrays.add_argument("--layout", choices=("hwc", "chw"), default="hwc", help="the order of the axes")
+    masks = formats.add_parser(
+        "masks", parents=[shared], help="IMG.npy, a vector a mask, with IMG.json (SAM's), IMG_masks.npy or IMG.png"
+    )
+    masks.add_argument(
+        "--unlabelled",
+        type=_grey,
+        default=0,
+        metavar="VALUE",
+        help="of label pictures, the value that means no mask: 0, and value 1 is of the first vector; with another "
+        "(255) value 0 is of the first",
+    )
     space = (
         "the text encoder whose words lie in the space of the features, as query's --encoder names it "
         "(open_clip:ViT-B-32/openai): query opens it where no encoder is given, and a service takes the one that it "
         "has under that name; 'none': no text encoder shares it, so a lift is asked by example. Packs of one lift "
         "must agree"
     )
-    for command in (langsplat, arrays):
+    for command in (langsplat, arrays, masks):
         command.add_argument("folder", type=Path, help="the folder of the files")
         command.add_argument("-o", "--output", type=Path, required=True, metavar="PACK", help="the pack to write")
         command.add_argument("--encoder-name", metavar="NAME", help="the 2D encoder that made the features")
@@ -284,6 +297,13 @@ def _seconds(text: str) -> float:
         value = 0.0
     if not 0 < value < float("inf"):
         raise argparse.ArgumentTypeError(f"expected seconds, got {text!r}")
+    return value
+
+
+def _grey(text: str) -> int:
+    value = int(text) if text.isascii() and text.isdigit() and len(text) <= 5 else LARGEST_GREY + 1
+    if value > LARGEST_GREY:
+        raise argparse.ArgumentTypeError(f"expected a whole number from 0 to {LARGEST_GREY}, got {text!r}")
     return value
 
 

@@ -5,13 +5,15 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from liftcore.commands.bars import progress_bars
-from liftcore.commands.reply import free_output, reply, writing
+from liftcore.commands.reply import free_output, reply, shown, writing
 
 if TYPE_CHECKING:
     import argparse
     from collections.abc import Iterator
 
     from liftcore.observe.folder import ViewFolder
+
+INPUTS = ("*.npy", "*.json", "*.png")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -21,10 +23,11 @@ def run(options: argparse.Namespace) -> int:
     from liftcore.observe.write_pack import write_pack
 
     views = _views(options)
-    out = free_output(options.output, list(options.folder.glob("*.npy")))
+    out = free_output(options.output, [path for kind in INPUTS for path in options.folder.glob(kind)])
     with progress_bars() as progress, writing(out):
         write_pack(out, views, _metadata(options), progress)
     packs = open_packs([out])
+    described = describe_packs(packs)
     document = {
         "out": str(out),
         "bytes": out.stat().st_size,
@@ -33,8 +36,9 @@ def run(options: argparse.Namespace) -> int:
         "encoder": packs.encoder,
         "text_space": packs.text_space,
         "normalised": packs.normalised,
-        "renamed": _renamed(views) if options.format == "npy" else {},
-        "warnings": describe_packs(packs)["warnings"],
+        "sizes": described["sizes"],
+        "renamed": {} if options.format == "langsplat" else _renamed(views),
+        "warnings": described["warnings"],
     }
     reply(document, as_json=options.json, lines=_lines(document))
     return 0
@@ -47,6 +51,7 @@ def _renamed(views: ViewFolder) -> dict[str, str]:
 
 def _lines(document: dict[str, Any]) -> Iterator[str]:
     yield f"{document['out']}: {document['views']} views, {document['channels']} channels, {document['bytes']} bytes"
+    yield f"  {shown(document['sizes'])}"
     for name, view in list(document["renamed"].items())[:1]:
         yield f"  views are named without the suffix of their images, as cameras are: {name} is {view!r}"
     yield from (f"warning: {warning}" for warning in document["warnings"])
@@ -57,6 +62,10 @@ def _views(options: argparse.Namespace) -> ViewFolder:
         from liftcore.observe.langsplat import langsplat_views
 
         return langsplat_views(options.folder)
+    if options.format == "masks":
+        from liftcore.observe.mask_folder import mask_views
+
+        return mask_views(options.folder, options.unlabelled)
     from liftcore.observe.arrays import array_views
 
     return array_views(options.folder, options.layout)

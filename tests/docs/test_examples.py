@@ -6,21 +6,26 @@ import io
 import json
 import re
 import shlex
+import sys
 import zipfile
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from fastapi.routing import APIRoute
 from PIL import Image
 from pydantic import BaseModel
 
 from liftcore.cli import main
+from liftcore.observe.rle import mask_of_runs, read_runs
 from liftcore.scene.load import load_splats
 from service import wire
 from service.routes import assets, jobs, lifts, operations, queries, tradeoffs
 from tests.api.tiny_scene import WIDTH, codebook, colmap_zip, labels, make_scene
+from tests.run_lengths import sam_records
 
 from .readme import blocks, text
 
@@ -49,13 +54,78 @@ def scene_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_python_example_finds_the_apple(scene_folder: Path) -> None:
-    (example,) = blocks("README.md", "python")
-    names: dict[str, object] = {}
-    exec(compile(example, "README.md", "exec"), names)
-    mask = names["mask"]
+    mask = run_example("from liftcore.lift import lift")["mask"]
     columns = mask.nonzero()[:, 1]  # pyright: ignore[reportAttributeAccessIssue]
     assert len(columns) > 0
     assert int(columns.max()) < WIDTH // 2  # the apple is the cluster on the left
+
+
+def test_sams_masks_make_a_lift_that_knows_the_words(scene_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (scene_folder / "photos").mkdir()
+    for view, clusters in labels().items():
+        Image.fromarray((80 * clusters[0] + 40).astype(np.uint8)).save(scene_folder / "photos" / f"{view}.jpg")
+    for name, module in stand_ins().items():
+        monkeypatch.setitem(sys.modules, name, module)
+    run_example("from segment_anything import")
+    with zipfile.ZipFile(io.BytesIO(colmap_zip())) as archive:
+        archive.extractall(scene_folder)
+    (scene_folder / "features.safetensors").unlink()
+    section = text("README.md").partition("### From SAM's masks")[2].partition("\n## ")[0]
+    lines = [line for line in section.splitlines() if line.startswith(".venv/bin/splatlift ")]
+    commands = [shlex.split(line)[1:] for line in lines]
+    assert [command[0] for command in commands] == ["pack", "lift"]
+    question = ["query", "scene.lift.safetensors", "apple", "--table", "words.safetensors", "--view", "middle"]
+    assert [main(command) for command in [*commands, [*question, "--mask", "apple.png"]]] == [0, 0, 0]
+    with Image.open(scene_folder / "apple.png") as mask:
+        columns = np.asarray(mask).nonzero()[1]
+    assert len(columns) > 0 and columns.max() < WIDTH // 2
+
+
+def run_example(start: str) -> dict[str, Any]:
+    """The names that the one Python example with such a line leaves behind."""
+    (example,) = (block for block in blocks("README.md", "python") if start in block)
+    names: dict[str, Any] = {}
+    exec(compile(example, "README.md", "exec"), names)
+    return names
+
+
+def stand_ins() -> dict[str, ModuleType]:
+    """segment-anything and open_clip by the names that are used of them: they tell clusters by their grey.
+
+    Masks are run lengths of what is of one grey; a crop's vector is the codebook's row of its brightest pixel's grey.
+    """
+
+    def generate(image: np.ndarray) -> list[dict[str, Any]]:
+        clusters = np.rint((image[..., 0].astype(float) - 40) / 80)
+        found = sam_records(np.stack([clusters == k for k in range(3)]))
+        for k, record in enumerate(found):
+            rows, columns = np.nonzero(clusters == k)
+            corner = [int(columns.min()), int(rows.min())]
+            record["bbox"] = [*corner, int(columns.max()) - corner[0], int(rows.max()) - corner[1]]
+        return found
+
+    def rle_to_mask(segmentation: dict[str, Any]) -> np.ndarray:
+        return mask_of_runs(*read_runs(segmentation, "a mask"))
+
+    def encode(images: torch.Tensor) -> torch.Tensor:
+        clusters = ((images.flatten(1).amax(dim=1) - 40) / 80).round().long()
+        return torch.from_numpy(codebook()).float()[clusters]
+
+    model = SimpleNamespace(eval=lambda: None, encode_image=encode)
+    generator = SimpleNamespace(generate=generate)
+    modules = {name: ModuleType(name) for name in ("segment_anything", "segment_anything.utils.amg", "open_clip")}
+    modules["segment_anything.utils"] = ModuleType("segment_anything.utils")
+    vars(modules["segment_anything"]).update(
+        SamAutomaticMaskGenerator=lambda sam, output_mode: generator,
+        build_sam_vit_h=lambda checkpoint: None,
+    )
+    vars(modules["segment_anything.utils.amg"]).update(rle_to_mask=rle_to_mask)
+    vars(modules["open_clip"]).update(
+        create_model_and_transforms=lambda name, pretrained: (
+            model, None, lambda crop: torch.from_numpy(np.array(crop)).float(),
+        )
+    )  # fmt: skip
+    return modules
 
 
 def test_command_line_example_writes_its_files(scene_folder: Path) -> None:

@@ -6,7 +6,9 @@ import json
 from typing import TYPE_CHECKING
 
 import numpy as np
+from PIL import Image
 
+from liftcore.observe.observation import RegionMap
 from liftcore.observe.pack import open_packs
 
 from .command_line import assert_one_line, run
@@ -72,3 +74,38 @@ def test_two_maps_of_one_view_are_refused(tmp_path: Path, capsys: pytest.Capture
     assert (status, out) == (2, "")
     assert_one_line(err)
     assert "a.jpg.npy and a.npy, both of the view 'a'" in err
+
+
+def test_masks_and_their_vectors_are_packed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "masks"
+    folder.mkdir()
+    labels = np.array([[255, 0], [1, 1]], np.uint8)
+    Image.fromarray(labels).save(folder / "a.png")
+    np.save(folder / "a.jpg.npy", np.eye(2, 5, dtype=np.float16))
+    pack = tmp_path / "p.safetensors"
+    options = ["--encoder-name", "clip", "--text-space", "open_clip:ViT-B-16", "--normalised"]
+    status, out, err = run(capsys, "pack", "masks", folder, "-o", pack, "--unlabelled", 255, *options)
+    assert (status, err) == (0, "")
+    assert "1 views, 5 channels" in out and "1 levels of 2x2" in out and "a.jpg.npy is 'a'" in out
+    regions = open_packs([pack]).observation("a")
+    assert isinstance(regions, RegionMap)
+    assert regions.labels.tolist() == [[[-1, 0], [1, 1]]]
+    status, out, _ = run(capsys, "pack", "masks", folder, "-o", pack, "--unlabelled", 255, *options, "--json")
+    document = json.loads(out)
+    assert (document["views"], document["text_space"], document["normalised"]) == (1, "open_clip:ViT-B-16", True)
+    assert (document["sizes"], document["warnings"]) == (["1 levels of 2x2"], [])
+
+
+def test_masks_that_do_not_fit_write_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    np.save(tmp_path / "a.npy", np.eye(2, 5, dtype=np.float16))
+    (tmp_path / "a.json").write_text("[]", encoding="utf-8")
+    for pack, message in ((tmp_path / "p.safetensors", "2 masks, one a vector"), (tmp_path / "a.json", "the inputs")):
+        status, out, err = run(capsys, "pack", "masks", tmp_path, "-o", pack)
+        assert (status, out) == (2, "")
+        assert_one_line(err)
+        assert message in err
+    assert not (tmp_path / "p.safetensors").exists()
+    for value in ("-1", "65536", "x", "1" * 5000):
+        status, out, err = run(capsys, "pack", "masks", tmp_path, "-o", "p.safetensors", f"--unlabelled={value}")
+        assert (status, out) == (2, "")
+        assert "a whole number from 0 to 65535" in err
