@@ -29,30 +29,32 @@ def layered(masks: Sequence[np.ndarray], where: str) -> np.ndarray:
     Raises:
         InvalidFeatures: they take more than MAX_LEVELS levels.
     """
-    boxes = [_box(mask) for mask in masks]
-    areas = [int(np.count_nonzero(mask)) for mask in masks]
-    levels = [np.full(masks[0].shape, NO_LABEL, np.int32)]
+    boxes, areas = zip(*map(_extent, masks), strict=True)
+    # Room for all levels that there may be: pages of those that are never written take no memory.
+    labels = np.empty((min(MAX_LEVELS, len(masks)), *masks[0].shape), np.int32)
+    labels[0] = NO_LABEL
+    used = 1
     for number in sorted(range(len(masks)), key=lambda number: -areas[number]):
         if not areas[number]:
-            continue
-        inside = masks[number][boxes[number]]
-        windows = (level[boxes[number]] for level in levels)
-        window = next((window for window in windows if not ((window != NO_LABEL) & inside).any()), None)
-        if window is None:
-            if len(levels) == MAX_LEVELS:
-                raise _too_many(masks, where)
-            levels.append(np.full_like(levels[0], NO_LABEL))
-            window = levels[-1][boxes[number]]
-        window[inside] = number
-    return np.stack(levels)
+            break
+        inside, windows = masks[number][boxes[number]], labels[:, *boxes[number]]
+        level = next((k for k in range(used) if not ((windows[k] != NO_LABEL) & inside).any()), used)
+        if level == MAX_LEVELS:
+            raise _too_many(masks, where)
+        if level == used:
+            labels[level] = NO_LABEL
+            used += 1
+        windows[level][inside] = number
+    return labels[:used]
 
 
-def _box(mask: np.ndarray) -> tuple[slice, slice]:
-    """The rows and columns of a mask's pixels; all of them where it has none."""
+def _extent(mask: np.ndarray) -> tuple[tuple[slice, slice], int]:
+    """The rows and columns between which a mask's pixels lie, and how many it has."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     if not len(rows):
-        return slice(None), slice(None)
-    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
+        return (slice(0), slice(0)), 0
+    box = slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
+    return box, int(np.count_nonzero(mask[box]))
 
 
 def _too_many(masks: Sequence[np.ndarray], where: str) -> InvalidFeatures:
