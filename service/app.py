@@ -26,7 +26,7 @@ from service.parts import Parts
 from service.queries.warm import QueryLimits, WarmWorker
 from service.readiness import Readiness
 from service.recorder import RecordedApp
-from service.routes import assets, jobs, lifts, operations, queries, tradeoffs
+from service.routes import assets, jobs, lifts, operations, queries, reference, tradeoffs
 from service.settings import ServiceSettings
 from service.stopping import RefuseWork, Stopping
 from service.store.garbage import Collector
@@ -71,6 +71,8 @@ def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, work
         description="Lift 2D features onto trained splat scenes and query them in words.",
         lifespan=lifespan,
         responses=problems.RESPONSES,
+        docs_url=None,  # FastAPI's own pages load their scripts from other hosts
+        redoc_url=None,
         redirect_slashes=False,
     )
     app.state.stopping, app.state.metrics = stopping, metrics
@@ -79,6 +81,7 @@ def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, work
     app.add_middleware(RefuseWork, stopping=stopping)
     app.add_middleware(Gate, keys=store.keys, settings=settings)  # outside of it: no body of a stranger is read
     problems.install(app)
+    app.include_router(reference.router)
     app.include_router(operations.router)  # probes and links to the page may carry what they like
     for module in (assets, jobs, lifts, tradeoffs, queries):
         app.include_router(module.router, dependencies=[KnownParameters])

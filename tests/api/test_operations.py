@@ -372,3 +372,12 @@ def test_log_of_a_server_is_json_lines_and_holds_no_secret(tmp_path: Path, table
     wanted = {"method", "route", "path", "status", "seconds", "received", "sent"}
     assert all(wanted <= line.keys() for line in access)
     assert access[-1]["received"] == len(b"the-secret") and access[-1]["sent"] > 0
+
+
+def test_routes_are_described_without_another_host(client: TestClient) -> None:
+    page = client.get("/docs").text
+    asked = re.findall(r"(?:src|href|url)[=:]\s*['\"]([^'\"]+)", page)
+    assert {"openapi.json", "docs/swagger-ui-bundle.js", "docs/swagger-ui.css"} <= set(asked)
+    assert all(client.get(f"/{address}").status_code == 200 for address in asked if address != "data:,")
+    assert "//" not in page.replace("<!-- ", "").split("<script>")[0]
+    assert client.get("/redoc").status_code == 404
