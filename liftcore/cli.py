@@ -11,7 +11,7 @@ import importlib
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from liftcore import __version__
 from liftcore.errors import SplatliftError
@@ -35,6 +35,22 @@ INTERRUPTED = 130
 
 class _Parser(argparse.ArgumentParser):
     """Argument errors are bad input like any other: one line, exit 2."""
+
+    last = ""  # the argument that may be left out, and then come after options
+
+    def parse_known_args(  # pyright: ignore[reportIncompatibleMethodOverride]: it has overloads
+        self, args: Any = None, namespace: Any = None
+    ) -> tuple[Any, list[str]]:
+        """Parse, with the last argument wherever it stands: argparse gives it up where an option comes before it."""
+        options, rest = super().parse_known_args(args, namespace)
+        if not self.last or not rest or (rest[0].startswith("-") and rest[0] != "--"):
+            return options, rest
+        words = rest[1:] if rest[0] == "--" else rest
+        if words and getattr(options, self.last) is None:
+            setattr(options, self.last, words.pop(0))
+        if words:
+            self.error(f"unrecognized arguments: {' '.join(words)}; a text of several words is one, in quotes")
+        return options, []
 
     def error(self, message: str) -> NoReturn:
         self.exit(BAD_INPUT, f"{self.prog}: {' '.join(message.split())}; see '{self.prog} --help'\n")
@@ -166,16 +182,17 @@ def _add_tradeoff(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--threads", type=_count, metavar="N", help="else as many as there are cores")
 
 
-def _add_query(parser: argparse.ArgumentParser) -> None:
+def _add_query(parser: _Parser) -> None:
+    parser.last = "text"
     parser.add_argument("lift", type=Path, help="a lift (.safetensors)")
-    parser.add_argument("text", nargs="?", help="the words to look for; may be left out beside --like")
+    parser.add_argument("text", nargs="?", help="what to look for, in quotes; may be left out beside --like")
     like = "VIEW:x,y (a pixel), region:VIEW:LEVEL:ID, splat:J or a vector FILE.npy; may be given several times"
     parser.add_argument("--like", action="append", default=[], metavar="EXAMPLE", help=f"more of this: {like}")
     parser.add_argument("--unlike", action="append", default=[], metavar="EXAMPLE", help="less of that, likewise")
     words = parser.add_mutually_exclusive_group()
     words.add_argument("--table", type=Path, metavar="FILE", help="precomputed text embeddings")
     words.add_argument("--encoder", metavar="NAME", help="minilm, open_clip:MODEL[/PRETRAINED], table:FILE")
-    parser.add_argument("--negative", nargs="+", default=[], metavar="WORD", help="words to compete with")
+    _add_negative(parser, ", so TEXT goes before it")
     methods = "auto, valley, paper, otsu, stability or a number"
     parser.add_argument("--threshold", default="auto", metavar="T", help=methods)
     parser.add_argument("--instances", type=_count, metavar="N", help="how many there are, if you know")
@@ -187,6 +204,11 @@ def _add_query(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--scores", type=Path, metavar="NPY", help="write the scores [P], float32")
     parser.add_argument("--object", type=Path, metavar="PLY", help="write the splats that were found, and no others")
     parser.add_argument("--coloured", type=Path, metavar="PLY", help="write all splats, coloured by their scores")
+
+
+def _add_negative(parser: argparse.ArgumentParser, order: str = "") -> None:
+    competitors = f"texts to compete with: all up to the next option{order}; may be given several times"
+    parser.add_argument("--negative", nargs="+", action="extend", default=[], metavar="WORD", help=competitors)
 
 
 def _add_pack(parser: argparse.ArgumentParser, shared: _Parser) -> None:
@@ -253,7 +275,7 @@ def _add_evaluate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--threshold", default="auto", metavar="T", help="of P2 and P3: auto, valley, paper, otsu, a number"
     )
-    parser.add_argument("--negative", nargs="+", default=[], metavar="WORD", help="words to compete with")
+    _add_negative(parser)
     parser.add_argument("--held-out", type=Path, metavar="FILE", help="the only frames to judge, a name a line")
 
 

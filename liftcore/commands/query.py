@@ -59,6 +59,13 @@ def run(options: argparse.Namespace) -> int:
 def _query(options: argparse.Namespace) -> Query:
     from liftcore.query.query import Query
 
+    if options.text is None and not options.like and options.negative:
+        raise InvalidQuery(
+            "text",
+            expected="what to look for, before --negative",
+            got=f"--negative {' '.join(options.negative)} alone",
+            hint="--negative takes all words up to the next option",
+        )
     return Query(
         positives=(*([options.text] if options.text is not None else []), *_examples(options.like, "--like")),
         negatives=(*options.negative, *_examples(options.unlike, "--unlike")),

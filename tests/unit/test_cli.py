@@ -151,6 +151,40 @@ def test_output_is_never_an_input_or_a_folder(scene: Path, capsys: pytest.Captur
         assert message in err
 
 
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["L", "--table", "w", "a mug"],
+        ["--table", "w", "L", "a mug"],
+        ["--like", "e.npy", "L", "--view", "v", "a mug"],
+        ["L", "--view", "v", "a mug", "--negative", "cat", "dog", "--table", "w", "--negative", "cow"],
+        ["L", "--view", "v", "--", "a mug"],
+    ],
+)
+def test_the_text_of_a_query_stands_before_between_or_after_options(arguments: list[str]) -> None:
+    options = cli.build_parser().parse_args(["query", *arguments])
+    assert (str(options.lift), options.text) == ("L", "a mug")
+    assert options.negative == (["cat", "dog", "cow"] if "--negative" in arguments else [])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["L", "red", "mug"], "arguments: mug; a text of several words is one, in quotes"),
+        (["L", "--view", "v", "red", "mug"], "arguments: mug; a text of several words is one, in quotes"),
+        (["L", "--vieuw", "v", "mug"], "arguments: --vieuw v"),
+        (["L", "--negative", "cat", "mug"], "expected what to look for, before --negative, got --negative cat mug"),
+    ],
+)
+def test_words_that_a_query_has_no_place_for_are_told(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    status, out, err = run(capsys, "query", *arguments)
+    assert (status, out) == (2, "")
+    assert message in err
+    assert_one_line(err)
+
+
 def test_picture_without_a_view_is_refused(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
     status, _, err = run(capsys, "query", scene / "l", "cat", "--mask", scene / "m.png")
     assert status == 2
