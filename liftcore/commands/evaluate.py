@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 from liftcore.commands.bars import progress_bars
 from liftcore.commands.reply import reply
-from liftcore.errors import InvalidInput, InvalidQuery
+from liftcore.commands.text_encoder import encoder_spec
+from liftcore.errors import InvalidInput
 
 if TYPE_CHECKING:
     import argparse
@@ -17,7 +18,6 @@ if TYPE_CHECKING:
     from liftcore.measure.protocols import EvaluationProtocol, LabelledScene
     from liftcore.measure.protocols.evaluation import EvaluationSettings, SceneResult
     from liftcore.measure.published import Published
-    from liftcore.query.scene import QueryScene
 
 _LIFT_SUFFIX = ".safetensors"
 _IOUS = {"object_micro": "mIoU, objects", "frame_macro": "mIoU, frames", "class_pooled": "IoU, classes"}
@@ -43,7 +43,7 @@ def run(options: argparse.Namespace) -> int:
     with progress_bars() as progress:
         for name, path in lifts.items():
             scene = QueryScene.open(path)
-            encoder = open_encoder(_encoder(options, scene))
+            encoder = open_encoder(encoder_spec(options, scene.lift.metadata.text_space))
             found, said = evaluate_scene(scenes[name], scene, encoder, settings, progress)
             results += found
             warnings += said
@@ -121,16 +121,6 @@ def _names(path: Path) -> frozenset[str]:
     if not names:
         raise InvalidInput("--held-out", expected="a file of view names, one a line", got=f"none in {path}")
     return names
-
-
-def _encoder(options: argparse.Namespace, scene: QueryScene) -> str:
-    if options.table:
-        return f"table:{options.table}"
-    spec = options.encoder or scene.lift.metadata.text_space
-    if spec in ("", "none"):
-        got = "neither, and the lift does not name its text space"
-        raise InvalidQuery("encoder", expected="--table FILE or --encoder NAME", got=got)
-    return spec
 
 
 def _document(

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from liftcore.commands.reply import free_output, reply, writing
+from liftcore.commands.text_encoder import encoder_spec
 from liftcore.errors import InvalidQuery
 from liftcore.files import whole_file
 
@@ -88,16 +89,7 @@ def _examples(notations: list[str], argument: str) -> list[Example]:
 def _encoder(options: argparse.Namespace, scene: QueryScene) -> TextEncoder:
     from liftcore.query.encoders import open_encoder
 
-    space = scene.lift.metadata.text_space
-    spec = f"table:{options.table}" if options.table else options.encoder or space
-    if spec in ("", "none"):
-        raise InvalidQuery(
-            "encoder",
-            expected="--table FILE or --encoder NAME",
-            got="neither, and the lift does not name its text space",
-            hint="or ask by example, with --like",
-        )
-    return open_encoder(spec)
+    return open_encoder(encoder_spec(options, scene.lift.metadata.text_space, hint="or ask by example, with --like"))
 
 
 def _threshold(text: str) -> str | float:

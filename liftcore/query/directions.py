@@ -60,10 +60,11 @@ def _encode(scene: QueryScene, query: Query, encoder: TextEncoder | None) -> dic
     texts = {place: term for place, term in enumerate(query.terms) if isinstance(term, str)}
     if not texts:
         return {}
-    space = scene.lift.metadata.text_space or "none"
+    space = scene.lift.metadata.text_space or "not named"
     if encoder is None:
+        expected = f"a text encoder (the lift's text space: {space})"
         hint = "name a text encoder of the lift's space, or ask by example"
-        raise InvalidQuery("encoder", expected=f"one for the text space {space}", got="none", hint=hint)
+        raise InvalidQuery("encoder", expected=expected, got="no encoder", hint=hint)
     if encoder.channels != scene.channels:
         raise InvalidQuery(
             "encoder",

@@ -7,6 +7,7 @@ import os
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,7 +15,7 @@ import pytest
 import torch
 
 from liftcore import cli
-from liftcore.artifact import load_lift
+from liftcore.artifact import load_lift, save_lift
 from liftcore.commands import bars, reply
 from liftcore.commands.lift import pairs_of
 from liftcore.errors import InvalidSettings, SplatliftError
@@ -182,6 +183,20 @@ def test_words_that_a_query_has_no_place_for_are_told(
     status, out, err = run(capsys, "query", *arguments)
     assert (status, out) == (2, "")
     assert message in err
+    assert_one_line(err)
+
+
+@pytest.mark.parametrize(("space", "told"), [("none", "text space is 'none': its"), ("", "text space is not named")])
+def test_words_to_a_lift_without_a_text_encoder_are_refused_with_its_text_space(
+    space: str, told: str, scene: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(capsys, *lift_arguments(scene))[0] == 0
+    lift = load_lift(scene / "lift.safetensors")
+    lift = replace(lift, metadata=lift.metadata.model_copy(update={"text_space": space}))
+    save_lift(lift, scene / "other.safetensors")
+    status, out, err = run(capsys, "query", scene / "other.safetensors", "mug")
+    assert (status, out) == (2, "")
+    assert told in err and "--like" in err
     assert_one_line(err)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
+from liftcore.artifact import load_lift, save_lift
 from tests.labelled_scene import FRAMES, LIFTED, isat, rectangle, write_3d_ovs_labels, write_lerf_labels, write_lift
 
 from .command_line import run
@@ -161,6 +163,18 @@ def test_what_cannot_be_judged_exits_2_with_one_line(
     status, out, err = run(capsys, "evaluate", "lerf-ovs", *given, "--data", folder / "lerf_ovs")
     assert (status, out) == (2, "")
     assert message in err and err.count("\n") == 1
+
+
+@pytest.mark.parametrize(("space", "told"), [("none", "text space is 'none'"), ("", "text space is not named")])
+def test_a_lift_without_a_text_encoder_is_refused_with_its_text_space(
+    space: str, told: str, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lift = load_lift(folder / "kitchen.lift.safetensors")
+    lift = replace(lift, metadata=lift.metadata.model_copy(update={"text_space": space}))
+    save_lift(lift, tmp_path / "kitchen.lift.safetensors")
+    status, out, err = run(capsys, "evaluate", "lerf-ovs", tmp_path, "--data", folder / "lerf_ovs")
+    assert (status, out) == (2, "")
+    assert told in err and "--table FILE or --encoder NAME" in err and err.count("\n") == 1
 
 
 def test_a_category_that_the_table_lacks_is_named(

@@ -108,6 +108,16 @@ def test_an_encoder_of_another_space_is_refused_with_both_named(lift_file: Path)
         ask(QueryScene.open(lift_file), "x", Axes(5))
 
 
+@pytest.mark.parametrize(("space", "told"), [("", "not named"), ("none", "none"), ("axes", "axes")])
+def test_words_without_an_encoder_are_refused_with_the_lifts_text_space(
+    space: str, told: str, lift_file: Path
+) -> None:
+    lift = load_lift(lift_file)
+    lift = replace(lift, metadata=lift.metadata.model_copy(update={"text_space": space}))
+    with pytest.raises(InvalidQuery, match=rf"text space: {told}\), got no encoder"):
+        ask(QueryScene(lift, lift_file), "x")
+
+
 def test_a_look_is_the_scores_rendered_and_cut(lift_file: Path) -> None:
     scene = QueryScene.open(lift_file)
     answer = ask(scene, Query(("x",), threshold=0.4), Axes())
