@@ -20,6 +20,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 
 from liftcore.errors import InvalidQuery
@@ -84,7 +85,8 @@ def find_threshold(
     Args:
         scores: [n] f32, finite.
         method: one of ``METHODS``, or a number to use as it is.
-        weights: [n] f32, how much each score counts, at least zero; None = equally.
+        weights: [n] f32, how much each score counts, at least zero: the evidence of splats; None = equally, as the
+            pixels of a view do.
         instances: how many things the user says there are: the valley is then the one below as many hills, counted
             from the top. With it ``auto`` takes the valley. Only the user can know it; None = not said.
 
@@ -103,7 +105,15 @@ def find_threshold(
     if histogram is None:
         return Threshold(low, method, f"All scores are {low:.4g}: the histogram has no valley.")
     value, explanation = _METHODS[method](histogram) if instances is None else valley(histogram, instances)
-    return Threshold(min(max(value, low), high), method, explanation)
+    value = min(max(value, low), high)
+    share = f"{_share_above(histogram, value):.1%} of the {'pixels' if weights is None else 'evidence'}"
+    return Threshold(value, method, f"{explanation.removesuffix('.')}; {share} at or above {value:.4g}.")
+
+
+def _share_above(histogram: Histogram, value: float) -> float:
+    """The share of the mass at or above a value, as if it lay evenly in each bin."""
+    above = np.append(histogram.above(), 0.0)
+    return float(np.interp((value - histogram.low) / histogram.width, np.arange(len(above)), above))
 
 
 _METHODS: dict[str, Callable[[Histogram], tuple[float, str]]] = {

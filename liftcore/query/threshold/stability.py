@@ -40,5 +40,4 @@ def stability(histogram: Histogram) -> tuple[float, str]:
     run = min(stretches, key=lambda run: float(slopes[run].mean()))
     first, last = (histogram.edge((place + 1) * every) for place in (run[0], run[-1]))
     value = (first + last) / 2
-    share = histogram.above()[(run[0] + run[-1] + 2) * every // 2]
-    return value, f"The share found is stable from {first:.4g} to {last:.4g}; {share:.1%} lies above the middle."
+    return value, f"The share found is stable from {first:.4g} to {last:.4g}, and its middle is taken."

@@ -39,8 +39,8 @@ def steady(histogram: Histogram) -> tuple[float, str]:
     assert run is not None
     place = sum(run) // 2
     value = histogram.edge(place + 0.5)
-    found = f"The share found changes least, in log-odds, around {value:.4g}; {above[place]:.1%} lies above"
+    found = f"The share found changes least, in log-odds, around {value:.4g}"
     if density[place] < density[place:].max():
         return value, f"{found}."
     # Over one hill the log-odds are steadiest near its middle, which means nothing.
-    return value, f"{found}, but no hill of the histogram does: take it with care, or name a threshold."
+    return value, f"{found}, but no hill of the histogram lies above it: take it with care, or name a threshold."

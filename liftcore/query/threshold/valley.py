@@ -27,12 +27,12 @@ def valley(histogram: Histogram, instances: int = 1) -> tuple[float, str]:
     if not hills:
         return stand_in(histogram, "no hill with a valley before it")
     peak, place = hills[-1]
-    value, above = histogram.edge(place), histogram.above()[place]
+    value = histogram.edge(place)
     which = "first hill" if instances == 1 else f"hill {len(hills)}"
     lack = "" if len(hills) == instances else f" (there are no {instances})"
     return value, (
         f"From the top down, the histogram's {which}{lack} lies at {histogram.edge(peak):.4g} and the valley "
-        f"before it at {value:.4g}; {above:.1%} lies above."
+        f"before it at {value:.4g}."
     )
 
 

@@ -129,6 +129,18 @@ def test_weights_count_like_repeated_scores() -> None:
         assert weighted == pytest.approx(find_threshold(repeated, method).value, abs=2e-3)
 
 
+@pytest.mark.parametrize("method", SEARCHED)
+def test_the_share_above_is_told_as_one_of_the_evidence_or_of_the_pixels(method: str) -> None:
+    scores = hills((0.2, 0.01, 9000), (0.3, 0.01, 1000))
+    weights = torch.where(scores > 0.25, 1.0, 9.0)  # a tenth of the scores is an eighty-second of the weight
+    assert f"; 10.0% of the pixels at or above {find_threshold(scores, method).value:.4g}." in told(scores, method)
+    assert "; 1.2% of the evidence at or above 0.2" in told(scores, method, weights)
+
+
+def told(scores: torch.Tensor, method: str, weights: torch.Tensor | None = None) -> str:
+    return find_threshold(scores, method, weights).explanation
+
+
 SCORES = hnp.arrays(np.float32, st.integers(1, 300), elements=st.floats(-1, 1, width=32, allow_subnormal=False))
 
 
