@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import json
 import math
+import os
 import signal
 import socket
 import sys
@@ -14,6 +16,7 @@ from typing import Any
 import uvicorn
 from fastapi import FastAPI
 from pydantic import ValidationError
+from pydantic_settings import SettingsError
 
 from liftcore.errors import SplatliftError
 from service.app import assemble, pace_of
@@ -21,6 +24,7 @@ from service.connection import watched
 from service.errors import Misconfigured
 from service.keys.hosts import is_loopback
 from service.logs import start_logging
+from service.queries.encoder_files import require_encoder_files
 from service.settings import ServiceSettings
 from service.stopping import Stopping
 from service.store.keys import any_key
@@ -79,10 +83,22 @@ def parse(arguments: Sequence[str]) -> ServiceSettings:
         given["text_spaces"] = {name: spec for name, _, spec in pairs}
     try:
         return ServiceSettings(**given)
+    except SettingsError as error:  # of a variable that is to hold JSON, and does not
+        raise _no_json(error) from None
     except ValidationError as error:
         first = error.errors()[0]
         name = ".".join(str(part) for part in first["loc"])
         raise Misconfigured(name, expected=first["msg"].lower(), got=repr(first["input"])) from None
+
+
+def _no_json(error: SettingsError) -> Misconfigured:
+    field = next((name for name in ServiceSettings.model_fields if f'"{name}"' in str(error)), "settings")
+    variable = f"SPLATLIFT_{field.upper()}"
+    example = json.dumps({"NAME": "table:FILE"})
+    return Misconfigured(
+        variable, expected="JSON", got=repr(os.environ.get(variable, "something else"))[:120],
+        hint=f"a JSON object looks like '{example}'",
+    )  # fmt: skip
 
 
 def require_keys(settings: ServiceSettings) -> None:
@@ -131,6 +147,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         settings = parse(sys.argv[1:] if arguments is None else arguments)
         require_keys(settings)
+        require_encoder_files(settings)
         listener = bind(settings.host, settings.port)
         try:
             store = Store.open(settings.data, floor_bytes=settings.disk_floor_bytes)

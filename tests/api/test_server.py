@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import socket
 import subprocess
@@ -13,7 +14,9 @@ from pathlib import Path
 from typing import IO
 
 import httpx
+import numpy as np
 import pytest
+from safetensors.numpy import save
 
 from service.__main__ import main, parse
 from service.errors import InvalidRequest
@@ -89,6 +92,52 @@ def test_binding_beyond_loopback_is_refused(host: str, tmp_path: Path, capsys: p
 def test_bad_settings_are_one_line(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(arguments) == 2
     assert capsys.readouterr().err.count("\n") == 1
+
+
+@pytest.mark.parametrize("command", ["service", "service.keys"])
+def test_a_variable_that_is_no_json_is_one_line(command: str, tmp_path: Path) -> None:
+    arguments = ["list", "--data", str(tmp_path)] if command == "service.keys" else ["--data", str(tmp_path)]
+    result = subprocess.run(
+        [sys.executable, "-m", command, *arguments], cwd=ROOT, capture_output=True, text=True, check=False,
+        timeout=120, env=os.environ | {"SPLATLIFT_TEXT_SPACES": "{bad"},
+    )  # fmt: skip
+    assert (result.returncode, result.stdout) == (2, "")
+    assert "SPLATLIFT_TEXT_SPACES: expected JSON, got '{bad'" in result.stderr
+    assert result.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        (None, "No such file"),
+        (b"", "an empty file"),
+        (b"PK\x03\x04 and a zip", "pickle or a zip"),
+        (save({"rows": np.eye(2)}), "embeddings"),
+        (save({"embeddings": np.eye(2)}), "no words"),
+        (save({"embeddings": np.eye(2)}, {"words": "[1"}), "in "),
+        (save({"embeddings": np.eye(2)}, {"words": '["cat"]'}), "1 words and embeddings [2, 2]"),
+    ],
+)
+@pytest.mark.parametrize("setting", ["--encoder", "--text-space"])
+def test_a_text_table_that_is_none_is_told_at_the_start(
+    setting: str, content: bytes | None, told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    table = tmp_path / "words.safetensors"
+    if content is not None:
+        table.write_bytes(content)
+    spec = {"--encoder": f"table:{table}", "--text-space": f"clip=table:{table}"}[setting]
+    assert main([setting, spec, "--data", str(tmp_path / "data"), "--port", "0"]) == 2
+    said = capsys.readouterr().err
+    name = "encoder" if setting == "--encoder" else "text_spaces, 'clip'"
+    assert said.startswith(f"splatlift: {name}: expected ") and told in said and str(table) in said
+    assert said.count("\n") == 1
+    assert not (tmp_path / "data").exists()
+
+
+def test_weights_that_are_not_there_are_told_at_the_start(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["--encoder", f"open_clip:RN50@{tmp_path / 'w.pt'}", "--data", str(tmp_path / "data")]
+    assert main(arguments) == 2
+    assert "w.pt (No such file" in capsys.readouterr().err
 
 
 def test_settings_come_from_the_environment_and_the_command_line_wins(
