@@ -45,12 +45,21 @@ def choose(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     best = by_name[front[-1]]
     floor = _value(best, accuracy) - WITHIN * abs(_value(best, accuracy))
     taken = by_name[next(name for name in front if _value(by_name[name], accuracy) >= floor)]
-    why = (
-        f"{taken['name']} is the fastest whose {NAMES[accuracy]} ({_value(taken, accuracy):.4f}) is "
-        f"within {WITHIN:.0%} of the best ({best['name']}, {_value(best, accuracy):.4f}): {taken['cpu_s']:.2f} s "
-        f"of processor time against {best['cpu_s']:.2f} s"
-    )
+    why = _why(taken, best, accuracy)
     return {"name": taken["name"], "options": taken["options"], "accuracy": accuracy, "front": front, "why": why}
+
+
+def _why(taken: Mapping[str, Any], best: Mapping[str, Any], accuracy: str) -> str:
+    figure, value, seconds = NAMES[accuracy], f"{_value(taken, accuracy):.4f}", f"{taken['cpu_s']:.2f} s"
+    if taken is best:
+        return (
+            f"{taken['name']} has the best {figure} ({value}), and none within {WITHIN:.0%} of it takes less than "
+            f"its {seconds} of processor time"
+        )
+    return (
+        f"{taken['name']} is the fastest whose {figure} ({value}) is within {WITHIN:.0%} of the best "
+        f"({best['name']}, {_value(best, accuracy):.4f}): {seconds} of processor time against {best['cpu_s']:.2f} s"
+    )
 
 
 def _value(run: Mapping[str, Any], accuracy: str) -> float:
