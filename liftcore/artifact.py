@@ -67,7 +67,7 @@ class Lift:
     cluster_features: Tensor | None = None  # [K, F] like features; a zero row: its splats keep their own
 
 
-def save_lift(lift: Lift, path: Path) -> None:
+def save_lift(lift: Lift, path: Path | str) -> None:
     """Write the lift whole or not at all (temporary file, fsync, rename), with no copy of X in memory."""
     from liftcore.safetensors_header import safetensors_header, tensor_bytes
 
@@ -75,7 +75,7 @@ def save_lift(lift: Lift, path: Path) -> None:
     tensors = {name: getattr(lift, name) for name in present}
     specs = [(name, tensor.dtype, tuple(tensor.shape)) for name, tensor in tensors.items()]
     header, offsets = safetensors_header(specs, {"splatlift": lift.metadata.model_dump_json()})
-    with whole_file(path) as handle:
+    with whole_file(Path(path)) as handle:
         handle.write(header)
         for name, offset in offsets.items():
             handle.seek(len(header) + offset)

@@ -25,6 +25,7 @@ EXPERIMENTS = (
 )  # fmt: skip
 
 PRESETS = "row-sum, tikhonov (default), argmax, top-k, front-mass, centre or mean"
+THRESHOLDS = "auto, valley, paper, otsu, stability or a number"
 
 LARGEST_GREY = 65_535  # of a picture of 16 bits
 
@@ -193,8 +194,7 @@ def _add_query(parser: _Parser) -> None:
     words.add_argument("--table", type=Path, metavar="FILE", help="precomputed text embeddings")
     words.add_argument("--encoder", metavar="NAME", help="minilm, open_clip:MODEL[/PRETRAINED], table:FILE")
     _add_negative(parser, ", so TEXT goes before it")
-    methods = "auto, valley, paper, otsu, stability or a number"
-    parser.add_argument("--threshold", default="auto", metavar="T", help=methods)
+    parser.add_argument("--threshold", default="auto", metavar="T", help=THRESHOLDS)
     parser.add_argument("--instances", type=_count, metavar="N", help="how many there are, if you know")
     parser.add_argument("--keep", choices=("all", "largest"), default="all", help="components of the mask")
     parser.add_argument("--top", type=_count, default=0, metavar="N", help="name the best N splats")
@@ -259,7 +259,7 @@ def _add_encode(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_inspect(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("file", type=Path, help="splats, cameras, features, a lift or a text table")
+    parser.add_argument("file", type=Path, help="splats, cameras, features, a lift, masks or a text table")
 
 
 def _add_evaluate(parser: argparse.ArgumentParser) -> None:
@@ -272,9 +272,7 @@ def _add_evaluate(parser: argparse.ArgumentParser) -> None:
     words.add_argument("--table", type=Path, metavar="FILE", help="precomputed text embeddings")
     words.add_argument("--encoder", metavar="NAME", help="else the one that the lift's text space names")
     parser.add_argument("--protocol", nargs="+", choices=("P1", "P2", "P3"), help="else all three")
-    parser.add_argument(
-        "--threshold", default="auto", metavar="T", help="of P2 and P3: auto, valley, paper, otsu, a number"
-    )
+    parser.add_argument("--threshold", default="auto", metavar="T", help=f"of P2 and P3: {THRESHOLDS}")
     _add_negative(parser)
     parser.add_argument("--held-out", type=Path, metavar="FILE", help="the only frames to judge, a name a line")
 

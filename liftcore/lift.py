@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -11,6 +12,7 @@ import torch
 from liftcore import __version__
 from liftcore.artifact import Lift, LiftMetadata
 from liftcore.device import Device, choose_device, within_memory
+from liftcore.errors import InvalidFeatures
 from liftcore.input_files import input_file
 from liftcore.observe.pack import FeaturePacks, open_packs, pair
 from liftcore.plan.plan import plan_lift
@@ -38,7 +40,6 @@ from liftcore.warm_up import warm_up_lift
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from pathlib import Path
 
     from liftcore.artifact import InputFile
     from liftcore.plan.plan import Plan
@@ -74,9 +75,9 @@ class Run:
 
 
 def lift(
-    splats: Path,
-    cameras: Path,
-    features: Sequence[Path],
+    splats: Path | str,
+    cameras: Path | str,
+    features: Sequence[Path | str],
     settings: LiftSettings,
     *,
     threads: int | None = None,
@@ -86,21 +87,25 @@ def lift(
     """Lift the features of the packs onto the splats.
 
     Args:
-        splats: a PLY of any dialect. cameras: COLMAP, transforms.json or cameras.json. features: feature packs.
+        splats: a PLY of any dialect. cameras: COLMAP, transforms.json or cameras.json. features: feature packs, a
+            list of one or more.
         threads: None takes the cores that this process may use. The number changes no bit of the result.
         progress: told of every view and slice; an exception from it stops the work.
         checkpoint: keeps walked views on the disk; the same lift goes on from there, identical to the bit.
 
     Raises:
-        InvalidInput: a file is malformed, or the packs do not fit the cameras.
+        InvalidInput: a file is malformed, the packs do not fit the cameras, or they are no list.
         InvalidSettings: the splats' kernel has no opacity compensation, and the settings ask for it.
         Unavailable: neither memory nor disk can hold what the lift needs, or there is no such device as asked for.
     """
+    if isinstance(features, str | Path):  # a text is a sequence too, of letters
+        raise InvalidFeatures("features", expected="a list of feature packs", got=f"{str(features)!r} alone")
+    scene, views, *packs = (Path(path) for path in (splats, cameras, *features))
     run = Run(settings, threads, progress, Timings(), choose_device(settings.device))
     with run.timings.stage("read"):
-        sources = open_sources(splats, cameras, features, settings)
+        sources = open_sources(scene, views, packs, settings)
     with run.timings.stage("digest"):
-        inputs = [input_file(path) for path in (splats, cameras, *features)]
+        inputs = [input_file(path) for path in (scene, views, *packs)]
     return lift_sources(run, sources, inputs, checkpoint)
 
 

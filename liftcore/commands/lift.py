@@ -50,29 +50,53 @@ def settings_of(options: argparse.Namespace) -> LiftSettings:
     """Settings of ``--preset``, ``--speed``, ``--device`` and ``--set key=value``.
 
     Raises:
-        InvalidSettings: a pair without ``=``, an unknown name or a value out of range.
+        InvalidSettings: a pair without ``=``, an unknown name, one with two values or a value out of range.
     """
     named = {"preset": options.preset, "speed": options.speed, "device": options.device}
-    given = {name: value for name, value in named.items() if value is not None}
-    return LiftSettings.of(**{**given, **pairs_of(options.set)})
+    values = pairs_of(options.set)
+    for name, value in named.items():
+        if value is not None and values.setdefault(name, value) != value:
+            raise _contradiction(name, f"--{name} {value}", f"--set {name}={values[name]}")
+    return LiftSettings.of(**values)
 
 
 def pairs_of(pairs: Sequence[str]) -> dict[str, Any]:
     """Names and values of ``key=value``; a value is JSON, or else a word.
 
     Raises:
-        InvalidSettings: a pair without ``=``.
+        InvalidSettings: a pair without ``=``, an unknown name or one with two values.
     """
     values: dict[str, Any] = {}
     for pair in pairs:
         key, equals, text = pair.partition("=")
         if not equals or not key:
             raise InvalidSettings("--set", expected="key=value", got=repr(pair))
-        try:
-            values[key] = json.loads(text)
-        except (ValueError, RecursionError):
-            values[key] = text
+        if key not in LiftSettings.model_fields:
+            raise _unknown(key)
+        value = _value(text)
+        if values.setdefault(key, value) != value:
+            raise _contradiction(key, f"--set {key}={values[key]}", f"--set {pair}")
     return values
+
+
+def _value(text: str) -> Any:
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError):
+        return text
+
+
+def _unknown(name: str) -> InvalidSettings:
+    from rapidfuzz import process
+
+    near = process.extract(name.replace("-", "_"), list(LiftSettings.model_fields), limit=3)
+    hint = f"nearest: {', '.join(known for known, _, _ in near)}"
+    return InvalidSettings("--set", expected="a setting of a lift", got=f"the unknown {name[:80]!r}", hint=hint)
+
+
+def _contradiction(name: str, one: str, other: str) -> InvalidSettings:
+    hint = "leave one of them out"
+    return InvalidSettings(name, expected="one value", got=f"{one} and {other}"[:200], hint=hint)
 
 
 def plan_of(options: argparse.Namespace, settings: LiftSettings) -> Plan:

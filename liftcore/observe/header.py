@@ -30,7 +30,8 @@ def check_header(path: Path, name: str, fault: type[InvalidInput], *, expected: 
         with path.open("rb") as handle:
             start = handle.read(_START)
     except OSError as error:
-        raise fault(name, expected=expected, got=f"a file that does not open ({error.strerror})") from None
+        got = "a folder" if path.is_dir() else f"a file that does not open ({error.strerror})"
+        raise fault(name, expected=expected, got=got, hint=hint) from None
     length = struct.unpack("<Q", start[:8])[0] if len(start) == _START else 0
     # A header may be as long as such a signature reads as a number: 640 bytes are b"\x80\x02". Then it is JSON.
     signed = start[:2] in (b"PK", b"\x80\x02") and not (start[8:] == b"{" and length <= MAX_HEADER_BYTES)

@@ -210,7 +210,7 @@ def describe_table(path: Path) -> dict[str, Any]:
         "rows": len(embeddings),
         "channels": embeddings.shape[-1],
         "encoder": metadata.get("encoder", metadata.get("model", "")),
-        "words": words[:20],
+        "words": words,
         "norms": _ends(norms),
         "warnings": warnings,
     }

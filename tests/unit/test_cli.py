@@ -7,27 +7,23 @@ import os
 import re
 import subprocess
 import sys
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import save_file
 
 from liftcore import cli
-from liftcore.artifact import load_lift, save_lift
+from liftcore.artifact import load_lift
 from liftcore.commands import bars, reply
 from liftcore.commands.lift import pairs_of
-from liftcore.errors import InvalidSettings, SplatliftError
-from liftcore.observe.observation import RegionMap
-from liftcore.observe.write_pack import write_pack
-from liftcore.scene.cameras import Camera, Cameras
-from liftcore.scene.inria import write_inria_cameras
-from liftcore.scene.ply import read_splats, write_splats
-from liftcore.scene.splats import Splats
+from liftcore.errors import InvalidFeatures, InvalidSettings, SplatliftError
+from liftcore.lift import lift
+from liftcore.query.threshold import METHODS
 from liftcore.solve.settings import LiftSettings, Preset
 
-from .command_line import assert_one_line, run
+from .command_line import assert_one_line, lift_arguments, run, write_toy_scene
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -37,33 +33,10 @@ COMMANDS = ["demo", "serve", "lift", "plan", "query", "pack", "encode", "inspect
 
 @pytest.fixture
 def scene(tmp_path: Path) -> Path:
-    """Two splats before one camera, red at its left and green at its right, with a region for each."""
-    splats = Splats(
-        means=torch.tensor([[-0.5, 0.0, 2.0], [0.5, 0.0, 2.0]]),
-        quats=torch.tensor([[1.0, 0, 0, 0]] * 2),
-        log_scales=torch.full((2, 3), -1.5),
-        opacity_logits=torch.full((2,), 4.0),
-        sh=torch.zeros(2, 1, 3),
-    )
-    write_splats(splats, tmp_path / "splats.ply")
-    camera = Camera("front", 32, 16, 16.0, 16.0, 16.0, 8.0, np.eye(4))
-    write_inria_cameras(Cameras((camera,)), tmp_path / "cameras.json")
-    labels = torch.zeros(1, 16, 32, dtype=torch.int32)
-    labels[..., 16:] = 1
-    regions = RegionMap(labels, torch.eye(2, 3))
-    metadata = {"encoder": "toy", "text_space": "none"}
-    write_pack(tmp_path / "pack.safetensors", {"front": regions, "lost": regions}, metadata)
-    return tmp_path
-
-
-def lift_arguments(scene: Path, *more: object) -> list[object]:
-    files = [scene / name for name in ("splats.ply", "cameras.json", "pack.safetensors")]
-    return ["lift", *files, "-o", scene / "lift.safetensors", *more]
+    return write_toy_scene(tmp_path)
 
 
 def test_scene_is_lifted_inspected_and_queried(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from safetensors.torch import save_file
-
     status, out, err = run(capsys, *lift_arguments(scene, "--preset", "row-sum", "--json"))
     assert (status, err) == (0, "")
     document = json.loads(out)
@@ -111,7 +84,13 @@ def test_scene_is_lifted_inspected_and_queried(scene: Path, capsys: pytest.Captu
     [
         (["--preset", "magic"], "preset"),
         (["--set", "power=3"], "power"),
-        (["--set", "nonsense=1"], "nonsense"),
+        (["--set", "nonsense=1"], "--set: expected a setting of a lift, got the unknown 'nonsense'; nearest: "),
+        (["--set", "robust-steps=1"], "nearest: robust_steps"),
+        (["--preset", "row-sum", "--set", "preset=argmax"], "got --preset row-sum and --set preset=argmax"),
+        (
+            ["--set", "stride=2", "--set", "stride=3"],
+            "stride: expected one value, got --set stride=2 and --set stride=3",
+        ),
         (["--set", "power"], "key=value"),
     ],
 )
@@ -144,6 +123,15 @@ def test_bad_input_exits_2_and_leaves_nothing(
     assert sorted(scene.iterdir()) == before
 
 
+def test_a_folder_in_place_of_a_pack_is_told_how_one_is_made(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (scene / "maps").mkdir()
+    arguments = lift_arguments(scene)
+    status, out, err = run(capsys, *arguments[:3], scene / "maps", *arguments[4:])
+    assert (status, out) == (2, "")
+    assert "got a folder; make packs with 'splatlift pack'" in err
+    assert_one_line(err)
+
+
 def test_output_is_never_an_input_or_a_folder(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
     files = [scene / name for name in ("splats.ply", "cameras.json", "pack.safetensors")]
     for out, message in ((scene, "the folder"), (files[0], "another file than the inputs")):
@@ -152,99 +140,19 @@ def test_output_is_never_an_input_or_a_folder(scene: Path, capsys: pytest.Captur
         assert message in err
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ["L", "--table", "w", "a mug"],
-        ["--table", "w", "L", "a mug"],
-        ["--like", "e.npy", "L", "--view", "v", "a mug"],
-        ["L", "--view", "v", "a mug", "--negative", "cat", "dog", "--table", "w", "--negative", "cow"],
-        ["L", "--view", "v", "--", "a mug"],
-    ],
-)
-def test_the_text_of_a_query_stands_before_between_or_after_options(arguments: list[str]) -> None:
-    options = cli.build_parser().parse_args(["query", *arguments])
-    assert (str(options.lift), options.text) == ("L", "a mug")
-    assert options.negative == (["cat", "dog", "cow"] if "--negative" in arguments else [])
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["L", "red", "mug"], "arguments: mug; a text of several words is one, in quotes"),
-        (["L", "--view", "v", "red", "mug"], "arguments: mug; a text of several words is one, in quotes"),
-        (["L", "--vieuw", "v", "mug"], "arguments: --vieuw v"),
-        (["L", "--negative", "cat", "mug"], "expected what to look for, before --negative, got --negative cat mug"),
-    ],
-)
-def test_words_that_a_query_has_no_place_for_are_told(
-    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    status, out, err = run(capsys, "query", *arguments)
-    assert (status, out) == (2, "")
-    assert message in err
-    assert_one_line(err)
-
-
-@pytest.mark.parametrize(("space", "told"), [("none", "text space is 'none': its"), ("", "text space is not named")])
-def test_words_to_a_lift_without_a_text_encoder_are_refused_with_its_text_space(
-    space: str, told: str, scene: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run(capsys, *lift_arguments(scene))[0] == 0
-    lift = load_lift(scene / "lift.safetensors")
-    lift = replace(lift, metadata=lift.metadata.model_copy(update={"text_space": space}))
-    save_lift(lift, scene / "other.safetensors")
-    status, out, err = run(capsys, "query", scene / "other.safetensors", "mug")
-    assert (status, out) == (2, "")
-    assert told in err and "--like" in err
-    assert_one_line(err)
-
-
-def test_picture_without_a_view_is_refused(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    status, _, err = run(capsys, "query", scene / "l", "cat", "--mask", scene / "m.png")
-    assert status == 2
-    assert "no --view" in err
-
-
-def test_what_a_query_found_is_written_as_splats(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(capsys, *lift_arguments(scene))[0] == 0
-    question = ["query", scene / "lift.safetensors", "--like", "splat:1", "--json"]
-    files = {kind: scene / f"{kind}.ply" for kind in ("object", "coloured")}
-    written = [part for kind, path in files.items() for part in (f"--{kind}", path)]
-    status, out, err = run(capsys, *question, "--threshold", "0.5", *written)
-    assert (status, err) == (0, "")
-    assert json.loads(out)["files"] == {kind: str(path) for kind, path in files.items()}
-    whole = read_splats(scene / "splats.ply")
-    assert torch.equal(read_splats(files["object"]).means, whole.means[1:])
-    assert torch.equal(read_splats(files["coloured"]).means, whole.means)
-
-
-def test_nothing_found_is_no_file_and_a_word_on_what_to_try(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(capsys, *lift_arguments(scene))[0] == 0
-    before = sorted(scene.iterdir())
-    question = ["query", scene / "lift.safetensors", "--like", "splat:1", "--threshold", "2"]
-    status, out, err = run(capsys, *question, "--scores", scene / "s.npy", "--object", scene / "o.ply")
-    assert (status, out) == (2, "")
-    assert "nothing stands out" in err
-    assert "lower threshold" in err
-    assert_one_line(err)
-    assert sorted(scene.iterdir()) == before
-
-
-def test_an_answer_is_never_written_over_what_was_lifted(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(capsys, *lift_arguments(scene))[0] == 0
-    before = {path: path.read_bytes() for path in scene.iterdir()}
-    for name in ("splats.ply", "cameras.json", "pack.safetensors", "lift.safetensors"):
-        question = ["query", scene / "lift.safetensors", "--like", "splat:1"]
-        status, _, err = run(capsys, *question, "--object", scene / name)
-        assert status == 2
-        assert "another file than the inputs" in err
-    assert {path: path.read_bytes() for path in scene.iterdir()} == before
+def test_a_lift_takes_its_files_as_texts_and_its_packs_as_a_list(scene: Path) -> None:
+    files = [str(scene / name) for name in ("splats.ply", "cameras.json", "pack.safetensors")]
+    made = lift(files[0], files[1], files[2:], LiftSettings.of())
+    assert made.metadata.splats.path == str((scene / "splats.ply").resolve())
+    for alone in (files[2], scene / "pack.safetensors"):
+        with pytest.raises(InvalidFeatures, match="a list of feature packs"):
+            lift(files[0], files[1], alone, LiftSettings.of())  # pyright: ignore[reportArgumentType]
 
 
 def test_settings_are_json_or_words() -> None:
     pairs = pairs_of(["power=2", "lift_gain=0.8", "dtype=float32", "certificate_rays=0"])
     settings = LiftSettings.of(preset="row-sum", **pairs)
+    assert pairs_of(["power=2", "power=2"]) == {"power": 2}
     assert (settings.power, settings.lift_gain, settings.dtype) == (2, 0.8, "float32")
     with pytest.raises(InvalidSettings):
         pairs_of(["=1"])
@@ -275,6 +183,19 @@ def test_inspect_speaks_to_people_and_programs(scene: Path, capsys: pytest.Captu
     status, out, _ = run(capsys, "inspect", scene / "splats.ply", "--json")
     assert json.loads(out)["splats"] == 2
     assert out.count("\n") == 1
+
+
+def test_inspect_counts_all_words_of_a_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = [f"word {row}" for row in range(50)]
+    save_file({"embeddings": torch.eye(50)}, str(tmp_path / "t"), metadata={"words": json.dumps(words)})
+    assert "word 5, ... (50)\n" in run(capsys, "inspect", tmp_path / "t")[1]
+    assert json.loads(run(capsys, "inspect", tmp_path / "t", "--json")[1])["words"] == words
+
+
+@pytest.mark.parametrize("command", ["query", "evaluate"])
+def test_help_names_every_threshold(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    out = " ".join(run(capsys, command, "--help")[1].split())
+    assert f"{', '.join(METHODS)} or a number" in out
 
 
 def test_help_names_every_preset(capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,0 +1,114 @@
+"""``splatlift query``: where its words may stand, what it refuses, and what it writes."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import pytest
+import torch
+
+from liftcore import cli
+from liftcore.artifact import load_lift, save_lift
+from liftcore.scene.ply import read_splats
+
+from .command_line import assert_one_line, lift_arguments, run, write_toy_scene
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    return write_toy_scene(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["L", "--table", "w", "a mug"],
+        ["--table", "w", "L", "a mug"],
+        ["--like", "e.npy", "L", "--view", "v", "a mug"],
+        ["L", "--view", "v", "a mug", "--negative", "cat", "dog", "--table", "w", "--negative", "cow"],
+        ["L", "--view", "v", "--", "a mug"],
+    ],
+)
+def test_the_text_of_a_query_stands_before_between_or_after_options(arguments: list[str]) -> None:
+    options = cli.build_parser().parse_args(["query", *arguments])
+    assert (str(options.lift), options.text) == ("L", "a mug")
+    assert options.negative == (["cat", "dog", "cow"] if "--negative" in arguments else [])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["L", "red", "mug"], "arguments: mug; a text of several words is one, in quotes"),
+        (["L", "--view", "v", "red", "mug"], "arguments: mug; a text of several words is one, in quotes"),
+        (["L", "--vieuw", "v", "mug"], "arguments: --vieuw v"),
+        (["L", "--negative", "cat", "mug"], "expected what to look for, before --negative, got --negative cat mug"),
+    ],
+)
+def test_words_that_a_query_has_no_place_for_are_told(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    status, out, err = run(capsys, "query", *arguments)
+    assert (status, out) == (2, "")
+    assert message in err
+    assert_one_line(err)
+
+
+@pytest.mark.parametrize(("space", "told"), [("none", "text space is 'none': its"), ("", "text space is not named")])
+def test_words_to_a_lift_without_a_text_encoder_are_refused_with_its_text_space(
+    space: str, told: str, scene: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(capsys, *lift_arguments(scene))[0] == 0
+    lift = load_lift(scene / "lift.safetensors")
+    lift = replace(lift, metadata=lift.metadata.model_copy(update={"text_space": space}))
+    save_lift(lift, scene / "other.safetensors")
+    status, out, err = run(capsys, "query", scene / "other.safetensors", "mug")
+    assert (status, out) == (2, "")
+    assert told in err and "--like" in err
+    assert_one_line(err)
+
+
+def test_picture_without_a_view_is_refused(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, _, err = run(capsys, "query", scene / "l", "cat", "--mask", scene / "m.png")
+    assert status == 2
+    assert "no --view" in err
+
+
+def test_what_a_query_found_is_written_as_splats(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(capsys, *lift_arguments(scene))[0] == 0
+    question = ["query", scene / "lift.safetensors", "--like", "splat:1", "--json"]
+    files = {kind: scene / f"{kind}.ply" for kind in ("object", "coloured")}
+    written = [part for kind, path in files.items() for part in (f"--{kind}", path)]
+    status, out, err = run(capsys, *question, "--threshold", "0.5", *written)
+    assert (status, err) == (0, "")
+    assert json.loads(out)["files"] == {kind: str(path) for kind, path in files.items()}
+    whole = read_splats(scene / "splats.ply")
+    assert torch.equal(read_splats(files["object"]).means, whole.means[1:])
+    assert torch.equal(read_splats(files["coloured"]).means, whole.means)
+
+
+def test_nothing_found_is_no_file_and_a_word_on_what_to_try(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(capsys, *lift_arguments(scene))[0] == 0
+    before = sorted(scene.iterdir())
+    question = ["query", scene / "lift.safetensors", "--like", "splat:1", "--threshold", "2"]
+    status, out, err = run(capsys, *question, "--scores", scene / "s.npy", "--object", scene / "o.ply")
+    assert (status, out) == (2, "")
+    assert "nothing stands out" in err
+    assert "lower threshold" in err
+    assert_one_line(err)
+    assert sorted(scene.iterdir()) == before
+
+
+def test_an_answer_is_never_written_over_what_was_lifted(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(capsys, *lift_arguments(scene))[0] == 0
+    before = {path: path.read_bytes() for path in scene.iterdir()}
+    for name in ("splats.ply", "cameras.json", "pack.safetensors", "lift.safetensors"):
+        question = ["query", scene / "lift.safetensors", "--like", "splat:1"]
+        status, _, err = run(capsys, *question, "--object", scene / name)
+        assert status == 2
+        assert "another file than the inputs" in err
+    assert {path: path.read_bytes() for path in scene.iterdir()} == before
