@@ -54,10 +54,14 @@ def scene_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_python_example_finds_the_apple(scene_folder: Path) -> None:
-    mask = run_example("from liftcore.lift import lift")["mask"]
-    columns = mask.nonzero()[:, 1]  # pyright: ignore[reportAttributeAccessIssue]
+    names = run_example("from liftcore.lift import lift")
+    made, scene, mask, more = (names[name] for name in ("made", "scene", "mask", "more"))
+    columns = mask.nonzero()[:, 1]
     assert len(columns) > 0
     assert int(columns.max()) < WIDTH // 2  # the apple is the cluster on the left
+    assert more.count > 0 and float(scene.splats.means[more.selected, 0].max()) < 0  # and so is the example
+    assert names["features"].shape == made.features.shape
+    assert any((scene_folder / "walked").iterdir())
 
 
 def test_sams_masks_make_a_lift_that_knows_the_words(scene_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -136,6 +140,12 @@ def test_command_line_example_writes_its_files(scene_folder: Path) -> None:
     apple, scores = (load_splats(scene_folder / name) for name in ("apple.ply", "scores.ply"))
     assert 0 < apple.count < scores.count == load_splats(scene_folder / "scene.ply").count
     assert float(apple.means[:, 0].max()) < 0  # the apple is the cluster on the left
+
+
+def test_no_example_saves_an_error_as_what_was_asked_for() -> None:
+    saving = [line for block in blocks("README.md", "sh") for line in block.splitlines() if " -o " in line]
+    curls = [line for line in saving if line.startswith("curl ")]
+    assert curls and all(re.match(r"curl -[a-zA-Z]*f", line) for line in curls)
 
 
 def test_the_way_from_own_maps_to_a_mask_leads_there(scene_folder: Path) -> None:
