@@ -58,7 +58,7 @@ class Sources:
 
     splats: Splats
     cameras: Cameras
-    packs: FeaturePacks
+    packs: FeaturePacks  # their views named like their cameras
     views: list[str]  # that may be lifted, in the order of the sums
     unpaired: list[str]  # views with features and no camera
 
@@ -176,9 +176,8 @@ def open_sources(splats: Path, cameras: Path, features: Sequence[Path], settings
     """Open what a lift is made from; views are paired by name, and every ``view_stride``-th is taken."""
     scene, views = load_splats(splats, kernel_named(settings.kernel), colour=False), load_cameras(cameras)
     check_antialiased(scene.kernel, settings.antialiased)
-    packs = open_packs(features)
-    names, unpaired = pair(packs, views)
-    return Sources(scene, views, packs, names[:: settings.view_stride], unpaired)
+    packs, unpaired = pair(open_packs(features), views)
+    return Sources(scene, views, packs, list(packs.views[:: settings.view_stride]), unpaired)
 
 
 def planned(sources: Sources, settings: LiftSettings, device: Device, threads: int | None = None) -> Plan:

@@ -10,6 +10,7 @@ from liftcore.commands.reply import free_output, reply, shown, writing
 if TYPE_CHECKING:
     import argparse
     from collections.abc import Iterator
+    from pathlib import Path
 
     from liftcore.observe.folder import ViewFolder
 
@@ -23,7 +24,7 @@ def run(options: argparse.Namespace) -> int:
     from liftcore.observe.write_pack import write_pack
 
     views = _views(options)
-    out = free_output(options.output, [path for kind in INPUTS for path in options.folder.glob(kind)])
+    out = free_output(options.output, [path for kind in INPUTS for path in options.folder.rglob(kind)])
     with progress_bars() as progress, writing(out):
         write_pack(out, views, _metadata(options), progress)
     packs = open_packs([out])
@@ -37,16 +38,17 @@ def run(options: argparse.Namespace) -> int:
         "text_space": packs.text_space,
         "normalised": packs.normalised,
         "sizes": described["sizes"],
-        "renamed": {} if options.format == "langsplat" else _renamed(views),
+        "renamed": {} if options.format == "langsplat" else _renamed(views, options.folder),
         "warnings": described["warnings"],
     }
     reply(document, as_json=options.json, lines=_lines(document))
     return 0
 
 
-def _renamed(views: ViewFolder) -> dict[str, str]:
+def _renamed(views: ViewFolder, folder: Path) -> dict[str, str]:
     """The views that lost the suffix of an image, by their files."""
-    return {path.name: view for view, path in views.files.items() if path.name != f"{view}.npy"}
+    files = {path.relative_to(folder).as_posix(): view for view, path in views.files.items()}
+    return {name: view for name, view in files.items() if name != f"{view}.npy"}
 
 
 def _lines(document: dict[str, Any]) -> Iterator[str]:

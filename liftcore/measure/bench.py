@@ -144,11 +144,10 @@ def _real(folder: Path, channels: int, levels: int, count: int) -> Workload:
     packs = [folder / name for name in ("regions.safetensors", "features.safetensors") if (folder / name).is_file()]
     if not packs:
         raise InvalidInput("scene", expected="a folder with regions.safetensors", got=str(folder))
-    features = open_packs(packs[:1])
     cameras = load_cameras(cameras_of(folder))
-    names = pair(features, cameras)[0][:count]
+    features = pair(open_packs(packs[:1]), cameras)[0]
     views = []
-    for number, name in enumerate(names):
+    for number, name in enumerate(features.views[:count]):
         observed = features.observation(name)
         if not isinstance(observed, RegionMap):
             raise InvalidInput("scene", expected="a pack of region maps", got=f"grids in {packs[0].name}")

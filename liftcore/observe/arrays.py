@@ -46,7 +46,7 @@ class ArrayViews(ViewFolder):
 
 
 def array_views(folder: Path, layout: Layout = "hwc") -> ArrayViews:
-    """The views of a folder of ``IMG.npy`` files [h, w, F], or [F, h, w] with the layout ``chw``.
+    """The views of a folder of ``IMG.npy`` files [h, w, F], or [F, h, w] with the layout ``chw``, or its sub-folders.
 
     ``IMG.jpg.npy`` is of the view ``IMG``, as the camera of ``IMG.jpg`` is.
 
@@ -54,8 +54,8 @@ def array_views(folder: Path, layout: Layout = "hwc") -> ArrayViews:
         InvalidFeatures: the folder has no such files, or two of one view.
     """
     files: dict[str, Path] = {}
-    for path in npy_files(folder, ".npy").values():
-        view = without_image_suffix(path.name.removesuffix(".npy"))
+    for name, path in npy_files(folder, ".npy").items():
+        view = without_image_suffix(name)
         if view in files:
             got = f"{files[view].name} and {path.name}, both of the view {view!r}"
             raise InvalidFeatures(str(folder), expected="one file a view", got=got)

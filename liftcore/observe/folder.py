@@ -35,16 +35,25 @@ class ViewFolder(Mapping[str, Observation]):
         return len(self.files)
 
 
+def files_below(folder: Path) -> list[Path]:
+    """The files of a folder and its sub-folders, sorted; hidden sub-folders are left out."""
+    inner = {path: path.relative_to(folder).parts[:-1] for path in sorted(folder.rglob("*")) if path.is_file()}
+    return [path for path, parts in inner.items() if not any(part.startswith(".") for part in parts)]
+
+
 def npy_files(folder: Path, suffix: str) -> dict[str, Path]:
-    """View name -> file, of the files in the folder whose names end so, sorted.
+    """View name -> file, of the files in the folder and its sub-folders whose names end so, sorted.
+
+    A file of a sub-folder is of the view ``camA/000``, as rigs have them. Hidden sub-folders are left out.
 
     Raises:
         InvalidFeatures: there is none; pickles are named as the reason where there are some.
     """
     if not folder.is_dir():
         raise InvalidFeatures(str(folder), expected=f"a folder of *{suffix} files", got="no such folder")
-    files = sorted(path for path in folder.iterdir() if path.is_file())
-    found = {path.name.removesuffix(suffix): path for path in files if path.name.endswith(suffix)}
+    files = files_below(folder)
+    named = {path.relative_to(folder).as_posix(): path for path in files if path.name.endswith(suffix)}
+    found = {name.removesuffix(suffix): path for name, path in named.items()}
     if found:
         return found
     pickles = [path.name for path in files if path.suffix.lower() in PICKLED]

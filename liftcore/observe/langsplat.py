@@ -37,7 +37,7 @@ class LangSplatViews(ViewFolder):
 
 
 def langsplat_views(folder: Path) -> LangSplatViews:
-    """The views of a folder of ``IMG_s.npy`` and ``IMG_f.npy`` files.
+    """The views of a folder of ``IMG_s.npy`` and ``IMG_f.npy`` files, and of its sub-folders.
 
     Raises:
         InvalidFeatures: the folder has no such files, or a map lacks its embeddings.

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from liftcore.errors import InvalidFeatures
-from liftcore.observe.folder import ViewFolder, npy_files
+from liftcore.observe.folder import ViewFolder, files_below, npy_files
 from liftcore.observe.label_picture import picture_labels
 from liftcore.observe.layering import layered
 from liftcore.observe.mask_ids import mask_ids
@@ -52,7 +52,7 @@ class MaskViews(ViewFolder):
 
 
 def mask_views(folder: Path, unlabelled: int = 0) -> MaskViews:
-    """The views of a folder; ``IMG.jpg.npy`` is of the view ``IMG``, as the camera of ``IMG.jpg`` is.
+    """The views of a folder and its sub-folders; ``IMG.jpg.npy`` is of the view ``IMG``, as the camera of ``IMG.jpg``.
 
     Args:
         folder: the folder. unlabelled: what pixels without a mask have in label pictures.
@@ -62,7 +62,7 @@ def mask_views(folder: Path, unlabelled: int = 0) -> MaskViews:
             one of them.
     """
     arrays = npy_files(folder, VECTORS).values()
-    others = sorted(path for path in folder.iterdir() if path.suffix.lower() in (RUNS, PICTURE) and path.is_file())
+    others = [path for path in files_below(folder) if path.suffix.lower() in (RUNS, PICTURE)]
     masks = _by_view([*(path for path in arrays if path.name.endswith(ARRAY)), *others], folder, "masks")
     vectors = _by_view((path for path in arrays if not path.name.endswith(ARRAY)), folder, "vectors")
     for view, path in vectors.items():
@@ -82,8 +82,8 @@ def mask_views(folder: Path, unlabelled: int = 0) -> MaskViews:
 def _by_view(paths: Iterable[Path], folder: Path, what: str) -> dict[str, Path]:
     found: dict[str, Path] = {}
     for path in paths:
-        stem = path.name.removesuffix(ARRAY) if path.name.endswith(ARRAY) else path.stem
-        view = without_image_suffix(stem)
+        inner = path.relative_to(folder).as_posix()
+        view = without_image_suffix(inner.removesuffix(ARRAY if inner.endswith(ARRAY) else path.suffix))
         if view in found:
             got = f"{found[view].name} and {path.name}, both of the view {view!r}"
             hint = "photos belong in another folder than their masks" if what == "masks" else ""

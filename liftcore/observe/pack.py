@@ -6,7 +6,7 @@ none, i16 or i32 with -1) with ``V/codebook`` [M, F], or a grid, ``V/grid`` [h, 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -15,9 +15,10 @@ from liftcore.errors import InvalidFeatures
 from liftcore.observe.finite import check_finite
 from liftcore.observe.header import check_header
 from liftcore.observe.observation import NO_LABEL, FeatureGrid, Observation, RegionMap
+from liftcore.scene.view_pairs import NAMED_AFTER, cameras_of_views
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
 
     from torch import Tensor
@@ -48,6 +49,23 @@ class _PackFile:
 
 
 @dataclass(frozen=True)
+class _Stored:
+    """Where a view is: its pack, and its name in it."""
+
+    pack: _PackFile
+    name: str
+
+    def has(self, part: str) -> bool:
+        return f"{self.name}/{part}" in self.pack.specs
+
+    def spec(self, part: str) -> TensorSpec:
+        return self.pack.specs[f"{self.name}/{part}"]
+
+    def where(self, part: str) -> str:
+        return f"{self.pack.path} view {self.name!r} {part}"
+
+
+@dataclass(frozen=True)
 class FeaturePacks:
     """One or more packs that make one set of views. Headers are checked; tensors are read when asked for."""
 
@@ -57,16 +75,16 @@ class FeaturePacks:
     text_space: str  # the text encoder that shares the space; "" unknown, "none" when there is none
     normalised: bool | None  # whether codebook rows and grid cells are unit vectors; None when not told
     paths: tuple[Path, ...]
-    _files: dict[str, _PackFile]  # view -> its pack
+    _stored: Mapping[str, _Stored]
 
     def is_regions(self, view: str) -> bool:
         """Whether the view is a region map; else it is a grid."""
-        return f"{view}/labels" in self._file(view).specs
+        return self._find(view).has("labels")
 
     def specs(self, view: str) -> dict[str, TensorSpec]:
         """The view's tensors by part (labels, codebook, grid), from the header alone."""
-        specs = self._file(view).specs
-        return {part: specs[f"{view}/{part}"] for part in PARTS if f"{view}/{part}" in specs}
+        stored = self._find(view)
+        return {part: stored.spec(part) for part in PARTS if stored.has(part)}
 
     def map_size(self, view: str) -> tuple[int, int]:
         """Width and height of a view's labels or grid, from the header alone."""
@@ -80,11 +98,11 @@ class FeaturePacks:
         Raises:
             InvalidFeatures: no such view, a label out of the codebook, or a feature that is not finite.
         """
-        pack = self._file(view)
-        if self.is_regions(view):
-            codebook = _features(pack, view, "codebook")
-            return RegionMap(_labels(pack, view, rows=codebook.shape[0]), codebook)
-        return FeatureGrid(_features(pack, view, "grid"))
+        stored = self._find(view)
+        if stored.has("labels"):
+            codebook = _features(stored, "codebook")
+            return RegionMap(_labels(stored, rows=codebook.shape[0]), codebook)
+        return FeatureGrid(_features(stored, "grid"))
 
     def sample_rows(self, view: str, count: int) -> Tensor:
         """Some rows [n, F] of the view's codebook, ``count`` at most; nothing else of it is read or checked.
@@ -92,7 +110,8 @@ class FeaturePacks:
         The first rows of a codebook, or evenly spaced cells of a grid.
         """
         part = "codebook" if self.is_regions(view) else "grid"
-        stored = self._file(view).handle.get_slice(f"{view}/{part}")
+        found = self._find(view)
+        stored = found.pack.handle.get_slice(f"{found.name}/{part}")
         if part == "codebook":
             return stored[:count]
         height, width = self.specs(view)[part].shape[:2]
@@ -100,10 +119,15 @@ class FeaturePacks:
         cells = _spread(width, count // len(lines))
         return torch.cat([stored[line][cells] for line in lines])
 
-    def _file(self, view: str) -> _PackFile:
-        if view not in self._files:
+    def renamed(self, names: Mapping[str, str]) -> FeaturePacks:
+        """The views that ``names`` gives a name, under it, and no others."""
+        stored = {name: self._find(view) for view, name in names.items()}
+        return replace(self, views=tuple(sorted(stored)), _stored=stored)
+
+    def _find(self, view: str) -> _Stored:
+        if view not in self._stored:
             raise InvalidFeatures("view", expected="a view of the feature packs", got=repr(view))
-        return self._files[view]
+        return self._stored[view]
 
 
 def open_packs(paths: Sequence[Path]) -> FeaturePacks:
@@ -137,26 +161,25 @@ def open_packs(paths: Sequence[Path]) -> FeaturePacks:
         text_space=_agreed(packs, "text_space"),
         normalised={"true": True, "false": False}.get(normalised),
         paths=tuple(paths),
-        _files=files,
+        _stored={view: _Stored(pack, view) for view, pack in files.items()},
     )
 
 
-def pair(packs: FeaturePacks, cameras: Cameras) -> tuple[list[str], list[str]]:
-    """The views that have a camera, and those that have none (to be skipped and reported).
+def pair(packs: FeaturePacks, cameras: Cameras) -> tuple[FeaturePacks, list[str]]:
+    """The views that have a camera, named like it, and the names of those that have none, to be skipped and told.
 
     Raises:
         InvalidFeatures: no view has a camera.
     """
-    names = cameras.by_name
-    paired = [view for view in packs.views if view in names]
-    if not paired:
+    names = cameras_of_views(packs.views, cameras.by_name)
+    if not names:
         raise InvalidFeatures(
             "features",
             expected="views named like the cameras",
-            got=f"views {_examples(packs.views)} and cameras {_examples(names)}, none in common",
-            hint="a view is named after its image, without the extension",
+            got=f"views {_examples(packs.views)} and cameras {_examples(cameras.by_name)}, none in common",
+            hint=NAMED_AFTER,
         )
-    return paired, [view for view in packs.views if view not in names]
+    return packs.renamed(names), [view for view in packs.views if view not in names]
 
 
 def _spread(length: int, count: int) -> list[int]:
@@ -229,24 +252,24 @@ def _agreed(packs: Sequence[_PackFile], key: str) -> str:
     return next(iter(told), "")
 
 
-def _features(pack: _PackFile, view: str, part: str) -> Tensor:
+def _features(stored: _Stored, part: str) -> Tensor:
     """[.., F] f16 or f32, finite."""
-    values: Tensor = pack.handle.get_tensor(f"{view}/{part}")
+    values: Tensor = stored.pack.handle.get_tensor(f"{stored.name}/{part}")
     values = values.float() if values.dtype == torch.bfloat16 else values
-    check_finite(values, f"{pack.path} view {view!r} {part}")
+    check_finite(values, stored.where(part))
     return values
 
 
-def _labels(pack: _PackFile, view: str, rows: int) -> Tensor:
+def _labels(stored: _Stored, rows: int) -> Tensor:
     """[L, h, w] i32 with -1 for none, all below ``rows``."""
-    stored: Tensor = pack.handle.get_tensor(f"{view}/labels")
-    labels = stored.to(torch.int32)
-    if stored.dtype == torch.uint8:
-        labels[stored == U8_NO_LABEL] = NO_LABEL
+    raw: Tensor = stored.pack.handle.get_tensor(f"{stored.name}/labels")
+    labels = raw.to(torch.int32)
+    if raw.dtype == torch.uint8:
+        labels[raw == U8_NO_LABEL] = NO_LABEL
     low, high = (int(value) for value in torch.aminmax(labels))
     if low < NO_LABEL or high >= rows:
         raise InvalidFeatures(
-            f"{pack.path} view {view!r} labels",
+            stored.where("labels"),
             expected=f"rows of its codebook (0..{rows - 1}) or {NO_LABEL} for none",
             got=f"the label {low if low < NO_LABEL else high}",
         )

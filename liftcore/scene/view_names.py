@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections import Counter
 from pathlib import PurePosixPath
 from typing import TYPE_CHECKING
 
@@ -34,7 +33,10 @@ UNSAYABLE = re.compile("[\\x00-\\x1f\\x7f\\ud800-\\udfff]")
 
 
 def view_names(images: Sequence[str]) -> list[str]:
-    """One view name an image: the file's stem, or the relative path without extension where stems collide.
+    """One view name an image: the file's stem; where any stems of the scene collide, all keep their folders.
+
+    Were it only those that collide, the longer of two cameras of a rig would have its last photos named otherwise
+    than its first.
 
     Raises:
         InvalidCameras: a name with control characters, or with half of a surrogate pair, which no UTF-8 can say.
@@ -44,8 +46,7 @@ def view_names(images: Sequence[str]) -> list[str]:
             raise InvalidCameras("image name", expected="one of printable characters", got=ascii(image)[:60])
     paths = [without_image_suffix(image) for image in images]
     stems = [PurePosixPath(path).name for path in paths]
-    uses = Counter(stems)
-    return [stem if uses[stem] == 1 else path for stem, path in zip(stems, paths, strict=True)]
+    return stems if len(set(stems)) == len(stems) else paths
 
 
 def without_image_suffix(image: str) -> str:

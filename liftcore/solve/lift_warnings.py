@@ -42,7 +42,8 @@ def lift_warnings(
     warnings = []
     skipped, empty = facts["views_without_camera"], facts["views_without_splats"]
     if skipped:
-        warnings.append(f"{len(skipped)} views have features but no camera and were skipped: {_some(skipped)}")
+        told = f"{len(skipped)} views have features but no camera and were skipped: {_some(skipped)}"
+        warnings.append(told + _folders_of(views))
     if empty:
         warnings.append(f"{len(empty)} of {len(views)} views meet no splat: {_some(empty)}")
     unseen, faint = int((sums == 0).sum()), int(((sums > 0) & (sums < FAINT)).sum())
@@ -81,6 +82,12 @@ def order_warnings(splats: Splats, views: Sequence[Camera]) -> list[str]:
         f"{len(coarse)} of {len(views)} views are so far from the splats that float32 depths cannot order most of "
         f"them: {_some(coarse)}"
     ]
+
+
+def _folders_of(views: Sequence[Camera]) -> str:
+    """What to do where cameras are named with their folders, as those of a rig are."""
+    example = next((camera.name for camera in views if "/" in camera.name), None)
+    return f"; cameras are named with their folders here, such as {example}: name views like them" if example else ""
 
 
 def _some(names: Sequence[str]) -> str:

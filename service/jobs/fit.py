@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from liftcore.errors import InvalidFeatures, InvalidSettings, InvalidSplats
@@ -11,6 +11,7 @@ from liftcore.raster.antialiased import check_antialiased
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.ply_dialect import model_slots
 from liftcore.scene.ply_header import read_header
+from liftcore.scene.view_pairs import NAMED_AFTER, cameras_of_views
 from liftcore.solve.settings import LiftSettings
 from service.errors import InvalidRequest
 from service.store.assets import AssetRecord, kernel_of
@@ -37,13 +38,13 @@ def check_fit(cameras: AssetRecord, features: Sequence[AssetRecord]) -> None:
     if len(channels) > 1:
         got = " and ".join(f"{count} in {pack}" for count, pack in channels.items())
         raise InvalidFeatures("features", expected="packs with the same channels", got=got)
-    known = set(cameras.counts["names"])
-    if not known & owner.keys():
+    known = cameras.counts["names"]
+    if not cameras_of_views(owner, known):
         raise InvalidFeatures(
             "features",
             expected="views named like the cameras",
             got=f"views {_examples(owner)} and cameras {_examples(known)}, none in common",
-            hint="a view is named after its image, without the extension",
+            hint=NAMED_AFTER,
         )
 
 
@@ -91,15 +92,16 @@ def check_labels(
     if table.counts["channels"] != channels:
         expected, got = f"a table with {channels} channels, as the features", f"{table.counts['channels']}"
         raise InvalidRequest("labels.table", expected=expected, got=got)
-    known = set(cameras.counts["names"])
-    masked = known.intersection(masks.counts["names"])
+    known = cameras.counts["names"]
+    masked = set(cameras_of_views(masks.counts["names"], known).values())
     if not masked:
         raise InvalidRequest(
             "labels.masks",
             expected="masks of views named like the cameras",
-            got=f"masks of {_examples(set(masks.counts['names']))} and cameras {_examples(known)}, none in common",
+            got=f"masks of {_examples(masks.counts['names'])} and cameras {_examples(known)}, none in common",
         )
-    views = sorted(known.intersection(view for pack in features for view in pack.counts["names"]))
+    named = [view for pack in features for view in pack.counts["names"]]
+    views = sorted(cameras_of_views(named, known).values())
     if masked.issuperset(views[:: LiftSettings.of(**order.settings).view_stride]):
         expected = "features of views besides those with masks, which are not lifted"
         raise InvalidRequest("labels.masks", expected=expected, got="masks of all of them")
@@ -112,5 +114,5 @@ def scratch_bytes(kind: JobKind, splats: AssetRecord, features: Sequence[AssetRe
     return splats.counts.get("splats", 0) * (1 + features[0].counts["channels"]) * FLOAT_BYTES
 
 
-def _examples(names: dict[str, str] | set[str]) -> str:
+def _examples(names: Iterable[str]) -> str:
     return ", ".join(repr(name) for name in sorted(names)[:3])

@@ -66,6 +66,30 @@ def test_maps_named_after_whole_images_are_packed_under_their_cameras_names(
     assert open_packs([tmp_path / "p.safetensors"]).views == ("a", "b", "frame.0001")
 
 
+def test_maps_of_a_rig_keep_their_folders(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("camA/000.npy", "camB/000.jpg.npy", ".trash/000.npy"):
+        (tmp_path / "maps" / name).parent.mkdir(parents=True)
+        np.save(tmp_path / "maps" / name, np.ones((3, 4, 5), np.float16))
+    arguments = ["pack", "npy", tmp_path / "maps", "-o", tmp_path / "p.safetensors", "--json"]
+    status, out, _ = run(capsys, *arguments)
+    assert (status, json.loads(out)["renamed"]) == (0, {"camB/000.jpg.npy": "camB/000"})
+    assert open_packs([tmp_path / "p.safetensors"]).views == ("camA/000", "camB/000")
+    arguments[4] = tmp_path / "maps" / "camA" / "000.npy"
+    status, out, err = run(capsys, *arguments)
+    assert (status, out) == (2, "")
+    assert_one_line(err)
+
+
+def test_masks_of_a_rig_keep_their_folders(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for folder in ("camA", "camB"):
+        (tmp_path / "rig" / folder).mkdir(parents=True)
+        np.save(tmp_path / "rig" / folder / "000_s.npy", np.zeros((1, 2, 2), np.int32))
+        np.save(tmp_path / "rig" / folder / "000_f.npy", np.ones((1, 5), np.float32))
+    status, _, _ = run(capsys, "pack", "langsplat", tmp_path / "rig", "-o", tmp_path / "p.safetensors")
+    assert status == 0
+    assert open_packs([tmp_path / "p.safetensors"]).views == ("camA/000", "camB/000")
+
+
 def test_two_maps_of_one_view_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "maps").mkdir()
     for name in ("a.npy", "a.jpg.npy"):

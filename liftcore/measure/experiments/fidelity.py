@@ -72,8 +72,8 @@ def rendered_cosine(
     Args:
         features: [P, F]. A pixel whose ray meets nothing counts as zero.
     """
-    packs = open_packs([pack])
-    names = pair(packs, cameras)[0][::every]
+    packs = pair(open_packs([pack]), cameras)[0]
+    names = packs.views[::every]
     totals = [view_cosines(raster, cameras.get(name), packs.observation(name), features, walk) for name in names]
     cosines = np.concatenate(totals)
     return float(cosines.mean()), len(names)

@@ -32,8 +32,8 @@ COLUMNS = ("method", "rate", "accuracy", "miou")
 def measure(subject: Subject) -> dict[str, Any]:
     """Accuracy and held-out mIoU of each method at each rate; the same wrong masks for all methods."""
     truth = Tabletop(subject.folder)
-    packs = open_packs([subject.pack(PACK)])
-    seen = {name: packs.observation(name) for name in pair(packs, truth.cameras)[0]}
+    packs = pair(open_packs([subject.pack(PACK)]), truth.cameras)[0]
+    seen = {name: packs.observation(name) for name in packs.views}
     maps = {name: observed for name, observed in seen.items() if isinstance(observed, RegionMap)}
     rows = []
     for rate in RATES:

@@ -34,7 +34,7 @@ def measure(subject: Subject) -> dict[str, Any]:
     truth = Tabletop(subject.folder)
     rows = []
     for pack in subject.packs(*PACKS):
-        names = pair(open_packs([subject.pack(pack)]), truth.cameras)[0][:: subject.every]
+        names = pair(open_packs([subject.pack(pack)]), truth.cameras)[0].views[:: subject.every]
         for method, settings in METHODS.items():
             for share in SHARES:
                 found = []

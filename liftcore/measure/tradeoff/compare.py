@@ -80,8 +80,8 @@ def _order(scene: Scene, settings: Mapping[str, Any], threads: int | None, folde
     """The views of each kind. Every HOLD_OUT-th view is held out, and what has masks is."""
     cameras = load_cameras(scene.cameras)
     stride = LiftSettings.of(**settings).view_stride
-    packs = open_packs(scene.features)
-    names = pair(packs, cameras)[0][::stride]
+    packs = pair(open_packs(scene.features), cameras)[0]
+    names = packs.views[::stride]
     labelled: list[str] = []
     if scene.labels is not None:
         if scene.table is None or not scene.classes:
@@ -89,7 +89,7 @@ def _order(scene: Scene, settings: Mapping[str, Any], threads: int | None, folde
         channels = class_vectors(scene).shape[1]
         if channels != packs.channels:
             raise InvalidInput("table", expected=f"{packs.channels} channels, as the features", got=f"{channels}")
-        labelled = [view for view in sorted(labelled_masks(scene)) if view in cameras.by_name]
+        labelled = sorted(labelled_masks(scene, cameras))
         if not labelled:
             raise InvalidInput("labels", expected="VIEW/mask of some camera", got="none")
     free = [name for name in names if name not in set(labelled)]

@@ -13,6 +13,7 @@ from liftcore.measure.experiments.fidelity import view_cosines
 from liftcore.observe.masks import read_masks
 from liftcore.query.encoders.table import TableEncoder
 from liftcore.raster.cpu import CpuRaster
+from liftcore.scene.view_pairs import cameras_of_views
 from liftcore.solve.accumulate import render_walk
 
 if TYPE_CHECKING:
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from liftcore.artifact import Lift
     from liftcore.lift import Sources
     from liftcore.measure.tradeoff.order import Order, Scene
+    from liftcore.scene.cameras import Cameras
 
 LOW_QUANTILE = 0.05
 ROWS = 1 << 16  # compared at a time
@@ -43,7 +45,7 @@ def judge(order: Order, sources: Sources, reference: tuple[Tensor, Tensor], made
     figures["mask_iou"] = None
     if order.scene.labels is not None and order.labelled:
         classes = class_vectors(order.scene)
-        masks = labelled_masks(order.scene)
+        masks = labelled_masks(order.scene, sources.cameras)
         scores = (
             rendered_scores(raster, sources.cameras.get(view), made.features, classes, walk)
             for view in order.labelled
@@ -90,11 +92,12 @@ def class_vectors(scene: Scene) -> Tensor:
     return torch.as_tensor(TableEncoder.open(scene.table).encode(scene.classes))
 
 
-def labelled_masks(scene: Scene) -> dict[str, Tensor]:
-    """View -> [h, w] i64 of class numbers, as `liftcore.observe.masks.read_masks` has it."""
+def labelled_masks(scene: Scene, cameras: Cameras) -> dict[str, Tensor]:
+    """Camera -> its [h, w] i64 of class numbers, as `liftcore.observe.masks.read_masks` has it."""
     if scene.labels is None:
         raise ValueError("there are no labels")
-    return read_masks(scene.labels, len(scene.classes))
+    masks = read_masks(scene.labels, len(scene.classes))
+    return {camera: masks[view] for view, camera in cameras_of_views(masks, cameras.by_name).items()}
 
 
 def _resized(labels: Tensor, mask: Tensor) -> Tensor:

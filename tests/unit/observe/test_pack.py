@@ -179,9 +179,22 @@ def test_unknown_view_is_refused(tmp_path: Path) -> None:
 def test_views_without_a_camera_are_reported_and_no_pair_at_all_is_refused(tmp_path: Path) -> None:
     tensors = {**regions(0), "b/grid": torch.ones(1, 1, 3)}
     packs = open_packs([saved(tmp_path / "pack", tensors)])
-    assert pair(packs, cameras("c", "b")) == (["b"], ["a"])
+    paired, without = pair(packs, cameras("c", "b"))
+    assert (paired.views, without) == (("b",), ["a"])
     with pytest.raises(InvalidFeatures, match=r"views 'a', 'b' and cameras 'x', 'y', none in common"):
         pair(packs, cameras("x", "y"))
+
+
+def test_paired_views_are_named_like_their_cameras_and_tell_their_own_names(tmp_path: Path) -> None:
+    tensors = {**regions(0, 9), "camB/b/grid": torch.ones(1, 2, 3), "c/grid": torch.ones(1, 1, 3)}
+    packs = open_packs([saved(tmp_path / "pack", tensors)])
+    paired, without = pair(packs, cameras("camA/a", "b", "camA/x"))
+    assert (paired.views, without) == (("b", "camA/a"), ["c"])
+    assert (paired.is_regions("camA/a"), paired.map_size("b"), list(paired.specs("b"))) == (True, (2, 1), ["grid"])
+    assert torch.equal(paired.observation("b").codebook, torch.ones(2, 3))
+    assert torch.equal(paired.sample_rows("camA/a", 2), CODEBOOK[:2])
+    with pytest.raises(InvalidFeatures, match=r"view 'a' labels: .*the label 9"):
+        paired.observation("camA/a")
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.float32])
@@ -246,7 +259,7 @@ def test_real_packs_pair_with_their_cameras(shared_data: Path) -> None:
     plush = shared_data / "plush"
     packs = open_packs([plush / "grids.safetensors", plush / "grids_test.safetensors"])
     paired, without = pair(packs, load_cameras(plush))
-    assert (len(paired), without, packs.channels, packs.text_space) == (97, [], 320, "none")
+    assert (len(paired.views), without, packs.channels, packs.text_space) == (97, [], 320, "none")
     found = open_packs([plush / "regions.safetensors"])
     view = found.observation(found.views[0])
     assert isinstance(view, RegionMap)

@@ -7,6 +7,7 @@ import math
 import shutil
 import struct
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -355,9 +356,29 @@ def test_pickled_splats_are_refused_unopened(tmp_path: Path) -> None:
         load_splats(tmp_path / "ckpt.pt")
 
 
-def test_views_are_named_by_stem_and_by_path_where_stems_collide() -> None:
-    images = ["a/001.jpg", "b\\001.png", "002.JPG", "./train/r_0", "frame.0001"]
-    assert view_names(images) == ["a/001", "b/001", "002", "r_0", "frame.0001"]
+def test_views_are_named_by_stem_and_all_by_path_where_any_stems_collide() -> None:
+    images = ["a/001.jpg", "b\\002.png", "003.JPG", "./train/r_0", "frame.0001"]
+    assert view_names(images) == ["001", "002", "003", "r_0", "frame.0001"]
+    assert view_names([*images, "b/001.jpg"]) == ["a/001", "b/002", "003", "train/r_0", "frame.0001", "b/001"]
+
+
+RIG = [f"camA/{k:03}.jpg" for k in range(4)] + [f"camB/{k:03}.jpg" for k in range(3)]
+
+
+@pytest.mark.parametrize("kind", ["folder", "text", "zip", "transforms", "inria"])
+def test_every_view_of_a_rig_keeps_its_folder_in_every_format(kind: str, tmp_path: Path) -> None:
+    images = [(*IMAGES[0][:3], name) for name in RIG]
+    path = write_files(tmp_path / "rig", (text_files if kind == "text" else binary_files)(images=images))
+    if kind == "zip":
+        path = Path(shutil.make_archive(str(path), "zip", path))
+    elif kind == "transforms":
+        path = with_json(tmp_path, transforms_of(load_cameras(path)))
+    elif kind == "inria":
+        cameras = [replace(camera, cx=camera.width / 2, cy=camera.height / 2) for camera in load_cameras(path)]
+        path = tmp_path / "cameras.json"
+        write_inria_cameras(Cameras(tuple(cameras)), path)
+    names = [camera.name.removeprefix("images/") for camera in load_cameras(path)]
+    assert names == [name.removesuffix(".jpg") for name in RIG]
 
 
 def test_unknown_view_names_its_neighbours(model: Path) -> None:

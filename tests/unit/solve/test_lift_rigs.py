@@ -1,0 +1,50 @@
+"""Views of packs whose names have folders that the cameras' names leave out are lifted like any other."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+import torch
+
+from liftcore.lift import lift
+from liftcore.observe.pack import open_packs
+from liftcore.observe.write_pack import write_pack
+from liftcore.solve.settings import LiftSettings
+
+from .test_lift_equals_dense import write_scene
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+SETTINGS = LiftSettings.of(certificate_rays=10)
+
+
+def repacked(features: Path, names: dict[str, str], out: Path) -> Path:
+    packs = open_packs([features])
+    write_pack(out, {name: packs.observation(view) for view, name in names.items()}, {"encoder": "random"})
+    return out
+
+
+def test_folders_before_the_names_of_views_change_no_bit(tmp_path: Path) -> None:
+    splats, cameras, features = write_scene(tmp_path, 3)
+    rig = repacked(features, {"v0": "camA/v0", "v1": "camA/v1", "v2": "camB/v2"}, tmp_path / "rig.safetensors")
+    plain, made = (lift(splats, cameras, [pack], SETTINGS) for pack in (features, rig))
+    assert torch.equal(plain.features, made.features)
+    assert made.metadata.views == plain.metadata.views == ("v0", "v1", "v2")
+    assert made.metadata.certificate["warnings"] == plain.metadata.certificate["warnings"]
+
+
+def test_the_warning_of_skipped_views_tells_how_a_rig_is_named(tmp_path: Path) -> None:
+    splats, cameras, features = write_scene(tmp_path, 3)
+    records = json.loads(cameras.read_text())
+    for record, name in zip(records, ("camA/0", "camA/1", "camB/0"), strict=True):
+        record["img_name"] = name
+    cameras.write_text(json.dumps(records))
+    short = repacked(features, {"v0": "0", "v1": "1"}, tmp_path / "short.safetensors")
+    made = lift(splats, cameras, [short], SETTINGS)
+    assert (made.metadata.views, made.metadata.certificate["views_without_camera"]) == (("camA/1",), ["0"])
+    [warning] = [text for text in made.metadata.certificate["warnings"] if "skipped" in text]
+    assert warning.endswith(
+        "skipped: 0; cameras are named with their folders here, such as camA/1: name views like them"
+    )
