@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from liftcore.errors import InvalidCameras, NotFound
+from liftcore.nearest import nearest
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -18,6 +20,9 @@ MAX_SIDE = 32_768  # pixels; larger images are a broken header, not a photo
 MIN_FOCAL, MAX_FOCAL = 1e-3, 1e9  # pixels; float64 squares of what they project stay finite
 MAX_OFF_CENTRE = 1e9  # pixels of the principal point
 MAX_REACH = 1e12  # scene units from the origin; float32 has no detail left long before
+MAX_VIEWS = 100_000  # of a scene: many times what anybody lifts, and read and checked in seconds
+NEAREST = 3  # views named when one is unknown
+SHOWN = 120  # characters of a name that is unknown
 SAME_NAMES = (
     "a view is known by its photo's name without the suffix: rename photos, or, where training and test photos share "
     "names (Blender's scenes; Inria's cameras.json has the test views first), take one of both out or put "
@@ -101,6 +106,17 @@ def told_of(source: str) -> Iterator[None]:
         raise InvalidCameras(argument, expected=error.expected, got=error.got, hint=error.hint) from None
 
 
+def check_count(count: int, source: str) -> None:
+    """Refuse more views than a scene may have, by their number alone.
+
+    Raises:
+        InvalidCameras: there are more than MAX_VIEWS.
+    """
+    if count > MAX_VIEWS:
+        hint = "lift fewer photos, such as every second one"
+        raise InvalidCameras(source, expected=f"at most {MAX_VIEWS} views", got=f"{count} or more", hint=hint)
+
+
 @dataclass(frozen=True)
 class Cameras:
     """The views of a scene, in file order, looked up by name."""
@@ -110,6 +126,7 @@ class Cameras:
     def __post_init__(self) -> None:
         if not self.views:
             raise InvalidCameras("cameras", expected="at least one view", got="none")
+        check_count(len(self.views), "cameras")
         seen: set[str] = set()
         for camera in self.views:
             if camera.name in seen:
@@ -118,7 +135,7 @@ class Cameras:
                 )
             seen.add(camera.name)
 
-    @property
+    @cached_property
     def by_name(self) -> Mapping[str, Camera]:
         """Name -> camera."""
         return {camera.name: camera for camera in self.views}
@@ -131,12 +148,8 @@ class Cameras:
         """
         found = self.by_name.get(name)
         if found is None:
-            from rapidfuzz import process
-
-            near = [match[0] for match in process.extract(name, list(self.by_name), limit=3)]
-            raise NotFound(
-                "view", expected="the name of a camera", got=repr(name), hint=f"nearest: {', '.join(near)}"
-            )
+            got, hint = repr(name[:SHOWN]), nearest(name, self.by_name, NEAREST)
+            raise NotFound("view", expected="the name of a camera", got=got, hint=hint)
         return found
 
     def __len__(self) -> int:

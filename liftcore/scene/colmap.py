@@ -6,13 +6,13 @@ import math
 import mmap
 import struct
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from liftcore.errors import InvalidCameras
 from liftcore.scene.camera_models import COLMAP_MODELS, MODELS_BY_NAME, UNDISTORT, CameraModel, pinhole
-from liftcore.scene.cameras import Camera, Cameras, told_of
+from liftcore.scene.cameras import Camera, Cameras, check_count, told_of
 from liftcore.scene.foreign import refuse_pointer
 from liftcore.scene.view_names import view_names
 
@@ -25,6 +25,7 @@ MAX_NAME_BYTES = 4096
 POINT_BYTES = 24  # x, y and the id of its 3D point
 MODEL_FILES = ("cameras.bin", "cameras.txt", "images.bin", "images.txt")
 RE_EXPORT = "export the sparse model again"
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,8 @@ def read_colmap(folder: Path) -> Cameras:
     if camera_file.suffix == ".bin":
         sensors, images = _read_binary(camera_file, image_file)
     else:
-        sensors, images = dict(_text_sensors(camera_file)), list(_text_images(image_file))
+        sensors = dict(_counted(_text_sensors(camera_file), camera_file))
+        images = list(_counted(_text_images(image_file), image_file))
     with told_of(str(folder)):
         names = view_names([image.name for image in images])
         pairs = zip(names, images, strict=True)
@@ -123,6 +125,12 @@ class _Bytes:
         self.skip(struct.calcsize(layout))
         return struct.unpack_from(layout, self.data, start)
 
+    def views(self, what: str, least_bytes: int) -> range:
+        """As many views or their cameras as the file announces, which a scene may have."""
+        count = self.count(what, least_bytes)
+        check_count(count, self.source)
+        return range(count)
+
     def count(self, what: str, least_bytes: int) -> int:
         """A number of records, which the rest of the file must have room for."""
         (count,) = self.take("<Q")
@@ -154,9 +162,9 @@ class _Bytes:
 
 def _read_binary(camera_file: Path, image_file: Path) -> tuple[dict[int, _Sensor], list[_Image]]:
     cameras = _Bytes(camera_file)
-    sensors = dict(_binary_sensor(cameras) for _ in range(cameras.count("cameras", 24 + 3 * 8)))
+    sensors = dict(_binary_sensor(cameras) for _ in cameras.views("cameras", 24 + 3 * 8))
     images = _Bytes(image_file)
-    return sensors, [_binary_image(images) for _ in range(images.count("images", 64 + 1 + 8))]
+    return sensors, [_binary_image(images) for _ in images.views("images", 64 + 1 + 8)]
 
 
 def _binary_sensor(data: _Bytes) -> tuple[int, _Sensor]:
@@ -216,6 +224,13 @@ def _text_images(path: Path) -> Iterator[_Image]:
         if len(points) % 3 or (points and not points[-1].lstrip("-").isdigit()):
             expected = "X Y POINT3D_ID of each point of an image after its line, or an empty line"
             raise InvalidCameras(str(path), expected=expected, got=repr(" ".join(points)[:80]), hint=RE_EXPORT)
+
+
+def _counted(records: Iterator[T], path: Path) -> Iterator[T]:
+    """The records of a text, which announces no number, as long as a scene may have so many."""
+    for count, record in enumerate(records, start=1):
+        check_count(count, str(path))
+        yield record
 
 
 def _bad_line(path: Path, expected: str, line: str) -> InvalidCameras:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from liftcore.errors import InvalidCameras
 from liftcore.files import whole_file
-from liftcore.scene.cameras import Camera, Cameras, world_to_camera
+from liftcore.scene.cameras import Camera, Cameras, check_count, world_to_camera
 from liftcore.scene.json_file import FORMATS, entry, matrix, number, pixels
 from liftcore.scene.view_names import view_names
 
@@ -30,6 +30,7 @@ def parse_inria(document: Any, source: str) -> Cameras:
         if isinstance(document[0], dict):
             got = f"a list of objects with {', '.join(list(document[0])[:5])}"
         raise InvalidCameras(source, expected=FORMATS, got=got)
+    check_count(len(document), source)
     images = [str(entry(record, "img_name", f"{source} camera {i}")) for i, record in enumerate(document)]
     views = zip(view_names(images), document, strict=True)
     return Cameras(tuple(_camera(name, record, source) for name, record in views))

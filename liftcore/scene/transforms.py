@@ -10,7 +10,7 @@ import numpy as np
 
 from liftcore.errors import InvalidCameras
 from liftcore.scene.camera_models import Intrinsics
-from liftcore.scene.cameras import Camera, Cameras, world_to_camera
+from liftcore.scene.cameras import Camera, Cameras, check_count, world_to_camera
 from liftcore.scene.json_file import FORMATS, entry, matrix, number, pixels
 from liftcore.scene.view_names import view_names
 
@@ -55,6 +55,7 @@ def parse_transforms(document: Any, source: str) -> Cameras:
     frames = document["frames"]
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
         raise InvalidCameras(f"{source} frames", expected="a list of objects", got=repr(frames)[:60])
+    check_count(len(frames), f"{source} frames")
     files = [str(entry(frame, "file_path", f"{source} frame {i}")) for i, frame in enumerate(frames)]
     views = zip(view_names(files), frames, strict=True)
     return Cameras(tuple(_camera(name, ChainMap(frame, document), source) for name, frame in views))

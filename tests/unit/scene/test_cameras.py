@@ -6,6 +6,7 @@ import json
 import math
 import shutil
 import struct
+import time
 import zipfile
 from dataclasses import replace
 from pathlib import Path
@@ -386,6 +387,45 @@ def test_unknown_view_names_its_neighbours(model: Path) -> None:
     assert len(cameras) == len(CAMERAS) + 1
     with pytest.raises(NotFound, match="frame_2"):
         cameras.get("frame_3")
+
+
+def test_neighbours_of_a_long_name_are_found_at_once() -> None:
+    pose = np.eye(4)
+    far = [Camera(f"{k:06}" + "x" * 300, 4, 4, 5.0, 5.0, 2.0, 2.0, pose) for k in range(20_000)]
+    cameras = Cameras(tuple(far))
+    assert cameras.by_name is cameras.by_name  # made once, not at every look
+    started = time.perf_counter()
+    with pytest.raises(NotFound, match="nearest: ") as caught:
+        cameras.get("000001" + "y" * 494)
+    assert time.perf_counter() - started < 1  # all of them in full took 15 s
+    assert len(str(caught.value)) < 500
+
+
+@pytest.mark.parametrize("kind", ["binary", "text", "transforms", "inria"])
+def test_more_views_than_a_scene_may_have_are_refused_before_they_are_read(
+    kind: str, tmp_path: Path, model: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("liftcore.scene.cameras.MAX_VIEWS", 2)
+    monkeypatch.setattr("liftcore.scene.colmap._camera", None)
+    path = write_files(tmp_path / "many", (text_files if kind == "text" else binary_files)())
+    if kind == "binary":
+        announced = struct.pack("<Q", 3) + b"\0" * 3 * 73  # nothing that could be read
+        path = write_files(tmp_path / "many", {"images.bin": announced})
+    elif kind == "transforms":
+        path = with_json(tmp_path, {"frames": [{}] * 3})
+    elif kind == "inria":
+        path = with_json(tmp_path, [{"img_name": "a"}] * 3)
+    with pytest.raises(InvalidCameras, match=r"at most 2 views, got 3 or more; lift fewer photos"):
+        load_cameras(path)
+
+
+def test_announced_bombs_of_empty_images_are_refused(tmp_path: Path) -> None:
+    images = struct.pack("<Q", 300_000) + b"\0" * 300_000 * 73
+    path = write_files(tmp_path / "bomb", {**binary_files(), "images.bin": images})
+    started = time.perf_counter()
+    with pytest.raises(InvalidCameras, match=r"images\.bin: expected at most 100000 views, got 300000 or more"):
+        load_cameras(path)
+    assert time.perf_counter() - started < 1
 
 
 def test_real_cameras_agree_in_both_formats(shared_data: Path) -> None:

@@ -1,0 +1,20 @@
+"""Hints that name what is most like a text, at a cost that neither its length nor that of a list runs up."""
+
+from __future__ import annotations
+
+from itertools import islice
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+_SHOWN = 80  # characters of each name, and of the text, that are compared and shown
+_COMPARED = 2000  # names that a hint looks at: all of a long list would hold up other requests for seconds
+
+
+def nearest(text: str, names: Iterable[str], count: int) -> str:
+    """A hint that names the ``count`` names most like the text, of the first thousands and by their first letters."""
+    from rapidfuzz import process
+
+    cut = [name[:_SHOWN] for name in islice(names, _COMPARED)]
+    return f"nearest: {', '.join(name for name, _, _ in process.extract(text[:_SHOWN], cut, limit=count))}"
