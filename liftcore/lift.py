@@ -30,7 +30,6 @@ from liftcore.solve.host import Host
 from liftcore.solve.kept_columns import kept_columns
 from liftcore.solve.least_squares import refine
 from liftcore.solve.lift_warnings import lift_warnings
-from liftcore.solve.map_shapes import shape_warnings
 from liftcore.solve.reference import reference
 from liftcore.solve.robust import robust_weights
 from liftcore.solve.solver import closed_form_on
@@ -158,7 +157,7 @@ def _lift_on(run: Run, plan: Plan, sources: Sources, inputs: list[InputFile], ch
         }
     lifted = [sources.cameras.get(name) for name in sources.views]
     told = lift_warnings(sources.splats, lifted, geometry.denominators, settings.dtype, X.dtype, facts)
-    facts["warnings"] = [*told, *shape_warnings(sources.packs, lifted)]
+    facts["warnings"] = [*told, *plan.shapes]
     with run.timings.stage("certify"):
         certificate = certify(geometry, X, geometry.codebooks.__getitem__, settings, threads) | notes | facts
     return Lift(

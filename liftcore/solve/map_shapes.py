@@ -12,24 +12,38 @@ if TYPE_CHECKING:
 
 FEW_CELLS = 4  # on a side; of fewer a shape says little
 FAR = 2.0  # times wider or narrower than the image: square maps of photos are nearer
+CELL = 1  # cells of a map, and pixels of its image, that rounding to whole ones may add or take on a side
 TURNED = 1.2  # times nearer to the image's shape when rows and columns are swapped
 
 
 def shape_warnings(packs: FeaturePacks, views: Sequence[Camera]) -> list[str]:
-    """A warning where maps are far from the shape of their images, or nearer to it when turned.
+    """Warnings where maps are far from the shape of their images or nearer to it when turned, or else stretched.
 
-    Maps of any shape are stretched over their image, as encoders squeeze images into squares; so no lift is refused.
+    Maps of any shape are stretched over their image, as some encoders squeeze images into squares; what they cannot
+    be told from is a crop, so no lift is refused.
     """
-    odd = [camera for camera in views if _odd(packs.map_size(camera.name), camera)]
-    if not odd:
-        return []
-    first = odd[0]
-    width, height = packs.map_size(first.name)
-    shapes = f"{first.name}: {width}x{height} for {first.width}x{first.height}"
+    odd, stretched = [], []
+    for camera in views:
+        size = packs.map_size(camera.name)
+        if _odd(size, camera):
+            odd.append(camera)
+        elif _stretched(size, camera):
+            stretched.append(camera)
+    advice = {
+        "of another shape than their images{}: see that they are [rows, columns], channels last": odd,
+        "of another aspect than their images{}, over which they are stretched: maps must cover the whole image, and "
+        "those of a centre crop do not": stretched,
+    }
     return [
-        f"{len(odd)} of {len(views)} views have maps of another shape than their images ({shapes}): see that they are"
-        " [rows, columns], channels last"
+        f"{len(found)} of {len(views)} views have maps {text.format(_shapes(packs, found[0]))}"
+        for text, found in advice.items()
+        if found
     ]
+
+
+def _shapes(packs: FeaturePacks, camera: Camera) -> str:
+    width, height = packs.map_size(camera.name)
+    return f" ({camera.name}: {width}x{height} for {camera.width}x{camera.height})"
 
 
 def _odd(size: tuple[int, int], camera: Camera) -> bool:
@@ -38,6 +52,13 @@ def _odd(size: tuple[int, int], camera: Camera) -> bool:
         return False
     off, turned = (_factor(ratio * camera.height / camera.width) for ratio in (width / height, height / width))
     return off > FAR or off > TURNED * turned
+
+
+def _stretched(size: tuple[int, int], camera: Camera) -> bool:
+    """Whether no scale makes both sides of the image those of the map, to a cell, nor to a pixel of the image."""
+    (width, height), (W, H) = size, (camera.width, camera.height)
+    wide = (width - CELL) * (H - CELL) > (height + CELL) * (W + CELL)
+    return wide or (height - CELL) * (W - CELL) > (width + CELL) * (H + CELL)
 
 
 def _factor(ratio: float) -> float:

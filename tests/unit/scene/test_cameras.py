@@ -397,7 +397,7 @@ def test_neighbours_of_a_long_name_are_found_at_once() -> None:
     started = time.perf_counter()
     with pytest.raises(NotFound, match="nearest: ") as caught:
         cameras.get("000001" + "y" * 494)
-    assert time.perf_counter() - started < 1  # all of them in full took 15 s
+    assert time.perf_counter() - started < 1  # all of them in full take many times that
     assert len(str(caught.value)) < 500
 
 

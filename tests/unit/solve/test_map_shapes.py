@@ -8,12 +8,15 @@ import numpy as np
 import pytest
 import torch
 
-from liftcore.lift import lift
+from liftcore.device import CPU
+from liftcore.lift import lift, open_sources, planned
+from liftcore.measure.scene_files import cameras_of
 from liftcore.observe.inspect import inspect_file
 from liftcore.observe.observation import FeatureGrid, Observation, RegionMap
-from liftcore.observe.pack import open_packs
+from liftcore.observe.pack import open_packs, pair
 from liftcore.observe.write_pack import write_pack
 from liftcore.scene.cameras import Camera
+from liftcore.scene.load import load_cameras
 from liftcore.solve.map_shapes import shape_warnings
 from liftcore.solve.settings import LiftSettings
 
@@ -33,13 +36,48 @@ def grid(height: int, width: int, channels: int = 3) -> FeatureGrid:
 
 @pytest.mark.parametrize(
     ("cells", "size"),
-    [((30, 40), (640, 480)), ((24, 24), (640, 480)), ((24, 24), (1280, 720)), ((23, 31), (990, 742)),
-     ((1, 3), (64, 48)), ((16, 16), (480, 640)), ((9, 12), (500, 500))],
+    [((30, 40), (640, 480)), ((23, 31), (990, 742)), ((23, 30), (990, 742)), ((24, 31), (990, 742)),
+     ((1, 3), (64, 48)),
+     ((2, 2), (1280, 720)), ((371, 495), (990, 742)), ((3286, 4946), (1237, 821)), ((1, 1), (500, 2))],
 )  # fmt: skip
 def test_maps_as_encoders_make_them_are_not_told(
     tmp_path: Path, cells: tuple[int, int], size: tuple[int, int]
 ) -> None:
     assert told(tmp_path, grid(*cells), size) == []
+
+
+@pytest.mark.parametrize(
+    ("cells", "size"),
+    [((23, 23), (990, 742)), ((24, 24), (1280, 720)), ((16, 16), (480, 640)), ((9, 12), (500, 500))],
+)
+def test_maps_that_may_be_crops_are_told(tmp_path: Path, cells: tuple[int, int], size: tuple[int, int]) -> None:
+    [warning] = told(tmp_path, grid(*cells), size)
+    assert f"1 of 1 views have maps of another aspect than their images (v: {cells[1]}x{cells[0]} for" in warning
+    assert f"{size[0]}x{size[1]})" in warning and "must cover the whole image" in warning
+
+
+def test_a_crop_is_told_by_the_lift_and_by_its_plan(tmp_path: Path) -> None:
+    splats, cameras, _ = write_scene(tmp_path, 3)
+    pack, settings = tmp_path / "crops.safetensors", LiftSettings.of(certificate_rays=10)
+    write_pack(pack, {"v0": grid(23, 31), "v1": grid(23, 23), "v2": grid(23, 23)}, {"encoder": "e"})
+    [planned_for] = planned(open_sources(splats, cameras, [pack], settings), settings, CPU).shapes
+    assert planned_for.startswith("2 of 3 views have maps of another aspect than their images (v1: 23x23 for 37x27)")
+    warnings = lift(splats, cameras, [pack], settings).metadata.certificate["warnings"]
+    assert warnings.count(planned_for) == 1
+
+
+@pytest.mark.parametrize(
+    ("scene", "packs"),
+    [
+        ("plush", ("grids", "grids_test", "regions")),
+        ("tabletop", ("grids", "features", "features_clean", "features_hard")),
+    ],
+)
+def test_real_maps_are_not_told(scene: str, packs: tuple[str, ...], shared_data: Path) -> None:
+    cameras = load_cameras(cameras_of(shared_data / scene))
+    for name in packs:
+        paired = pair(open_packs([shared_data / scene / f"{name}.safetensors"]), cameras)[0]
+        assert shape_warnings(paired, [cameras.get(view) for view in paired.views]) == []
 
 
 @pytest.mark.parametrize(("cells", "size"), [((40, 30), (640, 480)), ((512, 30), (640, 480)), ((6, 30), (400, 400))])
