@@ -52,7 +52,9 @@ class MaskViews(ViewFolder):
 
 
 def mask_views(folder: Path, unlabelled: int = 0) -> MaskViews:
-    """The views of a folder and its sub-folders; ``IMG.jpg.npy`` is of the view ``IMG``, as the camera of ``IMG.jpg``.
+    """The views of a folder and its sub-folders.
+
+    ``IMG.jpg.npy`` is of the view ``IMG``, as the camera of ``IMG.jpg`` is.
 
     Args:
         folder: the folder. unlabelled: what pixels without a mask have in label pictures.

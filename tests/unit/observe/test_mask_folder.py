@@ -266,3 +266,15 @@ def test_pictures_beyond_pillows_limit_are_refused(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 5)
     with pytest.raises(InvalidFeatures, match="at most 10 pixels, got a larger picture"):
         mask_views(tmp_path)["a"]
+
+
+def test_masks_of_sub_folders_are_views_with_their_folders(tmp_path: Path) -> None:
+    for camera, ids in (("camA", LABELS), ("camB", LABELS[::-1])):
+        (tmp_path / camera).mkdir()
+        np.save(tmp_path / camera / "0.jpg.npy", VECTORS)
+        np.save(tmp_path / camera / "0_masks.npy", ids)
+    (tmp_path / ".thumbnails").mkdir()
+    (tmp_path / ".thumbnails" / "0.png").write_bytes(b"no mask")
+    views = mask_views(tmp_path)
+    assert list(views) == ["camA/0", "camB/0"]
+    assert np.array_equal(views["camB/0"].labels.numpy()[0], LABELS[::-1])

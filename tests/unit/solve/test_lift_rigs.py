@@ -7,9 +7,15 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from liftcore.artifact import save_lift
 from liftcore.lift import lift
+from liftcore.observe.observation import RegionMap
 from liftcore.observe.pack import open_packs
 from liftcore.observe.write_pack import write_pack
+from liftcore.query.directions import directions
+from liftcore.query.example import Region
+from liftcore.query.query import Query
+from liftcore.query.scene import QueryScene
 from liftcore.solve.settings import LiftSettings
 
 from .test_lift_equals_dense import write_scene
@@ -33,6 +39,15 @@ def test_folders_before_the_names_of_views_change_no_bit(tmp_path: Path) -> None
     assert torch.equal(plain.features, made.features)
     assert made.metadata.views == plain.metadata.views == ("v0", "v1", "v2")
     assert made.metadata.certificate["warnings"] == plain.metadata.certificate["warnings"]
+    save_lift(made, tmp_path / "rig.lift")
+    scene, packs = QueryScene.open(tmp_path / "rig.lift"), open_packs([features])
+    observation = packs.observation("v1")
+    assert isinstance(observation, RegionMap)
+    label = int(observation.labels[0].max())  # the region is asked for by the lift's name of the view
+    (direction,) = directions(scene, Query((Region("v1", 0, label),)), None)
+    assert torch.allclose(
+        direction, torch.nn.functional.normalize(observation.codebook[label].float(), dim=0), atol=1e-3
+    )
 
 
 def test_the_warning_of_skipped_views_tells_how_a_rig_is_named(tmp_path: Path) -> None:
