@@ -277,4 +277,4 @@ def test_masks_of_sub_folders_are_views_with_their_folders(tmp_path: Path) -> No
     (tmp_path / ".thumbnails" / "0.png").write_bytes(b"no mask")
     views = mask_views(tmp_path)
     assert list(views) == ["camA/0", "camB/0"]
-    assert np.array_equal(views["camB/0"].labels.numpy()[0], LABELS[::-1])
+    assert np.array_equal(views.read("camB/0").labels.numpy()[0], LABELS[::-1])

@@ -1,0 +1,29 @@
+"""Cameras as JSON documents."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from liftcore.scene.cameras import Cameras
+
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def transforms_of(cameras: Cameras) -> dict[str, Any]:
+    frames = []
+    for camera in cameras:
+        pose = np.linalg.inv(camera.world_to_camera) @ FLIP
+        size = {"w": camera.width, "h": camera.height}
+        lens = {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
+        frames.append({"file_path": f"images/{camera.name}.png", "transform_matrix": pose.tolist(), **size, **lens})
+    return {"frames": frames}
+
+
+def with_json(tmp_path: Path, document: Any) -> Path:
+    path = tmp_path / "document.json"
+    path.write_text(json.dumps(document))
+    return path

@@ -1,0 +1,95 @@
+"""How views are named in all formats, how many there may be, and what is said of a name that none has."""
+
+from __future__ import annotations
+
+import shutil
+import struct
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from camera_documents import transforms_of, with_json
+from colmap_files import CAMERAS, IMAGES, binary_files, text_files, write_files
+from rapidfuzz import process
+
+from liftcore.errors import InvalidCameras, NotFound
+from liftcore.scene.cameras import Camera, Cameras
+from liftcore.scene.inria import write_inria_cameras
+from liftcore.scene.load import load_cameras
+from liftcore.scene.view_names import view_names
+
+
+@pytest.fixture
+def model(tmp_path: Path) -> Path:
+    return write_files(tmp_path / "model", binary_files())
+
+
+def test_views_are_named_by_stem_and_all_by_path_where_any_stems_collide() -> None:
+    images = ["a/001.jpg", "b\\002.png", "003.JPG", "./train/r_0", "frame.0001"]
+    assert view_names(images) == ["001", "002", "003", "r_0", "frame.0001"]
+    assert view_names([*images, "b/001.jpg"]) == ["a/001", "b/002", "003", "train/r_0", "frame.0001", "b/001"]
+
+
+RIG = [f"camA/{k:03}.jpg" for k in range(4)] + [f"camB/{k:03}.jpg" for k in range(3)]
+
+
+@pytest.mark.parametrize("kind", ["folder", "text", "zip", "transforms", "inria"])
+def test_every_view_of_a_rig_keeps_its_folder_in_every_format(kind: str, tmp_path: Path) -> None:
+    images = [(*IMAGES[0][:3], name) for name in RIG]
+    path = write_files(tmp_path / "rig", (text_files if kind == "text" else binary_files)(images=images))
+    if kind == "zip":
+        path = Path(shutil.make_archive(str(path), "zip", path))
+    elif kind == "transforms":
+        path = with_json(tmp_path, transforms_of(load_cameras(path)))
+    elif kind == "inria":
+        cameras = [replace(camera, cx=camera.width / 2, cy=camera.height / 2) for camera in load_cameras(path)]
+        path = tmp_path / "cameras.json"
+        write_inria_cameras(Cameras(tuple(cameras)), path)
+    names = [camera.name.removeprefix("images/") for camera in load_cameras(path)]
+    assert names == [name.removesuffix(".jpg") for name in RIG]
+
+
+def test_unknown_view_names_its_neighbours(model: Path) -> None:
+    cameras = load_cameras(model)
+    assert len(cameras) == len(CAMERAS) + 1
+    with pytest.raises(NotFound, match="frame_2"):
+        cameras.get("frame_3")
+
+
+def test_neighbours_of_a_long_name_are_sought_among_few(monkeypatch: pytest.MonkeyPatch) -> None:
+    pose = np.eye(4)
+    far = [Camera(f"{k:06}" + "x" * 300, 4, 4, 5.0, 5.0, 2.0, 2.0, pose) for k in range(20_000)]
+    cameras = Cameras(tuple(far))
+    assert cameras.by_name is cameras.by_name  # made once, not at every look
+    compared = []
+    monkeypatch.setattr(process, "extract", lambda text, cut, **_: compared.extend([text, *cut]) or [])
+    with pytest.raises(NotFound, match="nearest:") as caught:
+        cameras.get("000001" + "y" * 494)
+    assert len(compared) == 2001 and max(map(len, compared)) == 80
+    assert len(str(caught.value)) < 500
+
+
+@pytest.mark.parametrize("kind", ["binary", "text", "transforms", "inria"])
+def test_more_views_than_a_scene_may_have_are_refused_before_they_are_read(
+    kind: str, tmp_path: Path, model: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("liftcore.scene.cameras.MAX_VIEWS", 2)
+    monkeypatch.setattr("liftcore.scene.colmap._camera", None)
+    path = write_files(tmp_path / "many", (text_files if kind == "text" else binary_files)())
+    if kind == "binary":
+        announced = struct.pack("<Q", 3) + b"\0" * 3 * 73  # nothing that could be read
+        path = write_files(tmp_path / "many", {"images.bin": announced})
+    elif kind == "transforms":
+        path = with_json(tmp_path, {"frames": [{}] * 3})
+    elif kind == "inria":
+        path = with_json(tmp_path, [{"img_name": "a"}] * 3)
+    with pytest.raises(InvalidCameras, match=r"at most 2 views, got 3 or more; lift fewer photos"):
+        load_cameras(path)
+
+
+def test_announced_bombs_of_empty_images_are_refused(tmp_path: Path) -> None:
+    images = struct.pack("<Q", 300_000) + b"\0" * 300_000 * 73
+    path = write_files(tmp_path / "bomb", {**binary_files(), "images.bin": images})
+    with pytest.raises(InvalidCameras, match=r"images\.bin: expected at most 100000 views, got 300000 or more"):
+        load_cameras(path)
