@@ -17,6 +17,7 @@ from liftcore.observe.header import check_header
 from service.errors import Misconfigured
 from service.settings import ServiceSettings, encoder_file, encoder_label
 
+KINDS = "table:FILE, minilm, open_clip:MODEL/TAG or open_clip:MODEL@FILE"
 TABLE = "a text table: safetensors with embeddings [n, F] and metadata words, a JSON list of n strings"
 
 
@@ -24,12 +25,15 @@ def require_encoder_files(settings: ServiceSettings) -> None:
     """See that every file that a text encoder of the settings names is there, and that tables look like ones.
 
     Raises:
-        Misconfigured: a file is missing or does not open, or a table is none; the setting is named.
+        Misconfigured: there is no such encoder, a file is missing or does not open, or a table is none. The setting
+            is named.
     """
     named = {"encoder": settings.encoder}
     named |= {f"text_spaces, {space!r}": spec for space, spec in settings.text_spaces.items()}
     for argument, spec in named.items():
         path = encoder_file(spec)
+        if path is None and spec != "minilm" and not spec.startswith("open_clip:"):
+            raise Misconfigured(argument, expected=KINDS, got=repr(spec))
         if path is not None:
             _require_readable(argument, path)
             if encoder_label(spec) == "table":

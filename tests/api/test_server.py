@@ -157,6 +157,15 @@ def test_every_setting_is_described() -> None:
         assert field.description, name
 
 
+def test_encoder_that_does_not_exist_is_told_before_the_start(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["--text-space", "clip=nonsense", "--data", str(tmp_path / "data")]) == 2
+    told = capsys.readouterr().err
+    assert "text_spaces, 'clip'" in told and "minilm" in told and "'nonsense'" in told
+    assert not (tmp_path / "data").exists()
+
+
 def test_encoder_is_chosen_by_text_space_and_never_by_the_client(tmp_path: Path) -> None:
     settings = ServiceSettings.model_validate({"data": tmp_path, "text_spaces": {"clip": "open_clip:X@w.pt"}})
     assert settings.encoder_spec("clip", None) == "open_clip:X@w.pt"
