@@ -49,9 +49,9 @@ class _Parser(argparse.ArgumentParser):
         words = rest[1:] if rest[0] == "--" else rest
         if words and getattr(options, self.last) is None:
             setattr(options, self.last, words.pop(0))
-        if words:
+        if words and not any(word.startswith("-") for word in words):
             self.error(f"unrecognized arguments: {' '.join(words)}; a text of several words is one, in quotes")
-        return options, []
+        return options, words
 
     def error(self, message: str) -> NoReturn:
         self.exit(BAD_INPUT, f"{self.prog}: {' '.join(message.split())}; see '{self.prog} --help'\n")

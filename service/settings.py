@@ -79,7 +79,9 @@ class ServiceSettings(BaseSettings):
         3600, ge=10, description="the largest budget of a trade-off; larger ones are answered 422"
     )
     lease_seconds: float = Field(
-        30, ge=3, description="silence after which a job's process is given up and its job goes back in line"
+        30,
+        ge=3,
+        description="silence after which a job's process, unless it computes, is given up: its job waits anew",
     )
     checkpoint_seconds: float = Field(2, ge=0, description="work that a killed lift may have to do again")
     max_streams: int = Field(32, ge=1, description="clients that may follow events at the same time; more get 503")

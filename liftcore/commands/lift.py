@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from liftcore.commands.bars import progress_bars
 from liftcore.commands.reply import free_output, reply, shown, writing
 from liftcore.errors import InvalidSettings
+from liftcore.nearest import nearest
 from liftcore.solve.settings import LiftSettings
 
 if TYPE_CHECKING:
@@ -74,8 +75,9 @@ def pairs_of(pairs: Sequence[str]) -> dict[str, Any]:
         if key not in LiftSettings.model_fields:
             raise _unknown(key)
         value = _value(text)
-        if values.setdefault(key, value) != value:
+        if key in values and values[key] != value:
             raise _contradiction(key, f"--set {key}={values[key]}", f"--set {pair}")
+        values[key] = value
     return values
 
 
@@ -87,10 +89,7 @@ def _value(text: str) -> Any:
 
 
 def _unknown(name: str) -> InvalidSettings:
-    from rapidfuzz import process
-
-    near = process.extract(name.replace("-", "_"), list(LiftSettings.model_fields), limit=3)
-    hint = f"nearest: {', '.join(known for known, _, _ in near)}"
+    hint = nearest(name.replace("-", "_"), LiftSettings.model_fields, 3)
     return InvalidSettings("--set", expected="a setting of a lift", got=f"the unknown {name[:80]!r}", hint=hint)
 
 

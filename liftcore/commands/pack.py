@@ -14,8 +14,6 @@ if TYPE_CHECKING:
 
     from liftcore.observe.folder import ViewFolder
 
-INPUTS = ("*.npy", "*.json", "*.png")
-
 
 def run(options: argparse.Namespace) -> int:
     """Write the pack whole or not at all, and say what is in it."""
@@ -24,7 +22,7 @@ def run(options: argparse.Namespace) -> int:
     from liftcore.observe.write_pack import write_pack
 
     views = _views(options)
-    out = free_output(options.output, [path for kind in INPUTS for path in options.folder.rglob(kind)])
+    out = free_output(options.output, views.inputs)
     with progress_bars() as progress, writing(out):
         write_pack(out, views, _metadata(options), progress)
     packs = open_packs([out])
@@ -37,6 +35,7 @@ def run(options: argparse.Namespace) -> int:
         "encoder": packs.encoder,
         "text_space": packs.text_space,
         "normalised": packs.normalised,
+        "folders": sorted({view.rpartition("/")[0] for view in views if "/" in view}),
         "sizes": described["sizes"],
         "renamed": {} if options.format == "langsplat" else _renamed(views, options.folder),
         "warnings": described["warnings"],
@@ -54,6 +53,8 @@ def _renamed(views: ViewFolder, folder: Path) -> dict[str, str]:
 def _lines(document: dict[str, Any]) -> Iterator[str]:
     yield f"{document['out']}: {document['views']} views, {document['channels']} channels, {document['bytes']} bytes"
     yield f"  {shown(document['sizes'])}"
+    if document["folders"]:
+        yield f"  of sub-folders, whose names are part of their views': {', '.join(document['folders'][:8])}"
     for name, view in list(document["renamed"].items())[:1]:
         yield f"  views are named without the suffix of their images, as cameras are: {name} is {view!r}"
     yield from (f"warning: {warning}" for warning in document["warnings"])

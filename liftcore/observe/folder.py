@@ -21,6 +21,11 @@ class ViewFolder(Mapping[str, Observation]):
     def __init__(self, files: Mapping[str, Path]) -> None:
         self.files = files
 
+    @property
+    def inputs(self) -> list[Path]:
+        """All files that are read."""
+        return list(self.files.values())
+
     @abstractmethod
     def read(self, view: str) -> Observation:
         """Read and check one view."""

@@ -24,6 +24,11 @@ if TYPE_CHECKING:
 class LangSplatViews(ViewFolder):
     """The views of a LangSplat folder; ids and embeddings are checked when a view is read."""
 
+    @property
+    def inputs(self) -> list[Path]:
+        """All files that are read."""
+        return [*super().inputs, *map(_codebook_file, super().inputs)]
+
     def read(self, view: str) -> RegionMap:
         """The region map of one view.
 

@@ -40,6 +40,11 @@ class MaskViews(ViewFolder):
         self.masks = masks
         self.unlabelled = unlabelled
 
+    @property
+    def inputs(self) -> list[Path]:
+        """All files that are read."""
+        return [*super().inputs, *self.masks.values()]
+
     def read(self, view: str) -> RegionMap:
         """The region map of one view: labels are rows of the vectors, in the order of the masks.
 
@@ -115,7 +120,7 @@ def _labels(path: Path, rows: int, unlabelled: int) -> np.ndarray:
 
 def _check_ids(stored: np.ndarray, rows: int, path: Path) -> None:
     """Refuse masks of zeros and ones, a plane each: as ids they would all be of the first two vectors."""
-    if stored.ndim == 3 and len(stored) == rows and float(stored.min()) >= 0 and float(stored.max()) <= 1:
+    if stored.ndim == 3 and len(stored) == rows > 1 and float(stored.min()) >= 0 and float(stored.max()) <= 1:
         got = f"{stored.dtype} {list(stored.shape)} of zeros and ones"
         hint = "masks that may overlap are booleans: numpy.save(name, masks.astype(bool))"
         raise InvalidFeatures(str(path), expected="mask ids, or booleans", got=got, hint=hint)

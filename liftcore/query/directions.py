@@ -12,6 +12,7 @@ import torch
 from liftcore.errors import InvalidQuery, NotFound
 from liftcore.observe.observation import RegionMap
 from liftcore.query.example import OneSplat, Pixel, Region, Vector
+from liftcore.scene.view_pairs import cameras_of_views
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -123,9 +124,10 @@ def _rendered(scene: QueryScene, pixel: Pixel) -> Tensor:
 
 def _observation(scene: QueryScene, example: Region) -> RegionMap:
     packs = scene.packs
-    if example.view not in packs.views:
+    view = cameras_of_views([example.view], packs.views).get(example.view)  # named as the pack or its camera is
+    if view is None:
         raise NotFound(str(example), expected="a view of the lift's feature packs", got=repr(example.view))
-    observation = packs.observation(example.view)
+    observation = packs.observation(view)
     if not isinstance(observation, RegionMap):
         hint = "ask by a pixel, VIEW:x,y"
         raise InvalidQuery(str(example), expected="a view with regions", got="a feature grid", hint=hint)

@@ -140,19 +140,16 @@ class QueryScene:
 
     @cached_property
     def packs(self) -> FeaturePacks:
-        """The feature packs that were lifted, with the lift's names of their views; queries by region read a row.
+        """The feature packs that were lifted; queries by region read a row of them.
 
         Raises:
             InvalidLift: a pack moved, or is another than the one that was lifted.
         """
         from liftcore.observe.pack import open_packs
-        from liftcore.scene.view_pairs import cameras_of_views
 
         files = zip(self.lift.metadata.features, self._packs_at, strict=True)
         moved = [file.model_copy(update={"path": str(path)}) for file, path in files]
-        packs = open_packs([unchanged("features", file, self.path) for file in moved])
-        lifted = cameras_of_views(packs.views, self.lift.metadata.views)
-        return packs.renamed({view: lifted.get(view, view) for view in packs.views})
+        return open_packs([unchanged("features", file, self.path) for file in moved])
 
     def find_packs(self, paths: Sequence[Path]) -> None:
         """Say where the feature packs lie now, when they moved since the lift; in the lift's order."""

@@ -7,6 +7,7 @@ million items, so what lies in memory at a time has a bound, and only then is a 
 from __future__ import annotations
 
 from itertools import pairwise
+from threading import Lock
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from liftcore.raster.protocol import RegionWeights
     from liftcore.raster.walk import Frame
 
-MOST_LISTED = 1 << 24  # tiles that one share of the splats may list before the view is cut
+MOST_LISTED = 1 << 26  # tiles that all splats together may list before the view is cut
 BAND_ITEMS = 1 << 24  # of a band's lists, unless one tile has more: there may be several entries of W to each
 NO_LIMIT = np.iinfo(np.int64).max
 
@@ -52,18 +53,21 @@ class Bands:
             yield frame
 
     def _frame(self, span: tuple[int, int], most: int) -> Frame | None:
-        """The frame of the tiles from ``span[0]`` to ``span[1]``; None where a part lists more than ``most``."""
+        """The frame of the tiles from ``span[0]`` to ``span[1]``; None where there are more than ``most`` items."""
         counts = np.zeros((len(self._parts), self._bare.rows * self._bare.columns), np.int64)
-        over = False
+        found = 0
 
         def listed(part: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            nonlocal over
-            lengths, tiles = self._list(part[: 0 if over else None], span, most, counts)
-            over |= len(tiles) > most
+            nonlocal found
+            room = most - found
+            lengths, tiles = self._list(part if room >= 0 else part[:0], span, max(0, room), counts)
+            with lock:
+                found += len(tiles)
             return lengths, tiles
 
+        lock = Lock()
         lists = self._run(listed, list(zip(self._parts, counts, strict=True)))
-        if over:
+        if found > most:
             return None
         starts, cursors = tile_places(counts)
         items = np.empty(starts[-1], np.int32)
@@ -81,7 +85,7 @@ class Bands:
     def _counted(self) -> np.ndarray:
         """[tiles] i64: how many splats touch each tile, by lists that are not kept."""
         tiles = self._bare.rows * self._bare.columns
-        at_a_time = max(1, MOST_LISTED // tiles)
+        at_a_time = max(1, BAND_ITEMS // tiles)
 
         def counted(part: np.ndarray) -> np.ndarray:
             counts = np.zeros(tiles, np.int64)

@@ -12,6 +12,7 @@ import numpy as np
 
 from liftcore.errors import InvalidCameras, NotFound
 from liftcore.nearest import nearest
+from liftcore.scene.view_pairs import cameras_of_views
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -141,12 +142,12 @@ class Cameras:
         return {camera.name: camera for camera in self.views}
 
     def get(self, name: str) -> Camera:
-        """The view of that name.
+        """The view of that name, or of a name that pairs with it (`view_pairs`): lifts of before name rigs otherwise.
 
         Raises:
             NotFound: no view has it; the error names the nearest ones.
         """
-        found = self.by_name.get(name)
+        found = self.by_name.get(name) or self.by_name.get(cameras_of_views([name], self.by_name).get(name, ""))
         if found is None:
             got, hint = repr(name[:SHOWN]), nearest(name, self.by_name, NEAREST)
             raise NotFound("view", expected="the name of a camera", got=got, hint=hint)

@@ -73,6 +73,9 @@ _SPEEDS: dict[Speed, dict[str, Any]] = {
 }
 
 
+MOST_CERTIFICATE_RAYS = 1_000_000  # of a new lift: ten millions of one view took 8 GB
+
+
 class LiftSettings(BaseModel):
     """All that decides the result of a lift, and where it runs. Knobs left out take the preset's values."""
 
@@ -117,7 +120,7 @@ class LiftSettings(BaseModel):
         False, description="splats without a cluster's feature are solved for again from the kept regions alone"
     )
     aggregation_channels: int = Field(50, ge=1, le=1_024, description="principal components that it sees")
-    certificate_rays: int = Field(10_000, ge=0, le=1_000_000, description="rays sampled for the certificate")
+    certificate_rays: int = Field(10_000, ge=0, le=10_000_000, description="rays sampled for the certificate")
     seed: int = Field(0, ge=0, lt=2**31, description="of samples, random projections and strides")
     cg_steps: int = Field(0, ge=0, le=10_000, description="least-squares steps from the closed form on, 0 = none")
     damping: float = Field(1.0, ge=0, le=1e6, description="mu, pulls least squares towards the closed form")
@@ -157,7 +160,7 @@ class LiftSettings(BaseModel):
             InvalidSettings: an unknown name or a value out of range.
         """
         try:
-            return cls(**values)
+            settings = cls(**values)
         except ValidationError as error:
             first = error.errors()[0]
             name = ".".join(str(part) for part in first["loc"]) or "settings"
@@ -165,3 +168,7 @@ class LiftSettings(BaseModel):
             known = ", ".join(cls.model_fields)
             hint = f"the settings are {known}" if first["type"] == "extra_forbidden" else ""
             raise InvalidSettings(name, expected=expected, got=repr(first["input"])[:_SHOWN], hint=hint) from None
+        if settings.certificate_rays > MOST_CERTIFICATE_RAYS:  # here, not in the field: older lifts have more
+            expected, got = f"at most {MOST_CERTIFICATE_RAYS} rays", str(settings.certificate_rays)
+            raise InvalidSettings("certificate_rays", expected=expected, got=got)
+        return settings

@@ -85,6 +85,15 @@ def test_a_band_holds_no_more_than_it_may(cut):
     assert len(frames) < lengths.shape[1]  # and not each by itself
 
 
+@pytest.mark.parametrize("threads", [1, 2, 3])
+def test_a_view_is_cut_where_all_its_lists_together_are_too_long(threads, monkeypatch):
+    splats = random_splats(5, 300)
+    (whole,) = CpuRaster(splats, threads)._bands(CAMERA, Walk())
+    for most, cut in ((len(whole.items), False), (len(whole.items) - 1, True), (0, True)):
+        monkeypatch.setattr(bands, "MOST_LISTED", most)
+        assert (CpuRaster(splats, threads)._bands(CAMERA, Walk())._whole is None) is cut
+
+
 def test_a_view_of_usual_lists_is_one_band():
     raster = CpuRaster(random_splats(5, 300), threads=1)
     (first,), (again,) = raster._bands(CAMERA, Walk()), raster._bands(CAMERA, Walk())

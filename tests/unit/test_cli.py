@@ -158,6 +158,18 @@ def test_settings_are_json_or_words() -> None:
         pairs_of(["=1"])
 
 
+def test_older_lifts_may_have_had_more_rays_than_new_ones_may() -> None:
+    assert LiftSettings.model_validate({"certificate_rays": 5_000_000}).certificate_rays == 5_000_000
+    with pytest.raises(InvalidSettings, match="certificate_rays: expected at most 1000000 rays, got 5000000"):
+        LiftSettings.of(certificate_rays=5_000_000)
+
+
+def test_not_a_number_is_no_contradiction() -> None:
+    assert str(pairs_of(["damping=NaN"])["damping"]) == "nan"
+    with pytest.raises(InvalidSettings, match="damping: expected one value"):
+        pairs_of(["damping=1", "damping=2"])
+
+
 def test_plan_is_printed_alone_and_before_a_lift_and_kept_with_it(
     scene: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -133,3 +133,21 @@ def test_masks_that_do_not_fit_write_nothing(tmp_path: Path, capsys: pytest.Capt
         status, out, err = run(capsys, "pack", "masks", tmp_path, "-o", "p.safetensors", f"--unlabelled={value}")
         assert (status, out) == (2, "")
         assert "a whole number from 0 to 65535" in err
+
+
+def test_sub_folders_are_told_and_no_input_is_written_over(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "masks"
+    for camera in ("camA", "camB"):
+        (folder / camera).mkdir(parents=True)
+        np.save(folder / camera / "0.npy", np.ones((1, 3), np.float32))
+        Image.fromarray(np.ones((2, 2), np.uint8)).save(folder / camera / "0.PNG", format="PNG")
+    status, out, _ = run(capsys, "pack", "masks", folder, "-o", tmp_path / "p.safetensors")
+    assert status == 0
+    assert "of sub-folders, whose names are part of their views': camA, camB" in out
+    for name in ("0.PNG", "0.npy"):
+        before = (folder / "camA" / name).read_bytes()
+        status, _, err = run(capsys, "pack", "masks", folder, "-o", folder / "camA" / name)
+        assert status == 2 and "another file than the inputs" in err
+        assert (folder / "camA" / name).read_bytes() == before

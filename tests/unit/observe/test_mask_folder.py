@@ -268,6 +268,12 @@ def test_pictures_beyond_pillows_limit_are_refused(tmp_path: Path, monkeypatch: 
         mask_views(tmp_path)["a"]
 
 
+def test_one_mask_over_the_whole_photo_is_one(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", VECTORS[:1])
+    np.save(tmp_path / "a_masks.npy", np.zeros((1, 3, 4), np.int32))
+    assert not mask_views(tmp_path).read("a").labels.any()
+
+
 def test_masks_of_sub_folders_are_views_with_their_folders(tmp_path: Path) -> None:
     for camera, ids in (("camA", LABELS), ("camB", LABELS[::-1])):
         (tmp_path / camera).mkdir()

@@ -57,6 +57,17 @@ def test_unknown_view_names_its_neighbours(model: Path) -> None:
         cameras.get("frame_3")
 
 
+def test_a_view_is_found_by_its_last_part_where_that_is_clear() -> None:
+    """Lifts of before name the views of a rig that are alone with their number without its folder."""
+    pose = np.eye(4)
+    names = ("images/camA/000", "images/camB/000", "images/camA/001")
+    cameras = Cameras(tuple(Camera(name, 4, 4, 5.0, 5.0, 2.0, 2.0, pose) for name in names))
+    assert cameras.get("001").name == cameras.get("camA/001").name == "images/camA/001"
+    for unclear in ("000", "camB/001", "images/camB/001"):
+        with pytest.raises(NotFound):
+            cameras.get(unclear)
+
+
 def test_neighbours_of_a_long_name_are_sought_among_few(monkeypatch: pytest.MonkeyPatch) -> None:
     pose = np.eye(4)
     far = [Camera(f"{k:06}" + "x" * 300, 4, 4, 5.0, 5.0, 2.0, 2.0, pose) for k in range(20_000)]
