@@ -81,7 +81,7 @@ class ServiceSettings(BaseSettings):
     lease_seconds: float = Field(
         30,
         ge=3,
-        description="silence after which a job's process, unless it computes, is given up: its job waits anew",
+        description="silence after which a job's process is given up, unless it computes, and its job waits anew",
     )
     checkpoint_seconds: float = Field(2, ge=0, description="work that a killed lift may have to do again")
     max_streams: int = Field(32, ge=1, description="clients that may follow events at the same time; more get 503")
