@@ -55,7 +55,7 @@ class Bands:
     def _frame(self, span: tuple[int, int], most: int) -> Frame | None:
         """The frame of the tiles from ``span[0]`` to ``span[1]``; None where there are more than ``most`` items."""
         counts = np.zeros((len(self._parts), self._bare.rows * self._bare.columns), np.int64)
-        found = 0
+        found, lock = 0, Lock()
 
         def listed(part: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             nonlocal found
@@ -65,7 +65,6 @@ class Bands:
                 found += len(tiles)
             return lengths, tiles
 
-        lock = Lock()
         lists = self._run(listed, list(zip(self._parts, counts, strict=True)))
         if found > most:
             return None
@@ -78,7 +77,10 @@ class Bands:
         self._run(fill, list(zip(self._parts, lists, cursors, strict=True)))
         return self._bare._replace(starts=starts, items=items)
 
-    def _list(self, part: np.ndarray, span: tuple[int, int], most: int, counts: np.ndarray) -> tuple:
+    def _list(
+        self, part: np.ndarray, span: tuple[int, int], most: int, counts: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """``list_tiles`` of a part [n] i32 of the depth order: lengths [n] i32, tiles [sum] i32; counts grow."""
         size = self._bare.rows, self._bare.columns
         return list_tiles(part, self._bare.kernel, self._bare.records, size, span, most, counts)
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from liftcore.errors import InvalidSplats
-from liftcore.scene.kernel import Kernel as Kernel  # noqa: PLC0414  # who has splats has their kernels
+from liftcore.scene.kernel import Kernel
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -71,18 +71,23 @@ def test_sams_masks_make_a_lift_that_knows_the_words(scene_folder: Path, monkeyp
     for name, module in stand_ins().items():
         monkeypatch.setitem(sys.modules, name, module)
     run_example("from segment_anything import")
-    with zipfile.ZipFile(io.BytesIO(colmap_zip())) as archive:
-        archive.extractall(scene_folder)
-    (scene_folder / "features.safetensors").unlink()
-    section = text("README.md").partition("### From SAM's masks")[2].partition("\n## ")[0]
-    lines = [line for line in section.splitlines() if line.startswith(".venv/bin/splatlift ")]
-    commands = [shlex.split(line)[1:] for line in lines]
+    commands = commands_between("### From SAM's masks", "\n## ", scene_folder)
     assert [command[0] for command in commands] == ["pack", "lift"]
     question = ["query", "scene.lift.safetensors", "apple", "--table", "words.safetensors", "--view", "middle"]
     assert [main(command) for command in [*commands, [*question, "--mask", "apple.png"]]] == [0, 0, 0]
     with Image.open(scene_folder / "apple.png") as mask:
         columns = np.asarray(mask).nonzero()[1]
     assert len(columns) > 0 and columns.max() < WIDTH // 2
+
+
+def commands_between(begin: str, end: str, folder: Path) -> list[list[str]]:
+    """The commands of a part of README, for a folder with a COLMAP model and without features."""
+    with zipfile.ZipFile(io.BytesIO(colmap_zip())) as archive:
+        archive.extractall(folder)
+    (folder / "features.safetensors").unlink()
+    section = text("README.md").partition(begin)[2].partition(end)[0]
+    lines = [line for line in section.splitlines() if line.startswith(".venv/bin/splatlift ")]
+    return [shlex.split(line)[1:] for line in lines]
 
 
 def run_example(start: str) -> dict[str, Any]:
@@ -153,12 +158,7 @@ def test_the_way_from_own_maps_to_a_mask_leads_there(scene_folder: Path) -> None
     for view, clusters in labels().items():
         grid = codebook()[clusters[0]].transpose(2, 0, 1)  # [F, h, w], as PyTorch has it
         np.save(scene_folder / "maps" / f"{view}.png.npy", grid.astype(np.float16))
-    with zipfile.ZipFile(io.BytesIO(colmap_zip())) as archive:
-        archive.extractall(scene_folder)
-    (scene_folder / "features.safetensors").unlink()
-    section = text("README.md").partition("## Your own scene")[2].partition("The same over HTTP")[0]
-    lines = [line for line in section.splitlines() if line.startswith(".venv/bin/splatlift ")]
-    commands = [shlex.split(line)[1:] for line in lines]
+    commands = commands_between("## Your own scene", "The same over HTTP", scene_folder)
     assert [command[0] for command in commands] == ["inspect", "inspect", "pack", "lift", "query"]
     assert [main(command) for command in commands] == [0] * len(commands)
     with Image.open(scene_folder / "apple.png") as mask:
