@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from copy import deepcopy
+from dataclasses import dataclass
 from typing import Any
 
 from pydantic import (
@@ -10,12 +12,14 @@ from pydantic import (
     BaseModel,
     BeforeValidator,
     ConfigDict,
+    GetJsonSchemaHandler,
     ValidationError,
     ValidatorFunctionWrapHandler,
     WrapValidator,
     model_validator,
 )
-from pydantic_core import PydanticCustomError
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema, PydanticCustomError
 
 NAME_CHARACTERS = 80  # of a name that a client sent, told back
 
@@ -56,6 +60,21 @@ def _no_boolean(value: Any) -> Any:
 
 
 NoBoolean = BeforeValidator(_no_boolean)  # of a number: pydantic reads true as 1
+
+
+@dataclass(frozen=True)
+class Published:
+    """Shows a field in the OpenAPI document as a model's own fields, which another module checks in its own words."""
+
+    model: type[BaseModel]
+    without: Sequence[str] = ()
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        shown = deepcopy(handler.resolve_ref_schema(handler(self.model.__pydantic_core_schema__)))
+        for name in self.without:
+            shown["properties"].pop(name)
+        del shown["title"]
+        return shown
 
 
 class Body(BaseModel):

@@ -7,10 +7,12 @@ from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from service.fields import Body, NoBoolean, at_most, takes
+from liftcore.solve.settings import LiftSettings
+from service.fields import Body, NoBoolean, Published, at_most, takes
 
 ASSET_ID = r"^sha256:[0-9a-f]{64}$"
 JOB_ID = r"^[0-9a-f]{32}$"
+COMPARED = ("preset", "speed")  # what differs between the runs of a trade-off
 VIEW_CHARACTERS = 500  # of a camera's name that can be asked for
 
 AssetId = Annotated[str, Field(pattern=ASSET_ID, description="sha256: and the digest of the bytes, in hex")]
@@ -89,9 +91,10 @@ class LiftRequest(Body):
     splats: AssetId
     cameras: AssetId
     features: Annotated[list[AssetId], Field(min_length=1, max_length=10_000)]
-    settings: dict[str, Scalar] = Field(
+    settings: Annotated[dict[str, Scalar], Published(LiftSettings)] = Field(
         default_factory=dict,
-        description="preset and knobs of the lift; those left out take the preset's values",
+        description="preset and knobs of the lift; those left out take the values of the preset and the speed",
+        examples=[{"preset": "tikhonov", "speed": "balanced"}],
     )
 
 
@@ -108,8 +111,10 @@ class Labels(Body):
 class TradeoffRequest(LiftRequest):
     """What to compare: lifts of these assets, each with another preset or place of the dial."""
 
-    settings: dict[str, Scalar] = Field(
-        default_factory=dict, description="of all runs: knobs of the lift beside preset and speed, which are compared"
+    settings: Annotated[dict[str, Scalar], Published(LiftSettings, without=COMPARED)] = Field(
+        default_factory=dict,
+        description="of all runs: knobs of the lift beside preset and speed, which are compared",
+        examples=[{"robust_steps": 1}],
     )
     budget_s: Annotated[float, Field(ge=10, le=86_400), NoBoolean] = Field(
         600, description="seconds to plan with; the exact run is made whatever it takes"

@@ -5,10 +5,13 @@ Importing this module loads neither torch nor numba: the service validates reque
 
 from __future__ import annotations
 
+import json
+from collections.abc import Callable, Iterable, Mapping
 from enum import StrEnum
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic_core import PydanticCustomError
 
 from liftcore.errors import InvalidSettings
 from liftcore.raster.weighting import MOST_OF_A_RAY, Selection
@@ -87,7 +90,7 @@ class LiftSettings(BaseModel):
     k: int = Field(40, ge=1, le=MOST_OF_A_RAY, description="how many weights of a ray top-k keeps")
     mass: float = Field(0.75, gt=0, le=1, description="the share of the light within which front-mass keeps weights")
     weight_floor: float = Field(0.0, ge=0, lt=1, description="smaller weights count none, in every selection")
-    power: Literal[0, 1, 2] = Field(2, description="a kept weight's exponent: 1, w or w^2")
+    power: int = Field(2, ge=0, le=2, description="a kept weight's exponent: 1, w or w^2")
     lift_gain: float = Field(TIKHONOV_GAIN, gt=0, le=16, description="lambda on the opacity logits, lifting")
     render_gain: float = Field(TIKHONOV_GAIN, gt=0, le=16, description="lambda on the opacity logits, rendering")
     alpha_cap: float = Field(0.99, gt=0, le=LARGEST_ALPHA, description="the largest alpha of a splat on a ray")
@@ -120,7 +123,13 @@ class LiftSettings(BaseModel):
         False, description="splats without a cluster's feature are solved for again from the kept regions alone"
     )
     aggregation_channels: int = Field(50, ge=1, le=1_024, description="principal components that it sees")
-    certificate_rays: int = Field(10_000, ge=0, le=10_000_000, description="rays sampled for the certificate")
+    certificate_rays: int = Field(
+        10_000,
+        ge=0,
+        le=10_000_000,
+        description="rays sampled for the certificate",
+        json_schema_extra={"maximum": MOST_CERTIFICATE_RAYS},  # of a new lift
+    )
     seed: int = Field(0, ge=0, lt=2**31, description="of samples, random projections and strides")
     cg_steps: int = Field(0, ge=0, le=10_000, description="least-squares steps from the closed form on, 0 = none")
     damping: float = Field(1.0, ge=0, le=1e6, description="mu, pulls least squares towards the closed form")
@@ -149,26 +158,56 @@ class LiftSettings(BaseModel):
     @model_validator(mode="after")
     def _resolves_whole_regions(self) -> Self:
         if self.aggregation_resolve and self.levels == "composite":
-            raise ValueError("aggregation_resolve drops regions, which levels=composite cuts to pieces")
+            told = "other levels than composite, which cut to pieces the regions that aggregation_resolve drops"
+            raise PydanticCustomError("whole_regions", "{expected}", {"expected": told})
         return self
 
     @classmethod
     def of(cls, /, **values: Any) -> Self:
-        """Settings from keyword arguments, with errors in the project's own words.
+        """Settings from keyword arguments, of which texts may stand for numbers, as on a command line.
 
         Raises:
             InvalidSettings: an unknown name or a value out of range.
         """
+        return cls._checked(lambda: cls(**values))
+
+    @classmethod
+    def of_json(cls, values: Mapping[str, Any]) -> Self:
+        """Settings from JSON, where a number is a number and a boolean no number.
+
+        Raises:
+            InvalidSettings: an unknown name, or a value of another type or out of range.
+        """
+        whole = {name: int(value) if _is_whole(value) else value for name, value in values.items()}
+        text = json.dumps(whole, ensure_ascii=False).encode("utf-8", "replace")  # half a surrogate pair is no setting
+        return cls._checked(lambda: cls.model_validate_json(text, strict=True))
+
+    @classmethod
+    def _checked(cls, made: Callable[[], Self]) -> Self:
+        """The settings that are made, or what is wrong with them in the project's own words."""
         try:
-            settings = cls(**values)
+            settings = made()
         except ValidationError as error:
-            first = error.errors()[0]
-            name = ".".join(str(part) for part in first["loc"]) or "settings"
-            expected = first["msg"][0].lower() + first["msg"][1:]
-            known = ", ".join(cls.model_fields)
-            hint = f"the settings are {known}" if first["type"] == "extra_forbidden" else ""
-            raise InvalidSettings(name, expected=expected, got=repr(first["input"])[:_SHOWN], hint=hint) from None
+            raise _told(error, cls.model_fields) from None
         if settings.certificate_rays > MOST_CERTIFICATE_RAYS:  # here, not in the field: older lifts have more
             expected, got = f"at most {MOST_CERTIFICATE_RAYS} rays", str(settings.certificate_rays)
             raise InvalidSettings("certificate_rays", expected=expected, got=got)
         return settings
+
+
+def _told(error: ValidationError, known: Iterable[str]) -> InvalidSettings:
+    """The first thing that is wrong, with all that its setting may be."""
+    first, *others = error.errors()
+    name, branches = "settings", [first]
+    if first["loc"]:
+        name = str(first["loc"][0])[:_SHOWN]
+        branches += [other for other in others if other["loc"][:1] == first["loc"][:1]]
+    if first["type"] == "extra_forbidden":
+        return InvalidSettings(name, expected=f"one of {', '.join(known)}", got="an unknown setting")
+    expected = " or ".join(branch["msg"].removeprefix("Input should be ") for branch in branches)
+    return InvalidSettings(name, expected=expected, got=repr(first["input"])[:_SHOWN])
+
+
+def _is_whole(value: Any) -> bool:
+    """Whether JSON means a whole number, which some write as 2.0."""
+    return isinstance(value, float) and value.is_integer()

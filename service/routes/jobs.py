@@ -10,7 +10,6 @@ import anyio
 from fastapi import APIRouter, Header, Query, Response
 from fastapi.responses import JSONResponse
 
-from liftcore.errors import InvalidSettings
 from liftcore.solve.settings import LiftSettings
 from service import request_id, wire
 from service.faults import error_of
@@ -63,7 +62,7 @@ REPEATED: dict[int | str, dict[str, Any]] = {
 @router.post("/lift", response_model=wire.Job, status_code=202, responses=REPEATED)
 def submit(order: wire.LiftRequest, here: Here, key: Key = None) -> Response:
     """Lift features onto splats. The job is on the disk before this answers."""
-    settings = parse_settings(order.settings)
+    settings = LiftSettings.of_json(order.settings)
     wanted = JobOrder(
         splats=order.splats,
         cameras=order.cameras,
@@ -147,19 +146,6 @@ def require_fit(order: JobOrder, here: Parts) -> None:
     if judges:
         check_labels(order, cameras, packs, *judges)
     here.store.files.require_room(scratch_bytes(order.kind, splats, packs))
-
-
-def parse_settings(given: dict[str, wire.Scalar]) -> LiftSettings:
-    """The settings of a lift.
-
-    Raises:
-        InvalidSettings: an unknown name or a value out of range.
-    """
-    known = LiftSettings.model_fields
-    for name in given:
-        if name not in known:
-            raise InvalidSettings(name[:80], expected=f"one of {', '.join(known)}", got="an unknown setting")
-    return LiftSettings.of(**given)
 
 
 def event_data(event: Event) -> str:

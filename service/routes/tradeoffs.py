@@ -7,16 +7,16 @@ from typing import Any
 from fastapi import APIRouter, Request, Response
 
 from liftcore.errors import InvalidSettings
+from liftcore.solve.settings import LiftSettings
 from service import request_id, wire
 from service.content import TAGGED, tagged, unchanged
 from service.errors import InvalidRequest
 from service.parts import Here
-from service.routes.jobs import REPEATED, Key, parse_settings, take
+from service.routes.jobs import REPEATED, Key, take
 from service.routes.queries import PNG
 from service.store.jobs import JobOrder, fingerprint
 from service.store.tradeoffs import TradeoffRecord
 
-COMPARED = ("preset", "speed")
 MARKDOWN_TYPE = "text/markdown; charset=utf-8"
 MARKDOWN: dict[int | str, dict[str, Any]] = {200: {"content": {MARKDOWN_TYPE: {"schema": {"type": "string"}}}}}
 
@@ -26,10 +26,10 @@ router = APIRouter(tags=["trade-offs"])
 @router.post("/tradeoff", response_model=wire.Job, status_code=202, responses=REPEATED)
 def submit(order: wire.TradeoffRequest, here: Here, key: Key = None) -> Response:
     """Compare the dial and the presets on a scene within a budget. The job is on the disk before this answers."""
-    for name in COMPARED:
+    for name in wire.COMPARED:
         if name in order.settings:
             raise InvalidSettings(name, expected="settings that are the same in all runs", got="one that is compared")
-    parse_settings(order.settings)
+    LiftSettings.of_json(order.settings)
     if order.budget_s > here.settings.tradeoff_seconds:
         most = f"at most {here.settings.tradeoff_seconds:g} s, as the operator allows"
         raise InvalidRequest("budget_s", expected=most, got=f"{order.budget_s:g}")

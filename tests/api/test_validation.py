@@ -7,6 +7,9 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
+from liftcore.solve.settings import LiftSettings
+from service.wire import COMPARED
+
 from .test_problems import NO_ASSET, assert_problem
 
 JSON = {"Content-Type": "application/json"}
@@ -106,3 +109,24 @@ def test_texts_have_a_length_together(client: TestClient, name: str) -> None:
         assert (told["status"], told["argument"]) == (422, name)
         assert told["expected"] == f"texts of at most 4000 characters together, which are {len(''.join(texts))}"
     assert "4000" not in client.post("/query", json={"text": ["apple"], name: ["a" * 125] * 32}).text
+
+
+def test_settings_have_the_types_that_the_document_shows(client: TestClient) -> None:
+    order = {"splats": NO_ASSET, "cameras": NO_ASSET, "features": [NO_ASSET]}
+    shown = client.get("/openapi.json").json()["components"]["schemas"]
+    for path, schema, left_out in (("/lift", "LiftRequest", set()), ("/tradeoff", "TradeoffRequest", set(COMPARED))):
+        fields = shown[schema]["properties"]["settings"]
+        assert set(fields["properties"]) == set(LiftSettings.model_fields) - left_out
+        assert fields["additionalProperties"] is False
+        assert fields["properties"]["stride"]["type"] == "integer"
+        told = assert_problem(client.post(path, json=order | {"settings": {"stride": "2"}}))
+        assert (told["status"], told["argument"], told["expected"]) == (422, "stride", "a valid integer")
+        for example in fields["examples"]:  # right, so it is the assets that are missed
+            assert client.post(path, json=order | {"settings": example}).status_code == 404
+
+
+def test_unknown_setting_is_refused_with_the_known_ones(client: TestClient) -> None:
+    order = {"splats": NO_ASSET, "cameras": NO_ASSET, "features": [NO_ASSET]}
+    told = assert_problem(client.post("/lift", json=order | {"settings": {"x" * 500: 1}}))
+    assert (told["status"], told["argument"], told["got"]) == (422, "x" * 80, "an unknown setting")
+    assert told["expected"].startswith("one of preset, speed, ")

@@ -1,0 +1,68 @@
+"""Settings as JSON and as keyword arguments, and what is told of those that do not fit."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from liftcore.errors import InvalidSettings
+from liftcore.solve.settings import LiftSettings, Preset
+
+LEVELS = "'rows' or 'composite' or a valid integer"
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [
+        ("stride", "2", "a valid integer"),
+        ("stride", True, "a valid integer"),
+        ("stride", 2.5, "a valid integer"),
+        ("power", True, "a valid integer"),
+        ("power", 3, "less than or equal to 2"),
+        ("antialiased", 1, "a valid boolean"),
+        ("lift_gain", "1.2", "a valid number"),
+        ("lift_gain", float("nan"), "less than or equal to 16"),
+        ("lift_gain", 1e400, "less than or equal to 16"),
+        ("levels", True, LEVELS),
+        ("levels", "1", LEVELS),
+        ("preset", "\ud800", "'row-sum', 'tikhonov', 'argmax', 'top-k', 'front-mass', 'centre' or 'mean'"),
+        ("certificate_rays", 1_000_001, "at most 1000000 rays"),
+        ("k", 1e300, "less than or equal to 64"),
+    ],
+)
+def test_json_has_types(name: str, value: Any, expected: str) -> None:
+    with pytest.raises(InvalidSettings) as raised:
+        LiftSettings.of_json({name: value})
+    assert (raised.value.argument, raised.value.expected) == (name, expected)
+    assert len(raised.value.got) <= 80
+
+
+def test_json_may_write_whole_numbers_with_a_point() -> None:
+    settings = LiftSettings.of_json({"stride": 2.0, "lift_gain": 2, "preset": "row-sum", "levels": 1.0})
+    assert settings == LiftSettings.of(stride=2, lift_gain=2.0, preset=Preset.ROW_SUM, levels=1)
+    assert isinstance(settings.stride, int)
+
+
+def test_texts_may_stand_for_numbers_on_a_command_line() -> None:
+    assert LiftSettings.of(stride="2", lift_gain="1.5") == LiftSettings.of_json({"stride": 2, "lift_gain": 1.5})
+
+
+@pytest.mark.parametrize("made", [LiftSettings.of_json, lambda values: LiftSettings.of(**values)])
+def test_what_is_wrong_is_told_in_our_words(made: Any) -> None:
+    with pytest.raises(InvalidSettings, match=r"^lambda: expected one of preset, speed, .*, got an unknown setting$"):
+        made({"lambda": 1.2})
+    with pytest.raises(InvalidSettings, match=r"^settings: expected other levels than composite"):
+        made({"aggregation_resolve": True, "levels": "composite"})
+
+
+def test_published_schema_has_every_setting_and_what_a_new_lift_may_have() -> None:
+    fields = LiftSettings.model_json_schema()["properties"]
+    assert set(fields) == set(LiftSettings.model_fields)
+    for name, field in fields.items():
+        assert field.get("description") or name == "preset", name
+        for end in ("minimum", "maximum"):
+            if end in field:
+                LiftSettings.of_json({name: field[end]})
+    with pytest.raises(InvalidSettings):
+        LiftSettings.of_json({"certificate_rays": fields["certificate_rays"]["maximum"] + 1})
