@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from liftcore.commands.bars import progress_bars
 from liftcore.commands.reply import free_output, reply, writing
+from liftcore.commands.sub_folders import folders_of, told_folders
 
 if TYPE_CHECKING:
     import argparse
@@ -30,6 +31,7 @@ def run(options: argparse.Namespace) -> int:
         "out": str(out),
         "bytes": out.stat().st_size,
         "views": encoded.views,
+        "folders": folders_of(images),
         "channels": encoder.channels,
         "patch": encoder.pixels.patch,
         "size": options.size or encoder.pixels.shorter,
@@ -39,7 +41,8 @@ def run(options: argparse.Namespace) -> int:
         "warnings": _warnings(encoded, encoder),
     }
     line = f"{out}: {encoded.views} views, {encoder.channels} channels, {document['bytes']} bytes"
-    reply(document, as_json=options.json, lines=[line, *(f"warning: {text}" for text in document["warnings"])])
+    lines = [line, *told_folders(document["folders"])]
+    reply(document, as_json=options.json, lines=[*lines, *(f"warning: {text}" for text in document["warnings"])])
     return 0
 
 

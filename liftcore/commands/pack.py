@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from liftcore.commands.bars import progress_bars
 from liftcore.commands.reply import free_output, reply, shown, writing
+from liftcore.commands.sub_folders import folders_of, told_folders
 
 if TYPE_CHECKING:
     import argparse
@@ -35,7 +36,7 @@ def run(options: argparse.Namespace) -> int:
         "encoder": packs.encoder,
         "text_space": packs.text_space,
         "normalised": packs.normalised,
-        "folders": sorted({view.rpartition("/")[0] for view in views if "/" in view}),
+        "folders": folders_of(views),
         "sizes": described["sizes"],
         "renamed": {} if options.format == "langsplat" else _renamed(views, options.folder),
         "warnings": described["warnings"],
@@ -53,8 +54,7 @@ def _renamed(views: ViewFolder, folder: Path) -> dict[str, str]:
 def _lines(document: dict[str, Any]) -> Iterator[str]:
     yield f"{document['out']}: {document['views']} views, {document['channels']} channels, {document['bytes']} bytes"
     yield f"  {shown(document['sizes'])}"
-    if document["folders"]:
-        yield f"  of sub-folders, whose names are part of their views': {', '.join(document['folders'][:8])}"
+    yield from told_folders(document["folders"])
     for name, view in list(document["renamed"].items())[:1]:
         yield f"  views are named without the suffix of their images, as cameras are: {name} is {view!r}"
     yield from (f"warning: {warning}" for warning in document["warnings"])

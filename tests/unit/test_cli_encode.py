@@ -34,6 +34,22 @@ def weights(tmp_path: Path) -> Path:
     return path
 
 
+def test_sub_folders_are_told_as_they_are_part_of_the_names(
+    photos: Path, weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pack, options = tmp_path / "pack.safetensors", ["--encoder", f"maskclip:ViT-S-32-alt@{weights}", "--size", 64]
+    status, out, err = run(capsys, "encode", photos, "-o", pack, *options)
+    assert (status, err) == (0, "")
+    assert "sub-folders" not in out
+    rig = tmp_path / "rig"
+    (rig / "camA").mkdir(parents=True)
+    (photos / "left.png").rename(rig / "camA" / "000.png")
+    status, out, err = run(capsys, "encode", rig, "-o", pack, *options)
+    assert (status, err) == (0, "")
+    assert out.splitlines()[1:] == ["  of sub-folders, whose names are part of their views': camA"]
+    assert open_packs([pack]).views == ("camA/000",)
+
+
 def test_encoded_photos_are_lifted_and_asked_in_the_text_space_of_their_pack(
     photos: Path, weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from liftcore.errors import InvalidInput
-from liftcore.observe.arrays import array_views
+from liftcore.observe.arrays import ArrayViews
 from liftcore.observe.encoders.images import prepare, read_image
 from liftcore.observe.finite import check_finite
 from liftcore.observe.write_pack import write_pack
@@ -74,13 +74,14 @@ def encode_images(
     wide: list[str] = []
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as scratch:
+        files = {name: Path(scratch, f"{number}.npy") for number, name in enumerate(images)}
         done = 0
         for names, batch in _batches(images, encoder, settings, turned):
             for name, grid in zip(names, encoder.encode(batch), strict=True):
                 stored = _stored(grid, name, settings)
                 if stored.dtype == torch.float32:
                     wide.append(name)
-                np.save(Path(scratch, f"{name}.npy"), stored.numpy())
+                np.save(files[name], stored.numpy())
             done += len(names)
             progress("encode", done, len(images), "views")
         metadata = {
@@ -88,7 +89,7 @@ def encode_images(
             "text_space": encoder.text_space,
             "normalised": "true" if settings.normalised else "false",
         }
-        write_pack(out, array_views(Path(scratch)), metadata, progress)
+        write_pack(out, ArrayViews(files, "hwc"), metadata, progress)
     return Encoded(len(images), tuple(turned), tuple(wide))
 
 

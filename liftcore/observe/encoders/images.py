@@ -11,7 +11,8 @@ import torch
 from PIL import Image, ImageOps, UnidentifiedImageError
 
 from liftcore.errors import InvalidInput
-from liftcore.scene.view_names import IMAGE_SUFFIXES, view_names
+from liftcore.observe.folder import files_below
+from liftcore.scene.view_names import IMAGE_SUFFIXES, without_image_suffix
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -32,37 +33,34 @@ _FILTERS = {
 
 
 def find_images(paths: Sequence[Path]) -> dict[str, Path]:
-    """View name -> image, of files and folders (not of folders in them), sorted by name.
+    """View name -> image, of files and folders, sorted by name; an image of a sub-folder is of the view ``camA/000``.
 
     Raises:
         InvalidInput: nothing is there, a folder has no image, or two images would be the same view.
     """
-    files: list[Path] = []
-    for path in paths:
-        if path.is_dir():
-            files += _images_of(path)
-        elif path.is_file():
-            files.append(path)
-        else:
-            raise InvalidInput("images", expected="images or folders of images", got=f"nothing at {path}")
     found: dict[str, Path] = {}
-    for file in files:
-        (name,) = view_names([file.name])
-        if found.get(name, file) != file:
-            got = f"{found[name]} and {file}"
-            raise InvalidInput("images", expected="one image a view", got=got, hint="a view is named after its image")
-        found[name] = file
+    for path in paths:
+        for file in _images_of(path):
+            name = without_image_suffix(file.relative_to(path).as_posix() if path.is_dir() else file.name)
+            if found.get(name, file) != file:
+                got = f"{found[name]} and {file}"
+                raise InvalidInput(
+                    "images", expected="one image a view", got=got, hint="a view is named after its image"
+                )
+            found[name] = file
     return dict(sorted(found.items()))
 
 
-def _images_of(folder: Path) -> list[Path]:
-    try:
-        files = sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
-    except OSError as error:
-        raise InvalidInput(str(folder), expected="a folder that opens", got=str(error.strerror)) from None
-    images = [path for path in files if path.suffix.lower() in IMAGE_SUFFIXES]
+def _images_of(path: Path) -> list[Path]:
+    """The images of a folder and its sub-folders, or the one image that is no folder."""
+    if path.is_file():
+        return [path]
+    if not path.is_dir():
+        raise InvalidInput("images", expected="images or folders of images", got=f"nothing at {path}")
+    files = [file for file in files_below(path) if not file.name.startswith(".")]
+    images = [file for file in files if file.suffix.lower() in IMAGE_SUFFIXES]
     if not images:
-        raise InvalidInput(str(folder), expected="images (.jpg, .png, ...)", got=f"{len(files)} other files")
+        raise InvalidInput(str(path), expected="readable images (.jpg, .png, ...)", got=f"{len(files)} other files")
     return images
 
 

@@ -202,6 +202,20 @@ def test_views_are_named_after_their_images(photos: Path) -> None:
         find_images([photos])
 
 
+def test_images_of_sub_folders_keep_these_in_their_names(photos: Path) -> None:
+    for name in ("camA/000.jpg", "camB/000.jpg", "camB/001.png", ".thumbnails/000.jpg"):
+        (photos / name).parent.mkdir(exist_ok=True)
+        (photos / name).write_bytes(b"")
+    assert find_images([photos]) == {
+        "camA/000": photos / "camA/000.jpg",
+        "camB/000": photos / "camB/000.jpg",
+        "camB/001": photos / "camB/001.png",
+    }
+    assert list(find_images([photos / "camB"])) == ["000", "001"]
+    with pytest.raises(InvalidInput, match="one image a view"):
+        find_images([photos / "camA", photos / "camB"])
+
+
 def test_folders_without_images_and_nothing_at_all_are_refused(photos: Path) -> None:
     (photos / "notes.txt").write_bytes(b"")
     with pytest.raises(InvalidInput, match="1 other files"):
