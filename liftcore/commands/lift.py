@@ -29,8 +29,11 @@ def run(options: argparse.Namespace) -> int:
     views = camera_files(options.cameras) if options.cameras.is_dir() else [options.cameras]
     out = free_output(options.output, [options.splats, *views, *options.features])
 
+    told: Sequence[str] = ()
     if options.explain and not options.json:  # the document holds the plan anyway
-        print(*plan_of(options, settings).lines(), sep="\n", flush=True)
+        plan = plan_of(options, settings)
+        told = plan.shapes
+        print(*plan.lines(), sep="\n", flush=True)
     with progress_bars() as progress:
         result = lift(
             options.splats,
@@ -42,8 +45,10 @@ def run(options: argparse.Namespace) -> int:
         )
     with writing(out):
         save_lift(result, out)
-    document = {"out": str(out), **_summary(result), "warnings": result.metadata.certificate["warnings"]}
-    reply(document, as_json=options.json, lines=_lines(document))
+    warnings = result.metadata.certificate["warnings"]
+    document = {"out": str(out), **_summary(result), "warnings": warnings}
+    new = [warning for warning in warnings if warning not in told]
+    reply(document, as_json=options.json, lines=_lines(document | {"warnings": new}))
     return 0
 
 

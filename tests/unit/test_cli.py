@@ -20,6 +20,8 @@ from liftcore.commands import bars, reply
 from liftcore.commands.lift import pairs_of
 from liftcore.errors import InvalidFeatures, InvalidSettings, SplatliftError
 from liftcore.lift import lift
+from liftcore.observe.observation import FeatureGrid
+from liftcore.observe.write_pack import write_pack
 from liftcore.query.threshold import METHODS
 from liftcore.solve.settings import LiftSettings, Preset
 
@@ -186,6 +188,15 @@ def test_plan_is_printed_alone_and_before_a_lift_and_kept_with_it(
     made = load_lift(scene / "lift.safetensors").metadata
     assert (made.settings.speed, made.settings.stride, made.settings.view_cosine) == ("draft", 1, 0.98)
     assert made.certificate["plan"]["memory_bytes"] == plan["memory_bytes"]
+
+
+def test_what_the_plan_warned_of_is_said_once(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    square = FeatureGrid(torch.ones(16, 16, 3))
+    write_pack(scene / "pack.safetensors", {"front": square}, {"encoder": "toy", "text_space": "none"})
+    for more in (["--explain"], []):
+        assert run(capsys, *lift_arguments(scene), *more)[1].count("maps of another aspect") == 1
+    document = json.loads(run(capsys, *lift_arguments(scene), "--explain", "--json")[1])
+    assert sum("maps of another aspect" in warning for warning in document["warnings"]) == 1
 
 
 def test_inspect_speaks_to_people_and_programs(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
