@@ -74,5 +74,6 @@ def write_truth_scene(folder: Path) -> Path:
 
 def _mask(raster: CpuRaster, camera: Camera, classes: torch.Tensor) -> torch.Tensor:
     """[H, W] i32, the class of the largest weight of a ray; -1 where a ray meets nothing."""
-    ids = raster.top_weights(camera, Walk(), 1)[0][:, :, 0].long()
+    each = torch.arange(raster.splats.count, dtype=torch.int32)
+    ids = raster.strongest_labels(camera, each, Walk()).long()
     return torch.where(ids >= 0, classes[ids.clamp_min(0)].long(), -1).int()

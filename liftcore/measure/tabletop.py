@@ -1,12 +1,10 @@
 """Accuracy on the tabletop scene, beside the baselines that its data README gives.
 
-    python -m liftcore.measure.tabletop DIR [--presets] [--robust N] [--json]
+    python -m liftcore.measure.tabletop DIR [--robust N] [--json]
 
 Each row is one lift. Splat accuracy is the share of splats whose most similar class vector is their own class, over
-the splats whose evidence from the 52 views of ``features.safetensors`` exceeds 0.5, whatever the lift; and over those
-whose largest weight on any ray of these views exceeds 0.1. mIoU is of the argmax over the class scores, rendered in
-the held-out views with the opacity gain of the lift. ``--presets`` compares
-all presets instead.
+the splats whose evidence from the 52 views of ``features.safetensors`` exceeds 0.5, whatever the lift. mIoU is of the
+argmax over the class scores, rendered in the held-out views with the opacity gain of the lift.
 """
 
 from __future__ import annotations
@@ -32,7 +30,7 @@ from liftcore.raster.cpu import CpuRaster
 from liftcore.raster.protocol import Walk, Weighting
 from liftcore.scene.load import load_cameras, load_splats
 from liftcore.solve.accumulate import render_walk
-from liftcore.solve.settings import LiftSettings, Preset
+from liftcore.solve.settings import LiftSettings
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -44,9 +42,7 @@ if TYPE_CHECKING:
 
 EVIDENCE_PACK = "features"  # its views say which splats count
 EVIDENCE_OVER = 0.5
-WEIGHT_OVER = 0.1
 TRUTH_FILES = ("truth.json", "truth.safetensors", "text_table.safetensors")
-LARGE_A_RAY = 9  # weights over 0.1 that a ray can have, as they sum to one at most
 
 
 @dataclass(frozen=True)
@@ -59,28 +55,25 @@ class Case:
     accuracy: float | None = None
     miou: float | None = None
     grid_reading: str = "bilinear"
-    preset: str = "row-sum"
-    knobs: tuple[tuple[str, float], ...] = ()  # settings beside the preset
     robust_steps: int = 0
 
     @property
     def settings(self) -> LiftSettings:
         """The weights of the row, without a certificate."""
-        own = {
-            "power": self.power,
-            "lift_gain": self.gain,
-            "render_gain": self.gain,
-            "grid_reading": self.grid_reading,
-            "robust_steps": self.robust_steps,
-        }
-        return LiftSettings.of(preset=self.preset, certificate_rays=0, **{**own, **dict(self.knobs)})
+        return LiftSettings.of(
+            preset="row-sum",
+            power=self.power,
+            lift_gain=self.gain,
+            render_gain=self.gain,
+            grid_reading=self.grid_reading,
+            robust_steps=self.robust_steps,
+            certificate_rays=0,
+        )
 
     @property
     def name(self) -> str:
         """As the table prints it."""
         robust = f", robust {self.robust_steps}" if self.robust_steps else ""
-        if self.preset != "row-sum" or self.knobs:
-            return ", ".join([self.pack, self.preset, *(f"{key} {value:g}" for key, value in self.knobs)]) + robust
         weights = ("w" if self.power == 1 else "w^2") + ("" if self.gain == 1 else f", lambda {self.gain:g}")
         reading = f" {self.grid_reading}" if self.pack == "grids" else ""
         return f"{self.pack}{reading}, {weights}{robust}"
@@ -106,48 +99,11 @@ CASES = (
 )
 
 
-def preset_case(pack: str, preset: str, base: tuple[float, float] | None = None, **knobs: float) -> Case:
-    """A preset with some knobs turned, and the accuracy and mIoU that the data README gives for it."""
-    settings = LiftSettings.of(preset=preset, **knobs)
-    accuracy, miou = base or (None, None)
-    return Case(pack, settings.power, settings.lift_gain, accuracy, miou, preset=preset, knobs=tuple(knobs.items()))
-
-
-# The data README's gate has no floor, and its top-5 another k than Dr. Splat's.
-_PRESET_BASES = {
-    ("features", "row-sum"): (0.952, 0.989),
-    ("features_hard", "row-sum"): (0.900, 0.935),
-    ("features_hard", "tikhonov"): (0.899, 0.940),
-    ("features_hard", "front-mass"): (0.891, 0.932),
-    ("features_hard", "argmax"): (0.741, 0.939),
-}
-PRESET_CASES = (
-    *(
-        preset_case(pack, preset, _PRESET_BASES.get((pack, preset)))
-        for pack in ("features", "features_hard", "grids")
-        for preset in Preset
-    ),
-    *(
-        preset_case(pack, preset, aggregation=True)
-        for pack in ("features", "features_hard", "grids")
-        for preset in ("row-sum", "tikhonov")
-    ),
-    preset_case("features_hard", "front-mass", (0.895, 0.938), power=2),
-    preset_case("features_hard", "front-mass", weight_floor=0.13),
-    preset_case("features_hard", "top-k", (0.875, 0.939), k=5),
-    preset_case("features_hard", "mean", weight_floor=0.01),
-    preset_case("features_hard", "mean", weight_floor=0.1),
-    preset_case("features_hard", "row-sum", stride=2),
-    preset_case("features_hard", "row-sum", stride=4),
-)
-
-
 @dataclass(frozen=True)
 class Figures:
     """What a lift reached."""
 
     accuracy: float  # over splats with evidence over 0.5
-    accuracy_visible: float  # over splats with a weight over 0.1
     miou: float
     seconds: float  # of the lift, without reading the truth
 
@@ -174,20 +130,16 @@ class Tabletop:
         self.classes: Tensor = torch.nn.functional.normalize(vectors.float(), dim=1)  # [K, F]
         self.cameras: Cameras = load_cameras(cameras_of(folder))
         self.raster = CpuRaster(load_splats(folder / "point_cloud.ply"))
-        self.counted, self.visible = self._counted_splats()
+        self.counted = self._counted_splats()
 
-    def _counted_splats(self) -> tuple[Tensor, Tensor]:
-        """Splats with evidence over 0.5, and with a weight over 0.1, in the views of EVIDENCE_PACK."""
+    def _counted_splats(self) -> Tensor:
+        """[P] bool: splats with evidence over 0.5 in the views of EVIDENCE_PACK."""
         nothing = RegionMap(torch.full((1, 1, 1), NO_LABEL, dtype=torch.int32), torch.ones(1, 1))
-        count = self.raster.splats.count
-        evidence, visible = np.zeros(count), torch.zeros(count, dtype=torch.bool)
+        evidence = np.zeros(self.raster.splats.count)
         for view in open_packs([self.folder / f"{EVIDENCE_PACK}.safetensors"]).views:
-            camera = self.cameras.get(view)
-            weights = self.raster.region_weights(camera, nothing, Walk(), Weighting())
+            weights = self.raster.region_weights(self.cameras.get(view), nothing, Walk(), Weighting())
             evidence[weights.evidence_splats.numpy()] += weights.evidence.numpy()
-            ids, large = self.raster.top_weights(camera, Walk(), LARGE_A_RAY)
-            visible[ids[large > WEIGHT_OVER].long()] = True
-        return torch.from_numpy(evidence > EVIDENCE_OVER), visible
+        return torch.from_numpy(evidence > EVIDENCE_OVER)
 
     def measure(self, case: Case) -> Figures:
         """Lift, classify the splats, and look from the held-out views."""
@@ -210,7 +162,6 @@ class Tabletop:
         ious = class_ious(torch.stack(seen), torch.stack(list(self.held_out.values())), len(self.classes))
         return Figures(
             splat_accuracy(scores, self.objects, self.counted),
-            splat_accuracy(scores, self.objects, self.visible),
             float(ious.nanmean()),
             seconds,
         )
@@ -233,18 +184,18 @@ def measure_all(folder: Path, cases: Sequence[Case] = CASES) -> dict[str, Any]:
     """All cases as plain numbers, with the hardware that took the seconds."""
     scene = Tabletop(folder)
     rows = [{"name": case.name, "baseline": asdict(case), **asdict(scene.measure(case))} for case in cases]
-    counted = {"evidence_over_half": int(scene.counted.sum()), "weight_over_a_tenth": int(scene.visible.sum())}
-    return {"splats": scene.raster.splats.count, **counted, "rows": rows, "hardware": hardware()}
+    counted = int(scene.counted.sum())
+    return {"splats": scene.raster.splats.count, "evidence_over_half": counted, "rows": rows, "hardware": hardware()}
 
 
 def table_of(document: dict[str, Any]) -> str:
     """The rows beside their baselines, and the machine, for people."""
-    head = f"{'features, weights':<38}{'accuracy':>9}{'base':>7}{'visible':>9}{'mIoU':>8}{'base':>7}{'lift s':>8}"
+    head = f"{'features, weights':<38}{'accuracy':>9}{'base':>7}{'mIoU':>8}{'base':>7}{'lift s':>8}"
     lines = [head]
     for row in document["rows"]:
         base = [f"{row['baseline'][key]:.3f}" if row["baseline"][key] else "-" for key in ("accuracy", "miou")]
         lines.append(
-            f"{row['name']:<38}{row['accuracy']:>9.4f}{base[0]:>7}{row['accuracy_visible']:>9.4f}"
+            f"{row['name']:<38}{row['accuracy']:>9.4f}{base[0]:>7}"
             f"{row['miou']:>8.4f}{base[1]:>7}{row['seconds']:>8.1f}"
         )
     lines.append(", ".join(f"{key} {value}" for key, value in document["hardware"].items()))
@@ -255,12 +206,10 @@ def main() -> None:
     """Print the table, or one JSON object."""
     parser = argparse.ArgumentParser(prog="python -m liftcore.measure.tabletop", description=__doc__)
     parser.add_argument("folder", type=Path, metavar="DIR", help="the tabletop scene")
-    parser.add_argument("--presets", action="store_true", help="all presets on noisy, hard and grid features")
     parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
     parser.add_argument("--robust", type=int, default=0, metavar="N", help="lift with N robust steps")
     options = parser.parse_args()
-    cases = PRESET_CASES if options.presets else CASES
-    document = measure_all(options.folder, [replace(case, robust_steps=options.robust) for case in cases])
+    document = measure_all(options.folder, [replace(case, robust_steps=options.robust) for case in CASES])
     print(json.dumps(document) if options.json else table_of(document))
 
 

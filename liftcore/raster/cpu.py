@@ -28,7 +28,7 @@ from liftcore.raster.projection import Targets, view_of
 from liftcore.raster.protocol import Look, RayRows, RegionWeights, Walk, Walked, Weighting
 from liftcore.raster.readings import reading_of
 from liftcore.raster.region_weights import weigh_tiles
-from liftcore.raster.rendering import render_tiles, top_tiles, trace_rays
+from liftcore.raster.rendering import render_tiles, trace_rays
 from liftcore.raster.selection import choice_of
 from liftcore.raster.side_by_side import side_by_side, views_at_a_time
 from liftcore.raster.strided import check_stride, every_pixel, places_on, strided
@@ -153,14 +153,6 @@ class CpuRaster:
     def row_sums(self, camera: Camera, walk: Walk) -> Tensor:
         """``A 1``: [H, W] f32."""
         return self.render(camera, torch.ones(self.splats.count, 1), walk)[:, :, 0]
-
-    def top_weights(self, camera: Camera, walk: Walk, count: int) -> tuple[Tensor, Tensor]:
-        """The largest weights of every ray, descending. See the protocol."""
-        ids = np.full((camera.height, camera.width, count), -1, np.int32)
-        weights = np.zeros((camera.height, camera.width, count), np.float32)
-        for frame in self._bands(camera, every_pixel(walk)):
-            self._over_tiles(frame, lambda frame, first, last: top_tiles(first, last, frame, ids, weights))
-        return torch.from_numpy(ids), torch.from_numpy(weights)
 
     def strongest_labels(self, camera: Camera, labels: Tensor, walk: Walk) -> Tensor:
         """``argmax(A onehot(labels))``: labels [P] i32 in -1..K - 1 -> [H, W] i32. See the protocol."""

@@ -139,18 +139,6 @@ class OracleRaster:
         """``A 1``."""
         return self.render(camera, torch.ones(self.splats.count, 1), walk)[:, :, 0]
 
-    def top_weights(self, camera: Camera, walk: Walk, count: int) -> tuple[Tensor, Tensor]:
-        """The largest weights of every ray by a full sort."""
-        A = dense_view(self.splats, camera, walk).A
-        order = np.argsort(-A, axis=1, kind="stable")[:, :count]
-        weights = np.take_along_axis(A, order, axis=1)
-        missing = count - order.shape[1]
-        order = np.pad(np.where(weights > 0, order, -1), ((0, 0), (0, missing)), constant_values=-1)
-        weights = np.pad(weights, ((0, 0), (0, missing)))
-        shape = (camera.height, camera.width, count)
-        ids = torch.from_numpy(order.astype(np.int32)).reshape(shape)
-        return ids, torch.from_numpy(weights.astype(np.float32)).reshape(shape)
-
     def strongest_labels(self, camera: Camera, labels: Tensor, walk: Walk) -> Tensor:
         """``argmax(A Gamma) - 1`` with the one-hot matrix Gamma [P, K + 1] written out, its first column for -1."""
         onehot = np.eye(int(labels.max()) + 2)[labels.numpy() + 1]

@@ -113,10 +113,6 @@ class Raster(Protocol):
         """``A 1``: [H, W] f32 (Property 2)."""
         ...
 
-    def top_weights(self, camera: Camera, walk: Walk, count: int) -> tuple[Tensor, Tensor]:
-        """The largest weights of every ray, descending: ids [H, W, count] i32 (-1 = none), weights f32."""
-        ...
-
     def strongest_labels(self, camera: Camera, labels: Tensor, walk: Walk) -> Tensor:
         """``argmax(A onehot(labels))``: labels [P] i32 in -1..K - 1 -> [H, W] i32.
 

@@ -1,11 +1,11 @@
-"""``A X`` and what else is read off the rays: images, row sums, the largest weights, whole rows of A."""
+"""``A X`` and what else is read off the rays: images, row sums, whole rows of A."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from liftcore.jit import kernel
-from liftcore.lanes import LANES, PIXELS, ROWS, WEIGHTS, in_all_lanes, keep_lanes, lanes_at, plus_product
+from liftcore.lanes import LANES, PIXELS, in_all_lanes, keep_lanes, lanes_at, plus_product
 from liftcore.lanes_halves import lowest_half, without_lowest
 from liftcore.raster.constants import TILE
 from liftcore.raster.footprints import alpha_at
@@ -43,46 +43,6 @@ def render_tiles(first, last, frame, values, image):
                 for channel in range(channels):
                     image[y0 + y, x0 + x, channel] = sums[channel * PIXELS + place_of(y, x)]
         sums[:] = 0
-
-
-@kernel
-def top_tiles(first, last, frame, ids, weights):
-    """The largest weights of every ray of tiles ``first..last``, descending.
-
-    Args:
-        ids: [H, W, K] i32, filled with -1 before. weights: [H, W, K] f32, filled with 0 before.
-    """
-    count = ids.shape[2]
-    rays = new_rays(frame)
-    for tile in range(first, last):
-        x0 = (tile % frame.columns) * TILE
-        y0 = (tile // frame.columns) * TILE
-        start_rays(rays, frame, tile)
-        for step in range(frame.starts[tile], frame.starts[tile + 1]):
-            if (step - frame.starts[tile]) % CHECK_EVERY == 0 and not look(rays, False):
-                break
-            splat = next_splat(frame, tile, step, float(x0), float(y0))
-            number = frame.ids[frame.items[step]]
-            halves = meets(rays, splat)
-            while halves:
-                half = lowest_half(halves)
-                halves = without_lowest(halves)
-                keep_lanes(rays.state, WEIGHTS, blend(rays, splat, half))
-                y, left = y0 + half % ROWS, x0 + half // ROWS * LANES
-                for lane in range(LANES):
-                    weight = rays.state[WEIGHTS + lane]
-                    if weight <= 0:
-                        continue
-                    x = left + lane
-                    k = count
-                    while k > 0 and weights[y, x, k - 1] < weight:
-                        if k < count:
-                            weights[y, x, k] = weights[y, x, k - 1]
-                            ids[y, x, k] = ids[y, x, k - 1]
-                        k -= 1
-                    if k < count:
-                        weights[y, x, k] = weight
-                        ids[y, x, k] = number
 
 
 @kernel

@@ -45,6 +45,5 @@ def warm_up(
         raster.region_weights(camera, observation, walk, weighting)
     raster.adjoint(camera, torch.ones(16, 16, 1), Walk())
     raster.row_sums(camera, Walk())
-    raster.top_weights(camera, Walk(), 1)
     raster.strongest_labels(camera, torch.zeros(1, dtype=torch.int32), Walk())
     raster.ray_rows(camera, torch.zeros(1, 2, dtype=torch.int32), Walk())

@@ -24,7 +24,6 @@ def tabletop(shared_data: Path) -> Tabletop:
 def test_the_splats_that_count_are_those_of_the_data_readme(tabletop):
     share = float(tabletop.counted.float().mean())
     assert share == pytest.approx(0.9056, abs=5e-4)
-    assert 0.5 < float(tabletop.visible.float().mean()) < share
 
 
 @pytest.mark.parametrize("case", BARS, ids=lambda case: case.name)
@@ -34,7 +33,6 @@ def test_a_row_sum_lift_reaches_the_baseline(tabletop, case: Case):
     got = tabletop.measure(case)
     assert got.accuracy >= case.accuracy - ROUNDING
     assert got.miou >= case.miou - ROUNDING
-    assert got.accuracy_visible > got.accuracy
 
 
 def test_a_robust_step_wins_on_hard_masks_for_splats_and_for_pictures(tabletop):

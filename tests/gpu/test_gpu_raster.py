@@ -103,7 +103,6 @@ def every_product(raster: GpuRaster, camera: Camera) -> list[torch.Tensor]:
         *top_two(raster, camera), *as_parts(raster.region_weights(camera, random_regions(8), WALK, Weighting(2))),
         rows.row_starts, rows.splats, rows.weights, raster.row_sums(camera, WALK),
         raster.adjoint(camera, image, WALK), raster.strongest_labels(camera, labels, WALK),
-        *raster.top_weights(camera, WALK, 3),
     ]  # fmt: skip
 
 
@@ -197,10 +196,10 @@ def test_ranks_in_parts_of_a_run_are_those_of_the_run(monkeypatch):
         ranks(kernel, programs, *rest, **named)
 
     monkeypatch.setattr(selecting, "launch", counting)
-    whole = [*top_two(gpu_raster(splats), camera), *gpu_raster(splats).top_weights(camera, WALK, 3)]
+    whole = top_two(gpu_raster(splats), camera)
     monkeypatch.setattr(selecting, "A_PIXEL", 0)
-    cut = [*top_two(gpu_raster(splats), camera), *gpu_raster(splats).top_weights(camera, WALK, 3)]
-    assert launched == [6, 6] + [1] * 12
+    cut = top_two(gpu_raster(splats), camera)
+    assert launched == [6] + [1] * 6
     assert all(torch.equal(first, second) for first, second in zip(whole, cut, strict=True))
 
 
@@ -239,8 +238,6 @@ def test_a_view_that_sees_nothing_gives_empty_products(kernel):
     assert [part.numel() for part in as_parts(weights)] == [0, 1, 0, 0, 0, 0]
     assert not raster.row_sums(away, Walk()).any()
     assert not raster.adjoint(away, torch.ones(18, 20, 2), Walk()).any()
-    ids, largest = raster.top_weights(away, Walk(), 2)
-    assert (ids == -1).all() and not largest.any()
     assert (raster.strongest_labels(away, torch.zeros(5, dtype=torch.int32), Walk()) == -1).all()
     assert raster.ray_rows(away, torch.zeros(2, 2, dtype=torch.int32), Walk()).row_starts.tolist() == [0, 0, 0]
 

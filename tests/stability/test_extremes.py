@@ -47,13 +47,6 @@ def test_images_of_any_shape_equal_the_oracle(size):
     assert_equals_the_oracle(splats_at(ROW), camera_at_origin(*size), Walk())
 
 
-def test_a_view_that_sees_nothing_has_no_top_weights():
-    behind = splats_at([(0.0, 0.0, -2.0), (1e6, 0.0, 1.0)])
-    ids, weights = CpuRaster(behind).top_weights(camera_at_origin(), Walk(), 3)
-    assert int(ids.max()) == -1
-    assert float(weights.max()) == 0
-
-
 @pytest.mark.parametrize("turn", [(1.0, 0.0, 0.0, 0.0), (0.707, 0.0, 0.707, 0.0), (0.707, 0.707, 0.0, 0.0), TURNED])
 def test_needles_side_on_and_end_on_equal_the_oracle(turn):
     length = math.log(1.0)

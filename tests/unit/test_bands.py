@@ -33,7 +33,6 @@ def products(raster: CpuRaster) -> dict[str, tuple[torch.Tensor, ...]]:
     rows = raster.ray_rows(CAMERA, PIXELS, walk)
     return {
         "render": (raster.render(CAMERA, values, walk),),
-        "top": raster.top_weights(CAMERA, walk, 3),
         "labels": (raster.strongest_labels(CAMERA, labels, walk),),
         "rows": (rows.row_starts, rows.splats, rows.weights),
     }

@@ -19,7 +19,6 @@ from liftcore.device import indexed, out_of_memory
 from liftcore.errors import Unavailable
 from liftcore.raster.antialiased import check_antialiased
 from liftcore.raster.arguments import check_image, check_labels, check_rows
-from liftcore.raster.constants import TILE
 from liftcore.raster.gpu import rendering, weighing
 from liftcore.raster.gpu.ahead import made_ahead
 from liftcore.raster.gpu.frame import Frame
@@ -28,7 +27,6 @@ from liftcore.raster.gpu.memory import USUAL_LEVELS, raster_bytes
 from liftcore.raster.gpu.projection import Projection
 from liftcore.raster.gpu.room import SCENE_SHARE, room_within, scene_bytes
 from liftcore.raster.gpu.scene import scene_on, with_opacity
-from liftcore.raster.gpu.selecting import A_RANK, largest_weights, ranked_runs
 from liftcore.raster.gpu.slots import DeviceReading
 from liftcore.raster.gpu.tracing import ray_rows
 from liftcore.raster.kernels import activated, with_gain
@@ -45,7 +43,6 @@ if TYPE_CHECKING:
 
     from liftcore.observe.observation import Observation
     from liftcore.raster.gpu.scene import DeviceScene
-    from liftcore.raster.gpu.tile_lists import Lists
     from liftcore.scene.cameras import Camera
     from liftcore.scene.splats import Splats
 
@@ -180,18 +177,6 @@ class GpuRaster:
         return self.render(camera, torch.ones(self.splats.count, 1), walk)[:, :, 0]
 
     @_within_memory
-    def top_weights(self, camera: Camera, walk: Walk, count: int) -> tuple[Tensor, Tensor]:
-        """The largest weights of every ray, descending. See the protocol."""
-        frame = self._frame(camera, every_pixel(walk))
-        ids = torch.full((frame.rows * TILE, frame.columns * TILE, count), -1, dtype=torch.int32)
-        weights = torch.zeros(frame.rows * TILE, frame.columns * TILE, count)
-        for band in frame.bands:
-            _fill_largest(frame, frame.lists_of(band), ids, weights)
-        return ids[: camera.height, : camera.width].contiguous(), weights[
-            : camera.height, : camera.width
-        ].contiguous()
-
-    @_within_memory
     def strongest_labels(self, camera: Camera, labels: Tensor, walk: Walk) -> Tensor:
         """``argmax(A onehot(labels))``: labels [P] i32 in -1..K - 1 -> [H, W] i32. See the protocol."""
         check_labels(labels, self.splats.count)
@@ -236,17 +221,3 @@ class GpuRaster:
             staged = self._free is not None and self._size > SCENE_SHARE * self._free
             self._scene = scene_on(torch.device("cpu") if staged else self.device, self._host)
         return self._scene
-
-
-def _fill_largest(frame: Frame, lists: Lists, ids: Tensor, weights: Tensor) -> None:
-    """Write a band's part of ``top_weights`` into ids and weights [rows of tiles, columns of tiles, count]."""
-    runs = [part for run in frame.tile_runs(lists) for part in ranked_runs(frame, run, A_RANK * ids.shape[2])]
-    for first, last in runs:
-        own, numbers = largest_weights(frame, lists, (first, last), ids.shape[2])
-        met = own > 0
-        items = torch.where(met, lists.starts[first:last, None, None] + numbers, 0)
-        named = torch.where(met, lists.ids[lists.items[items].long()] if lists.items.numel() else -1, -1)
-        tile = torch.arange(lists.first_tile + first, lists.first_tile + last)[:, None]
-        pixel = torch.arange(TILE * TILE)[None, :]
-        y, x = tile // frame.columns * TILE + pixel // TILE, tile % frame.columns * TILE + pixel % TILE
-        ids[y, x], weights[y, x] = named.to(torch.int32).cpu(), own.cpu()

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from liftcore.raster.gpu.frame import Frame
     from liftcore.raster.gpu.tile_lists import Lists
 
-A_MARK, A_RANK = 12, 80  # bytes of one of a ray's largest weights: where marks are made, where they are put in order
+A_MARK = 8  # bytes of one of a ray's largest weights, where marks are made
 _WIDE = 32  # ranks a ray that more warps share, or the registers of a thread would not hold its part
 
 _CHUNK = tl.constexpr(CHUNK)
@@ -88,7 +88,7 @@ def counted(
 
 @jit
 def _rank(
-    places, inks, starts, items, scratch, largest, numbers, band_tile, own_tile, columns, width, height, count,
+    places, inks, starts, items, scratch, largest, band_tile, own_tile, columns, width, height, count,
     cap, stop, floor, KIND: tl.constexpr, COUNT: tl.constexpr,
 ):  # fmt: skip
     own = own_tile + tl.program_id(0)
@@ -120,44 +120,6 @@ def _rank(
         at += _CHUNK
     to = (tl.program_id(0) * _PIXELS + pixel)[:, None] * count + rank[None, :]
     tl.store(largest + to, held, mask=(rank < count)[None, :] & (pixel >= 0)[:, None])
-    tl.store(numbers + to, order, mask=(rank < count)[None, :] & (pixel >= 0)[:, None])
-
-
-def ranked_runs(frame: Frame, run: tuple[int, int], place_bytes: int) -> list[tuple[int, int]]:
-    """Parts of a run of tiles whose ranks take no more than ``room.A_PIXEL`` has for the pixels of all of the run.
-
-    Args:
-        place_bytes: what is held of a ray's ranks, all of them together.
-    """
-    step = max(1, frame.room.tiles * A_PIXEL // place_bytes)
-    return [(first, min(first + step, run[1])) for first in range(run[0], run[1], step)]
-
-
-def largest_weights(frame: Frame, lists: Lists, run: tuple[int, int], count: int) -> tuple[Tensor, Tensor]:
-    """The largest weights of every ray of a run of tiles, descending, equal ones near to far.
-
-    Returns:
-        weights [tiles, 256, count] f32, 0 where there are fewer; and their numbers in the tile's list, i64.
-    """
-    weights, numbers = _ranks(frame, lists, run, count)
-    near_first = torch.sort(numbers, dim=2)
-    weights = weights.gather(2, near_first.indices)
-    down = torch.sort(weights, dim=2, descending=True, stable=True)
-    return down.values, near_first.values.gather(2, down.indices).long()
-
-
-def _ranks(frame: Frame, lists: Lists, run: tuple[int, int], count: int) -> tuple[Tensor, Tensor]:
-    """The same in no order, the numbers in i32."""
-    tiles = run[1] - run[0]
-    weights = torch.zeros(tiles, TILE * TILE, count, device=frame.device)
-    numbers = torch.zeros(tiles, TILE * TILE, count, dtype=torch.int32, device=frame.device)
-    wide = 1 << (count - 1).bit_length()
-    launch(
-        _rank, tiles, *lists.splats, lists.starts, lists.items, frame.scratch(tiles), weights, numbers,
-        lists.first_tile, run[0], *frame.size, count, *frame.cuts, KIND=frame.kind,
-        COUNT=wide, warps=8 if wide >= _WIDE else WARPS,
-    )  # fmt: skip
-    return weights, numbers
 
 
 def marks_of(frame: Frame, lists: Lists, run: tuple[int, int], count: int) -> tuple[Tensor, Tensor]:
@@ -167,9 +129,25 @@ def marks_of(frame: Frame, lists: Lists, run: tuple[int, int], count: int) -> tu
         least [tiles, 256] f32, the k-th largest weight, 0 when there are fewer; room [tiles, 256] i32, how many
         weights equal to it are among the k.
     """
-    parts = [_marks(_ranks(frame, lists, part, count)[0]) for part in ranked_runs(frame, run, A_MARK * count)]
-    least, room = (torch.cat(column) for column in zip(*parts, strict=True))
+    # Parts of the run, so that the largest weights take no more than A_PIXEL has for the pixels of all of it.
+    step = max(1, frame.room.tiles * A_PIXEL // (A_MARK * count))
+    parts = [(first, min(first + step, run[1])) for first in range(run[0], run[1], step)]
+    marks = [_marks(_largest_weights(frame, lists, part, count)) for part in parts]
+    least, room = (torch.cat(column) for column in zip(*marks, strict=True))
     return least, room
+
+
+def _largest_weights(frame: Frame, lists: Lists, run: tuple[int, int], count: int) -> Tensor:
+    """[tiles, 256, count] f32: the largest weights of each ray of a run, in no order; 0 where there are fewer."""
+    tiles = run[1] - run[0]
+    weights = torch.zeros(tiles, TILE * TILE, count, device=frame.device)
+    wide = 1 << (count - 1).bit_length()
+    launch(
+        _rank, tiles, *lists.splats, lists.starts, lists.items, frame.scratch(tiles), weights,
+        lists.first_tile, run[0], *frame.size, count, *frame.cuts, KIND=frame.kind,
+        COUNT=wide, warps=8 if wide >= _WIDE else WARPS,
+    )  # fmt: skip
+    return weights
 
 
 def _marks(weights: Tensor) -> tuple[Tensor, Tensor]:
