@@ -159,7 +159,7 @@ def _lift_on(run: Run, plan: Plan, sources: Sources, inputs: list[InputFile], ch
     told = lift_warnings(sources.splats, lifted, geometry.denominators, settings.dtype, X.dtype, facts)
     facts["warnings"] = [*told, *plan.shapes]
     with run.timings.stage("certify"):
-        certificate = certify(geometry, X, geometry.codebooks.__getitem__, settings, threads) | notes | facts
+        certificate = certify(geometry, X, settings, threads) | notes | facts
     return Lift(
         features=X,
         evidence=torch.from_numpy(geometry.evidence).to(torch.float32),

@@ -13,11 +13,11 @@ if TYPE_CHECKING:
     from liftcore.scene.cameras import Camera
 
 
-def class_scores(features: Tensor, classes: Tensor, block: int = 65_536) -> Tensor:
+def class_scores(features: Tensor, classes: Tensor) -> Tensor:
     """Cosine of every splat with every class vector: features [P, F], classes [K, F] unit -> [P, K] f32."""
     parts = []
-    for begin in range(0, features.shape[0], block):
-        rows = features[begin : begin + block].to(torch.float32)
+    for block in features.split(65_536):
+        rows = block.to(torch.float32)
         norms = torch.linalg.vector_norm(rows, dim=1, keepdim=True).clamp_min(1e-12)
         parts.append(rows / norms @ classes.to(torch.float32).T)
     return torch.cat(parts)

@@ -9,8 +9,8 @@ import torch
 
 from liftcore.raster.protocol import Look
 from liftcore.raster.weights_home import on_host
-from liftcore.solve.accumulate import row_totals
 from liftcore.solve.columns import Columns, by_tuples
+from liftcore.solve.totals import row_totals
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

@@ -19,11 +19,12 @@ import torch
 
 from liftcore.progress import silent
 from liftcore.raster.cpu import CpuRaster
-from liftcore.solve.accumulate import lift_walk, row_totals, weighting_of
+from liftcore.solve.accumulate import lift_walk, weighting_of
 from liftcore.solve.closed_form import solve_closed_form
 from liftcore.solve.columns import by_tuples
 from liftcore.solve.host import Host
 from liftcore.solve.settings import LiftSettings
+from liftcore.solve.totals import row_totals
 from liftcore.solve.view_weights import ViewWeights
 
 if TYPE_CHECKING:

@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING, Self
 
 from liftcore.artifact import Lift, load_lift
 from liftcore.errors import InvalidQuery
-from liftcore.query.scores import feature_norms, mean_direction
+from liftcore.query.products import norms_of
+from liftcore.query.scores import mean_direction
 from liftcore.query.unchanged import unchanged
 from liftcore.raster.protocol import Walk
+from liftcore.solve.accumulate import render_walk
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -50,7 +52,7 @@ class QueryScene:
     @cached_property
     def norms(self) -> Tensor:
         """[P] f32, the features' norms, computed once a lift."""
-        return feature_norms(self.lift.features)
+        return norms_of(self.lift.features)
 
     @cached_property
     def seen(self) -> Tensor:
@@ -165,5 +167,4 @@ class QueryScene:
     @property
     def walk(self) -> Walk:
         """How rays walk when scores are rendered: with the lift's rendering gain (App. Tikhonov)."""
-        settings = self.lift.metadata.settings
-        return Walk(settings.render_gain, settings.alpha_cap, settings.transmittance_stop, settings.antialiased)
+        return render_walk(self.lift.metadata.settings)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from liftcore.errors import InvalidQuery
-from liftcore.query.products import cosines_of, norms_of
+from liftcore.query.products import cosines_of
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -22,41 +22,12 @@ LEAST_OFFSET = 1e-3  # from the mean, of unit features: what is nearer has no di
 RELEVANCY_SHARPNESS = 10.0  # the softmax's inverse temperature in LERF and LangSplat
 
 
-def feature_norms(features: Tensor) -> Tensor:
-    """Euclidean norms of the rows.
-
-    Args:
-        features: [P, F] f16 or f32.
-
-    Returns:
-        [P] f32, zero for zero rows.
-    """
-    return norms_of(features)
-
-
-def cosine(features: Tensor, norms: Tensor, text: Tensor) -> Tensor:
-    """Cosine of every splat's feature to a text, ``<x_j, t> / (|x_j| |t|)``.
-
-    Args:
-        features: [P, F] f16 or f32.
-        norms: [P] f32, from `feature_norms`.
-        text: [F] f32, any length above zero.
-
-    Returns:
-        [P] f32 in [-1, 1]; a zero row scores the minimum, -1.
-
-    Raises:
-        InvalidQuery: the text's vector has another length than the features, is zero or is not finite.
-    """
-    return cosines(features, norms, text[None])[:, 0]
-
-
 def cosines(features: Tensor, norms: Tensor, texts: Tensor) -> Tensor:
     """Cosine to several texts in one pass over the features.
 
     Args:
         features: [P, F] f16 or f32.
-        norms: [P] f32, from `feature_norms`.
+        norms: [P] f32, from `norms_of`.
         texts: [n, F] f32, rows of any length above zero.
 
     Returns:
@@ -77,7 +48,7 @@ def mean_direction(features: Tensor, norms: Tensor, weights: Tensor) -> Tensor:
     """The weighted mean of the unit rows, [F] f32; of zero rows and weights nothing but zeros.
 
     Args:
-        features: [P, F] f16 or f32. norms: [P] f32, from `feature_norms`. weights: [P] f32, at least zero.
+        features: [P, F] f16 or f32. norms: [P] f32, from `norms_of`. weights: [P] f32, at least zero.
     """
     shares = torch.where(norms > 0, weights.double() / norms.clamp_min(1e-30).double(), 0.0)
     total = torch.zeros(features.shape[1], dtype=torch.float64)
@@ -96,7 +67,7 @@ def cosines_about(features: Tensor, norms: Tensor, mean: Tensor, examples: Tenso
     tells them apart. Words lie in another cone, so they are compared by plain cosines.
 
     Args:
-        features: [P, F] f16 or f32. norms: [P] f32, from `feature_norms`.
+        features: [P, F] f16 or f32. norms: [P] f32, from `norms_of`.
         mean: [F] f32, the mean of the unit features, of length below one.
         examples: [n, F] f32, unit rows.
 

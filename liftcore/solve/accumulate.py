@@ -17,7 +17,7 @@ from liftcore.one_thread import one_thread
 from liftcore.raster.protocol import Look, RayRows, Walk, Weighting
 from liftcore.solve.columns import Columns, as_walked
 from liftcore.solve.readout import Readout, read_pixels, sample_pixels
-from liftcore.solve.totals import Totals, row_totals
+from liftcore.solve.totals import Totals
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -30,18 +30,6 @@ if TYPE_CHECKING:
     from liftcore.scene.cameras import Camera, Cameras
     from liftcore.solve.settings import LiftSettings
     from liftcore.solve.view_weights import ViewWeights
-
-__all__ = [
-    "Geometry",
-    "SampledRays",
-    "accumulate",
-    "as_read",
-    "lift_walk",
-    "render_walk",
-    "row_totals",
-    "strided_walk",
-    "weighting_of",
-]
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from liftcore.jit import vectorised
 from liftcore.one_thread import one_thread
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Iterator, Sequence
 
     from torch import Tensor
 
@@ -52,7 +52,6 @@ class ViewMeasures:
 def certify(
     geometry: Geometry,
     features: Tensor,
-    codebooks: Callable[[int], Tensor],
     settings: LiftSettings,
     threads: int | None = None,
 ) -> dict[str, Any]:
@@ -60,14 +59,12 @@ def certify(
 
     Args:
         features: [P, F], as they are stored.
-        codebooks: view number -> E_v [M, F].
         threads: None takes the cores that this process may use. The number changes no bit.
 
     Returns:
         Plain numbers, ready for JSON; None where nothing was sampled.
     """
-    books = [codebooks(number) for number in range(len(geometry.samples))]
-    measures = measure_samples(geometry.samples, features, books, threads)
+    measures = measure_samples(geometry.samples, features, geometry.codebooks, threads)
     row_sums, residuals = measures.row_sums, measures.residuals
     beta = quantiles(measures.betas)
     return {

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from liftcore.solve.accumulate import row_totals
+from liftcore.solve.totals import row_totals
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

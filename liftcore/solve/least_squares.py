@@ -37,9 +37,7 @@ class Refinement:
     """The refined features, and how it went."""
 
     features: Tensor  # [P, F], as they came in; float32 where float16 cannot hold them
-    result: str  # "converged", "steps" (all were used) or "breakdown"
-    stats: dict[str, Any]  # plain numbers, ready for JSON
-    message: str  # for the user
+    stats: dict[str, Any]  # ready for JSON; result: "converged", "steps" (all were used) or "breakdown"
 
 
 @dataclass(frozen=True)
@@ -135,8 +133,8 @@ def _summary(features: Tensor, outcomes: Sequence[BlockOutcome], settings: LiftS
         "gradient": gradient,
         "residuals": losses,
     }
-    message = (
+    stats["message"] = (
         f"{stats['steps']} steps with damping {settings.damping:g} left {100 * change:.1f}% of the closed form's "
         f"residual in {stats['channels']} channels: {why}."
     )
-    return Refinement(features, result, stats | {"message": message}, message)
+    return Refinement(features, stats)

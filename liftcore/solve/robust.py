@@ -36,10 +36,10 @@ import numpy as np
 import torch
 
 from liftcore.one_thread import one_thread
-from liftcore.solve.accumulate import row_totals
 from liftcore.solve.gathering import Gathering
 from liftcore.solve.host import ALL_CORES, Host
 from liftcore.solve.judging import Judged, judge_share, scatter_judged, to_cosines, to_old_sums, to_weights
+from liftcore.solve.totals import row_totals
 from liftcore.solve.weight_tables import WeightTables, addresses_of
 from liftcore.solve.weighted_sums import channel_slices, first_columns, strips_of
 

@@ -59,7 +59,6 @@ class JobRecord:
     created: float
     started: float | None
     ended: float | None
-    leased_until: float | None
     request_id: str | None = None
     kind: JobKind = JobKind.LIFT
     parameters: dict[str, Any] = field(default_factory=dict)
@@ -221,7 +220,6 @@ def record(connection: sqlite3.Connection, row: sqlite3.Row) -> JobRecord:
         created=row["created"],
         started=row["started"],
         ended=row["ended"],
-        leased_until=row["leased_until"],
         request_id=row["request_id"],
         kind=JobKind(row["kind"]),
         parameters=json.loads(row["parameters"]),

@@ -17,6 +17,7 @@ from liftcore.raster.cpu import CpuRaster
 from liftcore.scene.load import load_cameras, load_splats
 from liftcore.solve.accumulate import render_walk
 from liftcore.solve.readout import read_pixels, sample_pixels
+from liftcore.solve.settings import Preset
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -33,12 +34,12 @@ if TYPE_CHECKING:
 TITLE = "Feature fidelity"
 SOURCE = "the paper's Table 1b"
 PACKS = ("features_clean", "features", "features_hard", "grids", "regions")
-PRESETS = ("row-sum", "tikhonov", "argmax", "top-k", "front-mass", "centre", "mean")
 PIXELS = 1_000  # a view
 NOTE = (
     "Vectors of one encoder lie in a narrow cone, so that even unlike ones have a large cosine: compare rows, and "
     "read no quality into a figure by itself."
 )
+PRESETS = tuple(map(str, Preset))
 COLUMNS = ("pack", "preset", "views", "cosine", "held_out_views", "held_out_cosine")
 
 

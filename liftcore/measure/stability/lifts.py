@@ -13,7 +13,7 @@ import numpy as np
 
 from liftcore.errors import SplatliftError
 from liftcore.lift import lift
-from liftcore.measure.stability.case import Extreme, Found
+from liftcore.measure.stability.case import Extreme, Found, always
 from liftcore.measure.stability.scenes import of_kernel, splats_at
 from liftcore.measure.stability.weights import exact_view
 from liftcore.observe.inspect import describe_packs
@@ -50,8 +50,17 @@ class Task:
     settings: Mapping[str, Any] = field(default_factory=lambda: {"dtype": "float32"})
 
 
-def lifted(name: str, exact: str, task: Callable[[], Task], claim: Callable[[Lift], bool], **more: Any) -> Extreme:
-    """An extreme whose features are held to the dense definition, relative to the longest value that came in."""
+def lifted(
+    name: str, exact: str, task: Callable[[], Task], claim: Callable[[Any], bool] = always, **more: Any
+) -> Extreme:
+    """An extreme whose features are held to the dense definition, relative to the longest value that came in.
+
+    Args:
+        name: of the row. exact: what exact arithmetic says.
+        task: what is lifted.
+        claim: ``exact`` as a function of the Lift.
+        more: kernels, bound and told of the Extreme.
+    """
     return Extreme(name, exact, partial(_measure, task, claim), **more)
 
 

@@ -61,17 +61,12 @@ def _task(observation: Observation, **settings: object) -> Task:
     return Task({"v0": observation}, settings={"dtype": "float32", **settings})
 
 
-def _any(_: object) -> bool:
-    return True
-
-
 LENGTHS: tuple[Extreme, ...] = (
     *(
         lifted(
             f"F = {channels}",
             "a weighted mean of the rows",
             lambda channels=channels: _task(checkerboard(channels=channels)),
-            _any,
             bound=SUM,
         )
         for channels in (1, 8_192)
@@ -99,7 +94,6 @@ LENGTHS: tuple[Extreme, ...] = (
         "values of 1e-40, below the normal numbers of float32",
         "a weighted mean",
         lambda: _task(checkerboard(scale=1e-40)),
-        _any,
         bound=1e-3,
         kernels=GAUSSIAN,
     ),
@@ -107,7 +101,6 @@ LENGTHS: tuple[Extreme, ...] = (
         "a zero row in the codebook",
         "it pulls means towards zero; it has no direction",
         lambda: _task(_zero_row()),
-        _any,
         bound=SUM,
         told="codebook rows are zero",
     ),
@@ -129,7 +122,7 @@ LENGTHS: tuple[Extreme, ...] = (
 )
 
 MAPS: tuple[Extreme, ...] = (
-    lifted("a mask of one pixel", "what its ray meets has its feature", lambda: _task(_one_pixel()), _any, bound=SUM),
+    lifted("a mask of one pixel", "what its ray meets has its feature", lambda: _task(_one_pixel()), bound=SUM),
     lifted(
         "one label on the whole image",
         "every splat that is seen has the same feature",
@@ -148,14 +141,12 @@ MAPS: tuple[Extreme, ...] = (
         "a region a pixel",
         "the dense map",
         lambda: _task(_labelled(np.arange(HEIGHT * WIDTH).reshape(HEIGHT, WIDTH), HEIGHT * WIDTH)),
-        _any,
         bound=SUM,
     ),
     lifted(
         "labels of 32,766 and 32,767, the last of int16",
         "as with small numbers",
         lambda: _task(_labelled(LARGEST_I16 - np.indices((HEIGHT, WIDTH)).sum(axis=0) % 2, LARGEST_I16 + 1)),
-        _any,
         bound=SUM,
         kernels=GAUSSIAN,
         told="are read by no label",
@@ -164,7 +155,6 @@ MAPS: tuple[Extreme, ...] = (
         "a label of 32,768, the first beyond int16",
         "as with small numbers",
         lambda: _task(_one_pixel(LARGEST_I16 + 1, LARGEST_I16 + 2)),
-        _any,
         bound=SUM,
         kernels=GAUSSIAN,
         told="are read by no label",
@@ -215,7 +205,6 @@ MAPS: tuple[Extreme, ...] = (
         "a grid finer than the pixels",
         "the cells nearest to pixel centres",
         lambda: _task(FeatureGrid(torch.rand(50, 70, 6, generator=torch.manual_seed(0)))),
-        _any,
         bound=SUM,
     ),
     *(
@@ -223,7 +212,6 @@ MAPS: tuple[Extreme, ...] = (
             f"squared weights and a gain of {gain:g}",
             "the mean under polarised opacities",
             lambda gain=gain: _task(checkerboard(), power=2, lift_gain=gain),
-            _any,
             bound=SUM,
         )
         for gain in (0.01, 8.0, 16.0)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from liftcore.measure.stability.case import WEIGHTS, Extreme, Found
+from liftcore.measure.stability.case import WEIGHTS, Extreme, Found, always
 from liftcore.measure.stability.weights import compare, exact_view
 from liftcore.raster.protocol import Walk
 from liftcore.scene.cameras import Camera, Cameras
@@ -28,11 +28,6 @@ class View:
     splats: Splats
     camera: Camera
     walk: Walk = field(default_factory=Walk)
-
-
-def always(_: np.ndarray) -> bool:
-    """No claim beyond equality with the oracle."""
-    return True
 
 
 def walked(

@@ -37,7 +37,13 @@ if TYPE_CHECKING:
 
     from liftcore.query.threshold.histogram import Histogram
 
-METHODS = ("auto", "valley", "paper", "otsu", "stability")
+METHODS: dict[str, Callable[[Histogram], tuple[float, str]]] = {
+    "auto": steady,
+    "valley": valley,
+    "paper": paper,
+    "otsu": otsu,
+    "stability": stability,
+}
 MOST_INSTANCES = 100  # more hills than a histogram can show
 
 
@@ -104,7 +110,7 @@ def find_threshold(
     histogram = count(scores, low, high, weights)
     if histogram is None:
         return Threshold(low, method, f"All scores are {low:.4g}: the histogram has no valley.")
-    value, explanation = _METHODS[method](histogram) if instances is None else valley(histogram, instances)
+    value, explanation = METHODS[method](histogram) if instances is None else valley(histogram, instances)
     value = min(max(value, low), high)
     share = f"{_share_above(histogram, value):.1%} of the {'pixels' if weights is None else 'evidence'}"
     return Threshold(value, method, f"{explanation.removesuffix('.')}; {share} at or above {value:.4g}.")
@@ -114,12 +120,3 @@ def _share_above(histogram: Histogram, value: float) -> float:
     """The share of the mass at or above a value, as if it lay evenly in each bin."""
     above = np.append(histogram.above(), 0.0)
     return float(np.interp((value - histogram.low) / histogram.width, np.arange(len(above)), above))
-
-
-_METHODS: dict[str, Callable[[Histogram], tuple[float, str]]] = {
-    "auto": steady,
-    "valley": valley,
-    "paper": paper,
-    "otsu": otsu,
-    "stability": stability,
-}

@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from liftcore.errors import InvalidQuery
-from liftcore.query.scores import combine, cosine, cosines, cosines_about, feature_norms, mean_direction, relevancy
+from liftcore.query.products import norms_of
+from liftcore.query.scores import combine, cosines, cosines_about, mean_direction, relevancy
 
 
 @given(
@@ -24,7 +25,7 @@ def test_cosine_equals_its_definition(count: int, channels: int, dtype: torch.dt
     text = torch.randn(channels, generator=generator)
     wide = features.double()
     expected = (wide @ text.double()) / (wide.norm(dim=1) * text.double().norm()).clamp_min(1e-300)
-    found = cosine(features, feature_norms(features), text)
+    found = cosines(features, norms_of(features), text[None])[:, 0]
     torch.testing.assert_close(
         found.double()[wide.norm(dim=1) > 0], expected[wide.norm(dim=1) > 0], atol=1e-5, rtol=0
     )
@@ -32,15 +33,15 @@ def test_cosine_equals_its_definition(count: int, channels: int, dtype: torch.dt
 
 def test_a_splat_without_a_feature_scores_the_minimum() -> None:
     features = torch.tensor([[0.0, 0.0], [1.0, 0.0]])
-    assert cosine(features, feature_norms(features), torch.tensor([1.0, 0.0])).tolist() == [-1.0, 1.0]
+    assert cosines(features, norms_of(features), torch.tensor([1.0, 0.0])[None])[:, 0].tolist() == [-1.0, 1.0]
 
 
 def test_several_texts_in_one_pass_equal_one_by_one() -> None:
     features = torch.randn(3000, 96).half()
-    norms, texts = feature_norms(features), torch.randn(4, 96)
+    norms, texts = norms_of(features), torch.randn(4, 96)
     together = cosines(features, norms, texts)
     for column, text in enumerate(texts):
-        torch.testing.assert_close(together[:, column], cosine(features, norms, text), atol=1e-6, rtol=0)
+        torch.testing.assert_close(together[:, column], cosines(features, norms, text[None])[:, 0], atol=1e-6, rtol=0)
 
 
 def test_relevancy_is_the_least_softmax_over_negatives() -> None:
@@ -72,7 +73,7 @@ def test_cosines_about_the_mean_equal_their_definition(seed: int, cone: float, d
     generator = torch.Generator().manual_seed(seed)
     features = (torch.randn(400, 32, generator=generator) + cone * 20 * torch.ones(32)).to(dtype)
     features[7] = 0
-    norms, weights = feature_norms(features), torch.rand(400, generator=generator)
+    norms, weights = norms_of(features), torch.rand(400, generator=generator)
     unit = torch.nn.functional.normalize(features.double(), dim=1)
     shares = weights.double() * (norms > 0)
     mean = (unit * shares[:, None]).sum(dim=0) / shares.sum()
@@ -87,7 +88,7 @@ def test_cosines_about_the_mean_equal_their_definition(seed: int, cone: float, d
 
 def test_a_scene_of_one_feature_is_all_alike() -> None:
     features = torch.ones(5, 4)
-    norms = feature_norms(features)
+    norms = norms_of(features)
     mean = mean_direction(features, norms, torch.ones(5))
     assert cosines_about(features, norms, mean, features[:1] / 2).tolist() == [[0.0]] * 5
     assert mean_direction(features, norms, torch.zeros(5)).tolist() == [0.0] * 4
@@ -106,4 +107,4 @@ def test_several_positives_are_as_good_as_the_nearest_one() -> None:
 def test_a_text_without_direction_or_of_another_length_is_refused(text: torch.Tensor) -> None:
     features = torch.randn(5, 8)
     with pytest.raises(InvalidQuery):
-        cosine(features, feature_norms(features), text)
+        cosines(features, norms_of(features), text[None])[:, 0]

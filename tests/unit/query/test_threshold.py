@@ -14,7 +14,7 @@ from hypothesis.extra import numpy as hnp
 from liftcore.errors import InvalidQuery
 from liftcore.query.threshold import METHODS, find_threshold
 
-SEARCHED = METHODS  # every method that looks at the scores
+SEARCHED = tuple(METHODS)  # every method that looks at the scores
 
 
 def hills(*parts: tuple[float, float, int], seed: int = 0) -> torch.Tensor:

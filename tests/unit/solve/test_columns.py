@@ -13,12 +13,12 @@ from liftcore.observe.observation import NO_LABEL, FeatureGrid, RegionMap
 from liftcore.progress import silent
 from liftcore.raster.cpu import CpuRaster
 from liftcore.raster.protocol import Walk, Weighting
-from liftcore.solve.accumulate import row_totals
 from liftcore.solve.closed_form import Solution, solve_closed_form
 from liftcore.solve.columns import Columns, by_rows, by_tuples
 from liftcore.solve.host import Host
 from liftcore.solve.on_device import Place, solve_on_device
 from liftcore.solve.settings import LiftSettings
+from liftcore.solve.totals import row_totals
 from tests.scenes import random_camera, random_splats
 
 SIZE = 48

@@ -56,7 +56,7 @@ def test_damped_steps_end_at_the_damped_normal_equations(seed, grids, damping):
     scene = SmallScene(seed, grids)
     made = refined(scene, damping=damping)
     expected = scene.damped(damping)
-    assert made.result == "converged"
+    assert made.stats["result"] == "converged"
     assert np.abs(made.features.numpy() - expected).max() < 5e-3 * max(1.0, np.abs(expected).max())
 
 
@@ -86,8 +86,8 @@ def test_the_residuals_told_are_those_of_the_dense_matrix_and_fall(damping):
         assert told[-1] == pytest.approx(scene.loss(made.features), rel=1e-3)
     if damping == 0:
         assert (np.diff(told) <= 1e-6 * told[0]).all()
-    assert "steps" in made.message
-    assert str(damping) in made.message or f"{damping:g}" in made.message
+    assert "steps" in made.stats["message"]
+    assert str(damping) in made.stats["message"] or f"{damping:g}" in made.stats["message"]
 
 
 def test_a_full_basis_gives_the_solution_of_all_channels():
