@@ -32,7 +32,7 @@ from liftcore.solve.least_squares import refine
 from liftcore.solve.lift_warnings import lift_warnings
 from liftcore.solve.reference import reference
 from liftcore.solve.robust import robust_weights
-from liftcore.solve.solver import closed_form_on
+from liftcore.solve.solver import closed_form
 from liftcore.solve.view_weights import ViewWeights
 from liftcore.timings import Timings
 from liftcore.warm_up import warm_up_lift
@@ -195,8 +195,8 @@ def _solve(run: Run, store: ViewWeights, geometry: Geometry, host: Host) -> tupl
     with run.timings.stage("robust"):
         weights = robust_weights(store, geometry.codebooks, sums, settings.robust_steps, run.progress, host)
     with run.timings.stage("solve"):
-        closed_form, dtype = closed_form_on(run.device, host), getattr(torch, settings.dtype)
-        return weights, closed_form(weights, geometry.columns.__getitem__, sums, dtype, run.progress)
+        dtype = getattr(torch, settings.dtype)
+        return weights, closed_form(weights, geometry.columns, sums, dtype, run.progress, run.device, host)
 
 
 def _refine(
@@ -248,8 +248,7 @@ def _resolve(
         return 0.0
     with run.timings.stage("resolve"):
         fewer, denominators = kept_columns(weights, aggregation.kept, X.shape[0])
-        columns, closed_form = geometry.columns.__getitem__, closed_form_on(run.device, host)
-        again = closed_form(fewer, columns, denominators, X.dtype, run.progress).features
+        again = closed_form(fewer, geometry.columns, denominators, X.dtype, run.progress, run.device, host).features
         chosen = aggregation.own & torch.from_numpy(denominators > 0)
         X[chosen] = again[chosen].to(X.dtype)
         return float(chosen.float().mean())

@@ -24,7 +24,7 @@ from liftcore.raster.open_raster import open_raster
 from liftcore.solve.accumulate import lift_walk, weighting_of
 from liftcore.solve.host import Host
 from liftcore.solve.settings import LiftSettings, Preset
-from liftcore.solve.solver import closed_form_on
+from liftcore.solve.solver import closed_form
 from liftcore.solve.view_weights import ViewWeights
 from liftcore.warm_up import warm_up_lift
 
@@ -105,8 +105,8 @@ def time_lift(work: Workload, preset: Preset, device: Device, threads: int | Non
             start = time.perf_counter()
             denominators, columns = walk_regions(raster, work.views, looking, count, store)
             middle = time.perf_counter()
-            closed_form = closed_form_on(device, Host(threads, means=work.splats.means))
-            closed_form(store, columns.__getitem__, denominators, torch.float16, silent)
+            host = Host(threads, means=work.splats.means)
+            closed_form(store, columns, denominators, torch.float16, silent, device, host)
             geometry.append((middle - start) / len(work.views))
             solution.append((time.perf_counter() - middle) / len(work.views))
             entries = sum(len(part.columns) for part in store)

@@ -119,7 +119,7 @@ def time_stages(work: Workload, preset: Preset) -> dict[str, Any]:
         clock = Clock()
         with clock.stage("solution"):
             host = Host(1, means=work.splats.means)
-            solve_closed_form(store, columns.__getitem__, denominators, torch.float16, silent, host)
+            solve_closed_form(store, columns, denominators, torch.float16, silent, host)
     share = 1 / len(views)
     solution = Clock({"solution": clock.wall["solution"] * share}, {"solution": clock.cpu["solution"] * share})
     return {

@@ -39,7 +39,7 @@ from liftcore.solve.weighted_sums import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
 
     from torch import Tensor
 
@@ -113,7 +113,7 @@ def _store_singles(source, width, begin, features):
 @one_thread()
 def solve_closed_form(
     store: Sequence[RegionWeights] | ViewWeights,
-    columns: Callable[[int], Columns],
+    columns: Sequence[Columns],
     denominators: np.ndarray,
     dtype: torch.dtype,
     progress: Progress,
@@ -123,13 +123,12 @@ def solve_closed_form(
 
     Args:
         store: W of every view.
-        columns: view number -> what the columns of its W stand for.
+        columns: of every view, what the columns of its W stand for.
         denominators: [P] f64, row sums of W over all views.
         dtype: how X is stored; float16 becomes float32 when the codebooks are too large or too small for it.
         host: what there is to solve with, and where X is to lie.
     """
-    own = [columns(view) for view in range(len(store))]
-    books = [part.codebook for part in own]
+    books = [part.codebook for part in columns]
     channels = books[0].shape[1]
     norms = [torch.linalg.vector_norm(book, dim=1, dtype=torch.float64).numpy() for book in books]
     unit = all(bool((np.abs(norm - 1) < UNIT_TOLERANCE).all()) for norm in norms)
@@ -140,20 +139,20 @@ def solve_closed_form(
     kept = features.view(torch.uint16).numpy() if dtype == torch.float16 else features.numpy()
     squares, nothing = np.zeros(count), kept[:0]
     scale = np.divide(1.0, denominators, out=np.zeros(count), where=denominators > 0)
-    halves = all(_in_halves(part, dtype) for part in own)
-    counts, tables = [part.count for part in own], WeightTables(store)
+    halves = all(_in_halves(part, dtype) for part in columns)
+    counts, tables = [part.count for part in columns], WeightTables(store)
     slices = channel_slices(sum(counts), channels, (2 if halves else 4) + (0 if unit else 4))
     with host.workers() as (_, each_share):
-        own_columns = (first_columns(counts), scale)
-        gathering = Gathering(each_share, tables, own_columns, host.places(channels), channels * dtype.itemsize)
+        columns_of_all = (first_columns(counts), scale)
+        gathering = Gathering(each_share, tables, columns_of_all, host.places(channels), channels * dtype.itemsize)
         for number, (begin, end) in enumerate(slices):
-            parts = (part.means(part.codebook[:, begin:end]) for part in own)
+            parts = (part.means(part.codebook[:, begin:end]) for part in columns)
             strips = strips_of(parts, counts, end - begin, torch.float16 if halves else torch.float32)
             sums = [(strips, (squares if unit else np.zeros(count), begin, kept))]
             if not unit:
                 parts = (
                     part.means(_unit_rows(part.codebook[:, begin:end], norm))
-                    for part, norm in zip(own, norms, strict=True)
+                    for part, norm in zip(columns, norms, strict=True)
                 )
                 sums.append((strips_of(parts, counts, end - begin, torch.float32), (squares, begin, nothing)))
             _solve_strips(each_share, gathering, sums)

@@ -18,7 +18,7 @@ from liftcore.observe.label_tuples import label_tuples
 from liftcore.observe.observation import NO_LABEL, Observation, RegionMap
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Iterable
 
     from torch import Tensor
 
@@ -65,9 +65,9 @@ class Columns:
         return replace(weights, weights=torch.from_numpy(values))
 
 
-def rows_of(codebooks: Sequence[Tensor]) -> Callable[[int], Columns]:
+def rows_of(codebooks: Iterable[Tensor]) -> list[Columns]:
     """Columns that are the rows of every view's codebook."""
-    return lambda view: Columns(codebooks[view])
+    return [Columns(book) for book in codebooks]
 
 
 def by_rows(settings: LiftSettings) -> bool:

@@ -25,7 +25,7 @@ from liftcore.solve.device_blocks import GRAIN, block_room, bounds_of, device_sl
 from liftcore.solve.feature_room import in_memory
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Iterator, Sequence
 
     from torch import Tensor
 
@@ -57,7 +57,7 @@ class BlockRows:
 
 def solve_on_device(
     store: Sequence[RegionWeights] | ViewWeights,
-    columns: Callable[[int], Columns],
+    columns: Sequence[Columns],
     denominators: np.ndarray,
     dtype: torch.dtype,
     progress: Progress,
@@ -73,8 +73,7 @@ def solve_on_device(
     Raises:
         RuntimeError: not even a grain of splats fits beside a slice of the codebooks (``device.out_of_memory``).
     """
-    own = [columns(view) for view in range(len(store))]
-    books = [part.codebook for part in own]
+    books = [part.codebook for part in columns]
     count, channels = denominators.shape[0], books[0].shape[1]
     norms = [torch.linalg.vector_norm(book, dim=1, dtype=torch.float64) for book in books]
     unit = all(bool(((norm - 1).abs() < UNIT_TOLERANCE).all()) for norm in norms)
@@ -82,13 +81,13 @@ def solve_on_device(
         dtype = torch.float32
     scale = torch.from_numpy(np.divide(1.0, denominators, out=np.zeros(count), where=denominators > 0))
     X, squares = room(count, channels, dtype), torch.zeros(count, dtype=torch.float64)
-    counts = [part.count for part in own]
+    counts = [part.count for part in columns]
     work, rows = _Work(store, counts, scale, place.device, X, squares), sum(counts)
     slices = device_slices(rows, channels)
     for number, (begin, end) in enumerate(slices):
         chosen = slice(begin, end)
-        values = _all_columns(own, chosen, place.device)
-        units = None if unit else _all_columns(own, chosen, place.device, norms)
+        values = _all_columns(columns, chosen, place.device)
+        units = None if unit else _all_columns(columns, chosen, place.device, norms)
         most = block_room(place.free, rows, end - begin, unit)
         for block in splat_blocks(store, count, end - begin, most):
             for done in _solve_fitting(work, _Slice(chosen, values, units), block):

@@ -27,7 +27,7 @@ from liftcore.progress import silent
 from liftcore.raster.open_raster import open_raster
 from liftcore.raster.protocol import Walk, Weighting
 from liftcore.solve.host import Host
-from liftcore.solve.solver import closed_form_on
+from liftcore.solve.solver import closed_form
 from liftcore.solve.view_weights import ViewWeights
 
 if TYPE_CHECKING:
@@ -96,8 +96,8 @@ def lift_ours(splats: Splats, views: Views, device: Device) -> tuple[Tensor, Ten
     with ViewWeights() as store:
         looking = Walk(), Weighting()
         totals, columns = walk_regions(open_raster(splats, device), views, looking, splats.count, store)
-        closed_form = closed_form_on(device, Host(means=splats.means))
-        X = closed_form(store, columns.__getitem__, totals, torch.float32, silent).features
+        host = Host(means=splats.means)
+        X = closed_form(store, columns, totals, torch.float32, silent, device, host).features
     return X, torch.from_numpy(totals)
 
 

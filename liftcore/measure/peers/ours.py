@@ -30,5 +30,5 @@ class Ours:
         with ViewWeights() as store:
             totals, columns = walk_regions(raster, work.views, looking, work.splats.count, store)
             host = Host(work.threads, means=work.splats.means)
-            solution = solve_closed_form(store, columns.__getitem__, totals, torch.float32, silent, host)
+            solution = solve_closed_form(store, columns, totals, torch.float32, silent, host)
         return Answer(solution.features, torch.from_numpy(totals))

@@ -102,5 +102,6 @@ def _solved(views: list[RegionWeights], equal: bool) -> float:
             weights = view.weights.double()
             total += float(weights.sum())
             value += float(weights @ book[view.columns.long(), 0].double())
-        solved = solve_closed_form(store, lambda _: Columns(book), np.array([total]), torch.float32, silent, Host(1))
+        columns = [Columns(book)] * len(store)
+        solved = solve_closed_form(store, columns, np.array([total]), torch.float32, silent, Host(1))
     return abs(float(solved.features[0, 0]) * total / value - 1)

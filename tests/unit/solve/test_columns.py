@@ -42,7 +42,7 @@ def solved(views, weighting: Weighting, dtype: torch.dtype, on_device: bool = Fa
         store.append(columns.weighted(RASTER.region_weights(CAMERA, walked, Walk(), weighting)))
         totals[store[-1].splats.numpy()] += row_totals(store[-1])
     own = [columns for _, columns in views]
-    arguments = (store, own.__getitem__, totals, dtype, silent)
+    arguments = (store, own, totals, dtype, silent)
     if on_device:
         return solve_on_device(*arguments, Place(torch.device("cpu"))), totals
     return solve_closed_form(*arguments, Host(1)), totals
@@ -78,7 +78,7 @@ def test_splats_that_no_view_labels_have_zeros_wherever_x_lies():
     def used(splats: int, channels: int, dtype: torch.dtype) -> torch.Tensor:
         return torch.full((splats, channels), 7.0, dtype=dtype)
 
-    arguments = ([weights], lambda _: Columns(own.codebook), np.zeros(RASTER.splats.count), torch.float16, silent)
+    arguments = ([weights], [Columns(own.codebook)], np.zeros(RASTER.splats.count), torch.float16, silent)
     assert not solve_closed_form(*arguments, Host(1, used)).features.any()
     assert not solve_on_device(*arguments, Place(torch.device("cpu")), used).features.any()
 

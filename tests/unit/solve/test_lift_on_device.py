@@ -78,7 +78,7 @@ def test_tuples_of_labels_on_the_card_give_what_they_give_on_the_processor(tmp_p
 
 def test_solution_has_the_memory_of_the_last_view(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scene, opened, told = write_scene(tmp_path, 3), [], []
-    open_raster, closed_form_on = lifting.open_raster, lifting.closed_form_on
+    open_raster, closed_form = lifting.open_raster, lifting.closed_form
 
     def opening(*given: Any) -> Any:
         opened.append(open_raster(*given))
@@ -86,10 +86,10 @@ def test_solution_has_the_memory_of_the_last_view(tmp_path: Path, monkeypatch: p
 
     def solving(*given: Any) -> Any:
         told.append(opened[-1]._kept)
-        return closed_form_on(*given)
+        return closed_form(*given)
 
     monkeypatch.setattr(lifting, "open_raster", opening)
-    monkeypatch.setattr(lifting, "closed_form_on", solving)
+    monkeypatch.setattr(lifting, "closed_form", solving)
     lifted(scene, CARD, LiftSettings.of(certificate_rays=2, view_stride=3))
     assert told == [None]
 

@@ -18,7 +18,7 @@ from liftcore.solve.columns import Columns, rows_of
 from liftcore.solve.device_blocks import GRAIN, SLICE_BYTES, block_bytes, device_slices, splat_blocks
 from liftcore.solve.host import Host
 from liftcore.solve.on_device import Place, solve_on_device, squared_lengths
-from liftcore.solve.solver import closed_form_on
+from liftcore.solve.solver import closed_form
 from liftcore.solve.totals import Totals, row_totals, sums_in_order
 from liftcore.solve.view_weights import ViewWeights
 
@@ -152,7 +152,7 @@ def test_sums_of_a_million_entries_and_of_many_views_keep_their_digits() -> None
     views = [view_of([0], [1], [0], [0.3]) for _ in range(2_000)]
     for store in ([long], views):
         solved = solve_on_device(
-            store, lambda _: Columns(book), sums_of(store, 1), torch.float32, silent, Place(HERE)
+            store, [Columns(book)] * len(store), sums_of(store, 1), torch.float32, silent, Place(HERE)
         )
         error = abs(float(solved.features[0, 0]) / float(book) - 1)
         assert error < 5e-6  # of 256 equal terms; a million added one by one are wrong in the third digit
@@ -240,8 +240,7 @@ def test_solution_without_room_beside_the_weights_brings_them_home(monkeypatch: 
         return "solved"
 
     monkeypatch.setattr(solver, "solve_on_device", crowded)
-    closed_form = closed_form_on(Device("cuda", HERE), Host())
-    rest = (rows_of([torch.zeros(1, 1)]), np.zeros(1), torch.float32, silent)
+    rest = (rows_of([torch.zeros(1, 1)]), np.zeros(1), torch.float32, silent, Device("cuda", HERE), Host())
     with ViewWeights(card=(HERE, 1 << 20)) as store:
         store.append(random_view(0, 3))
         if HERE.type == "cpu":  # a view of the host is no card's
