@@ -16,7 +16,6 @@ import torch
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from liftcore.errors import InvalidLift
-from liftcore.files import whole_file
 from liftcore.solve.settings import LiftSettings
 
 if TYPE_CHECKING:
@@ -69,17 +68,11 @@ class Lift:
 
 def save_lift(lift: Lift, path: Path | str) -> None:
     """Write the lift whole or not at all (temporary file, fsync, rename), with no copy of X in memory."""
-    from liftcore.safetensors_header import safetensors_header, tensor_bytes
+    from liftcore.safetensors_file import write_tensors
 
     present = TENSORS if lift.cluster is None else TENSORS + CLUSTER_TENSORS
     tensors = {name: getattr(lift, name) for name in present}
-    specs = [(name, tensor.dtype, tuple(tensor.shape)) for name, tensor in tensors.items()]
-    header, offsets = safetensors_header(specs, {"splatlift": lift.metadata.model_dump_json()})
-    with whole_file(Path(path)) as handle:
-        handle.write(header)
-        for name, offset in offsets.items():
-            handle.seek(len(header) + offset)
-            handle.write(tensor_bytes(tensors[name]))
+    write_tensors(Path(path), tensors, {"splatlift": lift.metadata.model_dump_json()})
 
 
 def load_lift(path: Path) -> Lift:

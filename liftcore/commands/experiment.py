@@ -13,10 +13,11 @@ if TYPE_CHECKING:
 def run(options: argparse.Namespace) -> int:
     """Run one experiment; print its table, or its document with ``--json``; JSON and plot go to a folder."""
     from liftcore.measure.experiments.run import run_experiment, table_of
+    from liftcore.measure.hardware import machine_line
 
     document = run_experiment(options.name, options.scene, options.out, options.every)
     lines = [f"{document['title']} ({document['source']})", "", *table_of(document), ""]
-    machine = ", ".join(f"{key} {value}" for key, value in document["hardware"].items())
+    machine = machine_line(document["hardware"])
     lines += [f"{document['date']}, {document['seconds']:.0f} s on {machine}", *document["files"]]
     reply(document, as_json=options.json, lines=lines)
     return 0

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from liftcore.errors import InvalidInput
+from liftcore.strict_json import finite
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -21,7 +21,7 @@ SHOWN_ITEMS = 6  # of a list, for people
 def reply(document: Mapping[str, Any], *, as_json: bool, lines: Iterable[str] | None = None) -> None:
     """Print one JSON object, or else ``lines``, or else the document's entries, a line each."""
     if as_json:
-        print(json.dumps(_strict(document), allow_nan=False))
+        print(json.dumps(finite(document), allow_nan=False))
         return
     for line in lines if lines is not None else _entries(document):
         print(line)
@@ -58,17 +58,6 @@ def writing(path: Path) -> Iterator[None]:
     except OSError as error:
         got = f"{path} ({error.strerror or error})"
         raise InvalidInput("output", expected="a file that can be written", got=got) from None
-
-
-def _strict(value: Any) -> Any:
-    """JSON has no NaN and no infinity: they become null."""
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, Mapping):
-        return {str(key): _strict(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_strict(item) for item in value]
-    return value
 
 
 def _entries(document: Mapping[str, Any]) -> Iterable[str]:

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import os
-import platform
-import resource
 import statistics
 import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import torch
 
-from liftcore.device import Device, choose_device, processor
+from liftcore.device import Device, choose_device
 from liftcore.errors import InvalidInput
+from liftcore.measure.hardware import hardware, peak_memory
 from liftcore.measure.region_walk import walk_regions
 from liftcore.measure.synthetic import room_cameras, room_regions, room_splats
 from liftcore.observe.observation import Observation, RegionMap
@@ -74,7 +71,6 @@ def run_bench(options: dict[str, Any]) -> dict[str, Any]:
     else:
         chosen = _presets(options, tuple(Preset))
         presets = {str(preset): time_lift(work, preset, device, options.get("threads")) for preset in chosen}
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
     return {
         "workload": work.name,
         "splats": work.splats.count,
@@ -85,7 +81,7 @@ def run_bench(options: dict[str, Any]) -> dict[str, Any]:
         "levels": options.get("levels") or 4,
         "compile_or_load_s": compile_seconds,
         "presets": presets,
-        "peak_memory_bytes": peak,
+        "peak_memory_bytes": peak_memory(),
         "hardware": hardware() | ({} if device.kind == "cpu" else {"device": device.facts()}),
     }
 
@@ -165,22 +161,3 @@ def _size(text: str) -> tuple[int, int]:
     if len(parts) != 2 or not all(part.isdigit() for part in parts):
         raise InvalidInput("size", expected="WIDTHxHEIGHT in pixels", got=repr(text))
     return int(parts[0]), int(parts[1])
-
-
-def hardware() -> dict[str, Any]:
-    """The machine and the versions that a figure was taken on.
-
-    The processor has LLVM's name too, for which code is compiled: a virtual one's own name may be no more than its
-    maker's, of generations a factor of two apart.
-    """
-    import numba
-    from llvmlite.binding import get_host_cpu_name
-
-    return {
-        "cpu": f"{processor()} ({get_host_cpu_name()})",
-        "cores": len(os.sched_getaffinity(0)),
-        "python": platform.python_version(),
-        "torch": torch.__version__,
-        "numba": numba.__version__,
-        "numpy": np.__version__,
-    }

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from liftcore.device import CPU
 from liftcore.input_files import input_file
 from liftcore.lift import Run, lift_sources, open_sources
-from liftcore.measure.bench import hardware
+from liftcore.measure.hardware import hardware, machine_line
 from liftcore.measure.tradeoff.judge import cosine_figures
 from liftcore.progress import silent
 from liftcore.solve.settings import LiftSettings, Preset, Speed
@@ -74,7 +74,7 @@ def table_of(rows: Sequence[dict[str, Any]]) -> str:
             f"{row['speed']:<10}{row['views']:>6}{row['processor_seconds']:>13.2f}{row['less_than_exact']:>6.1f}x"
             f"  {cosines}{expected}"
         )
-    lines.append(", ".join(f"{key} {value}" for key, value in hardware().items()))
+    lines.append(machine_line(hardware()))
     return "\n".join(lines)
 
 

@@ -22,7 +22,7 @@ from liftcore import __version__
 from liftcore.artifact import InputFile, Lift, LiftMetadata, save_lift
 from liftcore.errors import InvalidInput
 from liftcore.input_files import input_file
-from liftcore.measure.bench import hardware
+from liftcore.measure.hardware import hardware
 from liftcore.measure.synthetic import room_cameras, room_splats
 from liftcore.query.ask import ask, look
 from liftcore.query.pictures import mask_png

@@ -22,7 +22,7 @@ import torch
 from liftcore.errors import InvalidInput
 from liftcore.lift import lift
 from liftcore.measure.accuracy import class_ious, class_scores, rendered_scores, splat_accuracy
-from liftcore.measure.bench import hardware
+from liftcore.measure.hardware import hardware, machine_line
 from liftcore.measure.scene_files import cameras_of
 from liftcore.observe.observation import NO_LABEL, RegionMap
 from liftcore.observe.pack import open_packs
@@ -198,7 +198,7 @@ def table_of(document: dict[str, Any]) -> str:
             f"{row['name']:<38}{row['accuracy']:>9.4f}{base[0]:>7}"
             f"{row['miou']:>8.4f}{base[1]:>7}{row['seconds']:>8.1f}"
         )
-    lines.append(", ".join(f"{key} {value}" for key, value in document["hardware"].items()))
+    lines.append(machine_line(document["hardware"]))
     return "\n".join(lines)
 
 

@@ -26,7 +26,7 @@ import torch
 from liftcore.artifact import save_lift
 from liftcore.errors import InvalidQuery
 from liftcore.lift import lift
-from liftcore.measure.bench import hardware
+from liftcore.measure.hardware import hardware, machine_line
 from liftcore.measure.tabletop import Tabletop
 from liftcore.query.ask import ask, look
 from liftcore.query.directions import MINIMUM_ROW_SUM
@@ -195,7 +195,7 @@ def table_of(document: dict[str, Any]) -> str:
         lines.append(
             f"{head:<36}" + "".join(f"{row[name]:>10.3f}" if name in row else f"{'-':>10}" for name in names)
         )
-    lines.append(", ".join(f"{key} {value}" for key, value in document["hardware"].items()))
+    lines.append(machine_line(document["hardware"]))
     return "\n".join(lines)
 
 

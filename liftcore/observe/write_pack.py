@@ -12,7 +12,7 @@ from liftcore.observe.finite import check_finite
 from liftcore.observe.header import MAX_HEADER_BYTES
 from liftcore.observe.observation import Observation, RegionMap
 from liftcore.progress import Progress, silent
-from liftcore.safetensors_header import safetensors_header, tensor_bytes
+from liftcore.safetensors_file import safetensors_header, tensor_bytes
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping

@@ -22,10 +22,9 @@ from llvmlite.binding import get_host_cpu_name
 from safetensors import SafetensorError, safe_open
 
 from liftcore import __version__
-from liftcore.files import whole_file
 from liftcore.raster.protocol import RayRows, RegionWeights, Walked
 from liftcore.raster.weights_home import on_host
-from liftcore.safetensors_header import safetensors_header, tensor_bytes
+from liftcore.safetensors_file import write_tensors
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
@@ -162,18 +161,12 @@ class _Journal:
 
     def _write(self) -> None:
         tensors = {
-            f"{number}/{name}": tensor.contiguous()
+            f"{number}/{name}": tensor
             for number, (_, answer) in enumerate(self._fresh)
             for name, tensor in answer.items()
         }
         metadata = {"key": self._key, "calls": json.dumps([call for call, _ in self._fresh])}
-        specs = [(name, tensor.dtype, tuple(tensor.shape)) for name, tensor in tensors.items()]
-        header, offsets = safetensors_header(specs, metadata)
-        with whole_file(self._block(self._count - len(self._fresh))) as handle:
-            handle.write(header)
-            for name, offset in offsets.items():
-                handle.seek(len(header) + offset)
-                handle.write(tensor_bytes(tensors[name]))
+        write_tensors(self._block(self._count - len(self._fresh)), tensors, metadata)
 
     def _block(self, first: int) -> Path:
         return self._folder / f"{first:06d}.safetensors"

@@ -14,8 +14,8 @@ from liftcore.measure.tradeoff.report import page_of, save
 from liftcore.progress import Progress
 from liftcore.scene.splats import Kernel
 from liftcore.solve.settings import LiftSettings
+from liftcore.strict_json import finite
 from liftcore.warm_up import warm_up_lift
-from service.finite import finite
 
 SHOWN_DIGITS = 12  # of the splats' digest, by which the chart names the scene
 

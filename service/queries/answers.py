@@ -8,7 +8,6 @@ import hashlib
 import io
 import itertools
 import json
-import math
 import threading
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, replace
@@ -31,6 +30,7 @@ from liftcore.query.scene import QueryScene
 from liftcore.query.splat_files import coloured_ply, object_ply
 from liftcore.raster.warm_up import warm_up
 from liftcore.scene.splats import Kernel
+from liftcore.strict_json import finite
 from service.errors import NoSpace
 from service.queries.frames import Frame
 from service.queries.kept import Kept
@@ -264,9 +264,9 @@ def describe(scene: QueryScene, answer: Answer, count: int) -> dict[str, Any]:
     """The answer in numbers, as JSON takes them; ``count`` of the best splats."""
     found = top(answer, scene, count)
     return {
-        "statistics": {name: _finite(value) for name, value in answer.statistics.items()},
+        "statistics": finite(answer.statistics),
         "threshold": {
-            "value": _finite(answer.threshold),
+            "value": finite(answer.threshold),
             "method": answer.threshold_method,
             "explanation": answer.explanation,
         },
@@ -274,7 +274,3 @@ def describe(scene: QueryScene, answer: Answer, count: int) -> dict[str, Any]:
         "top": [asdict(splat) for splat in found.best],
         "box": None if found.box is None else {"low": found.box[0], "high": found.box[1]},
     }
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None

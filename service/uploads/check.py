@@ -21,8 +21,8 @@ from liftcore.observe.pack import open_packs
 from liftcore.query.encoders.table import TableEncoder
 from liftcore.scene.inspect import describe_camera_file, describe_splats
 from liftcore.scene.load import load_splats
+from liftcore.strict_json import finite
 from service.faults import fault_of
-from service.finite import finite
 from service.uploads.checking import INVALID
 from service.wire import VIEW_CHARACTERS, AssetKind
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from liftcore.errors import InvalidInput
 from liftcore.files import whole_file
 from liftcore.measure.experiments.run import table_of
+from liftcore.measure.hardware import machine_line
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -38,7 +39,7 @@ def page_of(folder: Path) -> str:
 
 
 def _section(file: Path, document: Mapping[str, Any]) -> Iterator[str]:
-    machine = ", ".join(f"{key} {value}" for key, value in document["hardware"].items())
+    machine = machine_line(document["hardware"])
     yield f"## {document['title']}: {document['scene']}\n"
     taken = f"{document['date']}, {document['seconds']:.0f} s; {machine}"
     yield f"After {document['source']}. `{document['command']}`, {taken}.\n"

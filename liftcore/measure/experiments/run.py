@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from liftcore.errors import InvalidInput
-from liftcore.measure.bench import hardware
 from liftcore.measure.experiments.figure import save_experiment
 from liftcore.measure.experiments.subject import Subject
+from liftcore.measure.hardware import hardware
 
 
 def run_experiment(name: str, scene: Path, out: Path, every: int = 1) -> dict[str, Any]:

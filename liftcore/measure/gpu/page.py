@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
-from liftcore.measure.bench import hardware
 from liftcore.measure.gpu.figures import SEEN
+from liftcore.measure.hardware import hardware, machine_line
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -44,7 +44,7 @@ def page(found: Findings) -> str:
 def _head(found: Findings) -> Iterator[str]:
     facts = found.device.facts()
     versions = ", ".join(f"{name} {version}" for name, version in facts["versions"].items())
-    machine = ", ".join(f"{name} {value}" for name, value in hardware().items())
+    machine = machine_line(hardware())
     yield "# On a GPU"
     yield ""
     yield f"{facts['name']} ({versions}; {machine}), {datetime.now(UTC):%Y-%m-%d}, written by `{found.command}`."

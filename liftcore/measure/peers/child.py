@@ -15,9 +15,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from liftcore.measure.hardware import peak_memory
 from liftcore.measure.peers.everybody import PEERS, TINY
 from liftcore.measure.peers.work import Size, room
-from liftcore.measure.tradeoff.child import peak_memory
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

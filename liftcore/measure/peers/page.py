@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
-from liftcore.measure.bench import hardware
+from liftcore.measure.hardware import hardware, machine_line
 from liftcore.measure.peers.agreement import SAME, SEEN
 from liftcore.measure.peers.tried import DAY, RAN, STOPPED
 from liftcore.measure.peers.work import LEVELS
@@ -54,7 +54,7 @@ def in_words(size: Size) -> str:
 
 
 def _head(found: Findings) -> Iterator[str]:
-    machine = ", ".join(f"{key} {value}" for key, value in hardware().items())
+    machine = machine_line(hardware())
     yield "# Peers on the same work"
     yield ""
     yield (

@@ -6,7 +6,7 @@ import math
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
-from liftcore.measure.bench import hardware
+from liftcore.measure.hardware import hardware, machine_line
 from liftcore.measure.stability.accumulation import (
     MOST_VIEWS,
     SIDES,
@@ -56,7 +56,7 @@ taken by convention; where not all kernels tell the same, the ones that do are n
 
 def page() -> str:
     """Measure everything; the page as Markdown."""
-    machine = ", ".join(f"{key} {value}" for key, value in hardware().items())
+    machine = machine_line(hardware())
     lines = [HEAD.format(date=datetime.now(UTC).date().isoformat(), machine=machine)]
     for title, extremes in TABLES.items():
         lines += [f"## {title}\n", *table_of(extremes), ""]

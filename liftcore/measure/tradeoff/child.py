@@ -7,17 +7,16 @@ from __future__ import annotations
 
 import json
 import os
-import resource
 import sys
 import time
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from liftcore.device import choose_device
 from liftcore.errors import SplatliftError
 from liftcore.input_files import input_file
 from liftcore.lift import Run, lift_sources, open_sources
+from liftcore.measure.hardware import peak_memory
 from liftcore.measure.tradeoff.judge import judge
 from liftcore.measure.tradeoff.order import Order
 from liftcore.progress import silent
@@ -80,19 +79,6 @@ def _reference(order: Order, made: Lift) -> tuple[torch.Tensor, torch.Tensor]:
         return made.features[:0], made.evidence[:0]
     with safe_open(str(path), framework="pt") as kept:
         return kept.get_tensor("features"), kept.get_tensor("evidence")
-
-
-def peak_memory() -> int:
-    """Bytes of this process at its largest.
-
-    Not ``ru_maxrss`` where Linux says better: that one survives exec, so a child starts from its parent's size.
-    """
-    status = Path("/proc/self/status")
-    if status.is_file():
-        lines = [line for line in status.read_text(encoding="ascii").splitlines() if line.startswith("VmHWM:")]
-        if lines:
-            return int(lines[0].split()[1]) * 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 
 def main() -> int:

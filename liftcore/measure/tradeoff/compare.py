@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from liftcore.errors import InvalidInput, Unavailable
-from liftcore.measure.bench import hardware
+from liftcore.measure.hardware import hardware
 from liftcore.measure.tradeoff.choice import choose
 from liftcore.measure.tradeoff.judge import class_vectors, labelled_masks
 from liftcore.measure.tradeoff.order import CANDIDATES, DRAFT, EXACT, HOLD_OUT, Candidate, Order, Scene

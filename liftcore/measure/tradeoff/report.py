@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from liftcore.files import whole_file
 from liftcore.measure.experiments.figure import save_experiment
+from liftcore.measure.hardware import machine_line
 from liftcore.measure.tradeoff.chart import draw
 
 if TYPE_CHECKING:
@@ -43,7 +44,7 @@ def page_of(document: Mapping[str, Any]) -> list[str]:
         "",
         f"`{document['command']}`, {document['date']}, {document['seconds']:.0f} s; {views['lifted']} views lifted"
         f"{subset}, {views['held_out']} with features and {document['labelled_views']} with masks held out.{skipped} "
-        + ", ".join(f"{key} {value}" for key, value in machine.items()),
+        + machine_line(machine),
     ]
 
 

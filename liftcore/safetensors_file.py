@@ -1,4 +1,4 @@
-"""The header of a safetensors file, for writers that stream their tensors after it."""
+"""Safetensors files written whole or not at all, their tensors one by one, with no copy in memory."""
 
 from __future__ import annotations
 
@@ -7,8 +7,11 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from liftcore.files import whole_file
+
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
+    from pathlib import Path
 
     from torch import Tensor
 
@@ -23,6 +26,17 @@ TYPES = {
     torch.int16: "I16",
     torch.bool: "BOOL",
 }
+
+
+def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
+    """Write tensors of any strides and place."""
+    specs = [(name, tensor.dtype, tuple(tensor.shape)) for name, tensor in tensors.items()]
+    header, offsets = safetensors_header(specs, metadata)
+    with whole_file(path) as handle:
+        handle.write(header)
+        for name, offset in offsets.items():
+            handle.seek(len(header) + offset)
+            handle.write(tensor_bytes(tensors[name]))
 
 
 def safetensors_header(specs: Iterable[Spec], metadata: Mapping[str, str]) -> tuple[bytes, dict[str, int]]:
