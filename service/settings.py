@@ -9,11 +9,11 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
+from liftcore.query.encoders.specs import NO_WORDS
 from service.errors import InvalidRequest
 
 MiB = 1 << 20
 GiB = 1 << 30
-NO_WORDS = "none"  # the text space of features that no text encoder shares
 
 
 class ServiceSettings(BaseSettings):

@@ -123,28 +123,21 @@ def _document(answer: Answer, seen: Look | None, encoder: TextEncoder | None) ->
 
 def _write(options: argparse.Namespace, scene: QueryScene, answer: Answer, seen: Look | None) -> dict[str, str]:
     """Write what was asked for, the object first: when nothing was found, nothing is written."""
-    from liftcore.query.pictures import save_attention, save_mask
-    from liftcore.query.splat_files import save_coloured, save_object
+    from liftcore.query.pictures import attention_png, mask_png
+    from liftcore.query.splat_files import coloured_ply, object_ply, scores_npy
 
-    save: dict[str, Callable[[Path], None]] = {
-        "object": lambda path: save_object(scene, answer, path),
-        "coloured": lambda path: save_coloured(scene, answer, path),
-        "scores": lambda path: _save_scores(answer, path),
+    blocks: dict[str, Callable[[], Iterable[bytes]]] = {
+        "object": lambda: object_ply(scene, answer),
+        "coloured": lambda: coloured_ply(scene, answer),
+        "scores": lambda: [scores_npy(answer)],
     }
     if seen is not None:
-        save |= {"mask": lambda path: save_mask(seen, path), "attention": lambda path: save_attention(seen, path)}
+        blocks |= {"mask": lambda: [mask_png(seen)], "attention": lambda: [attention_png(seen)]}
     files = {kind: path for kind in OUTPUTS if (path := getattr(options, kind)) is not None}
     for kind, path in files.items():
-        with writing(path):
-            save[kind](path)
+        with writing(path), whole_file(path) as handle:
+            handle.writelines(blocks[kind]())
     return {kind: str(path) for kind, path in files.items()}
-
-
-def _save_scores(answer: Answer, path: Path) -> None:
-    import numpy as np
-
-    with whole_file(path) as handle:
-        np.save(handle, answer.scores.numpy())
 
 
 def _lines(document: dict[str, Any]) -> Iterable[str]:

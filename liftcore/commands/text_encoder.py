@@ -5,11 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from liftcore.errors import InvalidQuery
+from liftcore.query.encoders.specs import NO_WORDS
 
 if TYPE_CHECKING:
     import argparse
-
-NO_WORDS = "none"  # the text space of features that no text encoder shares
 
 
 def encoder_spec(options: argparse.Namespace, text_space: str, hint: str = "") -> str:

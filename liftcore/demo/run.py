@@ -13,9 +13,10 @@ import numpy as np
 from PIL import Image
 
 from liftcore.demo.client import Client
-from liftcore.demo.scene_folder import NO_WORDS, DemoScene, Truth, find_scene
+from liftcore.demo.scene_folder import DemoScene, Truth, find_scene
 from liftcore.demo.server import Server
 from liftcore.demo.write_scene import write_still_life
+from liftcore.query.encoders.specs import NO_WORDS
 from liftcore.query.pictures import overlay
 
 if TYPE_CHECKING:

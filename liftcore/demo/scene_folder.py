@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from liftcore.errors import InvalidInput
+from liftcore.query.encoders.specs import NO_WORDS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
 _CAMERA_FILES = ("cameras.json", "transforms.json", "cameras.zip")
 _MODEL_FOLDERS = ("sparse/0", "sparse")
 _TABLE = "text_table.safetensors"
-NO_WORDS = "none"  # the text space of features that no text encoder shares
 _BUILT_IN = "minilm"  # the text encoder that needs no files
 _PHRASES = 3  # asked when nobody says which
 

@@ -15,10 +15,10 @@ from liftcore.errors import InvalidFeatures
 from liftcore.observe.finite import check_finite
 from liftcore.observe.header import check_header
 from liftcore.observe.observation import NO_LABEL, FeatureGrid, Observation, RegionMap
-from liftcore.scene.view_pairs import NAMED_AFTER, cameras_of_views
+from liftcore.scene.view_pairs import require_pairs
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     from torch import Tensor
@@ -171,14 +171,7 @@ def pair(packs: FeaturePacks, cameras: Cameras) -> tuple[FeaturePacks, list[str]
     Raises:
         InvalidFeatures: no view has a camera.
     """
-    names = cameras_of_views(packs.views, cameras.by_name)
-    if not names:
-        raise InvalidFeatures(
-            "features",
-            expected="views named like the cameras",
-            got=f"views {_examples(packs.views)} and cameras {_examples(cameras.by_name)}, none in common",
-            hint=NAMED_AFTER,
-        )
+    names = require_pairs(packs.views, cameras.by_name)
     return packs.renamed(names), [view for view in packs.views if view not in names]
 
 
@@ -186,10 +179,6 @@ def _spread(length: int, count: int) -> list[int]:
     """At most ``count`` places of so many, evenly spaced and off the ends; one at least."""
     steps = max(1, min(count, length))
     return [(2 * k + 1) * length // (2 * steps) for k in range(steps)]
-
-
-def _examples(names: Iterable[str]) -> str:
-    return ", ".join(repr(name) for name in sorted(names)[:3])
 
 
 def _open(path: Path) -> _PackFile:

@@ -10,14 +10,12 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 from liftcore.errors import InvalidQuery
-from liftcore.files import whole_file
 from liftcore.query.colours import cluster_colours, heat_colours, seen_colours
 from liftcore.query.depth import shown_depth
 from liftcore.raster.protocol import Walk
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-    from pathlib import Path
 
     from liftcore.query.ask import Look
     from liftcore.query.scene import QueryScene
@@ -50,16 +48,6 @@ def render_png(scene: QueryScene, view: str, what: str = "rgb") -> bytes:
         depth = shown_depth(scene, view)
         return _png(depth.levels, depth.text())
     return _png(render(scene, view, what))
-
-
-def save_mask(look: Look, path: Path) -> None:
-    """Write `mask_png` to a file."""
-    _save(mask_png(look), path)
-
-
-def save_attention(look: Look, path: Path) -> None:
-    """Write `attention_png` to a file."""
-    _save(attention_png(look), path)
 
 
 def render(scene: QueryScene, view: str, what: str = "rgb") -> np.ndarray:
@@ -138,8 +126,3 @@ def _png(pixels: np.ndarray, text: Mapping[str, str] | None = None) -> bytes:
         chunks.add_text(name, value)
     Image.fromarray(np.ascontiguousarray(pixels)).save(buffer, format="PNG", pnginfo=chunks)
     return buffer.getvalue()
-
-
-def _save(content: bytes, path: Path) -> None:
-    with whole_file(path) as handle:
-        handle.write(content)

@@ -1,21 +1,23 @@
-"""Answers as splat files: what was found alone, or the whole scene in the colours of its scores.
+"""Answers as files: what was found alone, the whole scene in the colours of its scores, or the scores.
 
-Both are copies of the file that was lifted, in its dialect and in the order of its rows: whatever opens that file
-opens them, and they can be lifted again.
+Splat files are copies of the file that was lifted, in its dialect and in the order of its rows: whatever opens that
+file opens them, and they can be lifted again.
 """
 
 from __future__ import annotations
 
+import io
 from typing import TYPE_CHECKING
 
+import numpy as np
+import torch
+
 from liftcore.errors import InvalidQuery
-from liftcore.files import whole_file
 from liftcore.query.colours import NOT_SEEN_COLOUR, constant_terms, heat_colours
 from liftcore.scene.ply_copy import recoloured, some_rows
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
-    from pathlib import Path
 
     from liftcore.query.ask import Answer
     from liftcore.query.scene import QueryScene
@@ -54,17 +56,8 @@ def coloured_ply(scene: QueryScene, answer: Answer) -> Iterable[bytes]:
     return recoloured(scene.splat_file, constant_terms(colours))
 
 
-def save_object(scene: QueryScene, answer: Answer, path: Path) -> None:
-    """Write `object_ply` to a file."""
-    _save(object_ply(scene, answer), path)
-
-
-def save_coloured(scene: QueryScene, answer: Answer, path: Path) -> None:
-    """Write `coloured_ply` to a file."""
-    _save(coloured_ply(scene, answer), path)
-
-
-def _save(blocks: Iterable[bytes], path: Path) -> None:
-    with whole_file(path) as handle:
-        for block in blocks:
-            handle.write(block)
+def scores_npy(answer: Answer) -> bytes:
+    """The score of every splat, [P] f32, as an ``.npy`` file."""
+    content = io.BytesIO()
+    np.save(content, answer.scores.to(torch.float32).numpy())
+    return content.getvalue()

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections import Counter
 from typing import TYPE_CHECKING
 
+from liftcore.errors import InvalidFeatures
+
 if TYPE_CHECKING:
     from collections.abc import Collection
 
@@ -31,6 +33,28 @@ def cameras_of_views(views: Collection[str], cameras: Collection[str]) -> dict[s
         elif other is not None and (_ends(view, other) or _ends(other, view)):
             pairs[view] = other
     return pairs
+
+
+def require_pairs(views: Collection[str], cameras: Collection[str]) -> dict[str, str]:
+    """`cameras_of_views` of the views of features.
+
+    Raises:
+        InvalidFeatures: no view has a camera.
+    """
+    pairs = cameras_of_views(views, cameras)
+    if not pairs:
+        raise InvalidFeatures(
+            "features",
+            expected="views named like the cameras",
+            got=f"views {some_of(views)} and cameras {some_of(cameras)}, none in common",
+            hint=NAMED_AFTER,
+        )
+    return pairs
+
+
+def some_of(names: Collection[str]) -> str:
+    """The first few, for an error."""
+    return ", ".join(repr(name) for name in sorted(names)[:3])
 
 
 def _last(name: str) -> str:

@@ -24,6 +24,7 @@ from liftcore.errors import SplatliftError
 from liftcore.progress import Progress
 from service.errors import NoSpace, OverLimit
 from service.faults import fault_of
+from service.own_stdout import own_stdout
 from service.wire import JobKind
 
 Work = Callable[[dict[str, Any], Progress], dict[str, Any]]  # an order to what is told of its result
@@ -108,9 +109,7 @@ def _end_with_parent(stdin: BinaryIO) -> None:
 
 def main() -> None:
     """Run one job."""
-    # Libraries may print; the pipe is for messages only.
-    out = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)
+    out = own_stdout()
     stdin = os.fdopen(os.dup(0), "rb", buffering=0)
     threading.Thread(target=_end_with_parent, args=(stdin,), daemon=True).start()
     report = Reporter(out)

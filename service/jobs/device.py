@@ -7,12 +7,12 @@ what is missing, in one JSON line on stdout.
 from __future__ import annotations
 
 import json
-import os
 import sys
 
 from liftcore.device import choose_device
 from liftcore.errors import SplatliftError
 from service.faults import fault_of
+from service.own_stdout import own_stdout
 
 
 def look(asked: str) -> dict[str, object]:
@@ -26,9 +26,7 @@ def look(asked: str) -> dict[str, object]:
 
 def main() -> None:
     """Look for the device that the command line names."""
-    # Libraries may print; the pipe is for the message only.
-    out = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)
+    out = own_stdout()
     out.write(json.dumps(look(sys.argv[1])).encode() + b"\n")
     out.flush()
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from liftcore.errors import InvalidFeatures, InvalidSettings, InvalidSplats
@@ -11,7 +11,7 @@ from liftcore.raster.antialiased import check_antialiased
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.ply_dialect import model_slots
 from liftcore.scene.ply_header import read_header
-from liftcore.scene.view_pairs import NAMED_AFTER, cameras_of_views
+from liftcore.scene.view_pairs import cameras_of_views, require_pairs, some_of
 from liftcore.solve.settings import LiftSettings
 from service.errors import InvalidRequest
 from service.store.assets import AssetRecord, kernel_of
@@ -38,14 +38,7 @@ def check_fit(cameras: AssetRecord, features: Sequence[AssetRecord]) -> None:
     if len(channels) > 1:
         got = " and ".join(f"{count} in {pack}" for count, pack in channels.items())
         raise InvalidFeatures("features", expected="packs with the same channels", got=got)
-    known = cameras.counts["names"]
-    if not cameras_of_views(owner, known):
-        raise InvalidFeatures(
-            "features",
-            expected="views named like the cameras",
-            got=f"views {_examples(owner)} and cameras {_examples(known)}, none in common",
-            hint=NAMED_AFTER,
-        )
+    require_pairs(owner, cameras.counts["names"])
 
 
 def check_kernel(splats: AssetRecord, settings: Mapping[str, Any]) -> None:
@@ -98,7 +91,7 @@ def check_labels(
         raise InvalidRequest(
             "labels.masks",
             expected="masks of views named like the cameras",
-            got=f"masks of {_examples(masks.counts['names'])} and cameras {_examples(known)}, none in common",
+            got=f"masks of {some_of(masks.counts['names'])} and cameras {some_of(known)}, none in common",
         )
     named = [view for pack in features for view in pack.counts["names"]]
     views = sorted(cameras_of_views(named, known).values())
@@ -112,7 +105,3 @@ def scratch_bytes(kind: JobKind, splats: AssetRecord, features: Sequence[AssetRe
     if kind is not JobKind.TRADEOFF:
         return 0
     return splats.counts.get("splats", 0) * (1 + features[0].counts["channels"]) * FLOAT_BYTES
-
-
-def _examples(names: Iterable[str]) -> str:
-    return ", ".join(repr(name) for name in sorted(names)[:3])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import errno
 import hashlib
-import io
 import itertools
 import json
 import threading
@@ -14,7 +13,6 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from liftcore.artifact import load_lift
@@ -27,7 +25,7 @@ from liftcore.query.pictures import attention_png, mask_png, render_png
 from liftcore.query.products import cosines_of, norms_of
 from liftcore.query.query import Query
 from liftcore.query.scene import QueryScene
-from liftcore.query.splat_files import coloured_ply, object_ply
+from liftcore.query.splat_files import coloured_ply, object_ply, scores_npy
 from liftcore.raster.warm_up import warm_up
 from liftcore.scene.splats import Kernel
 from liftcore.strict_json import finite
@@ -165,9 +163,7 @@ class Answers:
         return Frame(describe(scene, answer, request["top"]))
 
     def _scores(self, request: dict[str, Any]) -> Frame:
-        file = io.BytesIO()
-        np.save(file, self._answer(request).scores.to(torch.float32).numpy())
-        return Frame({}, file.getvalue())
+        return Frame({}, scores_npy(self._answer(request)))
 
     def _mask(self, request: dict[str, Any]) -> Frame:
         return Frame({}, mask_png(self._look(request)))

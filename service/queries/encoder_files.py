@@ -14,10 +14,10 @@ from safetensors import SafetensorError, safe_open
 
 from liftcore.errors import InvalidInput
 from liftcore.observe.header import check_header
+from liftcore.query.encoders.specs import ENCODER_SPECS
 from service.errors import Misconfigured
 from service.settings import ServiceSettings, encoder_file, encoder_label
 
-KINDS = "table:FILE, minilm, open_clip:MODEL/TAG or open_clip:MODEL@FILE"
 TABLE = "a text table: safetensors with embeddings [n, F] and metadata words, a JSON list of n strings"
 
 
@@ -33,7 +33,7 @@ def require_encoder_files(settings: ServiceSettings) -> None:
     for argument, spec in named.items():
         path = encoder_file(spec)
         if path is None and spec != "minilm" and not spec.startswith("open_clip:"):
-            raise Misconfigured(argument, expected=KINDS, got=repr(spec))
+            raise Misconfigured(argument, expected=f"one of {', '.join(ENCODER_SPECS)}", got=repr(spec))
         if path is not None:
             _require_readable(argument, path)
             if encoder_label(spec) == "table":

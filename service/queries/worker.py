@@ -8,7 +8,6 @@ they need.
 
 from __future__ import annotations
 
-import os
 import sys
 import threading
 import traceback
@@ -16,6 +15,7 @@ from typing import Any
 
 from liftcore.errors import SplatliftError
 from service.faults import fault_of
+from service.own_stdout import own_stdout
 from service.queries.answers import Answers, use_one_library_thread
 from service.queries.frames import Frame, read_frame, write_frame
 from service.settings import encoder_version
@@ -41,9 +41,7 @@ def _warm_up(answers: Answers, encoder: str) -> None:
 
 def main() -> None:
     """Answer until stdin ends."""
-    # Libraries may print; the pipe is for answers only.
-    out = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)
+    out = own_stdout()
     use_one_library_thread()
     answers = Answers(scenes=int(sys.argv[1]), cache_bytes=int(sys.argv[2]))
     threading.Thread(target=_warm_up, args=(answers, sys.argv[3]), daemon=True).start()

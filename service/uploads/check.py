@@ -7,7 +7,6 @@ Run as ``python -m service.uploads.check KIND PATH MEMORY_BYTES``. It says ``rea
 from __future__ import annotations
 
 import json
-import os
 import resource
 import sys
 import zipfile
@@ -23,6 +22,7 @@ from liftcore.scene.inspect import describe_camera_file, describe_splats
 from liftcore.scene.load import load_splats
 from liftcore.strict_json import finite
 from service.faults import fault_of
+from service.own_stdout import own_stdout
 from service.uploads.checking import INVALID
 from service.wire import VIEW_CHARACTERS, AssetKind
 
@@ -103,9 +103,7 @@ def _say(out: BinaryIO, message: dict[str, Any]) -> None:
 def main() -> None:
     """Check the file that the command line names."""
     kind, path, memory = AssetKind(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3])
-    # Libraries may print; the pipe is for messages only.
-    out = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)
+    out = own_stdout()
     # Private memory and not address space: mapped files, however large, cost none.
     resource.setrlimit(resource.RLIMIT_DATA, (memory, memory))
     _say(out, {"event": "ready"})

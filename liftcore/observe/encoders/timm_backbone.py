@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Self
 import torch
 
 from liftcore.errors import InvalidInput, Unavailable
+from liftcore.nearest import nearest
 from liftcore.observe.encoders import Pixels
 from liftcore.observe.encoders.cell_shift import cell_shift, kept, shifted
 from liftcore.query.encoders.open_clip_models import WEIGHT_SUFFIXES
@@ -92,12 +93,8 @@ class TimmEncoder:
 def _check_name(label: str, name: str) -> None:
     timm = _library()
     if not timm.is_model(name):
-        from rapidfuzz import process
-
-        near = [match[0] for match in process.extract(name, timm.list_models(), limit=3)]
-        raise InvalidInput(
-            label, expected="a model that timm knows", got=repr(name), hint=f"nearest: {', '.join(near)}"
-        )
+        hint = nearest(name, timm.list_models(), 3)
+        raise InvalidInput(label, expected="a model that timm knows", got=repr(name), hint=hint)
 
 
 def _by_name(label: str, name: str) -> Any:

@@ -6,18 +6,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 from liftcore.errors import InvalidQuery
+from liftcore.query.encoders.specs import ENCODER_SPECS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from torch import Tensor
-
-ENCODER_SPECS = (
-    "table:FILE.safetensors",
-    "minilm",
-    "open_clip:MODEL/PRETRAINED_TAG",
-    "open_clip:MODEL@WEIGHTS_FILE",
-)
 
 
 class TextEncoder(Protocol):

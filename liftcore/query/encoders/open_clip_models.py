@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from liftcore.errors import InvalidQuery, Unavailable
+from liftcore.nearest import nearest
 from liftcore.query.encoders.torchvision_ops import import_torchvision
 
 if TYPE_CHECKING:
@@ -89,14 +90,11 @@ def library() -> Any:
 def _check_model(label: str, model_name: str) -> None:
     known = library().list_models()
     if model_name not in known:
-        from rapidfuzz import process
-
-        near = [match[0] for match in process.extract(model_name, known, limit=3)]
         raise InvalidQuery(
             label,
             expected="a model that open_clip knows",
             got=repr(model_name),
-            hint=f"nearest: {', '.join(near)}",
+            hint=nearest(model_name, known, 3),
         )
 
 

@@ -19,7 +19,7 @@ from liftcore.query.example import Region
 from liftcore.query.pictures import attention_png, render
 from liftcore.query.query import Query
 from liftcore.query.scene import QueryScene
-from liftcore.query.splat_files import coloured_ply, object_ply, save_coloured, save_object
+from liftcore.query.splat_files import coloured_ply, object_ply
 from liftcore.raster.cpu import CpuRaster
 from liftcore.scene.load import load_splats
 from liftcore.solve.settings import LiftSettings
@@ -46,7 +46,7 @@ def of_lamp(scene: QueryScene, threshold: float = 0.5) -> Answer:
 
 def test_the_object_is_what_was_selected_and_can_be_lifted_again(scene: QueryScene, tmp_path: Path) -> None:
     answer = of_lamp(scene)
-    save_object(scene, answer, tmp_path / "lamp.ply")
+    (tmp_path / "lamp.ply").write_bytes(b"".join(object_ply(scene, answer)))
     rows = splat_rows()[answer.selected[:-1].numpy()]
     assert SPLATS_A_CLUSTER * 0.8 <= len(rows) <= SPLATS_A_CLUSTER * 1.2
     assert (tmp_path / "lamp.ply").read_bytes() == ply(rows)
@@ -56,7 +56,7 @@ def test_the_object_is_what_was_selected_and_can_be_lifted_again(scene: QuerySce
 
 
 def test_the_object_rendered_alone_lies_where_the_object_is(scene: QueryScene, tmp_path: Path) -> None:
-    save_object(scene, of_lamp(scene), tmp_path / "lamp.ply")
+    (tmp_path / "lamp.ply").write_bytes(b"".join(object_ply(scene, of_lamp(scene))))
     alone = CpuRaster(load_splats(tmp_path / "lamp.ply"))
     columns = (alone.row_sums(scene.cameras.get("middle"), scene.walk) > 0.5).nonzero()[:, 1]
     assert len(columns) > 0 and int(columns.min()) >= WIDTH // 2
@@ -64,21 +64,21 @@ def test_the_object_rendered_alone_lies_where_the_object_is(scene: QueryScene, t
 
 def test_every_selected_row_is_in_the_object_whatever_the_threshold(scene: QueryScene, tmp_path: Path) -> None:
     answer = of_lamp(scene, -1.0)
-    save_object(scene, answer, tmp_path / "all.ply")
+    (tmp_path / "all.ply").write_bytes(b"".join(object_ply(scene, answer)))
     assert (tmp_path / "all.ply").read_bytes() == ply(splat_rows())
     assert torch.equal(answer.selected, answer.seen)
 
 
 def test_nothing_selected_is_no_file(scene: QueryScene, tmp_path: Path) -> None:
     with pytest.raises(InvalidQuery, match=r"none of 61.*lower threshold"):
-        save_object(scene, of_lamp(scene, 2.0), tmp_path / "lamp.ply")
+        (tmp_path / "lamp.ply").write_bytes(b"".join(object_ply(scene, of_lamp(scene, 2.0))))
     assert not (tmp_path / "lamp.ply").exists()
 
 
 def test_scores_have_the_colours_of_the_map_and_what_was_not_seen_is_grey(scene: QueryScene, tmp_path: Path) -> None:
     answer = of_lamp(scene)
     assert not answer.seen[-1]
-    save_coloured(scene, answer, tmp_path / "scores.ply")
+    (tmp_path / "scores.ply").write_bytes(b"".join(coloured_ply(scene, answer)))
     sh = load_splats(tmp_path / "scores.ply").sh
     assert sh is not None
     colours = np.round(255 * (0.5 + SH_C0 * sh[:, 0].double().numpy())).astype(int)
@@ -92,7 +92,7 @@ def test_scores_have_the_colours_of_the_map_and_what_was_not_seen_is_grey(scene:
 def test_the_coloured_scene_looks_like_the_attention(scene: QueryScene, tmp_path: Path) -> None:
     answer = of_lamp(scene)
     seen = look(scene, answer, "middle")
-    save_coloured(scene, answer, tmp_path / "scores.ply")
+    (tmp_path / "scores.ply").write_bytes(b"".join(coloured_ply(scene, answer)))
     coloured = QueryScene(scene.lift, scene.path)
     coloured.__dict__["splats"] = load_splats(tmp_path / "scores.ply")
     shown = render(coloured, "middle").astype(int)
