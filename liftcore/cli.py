@@ -27,6 +27,11 @@ EXPERIMENTS = (
 PRESETS = "row-sum, tikhonov (default), argmax, top-k, front-mass, centre or mean"
 THRESHOLDS = "auto, valley, paper, otsu, stability or a number"
 
+KEY_QUOTAS = {
+    "--max-bytes": "of its assets and lifts",
+    "--max-queued": "jobs of it in line",
+    "--max-uploads": "at the same time",
+}
 LARGEST_GREY = 65_535  # of a picture of 16 bits
 
 BAD_INPUT = 2
@@ -131,9 +136,8 @@ def _add_keys(parser: argparse.ArgumentParser, shared: _Parser) -> None:
     create = actions.add_parser("create", parents=[shared], help="make a key and show it, once")
     create.add_argument("--name", required=True, metavar="NAME", help="whose it is, or what for")
     create.add_argument("--scopes", required=True, metavar="SCOPES", help="read,write,metrics,admin: what it may do")
-    create.add_argument("--max-bytes", metavar="N", help="of its assets and lifts; else as the server is set")
-    create.add_argument("--max-queued", metavar="N", help="jobs of it in line; else as the server is set")
-    create.add_argument("--max-uploads", metavar="N", help="at the same time; else as the server is set")
+    for option, limit in KEY_QUOTAS.items():
+        create.add_argument(option, type=_whole, metavar="N", help=f"{limit}; else as the server is set")
     listing = actions.add_parser("list", parents=[shared], help="all keys, without their secrets")
     revoke = actions.add_parser("revoke", parents=[shared], help="end a key; what it made stays, for admins")
     revoke.add_argument("id", metavar="ID", help="as keys list shows it")
@@ -332,6 +336,12 @@ def _count(text: str) -> int:
     if value < 1:
         raise argparse.ArgumentTypeError(f"expected a whole number of one or more, got {text!r}")
     return value
+
+
+def _whole(text: str) -> int:
+    if not (text.isascii() and text.isdigit()) or int(text) >= 2**63:
+        raise argparse.ArgumentTypeError(f"expected a whole number, got {text[:80]!r}")
+    return int(text)
 
 
 if __name__ == "__main__":

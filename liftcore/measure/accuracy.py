@@ -45,3 +45,9 @@ def class_ious(labels: Tensor, truth: Tensor, count: int) -> Tensor:
         if union:
             ious[k] = int((mine & real).sum()) / union
     return ious
+
+
+def mask_iou(mask: Tensor, truth: Tensor) -> float:
+    """Intersection over union of two masks [H, W] bool; one where both are empty."""
+    union = int((mask | truth).sum())
+    return int((mask & truth).sum()) / union if union else 1.0

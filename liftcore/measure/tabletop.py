@@ -33,7 +33,7 @@ from liftcore.solve.accumulate import render_walk
 from liftcore.solve.settings import LiftSettings
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     from torch import Tensor
 
@@ -157,14 +157,17 @@ class Tabletop:
             raster: of the same splats in another form; None takes the scene's own.
         """
         scores = class_scores(features, self.classes)
-        maps = self.maps(features, settings, raster or self.raster)
-        seen = [image.argmax(dim=2) for image in maps]
-        ious = class_ious(torch.stack(seen), torch.stack(list(self.held_out.values())), len(self.classes))
+        miou = self.miou(self.maps(features, settings, raster or self.raster))
         return Figures(
             splat_accuracy(scores, self.objects, self.counted),
-            float(ious.nanmean()),
+            miou,
             seconds,
         )
+
+    def miou(self, maps: Iterable[Tensor]) -> float:
+        """Mean IoU over classes of each pixel's best class, of score maps [H, W, K] of the held-out views."""
+        best = torch.stack([image.argmax(dim=2) for image in maps])
+        return float(class_ious(best, torch.stack(list(self.held_out.values())), len(self.classes)).nanmean())
 
     def maps(self, features: Tensor, settings: LiftSettings, raster: Raster) -> Iterator[Tensor]:
         """Each held-out view's rendered class scores [H, W, K] f32."""

@@ -26,6 +26,7 @@ import torch
 from liftcore.artifact import save_lift
 from liftcore.errors import InvalidQuery
 from liftcore.lift import lift
+from liftcore.measure.accuracy import mask_iou
 from liftcore.measure.hardware import hardware, machine_line
 from liftcore.measure.tabletop import Tabletop
 from liftcore.query.ask import ask, look
@@ -43,12 +44,6 @@ if TYPE_CHECKING:
 
 PACKS = ("features", "features_hard", "features_clean", "grids")
 PRESETS = ("row-sum", "tikhonov")
-
-
-def mask_iou(mask: Tensor, truth: Tensor) -> float:
-    """Intersection over union of two masks [H, W] bool; one where both are empty."""
-    union = int((mask | truth).sum())
-    return int((mask & truth).sum()) / union if union else 1.0
 
 
 def best_iou(attention: Tensor, met: Tensor, truth: Tensor) -> float:

@@ -1,1 +1,1 @@
-"""How jobs run: one supervisor thread, one child process a job."""
+"""How jobs run: a supervisor thread and a child process for each that runs."""

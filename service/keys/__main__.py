@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from liftcore.cli import build_parser
 from liftcore.errors import NotFound, SplatliftError
 from service.__main__ import parse
 from service.errors import InvalidRequest
@@ -26,7 +27,7 @@ MAX_NAME = 100
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Do what the command line says; the exit status."""
-    given = build_parser().parse_args(arguments)
+    given = build_parser().parse_args(["keys", *(sys.argv[1:] if arguments is None else arguments)])
     try:
         data = parse([] if given.data is None else ["--data", str(given.data)]).data
         with opened(data, make=given.action == "create") as keys:
@@ -38,25 +39,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"splatlift: data: expected a directory to write to, got {error}", file=sys.stderr)
         return 2
     return 0
-
-
-def build_parser() -> argparse.ArgumentParser:
-    """The three actions and their options."""
-    parser = argparse.ArgumentParser(prog="splatlift keys", description=__doc__)
-    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
-    create = actions.add_parser("create", help="make a key and show it, once")
-    create.add_argument("--name", required=True, help="whose it is, or what for")
-    create.add_argument("--scopes", required=True, help="read, write, metrics, admin, with commas between")
-    create.add_argument("--max-bytes", type=_whole, help="of its assets and results; else as the server is set")
-    create.add_argument("--max-queued", type=_whole, help="jobs of it in line; else as the server is set")
-    create.add_argument("--max-uploads", type=_whole, help="at the same time; else as the server is set")
-    listing = actions.add_parser("list", help="all keys, without their secrets")
-    revoke = actions.add_parser("revoke", help="end a key; its things stay, for admins")
-    revoke.add_argument("id", help="as keys list shows it")
-    for action in (create, listing, revoke):
-        action.add_argument("--data", type=Path, help="the service's directory")
-        action.add_argument("--json", action="store_true", help="print JSON and nothing else")
-    return parser
 
 
 @contextmanager
@@ -147,12 +129,6 @@ def _limits(key: KeyRecord) -> str:
 
 def _when(seconds: float) -> str:
     return time.strftime("%Y-%m-%d %H:%M", time.gmtime(seconds)) + "Z"
-
-
-def _whole(text: str) -> int:
-    if not (text.isascii() and text.isdigit()) or int(text) >= 2**63:
-        raise argparse.ArgumentTypeError(f"expected a whole number, got {text!r}")
-    return int(text)
 
 
 if __name__ == "__main__":

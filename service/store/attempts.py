@@ -12,12 +12,12 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
-from liftcore.errors import NotFound, SplatliftError
+from liftcore.errors import SplatliftError
 from service.errors import Conflict, Crashed
 from service.faults import fault_of
 from service.store.database import Database
 from service.store.events import EventKind, log_line, note
-from service.store.jobs import JobRecord, find, record
+from service.store.jobs import JobRecord, find, record, row_of
 from service.store.owners import Owned
 from service.wire import ENDED, JobState
 
@@ -117,9 +117,7 @@ class AttemptStore(Owned):
             Conflict: it has succeeded or failed.
         """
         with self._database.write() as connection:
-            row = find(connection, job, self._owner)
-            if row is None:
-                raise NotFound("job", expected="the id of a job", got=job)
+            row = row_of(connection, job, self._owner)
             state = JobState(row["state"])
             if state in (JobState.CANCELING, JobState.CANCELED):
                 return False

@@ -147,9 +147,7 @@ class JobStore(Owned):
             NotFound: there is none.
         """
         with self._database.read() as connection:
-            row = find(connection, job, self._owner)
-            if row is None:
-                raise NotFound("job", expected="the id of a job", got=job)
+            row = row_of(connection, job, self._owner)
             return record(connection, row)
 
     def count_by_state(self) -> dict[JobState, int]:
@@ -178,9 +176,7 @@ class JobStore(Owned):
             Conflict: it has not ended, or it has a result that was not given up.
         """
         with self._database.write() as connection:
-            row = find(connection, job, self._owner)
-            if row is None:
-                raise NotFound("job", expected="the id of a job", got=job)
+            row = row_of(connection, job, self._owner)
             if row["state"] not in ENDED:
                 raise Conflict(
                     "job", expected="a job that has ended", got=f"one that is {row['state']}",
@@ -202,6 +198,18 @@ class JobStore(Owned):
 def find(connection: sqlite3.Connection, job: str, owner: Owner) -> sqlite3.Row | None:
     """The row of a job that an owner sees."""
     return connection.execute(f"SELECT * FROM jobs WHERE id = :job AND {SEEN}", owner.terms(job=job)).fetchone()
+
+
+def row_of(connection: sqlite3.Connection, job: str, owner: Owner) -> sqlite3.Row:
+    """`find`, where there must be one.
+
+    Raises:
+        NotFound: there is no such job, or the owner does not see it.
+    """
+    row = find(connection, job, owner)
+    if row is None:
+        raise NotFound("job", expected="the id of a job", got=job)
+    return row
 
 
 def record(connection: sqlite3.Connection, row: sqlite3.Row) -> JobRecord:

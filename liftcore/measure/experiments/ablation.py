@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from liftcore.measure.accuracy import mask_iou
 from liftcore.measure.tabletop import Tabletop
-from liftcore.measure.thresholds import mask_iou
 from liftcore.query.directions import MINIMUM_ROW_SUM
 from liftcore.query.threshold import find_threshold
 from liftcore.solve.accumulate import render_walk

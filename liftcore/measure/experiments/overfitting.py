@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from liftcore.measure.accuracy import class_ious, splat_accuracy
+from liftcore.measure.accuracy import splat_accuracy
 from liftcore.measure.tabletop import Tabletop
 from liftcore.observe.observation import Observation, RegionMap
 from liftcore.observe.pack import open_packs
@@ -119,10 +119,7 @@ def measure(subject: Subject) -> dict[str, Any]:
 
 def _miou(scene: Tabletop, scores: Tensor) -> float:
     """Mean IoU of the rendered scores' argmax in the held-out views."""
-    masks = [scene.raster.render(scene.cameras.get(view), scores, Walk()).argmax(dim=2) for view in scene.held_out]
-    return float(
-        class_ious(torch.stack(masks), torch.stack(list(scene.held_out.values())), len(scene.classes)).nanmean()
-    )
+    return scene.miou(scene.raster.render(scene.cameras.get(view), scores, Walk()) for view in scene.held_out)
 
 
 def draw(figure: Figure, document: Mapping[str, Any]) -> None:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from liftcore.measure.thresholds import best_iou, deepest_pixel, mask_iou
+from liftcore.measure.accuracy import mask_iou
+from liftcore.measure.thresholds import best_iou, deepest_pixel
 
 
 def test_no_threshold_beats_the_best_one() -> None:
