@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 def run(options: argparse.Namespace) -> int:
     """Describe a file of any kind."""
-    from liftcore.observe.inspect import inspect_file
+    from liftcore.inspect_file import inspect_file
 
     reply({"file": str(options.file), **inspect_file(options.file)}, as_json=options.json)
     return 0

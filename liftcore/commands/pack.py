@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 def run(options: argparse.Namespace) -> int:
     """Write the pack whole or not at all, and say what is in it."""
-    from liftcore.observe.inspect import describe_packs
+    from liftcore.inspect_file import describe_packs
     from liftcore.observe.pack import open_packs
     from liftcore.observe.write_pack import write_pack
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from liftcore.raster.constants import ALPHA_FLOOR
 from liftcore.scene.foreign import SUFFIXES
 from liftcore.scene.load import camera_files, is_of_nerfstudio, load_cameras, load_splats, other_models
 from liftcore.scene.ply_dialect import nearest_dialect
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from liftcore.scene.splats import Splats
 
 QUANTILES = {"min": 0.0, "q01": 0.01, "median": 0.5, "q99": 0.99, "max": 1.0}
-ALPHA_FLOOR = 1 / 255  # a Gaussian never reaches a ray with less
 FAR = 1e5  # scene units; float32 resolves only a hundredth there
 TINY = 1e-7  # scene units
 LARGEST = 1e300  # shown in place of what overflows, which JSON cannot hold

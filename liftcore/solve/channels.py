@@ -68,7 +68,7 @@ def blocks(channels: int, axes: Tensor | None = None) -> list[Channels]:
     return [Channels(begin, min(begin + BLOCK, total), axes) for begin in range(0, total, BLOCK)]
 
 
-def principal_axes(codebooks: Sequence[Tensor], count: int) -> Tensor:
+def codebook_axes(codebooks: Sequence[Tensor], count: int) -> Tensor:
     """The ``count`` directions [F, count] f32 that hold most of the squares of all codebook rows.
 
     A block power iteration from a fixed start. The rows are not centred, so their mean is held too; every solution

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from liftcore.solve.channels import Channels, blocks, principal_axes
+from liftcore.solve.channels import Channels, blocks, codebook_axes
 from liftcore.solve.conjugate_gradients import CgOutcome, Stopping, Watch, column_dots, conjugate_gradients
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ def refine(
         codebooks: E_v [M, F] of every view.
     """
     reduced = 0 < settings.cg_basis < features.shape[1]
-    parts = blocks(features.shape[1], principal_axes(codebooks, settings.cg_basis) if reduced else None)
+    parts = blocks(features.shape[1], codebook_axes(codebooks, settings.cg_basis) if reduced else None)
     total = len(parts) * settings.cg_steps
     outcomes = []
     for number, part in enumerate(parts):

@@ -17,7 +17,7 @@ from service.errors import OverLimit
 from service.faults import fault_of
 from service.jobs.leftovers import mark
 from service.jobs.limits import JobLimits
-from service.jobs.pace import Pace
+from service.jobs.pace import StagePace
 from service.jobs.process import JobProcess
 from service.store.assets import kernel_of
 from service.store.jobs import JobRecord, labels_of
@@ -55,7 +55,7 @@ class Attempt:
         self._store = store
         self._limits = limits
         self._command = command
-        self._pace = Pace()
+        self._pace = StagePace()
         self._renewed = time.monotonic()
 
     def run(self, stopping: threading.Event) -> None:

@@ -6,7 +6,7 @@ import time
 from typing import Any
 
 
-class Pace:
+class StagePace:
     """Adds ``eta_s`` to the progress that a child reports."""
 
     def __init__(self) -> None:

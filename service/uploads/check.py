@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from liftcore.errors import InvalidCameras, InvalidInput, SplatliftError
-from liftcore.observe.inspect import describe_packs, describe_table
+from liftcore.inspect_file import describe_packs, describe_table
 from liftcore.observe.masks import describe_masks
 from liftcore.observe.pack import open_packs
 from liftcore.query.encoders.table import TableEncoder

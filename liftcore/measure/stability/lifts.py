@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from liftcore.errors import SplatliftError
+from liftcore.inspect_file import describe_packs
 from liftcore.lift import lift
 from liftcore.measure.stability.case import Extreme, Found, always
 from liftcore.measure.stability.scenes import of_kernel, splats_at
 from liftcore.measure.stability.weights import exact_view
-from liftcore.observe.inspect import describe_packs
 from liftcore.observe.pack import open_packs
 from liftcore.observe.write_pack import write_pack
 from liftcore.raster.oracle import reading_matrix

@@ -8,7 +8,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from liftcore.observe.inspect import inspect_file
+from liftcore.inspect_file import inspect_file
 from liftcore.observe.masks import read_masks
 
 

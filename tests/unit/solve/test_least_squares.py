@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from liftcore.lift import lift
 from liftcore.observe.observation import Observation, RegionMap
 from liftcore.progress import silent
-from liftcore.solve.channels import BLOCK, blocks, principal_axes, random_axes
+from liftcore.solve.channels import BLOCK, blocks, codebook_axes, random_axes
 from liftcore.solve.least_squares import Refinement, refine
 from liftcore.solve.settings import LiftSettings
 from tests.unit.solve.dense_rays import SmallScene
@@ -104,7 +104,7 @@ def test_a_full_basis_gives_the_solution_of_all_channels():
 
 def test_what_lies_outside_the_basis_is_kept():
     scene = SmallScene(4)
-    axes = principal_axes(scene.codebooks, 2)
+    axes = codebook_axes(scene.codebooks, 2)
     made = refined(scene, damping=0.1, cg_basis=2)
     step = made.features - scene.closed_form
     assert float(step.norm()) > 0.1
@@ -115,13 +115,13 @@ def test_axes_hold_most_of_the_squares_and_repeat_to_the_bit():
     generator = torch.Generator().manual_seed(0)
     spread = torch.logspace(0, -3, 20)
     books = [torch.randn(50, 20, generator=generator) * spread for _ in range(3)]
-    axes = principal_axes(books, 4)
+    axes = codebook_axes(books, 4)
     exact = torch.linalg.svd(torch.cat(books), full_matrices=False).Vh[:4].T
     assert torch.allclose(axes.T @ axes, torch.eye(4), atol=1e-5)
     assert torch.allclose(axes @ axes.T, exact @ exact.T, atol=1e-3)
     threads = torch.get_num_threads()
     torch.set_num_threads(3)
-    again = principal_axes(books, 4)
+    again = codebook_axes(books, 4)
     torch.set_num_threads(threads)
     assert torch.equal(axes, again)
 

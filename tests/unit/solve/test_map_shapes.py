@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from liftcore.device import CPU
+from liftcore.inspect_file import inspect_file
 from liftcore.lift import lift, open_sources, planned
 from liftcore.measure.scene_files import cameras_of
-from liftcore.observe.inspect import inspect_file
 from liftcore.observe.observation import FeatureGrid, Observation, RegionMap
 from liftcore.observe.pack import open_packs, pair
 from liftcore.observe.write_pack import write_pack

@@ -13,7 +13,7 @@ from safetensors.torch import save_file
 
 from liftcore.artifact import InputFile, Lift, LiftMetadata, save_lift
 from liftcore.errors import InvalidInput, InvalidSplats, SplatliftError
-from liftcore.observe.inspect import inspect_file
+from liftcore.inspect_file import inspect_file
 from liftcore.observe.observation import FeatureGrid, RegionMap
 from liftcore.observe.write_pack import write_pack
 from liftcore.scene.cameras import Camera, Cameras
