@@ -1,0 +1,129 @@
+"""Chromium without a screen, told what to do over two pipes: DevTools' own protocol, with no driver between."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import select
+import shutil
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Self
+
+NAMES = ("chromium", "chromium-browser", "google-chrome")
+PATIENCE_SECONDS = 60.0  # for what takes a second; the machine may be busy
+OPTIONS = (
+    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync",
+    "--disable-background-networking", "--disable-component-update", "--disable-dev-shm-usage",
+    "--window-size=1200,900", "--remote-debugging-pipe",
+)  # fmt: skip
+SHIFT = 8  # DevTools' bit of the key
+
+
+def chromium() -> str | None:
+    """The browser's program, if this machine has one."""
+    return next((path for name in NAMES if (path := shutil.which(name))), None)
+
+
+class Browser:
+    """One window. What its scripts say of errors that nobody caught is kept in ``faults``."""
+
+    def __init__(self, process: subprocess.Popen[bytes], told: int, heard: int) -> None:
+        self._process, self._told, self._heard = process, told, heard
+        self._buffer, self._last, self._session = b"", 0, ""
+        self.faults: list[str] = []
+
+    @classmethod
+    @contextlib.contextmanager
+    def started(cls, program: str, profile: Path) -> Iterator[Self]:
+        """A browser with an empty profile; gone at the end."""
+        (theirs_in, told), (heard, theirs_out) = os.pipe(), os.pipe()
+        # Chromium looks for its pipes at 3 and 4, where this process has other things.
+        moved = f'exec "$@" 3<&{theirs_in} 4>&{theirs_out}'
+        command = ["bash", "-c", moved, "bash", program, *OPTIONS, f"--user-data-dir={profile}", "about:blank"]
+        quiet = subprocess.DEVNULL
+        process = subprocess.Popen(command, stdout=quiet, stderr=quiet, pass_fds=(theirs_in, theirs_out))
+        os.close(theirs_in)
+        os.close(theirs_out)
+        try:
+            browser = cls(process, told, heard)
+            browser._attach()
+            yield browser
+        finally:
+            process.kill()
+            process.wait()
+            os.close(told)
+            os.close(heard)
+
+    def _attach(self) -> None:
+        pages = [info for info in self._call("Target.getTargets")["targetInfos"] if info["type"] == "page"]
+        attached = self._call("Target.attachToTarget", targetId=pages[0]["targetId"], flatten=True)
+        self._session = attached["sessionId"]
+        self._call("Page.enable")
+        self._call("Runtime.enable")
+
+    def open(self, address: str) -> None:
+        """Go to an address, and wait until the document is there."""
+        self._call("Page.navigate", url=address)
+        self.until("document.readyState === 'complete' && location.href !== 'about:blank'")
+
+    def value(self, script: str) -> Any:
+        """What an expression, or a promise of it, comes to."""
+        result = self._call("Runtime.evaluate", expression=script, awaitPromise=True, returnByValue=True)
+        if "exceptionDetails" in result:
+            raise AssertionError(f"{script}: {result['exceptionDetails']}")
+        return result["result"].get("value")
+
+    def until(self, script: str) -> None:
+        """Wait until an expression is true."""
+        deadline = time.monotonic() + PATIENCE_SECONDS
+        while time.monotonic() < deadline:
+            with contextlib.suppress(AssertionError):  # while one document makes room for the next
+                if self.value(script):
+                    return
+            time.sleep(0.05)
+        raise AssertionError(f"never true: {script}; the page: {self.value('document.body.innerText')}")
+
+    def press(self, selector: str, x: float = 0.5, y: float = 0.5, *, shift: bool = False) -> None:
+        """Click an element, x and y as shares of its box."""
+        self.value(f"document.querySelector({json.dumps(selector)}).scrollIntoView()")
+        box = self.value(f"document.querySelector({json.dumps(selector)}).getBoundingClientRect().toJSON()")
+        place = {"x": box["left"] + x * box["width"], "y": box["top"] + y * box["height"]}
+        for kind in ("mousePressed", "mouseReleased"):
+            self._call(
+                "Input.dispatchMouseEvent", type=kind, button="left", clickCount=1, modifiers=SHIFT * shift, **place
+            )
+
+    def write(self, selector: str, text: str) -> None:
+        """Put text into a field, in place of what is there."""
+        self.value(f"document.querySelector({json.dumps(selector)}).select()")
+        self._call("Input.insertText", text=text)
+
+    def _call(self, method: str, **parameters: Any) -> dict[str, Any]:
+        self._last += 1
+        message: dict[str, Any] = {"id": self._last, "method": method, "params": parameters}
+        if self._session:
+            message["sessionId"] = self._session
+        os.write(self._told, json.dumps(message).encode() + b"\0")
+        while True:
+            answer = self._next()
+            if answer.get("method") == "Runtime.exceptionThrown":
+                self.faults.append(str(answer["params"]["exceptionDetails"]))
+            if answer.get("id") == self._last:
+                if "error" in answer:
+                    raise AssertionError(f"{method}: {answer['error']}")
+                return answer["result"]
+
+    def _next(self) -> dict[str, Any]:
+        while b"\0" not in self._buffer:
+            if not select.select([self._heard], [], [], PATIENCE_SECONDS)[0]:
+                raise AssertionError("the browser says nothing")
+            block = os.read(self._heard, 1 << 16)
+            if not block:
+                raise AssertionError("the browser has gone")
+            self._buffer += block
+        message, _, self._buffer = self._buffer.partition(b"\0")
+        return json.loads(message)
