@@ -135,8 +135,10 @@ def _write(options: argparse.Namespace, scene: QueryScene, answer: Answer, seen:
         blocks |= {"mask": lambda: [mask_png(seen)], "attention": lambda: [attention_png(seen)]}
     files = {kind: path for kind in OUTPUTS if (path := getattr(options, kind)) is not None}
     for kind, path in files.items():
-        with writing(path), whole_file(path) as handle:
-            handle.writelines(blocks[kind]())
+        with writing(path):
+            content = blocks[kind]()  # before there is a draft, or a folder for it: nothing found is no file
+            with whole_file(path) as handle:
+                handle.writelines(content)
     return {kind: str(path) for kind, path in files.items()}
 
 
