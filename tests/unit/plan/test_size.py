@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -25,7 +26,7 @@ from liftcore.plan.memory import (
     free_memory,
     group_memory,
 )
-from liftcore.plan.rank import ROUNDING, codebook_rank, rank_of
+from liftcore.plan.rank import ROUNDING, Rank, codebook_rank, rank_of
 from liftcore.solve.columns import as_walked
 from liftcore.solve.feature_room import file_system, in_file, room_within
 from liftcore.solve.settings import LiftSettings, Speed
@@ -56,6 +57,19 @@ def test_rank_of_packs_of_two_types_is_above_the_coarser_rounding(tmp_path):
     write_pack(tmp_path / "p", {"v0": RegionMap(labels, rows), "v1": RegionMap(labels, rows.half())}, {})
     packs = open_packs([tmp_path / "p"])
     assert codebook_rank(packs, packs.views).rank == 3
+
+
+@pytest.mark.parametrize(("rank", "bound"), [((8, 6, 5, 3), ""), ((4, 6, 4, 3), "at least "), ((6, 6, 6, 3), "")])
+def test_rank_as_large_as_its_sample_is_told_as_a_bound(tmp_path, rank, bound):
+    paths = write_scene(tmp_path, 2)
+    plan = planned(open_sources(paths[0], paths[1], [paths[2]], LiftSettings.of()), LiftSettings.of(), CPU, 1)
+    rows, channels, number, enough = rank
+    told = "\n".join(replace(plan, rank=Rank(channels, rows, number, enough)).lines())
+    assert (
+        f"{channels} channels; {rows} sampled codebook rows have rank {bound}{number}, and {enough} directions"
+        in told
+    )
+    assert plan.kept_on_card == 0  # there is none
 
 
 @pytest.mark.parametrize("grids", [False, True])

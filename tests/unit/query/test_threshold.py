@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -36,7 +37,12 @@ def test_auto_finds_a_small_object_beside_two_large_backgrounds() -> None:
 
 def test_paper_takes_the_valley_next_to_the_largest_peak_and_auto_the_topmost() -> None:
     scores = hills((0.15, 0.008, 50_000), (0.2, 0.008, 20_000), (0.3, 0.005, 3000))
-    assert 0.16 < find_threshold(scores, "paper").value < 0.19
+    found = find_threshold(scores, "paper")
+    assert 0.16 < found.value < 0.19
+    assert re.match(
+        r"The histogram's largest peak lies at 0\.1[45]\d* and the next valley above it at 0\.1[678]",
+        found.explanation,
+    )
     assert 0.22 < find_threshold(scores, "auto").value < 0.29
 
 
@@ -61,6 +67,9 @@ def test_the_users_count_of_instances_chooses_the_hill(instances: int, low: floa
         found = find_threshold(scores, method, instances=instances)
         assert low < found.value < high
     assert ("there are no 9" in found.explanation) == (instances == 9)
+    assert ("first hill" in found.explanation, f"hill {min(instances, 3)}" in found.explanation) == (
+        instances == 1, instances > 1
+    )  # fmt: skip
 
 
 def test_auto_says_when_nothing_stands_apart() -> None:

@@ -124,6 +124,7 @@ def test_the_reference_finds_the_least_squares_loss(grids):
     assert told["optimum"] * len(scene.B) == pytest.approx(least, rel=0.1)
     assert told["ratio"] == pytest.approx(scene.loss(scene.closed_form) / least, rel=0.03)
     assert told["channels"] == 512
+    assert told["converged"] and "not converged" not in told["message"]
 
 
 def test_the_reference_of_the_optimum_is_itself():
