@@ -93,9 +93,10 @@ def test_a_ramp_is_nowhere_stable_and_says_so() -> None:
     assert "stands in" in find_threshold(torch.linspace(0, 1, 10_000), "stability").explanation
 
 
-def test_one_hill_falls_back_to_otsu_and_says_so() -> None:
+@pytest.mark.parametrize("method", ["paper", "valley"])
+def test_one_hill_falls_back_to_otsu_and_says_so(method: str) -> None:
     rising = torch.linspace(0, 1, 10_000) ** 0.5  # the histogram only rises
-    found = find_threshold(rising, "paper")
+    found = find_threshold(rising, method)
     assert found.value == find_threshold(rising, "otsu").value
     assert "stands in" in found.explanation
 
