@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import re
 import shutil
@@ -313,6 +314,20 @@ def test_secret_is_neither_kept_nor_logged(house: Guarded, tmp_path: Path, caplo
     assert ours and not any(secret in line for line in ours)
     files = [path for path in (tmp_path / "data").rglob("*") if path.is_file()]
     assert files and not any(secret.encode() in path.read_bytes() for path in files)
+
+
+def test_keys_speak_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def told(*arguments: str) -> Any:
+        assert main([*arguments, "--json", "--data", str(tmp_path / "new" / "data")]) == 0
+        return json.loads(capsys.readouterr().out)
+
+    made = told("create", "--name", "x", "--scopes", "write,read", "--max-bytes", "5", "--max-uploads", "2")
+    secret = made.pop("key")
+    assert (made["scopes"], made["revoked"]) == (["read", "write"], None)
+    assert (made["max_bytes"], made["max_queued"], made["max_uploads"]) == (5, None, 2)
+    assert told("list") == {"keys": [made]} and secret not in str(made)
+    gone = told("revoke", made["id"])
+    assert gone["revoked"] >= made["created"] and told("list") == {"keys": [gone]}
 
 
 @pytest.mark.parametrize(

@@ -106,7 +106,12 @@ def test_cameras_are_described(tmp_path: Path) -> None:
     found = inspected(tmp_path)
     assert (found["kind"], found["views"], found["sizes"]) == ("cameras", 2, ["40x30"])
     assert found["focal_lengths"] == {"min": 5.0, "max": 6.0}
+    assert found["box"] == [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
     assert found["warnings"] == ["2 views share 1 places"]
+    pose = np.eye(4)
+    pose[:3, 3] = [1.0, -2.0, 3.0]  # of the world in the camera: its centre is the negative
+    write_inria_cameras(Cameras((views[0], replace(views[1], world_to_camera=pose))), tmp_path / "cameras.json")
+    assert inspected(tmp_path)["box"] == [[-1.0, 0.0, -3.0], [0.0, 2.0, 0.0]]
 
 
 def test_features_are_described_and_their_faults_counted(tmp_path: Path) -> None:

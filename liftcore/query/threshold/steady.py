@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from liftcore.query.threshold.histogram import LEAST_SHARE, longest_run
-from liftcore.query.threshold.otsu import stand_in
 
 if TYPE_CHECKING:
     from liftcore.query.threshold.histogram import Histogram
@@ -29,9 +28,7 @@ def steady(histogram: Histogram) -> tuple[float, str]:
     density = histogram.smoothed()
     density = density / density.sum()
     above = np.cumsum(density[::-1])[::-1] - density / 2  # at the middles of the bins
-    counted = np.minimum(above, 1 - above) >= LEAST_SHARE
-    if not counted.any():
-        return stand_in(histogram, "all its scores in one place but a few")
+    counted = np.minimum(above, 1 - above) >= LEAST_SHARE  # some are: no smoothed bin has more than a fifth of all
     slope = np.full(len(density), np.inf)
     slope[counted] = density[counted] / (above[counted] * (1 - above[counted]))
     # Empty stretches tie at zero: the middle of the widest keeps clear of both its sides.

@@ -163,6 +163,14 @@ def test_the_number_of_threads_changes_no_bit_of_a_refined_lift(tmp_path):
         assert runs[0].metadata.certificate == other.metadata.certificate
 
 
+def test_all_that_was_seen_is_refined_however_faintly(tmp_path, monkeypatch):
+    paths, given = write_scene(tmp_path, 7), []
+    monkeypatch.setattr("liftcore.lift.refine", lambda *told: given.append(told[2]) or refine(*told))
+    made = lift(paths[0], paths[1], [paths[2]], LiftSettings.of(preset="row-sum", cg_steps=1))
+    assert np.array_equal(given[0], made.seen.numpy())
+    assert (made.evidence[made.seen] < 0.5).any()  # or it would say nothing of faint ones
+
+
 def test_a_lift_takes_no_step_unless_asked(tmp_path):
     paths = write_scene(tmp_path, 8)
     said = []
