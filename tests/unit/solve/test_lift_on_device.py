@@ -164,5 +164,6 @@ def test_card_without_room_leaves_an_auto_lift_to_the_processor(
     left = planned(sources, SETTINGS, CARD)
     assert left.device == CPU and left.on_device is None
     assert "the processor lifts" in left.warnings[0]
+    assert lifted(scene, CARD).metadata.certificate["device"] == CPU.facts()
     with pytest.raises(Unavailable, match="device"):
         planned(sources, SETTINGS.model_copy(update={"device": "cuda"}), CARD)
