@@ -14,7 +14,7 @@ from starlette.datastructures import Headers
 
 from liftcore.errors import SplatliftError
 from service.errors import ForeignOrigin, Misdirected
-from service.keys.gate import CALLER, Gate
+from service.keys.gate import CALLER, Caller, Gate
 from service.keys.hosts import Hosts, host_name, is_loopback
 from service.keys.scopes import OPEN, needed
 from service.settings import ServiceSettings
@@ -185,3 +185,30 @@ def test_uploads_at_a_time_have_a_quota_a_key(tmp_path: Path) -> None:
         assert most == 6
     finally:
         store.close()
+
+
+def test_key_has_its_own_quota_and_else_that_of_every_key(tmp_path: Path) -> None:
+    store = Store.open(tmp_path)
+    callers: list[Caller] = []
+
+    async def seen(scope: Any, receive: Any, send: Any) -> None:
+        callers.append(scope["state"][CALLER])
+
+    async def nothing(message: Any = None) -> Any:
+        raise AssertionError("nobody reads or answers here")
+
+    shared = {"key_bytes": 70, "key_queued": 80, "key_uploads": 90}
+    gate = Gate(seen, store.keys, ServiceSettings.model_validate({"data": tmp_path, **shared}))
+
+    async def run() -> None:
+        for own in ({}, {"max_bytes": 1}, {"max_queued": 2}, {"max_uploads": 3}, {"max_bytes": 0, "max_queued": 0}):
+            secret = make_key(store, "read", **own)[1]
+            headers = [(b"host", b"localhost"), (b"authorization", f"Bearer {secret}".encode())]
+            await gate({"type": "http", "method": "GET", "path": "/jobs", "headers": headers}, nothing, nothing)
+
+    try:
+        anyio.run(run)
+    finally:
+        store.close()
+    quotas = [(caller.owner.max_bytes, caller.owner.max_queued, caller.max_uploads) for caller in callers]
+    assert quotas == [(70, 80, 90), (1, 80, 90), (70, 2, 90), (70, 80, 3), (0, 0, 90)]

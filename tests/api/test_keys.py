@@ -262,6 +262,13 @@ def test_open_until_the_first_key_and_never_again(tmp_path: Path, capsys: pytest
         assert "security" not in document["paths"]["/healthz"]["get"]
 
 
+def test_key_that_is_revoked_again_was_revoked_the_first_time(house: Guarded) -> None:
+    assert house.store.keys.revoke(house.ids["bob"]).revoked is not None
+    with house.store.database.write() as connection:
+        connection.execute("UPDATE keys SET revoked = 7 WHERE id = ?", (house.ids["bob"],))
+    assert house.store.keys.revoke(house.ids["bob"]).revoked == 7
+
+
 def test_revoked_key_loses_its_streams(house: Guarded, monkeypatch: pytest.MonkeyPatch) -> None:
     replies, sent = list[Any](), threading.Event()
 

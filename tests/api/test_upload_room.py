@@ -67,3 +67,16 @@ def test_key_with_little_room_writes_no_large_draft(store: Store, most: Callable
     reply = put(store, {"Authorization": f"Bearer {secret}"})
     assert (reply.status_code, reply.json()["type"]) == (403, "/problems/over-quota")
     assert most() <= left
+
+
+@pytest.mark.parametrize(("full", "status"), [("quota", 403), ("disk", 507)])
+def test_no_byte_is_taken_where_nothing_may_be_stored(
+    store: Store, monkeypatch: pytest.MonkeyPatch, full: str, status: int
+) -> None:
+    taken: list[bytes] = []
+    monkeypatch.setattr(Intake, "feed", lambda intake, chunk: taken.append(chunk))
+    _, secret = store.keys.create("small", parse_scopes(["write"]), Quota(max_bytes=0 if full == "quota" else None))
+    if full == "disk":
+        monkeypatch.setattr(DataDirectory, "free_bytes", lambda files: files.floor_bytes - 1)
+    assert put(store, {"Authorization": f"Bearer {secret}"}).status_code == status
+    assert taken == []

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from PIL import Image
+from PIL import ExifTags, Image
 
 from liftcore.observe.observation import FeatureGrid
 from liftcore.observe.pack import open_packs
@@ -48,6 +48,19 @@ def test_sub_folders_are_told_as_they_are_part_of_the_names(
     assert (status, err) == (0, "")
     assert out.splitlines()[1:] == ["  of sub-folders, whose names are part of their views': camA"]
     assert open_packs([pack]).views == ("camA/000",)
+
+
+def test_photos_that_were_turned_are_told(
+    photos: Path, weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 6
+    Image.new("RGB", (64, 48)).save(photos / "turned.jpg", exif=exif)
+    options = ["--encoder", f"maskclip:ViT-S-32-alt@{weights}", "--size", 64, "--json"]
+    status, out, err = run(capsys, "encode", photos, "-o", tmp_path / "pack.safetensors", *options)
+    assert (status, err) == (0, "")
+    (warning,) = json.loads(out)["warnings"]
+    assert warning.startswith("1 images were turned upright as their EXIF says (turned)")
 
 
 def test_encoded_photos_are_lifted_and_asked_in_the_text_space_of_their_pack(

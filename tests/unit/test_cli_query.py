@@ -18,6 +18,8 @@ from .command_line import assert_one_line, lift_arguments, run, write_toy_scene
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from liftcore.query.query import Query
+
 
 @pytest.fixture
 def scene(tmp_path: Path) -> Path:
@@ -76,6 +78,34 @@ def test_picture_without_a_view_is_refused(scene: Path, capsys: pytest.CaptureFi
     status, _, err = run(capsys, "query", scene / "l", "cat", "--mask", scene / "m.png")
     assert status == 2
     assert "no --view" in err
+
+
+def test_every_term_and_option_is_part_of_the_query(
+    scene: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(capsys, *lift_arguments(scene))[0] == 0
+    asked: list[Query] = []
+
+    def ask(scene: object, query: Query, encoder: object) -> None:
+        asked.append(query)
+        raise KeyboardInterrupt  # what is found is another matter
+
+    monkeypatch.setattr("liftcore.query.ask.ask", ask)
+    question = ["query", scene / "lift.safetensors", "--like", "splat:1", "--unlike", "splat:0"]
+    for options in ([], ["--threshold", "0.25", "--keep", "largest"], ["--instances", "3"]):
+        assert run(capsys, *question, *options)[0] == cli.INTERRUPTED
+    told = [(query.threshold, query.keep, query.instances) for query in asked]
+    assert told == [("auto", "all", None), (0.25, "largest", None), ("auto", "all", 3)]
+    assert {(*map(str, query.positives), *map(str, query.negatives)) for query in asked} == {("splat:1", "splat:0")}
+
+
+def test_one_file_for_two_pictures_is_refused(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    picture = scene / "m.png"
+    arguments = ["cat", "--view", "v", "--mask", picture, "--attention", picture]
+    status, out, err = run(capsys, "query", scene / "l", *arguments)
+    assert (status, out) == (2, "") and not picture.exists()
+    assert "got the same file twice" in err
+    assert_one_line(err)
 
 
 def test_what_a_query_found_is_written_as_splats(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:

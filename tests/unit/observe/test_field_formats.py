@@ -94,6 +94,12 @@ def test_arrays_of_another_shape_are_refused(tmp_path: Path) -> None:
             array_views(tmp_path)[view]
 
 
+def test_numbers_beyond_what_a_pack_holds_are_refused_with_their_view(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", np.array([[[1.0, 1e300]]]))
+    with pytest.raises(InvalidFeatures, match=r"'a' features: expected finite values .*got 1 of 2"):
+        write_pack(tmp_path / "pack", array_views(tmp_path), {})
+
+
 def test_folder_without_arrays_says_why(tmp_path: Path) -> None:
     with pytest.raises(InvalidFeatures, match="no such folder"):
         array_views(tmp_path / "nowhere")

@@ -142,9 +142,10 @@ def test_vectors_that_do_not_fit_are_refused(vectors: np.ndarray, message: str, 
         mask_views(tmp_path)["a"]
 
 
-def test_vectors_that_are_not_finite_are_refused_with_their_view(tmp_path: Path) -> None:
+@pytest.mark.parametrize("bad", [np.nan, 1e300])
+def test_vectors_that_are_not_finite_in_a_pack_are_refused_with_their_view(bad: float, tmp_path: Path) -> None:
     np.save(tmp_path / "a_masks.npy", LABELS)
-    np.save(tmp_path / "a.npy", np.where(VECTORS == 7, np.nan, VECTORS))
+    np.save(tmp_path / "a.npy", np.where(VECTORS == 7, bad, VECTORS.astype(np.float64)))
     with pytest.raises(InvalidFeatures, match=r"view 'a' features.*1 of 15"):
         write_pack(tmp_path / "pack.safetensors", mask_views(tmp_path), {})
     assert not (tmp_path / "pack.safetensors").exists()

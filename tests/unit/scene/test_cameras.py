@@ -239,6 +239,19 @@ BAD_TRANSFORMS = {
         },
         "document.json camera 'a' pose: expected a proper rotation, got a rotation scaled by 2",
     ),
+    "sheared": (
+        {
+            "fl_x": 5,
+            "w": 9,
+            "h": 9,
+            "frames": [{"file_path": "a", "transform_matrix": np.diag([4.0, 2, 1, 1]).tolist()}],
+        },
+        "expected a proper rotation, got a matrix off by",
+    ),
+    "short row": (
+        {"fl_x": 5, "w": 9, "h": 9, "frames": [{**GOOD_FRAME, "transform_matrix": [*np.eye(4).tolist()[:3], [1]]}]},
+        "4x4 matrix as nested lists",
+    ),
     "homogeneous": (
         {"fl_x": 5, "w": 9, "h": 9, "frames": [{**GOOD_FRAME, "transform_matrix": (2 * np.eye(4)).tolist()}]},
         "0 0 0 1 as the last row, got 0 0 0 2",

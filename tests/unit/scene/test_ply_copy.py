@@ -57,6 +57,15 @@ def test_carriage_returns_survive_in_a_copy(tmp_path: Path) -> None:
     assert read_splats(tmp_path / "copy.ply").count == 2
 
 
+def test_elements_behind_the_vertices_are_no_rows_of_a_copy(tmp_path: Path) -> None:
+    plain = ply_bytes(INRIA)
+    others = b"element version 200\nproperty uchar number\n"  # as many bytes as two splats and more
+    path = with_ply(tmp_path, plain.replace(b"end_header", others + b"end_header") + bytes(200))
+    assert b"".join(some_rows(path, np.ones(5, bool))) == plain
+    copy = b"".join(recoloured(path, np.zeros((5, 3), np.float32)))
+    assert len(copy) == len(plain) and len(rows_of(copy)) == 5
+
+
 @pytest.mark.parametrize("dialect", [name for name in DIALECTS if name != "no colour"])
 def test_colours_of_every_dialect_are_the_same_from_everywhere(dialect: str, tmp_path: Path) -> None:
     names = DIALECTS[dialect]
