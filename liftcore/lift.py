@@ -50,6 +50,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+LEAST_KEPT = 0.5  # of a splat's weight, in regions that the aggregation kept, for it to be solved for again
+
 
 @dataclass(frozen=True)
 class Sources:
@@ -243,13 +245,17 @@ def _host(run: Run, plan: Plan, sources: Sources, taken: int = 0) -> Host:
 def _resolve(
     run: Run, weights: ViewWeights, geometry: Geometry, aggregation: Aggregation, X: torch.Tensor, host: Host
 ) -> float:
-    """Solve again, from the kept regions alone, for splats that took no cluster's feature; their share of all."""
+    """Solve again, from the kept regions alone, for splats that took no cluster's feature; their share of all.
+
+    Only those most of whose weight lies in kept regions: it is their neighbours' regions that reach the others.
+    """
     if all(rows is None for rows in aggregation.kept):
         return 0.0
     with run.timings.stage("resolve"):
         fewer, denominators = kept_columns(weights, aggregation.kept, X.shape[0])
         again = closed_form(fewer, geometry.columns, denominators, X.dtype, run.progress, run.device, host).features
-        chosen = aggregation.own & torch.from_numpy(denominators > 0)
+        most = (denominators > 0) & (denominators >= LEAST_KEPT * geometry.denominators)
+        chosen = aggregation.own & torch.from_numpy(most)
         X[chosen] = again[chosen].to(X.dtype)
         return float(chosen.float().mean())
 

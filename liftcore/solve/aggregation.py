@@ -6,8 +6,9 @@
 4. A cluster's feature is the mean of its kept regions' codebook rows, and its splats take it.
 
 Splats in no cluster, and those of clusters without a kept region, keep their own features, or with
-``aggregation_resolve`` are solved for again from the kept regions alone. Grids have no regions to filter: where no
-view has any, a cluster's feature is the mean of its splats' features, weighted by evidence.
+``aggregation_resolve`` are solved for again from the kept regions alone, if these have most of their weight. Grids
+have no regions to filter: where no view has any, a cluster's feature is the mean of its splats' features, weighted by
+evidence.
 """
 
 from __future__ import annotations

@@ -120,7 +120,9 @@ class LiftSettings(BaseModel):
     aggregation_neighbours: int = Field(10, ge=1, le=1_000, description="neighbours that a splat's density reaches")
     aggregation_sample: int = Field(10_000, ge=2, le=50_000, description="splats that HDBSCAN sees")
     aggregation_resolve: bool = Field(
-        False, description="splats without a cluster's feature are solved for again from the kept regions alone"
+        False,
+        description="splats without a cluster's feature are solved for again from the kept regions alone, if these "
+        "have most of their weight",
     )
     aggregation_channels: int = Field(50, ge=1, le=1_024, description="principal components that it sees")
     certificate_rays: int = Field(

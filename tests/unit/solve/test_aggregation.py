@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from liftcore.artifact import CLUSTER_TENSORS, load_lift, save_lift
 from liftcore.errors import InvalidLift
-from liftcore.lift import lift
+from liftcore.lift import LEAST_KEPT, lift
 from liftcore.observe.observation import FeatureGrid, RegionMap
 from liftcore.observe.pack import open_packs
 from liftcore.observe.write_pack import write_pack
@@ -23,10 +23,11 @@ from liftcore.scene.cameras import Cameras
 from liftcore.scene.inria import write_inria_cameras
 from liftcore.scene.load import load_cameras, load_splats
 from liftcore.scene.ply import write_splats
-from liftcore.solve.accumulate import render_walk
+from liftcore.solve.accumulate import lift_walk, render_walk, weighting_of
 from liftcore.solve.aggregation import KeptRegions, evidence_means, filter_regions, kept_means, spread
 from liftcore.solve.clustering import Clustering
 from liftcore.solve.settings import LiftSettings
+from liftcore.solve.totals import row_totals
 from tests.scenes import centred, random_camera, random_grid, random_regions, random_splats
 
 SETTINGS = LiftSettings.of(aggregation=True, aggregation_iou=0.3, certificate_rays=10)
@@ -159,7 +160,19 @@ def test_a_lift_with_aggregation_has_one_feature_a_cluster_and_says_so(tmp_path,
     assert float(agree.float().mean()) > 0.95
 
 
-def test_what_takes_no_cluster_is_solved_again_as_if_the_other_regions_had_never_been(tmp_path):
+def weights_of(splats, cameras, maps, settings) -> np.ndarray:
+    """[P] f64, the sum of each splat's weights on the labelled rays of all views."""
+    raster, views = CpuRaster(load_splats(splats)), load_cameras(cameras)
+    total = np.zeros(raster.splats.count)
+    for name in maps.keys() & views.by_name.keys():
+        weights = raster.region_weights(views.get(name), maps[name], lift_walk(settings), weighting_of(settings))
+        total[weights.splats.numpy()] += row_totals(weights)
+    return total
+
+
+@pytest.mark.parametrize("least", [LEAST_KEPT, 0.7])
+def test_what_takes_no_cluster_is_solved_again_as_if_the_other_regions_had_never_been(tmp_path, monkeypatch, least):
+    monkeypatch.setattr("liftcore.lift.LEAST_KEPT", least)
     (splats, cameras, features), _ = write_scene(tmp_path, "regions")
     # A third of the first view is a region that no cluster confirms.
     packs = open_packs([features])
@@ -174,6 +187,8 @@ def test_what_takes_no_cluster_is_solved_again_as_if_the_other_regions_had_never
     result = lift(splats, cameras, [features], LiftSettings.of(aggregation=True, aggregation_resolve=True, **knobs))
     facts = result.metadata.certificate["aggregation"]
     assert facts["kept_regions"] < facts["regions"] and facts["resolved"] > 0
+    plain = lift(splats, cameras, [features], LiftSettings.of(aggregation=True, **knobs))
+    whole = weights_of(splats, cameras, maps | {"v0": wrong}, plain.metadata.settings)
 
     lifted = (CpuRaster(load_splats(splats)), load_cameras(cameras), open_packs([features]), result.metadata.views)
     assert result.cluster is not None and result.cluster_features is not None
@@ -189,7 +204,11 @@ def test_what_takes_no_cluster_is_solved_again_as_if_the_other_regions_had_never
         splats, cameras, [tmp_path / "kept.safetensors"], LiftSettings.of(**(knobs | {"aggregation_iou": 0.75}))
     )
     own = ~(result.cluster_features != 0).any(dim=1)[result.cluster.long()] | (result.cluster < 0)
-    again = own & without.seen
+    share = weights_of(splats, cameras, maps, plain.metadata.settings) / np.maximum(whole, 1e-30)
+    most = torch.from_numpy(share >= least)
+    again, not_again = own & without.seen & most, own & without.seen & ~most
+    assert not_again.any() == (least > LEAST_KEPT)
+    assert torch.equal(result.features[not_again], plain.features[not_again])
     assert facts["resolved"] == pytest.approx(float(again.float().mean()))
     assert torch.allclose(result.features[again], without.features[again], atol=1e-6)
 
