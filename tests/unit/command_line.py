@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -26,6 +28,19 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, st
     status = cli.main([str(argument) for argument in arguments])
     captured = capsys.readouterr()
     return status, captured.out, captured.err
+
+
+def programs_become(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
+    """Where commands that become another Python program leave its arguments, in place of becoming it."""
+    calls: list[list[str]] = []
+
+    def execv(program: str, arguments: list[str]) -> None:
+        assert program == sys.executable
+        calls.append(arguments[1:])
+        raise KeyboardInterrupt  # the real one does not return either
+
+    monkeypatch.setattr(os, "execv", execv)
+    return calls
 
 
 def assert_one_line(err: str) -> None:

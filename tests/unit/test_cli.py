@@ -25,7 +25,7 @@ from liftcore.observe.write_pack import write_pack
 from liftcore.query.threshold import METHODS
 from liftcore.solve.settings import LiftSettings, Preset
 
-from .command_line import assert_one_line, lift_arguments, run, write_toy_scene
+from .command_line import assert_one_line, lift_arguments, programs_become, run, write_toy_scene
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -260,14 +260,7 @@ def test_our_own_fault_exits_1_with_one_line(
 
 
 def test_serve_becomes_the_service(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    calls: list[list[str]] = []
-
-    def execv(program: str, arguments: list[str]) -> None:
-        assert program == sys.executable
-        calls.append(arguments[1:])
-        raise KeyboardInterrupt  # the real one does not return either
-
-    monkeypatch.setattr(os, "execv", execv)
+    calls = programs_become(monkeypatch)
     assert run(capsys, "serve", "--port", "0", "--data", "d", "--encoder", "minilm")[0] == cli.INTERRUPTED
     assert calls == [["-m", "service", "--port", "0", "--data", "d", "--encoder", "minilm"]]
 

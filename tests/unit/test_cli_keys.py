@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import os
-import sys
-
 import pytest
 
 from liftcore import cli
 
-from .command_line import run
+from .command_line import programs_become, run
 
 
 @pytest.mark.parametrize(
@@ -24,14 +21,7 @@ from .command_line import run
 def test_keys_becomes_the_program_of_the_service(
     arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    calls: list[list[str]] = []
-
-    def execv(program: str, given: list[str]) -> None:
-        assert program == sys.executable
-        calls.append(given[1:])
-        raise KeyboardInterrupt  # the real one does not return either
-
-    monkeypatch.setattr(os, "execv", execv)
+    calls = programs_become(monkeypatch)
     assert run(capsys, "keys", *arguments)[0] == cli.INTERRUPTED
     (call,) = calls
     assert call[:2] == ["-m", "service.keys"]
