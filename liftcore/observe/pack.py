@@ -6,7 +6,8 @@ none, i16 or i32 with -1) with ``V/codebook`` [M, F], or a grid, ``V/grid`` [h, 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import math
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -15,6 +16,7 @@ from liftcore.errors import InvalidFeatures
 from liftcore.observe.finite import check_finite
 from liftcore.observe.header import check_header
 from liftcore.observe.observation import NO_LABEL, FeatureGrid, Observation, RegionMap
+from liftcore.observe.through_lens import as_pinhole_sees, grid_sides
 from liftcore.scene.view_pairs import require_pairs
 
 if TYPE_CHECKING:
@@ -23,7 +25,7 @@ if TYPE_CHECKING:
 
     from torch import Tensor
 
-    from liftcore.scene.cameras import Cameras
+    from liftcore.scene.cameras import Camera, Cameras
 
 MAX_CHANNELS = 1 << 16
 U8_NO_LABEL = 255
@@ -76,24 +78,34 @@ class FeaturePacks:
     normalised: bool | None  # whether codebook rows and grid cells are unit vectors; None when not told
     paths: tuple[Path, ...]
     _stored: Mapping[str, _Stored]
+    _cameras: Mapping[str, Camera] = field(default_factory=dict)  # of views that are seen as their pinholes see them
 
     def is_regions(self, view: str) -> bool:
         """Whether the view is a region map; else it is a grid."""
         return self._find(view).has("labels")
 
     def specs(self, view: str) -> dict[str, TensorSpec]:
-        """The view's tensors by part (labels, codebook, grid), from the header alone."""
+        """The tensors of a view's observation by part (labels, codebook, grid), from the header alone."""
         stored = self._find(view)
-        return {part: stored.spec(part) for part in PARTS if stored.has(part)}
+        specs = {part: stored.spec(part) for part in PARTS if stored.has(part)}
+        camera = self._cameras.get(view)
+        if camera is None or camera.lens is None:
+            return specs
+        if "grid" in specs:
+            height, width, channels = specs["grid"].shape
+            return {"grid": replace(specs["grid"], shape=(*grid_sides(height, width, camera), channels))}
+        levels = math.prod(specs["labels"].shape[:-2])
+        labels = replace(specs["labels"], shape=(levels, camera.height, camera.width))
+        return specs | {"labels": labels}
 
     def map_size(self, view: str) -> tuple[int, int]:
-        """Width and height of a view's labels or grid, from the header alone."""
-        specs = self.specs(view)
-        height, width = specs["labels"].shape[1:] if "labels" in specs else specs["grid"].shape[:2]
+        """Width and height of a view's labels or grid as they lie in the file, from the header alone."""
+        stored = self._find(view)
+        height, width = stored.spec("labels").shape[-2:] if stored.has("labels") else stored.spec("grid").shape[:2]
         return width, height
 
     def observation(self, view: str) -> Observation:
-        """Read and check one view.
+        """Read and check one view; of packs that were paired with cameras as its pinhole sees it.
 
         Raises:
             InvalidFeatures: no such view, a label out of the codebook, or a feature that is not finite.
@@ -101,28 +113,31 @@ class FeaturePacks:
         stored = self._find(view)
         if stored.has("labels"):
             codebook = _features(stored, "codebook")
-            return RegionMap(_labels(stored, rows=codebook.shape[0]), codebook)
-        return FeatureGrid(_features(stored, "grid"))
+            found = RegionMap(_labels(stored, rows=codebook.shape[0]), codebook)
+        else:
+            found = FeatureGrid(_features(stored, "grid"))
+        return as_pinhole_sees(found, self._cameras[view]) if view in self._cameras else found
 
     def sample_rows(self, view: str, count: int) -> Tensor:
         """Some rows [n, F] of the view's codebook, ``count`` at most; nothing else of it is read or checked.
 
-        The first rows of a codebook, or evenly spaced cells of a grid.
+        The first rows of a codebook, or evenly spaced cells of a grid as it lies in the file.
         """
         part = "codebook" if self.is_regions(view) else "grid"
         found = self._find(view)
         stored = found.pack.handle.get_slice(f"{found.name}/{part}")
         if part == "codebook":
             return stored[:count]
-        height, width = self.specs(view)[part].shape[:2]
+        height, width = found.spec(part).shape[:2]
         lines = _spread(height, round(count**0.5))
         cells = _spread(width, count // len(lines))
         return torch.cat([stored[line][cells] for line in lines])
 
-    def renamed(self, names: Mapping[str, str]) -> FeaturePacks:
-        """The views that ``names`` gives a name, under it, and no others."""
+    def seen_by(self, names: Mapping[str, str], cameras: Mapping[str, Camera]) -> FeaturePacks:
+        """The views that ``names`` gives the name of a camera, under it and as it sees them, and no others."""
         stored = {name: self._find(view) for view, name in names.items()}
-        return replace(self, views=tuple(sorted(stored)), _stored=stored)
+        used = {name: cameras[name] for name in stored}
+        return replace(self, views=tuple(sorted(stored)), _stored=stored, _cameras=used)
 
     def _find(self, view: str) -> _Stored:
         if view not in self._stored:
@@ -172,7 +187,7 @@ def pair(packs: FeaturePacks, cameras: Cameras) -> tuple[FeaturePacks, list[str]
         InvalidFeatures: no view has a camera.
     """
     names = require_pairs(packs.views, cameras.by_name)
-    return packs.renamed(names), [view for view in packs.views if view not in names]
+    return packs.seen_by(names, cameras.by_name), [view for view in packs.views if view not in names]
 
 
 def _spread(length: int, count: int) -> list[int]:

@@ -133,7 +133,7 @@ def look(scene: QueryScene, answer: Answer, view: str) -> Look:
     # A splat without a feature adds nothing to a ray; its score of -1 would count against its neighbours.
     rendered = torch.where(answer.seen, answer.scores, 0.0)
     values = torch.stack([rendered, torch.ones_like(rendered)], dim=1)
-    image = scene.raster.render(scene.camera(view), values, scene.walk)
+    image = scene.image(view, lambda camera: scene.raster.render(camera, values, scene.walk))
     attention, row_sums = image[..., 0].contiguous(), image[..., 1].contiguous()
     met = row_sums >= MINIMUM_ROW_SUM
     query = answer.query

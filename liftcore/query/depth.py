@@ -48,11 +48,11 @@ def expected_depth(scene: QueryScene, view: str) -> tuple[Tensor, Tensor]:
         InvalidQuery: its image is larger than pictures may be.
         InvalidLift: the splats or the cameras moved or changed since the lift.
     """
-    camera = scene.camera(view)
-    pose = torch.from_numpy(camera.world_to_camera[2].copy())
+    pose = torch.from_numpy(scene.cameras.get(view).world_to_camera[2].copy())
     depths = (scene.splats.means.double() @ pose[:3] + pose[3]).to(torch.float32)
     values = torch.stack([depths, torch.ones_like(depths)], dim=1)
-    image = scene.raster.render(camera, values, Walk(antialiased=scene.walk.antialiased))
+    walk = Walk(antialiased=scene.walk.antialiased)
+    image = scene.image(view, lambda camera: scene.raster.render(camera, values, walk))
     covered = image[..., 1] > 0
     return torch.where(covered, image[..., 0] / image[..., 1], 0.0), covered
 

@@ -12,6 +12,7 @@ import torch
 from liftcore.errors import InvalidQuery, NotFound
 from liftcore.observe.observation import RegionMap
 from liftcore.query.example import OneSplat, Pixel, Region, Vector
+from liftcore.scene.lens import drawn_by, photo_size, pixel_of
 from liftcore.scene.view_pairs import cameras_of_views
 
 if TYPE_CHECKING:
@@ -109,10 +110,16 @@ def _of_example(scene: QueryScene, example: Pixel | OneSplat | Vector) -> Tensor
 def _rendered(scene: QueryScene, pixel: Pixel) -> Tensor:
     """``sum_j A_ij x_j`` of the pixel's ray, [F] f64, walked as scores are rendered."""
     camera = scene.cameras.get(pixel.view)
-    if not (0 <= pixel.x < camera.width and 0 <= pixel.y < camera.height):
-        expected = f"x in 0..{camera.width - 1} and y in 0..{camera.height - 1}"
+    width, height = photo_size(camera)
+    if not (0 <= pixel.x < width and 0 <= pixel.y < height):
+        expected = f"x in 0..{width - 1} and y in 0..{height - 1}"
         raise InvalidQuery(str(pixel), expected=expected, got=f"{pixel.x},{pixel.y}")
-    row = scene.raster.ray_rows(camera, torch.tensor([[pixel.x, pixel.y]], dtype=torch.int32), scene.walk)
+    drawn = pixel_of(camera, pixel.x, pixel.y)
+    if drawn is None:
+        hint = "pick a pixel nearer to the middle"
+        got = "one at the rim of a wide lens"
+        raise InvalidQuery(str(pixel), expected="a pixel that a pinhole sees", got=got, hint=hint)
+    row = scene.raster.ray_rows(drawn_by(camera), torch.tensor([drawn], dtype=torch.int32), scene.walk)
     met = float(row.weights.sum())
     if met < MINIMUM_ROW_SUM:
         raise InvalidQuery(

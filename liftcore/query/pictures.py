@@ -63,9 +63,9 @@ def render(scene: QueryScene, view: str, what: str = "rgb") -> np.ndarray:
     """
     if what == "cluster":
         return render_clusters(scene, view)
-    camera = scene.camera(view)
-    colours = scene.principal if what == "pca" else seen_colours(scene.splats, camera)
-    image = scene.raster.render(camera, colours, Walk(antialiased=scene.walk.antialiased))
+    colours = scene.principal if what == "pca" else seen_colours(scene.splats, scene.cameras.get(view))
+    walk = Walk(antialiased=scene.walk.antialiased)
+    image = scene.image(view, lambda camera: scene.raster.render(camera, colours, walk))
     levels = image.numpy()  # in place: an image of floats is large
     np.clip(levels, 0.0, 1.0, out=levels)
     levels *= 255
@@ -86,10 +86,10 @@ def render_clusters(scene: QueryScene, view: str) -> np.ndarray:
     if clusters is None or means is None:
         hint = "lift again with the setting aggregation=true"
         raise InvalidQuery("what", expected="a lift with clusters", got="a lift without aggregation", hint=hint)
-    camera = scene.camera(view)
-    shown = scene.raster.strongest_labels(camera, clusters, scene.walk).numpy()
-    picture = cluster_colours(means.shape[0])[shown]  # the last colour is that of label -1
-    picture[scene.raster.row_sums(camera, scene.walk).numpy() <= 0] = 0
+    labels = scene.image(view, lambda camera: scene.raster.strongest_labels(camera, clusters, scene.walk))
+    picture = cluster_colours(means.shape[0])[labels.numpy()]  # the last colour is that of label -1
+    sums = scene.image(view, lambda camera: scene.raster.row_sums(camera, scene.walk))
+    picture[sums.numpy() <= 0] = 0
     return picture
 
 

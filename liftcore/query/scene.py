@@ -8,14 +8,16 @@ from typing import TYPE_CHECKING, Self
 
 from liftcore.artifact import Lift, load_lift
 from liftcore.errors import InvalidQuery
+from liftcore.query.in_photo import in_photo
 from liftcore.query.products import norms_of
 from liftcore.query.scores import mean_direction
 from liftcore.query.unchanged import unchanged
 from liftcore.raster.protocol import Walk
+from liftcore.scene.lens import drawn_by, photo_size
 from liftcore.solve.accumulate import render_walk
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from torch import Tensor
 
@@ -123,8 +125,8 @@ class QueryScene:
 
         return load_cameras(unchanged("cameras", self.lift.metadata.cameras, self.path))
 
-    def camera(self, view: str) -> Camera:
-        """The camera that draws a view.
+    def image(self, view: str, draw: Callable[[Camera], Tensor]) -> Tensor:
+        """A picture [H, W, ..] of a view in its photo's pixels, from what draws one of a pinhole (`in_photo`).
 
         Raises:
             NotFound: no camera has this name.
@@ -132,13 +134,14 @@ class QueryScene:
             InvalidLift: the cameras moved or changed since the lift.
         """
         camera = self.cameras.get(view)
-        if camera.width * camera.height > MOST_PIXELS:
-            raise InvalidQuery(
-                "view", expected=f"an image of at most {MOST_PIXELS} pixels to draw",
-                got=f"{camera.width}x{camera.height} in {view!r}",
-                hint="give the scene a camera of the same pose with width, height, fx, fy, cx and cy divided alike",
-            )  # fmt: skip
-        return camera
+        for width, height in (photo_size(camera), photo_size(drawn_by(camera))):
+            if width * height > MOST_PIXELS:
+                raise InvalidQuery(
+                    "view", expected=f"an image of at most {MOST_PIXELS} pixels to draw",
+                    got=f"{width}x{height} in {view!r}",
+                    hint="give the scene a camera of that pose with width, height, fx, fy, cx and cy divided alike",
+                )  # fmt: skip
+        return in_photo(camera, draw)
 
     @cached_property
     def packs(self) -> FeaturePacks:

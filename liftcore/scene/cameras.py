@@ -1,4 +1,4 @@
-"""Pinhole cameras with known poses, validated once."""
+"""Cameras with known poses, validated once."""
 
 from __future__ import annotations
 
@@ -17,6 +17,8 @@ from liftcore.scene.view_pairs import cameras_of_views
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
+    from liftcore.scene.lens import Lens
+
 MAX_SIDE = 32_768  # pixels; larger images are a broken header, not a photo
 MIN_FOCAL, MAX_FOCAL = 1e-3, 1e9  # pixels; float64 squares of what they project stay finite
 MAX_OFF_CENTRE = 1e9  # pixels of the principal point
@@ -33,7 +35,7 @@ SAME_NAMES = (
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """One undistorted pinhole view. OpenCV axes (x right, y down, z forward), pixel centres at +0.5."""
+    """One pinhole view. OpenCV axes (x right, y down, z forward), pixel centres at +0.5."""
 
     name: str  # the image's name without its extension; pairs the view with its features
     width: int  # pixels
@@ -43,6 +45,7 @@ class Camera:
     cx: float  # pixels, from the left edge of the first pixel
     cy: float  # pixels, from the top edge of the first pixel
     world_to_camera: np.ndarray  # [4, 4] f64, rigid
+    lens: Lens | None = None  # of a distorted photo, which this pinhole stands for; None: the photo is as it says
 
     def __post_init__(self) -> None:
         pose = np.array(self.world_to_camera, dtype=np.float64)
@@ -135,6 +138,11 @@ class Cameras:
                     "cameras", expected="one view a name", got=f"{camera.name!r} twice", hint=SAME_NAMES
                 )
             seen.add(camera.name)
+
+    @property
+    def distorted(self) -> tuple[str, ...]:
+        """The names of the views whose photos are distorted."""
+        return tuple(camera.name for camera in self.views if camera.lens is not None)
 
     @cached_property
     def by_name(self) -> Mapping[str, Camera]:

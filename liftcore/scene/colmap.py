@@ -11,9 +11,17 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from liftcore.errors import InvalidCameras
-from liftcore.scene.camera_models import COLMAP_MODELS, MODELS_BY_NAME, UNDISTORT, CameraModel, pinhole
+from liftcore.scene.camera_models import (
+    COLMAP_MODELS,
+    MODELS_BY_NAME,
+    READ_MODELS,
+    UNDISTORT,
+    CameraModel,
+    calibration,
+)
 from liftcore.scene.cameras import Camera, Cameras, check_count, told_of
 from liftcore.scene.foreign import refuse_pointer
+from liftcore.scene.lens import behind_lens
 from liftcore.scene.view_names import view_names
 
 if TYPE_CHECKING:
@@ -64,7 +72,7 @@ def read_colmap(folder: Path) -> Cameras:
     """The cameras of a sparse model, by image name.
 
     Raises:
-        InvalidCameras: a file is missing or malformed, or a camera is distorted.
+        InvalidCameras: a file is missing or malformed, or a camera is distorted in a way that is not read.
     """
     camera_file, image_file = model_files(folder)
     for path in (camera_file, image_file):
@@ -82,15 +90,16 @@ def read_colmap(folder: Path) -> Cameras:
 
 
 def _camera(name: str, image: _Image, sensors: Mapping[int, _Sensor], files: tuple[Path, Path]) -> Camera:
-    """The view of an image; only a camera that an image uses has to be a pinhole."""
+    """The view of an image; only a camera that an image uses has to be of a model that is read."""
     sensor, source = sensors.get(image.camera), str(files[1])
     if sensor is None:
         raise InvalidCameras(source, expected="images of known cameras", got=f"{name!r} of camera {image.camera}")
-    intrinsics = pinhole(sensor.model, sensor.parameters, f"{files[0]} camera {image.camera}")
+    intrinsics, distortion = calibration(sensor.model, sensor.parameters, f"{files[0]} camera {image.camera}")
     pose = np.eye(4)
     pose[:3, :3] = _rotation(np.array(image.quaternion), f"{source} image {name!r}")
     pose[:3, 3] = image.translation
-    return Camera(name, sensor.width, sensor.height, *intrinsics, world_to_camera=pose)
+    camera = Camera(name, sensor.width, sensor.height, *intrinsics, world_to_camera=pose)
+    return camera if distortion is None else behind_lens(camera, distortion)
 
 
 def _rotation(quaternion: np.ndarray, source: str) -> np.ndarray:
@@ -171,7 +180,7 @@ def _binary_sensor(data: _Bytes) -> tuple[int, _Sensor]:
     number, model, width, height = data.take("<IiQQ")
     if not 0 <= model < len(COLMAP_MODELS):
         got = f"camera model id {model}"
-        raise InvalidCameras(data.source, expected="a pinhole camera", got=got, hint=UNDISTORT)
+        raise InvalidCameras(data.source, expected=f"a camera of {READ_MODELS}", got=got, hint=UNDISTORT)
     parameters = data.take(f"<{COLMAP_MODELS[model].parameters}d")
     return number, _Sensor(width, height, COLMAP_MODELS[model], parameters)
 
@@ -203,7 +212,7 @@ def _text_sensors(path: Path) -> Iterator[tuple[int, _Sensor]]:
             camera, size = int(number), (int(width), int(height))
         except ValueError:
             raise _bad_line(path, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]", line) from None
-        unknown = CameraModel(model[:60], len(parameters), 0, perspective=False)
+        unknown = CameraModel(model[:60], len(parameters), 0, None)
         yield camera, _Sensor(*size, MODELS_BY_NAME.get(model, unknown), parameters)
 
 

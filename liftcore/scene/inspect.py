@@ -8,7 +8,9 @@ import numpy as np
 import torch
 
 from liftcore.raster.constants import ALPHA_FLOOR
+from liftcore.scene.distorted import distortion_warning
 from liftcore.scene.foreign import SUFFIXES
+from liftcore.scene.lens import photo_size
 from liftcore.scene.load import camera_files, is_of_nerfstudio, load_cameras, load_splats, other_models
 from liftcore.scene.ply_dialect import nearest_dialect
 from liftcore.scene.splats import Kernel
@@ -97,12 +99,13 @@ def describe_camera_file(path: Path) -> dict[str, Any]:
 def describe_cameras(cameras: Cameras) -> dict[str, Any]:
     """Counts, ranges and warnings of cameras."""
     centres = np.stack([camera.centre for camera in cameras])
-    sizes = sorted({f"{camera.width}x{camera.height}" for camera in cameras})
+    sizes = sorted({"{}x{}".format(*photo_size(camera)) for camera in cameras})
     focals = [focal for camera in cameras for focal in (camera.fx, camera.fy)]
     return {
         "views": len(cameras),
         "names": [camera.name for camera in cameras],
         "sizes": sizes,
+        "distorted": len(cameras.distorted),
         "focal_lengths": {"min": min(focals), "max": max(focals)},
         "box": [centres.min(axis=0).tolist(), centres.max(axis=0).tolist()],
         "warnings": _camera_warnings(cameras, centres),
@@ -156,12 +159,13 @@ def _reading_warnings(splats: Splats) -> list[str]:
 
 
 def _camera_warnings(cameras: Cameras, centres: np.ndarray) -> list[str]:
+    photos = {camera.name: camera.lens or camera for camera in cameras}
     off = [
-        camera.name
-        for camera in cameras
-        if abs(camera.cx / camera.width - 0.5) > OFF_CENTRE or abs(camera.cy / camera.height - 0.5) > OFF_CENTRE
+        name
+        for name, photo in photos.items()
+        if abs(photo.cx / photo.width - 0.5) > OFF_CENTRE or abs(photo.cy / photo.height - 0.5) > OFF_CENTRE
     ]
-    warnings = []
+    warnings = distortion_warning(cameras.views)
     if off:
         warnings.append(f"{len(off)} views have their principal point far off the centre, such as {off[0]!r}")
     places = len(np.unique(centres, axis=0))

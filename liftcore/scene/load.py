@@ -6,13 +6,13 @@ import zipfile
 from typing import TYPE_CHECKING
 
 from liftcore.errors import InvalidCameras, InvalidSplats
-from liftcore.scene.camera_models import UNDISTORT
 from liftcore.scene.cameras import told_of
 from liftcore.scene.colmap import MODEL_FILES, has_model, is_whole, model_files, read_colmap
+from liftcore.scene.distorted import is_undistorted, refuse_both
 from liftcore.scene.foreign import LFS_POINTER, refuse_pointer
 from liftcore.scene.inria import parse_inria
 from liftcore.scene.json_file import read_json
-from liftcore.scene.model_folders import model_folder, models_below, scene_of
+from liftcore.scene.model_folders import model_folder, models_below
 from liftcore.scene.model_zip import models_in_zip, read_model_zip
 from liftcore.scene.transforms import parse_transforms
 
@@ -126,14 +126,12 @@ def _from_folder(folder: Path) -> Cameras:
         hint = f"name what is meant, such as {_some(others)}" if others else ""
         got = "a folder without any of them" + (" at the usual places" if others else "")
         raise InvalidCameras(str(folder), expected=CAMERA_FORMATS, got=got, hint=hint)
-    try:
-        return read_colmap(files[0].parent)
-    except InvalidCameras as error:
-        others = [path for path in _cameras_below(scene_of(folder)) if path != files[0].parent]
-        if error.hint != UNDISTORT or not others:
-            raise
-        hint = f"name what is undistorted already, if it is, such as {_some(others)}; else {UNDISTORT}"
-        raise InvalidCameras(error.argument, expected=error.expected, got=error.got, hint=hint) from None
+    cameras = read_colmap(files[0].parent)
+    if cameras.distorted:
+        others = [model for model in models_below(folder) if folder / model != files[0].parent]
+        straight = [str(folder / model) for model in others if is_undistorted(folder / model)]
+        refuse_both(str(folder), str(files[0].parent), straight, "name the one")
+    return cameras
 
 
 def _cameras_below(scene: Path) -> list[Path]:

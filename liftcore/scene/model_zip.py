@@ -5,12 +5,13 @@ from __future__ import annotations
 import tempfile
 import zipfile
 import zlib
+from itertools import islice
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
 
 from liftcore.errors import InvalidCameras
-from liftcore.scene.camera_models import UNDISTORT
 from liftcore.scene.colmap import MODEL_FILES, read_colmap
+from liftcore.scene.distorted import is_undistorted, refuse_both
 from liftcore.scene.model_folders import model_names, whole_models
 
 if TYPE_CHECKING:
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 
 MAX_UNZIPPED_BYTES = 512 * 1024 * 1024
 MAX_ZIP_MEMBERS = 100_000
+MOST_MODELS = 8  # of a zip that are looked at
 
 
 def read_model_zip(path: Path) -> Cameras:
@@ -29,30 +31,18 @@ def read_model_zip(path: Path) -> Cameras:
         InvalidCameras: there is none, or it is malformed or too large.
     """
     with tempfile.TemporaryDirectory(prefix="splatlift-") as folder:
+        first = Path(folder)
+        _unzip_model(path, 0, first)
         try:
-            with zipfile.ZipFile(path) as archive:
-                budget = MAX_UNZIPPED_BYTES
-                for name, member in _model_members(archive, path).items():
-                    budget -= _unzip(archive, member, Path(folder) / name, budget)
-        except (
-            zipfile.BadZipFile,
-            EOFError,
-            NotImplementedError,
-            RuntimeError,
-            ValueError,
-            zlib.error,
-        ) as error:
-            got = f"one that does not open ({str(error)[:120]})"
-            raise InvalidCameras(str(path), expected="a zip of a COLMAP sparse model", got=got) from None
-        try:
-            return read_colmap(Path(folder))
+            cameras = read_colmap(first)
         except InvalidCameras as error:
-            argument = error.argument.replace(folder, str(path))
-            got, hint = error.got.replace(folder, str(path)), error.hint
-            others = models_in_zip(path)[1:] if hint == UNDISTORT else []
-            if others:
-                hint = f"zip what is undistorted already by itself, if it is, such as {others[0]}; else {UNDISTORT}"
-            raise InvalidCameras(argument, expected=error.expected, got=got, hint=hint) from None
+            argument, got = (text.replace(folder, str(path)) for text in (error.argument, error.got))
+            raise InvalidCameras(argument, expected=error.expected, got=got, hint=error.hint) from None
+    if cameras.distorted:
+        read, *others = models_in_zip(path)[:MOST_MODELS]
+        undistorted = [name for place, name in enumerate(others, start=1) if _is_undistorted(path, place)]
+        refuse_both(str(path), read, undistorted, "zip the one alone")
+    return cameras
 
 
 def models_in_zip(path: Path) -> list[str]:
@@ -67,13 +57,34 @@ def _files(archive: zipfile.ZipFile) -> Mapping[str, zipfile.ZipInfo]:
     return {str(PurePosixPath(member.filename.replace("\\", "/"))): member for member in members}
 
 
-def _model_members(archive: zipfile.ZipFile, path: Path) -> Mapping[str, zipfile.ZipInfo]:
-    """Cameras and images of the preferred model, by the last part of their names, which is one of four."""
+def _is_undistorted(path: Path, place: int) -> bool:
+    """Whether the zip's model of this place among all reads, and is of pinholes alone."""
+    with tempfile.TemporaryDirectory(prefix="splatlift-") as folder:
+        try:
+            _unzip_model(path, place, Path(folder))
+        except InvalidCameras:
+            return False
+        return is_undistorted(Path(folder))
+
+
+def _unzip_model(path: Path, place: int, folder: Path) -> None:
+    """Unzip the cameras and images of the model of this place among all, by the last part of their names."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            budget = MAX_UNZIPPED_BYTES
+            for name, member in _model_members(archive, path, place).items():
+                budget -= _unzip(archive, member, folder / name, budget)
+    except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError, ValueError, zlib.error) as error:
+        got = f"one that does not open ({str(error)[:120]})"
+        raise InvalidCameras(str(path), expected="a zip of a COLMAP sparse model", got=got) from None
+
+
+def _model_members(archive: zipfile.ZipFile, path: Path, place: int) -> Mapping[str, zipfile.ZipInfo]:
     count = len(archive.infolist())
     if count > MAX_ZIP_MEMBERS:
         raise InvalidCameras(str(path), expected=f"at most {MAX_ZIP_MEMBERS} files", got=str(count))
     files = _files(archive)
-    for root, kind in whole_models(files):
+    for root, kind in islice(whole_models(files), place, None):
         return {PurePosixPath(name).name: files[name] for name in model_names(root, kind)}
     got, hint = _what_else(files)
     expected = "a COLMAP model (cameras and images, .bin or .txt) in the zip"

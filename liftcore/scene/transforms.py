@@ -9,18 +9,23 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from liftcore.errors import InvalidCameras
-from liftcore.scene.camera_models import Intrinsics
+from liftcore.scene.camera_models import Intrinsics, distortion_of
 from liftcore.scene.cameras import Camera, Cameras, check_count, world_to_camera
 from liftcore.scene.json_file import FORMATS, entry, matrix, number, pixels
+from liftcore.scene.lens import behind_lens
 from liftcore.scene.view_names import view_names
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from liftcore.scene.distortion import Distortion
+
 PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
+FISHEYE = "OPENCV_FISHEYE"
+LISTED = ("k1", "k2", "k3", "k4", "p1", "p2")  # nerfstudio's distortion_params
+READ = {True: ("k1", "k2", "k3", "k4"), False: ("k1", "k2", "k3", "p1", "p2")}  # of a fisheye, and of others
 DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4")
-NO_PINHOLE = (
-    "is_fisheye",
+OTHER_LENSES = (
     "latlong",
     "equirectangular",
     "ftheta_p0",
@@ -45,7 +50,7 @@ def parse_transforms(document: Any, source: str) -> Cameras:
     normalises poses unless told not to) must be exported together with its cameras.
 
     Raises:
-        InvalidCameras: a key is missing or malformed, or a camera is distorted.
+        InvalidCameras: a key is missing or malformed, or a camera is distorted in a way that is not read.
     """
     if not isinstance(document, dict) or "frames" not in document:
         some = ", ".join(list(document)[:5]) if isinstance(document, dict) else type(document).__name__
@@ -63,8 +68,7 @@ def parse_transforms(document: Any, source: str) -> Cameras:
 
 def _camera(name: str, keys: ChainMap[str, Any], source: str) -> Camera:
     where = f"{source} frame {name!r}"
-    for scope in keys.maps:  # the frame's own and the shared ones: programs differ in which of them counts
-        _refuse_distortion(scope, where)
+    distortion = _distortion(keys, where)
     if "w" not in keys or "h" not in keys:
         hint = 'add the size of the photos as "w" and "h" at the top level of the file'
         raise InvalidCameras(where, expected="an image size, w and h", got="none", hint=hint)
@@ -75,7 +79,8 @@ def _camera(name: str, keys: ChainMap[str, Any], source: str) -> Camera:
         raise InvalidCameras(f"{where} transform_matrix", expected="0 0 0 1 as the last row", got=got)
     pose = world_to_camera(given[:3, :3] * OPENGL_TO_OPENCV, given[:3, 3])
     intrinsics = _intrinsics(keys, width, height, where)
-    return Camera(name, width, height, *intrinsics, world_to_camera=pose)
+    camera = Camera(name, width, height, *intrinsics, world_to_camera=pose)
+    return camera if distortion is None else behind_lens(camera, distortion)
 
 
 def _intrinsics(keys: Mapping[str, Any], width: int, height: int, where: str) -> Intrinsics:
@@ -104,18 +109,44 @@ def _focal(keys: Mapping[str, Any], axis: str, side: int, where: str) -> float |
     return 0.5 * side / math.tan(0.5 * angle)
 
 
-def _refuse_distortion(keys: Mapping[str, Any], where: str) -> None:
+def _distortion(keys: ChainMap[str, Any], where: str) -> Distortion | None:
+    """How a frame's photo is distorted; None where it is not."""
     model = keys.get("camera_model", "PINHOLE")
-    other = next((key for key in NO_PINHOLE if keys.get(key)), None)
-    if model not in PERSPECTIVE or other:
-        got = repr(model)[:60] if model not in PERSPECTIVE else f"{other}"
-        raise InvalidCameras(where, expected="a perspective camera", got=got, hint=UNDISTORT)
-    listed = keys.get("distortion_params") or []
-    if not isinstance(listed, list):
-        raise InvalidCameras(f"{where} distortion_params", expected="a list of numbers", got=repr(listed)[:60])
-    given = {key: keys.get(key, 0) for key in DISTORTION}
-    given |= {f"distortion_params[{i}]": value for i, value in enumerate(listed)}
-    for key, value in given.items():
-        if number(value, f"{where} {key}") != 0:
-            got = f"{key} = {value:g}"
-            raise InvalidCameras(where, expected="a camera without distortion", got=got, hint=UNDISTORT)
+    other = next((key for scope in keys.maps for key in OTHER_LENSES if scope.get(key)), None)
+    if model not in (*PERSPECTIVE, FISHEYE) or other:
+        got = other or repr(model)[:60]
+        raise InvalidCameras(where, expected=f"a perspective camera or {FISHEYE}", got=got, hint=UNDISTORT)
+    fisheye = model == FISHEYE or bool(keys.get("is_fisheye"))
+    found = [given for scope in keys.maps if (given := _given(scope, where)) is not None]
+    if any(given != found[0] for given in found):  # programs differ in which of them counts
+        told = " and ".join(_told(given) for given in found)
+        raise InvalidCameras(where, expected="the same distortion as that of all frames", got=told)
+    values = found[0] if found else {}
+    unread = next((key for key in values if key not in READ[fisheye]), None)
+    if unread:
+        kind = "a fisheye" if fisheye else "a perspective camera"
+        expected = f"{', '.join(READ[fisheye])} alone of {kind}"
+        raise InvalidCameras(where, expected=expected, got=f"{unread} = {values[unread]:g}", hint=UNDISTORT)
+    return distortion_of(values, fisheye=fisheye)
+
+
+def _given(scope: Mapping[str, Any], where: str) -> dict[str, float] | None:
+    """The parameters that are not zero, by name; None where none is named."""
+    listed = scope.get("distortion_params")
+    if listed is not None and (not isinstance(listed, list) or len(listed) not in (0, len(LISTED))):
+        expected = f"a list of the {len(LISTED)} numbers {', '.join(LISTED)}"
+        raise InvalidCameras(f"{where} distortion_params", expected=expected, got=repr(listed)[:60])
+    if not listed and not any(key in scope for key in DISTORTION):
+        return None
+    given = {key: number(scope[key], f"{where} {key}") for key in DISTORTION if key in scope}
+    named = {key: value for key, value in given.items() if value != 0}
+    values = [number(value, f"{where} distortion_params[{i}]") for i, value in enumerate(listed or [])]
+    of_list = {key: value for key, value in zip(LISTED, values, strict=False) if value != 0}
+    if named and of_list and named != of_list:
+        got = f"{_told(named)} and {_told(of_list)}"
+        raise InvalidCameras(f"{where} distortion_params", expected="what the single parameters say", got=got)
+    return of_list or named
+
+
+def _told(values: Mapping[str, float]) -> str:
+    return ", ".join(f"{key} = {value:g}" for key, value in values.items()) or "none"

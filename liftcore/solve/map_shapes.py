@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from liftcore.scene.lens import photo_size
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
@@ -25,9 +27,9 @@ def shape_warnings(packs: FeaturePacks, views: Sequence[Camera]) -> list[str]:
     odd, stretched = [], []
     for camera in views:
         size = packs.map_size(camera.name)
-        if _odd(size, camera):
+        if _odd(size, photo_size(camera)):
             odd.append(camera)
-        elif _stretched(size, camera):
+        elif _stretched(size, photo_size(camera)):
             stretched.append(camera)
     advice = {
         "of another shape than their images{}: see that they are [rows, columns], channels last": odd,
@@ -42,21 +44,21 @@ def shape_warnings(packs: FeaturePacks, views: Sequence[Camera]) -> list[str]:
 
 
 def _shapes(packs: FeaturePacks, camera: Camera) -> str:
-    width, height = packs.map_size(camera.name)
-    return f" ({camera.name}: {width}x{height} for {camera.width}x{camera.height})"
+    (width, height), (W, H) = packs.map_size(camera.name), photo_size(camera)
+    return f" ({camera.name}: {width}x{height} for {W}x{H})"
 
 
-def _odd(size: tuple[int, int], camera: Camera) -> bool:
-    width, height = size
+def _odd(size: tuple[int, int], photo: tuple[int, int]) -> bool:
+    (width, height), (W, H) = size, photo
     if min(width, height) < FEW_CELLS:
         return False
-    off, turned = (_factor(ratio * camera.height / camera.width) for ratio in (width / height, height / width))
+    off, turned = (_factor(ratio * H / W) for ratio in (width / height, height / width))
     return off > FAR or off > TURNED * turned
 
 
-def _stretched(size: tuple[int, int], camera: Camera) -> bool:
+def _stretched(size: tuple[int, int], photo: tuple[int, int]) -> bool:
     """Whether no scale makes both sides of the image those of the map, to a cell, nor to a pixel of the image."""
-    (width, height), (W, H) = size, (camera.width, camera.height)
+    (width, height), (W, H) = size, photo
     wide = (width - CELL) * (H - CELL) > (height + CELL) * (W + CELL)
     return wide or (height - CELL) * (W - CELL) > (width + CELL) * (H + CELL)
 

@@ -10,6 +10,7 @@ from liftcore.measure.protocols import EvaluationProtocol
 from liftcore.measure.protocols.judging import Judged, Means, judge, mean_of_scenes, means, pooled_ious
 from liftcore.progress import Progress, silent
 from liftcore.query.scores import DEFAULT_NEGATIVES
+from liftcore.scene.lens import photo_size
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
@@ -158,7 +159,7 @@ def _truth(
     if len(paired) < len(wanted):
         lost = [view for view in wanted if view not in cameras]
         warnings.append(f"{labels.name}: {_named(lost)} have labels but no camera and were skipped")
-    truth = {view: labels.objects(view, cameras[view].width, cameras[view].height) for view in paired}
+    truth = {view: labels.objects(view, *photo_size(cameras[view])) for view in paired}
     empty = [view for view, things in truth.items() if not any(thing.mask.any() for thing in things)]
     if empty:
         warnings.append(f"{labels.name}: {_named(empty)} have no labelled object")

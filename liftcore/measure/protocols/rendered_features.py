@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
     from liftcore.query.encoders import TextEncoder
     from liftcore.query.scene import QueryScene
+    from liftcore.scene.cameras import Camera
 
 MEAN_FILTER = 30  # pixels
 CUT = 0.4  # of the map stretched to -1..1
@@ -61,8 +62,10 @@ class RenderedFeatures:
 
     def cosines(self, view: str) -> Tensor:
         """[H, W, n + N] f32, of the rendered features to the texts and the negatives; 0 where nothing is seen."""
-        scene = self._scene
-        camera, features = scene.cameras.get(view), scene.lift.features
+        return self._scene.image(view, self._cosines)
+
+    def _cosines(self, camera: Camera) -> Tensor:
+        scene, features = self._scene, self._scene.lift.features
         products = scene.raster.render(camera, self._products, scene.walk)
         squares = torch.zeros(products.shape[:2])
         for start in range(0, features.shape[1], _SLICE):

@@ -43,7 +43,7 @@ class RenderedScores:
     def look(self, view: str) -> dict[str, Prediction]:
         """What each text finds in a view."""
         scene = self._scene
-        image = scene.raster.render(scene.cameras.get(view), self._values, scene.walk)
+        image = scene.image(view, lambda camera: scene.raster.render(camera, self._values, scene.walk))
         met = image[..., -1] >= MINIMUM_ROW_SUM
         found = {}
         for k, text in enumerate(self._texts):

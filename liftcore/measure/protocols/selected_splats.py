@@ -53,4 +53,4 @@ class SelectedSplats:
         splats = self._scene.splats
         logits = torch.where(selected, splats.opacity_logits, _GONE)
         alone = CpuRaster(replace(splats, opacity_logits=logits))
-        return alone.row_sums(self._scene.cameras.get(view), self._scene.walk)
+        return self._scene.image(view, lambda camera: alone.row_sums(camera, self._scene.walk))

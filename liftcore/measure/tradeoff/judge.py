@@ -12,6 +12,7 @@ from liftcore.measure.accuracy import class_ious, rendered_scores
 from liftcore.measure.experiments.fidelity import view_cosines
 from liftcore.observe.masks import read_masks
 from liftcore.query.encoders.table import TableEncoder
+from liftcore.query.in_photo import in_photo
 from liftcore.raster.cpu import CpuRaster
 from liftcore.scene.view_pairs import cameras_of_views
 from liftcore.solve.accumulate import render_walk
@@ -46,13 +47,13 @@ def judge(order: Order, sources: Sources, reference: tuple[Tensor, Tensor], made
     if order.scene.labels is not None and order.labelled:
         classes = class_vectors(order.scene)
         masks = labelled_masks(order.scene, sources.cameras)
-        scores = (
-            rendered_scores(raster, sources.cameras.get(view), made.features, classes, walk)
-            for view in order.labelled
-        )
-        found = [
-            _resized(image.argmax(dim=2), masks[view]) for view, image in zip(order.labelled, scores, strict=True)
-        ]
+        found = []
+        for view in order.labelled:
+            scores = in_photo(
+                sources.cameras.get(view),
+                lambda camera: rendered_scores(raster, camera, made.features, classes, walk),
+            )
+            found.append(_resized(scores.argmax(dim=2), masks[view]))
         truth = [masks[view].flatten() for view in order.labelled]
         ious = class_ious(torch.cat(found), torch.cat(truth), len(classes))
         mean = float(ious.nanmean())

@@ -1,4 +1,4 @@
-"""Cameras as JSON documents."""
+"""Cameras as JSON documents, and what makes them the same."""
 
 from __future__ import annotations
 
@@ -27,3 +27,11 @@ def with_json(tmp_path: Path, document: Any) -> Path:
     path = tmp_path / "document.json"
     path.write_text(json.dumps(document))
     return path
+
+
+def assert_same(one: Cameras, other: Cameras) -> None:
+    assert [view.name for view in one] == [view.name for view in other]
+    for a, b in zip(one, other, strict=True):
+        assert (a.width, a.height) == (b.width, b.height)
+        assert np.allclose([a.fx, a.fy, a.cx, a.cy], [b.fx, b.fy, b.cx, b.cy], atol=1e-9)
+        assert np.allclose(a.world_to_camera, b.world_to_camera, atol=1e-12)

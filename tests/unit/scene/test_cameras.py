@@ -11,23 +11,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from camera_documents import transforms_of, with_json
+from camera_documents import assert_same, with_json
 from colmap_files import IMAGES, binary_files, text_files, write_files
 
 from liftcore.errors import InvalidCameras, InvalidSplats
 from liftcore.scene import json_file, model_zip
 from liftcore.scene.cameras import Camera, Cameras
+from liftcore.scene.distortion import Brown, Fisheye
 from liftcore.scene.inria import write_inria_cameras
 from liftcore.scene.inspect import describe_camera_file
+from liftcore.scene.lens import Lens
 from liftcore.scene.load import load_cameras, load_splats, other_models
-
-
-def assert_same(one: Cameras, other: Cameras) -> None:
-    assert [view.name for view in one] == [view.name for view in other]
-    for a, b in zip(one, other, strict=True):
-        assert (a.width, a.height) == (b.width, b.height)
-        assert np.allclose([a.fx, a.fy, a.cx, a.cy], [b.fx, b.fy, b.cx, b.cy], atol=1e-9)
-        assert np.allclose(a.world_to_camera, b.world_to_camera, atol=1e-12)
 
 
 @pytest.fixture
@@ -110,30 +104,57 @@ def test_error_in_a_zip_names_the_zip(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("number", "name", "parameters"),
+    ("number", "name", "parameters", "distortion"),
     [
-        (2, "SIMPLE_RADIAL", (500.0, 320.0, 240.0, 0.0)),
-        (3, "RADIAL", (500.0, 320.0, 240.0, 0.0, 0.0)),
-        (4, "OPENCV", (500.0, 500.0, 320.0, 240.0, 0.0, 0.0, 0.0, 0.0)),
-        (6, "FULL_OPENCV", (500.0, 500.0, 320.0, 240.0, *[0.0] * 8)),
+        (2, "SIMPLE_RADIAL", (500.0, 320.0, 240.0), (0.01,)),
+        (3, "RADIAL", (500.0, 320.0, 240.0), (0.01, -0.02)),
+        (4, "OPENCV", (500.0, 500.0, 320.0, 240.0), (0.01, -0.02, 0.001, 0.002)),
+        (6, "FULL_OPENCV", (500.0, 500.0, 320.0, 240.0), (0.01, -0.02, 0.001, 0.002, 0.03, 0.004, 0.005, 0.006)),
     ],
 )
-def test_distorted_model_is_a_pinhole_only_without_distortion(
-    number: int, name: str, parameters: tuple[float, ...], tmp_path: Path
+def test_perspective_models_are_pinholes_without_distortion_and_have_a_lens_with_it(
+    number: int, name: str, parameters: tuple[float, ...], distortion: tuple[float, ...], tmp_path: Path
+) -> None:
+    lens = Brown(**dict(zip(("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"), distortion, strict=False)))
+    for files in (binary_files, text_files):
+        sensor = {1: (number, name, (*parameters, *[0.0] * len(distortion)))}
+        straight = load_cameras(write_files(tmp_path / files.__name__, files(sensor, IMAGES[:1])))
+        assert straight.distorted == ()
+        assert (straight.views[0].fx, straight.views[0].fy, straight.views[0].cx) == (500.0, 500.0, 320.0)
+        sensor = {1: (number, name, (*parameters, *distortion))}
+        bent = load_cameras(write_files(tmp_path / files.__name__, files(sensor, IMAGES[:1])))
+        assert bent.distorted == ("frame 1",)
+        assert bent.views[0].lens == Lens(640, 480, 500.0, 500.0, 320.0, 240.0, lens)
+
+
+@pytest.mark.parametrize(
+    ("number", "name", "parameters", "k"),
+    [
+        (5, "OPENCV_FISHEYE", (500.0, 510.0, 320.0, 240.0, 0.1, 0.02, 0.003, 0.0), (0.1, 0.02, 0.003, 0.0)),
+        (5, "OPENCV_FISHEYE", (500.0, 510.0, 320.0, 240.0, *[0.0] * 4), (0.0,) * 4),
+        (8, "SIMPLE_RADIAL_FISHEYE", (500.0, 320.0, 240.0, 0.1), (0.1, 0.0, 0.0, 0.0)),
+        (9, "RADIAL_FISHEYE", (500.0, 320.0, 240.0, 0.1, 0.02), (0.1, 0.02, 0.0, 0.0)),
+    ],
+)
+def test_a_fisheye_always_has_a_lens(
+    number: int, name: str, parameters: tuple[float, ...], k: tuple[float, ...], tmp_path: Path
 ) -> None:
     for files in (binary_files, text_files):
         sensor = {1: (number, name, parameters)}
-        straight = load_cameras(write_files(tmp_path / files.__name__, files(sensor, IMAGES[:1])))
-        assert (straight.views[0].fx, straight.views[0].fy, straight.views[0].cx) == (500.0, 500.0, 320.0)
-        bent = {1: (number, name, (*parameters[:-1], 0.01))}
-        with pytest.raises(InvalidCameras, match=r"without distortion.*0\.01.*colmap image_undistorter"):
-            load_cameras(write_files(tmp_path / files.__name__, files(bent, IMAGES[:1])))
+        [view] = load_cameras(write_files(tmp_path / files.__name__, files(sensor, IMAGES[:1])))
+        assert view.lens is not None
+        assert view.lens.distortion == Fisheye(*k)
+        assert (view.lens.fx, view.lens.cx, view.lens.cy) == (500.0, 320.0, 240.0)
 
 
-def test_fisheye_is_refused(tmp_path: Path) -> None:
-    sensor = {1: (5, "OPENCV_FISHEYE", (500.0, 500.0, 320.0, 240.0, 0.0, 0.0, 0.0, 0.0))}
+@pytest.mark.parametrize(
+    ("number", "name", "count"),
+    [(7, "FOV", 5), (10, "THIN_PRISM_FISHEYE", 12), (11, "RAD_TAN_THIN_PRISM_FISHEYE", 16)],
+)
+def test_models_that_are_not_read_are_refused(number: int, name: str, count: int, tmp_path: Path) -> None:
+    sensor = {1: (number, name, (500.0, 500.0, 320.0, 240.0, *[0.0] * (count - 4)))}
     for files in (binary_files, text_files):
-        with pytest.raises(InvalidCameras, match=r"perspective.*OPENCV_FISHEYE.*image_undistorter"):
+        with pytest.raises(InvalidCameras, match=rf"SIMPLE_PINHOLE, .*, got {name}; .*image_undistorter"):
             load_cameras(write_files(tmp_path / files.__name__, files(sensor, IMAGES[:1])))
 
 
@@ -185,107 +206,6 @@ def test_missing_images_file_is_named(tmp_path: Path) -> None:
     write_files(tmp_path, {"cameras.bin": binary_files()["cameras.bin"]})
     with pytest.raises(InvalidCameras, match=r"images\.bin"):
         load_cameras(tmp_path)
-
-
-def test_transforms_and_colmap_mean_the_same(model: Path, tmp_path: Path) -> None:
-    cameras = load_cameras(model)
-    assert_same(load_cameras(with_json(tmp_path, transforms_of(cameras))), cameras)
-
-
-def test_opengl_camera_looks_along_its_negative_z(tmp_path: Path) -> None:
-    pose = np.eye(4)
-    pose[:3, 3] = [0, 0, 5]
-    frame = {"file_path": "./train/r_0", "transform_matrix": pose.tolist()}
-    document = {"camera_angle_x": math.pi / 2, "w": 100, "h": 50, "frames": [frame]}
-    camera = load_cameras(with_json(tmp_path, document)).views[0]
-    assert camera.name == "r_0"
-    assert camera.fx == pytest.approx(50)
-    assert camera.fy == camera.fx
-    assert (camera.cx, camera.cy) == (50, 25)
-    ahead = camera.world_to_camera @ [0, 1, 0, 1]  # below the camera along -z, and above it along y
-    assert np.allclose(ahead, [0, -1, 5, 1])
-
-
-def test_frame_intrinsics_come_before_shared_ones(tmp_path: Path) -> None:
-    frame = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist(), "fl_x": 70.0, "w": 20.0}
-    document = {"fl_x": 50.0, "w": 100, "h": 50, "frames": [frame, {**frame, "file_path": "b.png", "w": 30}]}
-    first, second = load_cameras(with_json(tmp_path, document))
-    assert (first.fx, first.fy, first.width, second.width, second.height) == (70.0, 70.0, 20, 30, 50)
-
-
-GOOD_FRAME = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}
-BAD_TRANSFORMS = {
-    "no size": ({"fl_x": 50, "frames": [GOOD_FRAME]}, "image size"),
-    "no focal length": ({"w": 9, "h": 9, "frames": [GOOD_FRAME]}, "fl_x or camera_angle_x"),
-    "distortion": ({"fl_x": 5, "w": 9, "h": 9, "k1": 0.1, "frames": [GOOD_FRAME]}, r"k1 = 0\.1.*undistorter"),
-    "fisheye": ({"camera_model": "OPENCV_FISHEYE", "frames": [GOOD_FRAME]}, "OPENCV_FISHEYE"),
-    "no frames": ({"w": 9}, r"'frames' \(nerfstudio\) or a list of cameras.*got an object with w"),
-    "empty frames": ({"frames": []}, "document.json cameras: expected at least one view"),
-    "frames of numbers": ({"frames": [1]}, "list of objects"),
-    "no path": ({"frames": [{}]}, "'file_path'"),
-    "no matrix": ({"fl_x": 5, "w": 9, "h": 9, "frames": [{"file_path": "a"}]}, "matrix"),
-    "NaN": ({"fl_x": math.nan, "w": 9, "h": 9, "frames": [GOOD_FRAME]}, "a finite number, got nan"),
-    "huge": ({"fl_x": 10**400, "w": 9, "h": 9, "frames": [GOOD_FRAME]}, "a finite number"),
-    "text": ({"fl_x": "50", "w": 9, "h": 9, "frames": [GOOD_FRAME]}, "a finite number"),
-    "half a pixel": ({"fl_x": 5, "w": 9.5, "h": 9, "frames": [GOOD_FRAME]}, "whole number of pixels"),
-    "angle": ({"camera_angle_x": 4, "w": 9, "h": 9, "frames": [GOOD_FRAME]}, "an angle"),
-    "zero focal length": ({"fl_x": 0, "fl_y": 5, "w": 9, "h": 9, "frames": [GOOD_FRAME]}, "positive focal"),
-    "scaled": (
-        {
-            "fl_x": 5,
-            "w": 9,
-            "h": 9,
-            "frames": [{"file_path": "a", "transform_matrix": np.diag([2.0, 2, 2, 1]).tolist()}],
-        },
-        "document.json camera 'a' pose: expected a proper rotation, got a rotation scaled by 2",
-    ),
-    "sheared": (
-        {
-            "fl_x": 5,
-            "w": 9,
-            "h": 9,
-            "frames": [{"file_path": "a", "transform_matrix": np.diag([4.0, 2, 1, 1]).tolist()}],
-        },
-        "expected a proper rotation, got a matrix off by",
-    ),
-    "short row": (
-        {"fl_x": 5, "w": 9, "h": 9, "frames": [{**GOOD_FRAME, "transform_matrix": [*np.eye(4).tolist()[:3], [1]]}]},
-        "4x4 matrix as nested lists",
-    ),
-    "homogeneous": (
-        {"fl_x": 5, "w": 9, "h": 9, "frames": [{**GOOD_FRAME, "transform_matrix": (2 * np.eye(4)).tolist()}]},
-        "0 0 0 1 as the last row, got 0 0 0 2",
-    ),
-    "listed distortion": (
-        {"fl_x": 5, "w": 9, "h": 9, "distortion_params": [0, 0.02], "frames": [GOOD_FRAME]},
-        r"distortion_params\[1\] = 0\.02.*OpenCV",
-    ),
-    "a frame's listed distortion": (
-        {"fl_x": 5, "w": 9, "h": 9, "frames": [{**GOOD_FRAME, "distortion_params": [0.1]}]},
-        r"distortion_params\[0\] = 0\.1",
-    ),
-    "shared distortion beside a frame's zero": (
-        {"fl_x": 5, "w": 9, "h": 9, "k1": 0.1, "frames": [{**GOOD_FRAME, "k1": 0}]},
-        r"k1 = 0\.1",
-    ),
-    "distortion that is no list": (
-        {"fl_x": 5, "w": 9, "h": 9, "distortion_params": "k1", "frames": [GOOD_FRAME]},
-        "a list of numbers, got 'k1'",
-    ),
-    "f-theta": ({"fl_x": 5, "w": 9, "h": 9, "ftheta_p0": 1.5, "frames": [GOOD_FRAME]}, "got ftheta_p0"),
-    "panorama": ({"fl_x": 5, "w": 9, "h": 9, "equirectangular": True, "frames": [GOOD_FRAME]}, "equirectangular"),
-    "another name of the focal length": (
-        {"fx": 5, "w": 9, "h": 9, "frames": [GOOD_FRAME]},
-        "neither, but 'fx'; add the focal length in pixels as fl_x",
-    ),
-}
-
-
-@pytest.mark.parametrize("case", BAD_TRANSFORMS)
-def test_bad_transforms_are_refused(case: str, tmp_path: Path) -> None:
-    document, message = BAD_TRANSFORMS[case]
-    with pytest.raises(InvalidCameras, match=message):
-        load_cameras(with_json(tmp_path, document))
 
 
 def test_inria_cameras_survive_a_round_trip(model: Path, tmp_path: Path) -> None:

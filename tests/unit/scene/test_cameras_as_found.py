@@ -86,19 +86,34 @@ def test_folder_and_zip_read_the_same_model(places: tuple[str, ...], tmp_path: P
     assert sorted(other_models(scene)) == sorted(places[1:])
 
 
-def test_refusal_of_distortion_names_what_else_is_there(tmp_path: Path) -> None:
+@pytest.mark.parametrize("packed", [False, True])
+def test_distorted_cameras_beside_undistorted_ones_are_refused(packed: bool, tmp_path: Path) -> None:
     scene = tmp_path / "scene"
+
+    def given() -> Path:
+        return tmp_path / shutil.make_archive(str(scene), "zip", scene) if packed else scene
+
     write_files(scene / "sparse/0", binary_files(DISTORTED))
-    with pytest.raises(InvalidCameras, match=r"distortion 0\.1; undistort the photos first"):
-        load_cameras(scene)
+    assert len(load_cameras(given()).distorted) == 2
+    write_files(scene / "sparse/1", binary_files(DISTORTED))  # COLMAP's second component, of the same lens
+    write_files(scene / "sparse/2", {**binary_files(), "images.bin": b"cut"})
+    assert len(load_cameras(given()).distorted) == 2
     write_files(scene / "dense/0/sparse", binary_files())
-    (scene / "transforms.json").write_text("{}")
-    with pytest.raises(InvalidCameras, match=r"such as .*/dense/0/sparse or .*/transforms\.json; else undistort"):
-        load_cameras(scene)
-    with pytest.raises(InvalidCameras, match=r"such as .*/dense/0/sparse or .*/transforms\.json; else undistort"):
-        load_cameras(scene / "sparse/0")
-    with pytest.raises(InvalidCameras, match=r"by itself, if it is, such as dense/0/sparse; else undistort"):
-        load_cameras(tmp_path / shutil.make_archive(str(scene), "zip", scene))
+    how = "zip the one alone" if packed else "name the one"
+    both = rf"distorted ones in (.*/)?sparse/0 and undistorted ones in (.*/)?dense/0/sparse; {how} whose photos"
+    with pytest.raises(InvalidCameras, match=both):
+        load_cameras(given())
+    if not packed:
+        assert len(load_cameras(scene / "sparse/0").distorted) == 2
+        assert load_cameras(scene / "dense/0/sparse").distorted == ()
+
+
+def test_distorted_photos_are_told(tmp_path: Path) -> None:
+    found = inspect_file(write_files(tmp_path / "model", binary_files(DISTORTED)))
+    assert found["distorted"] == 2
+    assert found["sizes"] == ["640x480"]  # of the photos
+    assert any("2 of 3 views are of distorted photos: features must be" in text for text in found["warnings"])
+    assert inspect_file(write_files(tmp_path / "plain", binary_files()))["distorted"] == 0
 
 
 @pytest.mark.parametrize("key", ["applied_transform", "ply_file_path"])
@@ -157,7 +172,7 @@ def test_folder_without_a_usual_name_says_what_can_be_named(tmp_path: Path) -> N
         load_cameras(write_files(tmp_path / "empty", {}))
 
 
-def test_camera_that_no_image_uses_may_be_distorted(tmp_path: Path) -> None:
+def test_camera_that_no_image_uses_may_be_of_any_model(tmp_path: Path) -> None:
     for files in (binary_files, text_files):
         assert len(names(write_files(tmp_path / files.__name__, files({**CAMERAS, **LENS})))) == 3
     unknown = text_files({**CAMERAS, 3: (99, "CROOKED", (1.0, 2.0))})  # of a binary one nobody knows the length

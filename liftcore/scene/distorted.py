@@ -1,0 +1,51 @@
+"""Distorted cameras beside undistorted ones of the same photos: which of the two is meant cannot be guessed."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from liftcore.errors import InvalidCameras
+from liftcore.scene.colmap import read_colmap
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from liftcore.scene.cameras import Camera
+
+
+def is_undistorted(model: Path) -> bool:
+    """Whether a folder has a model that reads, of pinholes alone."""
+    try:
+        return not read_colmap(model).distorted
+    except InvalidCameras:
+        return False
+
+
+def refuse_both(source: str, read: str, undistorted: Sequence[str], choose: str) -> None:
+    """Refuse distorted cameras where undistorted ones lie beside them.
+
+    Args:
+        source: what holds both. read: the distorted model. undistorted: the others. choose: how one of them is.
+
+    Raises:
+        InvalidCameras: there are others.
+    """
+    if undistorted:
+        raise InvalidCameras(
+            source,
+            expected="distorted or undistorted cameras, not both",
+            got=f"distorted ones in {read} and undistorted ones in {undistorted[0]}",
+            hint=f"{choose} whose photos the features were made of",
+        )
+
+
+def distortion_warning(views: Sequence[Camera]) -> list[str]:
+    """What is to be said of distorted views, if there are some."""
+    count = sum(camera.lens is not None for camera in views)
+    if not count:
+        return []
+    return [
+        f"{count} of {len(views)} views are of distorted photos: features must be of the photos as they were taken, "
+        "not of undistorted ones"
+    ]

@@ -1,0 +1,66 @@
+"""Pictures of distorted photos lie over the photos, pixel by pixel."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from liftcore.query.in_photo import in_photo
+from liftcore.scene.cameras import Camera
+from liftcore.scene.distortion import Brown, Distortion, Fisheye
+from liftcore.scene.lens import behind_lens, drawn_by, photo_places
+
+BARREL = Brown(k1=-0.25, k2=0.04, p1=0.002, p2=-0.001)
+PINCUSHION = Brown(k1=0.2)
+PLAIN = Camera("v", 60, 44, 48.0, 47.0, 29.0, 23.0, np.eye(4))
+
+
+def places(of: Camera) -> torch.Tensor:
+    """[H, W, 2], the places of a pinhole's own pixels."""
+    y, x = torch.meshgrid(torch.arange(of.height) + 0.5, torch.arange(of.width) + 0.5, indexing="ij")
+    return torch.stack([x, y], dim=2)
+
+
+@pytest.mark.parametrize("distortion", [BARREL, PINCUSHION])
+def test_numbers_are_interpolated_where_the_photo_shows_them(distortion: Distortion) -> None:
+    camera = behind_lens(PLAIN, distortion)
+    picture = in_photo(camera, places)  # linear, so interpolation is exact off the very border
+    assert picture.shape == (44, 60, 2)
+    wanted = torch.stack([torch.from_numpy(axis) for axis in photo_places(camera.lens)], dim=2) if camera.lens else 0
+    assert float((picture - wanted)[2:-2, 2:-2].abs().max()) < 1e-4
+    assert float((picture - wanted).abs().max()) <= 0.5
+
+
+def test_labels_are_those_of_the_nearest_pixel() -> None:
+    camera = behind_lens(PLAIN, BARREL)
+
+    def columns(of: Camera) -> torch.Tensor:
+        return torch.arange(of.width, dtype=torch.int32).expand(of.height, -1)
+
+    picture = in_photo(camera, columns)
+    assert picture.dtype == torch.int32
+    assert camera.lens is not None
+    assert torch.equal(picture, torch.from_numpy(np.floor(photo_places(camera.lens)[0])).to(torch.int32))
+
+
+def test_a_photo_without_a_lens_is_as_drawn() -> None:
+    drawn = torch.rand(44, 60)
+    assert in_photo(PLAIN, lambda _: drawn) is drawn
+
+
+def test_the_rim_that_no_pinhole_sees_is_empty() -> None:
+    whole = Camera("v", 160, 160, 50.0, 50.0, 80.0, 80.0, np.eye(4))
+    camera = behind_lens(whole, Fisheye())
+    for dtype in (torch.float32, torch.int32):
+        picture = in_photo(camera, lambda of: torch.ones(of.height, of.width, dtype=dtype))  # noqa: B023 - called here
+        assert float(picture[80, 80]) == 1
+        assert float(picture[0, 0]) == float(picture[80, 0]) == 0
+    assert drawn_by(camera).width < 180
+
+
+def test_large_pictures_are_carried_in_bands_to_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
+    camera = behind_lens(PLAIN, BARREL)
+    whole = in_photo(camera, places)
+    monkeypatch.setattr("liftcore.query.in_photo.BAND_PIXELS", 1)
+    assert torch.equal(in_photo(camera, places), whole)

@@ -1,0 +1,113 @@
+"""Distorted photos, from files to pictures: features reach the splats that the photos show, masks lie over them."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from liftcore.artifact import Lift, save_lift
+from liftcore.errors import InvalidQuery
+from liftcore.lift import lift
+from liftcore.query.ask import ask, look
+from liftcore.query.example import Pixel, Region
+from liftcore.query.pictures import render_png
+from liftcore.query.query import Query
+from liftcore.query.scene import QueryScene
+from liftcore.scene.cameras import Camera
+from liftcore.scene.load import load_cameras
+from liftcore.solve.settings import LiftSettings
+from tests.distorted_scene import (
+    HEIGHT,
+    LENSES,
+    VIEWS,
+    WIDTH,
+    is_clear,
+    photo_of,
+    quarter,
+    wall,
+    write_distorted_scene,
+)
+
+CLEAR = 0.1  # from the border of a quarter: two standard deviations of a splat, or three pixels
+
+
+def lifted(folder: Path, lens: str, *, grids: bool = False) -> Lift:
+    splats, cameras, features = write_distorted_scene(folder, lens, grids=grids)
+    return lift(splats, cameras, [features], LiftSettings.of(preset="row-sum"))
+
+
+def share_of_own_quarter(made: Lift) -> torch.Tensor:
+    """Of each seen splat that lies clear of borders, the share of its own quarter in its feature."""
+    x, y = (axis.numpy() for axis in wall().means.T[:2])
+    clear = is_clear(x, y, CLEAR) & made.seen.numpy()
+    own = made.features.float()[torch.arange(len(x)), torch.from_numpy(quarter(x, y))]
+    return (own / made.features.float().sum(dim=1)).nan_to_num(nan=1.0)[torch.from_numpy(clear)]
+
+
+@pytest.mark.parametrize("grids", [False, True])
+@pytest.mark.parametrize("lens", LENSES)
+def test_features_reach_the_splats_that_the_photo_shows(lens: str, grids: bool, tmp_path: Path) -> None:
+    made = lifted(tmp_path, lens, grids=grids)
+    shares = share_of_own_quarter(made)
+    assert len(shares) > 500
+    assert float(shares.min()) > 0.9
+    assert any("distorted photos" in text for text in made.metadata.certificate["warnings"])
+    # The same maps taken for a pinhole's put the border elsewhere.
+    document = json.loads((tmp_path / "transforms.json").read_text())
+    plain = {key: value for key, value in document.items() if key not in LENSES[lens][0]}
+    (tmp_path / "transforms.json").write_text(json.dumps(plain))
+    paths = tmp_path / "splats.ply", tmp_path / "transforms.json"
+    ignored = lift(*paths, [tmp_path / "features.safetensors"], LiftSettings.of(preset="row-sum"))
+    assert float(share_of_own_quarter(ignored).min()) < 0.5
+    assert not any("distorted photos" in text for text in ignored.metadata.certificate["warnings"])
+
+
+def is_lifted(camera: Camera) -> np.ndarray:
+    """[H, W] bool, the pixels of the photo that the camera's pinhole sees."""
+    assert camera.lens is not None
+    v, u = np.meshgrid(np.arange(HEIGHT) + 0.5, np.arange(WIDTH) + 0.5, indexing="ij")
+    x, y = camera.lens.on_plane(u, v)
+    x, y = x * camera.fx + camera.cx, y * camera.fy + camera.cy
+    return (x >= 0) & (x <= camera.width) & (y >= 0) & (y <= camera.height)
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_masks_lie_over_the_photo(lens: str, tmp_path: Path) -> None:
+    save_lift(lifted(tmp_path, lens), tmp_path / "made.safetensors")
+    scene = QueryScene.open(tmp_path / "made.safetensors")
+    for view in VIEWS:
+        photo = np.where(is_lifted(scene.cameras.get(view)), photo_of(view, lens, CLEAR), -1)
+        for part in np.unique(photo[photo >= 0]):
+            y, x = np.argwhere(photo == part)[len(np.argwhere(photo == part)) // 2]
+            answer = ask(scene, Query((Pixel(view, int(x), int(y)),), threshold=0.5))
+            seen = look(scene, answer, view)
+            assert seen.mask.shape == photo.shape
+            found, truth = seen.mask.numpy() & (photo >= 0), photo == part
+            assert (found & truth).sum() / (found | truth).sum() > 0.99
+    answer = ask(scene, Query((Region("left", 0, 1),), threshold=0.5))
+    shown = is_lifted(scene.cameras.get("left")) & (photo_of("left", lens, CLEAR) == 1)
+    assert look(scene, answer, "left").mask.numpy()[shown].all()
+    with pytest.raises(InvalidQuery, match=rf"x in 0\.\.{WIDTH - 1} and y in 0\.\.{HEIGHT - 1}, got {WIDTH},0"):
+        ask(scene, Query((Pixel("left", WIDTH, 0),)))
+    for what in ("rgb", "pca", "depth"):
+        picture = Image.open(io.BytesIO(render_png(scene, "left", what)))
+        assert picture.size == (WIDTH, HEIGHT)
+        assert np.asarray(picture).max() > 0
+
+
+def test_a_pixel_at_the_rim_of_a_wide_photo_has_no_pinhole(tmp_path: Path) -> None:
+    document = {"w": 400, "h": 40, "fl_x": 100, "fl_y": 100, "camera_model": "OPENCV_FISHEYE"}
+    save_lift(lifted(tmp_path, "fisheye"), tmp_path / "made.safetensors")
+    scene = QueryScene.open(tmp_path / "made.safetensors")
+    frame = {"file_path": "wide.jpg", "transform_matrix": np.diag([1.0, -1.0, -1.0, 1.0]).tolist()}
+    (tmp_path / "wide.json").write_text(json.dumps({**document, "frames": [frame]}))
+    scene.__dict__["cameras"] = load_cameras(tmp_path / "wide.json")
+    assert len(ask(scene, Query((Pixel("wide", 200, 20),), threshold=0.5)).scores) == 3600
+    with pytest.raises(InvalidQuery, match="a pixel that a pinhole sees, got one at the rim of a wide lens; pick"):
+        ask(scene, Query((Pixel("wide", 2, 20),)))
