@@ -96,8 +96,12 @@ def no_views() -> bytes:
     return json.dumps(cameras_document() | {"frames": []}).encode()
 
 
-def distorted() -> bytes:
-    return json.dumps(cameras_document() | {"k1": 0.3, "camera_model": "OPENCV"}).encode()
+def distortion_that_turns_back() -> bytes:
+    return json.dumps(cameras_document() | {"k1": -9.0, "camera_model": "OPENCV"}).encode()
+
+
+def distortion_of_a_thin_prism() -> bytes:
+    return json.dumps(cameras_document() | {"k1": 0.3, "s1": 0.01, "camera_model": "OPENCV"}).encode()
 
 
 def label_out_of_the_codebook() -> bytes:
@@ -161,7 +165,8 @@ BAD: list[tuple[str, Callable[[], bytes]]] = [
     ("cameras", nameless_camera),
     ("cameras", camera_that_no_query_can_name),
     ("cameras", no_views),
-    ("cameras", distorted),
+    ("cameras", distortion_that_turns_back),
+    ("cameras", distortion_of_a_thin_prism),
     ("cameras", garbage),
     ("features", label_out_of_the_codebook),
     ("features", codebook_with_nan),
