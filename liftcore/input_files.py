@@ -3,23 +3,40 @@
 from __future__ import annotations
 
 import hashlib
-from pathlib import Path
+import os
+from typing import TYPE_CHECKING
 
 from liftcore.artifact import InputFile
-from liftcore.scene.load import camera_files
+from liftcore.scene.camera_source import camera_source
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+
+def input_files(splats: Path, cameras: Path, features: Sequence[Path]) -> list[InputFile]:
+    """The inputs of a lift: splats, cameras and feature packs."""
+    return [input_file(splats), camera_input(cameras), *(input_file(pack) for pack in features)]
 
 
 def input_file(path: Path) -> InputFile:
-    """Where an input is and what it is: the digest of the file, or of the names and digests of a folder's cameras.
+    """Where a file is, and its digest."""
+    resolved = path.resolve()
+    return InputFile(path=str(resolved), sha256=sha256_of(resolved))
+
+
+def camera_input(path: Path) -> InputFile:
+    """Where cameras are, and the digest of their file or, of several, of the names and digests of all that are read.
 
     Photos, features and lifts that lie in the same folder do not count: they may come and go.
     """
     resolved = path.resolve()
-    if not resolved.is_dir():
-        return InputFile(path=str(resolved), sha256=sha256_of(resolved))
-    total = hashlib.sha256()
-    for part in camera_files(resolved):
-        total.update(f"{part.relative_to(resolved)} {sha256_of(part)}\n".encode())
+    files = camera_source(resolved).files
+    if files == [resolved]:
+        return input_file(resolved)
+    folder, total = resolved if resolved.is_dir() else resolved.parent, hashlib.sha256()
+    for part in files:
+        total.update(f"{os.path.relpath(part, folder)} {sha256_of(part)}\n".encode())
     return InputFile(path=str(resolved), sha256=total.hexdigest())
 
 

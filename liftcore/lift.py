@@ -13,7 +13,7 @@ from liftcore import __version__
 from liftcore.artifact import Lift, LiftMetadata
 from liftcore.device import Device, choose_device, within_memory
 from liftcore.errors import InvalidFeatures
-from liftcore.input_files import input_file
+from liftcore.input_files import input_files
 from liftcore.observe.pack import FeaturePacks, open_packs, pair
 from liftcore.plan.plan import plan_lift
 from liftcore.progress import Progress, silent
@@ -106,7 +106,7 @@ def lift(
     with run.timings.stage("read"):
         sources = open_sources(scene, views, packs, settings)
     with run.timings.stage("digest"):
-        inputs = [input_file(path) for path in (scene, views, *packs)]
+        inputs = input_files(scene, views, packs)
     return lift_sources(run, sources, inputs, checkpoint)
 
 

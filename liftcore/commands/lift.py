@@ -24,9 +24,9 @@ def run(options: argparse.Namespace) -> int:
     settings = settings_of(options)
     from liftcore.artifact import save_lift
     from liftcore.lift import lift
-    from liftcore.scene.load import camera_files
+    from liftcore.scene.camera_source import camera_source
 
-    views = camera_files(options.cameras) if options.cameras.is_dir() else [options.cameras]
+    views = camera_source(options.cameras).files
     out = free_output(options.output, [options.splats, *views, *options.features])
 
     told: Sequence[str] = ()

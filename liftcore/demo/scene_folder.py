@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
 _CAMERA_FILES = ("cameras.json", "transforms.json", "cameras.zip")
-_MODEL_FOLDERS = ("sparse/0", "sparse")
 _TABLE = "text_table.safetensors"
 _BUILT_IN = "minilm"  # the text encoder that needs no files
 _PHRASES = 3  # asked when nobody says which
@@ -100,20 +99,22 @@ def _first(folder: Path, pattern: str, what: str) -> Path:
 
 
 def _cameras(folder: Path, scratch: Path) -> Path:
-    for name in _CAMERA_FILES:
-        if (folder / name).is_file():
-            return folder / name
-    for name in _MODEL_FOLDERS:
-        files = sorted(path for path in (folder / name).glob("*") if path.suffix in (".bin", ".txt"))
-        if files:
-            scratch.mkdir(parents=True, exist_ok=True)
-            packed = scratch / "cameras.zip"
-            with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
-                for file in files:
-                    archive.write(file, file.name)
-            return packed
-    wanted = ", ".join([*_CAMERA_FILES, *_MODEL_FOLDERS])
-    raise InvalidInput(f"cameras of {folder.name}", expected=f"one of {wanted}", got="none")
+    """The one file of the cameras; of several, such as a COLMAP model's, a zip in ``scratch``."""
+    from liftcore.scene.camera_source import camera_source
+
+    named = [folder / name for name in _CAMERA_FILES if (folder / name).is_file()]
+    files = [file for file in camera_source(named[0] if named else folder).files if file.is_file()]
+    if not files:
+        wanted = ", ".join([*_CAMERA_FILES, "sparse/0"])
+        raise InvalidInput(f"cameras of {folder.name}", expected=f"one of {wanted}", got="none")
+    if len(files) == 1:
+        return files[0]
+    scratch.mkdir(parents=True, exist_ok=True)
+    packed = scratch / "cameras.zip"
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+        for file in files:
+            archive.write(file, file.name)
+    return packed
 
 
 def _features(folder: Path) -> Path:

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from liftcore.device import CPU
-from liftcore.input_files import input_file
+from liftcore.input_files import input_files
 from liftcore.lift import Run, lift_sources, open_sources
 from liftcore.measure.hardware import hardware, machine_line
 from liftcore.measure.tradeoff.judge import cosine_figures
@@ -38,7 +38,7 @@ def measure_dial(
 ) -> list[dict[str, Any]]:
     """A row of plain numbers for each speed, ``exact`` first whether it is asked for or not."""
     splats, cameras, features = (folder / name for name in ("point_cloud.ply", "cameras.json", pack))
-    inputs = [input_file(path) for path in (splats, cameras, features)]
+    inputs = input_files(splats, cameras, [features])
     chosen = list(dict.fromkeys([Speed.EXACT, *speeds]))
     seconds: dict[Speed, float] = {}
     made: dict[Speed, Lift] = {}

@@ -31,9 +31,10 @@ def unchanged(role: str, remembered: InputFile, lift: Path) -> Path:
             hint=f"move the {role} back to {path}, or lift again from where they are now",
         )
     # The lift's own digest: one definition for files and folders, where it was taken and where it is checked.
-    from liftcore.input_files import input_file
+    from liftcore.input_files import camera_input, input_file
 
-    if input_file(path).sha256 != remembered.sha256:
+    found = (camera_input if role == "cameras" else input_file)(path)
+    if found.sha256 != remembered.sha256:
         raise InvalidLift(
             str(lift),
             expected=f"the {role} that were lifted at {path}",

@@ -126,6 +126,7 @@ class Cameras:
     """The views of a scene, in file order, looked up by name."""
 
     views: tuple[Camera, ...]
+    frame: str | None = None  # the name of the file by which they were moved to the frame of the splats
 
     def __post_init__(self) -> None:
         if not self.views:

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import zipfile
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
 from liftcore.raster.constants import ALPHA_FLOOR
+from liftcore.scene.camera_source import TRANSFORMS, camera_source, is_of_nerfstudio
 from liftcore.scene.distorted import distortion_warning
 from liftcore.scene.foreign import SUFFIXES
+from liftcore.scene.frame import FRAME_FILE
 from liftcore.scene.lens import photo_size
-from liftcore.scene.load import camera_files, is_of_nerfstudio, load_cameras, load_splats, other_models
+from liftcore.scene.load import load_cameras, load_splats, other_models
 from liftcore.scene.ply_dialect import nearest_dialect
 from liftcore.scene.splats import Kernel
 
@@ -30,7 +33,11 @@ LARGEST = 1e300  # shown in place of what overflows, which JSON cannot hold
 OFF_CENTRE = 0.1  # of the image's side
 OWN_FRAME = (
     "poses of nerfstudio's own files: it trains in another frame than they are in, unless it was told "
-    "--orientation-method none --center-method none --auto-scale-poses False, and the splats must lie in this one"
+    f"--orientation-method none --center-method none --auto-scale-poses False. Put its run's {FRAME_FILE} beside them"
+)
+OTHER_FRAME = (
+    f"the COLMAP model was read, and beside it lies nerfstudio's {TRANSFORMS}, which is in another frame: if "
+    f"nerfstudio trained the splats, put its run's {FRAME_FILE} beside them"
 )
 SHOWN = 3  # names in a warning
 MANY = 100  # splats: what all of so many have in common is no accident
@@ -50,7 +57,7 @@ def inspect_file(path: Path) -> dict[str, Any]:
     if is_splats(path):
         return {"kind": "splats", "bytes": path.stat().st_size, **describe_splats(load_splats(path))}
     found = describe_camera_file(path)  # first: which of its files are there is told better by who reads them
-    size = sum(file.stat().st_size for file in ([path] if path.is_file() else camera_files(path)))
+    size = sum(file.stat().st_size for file in camera_source(path).files)
     return {"kind": "cameras", "bytes": size, **found}
 
 
@@ -91,8 +98,8 @@ def describe_camera_file(path: Path) -> dict[str, Any]:
     found, others = describe_cameras(load_cameras(path)), other_models(path)
     if others:
         found["warnings"].append(f"{len(others)} more COLMAP models were not read: {', '.join(others[:SHOWN])}")
-    if is_of_nerfstudio(path):
-        found["warnings"].append(OWN_FRAME)
+    if found["frame"] is None:
+        found["warnings"] += _frame_warnings(path)
     return found
 
 
@@ -106,10 +113,22 @@ def describe_cameras(cameras: Cameras) -> dict[str, Any]:
         "names": [camera.name for camera in cameras],
         "sizes": sizes,
         "distorted": len(cameras.distorted),
+        "frame": cameras.frame,
         "focal_lengths": {"min": min(focals), "max": max(focals)},
         "box": [centres.min(axis=0).tolist(), centres.max(axis=0).tolist()],
         "warnings": _camera_warnings(cameras, centres),
     }
+
+
+def _frame_warnings(path: Path) -> list[str]:
+    """What is to be said of cameras that may not be in the frame of their splats."""
+    source = camera_source(path)
+    if source.model is not None:
+        beside = path / TRANSFORMS
+        return [OTHER_FRAME] if beside.is_file() and is_of_nerfstudio(beside) else []
+    if source.file is None or zipfile.is_zipfile(source.file) or not is_of_nerfstudio(source.file):
+        return []
+    return [OWN_FRAME]
 
 
 def _quantiles(values: Tensor) -> dict[str, float]:

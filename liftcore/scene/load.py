@@ -6,15 +6,11 @@ import zipfile
 from typing import TYPE_CHECKING
 
 from liftcore.errors import InvalidCameras, InvalidSplats
-from liftcore.scene.cameras import told_of
-from liftcore.scene.colmap import MODEL_FILES, has_model, is_whole, model_files, read_colmap
+from liftcore.scene.camera_source import camera_source
+from liftcore.scene.camera_zip import models_in_zip, read_camera_zip
 from liftcore.scene.distorted import is_undistorted, refuse_both
 from liftcore.scene.foreign import LFS_POINTER, refuse_pointer
-from liftcore.scene.inria import parse_inria
-from liftcore.scene.json_file import read_json
-from liftcore.scene.model_folders import model_folder, models_below
-from liftcore.scene.model_zip import models_in_zip, read_model_zip
-from liftcore.scene.transforms import parse_transforms
+from liftcore.scene.model_folders import models_below
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -22,7 +18,6 @@ if TYPE_CHECKING:
     from liftcore.scene.cameras import Cameras
     from liftcore.scene.splats import Kernel, Splats
 
-JSON_FILES = ("transforms.json", "cameras.json")
 CAMERA_FORMATS = "a COLMAP sparse model (folder or .zip), a transforms.json or a cameras.json"
 PICKLED = (".pt", ".pth", ".ckpt", ".pkl")
 
@@ -61,7 +56,7 @@ def _begins(path: Path, first: bytes) -> bool:
 
 
 def load_cameras(path: Path) -> Cameras:
-    """Read cameras from a folder, a JSON file or a zipped COLMAP model, recognised by content.
+    """Read cameras from a folder, a JSON file or a zip, recognised by content (`camera_source`).
 
     Raises:
         InvalidCameras: nothing here is a camera format that we know, or what it holds is malformed.
@@ -72,29 +67,19 @@ def load_cameras(path: Path) -> Cameras:
         raise InvalidCameras(str(path), expected=CAMERA_FORMATS, got="no such file or folder")
     try:
         if zipfile.is_zipfile(path):
-            return read_model_zip(path)
+            return read_camera_zip(path)
         with path.open("rb") as handle:
             start = handle.read(64).lstrip(b"\xef\xbb\xbf \t\r\n")
     except OSError as error:
         got = f"a file that does not open ({error.strerror})"
         raise InvalidCameras(str(path), expected=CAMERA_FORMATS, got=got) from None
-    if path.name in MODEL_FILES and has_model(path.parent):
-        return read_colmap(path.parent)
-    if start[:1] not in (b"[", b"{"):
+    source = camera_source(path)
+    if source.model is None and start[:1] not in (b"[", b"{"):
         refuse_pointer(str(path), start)
         got = f"a file that begins with {start[:8]!r}" if start else "an empty file"
         hint = "of a COLMAP model give the folder, or a zip of its cameras.* and images.* together"
         raise InvalidCameras(str(path), expected=CAMERA_FORMATS, got=got, hint=hint)
-    return _from_json(path)
-
-
-def camera_files(folder: Path) -> list[Path]:
-    """The files of a folder that its cameras are read from: a whole model, else a JSON file, else half a model."""
-    model = model_folder(folder)
-    documents = [folder / name for name in JSON_FILES if (folder / name).is_file()]
-    if model is not None and (is_whole(model) or not documents):
-        return model_files(model)
-    return documents[:1]
+    return source.read()
 
 
 def other_models(path: Path) -> list[str]:
@@ -103,34 +88,22 @@ def other_models(path: Path) -> list[str]:
     COLMAP writes several where photos did not all hang together, each in a frame of its own.
     """
     if path.is_dir():
-        files = camera_files(path)
-        return [str(model) for model in models_below(path) if len(files) > 1 and path / model != files[0].parent]
+        read = camera_source(path).model
+        return [] if read is None else [str(model) for model in models_below(path) if path / model != read]
     return models_in_zip(path)[1:] if zipfile.is_zipfile(path) else []
 
 
-def is_of_nerfstudio(path: Path) -> bool:
-    """Whether cameras are read from a transforms.json that nerfstudio's own converter wrote."""
-    files = camera_files(path) if path.is_dir() else [path]
-    if len(files) != 1 or files[0].name in MODEL_FILES or zipfile.is_zipfile(files[0]):
-        return False
-    document = read_json(files[0])
-    return isinstance(document, dict) and ("applied_transform" in document or "ply_file_path" in document)
-
-
 def _from_folder(folder: Path) -> Cameras:
-    files = camera_files(folder)
-    if len(files) == 1:
-        return _from_json(files[0])
-    if not files:
+    source = camera_source(folder)
+    if source.model is None and source.file is None:
         others = _cameras_below(folder)
         hint = f"name what is meant, such as {_some(others)}" if others else ""
         got = "a folder without any of them" + (" at the usual places" if others else "")
         raise InvalidCameras(str(folder), expected=CAMERA_FORMATS, got=got, hint=hint)
-    cameras = read_colmap(files[0].parent)
-    if cameras.distorted:
-        others = [model for model in models_below(folder) if folder / model != files[0].parent]
-        straight = [str(folder / model) for model in others if is_undistorted(folder / model)]
-        refuse_both(str(folder), str(files[0].parent), straight, "name the one")
+    cameras = source.read()
+    if source.model is not None and cameras.distorted:
+        straight = [str(folder / model) for model in other_models(folder) if is_undistorted(folder / model)]
+        refuse_both(str(folder), str(source.model), straight, "name the one")
     return cameras
 
 
@@ -140,9 +113,3 @@ def _cameras_below(scene: Path) -> list[Path]:
 
 def _some(paths: list[Path]) -> str:
     return " or ".join(str(path) for path in paths[:2])
-
-
-def _from_json(path: Path) -> Cameras:
-    document = read_json(path)
-    with told_of(str(path)):
-        return (parse_inria if isinstance(document, list) else parse_transforms)(document, str(path))

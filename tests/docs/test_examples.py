@@ -71,7 +71,7 @@ def test_sams_masks_make_a_lift_that_knows_the_words(scene_folder: Path, monkeyp
     for name, module in stand_ins().items():
         monkeypatch.setitem(sys.modules, name, module)
     run_example("from segment_anything import")
-    commands = commands_between("### From SAM's masks", "\n## ", scene_folder)
+    commands = commands_between("### From SAM's masks", "\n### ", scene_folder)
     assert [command[0] for command in commands] == ["pack", "lift"]
     question = ["query", "scene.lift.safetensors", "apple", "--table", "words.safetensors", "--view", "middle"]
     assert [main(command) for command in [*commands, [*question, "--mask", "apple.png"]]] == [0, 0, 0]

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from liftcore.device import choose_device
 from liftcore.errors import SplatliftError
-from liftcore.input_files import input_file
+from liftcore.input_files import input_files
 from liftcore.lift import Run, lift_sources, open_sources
 from liftcore.measure.hardware import peak_memory
 from liftcore.measure.tradeoff.judge import judge
@@ -44,8 +44,7 @@ def measured(order: Order) -> dict[str, Any]:
     sources = replace(sources, views=[view for view in sources.views if view in wanted])
     read = {"cpu": time.process_time() - cpu, "wall": time.perf_counter() - wall}
     with run.timings.stage("digest"):
-        files = (order.scene.splats, order.scene.cameras, *order.scene.features)
-        inputs = [input_file(path) for path in files]
+        inputs = input_files(order.scene.splats, order.scene.cameras, order.scene.features)
     with run.timings.stage("compile"):
         warm_up_lift(sources.splats.kernel, run.device, settings)  # the lift's own then takes no time
     cpu, wall = time.process_time(), time.perf_counter()

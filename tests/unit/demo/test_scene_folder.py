@@ -14,6 +14,7 @@ from safetensors.torch import save_file
 
 from liftcore.demo.scene_folder import find_scene
 from liftcore.errors import InvalidInput
+from liftcore.scene.frame import FRAME_FILE
 
 INRIA_CAMERA = {
     "id": 0, "img_name": "v", "width": 4, "height": 3, "fx": 4.0, "fy": 4.0,
@@ -49,6 +50,17 @@ def test_a_scene_is_found_by_what_its_files_are(folder: Path, tmp_path: Path) ->
     mask = scene.truth.mask_of("the fish", "v")
     assert mask is not None and mask.tolist() == [[False, False, True]]
     assert scene.truth.mask_of("the unknown", "v") is None
+
+
+def test_cameras_go_up_with_the_frame_of_their_splats(folder: Path, tmp_path: Path) -> None:
+    (folder / "transforms.json").touch()
+    assert find_scene(folder, (), tmp_path / "scratch").cameras == folder / "transforms.json"
+    (folder / FRAME_FILE).touch()
+    packed = find_scene(folder, (), tmp_path / "scratch").cameras
+    assert zipfile.ZipFile(packed).namelist() == ["transforms.json", FRAME_FILE]
+    (folder / "transforms.json").unlink()
+    packed = find_scene(folder, (), tmp_path / "scratch").cameras
+    assert zipfile.ZipFile(packed).namelist() == ["cameras.bin", "images.bin", FRAME_FILE]
 
 
 def test_phrases_of_the_user_come_first_and_a_table_is_the_encoder(folder: Path, tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from camera_documents import assert_same, with_json
 from colmap_files import IMAGES, binary_files, text_files, write_files
 
 from liftcore.errors import InvalidCameras, InvalidSplats
-from liftcore.scene import json_file, model_zip
+from liftcore.scene import camera_zip, json_file
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.distortion import Brown, Fisheye
 from liftcore.scene.inria import write_inria_cameras
@@ -76,7 +76,7 @@ def test_models_that_are_not_read_are_told(packed: bool, tmp_path: Path) -> None
 
 
 def test_zip_bomb_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(model_zip, "MAX_UNZIPPED_BYTES", 1000)
+    monkeypatch.setattr(camera_zip, "MAX_UNZIPPED_BYTES", 1000)
     path = tmp_path / "bomb.zip"
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("cameras.bin", bytes(100_000))

@@ -209,7 +209,7 @@ def test_zip_with_other_separators_is_read(root: str, tmp_path: Path) -> None:
     [
         ("sparse/0/cameras.bin", r"got 'sparse/0/cameras\.bin' without 'images\.bin'; zip both"),
         ("images.txt", r"got 'images\.txt' without 'cameras\.txt'; zip both"),
-        ("data/transforms.json", r"got 'data/transforms\.json'; give the JSON file itself"),
+        ("data/transforms.json", r"got 'data/transforms\.json'; give the JSON file itself, or zip it with"),
         ("photo.jpg", r"got none; zip the folder that has cameras\.bin"),
     ],
 )

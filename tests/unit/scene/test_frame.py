@@ -1,0 +1,253 @@
+"""Cameras in the frame that nerfstudio and gsplat train in, told by the file that nerfstudio writes."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from camera_documents import FLIP, assert_same, transforms_of
+from colmap_files import CAMERAS, binary_files, write_files
+from scipy.spatial.transform import Rotation
+
+from liftcore.errors import InvalidCameras
+from liftcore.input_files import camera_input
+from liftcore.scene.cameras import Camera, Cameras
+from liftcore.scene.frame import FRAME_FILE, Similarity
+from liftcore.scene.inria import write_inria_cameras
+from liftcore.scene.inspect import inspect_file
+from liftcore.scene.load import load_cameras
+
+APPLIED = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])  # of nerfstudio's converter
+SCALE, APPLIED_SCALE = 0.37, 4.0
+
+
+def oriented() -> np.ndarray:
+    """[4, 4], how a run turns and centres the poses of its transforms.json."""
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_euler("xyz", [20, -35, 70], degrees=True).as_matrix()
+    pose[:3, 3] = (0.4, -1.3, 2.2)
+    return pose
+
+
+def trained(poses: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Camera-to-world poses of a transforms.json as nerfstudio trains on them: moved, then scaled."""
+    moved = {name: oriented() @ pose for name, pose in poses.items()}
+    return {name: np.vstack([np.hstack([p[:3, :3], SCALE * p[:3, 3:]]), p[3:]]) for name, p in moved.items()}
+
+
+@pytest.fixture
+def model(tmp_path: Path) -> Path:
+    return write_files(tmp_path / "model", binary_files())
+
+
+@pytest.fixture
+def run(tmp_path: Path, model: Path) -> Path:
+    """A folder with the transforms.json of the model's poses, and the file of a run."""
+    document, poses = transforms_of(load_cameras(model)), {}
+    for record in document["frames"]:
+        poses[record["file_path"]] = APPLIED @ np.array(record["transform_matrix"])
+        record["transform_matrix"] = poses[record["file_path"]].tolist()
+    folder = tmp_path / "run"
+    folder.mkdir()
+    (folder / "transforms.json").write_text(json.dumps({**document, "applied_transform": APPLIED[:3].tolist()}))
+    (folder / FRAME_FILE).write_text(json.dumps({"transform": (oriented() @ APPLIED)[:3].tolist(), "scale": SCALE}))
+    (folder.parent / "trained.json").write_text(json.dumps({k: v.tolist() for k, v in trained(poses).items()}))
+    return folder
+
+
+@pytest.fixture
+def expected(run: Path, model: Path) -> Cameras:
+    """The model's cameras with the poses that nerfstudio trains on."""
+    poses = json.loads((run.parent / "trained.json").read_text())
+    views = []
+    for camera, pose in zip(load_cameras(model), poses.values(), strict=True):
+        sizes = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+        views.append(Camera(camera.name, *sizes, world_to_camera=np.linalg.inv(np.array(pose) @ FLIP)))
+    return Cameras(tuple(views))
+
+
+def test_poses_of_a_transforms_json_are_moved_as_nerfstudio_moves_them(run: Path, expected: Cameras) -> None:
+    for path in (run, run / "transforms.json"):
+        cameras = load_cameras(path)
+        assert cameras.frame == FRAME_FILE
+        assert_same(cameras, expected)
+    (run / FRAME_FILE).unlink()
+    assert load_cameras(run).frame is None
+    with pytest.raises(AssertionError):
+        assert_same(load_cameras(run), expected)
+
+
+def test_scale_that_was_applied_before_is_not_applied_twice(run: Path, expected: Cameras) -> None:
+    document = json.loads((run / "transforms.json").read_text())
+    (run / "transforms.json").write_text(json.dumps({**document, "applied_scale": APPLIED_SCALE}))
+    told = json.loads((run / FRAME_FILE).read_text())
+    (run / FRAME_FILE).write_text(json.dumps({**told, "scale": SCALE * APPLIED_SCALE}))  # what nerfstudio then writes
+    assert_same(load_cameras(run), expected)
+
+
+@pytest.mark.parametrize("place", [".", "sparse/0", "colmap/sparse/0"])
+def test_models_are_moved_to_the_same_frame(
+    place: str, run: Path, model: Path, expected: Cameras, tmp_path: Path
+) -> None:
+    scene = tmp_path / "scene"
+    shutil.copytree(model, scene / place)
+    shutil.copy(run / FRAME_FILE, scene)
+    for path in (scene, scene / place, scene / place / "images.bin"):
+        assert_same(load_cameras(path), expected)
+    assert_same(load_cameras(Path(shutil.make_archive(str(scene), "zip", scene))), expected)
+
+
+def test_transforms_json_comes_before_a_model_where_the_frame_is_told(
+    run: Path, model: Path, expected: Cameras
+) -> None:
+    document = json.loads((run / "transforms.json").read_text())
+    del document["applied_transform"]  # of a capture whose poses are no COLMAP model's
+    (run / "transforms.json").write_text(json.dumps(document))
+    (run / FRAME_FILE).write_text(json.dumps({"transform": oriented()[:3].tolist(), "scale": SCALE}))
+    shutil.copytree(model, run / "colmap/sparse/0")
+    for path in (run, Path(shutil.make_archive(str(run), "zip", run))):
+        assert_same(load_cameras(path), expected)
+
+
+@pytest.mark.parametrize("flat", [False, True])
+def test_zip_of_the_two_files_is_read(flat: bool, run: Path, expected: Cameras, tmp_path: Path) -> None:
+    scene = tmp_path / "scene"
+    inner = scene if flat else scene / "outputs/splatfacto/2026-01-01"
+    inner.mkdir(parents=True)
+    shutil.copy(run / "transforms.json", scene)
+    shutil.copy(run / FRAME_FILE, inner)
+    path = Path(shutil.make_archive(str(scene), "zip", scene))
+    assert_same(load_cameras(path), expected)
+    assert inspect_file(path)["warnings"] == []
+
+
+def test_pixels_show_what_they_showed(model: Path) -> None:
+    rng = np.random.default_rng(0)
+    points = np.concatenate([rng.normal(size=(50, 3)), np.ones((50, 1))], axis=1)
+    matrix = np.eye(4)
+    matrix[:3] = 2.5 * oriented()[:3]
+    moved = points @ matrix.T
+    for before, after in zip(
+        load_cameras(model), Similarity.of(matrix, "here").moved(load_cameras(model)), strict=True
+    ):
+        assert np.allclose((moved @ after.world_to_camera.T)[:, :3], 2.5 * (points @ before.world_to_camera.T)[:, :3])
+
+
+def test_transform_of_gsplat_holds_its_scale(run: Path, expected: Cameras, model: Path, tmp_path: Path) -> None:
+    """Its ``Parser.transform`` written in nerfstudio's layout, as README has it."""
+    transform = oriented() @ APPLIED
+    transform[:3] *= SCALE
+    scene = tmp_path / "scene"
+    shutil.copytree(model, scene / "sparse/0")
+    (scene / FRAME_FILE).write_text(json.dumps({"transform": transform[:3].tolist(), "scale": 1.0}))
+    assert_same(load_cameras(scene), expected)
+
+
+def test_lenses_stay_as_they_are(run: Path, tmp_path: Path) -> None:
+    scene = tmp_path / "scene"
+    write_files(scene / "sparse/0", binary_files({**CAMERAS, 1: (2, "SIMPLE_RADIAL", (500.0, 320.0, 240.0, 0.1))}))
+    before = load_cameras(scene)
+    shutil.copy(run / FRAME_FILE, scene)
+    after = load_cameras(scene)
+    assert [view.lens for view in after] == [view.lens for view in before]
+    assert len(after.distorted) == 2
+
+
+@pytest.mark.parametrize(
+    ("told", "message"),
+    [
+        ([1], "an object with 'transform', got list"),
+        ({"scale": 1}, "an object with 'transform'"),
+        ({"transform": np.eye(4)[:3].tolist()}, "an object with 'scale'"),
+        ({"transform": np.eye(3).tolist(), "scale": 1}, "a 3x4 or 4x4 matrix"),
+        ({"transform": np.diag([1.0, 1, -1, 1]).tolist(), "scale": 1}, "a proper rotation .* a determinant of -1"),
+        ({"transform": np.zeros((3, 4)).tolist(), "scale": 1}, "a determinant of 0"),
+        (
+            {"transform": np.diag([1.0, 1, 2, 1]).tolist(), "scale": 1},
+            "a rotation, a shift and a scale, got a matrix off",
+        ),
+        ({"transform": np.eye(4).tolist(), "scale": 0}, r"scale: expected a scale in 1e-09\.\.1e\+09, got 0"),
+        ({"transform": np.eye(4).tolist(), "scale": 1e300}, "scale: expected a scale in"),
+        ({"transform": np.diag([1e12, 1e12, 1e12, 1]).tolist(), "scale": 1}, "numbers within 1e"),
+        ({"transform": [[float("nan")] * 4] * 3, "scale": 1}, "a finite number"),
+    ],
+)
+def test_frame_that_is_none_is_refused(told: Any, message: str, run: Path) -> None:
+    (run / FRAME_FILE).write_text(json.dumps(told))
+    with pytest.raises(InvalidCameras, match=rf"dataparser_transforms\.json.*{message}"):
+        load_cameras(run)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("applied_transform", np.zeros((3, 4)).tolist(), "applied_transform: expected a proper rotation"),
+        ("applied_transform", "up", "applied_transform: expected a 3x4 or 4x4 matrix"),
+        ("applied_scale", 0, "applied_scale: expected a scale in"),
+    ],
+)
+def test_what_was_applied_before_is_checked(key: str, value: Any, message: str, run: Path) -> None:
+    document = json.loads((run / "transforms.json").read_text())
+    (run / "transforms.json").write_text(json.dumps({**document, key: value}))
+    with pytest.raises(InvalidCameras, match=rf"transforms\.json {message}"):
+        load_cameras(run)
+
+
+def test_inria_cameras_are_in_the_frame_of_their_splats(run: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "inria"
+    folder.mkdir()
+    camera = Camera("a", 9, 9, 5, 5, 4.5, 4.5, np.eye(4))
+    write_inria_cameras(Cameras((camera,)), folder / "cameras.json")
+    shutil.copy(run / FRAME_FILE, folder)
+    for path in (folder, folder / "cameras.json"):
+        with pytest.raises(InvalidCameras, match=r"cameras that are still to be moved, got Inria's.*; take .* away"):
+            load_cameras(path)
+
+
+@pytest.mark.parametrize("name", [FRAME_FILE, "transforms.json"])
+def test_zip_of_several_runs_is_refused(name: str, run: Path) -> None:
+    (run / "other").mkdir()
+    shutil.copy(run / name, run / "other")
+    path = Path(shutil.make_archive(str(run), "zip", run))
+    with pytest.raises(InvalidCameras, match=rf"expected one {name}, got {name} and other/{name}; zip those of one"):
+        load_cameras(path)
+
+
+def test_folder_with_the_frame_alone_has_no_cameras(run: Path) -> None:
+    (run / "transforms.json").unlink()
+    with pytest.raises(InvalidCameras, match="got a folder without any of them"):
+        load_cameras(run)
+
+
+def test_the_frame_is_told_and_counts(run: Path, model: Path, tmp_path: Path) -> None:
+    found = inspect_file(run)
+    assert (found["frame"], found["warnings"]) == (FRAME_FILE, [])
+    assert found["bytes"] == sum(path.stat().st_size for path in run.iterdir())
+    shutil.copytree(model, run / "sparse/0")
+    (run / FRAME_FILE).unlink()
+    found = inspect_file(run)
+    assert found["frame"] is None
+    assert any("the COLMAP model was read, and beside it lies nerfstudio's" in text for text in found["warnings"])
+    assert any(
+        f"Put its run's {FRAME_FILE} beside" in text for text in inspect_file(run / "transforms.json")["warnings"]
+    )
+    (run / "transforms.json").write_text("{")
+    assert inspect_file(run)["warnings"] == []
+
+
+@pytest.mark.parametrize("given", [lambda run: run, lambda run: run / "transforms.json"], ids=["folder", "file"])
+def test_another_frame_is_another_input(given: Callable[[Path], Path], run: Path) -> None:
+    before = camera_input(given(run))
+    told = json.loads((run / FRAME_FILE).read_text())
+    (run / FRAME_FILE).write_text(json.dumps({**told, "scale": 2 * SCALE}))
+    assert camera_input(given(run)).sha256 != before.sha256
+    (run / FRAME_FILE).unlink()
+    assert camera_input(given(run)).sha256 not in (before.sha256, "")
+    (run / "photo.jpg").write_bytes(b"not read")
+    (run / FRAME_FILE).write_text(json.dumps(told))
+    assert camera_input(given(run)) == before
