@@ -19,6 +19,10 @@ if TYPE_CHECKING:
     from liftcore.scene.splats import Kernel, Splats
 
 CAMERA_FORMATS = "a COLMAP sparse model (folder or .zip), a transforms.json or a cameras.json"
+EXPORT = (
+    "export the splats as PLY from the program that trained them (nerfstudio: ns-export gaussian-splat; gsplat's "
+    "simple_trainer: --save-ply)"
+)
 PICKLED = (".pt", ".pth", ".ckpt", ".pkl")
 
 
@@ -42,7 +46,7 @@ def load_splats(path: Path, kernel: Kernel | None = None, *, colour: bool = True
             str(path),
             expected="a PLY file",
             got="a Python pickle, which may run code when it is opened",
-            hint="export the splats as PLY from the program that trained them",
+            hint=EXPORT,
         )
     return read_splats(path, kernel, colour=colour)
 
