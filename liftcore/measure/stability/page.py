@@ -17,6 +17,7 @@ from liftcore.measure.stability.accumulation import (
 )
 from liftcore.measure.stability.case import KERNELS
 from liftcore.measure.stability.of_features import LENGTHS, MAPS, REFUSALS
+from liftcore.measure.stability.of_lenses import LENSES
 from liftcore.measure.stability.of_splats import OPACITIES, PLACES, SHAPES
 from liftcore.measure.stability.of_views import VIEWS
 from liftcore.measure.stability.wide import CONDITION, survey
@@ -32,6 +33,7 @@ TABLES: dict[str, tuple[Extreme, ...]] = {
     "Shapes": SHAPES,
     "Places and crowds": PLACES,
     "Cameras and images": VIEWS,
+    "Distorted photos and other frames": LENSES,
     "Features": LENGTHS,
     "Maps, labels and gains": MAPS,
     "Refused": REFUSALS,
@@ -45,12 +47,14 @@ What becomes of a lift at the extremes: measured, a row a case, by
 `python -m liftcore.measure.stability docs/stability.md` ({date}; {machine}). Each row is a test too
 (`tests/stability/test_table.py`), from the same definition.
 
-The error of weights is the largest difference from the float64 oracle (`liftcore/raster/oracle.py`) over all weights,
-their squares, the row sums and the evidence, on all rays of the view and over the kernels that are named; a row says
-how many rays float32 decided otherwise at a cut-off, if any did. The error of features is the largest difference from
-the dense closed form in float64, over the largest value of the codebook. What float32 gives is shown for the first
-kernel named. "Told" are the words of `splatlift inspect` and of the lift's own warnings, where something is lost or
-taken by convention; where not all kernels tell the same, the ones that do are named before it.
+The error of weights is the largest difference from the float64 oracle (`liftcore/raster/oracle.py`) over all
+weights, their squares, the row sums and the evidence, on all rays of the view and over the kernels that are named;
+a row says how many rays float32 decided otherwise at a cut-off, if any did. The error of a distorted photo is how
+far from a pixel, in pixels, its ray meets the photo again, once it was carried to the pinhole that draws it. The
+error of features is the largest difference from the dense closed form in float64, over the largest value of the
+codebook. What float32 gives is shown for the first kernel named. "Told" are the words of `splatlift inspect` and of
+the lift's own warnings, where something is lost or taken by convention; where not all kernels tell the same, the
+ones that do are named before it.
 """
 
 
