@@ -303,7 +303,7 @@ def _add_experiment(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         "row_sums needs splats and cameras alone; conditioning too, and measures beta where features, regions or "
         "features_clean (.safetensors) are; fidelity one of those, features_hard or grids. The others need truth in "
-        "the layout of tabletop (truth.json, truth.safetensors, text_table.safetensors; the README's section "
+        "the layout of tabletop (truth.json, truth.safetensors, text_table.safetensors; docs/accuracy.md, "
         "Experiments) and features; lambda_sweep and overfitting features_hard beside it, mask_noise features_clean."
     )
     parser.add_argument("name", choices=EXPERIMENTS, metavar="NAME", help=", ".join(EXPERIMENTS))

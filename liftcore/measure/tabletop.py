@@ -179,7 +179,7 @@ class Tabletop:
 def _no_truth(folder: Path, got: str) -> InvalidInput:
     return InvalidInput(
         str(folder), expected=f"truth in the layout of tabletop ({', '.join(TRUTH_FILES)})", got=got,
-        hint="the README's section Experiments says what they hold, and which experiments need none",
+        hint="docs/accuracy.md says under Experiments what they hold, and which experiments need none",
     )  # fmt: skip
 
 

@@ -7,11 +7,15 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = ("README.md", "ARCHITECTURE.md")
+SCENES, LIFTING, ASKING, COMMANDS, SERVICE, ACCURACY = (
+    f"docs/{page}.md" for page in ("scenes", "lifting", "asking", "commands", "service", "accuracy")
+)
+GUIDE = ("README.md", SCENES, LIFTING, ASKING, COMMANDS, SERVICE, ACCURACY)  # what users read
 PAGES = (*DOCUMENTS, *sorted(str(page.relative_to(ROOT)) for page in ROOT.glob("docs/*.md")))
 
 
 def text(name: str) -> str:
-    """A document of the repository's root."""
+    """A document, by its path in the repository."""
     return (ROOT / name).read_text(encoding="utf-8")
 
 

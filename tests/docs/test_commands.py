@@ -14,7 +14,20 @@ from liftcore.cli import build_parser
 from liftcore.solve.settings import LiftSettings, Preset
 from service.settings import ServiceSettings
 
-from .readme import DOCUMENTS, PAGES, ROOT, blocks, inline_code, shell_commands, table_heads, text
+from .readme import (
+    COMMANDS,
+    DOCUMENTS,
+    GUIDE,
+    LIFTING,
+    PAGES,
+    ROOT,
+    SERVICE,
+    blocks,
+    inline_code,
+    shell_commands,
+    table_heads,
+    text,
+)
 
 
 @pytest.mark.parametrize("document", PAGES)
@@ -24,10 +37,17 @@ def test_relative_links_lead_somewhere(document: str) -> None:
     assert not missing
 
 
-def test_links_within_the_readme_lead_to_its_headings() -> None:
-    headings = re.findall(r"^#+ (.*)$", text("README.md"), flags=re.MULTILINE)
-    places = {re.sub(r"[^a-z0-9 -]", "", heading.lower()).replace(" ", "-") for heading in headings}
-    assert set(re.findall(r"\]\(#([^)]+)\)", text("README.md"))) <= places
+@pytest.mark.parametrize("document", PAGES)
+def test_links_to_headings_lead_there(document: str) -> None:
+    for page, place in re.findall(r"\]\(([\w./]*)#([^)]+)\)", text(document)):
+        target = (ROOT / document).parent / page if page else ROOT / document
+        headings = re.findall(r"^#+ (.*)$", target.read_text(encoding="utf-8"), flags=re.MULTILINE)
+        assert place in {re.sub(r"[^a-z0-9 -]", "", head.lower()).replace(" ", "-") for head in headings}, place
+
+
+def test_every_page_of_the_guide_is_in_the_readme() -> None:
+    linked = set(re.findall(r"\]\((docs/\w+\.md)", text("README.md")))
+    assert linked == set(PAGES) - set(DOCUMENTS)
 
 
 @pytest.mark.parametrize("document", PAGES)
@@ -63,8 +83,8 @@ def test_ci_runs_the_readmes_test_command() -> None:
     assert "make test" in (ROOT / ".ci" / "run").read_text(encoding="utf-8")
 
 
-def test_commands_of_the_readme_parse() -> None:
-    commands = [shlex.split(command) for command in shell_commands("README.md")]
+def test_commands_of_the_guide_parse() -> None:
+    commands = [shlex.split(command) for page in GUIDE for command in shell_commands(page)]
     assert {"pack", "lift", "query", "serve", "keys", "tradeoff"} <= {command[0] for command in commands}
     for command in commands:
         assert build_parser().parse_args(command).command == command[0]
@@ -83,7 +103,7 @@ def test_commands_within_sentences_and_tables_parse(document: str, capsys: pytes
             assert "arguments are required" in said or "choice: 'NAME'" in said, said
 
 
-def test_every_command_is_in_the_readme_with_all_its_options() -> None:
+def test_every_command_is_told_with_all_its_options() -> None:
     parsers = _commands()
     rows = {head.strip("`"): row for head, row in _command_rows().items()}
     assert rows.keys() == {f"splatlift {name}" for name in parsers}
@@ -95,20 +115,20 @@ def test_every_command_is_in_the_readme_with_all_its_options() -> None:
             assert action.dest in ("help", "json", "debug") or _is_told(action, told), (name, action.dest)
 
 
-def test_every_setting_of_a_lift_is_in_the_readme_with_its_default() -> None:
-    rows = dict(re.findall(r"^\| `([a-z_]+)` \| (.*?) \|", text("README.md"), flags=re.MULTILINE))
+def test_every_setting_of_a_lift_is_told_with_its_default() -> None:
+    rows = dict(re.findall(r"^\| `([a-z_]+)` \| (.*?) \|", text(LIFTING), flags=re.MULTILINE))
     for name, default in LiftSettings.of().model_dump(mode="json").items():
         shown = rows[name].split(" (")[0].strip("`")
         assert shown in (str(default), json.dumps(default)) or float(shown) == default, name
 
 
-def test_every_preset_is_in_the_readme() -> None:
-    heads = " ".join(table_heads("README.md"))
+def test_every_preset_is_told() -> None:
+    heads = " ".join(table_heads(LIFTING))
     assert all(f"`{preset}`" in heads for preset in Preset)
 
 
-def test_every_setting_of_the_service_is_in_the_readme_with_its_default() -> None:
-    rows = dict(re.findall(r"^\| `SPLATLIFT_([A-Z_]+)` \| (.*?) \|", text("README.md"), flags=re.MULTILINE))
+def test_every_setting_of_the_service_is_told_with_its_default() -> None:
+    rows = dict(re.findall(r"^\| `SPLATLIFT_([A-Z_]+)` \| (.*?) \|", text(SERVICE), flags=re.MULTILINE))
     assert rows.keys() == {field.upper() for field in ServiceSettings.model_fields}
     for name, field in ServiceSettings.model_fields.items():
         default = field.get_default(call_default_factory=True)
@@ -122,7 +142,7 @@ def _commands() -> dict[str, argparse.ArgumentParser]:
 
 
 def _command_rows() -> dict[str, str]:
-    return dict(re.findall(r"^\| (`splatlift [a-z]+`) \| (.*) \|$", text("README.md"), flags=re.MULTILINE))
+    return dict(re.findall(r"^\| (`splatlift [a-z]+`) \| (.*) \|$", text(COMMANDS), flags=re.MULTILINE))
 
 
 def _actions(parser: argparse.ArgumentParser) -> list[argparse.Action]:

@@ -1,4 +1,4 @@
-"""The README's examples run, and show what the service really answers."""
+"""The guide's examples run, and show what the service really answers."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from service.routes import assets, jobs, lifts, operations, queries, tradeoffs
 from tests.api.tiny_scene import WIDTH, codebook, colmap_zip, labels, make_scene
 from tests.run_lengths import sam_records
 
-from .readme import blocks, text
+from .readme import ASKING, COMMANDS, GUIDE, SCENES, SERVICE, blocks, text
 
 ROUTES: tuple[ModuleType, ...] = (operations, assets, jobs, lifts, tradeoffs, queries)
 SHAPES: dict[str, type[BaseModel]] = {  # a field that no other answer has -> the answer
@@ -40,7 +40,7 @@ SHAPES: dict[str, type[BaseModel]] = {  # a field that no other answer has -> th
 
 @pytest.fixture
 def scene_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The tiny scene under the names that the README uses, as the working directory."""
+    """The tiny scene under the names that the guide uses, as the working directory."""
     scene = make_scene()
     for name, content in (
         ("scene.ply", scene.splats),
@@ -54,7 +54,7 @@ def scene_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_python_example_finds_the_apple(scene_folder: Path) -> None:
-    names = run_example("from liftcore.lift import lift")
+    names = run_example(COMMANDS, "from liftcore.lift import lift")
     made, scene, mask, more = (names[name] for name in ("made", "scene", "mask", "more"))
     columns = mask.nonzero()[:, 1]
     assert len(columns) > 0
@@ -70,8 +70,8 @@ def test_sams_masks_make_a_lift_that_knows_the_words(scene_folder: Path, monkeyp
         Image.fromarray((80 * clusters[0] + 40).astype(np.uint8)).save(scene_folder / "photos" / f"{view}.jpg")
     for name, module in stand_ins().items():
         monkeypatch.setitem(sys.modules, name, module)
-    run_example("from segment_anything import")
-    commands = commands_between("### From SAM's masks", "\n### ", scene_folder)
+    run_example(SCENES, "from segment_anything import")
+    commands = commands_between(SCENES, "## From SAM's masks", "\n## ", scene_folder)
     assert [command[0] for command in commands] == ["pack", "lift"]
     question = ["query", "scene.lift.safetensors", "apple", "--table", "words.safetensors", "--view", "middle"]
     assert [main(command) for command in [*commands, [*question, "--mask", "apple.png"]]] == [0, 0, 0]
@@ -80,21 +80,21 @@ def test_sams_masks_make_a_lift_that_knows_the_words(scene_folder: Path, monkeyp
     assert len(columns) > 0 and columns.max() < WIDTH // 2
 
 
-def commands_between(begin: str, end: str, folder: Path) -> list[list[str]]:
-    """The commands of a part of README, for a folder with a COLMAP model and without features."""
+def commands_between(page: str, begin: str, end: str, folder: Path) -> list[list[str]]:
+    """The commands of a part of a page, for a folder with a COLMAP model and without features."""
     with zipfile.ZipFile(io.BytesIO(colmap_zip())) as archive:
         archive.extractall(folder)
     (folder / "features.safetensors").unlink()
-    section = text("README.md").partition(begin)[2].partition(end)[0]
+    section = text(page).partition(begin)[2].partition(end)[0]
     lines = [line for line in section.splitlines() if line.startswith(".venv/bin/splatlift ")]
     return [shlex.split(line)[1:] for line in lines]
 
 
-def run_example(start: str) -> dict[str, Any]:
-    """The names that the one Python example with such a line leaves behind."""
-    (example,) = (block for block in blocks("README.md", "python") if start in block)
+def run_example(page: str, start: str) -> dict[str, Any]:
+    """The names that the one Python example of a page with such a line leaves behind."""
+    (example,) = (block for block in blocks(page, "python") if start in block)
     names: dict[str, Any] = {}
-    exec(compile(example, "README.md", "exec"), names)
+    exec(compile(example, page, "exec"), names)
     return names
 
 
@@ -138,7 +138,7 @@ def stand_ins() -> dict[str, ModuleType]:
 
 
 def test_command_line_example_writes_its_files(scene_folder: Path) -> None:
-    lines = [line for block in blocks("README.md", "sh") for line in block.splitlines()]
+    lines = [line for page in (COMMANDS, ASKING) for block in blocks(page, "sh") for line in block.splitlines()]
     commands = [line.split()[1:] for line in lines if line.startswith("splatlift ")]
     assert [main(command) for command in commands] == [0] * len(commands)
     assert (scene_folder / "apple.png").is_file()
@@ -148,7 +148,8 @@ def test_command_line_example_writes_its_files(scene_folder: Path) -> None:
 
 
 def test_no_example_saves_an_error_as_what_was_asked_for() -> None:
-    saving = [line for block in blocks("README.md", "sh") for line in block.splitlines() if " -o " in line]
+    shell = [block for page in GUIDE for block in blocks(page, "sh")]
+    saving = [line for block in shell for line in block.splitlines() if " -o " in line]
     curls = [line for line in saving if line.startswith("curl ")]
     assert curls and all(re.match(r"curl -[a-zA-Z]*f", line) for line in curls)
 
@@ -158,7 +159,7 @@ def test_the_way_from_own_maps_to_a_mask_leads_there(scene_folder: Path) -> None
     for view, clusters in labels().items():
         grid = codebook()[clusters[0]].transpose(2, 0, 1)  # [F, h, w], as PyTorch has it
         np.save(scene_folder / "maps" / f"{view}.png.npy", grid.astype(np.float16))
-    commands = commands_between("## Your own scene", "The same over HTTP", scene_folder)
+    commands = commands_between("README.md", "## Your own scene", "The same over HTTP", scene_folder)
     assert [command[0] for command in commands] == ["inspect", "inspect", "pack", "lift", "query"]
     assert [main(command) for command in commands] == [0] * len(commands)
     with Image.open(scene_folder / "apple.png") as mask:
@@ -167,7 +168,7 @@ def test_the_way_from_own_maps_to_a_mask_leads_there(scene_folder: Path) -> None
 
 
 def test_json_examples_show_fields_that_the_service_sends() -> None:
-    examples = [json.loads(block) for block in blocks("README.md", "json")]
+    examples = [json.loads(block) for block in blocks(SERVICE, "json")]
     seen = set()
     for example in examples:
         model = next(model for field, model in SHAPES.items() if field in example)
@@ -176,8 +177,8 @@ def test_json_examples_show_fields_that_the_service_sends() -> None:
     assert seen == set(SHAPES.values())
 
 
-def test_every_route_is_in_the_readme_and_no_other() -> None:
-    rows = [line.split(" | ")[0] for line in text("README.md").splitlines() if line.startswith("| `")]
+def test_every_route_is_told_and_no_other() -> None:
+    rows = [line.split(" | ")[0] for line in text(SERVICE).splitlines() if line.startswith("| `")]
     named = {match for row in rows for match in re.findall(r"`([A-Z]+ /[^`]*)`", row)}
     real = set()
     for module in ROUTES:
