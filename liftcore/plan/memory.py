@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from liftcore.errors import Unavailable
+from liftcore.observe.through_lens import kept_bytes
 from liftcore.raster.constants import TILE
 from liftcore.raster.kernels import RECORDS
 from liftcore.solve.columns import by_rows
@@ -62,7 +63,8 @@ def memory_parts(
         "libraries": LIBRARIES,
         "splats": inputs,
         "scene": splats.count * SCENE_BYTES,
-        "view": walk + 2 * labels + weights,  # labels of the next one, too, and weights that wait for their turn
+        # Labels of the next one, too, and weights that wait for their turn.
+        "view": walk + 2 * labels + kept_bytes(cameras.values()) + weights,
         "weights": min(len(cameras) * weights, MEMORY_LIMIT),
         "gathered": gathered * (ENTRY_BYTES + (JUDGED_BYTES if settings.robust_steps else 0)),
         "codebooks": _all_codebook_bytes(packs, cameras, settings),

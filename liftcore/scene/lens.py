@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 WIDEST = float(np.tan(np.radians(60)))  # of a pinhole's image from its axis, on the plane one unit before it
 GROWTH = 0.5  # of the photo's sides, by which a pinhole's image is larger on each side at most
 BORDER_PLACES = 33  # on each side of the photo
-BAND_PIXELS = 1 << 20  # carried at a time
-KEPT_PHOTOS = 2  # whose places are kept: mostly one lens took all photos
+BAND_PIXELS = 1 << 15  # carried at a time: what that takes stays in the cache
+KEPT_PHOTOS = 1  # whose places are kept, 8 bytes a pixel: mostly one lens took all photos
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from liftcore.observe import through_lens
 from liftcore.observe.observation import FeatureGrid, RegionMap
 from liftcore.observe.pack import open_packs, pair
 from liftcore.observe.through_lens import as_pinhole_sees
@@ -104,3 +105,18 @@ def test_packs_tell_before_a_map_is_read_what_size_it_will_have(tmp_path: Path) 
     assert packs.observation("bent").codebook.shape == (1, 3)
     assert [packs.map_size(name) for name in maps] == [(30, 22), (15, 11), (30, 22)]  # of the photos, as they lie
     assert tuple(packs.specs("plain")["labels"].shape) == (1, 22, 30)
+
+
+def test_bands_make_no_difference_to_labels(monkeypatch: pytest.MonkeyPatch) -> None:
+    view = camera(BARREL)
+    labels = RegionMap(torch.arange(44 * 60, dtype=torch.int32).reshape(1, 44, 60), torch.ones(44 * 60, 1))
+    whole = as_pinhole_sees(labels, view).labels
+    monkeypatch.setattr(through_lens, "BAND_PIXELS", 7 * view.width)
+    through_lens._label_places.cache_clear()
+    assert torch.equal(as_pinhole_sees(labels, view).labels, whole)
+
+
+def test_places_of_labels_are_kept_for_the_largest_pinhole_behind_a_lens() -> None:
+    view, plain = camera(BARREL), Camera("p", 500, 400, 48.0, 47.0, 29.0, 23.0, np.eye(4))
+    assert through_lens.kept_bytes([plain]) == 0
+    assert through_lens.kept_bytes([plain, view]) == 2 * 4 * view.width * view.height
