@@ -110,10 +110,12 @@ def test_packs_tell_before_a_map_is_read_what_size_it_will_have(tmp_path: Path) 
 def test_bands_make_no_difference_to_labels(monkeypatch: pytest.MonkeyPatch) -> None:
     view = camera(BARREL)
     labels = RegionMap(torch.arange(44 * 60, dtype=torch.int32).reshape(1, 44, 60), torch.ones(44 * 60, 1))
-    whole = as_pinhole_sees(labels, view).labels
+    whole = as_pinhole_sees(labels, view)
     monkeypatch.setattr(through_lens, "BAND_PIXELS", 7 * view.width)
     through_lens._label_places.cache_clear()
-    assert torch.equal(as_pinhole_sees(labels, view).labels, whole)
+    parts = as_pinhole_sees(labels, view)
+    assert isinstance(whole, RegionMap) and isinstance(parts, RegionMap)
+    assert torch.equal(parts.labels, whole.labels)
 
 
 def test_places_of_labels_are_kept_for_the_largest_pinhole_behind_a_lens() -> None:
