@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from liftcore.artifact import InputFile
@@ -11,7 +12,6 @@ from liftcore.scene.camera_source import camera_source
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from pathlib import Path
 
 
 def input_files(splats: Path, cameras: Path, features: Sequence[Path]) -> list[InputFile]:
@@ -30,14 +30,14 @@ def camera_input(path: Path) -> InputFile:
 
     Photos, features and lifts that lie in the same folder do not count: they may come and go.
     """
-    resolved = path.resolve()
-    files = camera_source(resolved).files
-    if files == [resolved]:
-        return input_file(resolved)
-    folder, total = resolved if resolved.is_dir() else resolved.parent, hashlib.sha256()
+    given = Path(os.path.abspath(path))  # links stay: other files count beside them than where they lead
+    files = camera_source(given).files
+    if files == [given]:
+        return InputFile(path=str(given), sha256=sha256_of(given))
+    folder, total = given if given.is_dir() else given.parent, hashlib.sha256()
     for part in files:
         total.update(f"{os.path.relpath(part, folder)} {sha256_of(part)}\n".encode())
-    return InputFile(path=str(resolved), sha256=total.hexdigest())
+    return InputFile(path=str(given), sha256=total.hexdigest())
 
 
 def sha256_of(path: Path) -> str:

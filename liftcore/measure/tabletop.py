@@ -129,6 +129,12 @@ class Tabletop:
             raise _no_truth(folder, f"files that do not hold that ({type(error).__name__}: {error})") from None
         self.classes: Tensor = torch.nn.functional.normalize(vectors.float(), dim=1)  # [K, F]
         self.cameras: Cameras = load_cameras(cameras_of(folder))
+        if self.cameras.distorted:
+            raise InvalidInput(
+                str(folder), expected="undistorted cameras beside its truth",
+                got=f"{len(self.cameras.distorted)} distorted ones",
+                hint="'splatlift tradeoff --labels' takes them, or undistort photos and masks",
+            )  # fmt: skip
         self.raster = CpuRaster(load_splats(folder / "point_cloud.ply"))
         self.counted = self._counted_splats()
 

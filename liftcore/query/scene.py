@@ -123,7 +123,8 @@ class QueryScene:
         """
         from liftcore.scene.load import load_cameras
 
-        return load_cameras(unchanged("cameras", self.lift.metadata.cameras, self.path))
+        # Which of several models was meant, the lift knew: its digest tells that the same is read.
+        return load_cameras(unchanged("cameras", self.lift.metadata.cameras, self.path), choosing=False)
 
     def image(self, view: str, draw: Callable[[Camera], Tensor]) -> Tensor:
         """A picture [H, W, ..] of a view in its photo's pixels, from what draws one of a pinhole (`in_photo`).
@@ -138,7 +139,7 @@ class QueryScene:
             if width * height > MOST_PIXELS:
                 raise InvalidQuery(
                     "view", expected=f"an image of at most {MOST_PIXELS} pixels to draw",
-                    got=f"{width}x{height} in {view!r}",
+                    got=f"{width}x{height} in {view!r}" + (", for its distorted photo" if camera.lens else ""),
                     hint="give the scene a camera of that pose with width, height, fx, fy, cx and cy divided alike",
                 )  # fmt: skip
         return in_photo(camera, draw)

@@ -6,9 +6,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from liftcore.errors import InvalidLift
+from liftcore.scene.frame import FRAME_FILE
 
 if TYPE_CHECKING:
     from liftcore.artifact import InputFile
+
+COUNTS = {"cameras": f" ({FRAME_FILE} beside them counts too)"}
 
 
 def unchanged(role: str, remembered: InputFile, lift: Path) -> Path:
@@ -39,6 +42,6 @@ def unchanged(role: str, remembered: InputFile, lift: Path) -> Path:
             str(lift),
             expected=f"the {role} that were lifted at {path}",
             got="a file with another SHA-256",
-            hint=f"the {role} changed since the lift: restore them, or lift again",
+            hint=f"the {role} changed since the lift{COUNTS.get(role, '')}: restore them, or lift again",
         )
     return path

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
+
 from liftcore.errors import InvalidCameras
 from liftcore.scene.distortion import Brown, Distortion, Fisheye
 
@@ -46,6 +48,12 @@ COLMAP_MODELS = (
     CameraModel("RADIAL_FISHEYE", 5, 1, ("k1", "k2"), fisheye=True),
     CameraModel("THIN_PRISM_FISHEYE", 12, 2, None),
     CameraModel("RAD_TAN_THIN_PRISM_FISHEYE", 16, 2, None),
+    CameraModel("SIMPLE_DIVISION", 4, 1, None),
+    CameraModel("DIVISION", 5, 2, None),
+    CameraModel("SIMPLE_FISHEYE", 3, 1, (), fisheye=True),
+    CameraModel("FISHEYE", 4, 2, (), fisheye=True),
+    CameraModel("EUCM", 6, 2, None),
+    CameraModel("EQUIRECTANGULAR", 2, 0, None),
 )
 MODELS_BY_NAME = {model.name: model for model in COLMAP_MODELS}
 READ_MODELS = ", ".join(model.name for model in COLMAP_MODELS if model.distortion is not None)
@@ -55,7 +63,7 @@ def calibration(model: CameraModel, parameters: Sequence[float], source: str) ->
     """The intrinsics of a camera of this model, and how it is distorted; None where it is not.
 
     Raises:
-        InvalidCameras: the model has another number of parameters, or is one that is not read.
+        InvalidCameras: a parameter is missing, too many or not finite, or the model is one that is not read.
     """
     if model.distortion is None:
         raise InvalidCameras(source, expected=f"a camera of {READ_MODELS}", got=model.name, hint=UNDISTORT)
@@ -64,6 +72,9 @@ def calibration(model: CameraModel, parameters: Sequence[float], source: str) ->
             source, expected=f"{model.parameters} parameters of {model.name}", got=str(len(parameters))
         )
     centre = model.focals + 2
+    if not np.isfinite(parameters[centre:]).all():
+        got = " ".join(f"{value:g}" for value in parameters[centre:])
+        raise InvalidCameras(source, expected=f"finite {', '.join(model.distortion)}", got=got)
     intrinsics = Intrinsics(parameters[0], parameters[model.focals - 1], *parameters[model.focals : centre])
     named = dict(zip(model.distortion, parameters[centre:], strict=True))
     return intrinsics, distortion_of(named, fisheye=model.fisheye)

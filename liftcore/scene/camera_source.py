@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import zipfile
+import os
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from liftcore.errors import InvalidCameras
@@ -16,8 +17,6 @@ from liftcore.scene.model_folders import model_folder, scene_of
 from liftcore.scene.transforms import parse_transforms
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from liftcore.scene.cameras import Cameras
 
 TRANSFORMS = "transforms.json"
@@ -65,15 +64,13 @@ class CameraSource:
 def camera_source(path: Path) -> CameraSource:
     """The source of a path: of a folder a whole model, else a JSON file, else half a model; of a file itself.
 
-    A ``FRAME_FILE`` counts in the folder, beside the file, and in the scene's folder of a model that is named. In a
-    folder with one a transforms.json comes first: nerfstudio trains on its intrinsics.
+    A ``FRAME_FILE`` counts in the folder, beside the file, and from a model's folder up to its scene's. In a folder
+    with one a transforms.json comes first: nerfstudio trains on its intrinsics.
     """
     if path.is_dir():
         return _of_folder(path)
     if path.name in MODEL_FILES and has_model(path.parent):
-        return _of_model(path.parent, path.parent)
-    if path.is_file() and zipfile.is_zipfile(path):
-        return CameraSource(file=path)
+        return _of_model(path.parent)
     return CameraSource(file=path, frame=_frame_in(path.parent))
 
 
@@ -92,14 +89,35 @@ def _of_folder(folder: Path) -> CameraSource:
     if frame and (folder / TRANSFORMS).is_file():
         return CameraSource(file=folder / TRANSFORMS, frame=frame)
     if model is not None and (is_whole(model) or not documents):
-        return _of_model(model, folder)
+        return _of_model(model)
     return CameraSource(file=next(iter(documents), None), frame=frame)
 
 
-def _of_model(model: Path, folder: Path) -> CameraSource:
-    return CameraSource(model=model, frame=_frame_in(folder) or _frame_in(scene_of(model.resolve())))
+def found_near(model: Path, name: str) -> list[Path]:
+    """Files of a name from a model's folder up to its scene's, the nearest first."""
+    return [folder / name for folder in _up_to_scene(model) if (folder / name).is_file()]
+
+
+def _of_model(model: Path) -> CameraSource:
+    frames = filter(None, map(_frame_in, _up_to_scene(model)))
+    return CameraSource(model=model, frame=next(frames, None))
+
+
+def _up_to_scene(model: Path) -> list[Path]:
+    folder = Path(os.path.abspath(model))  # links stay: files lie where somebody put them
+    return [folder, *(parent for parent in folder.parents if parent.is_relative_to(scene_of(folder)))]
 
 
 def _frame_in(folder: Path) -> Path | None:
+    """The frame's file in a folder, if there is one.
+
+    Raises:
+        InvalidCameras: there is something else of that name, such as a link that leads nowhere.
+    """
     path = folder / FRAME_FILE
-    return path if path.is_file() else None
+    if path.is_file():
+        return path
+    if os.path.lexists(path):
+        got = "a link that leads to none" if path.is_symlink() else "none"
+        raise InvalidCameras(str(path), expected="a file", got=got, hint="copy the file itself, or take it away")
+    return None

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from liftcore.errors import InvalidCameras
 from liftcore.scene.colmap import read_colmap
+from liftcore.scene.lens import lifted_share
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -42,10 +43,10 @@ def refuse_both(source: str, read: str, undistorted: Sequence[str], choose: str)
 
 def distortion_warning(views: Sequence[Camera]) -> list[str]:
     """What is to be said of distorted views, if there are some."""
-    count = sum(camera.lens is not None for camera in views)
-    if not count:
+    shares = [lifted_share(camera) for camera in views if camera.lens is not None]
+    if not shares:
         return []
     return [
-        f"{count} of {len(views)} views are of distorted photos: features must be of the photos as they were taken, "
-        "not of undistorted ones"
+        f"{len(shares)} of {len(views)} views are of distorted photos, of each of which {min(shares):.0%} or more is "
+        "lifted: features must be of the photos as they were taken, not of undistorted ones"
     ]

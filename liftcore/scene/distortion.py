@@ -6,12 +6,14 @@ would meet in one place, it has no way back, and ``straight`` gives NaN.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 ITERATIONS = 30  # of Newton's method, which needs four to six where a lens is one
 TOLERANCE = 1e-9  # on the plane: a millionth of a pixel
+RADII, DIRECTIONS = 513, 16  # at which it is looked whether a lens turns back
 FARTHEST = 1e3  # on the plane: what a fisheye sees beside or behind the camera is put so far out
 
 
@@ -44,28 +46,37 @@ class Brown:
 
     def straight(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The inverse of ``bent``, by Newton's method; NaN where there is none, or the lens turned back before."""
-        p1, p2, u, v = self.p1, self.p2, np.array(x, np.float64), np.array(y, np.float64)
+        u, v = np.array(x, np.float64), np.array(y, np.float64)
         with np.errstate(all="ignore"):  # what diverges is found by its residual
             for _ in range(ITERATIONS):
                 miss_x, miss_y = (bent - given for bent, given in zip(self.bent(u, v), (x, y), strict=True))
                 if max(np.abs(miss_x).max(), np.abs(miss_y).max()) < TOLERANCE:
                     break
-                radial, slope = self._radial(u * u + v * v)
-                a = radial + 2 * u * u * slope + 2 * p1 * v + 6 * p2 * u
-                b = 2 * u * v * slope + 2 * p1 * u + 2 * p2 * v  # the Jacobian is symmetric
-                d = radial + 2 * v * v * slope + 6 * p1 * v + 2 * p2 * u
+                a, b, d = self._slopes(u, v)
                 determinant = a * d - b * b
                 u, v = u - (d * miss_x - b * miss_y) / determinant, v - (a * miss_y - b * miss_x) / determinant
             miss = np.hypot(*(bent - given for bent, given in zip(self.bent(u, v), (x, y), strict=True)))
             lost = ~(miss < 100 * TOLERANCE)
         return np.where(lost, np.nan, u), np.where(lost, np.nan, v)
 
-    def turns_back(self, radius: float) -> bool:
-        """Whether what lies farther out comes to lie farther in, up to this radius of a pinhole."""
-        with np.errstate(all="ignore"):
-            squares = np.linspace(0, radius, 257) ** 2
-            radial, slope = self._radial(squares)
-            return not bool((radial + 2 * squares * slope > 0).all())
+    def reach(self, radius: float) -> float:
+        """How far from the axis of a pinhole the lens turns back, looked for up to a radius; infinity: nowhere."""
+        angles = np.arange(DIRECTIONS if self.p1 or self.p2 else 1) * (2 * np.pi / DIRECTIONS)
+        radii = np.linspace(0, radius, RADII)
+        with np.errstate(all="ignore"):  # at a pole nothing is above zero
+            a, b, d = self._slopes(radii[:, None] * np.cos(angles), radii[:, None] * np.sin(angles))
+            forth = np.all((a * d - b * b > 0) & (a + d > 0), axis=1, keepdims=True)[:, 0]
+        return _first_back(forth, radii)
+
+    def _slopes(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The derivatives of x' by x, of x' by y, which is that of y' by x, and of y' by y."""
+        p1, p2 = self.p1, self.p2
+        radial, slope = self._radial(x * x + y * y)
+        return (
+            radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x,
+            2 * x * y * slope + 2 * p1 * x + 2 * p2 * y,
+            radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x,
+        )
 
     def _radial(self, squares: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """g and its derivative by r^2."""
@@ -106,15 +117,22 @@ class Fisheye:
         factor = np.where(radius > 0, reach / np.where(radius > 0, radius, 1.0), 1.0)
         return np.where(lost, np.nan, x * factor), np.where(lost, np.nan, y * factor)
 
-    def turns_back(self, radius: float) -> bool:
-        """Whether what lies farther out comes to lie farther in, up to this radius of a pinhole."""
-        return not bool((self._bent(np.linspace(0, np.arctan(radius), 257))[1] > 0).all())
+    def reach(self, radius: float) -> float:
+        """How far from the axis of a pinhole the lens turns back, looked for up to a radius; infinity: nowhere."""
+        angles = np.linspace(0, np.arctan(radius), RADII)
+        with np.errstate(all="ignore"):
+            return _first_back(self._bent(angles)[1] > 0, np.tan(angles))
 
     def _bent(self, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """r' and its derivative."""
         k1, k2, k3, k4, a = self.k1, self.k2, self.k3, self.k4, angle * angle
         bent = angle * (1 + a * (k1 + a * (k2 + a * (k3 + a * k4))))
         return bent, 1 + a * (3 * k1 + a * (5 * k2 + a * (7 * k3 + a * 9 * k4)))
+
+
+def _first_back(forth: np.ndarray, radii: np.ndarray) -> float:
+    """The last of the radii [n] before the first that is not ``forth`` [n]; infinity where all are."""
+    return math.inf if forth.all() else float(radii[max(0, int(np.argmin(forth)) - 1)])
 
 
 Distortion = Brown | Fisheye

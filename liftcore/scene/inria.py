@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 CENTRE_TOLERANCE = 1e-6  # pixels
+KEEP = "keep these cameras as a COLMAP model or transforms.json"
 
 
 def parse_inria(document: Any, source: str) -> Cameras:
@@ -50,7 +51,7 @@ def write_inria_cameras(cameras: Cameras, path: Path) -> None:
     """Write cameras.json, whole or not at all.
 
     Raises:
-        InvalidCameras: a principal point is off the image's centre, which the format cannot say.
+        InvalidCameras: a photo is distorted, or its principal point off the centre, which the format cannot say.
     """
     records = [_record(i, camera) for i, camera in enumerate(cameras)]
     with whole_file(path) as handle:
@@ -58,11 +59,12 @@ def write_inria_cameras(cameras: Cameras, path: Path) -> None:
 
 
 def _record(index: int, camera: Camera) -> dict[str, Any]:
+    if camera.lens is not None:
+        raise InvalidCameras("cameras.json", expected="cameras without distortion", got=repr(camera.name), hint=KEEP)
     off = max(abs(camera.cx - camera.width / 2), abs(camera.cy - camera.height / 2))
     if off > CENTRE_TOLERANCE:
         got = f"one {off:g} pixels off in {camera.name!r}"
-        hint = "keep these cameras as a COLMAP model or transforms.json"
-        raise InvalidCameras("cameras.json", expected="principal points at the centre", got=got, hint=hint)
+        raise InvalidCameras("cameras.json", expected="principal points at the centre", got=got, hint=KEEP)
     return {
         "id": index,
         "img_name": camera.name,

@@ -9,7 +9,8 @@ import numpy as np
 import torch
 
 from liftcore.raster.constants import ALPHA_FLOOR
-from liftcore.scene.camera_source import TRANSFORMS, camera_source, is_of_nerfstudio
+from liftcore.scene.camera_source import TRANSFORMS, camera_source, found_near, is_of_nerfstudio
+from liftcore.scene.camera_zip import has_transforms
 from liftcore.scene.distorted import distortion_warning
 from liftcore.scene.foreign import SUFFIXES
 from liftcore.scene.frame import FRAME_FILE
@@ -124,11 +125,12 @@ def _frame_warnings(path: Path) -> list[str]:
     """What is to be said of cameras that may not be in the frame of their splats."""
     source = camera_source(path)
     if source.model is not None:
-        beside = path / TRANSFORMS
-        return [OTHER_FRAME] if beside.is_file() and is_of_nerfstudio(beside) else []
-    if source.file is None or zipfile.is_zipfile(source.file) or not is_of_nerfstudio(source.file):
+        return [OTHER_FRAME] if any(map(is_of_nerfstudio, found_near(source.model, TRANSFORMS))) else []
+    if source.file is None:
         return []
-    return [OWN_FRAME]
+    if zipfile.is_zipfile(source.file):
+        return [OTHER_FRAME] if has_transforms(source.file) else []
+    return [OWN_FRAME] if is_of_nerfstudio(source.file) else []
 
 
 def _quantiles(values: Tensor) -> dict[str, float]:

@@ -59,19 +59,23 @@ def _begins(path: Path, first: bytes) -> bool:
         return False
 
 
-def load_cameras(path: Path) -> Cameras:
+def load_cameras(path: Path, *, choosing: bool = True) -> Cameras:
     """Read cameras from a folder, a JSON file or a zip, recognised by content (`camera_source`).
+
+    Args:
+        path: the folder or file.
+        choosing: whether distorted cameras beside undistorted ones are refused, as somebody has to choose.
 
     Raises:
         InvalidCameras: nothing here is a camera format that we know, or what it holds is malformed.
     """
     if path.is_dir():
-        return _from_folder(path)
+        return _from_folder(path, choosing=choosing)
     if not path.is_file():
         raise InvalidCameras(str(path), expected=CAMERA_FORMATS, got="no such file or folder")
     try:
         if zipfile.is_zipfile(path):
-            return read_camera_zip(path)
+            return read_camera_zip(path, camera_source(path).frame, choosing=choosing)
         with path.open("rb") as handle:
             start = handle.read(64).lstrip(b"\xef\xbb\xbf \t\r\n")
     except OSError as error:
@@ -97,7 +101,7 @@ def other_models(path: Path) -> list[str]:
     return models_in_zip(path)[1:] if zipfile.is_zipfile(path) else []
 
 
-def _from_folder(folder: Path) -> Cameras:
+def _from_folder(folder: Path, *, choosing: bool) -> Cameras:
     source = camera_source(folder)
     if source.model is None and source.file is None:
         others = _cameras_below(folder)
@@ -105,7 +109,7 @@ def _from_folder(folder: Path) -> Cameras:
         got = "a folder without any of them" + (" at the usual places" if others else "")
         raise InvalidCameras(str(folder), expected=CAMERA_FORMATS, got=got, hint=hint)
     cameras = source.read()
-    if source.model is not None and cameras.distorted:
+    if choosing and source.model is not None and cameras.distorted:
         straight = [str(folder / model) for model in other_models(folder) if is_undistorted(folder / model)]
         refuse_both(str(folder), str(source.model), straight, "name the one")
     return cameras

@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 
 from liftcore.artifact import Lift, save_lift
-from liftcore.errors import InvalidQuery
+from liftcore.errors import InvalidCameras, InvalidQuery
 from liftcore.lift import lift
 from liftcore.query.ask import ask, look
 from liftcore.query.example import Pixel, Region
@@ -20,9 +20,11 @@ from liftcore.query.pictures import render_png
 from liftcore.query.query import Query
 from liftcore.query.scene import QueryScene
 from liftcore.scene.cameras import Camera
+from liftcore.scene.inria import write_inria_cameras
 from liftcore.scene.load import load_cameras
 from liftcore.solve.settings import LiftSettings
 from tests.distorted_scene import (
+    BARREL,
     HEIGHT,
     LENSES,
     VIEWS,
@@ -111,3 +113,30 @@ def test_a_pixel_at_the_rim_of_a_wide_photo_has_no_pinhole(tmp_path: Path) -> No
     assert len(ask(scene, Query((Pixel("wide", 200, 20),), threshold=0.5)).scores) == 3600
     with pytest.raises(InvalidQuery, match="a pixel that a pinhole sees, got one at the rim of a wide lens; pick"):
         ask(scene, Query((Pixel("wide", 2, 20),)))
+
+
+def test_a_model_that_comes_later_changes_no_lift(tmp_path: Path) -> None:
+    scene = tmp_path / "scene"
+    splats, cameras, features = write_distorted_scene(scene, "barrel")
+    document = json.loads(cameras.read_text())
+    size = (document["fl_x"], document["fl_y"], document["cx"], document["cy"])
+    lines = ["\n".join(f"{i} 1 0 0 0 {-x} 0 0 1 {name}.jpg\n" for i, (name, x) in enumerate(VIEWS.items()))]
+    for place, model in (("sparse/0", ("OPENCV", *size, *BARREL.values())), ("dense/0/sparse", ("PINHOLE", *size))):
+        folder = scene / place
+        folder.mkdir(parents=True)
+        (folder / "cameras.txt").write_text(f"1 {model[0]} {WIDTH} {HEIGHT} {' '.join(map(str, model[1:]))}\n")
+        (folder / "images.txt").write_text(lines[0])
+        if place == "sparse/0":
+            save_lift(
+                lift(splats, scene, [features], LiftSettings.of(preset="row-sum")), tmp_path / "made.safetensors"
+            )
+    with pytest.raises(InvalidCameras, match="not both"):
+        load_cameras(scene)
+    opened = QueryScene.open(tmp_path / "made.safetensors")
+    assert opened.cameras.distorted == tuple(VIEWS)
+
+
+def test_what_cannot_say_a_lens_is_not_written(tmp_path: Path) -> None:
+    cameras = load_cameras(write_distorted_scene(tmp_path / "scene", "barrel")[1])
+    with pytest.raises(InvalidCameras, match="cameras without distortion, got 'left'; keep these"):
+        write_inria_cameras(cameras, tmp_path / "cameras.json")

@@ -19,7 +19,7 @@ from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.distorted import distortion_warning
 from liftcore.scene.distortion import Brown, Distortion, Fisheye
 from liftcore.scene.frame import Similarity
-from liftcore.scene.lens import behind_lens, drawn_by, photo_places
+from liftcore.scene.lens import behind_lens, drawn_by, lifted_share, photo_places
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -108,6 +108,12 @@ LENSES: tuple[Extreme, ...] = (
         lambda: _behind(Brown(k1=-4 / 27 / (CORNER * (1 + 1e-6)) ** 2)),
     ),
     photographed(
+        "a barrel lens that turns back before the photo's corners",
+        "corners without rays; lifted is what has some",
+        lambda: _behind(Brown(k1=-4 / 27 / (CORNER * 0.9) ** 2)),
+        lambda camera: 0.8 < lifted_share(camera) < 1,
+    ),
+    photographed(
         "a pincushion of k1 = 1000", "a photo of what lies near the axis", lambda: _behind(Brown(k1=1000.0))
     ),
     photographed(
@@ -139,10 +145,10 @@ LENSES: tuple[Extreme, ...] = (
         like=_where_they_were,
     ),
     refused(
-        "a distortion that turns back within the photo",
-        "two pixels with one ray",
-        lambda: _behind(Brown(k1=-4 / 27 / (CORNER * (1 - 1e-3)) ** 2)),
-        "turns back within the photo",
+        "a barrel that turns back near the axis (k1 = -9)",
+        "hardly a pixel with a ray of its own",
+        lambda: _behind(Brown(k1=-9.0)),
+        "of the photo",
         kernels=GAUSSIAN,
     ),
     refused(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import zipfile
 from pathlib import Path
@@ -112,7 +113,12 @@ def test_distorted_photos_are_told(tmp_path: Path) -> None:
     found = inspect_file(write_files(tmp_path / "model", binary_files(DISTORTED)))
     assert found["distorted"] == 2
     assert found["sizes"] == ["640x480"]  # of the photos
-    assert any("2 of 3 views are of distorted photos: features must be" in text for text in found["warnings"])
+    assert any(
+        re.search(
+            "2 of 3 views are of distorted photos, of each of which 9[0-9]% or more is lifted: features must be", text
+        )
+        for text in found["warnings"]
+    )
     assert inspect_file(write_files(tmp_path / "plain", binary_files()))["distorted"] == 0
 
 
@@ -240,3 +246,29 @@ def test_what_is_wrong_with_a_view_of_a_model_names_the_model(tmp_path: Path) ->
     folder = write_files(tmp_path / "model", binary_files(images=images))
     with pytest.raises(InvalidCameras, match=r"model cameras: expected one view a name, got 'a' twice; .*train/r_0"):
         load_cameras(folder)
+
+
+def test_fisheyes_of_new_colmap_are_read(tmp_path: Path) -> None:
+    for number, parameters in ((14, (500.0, 320.0, 240.0)), (15, (500.0, 500.0, 320.0, 240.0))):
+        files = binary_files({**CAMERAS, 1: (number, "", parameters)})
+        assert len(load_cameras(write_files(tmp_path / str(number), files)).distorted) == 2
+    with pytest.raises(InvalidCameras, match=r"expected a camera of .*FISHEYE, got EUCM; undistort"):
+        load_cameras(write_files(tmp_path / "other", binary_files({**CAMERAS, 1: (16, "", (1.0,) * 6)})))
+
+
+def test_distortion_that_is_no_number_is_told(tmp_path: Path) -> None:
+    files = text_files({**CAMERAS, 1: (2, "SIMPLE_RADIAL", (500.0, 320.0, 240.0, float("nan")))})
+    with pytest.raises(InvalidCameras, match="camera 1: expected finite k1, got nan"):
+        load_cameras(write_files(tmp_path / "model", files))
+
+
+def test_zip_of_damaged_lzma_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "scene.zip"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_LZMA) as archive:
+        for name, content in binary_files().items():
+            archive.writestr(name, content * 50)
+    content = bytearray(path.read_bytes())
+    content[60:100] = bytes(40)
+    path.write_bytes(content)
+    with pytest.raises(InvalidCameras, match="a zip of a COLMAP sparse model, got one that does not open"):
+        load_cameras(path)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -77,7 +79,7 @@ def test_a_perspective_lens_is_undone_where_it_does_not_turn_back(
 ) -> None:
     lens = Brown(k1=k[0], k2=k[1], k3=k[2], p1=p[0], p2=p[1])
     point = radius * np.array([[np.cos(angle), np.sin(angle)]])
-    if not lens.turns_back(1.05 * radius):
+    if lens.reach(1.05 * radius) == math.inf:
         assert np.abs(straight(lens, bent(lens, point)) - point).max() < 1e-6
 
 
@@ -87,16 +89,25 @@ def test_a_fisheye_is_undone_where_it_does_not_turn_back(
 ) -> None:
     lens, radius = Fisheye(*k), np.tan(off_axis)
     point = radius * np.array([[np.cos(angle), np.sin(angle)]])
-    if not lens.turns_back(np.tan(off_axis + 0.05)):
+    if lens.reach(np.tan(off_axis + 0.05)) == math.inf:
         assert np.abs(straight(lens, bent(lens, point)) - point).max() < 1e-5
 
 
 def test_what_a_lens_cannot_show_has_no_way_back() -> None:
     folding = Brown(k1=-1.0)  # r (1 - r^2) is 0.385 at most
     assert np.isnan(straight(folding, np.array([[0.5, 0.0]]))).all()
-    assert folding.turns_back(0.6)
-    assert not folding.turns_back(0.5)
-    assert Fisheye(k1=-0.5).turns_back(2.0)
+    assert folding.reach(0.6) == pytest.approx(1 / math.sqrt(3), rel=0.003)
+    assert folding.reach(0.5) == math.inf
+    assert Fisheye(k1=-0.5).reach(2.0) == pytest.approx(math.tan(math.sqrt(2 / 3)), rel=0.005)  # 1 = 1.5 angle^2
+
+
+def test_tangential_distortion_turns_back_on_one_side() -> None:
+    lens = Brown(p2=0.1)  # x + 0.3 x^2 on the axis
+    assert lens.reach(3.0) == pytest.approx(1 / 0.6, rel=0.01)
+
+
+def test_a_pole_is_no_way_forth() -> None:
+    assert Brown(k4=-1.0).reach(2.0) == pytest.approx(1.0, rel=0.01)
 
 
 def test_a_fisheye_sees_what_no_pinhole_does_far_out() -> None:

@@ -251,3 +251,77 @@ def test_another_frame_is_another_input(given: Callable[[Path], Path], run: Path
     (run / "photo.jpg").write_bytes(b"not read")
     (run / FRAME_FILE).write_text(json.dumps(told))
     assert camera_input(given(run)) == before
+
+
+def test_link_counts_where_it_lies_in_the_lift_and_after(run: Path, expected: Cameras, tmp_path: Path) -> None:
+    scene = tmp_path / "linked"
+    scene.mkdir()
+    (scene / "transforms.json").symlink_to(run / "transforms.json")
+    told = json.loads((run / FRAME_FILE).read_text())
+    (run / FRAME_FILE).unlink()
+    (scene / FRAME_FILE).write_text(json.dumps(told))
+    remembered = camera_input(scene / "transforms.json")
+    assert_same(load_cameras(Path(remembered.path)), expected)
+    (scene / FRAME_FILE).write_text(json.dumps({**told, "scale": 2 * SCALE}))
+    assert camera_input(Path(remembered.path)).sha256 != remembered.sha256
+
+
+@pytest.mark.parametrize("kind", ["link", "folder"])
+def test_frame_that_is_no_file_is_told(kind: str, run: Path, model: Path) -> None:
+    (run / FRAME_FILE).unlink()
+    if kind == "link":
+        (run / FRAME_FILE).symlink_to("outputs/nowhere")
+    else:
+        (run / FRAME_FILE).mkdir()
+    shutil.copytree(model, run / "sparse/0")
+    said = "a link that leads to none" if kind == "link" else "none"
+    for path in (run, run / "transforms.json", run / "sparse/0"):
+        with pytest.raises(InvalidCameras, match=rf"{FRAME_FILE}: expected a file, got {said}; copy the file itself"):
+            load_cameras(path)
+
+
+def test_frame_beside_a_zip_counts_where_the_zip_has_none(run: Path, expected: Cameras, tmp_path: Path) -> None:
+    told = json.loads((run / FRAME_FILE).read_text())
+    path = Path(shutil.make_archive(str(tmp_path / "scene"), "zip", run))
+    (tmp_path / FRAME_FILE).write_text(json.dumps({**told, "scale": 5 * SCALE}))
+    assert_same(load_cameras(path), expected)
+    (run / FRAME_FILE).unlink()
+    path = Path(shutil.make_archive(str(tmp_path / "scene"), "zip", run))
+    (tmp_path / FRAME_FILE).write_text(json.dumps(told))
+    before = camera_input(path)
+    assert_same(load_cameras(path), expected)
+    (tmp_path / FRAME_FILE).unlink()
+    assert camera_input(path).sha256 != before.sha256
+
+
+def test_frame_of_another_model_of_a_zip_is_refused(
+    run: Path, model: Path, expected: Cameras, tmp_path: Path
+) -> None:
+    scenes = tmp_path / "scenes"
+    for name in ("a", "b"):
+        shutil.copytree(model, scenes / name / "sparse/0")
+    shutil.copy(run / FRAME_FILE, scenes / "b")
+    with pytest.raises(InvalidCameras, match=r"got one of b and the model a/sparse/0; zip those of one run alone"):
+        load_cameras(Path(shutil.make_archive(str(scenes), "zip", scenes)))
+    shutil.copy(run / FRAME_FILE, scenes / "a")
+    assert_same(load_cameras(Path(shutil.make_archive(str(scenes), "zip", scenes))), expected)
+
+
+def test_hidden_files_of_a_zip_do_not_count(run: Path, expected: Cameras) -> None:
+    (run / ".ipynb_checkpoints").mkdir()
+    shutil.copy(run / "transforms.json", run / ".ipynb_checkpoints")
+    assert_same(load_cameras(Path(shutil.make_archive(str(run), "zip", run))), expected)
+
+
+def test_transforms_of_another_name_are_zipped_with_their_frame(run: Path, expected: Cameras) -> None:
+    (run / "transforms.json").rename(run / "transforms_train.json")
+    assert_same(load_cameras(run / "transforms_train.json"), expected)
+    assert_same(load_cameras(Path(shutil.make_archive(str(run), "zip", run))), expected)
+
+
+def test_transforms_of_another_frame_are_told_beside_a_model(run: Path, model: Path) -> None:
+    (run / FRAME_FILE).unlink()
+    shutil.copytree(model, run / "colmap/sparse/0")
+    zipped = Path(shutil.make_archive(str(run), "zip", run))
+    for path in (run, run / "colmap/sparse/0", run / "colmap/sparse/0/cameras.bin", zipped):
+        assert any("beside it lies nerfstudio's" in text for text in inspect_file(path)["warnings"])

@@ -11,7 +11,7 @@ import pytest
 from liftcore.errors import InvalidCameras
 from liftcore.scene.cameras import Camera
 from liftcore.scene.distortion import Brown, Distortion, Fisheye
-from liftcore.scene.lens import Lens, behind_lens, drawn_by, photo_places, photo_size, pixel_of
+from liftcore.scene.lens import Lens, behind_lens, drawn_by, lifted_share, photo_places, photo_size, pixel_of
 
 BARREL = Brown(k1=-0.2, k2=0.03, p1=0.001, p2=-0.002)
 PINCUSHION = Brown(k1=0.15)
@@ -91,14 +91,59 @@ def test_the_pinhole_of_a_whole_hemisphere_ends_at_sixty_degrees() -> None:
 @pytest.mark.parametrize(
     ("distortion", "message"),
     [
-        (Brown(k1=-1.5), "turns back within the photo"),
-        (Brown(k1=math.nan), "turns back"),
+        (Brown(k1=-9.0), r"a pinhole sees \d\.\d% of the photo"),
+        (Brown(k1=math.nan), "nothing of the photo"),
         (Brown(k1=1e200, k2=1e200), "turns back|nothing of the photo"),
-        (Fisheye(k1=-0.9), "turns back"),
-        (Fisheye(k1=math.inf), "turns back"),
-        (Brown(p1=5.0, p2=5.0), "turns back|nothing of the photo"),
+        (Brown(k4=-2.0), "turns back within the photo"),
+        (Fisheye(k1=-5.0), r"a pinhole sees \d\.\d% of the photo"),
+        (Fisheye(k1=math.inf), "nothing of the photo"),
+        (Brown(p1=5.0, p2=5.0), "nothing of the photo"),
     ],
 )
 def test_what_no_lens_does_is_refused(distortion: Distortion, message: str) -> None:
     with pytest.raises(InvalidCameras, match=f"camera 'v' distortion: .*({message}).*calibrate"):
         camera(distortion)
+
+
+@pytest.mark.parametrize(
+    ("distortion", "width", "height", "focal"),
+    [
+        (Brown(k1=-0.2), 1920, 1080, 1150.0),  # COLMAP's own for wide lenses: its corners have no rays
+        (Brown(k1=-0.3), 1920, 1080, 1000.0),  # nor have the left and right sides
+        (Fisheye(-1 / 24, 1 / 1920), 1000, 1000, 330.0),  # a circle in a square
+    ],
+)
+def test_a_photo_whose_corners_show_no_ray_is_lifted_as_far_as_it_shows_some(
+    distortion: Distortion, width: int, height: int, focal: float
+) -> None:
+    view = behind_lens(Camera("v", width, height, focal, focal, width / 2, height / 2, np.eye(4)), distortion)
+    lens = view.lens
+    assert lens is not None and lifted_share(view) > 0.3
+    u, v = np.meshgrid(np.linspace(0, view.width, 65), np.linspace(0, view.height, 65))
+    x, y = (u - view.cx) / view.fx, (v - view.cy) / view.fy
+    on_photo = lens.on_photo(x, y)
+    for at, length in zip(on_photo, (width, height), strict=True):
+        assert at.min() > -1e-3 and at.max() < length + 1e-3
+    back = lens.on_plane(*on_photo)  # no other ray is at the same place
+    inside = np.hypot(x, y) < 0.999 * np.hypot(x, y).max()
+    assert np.abs(back[0] - x)[inside].max() < 1e-6 and np.abs(back[1] - y)[inside].max() < 1e-6
+    drawn = drawn_by(view)
+    assert drawn.width >= view.width and drawn.height >= view.height
+
+
+def test_share_of_a_photo_that_is_lifted_is_what_its_pinhole_sees() -> None:
+    view = camera(BARREL)
+    assert view.lens is not None
+    v, u = np.meshgrid(np.arange(view.lens.height) + 0.5, np.arange(view.lens.width) + 0.5, indexing="ij")
+    x, y = view.lens.on_plane(u, v)
+    x, y = x * view.fx + view.cx, y * view.fy + view.cy
+    seen = (x >= 0) & (x <= view.width) & (y >= 0) & (y <= view.height)
+    assert lifted_share(view) == pytest.approx(seen.mean(), abs=0.01)
+
+
+def test_a_pixel_alone_is_found_where_all_are() -> None:
+    view = camera(BARREL)
+    assert view.lens is not None
+    columns, rows = photo_places(view.lens)
+    for x, y in ((0, 0), (7, 30), (view.lens.width - 1, view.lens.height - 1)):
+        assert pixel_of(view, x, y) == (int(columns[y, x]), int(rows[y, x]))
