@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
@@ -132,6 +133,21 @@ def test_truth_of_another_layout_is_bad_input(scene, tmp_path, capsys):
     (tmp_path / "truth.json").write_text("{}")
     assert main(["experiment", "ablation", str(tmp_path)]) == 2
     assert "truth in the layout of tabletop" in capsys.readouterr().err
+
+
+def test_truth_of_distorted_photos_is_told_what_takes_it(scene, tmp_path, capsys):
+    for file in scene.iterdir():
+        (tmp_path / file.name).symlink_to(file)
+    (tmp_path / "cameras.json").unlink()
+    frames = []
+    for camera in load_cameras(scene / "cameras.json"):
+        pose = np.linalg.inv(camera.world_to_camera) @ np.diag([1.0, -1.0, -1.0, 1.0])
+        photo = {"w": camera.width, "h": camera.height, "fl_x": camera.fx, "k1": -0.1}
+        frames.append({"file_path": f"{camera.name}.jpg", "transform_matrix": pose.tolist(), **photo})
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
+    assert main(["experiment", "ablation", str(tmp_path)]) == 2
+    err = capsys.readouterr().err
+    assert "undistorted cameras beside its truth" in err and "splatlift tradeoff --labels" in err
 
 
 @pytest.mark.parametrize("name", ["fidelity", "ablation"])
