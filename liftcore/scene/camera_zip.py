@@ -121,6 +121,8 @@ def _unzip(path: Path, pick: Callable[[Files], Files], folder: Path) -> None:
             for name, member in pick(_files(archive)).items():
                 budget -= _unzip_one(archive, member, folder / name, budget)
     except BROKEN as error:
+        if isinstance(error, OSError) and error.errno is not None:
+            raise  # of the disk, and not of what is in the zip
         got = f"one that does not open ({str(error)[:120]})"
         raise InvalidCameras(str(path), expected="a zip of a COLMAP sparse model", got=got) from None
 
