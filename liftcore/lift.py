@@ -159,7 +159,7 @@ def _lift_on(run: Run, plan: Plan, sources: Sources, inputs: list[InputFile], ch
         }
     lifted = [sources.cameras.get(name) for name in sources.views]
     told = lift_warnings(sources.splats, lifted, geometry.denominators, settings.dtype, X.dtype, facts)
-    facts["warnings"] = [*told, *plan.photos]
+    facts["warnings"] = [*told, *plan.told]
     with run.timings.stage("certify"):
         certificate = certify(geometry, X, settings, threads) | notes | facts
     return Lift(

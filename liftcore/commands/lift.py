@@ -32,7 +32,7 @@ def run(options: argparse.Namespace) -> int:
     told: Sequence[str] = ()
     if options.explain and not options.json:  # the document holds the plan anyway
         plan = plan_of(options, settings)
-        told = plan.photos
+        told = plan.told
         print(*plan.lines(), sep="\n", flush=True)
     with progress_bars() as progress:
         result = lift(

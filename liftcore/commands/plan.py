@@ -17,6 +17,6 @@ def run(options: argparse.Namespace) -> int:
     views = {"lifted": list(plan.views), "left_out": list(plan.left_out)}
     today = plan.on_device.today() if plan.on_device else {}
     device = {"kind": plan.device.kind, "name": plan.device.name, **today}
-    document = {**plan.facts(), "device": device, "views": views, "warnings": [*plan.warnings, *plan.photos]}
+    document = {**plan.facts(), "device": device, "views": views, "warnings": [*plan.warnings, *plan.told]}
     reply(document, as_json=options.json, lines=plan.lines())
     return 0

@@ -16,6 +16,7 @@ from liftcore.plan.rank import ENOUGH, Rank, codebook_rank
 from liftcore.plan.visibility import visibility
 from liftcore.raster.side_by_side import views_at_a_time
 from liftcore.scene.distorted import distortion_warning
+from liftcore.scene.frame import frame_warning
 from liftcore.solve.accumulate import lift_walk
 from liftcore.solve.map_shapes import shape_warnings
 
@@ -55,7 +56,7 @@ class Plan:
     on_device: DevicePlan | None  # what it takes of a card, where it is one
     features_room: int | None  # bytes of this machine's memory that X may take today; None for no limit
     warnings: tuple[str, ...]  # of this machine, today
-    photos: tuple[str, ...]  # warnings of photos and maps, which the certificate of the lift has too
+    told: tuple[str, ...]  # warnings of what is lifted, which the certificate of the lift has too
 
     @property
     def memory_bytes(self) -> int:
@@ -101,7 +102,7 @@ class Plan:
         parts = ", ".join(f"{name} {size / 2**20:.0f}" for name, size in sizes.items())
         yield f"  features as {self.dtype}; about {sum(sizes.values()) / 2**20:.0f} MiB at the peak ({parts})"
         yield f"  on {self.device.name}" + (f": {self.on_device.line()}" if self.on_device else "")
-        yield from (f"warning: {warning}" for warning in (*self.warnings, *self.photos))
+        yield from (f"warning: {warning}" for warning in (*self.warnings, *self.told))
 
     @property
     def kept_on_card(self) -> int:
@@ -167,7 +168,11 @@ def plan_lift(
         on_device=on_device if on_card else None,
         features_room=features_room(today, free),
         warnings=(*short, *check_memory(today, free)),
-        photos=(*distortion_warning(list(lifted.values())), *shape_warnings(packs, list(lifted.values()))),
+        told=(
+            *frame_warning(cameras),
+            *distortion_warning(list(lifted.values())),
+            *shape_warnings(packs, list(lifted.values())),
+        ),
     )
 
 

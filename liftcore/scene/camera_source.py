@@ -14,7 +14,7 @@ from liftcore.scene.frame import FRAME_FILE, read_frame
 from liftcore.scene.inria import parse_inria
 from liftcore.scene.json_file import read_json
 from liftcore.scene.model_folders import model_folder, scene_of
-from liftcore.scene.transforms import parse_transforms
+from liftcore.scene.transforms import OF_NERFSTUDIO, parse_transforms
 
 if TYPE_CHECKING:
     from liftcore.scene.cameras import Cameras
@@ -80,7 +80,7 @@ def is_of_nerfstudio(document: Path) -> bool:
         found = read_json(document)
     except InvalidCameras:
         return False
-    return isinstance(found, dict) and ("applied_transform" in found or "ply_file_path" in found)
+    return isinstance(found, dict) and any(key in found for key in OF_NERFSTUDIO)
 
 
 def _of_folder(folder: Path) -> CameraSource:

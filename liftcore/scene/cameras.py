@@ -127,6 +127,7 @@ class Cameras:
 
     views: tuple[Camera, ...]
     frame: str | None = None  # the name of the file by which they were moved to the frame of the splats
+    of_nerfstudio: bool = False  # as its own converter writes them, and not moved
 
     def __post_init__(self) -> None:
         if not self.views:

@@ -16,6 +16,10 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 FRAME_FILE = "dataparser_transforms.json"  # as nerfstudio names it, in the folder of a run
+OWN_FRAME = (
+    "poses of nerfstudio's own files: it trains in another frame than they are in, unless it was told "
+    f"--orientation-method none --center-method none --auto-scale-poses False. Put its run's {FRAME_FILE} beside them"
+)
 TOLERANCE = 1e-3  # of a rotation's entries: they were float32 on the way
 LEAST, LARGEST = 1e-9, 1e9  # scales
 
@@ -87,6 +91,11 @@ def read_frame(path: Path, applied: Mapping[str, Any], source: str) -> Similarit
     left = moved @ np.linalg.inv(before)
     left[:3] *= scale / _scale(applied.get("applied_scale", 1.0), f"{source} applied_scale")
     return Similarity.of(left, f"{path} transform")
+
+
+def frame_warning(cameras: Cameras) -> list[str]:
+    """What is to be said of cameras that may not be in the frame of their splats."""
+    return [OWN_FRAME] if cameras.of_nerfstudio else []
 
 
 def _affine(value: Any, source: str) -> np.ndarray:

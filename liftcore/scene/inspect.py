@@ -13,7 +13,7 @@ from liftcore.scene.camera_source import TRANSFORMS, camera_source, found_near, 
 from liftcore.scene.camera_zip import has_transforms
 from liftcore.scene.distorted import distortion_warning
 from liftcore.scene.foreign import SUFFIXES
-from liftcore.scene.frame import FRAME_FILE
+from liftcore.scene.frame import FRAME_FILE, frame_warning
 from liftcore.scene.lens import photo_size
 from liftcore.scene.load import load_cameras, load_splats, other_models
 from liftcore.scene.ply_dialect import nearest_dialect
@@ -32,10 +32,6 @@ FAR = 1e5  # scene units; float32 resolves only a hundredth there
 TINY = 1e-7  # scene units
 LARGEST = 1e300  # shown in place of what overflows, which JSON cannot hold
 OFF_CENTRE = 0.1  # of the image's side
-OWN_FRAME = (
-    "poses of nerfstudio's own files: it trains in another frame than they are in, unless it was told "
-    f"--orientation-method none --center-method none --auto-scale-poses False. Put its run's {FRAME_FILE} beside them"
-)
 OTHER_FRAME = (
     f"the COLMAP model was read, and beside it lies nerfstudio's {TRANSFORMS}, which is in another frame: if "
     f"nerfstudio trained the splats, put its run's {FRAME_FILE} beside them"
@@ -122,15 +118,12 @@ def describe_cameras(cameras: Cameras) -> dict[str, Any]:
 
 
 def _frame_warnings(path: Path) -> list[str]:
-    """What is to be said of cameras that may not be in the frame of their splats."""
+    """What is to be said where other cameras than those of nerfstudio were read beside its own."""
     source = camera_source(path)
     if source.model is not None:
         return [OTHER_FRAME] if any(map(is_of_nerfstudio, found_near(source.model, TRANSFORMS))) else []
-    if source.file is None:
-        return []
-    if zipfile.is_zipfile(source.file):
-        return [OTHER_FRAME] if has_transforms(source.file) else []
-    return [OWN_FRAME] if is_of_nerfstudio(source.file) else []
+    in_zip = source.file is not None and zipfile.is_zipfile(source.file) and has_transforms(source.file)
+    return [OTHER_FRAME] if in_zip else []
 
 
 def _quantiles(values: Tensor) -> dict[str, float]:
@@ -186,7 +179,7 @@ def _camera_warnings(cameras: Cameras, centres: np.ndarray) -> list[str]:
         for name, photo in photos.items()
         if abs(photo.cx / photo.width - 0.5) > OFF_CENTRE or abs(photo.cy / photo.height - 0.5) > OFF_CENTRE
     ]
-    warnings = distortion_warning(cameras.views)
+    warnings = distortion_warning(cameras.views) + frame_warning(cameras)
     if off:
         warnings.append(f"{len(off)} views have their principal point far off the centre, such as {off[0]!r}")
     places = len(np.unique(centres, axis=0))

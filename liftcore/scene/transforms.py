@@ -40,6 +40,7 @@ UNDISTORT = (
     "and lift on them, and write their fl_x, fl_y, cx and cy without distortion"
 )
 LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])  # of a rigid pose
+OF_NERFSTUDIO = ("applied_transform", "ply_file_path")  # what its own converter writes, and others do not
 OPENGL_TO_OPENCV = np.array([1.0, -1.0, -1.0])  # a camera's y up and z back become down and ahead
 
 
@@ -63,7 +64,8 @@ def parse_transforms(document: Any, source: str) -> Cameras:
     check_count(len(frames), f"{source} frames")
     files = [str(entry(frame, "file_path", f"{source} frame {i}")) for i, frame in enumerate(frames)]
     views = zip(view_names(files), frames, strict=True)
-    return Cameras(tuple(_camera(name, ChainMap(frame, document), source) for name, frame in views))
+    cameras = tuple(_camera(name, ChainMap(frame, document), source) for name, frame in views)
+    return Cameras(cameras, of_nerfstudio=any(key in document for key in OF_NERFSTUDIO))
 
 
 def _camera(name: str, keys: ChainMap[str, Any], source: str) -> Camera:

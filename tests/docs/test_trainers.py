@@ -66,9 +66,13 @@ def test_lift_of_nerfstudios_scene_finds_the_apple(folder: Path, capsys: pytest.
     assert (copy[0], packed[1:4]) == ("cp", ["-m", "zipfile", "-c"])
     assert main(["inspect", "data"]) == 0
     assert "--orientation-method none" in capsys.readouterr().out
+    unmoved = ["lift", "splat.ply", "data", "features.safetensors", "-o", "unmoved.lift.safetensors"]
+    assert main(unmoved) == 0
+    assert "Put its run's dataparser_transforms.json beside them" in capsys.readouterr().out
     shutil.copy(*copy[1:])
     assert [main(command[1:]) for command in splatlift] == [0, 0]
-    assert "dataparser_transforms.json" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "dataparser_transforms.json" in said and "Put its run's" not in said
     question = ["query", "plants.lift.safetensors", "apple", "--table", "words.safetensors", "--view", "middle"]
     assert main([*question, "--mask", "apple.png"]) == 0
     with Image.open("apple.png") as mask:

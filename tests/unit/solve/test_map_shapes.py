@@ -60,7 +60,7 @@ def test_a_crop_is_told_by_the_lift_and_by_its_plan(tmp_path: Path) -> None:
     splats, cameras, _ = write_scene(tmp_path, 3)
     pack, settings = tmp_path / "crops.safetensors", LiftSettings.of(certificate_rays=10)
     write_pack(pack, {"v0": grid(23, 31), "v1": grid(23, 23), "v2": grid(23, 23)}, {"encoder": "e"})
-    [planned_for] = planned(open_sources(splats, cameras, [pack], settings), settings, CPU).photos
+    [planned_for] = planned(open_sources(splats, cameras, [pack], settings), settings, CPU).told
     assert planned_for.startswith("2 of 3 views have maps of another aspect than their images (v1: 23x23 for 37x27)")
     warnings = lift(splats, cameras, [pack], settings).metadata.certificate["warnings"]
     assert warnings.count(planned_for) == 1
