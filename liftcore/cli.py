@@ -200,8 +200,10 @@ def _add_query(parser: _Parser) -> None:
     _add_negative(parser, ", so TEXT goes before it")
     parser.add_argument("--threshold", default="auto", metavar="T", help=THRESHOLDS)
     parser.add_argument("--instances", type=_count, metavar="N", help="how many there are, if you know")
-    parser.add_argument("--keep", choices=("all", "largest"), default="all", help="components of the mask")
+    keep = "of what was found, all or the largest alone: in the mask, in --object and in --objects"
+    parser.add_argument("--keep", choices=("all", "largest"), default="all", help=keep)
     parser.add_argument("--top", type=_count, default=0, metavar="N", help="name the best N splats")
+    parser.add_argument("--objects", action="store_true", help="name the things found, with their places and boxes")
     parser.add_argument("--view", metavar="NAME", help="the camera to see the answer from")
     parser.add_argument("--mask", type=Path, metavar="PNG", help="write the mask of the view")
     parser.add_argument("--attention", type=Path, metavar="PNG", help="write the attention map of the view")

@@ -239,10 +239,20 @@ class TopSplat(BaseModel):
 
 
 class Box(BaseModel):
-    """The axis-aligned box of the centres of the selected splats, world frame."""
+    """An axis-aligned box, world frame."""
 
-    low: list[float]
+    low: list[float] = Field(description="x y z")
     high: list[float]
+
+
+class FoundObject(BaseModel):
+    """Splats at or above the threshold that hang together."""
+
+    splats: int = Field(description="how many")
+    share: float = Field(description="of the evidence of all splats at or above the threshold")
+    score: float = Field(description="the mean of its splats' scores, by their evidence")
+    centre: list[float] = Field(description="the middle of its box: x y z, world frame")
+    box: Box = Field(description="of its splats' centres, but for a thousandth of the evidence at each end")
 
 
 Notation = Annotated[
@@ -275,7 +285,7 @@ class Question(BaseModel):
     negatives: Texts = Field([], description="what it is not; likewise")
     threshold: Cut = Field("auto", description="how to find it, or the score from which a splat counts as found")
     instances: Count | None = Field(None, description="how many there are, if you know")
-    keep: Literal["all", "largest"] = Field("all", description="components of a mask")
+    keep: Literal["all", "largest"] = Field("all", description="of what was found, in masks, splats and objects")
     encoder: str | None = Field(None, max_length=200, description="a text space that the operator set up, or default")
 
 
@@ -327,8 +337,17 @@ class QueryAnswer(BaseModel):
     threshold: Threshold
     count: int = Field(description="splats at or above the threshold")
     top: list[TopSplat]
-    box: Box | None
     links: dict[str, str]
+
+
+class ObjectsAnswer(BaseModel):
+    """The things that were found."""
+
+    lift: JobId
+    threshold: Threshold
+    count: int = Field(description="splats at or above the threshold")
+    objects: list[FoundObject] = Field(description="those with the most evidence first")
+    strays: int = Field(description="splats at or above the threshold in none of them")
 
 
 class Health(BaseModel):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -34,6 +35,7 @@ def run(options: argparse.Namespace) -> int:
     for path in outputs:
         free_output(path, [options.lift, *([options.table] if options.table else [])])
     from liftcore.query.ask import ask, look, top
+    from liftcore.query.objects import objects
     from liftcore.query.query import texts_of
     from liftcore.query.scene import QueryScene
 
@@ -47,11 +49,11 @@ def run(options: argparse.Namespace) -> int:
     seen = look(scene, answer, options.view) if options.view else None
     document = _document(answer, seen, encoder)
     if options.top:
-        found = top(answer, scene, options.top)
-        document["top"] = [
-            {"splat": best.splat, "score": best.score, "position": best.position} for best in found.best
-        ]
-        document["box"] = found.box
+        document["top"] = [asdict(best) for best in top(answer, scene, options.top)]
+    if options.objects:
+        found = objects(scene, answer)
+        document["objects"] = [asdict(thing) for thing in found.found]
+        document["strays"] = found.strays
     document["files"] = _write(options, scene, answer, seen)
     reply(document, as_json=options.json, lines=_lines(document))
     return 0
@@ -151,6 +153,17 @@ def _lines(document: dict[str, Any]) -> Iterable[str]:
         view = document["view"]
         yield f"  view {view['name']}: {view['mask_share']:.2%} of the image ({view['explanation']})"
     for best in document.get("top", []):
-        position = ", ".join(f"{value:.4g}" for value in best["position"])
-        yield f"  splat {best['splat']}: score {best['score']:.4g} at {position}"
+        yield f"  splat {best['splat']}: score {best['score']:.4g} at {_place(best['position'])}"
+    for number, thing in enumerate(document.get("objects", []), 1):
+        low, high = thing["box"]
+        yield (
+            f"  object {number}: {thing['splats']} splats, {thing['share']:.1%} of the evidence, score "
+            f"{thing['score']:.4g}, at {_place(thing['centre'])}, from {_place(low)} to {_place(high)}"
+        )
+    if document.get("strays"):
+        yield f"  {document['strays']} splats are strays: single or in specks, and of no object"
     yield from (f"  {kind}: {path}" for kind, path in document["files"].items())
+
+
+def _place(point: tuple[float, ...]) -> str:
+    return f"({', '.join(f'{value:.4g}' for value in point)})"

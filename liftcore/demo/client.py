@@ -68,6 +68,10 @@ class Client:
         answer = self._call("GET", "/query", params={"lift": lift, "text": text, **more}).json()
         return answer, 1e3 * (time.perf_counter() - begin)
 
+    def objects(self, lift: str, text: str) -> list[dict[str, Any]]:
+        """``GET /query/objects``: the things that were found."""
+        return self._call("GET", "/query/objects", params={"lift": lift, "text": text}).json()["objects"]
+
     def picture(self, path: str, **parameters: str) -> tuple[bytes, float]:
         """A PNG of the service, and the milliseconds that it took to come."""
         begin = time.perf_counter()

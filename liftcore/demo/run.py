@@ -39,6 +39,7 @@ class Finding:
     score: float  # the best cosine
     threshold: float | None  # on the splats' scores
     explanation: str
+    objects: list[dict[str, Any]]  # the things found, with their places
     query_ms: float
     mask_ms: float  # the mean over views, query excluded
     iou: float | None  # the mean over views with truth
@@ -174,6 +175,7 @@ def _find(client: Client, lift: str, phrase: str, subject: DemoScene, out: Path)
         score=best[0]["score"] if best else float("nan"),
         threshold=answer["threshold"]["value"],
         explanation=answer["threshold"]["explanation"],
+        objects=client.objects(lift, phrase),
         query_ms=query_ms,
         mask_ms=sum(times) / len(times),
         iou=_mean_iou(phrase, masks, subject.truth),
@@ -246,4 +248,7 @@ class _Voice:
             f"      {found.splats:,} splats, best score {found.score:.2f}, {bar}, "
             f"{found.query_ms:.0f} ms (mask {found.mask_ms:.0f} ms){iou}"
         )
+        for number, thing in enumerate(found.objects, 1):
+            place = ", ".join(f"{value:.2f}" for value in thing["centre"])
+            self.line(f"      object {number}: {thing['splats']:,} splats around ({place})")
         self.line(f"      {found.pictures['found']}")

@@ -124,7 +124,7 @@ def measure_tabletop(
     for pack in packs:
         for preset in presets:
             files = [folder / name for name in ("point_cloud.ply", "cameras.json", f"{pack}.safetensors")]
-            opened = _lifted(files, preset, scene.raster)
+            opened = lifted(files, preset, scene.raster)
             row = measure_phrases(opened, scene.classes, scene.held_out)
             examples = measure_pixels(opened, scene.classes, scene.held_out)
             rows.append({"scene": "tabletop", "features": pack, "preset": preset, **row, **examples})
@@ -157,7 +157,7 @@ def measure_still_life(presets: Sequence[str] = PRESETS) -> list[dict[str, Any]]
             moved = {view: replace(part, codebook=_in_cone(part.codebook, cone)) for view, part in observed.items()}
             write_pack(files[2], moved, {"encoder": "generated", "text_space": "minilm", "normalised": "true"})
             for preset in presets:
-                opened = _lifted(files, preset, raster)
+                opened = lifted(files, preset, raster)
                 row = measure_phrases(opened, encoder.encode(made.things), held_out)
                 rows.append({"scene": "still life", "features": name, "preset": preset, **row})
     return rows
@@ -170,7 +170,7 @@ def _in_cone(codebook: Tensor, share: float) -> Tensor:
     return torch.nn.functional.normalize(drawn, dim=1).half() if share else codebook
 
 
-def _lifted(files: list[Path], preset: str, raster: Any) -> QueryScene:
+def lifted(files: list[Path], preset: str, raster: Any) -> QueryScene:
     """The files lifted and opened, with the splats of a raster that is there already."""
     made = lift(files[0], files[1], files[2:], LiftSettings.of(preset=preset, certificate_rays=0))
     with tempfile.TemporaryDirectory() as place:

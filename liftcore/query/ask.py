@@ -68,21 +68,16 @@ class Look:
     explanation: str
 
 
+Point = tuple[float, float, float]  # x y z, world frame, scene units
+
+
 @dataclass(frozen=True)
 class TopSplat:
     """One of the best splats of an answer."""
 
     splat: int  # its row in the splat file
     score: float
-    position: tuple[float, float, float]  # world frame, scene units
-
-
-@dataclass(frozen=True)
-class Found:
-    """Where an answer lies in the world."""
-
-    best: tuple[TopSplat, ...]  # descending by score
-    box: tuple[tuple[float, ...], tuple[float, ...]] | None  # least and greatest corner of the selected; None = none
+    position: Point
 
 
 def ask(scene: QueryScene, query: Query | str, encoder: TextEncoder | None = None) -> Answer:
@@ -143,8 +138,8 @@ def look(scene: QueryScene, answer: Answer, view: str) -> Look:
     return Look(view, attention, row_sums, mask, found.value, found.method, found.explanation)
 
 
-def top(answer: Answer, scene: QueryScene, count: int) -> Found:
-    """The best splats of an answer with their places, and the box around all selected ones.
+def top(answer: Answer, scene: QueryScene, count: int) -> tuple[TopSplat, ...]:
+    """The best splats of an answer with their places, descending by score.
 
     Raises:
         InvalidLift: the splats moved or changed since the lift.
@@ -152,16 +147,11 @@ def top(answer: Answer, scene: QueryScene, count: int) -> Found:
     means = scene.splats.means
     ranked = answer.scores if scene.all_seen else torch.where(answer.seen, answer.scores, -torch.inf)
     scores, order = torch.topk(ranked, min(count, len(ranked)))
-    best = tuple(
+    return tuple(
         TopSplat(row, score, _point(means[row]))
         for row, score in zip(order.tolist(), scores.tolist(), strict=True)
         if score > -torch.inf
     )
-    chosen = torch.from_numpy(np.flatnonzero(answer.selected.numpy()))
-    if not len(chosen):
-        return Found(best, None)
-    low, high = torch.aminmax(scene.axes.index_select(1, chosen), dim=1)
-    return Found(best, (_point(low), _point(high)))
 
 
 def _similarities(scene: QueryScene, questions: Sequence[Question]) -> list[Tensor]:
@@ -211,6 +201,6 @@ def _statistics(scores: Tensor) -> dict[str, float]:
     return {"min": float(low), "max": float(high), "mean": float(scores.mean()), **quantiles}
 
 
-def _point(row: Tensor) -> tuple[float, float, float]:
+def _point(row: Tensor) -> Point:
     x, y, z = row.tolist()
     return x, y, z

@@ -14,6 +14,7 @@ import torch
 
 from liftcore.errors import InvalidQuery
 from liftcore.query.colours import NOT_SEEN_COLOUR, constant_terms, heat_colours
+from liftcore.query.objects import objects
 from liftcore.scene.ply_copy import recoloured, some_rows
 
 if TYPE_CHECKING:
@@ -26,8 +27,10 @@ if TYPE_CHECKING:
 def object_ply(scene: QueryScene, answer: Answer) -> Iterable[bytes]:
     """The splats that were selected, as a file in blocks; every property of theirs to the byte.
 
+    A query that keeps the largest gets the largest object alone (`objects`).
+
     Raises:
-        InvalidQuery: none was selected: most viewers open no file without splats.
+        InvalidQuery: none was selected: most viewers open no file without splats; or more than objects are made of.
         InvalidLift: the splats moved or changed since the lift.
     """
     if answer.count == 0:
@@ -37,6 +40,8 @@ def object_ply(scene: QueryScene, answer: Answer) -> Iterable[bytes]:
             got=f"none of {len(answer.scores)}: nothing stands out",
             hint="name a lower threshold, or ask in other words or by example",
         )
+    if answer.query.keep == "largest":
+        return some_rows(scene.splat_file, objects(scene, answer).numbers == 0)
     return some_rows(scene.splat_file, answer.selected.numpy())
 
 

@@ -21,6 +21,7 @@ from liftcore.query.ask import Answer, Look, Question, answers, look, question, 
 from liftcore.query.encoders import TextEncoder, open_encoder
 from liftcore.query.encoders.remembering import RememberingEncoder
 from liftcore.query.example import Example, Vector, parse_example
+from liftcore.query.objects import Objects, objects
 from liftcore.query.pictures import attention_png, mask_png, render_png
 from liftcore.query.products import cosines_of, norms_of
 from liftcore.query.query import Query
@@ -58,6 +59,7 @@ class Answers:
         self._warm: set[Kernel] = set()  # kernels of splats whose compiled code is loaded, or being loaded
         self._operations: dict[str, Callable[[dict[str, Any]], Frame]] = {
             "query": self._query,
+            "objects": self._objects,
             "scores": self._scores,
             "mask": self._mask,
             "attention": self._attention,
@@ -162,6 +164,10 @@ class Answers:
             scene.cameras.get(request["view"])  # links to pictures of a view that is not there help nobody
         return Frame(describe(scene, answer, request["top"]))
 
+    def _objects(self, request: dict[str, Any]) -> Frame:
+        answer = self._answer(request)
+        return Frame(_found(answer) | describe_objects(objects(self._scene(request), answer)))
+
     def _scores(self, request: dict[str, Any]) -> Frame:
         return Frame({}, scores_npy(self._answer(request)))
 
@@ -258,15 +264,16 @@ def open_scene(request: dict[str, Any]) -> QueryScene:
 
 def describe(scene: QueryScene, answer: Answer, count: int) -> dict[str, Any]:
     """The answer in numbers, as JSON takes them; ``count`` of the best splats."""
-    found = top(answer, scene, count)
-    return {
-        "statistics": finite(answer.statistics),
-        "threshold": {
-            "value": finite(answer.threshold),
-            "method": answer.threshold_method,
-            "explanation": answer.explanation,
-        },
-        "count": answer.count,
-        "top": [asdict(splat) for splat in found.best],
-        "box": None if found.box is None else {"low": found.box[0], "high": found.box[1]},
-    }
+    best = [asdict(splat) for splat in top(answer, scene, count)]
+    return {"statistics": finite(answer.statistics), **_found(answer), "top": best}
+
+
+def describe_objects(found: Objects) -> dict[str, Any]:
+    """The things that were found, as JSON takes them."""
+    things = [asdict(thing) | {"box": {"low": thing.box[0], "high": thing.box[1]}} for thing in found.found]
+    return {"objects": things, "strays": found.strays}
+
+
+def _found(answer: Answer) -> dict[str, Any]:
+    cut = {"method": answer.threshold_method, "explanation": answer.explanation}
+    return {"threshold": {"value": finite(answer.threshold), **cut}, "count": answer.count}

@@ -35,7 +35,7 @@ View = Annotated[str, Query(min_length=1, max_length=wire.VIEW_CHARACTERS, descr
 
 @router.get("/query", response_model=wire.QueryAnswer)
 def query(asked: Annotated[wire.AskedWhere, Query()], here: Here) -> wire.QueryAnswer:
-    """Where it is: scores in numbers, the best splats, a box, and links to pictures."""
+    """Where it is: scores in numbers, the best splats, and links to objects, splats and pictures."""
     return _answer(asked, here)
 
 
@@ -43,6 +43,18 @@ def query(asked: Annotated[wire.AskedWhere, Query()], here: Here) -> wire.QueryA
 def query_by_body(asked: wire.AskedInBody, here: Here) -> wire.QueryAnswer:
     """The same for a query in a body, where examples may be vectors. POST the same body to the links of those."""
     return _answer(asked, here)
+
+
+@router.get("/query/objects", response_model=wire.ObjectsAnswer)
+def objects(asked: Annotated[wire.Asked, Query()], here: Here) -> wire.ObjectsAnswer:
+    """The things that were found, splats that touch one another: where each lies, and how large it is."""
+    return _objects(asked, here)
+
+
+@router.post("/query/objects", response_model=wire.ObjectsAnswer)
+def objects_by_body(asked: wire.AskedInBody, here: Here) -> wire.ObjectsAnswer:
+    """The things that were found, for a query in a body."""
+    return _objects(asked, here)
 
 
 @router.get("/query/scores", responses=NPY | TAGGED, response_class=Response)
@@ -139,6 +151,12 @@ def _answer(asked: wire.AskedWhere | wire.AskedInBody, here: Parts) -> wire.Quer
         links=answer_links(asked, lift, view, found=found["count"] > 0),
         **found,
     )
+
+
+def _objects(asked: wire.Asked | wire.AskedInBody, here: Parts) -> wire.ObjectsAnswer:
+    lift = find_lift(asked.lift, here)
+    found = here.queries.call(query_request("objects", asked, lift, here)).header
+    return wire.ObjectsAnswer(lift=lift.id, **found)
 
 
 def _view(asked: wire.AskedInBody) -> str:

@@ -72,10 +72,12 @@ def entity_tag(asked: dict[str, Any], lift: LiftRecord) -> str:
 def answer_links(asked: Question, lift: LiftRecord, view: str | None, *, found: bool) -> dict[str, str]:
     """The URLs of other looks at the same query; vectors do not fit in one, and are sent there again.
 
-    Where nothing was ``found`` there is no object.
+    Where nothing was ``found`` there are no objects.
     """
     links = {"lift": f"/lifts/{lift.id}", "scores": _link("/query/scores", asked, lift=lift.id)}
-    links |= {"object": _link("/query/splats?what=object", asked, lift=lift.id)} if found else {}
+    if found:
+        links["objects"] = _link("/query/objects", asked, lift=lift.id)
+        links["object"] = _link("/query/splats?what=object", asked, lift=lift.id)
     links["coloured"] = _link("/query/splats?what=scores", asked, lift=lift.id)
     if view is not None:
         links["mask"] = _link("/query/mask", asked, lift=lift.id, view=view)

@@ -244,15 +244,34 @@ function tell(found) {
   at("answer").textContent = `${found.count.toLocaleString()} splats${cut}. ${found.threshold.explanation}`;
   const facts = [["threshold", `${number(found.threshold.value)} (${found.threshold.method})`]];
   if (found.top.length) facts.push(["best splat", `${found.top[0].splat}, score ${number(found.top[0].score)}`]);
-  if (found.box) facts.push(["box from", found.box.low.map(number).join(", ")], ["box to", found.box.high.map(number).join(", ")]);
   for (const name of ["min", "q05", "q50", "q95", "max"]) facts.push([`score ${name}`, number(found.statistics[name])]);
-  at("numbers").replaceChildren(...facts.flatMap(([name, value]) => {
+  at("numbers").replaceChildren(...rows(facts));
+}
+
+function rows(facts) {
+  return facts.flatMap(([name, value]) => {
     const term = document.createElement("dt");
     const told = document.createElement("dd");
     term.textContent = name;
     told.textContent = value;
     return [term, told];
-  }));
+  });
+}
+
+async function tellObjects(url, mine) {
+  const facts = [];
+  try {
+    const { objects, strays } = await json(url);
+    objects.forEach(({ splats, centre, box }, place) => {
+      const sides = box.high.map((high, axis) => number(high - box.low[axis]));
+      facts.push([`object ${place + 1}`,
+        `${splats.toLocaleString()} splats around (${centre.map(number).join(", ")}), ${sides.join(" x ")}`]);
+    });
+    if (strays) facts.push(["strays", `${strays.toLocaleString()} splats, in none of them`]);
+  } catch (problem) {
+    facts.push(["objects", problem.message]);
+  }
+  if (mine === turn) at("numbers").append(...rows(facts));
 }
 
 function clear() {
@@ -294,6 +313,7 @@ async function look() {
     hang("attention", heat);
     at("attention").dataset.ready = "yes";
     arrange();
+    if (found.links.objects) await tellObjects(found.links.objects, mine);
   } catch (problem) {
     if (mine !== turn) return;
     clear();

@@ -18,7 +18,8 @@ from .test_problems import assert_problem
 from .tiny_scene import CHANNELS, HEIGHT, SPLATS_A_CLUSTER, WIDTH, TinyScene, codebook
 
 LAMP = (26, HEIGHT // 2)  # a pixel of the lamp in view "middle"
-ROUTES = ("/query", "/query/scores", "/query/mask", "/query/attention", "/query/splats")
+ROUTES = ("/query", "/query/objects", "/query/scores", "/query/mask", "/query/attention", "/query/splats")
+NEED_NO_VIEW = ("/query/objects", "/query/scores", "/query/splats")
 
 
 def of_lamp(answer: dict[str, Any]) -> bool:
@@ -162,8 +163,8 @@ def test_what_an_example_lacks_is_told_beside_it(client: TestClient, lift: dict[
     ],
 )  # fmt: skip
 def test_no_body_makes_a_query_our_fault(client: TestClient, lift: dict[str, Any], path: str, body: bytes) -> None:
-    if body == b'{"like": ["splat:1"], "view": "behind"}' and path in ("/query/scores", "/query/splats"):
-        return  # these need no view
+    if body == b'{"like": ["splat:1"], "view": "behind"}' and path in NEED_NO_VIEW:
+        return
     reply = client.post(path, content=body, headers={"Content-Type": "application/json"})
     assert 400 <= assert_problem(reply)["status"] < 500
 

@@ -25,7 +25,8 @@ def addresses(lift: dict[str, Any], uploaded: Uploaded) -> list[str]:
         "/healthz", "/readyz", "/version", "/metrics", "/", "/openapi.json", "/docs",
         "/assets", f"/assets/{uploaded.splats}", f"/assets/{uploaded.splats}/content",
         "/jobs", f"/jobs/{lift['id']}", f"/jobs/{lift['id']}/events", "/lifts", own, f"{own}/features",
-        f"/query?{asked}", f"/query/scores?{asked}", f"/query/mask?{asked}&view=left",
+        f"/query?{asked}", f"/query/objects?{asked}", f"/query/scores?{asked}",
+        f"/query/mask?{asked}&view=left",
         f"/render?lift={lift['id']}&view=left",
     ]  # fmt: skip
 

@@ -102,11 +102,8 @@ def naming(method: str, path: str, job: str, asset: str, house: Guarded) -> list
             wrong.append({"labels": {"masks": asset, "table": asset, "classes": ["apple"]}})
         return [{"json": house.body() | place} for place in wrong]
     if path.startswith("/query") or path == "/render":
-        unknown = (
-            {"/render": ("text",), "/query/scores": ("view",), "/query/splats": ("view",)}.get(path, ())
-            if method == "GET"
-            else ()
-        )
+        without_view = dict.fromkeys(("/query/scores", "/query/splats", "/query/objects"), ("view",))
+        unknown = ({"/render": ("text",)} | without_view).get(path, ()) if method == "GET" else ()
         asked = {name: value for name, value in ASKING.items() if name not in unknown} | {"lift": job}
         return [{"json": asked | {"text": ["apple"]}} if method == "POST" else {"params": asked}]
     assert "{" in path, f"{method} {path} names nothing: is it open to all, or does it belong into NAMELESS?"

@@ -41,6 +41,7 @@ ROUTES = {
     "/lifts/{lift}",
     "/lifts/{lift}/features",
     "/query",
+    "/query/objects",
     "/query/scores",
     "/query/mask",
     "/query/attention",
@@ -161,6 +162,8 @@ def test_long_body_is_413(client: TestClient) -> None:
         ("/query", {"encoder": "spare"}, 422, "invalid-query"),  # 5 channels and not 8
         ("/query/mask", {"view": "behind"}, 404, "not-found"),
         ("/query/mask", {}, 422, "invalid-request"),
+        ("/query/objects", {"threshold": "high"}, 422, "invalid-request"),
+        ("/query/objects", {"text": "zeppelin"}, 422, "invalid-query"),
         ("/query/scores", {"lift": "../../etc/passwd"}, 422, "invalid-request"),
         ("/query/splats", {"threshold": "2"}, 422, "invalid-query"),  # nothing was found, so there is no object
         ("/query/splats", {"what": "mesh"}, 422, "invalid-request"),

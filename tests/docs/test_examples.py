@@ -33,7 +33,8 @@ ROUTES: tuple[ModuleType, ...] = (operations, assets, jobs, lifts, tradeoffs, qu
 SHAPES: dict[str, type[BaseModel]] = {  # a field that no other answer has -> the answer
     "counts": wire.Asset,
     "attempt": wire.Job,
-    "threshold": wire.QueryAnswer,
+    "statistics": wire.QueryAnswer,
+    "strays": wire.ObjectsAnswer,
     "detail": wire.Problem,
 }
 

@@ -52,6 +52,8 @@ def test_word_finds_its_thing_in_the_picture(page: Browser) -> None:
     assert "splats at or above" in text_of(page, "#answer")
     columns = page.value(FOUND)
     assert columns and min(columns) > 16  # the lamp is the right one of three
+    page.until("document.querySelector('#numbers').textContent.includes('object 1')")
+    assert "splats around (1." in text_of(page, "#numbers") and "object 2" not in text_of(page, "#numbers")
     assert page.value("getComputedStyle(document.querySelector('#mask')).display") != "none"
     page.press("#show-mask")
     assert page.value("document.querySelector('#mask').hidden") is True

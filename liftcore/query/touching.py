@@ -1,0 +1,82 @@
+"""Which splats hang together: components of the graph in which neighbours touch."""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from liftcore.raster.constants import MAX_LOG_SCALE
+
+if TYPE_CHECKING:
+    from liftcore.scene.splats import Splats
+
+NEIGHBOURS = 16  # that each splat looks at, the nearest by their centres
+REACH = 2.0  # standard deviations to which a splat touches
+_PIECE = 1 << 15  # splats whose neighbours are looked at at once
+
+
+def touching(splats: Splats, rows: np.ndarray) -> np.ndarray:
+    """Put splats that touch, directly or through others, into one group.
+
+    Two splats touch where ``|m_j - m_k| <= 2 (s_j + s_k)``, with s the standard deviation of each along the line
+    between their centres, ``sqrt(d^T Sigma d)``: a rule without a length of its own, as scenes have no common unit.
+    Each looks at its 16 nearest among the rows.
+
+    Args:
+        splats: the scene.
+        rows: [n] i64, the splats to group; the others do not connect.
+
+    Returns:
+        [n] i32, the number of each row's group, from 0 in the order of their first rows.
+    """
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import KDTree
+
+    count = len(rows)
+    if count < 2:
+        return np.zeros(count, np.int32)
+    means = splats.means.numpy()[rows].astype(np.float64)
+    spreads = _spreads(splats, rows)
+    tree = KDTree(means)
+
+    def look(first: int) -> tuple[np.ndarray, np.ndarray]:
+        piece = slice(first, first + _PIECE)
+        near = np.asarray(tree.query(means[piece], min(NEIGHBOURS + 1, count))[1])  # itself, or its equal, among them
+        apart = means[near] - means[piece, None]
+        squares = np.concatenate([apart**2, apart[..., [0, 0, 1]] * apart[..., [1, 2, 2]]], axis=2)
+        # s |d| of both sides, so that nothing is divided by a distance of zero.
+        own = np.einsum("ns,nks->nk", spreads[piece], squares)
+        theirs = np.einsum("nks,nks->nk", spreads[near], squares)
+        reach = REACH * (np.sqrt(np.maximum(own, 0)) + np.sqrt(np.maximum(theirs, 0)))
+        touch = squares[..., :3].sum(axis=2) <= reach
+        return near[touch], touch.sum(axis=1)
+
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        looks = list(pool.map(look, range(0, count, _PIECE)))
+    columns, sizes = (np.concatenate(parts) for parts in zip(*looks, strict=True))
+    starts = np.concatenate([[0], np.cumsum(sizes)])
+    graph = csr_array((np.ones(len(columns), np.int8), columns, starts), shape=(count, count))
+    _, groups = connected_components(graph, directed=True, connection="weak")
+    return groups
+
+
+def _spreads(splats: Splats, rows: np.ndarray) -> np.ndarray:
+    """[n, 6] f64, Sigma of each splat: xx, yy, zz, and twice xy, xz, yz."""
+    scales = np.exp(splats.log_scales.numpy()[rows].astype(np.float64).clip(-MAX_LOG_SCALE, MAX_LOG_SCALE))
+    quats = splats.quats.numpy()[rows].astype(np.float64)
+    lengths = np.linalg.norm(quats, axis=1, keepdims=True)
+    w, x, y, z = np.where(lengths > 0, quats / np.maximum(lengths, np.finfo(float).tiny), [1.0, 0, 0, 0]).T
+    axes = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)],
+            [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)],
+            [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )[: scales.shape[1]]  # [axis, coordinate, n]; a disc has two
+    x, y, z = (axes * scales.T[:, None]).transpose(1, 0, 2)
+    products = (x * x, y * y, z * z, 2 * x * y, 2 * x * z, 2 * y * z)
+    return np.stack([product.sum(axis=0) for product in products], axis=1)

@@ -1,0 +1,116 @@
+"""What an answer found, thing by thing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from liftcore.artifact import save_lift
+from liftcore.errors import InvalidQuery
+from liftcore.lift import lift
+from liftcore.query import objects as module
+from liftcore.query.ask import Answer, ask
+from liftcore.query.example import Region
+from liftcore.query.objects import objects
+from liftcore.query.query import Query
+from liftcore.query.scene import QueryScene
+from liftcore.query.splat_files import object_ply
+from liftcore.solve.settings import LiftSettings
+from tests.api.tiny_scene import SPLATS_A_CLUSTER, make_scene, ply, splat_rows
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> QueryScene:
+    """The tiny scene lifted: three clusters side by side, 1.2 apart."""
+    tiny, folder = make_scene(), tmp_path_factory.mktemp("objects")
+    for name, content in (("s.ply", tiny.splats), ("c.json", tiny.cameras), ("f.safetensors", tiny.features)):
+        (folder / name).write_bytes(content)
+    made = lift(folder / "s.ply", folder / "c.json", [folder / "f.safetensors"], LiftSettings.of(preset="row-sum"))
+    save_lift(made, folder / "scene.lift")
+    return QueryScene.open(folder / "scene.lift")
+
+
+def of(scene: QueryScene, *clusters: int, keep: str = "all", rows: tuple[int, ...] = ()) -> Answer:
+    """An answer that selected these clusters and rows, with scores of .5 and more the later they stand."""
+    answer = ask(scene, Query((Region("left", 0, 2),), threshold=0.5, keep=keep))
+    selected = torch.zeros(3 * SPLATS_A_CLUSTER, dtype=torch.bool)
+    for cluster in clusters:
+        selected[cluster * SPLATS_A_CLUSTER : (cluster + 1) * SPLATS_A_CLUSTER] = True
+    selected[list(rows)] = True
+    return replace(answer, selected=selected, scores=torch.linspace(0.5, 1.0, len(selected)))
+
+
+def means(scene: QueryScene, cluster: int) -> np.ndarray:
+    return scene.splats.means.numpy()[cluster * SPLATS_A_CLUSTER : (cluster + 1) * SPLATS_A_CLUSTER]
+
+
+def test_clusters_that_are_apart_are_objects_with_their_boxes(scene: QueryScene) -> None:
+    answer = of(scene, 0, 2)
+    found = objects(scene, answer)
+    assert len(found.found) == 2 and found.strays == 0
+    evidence = scene.lift.evidence.numpy()
+    for number, thing in enumerate(found.found):
+        rows = np.flatnonzero(found.numbers == number)
+        cluster = rows[0] // SPLATS_A_CLUSTER
+        assert rows.tolist() == list(range(cluster * SPLATS_A_CLUSTER, (cluster + 1) * SPLATS_A_CLUSTER))
+        assert thing.splats == SPLATS_A_CLUSTER
+        assert thing.share == pytest.approx(evidence[rows].sum() / evidence[answer.selected.numpy()].sum())
+        assert thing.score == pytest.approx(np.average(answer.scores.numpy()[rows], weights=evidence[rows]))
+        low, high = means(scene, cluster).min(axis=0), means(scene, cluster).max(axis=0)
+        # So few splats have a thousandth of the evidence each, or more: the box holds all of them, or nearly.
+        assert (np.array(thing.box[0]) >= low).all() and (np.array(thing.box[1]) <= high).all()
+        assert np.array(thing.box) == pytest.approx(np.stack([low, high]), abs=0.3)
+        assert thing.centre == pytest.approx(np.mean(thing.box, axis=0))
+    assert found.found[0].share >= found.found[1].share
+    assert (found.numbers[SPLATS_A_CLUSTER : 2 * SPLATS_A_CLUSTER] == -1).all()
+
+
+def test_single_splats_elsewhere_are_strays_and_stretch_no_box(scene: QueryScene) -> None:
+    alone, with_stray = objects(scene, of(scene, 0)), objects(scene, of(scene, 0, rows=(2 * SPLATS_A_CLUSTER,)))
+    assert len(with_stray.found) == 1 and with_stray.strays == 1
+    assert with_stray.numbers[2 * SPLATS_A_CLUSTER] == -1
+    assert with_stray.found[0].box == alone.found[0].box
+    assert with_stray.found[0].share < alone.found[0].share == 1.0
+
+
+def test_who_keeps_the_largest_gets_it_alone_also_as_a_file(scene: QueryScene) -> None:
+    both, largest = objects(scene, of(scene, 0, 2)), objects(scene, of(scene, 0, 2, keep="largest"))
+    assert largest.found == both.found[:1]
+    assert largest.strays == both.found[1].splats
+    kept = b"".join(object_ply(scene, of(scene, 0, 2, keep="largest")))
+    assert kept == ply(splat_rows()[both.numbers == 0])
+    assert b"".join(object_ply(scene, of(scene, 0, 2))) == ply(splat_rows()[both.numbers >= 0])
+
+
+def test_nothing_found_is_no_object(scene: QueryScene) -> None:
+    found = objects(scene, of(scene))
+    assert (found.found, found.strays) == ((), 0)
+    assert (found.numbers == -1).all()
+
+
+def test_without_evidence_splats_count_alike(scene: QueryScene) -> None:
+    bare = QueryScene(replace(scene.lift, evidence=torch.zeros_like(scene.lift.evidence)), scene.path)
+    found = objects(bare, of(scene, 0, rows=(2 * SPLATS_A_CLUSTER, 2 * SPLATS_A_CLUSTER + 1)))
+    assert found.found[0].splats == SPLATS_A_CLUSTER
+    assert sum(thing.share for thing in found.found) <= 1.0
+
+
+def test_tails_of_a_thousandth_are_not_in_the_box() -> None:
+    means = np.zeros((2001, 3))
+    means[:, 0] = np.arange(2001)
+    low, high = module._box(means, np.ones(2001))
+    assert (low[0], high[0]) == (2, 1998)  # two of 2001 below, two above
+    weights = np.ones(2001)
+    weights[-1] = 100.0
+    assert module._box(means, weights)[1][0] == 2000
+    assert (module._box(means[:1], np.ones(1))[0] == 0).all()
+
+
+def test_more_splats_than_are_grouped_are_refused(scene: QueryScene, monkeypatch) -> None:
+    monkeypatch.setattr(module, "MOST_SPLATS", SPLATS_A_CLUSTER)
+    assert objects(scene, of(scene, 0)).found
+    with pytest.raises(InvalidQuery, match=r"threshold: expected at most 20 splats.*got 21; name a higher"):
+        objects(scene, of(scene, 0, rows=(2 * SPLATS_A_CLUSTER,)))
