@@ -9,7 +9,7 @@ from liftcore import __version__
 from service import wire
 from service.store.schema import MIGRATIONS
 
-API = "2"  # of the routes and their JSON: changes when a client that works today would break
+API = "1"  # of the routes and their JSON: changes when a client that works today would break
 PACKAGES = ("torch", "numpy", "numba", "fastapi", "uvicorn")
 
 

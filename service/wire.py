@@ -337,6 +337,7 @@ class QueryAnswer(BaseModel):
     threshold: Threshold
     count: int = Field(description="splats at or above the threshold")
     top: list[TopSplat]
+    box: Box | None = Field(description="around all splats at or above the threshold, strays too: see objects")
     links: dict[str, str]
 
 

@@ -49,11 +49,11 @@ def run(options: argparse.Namespace) -> int:
     seen = look(scene, answer, options.view) if options.view else None
     document = _document(answer, seen, encoder)
     if options.top:
-        document["top"] = [asdict(best) for best in top(answer, scene, options.top)]
+        best = top(answer, scene, options.top)
+        document |= {"top": [asdict(splat) for splat in best.best], "box": best.box}
     if options.objects:
         found = objects(scene, answer)
-        document["objects"] = [asdict(thing) for thing in found.found]
-        document["strays"] = found.strays
+        document |= {"objects": [asdict(thing) for thing in found.found], "strays": found.strays}
     document["files"] = _write(options, scene, answer, seen)
     reply(document, as_json=options.json, lines=_lines(document))
     return 0

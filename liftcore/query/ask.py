@@ -80,6 +80,14 @@ class TopSplat:
     position: Point
 
 
+@dataclass(frozen=True)
+class Found:
+    """Where an answer lies in the world."""
+
+    best: tuple[TopSplat, ...]  # descending by score
+    box: tuple[Point, Point] | None  # least and greatest corner of the centres of all selected; None = none
+
+
 def ask(scene: QueryScene, query: Query | str, encoder: TextEncoder | None = None) -> Answer:
     """Score every splat for a query and choose those that answer it.
 
@@ -138,8 +146,10 @@ def look(scene: QueryScene, answer: Answer, view: str) -> Look:
     return Look(view, attention, row_sums, mask, found.value, found.method, found.explanation)
 
 
-def top(answer: Answer, scene: QueryScene, count: int) -> tuple[TopSplat, ...]:
-    """The best splats of an answer with their places, descending by score.
+def top(answer: Answer, scene: QueryScene, count: int) -> Found:
+    """The best splats of an answer with their places, and the box around all selected ones.
+
+    A single stray splat stretches the box; ``objects`` tells strays from things.
 
     Raises:
         InvalidLift: the splats moved or changed since the lift.
@@ -147,11 +157,16 @@ def top(answer: Answer, scene: QueryScene, count: int) -> tuple[TopSplat, ...]:
     means = scene.splats.means
     ranked = answer.scores if scene.all_seen else torch.where(answer.seen, answer.scores, -torch.inf)
     scores, order = torch.topk(ranked, min(count, len(ranked)))
-    return tuple(
+    best = tuple(
         TopSplat(row, score, _point(means[row]))
         for row, score in zip(order.tolist(), scores.tolist(), strict=True)
         if score > -torch.inf
     )
+    chosen = torch.from_numpy(np.flatnonzero(answer.selected.numpy()))
+    if not len(chosen):
+        return Found(best, None)
+    low, high = torch.aminmax(scene.axes.index_select(1, chosen), dim=1)
+    return Found(best, (_point(low), _point(high)))
 
 
 def _similarities(scene: QueryScene, questions: Sequence[Question]) -> list[Tensor]:

@@ -17,7 +17,7 @@ import torch
 
 from liftcore.artifact import load_lift
 from liftcore.errors import SplatliftError
-from liftcore.query.ask import Answer, Look, Question, answers, look, question, top
+from liftcore.query.ask import Answer, Look, Point, Question, answers, look, question, top
 from liftcore.query.encoders import TextEncoder, open_encoder
 from liftcore.query.encoders.remembering import RememberingEncoder
 from liftcore.query.example import Example, Vector, parse_example
@@ -264,14 +264,19 @@ def open_scene(request: dict[str, Any]) -> QueryScene:
 
 def describe(scene: QueryScene, answer: Answer, count: int) -> dict[str, Any]:
     """The answer in numbers, as JSON takes them; ``count`` of the best splats."""
-    best = [asdict(splat) for splat in top(answer, scene, count)]
-    return {"statistics": finite(answer.statistics), **_found(answer), "top": best}
+    found = top(answer, scene, count)
+    best, box = [asdict(splat) for splat in found.best], None if found.box is None else _box(found.box)
+    return {"statistics": finite(answer.statistics), **_found(answer), "top": best, "box": box}
 
 
 def describe_objects(found: Objects) -> dict[str, Any]:
     """The things that were found, as JSON takes them."""
-    things = [asdict(thing) | {"box": {"low": thing.box[0], "high": thing.box[1]}} for thing in found.found]
+    things = [asdict(thing) | {"box": _box(thing.box)} for thing in found.found]
     return {"objects": things, "strays": found.strays}
+
+
+def _box(corners: tuple[Point, Point]) -> dict[str, Point]:
+    return {"low": corners[0], "high": corners[1]}
 
 
 def _found(answer: Answer) -> dict[str, Any]:

@@ -35,7 +35,7 @@ View = Annotated[str, Query(min_length=1, max_length=wire.VIEW_CHARACTERS, descr
 
 @router.get("/query", response_model=wire.QueryAnswer)
 def query(asked: Annotated[wire.AskedWhere, Query()], here: Here) -> wire.QueryAnswer:
-    """Where it is: scores in numbers, the best splats, and links to objects, splats and pictures."""
+    """Where it is: scores in numbers, the best splats, a box, and links to objects, splats and pictures."""
     return _answer(asked, here)
 
 

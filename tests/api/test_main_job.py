@@ -132,8 +132,10 @@ def test_query_finds_the_cluster_of_the_word(client: TestClient, lift: dict[str,
     assert (found["lift"], found["count"], found["threshold"]) == (lift["id"], answer["count"], answer["threshold"])
     (thing,) = found["objects"]
     middle = (cluster - 1) * 1.2
+    assert answer["box"]["low"][0] < middle < answer["box"]["high"][0]
     assert thing["box"]["low"][0] < middle < thing["box"]["high"][0]
     assert thing["centre"][0] == pytest.approx(middle, abs=0.2)
+    assert all(low <= inner for low, inner in zip(answer["box"]["low"], thing["box"]["low"], strict=True))
     assert thing["splats"] + found["strays"] == found["count"]
     assert 0 < thing["share"] <= 1 and thing["score"] >= 0.5
     assert answer["threshold"] == {"value": 0.5, "method": "fixed"} | {

@@ -132,12 +132,15 @@ def test_a_look_is_the_scores_rendered_and_cut(lift_file: Path) -> None:
         look(scene, answer, "frond")
 
 
-def test_the_best_splats_come_with_their_places(lift_file: Path) -> None:
+def test_the_best_splats_come_with_their_places_and_a_box(lift_file: Path) -> None:
     scene = QueryScene.open(lift_file)
-    found = top(ask(scene, "x", Axes()), scene, 4)
-    assert [best.splat % 3 for best in found] == [0] * 4
-    assert found[0].position == pytest.approx(scene.splats.means[found[0].splat].tolist())
-    assert len(top(ask(scene, "x", Axes()), scene, 10 * COUNT)) == COUNT - 1  # of all that were seen
+    answer = ask(scene, "x", Axes())
+    found = top(answer, scene, 4)
+    assert [best.splat % 3 for best in found.best] == [0] * 4
+    assert found.best[0].position == pytest.approx(scene.splats.means[found.best[0].splat].tolist())
+    assert found.box is not None
+    assert torch.all(scene.splats.means[answer.selected] >= torch.tensor(found.box[0]))
+    assert top(ask(scene, Query(("x",), threshold=2.0), Axes()), scene, 1).box is None
 
 
 def test_a_scene_that_moved_is_said_with_where_it_was(lift_file: Path) -> None:
