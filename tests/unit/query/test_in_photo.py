@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from liftcore.query.in_photo import in_photo
+from liftcore.query.in_photo import _read, in_photo
 from liftcore.scene.cameras import Camera
 from liftcore.scene.distortion import Brown, Distortion, Fisheye
 from liftcore.scene.lens import behind_lens, drawn_by, photo_places
@@ -64,3 +64,16 @@ def test_large_pictures_are_carried_in_bands_to_the_same_bits(monkeypatch: pytes
     whole = in_photo(camera, places)
     monkeypatch.setattr("liftcore.query.in_photo.BAND_PIXELS", 1)
     assert torch.equal(in_photo(camera, places), whole)
+
+
+def test_reading_reaches_the_borders_and_no_farther() -> None:
+    image = torch.rand(5, 7)
+    v, u = torch.meshgrid(torch.arange(5) + 0.5, torch.arange(7) + 0.5, indexing="ij")
+    assert torch.equal(_read(image, u, v), image)
+    labels = torch.arange(35, dtype=torch.int32).reshape(5, 7)
+    assert torch.equal(_read(labels, u, v), labels)
+    corner = torch.tensor([[0.0, 6.999]]), torch.tensor([[0.0, 4.999]])
+    assert torch.allclose(_read(image, *corner), torch.stack([image[0, 0], image[-1, -1]]))
+    assert _read(labels, *corner).tolist() == [[0, 34]]
+    beyond = torch.tensor([[-0.001, 7.0, 3.0, 3.0]]), torch.tensor([[2.0, 2.0, -0.001, 5.0]])
+    assert not _read(image, *beyond).any() and not _read(labels + 1, *beyond).any()

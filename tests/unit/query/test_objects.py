@@ -114,3 +114,11 @@ def test_more_splats_than_are_grouped_are_refused(scene: QueryScene, monkeypatch
     assert objects(scene, of(scene, 0)).found
     with pytest.raises(InvalidQuery, match=r"threshold: expected at most 20 splats.*got 21; name a higher"):
         objects(scene, of(scene, 0, rows=(2 * SPLATS_A_CLUSTER,)))
+
+
+def test_a_twentieth_of_the_evidence_of_the_largest_makes_an_object(scene: QueryScene) -> None:
+    for share, count in ((0.049, 1), (0.051, 2)):
+        evidence = torch.full_like(scene.lift.evidence, 1.0)
+        evidence[2 * SPLATS_A_CLUSTER :] = share
+        weighed = QueryScene(replace(scene.lift, evidence=evidence), scene.path)
+        assert len(objects(weighed, of(scene, 0, 2)).found) == count

@@ -99,3 +99,9 @@ def test_pieces_make_no_difference(monkeypatch) -> None:
     assert len(set(whole)) > 3
     monkeypatch.setattr(module, "_PIECE", 7)
     assert (touching(splats, np.arange(300)) == whole).all()
+
+
+def test_a_quaternion_of_zero_turns_nothing() -> None:
+    still = replace(needle(1.9, 0.1), quats=torch.zeros(3, 4))
+    assert touching(still, np.arange(3)).tolist() == [0, 0, 1]
+    assert touching(replace(still, means=still.means.roll(1, dims=1)), np.arange(3)).tolist() == [0, 1, 2]

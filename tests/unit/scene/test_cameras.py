@@ -276,3 +276,10 @@ def test_real_cameras_agree_in_both_formats(shared_data: Path) -> None:
     names = sorted(view.name for view in one)
     assert_same(Cameras(tuple(map(one.get, names))), Cameras(tuple(map(other.get, names))))
     assert len(load_cameras(shared_data / "tabletop")) == 60
+
+
+def test_json_beside_a_model_is_read_where_it_is_named(tmp_path: Path) -> None:
+    folder = write_files(tmp_path / "model", binary_files())
+    write_inria_cameras(Cameras((Camera("v", 64, 48, 50.0, 50.0, 32.0, 24.0, np.eye(4)),)), folder / "cameras.json")
+    assert [view.name for view in load_cameras(folder / "cameras.json")] == ["v"]
+    assert "v" not in [view.name for view in load_cameras(folder)]

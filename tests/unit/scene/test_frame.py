@@ -325,3 +325,13 @@ def test_transforms_of_another_frame_are_told_beside_a_model(run: Path, model: P
     zipped = Path(shutil.make_archive(str(run), "zip", run))
     for path in (run, run / "colmap/sparse/0", run / "colmap/sparse/0/cameras.bin", zipped):
         assert any("beside it lies nerfstudio's" in text for text in inspect_file(path)["warnings"])
+
+
+def test_frame_that_lies_elsewhere_in_a_zip_is_of_its_only_model(
+    run: Path, model: Path, expected: Cameras, tmp_path: Path
+) -> None:
+    scene = tmp_path / "scene"
+    shutil.copytree(model, scene / "sparse/0")
+    (scene / "outputs").mkdir()
+    shutil.copy(run / FRAME_FILE, scene / "outputs")
+    assert_same(load_cameras(Path(shutil.make_archive(str(scene), "zip", scene))), expected)
