@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import shutil
 from collections.abc import Callable
@@ -16,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from liftcore.errors import InvalidCameras
 from liftcore.input_files import camera_input
+from liftcore.scene import camera_zip
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.frame import FRAME_FILE, Similarity
 from liftcore.scene.inria import write_inria_cameras
@@ -335,3 +337,13 @@ def test_frame_that_lies_elsewhere_in_a_zip_is_of_its_only_model(
     (scene / "outputs").mkdir()
     shutil.copy(run / FRAME_FILE, scene / "outputs")
     assert_same(load_cameras(Path(shutil.make_archive(str(scene), "zip", scene))), expected)
+
+
+def test_full_disk_is_no_broken_zip(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: Any) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    path = Path(shutil.make_archive(str(run), "zip", run))
+    monkeypatch.setattr(camera_zip, "_unzip_one", full)
+    with pytest.raises(OSError, match="No space left"):
+        load_cameras(path)
