@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import lzma
 import tempfile
 import zipfile
@@ -12,7 +13,7 @@ from itertools import islice
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
 
-from liftcore.errors import InvalidCameras
+from liftcore.errors import InvalidCameras, Unavailable
 from liftcore.scene.camera_source import TRANSFORMS, camera_source
 from liftcore.scene.colmap import MODEL_FILES
 from liftcore.scene.distorted import is_undistorted, refuse_both
@@ -52,6 +53,7 @@ def read_camera_zip(path: Path, beside: Path | None = None, *, choosing: bool = 
 
     Raises:
         InvalidCameras: there is none, or it is malformed or too large.
+        Unavailable: the temporary folder has no room to unzip it.
     """
     with tempfile.TemporaryDirectory(prefix="splatlift-") as folder:
         first = Path(folder)
@@ -121,8 +123,11 @@ def _unzip(path: Path, pick: Callable[[Files], Files], folder: Path) -> None:
             for name, member in pick(_files(archive)).items():
                 budget -= _unzip_one(archive, member, folder / name, budget)
     except BROKEN as error:
-        if isinstance(error, OSError) and error.errno is not None:
-            raise  # of the disk, and not of what is in the zip
+        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+            expected = f"room in {tempfile.gettempdir()} for what is in the zip"
+            raise Unavailable(
+                str(path), expected=expected, got="a full disk", hint="make room, or set TMPDIR"
+            ) from None
         got = f"one that does not open ({str(error)[:120]})"
         raise InvalidCameras(str(path), expected="a zip of a COLMAP sparse model", got=got) from None
 

@@ -68,6 +68,7 @@ def load_cameras(path: Path, *, choosing: bool = True) -> Cameras:
 
     Raises:
         InvalidCameras: nothing here is a camera format that we know, or what it holds is malformed.
+        Unavailable: the temporary folder has no room for what is in a zip.
     """
     if path.is_dir():
         return _from_folder(path, choosing=choosing)
