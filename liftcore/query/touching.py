@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 NEIGHBOURS = 16  # that each splat looks at, the nearest by their centres
 REACH = 2.0  # standard deviations to which a splat touches
 _PIECE = 1 << 15  # splats whose neighbours are looked at at once
+_TOLD_APART = 1e-12  # of the farthest coordinate
 
 
 def touching(splats: Splats, rows: np.ndarray) -> np.ndarray:
@@ -41,11 +42,14 @@ def touching(splats: Splats, rows: np.ndarray) -> np.ndarray:
         return np.zeros(count, np.int32)
     means = splats.means.numpy()[rows].astype(np.float64)
     spreads = _spreads(splats, rows)
-    tree = KDTree(means)
+    # Points at one place make a leaf that no search can divide: told apart by less than float32 can, they are.
+    extent = float(np.abs(means).max()) or 1.0
+    places = means + _TOLD_APART * extent * np.random.default_rng(0).random(means.shape)
+    tree = KDTree(places)
 
     def look(first: int) -> tuple[np.ndarray, np.ndarray]:
         piece = slice(first, first + _PIECE)
-        near = np.asarray(tree.query(means[piece], min(NEIGHBOURS + 1, count))[1])  # itself, or its equal, among them
+        near = np.asarray(tree.query(places[piece], min(NEIGHBOURS + 1, count))[1])  # itself, or its equal, among them
         apart = means[near] - means[piece, None]
         squares = np.concatenate([apart**2, apart[..., [0, 0, 1]] * apart[..., [1, 2, 2]]], axis=2)
         # s |d| of both sides, so that nothing is divided by a distance of zero.
