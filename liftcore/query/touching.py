@@ -49,7 +49,7 @@ def touching(splats: Splats, rows: np.ndarray) -> np.ndarray:
 
     def look(first: int) -> tuple[np.ndarray, np.ndarray]:
         piece = slice(first, first + _PIECE)
-        near = np.asarray(tree.query(places[piece], min(NEIGHBOURS + 1, count))[1])  # itself, or its equal, among them
+        near = np.asarray(tree.query(places[piece], min(NEIGHBOURS + 1, count))[1])  # itself among them
         apart = means[near] - means[piece, None]
         squares = np.concatenate([apart**2, apart[..., [0, 0, 1]] * apart[..., [1, 2, 2]]], axis=2)
         # s |d| of both sides, so that nothing is divided by a distance of zero.

@@ -83,6 +83,9 @@ def test_zip_bomb_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         archive.writestr("images.bin", b"")
     with pytest.raises(InvalidCameras, match="at most 1000 bytes unzipped"):
         load_cameras(path)
+    monkeypatch.setattr(camera_zip, "MAX_ZIP_MEMBERS", 1)
+    with pytest.raises(InvalidCameras, match="at most 1 files, got 2"):
+        load_cameras(path)
 
 
 def test_zip_without_a_model_is_refused(tmp_path: Path) -> None:

@@ -327,6 +327,13 @@ def test_transforms_of_another_frame_are_told_beside_a_model(run: Path, model: P
     zipped = Path(shutil.make_archive(str(run), "zip", run))
     for path in (run, run / "colmap/sparse/0", run / "colmap/sparse/0/cameras.bin", zipped):
         assert any("beside it lies nerfstudio's" in text for text in inspect_file(path)["warnings"])
+    shutil.rmtree(run / "colmap")
+    document = json.loads((run / "transforms.json").read_text())
+    del document["applied_transform"]  # as others than nerfstudio's converter write it
+    for other in (json.dumps(document), json.dumps(list(document)), "{"):
+        shutil.copytree(model, run / "colmap/sparse/0", dirs_exist_ok=True)
+        (run / "transforms.json").write_text(other)
+        assert not any("nerfstudio" in text for text in inspect_file(run / "colmap/sparse/0")["warnings"])
 
 
 def test_frame_that_lies_elsewhere_in_a_zip_is_of_its_only_model(
