@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
     from liftcore.scene.cameras import Camera
 
+_NEARLY_ALL = 0.995  # a share that would be told as 100%
+
 
 def is_undistorted(model: Path) -> bool:
     """Whether a folder has a model that reads, of pinholes alone."""
@@ -46,7 +48,9 @@ def distortion_warning(views: Sequence[Camera]) -> list[str]:
     shares = [lifted_share(camera) for camera in views if camera.lens is not None]
     if not shares:
         return []
+    least = min(shares)
+    lifted = "nearly all" if least > _NEARLY_ALL else f"{least:.0%} or more"
     return [
-        f"{len(shares)} of {len(views)} views are of distorted photos, of each of which {min(shares):.0%} or more is "
+        f"{len(shares)} of {len(views)} views are of distorted photos, of each of which {lifted} is "
         "lifted: features must be of the photos as they were taken, not of undistorted ones"
     ]

@@ -10,6 +10,7 @@ import pytest
 
 from liftcore.errors import InvalidCameras
 from liftcore.scene.cameras import Camera
+from liftcore.scene.distorted import distortion_warning
 from liftcore.scene.distortion import Brown, Distortion, Fisheye
 from liftcore.scene.lens import Lens, behind_lens, drawn_by, lifted_share, photo_places, photo_size, pixel_of
 
@@ -147,3 +148,18 @@ def test_a_pixel_alone_is_found_where_all_are() -> None:
     columns, rows = photo_places(view.lens)
     for x, y in ((0, 0), (7, 30), (view.lens.width - 1, view.lens.height - 1)):
         assert pixel_of(view, x, y) == (int(columns[y, x]), int(rows[y, x]))
+
+
+def test_warning_tells_the_least_share_and_knows_no_hundred_percent_or_more() -> None:
+    barrel, slight, plain = (
+        camera(Brown(k1=-0.25)),
+        camera(Brown(k1=1e-12)),
+        replace(camera(Brown(k1=0.0)), lens=None),
+    )
+    (told,) = distortion_warning([slight, barrel, plain])
+    assert (
+        f"2 of 3 views are of distorted photos, of each of which {lifted_share(barrel):.0%} or more is lifted" in told
+    )
+    (told,) = distortion_warning([slight])
+    assert "of each of which nearly all is lifted: features" in told
+    assert distortion_warning([plain]) == []
