@@ -15,9 +15,10 @@ if TYPE_CHECKING:
     import argparse
     from collections.abc import Callable, Iterable
 
-    from liftcore.query.ask import Answer, Look
+    from liftcore.query.ask import Answer
     from liftcore.query.encoders import TextEncoder
     from liftcore.query.example import Example
+    from liftcore.query.look import Look
     from liftcore.query.query import Query
     from liftcore.query.scene import QueryScene
 
@@ -34,7 +35,8 @@ def run(options: argparse.Namespace) -> int:
         raise InvalidQuery(f"--{', --'.join(OUTPUTS)}", expected="a file each", got="the same file twice")
     for path in outputs:
         free_output(path, [options.lift, *([options.table] if options.table else [])])
-    from liftcore.query.ask import ask, look, top
+    from liftcore.query.ask import ask, top
+    from liftcore.query.look import look
     from liftcore.query.objects import objects
     from liftcore.query.query import texts_of
     from liftcore.query.scene import QueryScene
@@ -116,7 +118,6 @@ def _document(answer: Answer, seen: Look | None, encoder: TextEncoder | None) ->
     if seen is not None:
         document["view"] = {
             "name": seen.view,
-            "threshold": seen.threshold,
             "explanation": seen.explanation,
             "mask_share": float(seen.mask.float().mean()),
         }

@@ -1,14 +1,17 @@
-"""Thresholds and examples on the tabletop scene: mean IoU of masks in the held-out views, a phrase at a time.
+"""Masks on the tabletop scene: mean IoU in the views that were not lifted, a phrase at a time.
 
     python -m liftcore.measure.thresholds DIR [--json]
 
-Each phrase is asked alone, no other phrase and no truth is known to the threshold; ``best`` is the best possible
-threshold of each mask, which needs the truth. ``pixel`` asks by example in place of words: for each object, the
-pixel deepest inside it (farthest from its border) in the first held-out view, judged in the other held-out ones by
-the automatic threshold; ``words`` is the same for the phrase in the same views.
+Each phrase is asked alone, no other phrase and no truth is known to the threshold. A column a method: masks of the
+objects that it finds. ``rendered`` cuts the rendered scores of each view by an ``auto`` of its own instead (protocol
+P3), and ``best`` by the best possible threshold of each mask, which needs the truth. ``absent`` and ``absent
+rendered`` are the mean shares of the image that masks cover where nothing of the phrase is to be seen. ``pixel`` asks
+by example in place of words: for each object, the pixel deepest inside it (farthest from its border) in the first
+held-out view, judged in the other held-out ones; ``words`` is the same for the phrase in the same views. Both take
+the ``auto`` threshold.
 
 The scene is where the constants of ``valley`` were tuned; those of ``auto`` were not tuned. ``--still-life`` judges
-the same methods on the demo's scene with three kinds of mistakes.
+the same on the demo's scene with three kinds of mistakes.
 """
 
 from __future__ import annotations
@@ -29,9 +32,11 @@ from liftcore.lift import lift
 from liftcore.measure.accuracy import mask_iou
 from liftcore.measure.hardware import hardware, machine_line
 from liftcore.measure.tabletop import Tabletop
-from liftcore.query.ask import ask, look
+from liftcore.query.ask import ask
 from liftcore.query.directions import MINIMUM_ROW_SUM
-from liftcore.query.example import Pixel, Vector
+from liftcore.query.encoders import open_encoder
+from liftcore.query.example import Pixel
+from liftcore.query.look import look
 from liftcore.query.query import Query
 from liftcore.query.scene import QueryScene
 from liftcore.query.threshold import METHODS, find_threshold
@@ -42,8 +47,11 @@ if TYPE_CHECKING:
 
     from torch import Tensor
 
+    from liftcore.query.encoders import TextEncoder
+
 PACKS = ("features", "features_hard", "features_clean", "grids")
 PRESETS = ("row-sum", "tikhonov")
+COLUMNS = (*METHODS, "rendered", "best", "absent", "absent rendered")
 
 
 def best_iou(attention: Tensor, met: Tensor, truth: Tensor) -> float:
@@ -69,48 +77,59 @@ def deepest_pixel(truth: Tensor) -> tuple[int, int]:
     return int(x), int(y)
 
 
-def measure_phrases(scene: QueryScene, vectors: Tensor, held_out: Mapping[str, Tensor]) -> dict[str, float]:
-    """Mean IoU over phrases and views, by method and for the best possible threshold.
+def measure_phrases(
+    scene: QueryScene, phrases: Sequence[str], encoder: TextEncoder, held_out: Mapping[str, Tensor]
+) -> dict[str, float]:
+    """Mean IoU over phrases and views, by method and for cuts of the rendered scores.
 
     Args:
         scene: an opened lift.
-        vectors: [K, F] f32, a phrase each.
+        phrases: [K], asked one at a time.
+        encoder: of the lift's text space.
         held_out: view -> [H, W] int, the phrase that each pixel shows.
     """
-    ious: dict[str, list[float]] = {name: [] for name in (*METHODS, "best")}
-    for phrase, vector in enumerate(vectors):
-        answer = ask(scene, Query((Vector(tuple(vector.tolist())),)))
-        for view, labels in held_out.items():
-            truth = labels == phrase
-            if not truth.any():
-                continue
-            seen = look(scene, answer, view)
-            met = seen.row_sums >= MINIMUM_ROW_SUM
-            for method in METHODS:
-                cut = find_threshold(seen.attention[met], method).value
-                ious[method].append(mask_iou(met & (seen.attention >= cut), truth))
-            ious["best"].append(best_iou(seen.attention, met, truth))
-    return {name: float(np.mean(values)) for name, values in ious.items()}
+    rows: dict[str, list[float]] = {name: [] for name in COLUMNS}
+    for number, phrase in enumerate(phrases):
+        for method in METHODS:
+            answer = ask(scene, Query((phrase,), threshold=method), encoder)
+            for view, labels in held_out.items():
+                truth = labels == number
+                seen = look(scene, answer, view)
+                if truth.any():
+                    rows[method].append(mask_iou(seen.mask, truth))
+                if method != "auto":
+                    continue
+                met = seen.row_sums >= MINIMUM_ROW_SUM
+                rendered = met & (seen.attention >= find_threshold(seen.attention[met], method).value)
+                if truth.any():
+                    rows["rendered"].append(mask_iou(rendered, truth))
+                    rows["best"].append(best_iou(seen.attention, met, truth))
+                else:
+                    rows["absent"].append(float(seen.mask.float().mean()))
+                    rows["absent rendered"].append(float(rendered.float().mean()))
+    return {name: float(np.mean(values)) for name, values in rows.items() if values}
 
 
-def measure_pixels(scene: QueryScene, vectors: Tensor, held_out: Mapping[str, Tensor]) -> dict[str, Any]:
+def measure_pixels(
+    scene: QueryScene, phrases: Sequence[str], encoder: TextEncoder, held_out: Mapping[str, Tensor]
+) -> dict[str, Any]:
     """Query by one pixel of each object in the first view against the words for it, judged in the other views."""
     first, *others = held_out
     rows: dict[str, list[float]] = {"pixel": [], "words": []}
     refused = 0
-    for phrase, vector in enumerate(vectors):
-        shown = held_out[first] == phrase
+    for number, phrase in enumerate(phrases):
+        shown = held_out[first] == number
         if not shown.any():
             continue
-        asked = {"pixel": Pixel(first, *deepest_pixel(shown)), "words": Vector(tuple(vector.tolist()))}
+        asked = {"pixel": Pixel(first, *deepest_pixel(shown)), "words": phrase}
         for name, term in asked.items():
             try:
-                answer = ask(scene, Query((term,)))
+                answer = ask(scene, Query((term,)), encoder)
             except InvalidQuery:
                 refused += 1
                 continue
             for view in others:
-                truth = held_out[view] == phrase
+                truth = held_out[view] == number
                 if truth.any():
                     rows[name].append(mask_iou(look(scene, answer, view).mask, truth))
     return {name: float(np.mean(values)) for name, values in rows.items()} | {"refused": refused}
@@ -121,12 +140,14 @@ def measure_tabletop(
 ) -> list[dict[str, Any]]:
     """One row a lift of the tabletop scene."""
     scene, rows = Tabletop(folder), []
+    phrases = [thing["class"] for thing in json.loads((folder / "truth.json").read_text())["objects"]]
+    encoder = open_encoder(f"table:{folder / 'text_table.safetensors'}")
     for pack in packs:
         for preset in presets:
             files = [folder / name for name in ("point_cloud.ply", "cameras.json", f"{pack}.safetensors")]
             opened = lifted(files, preset, scene.raster)
-            row = measure_phrases(opened, scene.classes, scene.held_out)
-            examples = measure_pixels(opened, scene.classes, scene.held_out)
+            row = measure_phrases(opened, phrases, encoder, scene.held_out)
+            examples = measure_pixels(opened, phrases, encoder, scene.held_out)
             rows.append({"scene": "tabletop", "features": pack, "preset": preset, **row, **examples})
     return rows
 
@@ -136,7 +157,6 @@ def measure_still_life(presets: Sequence[str] = PRESETS) -> list[dict[str, Any]]
     from liftcore.demo.masks import Mistakes, observe, true_labels
     from liftcore.demo.still_life import still_life
     from liftcore.observe.write_pack import write_pack
-    from liftcore.query.encoders import open_encoder
     from liftcore.raster.cpu import CpuRaster
     from liftcore.scene.inria import write_inria_cameras
     from liftcore.scene.ply import write_splats
@@ -158,7 +178,7 @@ def measure_still_life(presets: Sequence[str] = PRESETS) -> list[dict[str, Any]]
             write_pack(files[2], moved, {"encoder": "generated", "text_space": "minilm", "normalised": "true"})
             for preset in presets:
                 opened = lifted(files, preset, raster)
-                row = measure_phrases(opened, encoder.encode(made.things), held_out)
+                row = measure_phrases(opened, made.things, encoder, held_out)
                 rows.append({"scene": "still life", "features": name, "preset": preset, **row})
     return rows
 
@@ -183,15 +203,21 @@ def lifted(files: list[Path], preset: str, raster: Any) -> QueryScene:
 
 def table_of(document: dict[str, Any]) -> str:
     """The rows and the machine, for people."""
-    names = (*METHODS, "best", "words", "pixel")
-    lines = [f"{'scene, features, preset':<36}" + "".join(f"{name:>10}" for name in names)]
+    names = (*COLUMNS, "words", "pixel")
+    lines = [f"{'scene, features, preset':<36}" + "".join(f"{name:>{_wide(name)}}" for name in names)]
     for row in document["rows"]:
         head = ", ".join(row[key] for key in ("scene", "features", "preset"))
-        lines.append(
-            f"{head:<36}" + "".join(f"{row[name]:>10.3f}" if name in row else f"{'-':>10}" for name in names)
-        )
+        lines.append(f"{head:<36}" + "".join(_cell(row, name) for name in names))
     lines.append(machine_line(document["hardware"]))
     return "\n".join(lines)
+
+
+def _wide(name: str) -> int:
+    return max(10, len(name) + 2)
+
+
+def _cell(row: Mapping[str, Any], name: str) -> str:
+    return f"{row[name]:>{_wide(name)}.3f}" if name in row else f"{'-':>{_wide(name)}}"
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""Ask a lift for words and examples: which splats answer, and where they lie in a view."""
+"""Ask a lift for words and examples: which splats answer, and where they lie."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from liftcore.query.components import largest_component
-from liftcore.query.directions import MINIMUM_ROW_SUM, directions
+from liftcore.query.directions import directions
 from liftcore.query.products import LOWEST_COSINE
 from liftcore.query.query import Query
 from liftcore.query.scores import combine, cosines, cosines_about
@@ -53,19 +52,6 @@ class Answer:
     def count(self) -> int:
         """How many splats were selected."""
         return int(self.selected.sum())
-
-
-@dataclass(frozen=True)
-class Look:
-    """An answer seen from one camera."""
-
-    view: str
-    attention: Tensor  # [H, W] f32, A s: the scores rendered with the lift's rendering gain
-    row_sums: Tensor  # [H, W] f32, A 1
-    mask: Tensor  # [H, W] bool, at or above the threshold where the ray meets the scene
-    threshold: float  # on the attention
-    threshold_method: str
-    explanation: str
 
 
 Point = tuple[float, float, float]  # x y z, world frame, scene units
@@ -120,30 +106,6 @@ def answers(scene: QueryScene, questions: Sequence[Question]) -> list[Answer]:
         return [_answer(scene, questions[0], similarities[0])]
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
         return list(pool.map(lambda asked, similar: _answer(scene, asked, similar), questions, similarities))
-
-
-def look(scene: QueryScene, answer: Answer, view: str) -> Look:
-    """See an answer from a camera: attention, and a mask by the view's own threshold.
-
-    The threshold is found again on the view's map, as the paper does; a fixed one is kept. All components of the
-    mask stay, unless the query asks for the largest.
-
-    Raises:
-        NotFound: no camera has this name.
-        InvalidQuery: the view's image is larger than pictures may be.
-        InvalidLift: the splats or the cameras moved or changed since the lift.
-    """
-    # A splat without a feature adds nothing to a ray; its score of -1 would count against its neighbours.
-    rendered = torch.where(answer.seen, answer.scores, 0.0)
-    values = torch.stack([rendered, torch.ones_like(rendered)], dim=1)
-    image = scene.image(view, lambda camera: scene.raster.render(camera, values, scene.walk))
-    attention, row_sums = image[..., 0].contiguous(), image[..., 1].contiguous()
-    met = row_sums >= MINIMUM_ROW_SUM
-    query = answer.query
-    found = find_threshold(attention[met], query.threshold, instances=query.instances)
-    mask = met & (attention >= found.value)
-    mask = largest_component(mask) if query.keep == "largest" else mask
-    return Look(view, attention, row_sums, mask, found.value, found.method, found.explanation)
 
 
 def top(answer: Answer, scene: QueryScene, count: int) -> Found:

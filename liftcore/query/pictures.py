@@ -17,7 +17,7 @@ from liftcore.raster.protocol import Walk
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from liftcore.query.ask import Look
+    from liftcore.query.look import Look
     from liftcore.query.scene import QueryScene
 
 _DIM = 0.35  # brightness that an overlay leaves to what was not found

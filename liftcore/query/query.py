@@ -29,7 +29,7 @@ class Query:
     negatives: tuple[Term, ...] = ()
     threshold: str | float = "auto"  # a method of liftcore.query.threshold, or a number on the scores
     instances: int | None = None  # how many there are, where the user knows
-    keep: str = "all"  # components of a view's mask: all, or the largest alone (8-connected)
+    keep: str = "all"  # of the objects that are found: all, or the largest alone
     names: tuple[str, ...] = ()  # what errors call each of the terms; () = what they are themselves
 
     def __post_init__(self) -> None:

@@ -17,10 +17,11 @@ import torch
 
 from liftcore.artifact import load_lift
 from liftcore.errors import SplatliftError
-from liftcore.query.ask import Answer, Look, Point, Question, answers, look, question, top
+from liftcore.query.ask import Answer, Point, Question, answers, question, top
 from liftcore.query.encoders import TextEncoder, open_encoder
 from liftcore.query.encoders.remembering import RememberingEncoder
 from liftcore.query.example import Example, Vector, parse_example
+from liftcore.query.look import Look, look
 from liftcore.query.objects import Objects, objects
 from liftcore.query.pictures import attention_png, mask_png, render_png
 from liftcore.query.products import cosines_of, norms_of
@@ -48,12 +49,12 @@ class Answers:
 
     Args:
         scenes: lifts that are kept open.
-        cache_bytes: of the answers and views that are kept; the last one is kept whatever its size.
+        cache_bytes: of the answers, objects and views that are kept; the last one is kept whatever its size.
     """
 
     def __init__(self, *, scenes: int, cache_bytes: int) -> None:
         self._scenes: Kept[QueryScene] = Kept(scenes)
-        self._cache: Kept[Answer | Look] = Kept(cache_bytes, bytes_of)
+        self._cache: Kept[Answer | Objects | Look] = Kept(cache_bytes, bytes_of)
         self._encoders: dict[str, tuple[object, TextEncoder]] = {}  # spec -> version of its file, encoder
         self._opening = threading.RLock()  # of encoders, which the warm-up opens too
         self._warm: set[Kernel] = set()  # kernels of splats whose compiled code is loaded, or being loaded
@@ -69,7 +70,7 @@ class Answers:
 
     @property
     def kept_bytes(self) -> int:
-        """The size of the answers and views that are kept."""
+        """The size of the answers, objects and views that are kept."""
         return self._cache.size
 
     def warm_up(self, encoder: str, version: object) -> None:
@@ -154,8 +155,18 @@ class Answers:
 
     def _look(self, request: dict[str, Any]) -> Look:
         answer, view = self._answer(request), request["view"]
-        made = self._cache.get((_key(request), view), lambda: look(self._scene(request), answer, view))
+
+        def make() -> Look:
+            return look(self._scene(request), answer, view, group=lambda *_: self._grouped(request))
+
+        made = self._cache.get((_key(request), "view", view), make)
         assert isinstance(made, Look)
+        return made
+
+    def _grouped(self, request: dict[str, Any]) -> Objects:
+        answer = self._answer(request)
+        made = self._cache.get((_key(request), "objects"), lambda: objects(self._scene(request), answer))
+        assert isinstance(made, Objects)
         return made
 
     def _query(self, request: dict[str, Any]) -> Frame:
@@ -165,8 +176,7 @@ class Answers:
         return Frame(describe(scene, answer, request["top"]))
 
     def _objects(self, request: dict[str, Any]) -> Frame:
-        answer = self._answer(request)
-        return Frame(_found(answer) | describe_objects(objects(self._scene(request), answer)))
+        return Frame(_found(self._answer(request)) | describe_objects(self._grouped(request)))
 
     def _scores(self, request: dict[str, Any]) -> Frame:
         return Frame({}, scores_npy(self._answer(request)))
@@ -217,11 +227,13 @@ def _key(request: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps([request[name] for name in names]).encode()).hexdigest()
 
 
-def bytes_of(made: Answer | Look) -> int:
-    """The memory that an answer, with its question, or a view of one takes."""
+def bytes_of(made: Answer | Objects | Look) -> int:
+    """The memory that an answer, with its question, the objects of one or a view of one takes."""
     if isinstance(made, Answer):
         tensors = made.scores.nbytes + made.seen.nbytes + made.selected.nbytes
         return ENTRY_BYTES + tensors + sum(map(_term_bytes, (*made.query.positives, *made.query.negatives)))
+    if isinstance(made, Objects):
+        return ENTRY_BYTES + made.numbers.nbytes
     return ENTRY_BYTES + made.attention.nbytes + made.row_sums.nbytes + made.mask.nbytes
 
 

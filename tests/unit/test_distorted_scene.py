@@ -14,8 +14,9 @@ from PIL import Image
 from liftcore.artifact import Lift, save_lift
 from liftcore.errors import InvalidCameras, InvalidQuery
 from liftcore.lift import lift
-from liftcore.query.ask import ask, look
+from liftcore.query.ask import ask
 from liftcore.query.example import Pixel, Region
+from liftcore.query.look import look
 from liftcore.query.pictures import render_png
 from liftcore.query.query import Query
 from liftcore.query.scene import QueryScene

@@ -8,7 +8,8 @@ import numpy as np
 import torch
 
 from liftcore.measure.protocols import Prediction
-from liftcore.query.ask import MINIMUM_ROW_SUM, ask
+from liftcore.query.ask import ask
+from liftcore.query.directions import MINIMUM_ROW_SUM
 from liftcore.query.query import Query
 from liftcore.query.threshold import find_threshold
 
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class RenderedScores:
-    """P3 on one lift (``Segmenter``): the same masks as ``query --mask`` makes, for all texts in one rendering."""
+    """P3 on one lift (``Segmenter``), for all texts in one rendering; each map has a threshold of its own."""
 
     def __init__(
         self,

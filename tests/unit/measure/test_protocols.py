@@ -18,10 +18,12 @@ from liftcore.measure.protocols.rendered_features import RenderedFeatures, segme
 from liftcore.measure.protocols.rendered_scores import RenderedScores
 from liftcore.measure.protocols.selected_splats import SelectedSplats
 from liftcore.measure.protocols.three_d_ovs import three_d_ovs_scenes
-from liftcore.query.ask import ask, look
+from liftcore.query.ask import ask
 from liftcore.query.encoders import open_encoder
+from liftcore.query.look import look
 from liftcore.query.query import Query
 from liftcore.query.scene import QueryScene
+from liftcore.query.threshold import find_threshold
 from tests.labelled_scene import HEIGHT, WIDTH, isat, rectangle, write_lift
 
 P1, P2, P3 = EvaluationProtocol
@@ -155,12 +157,14 @@ def test_p2_sees_the_selected_splats_alone(scene: QueryScene) -> None:
 
 
 @pytest.mark.parametrize("threshold", ["auto", 0.4])
-def test_p3_makes_the_masks_that_a_query_makes(scene: QueryScene, threshold: str | float) -> None:
+def test_p3_cuts_the_rendered_scores_of_a_query(scene: QueryScene, threshold: str | float) -> None:
     texts, encoder = ["book", "red apple"], words(scene)
     found = RenderedScores(scene, texts, encoder, threshold).look("frame_00002")
     for text in texts:
         seen = look(scene, ask(scene, Query((text,), threshold=threshold), encoder), "frame_00002")
-        assert (found[text].mask == seen.mask.numpy()).all() and found[text].mask.any()
+        met = seen.row_sums >= 0.5
+        cut = find_threshold(seen.attention[met], threshold).value
+        assert (found[text].mask == (met & (seen.attention >= cut)).numpy()).all() and found[text].mask.any()
         x, y = found[text].peak or (0, 0)
         assert seen.attention[y, x] == seen.attention.max()
 

@@ -13,10 +13,11 @@ import torch
 from PIL import Image
 
 from liftcore.artifact import Lift, LiftMetadata, load_lift, save_lift
-from liftcore.errors import InvalidLift, InvalidQuery, NotFound
+from liftcore.errors import InvalidLift, InvalidQuery
 from liftcore.input_files import input_file
-from liftcore.query.ask import ask, look, top
+from liftcore.query.ask import ask, top
 from liftcore.query.colours import NO_CLUSTER_COLOUR, SH_C0, cluster_colours, seen_colours
+from liftcore.query.look import look
 from liftcore.query.pictures import attention_png, mask_png, overlay, render, render_png
 from liftcore.query.query import Query
 from liftcore.query.scene import QueryScene
@@ -116,20 +117,6 @@ def test_words_without_an_encoder_are_refused_with_the_lifts_text_space(
     lift = replace(lift, metadata=lift.metadata.model_copy(update={"text_space": space}))
     with pytest.raises(InvalidQuery, match=rf"text space: {told}\), got no encoder"):
         ask(QueryScene(lift, lift_file), "x")
-
-
-def test_a_look_is_the_scores_rendered_and_cut(lift_file: Path) -> None:
-    scene = QueryScene.open(lift_file)
-    answer = ask(scene, Query(("x",), threshold=0.4), Axes())
-    seen = look(scene, answer, "front")
-    scores = torch.where(answer.seen, answer.scores, 0.0)[:, None]
-    camera = scene.cameras.get("front")
-    torch.testing.assert_close(seen.attention, scene.raster.render(camera, scores, scene.walk)[:, :, 0])
-    torch.testing.assert_close(seen.row_sums, scene.raster.row_sums(camera, scene.walk))
-    assert scene.walk.gain == scene.lift.metadata.settings.render_gain == 1.2
-    assert torch.equal(seen.mask, (seen.attention >= 0.4) & (seen.row_sums >= 0.5))
-    with pytest.raises(NotFound, match="front"):
-        look(scene, answer, "frond")
 
 
 def test_the_best_splats_come_with_their_places_and_a_box(lift_file: Path) -> None:

@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 from liftcore.artifact import load_lift, save_lift
 from liftcore.errors import InvalidLift, InvalidQuery, NotFound, SplatliftError
 from liftcore.lift import lift
-from liftcore.query.ask import ask, look
-from liftcore.query.components import largest_component
+from liftcore.query.ask import ask
 from liftcore.query.directions import directions
 from liftcore.query.example import Example, OneSplat, Pixel, Region, Vector, parse_example
+from liftcore.query.look import look
 from liftcore.query.query import Query
 from liftcore.query.scene import QueryScene
 from liftcore.query.vector_file import read_vector
@@ -154,23 +154,6 @@ def test_vectors_come_from_numpy_files(tmp_path: Path) -> None:
     np.save(tmp_path / "v.npy", np.ones((2, 2)))
     with pytest.raises(InvalidQuery, match="one vector"):
         read_vector(tmp_path / "v.npy")
-
-
-def test_the_largest_component_is_eight_connected() -> None:
-    mask = torch.zeros(6, 8, dtype=torch.bool)
-    mask[0, 0] = mask[1, 1] = mask[2, 2] = True  # by the corners
-    mask[5, 4:6] = True
-    expected = torch.zeros_like(mask)
-    expected[0, 0] = expected[1, 1] = expected[2, 2] = True
-    assert torch.equal(largest_component(mask), expected)
-    assert not largest_component(torch.zeros(3, 3, dtype=torch.bool)).any()
-
-
-def test_only_the_largest_part_of_a_mask_is_kept_when_asked(scene: QueryScene) -> None:
-    both = Query((Region("left", 0, 0), Region("left", 0, 2)), threshold=0.8)
-    whole = look(scene, ask(scene, both), "middle").mask
-    kept = look(scene, ask(scene, replace(both, keep="largest")), "middle").mask
-    assert 0 < int(kept.sum()) < int(whole.sum()) and not (kept & ~whole).any()
 
 
 def test_a_view_is_read_once_for_all_regions_of_it(scene: QueryScene, monkeypatch: pytest.MonkeyPatch) -> None:

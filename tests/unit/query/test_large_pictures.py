@@ -10,8 +10,9 @@ from liftcore.artifact import save_lift
 from liftcore.errors import InvalidQuery
 from liftcore.lift import lift
 from liftcore.query import scene as scenes
-from liftcore.query.ask import ask, look
+from liftcore.query.ask import ask
 from liftcore.query.example import OneSplat
+from liftcore.query.look import look
 from liftcore.query.pictures import render_png
 from liftcore.query.query import Query
 from liftcore.query.scene import QueryScene

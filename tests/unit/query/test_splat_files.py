@@ -13,9 +13,10 @@ from PIL import Image
 from liftcore.artifact import save_lift
 from liftcore.errors import InvalidLift, InvalidQuery
 from liftcore.lift import lift
-from liftcore.query.ask import Answer, ask, look
+from liftcore.query.ask import Answer, ask
 from liftcore.query.colours import NOT_SEEN_COLOUR, SH_C0, colour_map
 from liftcore.query.example import Region
+from liftcore.query.look import look
 from liftcore.query.pictures import attention_png, render
 from liftcore.query.query import Query
 from liftcore.query.scene import QueryScene
