@@ -5,13 +5,10 @@
 Each phrase is asked alone, no other phrase and no truth is known to the threshold. A column a method: masks of the
 objects that it finds. ``rendered`` cuts the rendered scores of each view by an ``auto`` of its own instead (protocol
 P3), and ``best`` by the best possible threshold of each mask, which needs the truth. ``absent`` and ``absent
-rendered`` are the mean shares of the image that masks cover where nothing of the phrase is to be seen. ``pixel`` asks
-by example in place of words: for each object, the pixel deepest inside it (farthest from its border) in the first
-held-out view, judged in the other held-out ones; ``words`` is the same for the phrase in the same views. Both take
-the ``auto`` threshold.
+rendered`` are the mean shares of the image that masks cover where nothing of the phrase is to be seen.
 
 The scene is where the constants of ``valley`` were tuned; those of ``auto`` were not tuned. ``--still-life`` judges
-the same on the demo's scene with three kinds of mistakes.
+the same on the demo's scene with three kinds of mistakes. Examples in place of words: ``liftcore.measure.examples``.
 """
 
 from __future__ import annotations
@@ -27,7 +24,6 @@ import numpy as np
 import torch
 
 from liftcore.artifact import save_lift
-from liftcore.errors import InvalidQuery
 from liftcore.lift import lift
 from liftcore.measure.accuracy import mask_iou
 from liftcore.measure.hardware import hardware, machine_line
@@ -35,7 +31,6 @@ from liftcore.measure.tabletop import Tabletop
 from liftcore.query.ask import ask
 from liftcore.query.directions import MINIMUM_ROW_SUM
 from liftcore.query.encoders import open_encoder
-from liftcore.query.example import Pixel
 from liftcore.query.look import look
 from liftcore.query.query import Query
 from liftcore.query.scene import QueryScene
@@ -66,15 +61,6 @@ def best_iou(attention: Tensor, met: Tensor, truth: Tensor) -> float:
     ious = hits / (chosen + int(truth.sum()) - hits)
     last = torch.cat([scores[1:] != scores[:-1], torch.ones(1, dtype=torch.bool)])  # of equal scores: all or none
     return float(ious[last].max())
-
-
-def deepest_pixel(truth: Tensor) -> tuple[int, int]:
-    """x and y of the pixel farthest from the border of a mask [H, W] bool, the topmost of equals."""
-    from scipy.ndimage import distance_transform_edt
-
-    depth = np.asarray(distance_transform_edt(np.pad(truth.numpy(), 1)))[1:-1, 1:-1]
-    y, x = np.unravel_index(int(depth.argmax()), depth.shape)
-    return int(x), int(y)
 
 
 def measure_phrases(
@@ -110,31 +96,6 @@ def measure_phrases(
     return {name: float(np.mean(values)) for name, values in rows.items() if values}
 
 
-def measure_pixels(
-    scene: QueryScene, phrases: Sequence[str], encoder: TextEncoder, held_out: Mapping[str, Tensor]
-) -> dict[str, Any]:
-    """Query by one pixel of each object in the first view against the words for it, judged in the other views."""
-    first, *others = held_out
-    rows: dict[str, list[float]] = {"pixel": [], "words": []}
-    refused = 0
-    for number, phrase in enumerate(phrases):
-        shown = held_out[first] == number
-        if not shown.any():
-            continue
-        asked = {"pixel": Pixel(first, *deepest_pixel(shown)), "words": phrase}
-        for name, term in asked.items():
-            try:
-                answer = ask(scene, Query((term,)), encoder)
-            except InvalidQuery:
-                refused += 1
-                continue
-            for view in others:
-                truth = held_out[view] == number
-                if truth.any():
-                    rows[name].append(mask_iou(look(scene, answer, view).mask, truth))
-    return {name: float(np.mean(values)) for name, values in rows.items()} | {"refused": refused}
-
-
 def measure_tabletop(
     folder: Path, packs: Sequence[str] = PACKS, presets: Sequence[str] = PRESETS
 ) -> list[dict[str, Any]]:
@@ -147,8 +108,7 @@ def measure_tabletop(
             files = [folder / name for name in ("point_cloud.ply", "cameras.json", f"{pack}.safetensors")]
             opened = lifted(files, preset, scene.raster)
             row = measure_phrases(opened, phrases, encoder, scene.held_out)
-            examples = measure_pixels(opened, phrases, encoder, scene.held_out)
-            rows.append({"scene": "tabletop", "features": pack, "preset": preset, **row, **examples})
+            rows.append({"scene": "tabletop", "features": pack, "preset": preset, **row})
     return rows
 
 
@@ -203,7 +163,7 @@ def lifted(files: list[Path], preset: str, raster: Any) -> QueryScene:
 
 def table_of(document: dict[str, Any]) -> str:
     """The rows and the machine, for people."""
-    names = (*COLUMNS, "words", "pixel")
+    names = COLUMNS
     lines = [f"{'scene, features, preset':<36}" + "".join(f"{name:>{_wide(name)}}" for name in names)]
     for row in document["rows"]:
         head = ", ".join(row[key] for key in ("scene", "features", "preset"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ import torch
 from liftcore.query.directions import directions
 from liftcore.query.products import LOWEST_COSINE
 from liftcore.query.query import Query
-from liftcore.query.scores import combine, cosines, cosines_about
+from liftcore.query.scores import LEAST_LIKENESS, combine, cosines, cosines_about
 from liftcore.query.threshold import find_threshold
 
 if TYPE_CHECKING:
@@ -155,7 +156,8 @@ def _answer(scene: QueryScene, asked: Question, similarities: Tensor) -> Answer:
     if not scene.all_seen:
         scores = torch.where(seen, scores, LOWEST_COSINE)
     known = scores if scene.all_seen else scores[seen]
-    found = find_threshold(known, query.threshold, scene.weights, query.instances)
+    least = -math.inf if any(isinstance(term, str) for term in query.positives) else LEAST_LIKENESS
+    found = find_threshold(known, query.threshold, scene.weights, query.instances, least)
     return Answer(
         query=query,
         scores=scores,

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 DEFAULT_NEGATIVES = ("object", "things", "stuff", "texture")  # LangSplat's canonical phrases
 _BLOCK, _BLOCK_FLOATS = 16_384, 1 << 25  # rows widened at once, and numbers in them
+# An example's score is 1 for the same and 0 for what the scene is on the whole; words have no such scale.
+LEAST_LIKENESS = 0.4  # of an example, below which the automatic threshold is not sought
 LEAST_OFFSET = 1e-3  # from the mean, of unit features: what is nearer has no direction that float16 could tell
 RELEVANCY_SHARPNESS = 10.0  # the softmax's inverse temperature in LERF and LangSplat
 

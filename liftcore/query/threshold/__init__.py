@@ -6,7 +6,7 @@ thresholds move with the scores: ``threshold(a s + b) = a threshold(s) + b`` for
 
 | method | the threshold | file |
 |---|---|---|
-| `auto` | where the share found changes least, in log-odds | `steady.py` |
+| `auto` | where the share found changes least, in log-odds; not below ``least`` | `steady.py` |
 | `valley` | the paper's appendix: from the top, the first local maximum, then the minimum before it | `valley.py` |
 | `paper` | the paper's main text, literally: the largest peak, then the adjacent smaller valley | `valley.py` |
 | `otsu` | the split with the largest variance between its sides | `otsu.py` |
@@ -81,6 +81,7 @@ def find_threshold(
     method: str | float = "auto",
     weights: Tensor | None = None,
     instances: int | None = None,
+    least: float = -math.inf,
 ) -> Threshold:
     """A threshold on scores by one of the methods above.
 
@@ -95,6 +96,7 @@ def find_threshold(
             pixels of a view do.
         instances: how many things the user says there are: the valley is then the one below as many hills, counted
             from the top. With it ``auto`` takes the valley. Only the user can know it; None = not said.
+        least: ``auto`` takes no lower score, unless too few lie above it.
 
     Raises:
         InvalidQuery: what `check_method` refuses, or scores that are not finite.
@@ -110,7 +112,10 @@ def find_threshold(
     histogram = count(scores, low, high, weights)
     if histogram is None:
         return Threshold(low, method, f"All scores are {low:.4g}: the histogram has no valley.")
-    value, explanation = METHODS[method](histogram) if instances is None else valley(histogram, instances)
+    if instances is not None:
+        value, explanation = valley(histogram, instances)
+    else:
+        value, explanation = steady(histogram, least) if method == "auto" else METHODS[method](histogram)
     value = min(max(value, low), high)
     share = f"{_share_above(histogram, value):.1%} of the {'pixels' if weights is None else 'evidence'}"
     return Threshold(value, method, f"{explanation.removesuffix('.')}; {share} at or above {value:.4g}.")

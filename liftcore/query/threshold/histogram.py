@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, overload
 
 import numpy as np
 import torch
@@ -27,8 +27,12 @@ class Histogram:
     low: float  # the left edge of the first bin
     width: float  # of a bin
 
-    def edge(self, position: float) -> float:
-        """The left edge of a bin; position + 0.5 is its middle."""
+    @overload
+    def edge(self, position: float) -> float: ...
+    @overload
+    def edge(self, position: np.ndarray) -> np.ndarray: ...
+    def edge(self, position: float | np.ndarray) -> float | np.ndarray:
+        """The left edge of a bin, or of each; position + 0.5 is its middle."""
         return self.low + position * self.width
 
     def smoothed(self) -> np.ndarray:

@@ -23,12 +23,20 @@ if TYPE_CHECKING:
     from liftcore.query.threshold.histogram import Histogram
 
 
-def steady(histogram: Histogram) -> tuple[float, str]:
-    """The score at which the log-odds of the share found fall least, and a sentence about it."""
+def steady(histogram: Histogram, least: float = -np.inf) -> tuple[float, str]:
+    """The score at which the log-odds of the share found fall least, and a sentence about it.
+
+    Args:
+        histogram: of the scores.
+        least: no lower score is taken, unless too few lie above it.
+    """
     density = histogram.smoothed()
     density = density / density.sum()
     above = np.cumsum(density[::-1])[::-1] - density / 2  # at the middles of the bins
     counted = np.minimum(above, 1 - above) >= LEAST_SHARE  # some are: no smoothed bin has more than a fifth of all
+    high = counted & (histogram.edge(np.arange(len(density)) + 0.5) >= least)
+    floor = f"Above {least:g} the" if high.any() and not high[counted].all() else "The"
+    counted = high if high.any() else counted
     slope = np.full(len(density), np.inf)
     slope[counted] = density[counted] / (above[counted] * (1 - above[counted]))
     # Empty stretches tie at zero: the middle of the widest keeps clear of both its sides.
@@ -36,7 +44,7 @@ def steady(histogram: Histogram) -> tuple[float, str]:
     assert run is not None
     place = sum(run) // 2
     value = histogram.edge(place + 0.5)
-    found = f"The share found changes least, in log-odds, around {value:.4g}"
+    found = f"{floor} share found changes least, in log-odds, around {value:.4g}"
     if density[place] < density[place:].max():
         return value, f"{found}."
     # Over one hill the log-odds are steadiest near its middle, which means nothing.

@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from liftcore.measure.accuracy import mask_iou
-from liftcore.measure.thresholds import best_iou, deepest_pixel
+from liftcore.measure.examples import deepest_pixel
+from liftcore.measure.thresholds import best_iou
 
 
 def test_no_threshold_beats_the_best_one() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from liftcore.query.example import Example, OneSplat, Pixel, Region, Vector, par
 from liftcore.query.look import look
 from liftcore.query.query import Query
 from liftcore.query.scene import QueryScene
+from liftcore.query.threshold import find_threshold
 from liftcore.query.vector_file import read_vector
 from liftcore.solve.settings import LiftSettings
 from tests.api.tiny_scene import CHANNELS, HEIGHT, SPLATS_A_CLUSTER, WIDTH, make_scene
@@ -85,6 +87,34 @@ def test_every_kind_of_example_finds_its_cluster_without_an_encoder(scene: Query
         answer = ask(scene, Query((example,)))
         assert answer.selected[splats].float().mean() > 0.7, example
         assert answer.count <= 1.3 * SPLATS_A_CLUSTER, example
+
+
+class Between:
+    """Encodes any text as the direction between the first two axes."""
+
+    name, channels = "between", CHANNELS
+
+    def encode(self, texts: Sequence[str]) -> torch.Tensor:
+        return torch.nn.functional.normalize(torch.eye(CHANNELS)[:2].sum(dim=0), dim=0).expand(len(texts), -1)
+
+
+def test_the_automatic_threshold_of_examples_is_above_a_least_likeness(scene: QueryScene) -> None:
+    """Ten splats as the example, fifteen a little like it: together they stand apart most from all others."""
+    count = 3 * SPLATS_A_CLUSTER
+    rows = np.zeros((count, CHANNELS))
+    rows[:10, 0], rows[10:25, :3], rows[25:, 1] = 1.0, [0.3, 0.3, 0.9], -1.0
+    noisy = torch.from_numpy(rows + np.random.default_rng(0).normal(0, 0.01, rows.shape)).float()
+    made = replace(scene.lift, features=noisy, evidence=torch.ones(count), seen=torch.ones(count, dtype=torch.bool))
+    lifted = QueryScene(made, scene.path)
+    by_example = ask(lifted, Query((OneSplat(0),)))
+    assert by_example.selected.nonzero()[:, 0].tolist() == list(range(10))
+    assert by_example.threshold > 0.4
+    assert find_threshold(by_example.scores).value < 0.0
+    in_words = ask(lifted, Query(("x",)), Between())
+    assert in_words.threshold < 0.0 and in_words.count == 25
+    both = ask(lifted, Query((OneSplat(0), "x")), Between())
+    assert both.threshold == pytest.approx(find_threshold(both.scores).value)
+    assert ask(lifted, Query((OneSplat(0),), threshold=0.1)).count == 25
 
 
 def test_positives_and_negatives_together_make_one_query(scene: QueryScene) -> None:

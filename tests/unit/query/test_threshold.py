@@ -58,6 +58,16 @@ def test_auto_finds_a_hill_whatever_its_size(count: int) -> None:
     assert 0.28 < find_threshold(scores, "auto").value < 0.38
 
 
+def test_auto_looks_no_lower_than_it_is_told_to() -> None:
+    scores = hills((-0.3, 0.05, 50_000), (0.3, 0.05, 20_000), (0.7, 0.05, 5000))
+    anywhere, above = find_threshold(scores), find_threshold(scores, least=0.4)
+    assert anywhere.value < 0.15 and anywhere.explanation.startswith("The share")
+    assert 0.4 < above.value < 0.6 and above.explanation.startswith("Above 0.4 the share")
+    for least in (-0.9, 2.0):  # below all, or where there is nothing
+        assert find_threshold(scores, least=least) == anywhere
+    assert find_threshold(scores, "valley", least=0.6) == find_threshold(scores, "valley")
+
+
 @pytest.mark.parametrize(
     ("instances", "low", "high"), [(1, 0.45, 0.55), (2, 0.3, 0.4), (3, 0.22, 0.28), (9, 0.22, 0.28)]
 )
