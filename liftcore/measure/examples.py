@@ -33,6 +33,7 @@ from liftcore.query.ask import Answer, ask
 from liftcore.query.directions import MINIMUM_ROW_SUM
 from liftcore.query.example import Pixel
 from liftcore.query.look import look
+from liftcore.query.objects import objects
 from liftcore.query.query import Query
 from liftcore.query.threshold import METHODS, find_threshold
 from liftcore.raster.cpu import CpuRaster
@@ -74,10 +75,15 @@ def measure_examples(scene: QueryScene, cases: Iterable[Case]) -> dict[str, floa
             refused += 1
             continue
         answers["anywhere"] = _anywhere(scene, answers["auto"])
+        found = {name: (answer, objects(scene, answer)) for name, answer in answers.items()}  # once for all views
         for view, truth in truths:
-            for name, answer in answers.items():
-                rows[name].append(mask_iou(look(scene, answer, view).mask, truth))
-            seen = look(scene, answers["auto"], view)
+            looks = {
+                name: look(scene, answer, view, group=lambda *_, known=known: known)
+                for name, (answer, known) in found.items()
+            }
+            for name, seen in looks.items():
+                rows[name].append(mask_iou(seen.mask, truth))
+            seen = looks["auto"]
             met = seen.row_sums >= MINIMUM_ROW_SUM
             cut = find_threshold(seen.attention[met]).value
             rows["rendered"].append(mask_iou(met & (seen.attention >= cut), truth))

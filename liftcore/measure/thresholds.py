@@ -32,6 +32,7 @@ from liftcore.query.ask import ask
 from liftcore.query.directions import MINIMUM_ROW_SUM
 from liftcore.query.encoders import open_encoder
 from liftcore.query.look import look
+from liftcore.query.objects import objects
 from liftcore.query.query import Query
 from liftcore.query.scene import QueryScene
 from liftcore.query.threshold import METHODS, find_threshold
@@ -78,9 +79,10 @@ def measure_phrases(
     for number, phrase in enumerate(phrases):
         for method in METHODS:
             answer = ask(scene, Query((phrase,), threshold=method), encoder)
+            found = objects(scene, answer)  # once for all views
             for view, labels in held_out.items():
                 truth = labels == number
-                seen = look(scene, answer, view)
+                seen = look(scene, answer, view, group=lambda *_, found=found: found)
                 if truth.any():
                     rows[method].append(mask_iou(seen.mask, truth))
                 if method != "auto":

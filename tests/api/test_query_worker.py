@@ -12,6 +12,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from liftcore.query import ask
+from liftcore.query.objects import objects
 from service import wire
 from service.queries import answers
 from service.queries.answers import Answers
@@ -113,6 +114,23 @@ def test_what_is_kept_stays_within_its_size_over_many_different_questions(
         reply_to([request_of(operation, text=["apple"], threshold=number / 300)], kept)
         sizes.append(kept.kept_bytes)
     assert max(sizes) <= limit and min(sizes[50:]) > limit / 2
+
+
+def test_objects_of_an_answer_are_made_once_for_all_its_masks(
+    request_of: Callable[..., dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[int] = []
+    monkeypatch.setattr(answers, "objects", lambda *both: made.append(0) or objects(*both))
+    kept = Answers(scenes=1, cache_bytes=1 << 20)
+    reply_to([request_of("scores", text=["apple"])], kept)
+    before = kept.kept_bytes
+    reply_to([request_of("objects", text=["apple"])], kept)
+    assert kept.kept_bytes == before + 4 * 60 + (2 << 10)
+    for view in ("left", "middle", "left"):
+        reply_to([request_of("mask", text=["apple"]) | {"view": view}], kept)
+    assert len(made) == 1
+    reply_to([request_of("mask", text=["lamp"])], kept)
+    assert len(made) == 2
 
 
 def test_cache_keeps_what_was_used_last() -> None:
