@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from liftcore.query.scene import QueryScene
 
 LEAST_EVIDENCE = 0.05  # of an object, as a share of the largest's
-MOST_SPLATS = 1 << 20  # that are grouped: a million take ten seconds of two cores and a gigabyte
+MOST_SPLATS = 1 << 20  # that are grouped: a million take seven seconds of two cores and a gigabyte
 _TAIL = 1e-3  # of an object's evidence that its box leaves out at each end of each axis
 
 

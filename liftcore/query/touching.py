@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+import math
 import os
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 
+from liftcore.jit import kernel
 from liftcore.raster.constants import MAX_LOG_SCALE
-
-if TYPE_CHECKING:
-    from liftcore.scene.splats import Splats
+from liftcore.scene.splats import Splats
 
 NEIGHBOURS = 16  # that each splat looks at, the nearest by their centres
 REACH = 2.0  # standard deviations to which a splat touches
@@ -50,13 +50,8 @@ def touching(splats: Splats, rows: np.ndarray) -> np.ndarray:
     def look(first: int) -> tuple[np.ndarray, np.ndarray]:
         piece = slice(first, first + _PIECE)
         near = np.asarray(tree.query(places[piece], min(NEIGHBOURS + 1, count))[1])  # itself among them
-        apart = means[near] - means[piece, None]
-        squares = np.concatenate([apart**2, apart[..., [0, 0, 1]] * apart[..., [1, 2, 2]]], axis=2)
-        # s |d| of both sides, so that nothing is divided by a distance of zero.
-        own = np.einsum("ns,nks->nk", spreads[piece], squares)
-        theirs = np.einsum("nks,nks->nk", spreads[near], squares)
-        reach = REACH * (np.sqrt(np.maximum(own, 0)) + np.sqrt(np.maximum(theirs, 0)))
-        touch = squares[..., :3].sum(axis=2) <= reach
+        touch = np.empty(near.shape, np.bool_)
+        find_touching(means, spreads, first, near, touch)
         return near[touch], touch.sum(axis=1)
 
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
@@ -66,6 +61,36 @@ def touching(splats: Splats, rows: np.ndarray) -> np.ndarray:
     graph = csr_array((np.ones(len(columns), np.int8), columns, starts), shape=(count, count))
     _, groups = connected_components(graph, directed=True, connection="weak")
     return groups
+
+
+def warm_up_touching() -> None:
+    """Compile what finds neighbours and load what searches them, before anyone waits for it."""
+    two = Splats(torch.zeros(2, 3), torch.ones(2, 4), torch.zeros(2, 3), torch.zeros(2))
+    touching(two, np.arange(2))
+
+
+@kernel
+def find_touching(means, spreads, first, near, touch):
+    """Mark in ``touch`` [m, k] bool which of the rows ``near`` [m, k] the rows from ``first`` on touch.
+
+    Args:
+        means: [n, 3] f64. spreads: [n, 6] f64, of `_spreads`.
+    """
+    for place in range(near.shape[0]):
+        own = first + place
+        for number in range(near.shape[1]):
+            other = near[place, number]
+            x = means[other, 0] - means[own, 0]
+            y = means[other, 1] - means[own, 1]
+            z = means[other, 2] - means[own, 2]
+            squares = (x * x, y * y, z * z, x * y, x * z, y * z)
+            # s |d| of both sides, so that nothing is divided by a distance of zero.
+            mine, theirs = 0.0, 0.0
+            for k in range(6):
+                mine += spreads[own, k] * squares[k]
+                theirs += spreads[other, k] * squares[k]
+            reach = REACH * (math.sqrt(max(mine, 0.0)) + math.sqrt(max(theirs, 0.0)))
+            touch[place, number] = squares[0] + squares[1] + squares[2] <= reach
 
 
 def _spreads(splats: Splats, rows: np.ndarray) -> np.ndarray:

@@ -28,6 +28,7 @@ from liftcore.query.products import cosines_of, norms_of
 from liftcore.query.query import Query
 from liftcore.query.scene import QueryScene
 from liftcore.query.splat_files import coloured_ply, object_ply, scores_npy
+from liftcore.query.touching import warm_up_touching
 from liftcore.raster.warm_up import warm_up
 from liftcore.scene.splats import Kernel
 from liftcore.strict_json import finite
@@ -83,6 +84,7 @@ class Answers:
         for dtype in (torch.float16, torch.float32):
             row = torch.ones(1, 1, dtype=dtype)
             cosines_of(row, norms_of(row), row.to(torch.float32))
+        warm_up_touching()
         self._warm_kernel(Kernel.GAUSSIAN_3D)
 
     def reply(self, request: dict[str, Any], ahead: Sequence[dict[str, Any]] = ()) -> Frame:

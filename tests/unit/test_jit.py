@@ -31,6 +31,7 @@ _NO_PART_OF_KERNELS = {
     "one_thread.py",
     "readout.py",
     "protocol.py",
+    "splats.py",
     "progress.py",
     "observation.py",
     "view_weights.py",
