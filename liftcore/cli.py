@@ -277,8 +277,8 @@ def _add_evaluate(parser: argparse.ArgumentParser) -> None:
     words = parser.add_mutually_exclusive_group()
     words.add_argument("--table", type=Path, metavar="FILE", help="precomputed text embeddings")
     words.add_argument("--encoder", metavar="NAME", help="else the one that the lift's text space names")
-    parser.add_argument("--protocol", nargs="+", choices=("P1", "P2", "P3"), help="else all three")
-    parser.add_argument("--threshold", default="auto", metavar="T", help=f"of P2 and P3: {THRESHOLDS}")
+    parser.add_argument("--protocol", nargs="+", choices=("P1", "P2", "P3", "own"), help="else all")
+    parser.add_argument("--threshold", default="auto", metavar="T", help=f"of P2, P3 and own: {THRESHOLDS}")
     _add_negative(parser)
     parser.add_argument("--held-out", type=Path, metavar="FILE", help="the only frames to judge, a name a line")
 

@@ -25,6 +25,7 @@ _SHOWN = {  # the means of a protocol that a table shows, and their names there
     "P1": _IOUS | {"localised": "mAcc, in a box"},
     "P2": _IOUS | {"accuracy_25": "mAcc@0.25", "accuracy_50": "mAcc@0.5"},
     "P3": _IOUS | {"localised": "mAcc, in the mask"},
+    "own": _IOUS | {"accuracy_25": "mAcc@0.25", "accuracy_50": "mAcc@0.5"},
 }
 
 

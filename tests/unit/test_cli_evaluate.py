@@ -40,14 +40,14 @@ def test_a_right_lift_scores_near_one_in_every_protocol_of_lerf_ovs(
 ) -> None:
     lift = folder / "kitchen.lift.safetensors"
     document = evaluate(capsys, "lerf-ovs", lift, "--data", folder / "lerf_ovs")
-    assert [row["protocol"] for row in document["measured"]] == ["P1", "P2", "P3"]
+    assert [row["protocol"] for row in document["measured"]] == ["P1", "P2", "P3", "own"]
     for row in document["measured"]:
         assert row["scene"] == "kitchen" and row["frames"] == list(FRAMES) and row["lifted_frames"] == [LIFTED]
         found = row["means"]["all labelled"]
         assert (found["frames"], found["objects"]) == (2, 4)
         assert min(found["object_micro"], found["frame_macro"], found["class_pooled"]) > 0.9
         assert (found["accuracy_25"], found["accuracy_50"]) == (1, 1)
-        assert found["localised"] == (None if row["protocol"] == "P2" else 1)
+        assert found["localised"] == (None if row["protocol"] in ("P2", "own") else 1)
         assert row["means"]["held out"]["frames"] == 1
         assert {thing["lifted"] for thing in row["objects"] if thing["view"] == LIFTED} == {True}
         assert row["classes"].keys() == {"red apple", "book"}
@@ -66,7 +66,7 @@ def test_a_wrong_label_has_the_iou_that_its_pixels_give(
     half = isat([("book", rectangle(90, 20, 140, 60)), ("red apple", rectangle(0, 0, 10, 10))])
     (labels / "frame_00001.json").write_text(json.dumps(half))
     lift = f"kitchen={folder / 'kitchen.lift.safetensors'}"
-    options = ["--data", tmp_path, "--protocol", "P2", "P3", "--threshold", 0.5]
+    options = ["--data", tmp_path, "--protocol", "P2", "P3", "own", "--threshold", 0.5]
     document = evaluate(capsys, "lerf-ovs", lift, *options)
     for row in document["measured"]:
         ious = {thing["category"]: thing["iou"] for thing in row["objects"]}

@@ -1,4 +1,4 @@
-"""How the field measures open-vocabulary segmentation: three protocols whose numbers cannot be compared.
+"""How the field measures open-vocabulary segmentation: three protocols whose numbers cannot be compared, and our own.
 
 - P1 (LangSplat): features are rendered, a relevancy map is made in 2D and cut at 0.4. Localised when its peak lies in
   a box of the object.
@@ -6,6 +6,8 @@
   0.25 (and 0.5).
 - P3 (LaGa, Splat Feature Solver): splats are scored in 3D, scores are rendered and cut in 2D. Localised when the peak
   of the map lies in the object's mask.
+- own: splats are selected in 3D, and a mask is where they are at least half of a ray, as a query makes it.
+  Localised as P2 is.
 """
 
 from __future__ import annotations
@@ -26,6 +28,7 @@ class EvaluationProtocol(StrEnum):
     P1 = "P1"
     P2 = "P2"
     P3 = "P3"
+    OWN = "own"
 
 
 @dataclass(frozen=True)

@@ -27,8 +27,8 @@ class EvaluationSettings:
     """What is measured, and how."""
 
     protocols: tuple[EvaluationProtocol, ...] = tuple(EvaluationProtocol)
-    threshold: str | float = "auto"  # of P2's splats and P3's maps; P1 has its own
-    negatives: tuple[str, ...] = ()  # P1: instead of LangSplat's four; P2 and P3: of each question
+    threshold: str | float = "auto"  # of P3's maps, and of the splats of P2 and our own; P1 has its own
+    negatives: tuple[str, ...] = ()  # P1: instead of LangSplat's four; else of each question
     held_out: frozenset[str] | None = None  # the only frames to judge; None = all that are labelled
 
 
@@ -119,6 +119,10 @@ def open_segmenter(
         from liftcore.measure.protocols.selected_splats import SelectedSplats
 
         return SelectedSplats(scene, texts, encoder, settings.threshold, settings.negatives)
+    if protocol is EvaluationProtocol.OWN:
+        from liftcore.measure.protocols.own_masks import OwnMasks
+
+        return OwnMasks(scene, texts, encoder, settings.threshold, settings.negatives)
     from liftcore.measure.protocols.rendered_scores import RenderedScores
 
     return RenderedScores(scene, texts, encoder, settings.threshold, settings.negatives)

@@ -11,22 +11,24 @@ import torch
 from PIL import Image
 
 from liftcore.errors import InvalidInput
-from liftcore.measure.protocols import EvaluationProtocol, LabelledObject, Prediction
+from liftcore.measure.protocols import EvaluationProtocol, LabelledObject, Prediction, own_masks
+from liftcore.measure.protocols.evaluation import EvaluationSettings, open_segmenter
 from liftcore.measure.protocols.judging import judge, mean_of_scenes, means, pooled_ious
 from liftcore.measure.protocols.lerf_ovs import lerf_scenes
 from liftcore.measure.protocols.rendered_features import RenderedFeatures, segment
 from liftcore.measure.protocols.rendered_scores import RenderedScores
 from liftcore.measure.protocols.selected_splats import SelectedSplats
 from liftcore.measure.protocols.three_d_ovs import three_d_ovs_scenes
-from liftcore.query.ask import ask
+from liftcore.query.ask import Answer, ask
 from liftcore.query.encoders import open_encoder
 from liftcore.query.look import look
+from liftcore.query.objects import objects
 from liftcore.query.query import Query
 from liftcore.query.scene import QueryScene
 from liftcore.query.threshold import find_threshold
 from tests.labelled_scene import HEIGHT, WIDTH, isat, rectangle, write_lift
 
-P1, P2, P3 = EvaluationProtocol
+P1, P2, P3, OWN = EvaluationProtocol
 
 
 @pytest.fixture(scope="module")
@@ -167,6 +169,20 @@ def test_p3_cuts_the_rendered_scores_of_a_query(scene: QueryScene, threshold: st
         assert (found[text].mask == (met & (seen.attention >= cut)).numpy()).all() and found[text].mask.any()
         x, y = found[text].peak or (0, 0)
         assert seen.attention[y, x] == seen.attention.max()
+
+
+def test_our_own_protocol_makes_the_masks_of_a_query(scene: QueryScene, monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[Answer] = []
+    monkeypatch.setattr(own_masks, "objects", lambda *asked: made.append(asked[1]) or objects(*asked))
+    texts, encoder = ["book", "red apple"], words(scene)
+    judged = open_segmenter(OWN, scene, texts, encoder, EvaluationSettings(negatives=("wall",)))
+    for view in ("frame_00001", "frame_00002"):
+        found = judged.look(view)
+        for text in texts:
+            seen = look(scene, ask(scene, Query((text,), ("wall",)), encoder), view)
+            assert (found[text].mask == seen.mask.numpy()).all() and found[text].mask.any()
+            assert found[text].peak is None
+    assert [answer.query.positives for answer in made] == [("book",), ("red apple",)]  # once for all views
 
 
 def labels_of(folder: Path, document: object) -> Path:
