@@ -49,6 +49,7 @@ if TYPE_CHECKING:
     from liftcore.solve.weighted_sums import Strips
 
 BLOCK_ENTRIES = 1 << 12  # summed strip by strip, before their splats' rows are copied to X
+NORM_VALUES = 1 << 16  # of a codebook that are widened at a time
 FLOAT16_MAX = 65_504.0
 FLOAT16_STEP = 2.0**-25  # the largest rounding error of its small values
 FLOAT16_ERROR = 1e-4  # of the longest vector, which float16 must hold
@@ -130,7 +131,7 @@ def solve_closed_form(
     """
     books = [part.codebook for part in columns]
     channels = books[0].shape[1]
-    norms = [torch.linalg.vector_norm(book, dim=1, dtype=torch.float64).numpy() for book in books]
+    norms = [row_norms(book).numpy() for book in books]
     unit = all(bool((np.abs(norm - 1) < UNIT_TOLERANCE).all()) for norm in norms)
     if dtype == torch.float16 and not fits_float16(books, max(float(norm.max()) for norm in norms)):
         dtype = torch.float32
@@ -165,6 +166,19 @@ def solve_closed_form(
 def _in_halves(columns: Columns, dtype: torch.dtype) -> bool:
     """Whether strips of f16 hold the columns: rows as they are, means of rows rounded as X is."""
     return columns.codebook.dtype == torch.float16 and (columns.tuples is None or dtype == torch.float16)
+
+
+def row_norms(book: Tensor) -> Tensor:
+    """[M] f64: lengths of a codebook's rows [M, F], f16 or f32.
+
+    Some rows at a time: all in float64 were four times what a codebook of float16 takes.
+    """
+    norms = torch.empty(book.shape[0], dtype=torch.float64)
+    step = max(1, NORM_VALUES // max(book.shape[1], 1))
+    for first in range(0, book.shape[0], step):
+        wide = book[first : first + step].float()  # two quick conversions instead of a slow one
+        torch.linalg.vector_norm(wide, dim=1, dtype=torch.float64, out=norms[first : first + step])
+    return norms
 
 
 def fits_float16(books: Sequence[Tensor], longest: float) -> bool:

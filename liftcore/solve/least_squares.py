@@ -49,6 +49,25 @@ class BlockOutcome:
     cg: CgOutcome
 
 
+@dataclass(frozen=True)
+class BlockFacts:
+    """What is kept of a solved block, whose vectors are as large as its part of X."""
+
+    channels: int
+    losses: list[float]
+    steps: int
+    gradient: float  # after the last step, relative to the first
+    converged: bool  # in all channels
+    broken: bool  # in any
+
+    @classmethod
+    def of(cls, block: BlockOutcome) -> BlockFacts:
+        """The facts of a block."""
+        cg, channels = block.cg, block.step.shape[1]
+        last = float(cg.gradients[-1])
+        return cls(channels, block.losses, cg.steps, last, bool(cg.converged.all()), bool(cg.broken.any()))
+
+
 def refine(
     rays: AllRays,
     features: Tensor,
@@ -67,7 +86,7 @@ def refine(
     reduced = 0 < settings.cg_basis < features.shape[1]
     parts = blocks(features.shape[1], codebook_axes(codebooks, settings.cg_basis) if reduced else None)
     total = len(parts) * settings.cg_steps
-    outcomes = []
+    solved = []
     for number, part in enumerate(parts):
         done = number * settings.cg_steps
 
@@ -76,9 +95,10 @@ def refine(
 
         block = solve_block(rays, part, features, seen, (settings.damping, settings.cg_steps), watch)
         features = part.add(features, block.step)
-        outcomes.append(block)
+        solved.append(BlockFacts.of(block))
+        del block  # before the next one is solved beside it
         progress("refine", done + settings.cg_steps, total, "steps")
-    return _summary(features, outcomes, settings, rays.rows)
+    return _summary(features, solved, settings, rays.rows)
 
 
 def solve_block(
@@ -111,25 +131,25 @@ def solve_block(
     return BlockOutcome(outcome.solution, losses, outcome)
 
 
-def _summary(features: Tensor, outcomes: Sequence[BlockOutcome], settings: LiftSettings, rows: int) -> Refinement:
-    longest = max(len(block.losses) for block in outcomes)
+def _summary(features: Tensor, solved: Sequence[BlockFacts], settings: LiftSettings, rows: int) -> Refinement:
+    longest = max(len(block.losses) for block in solved)
     losses = [
-        sum(block.losses[min(step, len(block.losses) - 1)] for block in outcomes) / max(rows, 1)
+        sum(block.losses[min(step, len(block.losses) - 1)] for block in solved) / max(rows, 1)
         for step in range(longest)
     ]
-    gradient = max(float(block.cg.gradients[-1]) for block in outcomes)
-    if any(block.cg.broken.any() for block in outcomes):
+    gradient = max(block.gradient for block in solved)
+    if any(block.broken for block in solved):
         result, why = "breakdown", "a direction without curvature ended some channels early; more damping helps"
-    elif all(block.cg.converged.all() for block in outcomes):
+    elif all(block.converged for block in solved):
         result, why = "converged", f"the gradient fell below {TOLERANCE:g} of the closed form's"
     else:
         result, why = "steps", f"the gradient is {gradient:.2g} of the closed form's; more cg_steps would go on"
     change = losses[-1] / losses[0] if losses[0] > 0 else 1.0
     stats = {
         "result": result,
-        "steps": max(block.cg.steps for block in outcomes),
+        "steps": max(block.steps for block in solved),
         "damping": settings.damping,
-        "channels": sum(block.step.shape[1] for block in outcomes),
+        "channels": sum(block.channels for block in solved),
         "gradient": gradient,
         "residuals": losses,
     }

@@ -20,7 +20,7 @@ import torch
 from torch.nn.functional import embedding_bag
 
 from liftcore.device import out_of_memory
-from liftcore.solve.closed_form import UNIT_TOLERANCE, Solution, fits_float16
+from liftcore.solve.closed_form import UNIT_TOLERANCE, Solution, fits_float16, row_norms
 from liftcore.solve.device_blocks import GRAIN, block_room, bounds_of, device_slices, splat_blocks
 from liftcore.solve.feature_room import in_memory
 
@@ -75,7 +75,7 @@ def solve_on_device(
     """
     books = [part.codebook for part in columns]
     count, channels = denominators.shape[0], books[0].shape[1]
-    norms = [torch.linalg.vector_norm(book, dim=1, dtype=torch.float64) for book in books]
+    norms = [row_norms(book) for book in books]
     unit = all(bool(((norm - 1).abs() < UNIT_TOLERANCE).all()) for norm in norms)
     if dtype == torch.float16 and not fits_float16(books, max(float(norm.max()) for norm in norms)):
         dtype = torch.float32
