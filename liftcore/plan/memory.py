@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tempfile
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,8 +12,10 @@ from liftcore.errors import Unavailable
 from liftcore.observe.through_lens import kept_bytes
 from liftcore.raster.constants import TILE
 from liftcore.raster.kernels import RECORDS
+from liftcore.solve.channels import BLOCK
+from liftcore.solve.clustering import BLOCK as CLUSTERED_ROWS
 from liftcore.solve.columns import by_rows
-from liftcore.solve.feature_room import check_disk
+from liftcore.solve.feature_room import check_disk, lack_of_disk
 from liftcore.solve.gathering import CHUNK_ENTRIES
 from liftcore.solve.view_weights import MEMORY_LIMIT
 from liftcore.solve.weighted_sums import strip_bytes
@@ -21,18 +24,22 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
     from liftcore.observe.pack import FeaturePacks, TensorSpec
+    from liftcore.plan.entries import PlannedEntries
     from liftcore.scene.cameras import Camera
     from liftcore.scene.splats import Splats
     from liftcore.solve.settings import LiftSettings
 
 LIBRARIES = 450_000_000  # of torch, numba, numpy and the compiled kernels, before anything is read
-ENTRIES_A_SPLAT = 1.5  # of W, for a splat that a view sees, with one level of regions; measured on real scenes
-MORE_ENTRIES = 0.6  # of it for each further level, where columns are tuples; ENTRIES_A_SPLAT where they are rows
 ENTRY_BYTES, ROW_BYTES = 8, 20  # column and weight; a splat's ids, row start and evidence
 JUDGED_BYTES = 8  # what the robust step finds of a gathered entry
-TILES_A_SPLAT = 6  # entries of tile lists and tile sums for a splat that a view sees, at full resolution
-TILE_ENTRY_BYTES = 4 + 4 + 2 * 16  # list, item, and an entry before and after it is gathered
+LISTED_BYTES = 4 + 4  # of a splat in the list of a tile: as it is found, and in its place
+WALKED_BYTES = 60  # of an entry of the walk: 16 before it is gathered, 8 after, 8 of its column, and growing arrays
 SCENE_BYTES = 9 * 8 + 3 * 8 + 8 * 8  # axes, opacities, reach; evidence, denominators, scale, order of the solution
+VECTORS = 10  # [P, C] f32 of a block of conjugate gradients, with those that its sums pass through
+IMAGES = 3  # [H, W, C] f32: rendered, what is left of B, and the way back
+TAP_BYTES, RAY_BYTES = 16, 8  # column and share; a ray's number
+UNIT_ROWS = 6  # [n, F] f32 on the way from features to directions
+CLUSTERING = 80_000_000  # of hdbscan and what it stands on
 WALK_BYTES = 68  # of a splat of the scene in the walk of a view, seen or not: depth, id, counts and sums of the merge
 CONTROL_GROUPS = (  # folder, and the files of limit, use and statistics: versions 2 and 1
     ("/sys/fs/cgroup", ("memory.max", "memory.current", "memory.stat")),
@@ -43,33 +50,64 @@ SPARE = 0.9  # of the memory that is free: others grow too
 
 
 def memory_parts(
-    splats: Splats, packs: FeaturePacks, cameras: Mapping[str, Camera], seen_a_view: float, settings: LiftSettings
+    splats: Splats,
+    packs: FeaturePacks,
+    cameras: Mapping[str, Camera],
+    planned: PlannedEntries,
+    settings: LiftSettings,
 ) -> dict[str, int]:
     """Bytes of each part of a lift at its peak, with one view in work.
 
+    What comes after the walks has the room that the view had: ``refinement`` and ``aggregation`` are what they take
+    beyond it.
+
     Args:
         cameras: the views that are lifted, by name.
-        seen_a_view: how many splats a view can see, in the mean.
+        planned: what the walks will make.
     """
     inputs = sum(t.nbytes for t in (splats.means, splats.quats, splats.log_scales, splats.opacity_logits))
     largest = max(camera.width * camera.height for camera in cameras.values())
-    entries = entries_a_splat(packs, cameras, settings)
-    gathered = min(int(len(cameras) * seen_a_view * entries), CHUNK_ENTRIES)
-    weights = weight_bytes(seen_a_view, entries)
-    seen = 8 * RECORDS[splats.kernel] + TILES_A_SPLAT * TILE_ENTRY_BYTES  # of a splat
+    gathered = min(int(len(cameras) * planned.splats * planned.entries), CHUNK_ENTRIES)
+    weights = weight_bytes(planned.splats, planned.entries)
+    seen = 8 * RECORDS[splats.kernel] + LISTED_BYTES * planned.listed + WALKED_BYTES * planned.walked  # of a splat
     labels = max(_label_bytes(packs, view) for view in cameras)
-    walk = int(seen_a_view * seen) + splats.count * WALK_BYTES + 8 * largest // TILE**2
-    return {
+    walk = int(planned.splats * seen) + splats.count * WALK_BYTES + 8 * largest // TILE**2
+    # Labels of the next one, too, and weights that wait for their turn.
+    view = walk + 2 * labels + kept_bytes(cameras.values()) + weights
+    parts = {
         "libraries": LIBRARIES,
         "splats": inputs,
         "scene": splats.count * SCENE_BYTES,
-        # Labels of the next one, too, and weights that wait for their turn.
-        "view": walk + 2 * labels + kept_bytes(cameras.values()) + weights,
+        "view": view,
         "weights": min(len(cameras) * weights, MEMORY_LIMIT),
         "gathered": gathered * (ENTRY_BYTES + (JUDGED_BYTES if settings.robust_steps else 0)),
         "codebooks": _all_codebook_bytes(packs, cameras, settings),
         "features": splats.count * packs.channels * (2 if settings.dtype == "float16" else 4),
     }
+    if settings.cg_steps or settings.reference_channels:
+        parts["refinement"] = max(0, _refinement_bytes(splats.count, packs, cameras, settings) - view)
+    if settings.aggregation:
+        rows = UNIT_ROWS * 4 * packs.channels
+        parts["view"] = max(view, rows * CLUSTERED_ROWS)  # each thread has a block of splats in work
+        parts["aggregation"] = CLUSTERING + rows * min(splats.count, settings.aggregation_sample)
+    return parts
+
+
+def weights_in_files(planned: PlannedEntries, views: int, settings: LiftSettings) -> int:
+    """Bytes of W of so many views that go to files of the temporary folder, as memory keeps no more of it."""
+    judged = planned.splats * planned.entries * 4 if settings.robust_steps else 0.0  # weights as they were judged
+    return max(0, int(views * (weight_bytes(planned.splats, planned.entries) + judged)) - MEMORY_LIMIT)
+
+
+def check_weights(size: int) -> list[str]:
+    """What to say of so many bytes of region weights in the temporary folder: nothing, or a warning."""
+    got = lack_of_disk(size) if size else ""
+    if not got:
+        return []
+    told = (
+        f"region weights of about {size / 2**30:.1f} GiB go to files in {tempfile.gettempdir()}, and there is {got}"
+    )
+    return [f"{told}: set TMPDIR to a folder with more room on a disk, or try fewer views (coverage)"]
 
 
 def free_memory() -> int | None:
@@ -132,12 +170,6 @@ def check_memory(parts: Mapping[str, int], free: int | None) -> list[str]:
     return told
 
 
-def entries_a_splat(packs: FeaturePacks, views: Iterable[str], settings: LiftSettings) -> float:
-    """Entries of W for a splat that a view sees."""
-    more = ENTRIES_A_SPLAT if by_rows(settings) else MORE_ENTRIES
-    return ENTRIES_A_SPLAT + more * (most_levels(packs, views) - 1)
-
-
 def weight_bytes(rows: float, entries: float) -> int:
     """Of W with so many rows of so many entries."""
     return int(rows * (ROW_BYTES + ENTRY_BYTES * entries))
@@ -165,6 +197,24 @@ def _label_bytes(packs: FeaturePacks, view: str) -> int:
     """Of the view's labels as they are walked; a grid's cells are labels where the nearest one is read."""
     spec = packs.specs(view).get("labels")
     return 4 * (codebook_rows(packs, view) if spec is None else math.prod(spec.shape))
+
+
+def _refinement_bytes(count: int, packs: FeaturePacks, cameras: Mapping[str, Camera], settings: LiftSettings) -> int:
+    """Of a block of conjugate gradients for so many splats, and of the optimum that the reference keeps."""
+    refined = min(BLOCK, settings.cg_basis or packs.channels) if settings.cg_steps else 0
+    channels = max(refined, min(BLOCK, settings.reference_channels))
+    pixels = [camera.width * camera.height for camera in cameras.values()]
+    rays = max(pixels[k] * _row_bytes(packs, view, settings) for k, view in enumerate(cameras))
+    images = max(pixels) * IMAGES * channels * 4
+    return count * 4 * (VECTORS * channels + settings.reference_channels) + images + rays + sum(pixels)
+
+
+def _row_bytes(packs: FeaturePacks, view: str, settings: LiftSettings) -> int:
+    """Of what a pixel's rows of B are read from: four cells of a grid, or a region a level."""
+    if packs.is_regions(view):
+        levels = most_levels(packs, [view]) if settings.levels == "rows" else 1
+        return levels * (RAY_BYTES + TAP_BYTES)
+    return RAY_BYTES + TAP_BYTES * (4 if settings.grid_reading == "bilinear" else 1)
 
 
 def _all_codebook_bytes(packs: FeaturePacks, views: Iterable[str], settings: LiftSettings) -> int:

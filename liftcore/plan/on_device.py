@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from liftcore.errors import Unavailable
-from liftcore.plan.memory import all_columns, codebook_rows, entries_a_splat, most_levels, weight_bytes
+from liftcore.plan.memory import all_columns, codebook_rows, most_levels, weight_bytes
 from liftcore.solve.device_blocks import GRAIN, SPARE, block_bytes, book_bytes, device_slices
 
 if TYPE_CHECKING:
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
     from liftcore.device import Device
     from liftcore.observe.pack import FeaturePacks
+    from liftcore.plan.entries import PlannedEntries
     from liftcore.scene.cameras import Camera
     from liftcore.scene.splats import Splats
     from liftcore.solve.settings import LiftSettings
@@ -104,13 +105,13 @@ def device_plan(
     splats: Splats,
     packs: FeaturePacks,
     cameras: Mapping[str, Camera],
-    seen_a_view: float,
+    planned: PlannedEntries,
     settings: LiftSettings,
 ) -> DevicePlan | None:
     """The plan of a lift on that device; None on the processor.
 
     Args:
-        cameras: the views that are lifted, by name. seen_a_view: how many splats a view can see, in the mean.
+        cameras: the views that are lifted, by name. planned: what the walks will make.
     """
     if device.kind == "cpu":
         return None
@@ -125,13 +126,13 @@ def device_plan(
     least = sum(codebook_rows(packs, name) for name in cameras)  # columns, for which slices are widest
     slices = device_slices(least, packs.channels)
     width = slices[0][1]
-    each = entries_a_splat(packs, cameras, settings)
-    entries = int(len(cameras) * seen_a_view * each)
+    seen = len(cameras) * planned.splats
+    entries = int(seen * planned.entries)
     return DevicePlan(
         name=device.name,
         view=max(raster_bytes(*view) for view in views),
         least_view=max(least_raster_bytes(*view) for view in views),
-        weights=weight_bytes(len(cameras) * seen_a_view, each),
+        weights=weight_bytes(seen, planned.entries),
         codebooks=book_bytes(rows, width, unit=False),
         block=block_bytes(splats.count, entries, width),
         grain=block_bytes(min(GRAIN, splats.count), math.ceil(entries * min(1.0, GRAIN / splats.count)), width),

@@ -9,7 +9,15 @@ from typing import TYPE_CHECKING, Any
 
 from liftcore.device import CPU
 from liftcore.plan.coverage import WELL_COVERED, spare_views, view_order, views_to_show
-from liftcore.plan.memory import check_memory, features_room, free_memory, memory_parts
+from liftcore.plan.entries import planned_entries
+from liftcore.plan.memory import (
+    check_memory,
+    check_weights,
+    features_room,
+    free_memory,
+    memory_parts,
+    weights_in_files,
+)
 from liftcore.plan.on_device import check_device_room, device_plan
 from liftcore.plan.pilot import PILOT_VIEWS, fly_pilot
 from liftcore.plan.rank import ENOUGH, Rank, codebook_rank
@@ -48,9 +56,11 @@ class Plan:
     spare: tuple[str, ...]  # of those lifted: what they show, WELL_COVERED of the others show too
     seen_share: float  # of the splats, that some view can see, before occlusion
     splats_a_view: float
+    entries_a_splat: float  # of W, of a splat in a view that can see it
     rank: Rank
     dtype: str  # that X is stored as, when it can hold the codebooks
     memory: Mapping[str, int]  # bytes a part, with one view in work
+    in_files: int  # bytes of region weights beyond those that stay in memory
     at_once: int  # views that this machine has in work
     device: Device  # that will walk and solve
     on_device: DevicePlan | None  # what it takes of a card, where it is one
@@ -63,6 +73,11 @@ class Plan:
         """The estimated peak with one view in work."""
         return sum(self.memory.values())
 
+    @property
+    def in_work(self) -> dict[str, int]:
+        """Bytes a part with as many views in work as this machine has."""
+        return _in_work(self.memory, self.at_once)
+
     def facts(self) -> dict[str, Any]:
         """Plain numbers for the certificate, without what only this machine has to do with."""
         return {
@@ -70,6 +85,7 @@ class Plan:
             "splats": self.splats,
             "seen_share": self.seen_share,
             "splats_a_view": self.splats_a_view,
+            "entries_a_splat": self.entries_a_splat,
             "views": len(self.views),
             "views_left_out": len(self.left_out),
             "view_cosine": self.view_cosine,
@@ -81,6 +97,7 @@ class Plan:
             "dtype": self.dtype,
             "memory_bytes": self.memory_bytes,
             "memory": dict(self.memory),
+            "weights_in_files_bytes": self.in_files,
             "device": self.device.kind,
             "device_memory": self.on_device.facts() if self.on_device else None,
         }
@@ -88,7 +105,8 @@ class Plan:
     def lines(self) -> Iterator[str]:
         """The plan for people."""
         yield f"plan: {self.splats} splats ({self.kernel}), {self.seen_share:.1%} in some view's field"
-        yield f"  a view shows {self.splats_a_view:.0f} of them, before occlusion"
+        parts = f"{self.entries_a_splat:.1f} regions or cells"
+        yield f"  a view shows {self.splats_a_view:.0f} of them, before occlusion, each in {parts}"
         left = f", {len(self.left_out)} left out" if self.left_out else ""
         if self.view_cosine is not None:
             left += f" (a pilot expects features with a cosine of {self.view_cosine:.3f} to those of all)"
@@ -98,9 +116,11 @@ class Plan:
             f"  {self.rank.channels} channels; {self.rank.rows} sampled codebook rows have rank {bound}"
             f"{self.rank.rank}, and {self.rank.enough} directions hold {ENOUGH:.0%} of their squares"
         )
-        sizes = _in_work(self.memory, self.at_once)
+        sizes = self.in_work
         parts = ", ".join(f"{name} {size / 2**20:.0f}" for name, size in sizes.items())
         yield f"  features as {self.dtype}; about {sum(sizes.values()) / 2**20:.0f} MiB at the peak ({parts})"
+        if self.in_files:
+            yield f"  {self.in_files / 2**20:.0f} MiB of region weights go to files in the temporary folder"
         yield f"  on {self.device.name}" + (f": {self.on_device.line()}" if self.on_device else "")
         yield from (f"warning: {warning}" for warning in (*self.warnings, *self.told))
 
@@ -143,13 +163,17 @@ def plan_lift(
     views = [names[k] for k in chosen]
     seen = seen.of(chosen)
     lifted = {name: by_name[name] for name in views}
-    parts = memory_parts(splats, packs, lifted, seen.splats_a_view, settings)
-    on_device = device_plan(device, splats, packs, lifted, seen.splats_a_view, settings)
+    entries = planned_entries(seen, packs, lifted, settings)
+    parts = memory_parts(splats, packs, lifted, entries, settings)
+    on_device = device_plan(device, splats, packs, lifted, entries, settings)
     short = check_device_room(on_device, settings.device) if on_device else []
     on_card = on_device is not None and not short
     at_once = 1 if on_card else min(len(views), views_at_a_time(threads or len(os.sched_getaffinity(0))))
     if on_card:
         parts["gathered"] = 0  # there W goes to the card block by block
+    home = settings.robust_steps or settings.aggregation_resolve  # W comes to the host, wherever it was made
+    kept = on_device.kept if on_device and on_card and not home else 0
+    in_files = max(0, weights_in_files(entries, len(views), settings) - kept)
     today, free = _in_work(parts, at_once), free_memory()
     return Plan(
         kernel=str(splats.kernel),
@@ -160,14 +184,16 @@ def plan_lift(
         spare=tuple(views[k] for k in spare_views(seen)),
         seen_share=seen.seen_share,
         splats_a_view=seen.splats_a_view,
+        entries_a_splat=entries.entries,
         rank=codebook_rank(packs, views),
         dtype=settings.dtype,
         memory=parts,
+        in_files=in_files,
         at_once=at_once,
         device=CPU if short else device,
         on_device=on_device if on_card else None,
         features_room=features_room(today, free),
-        warnings=(*short, *check_memory(today, free)),
+        warnings=(*short, *check_memory(today, free), *check_weights(in_files)),
         told=(
             *frame_warning(cameras),
             *distortion_warning(list(lifted.values())),

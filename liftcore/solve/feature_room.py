@@ -60,17 +60,23 @@ def in_file(splats: int, channels: int, dtype: torch.dtype) -> Tensor:
 
 
 def check_disk(size: int) -> None:
-    """See early that the disk has room for ``size`` bytes.
+    """See early that the disk has room for ``size`` bytes of features.
 
     Raises:
         Unavailable: it has not.
     """
+    got = lack_of_disk(size)
+    if got:
+        raise _no_disk(size, got)
+
+
+def lack_of_disk(size: int) -> str:
+    """What the temporary folder has in place of room for ``size`` bytes on a disk; empty where there is room."""
     folder = Path(tempfile.gettempdir())
     if file_system(folder) in IN_MEMORY:
-        raise _no_disk(size, "a temporary folder that lies in memory itself")
+        return "a temporary folder that lies in memory itself"
     free = shutil.disk_usage(folder).free
-    if free < size:
-        raise _no_disk(size, f"{free / 2**30:.1f} GiB of disk")
+    return "" if free >= size else f"{free / 2**30:.1f} GiB of disk"
 
 
 def file_system(folder: Path, mounts: Path = MOUNTS) -> str:

@@ -22,7 +22,6 @@ from liftcore.plan.memory import (
     LIBRARIES,
     all_columns,
     check_memory,
-    entries_a_splat,
     free_memory,
     group_memory,
 )
@@ -80,7 +79,7 @@ def test_rank_of_packs_looks_at_all_their_views(tmp_path, grids):
     assert found.rows >= 6
 
 
-def test_tuples_of_labels_are_planned_with_fewer_entries_and_with_no_fewer_columns_than_there_are(tmp_path):
+def test_tuples_of_labels_are_planned_with_no_fewer_columns_than_there_are(tmp_path):
     maps = {f"v{k}": observed(2, k) for k in (1, 3)}
     write_pack(tmp_path / "p", maps, {})
     packs, tuples, rows = open_packs([tmp_path / "p"]), LiftSettings.of(), LiftSettings.of(robust_steps=1)
@@ -88,7 +87,6 @@ def test_tuples_of_labels_are_planned_with_fewer_entries_and_with_no_fewer_colum
     assert all(columns.tuples is not None for columns in made)
     assert all_columns(packs, maps, rows) == sum(own.codebook.shape[0] for own in maps.values())
     assert all_columns(packs, maps, tuples) >= sum(columns.count for columns in made)
-    assert 1.0 < entries_a_splat(packs, maps, tuples) < entries_a_splat(packs, maps, rows)
 
 
 def test_a_robust_step_holds_as_much_again_of_each_gathered_entry(tmp_path):
@@ -99,6 +97,40 @@ def test_a_robust_step_holds_as_much_again_of_each_gathered_entry(tmp_path):
         return planned(open_sources(paths[0], paths[1], [paths[2]], settings), settings, CPU).memory["gathered"]
 
     assert gathered(robust_steps=1) == 2 * gathered() > 0
+
+
+@pytest.mark.parametrize(
+    ("own", "part"),
+    [
+        ({"cg_steps": 1}, "refinement"),
+        ({"reference_channels": 4}, "refinement"),
+        ({"aggregation": True}, "aggregation"),
+    ],
+)
+def test_what_comes_after_the_walks_is_planned_where_it_comes(tmp_path, own, part):
+    sources = open_sources(*write_scene(tmp_path, 2)[:2], [tmp_path / "features.safetensors"], LiftSettings.of())
+    plain, more = (planned(sources, LiftSettings.of(**chosen), CPU).memory for chosen in ({}, own))
+    assert set(more) - set(plain) == {part}
+    assert more[part] > 0
+
+
+def test_region_weights_that_go_to_files_are_planned_and_their_disk_is_looked_at(tmp_path, monkeypatch, disk):
+    paths = write_scene(tmp_path, 2)
+
+    def plan_of(**own):
+        settings = LiftSettings.of(**own)
+        return planned(open_sources(paths[0], paths[1], [paths[2]], settings), settings, CPU)
+
+    assert (plan_of().in_files, plan_of().facts()["weights_in_files_bytes"]) == (0, 0)
+    monkeypatch.setattr("liftcore.plan.memory.MEMORY_LIMIT", 0)
+    assert 0 < plan_of().in_files < plan_of(robust_steps=1).in_files
+    assert "of region weights go to files" in "\n".join(plan_of().lines())
+    assert plan_of().warnings == ()
+    disk(0)
+    assert "0.0 GiB of disk: set TMPDIR" in "\n".join(plan_of().lines())
+    monkeypatch.setattr("liftcore.solve.feature_room.file_system", lambda _: "tmpfs")
+    (told,) = plan_of().warnings
+    assert "a temporary folder that lies in memory itself: set TMPDIR" in told
 
 
 @pytest.fixture
