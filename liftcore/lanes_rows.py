@@ -63,39 +63,76 @@ def add_weighted_row(typingctx, target, place, source, entries, sparse, span):
     integers = types.UniTuple(types.intp, 2)
     pair = types.Tuple([types.Array(types.int32, 1, "C"), FLOAT_ARRAY])
     signature = types.void(FLOAT_ARRAY, types.intp, source, integers, pair, integers)
-    halves = source.dtype == types.uint16
 
     def codegen(context, builder, signature, args):
         target, place, source, entries, sparse, span = args
-        array = signature.args
-        first, last = cgutils.unpack_tuple(builder, entries)
-        stride, offset = cgutils.unpack_tuple(builder, span)
-        columns, weights = _tables(context, builder, pair, sparse)
-        smaller = halves and not converts(context)
-        load = _load_singles if not halves else _load_small if smaller else _load_halves
-        steps = [ir.Constant(place.type, part) for part in range(0, WIDE, _BROAD)]
-        places = [pointer_to(context, builder, array[0], target, builder.add(place, step)) for step in steps]
-        sums = [cgutils.alloca_once_value(builder, _load_singles(builder, pointer)) for pointer in places]
-
-        def row_at(entry: ir.Value) -> ir.Value:
-            column = builder.sext(builder.load(builder.gep(columns, [entry])), stride.type)
-            return builder.add(builder.mul(column, stride), offset)
-
-        with cgutils.for_range_slice(builder, first, last, ir.Constant(place.type, 1)) as (k, _):
-            soon = row_at(builder.add(k, ir.Constant(k.type, AHEAD)))
-            fetch(builder, pointer_to(context, builder, array[2], source, soon), WIDE * (2 if halves else 4))
-            single = builder.load(builder.gep(weights, [k]))
-            unit = builder.fmul(single, ir.Constant(FLOAT, _HALF_UNIT)) if smaller else single
-            weight = broadcast(builder, unit, _BROAD_FLOATS)
-            base = row_at(k)
-            for step, total in zip(steps, sums, strict=True):
-                row = load(builder, pointer_to(context, builder, array[2], source, builder.add(base, step)))
-                builder.store(fused(builder, row, weight, builder.load(total)), total)
-        for pointer, total in zip(places, sums, strict=True):
-            builder.store(builder.load(total), builder.bitcast(pointer, _BROAD_FLOATS.as_pointer()), align=4)
+        _add_rows(context, builder, signature.args[2], ([target], place, source, entries, span), (pair, sparse))
         return context.get_dummy_value()
 
     return signature, codegen
+
+
+@compiled
+def add_weighted_row_twice(typingctx, targets, place, source, entries, sparse, span):
+    """``add_weighted_row`` into the first target; into the second with weights ``weights[k] factors[columns[k]]``.
+
+    ``sparse = (columns i32, weights f32, factors f32)``. A row is read once for both sums.
+    """
+    integers = types.UniTuple(types.intp, 2)
+    tables = types.Tuple([types.Array(types.int32, 1, "C"), FLOAT_ARRAY, FLOAT_ARRAY])
+    signature = types.void(types.UniTuple(FLOAT_ARRAY, 2), types.intp, source, integers, tables, integers)
+
+    def codegen(context, builder, signature, args):
+        targets, place, source, entries, sparse, span = args
+        given = (cgutils.unpack_tuple(builder, targets), place, source, entries, span)
+        _add_rows(context, builder, signature.args[2], given, (tables, sparse))
+        return context.get_dummy_value()
+
+    return signature, codegen
+
+
+def _add_rows(context: Any, builder: Builder, kind: types.Array, given: tuple, sparse: tuple) -> None:
+    """The sums of weighted rows of a source of that kind into each target; of a second one with factors of the rows.
+
+    Args:
+        given: targets, place, source, entries and span. sparse: the type of the tuple of tables, and the tuple.
+    """
+    targets, place, source, entries, span = given
+    halves = kind.dtype == types.uint16
+    first, last = cgutils.unpack_tuple(builder, entries)
+    stride, offset = cgutils.unpack_tuple(builder, span)
+    columns, weights, *factors = _tables(context, builder, *sparse)
+    smaller = halves and not converts(context)
+    load = _load_singles if not halves else _load_small if smaller else _load_halves
+    steps = [ir.Constant(place.type, part) for part in range(0, WIDE, _BROAD)]
+    places = [
+        [pointer_to(context, builder, FLOAT_ARRAY, target, builder.add(place, step)) for step in steps]
+        for target in targets
+    ]
+    sums = [[cgutils.alloca_once_value(builder, _load_singles(builder, one)) for one in own] for own in places]
+
+    def column_of(entry: ir.Value) -> ir.Value:
+        return builder.sext(builder.load(builder.gep(columns, [entry])), stride.type)
+
+    def row_at(column: ir.Value) -> ir.Value:
+        return builder.add(builder.mul(column, stride), offset)
+
+    with cgutils.for_range_slice(builder, first, last, ir.Constant(place.type, 1)) as (k, _):
+        soon = row_at(column_of(builder.add(k, ir.Constant(k.type, AHEAD))))
+        fetch(builder, pointer_to(context, builder, kind, source, soon), WIDE * (2 if halves else 4))
+        single, column = builder.load(builder.gep(weights, [k])), column_of(k)
+        singles = [single, *(builder.fmul(single, builder.load(builder.gep(table, [column]))) for table in factors)]
+        unit = ir.Constant(FLOAT, _HALF_UNIT)
+        units = [builder.fmul(one, unit) if smaller else one for one in singles]
+        broad = [broadcast(builder, one, _BROAD_FLOATS) for one in units]
+        base = row_at(column)
+        for number, step in enumerate(steps):
+            row = load(builder, pointer_to(context, builder, kind, source, builder.add(base, step)))
+            for weight, own in zip(broad, sums, strict=True):
+                builder.store(fused(builder, row, weight, builder.load(own[number])), own[number])
+    for own, kept in zip(places, sums, strict=True):
+        for pointer, total in zip(own, kept, strict=True):
+            builder.store(builder.load(total), builder.bitcast(pointer, _BROAD_FLOATS.as_pointer()), align=4)
 
 
 @compiled

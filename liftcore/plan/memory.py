@@ -220,12 +220,14 @@ def _row_bytes(packs: FeaturePacks, view: str, settings: LiftSettings) -> int:
 def _all_codebook_bytes(packs: FeaturePacks, views: Iterable[str], settings: LiftSettings) -> int:
     """Of the codebooks, and of the strips of what W's columns stand for that the solution has beside.
 
-    Codebooks that are no unit vectors have strips of those, too. Which are, nobody knows before they are read.
+    Means over tuples of what is no unit vector have strips of those vectors' means, too. Which are, nobody knows
+    before they are read.
     """
     names = list(views)
     halves = all(_codebook_spec(packs, view).dtype == "F16" for view in names)
     size = 2 if halves and (by_rows(settings) or settings.dtype == "float16") else 4
-    strips = strip_bytes(all_columns(packs, names, settings), packs.channels, size + 4)
+    means = not by_rows(settings) and most_levels(packs, names) > 1
+    strips = strip_bytes(all_columns(packs, names, settings), packs.channels, size + (4 if means else 0))
     return sum(_codebook_bytes(packs, view) for view in names) + strips
 
 

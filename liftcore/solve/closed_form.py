@@ -36,6 +36,7 @@ from liftcore.solve.weighted_sums import (
     first_columns,
     strips_of,
     sum_strip,
+    sum_strip_twice,
 )
 
 if TYPE_CHECKING:
@@ -53,6 +54,7 @@ NORM_VALUES = 1 << 16  # of a codebook that are widened at a time
 FLOAT16_MAX = 65_504.0
 FLOAT16_STEP = 2.0**-25  # the largest rounding error of its small values
 FLOAT16_ERROR = 1e-4  # of the longest vector, which float16 must hold
+SHORTEST = 1e-30  # of the vectors whose inverse length float32 takes well, and of these inverses
 UNIT_TOLERANCE = 5e-3  # float16 unit vectors are off by less
 
 
@@ -142,20 +144,22 @@ def solve_closed_form(
     scale = np.divide(1.0, denominators, out=np.zeros(count), where=denominators > 0)
     halves = all(_in_halves(part, dtype) for part in columns)
     counts, tables = [part.count for part in columns], WeightTables(store)
-    slices = channel_slices(sum(counts), channels, (2 if halves else 4) + (0 if unit else 4))
+    inverse = None if unit else _inverse(columns, norms)
+    apart = not unit and inverse is None  # strips of unit vectors, beside the others
+    slices = channel_slices(sum(counts), channels, (2 if halves else 4) + (4 if apart else 0))
     with host.workers() as (_, each_share):
         columns_of_all = (first_columns(counts), scale)
         gathering = Gathering(each_share, tables, columns_of_all, host.places(channels), channels * dtype.itemsize)
         for number, (begin, end) in enumerate(slices):
             parts = (part.means(part.codebook[:, begin:end]) for part in columns)
             strips = strips_of(parts, counts, end - begin, torch.float16 if halves else torch.float32)
-            sums = [(strips, (squares if unit else np.zeros(count), begin, kept))]
-            if not unit:
+            sums = [(strips, inverse, (np.zeros(count) if apart else squares, begin, kept))]
+            if apart:
                 parts = (
                     part.means(_unit_rows(part.codebook[:, begin:end], norm))
                     for part, norm in zip(columns, norms, strict=True)
                 )
-                sums.append((strips_of(parts, counts, end - begin, torch.float32), (squares, begin, nothing)))
+                sums.append((strips_of(parts, counts, end - begin, torch.float32), None, (squares, begin, nothing)))
             _solve_strips(each_share, gathering, sums)
             del strips, sums  # before others are made
             progress("solve", number + 1, len(slices), "slices")
@@ -188,6 +192,19 @@ def fits_float16(books: Sequence[Tensor], longest: float) -> bool:
     return longest == 0 or FLOAT16_STEP * math.sqrt(books[0].shape[1]) <= FLOAT16_ERROR * longest
 
 
+def _inverse(columns: Sequence[Columns], norms: Sequence[np.ndarray]) -> np.ndarray | None:
+    """[rows] f32: of every row of all codebooks one over its length, zero for none, which makes of rows unit vectors.
+
+    None where columns are means of several rows, or a product with it would leave float32.
+    """
+    lengths = np.concatenate(norms)
+    lengths = np.where(lengths > 0, lengths, np.inf)
+    if any(part.tuples is not None for part in columns) or lengths.min() < SHORTEST:
+        return None
+    inverse = 1.0 / lengths
+    return None if inverse.min(initial=1.0, where=inverse > 0) < SHORTEST else inverse.astype(np.float32)
+
+
 def _unit_rows(part: Tensor, norms: np.ndarray) -> Tensor:
     """Some channels of a codebook as f32, every row divided by its norm, if it has one."""
     rows = part.to(torch.float32, copy=True).numpy()
@@ -195,11 +212,12 @@ def _unit_rows(part: Tensor, norms: np.ndarray) -> Tensor:
 
 
 @kernel
-def solve_share(share, splats, entries, strips, result):
+def solve_share(share, splats, entries, strips, inverse, result):
     """X of a share of a chunk over the channels of the strips, and the squared norms of its rows.
 
     Args:
         share: (first, last) of the chunk's ``splats`` [B] i64. entries: theirs. strips: Strips.
+        inverse: [rows] f32, what makes unit vectors of the strips' rows: then norms are those of their sums; or None.
         result: (squares [P] f64, which grow; the first channel; X [P, F] in the bits of f16 (u16), or f32, [0, F] to
             keep nothing).
     """
@@ -211,9 +229,16 @@ def solve_share(share, splats, entries, strips, result):
         count, own = last - first, Entries(starts[first : last + 1], entries.rows, entries.shares)
         sums, norms = np.empty((count, WIDE), np.float32), np.zeros(count)
         rows = np.empty((min(count, features.shape[0]), width), features.dtype)
-        for strip in range(strips.number):
-            sum_strip(own, strips, strip, sums)
-            finish_rows(sums, norms, strip * WIDE, rows)
+        if inverse is None:
+            for strip in range(strips.number):
+                sum_strip(own, strips, strip, sums)
+                finish_rows(sums, norms, strip * WIDE, rows)
+        else:
+            units, others = np.empty((count, WIDE), np.float32), np.zeros(count)
+            for strip in range(strips.number):
+                sum_strip_twice(own, strips, strip, inverse, (sums, units))
+                finish_rows(units, norms, strip * WIDE, rows[:0])
+                finish_rows(sums, others, strip * WIDE, rows)
         for row in range(count):
             squares[splats[first + row]] += norms[row]
         source = rows.reshape(-1)
@@ -222,12 +247,17 @@ def solve_share(share, splats, entries, strips, result):
 
 
 def _solve_strips(
-    each_share: EachShare, gathering: Gathering, sums: Sequence[tuple[Strips, tuple[np.ndarray, int, np.ndarray]]]
+    each_share: EachShare,
+    gathering: Gathering,
+    sums: Sequence[tuple[Strips, np.ndarray | None, tuple[np.ndarray, int, np.ndarray]]],
 ) -> None:
-    """Each of the strips for all splats, into its ``(squares, first channel, X)``; W is gathered once for all."""
+    """Each of the strips, with its rows' inverse lengths, for all splats, into its ``(squares, first channel, X)``.
+
+    W is gathered once for all.
+    """
     for chunk in gathering:
-        for strips, result in sums:
-            given = (chunk.splats, chunk.entries, strips, result)
+        for strips, inverse, result in sums:
+            given = (chunk.splats, chunk.entries, strips, inverse, result)
             each_share(lambda share, given=given: solve_share(share, *given), 0, chunk.splats.size)
 
 
@@ -235,7 +265,7 @@ def warm_up_solution() -> None:
     """Compile the kernels of the solution, or load them from the disk cache, for both types of X and of codebooks."""
     one = torch.zeros(1, dtype=torch.int32)
     weights = RegionWeights(one, torch.tensor([0, 1]), one, torch.ones(1), one, torch.ones(1))
-    for dtype, kind in product((torch.float16, torch.float32), repeat=2):
-        columns = rows_of([torch.ones(1, 1, dtype=kind)])
+    for dtype, kind, length in product((torch.float16, torch.float32), (torch.float16, torch.float32), (1.0, 2.0)):
+        columns = rows_of([torch.full((1, 1), length, dtype=kind)])
         solve_closed_form([weights], columns, np.ones(1), dtype, silent, Host(1))
     places_along_curve(torch.zeros(1, 3))  # which more channels than one ask for

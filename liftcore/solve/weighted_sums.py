@@ -19,7 +19,7 @@ import torch
 from liftcore.errors import Unavailable
 from liftcore.jit import kernel
 from liftcore.lanes import fetch_place
-from liftcore.lanes_rows import WIDE, add_weighted_row
+from liftcore.lanes_rows import WIDE, add_weighted_row, add_weighted_row_twice
 from liftcore.solve.weight_tables import rows_between, table_at
 
 if TYPE_CHECKING:
@@ -189,6 +189,25 @@ def sum_strip(entries, strips, strip, sums):
 
 
 @kernel
+def sum_strip_twice(entries, strips, strip, factors, sums):
+    """``sum_strip``, and ``others[b] = sum_k shares[k] factors[rows[k]] E[rows[k]]``, of which each row is read once.
+
+    Args:
+        factors: [rows] f32. sums: (sums, others), [B, WIDE] f32, written.
+    """
+    values, targets = strips.values, (sums[0].reshape(-1), sums[1].reshape(-1))
+    span, sparse = (WIDE, strip * strips.rows * WIDE), (entries.rows, entries.shares, factors)
+    sums[0][:], sums[1][:] = 0, 0
+    for splat in range(sums[0].shape[0]):
+        first, last, place = entries.starts[splat], entries.starts[splat + 1], splat * WIDE
+        if last - first > LONG:
+            own = (targets[0][place : place + WIDE], targets[1][place : place + WIDE])
+            _sum_parts_twice(own, values, (first, last), sparse, span)
+        elif first < last:
+            add_weighted_row_twice(targets, place, values, (first, last), sparse, span)
+
+
+@kernel
 def _sum_parts(target, values, entries, sparse, span):
     """One splat's sum, of many entries: the sums of LONG of them at a time are added in float64."""
     part, total = np.empty(WIDE, np.float32), np.zeros(WIDE)
@@ -197,3 +216,16 @@ def _sum_parts(target, values, entries, sparse, span):
         add_weighted_row(part, 0, values, (first, min(first + LONG, entries[1])), sparse, span)
         total += part
     target[:] = total
+
+
+@kernel
+def _sum_parts_twice(targets, values, entries, sparse, span):
+    """``_sum_parts`` of both sums."""
+    parts = (np.empty(WIDE, np.float32), np.empty(WIDE, np.float32))
+    totals = (np.zeros(WIDE), np.zeros(WIDE))
+    for first in range(entries[0], entries[1], LONG):
+        parts[0][:], parts[1][:] = 0, 0
+        add_weighted_row_twice(parts, 0, values, (first, min(first + LONG, entries[1])), sparse, span)
+        totals[0][:] += parts[0]
+        totals[1][:] += parts[1]
+    targets[0][:], targets[1][:] = totals[0], totals[1]

@@ -76,6 +76,22 @@ def test_every_entry_of_every_view_counts_once(scene):
     assert (totals == 0).any()
 
 
+@pytest.mark.parametrize("size", [1.0, 1e-33, 1e33])
+def test_agreement_is_that_of_unit_vectors_whatever_their_length(scene, size):
+    store, books, totals = scene
+    books = [book * size * torch.linspace(0.5, 2.0, len(book))[:, None] for book in books]
+    books[0][3] = 0  # a row of no direction agrees with none
+    sums = np.zeros((totals.size, CHANNELS))
+    for weights, book in zip(store, books, strict=True):
+        units = torch.nn.functional.normalize(book.double(), dim=1, eps=1e-300).numpy()
+        sums += dense(weights, totals.size, len(book)) @ units
+    expected = np.linalg.norm(sums, axis=1) / np.where(totals > 0, totals, 1.0)
+    found = solve_closed_form(store, rows_of(books), totals, torch.float32, silent, Host(1))
+    np.testing.assert_allclose(found.agreement.numpy(), expected, atol=2e-6)
+    near = np.abs(found.features.double().numpy()).max()
+    assert 0.1 * size < near < 10 * size
+
+
 def test_slices_of_channels_and_threads_change_no_bit(scene, monkeypatch):
     whole = solved(scene)
     assert torch.equal(whole, solved(scene, Host(3)))
