@@ -10,8 +10,9 @@ import numpy as np
 
 from liftcore.jit import kernel
 from liftcore.lanes import fetch_place
+from liftcore.lanes_halves import lowest_rank, without_lowest_rank
 
-LONG_ROW = 64  # columns; longer rows are sorted by the library
+WORD = 64  # columns of a set that a word holds
 NEAR, FAR = 12, 24  # entries ahead whose places in memory are asked for, and whose cursors, by which they are known
 
 
@@ -64,14 +65,15 @@ def merge_range(starts, gathered, slot_rows, codebook_rows, ids):
     levels = slot_rows.shape[1]
     records = ids.shape[0]
     sums = np.zeros(codebook_rows)
-    touched = np.empty(codebook_rows, np.int32)
+    # The columns that a record has: a set is in order as it is, where rows of fine cells had to be sorted.
+    touched = np.zeros(codebook_rows // WORD + 1, np.uint64)
     splats, lengths = np.empty(records, np.int32), np.empty(records, np.int64)
     met, evidence = np.empty(records, np.int32), np.empty(records, np.float32)
     most = words.shape[0] * levels  # known before: arrays that may be replaced in a loop are counted at each use
     columns, weights = np.empty(most, np.int32), np.empty(most, np.float32)
     rows = count = met_count = 0
     for record in range(records):
-        total, length = totals[record], 0
+        total, begun, low, high = totals[record], count, touched.shape[0], -1
         for i in range(starts[record], starts[record + 1]):
             slot = words[i, 0]
             if slot < 0:
@@ -79,36 +81,21 @@ def merge_range(starts, gathered, slot_rows, codebook_rows, ids):
             for level in range(levels):
                 column = slot_rows[slot, level]
                 if column >= 0:
-                    if sums[column] == 0:
-                        touched[length] = column
-                        length += 1
+                    word = column // WORD
+                    touched[word] |= np.uint64(1) << np.uint64(column % WORD)
+                    low, high = min(low, word), max(high, word)
                     sums[column] += numbers[i, 1]
         if total > 0:
             met[met_count], evidence[met_count] = ids[record], total
             met_count += 1
-        if length == 0:
-            continue
-        _sort(touched, length)
-        for k in range(length):
-            columns[count + k] = touched[k]
-            weights[count + k] = sums[touched[k]]
-            sums[touched[k]] = 0
-        count += length
-        splats[rows], lengths[rows] = ids[record], length
-        rows += 1
+        for word in range(low, high + 1):
+            left, touched[word] = touched[word], 0
+            while left:
+                column = word * WORD + lowest_rank(left)
+                left = without_lowest_rank(left)
+                columns[count], weights[count], sums[column] = column, sums[column], 0
+                count += 1
+        if count > begun:
+            splats[rows], lengths[rows] = ids[record], count - begun
+            rows += 1
     return splats[:rows], lengths[:rows], columns[:count], weights[:count], met[:met_count], evidence[:met_count]
-
-
-@kernel
-def _sort(values, length):
-    """Sort the first ``length`` values in place; most rows are short."""
-    if length > LONG_ROW:
-        values[:length] = np.sort(values[:length])
-        return
-    for i in range(1, length):
-        value = values[i]
-        k = i - 1
-        while k >= 0 and values[k] > value:
-            values[k + 1] = values[k]
-            k -= 1
-        values[k + 1] = value

@@ -1,9 +1,13 @@
 """S, tile by tile: which slots each half row of pixels reads, and how much.
 
 Both kinds of observation become the same list of taps. A region map's slots are the distinct label tuples of the
-tile (a ray's labels on all levels), its factors zeros and ones; a grid's slots are the cells that the tile's
-pixels read, its factors the bilinear weights. The pixel loop adds ``weights * factors`` into slots and knows
-neither labels nor channels; slots are expanded to codebook rows once a splat is done with the tile.
+tile (a ray's labels on all levels), its factors zeros and ones. The pixel loop adds ``weights * factors`` into lanes
+of a slot and knows neither labels nor channels; slots are expanded to codebook rows when entries are merged.
+
+Bilinear weights are products of a row's share and a column's, and all pixels of a half row have the rows' shares. So
+a grid's taps are **lines**: a row of cells as one side of the tile reads it, two for a half row however many cells it
+meets, with the row's share in all lanes. The columns' shares come once a splat is done: a line's lanes times those of
+a column add up to what the splat gave that cell, which is the slot.
 """
 
 from __future__ import annotations
@@ -22,8 +26,10 @@ from liftcore.raster.constants import TILE
 if TYPE_CHECKING:
     from liftcore.raster.protocol import Walk
 
-MAX_SLOTS = 4 * TILE * TILE  # every pixel reads four cells of its own at worst
-MAX_TAPS = HALVES * 4 * LANES  # every lane of a half row reads four cells of its own at worst
+SIDES = TILE // LANES  # of a tile: each half row lies on one
+MAX_LINES = 2 * TILE  # rows or columns of cells: every pixel reads two of its own at worst
+MAX_SLOTS = MAX_LINES * MAX_LINES
+MAX_TAPS = HALVES * LANES  # every lane of a half row reads a slot of its own at worst
 NO_SLOT = -1
 LAST_BIT = 63
 SEVERAL = -2  # a half row whose pixels read several slots, or parts of one
@@ -55,7 +61,11 @@ class TileTaps(NamedTuple):
     slot_sets: np.ndarray  # [32] u64, the slots that a half row reads, as ``slot_bit`` has sets of them
     factors: np.ndarray  # [MAX_TAPS * 8] f32
     slot_rows: np.ndarray  # [MAX_SLOTS, levels] i32, the codebook rows of a slot, -1 none
-    sizes: np.ndarray  # [2] i32: slots in use; 1 when all pixels read slot 0 and nothing else
+    sizes: (
+        np.ndarray
+    )  # [3] i32: slots in use; 1 when all pixels read slot 0 and nothing else; a grid's columns in use
+    spans: np.ndarray  # [SIDES, 2] i32, the columns that a side of the tile reads, first and last
+    shares: np.ndarray  # [SIDES * MAX_LINES * 8] f32, what each lane of a side reads of each of the tile's columns
 
 
 def reading_of(observation: Observation, width: int, height: int, walk: Walk) -> Reading:
@@ -102,7 +112,9 @@ def new_taps(levels):
         np.zeros(HALVES, np.uint64),
         np.zeros(MAX_TAPS * LANES, np.float32),
         np.zeros((MAX_SLOTS, levels), np.int32),
-        np.zeros(2, np.int32),
+        np.zeros(3, np.int32),
+        np.zeros((SIDES, 2), np.int32),
+        np.zeros(SIDES * MAX_LINES * LANES, np.float32),
     )
 
 
@@ -239,47 +251,63 @@ def _add_taps(tap_slots, factors, slots, first):
 
 @kernel
 def _read_grid(taps, reading, frame, x0, y0):
-    known = np.empty(MAX_SLOTS, np.int32)  # the grid cell of each slot
-    slot_rows, sizes, starts, tap_slots, factors = taps.slot_rows, taps.sizes, taps.starts, taps.slots, taps.factors
-    shares_x, shares_y, cell_x, cell_y = reading.share_x, reading.share_y, reading.cell_x, reading.cell_y
+    columns, rows = np.empty(MAX_LINES, np.int32), np.empty(MAX_LINES, np.int32)  # the cells', ascending
+    read, width = np.full((TILE, 2), NO_SLOT, np.int32), 0
+    taps.shares[:], taps.spans[:] = 0, 0
+    for x in range(x0, min(x0 + TILE, frame.width)):
+        side, lane = (x - x0) // LANES, (x - x0) % LANES
+        width = _read_lines(read[x - x0], columns, width, reading.cell_x[x], reading.share_x[x])
+        for right in range(2):
+            line = read[x - x0, right]
+            if line == NO_SLOT:
+                continue
+            if taps.spans[side, 1] == 0:
+                taps.spans[side, 0] = line
+            taps.spans[side, 1] = max(taps.spans[side, 1], line + 1)
+            share = reading.share_x[x] if right else 1 - reading.share_x[x]
+            taps.shares[(side * MAX_LINES + line) * LANES + lane] += share
+    height, read[:] = 0, NO_SLOT
+    for y in range(y0, min(y0 + TILE, frame.height)):
+        height = _read_lines(read[y - y0], rows, height, reading.cell_y[y], reading.share_y[y])
     count = 0
     for half in range(HALVES):
-        starts[half] = count
-        taps.alone[half] = NO_SLOT
-        y = y0 + half % ROWS
-        left = x0 + half // ROWS * LANES
-        if y >= frame.height or left >= frame.width:
+        taps.starts[half], taps.alone[half] = count, NO_SLOT
+        side, y = half // ROWS, y0 + half % ROWS
+        if y >= frame.height or x0 + side * LANES >= frame.width:
             continue
-        first_tap = count
-        for lane in range(LANES):
-            x = min(left + lane, frame.width - 1)
-            for corner in range(4):
-                right, below = corner % 2, corner // 2
-                share_x = shares_x[x] if right else 1 - shares_x[x]
-                share_y = shares_y[y] if below else 1 - shares_y[y]
-                if share_x == 0 or share_y == 0:
-                    continue
-                cell = (cell_y[y] + below) * reading.grid_width + cell_x[x] + right
-                slot = _slot_of_cell(slot_rows, sizes, known, cell)
-                tap = first_tap
-                while tap < count and tap_slots[tap] != slot:
-                    tap += 1
-                if tap == count:
-                    tap_slots[tap] = slot
-                    factors[tap * LANES : tap * LANES + LANES] = 0
-                    count += 1
-                factors[tap * LANES + lane] += share_x * share_y
         taps.alone[half] = SEVERAL
-    starts[HALVES] = count
+        for below in range(2):
+            line = read[half % ROWS, below]
+            if line != NO_SLOT:
+                taps.slots[count] = SIDES * line + side
+                share = reading.share_y[y] if below else 1 - reading.share_y[y]
+                taps.factors[count * LANES : count * LANES + LANES] = share
+                count += 1
+    taps.starts[HALVES] = count
+    for row in range(height):
+        for column in range(width):
+            taps.slot_rows[row * width + column, 0] = rows[row] * reading.grid_width + columns[column]
+    taps.sizes[0], taps.sizes[2] = height * width, width
 
 
 @kernel
-def _slot_of_cell(slot_rows, sizes, known, cell):
-    slots = sizes[0]
-    for slot in range(slots - 1, -1, -1):
-        if known[slot] == cell:
-            return slot
-    known[slots] = cell
-    slot_rows[slots, 0] = cell
-    sizes[0] = slots + 1
-    return slots
+def _read_lines(read, lines, known, cell, share):
+    """Number the two lines that a pixel reads, from ``cell`` on, where it reads any of them.
+
+    Args:
+        read: [2] i32, written; NO_SLOT where the share is zero. lines: [MAX_LINES] i32, ascending; grows.
+
+    Returns:
+        How many lines there are now.
+    """
+    for after in range(2):
+        if (share if after else 1 - share) == 0:
+            continue
+        line = max(known - 2, 0)  # pixels come in order: a line is new, or among the last two
+        while line < known and lines[line] != cell + after:
+            line += 1
+        if line == known:
+            lines[known] = cell + after
+            known += 1
+        read[after] = line
+    return known

@@ -26,9 +26,11 @@ from liftcore.lanes import (
 from liftcore.lanes_halves import lowest_rank, ranked_halves, without_lowest_rank
 from liftcore.lanes_select import any_above
 from liftcore.raster.constants import TILE
-from liftcore.raster.readings import LAST_BIT, MAX_SLOTS, NO_SLOT, new_taps, read_tile
+from liftcore.raster.readings import LAST_BIT, MAX_LINES, MAX_SLOTS, NO_SLOT, SIDES, new_taps, read_tile
 from liftcore.raster.selection import CENTRAL, LARGEST, NO_SPOT, chosen, new_marks, rank_tile, spot_of
 from liftcore.raster.walk import CHECK_EVERY, blend_both, look, meets, new_rays, next_splat, start_rays
+
+ROW_BITS = np.uint64((1 << SIDES) - 1)  # of a row of cells, in a set of slots
 
 
 @kernel
@@ -53,7 +55,8 @@ def weigh_tiles(first, last, frame, reading, squared, gate, plain):
     sums = np.zeros(MAX_SLOTS * LANES, np.float32)
     items, starts = frame.items, frame.starts
     tap_starts, tap_slots, factors = taps.starts, taps.slots, taps.factors
-    alone, slot_sets = taps.alone, taps.slot_sets
+    alone, slot_sets, spans, shares = taps.alone, taps.slot_sets, taps.spans, taps.shares
+    is_grid = reading.is_grid
     marks, spot = new_marks(gate), NO_SPOT
     # A slot that all pixels read holds just the evidence.
     reuse = plain is None and gate is None and not squared
@@ -71,7 +74,7 @@ def weigh_tiles(first, last, frame, reading, squared, gate, plain):
             rank_tile(rays, frame, tile, marks, plain)
         start_rays(rays, frame, tile)
         read_tile(taps, reading, frame, tile)
-        used, whole_tile = taps.sizes[0], reuse and taps.sizes[1] == 1
+        used, whole_tile, columns = taps.sizes[0], reuse and taps.sizes[1] == 1, taps.sizes[2]
         if slot_count + used > slot_rows.shape[0]:
             slot_rows = _grown_rows(slot_rows, slot_count + used)
         slot_rows[slot_count : slot_count + used] = taps.slot_rows[:used]
@@ -121,6 +124,22 @@ def weigh_tiles(first, last, frame, reading, squared, gate, plain):
                 if whole_tile and total > 0:
                     slots[count], weights[count] = slot_count, total
                     count += 1
+                while met and is_grid:  # a row of cells, as both sides of the tile read it
+                    row = lowest_rank(met) // SIDES
+                    sides = met >> np.uint64(SIDES * row)
+                    met &= ~(ROW_BITS << np.uint64(SIDES * row))
+                    begin = spans[0, 0] if sides & np.uint64(1) else spans[1, 0]
+                    end = spans[1, 1] if sides & np.uint64(2) else spans[0, 1]
+                    left, right = lanes_at(sums, SIDES * row * LANES), lanes_at(sums, (SIDES * row + 1) * LANES)
+                    keep_lanes(sums, SIDES * row * LANES, no_lanes())
+                    keep_lanes(sums, (SIDES * row + 1) * LANES, no_lanes())
+                    for column in range(begin, end):
+                        part = times(left, lanes_at(shares, column * LANES))
+                        part = plus_product(part, right, lanes_at(shares, (MAX_LINES + column) * LANES))
+                        given = sum_of_lanes(part)
+                        if given > 0:
+                            slots[count], weights[count] = slot_count + row * columns + column, given
+                            count += 1
                 while met:
                     slot = lowest_rank(met)
                     met = without_lowest_rank(met)
