@@ -61,9 +61,7 @@ class TileTaps(NamedTuple):
     slot_sets: np.ndarray  # [32] u64, the slots that a half row reads, as ``slot_bit`` has sets of them
     factors: np.ndarray  # [MAX_TAPS * 8] f32
     slot_rows: np.ndarray  # [MAX_SLOTS, levels] i32, the codebook rows of a slot, -1 none
-    sizes: (
-        np.ndarray
-    )  # [3] i32: slots in use; 1 when all pixels read slot 0 and nothing else; a grid's columns in use
+    sizes: np.ndarray  # [3] i32: slots in use; 1 when all pixels read slot 0 alone; columns of a grid in use
     spans: np.ndarray  # [SIDES, 2] i32, the columns that a side of the tile reads, first and last
     shares: np.ndarray  # [SIDES * MAX_LINES * 8] f32, what each lane of a side reads of each of the tile's columns
 

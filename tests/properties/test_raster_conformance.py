@@ -111,6 +111,19 @@ def test_a_region_or_a_cell_for_every_pixel_is_weighed_as_the_oracle_weighs_it(r
     assert np.abs(W - view.A[ray].T @ S).max() < INSIDE
 
 
+@pytest.mark.parametrize("size", [(72, 80), (1, 80), (72, 1), (1, 1), (37, 41)])
+@every_backend
+def test_grids_finer_than_pixels_and_of_one_cell_are_read_as_the_oracle_reads_them(size, backend):
+    camera, splats = random_camera(3, 20, 18), random_splats(3, 60)  # (72, 80): four cells of its own for each pixel
+    observation = random_grid(3, size)
+    view = dense_view(splats, camera, Walk())
+    S, ray = reading_matrix(observation, camera.width, camera.height)
+    weights = backend.open(splats).region_weights(camera, observation, Walk(), Weighting(2))
+    W = dense(weights, splats.count, observation.codebook.shape[0])
+    assert not view.cut.any() and W.max() > 0
+    assert np.abs(W - (view.A**2)[ray].T @ S).max() < INSIDE
+
+
 @every_footprint
 @every_backend
 def test_evidence_is_the_sum_of_plain_weights_whatever_the_gain(footprint, backend):
