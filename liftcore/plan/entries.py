@@ -68,7 +68,7 @@ def planned_entries(
         entries = parts.levels * _met(own, parts.cell, parts.reach)
         tile = float((TILE * settings.stride) ** 2)
         walked = parts.reach**2 * _met(own, tile, 1) + entries
-        sums += own.size * np.array([1.0, entries, _cells(own, tile, 1), walked])
+        sums += own.size * np.array([1.0, entries, _spread(own, tile, 1), walked])
     count = max(sums[0], 1.0)
     entries, listed, walked = (float(total / count) for total in sums[1:])
     return PlannedEntries(seen.splats_a_view, entries, listed, walked)
@@ -91,13 +91,13 @@ def _parts_of(packs: FeaturePacks, view: str, camera: Camera, settings: LiftSett
     return _Parts(min(max(own, (settings.stride / reach) ** 2), pixels), reach, 1.0 + more)
 
 
-def _cells(areas: np.ndarray, cell: float, reach: int) -> float:
-    """``r^2 k``: cells that a footprint of these areas [n] lies in, in the mean, were nothing before it."""
-    sides = 2.0 * np.sqrt(areas / (math.pi * cell)) / reach
-    return float(reach**2 * np.mean((sides + 1.0) ** 2))
+def _spread(areas: np.ndarray, cell: float, reach: int) -> float:
+    """``k`` of footprints of these areas [n] px^2, where a part has ``cell`` px^2 and a pixel reads ``reach^2``."""
+    sides = 2.0 * np.sqrt(areas / (math.pi * cell))
+    return float(np.mean((sides / reach + 1.0) ** 2))
 
 
 def _met(areas: np.ndarray, cell: float, reach: int) -> float:
-    """Of these cells, those that get some of its weight."""
-    k = _cells(areas, cell, reach) / reach**2
+    """The parts that get some of such a footprint's weight, in the mean."""
+    k = _spread(areas, cell, reach)
     return reach**2 * (OPEN * k + MET * k**BEND)

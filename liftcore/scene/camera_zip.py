@@ -28,16 +28,9 @@ if TYPE_CHECKING:
 MAX_UNZIPPED_BYTES = 512 * 1024 * 1024
 MAX_ZIP_MEMBERS = 100_000
 ONE_RUN = "zip those of one run alone"
-BROKEN = (
-    *(zipfile.BadZipFile, zlib.error, lzma.LZMAError),
-    *(
-        EOFError,
-        NotImplementedError,
-        OSError,
-        RuntimeError,
-        ValueError,
-    ),  # what zipfile and its decompressors raise too
-)
+# What zipfile and its decompressors raise of a broken or foreign file, bar what they name themselves.
+OTHERS = (EOFError, NotImplementedError, OSError, RuntimeError, ValueError)
+BROKEN = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, *OTHERS)
 MOST_MODELS = 8  # of a zip that are looked at
 Files = Mapping[str, zipfile.ZipInfo]  # by their names in the zip
 

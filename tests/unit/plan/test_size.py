@@ -89,6 +89,16 @@ def test_tuples_of_labels_are_planned_with_no_fewer_columns_than_there_are(tmp_p
     assert all_columns(packs, maps, tuples) >= sum(columns.count for columns in made)
 
 
+def test_tuples_of_labels_are_planned_with_fewer_entries_than_rows(tmp_path):
+    paths = write_scene(tmp_path, 2)  # one of its views has tuples
+
+    def entries(**own) -> float:
+        settings = LiftSettings.of(**own)
+        return planned(open_sources(paths[0], paths[1], [paths[2]], settings), settings, CPU).entries_a_splat
+
+    assert 1.0 < entries() < entries(robust_steps=1)
+
+
 def test_a_robust_step_holds_as_much_again_of_each_gathered_entry(tmp_path):
     paths = write_scene(tmp_path, 2)
 

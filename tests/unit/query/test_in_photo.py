@@ -49,13 +49,13 @@ def test_a_photo_without_a_lens_is_as_drawn() -> None:
     assert in_photo(PLAIN, lambda _: drawn) is drawn
 
 
-def test_the_rim_that_no_pinhole_sees_is_empty() -> None:
+@pytest.mark.parametrize("dtype", [torch.float32, torch.int32])
+def test_the_rim_that_no_pinhole_sees_is_empty(dtype: torch.dtype) -> None:
     whole = Camera("v", 160, 160, 50.0, 50.0, 80.0, 80.0, np.eye(4))
     camera = behind_lens(whole, Fisheye())
-    for dtype in (torch.float32, torch.int32):
-        picture = in_photo(camera, lambda of: torch.ones(of.height, of.width, dtype=dtype))  # noqa: B023 - called here
-        assert float(picture[80, 80]) == 1
-        assert float(picture[0, 0]) == float(picture[80, 0]) == 0
+    picture = in_photo(camera, lambda of: torch.ones(of.height, of.width, dtype=dtype))
+    assert float(picture[80, 80]) == 1
+    assert float(picture[0, 0]) == float(picture[80, 0]) == 0
     assert drawn_by(camera).width < 180
 
 
