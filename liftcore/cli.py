@@ -297,7 +297,9 @@ def _add_bench(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--views", type=_count, metavar="N")
     parser.add_argument("--threads", type=_count, metavar="N")
     parser.add_argument("--preset", metavar="NAME", help="one of lift's presets alone; else all")
-    parser.add_argument("--stages", action="store_true", help="every step of a view apart, on one thread")
+    only = parser.add_mutually_exclusive_group()
+    only.add_argument("--stages", action="store_true", help="every step of a view apart, on one thread")
+    only.add_argument("--bars", action="store_true", help="the project's aims beside what this machine does")
     _add_device(parser)
 
 
