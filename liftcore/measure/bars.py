@@ -114,7 +114,7 @@ def lines_of(document: dict[str, Any]) -> Iterator[str]:
 
 
 def inputs_bytes(work: Workload, channels: int) -> int:
-    """Bytes of splats as a lift reads them (no colour), and of label maps and float16 codebooks of so many channels."""
+    """Bytes of splats as a lift reads them (no colour), and of label maps and float16 codebooks of F channels."""
     splats = work.splats
     geometry = (splats.means, splats.quats, splats.log_scales, splats.opacity_logits)
     maps = [observed for _, observed in work.views if isinstance(observed, RegionMap)]

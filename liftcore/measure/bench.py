@@ -50,7 +50,7 @@ def run_bench(options: dict[str, Any]) -> dict[str, Any]:
     Args:
         options: scene (folder or None), splats, size ("WxH"), channels, levels, views, threads, device ("auto", "cpu"
             or "cuda"); preset (one alone, else all); stages (bool): every step apart, on one thread, as
-            ``liftcore.measure.stages`` has it; bars (bool): the project's aims, as ``liftcore.measure.bars`` has them.
+            ``liftcore.measure.stages`` has it; bars (bool): the aims, as ``liftcore.measure.bars`` has them.
 
     Returns:
         Plain numbers, ready for JSON: hardware, versions, seconds a view by stage (medians), peak memory.
