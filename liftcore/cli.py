@@ -150,6 +150,8 @@ def _add_lift(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="LIFT", help="the lift to write")
     _add_settings(parser)
     parser.add_argument("--explain", action="store_true", help="print the plan before the work")
+    goes_on = "a killed lift goes on from there, and one of the same regions with other features walks none again"
+    parser.add_argument("--checkpoint", type=Path, metavar="DIR", help=f"keep walked views there: {goes_on}")
     parser.add_argument("--threads", type=_count, metavar="N", help="else as many as there are cores")
 
 
