@@ -54,6 +54,8 @@ if not os.environ.get("NUMBA_CACHE_DIR"):
     config.__dict__["CACHE_DIR"] = str(_cache_folder())  # a plain module of settings, filled at import
 
 kernel = njit(nogil=True, cache=True)
+# Division by zero gives an infinity or none at all, as numbers do: without a branch for it loops become vectors.
+without_zero_checks = njit(nogil=True, cache=True, error_model="numpy")
 inlined = njit(nogil=True, cache=True, inline="always")
 # Sums may be reordered into lanes; the order is fixed at compile time, so results still repeat to the bit.
 vectorised = njit(nogil=True, cache=True, fastmath={"reassoc", "contract", "nsz"})

@@ -9,8 +9,9 @@ import numpy as np
 
 from liftcore.raster.constants import ALPHA_FLOOR, LARGEST_EXPONENT, LOW_PASS
 from liftcore.raster.footprints import BETAS, GAUSSIANS, Discs
-from liftcore.raster.projection import HALF_LOG2_E, Scene, axes_of, opacities, project_ellipses
+from liftcore.raster.projection import HALF_LOG2_E, Scene, axes_of, fades_of, opacities
 from liftcore.raster.projection_2dgs import project_discs
+from liftcore.raster.projection_ellipses import project_ellipses
 from liftcore.raster.records import BETA_RECORD, DISC_RECORD, GAUSSIAN_RECORD
 from liftcore.scene.splats import Kernel
 
@@ -26,9 +27,9 @@ RECORDS = {Kernel.GAUSSIAN_3D: GAUSSIAN_RECORD, Kernel.GAUSSIAN_2D: DISC_RECORD,
 
 def activated(splats: Splats, gain: float) -> Scene:
     """The splats with their opacities, ``sigmoid(gain theta)``, and how far they reach."""
-    means, empty = np.ascontiguousarray(splats.means.numpy()), np.empty(0)
+    means, empty = np.ascontiguousarray(splats.means.numpy().T), np.empty(0)
     plain = opacities(splats, 1.0)
-    return with_gain(Scene(means, axes_of(splats), empty, plain, empty, _betas(splats)), splats, gain)
+    return with_gain(Scene(means, axes_of(splats), empty, empty, plain, empty, _betas(splats)), splats, gain)
 
 
 def with_gain(scene: Scene, splats: Splats, gain: float) -> Scene:
@@ -41,7 +42,7 @@ def with_gain(scene: Scene, splats: Splats, gain: float) -> Scene:
         reach = np.where(strongest > 0, furthest, -1.0)
     else:
         reach = np.log2(np.maximum(strongest, ALPHA_FLOOR / 2) / ALPHA_FLOOR)
-    return scene._replace(opacity=opacity, reach=reach)
+    return scene._replace(opacity=opacity, fade=fades_of(opacity), reach=reach)
 
 
 def _betas(splats: Splats) -> np.ndarray:

@@ -17,7 +17,7 @@ import math
 
 from liftcore.jit import inlined, kernel
 from liftcore.raster.constants import EDGE_ON, NEAR_PLANE
-from liftcore.raster.projection import HALF_LOG2_E, fade_of, to_camera, turned
+from liftcore.raster.projection import HALF_LOG2_E, to_camera, turned
 from liftcore.raster.records import (
     CENTRE_X,
     CENTRE_Y,
@@ -87,7 +87,7 @@ def project_discs(first, last, scene, view, curvature, targets):
         if not (right >= 0.5 and left <= view.width - 0.5 and bottom >= 0.5 and top <= view.height - 0.5):
             continue
         record[OPACITY] = scene.opacity[j]
-        record[FADE] = fade_of(scene.opacity[j])
+        record[FADE] = scene.fade[j]
         record[PLAIN] = scene.plain[j]
         targets.depths[row] = centre[2]
         targets.ids[row] = j

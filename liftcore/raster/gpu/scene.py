@@ -23,7 +23,7 @@ INK = 10
 
 
 class DeviceScene(NamedTuple):
-    """``liftcore.raster.projection.Scene`` as tensors: on the device, or on the host and brought there in blocks."""
+    """``liftcore.raster.projection.Scene`` as tensors, a row a splat; on the device, or on the host."""
 
     means: Tensor  # [P, 3] f32, world
     axes: Tensor  # [P, 3, 3] f64 ([P, 3, 2] for 2DGS), scaled axes in columns, world
@@ -72,7 +72,8 @@ class Block(NamedTuple):
 
 def scene_on(device: torch.device, scene: Scene) -> DeviceScene:
     """The activated splats, moved: the numbers are those of the CPU backend."""
-    return DeviceScene(*(torch.from_numpy(part).to(device) for part in scene))
+    parts = (torch.from_numpy(getattr(scene, name)) for name in DeviceScene._fields)
+    return DeviceScene(*(part.movedim(-1, 0).contiguous().to(device) for part in parts))
 
 
 def block_of(scene: DeviceScene, rows: slice | Tensor, device: torch.device) -> Block:
