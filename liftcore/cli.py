@@ -151,6 +151,8 @@ def _add_lift(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="LIFT", help="the lift to write")
     _add_settings(parser)
     parser.add_argument("--explain", action="store_true", help="print the plan before the work")
+    goes_on = "a killed lift goes on from there, and one of the same regions with other features walks none again"
+    parser.add_argument("--checkpoint", type=Path, metavar="DIR", help=f"keep walked views there: {goes_on}")
     parser.add_argument("--threads", type=_count, metavar="N", help="else as many as there are cores")
 
 
@@ -302,7 +304,9 @@ def _add_bench(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--views", type=_count, metavar="N")
     parser.add_argument("--threads", type=_count, metavar="N")
     parser.add_argument("--preset", metavar="NAME", help="one of lift's presets alone; else all")
-    parser.add_argument("--stages", action="store_true", help="every step of a view apart, on one thread")
+    only = parser.add_mutually_exclusive_group()
+    only.add_argument("--stages", action="store_true", help="every step of a view apart, on one thread")
+    only.add_argument("--bars", action="store_true", help="the project's aims beside what this machine does")
     _add_device(parser)
 
 

@@ -32,7 +32,7 @@ _BROAD_FLOATS, _BROAD_INTS, _BROAD_SHORTS, _BROAD_HALVES = (
     ir.VectorType(kind, _BROAD) for kind in (FLOAT, INT, ir.IntType(16), ir.HalfType())
 )
 WIDE = 4 * _BROAD  # channels that are kept in registers
-AHEAD = 16  # entries between asking for a row and reading it; so many more columns have to be there to be read
+AHEAD = 32  # entries between asking for a row and reading it; so many more columns have to be there to be read
 _HALF_BITS = 0x0FFFE000 - (1 << 31)  # sign, exponent and mantissa of a float16 where a float32 has them
 _HALF_UNIT = 2.0**112  # what float16 is larger by than its bits moved into a float32
 

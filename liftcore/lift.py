@@ -92,7 +92,8 @@ def lift(
             list of one or more.
         threads: None takes the cores that this process may use. The number changes no bit of the result.
         progress: told of every view and slice; an exception from it stops the work.
-        checkpoint: keeps walked views on the disk; the same lift goes on from there, identical to the bit.
+        checkpoint: keeps walked views on the disk; the same lift goes on from there, identical to the bit, and so
+            does one that differs in features alone (another encoder's of the same regions).
 
     Raises:
         InvalidInput: a file is malformed, the packs do not fit the cameras, or they are no list.
@@ -136,7 +137,7 @@ def _lift_on(run: Run, plan: Plan, sources: Sources, inputs: list[InputFile], ch
     kept = plan.kept_on_card
     raster, device = open_raster(sources.splats, run.device, threads, kept), run.device.facts()
     with ViewWeights(card=(run.device.place, kept)) as store:
-        key = identity([part.sha256 for part in inputs], settings, device) if checkpoint else ""
+        key = identity(inputs[0].sha256, sources.splats.kernel, device) if checkpoint else ""
         with run.timings.stage("geometry"), resumed(raster, checkpoint, key) as walked:
             scene = (sources.splats.count, sources.cameras)
             geometry = accumulate(walked, scene, sources.packs, sources.views, settings, store, progress)

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     import argparse
     from collections.abc import Iterator
 
-_OPTIONS = ("scene", "splats", "size", "channels", "levels", "views", "threads", "preset", "stages", "device")
+_OPTIONS = ("scene", "splats", "size", "channels", "levels", "views", "threads", "preset", "stages", "bars", "device")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -18,14 +18,30 @@ def run(options: argparse.Namespace) -> int:
     from liftcore.measure.bench import run_bench
 
     document = run_bench({name: getattr(options, name) for name in _OPTIONS})
-    reply(document, as_json=options.json, lines=_steps(document) if options.stages else None)
+    lines = _steps(document) if options.stages else _bars(document) if options.bars else None
+    reply(document, as_json=options.json, lines=lines)
     return 0
+
+
+def _bars(document: dict[str, Any]) -> Iterator[str]:
+    """The aims and what was found, for people."""
+    from liftcore.measure.bars import lines_of
+
+    yield _told(document)
+    for preset, found in document["presets"].items():
+        yield f"{preset}, load {found['load']:.1f}:"
+        yield from (f"  {line}" for line in lines_of(found))
+
+
+def _told(document: dict[str, Any]) -> str:
+    """What was measured, and on what, in a line."""
+    rest = {key: value for key, value in document.items() if key not in ("presets", "hardware")}
+    return ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in (rest | document["hardware"]).items())
 
 
 def _steps(document: dict[str, Any]) -> Iterator[str]:
     """The steps of a view as a table for people."""
-    rest = {key: value for key, value in document.items() if key not in ("presets", "hardware")}
-    yield ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in (rest | document["hardware"]).items())
+    yield _told(document)
     for preset, found in document["presets"].items():
         yield f"{preset}: seconds a view on one thread, median (smallest); load {found['load']:.1f}"
         for name, figures in found["stages"].items():

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import json
+import tempfile
 from typing import TYPE_CHECKING, Any
 
 from liftcore.commands.bars import progress_bars
 from liftcore.commands.reply import free_output, reply, shown, writing
-from liftcore.errors import InvalidSettings
+from liftcore.errors import InvalidInput, InvalidSettings
 from liftcore.nearest import nearest
 from liftcore.solve.settings import LiftSettings
 
 if TYPE_CHECKING:
     import argparse
     from collections.abc import Iterable, Sequence
+    from pathlib import Path
 
     from liftcore.artifact import Lift
     from liftcore.plan.plan import Plan
+    from liftcore.solve.checkpoint import Checkpoint
 
 
 def run(options: argparse.Namespace) -> int:
@@ -28,6 +31,7 @@ def run(options: argparse.Namespace) -> int:
 
     views = camera_source(options.cameras).files
     out = free_output(options.output, [options.splats, *views, *options.features])
+    checkpoint = checkpoint_in(options.checkpoint) if options.checkpoint else None
 
     told: Sequence[str] = ()
     if options.explain and not options.json:  # the document holds the plan anyway
@@ -42,6 +46,7 @@ def run(options: argparse.Namespace) -> int:
             settings,
             threads=options.threads,
             progress=progress,
+            checkpoint=checkpoint,
         )
     with writing(out):
         save_lift(result, out)
@@ -50,6 +55,23 @@ def run(options: argparse.Namespace) -> int:
     new = [warning for warning in warnings if warning not in told]
     reply(document, as_json=options.json, lines=_lines(document | {"warnings": new}))
     return 0
+
+
+def checkpoint_in(folder: Path) -> Checkpoint:
+    """A checkpoint in that folder, which is made if need be: a lift itself would go on without one.
+
+    Raises:
+        InvalidInput: it is no folder, or nothing can be written there.
+    """
+    from liftcore.solve.checkpoint import Checkpoint
+
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return Checkpoint(folder)
+    except OSError as error:
+        got = f"{folder} ({error.strerror or error})"
+        raise InvalidInput("checkpoint", expected="a folder that can be written", got=got) from None
 
 
 def settings_of(options: argparse.Namespace) -> LiftSettings:

@@ -4,37 +4,45 @@ The geometry phase asks the raster for the same views in the same order whenever
 same settings. So a checkpoint is a journal of the answers, view by view, and nothing but the raster knows of it: sums
 over views are formed anew from the same numbers in the same order, and a resumed lift is identical to the bit. Views
 go to the disk in blocks, each one file that is whole or not there; those in work when a lift ends are walked again.
+
+An answer is known by what was asked: the splats, and of a view its camera, its regions, its rays and how they walk.
+No feature is among that (``A^T B = W E``), so a lift goes on from the answers of another where only features differ
+(another encoder's of the same regions), or what is made of W afterwards.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import re
 import time
 from collections import deque
 from contextlib import closing, contextmanager, suppress
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
+import torch
 from llvmlite.binding import get_host_cpu_name
 from safetensors import SafetensorError, safe_open
 
 from liftcore import __version__
+from liftcore.observe.observation import RegionMap
 from liftcore.raster.protocol import RayRows, RegionWeights, Walked
 from liftcore.raster.weights_home import on_host
-from liftcore.safetensors_file import write_tensors
+from liftcore.safetensors_file import tensor_bytes, write_tensors
 
 if TYPE_CHECKING:
-    from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Generator, Iterable, Iterator, Mapping
 
     from torch import Tensor
 
     from liftcore.raster.protocol import Look, Raster
-    from liftcore.solve.settings import LiftSettings
+    from liftcore.scene.kernel import Kernel
 
-FORMAT = "splatlift-checkpoint/2"
+FORMAT = "splatlift-checkpoint/3"
+_BLOCK = re.compile(r"\d{6,}\.safetensors|\.\d{6,}\.safetensors\.[0-9a-f]+\.part")  # by name, and its drafts
 _PARTS = {"weights": RegionWeights, "rows": RayRows}  # of Walked
 BLOCK_BYTES = 1 << 28  # a block is written when so much has come together, however little time went by
 
@@ -43,23 +51,42 @@ BLOCK_BYTES = 1 << 28  # a block is written when so much has come together, howe
 class Checkpoint:
     """Where a lift keeps the views that it has walked, and how much work it is ready to lose.
 
-    The folder belongs to one lift. It is made when there is something to keep, and is its owner's to remove.
+    The folder is for one lift at a time. It is made when there is something to keep, and is its owner's to remove. Of
+    what lies in it, files that are named as blocks are taken for them, and go when they are of no use.
     """
 
     folder: Path
     seconds: float = 2.0  # between blocks, of work; views in work may be lost too
 
 
-def identity(inputs: Sequence[str], settings: LiftSettings, device: Mapping[str, Any]) -> str:
-    """What a checkpoint is of, in hex: inputs [sha256, ...], settings, the code, and what runs it.
+def identity(splats: str, kernel: Kernel, device: Mapping[str, Any]) -> str:
+    """What all answers of a checkpoint are of, in hex: the splats, the code, and what runs it.
 
     Args:
+        splats: the digest of their file. kernel: that they are taken for.
         device: the facts of the device that walks, whatever the settings ask for: devices agree within rounding only.
     """
-    told = [FORMAT, __version__, get_host_cpu_name(), device, list(inputs), settings.model_dump(mode="json")]
+    told = [FORMAT, __version__, get_host_cpu_name(), device, splats, kernel.value]
     digest = hashlib.sha256(json.dumps(told).encode())
     for source in sorted(Path(__file__).parents[1].rglob("*.py")):
         digest.update(source.read_bytes())
+    return digest.hexdigest()
+
+
+def question(look: Look) -> str:
+    """What is asked of one view, in hex: all that its answer depends on beside the splats."""
+    camera, observed = look.camera, look.observation
+    told: list[Any] = [camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy]
+    told += [asdict(look.walk), asdict(look.weighting), observed.codebook.shape[0]]
+    parts = [torch.from_numpy(camera.world_to_camera.copy()), look.pixels]
+    if isinstance(observed, RegionMap):
+        parts.append(observed.labels)
+    else:
+        told.append(observed.grid.shape[:2])
+    told += [(str(part.dtype), tuple(part.shape)) for part in parts]
+    digest = hashlib.sha256(json.dumps(told).encode())
+    for part in parts:
+        digest.update(tensor_bytes(part))
     return digest.hexdigest()
 
 
@@ -89,11 +116,11 @@ class _ResumedRaster:
         looks, asked = iter(looks), deque[str]()
 
         def noted(look: Look) -> Look:
-            asked.append(look.camera.name)
+            asked.append(question(look))
             return look
 
         for look in looks:
-            known = self._journal.known(look.camera.name)
+            known = self._journal.known(question(look))
             if known is not None:
                 yield known
                 continue
@@ -120,13 +147,13 @@ class _Journal:
         self._since = time.monotonic()
         self._keeping = True
 
-    def known(self, view: str) -> Walked | None:
-        """What was found in the next view, if it is on the disk."""
+    def known(self, asked: str) -> Walked | None:
+        """The answer to the next question, if it is on the disk."""
         if not self._known:
             return None
         block, number, known = self._known.pop(0)
-        if known != view:
-            self._known.clear()  # of another course of work, which the key should have told
+        if known != asked:
+            self._known.clear()  # of another course of work: what follows is written over it
             return None
         self._count += 1
         weights, rows = (
@@ -135,15 +162,15 @@ class _Journal:
         )
         return Walked(RegionWeights(**weights), RayRows(**rows))
 
-    def keep(self, view: str, walked: Walked) -> None:
-        """Note what was found in the next view."""
+    def keep(self, asked: str, walked: Walked) -> None:
+        """Note the answer to the next question."""
         walked = replace(walked, weights=on_host(walked.weights))
         tensors = {
             f"{part}/{name}": getattr(getattr(walked, part), name)
             for part, kind in _PARTS.items()
             for name in _names(kind)
         }
-        self._fresh.append((view, tensors))
+        self._fresh.append((asked, tensors))
         self._count += 1
         size = sum(tensor.nbytes for _, tensors in self._fresh for tensor in tensors.values())
         if time.monotonic() - self._since >= self._seconds or size >= BLOCK_BYTES:
@@ -187,7 +214,7 @@ class _Journal:
             used.add(path)
             known += [(block, number, call) for number, call in enumerate(calls)]
         for path in self._folder.glob("*"):
-            if path not in used:
+            if path not in used and _BLOCK.fullmatch(path.name):
                 with suppress(OSError):
                     path.unlink()
         return known

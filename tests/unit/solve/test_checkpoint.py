@@ -7,17 +7,21 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
 from liftcore.artifact import TENSORS, Lift
 from liftcore.device import CPU, Device
 from liftcore.lift import lift
-from liftcore.observe.observation import NO_LABEL, RegionMap
+from liftcore.observe.observation import NO_LABEL, FeatureGrid, RegionMap
 from liftcore.observe.write_pack import write_pack
 from liftcore.raster.cpu import CpuRaster
+from liftcore.raster.protocol import Look, Walk, Weighting
+from liftcore.scene.cameras import Camera
+from liftcore.scene.kernel import Kernel
 from liftcore.scene.load import load_cameras
-from liftcore.solve.checkpoint import Checkpoint, identity
+from liftcore.solve.checkpoint import Checkpoint, identity, question
 from liftcore.solve.settings import LiftSettings
 
 from .test_lift_equals_dense import observed, write_scene
@@ -132,14 +136,89 @@ def test_lift_killed_while_it_solves_walks_no_view_again(tmp_path: Path, walks: 
     assert_same(lift(scene[0], scene[1], [scene[2]], settings), again)
 
 
-def test_checkpoint_of_other_settings_or_inputs_is_never_used(tmp_path: Path, walks: list[str]) -> None:
+def test_checkpoint_of_another_walk_or_other_splats_is_never_used(tmp_path: Path, walks: list[str]) -> None:
     scene = write_scene(tmp_path, 5)
     checkpoint = Checkpoint(tmp_path / "kept", seconds=0)
     lift(scene[0], scene[1], [scene[2]], LiftSettings.of(preset="row-sum"), checkpoint=checkpoint)
     other = lift(scene[0], scene[1], [scene[2]], LiftSettings.of(preset="tikhonov"), checkpoint=checkpoint)
     assert len(walks) == 6
     assert_same(lift(scene[0], scene[1], [scene[2]], LiftSettings.of(preset="tikhonov")), other)
-    assert identity(["a"], LiftSettings.of(), {}) != identity(["b"], LiftSettings.of(), {})
+    assert identity("a", Kernel.GAUSSIAN_3D, {}) != identity("b", Kernel.GAUSSIAN_3D, {})
+    assert identity("a", Kernel.GAUSSIAN_3D, {}) != identity("a", Kernel.BETA, {})
+
+
+@pytest.mark.parametrize("grids", [False, True])
+def test_other_features_of_the_same_regions_walk_no_view_again(tmp_path: Path, walks: list[str], grids: bool) -> None:
+    splats, cameras, features = write_scene(tmp_path, 8, grids)
+    checkpoint, settings = Checkpoint(tmp_path / "kept"), LiftSettings.of(certificate_rays=50)
+    lift(splats, cameras, [features], settings, checkpoint=checkpoint)
+    walks.clear()
+    other = tmp_path / "other.safetensors"
+    write_pack(other, {name: _other_encoder(seen) for name, seen in _views(cameras, 8, grids)}, {"encoder": "other"})
+    stored = settings.model_copy(update={"dtype": "float32"})
+    again = lift(splats, cameras, [other], stored, checkpoint=checkpoint)
+    assert walks == []
+    assert again.features.shape[1] == 5
+    assert_same(lift(splats, cameras, [other], stored), again)
+
+
+@pytest.mark.parametrize("changed", ["pose", "focal", "labels", "codebook", "stride", "power", "pixels"])
+def test_an_answer_is_to_one_question_alone(changed: str) -> None:
+    look = _look()
+    camera, regions = look.camera, look.observation
+    assert isinstance(regions, RegionMap)
+    pose = camera.world_to_camera.copy()
+    pose[0, 3] += 1e-9
+    labels = regions.labels.clone()
+    labels[0, 1, 2] += 1
+    other = {
+        "pose": replace(look, camera=replace(camera, world_to_camera=pose)),
+        "focal": replace(look, camera=replace(camera, fx=camera.fx + 1e-9)),
+        "labels": replace(look, observation=replace(regions, labels=labels)),
+        "codebook": replace(look, observation=replace(regions, codebook=torch.zeros(4, 2))),
+        "stride": replace(look, walk=Walk(stride=2)),
+        "power": replace(look, weighting=Weighting(power=2)),
+        "pixels": replace(look, pixels=look.pixels + 1),
+    }[changed]
+    assert question(other) != question(look)
+    features = replace(regions, codebook=torch.ones_like(regions.codebook))
+    assert question(replace(look, observation=features)) == question(look)
+
+
+def test_regions_and_cells_of_the_same_size_are_other_questions() -> None:
+    look = _look()
+    assert question(replace(look, observation=FeatureGrid(torch.zeros(1, 3, 2)))) != question(look)
+
+
+def test_files_that_are_no_blocks_stay_in_the_folder(tmp_path: Path) -> None:
+    scene, checkpoint = write_scene(tmp_path, 9), Checkpoint(tmp_path / "kept", seconds=0)
+    checkpoint.folder.mkdir()
+    kept = [checkpoint.folder / name for name in ("thesis.tex", "000001.safetensors.bak", "scene.safetensors")]
+    stale = [checkpoint.folder / name for name in ("000007.safetensors", ".000007.safetensors.0123abcd.part")]
+    for path in [*kept, *stale]:
+        path.write_bytes(b"words")
+    lift(scene[0], scene[1], [scene[2]], LiftSettings.of(), checkpoint=checkpoint)
+    assert all(path.read_bytes() == b"words" for path in kept)
+    assert not any(path.exists() for path in stale)
+
+
+def _views(cameras: Path, seed: int, grids: bool) -> list[tuple[str, RegionMap | FeatureGrid]]:
+    """What `write_scene` put into its pack."""
+    return [(camera.name, observed(seed, k, grids=grids)) for k, camera in enumerate(load_cameras(cameras))]
+
+
+def _other_encoder(seen: RegionMap | FeatureGrid) -> RegionMap | FeatureGrid:
+    """The same regions or cells with features of 5 channels."""
+    drawn = torch.randn(*seen.codebook.shape[:1], 5, generator=torch.Generator().manual_seed(0))
+    if isinstance(seen, RegionMap):
+        return replace(seen, codebook=drawn)
+    return FeatureGrid(drawn.reshape(*seen.grid.shape[:2], 5))
+
+
+def _look() -> Look:
+    camera = Camera("v", 8, 6, 9.0, 9.0, 4.0, 3.0, np.eye(4))
+    regions = RegionMap(torch.zeros(1, 6, 8, dtype=torch.int32), torch.zeros(3, 2))
+    return Look(camera, regions, Walk(), Weighting(), torch.zeros(2, 2, dtype=torch.int32))
 
 
 def test_checkpoint_of_another_device_is_never_used(
