@@ -28,9 +28,9 @@ PRESETS = "row-sum, tikhonov (default), argmax, top-k, front-mass, centre or mea
 THRESHOLDS = "auto, valley, paper, otsu, stability or a number"
 
 KEY_QUOTAS = {
-    "--max-bytes": "of its assets and lifts",
-    "--max-queued": "jobs of it in line",
-    "--max-uploads": "at the same time",
+    "--max-bytes": "most bytes stored, of its assets and lifts",
+    "--max-queued": "most jobs in line",
+    "--max-uploads": "most uploads at once",
 }
 LARGEST_GREY = 65_535  # of a picture of 16 bits
 
@@ -116,7 +116,8 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def _add_demo(parser: argparse.ArgumentParser) -> None:
-    holds = "its .ply, cameras.json, transforms.json or sparse/0, a feature pack; text_table.safetensors if any"
+    cameras = "cameras.json, transforms.json, cameras.zip or sparse/0"
+    holds = f"its .ply; {cameras}; a feature pack; text_table.safetensors if any"
     parser.add_argument("--scene", type=Path, metavar="DIR", help=f"a scene of your own ({holds}); else a still life")
     parser.add_argument(
         "--ask", action="append", default=[], metavar="TEXT", help="what to look for; may be given several times"
@@ -198,7 +199,9 @@ def _add_query(parser: _Parser) -> None:
     parser.add_argument("--unlike", action="append", default=[], metavar="EXAMPLE", help="less of that, likewise")
     words = parser.add_mutually_exclusive_group()
     words.add_argument("--table", type=Path, metavar="FILE", help="precomputed text embeddings")
-    words.add_argument("--encoder", metavar="NAME", help="minilm, open_clip:MODEL[/PRETRAINED], table:FILE")
+    words.add_argument(
+        "--encoder", metavar="NAME", help="minilm, open_clip:MODEL/TAG, open_clip:MODEL@FILE or table:FILE"
+    )
     _add_negative(parser, ", so TEXT goes before it")
     parser.add_argument("--threshold", default="auto", metavar="T", help=THRESHOLDS)
     parser.add_argument("--instances", type=_count, metavar="N", help="how many there are, if you know")
@@ -241,12 +244,13 @@ def _add_pack(parser: argparse.ArgumentParser, shared: _Parser) -> None:
         "has under that name; 'none': no text encoder shares it, so a lift is asked by example. Packs of one lift "
         "must agree"
     )
+    unit = "say that the vectors are unit vectors, or are not; this changes none of them"
     for command in (langsplat, arrays, masks):
         command.add_argument("folder", type=Path, help="the folder of the files")
         command.add_argument("-o", "--output", type=Path, required=True, metavar="PACK", help="the pack to write")
         command.add_argument("--encoder-name", metavar="NAME", help="the 2D encoder that made the features")
         command.add_argument("--text-space", metavar="NAME", help=space)
-        command.add_argument("--normalised", action=argparse.BooleanOptionalAction, help="unit vectors or not")
+        command.add_argument("--normalised", action=argparse.BooleanOptionalAction, help=unit)
 
 
 def _add_encode(parser: argparse.ArgumentParser) -> None:
@@ -256,7 +260,8 @@ def _add_encode(parser: argparse.ArgumentParser) -> None:
         "--encoder",
         required=True,
         metavar="SPEC",
-        help="maskclip:MODEL/TAG, clip:MODEL/TAG, timm:NAME, or MODEL@FILE",
+        help="maskclip:MODEL/TAG, clip:MODEL/TAG or timm:NAME; with weights of a file maskclip:MODEL@FILE, "
+        "clip:MODEL@FILE or timm:NAME@FILE",
     )
     parser.add_argument("--size", type=_count, metavar="PX", help="the images' shorter side; else the model's own")
     parser.add_argument("--batch", type=_count, default=1, metavar="N", help="images that are encoded together")

@@ -7,10 +7,10 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = ("README.md", "ARCHITECTURE.md")
-SCENES, LIFTING, ASKING, COMMANDS, SERVICE, ACCURACY = (
-    f"docs/{page}.md" for page in ("scenes", "lifting", "asking", "commands", "service", "accuracy")
+SCENES, LIFTING, ASKING, COMMANDS, SERVICE, ACCURACY, LIMITS = (
+    f"docs/{page}.md" for page in ("scenes", "lifting", "asking", "commands", "service", "accuracy", "limits")
 )
-GUIDE = ("README.md", SCENES, LIFTING, ASKING, COMMANDS, SERVICE, ACCURACY)  # what users read
+GUIDE = ("README.md", SCENES, LIFTING, ASKING, COMMANDS, SERVICE, ACCURACY, LIMITS)  # what users read
 PAGES = (*DOCUMENTS, *sorted(str(page.relative_to(ROOT)) for page in ROOT.glob("docs/*.md")))
 
 

@@ -39,14 +39,14 @@ def test_relative_links_lead_somewhere(document: str) -> None:
 
 @pytest.mark.parametrize("document", PAGES)
 def test_links_to_headings_lead_there(document: str) -> None:
-    for page, place in re.findall(r"\]\(([\w./]*)#([^)]+)\)", text(document)):
+    for page, place in re.findall(r"\]\(([\w./-]*)#([^)]+)\)", text(document)):
         target = (ROOT / document).parent / page if page else ROOT / document
         headings = re.findall(r"^#+ (.*)$", target.read_text(encoding="utf-8"), flags=re.MULTILINE)
         assert place in {re.sub(r"[^a-z0-9 -]", "", head.lower()).replace(" ", "-") for head in headings}, place
 
 
 def test_every_page_of_the_guide_is_in_the_readme() -> None:
-    linked = set(re.findall(r"\]\((docs/\w+\.md)", text("README.md")))
+    linked = set(re.findall(r"\]\((docs/[\w-]+\.md)", text("README.md")))
     assert linked == set(PAGES) - set(DOCUMENTS)
 
 
@@ -65,12 +65,12 @@ def test_named_modules_exist(document: str) -> None:
     assert not [name for name in named if find_spec(name) is None]
 
 
-@pytest.mark.parametrize("document", DOCUMENTS)
+@pytest.mark.parametrize("document", PAGES)
 def test_make_targets_exist(document: str) -> None:
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
     targets = set(re.findall(r"^([a-z]+):", makefile, flags=re.MULTILINE))
     named = set(re.findall(r"(?:`|^)make ([a-z]+)", text(document), flags=re.MULTILINE))
-    assert named
+    assert named or document not in DOCUMENTS
     assert named <= targets
 
 

@@ -20,11 +20,12 @@ from PIL import Image
 from pydantic import BaseModel
 
 from liftcore.cli import main
+from liftcore.observe.pack import open_packs
 from liftcore.observe.rle import mask_of_runs, read_runs
 from liftcore.scene.load import load_splats
 from service import wire
 from service.routes import assets, jobs, lifts, operations, queries, tradeoffs
-from tests.api.tiny_scene import WIDTH, codebook, colmap_zip, labels, make_scene
+from tests.api.tiny_scene import WIDTH, WORDS, codebook, colmap_zip, labels, make_scene
 from tests.run_lengths import sam_records
 
 from .readme import ASKING, COMMANDS, GUIDE, SCENES, SERVICE, blocks, text
@@ -71,7 +72,9 @@ def test_sams_masks_make_a_lift_that_knows_the_words(scene_folder: Path, monkeyp
         Image.fromarray((80 * clusters[0] + 40).astype(np.uint8)).save(scene_folder / "photos" / f"{view}.jpg")
     for name, module in stand_ins().items():
         monkeypatch.setitem(sys.modules, name, module)
+    (scene_folder / "words.safetensors").unlink()
     run_example(SCENES, "from segment_anything import")
+    run_example(SCENES, "open_clip.get_tokenizer")
     commands = commands_between(SCENES, "## From SAM's masks", "\n## ", scene_folder)
     assert [command[0] for command in commands] == ["pack", "lift"]
     question = ["query", "scene.lift.safetensors", "apple", "--table", "words.safetensors", "--view", "middle"]
@@ -81,13 +84,45 @@ def test_sams_masks_make_a_lift_that_knows_the_words(scene_folder: Path, monkeyp
     assert len(columns) > 0 and columns.max() < WIDTH // 2
 
 
+def test_langsplats_files_become_a_pack(scene_folder: Path) -> None:
+    (scene_folder / "language_features").mkdir()
+    for view, clusters in labels().items():
+        np.save(scene_folder / "language_features" / f"{view}_s.npy", clusters)
+        np.save(scene_folder / "language_features" / f"{view}_f.npy", codebook().astype(np.float16))
+    (command,) = commands_between(SCENES, "## From LangSplat's folders", "\n## ", scene_folder)
+    assert main(command) == 0
+    packs = open_packs([scene_folder / "features.safetensors"])
+    assert packs.views == tuple(sorted(labels())) and packs.text_space == command[-1]
+
+
+def test_pack_of_ones_own_program_makes_a_lift_that_python_reads(
+    scene_folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("labels", "vectors"):
+        (scene_folder / name).mkdir()
+    for view, clusters in labels().items():
+        np.save(scene_folder / "labels" / f"{view}.npy", clusters[0])
+        np.save(scene_folder / "vectors" / f"{view}.npy", codebook())
+    (scene_folder / "features.safetensors").unlink()
+    run_example(SCENES, 'Path("labels")')
+    sources = [str(scene_folder / name) for name in ("scene.ply", "cameras.json", "features.safetensors")]
+    assert main(["lift", *sources, "-o", "scene.lift.safetensors"]) == 0
+    capsys.readouterr()
+    names = run_example(SCENES, 'load_file("scene.lift.safetensors")')
+    assert len(capsys.readouterr().out.splitlines()) >= 3
+    places, features, sure = names["places"], names["lift"]["features"], names["sure"]
+    assert np.array_equal(places, load_splats(scene_folder / "scene.ply").means.numpy())
+    clusters = np.digitize(places[sure, 0], [-0.6, 0.6])  # 0 apple, 1 book, 2 lamp
+    assert len(set(clusters)) == 3 and np.array_equal(features[sure].argmax(axis=1), clusters)
+
+
 def commands_between(page: str, begin: str, end: str, folder: Path) -> list[list[str]]:
     """The commands of a part of a page, for a folder with a COLMAP model and without features."""
     with zipfile.ZipFile(io.BytesIO(colmap_zip())) as archive:
         archive.extractall(folder)
     (folder / "features.safetensors").unlink()
     section = text(page).partition(begin)[2].partition(end)[0]
-    lines = [line for line in section.splitlines() if line.startswith(".venv/bin/splatlift ")]
+    lines = [line for line in section.splitlines() if line.startswith("splatlift ")]
     return [shlex.split(line)[1:] for line in lines]
 
 
@@ -102,7 +137,8 @@ def run_example(page: str, start: str) -> dict[str, Any]:
 def stand_ins() -> dict[str, ModuleType]:
     """segment-anything and open_clip by the names that are used of them: they tell clusters by their grey.
 
-    Masks are run lengths of what is of one grey; a crop's vector is the codebook's row of its brightest pixel's grey.
+    Masks are run lengths of what is of one grey; a crop's vector is the codebook's row of its brightest pixel's grey,
+    a word's vector the row of the word, three times as long.
     """
 
     def generate(image: np.ndarray) -> list[dict[str, Any]]:
@@ -118,22 +154,26 @@ def stand_ins() -> dict[str, ModuleType]:
         return mask_of_runs(*read_runs(segmentation, "a mask"))
 
     def encode(images: torch.Tensor) -> torch.Tensor:
-        clusters = ((images.flatten(1).amax(dim=1) - 40) / 80).round().long()
+        clusters = ((images.cpu().flatten(1).amax(dim=1) - 40) / 80).round().long()
         return torch.from_numpy(codebook()).float()[clusters]
 
-    model = SimpleNamespace(eval=lambda: None, encode_image=encode)
+    model = SimpleNamespace(
+        eval=lambda: None, to=lambda device: model, encode_image=encode,
+        encode_text=lambda rows: 3 * torch.from_numpy(codebook()).float()[rows],
+    )  # fmt: skip
     generator = SimpleNamespace(generate=generate)
     modules = {name: ModuleType(name) for name in ("segment_anything", "segment_anything.utils.amg", "open_clip")}
     modules["segment_anything.utils"] = ModuleType("segment_anything.utils")
     vars(modules["segment_anything"]).update(
         SamAutomaticMaskGenerator=lambda sam, output_mode: generator,
-        build_sam_vit_h=lambda checkpoint: None,
+        build_sam_vit_h=lambda checkpoint: SimpleNamespace(to=lambda device: None),
     )
     vars(modules["segment_anything.utils.amg"]).update(rle_to_mask=rle_to_mask)
     vars(modules["open_clip"]).update(
         create_model_and_transforms=lambda name, pretrained: (
             model, None, lambda crop: torch.from_numpy(np.array(crop)).float(),
-        )
+        ),
+        get_tokenizer=lambda name: lambda texts: torch.tensor([WORDS.index(text) for text in texts]),
     )  # fmt: skip
     return modules
 
@@ -161,7 +201,7 @@ def test_the_way_from_own_maps_to_a_mask_leads_there(scene_folder: Path) -> None
         grid = codebook()[clusters[0]].transpose(2, 0, 1)  # [F, h, w], as PyTorch has it
         np.save(scene_folder / "maps" / f"{view}.png.npy", grid.astype(np.float16))
     commands = commands_between("README.md", "## Your own scene", "The same over HTTP", scene_folder)
-    assert [command[0] for command in commands] == ["inspect", "inspect", "pack", "lift", "query"]
+    assert [command[0] for command in commands] == ["inspect", "inspect", "pack", "plan", "lift", "query"]
     assert [main(command) for command in commands] == [0] * len(commands)
     with Image.open(scene_folder / "apple.png") as mask:
         columns = np.asarray(mask).nonzero()[1]
