@@ -11,8 +11,10 @@ from liftcore.device import CPU
 from liftcore.plan.coverage import WELL_COVERED, spare_views, view_order, views_to_show
 from liftcore.plan.entries import planned_entries
 from liftcore.plan.memory import (
+    all_weight_bytes,
     check_memory,
     check_weights,
+    dense_warning,
     features_room,
     free_memory,
     memory_parts,
@@ -190,7 +192,8 @@ def plan_lift(
         parts["gathered"] = 0  # there W goes to the card block by block
     home = settings.robust_steps or settings.aggregation_resolve  # W comes to the host, wherever it was made
     kept = on_device.kept if on_device and on_card and not home else 0
-    in_files = max(0, weights_in_files(entries, len(views), settings) - kept)
+    weights = all_weight_bytes(entries, len(views), settings)
+    in_files = max(0, weights_in_files(weights) - kept)
     today, free = _in_work(parts, at_once), free_memory()
     return Plan(
         kernel=str(splats.kernel),
@@ -216,6 +219,7 @@ def plan_lift(
             *frame_warning(cameras),
             *distortion_warning(list(lifted.values())),
             *shape_warnings(packs, list(lifted.values())),
+            *dense_warning(entries, weights),
         ),
     )
 
