@@ -48,7 +48,12 @@ def first_time(order: dict[str, Any]) -> bool:
     return not before
 
 
+def plan(line: str) -> None:
+    say(event="plan", plan={"summary": [line], "warnings": [], "splats": 1})
+
+
 def answer(order: dict[str, Any]) -> None:
+    plan("one splat")
     say(event="progress", stage="geometry", done=0, total=2, unit="views")
     say(event="progress", stage="geometry", done=1, total=2, unit="views")
     say(event="progress", stage="solve", done=1, total=1, unit="slices")
@@ -56,6 +61,7 @@ def answer(order: dict[str, Any]) -> None:
 
 
 def hang(order: dict[str, Any]) -> None:
+    plan("a long time")
     first_time(order)
     child = subprocess.Popen([sys.executable, "-S", "-c", "import time; time.sleep(600)"])
     (Path(order["work"]) / "grandchild").write_text(str(child.pid))
@@ -69,7 +75,10 @@ def die(order: dict[str, Any]) -> None:
 
 
 def die_once(order: dict[str, Any]) -> None:
-    die(order) if first_time(order) else answer(order)
+    if first_time(order):
+        plan("to die")
+        die(order)
+    answer(order)
 
 
 def stop_once(order: dict[str, Any]) -> None:
