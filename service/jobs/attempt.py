@@ -67,7 +67,7 @@ class Attempt:
             environment = mark(self._job.id) | {"TMPDIR": str(scratch)}
             heard = _Heard()
             self._log(f"attempt {self._job.attempt} begins{self._asked()}{self._kept()}")
-            with JobProcess([*self._command, str(order)], environment) as process:
+            with JobProcess([*self._command, str(order)], environment, self._job.id) as process:
                 why = self._follow(process, heard, stopping)
                 status = process.end()
             self._settle(draft, heard, why or _told(status), stopping)

@@ -112,6 +112,13 @@ def meet(order: dict[str, Any]) -> None:
     answer(order)
 
 
+def print_much(order: dict[str, Any]) -> None:
+    """Print as libraries do, and die of an error that nobody foresaw."""
+    os.write(2, b'a warning with "quotes" and \xff\n')
+    print("x" * 100_000, file=sys.stderr)
+    raise RuntimeError("unforeseen")
+
+
 def slowly(order: dict[str, Any]) -> None:
     """Take half a second."""
     time.sleep(0.5)
@@ -128,7 +135,7 @@ def toil(order: dict[str, Any]) -> None:
 
 BEHAVIOURS: dict[str, Callable[[dict[str, Any]], None]] = {
     function.__name__: function
-    for function in (answer, hang, die, die_once, stop_once, eat, feed, meet, slowly, toil)
+    for function in (answer, hang, die, die_once, stop_once, eat, feed, meet, print_much, slowly, toil)
 }
 
 
