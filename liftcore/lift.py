@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import logging
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,9 +14,10 @@ from liftcore.artifact import Lift, LiftMetadata
 from liftcore.device import Device, choose_device, within_memory
 from liftcore.errors import InvalidFeatures
 from liftcore.input_files import input_files
+from liftcore.listener import NOBODY, Listener
 from liftcore.observe.pack import FeaturePacks, open_packs, pair
 from liftcore.plan.plan import plan_lift
-from liftcore.progress import Progress, silent
+from liftcore.progress import Progress, one_step
 from liftcore.raster.antialiased import check_antialiased
 from liftcore.raster.open_raster import open_raster
 from liftcore.scene.load import kernel_named, load_cameras, load_splats
@@ -38,7 +39,7 @@ from liftcore.timings import Timings
 from liftcore.warm_up import warm_up_lift
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from liftcore.artifact import InputFile
     from liftcore.plan.plan import Plan
@@ -47,8 +48,6 @@ if TYPE_CHECKING:
     from liftcore.scene.splats import Kernel, Splats
     from liftcore.solve.closed_form import Solution
     from liftcore.solve.settings import LiftSettings
-
-log = logging.getLogger(__name__)
 
 LEAST_KEPT = 0.5  # of a splat's weight, in regions that the aggregation kept, for it to be solved for again
 
@@ -70,9 +69,20 @@ class Run:
 
     settings: LiftSettings
     threads: int | None
-    progress: Progress
+    listener: Listener
     timings: Timings
     device: Device  # that the settings ask for
+
+    @property
+    def progress(self) -> Progress:
+        """Told of every view and slice."""
+        return self.listener.progress
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Time the block, and tell of it as one step."""
+        with self.timings.stage(name), one_step(self.progress, name):
+            yield
 
 
 def lift(
@@ -82,7 +92,7 @@ def lift(
     settings: LiftSettings,
     *,
     threads: int | None = None,
-    progress: Progress = silent,
+    listener: Listener = NOBODY,
     checkpoint: Checkpoint | None = None,
 ) -> Lift:
     """Lift the features of the packs onto the splats.
@@ -91,7 +101,8 @@ def lift(
         splats: a PLY of any dialect. cameras: COLMAP, transforms.json or cameras.json. features: feature packs, a
             list of one or more.
         threads: None takes the cores that this process may use. The number changes no bit of the result.
-        progress: told of every view and slice; an exception from it stops the work.
+        listener: told of the plan before the first view is walked, of every stage, view and slice; an exception from
+            it stops the work.
         checkpoint: keeps walked views on the disk; the same lift goes on from there, identical to the bit, and so
             does one that differs in features alone (another encoder's of the same regions).
 
@@ -103,10 +114,10 @@ def lift(
     if isinstance(features, str | Path):  # a text is a sequence too, of letters
         raise InvalidFeatures("features", expected="a list of feature packs", got=f"{str(features)!r} alone")
     scene, views, *packs = (Path(path) for path in (splats, cameras, *features))
-    run = Run(settings, threads, progress, Timings(), choose_device(settings.device))
-    with run.timings.stage("read"):
+    run = Run(settings, threads, listener, Timings(), choose_device(settings.device))
+    with run.stage("read"):
         sources = open_sources(scene, views, packs, settings)
-    with run.timings.stage("digest"):
+    with run.stage("digest"):
         inputs = input_files(scene, views, packs)
     return lift_sources(run, sources, inputs, checkpoint)
 
@@ -114,11 +125,10 @@ def lift(
 def lift_sources(run: Run, sources: Sources, inputs: list[InputFile], checkpoint: Checkpoint | None = None) -> Lift:
     """The lift of what is open already: ``inputs`` are the files that it came from."""
     _warm_up(run, sources.splats.kernel)
-    with run.timings.stage("plan"):
+    with run.stage("plan"):
         plan = planned(sources, run.settings, run.device, run.threads)
         sources = replace(sources, views=list(plan.views))
-    for warning in plan.warnings:  # of this machine: equal inputs give equal lifts, so none is kept with them
-        log.warning(warning)
+    run.listener.plan(plan)
     if plan.device != run.device:
         run = replace(run, device=plan.device)
         _warm_up(run, sources.splats.kernel)
@@ -127,7 +137,7 @@ def lift_sources(run: Run, sources: Sources, inputs: list[InputFile], checkpoint
 
 
 def _warm_up(run: Run, kernel: Kernel) -> None:
-    with run.timings.stage("compile"):
+    with run.stage("compile"):
         warm_up_lift(kernel, run.device, run.settings)
 
 
@@ -161,7 +171,7 @@ def _lift_on(run: Run, plan: Plan, sources: Sources, inputs: list[InputFile], ch
     lifted = [sources.cameras.get(name) for name in sources.views]
     told = lift_warnings(sources.splats, lifted, geometry.denominators, settings.dtype, X.dtype, facts)
     facts["warnings"] = [*told, *plan.told]
-    with run.timings.stage("certify"):
+    with run.stage("certify"):
         certificate = certify(geometry, X, settings, threads) | notes | facts
     return Lift(
         features=X,

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Protocol
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 
 class Progress(Protocol):
@@ -15,3 +19,11 @@ class Progress(Protocol):
 
 def silent(stage: str, done: int, total: int, unit: str) -> None:
     """Say nothing."""
+
+
+@contextmanager
+def one_step(progress: Progress, stage: str) -> Iterator[None]:
+    """Tell of the block as a stage without parts that could be counted."""
+    progress(stage, 0, 1, "steps")
+    yield
+    progress(stage, 1, 1, "steps")

@@ -9,7 +9,9 @@ import os
 import signal
 import socket
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
 from types import FrameType
 from typing import Any
 
@@ -34,9 +36,10 @@ from service.store.store import DATABASE, Store
 class AnnouncingServer(uvicorn.Server):
     """Says on stdout where it listens, once it does, and stops in order: what it is told to stop by is no failure."""
 
-    def __init__(self, config: uvicorn.Config, stopping: Stopping) -> None:
+    def __init__(self, config: uvicorn.Config, stopping: Stopping, announce: Callable[[str], None]) -> None:
         super().__init__(config)
         self._stopping = stopping
+        self._announce = announce
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
         """Stop at the first signal; at a second SIGINT at once. uvicorn would die of the signal after the stop."""
@@ -54,7 +57,17 @@ class AnnouncingServer(uvicorn.Server):
         if self.started and sockets:
             host, port = sockets[0].getsockname()[:2]
             shown = f"[{host}]" if ":" in host else host
-            print(f"listening on http://{shown}:{port}", flush=True)
+            self._announce(f"http://{shown}:{port}")
+
+
+def say(address: str) -> None:
+    """Tell people where the server listens."""
+    print(f"listening on {address}", flush=True)
+
+
+def say_in_json(address: str, data: Path) -> None:
+    """Tell programs, and where everything lies."""
+    print(json.dumps({"address": address, "data": str(data.absolute())}), flush=True)
 
 
 def parse(arguments: Sequence[str]) -> ServiceSettings:
@@ -63,18 +76,7 @@ def parse(arguments: Sequence[str]) -> ServiceSettings:
     Raises:
         Misconfigured: a value that a setting does not take.
     """
-    parser = argparse.ArgumentParser(
-        prog="python -m service", description=__doc__, argument_default=argparse.SUPPRESS
-    )
-    parser.add_argument("--host", help="the address to bind; beyond loopback only with keys")
-    parser.add_argument("--port", type=int, help="the port to bind; 0 picks a free one")
-    parser.add_argument("--data", help="the directory for the database and all files")
-    parser.add_argument("--encoder", metavar="SPEC", help="the default text encoder: minilm, table:FILE, ...")
-    parser.add_argument(
-        "--text-space", action="append", dest="text_spaces", metavar="NAME=SPEC",
-        help="the text encoder of a text space; may be given several times",
-    )  # fmt: skip
-    given: dict[str, Any] = vars(parser.parse_args(arguments))
+    given = {name: value for name, value in options(arguments).items() if name != "json"}
     if "text_spaces" in given:
         pairs = [text.partition("=") for text in given["text_spaces"]]
         for name, _, spec in pairs:
@@ -89,6 +91,23 @@ def parse(arguments: Sequence[str]) -> ServiceSettings:
         first = error.errors()[0]
         name = ".".join(str(part) for part in first["loc"])
         raise Misconfigured(name, expected=first["msg"].lower(), got=repr(first["input"])) from None
+
+
+def options(arguments: Sequence[str]) -> dict[str, Any]:
+    """What the command line gives, by name; what it leaves out is not there."""
+    parser = argparse.ArgumentParser(
+        prog="python -m service", description=__doc__, argument_default=argparse.SUPPRESS
+    )
+    parser.add_argument("--host", help="the address to bind; beyond loopback only with keys")
+    parser.add_argument("--port", type=int, help="the port to bind; 0 picks a free one")
+    parser.add_argument("--data", help="the directory for the database and all files")
+    parser.add_argument("--encoder", metavar="SPEC", help="the default text encoder: minilm, table:FILE, ...")
+    parser.add_argument(
+        "--text-space", action="append", dest="text_spaces", metavar="NAME=SPEC",
+        help="the text encoder of a text space; may be given several times",
+    )  # fmt: skip
+    parser.add_argument("--json", action="store_true", help="say in one JSON object where it listens")
+    return vars(parser.parse_args(arguments))
 
 
 def _no_json(error: SettingsError) -> Misconfigured:
@@ -132,20 +151,21 @@ def bind(host: str, port: int) -> socket.socket:
     return listener
 
 
-def server_of(app: FastAPI, settings: ServiceSettings) -> AnnouncingServer:
-    """The server of an application."""
+def server_of(app: FastAPI, settings: ServiceSettings, announce: Callable[[str], None] = say) -> AnnouncingServer:
+    """The server of an application, which announces the address at which it listens."""
     connection = watched(pace_of(settings), settings.max_connections)
     config = uvicorn.Config(
         app, http=connection, log_config=None, log_level="warning", access_log=False, server_header=False, ws="none",
         timeout_graceful_shutdown=math.ceil(settings.stop_seconds),
     )  # fmt: skip
-    return AnnouncingServer(config, app.state.stopping)
+    return AnnouncingServer(config, app.state.stopping, announce)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the service until it is told to stop; the exit status."""
+    given = sys.argv[1:] if arguments is None else arguments
     try:
-        settings = parse(sys.argv[1:] if arguments is None else arguments)
+        settings = parse(given)
         require_keys(settings)
         require_encoder_files(settings)
         listener = bind(settings.host, settings.port)
@@ -160,7 +180,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     start_logging(settings.log_format)
     try:
         app = assemble(settings, store)
-        server_of(app, settings).run(sockets=[listener])
+        announce = partial(say_in_json, data=settings.data) if "json" in options(given) else say
+        server_of(app, settings, announce).run(sockets=[listener])
     finally:
         store.close()
         listener.close()

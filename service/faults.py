@@ -17,9 +17,14 @@ def fault_of(error: SplatliftError, names: Mapping[str, str] | None = None) -> d
         names: server path -> the name that the client knows; paths of this machine are nobody's business.
     """
     fault = {name: str(getattr(error, name)) for name in FIELDS}
-    for path, name in (names or {}).items():
-        fault = {field: text.replace(path, name) for field, text in fault.items()}
-    return {"kind": error.kind, **fault}
+    return {"kind": error.kind} | {field: renamed(text, names or {}) for field, text in fault.items()}
+
+
+def renamed(text: str, names: Mapping[str, str]) -> str:
+    """A text in which server paths have the names that the client knows."""
+    for path, name in names.items():
+        text = text.replace(path, name)
+    return text
 
 
 def error_of(fault: Mapping[str, str]) -> SplatliftError:

@@ -132,6 +132,15 @@ class Progress(BaseModel):
     eta_s: float | None = Field(description="seconds until the end of this stage, at its pace so far")
 
 
+class Plan(BaseModel):
+    """What a lift sets out to do: ``summary``, ``warnings``, and what its certificate will have as ``plan``."""
+
+    model_config = ConfigDict(extra="allow")  # the certificate's numbers
+
+    summary: list[str] = Field(description="the plan for people, a few lines")
+    warnings: list[str] = Field(description="of what is lifted, and of what the machine has for it today")
+
+
 class Job(BaseModel):
     """A lift or a trade-off on its way."""
 
@@ -144,6 +153,7 @@ class Job(BaseModel):
     features: list[AssetId]
     settings: dict[str, Any]
     parameters: dict[str, Any] = Field(description="of its kind: budget_s of a trade-off, and its labels")
+    plan: Plan | None = Field(description="of a lift, from before its first view is walked; the latest attempt's")
     progress: Progress | None
     problem: Problem | None
     created: float

@@ -36,9 +36,12 @@ class _Bars:
 
             self.close()
             self.stage = stage
-            self.bar = tqdm(total=total, desc=stage, unit=f" {unit}", file=sys.stderr, dynamic_ncols=True)
+            look = {"leave": total > 1, "file": sys.stderr, "dynamic_ncols": True}
+            self.bar = tqdm(total=total, desc=stage, unit=f" {unit}", **look)
         self.bar.total = total
         self.bar.update(done - self.bar.n)
+        if done >= total == 1:  # one step is shown while it lasts: the plan is printed where its bar was
+            self.close()
 
     def close(self) -> None:
         if self.bar is not None:

@@ -10,6 +10,7 @@ from liftcore.commands.bars import progress_bars
 from liftcore.commands.reply import free_output, reply, shown, writing
 from liftcore.errors import InvalidInput, InvalidSettings
 from liftcore.nearest import nearest
+from liftcore.progress import one_step
 from liftcore.solve.settings import LiftSettings
 
 if TYPE_CHECKING:
@@ -27,17 +28,20 @@ def run(options: argparse.Namespace) -> int:
     settings = settings_of(options)
     from liftcore.artifact import save_lift
     from liftcore.lift import lift
+    from liftcore.listener import Listener
     from liftcore.scene.camera_source import camera_source
 
     views = camera_source(options.cameras).files
     out = free_output(options.output, [options.splats, *views, *options.features])
     checkpoint = checkpoint_in(options.checkpoint) if options.checkpoint else None
 
-    told: Sequence[str] = ()
-    if options.explain and not options.json:  # the document holds the plan anyway
-        plan = plan_of(options, settings)
-        told = plan.told
-        print(*plan.lines(), sep="\n", flush=True)
+    plans: list[Plan] = []
+
+    def take(plan: Plan) -> None:
+        plans.append(plan)
+        if not options.json:
+            print(*(plan.lines() if options.explain else _in_short(plan)), sep="\n", flush=True)
+
     with progress_bars() as progress:
         result = lift(
             options.splats,
@@ -45,14 +49,15 @@ def run(options: argparse.Namespace) -> int:
             options.features,
             settings,
             threads=options.threads,
-            progress=progress,
+            listener=Listener(progress, take),
             checkpoint=checkpoint,
         )
-    with writing(out):
-        save_lift(result, out)
+        with writing(out), one_step(progress, "save"):
+            save_lift(result, out)
+    (plan,) = plans
     warnings = result.metadata.certificate["warnings"]
-    document = {"out": str(out), **_summary(result), "warnings": warnings}
-    new = [warning for warning in warnings if warning not in told]
+    document = {"out": str(out), **_summary(result), "warnings": [*plan.warnings, *warnings]}
+    new = [warning for warning in warnings if warning not in plan.told]  # the others were printed with the plan
     reply(document, as_json=options.json, lines=_lines(document | {"warnings": new}))
     return 0
 
@@ -133,6 +138,13 @@ def plan_of(options: argparse.Namespace, settings: LiftSettings) -> Plan:
     device = choose_device(settings.device)
     sources = open_sources(options.splats, options.cameras, options.features, settings)
     return planned(sources, settings, device, options.threads)
+
+
+def _in_short(plan: Plan) -> Iterable[str]:
+    head, *rest = plan.summary()
+    yield f"plan: {head}"
+    yield from (f"  {line}" for line in rest)
+    yield from (f"warning: {warning}" for warning in (*plan.warnings, *plan.told))
 
 
 def _summary(result: Lift) -> dict[str, Any]:

@@ -21,6 +21,8 @@ def run(options: argparse.Namespace) -> int:
         raise Unavailable("serve", expected="the package 'service'", got="an installation without it")
     given = {name: getattr(options, name) for name in _OPTIONS}
     arguments = [part for name, value in given.items() if value is not None for part in (f"--{name}", str(value))]
+    if options.json:
+        arguments.append("--json")
     sys.stdout.flush()
     sys.stderr.flush()
     os.execv(sys.executable, [sys.executable, "-m", "service", *arguments])

@@ -235,7 +235,8 @@ class _Voice:
         if not self._live:
             return
         step = job.get("progress") or {}
-        done = f"{step['stage']} {step['done']}/{step['total']} {step['unit']}" if step else ""
+        parts = f" {step['done']}/{step['total']} {step['unit']}" if step and step["total"] > 1 else ""
+        done = f"{step['stage']}{parts}" if step else ""
         text = f"{job['state']}  {done}" if job["state"] in ("queued", "running") else ""
         print(f"\r\033[K{text}", end="", file=sys.stderr, flush=True)
 

@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING, Any
 from liftcore.device import CPU
 from liftcore.input_files import input_files
 from liftcore.lift import Run, lift_sources, open_sources
+from liftcore.listener import NOBODY
 from liftcore.measure.hardware import hardware, machine_line
 from liftcore.measure.tradeoff.judge import cosine_figures
-from liftcore.progress import silent
 from liftcore.solve.settings import LiftSettings, Preset, Speed
 from liftcore.timings import Timings
 from liftcore.warm_up import warm_up_lift
@@ -48,7 +48,7 @@ def measure_dial(
             sources = open_sources(splats, cameras, [features], settings)
             warm_up_lift(sources.splats.kernel, CPU, settings)
             begin = time.process_time()
-            made[speed] = lift_sources(Run(settings, 1, silent, Timings(), CPU), sources, inputs)
+            made[speed] = lift_sources(Run(settings, 1, NOBODY, Timings(), CPU), sources, inputs)
             seconds[speed] = min(seconds.get(speed, float("inf")), time.process_time() - begin)
     exact = made[Speed.EXACT]
     return [

@@ -46,6 +46,7 @@ CONTROL_GROUPS = (  # folder, and the files of limit, use and statistics: versio
     ("/sys/fs/cgroup/memory", ("memory.limit_in_bytes", "memory.usage_in_bytes", "memory.stat")),
 )
 FILE_PAGES = ("inactive_file", "active_file")
+DENSE_ENTRIES = 12.0  # of a splat in a view: twice those of an encoder's grid of some thirty cells a side
 SPARE = 0.9  # of the memory that is free: others grow too
 
 
@@ -93,10 +94,24 @@ def memory_parts(
     return parts
 
 
-def weights_in_files(planned: PlannedEntries, views: int, settings: LiftSettings) -> int:
-    """Bytes of W of so many views that go to files of the temporary folder, as memory keeps no more of it."""
+def all_weight_bytes(planned: PlannedEntries, views: int, settings: LiftSettings) -> int:
+    """Bytes of W of so many views."""
     judged = planned.splats * planned.entries * 4 if settings.robust_steps else 0.0  # weights as they were judged
-    return max(0, int(views * (weight_bytes(planned.splats, planned.entries) + judged)) - MEMORY_LIMIT)
+    return int(views * (weight_bytes(planned.splats, planned.entries) + judged))
+
+
+def weights_in_files(size: int) -> int:
+    """Of so many bytes of W those that go to files of the temporary folder, as memory keeps no more of it."""
+    return max(0, size - MEMORY_LIMIT)
+
+
+def dense_warning(planned: PlannedEntries, size: int) -> list[str]:
+    """A warning where maps so fine make so many bytes of W that coarser ones would be worth the user's while."""
+    if planned.entries < DENSE_ENTRIES or not weights_in_files(size):
+        return []
+    told = f"a splat lies in about {planned.entries:.0f} regions or cells of a view's map, whose weights take about"
+    advice = "regions, or coarser grids, of the same features lift faster"
+    return [f"the maps are dense: {told} {size / 2**30:.1f} GiB; {advice}"]
 
 
 def check_weights(size: int) -> list[str]:

@@ -11,8 +11,10 @@ from liftcore.device import CPU
 from liftcore.plan.coverage import WELL_COVERED, spare_views, view_order, views_to_show
 from liftcore.plan.entries import planned_entries
 from liftcore.plan.memory import (
+    all_weight_bytes,
     check_memory,
     check_weights,
+    dense_warning,
     features_room,
     free_memory,
     memory_parts,
@@ -42,6 +44,7 @@ if TYPE_CHECKING:
 
 FEW_VIEWS = 32  # and below, view_cosine takes all: a pilot would cost what it saves
 SHOWN_VIEWS = 6  # names in a line for people
+MIB = 2**20
 
 
 @dataclass(frozen=True)
@@ -52,6 +55,7 @@ class Plan:
     splats: int  # P
     views: tuple[str, ...]  # that will be lifted, in the order of the sums
     left_out: tuple[str, ...]  # that the settings' coverage or view_cosine leaves out
+    there: int  # views with features and a camera, whatever the settings take of them
     view_cosine: float | None  # expected of the views' features against those of all, where a pilot chose them
     spare: tuple[str, ...]  # of those lifted: what they show, WELL_COVERED of the others show too
     seen_share: float  # of the splats, that some view can see, before occlusion
@@ -102,8 +106,19 @@ class Plan:
             "device_memory": self.on_device.facts() if self.on_device else None,
         }
 
+    def summary(self) -> Iterator[str]:
+        """The plan in short, for people: what is lifted, what it is made of, and what that takes."""
+        rank, seen = self.rank, f"{self.seen_share:.1%} in some view's field"
+        spare = f", {len(self.spare)} of which add nothing new" if self.spare else ""
+        yield f"{self.splats} splats ({self.kernel}), {seen}; {len(self.views)} of {self.there} views{spare}"
+        carried = f"rank {self._bound}{rank.rank}, {rank.enough} directions hold {ENOUGH:.0%}"
+        yield f"{rank.channels} channels ({carried}), stored as {self.dtype}"
+        card = f" and {self.on_device.peak / MIB:.0f} MiB of {self.device.name}" if self.on_device else ""
+        files = f", {self.in_files / MIB:.0f} MiB of region weights in files" if self.in_files else ""
+        yield f"about {sum(self.in_work.values()) / MIB:.0f} MiB at the peak{card}{files}"
+
     def lines(self) -> Iterator[str]:
-        """The plan for people."""
+        """The whole plan for people."""
         yield f"plan: {self.splats} splats ({self.kernel}), {self.seen_share:.1%} in some view's field"
         parts = f"{self.entries_a_splat:.1f} regions or cells"
         yield f"  a view shows {self.splats_a_view:.0f} of them, before occlusion, each in {parts}"
@@ -111,16 +126,15 @@ class Plan:
         if self.view_cosine is not None:
             left += f" (a pilot expects features with a cosine of {self.view_cosine:.3f} to those of all)"
         yield f"  {len(self.views)} views{left}{self._spare_line()}"
-        bound = "at least " if self.rank.rank == self.rank.rows < self.rank.channels else ""
         yield (
-            f"  {self.rank.channels} channels; {self.rank.rows} sampled codebook rows have rank {bound}"
+            f"  {self.rank.channels} channels; {self.rank.rows} sampled codebook rows have rank {self._bound}"
             f"{self.rank.rank}, and {self.rank.enough} directions hold {ENOUGH:.0%} of their squares"
         )
         sizes = self.in_work
-        parts = ", ".join(f"{name} {size / 2**20:.0f}" for name, size in sizes.items())
-        yield f"  features as {self.dtype}; about {sum(sizes.values()) / 2**20:.0f} MiB at the peak ({parts})"
+        parts = ", ".join(f"{name} {size / MIB:.0f}" for name, size in sizes.items())
+        yield f"  features as {self.dtype}; about {sum(sizes.values()) / MIB:.0f} MiB at the peak ({parts})"
         if self.in_files:
-            yield f"  {self.in_files / 2**20:.0f} MiB of region weights go to files in the temporary folder"
+            yield f"  {self.in_files / MIB:.0f} MiB of region weights go to files in the temporary folder"
         yield f"  on {self.device.name}" + (f": {self.on_device.line()}" if self.on_device else "")
         yield from (f"warning: {warning}" for warning in (*self.warnings, *self.told))
 
@@ -128,6 +142,11 @@ class Plan:
     def kept_on_card(self) -> int:
         """Bytes of region weights that stay on the card between the walks and the solution."""
         return self.on_device.kept if self.on_device else 0
+
+    @property
+    def _bound(self) -> str:
+        """A sample of fewer rows than channels can have no larger rank than it has rows."""
+        return "at least " if self.rank.rank == self.rank.rows < self.rank.channels else ""
 
     def _spare_line(self) -> str:
         if not self.spare:
@@ -173,13 +192,15 @@ def plan_lift(
         parts["gathered"] = 0  # there W goes to the card block by block
     home = settings.robust_steps or settings.aggregation_resolve  # W comes to the host, wherever it was made
     kept = on_device.kept if on_device and on_card and not home else 0
-    in_files = max(0, weights_in_files(entries, len(views), settings) - kept)
+    weights = all_weight_bytes(entries, len(views), settings)
+    in_files = max(0, weights_in_files(weights) - kept)
     today, free = _in_work(parts, at_once), free_memory()
     return Plan(
         kernel=str(splats.kernel),
         splats=splats.count,
         views=tuple(views),
         left_out=tuple(name for name in names if name not in set(views)),
+        there=len(packs.views),
         view_cosine=expected,
         spare=tuple(views[k] for k in spare_views(seen)),
         seen_share=seen.seen_share,
@@ -198,6 +219,7 @@ def plan_lift(
             *frame_warning(cameras),
             *distortion_warning(list(lifted.values())),
             *shape_warnings(packs, list(lifted.values())),
+            *dense_warning(entries, weights),
         ),
     )
 

@@ -67,7 +67,7 @@ class Attempt:
             environment = mark(self._job.id) | {"TMPDIR": str(scratch)}
             heard = _Heard()
             self._log(f"attempt {self._job.attempt} begins{self._asked()}{self._kept()}")
-            with JobProcess([*self._command, str(order)], environment) as process:
+            with JobProcess([*self._command, str(order)], environment, self._job.id) as process:
                 why = self._follow(process, heard, stopping)
                 status = process.end()
             self._settle(draft, heard, why or _told(status), stopping)
@@ -92,8 +92,11 @@ class Attempt:
         if message["event"] == "progress":
             if message["stage"] != heard.stage:
                 heard.stage = message["stage"]
-                self._log(f"{heard.stage}: {message['total']} {message['unit']}")
+                parts = f": {message['total']} {message['unit']}" if message["total"] > 1 else ""
+                self._log(f"{heard.stage}{parts}")
             self._store.attempts.advance(self._job.id, self._job.attempt, self._pace.progress(message))
+        elif message["event"] == "plan":
+            self._store.attempts.plan(self._job.id, self._job.attempt, message["plan"])
         elif message["event"] != "beat":
             heard.answer = message
 

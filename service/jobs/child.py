@@ -1,9 +1,9 @@
 """The process of one job: reads its order, does it, and says how it goes in JSON lines on stdout.
 
-Run as ``python -m service.jobs.child ORDER``, with a JSON file. Messages are ``{"event": "progress", ...}`` and
-``{"event": "beat"}``, any number of times, then one ``{"event": "done", ...}`` or ``{"event": "fault", ...}``. It
-writes nothing but its draft and its checkpoint, so whatever ends it leaves no half a result behind. When its stdin
-closes it ends by itself, with all that it started.
+Run as ``python -m service.jobs.child ORDER``, with a JSON file. Messages are ``{"event": "progress", ...}``,
+``{"event": "plan", ...}`` and ``{"event": "beat"}``, any number of times, then one ``{"event": "done", ...}`` or
+``{"event": "fault", ...}``. It writes nothing but its draft and its checkpoint, so whatever ends it leaves no half a
+result behind. When its stdin closes it ends by itself, with all that it started.
 """
 
 from __future__ import annotations
@@ -14,55 +14,23 @@ import json
 import os
 import signal
 import sys
+import tempfile
 import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from liftcore.errors import SplatliftError
-from liftcore.progress import Progress
 from service.errors import NoSpace, OverLimit
 from service.faults import fault_of
+from service.jobs.reporter import Reporter
 from service.own_stdout import own_stdout
 from service.wire import JobKind
 
-Work = Callable[[dict[str, Any], Progress], dict[str, Any]]  # an order to what is told of its result
+Work = Callable[[dict[str, Any], Reporter], dict[str, Any]]  # an order to what is told of its result
 
 NICENESS = 10  # queries come first: beside one, a lift gets a tenth of a core
 FIRST_TO_GO = 500  # when the machine runs out of memory, this process is ended rather than the server
-SECONDS_BETWEEN_BEATS = 1.0
-SECONDS_BETWEEN_WORDS = 0.25
-
-
-class Reporter:
-    """Progress as JSON lines: every new stage and every end of one, and now and then in between."""
-
-    def __init__(self, out: BinaryIO) -> None:
-        self._out = out
-        self._stage = ""
-        self._last = 0.0
-        self._turn = threading.Lock()  # one message at a time
-
-    def __call__(self, stage: str, done: int, total: int, unit: str) -> None:
-        """Say how far the work is (`liftcore.progress.Progress`)."""
-        now = time.monotonic()
-        if stage == self._stage and done < total and now - self._last < SECONDS_BETWEEN_WORDS:
-            return
-        self._stage, self._last = stage, now
-        self.say({"event": "progress", "stage": stage, "done": done, "total": total, "unit": unit})
-
-    def say(self, message: dict[str, Any]) -> None:
-        """Write one message."""
-        with self._turn:
-            self._out.write(json.dumps(message).encode() + b"\n")
-            self._out.flush()
-
-    def beat(self) -> None:
-        """Say for ever that this process is alive."""
-        while True:
-            self.say({"event": "beat"})
-            time.sleep(SECONDS_BETWEEN_BEATS)
 
 
 def work_of(kind: JobKind) -> Work:
@@ -83,6 +51,7 @@ def run(order: dict[str, Any], report: Reporter) -> dict[str, Any]:
         The last message.
     """
     kind = JobKind(order["kind"])
+    order["names"][tempfile.gettempdir()] = "the server's temporary folder"
     try:
         return {"event": "done", **work_of(kind)(order, report)}
     except SplatliftError as error:

@@ -11,7 +11,7 @@ from liftcore.device import Device, choose_device
 from liftcore.measure.tradeoff.compare import compare
 from liftcore.measure.tradeoff.order import CANDIDATES, EXACT, Scene
 from liftcore.measure.tradeoff.report import page_of, save
-from liftcore.progress import Progress
+from liftcore.progress import Progress, one_step
 from liftcore.scene.splats import Kernel
 from liftcore.solve.settings import LiftSettings
 from liftcore.strict_json import finite
@@ -30,9 +30,9 @@ def compare_as_ordered(order: dict[str, Any], progress: Progress) -> dict[str, A
         SplatliftError: as `liftcore.measure.tradeoff.compare.compare` has it.
     """
     scene, settings, parameters = _scene(order), order["settings"], order["parameters"]
-    progress("compile", 0, 1, "kernels")
     device = choose_device(settings.get("device", "auto"))
-    _compile(Kernel(order["kernel"]), device, settings)
+    with one_step(progress, "compile"):
+        _compile(Kernel(order["kernel"]), device, settings)
     progress("tradeoff", 0, len(CANDIDATES), "runs")
     found = compare(scene, parameters["budget_s"], settings, order["threads"], progress)
     named = {

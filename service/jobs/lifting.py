@@ -11,12 +11,17 @@ from typing import Any
 from liftcore.artifact import InputFile, LiftMetadata, save_lift
 from liftcore.input_files import sha256_of
 from liftcore.lift import lift
-from liftcore.progress import Progress
+from liftcore.listener import Listener, log_warnings
+from liftcore.plan.plan import Plan
+from liftcore.progress import one_step
 from liftcore.solve.checkpoint import Checkpoint
 from liftcore.solve.settings import LiftSettings
+from liftcore.strict_json import finite
+from service.faults import renamed
+from service.jobs.reporter import Reporter
 
 
-def lift_as_ordered(order: dict[str, Any], progress: Progress) -> dict[str, Any]:
+def lift_as_ordered(order: dict[str, Any], report: Reporter) -> dict[str, Any]:
     """Lift, and save the lift at ``output``.
 
     Returns:
@@ -25,25 +30,38 @@ def lift_as_ordered(order: dict[str, Any], progress: Progress) -> dict[str, Any]
     Raises:
         SplatliftError: as `liftcore.lift.lift` has it.
     """
+
+    def planned(plan: Plan) -> None:
+        log_warnings(plan)  # the operator's log has them too
+        report.plan(plan_document(plan, order["names"]))
+
     made = lift(
         Path(order["splats"]),
         Path(order["cameras"]),
         [Path(path) for path in order["features"]],
         LiftSettings.of(**order["settings"]),
         threads=order["threads"],
-        progress=progress,
+        listener=Listener(report, planned),
         checkpoint=Checkpoint(Path(order["work"]), order["checkpoint_seconds"]),
     )
     made = replace(made, metadata=_as_clients_know(made.metadata, order["file_names"]))
     output = Path(order["output"])
-    save_lift(made, output)
+    with one_step(report, "save"):
+        save_lift(made, output)
+        digest = sha256_of(output)
     return {
-        "sha256": sha256_of(output),
+        "sha256": digest,
         "count": made.features.shape[0],
         "channels": made.features.shape[1],
         # Through JSON and not model_dump: what is not finite must become null before it reaches a client.
         "metadata": json.loads(made.metadata.model_dump_json()),
     }
+
+
+def plan_document(plan: Plan, names: Mapping[str, str]) -> dict[str, Any]:
+    """A plan as `service.wire.Plan` has it, with the names that clients know in place of paths."""
+    warnings = [renamed(warning, names) for warning in (*plan.warnings, *plan.told)]
+    return finite({"summary": list(plan.summary()), "warnings": warnings, **plan.facts()})
 
 
 def _as_clients_know(metadata: LiftMetadata, names: Mapping[str, str]) -> LiftMetadata:

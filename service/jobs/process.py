@@ -13,6 +13,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
+from service.jobs.overheard import log_lines
+
 PIECE = 1 << 16
 GONE_SECONDS = 3.0  # the kernel takes a moment to end a group
 
@@ -20,18 +22,21 @@ GONE_SECONDS = 3.0  # the kernel takes a moment to end a group
 class JobProcess:
     """Started in a process group of its own, heard in JSON lines, and ended with its whole group.
 
-    Its standard input is a lifeline: it closes when the server ends, however the server ends.
+    What it prints on its standard error goes to the server's log, line by line. Its standard input is a lifeline: it
+    closes when the server ends, however the server ends.
     """
 
-    def __init__(self, command: Sequence[str], environment: Mapping[str, str]) -> None:
+    def __init__(self, command: Sequence[str], environment: Mapping[str, str], job: str) -> None:
         self._process = subprocess.Popen(
             command,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
             start_new_session=True,
             env=os.environ | dict(environment),
         )
-        assert self._process.stdout is not None
+        assert self._process.stdout is not None and self._process.stderr is not None
+        self._overheard = log_lines(self._process.stderr, job)
         self._pipe = self._process.stdout.fileno()
         self._open = True
         self._rest = b""
@@ -85,6 +90,7 @@ class JobProcess:
             os.killpg(self.pid, signal.SIGKILL)
             self._status = self._process.wait()
             self._await_group()
+            self._overheard.join(GONE_SECONDS)
             for pipe in (self._process.stdin, self._process.stdout):
                 assert pipe is not None
                 pipe.close()

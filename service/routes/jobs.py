@@ -47,7 +47,7 @@ EVENT = {
 }
 EVENTS: dict[int | str, dict[str, Any]] = {
     200: {
-        "description": "Server-sent events; the data are a JobStep, a Progress or a LogLine as JSON",
+        "description": "Server-sent events; the data are a JobStep, a Plan, a Progress or a LogLine as JSON",
         "content": {"text/event-stream": {"schema": EVENT}},
     },
     204: {"description": "The job has ended, and the client has its last event"},
@@ -89,7 +89,7 @@ def get_job(job: str, here: Here) -> wire.Job:
 
 @router.get("/jobs/{job}/events", response_class=Response, responses=EVENTS)
 async def follow_job(job: str, here: Here, last_event: LastEvent = 0) -> Response:
-    """What happens to a job, as it happens: its states, latest progress and log. Ends after the last state."""
+    """What happens to a job, as it happens: its states, plan, latest progress and log. Ends after the last state."""
     look = partial(here.store.events.after, job)
     state = await anyio.to_thread.run_sync(here.store.attempts.state, job)
     if not await anyio.to_thread.run_sync(look, last_event) and state in wire.ENDED:
@@ -152,6 +152,8 @@ def event_data(event: Event) -> str:
     """An event's data as the wire has it."""
     if event.kind is EventKind.PROGRESS:
         return wire.Progress.model_validate(event.data).model_dump_json()
+    if event.kind is EventKind.PLAN:
+        return wire.Plan.model_validate(event.data).model_dump_json()
     if event.kind is EventKind.LOG:
         return wire.LogLine.model_validate(event.data).model_dump_json()
     problem = event.data["problem"]
@@ -176,6 +178,7 @@ def shape(job: JobRecord) -> wire.Job:
         features=list(job.features),
         settings=job.settings,
         parameters=job.parameters,
+        plan=None if job.plan is None else wire.Plan.model_validate(job.plan),
         progress=None if job.progress is None else wire.Progress.model_validate(job.progress),
         problem=None if job.problem is None else problem_of(error_of(job.problem)),
         created=job.created,

@@ -67,13 +67,21 @@ class AttemptStore(Owned):
 
     def advance(self, job: str, attempt: int, progress: Mapping[str, Any]) -> None:
         """Note how far an attempt is."""
+        self._note_latest(job, attempt, EventKind.PROGRESS, progress)
+
+    def plan(self, job: str, attempt: int, plan: Mapping[str, Any]) -> None:
+        """Note what an attempt is about to do. It stays with the job until the next attempt has planned."""
+        self._note_latest(job, attempt, EventKind.PLAN, plan)
+
+    def _note_latest(self, job: str, attempt: int, kind: EventKind, data: Mapping[str, Any]) -> None:
+        """Keep what there is one of: in the job's column of that name, and as an event."""
         with self._database.write() as connection:
             changed = connection.execute(
-                f"UPDATE jobs SET progress = :progress WHERE {OWNS}",
-                {"progress": json.dumps(progress), "job": job, "attempt": attempt},
+                f"UPDATE jobs SET {kind} = :data WHERE {OWNS}",
+                {"data": json.dumps(data), "job": job, "attempt": attempt},
             )
             if changed.rowcount == 1:
-                note(connection, job, EventKind.PROGRESS, progress)
+                note(connection, job, kind, data)
 
     def log(self, job: str, attempt: int, text: str) -> None:
         """Add a line to the job's log."""

@@ -1,4 +1,4 @@
-"""What happened to a job, numbered: its states, its log, and its latest progress."""
+"""What happened to a job, numbered: its states, its log, its plan and its latest progress."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ class EventKind(StrEnum):
     """What an event tells of."""
 
     STATE = "state"
+    PLAN = "plan"
     PROGRESS = "progress"
     LOG = "log"
 
@@ -36,13 +37,13 @@ class Event:
 
 
 def note(connection: sqlite3.Connection, job: str, kind: EventKind, data: Mapping[str, Any]) -> None:
-    """Add an event within a write transaction. Of progress only the latest is kept, of the log the last lines."""
+    """Add an event within a write transaction. Of plan and progress the latest is kept, of the log the last lines."""
     connection.execute(
         "INSERT INTO job_events (job, number, kind, data, created)"
         " SELECT ?, coalesce(max(number), 0) + 1, ?, ?, ? FROM job_events WHERE job = ?",
         (job, kind, json.dumps(data), time.time(), job),
     )
-    kept = {EventKind.PROGRESS: 1, EventKind.LOG: LOG_LINES}.get(kind)
+    kept = {EventKind.PLAN: 1, EventKind.PROGRESS: 1, EventKind.LOG: LOG_LINES}.get(kind)
     if kept is not None:
         connection.execute(
             "DELETE FROM job_events WHERE job = :job AND kind = :kind AND number NOT IN"

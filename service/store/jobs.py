@@ -62,6 +62,7 @@ class JobRecord:
     request_id: str | None = None
     kind: JobKind = JobKind.LIFT
     parameters: dict[str, Any] = field(default_factory=dict)
+    plan: dict[str, Any] | None = None
 
 
 def labels_of(parameters: Mapping[str, Any]) -> list[tuple[str, AssetKind]]:
@@ -231,6 +232,7 @@ def record(connection: sqlite3.Connection, row: sqlite3.Row) -> JobRecord:
         request_id=row["request_id"],
         kind=JobKind(row["kind"]),
         parameters=json.loads(row["parameters"]),
+        plan=None if row["plan"] is None else json.loads(row["plan"]),
     )
 
 

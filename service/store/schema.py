@@ -121,4 +121,7 @@ CREATE TABLE job_labels (           -- what the labels of a job's parameters nam
 ) STRICT, WITHOUT ROWID;
 CREATE INDEX job_labels_of_asset ON job_labels (asset);
 """,
+    """
+ALTER TABLE jobs ADD COLUMN plan TEXT;              -- JSON: what the latest attempt that planned set out to do
+""",
 )

@@ -80,8 +80,19 @@ function brief(counts) {
     .map(([name, value]) => `${name} ${value.toLocaleString()}`).join(", ");
 }
 
+function planned({ summary, warnings }) {
+  const list = document.createElement("ul");
+  list.className = "plan";
+  for (const line of [...summary, ...warnings.map(warning => `warning: ${warning}`)]) {
+    const item = document.createElement("li");
+    item.textContent = line;
+    list.append(item);
+  }
+  return list;
+}
+
 function progress(job) {
-  const cell = document.createElement("span");
+  const cell = document.createElement("div");
   const step = job.progress;
   if (job.problem) {
     cell.className = "bad";
@@ -91,7 +102,9 @@ function progress(job) {
     bar.max = step.total;
     bar.value = step.done;
     const left = step.eta_s == null ? "" : `, ${Math.ceil(step.eta_s)} s left in this stage`;
-    cell.append(bar, ` ${step.stage} ${step.done}/${step.total} ${step.unit}${left}`);
+    const parts = step.total > 1 ? ` ${step.done}/${step.total} ${step.unit}` : "";
+    cell.append(bar, ` ${step.stage}${parts}${left}`);
+    if (job.plan) cell.append(planned(job.plan));
   } else if (job.ended && job.started) {
     cell.textContent = `took ${(job.ended - job.started).toFixed(1)} s`;
     if (job.links.chart) cell.append(": ", link(job.links.chart, "chart"), ", ", link(job.links.tradeoff, "figures"));

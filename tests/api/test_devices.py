@@ -17,6 +17,7 @@ from liftcore.progress import Progress
 from service.faults import fault_of
 from service.jobs import child, devices
 from service.jobs.devices import Devices
+from service.jobs.reporter import Reporter
 
 from .conftest import Uploaded
 from .test_problems import assert_problem
@@ -80,7 +81,7 @@ def test_job_that_meets_no_card_fails_in_words(tmp_path: Path, monkeypatch: pyte
         "kind": "lift", "splats": "s", "cameras": "c", "features": ["f"], "settings": {"device": "cuda"},
         "threads": 1, "work": str(tmp_path), "checkpoint_seconds": 1, "output": str(tmp_path / "o"), "names": {},
     }  # fmt: skip
-    told = child.run(order, child.Reporter(io.BytesIO()))
+    told = child.run(order, Reporter(io.BytesIO()))
     assert told == {"event": "fault", "fault": fault_of(LACK)}
 
 
@@ -89,5 +90,5 @@ def test_job_on_a_full_disk_fails_at_once_and_says_so(tmp_path: Path, monkeypatc
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr("service.jobs.lifting.lift_as_ordered", full)
-    fault = child.run({"kind": "lift", "names": {}}, child.Reporter(io.BytesIO()))["fault"]
+    fault = child.run({"kind": "lift", "names": {}}, Reporter(io.BytesIO()))["fault"]
     assert fault["kind"] == "no-space" and "delete" in fault["hint"]

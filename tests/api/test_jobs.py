@@ -144,7 +144,7 @@ def test_events_tell_the_whole_story_and_go_on_after_the_last_one_seen(quick: Qu
         assert reply.headers["content-type"].startswith("text/event-stream")
         story = events(reply.text)
         assert [data["state"] for _, name, data in story if name == "state"] == ["queued", "running", "succeeded"]
-        assert {name for _, name, _ in story} == {"state", "progress", "log"}
+        assert {name for _, name, _ in story} == {"state", "plan", "progress", "log"}
         numbers = [number for number, _, _ in story]
         assert numbers == sorted(set(numbers))
         third = {"Last-Event-ID": str(numbers[2])}
@@ -266,7 +266,7 @@ def test_database_of_the_first_schema_is_taken_over(tmp_path: Path) -> None:
     old.commit()
     old.close()
     store = Store.open(tmp_path / "data")
-    assert store.jobs.get("a").features == ("f",)
+    assert store.jobs.get("a").features == ("f",) and store.jobs.get("a").plan is None
     store.attempts.lose_all("the server died")
     assert [store.jobs.get(job).state for job in "abc"] == [JobState.QUEUED, JobState.QUEUED, JobState.FAILED]
     (last,) = store.events.after("c", 0)

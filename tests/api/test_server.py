@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import socket
@@ -69,6 +70,20 @@ def test_server_process_does_the_main_job(tmp_path: Path, scene: TinyScene, tabl
         assert answer["top"][0]["splat"] >= 40
         assert client.get(answer["links"]["mask"]).content.startswith(b"\x89PNG")
         assert "<title>splatlift</title>" in client.get("/").text
+
+
+def test_server_that_speaks_json_says_one_object_when_it_is_ready_and_nothing_after(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "liftcore.cli", "serve", "--json", "--port", "0", "--data", "kept"]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=tmp_path, env=environment) as process:
+        assert process.stdout is not None
+        try:
+            told = json.loads(process.stdout.readline())
+            assert told == {"address": told["address"], "data": str(tmp_path / "kept")}
+            assert httpx.get(f"{told['address']}/healthz").json() == {"status": "ok"}
+        finally:
+            process.send_signal(signal.SIGTERM)
+        assert (process.stdout.read(), process.wait(60)) == ("", 0)
 
 
 def test_http_process_loads_neither_torch_nor_numba_nor_hdbscan() -> None:

@@ -48,7 +48,12 @@ def first_time(order: dict[str, Any]) -> bool:
     return not before
 
 
+def plan(line: str) -> None:
+    say(event="plan", plan={"summary": [line], "warnings": [], "splats": 1})
+
+
 def answer(order: dict[str, Any]) -> None:
+    plan("one splat")
     say(event="progress", stage="geometry", done=0, total=2, unit="views")
     say(event="progress", stage="geometry", done=1, total=2, unit="views")
     say(event="progress", stage="solve", done=1, total=1, unit="slices")
@@ -56,6 +61,7 @@ def answer(order: dict[str, Any]) -> None:
 
 
 def hang(order: dict[str, Any]) -> None:
+    plan("a long time")
     first_time(order)
     child = subprocess.Popen([sys.executable, "-S", "-c", "import time; time.sleep(600)"])
     (Path(order["work"]) / "grandchild").write_text(str(child.pid))
@@ -69,7 +75,10 @@ def die(order: dict[str, Any]) -> None:
 
 
 def die_once(order: dict[str, Any]) -> None:
-    die(order) if first_time(order) else answer(order)
+    if first_time(order):
+        plan("to die")
+        die(order)
+    answer(order)
 
 
 def stop_once(order: dict[str, Any]) -> None:
@@ -103,6 +112,13 @@ def meet(order: dict[str, Any]) -> None:
     answer(order)
 
 
+def print_much(order: dict[str, Any]) -> None:
+    """Print as libraries do, and die of an error that nobody foresaw."""
+    os.write(2, b'a warning with "quotes" and \xff\n')
+    print("x" * 100_000, file=sys.stderr)
+    raise RuntimeError("unforeseen")
+
+
 def slowly(order: dict[str, Any]) -> None:
     """Take half a second."""
     time.sleep(0.5)
@@ -119,7 +135,7 @@ def toil(order: dict[str, Any]) -> None:
 
 BEHAVIOURS: dict[str, Callable[[dict[str, Any]], None]] = {
     function.__name__: function
-    for function in (answer, hang, die, die_once, stop_once, eat, feed, meet, slowly, toil)
+    for function in (answer, hang, die, die_once, stop_once, eat, feed, meet, print_much, slowly, toil)
 }
 
 

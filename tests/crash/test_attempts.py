@@ -67,6 +67,25 @@ def test_job_whose_child_died_succeeds_in_its_next_attempt(store: Store, supervi
     until(lambda: not store.files.work(job).exists())  # what it went on from is removed
 
 
+def test_plan_of_the_latest_attempt_stands(store: Store, supervising: Supervising) -> None:
+    job = submit(store)
+    with supervising("die_once"):
+        found = ended(store, job)
+    assert (found.state, found.attempt) == (JobState.SUCCEEDED, 2)
+    assert found.plan == {"summary": ["one splat"], "warnings": [], "splats": 1}
+    [event] = [event for event in store.events.after(job, 0) if event.kind is EventKind.PLAN]
+    assert event.data == found.plan
+
+
+def test_plan_outlives_the_attempt_that_made_it(store: Store) -> None:
+    job = submit(store)
+    assert store.attempts.claim(LEASE) is not None
+    store.attempts.plan(job, 1, {"summary": []})
+    store.attempts.lose(job, 1, "it died")
+    assert store.attempts.claim(LEASE) is not None
+    assert store.jobs.get(job).plan == {"summary": []}  # until this one has planned
+
+
 def test_child_that_is_stopped_past_its_lease_is_fenced(store: Store, supervising: Supervising) -> None:
     job = submit(store)
     with supervising("stop_once", lease_seconds=SHORT_LEASE):
@@ -100,11 +119,13 @@ def test_draft_of_a_stale_attempt_never_becomes_the_lift(store: Store) -> None:
         assert draft.read_bytes() == b"stale" and not store.files.lift(job).exists()
     store.attempts.fail(job, 1, {"kind": "crashed"})
     store.attempts.advance(job, 1, {"stage": "old"})
+    store.attempts.plan(job, 1, {"summary": ["old"]})
     store.attempts.log(job, 1, "old")
     assert store.attempts.renew(job, 1, LEASE) is None
     found = store.jobs.get(job)
-    assert (found.state, found.attempt, found.progress) == (JobState.RUNNING, 2, None)
+    assert (found.state, found.attempt, found.progress, found.plan) == (JobState.RUNNING, 2, None, None)
     assert "old" not in log_of(store, job)
+    assert EventKind.PLAN not in {event.kind for event in store.events.after(job, 0)}
 
 
 def test_server_that_slept_gives_its_children_a_lease(store: Store, supervising: Supervising) -> None:

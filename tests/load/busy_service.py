@@ -54,7 +54,7 @@ class BusyService:
         """Wait until a lift is past its start, and uses the cores."""
         deadline = time.monotonic() + PATIENCE_SECONDS
         while jobs := self._unfinished():
-            if any(job["state"] == "running" and job["progress"] for job in jobs):
+            if any(job["state"] == "running" and job["plan"] for job in jobs):  # and then it walks
                 return
             assert time.monotonic() < deadline, "no lift came to its walk"
             time.sleep(0.05)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import pytest
 
 from service.keys.scopes import Scope
@@ -90,6 +92,15 @@ def test_words_of_users_never_become_markup(page: Browser) -> None:
     page.until(TROUBLE)
     assert "<img src=x" in text_of(page, "#trouble")
     assert page.value("document.querySelectorAll('#trouble *').length") == 0
+
+
+def test_running_lift_shows_its_stage_and_its_plan(page: Browser) -> None:
+    plan = {"summary": ["60 splats", "8 channels"], "warnings": ["little <b>memory</b>"]}
+    job = {"state": "running", "plan": plan, "progress": {"stage": "compile", "done": 0, "total": 1, "unit": "steps"}}
+    page.value(f"document.body.append(progress({json.dumps(job)}))")
+    shown = "[...document.querySelectorAll('.plan li')].map(line => line.textContent)"
+    assert page.value(shown) == ["60 splats", "8 channels", "warning: little <b>memory</b>"]
+    assert text_of(page, "body > div:last-child").startswith(" compile60 splats")
 
 
 def test_link_opens_a_question(browser: Browser, served: Served) -> None:

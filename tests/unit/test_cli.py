@@ -268,7 +268,10 @@ def test_our_own_fault_exits_1_with_one_line(
 def test_serve_becomes_the_service(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     calls = programs_become(monkeypatch)
     assert run(capsys, "serve", "--port", "0", "--data", "d", "--encoder", "minilm")[0] == cli.INTERRUPTED
-    assert calls == [["-m", "service", "--port", "0", "--data", "d", "--encoder", "minilm"]]
+    run(capsys, "serve", "--json")
+    assert calls == [
+        ["-m", "service", "--port", "0", "--data", "d", "--encoder", "minilm"], ["-m", "service", "--json"]
+    ]  # fmt: skip
 
 
 def test_demo_and_bench_pass_their_options_on(

@@ -16,10 +16,10 @@ from liftcore.device import choose_device
 from liftcore.errors import SplatliftError
 from liftcore.input_files import input_files
 from liftcore.lift import Run, lift_sources, open_sources
+from liftcore.listener import NOBODY
 from liftcore.measure.hardware import peak_memory
 from liftcore.measure.tradeoff.judge import judge
 from liftcore.measure.tradeoff.order import Order
-from liftcore.progress import silent
 from liftcore.solve.settings import LiftSettings
 from liftcore.timings import Timings
 from liftcore.warm_up import warm_up_lift
@@ -36,7 +36,7 @@ BAD_INPUT = 2
 def measured(order: Order) -> dict[str, Any]:
     """Lift as ordered, and give the figures of the run and of its features."""
     settings = LiftSettings.of(**order.settings)
-    run = Run(settings, order.threads, silent, Timings(), choose_device(settings.device))
+    run = Run(settings, order.threads, NOBODY, Timings(), choose_device(settings.device))
     cpu, wall = time.process_time(), time.perf_counter()
     with run.timings.stage("read"):
         sources = open_sources(order.scene.splats, order.scene.cameras, order.scene.features, settings)

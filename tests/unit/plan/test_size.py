@@ -109,6 +109,17 @@ def test_a_robust_step_holds_as_much_again_of_each_gathered_entry(tmp_path):
     assert gathered(robust_steps=1) == 2 * gathered() > 0
 
 
+@pytest.mark.parametrize(("limit", "dense", "told"), [(0, 1, True), (0, 100, False), (GIB, 1, False)])
+def test_what_dense_maps_cost_is_told_where_there_is_much_to_save(tmp_path, monkeypatch, limit, dense, told):
+    splats, cameras, pack = write_scene(tmp_path, 2, grids=True)
+    monkeypatch.setattr("liftcore.plan.memory.MEMORY_LIMIT", limit)
+    monkeypatch.setattr("liftcore.plan.memory.DENSE_ENTRIES", dense)
+    warnings = lift(splats, cameras, [pack], LiftSettings.of(certificate_rays=10)).metadata.certificate["warnings"]
+    about = [warning for warning in warnings if warning.startswith("the maps are dense: a splat lies in about ")]
+    assert bool(about) is told
+    assert all("GiB; regions, or coarser grids, of the same features lift faster" in warning for warning in about)
+
+
 @pytest.mark.parametrize(
     ("own", "part"),
     [

@@ -14,6 +14,7 @@ import torch
 from liftcore.artifact import TENSORS, Lift
 from liftcore.device import CPU, Device
 from liftcore.lift import lift
+from liftcore.listener import Listener
 from liftcore.observe.observation import NO_LABEL, FeatureGrid, RegionMap
 from liftcore.observe.write_pack import write_pack
 from liftcore.raster.cpu import CpuRaster
@@ -75,7 +76,7 @@ def test_killed_lift_goes_on_from_its_last_block_to_the_same_bits(
     checkpoint = Checkpoint(tmp_path / "kept", seconds=0)
     for at in kills:
         with pytest.raises(Killed):
-            lift(*inputs, settings, threads=1, progress=killing("geometry", at), checkpoint=checkpoint)
+            lift(*inputs, settings, threads=1, listener=Listener(killing("geometry", at)), checkpoint=checkpoint)
     again = lift(*inputs, settings, threads=1, checkpoint=checkpoint)
     assert walks == ["v0", "v1", "v2"]  # none twice
     assert_same(whole, again)
@@ -104,7 +105,7 @@ def test_views_that_meet_no_label_are_kept_and_not_walked_again(
                 [features],
                 settings,
                 threads=1,
-                progress=killing("geometry", at),
+                listener=Listener(killing("geometry", at)),
                 checkpoint=checkpoint,
             )
     again = lift(splats, cameras, [features], settings, threads=1, checkpoint=checkpoint)
@@ -119,7 +120,7 @@ def test_lift_killed_beside_views_in_work_walks_them_again_to_the_same_bits(tmp_
     walks.clear()
     checkpoint = Checkpoint(tmp_path / "kept", seconds=0)
     with pytest.raises(Killed):
-        lift(*inputs, settings, threads=2, progress=killing("geometry", 1), checkpoint=checkpoint)
+        lift(*inputs, settings, threads=2, listener=Listener(killing("geometry", 1)), checkpoint=checkpoint)
     again = lift(*inputs, settings, threads=2, checkpoint=checkpoint)
     assert walks.count("v0") == 1
     assert {"v1", "v2"} <= set(walks)
@@ -130,7 +131,7 @@ def test_lift_killed_while_it_solves_walks_no_view_again(tmp_path: Path, walks: 
     scene = write_scene(tmp_path, 4)
     settings, checkpoint = LiftSettings.of(), Checkpoint(tmp_path / "kept")
     with pytest.raises(Killed):
-        lift(scene[0], scene[1], [scene[2]], settings, progress=killing("solve", 1), checkpoint=checkpoint)
+        lift(scene[0], scene[1], [scene[2]], settings, listener=Listener(killing("solve", 1)), checkpoint=checkpoint)
     again = lift(scene[0], scene[1], [scene[2]], settings, checkpoint=checkpoint)
     assert sorted(walks) == ["v0", "v1", "v2"]
     assert_same(lift(scene[0], scene[1], [scene[2]], settings), again)

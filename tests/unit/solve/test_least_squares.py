@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from liftcore.lift import lift
+from liftcore.listener import Listener
 from liftcore.observe.observation import Observation, RegionMap
 from liftcore.progress import silent
 from liftcore.solve.channels import BLOCK, blocks, codebook_axes, random_axes
@@ -178,10 +179,12 @@ def test_a_lift_takes_no_step_unless_asked(tmp_path):
     def progress(stage: str, done: int, total: int, unit: str) -> None:
         said.append((stage, done, total, unit))
 
-    plain = lift(paths[0], paths[1], [paths[2]], LiftSettings.of(), progress=progress)
+    plain = lift(paths[0], paths[1], [paths[2]], LiftSettings.of(), listener=Listener(progress))
     assert "refinement" not in plain.metadata.certificate
     assert not any(stage in ("refine", "rays") for stage, *_ in said)
-    steps = lift(paths[0], paths[1], [paths[2]], LiftSettings.of(cg_steps=3, damping=0.1), progress=progress)
+    steps = lift(
+        paths[0], paths[1], [paths[2]], LiftSettings.of(cg_steps=3, damping=0.1), listener=Listener(progress)
+    )
     told = steps.metadata.certificate["refinement"]
     assert [word for word in said if word[0] == "refine"][-1] == ("refine", 3, 3, "steps")
     assert told["residuals"][-1] < told["residuals"][0]

@@ -16,6 +16,7 @@ from liftcore.device import CPU, Device
 from liftcore.errors import Unavailable
 from liftcore.input_files import input_files
 from liftcore.lift import Run, lift_sources, open_sources, planned
+from liftcore.listener import NOBODY
 from liftcore.plan import plan
 from liftcore.plan.on_device import ROOM_SPARE
 from liftcore.progress import silent
@@ -44,7 +45,7 @@ SETTINGS = LiftSettings.of(certificate_rays=20, view_stride=2, robust_steps=1)  
 
 def lifted(scene: tuple[Path, Path, Path], device: Device, settings: LiftSettings = SETTINGS) -> Lift:
     sources = open_sources(scene[0], scene[1], [scene[2]], settings)
-    run = Run(settings, 1, silent, Timings(), device)
+    run = Run(settings, 1, NOBODY, Timings(), device)
     return lift_sources(run, sources, input_files(scene[0], scene[1], [scene[2]]))
 
 
