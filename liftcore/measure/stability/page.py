@@ -8,9 +8,13 @@ from typing import TYPE_CHECKING
 
 from liftcore.measure.hardware import hardware, machine_line
 from liftcore.measure.stability.accumulation import (
+    FEW,
+    MOST_CHANNELS,
+    MOST_JUDGED,
     MOST_VIEWS,
     SIDES,
     added_one_by_one,
+    robust_sums,
     sums_of_entries,
     sums_of_rays,
     sums_of_views,
@@ -102,21 +106,26 @@ def _sums() -> Iterator[str]:
         "Relative errors against float64 of the sums of one splat. Region weights and evidence are float32 in a tile "
         "(eight lanes of 32 rays) and float64 from tile to tile, `A^T Y` is float32 throughout; denominators and the "
         "evidence of all views are float64. The closed form adds up to 256 entries of a row and 64 views in float32, "
-        "then such parts; the last column is what one float32 sum would give. Equal terms are the worst, for then "
-        "all roundings go one way.\n"
+        "then such parts. The robust step adds up entries in such parts too, and products over channels 64 at a time "
+        "in float32, then in float64; the error is of the weights that it leaves. The last column is what one "
+        "float32 sum would give. Equal terms are the worst, for then all roundings go one way.\n"
     )
     rays = {side**2: sums_of_rays(side) for side in SIDES}
     names = list(next(iter(rays.values())))
     heads = f"| terms | {' | '.join(names)} | X, a row's entries: random / equal | X, views: random / equal "
-    yield f"{heads}| equal terms one by one |"
-    yield f"|---|{'---|' * (len(names) + 3)}"
+    yield f"{heads}| a robust step: entries / channels | equal terms one by one |"
+    yield f"|---|{'---|' * (len(names) + 4)}"
     for count, errors in rays.items():
         terms = 10 ** round(math.log10(count))
         entries = " / ".join(f"{sums_of_entries(terms, equal):.0e}" for equal in (False, True))
         views = "-"
         if terms <= MOST_VIEWS:
             views = " / ".join(f"{sums_of_views(terms, equal):.0e}" for equal in (False, True))
-        cells = [f"{terms:.0e}", *(f"{errors[name]:.0e}" for name in names), entries, views]
+        robust = "-"
+        if terms <= MOST_JUDGED:
+            channels = f"{robust_sums(FEW, terms):.0e}" if terms <= MOST_CHANNELS else "-"
+            robust = f"{robust_sums(terms, FEW):.0e} / {channels}"
+        cells = [f"{terms:.0e}", *(f"{errors[name]:.0e}" for name in names), entries, views, robust]
         yield f"| {' | '.join(cells)} | {added_one_by_one(terms):.0e} |"
 
 
