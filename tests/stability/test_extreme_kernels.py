@@ -74,6 +74,21 @@ def test_discs_seen_edge_on_equal_the_oracle(angle):
         assert_equals_the_oracle(splats, camera_at_origin(64, 48, focal=700.0))
 
 
+@pytest.mark.parametrize("thinness", [1e-2, 1e-4, 1e-6])
+def test_hairs_askew_keep_their_digits_far_from_their_middle(thinness):
+    # Along pixel centres, two columns a row, and 0.8 of the thin scale beside them: from pixel to pixel s changes
+    # by up to a million, and here it is small.
+    angle, beside = math.atan2(1.0, 2.0), 0.8 * thinness
+    splats = splats_at(
+        [(-beside * math.sin(angle), beside * math.cos(angle), 2.0)],
+        log_scales=[2.0, math.log(thinness), 0.0],
+        quats=(math.cos(angle / 2), 0.0, 0.0, math.sin(angle / 2)),
+        kernel=DISC,
+    )
+    A = assert_equals_the_oracle(splats, camera_at_origin(64, 32))
+    assert A.reshape(32, 64)[7, 14] > 0.4  # eighteen columns from the middle, the seventh pixel of its half row
+
+
 @pytest.mark.parametrize("height", [-0.5, 0.01, 0.3])
 @pytest.mark.parametrize("tilt", [math.pi / 2, 1.4, 1.2])
 def test_discs_that_pass_the_camera_end_at_their_horizon(height, tilt):

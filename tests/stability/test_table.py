@@ -8,7 +8,7 @@ import pytest
 
 from liftcore.measure.stability.case import Extreme, Found
 from liftcore.measure.stability.page import EXTREMES, TABLES, table_of
-from liftcore.measure.stability.wide import survey
+from liftcore.measure.stability.wide import BOUNDS, survey
 from liftcore.scene.splats import Kernel
 
 pytestmark = pytest.mark.usefixtures("every_kernel")
@@ -46,9 +46,9 @@ def test_a_row_names_who_tells_what_not_all_kernels_tell():
 
 
 @pytest.mark.parametrize("kernel", list(Kernel))
-def test_wide_scenes_equal_the_oracle_and_rarely_flip(kernel: Kernel):
-    got = survey(kernel, range(1_000, 1_020))
+def test_the_wide_scenes_of_the_page_equal_the_oracle_and_rarely_flip(kernel: Kernel):
+    got = survey(kernel)
     assert got.finite
-    assert got.error < 1e-5
+    assert got.error < BOUNDS[kernel]
     assert got.flips <= max(1, RAYS_FLIPPED * got.rays)
-    assert got.judged >= 15
+    assert got.judged >= 0.95 * got.scenes

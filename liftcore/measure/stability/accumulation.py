@@ -1,8 +1,8 @@
 """Sums over 10^3 .. 10^7 rays for one splat: what float32 with its partial sums gives beside float64.
 
 Looked at are the region weights and the evidence of a view, ``A^T Y`` of the least squares, the closed form over the
-codebook rows that one splat reads, and the closed form over views; not the robust step, whose products over channels
-are added one by one in float32. The worst for a sum is equal terms, for then all roundings go one way.
+codebook rows that one splat reads, and over views, and the robust step over such rows and over channels. The worst
+for a sum is equal terms, for then all roundings go one way; but equal regions have no direction for a robust step.
 """
 
 from __future__ import annotations
@@ -21,11 +21,15 @@ from liftcore.scene.splats import Splats
 from liftcore.solve.closed_form import solve_closed_form
 from liftcore.solve.columns import Columns
 from liftcore.solve.host import Host
+from liftcore.solve.robust import robust_weights
 from liftcore.solve.view_weights import ViewWeights
 
 SIDES = (32, 100, 316, 1_000, 3_162)  # pixels of square images: 10^3 .. 10^7 rays
 ROWS = 1_000  # of the codebook, which the entries read in turn
 MOST_VIEWS = 10_000
+MOST_JUDGED = 100_000  # rows of the robust step, each of which has a vector of its own
+MOST_CHANNELS = 10_000
+FEW = 8  # rows, or channels, where the others are many
 
 
 def sums_of_rays(side: int) -> dict[str, float]:
@@ -63,6 +67,27 @@ def sums_of_views(count: int, equal: bool) -> float:
     return _solved(views, equal)
 
 
+def robust_sums(rows: int, channels: int) -> float:
+    """Error of a splat's weights after one robust step, over the largest; it reads so many rows in each of two views.
+
+    A row is one direction times -1 .. 2, and noise.
+    """
+    rng = np.random.default_rng(2)
+    direction = rng.normal(0, 1, channels)
+    amounts, noise = rng.uniform(-1, 2, (2, rows, 1)), rng.normal(0, 1, (2, rows, channels))
+    books = (amounts * direction + noise).astype(np.float32)
+    weights = rng.uniform(0, 1, (2, rows)).astype(np.float32)
+    every, starts = torch.arange(rows, dtype=torch.int32), torch.tensor([0, rows])
+    total = weights.sum(dtype=np.float64)
+    with ViewWeights() as store:
+        for view in weights:
+            store.append(_row(every, torch.from_numpy(view), starts))
+        judged = robust_weights(store, [*map(torch.from_numpy, books)], np.array([total]), 1, silent, Host(1))
+        got = np.stack([view.weights.numpy() for view in judged])
+    exact = _robust_step(weights.astype(np.float64), books.astype(np.float64))
+    return float(np.abs(got - exact).max() / exact.max())
+
+
 def added_one_by_one(count: int) -> float:
     """Relative error of ``count`` equal terms in a single float32 sum, which nothing here is: to compare with."""
     terms = np.full(count, 0.3, np.float32)
@@ -90,6 +115,19 @@ def _entries(count: int, equal: bool) -> RegionWeights:
 def _row(columns: torch.Tensor, weights: torch.Tensor, starts: torch.Tensor) -> RegionWeights:
     first = torch.zeros(1, dtype=torch.int32)
     return RegionWeights(first, starts, columns, weights, first, torch.ones(1))
+
+
+def _robust_step(W: np.ndarray, E: np.ndarray) -> np.ndarray:
+    """W' [2, M] of one splat by the equation of ``liftcore.solve.robust``, from W [2, M] and E [2, M, F], in f64."""
+    units = E / np.linalg.norm(E, axis=2, keepdims=True)
+    away = units - np.einsum("vm,vmf->f", W, units) / W.sum()
+    e = away / np.linalg.norm(away, axis=2, keepdims=True)
+    others = np.einsum("vm,vmf->vf", W, e)[::-1]
+    r = others / np.linalg.norm(others, axis=1, keepdims=True)
+    cosines = np.maximum(np.einsum("vmf,vf->vm", e, r), 0)
+    own = W.sum(axis=1, keepdims=True) / W.sum()
+    new = W * ((1 - own) * cosines + own * (W * cosines).sum() / W.sum())
+    return new * W.sum() / new.sum()
 
 
 def _solved(views: list[RegionWeights], equal: bool) -> float:

@@ -292,7 +292,7 @@ PLACES: tuple[Extreme, ...] = (
         "a million splats on one ray",
         "a geometric series until the transmittance falls to 1e-4",
         lambda kernel: _crowd(1_000_000, -5.0, 1e-4, kernel),
-        kernels=GAUSSIAN,
+        kernels=FLOORED,
     ),
     Extreme(
         "a million DBS splats of alpha 1e-6 on one ray",

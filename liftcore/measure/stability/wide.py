@@ -2,16 +2,19 @@
 
 A ray within 1e-4 of a cut-off (an alpha of 1/255, the stop) may be decided otherwise in float32: those that are, are
 counted. Scenes whose projected covariance has a condition beyond CONDITION are walked, and not judged: there the
-float64 oracle itself is short of digits.
+float64 oracle itself is short of digits, for it inverts the covariance. Discs are all judged: rays cross their
+planes, and nothing is inverted.
+
+The page measures the scenes of SEEDS, and so does its test, which holds the errors to BOUNDS.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-import torch
 
+from liftcore.measure.stability.case import WEIGHTS
 from liftcore.measure.stability.scenes import IDENTITY, splats_at
 from liftcore.measure.stability.walks import View
 from liftcore.measure.stability.weights import compare
@@ -21,8 +24,11 @@ from liftcore.raster.protocol import Walk
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Kernel
 
+SEEDS = range(300)
+# At the rim of a narrow DBS splat sigma errs by a relative 2e-6 in float32, and alpha may change by up to 16 times
+# that: only what is steeper counts as near a cut-off.
+BOUNDS = {Kernel.GAUSSIAN_3D: WEIGHTS, Kernel.GAUSSIAN_2D: WEIGHTS, Kernel.BETA: 2 * WEIGHTS}
 CONDITION = 1e8
-FLAT = -40.0  # log scale of no thickness
 GAINS = (0.01, 0.5, 1.0, 1.2, 16.0)
 CAPS = (0.5, 0.85, 0.98, 0.9998)  # no power of 1 - cap is a stop, as (1 - 0.99)^2 is: that tie has its own row
 STOPS = (0.0, 1e-4, 0.05)
@@ -64,11 +70,11 @@ def wide_view(seed: int, kernel: Kernel) -> View:
     return View(splats, camera, walk)
 
 
-def survey(kernel: Kernel, seeds: range) -> Survey:
-    """Compare the scenes of the seeds with the oracle."""
+def survey(kernel: Kernel) -> Survey:
+    """Compare the scenes of SEEDS with the oracle."""
     judged = rays = near = flips = 0
     error, finite = 0.0, True
-    for seed in seeds:
+    for seed in SEEDS:
         view = wide_view(seed, kernel)
         got = compare(view.splats, view.camera, view.walk)
         finite &= got.finite and bool(got.got.min(initial=0) >= 0 and got.got.sum(axis=1).max() <= 1 + 1e-5)
@@ -78,15 +84,14 @@ def survey(kernel: Kernel, seeds: range) -> Survey:
             near += got.near
             flips += got.flips
             error = max(error, got.error)
-    return Survey(len(seeds), judged, rays, near, flips, error, finite)
+    return Survey(len(SEEDS), judged, rays, near, flips, error, finite)
 
 
 def judgeable(view: View) -> bool:
     """Whether the float64 oracle has digits enough for every splat before the camera."""
     splats, camera = view.splats, view.camera
-    if splats.kernel is Kernel.GAUSSIAN_2D:  # a disc is as narrow as a Gaussian without thickness
-        scales = torch.nn.functional.pad(splats.log_scales, (0, 1), value=FLAT)
-        splats = replace(splats, kernel=Kernel.GAUSSIAN_3D, log_scales=scales)
+    if splats.kernel is Kernel.GAUSSIAN_2D:
+        return True
     z = splats.means.double().numpy() @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
     ahead = np.flatnonzero(z >= NEAR_PLANE)
     return all(np.linalg.cond(projected_gaussian(splats, int(j), camera)[1]) < CONDITION for j in ahead)
