@@ -48,10 +48,16 @@ class GaussianLanes(NamedTuple):
 
 
 class BetaLanes(NamedTuple):
-    """``sigma = base + (start + root i)^2``, ``2^-e = (1 - sigma)^beta``, zero from ``sigma = 1`` on."""
+    """``sigma = base + (start + root i)^2``, ``2^-e = (1 - sigma)^beta``, zero from ``sigma = 1`` on.
+
+    Start and root have their rests, as values and steps of ``DiscLanes``: at the rim of a narrow splat
+    sigma is steep, and a start rounded at its own size would show in the last three digits of a weight.
+    """
 
     start: np.float32
+    start_rest: np.float32
     root: np.float32
+    root_rest: np.float32
     base: np.float32
     beta: np.float32
 
@@ -213,14 +219,15 @@ def _gaussian_exponent(builder: Builder, state: ir.Value, parts: list[ir.Value],
 def _beta_exponent(builder: Builder, state: ir.Value, parts: list[ir.Value], fade: ir.Value | None) -> ir.Value:
     """Of ``(1 - sigma)^beta``: ``1 - sigma`` is rounded for the logarithm, and what that lost is put back."""
     one, zero = _row(builder, state, _EXP2_ROW), constant(0.0)
-    sigma = _quadratic(builder, parts[:3])
+    u = _affine(builder, parts[:4])
+    sigma = fused(builder, u, u, parts[4])
     inside = builder.fcmp_ordered("<", sigma, one)
     rest = builder.select(inside, builder.fsub(one, sigma), one)
     smallest = constant(_SMALLEST_REST)
     rest = builder.select(builder.fcmp_ordered(">", rest, smallest), rest, smallest)
     lost = builder.fsub(builder.fsub(one, rest), sigma)
     logarithm = fused(builder, lost, constant(_LOG2_E), _log2(builder, state, rest))
-    exponent = builder.fmul(parts[3], builder.fsub(zero, logarithm))
+    exponent = builder.fmul(parts[5], builder.fsub(zero, logarithm))
     met = builder.and_(inside, builder.fcmp_ordered("<", exponent, _row(builder, state, _LARGEST_ROW)))
     return builder.select(met, _faded(builder, exponent, fade), constant(math.inf))
 

@@ -217,11 +217,6 @@ def _gaussian_lanes(splat, state, half):
     return GaussianLanes(state[STARTS + half], np.float32(splat.root_x), state[BASES + (half & (ROWS - 1))])
 
 
-def _beta_lanes(splat, state, half):
-    start, base = state[STARTS + half], state[BASES + (half & (ROWS - 1))]
-    return BetaLanes(start, np.float32(splat.root_x), base, np.float32(splat.beta))
-
-
 @inlined
 def _halved(value):
     """A float64 as a float32 and the rest of it."""
@@ -235,6 +230,13 @@ def _coarsened(value):
     large = _SPLITTER * value
     coarse = np.float32(large - (large - value))
     return coarse, np.float32(value - coarse)
+
+
+def _beta_lanes(splat, state, half):
+    dx, dy = half // ROWS * LANES - splat.mx, half % ROWS - splat.my
+    start, start_rest = _halved(splat.root_x * (dx - splat.slope * dy))
+    root, root_rest = _coarsened(splat.root_x)
+    return BetaLanes(start, start_rest, root, root_rest, np.float32(splat.ky * dy * dy), np.float32(splat.beta))
 
 
 def _disc_lanes(splat, state, half):

@@ -59,7 +59,7 @@ def test_what_is_no_number_has_no_weight_and_takes_no_light(part, broken):
     given = {"start": 0.0, "base": 0.0, "fade": 1.0, part: broken}
     for shape in (
         GaussianLanes(F(given["start"]), F(0.1), F(given["base"])),
-        BetaLanes(F(given["start"]), F(0.1), F(given["base"]), F(3.0)),
+        BetaLanes(F(given["start"]), F(0), F(0.1), F(0), F(given["base"]), F(3.0)),
     ):
         for floor in (ALPHA_FLOOR, 0.0):
             state = lit(floor, light=0.5)
@@ -82,7 +82,10 @@ SHARES = st.floats(1e-3, 1)
 
 @given(st.floats(-12, 12), st.floats(1e-3, 2), st.floats(0, 9), SHARES, SHARES, st.floats(0.01, 1))
 def test_blending_once_and_twice_agree_but_for_the_last_digits(start, root, base, opacity, plain, light):
-    for shape in (GaussianLanes(F(start), F(root), F(base)), BetaLanes(F(start), F(root), F(base), F(2.5))):
+    for shape in (
+        GaussianLanes(F(start), F(root), F(base)),
+        BetaLanes(F(start), F(0), F(root), F(0), F(base), F(2.5)),
+    ):
         floor = ALPHA_FLOOR if isinstance(shape, GaussianLanes) else 0.0
         twice = lit(floor, light=light)
         blended_twice(twice, shape, (F(opacity), F(plain)))
@@ -95,7 +98,7 @@ def test_blending_once_and_twice_agree_but_for_the_last_digits(start, root, base
 
 
 def test_a_faint_beta_splat_counts_as_far_as_float32_goes():
-    shape = BetaLanes(F(0.0), F(0.01), F(0.0), F(1.0))
+    shape = BetaLanes(F(0), F(0), F(0.01), F(0), F(0), F(1))
     assert weights_of(lit(0.0), shape, 2.0**-121)[0] == pytest.approx(2.0**-121, rel=1e-5)
     assert not weights_of(lit(0.0), shape, 2.0**-130).any()
 

@@ -8,7 +8,7 @@ import pytest
 
 from liftcore.measure.stability.case import Extreme, Found
 from liftcore.measure.stability.page import EXTREMES, TABLES, table_of
-from liftcore.measure.stability.wide import BOUNDS, survey
+from liftcore.measure.stability.wide import BOUND, survey
 from liftcore.scene.splats import Kernel
 
 pytestmark = pytest.mark.usefixtures("every_kernel")
@@ -49,6 +49,6 @@ def test_a_row_names_who_tells_what_not_all_kernels_tell():
 def test_the_wide_scenes_of_the_page_equal_the_oracle_and_rarely_flip(kernel: Kernel):
     got = survey(kernel)
     assert got.finite
-    assert got.error < BOUNDS[kernel]
+    assert got.error < BOUND
     assert got.flips <= max(1, RAYS_FLIPPED * got.rays)
     assert got.judged >= 0.95 * got.scenes

@@ -24,7 +24,7 @@ from liftcore.measure.stability.of_features import LENGTHS, MAPS, REFUSALS
 from liftcore.measure.stability.of_lenses import LENSES
 from liftcore.measure.stability.of_splats import OPACITIES, PLACES, SHAPES
 from liftcore.measure.stability.of_views import VIEWS
-from liftcore.measure.stability.wide import BOUNDS, CONDITION, SEEDS, survey
+from liftcore.measure.stability.wide import BOUND, CONDITION, SEEDS, survey
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -147,7 +147,7 @@ def _wide() -> Iterator[str]:
     for kernel, got in surveys.items():
         yield (
             f"| {kernel} | {got.judged} of {got.scenes} | {got.rays} | {got.near} | {got.flips} | {got.error:.1e} "
-            f"| {BOUNDS[kernel]:g} |"
+            f"| {BOUND:g} |"
             if got.finite
             else f"| {kernel} | NOT FINITE | | | | | |"
         )
