@@ -109,9 +109,9 @@ def dense_warning(planned: PlannedEntries, size: int) -> list[str]:
     """A warning where maps so fine make so many bytes of W that coarser ones would be worth the user's while."""
     if planned.entries < DENSE_ENTRIES or not weights_in_files(size):
         return []
-    told = f"a splat lies in about {planned.entries:.0f} regions or cells of a view's map, whose weights take about"
+    told = f"a splat has weights in about {planned.entries:.0f} regions or cells of each view's map"
     advice = "regions, or coarser grids, of the same features lift faster"
-    return [f"the maps are dense: {told} {size / 2**30:.1f} GiB; {advice}"]
+    return [f"the maps are dense: {told}, about {size / 2**30:.1f} GiB in all; {advice}"]
 
 
 def check_weights(size: int) -> list[str]:
