@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch.nn.functional import normalize
 
+from liftcore.measure.anonymous_memory import watched
 from liftcore.measure.hardware import peak_memory
 from liftcore.measure.region_walk import walk_regions
 from liftcore.observe.observation import RegionMap
@@ -63,28 +64,36 @@ def measure_bars(work: Workload, preset: Preset, device: Device, threads: int | 
     """The aims of a lift of this workload: seconds a view, what channels cost, memory.
 
     Returns:
-        ``bars``, and the figures behind them: seconds a view of geometry, and of the solution by channels; bytes.
+        ``bars``, and the figures behind them: seconds a view of geometry, and of the solution by channels; bytes, the
+        peak without pages of files where the system tells it.
     """
     settings, count = LiftSettings.of(preset=preset), work.splats.count
     looking, raster = (lift_walk(settings), weighting_of(settings)), open_raster(work.splats, device, threads)
-    geometry, solution, peak = [], {channels: [] for channels in CHANNELS}, 0
+    geometry, solution = [], {channels: [] for channels in CHANNELS}
+    peaks: dict[int, int] = {}
     host = Host(threads, means=work.splats.means)
     for _ in range(PASSES):
         with ViewWeights() as store:
             start = time.perf_counter()
-            denominators, columns = walk_regions(raster, work.views, looking, count, store)
+            with watched() as walking:
+                denominators, columns = walk_regions(raster, work.views, looking, count, store)
             geometry.append((time.perf_counter() - start) / len(work.views))
             for channels, seconds in solution.items():
                 books = _with_channels(columns, channels)
                 start = time.perf_counter()
-                closed_form(store, books, denominators, torch.float16, silent, device, host)
+                with watched() as solving:
+                    closed_form(store, books, denominators, torch.float16, silent, device, host)
                 seconds.append((time.perf_counter() - start) / len(work.views))
-                if channels == USUAL:
-                    peak = peak or peak_memory()  # of the first pass: no more channels were solved for yet
+                if channels not in peaks:  # a process that has solved for more keeps some of what that took
+                    peaks[channels] = max(walking.bytes or peak_memory(), solving.bytes or peak_memory())
     walked = statistics.median(geometry)
     view = {channels: walked + statistics.median(seconds) for channels, seconds in solution.items()}
-    held = {"inputs_bytes": inputs_bytes(work, USUAL), "features_bytes": 2 * count * USUAL, "peak_bytes": peak}
-    beyond = peak - held["inputs_bytes"] - held["features_bytes"]
+    held = {
+        "inputs_bytes": inputs_bytes(work, USUAL),
+        "features_bytes": 2 * count * USUAL,
+        "peak_bytes": peaks[USUAL],
+    }
+    beyond = peaks[USUAL] - held["inputs_bytes"] - held["features_bytes"]
     bars = (
         Bar(f"seconds a view, {USUAL} channels", view[USUAL], _view_seconds(work)),
         Bar(f"a view with {MANY} channels over one with {FEW}", view[MANY] / view[FEW], CHANNELS_RATIO),

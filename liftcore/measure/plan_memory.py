@@ -14,13 +14,13 @@ import argparse
 import json
 import multiprocessing
 import tempfile
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from liftcore.artifact import save_lift
 from liftcore.device import choose_device
 from liftcore.lift import lift, open_sources, planned
+from liftcore.measure.anonymous_memory import PAUSE, Most, anonymous_bytes
 from liftcore.measure.hardware import hardware, machine_line, peak_memory
 from liftcore.observe.pack import open_packs
 from liftcore.solve.settings import LiftSettings
@@ -38,7 +38,6 @@ REGIONS = (
     {"cg_steps": 1, "cg_basis": 32},
 )
 GRIDS = ({}, {"grid_reading": "nearest"}, {"aggregation": True}, {"cg_steps": 1, "cg_basis": 32})
-PAUSE = 0.003  # seconds between two looks at a process
 ANSWER = "answer.json"
 MIB = 2**20
 
@@ -70,13 +69,11 @@ def measure_lift(splats: Path, cameras: Path, pack: Path, own: dict[str, Any]) -
 
 def _watched(child: BaseProcess) -> int | None:
     """The most anonymous bytes that the process had until it ended; None where nothing tells them."""
-    most, status = 0, Path(f"/proc/{child.pid}/status")
+    most = Most()
     while child.is_alive():
-        with suppress(OSError):
-            lines = status.read_text(encoding="ascii").splitlines()
-            most = max([most, *(int(line.split()[1]) * 1024 for line in lines if line.startswith("RssAnon:"))])
+        most.take(anonymous_bytes(child.pid or 0))
         child.join(PAUSE)
-    return most or None
+    return most.bytes
 
 
 def _lift(paths: tuple[Path, Path, Path], own: dict[str, Any], folder: Path) -> None:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from liftcore.heap import give_back_free_memory
 from liftcore.raster.adjoint import add_sums, gather_tiles
 from liftcore.raster.antialiased import check_antialiased
 from liftcore.raster.arguments import check_image, check_labels, check_rows
@@ -104,7 +105,11 @@ class CpuRaster:
             return
         self._activated(first[0].walk.gain)  # once for all: the views of a lift have one gain
         rasters = [self._beside(end - begin) for begin, end in _shares(self.threads, len(first))]
-        yield from side_by_side(rasters, chain(first, looks))
+        try:
+            yield from side_by_side(rasters, chain(first, looks))
+        finally:
+            rasters.clear()
+            give_back_free_memory()
 
     def _beside(self, threads: int) -> CpuRaster:
         """Another raster of the same scene, which may work at the same time."""

@@ -78,3 +78,5 @@ def side_by_side(rasters: Sequence[Raster], looks: Iterable[Look]) -> Generator[
             yield waiting.popleft().result()
     finally:
         pool.shutdown(cancel_futures=True)
+        for raster in rasters:
+            raster.forget()

@@ -24,6 +24,7 @@ class Slow:
 
     def __init__(self) -> None:
         self.at_work, self.most, self.walked = 0, 0, []
+        self.forgotten = False
         self._lock = threading.Lock()
 
     def region_weights(self, camera: Any, *_: Any) -> str:
@@ -37,6 +38,9 @@ class Slow:
         if camera.name == "broken":
             raise ValueError(camera.name)
         return camera.name
+
+    def forget(self) -> None:
+        self.forgotten = True
 
 
 def looks(*names: str) -> Iterator[Look]:
@@ -68,6 +72,12 @@ def test_closing_awaits_the_views_in_work_and_begins_no_other() -> None:
     found.close()
     assert raster.at_work == 0
     assert len(raster.walked) <= 4
+
+
+def test_no_view_is_kept_when_the_walks_end() -> None:
+    rasters = [Slow() for _ in range(3)]
+    assert len(list(side_by_side([cast("Raster", raster) for raster in rasters], looks("v0", "v1")))) == 2
+    assert all(raster.forgotten for raster in rasters)
 
 
 @pytest.mark.parametrize(("threads", "views"), [(1, 1), (2, 2), (64, 4)])
