@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from liftcore.solve.host import EachShare
     from liftcore.solve.weight_tables import WeightTables
 
-CHUNK_ENTRIES = 1 << 24  # gathered at a time, unless a splat alone has more
+CHUNK_ENTRIES = 1 << 23  # gathered at a time, unless a splat alone has more
 CHUNK_BYTES = 1 << 29  # of X at a time: where it is a mapped file, more might not stay in memory
 
 

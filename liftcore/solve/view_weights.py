@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from torch import Tensor
 
-MEMORY_LIMIT = 3 << 26  # bytes of W that stay in memory; later views go to files
+MEMORY_LIMIT = 1 << 28  # bytes of W that stay in memory; later views go to files
 
 
 class ViewWeights:
