@@ -5,4 +5,4 @@ scene, ``B`` [rays x channels] the 2D features of its photos, ``X`` [splats x ch
 (*Splat Feature Solver*, Eq. 3). Nothing is imported here, so that light processes stay light.
 """
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
