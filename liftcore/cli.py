@@ -306,7 +306,7 @@ def _add_bench(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--preset", metavar="NAME", help="one of lift's presets alone; else all")
     only = parser.add_mutually_exclusive_group()
     only.add_argument("--stages", action="store_true", help="every step of a view apart, on one thread")
-    only.add_argument("--bars", action="store_true", help="the project's aims beside what this machine does")
+    only.add_argument("--aims", action="store_true", help="the project's aims beside what this machine does")
     _add_device(parser)
 
 

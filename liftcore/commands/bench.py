@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     import argparse
     from collections.abc import Iterator
 
-_OPTIONS = ("scene", "splats", "size", "channels", "levels", "views", "threads", "preset", "stages", "bars", "device")
+_OPTIONS = ("scene", "splats", "size", "channels", "levels", "views", "threads", "preset", "stages", "aims", "device")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -18,14 +18,14 @@ def run(options: argparse.Namespace) -> int:
     from liftcore.measure.bench import run_bench
 
     document = run_bench({name: getattr(options, name) for name in _OPTIONS})
-    lines = _steps(document) if options.stages else _bars(document) if options.bars else None
+    lines = _steps(document) if options.stages else _aims(document) if options.aims else None
     reply(document, as_json=options.json, lines=lines)
     return 0
 
 
-def _bars(document: dict[str, Any]) -> Iterator[str]:
+def _aims(document: dict[str, Any]) -> Iterator[str]:
     """The aims and what was found, for people."""
-    from liftcore.measure.bars import lines_of
+    from liftcore.measure.aims import lines_of
 
     yield _told(document)
     for preset, found in document["presets"].items():

@@ -50,7 +50,7 @@ def run_bench(options: dict[str, Any]) -> dict[str, Any]:
     Args:
         options: scene (folder or None), splats, size ("WxH"), channels, levels, views, threads, device ("auto", "cpu"
             or "cuda"); preset (one alone, else all); stages (bool): every step apart, on one thread, as
-            ``liftcore.measure.stages`` has it; bars (bool): the aims, as ``liftcore.measure.bars`` has them.
+            ``liftcore.measure.stages`` has it; aims (bool), as ``liftcore.measure.aims`` has them.
 
     Returns:
         Plain numbers, ready for JSON: hardware, versions, seconds a view by stage (medians), peak memory.
@@ -58,12 +58,12 @@ def run_bench(options: dict[str, Any]) -> dict[str, Any]:
     asked = LiftSettings.of(device=options.get("device") or "auto").device
     if options.get("stages") and asked == "cuda":
         raise InvalidInput("device", expected="cpu beside stages, which are the processor's", got=asked)
-    if options.get("bars") and options.get("channels"):
+    if options.get("aims") and options.get("channels"):
         raise InvalidInput(
-            "channels", expected="none beside bars, which have their own", got=str(options["channels"])
+            "channels", expected="none beside aims, which have their own", got=str(options["channels"])
         )
     device = choose_device("cpu" if options.get("stages") else asked)
-    work = _workload(options | ({"channels": 1} if options.get("bars") else {}))
+    work = _workload(options | ({"channels": 1} if options.get("aims") else {}))
     start = time.perf_counter()
     warm_up_lift(work.splats.kernel, device, LiftSettings.of(preset=Preset.ROW_SUM))
     compile_seconds = time.perf_counter() - start
@@ -73,11 +73,11 @@ def run_bench(options: dict[str, Any]) -> dict[str, Any]:
 
         chosen = _presets(options, (Preset.ROW_SUM, Preset.TIKHONOV))
         presets = {str(preset): time_stages(work, preset) for preset in chosen}
-    elif options.get("bars"):
-        from liftcore.measure.bars import CHANNELS, measure_bars
+    elif options.get("aims"):
+        from liftcore.measure.aims import CHANNELS, measure_aims
 
         chosen = _presets(options, (Preset.ROW_SUM,))
-        presets = {str(preset): measure_bars(work, preset, device, options.get("threads")) for preset in chosen}
+        presets = {str(preset): measure_aims(work, preset, device, options.get("threads")) for preset in chosen}
         channels = list(CHANNELS)
     else:
         chosen = _presets(options, tuple(Preset))

@@ -1,4 +1,4 @@
-"""``splatlift bench --bars``: the figures that the project set itself as aims, beside what this machine does.
+"""``splatlift bench --aims``: the figures that the project set itself as aims, beside what this machine does.
 
 One walk of all views a pass, and of its W the solution with few, usual and many channels: what a channel costs is
 then no matter of how busy the machine was between two runs.
@@ -45,8 +45,8 @@ MIB = 2**20
 
 
 @dataclass(frozen=True)
-class Bar:
-    """One aim, and what was found; at most that is met."""
+class Figure:
+    """One figure, and the most that it aims at."""
 
     name: str
     found: float
@@ -60,11 +60,11 @@ class Bar:
         )
 
 
-def measure_bars(work: Workload, preset: Preset, device: Device, threads: int | None = None) -> dict[str, Any]:
+def measure_aims(work: Workload, preset: Preset, device: Device, threads: int | None = None) -> dict[str, Any]:
     """The aims of a lift of this workload: seconds a view, what channels cost, memory.
 
     Returns:
-        ``bars``, and the figures behind them: seconds a view of geometry, and of the solution by channels; bytes, the
+        ``aims``, and the figures behind them: seconds a view of geometry, and of the solution by channels; bytes, the
         peak without pages of files where the system tells it.
     """
     settings, count = LiftSettings.of(preset=preset), work.splats.count
@@ -94,13 +94,13 @@ def measure_bars(work: Workload, preset: Preset, device: Device, threads: int | 
         "peak_bytes": peaks[USUAL],
     }
     beyond = peaks[USUAL] - held["inputs_bytes"] - held["features_bytes"]
-    bars = (
-        Bar(f"seconds a view, {USUAL} channels", view[USUAL], _view_seconds(work)),
-        Bar(f"a view with {MANY} channels over one with {FEW}", view[MANY] / view[FEW], CHANNELS_RATIO),
-        Bar("MiB beyond inputs and X", beyond / MIB, BEYOND_BYTES / MIB),
+    figures = (
+        Figure(f"seconds a view, {USUAL} channels", view[USUAL], _view_seconds(work)),
+        Figure(f"a view with {MANY} channels over one with {FEW}", view[MANY] / view[FEW], CHANNELS_RATIO),
+        Figure("MiB beyond inputs and X", beyond / MIB, BEYOND_BYTES / MIB),
     )
     return {
-        "bars": [bar.facts for bar in bars],
+        "aims": [figure.facts for figure in figures],
         "geometry_s_per_view": walked,
         "solve_s_per_view": {str(channels): statistics.median(seconds) for channels, seconds in solution.items()},
         "load": os.getloadavg()[0],
@@ -114,10 +114,11 @@ def _view_seconds(work: Workload) -> float | None:
 
 
 def lines_of(document: dict[str, Any]) -> Iterator[str]:
-    """The bars for people."""
-    for bar in document["bars"]:
-        aim = "no aim here" if bar["aim"] is None else f"aim {bar['aim']:g}, {'met' if bar['met'] else 'not met'}"
-        yield f"{bar['name']}: {bar['found']:.4g} ({aim})"
+    """The aims for people."""
+    for figure in document["aims"]:
+        aim = figure["aim"]
+        told = "no aim here" if aim is None else f"aim {aim:g}, {'met' if figure['met'] else 'not met'}"
+        yield f"{figure['name']}: {figure['found']:.4g} ({told})"
     solved = ", ".join(f"{channels} channels {each:.4f}" for channels, each in document["solve_s_per_view"].items())
     yield f"seconds a view: geometry {document['geometry_s_per_view']:.4f}; solution {solved}"
 

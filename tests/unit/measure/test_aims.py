@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from liftcore import cli
-from liftcore.measure import bars
-from liftcore.measure.bars import CHANNELS, FEW, MANY, USUAL, Bar, inputs_bytes
+from liftcore.measure import aims
+from liftcore.measure.aims import CHANNELS, FEW, MANY, USUAL, Figure, inputs_bytes
 from liftcore.measure.bench import Workload
 from liftcore.measure.synthetic import room_cameras, room_splats
 from liftcore.observe.observation import RegionMap
@@ -19,20 +19,20 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from typing import Any
 
-SMALL = ["bench", "--bars", "--splats", "2000", "--size", "64x48", "--views", "2"]
+SMALL = ["bench", "--aims", "--splats", "2000", "--size", "64x48", "--views", "2"]
 
 
-def test_a_bar_is_met_up_to_its_aim_and_says_so_only_where_there_is_one() -> None:
-    found = [Bar("ratio", found, 1.1).facts["met"] for found in (1.0, 1.1, 1.11)]
+def test_a_figure_meets_its_aim_up_to_it_and_says_so_only_where_there_is_one() -> None:
+    found = [Figure("ratio", found, 1.1).facts["met"] for found in (1.0, 1.1, 1.11)]
     assert found == [True, True, False]
-    assert "met" not in Bar("seconds", 1.0, None).facts
+    assert "met" not in Figure("seconds", 1.0, None).facts
 
 
-def test_bench_prints_every_bar_and_the_figures_behind_it(capsys: pytest.CaptureFixture[str]) -> None:
+def test_bench_prints_every_aim_and_the_figures_behind_it(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main([*SMALL, "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     found = document["presets"]["row-sum"]
-    seconds, ratio, memory = found["bars"]
+    seconds, ratio, memory = found["aims"]
     walked, solved = found["geometry_s_per_view"], found["solve_s_per_view"]
     assert document["channels"] == list(CHANNELS)
     assert seconds["found"] == pytest.approx(walked + solved[str(USUAL)])
@@ -43,12 +43,12 @@ def test_bench_prints_every_bar_and_the_figures_behind_it(capsys: pytest.Capture
     assert found["features_bytes"] == 2000 * USUAL * 2
     assert cli.main(SMALL) == 0
     lines = capsys.readouterr().out
-    assert all(bar["name"] in lines for bar in found["bars"])
+    assert all(aim["name"] in lines for aim in found["aims"])
 
 
 def test_the_solution_is_timed_for_each_number_of_channels_on_one_walk(monkeypatch: pytest.MonkeyPatch) -> None:
     walks, solved = [], []
-    walk, solve = bars.walk_regions, bars.closed_form
+    walk, solve = aims.walk_regions, aims.closed_form
 
     def counted(*given: Any) -> Any:
         walks.append(given)
@@ -60,11 +60,11 @@ def test_the_solution_is_timed_for_each_number_of_channels_on_one_walk(monkeypat
         assert torch.allclose(lengths, torch.ones_like(lengths), atol=2e-3)  # else they would be summed twice
         return solve(store, columns, *rest)
 
-    monkeypatch.setattr(bars, "walk_regions", counted)
-    monkeypatch.setattr(bars, "closed_form", noted)
+    monkeypatch.setattr(aims, "walk_regions", counted)
+    monkeypatch.setattr(aims, "closed_form", noted)
     assert cli.main([*SMALL, "--json"]) == 0
-    assert len(walks) == bars.PASSES
-    assert solved == list(CHANNELS) * bars.PASSES
+    assert len(walks) == aims.PASSES
+    assert solved == list(CHANNELS) * aims.PASSES
 
 
 def test_inputs_are_splats_without_colour_label_maps_and_codebooks() -> None:
@@ -74,7 +74,7 @@ def test_inputs_are_splats_without_colour_label_maps_and_codebooks() -> None:
     assert inputs_bytes(work, 10) == 500 * 4 * (3 + 4 + 3 + 1) + 2 * 6 * 8 * 4 + 2 * 3 * 10
 
 
-def test_bars_have_channels_of_their_own(capsys: pytest.CaptureFixture[str]) -> None:
+def test_aims_have_channels_of_their_own(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main([*SMALL, "--channels", "8"]) == 2
     assert "channels" in capsys.readouterr().err
     assert cli.main([*SMALL, "--stages"]) == 2
