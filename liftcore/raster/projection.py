@@ -89,7 +89,7 @@ def axes_of(splats: Splats) -> np.ndarray:
     rotation[2, 1] = 2 * (y * z + w * x)
     rotation[2, 2] = 1 - 2 * (x * x + y * y)
     log_scales = splats.log_scales.numpy().astype(np.float64).clip(-MAX_LOG_SCALE, MAX_LOG_SCALE)
-    return rotation[:, : log_scales.shape[1]] * np.exp(log_scales.T)
+    return np.ascontiguousarray(rotation[:, : log_scales.shape[1]] * np.exp(log_scales.T))
 
 
 @inlined
