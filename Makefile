@@ -43,11 +43,11 @@ gpu:  ## all that a card is for: CUDA's torch, conformance, speed, accuracy, gsp
 	@$(BIN)/python -c 'import sys, torch; sys.exit(torch.version.cuda is None)' || { echo "installing torch's CUDA build" \
 	&& $(BIN)/python -m pip install --quiet --force-reinstall $(CUDA_TORCH_PIP) $$(grep -E '^torch(vision)?==' requirements.lock) \
 	&& grep -vE '^(torch|torchvision|triton)==' requirements.lock | $(BIN)/python -m pip install --quiet -r /dev/stdin; }
-	@$(BIN)/python -m liftcore.measure.gpu --look
+	@$(BIN)/python -m tests.benchmarks.gpu --look
 	@$(BIN)/python -m pip install --quiet gsplat==1.5.3 ninja || echo "gsplat does not install here: the page will say so"
 	@held=0; env -u TRITON_INTERPRET $(BIN)/python -m pytest -rs tests/gpu tests/properties tests/unit/solve/test_on_device.py \
 	tests/unit/solve/test_lift_on_device.py || held=$$?; \
-	env -u TRITON_INTERPRET $(BIN)/python -m liftcore.measure.gpu docs/benchmarks_gpu.md --shared $(SHARED) && exit $$held
+	env -u TRITON_INTERPRET $(BIN)/python -m tests.benchmarks.gpu docs/benchmarks_gpu.md --shared $(SHARED) && exit $$held
 
 lint: $(READY)
 	$(BIN)/ruff check .

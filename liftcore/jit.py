@@ -22,9 +22,9 @@ from numba.core import config
 def _kernel_sources() -> list[Path]:
     """The files whose code or constants kernels are made of: a change in any other compiles nothing anew."""
     root = Path(__file__).parent
-    named = [root / "raster" / name for name in ("constants.py", "records.py")]
-    own = [Path(__file__), *sorted(root.glob("lanes*.py")), *named]
-    packages = [root / package for package in ("observe", "raster", "solve", "query")]
+    cpu = root / "raster" / "cpu"
+    own = [Path(__file__), root / "raster" / "constants.py", cpu / "records.py", *sorted(cpu.glob("lanes*.py"))]
+    packages = [root / package for package in ("features", "raster", "solve", "query")]
     rooms = [source for package in packages for source in sorted(package.rglob("*.py"))]
     return own + [source for source in rooms if b"from liftcore.jit import" in source.read_bytes()]
 

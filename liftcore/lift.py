@@ -10,17 +10,17 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from liftcore import __version__
-from liftcore.artifact import Lift, LiftMetadata
 from liftcore.device import Device, choose_device, within_memory
 from liftcore.errors import InvalidFeatures
-from liftcore.input_files import input_files
+from liftcore.features.pack import FeaturePacks, open_packs, pair
+from liftcore.io.input_files import input_files
+from liftcore.io.lift_file import LiftMetadata, LiftResult
+from liftcore.io.load import kernel_named, load_cameras, load_splats
 from liftcore.listener import NOBODY, Listener
-from liftcore.observe.pack import FeaturePacks, open_packs, pair
 from liftcore.plan.plan import plan_lift
 from liftcore.progress import Progress, one_step
 from liftcore.raster.antialiased import check_antialiased
 from liftcore.raster.open_raster import open_raster
-from liftcore.scene.load import kernel_named, load_cameras, load_splats
 from liftcore.solve.accumulate import Geometry, accumulate, as_read, lift_walk
 from liftcore.solve.aggregation import Aggregation, aggregate
 from liftcore.solve.all_rays import AllRays
@@ -34,16 +34,16 @@ from liftcore.solve.lift_warnings import lift_warnings
 from liftcore.solve.reference import reference
 from liftcore.solve.robust import robust_weights
 from liftcore.solve.solver import closed_form
-from liftcore.solve.view_weights import ViewWeights
+from liftcore.solve.view_weights import WeightStore
 from liftcore.timings import Timings
 from liftcore.warm_up import warm_up_lift
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from liftcore.artifact import InputFile
+    from liftcore.io.lift_file import InputFile
     from liftcore.plan.plan import Plan
-    from liftcore.raster.protocol import Raster
+    from liftcore.raster.base import Raster
     from liftcore.scene.cameras import Cameras
     from liftcore.scene.splats import Kernel, Splats
     from liftcore.solve.closed_form import Solution
@@ -94,7 +94,7 @@ def lift(
     threads: int | None = None,
     listener: Listener = NOBODY,
     checkpoint: Checkpoint | None = None,
-) -> Lift:
+) -> LiftResult:
     """Lift the features of the packs onto the splats.
 
     Args:
@@ -122,7 +122,9 @@ def lift(
     return lift_sources(run, sources, inputs, checkpoint)
 
 
-def lift_sources(run: Run, sources: Sources, inputs: list[InputFile], checkpoint: Checkpoint | None = None) -> Lift:
+def lift_sources(
+    run: Run, sources: Sources, inputs: list[InputFile], checkpoint: Checkpoint | None = None
+) -> LiftResult:
     """The lift of what is open already: ``inputs`` are the files that it came from."""
     _warm_up(run, sources.splats.kernel)
     with run.stage("plan"):
@@ -141,12 +143,14 @@ def _warm_up(run: Run, kernel: Kernel) -> None:
         warm_up_lift(kernel, run.device, run.settings)
 
 
-def _lift_on(run: Run, plan: Plan, sources: Sources, inputs: list[InputFile], checkpoint: Checkpoint | None) -> Lift:
+def _lift_on(
+    run: Run, plan: Plan, sources: Sources, inputs: list[InputFile], checkpoint: Checkpoint | None
+) -> LiftResult:
     """The lift as planned."""
     settings, threads, progress = run.settings, run.threads, run.progress
     kept = plan.kept_on_card
     raster, device = open_raster(sources.splats, run.device, threads, kept), run.device.facts()
-    with ViewWeights(card=(run.device.place, kept)) as store:
+    with WeightStore(card=(run.device.place, kept)) as store:
         key = identity(inputs[0].sha256, sources.splats.kernel, device) if checkpoint else ""
         with run.timings.stage("geometry"), resumed(raster, checkpoint, key) as walked:
             scene = (sources.splats.count, sources.cameras)
@@ -173,7 +177,7 @@ def _lift_on(run: Run, plan: Plan, sources: Sources, inputs: list[InputFile], ch
     facts["warnings"] = [*told, *plan.told]
     with run.stage("certify"):
         certificate = certify(geometry, X, settings, threads) | notes | facts
-    return Lift(
+    return LiftResult(
         features=X,
         evidence=torch.from_numpy(geometry.evidence).to(torch.float32),
         agreement=solution.agreement,
@@ -197,12 +201,12 @@ def planned(sources: Sources, settings: LiftSettings, device: Device, threads: i
     return plan_lift(sources.splats, sources.cameras, sources.packs, sources.views, settings, device, threads)
 
 
-def _blind(views: Sequence[str], store: ViewWeights) -> list[str]:
+def _blind(views: Sequence[str], store: WeightStore) -> list[str]:
     """The views whose rays met no splat."""
     return [name for name, part in zip(views, store, strict=True) if not part.evidence_splats.numel()]
 
 
-def _solve(run: Run, store: ViewWeights, geometry: Geometry, host: Host) -> tuple[ViewWeights, Solution]:
+def _solve(run: Run, store: WeightStore, geometry: Geometry, host: Host) -> tuple[WeightStore, Solution]:
     """The weights, which the robust steps may have changed, and the closed form of them."""
     settings, sums = run.settings, geometry.denominators
     with run.timings.stage("robust"):
@@ -254,7 +258,7 @@ def _host(run: Run, plan: Plan, sources: Sources, taken: int = 0) -> Host:
 
 
 def _resolve(
-    run: Run, weights: ViewWeights, geometry: Geometry, aggregation: Aggregation, X: torch.Tensor, host: Host
+    run: Run, weights: WeightStore, geometry: Geometry, aggregation: Aggregation, X: torch.Tensor, host: Host
 ) -> float:
     """Solve again, from the kept regions alone, for splats that took no cluster's feature; their share of all.
 

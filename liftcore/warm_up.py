@@ -8,14 +8,14 @@ import numpy as np
 import torch
 
 from liftcore.progress import silent
-from liftcore.raster.protocol import RegionWeights
-from liftcore.raster.warm_up import warm_up
+from liftcore.raster.base import RegionWeights
+from liftcore.raster.cpu.warm_up import warm_up
 from liftcore.solve.accumulate import lift_walk, weighting_of
 from liftcore.solve.closed_form import warm_up_solution
 from liftcore.solve.columns import warm_up_tuples
 from liftcore.solve.host import Host
 from liftcore.solve.robust import robust_weights
-from liftcore.solve.view_weights import ViewWeights
+from liftcore.solve.view_weights import WeightStore
 
 if TYPE_CHECKING:
     from liftcore.device import Device
@@ -35,6 +35,6 @@ def warm_up_lift(kernel: Kernel, device: Device, settings: LiftSettings) -> None
 
 def _warm_up_robust() -> None:
     one = torch.zeros(1, dtype=torch.int32)
-    with ViewWeights() as store:
+    with WeightStore() as store:
         store.append(RegionWeights(one, torch.tensor([0, 1]), one, torch.ones(1), one, torch.ones(1)))
         robust_weights(store, [torch.ones(1, 1)], np.ones(1), 1, silent, Host(1))

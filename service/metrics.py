@@ -107,7 +107,7 @@ class _Looked(Collector):
         return ()
 
     def collect(self) -> Iterator[Metric]:
-        """Look."""
+        """ViewMask."""
         counts = self._store.jobs.count_by_state()
         jobs = GaugeMetricFamily("splatlift_jobs", "Jobs by state.", labels=("state",))
         for state in JobState:

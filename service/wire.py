@@ -184,7 +184,7 @@ class LogLine(BaseModel):
     time: float = Field(description="seconds since 1970")
 
 
-class Lift(BaseModel):
+class LiftResult(BaseModel):
     """Features on splats. A lift has the id of the job that made it."""
 
     id: JobId
@@ -209,7 +209,7 @@ class Lift(BaseModel):
 class Lifts(BaseModel):
     """All lifts, newest first."""
 
-    lifts: list[Lift]
+    lifts: list[LiftResult]
 
 
 class Tradeoff(BaseModel):

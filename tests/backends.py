@@ -12,15 +12,15 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 
-from liftcore.raster.cpu import CpuRaster
+from liftcore.raster.cpu.raster import CpuRaster
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from hypothesis.strategies import SearchStrategy
 
+    from liftcore.raster.base import Raster
     from liftcore.raster.gpu.raster import GpuRaster
-    from liftcore.raster.protocol import Raster
     from liftcore.scene.splats import Splats
 
 
@@ -33,7 +33,7 @@ def gpu_raster(splats: Splats, free: int | None = None) -> GpuRaster:
 
 @dataclass(frozen=True)
 class Backend:
-    """One implementation of ``liftcore.raster.protocol.Raster``."""
+    """One implementation of ``liftcore.raster.base.Raster``."""
 
     name: str
     open: Callable[[Splats], Raster]

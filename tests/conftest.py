@@ -31,7 +31,7 @@ def shared_data() -> Path:
 @pytest.fixture(scope="session", autouse=True)
 def _compiled_kernels() -> None:
     """Compile the kernels once, before a test's time limit runs; processes that tests start load them from disk."""
-    from liftcore.raster.warm_up import warm_up
+    from liftcore.raster.cpu.warm_up import warm_up
 
     warm_up()
 
@@ -39,7 +39,7 @@ def _compiled_kernels() -> None:
 @pytest.fixture(scope="session")
 def every_kernel() -> None:
     """The other kernels' compiled code too, for the tests that walk them."""
-    from liftcore.raster.warm_up import warm_up
+    from liftcore.raster.cpu.warm_up import warm_up
     from liftcore.scene.splats import Kernel
 
     for kernel in Kernel:

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from liftcore.observe.observation import FeatureGrid, Observation, RegionMap
-from liftcore.observe.write_pack import write_pack
+from liftcore.features.views import FeatureGrid, Regions, ViewFeatures
+from liftcore.features.write_pack import write_pack
+from liftcore.io.ply import write_splats
 from liftcore.scene.distortion import Brown, Distortion, Fisheye
 from liftcore.scene.lens import Lens
-from liftcore.scene.ply import write_splats
 from liftcore.scene.splats import Splats
 
 AWAY, MEETING = 4.0, (1.9, -1.3)  # of the wall, and of its quarters
@@ -78,12 +78,12 @@ def write_distorted_scene(folder: Path, lens: str, *, grids: bool = False) -> tu
     size = {"w": WIDTH, "h": HEIGHT, "fl_x": FX, "fl_y": FY, "cx": CX, "cy": CY}
     paths[1].write_text(json.dumps({**size, **LENSES[lens][0], "frames": frames}))
     one_hot = torch.eye(4)
-    maps: dict[str, Observation] = {}
+    maps: dict[str, ViewFeatures] = {}
     for name in VIEWS:
         labels = torch.from_numpy(photo_of(name, lens))
         if grids:
             maps[name] = FeatureGrid(torch.where(labels[..., None] < 0, 0.0, one_hot[labels.clamp(0)]))
         else:
-            maps[name] = RegionMap(labels[None].to(torch.int32), one_hot)
+            maps[name] = Regions(labels[None].to(torch.int32), one_hot)
     write_pack(paths[2], maps, {"text_space": "quarters"})
     return paths

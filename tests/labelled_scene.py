@@ -14,11 +14,11 @@ import torch
 from PIL import Image
 from safetensors.torch import save_file
 
-from liftcore.artifact import Lift, LiftMetadata, save_lift
-from liftcore.input_files import input_file
+from liftcore.io.input_files import input_file
+from liftcore.io.inria import write_inria_cameras
+from liftcore.io.lift_file import LiftMetadata, LiftResult, save_lift
+from liftcore.io.ply import write_splats
 from liftcore.scene.cameras import Camera, Cameras
-from liftcore.scene.inria import write_inria_cameras
-from liftcore.scene.ply import write_splats
 from liftcore.scene.splats import Splats
 from liftcore.solve.settings import LiftSettings
 
@@ -70,7 +70,7 @@ def write_lift(folder: Path, name: str = "kitchen.lift.safetensors") -> Path:
     )
     seen, ones = torch.ones(count, dtype=torch.bool), torch.ones(count)
     path = folder / name
-    save_lift(Lift(words[owner].half(), ones * 9, ones, seen, metadata), path)
+    save_lift(LiftResult(words[owner].half(), ones * 9, ones, seen, metadata), path)
     return path
 
 

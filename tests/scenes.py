@@ -6,10 +6,10 @@ import numpy as np
 import torch
 from hypothesis import strategies as st
 
-from liftcore.measure.stability.scenes import of_kernel
-from liftcore.observe.observation import FeatureGrid, Observation, RegionMap
+from liftcore.features.views import FeatureGrid, Regions, ViewFeatures
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Kernel, Splats
+from tests.benchmarks.stability.scenes import of_kernel
 
 
 def random_splats(seed: int, count: int = 40, spread: float = 1.0, kernel: Kernel = Kernel.GAUSSIAN_3D) -> Splats:
@@ -49,17 +49,17 @@ def random_camera(seed: int, width: int = 37, height: int = 29, name: str = "v0"
 
 def random_regions(
     seed: int, levels: int = 2, rows: int = 5, size: tuple[int, int] = (15, 18), F: int = 6
-) -> RegionMap:
+) -> Regions:
     """Blocky label maps of another size than the image, some pixels unlabelled."""
     rng = np.random.default_rng(seed + 2_000)
     coarse = rng.integers(-1, rows, (levels, -(-size[0] // 3), -(-size[1] // 4)))
     labels = np.repeat(np.repeat(coarse, 3, axis=1), 4, axis=2)[:, : size[0], : size[1]]
     codebook = rng.normal(0, 1, (rows, F))
     codebook /= np.linalg.norm(codebook, axis=1, keepdims=True)
-    return RegionMap(torch.tensor(labels.copy(), dtype=torch.int32), torch.tensor(codebook, dtype=torch.float32))
+    return Regions(torch.tensor(labels.copy(), dtype=torch.int32), torch.tensor(codebook, dtype=torch.float32))
 
 
-def observed(seed: int, view: int, grids: bool = False) -> Observation:
+def observed(seed: int, view: int, grids: bool = False) -> ViewFeatures:
     """What a view of a scene observes: a grid, or regions, which W takes by tuples of labels in every second view."""
     if grids:
         return random_grid(seed + view)
@@ -73,7 +73,7 @@ def random_grid(seed: int, size: tuple[int, int] = (7, 9), F: int = 6) -> Featur
 
 
 @st.composite
-def scenes(draw: st.DrawFn, kernel: Kernel = Kernel.GAUSSIAN_3D) -> tuple[Splats, Camera, Observation]:
+def scenes(draw: st.DrawFn, kernel: Kernel = Kernel.GAUSSIAN_3D) -> tuple[Splats, Camera, ViewFeatures]:
     """A scene, a view and what the view observes."""
     seed = draw(st.integers(0, 2**20))
     spread = draw(st.sampled_from([0.2, 1.0, 3.0]))

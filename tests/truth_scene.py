@@ -9,15 +9,15 @@ import numpy as np
 import torch
 from safetensors.torch import save_file
 
-from liftcore.measure.noise import noisy_masks
-from liftcore.observe.observation import RegionMap
-from liftcore.observe.write_pack import write_pack
-from liftcore.raster.cpu import CpuRaster
-from liftcore.raster.protocol import Walk
+from liftcore.features.views import Regions
+from liftcore.features.write_pack import write_pack
+from liftcore.io.inria import write_inria_cameras
+from liftcore.io.ply import write_splats
+from liftcore.raster.base import CompositingParams
+from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.cameras import Camera, Cameras
-from liftcore.scene.inria import write_inria_cameras
-from liftcore.scene.ply import write_splats
 from liftcore.scene.splats import Splats
+from tests.benchmarks.noise import noisy_masks
 from tests.scenes import centred, look_at
 
 CLASSES = 4
@@ -58,7 +58,7 @@ def write_truth_scene(folder: Path) -> Path:
     raster = CpuRaster(splats)
     masks = {camera.name: _mask(raster, camera, classes) for camera in cameras}
     held_out = [f"v{k}" for k in HELD_OUT]
-    maps = {name: RegionMap(mask[None].int(), vectors) for name, mask in masks.items() if name not in held_out}
+    maps = {name: Regions(mask[None].int(), vectors) for name, mask in masks.items() if name not in held_out}
     write_splats(splats, folder / "point_cloud.ply")
     write_inria_cameras(cameras, folder / "cameras.json")
     for name, rate in (("features_clean", 0.0), ("features", 0.15), ("features_hard", 0.4)):
@@ -75,5 +75,5 @@ def write_truth_scene(folder: Path) -> Path:
 def _mask(raster: CpuRaster, camera: Camera, classes: torch.Tensor) -> torch.Tensor:
     """[H, W] i32, the class of the largest weight of a ray; -1 where a ray meets nothing."""
     each = torch.arange(raster.splats.count, dtype=torch.int32)
-    ids = raster.strongest_labels(camera, each, Walk()).long()
+    ids = raster.strongest_labels(camera, each, CompositingParams()).long()
     return torch.where(ids >= 0, classes[ids.clamp_min(0)].long(), -1).int()

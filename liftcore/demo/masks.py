@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from liftcore.observe.observation import NO_LABEL, RegionMap
-from liftcore.raster.protocol import Walk
+from liftcore.features.views import NO_LABEL, Regions
+from liftcore.raster.base import CompositingParams
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from liftcore.demo.still_life import StillLife
     from liftcore.query.encoders import TextEncoder
-    from liftcore.raster.protocol import Raster
+    from liftcore.raster.base import Raster
 
 LEAST_ROW_SUM = 0.5  # a ray below it has no true label
 LEAST_REGION = 25  # pixels; SAM drops smaller masks, and so do we
@@ -39,7 +39,7 @@ class Mistakes:
 def true_labels(scene: StillLife, raster: Raster, view: str) -> np.ndarray:
     """What every ray shows: [2, H, W] i32, objects and parts; -1 where the ray misses the scene."""
     onehot = torch.nn.functional.one_hot(torch.from_numpy(scene.splat_parts).long(), len(scene.parts))
-    sums = raster.render(scene.cameras.get(view), onehot.to(torch.float32), Walk()).numpy()
+    sums = raster.render(scene.cameras.get(view), onehot.to(torch.float32), CompositingParams()).numpy()
     owner = np.array(scene.thing_of_part)
     things = np.zeros((*sums.shape[:2], len(scene.things)), np.float32)
     for part, thing in enumerate(owner):
@@ -51,7 +51,7 @@ def true_labels(scene: StillLife, raster: Raster, view: str) -> np.ndarray:
 
 def observe(
     scene: StillLife, raster: Raster, encoder: TextEncoder, mistakes: Mistakes, seed: int
-) -> Mapping[str, RegionMap]:
+) -> Mapping[str, Regions]:
     """Region maps of all views that are not held out: two levels, objects and parts, with mistakes.
 
     Args:
@@ -74,13 +74,13 @@ def observe(
     return observed
 
 
-def _stack(levels: Sequence[tuple[np.ndarray, np.ndarray]]) -> RegionMap:
+def _stack(levels: Sequence[tuple[np.ndarray, np.ndarray]]) -> Regions:
     labels, codebook, rows = [], [], 0
     for level, vectors in levels:
         labels.append(np.where(level >= 0, level + rows, NO_LABEL))
         codebook.append(vectors)
         rows += len(vectors)
-    return RegionMap(
+    return Regions(
         labels=torch.from_numpy(np.stack(labels).astype(np.int32)),
         codebook=torch.from_numpy(np.concatenate(codebook)).to(torch.float16),
     )

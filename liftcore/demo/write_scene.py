@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from liftcore.raster.protocol import Raster
+    from liftcore.raster.base import Raster
 
 SEED = 7
 PICTURED = "view_07"  # of the held-out views, the one that shows every object whole
@@ -31,11 +31,11 @@ def write_still_life(folder: Path, phrases: Sequence[str], scene: StillLife | No
     Raises:
         Unavailable: the sentence encoder is not installed.
     """
-    from liftcore.observe.write_pack import write_pack
+    from liftcore.features.write_pack import write_pack
+    from liftcore.io.inria import write_inria_cameras
+    from liftcore.io.ply import write_splats
     from liftcore.query.encoders import open_encoder
-    from liftcore.raster.cpu import CpuRaster
-    from liftcore.scene.inria import write_inria_cameras
-    from liftcore.scene.ply import write_splats
+    from liftcore.raster.cpu.raster import CpuRaster
 
     scene = scene or still_life(SEED)
     raster = CpuRaster(scene.splats, threads=None)

@@ -5,7 +5,7 @@ the nearest cell, or four cells of a grid that is read bilinearly. Some of them 
 footprint is too faint, more of them the finer the cells are. With ``k`` the mean of ``(d / r + 1)^2`` over the splats
 that a view can see, before occlusion, such a splat has about ``r^2 (OPEN k + MET k^BEND)`` entries. The three were
 fitted to the entries of `tabletop` and `plush` with cells from a sixteenth of the image's height to a pixel, and a
-tenth was added; `python -m liftcore.measure.plan_memory SPLATS CAMERAS FEATURES...` holds the plan against lifts.
+tenth was added; `python -m tests.benchmarks.plan_memory SPLATS CAMERAS FEATURES...` holds the plan against lifts.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from liftcore.solve.columns import by_rows
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from liftcore.observe.pack import FeaturePacks
+    from liftcore.features.pack import FeaturePacks
     from liftcore.plan.visibility import Visibility
     from liftcore.scene.cameras import Camera
     from liftcore.solve.settings import LiftSettings

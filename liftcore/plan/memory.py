@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from liftcore.errors import Unavailable
-from liftcore.observe.through_lens import kept_bytes
+from liftcore.features.through_lens import kept_bytes
 from liftcore.raster.constants import TILE
-from liftcore.raster.kernels import RECORDS
+from liftcore.raster.cpu.kernels import RECORDS
 from liftcore.solve.channels import BLOCK
 from liftcore.solve.clustering import BLOCK as CLUSTERED_ROWS
 from liftcore.solve.columns import by_rows
@@ -23,7 +23,7 @@ from liftcore.solve.weighted_sums import strip_bytes
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from liftcore.observe.pack import FeaturePacks, TensorSpec
+    from liftcore.features.pack import FeaturePacks, TensorSpec
     from liftcore.plan.entries import PlannedEntries
     from liftcore.scene.cameras import Camera
     from liftcore.scene.splats import Splats

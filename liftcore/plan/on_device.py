@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from liftcore.device import Device
-    from liftcore.observe.pack import FeaturePacks
+    from liftcore.features.pack import FeaturePacks
     from liftcore.plan.entries import PlannedEntries
     from liftcore.scene.cameras import Camera
     from liftcore.scene.splats import Splats

@@ -33,20 +33,20 @@ from torch.nn.functional import embedding_bag
 from liftcore.one_thread import one_thread
 from liftcore.plan.visibility import spread
 from liftcore.progress import silent
-from liftcore.raster.cpu import CpuRaster
+from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.solve.accumulate import accumulate
 from liftcore.solve.channels import random_axes
 from liftcore.solve.totals import sums_in_order
-from liftcore.solve.view_weights import ViewWeights
+from liftcore.solve.view_weights import WeightStore
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from torch import Tensor
 
-    from liftcore.observe.pack import FeaturePacks
+    from liftcore.features.pack import FeaturePacks
     from liftcore.plan.visibility import Visibility
-    from liftcore.raster.protocol import RegionWeights
+    from liftcore.raster.base import RegionWeights
     from liftcore.scene.cameras import Cameras
     from liftcore.scene.splats import Splats
     from liftcore.solve.settings import LiftSettings
@@ -94,7 +94,7 @@ def fly_pilot(
     seen: Visibility,
     threads: int | None = None,
 ) -> Pilot:
-    """Walk evenly spaced views of ``names``, of which ``seen`` tells, two at least."""
+    """CompositingParams evenly spaced views of ``names``, of which ``seen`` tells, two at least."""
     total, count = len(names), min(PILOT_VIEWS, len(names))
     flown: list[int] = spread(total, count).tolist()
     chosen = [names[view] for view in flown]
@@ -103,7 +103,7 @@ def fly_pilot(
     own = settings.model_copy(update=coarse)
     axes = random_axes(packs.channels, min(PILOT_CHANNELS, packs.channels), settings.seed)
     said = _Said(spread(splats.count, seen.areas.shape[1]), splats.count, axes.shape[1])
-    with ViewWeights() as store, one_thread():
+    with WeightStore() as store, one_thread():
         raster = CpuRaster(splats, threads)
         geometry = accumulate(raster, (splats.count, cameras), packs, chosen, own, store, silent)
         for weights, columns in zip(store, geometry.columns, strict=True):
@@ -130,7 +130,7 @@ class _Said:
     def add(self, weights: RegionWeights, codebook: Tensor) -> None:
         """Add a view: its W, and what its columns read [T, C] f32."""
         places = torch.from_numpy(self._places[weights.splats.numpy()])
-        lengths = weights.row_starts.diff()
+        lengths = weights.indptr.diff()
         sampled, entries = places >= 0, torch.repeat_interleave(places >= 0, lengths)
         starts = torch.cat([lengths.new_zeros(1), lengths[sampled].cumsum(0)])
         columns, values = weights.columns[entries].long(), weights.weights[entries]

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from liftcore.device import CPU
+from liftcore.io.frame import frame_warning
 from liftcore.plan.coverage import WELL_COVERED, spare_views, view_order, views_to_show
 from liftcore.plan.entries import planned_entries
 from liftcore.plan.memory import (
@@ -24,9 +25,8 @@ from liftcore.plan.on_device import check_device_room, device_plan
 from liftcore.plan.pilot import PILOT_VIEWS, fly_pilot
 from liftcore.plan.rank import ENOUGH, Rank, codebook_rank
 from liftcore.plan.visibility import visibility
-from liftcore.raster.side_by_side import views_at_a_time
+from liftcore.raster.cpu.side_by_side import views_at_a_time
 from liftcore.scene.distorted import distortion_warning
-from liftcore.scene.frame import frame_warning
 from liftcore.solve.accumulate import lift_walk
 from liftcore.solve.map_shapes import shape_warnings
 
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from liftcore.device import Device
-    from liftcore.observe.pack import FeaturePacks
+    from liftcore.features.pack import FeaturePacks
     from liftcore.plan.on_device import DevicePlan
     from liftcore.plan.pilot import Pilot
     from liftcore.plan.visibility import Visibility

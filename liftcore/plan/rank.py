@@ -12,7 +12,7 @@ from liftcore.solve.principal_axes import one_blas_thread
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from liftcore.observe.pack import FeaturePacks
+    from liftcore.features.pack import FeaturePacks
 
 ROWS = 1_024  # sampled at most, as an eigenvalue problem of this size takes a third of a second
 VIEWS = 16  # that they are taken from at most

@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from liftcore.raster.kernels import RECORDS, activated, project
-from liftcore.raster.projection import Targets, view_of
-from liftcore.raster.records import EXTENT_X, EXTENT_Y
+from liftcore.raster.cpu.kernels import RECORDS, activated, project
+from liftcore.raster.cpu.projection import Targets, view_of
+from liftcore.raster.cpu.records import EXTENT_X, EXTENT_Y
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from liftcore.raster.protocol import Walk
+    from liftcore.raster.base import CompositingParams
     from liftcore.scene.cameras import Camera
     from liftcore.scene.splats import Splats
 
@@ -55,7 +55,7 @@ class Visibility:
         return float(self.in_view.mean()) * self.splats
 
 
-def visibility(splats: Splats, cameras: Sequence[Camera], walk: Walk) -> Visibility:
+def visibility(splats: Splats, cameras: Sequence[Camera], walk: CompositingParams) -> Visibility:
     """Project evenly spaced splats, SAMPLE at most, into every camera."""
     sample = spread_splats(splats, min(SAMPLE, splats.count))
     scene, count = activated(sample, walk.gain), sample.count

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from liftcore.raster.protocol import Walk
+from liftcore.raster.base import CompositingParams
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -51,7 +51,7 @@ def expected_depth(scene: QueryScene, view: str) -> tuple[Tensor, Tensor]:
     pose = torch.from_numpy(scene.cameras.get(view).world_to_camera[2].copy())
     depths = (scene.splats.means.double() @ pose[:3] + pose[3]).to(torch.float32)
     values = torch.stack([depths, torch.ones_like(depths)], dim=1)
-    walk = Walk(antialiased=scene.walk.antialiased)
+    walk = CompositingParams(antialiased=scene.walk.antialiased)
     image = scene.image(view, lambda camera: scene.raster.render(camera, values, walk))
     covered = image[..., 1] > 0
     return torch.where(covered, image[..., 0] / image[..., 1], 0.0), covered

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from liftcore.errors import InvalidQuery, NotFound
-from liftcore.observe.observation import RegionMap
+from liftcore.features.views import Regions
 from liftcore.query.example import OneSplat, Pixel, Region, Vector
 from liftcore.scene.lens import drawn_by, photo_size, pixel_of
 from liftcore.scene.view_pairs import cameras_of_views
@@ -129,19 +129,19 @@ def _rendered(scene: QueryScene, pixel: Pixel) -> Tensor:
     return row.weights.double() @ scene.lift.features[row.splats.long()].double()
 
 
-def _observation(scene: QueryScene, example: Region) -> RegionMap:
+def _observation(scene: QueryScene, example: Region) -> Regions:
     packs = scene.packs
     view = cameras_of_views([example.view], packs.views).get(example.view)  # named as the pack or its camera is
     if view is None:
         raise NotFound(str(example), expected="a view of the lift's feature packs", got=repr(example.view))
     observation = packs.observation(view)
-    if not isinstance(observation, RegionMap):
+    if not isinstance(observation, Regions):
         hint = "ask by a pixel, VIEW:x,y"
         raise InvalidQuery(str(example), expected="a view with regions", got="a feature grid", hint=hint)
     return observation
 
 
-def _codebook_row(observation: RegionMap, example: Region) -> Tensor:
+def _codebook_row(observation: Regions, example: Region) -> Tensor:
     levels = observation.labels.shape[0]
     if example.level >= levels:
         raise NotFound(str(example), expected=f"a level in 0..{levels - 1}", got=str(example.level))

@@ -12,24 +12,24 @@ from PIL.PngImagePlugin import PngInfo
 from liftcore.errors import InvalidQuery
 from liftcore.query.colours import cluster_colours, heat_colours, seen_colours
 from liftcore.query.depth import shown_depth
-from liftcore.raster.protocol import Walk
+from liftcore.raster.base import CompositingParams
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from liftcore.query.look import Look
     from liftcore.query.scene import QueryScene
+    from liftcore.query.view_mask import ViewMask
 
 _DIM = 0.35  # brightness that an overlay leaves to what was not found
 _OUTLINE = np.array([255, 209, 64], dtype=np.uint8)  # sRGB of the line around what was found
 
 
-def mask_png(look: Look) -> bytes:
+def mask_png(look: ViewMask) -> bytes:
     """The mask, white where found, one 8-bit channel [H, W]."""
     return _png(_mask(look))
 
 
-def attention_png(look: Look) -> bytes:
+def attention_png(look: ViewMask) -> bytes:
     """The attention through the colour map, RGB [H, W, 3]; black where the ray misses the scene."""
     return _png(_heat(look))
 
@@ -64,7 +64,7 @@ def render(scene: QueryScene, view: str, what: str = "rgb") -> np.ndarray:
     if what == "cluster":
         return render_clusters(scene, view)
     colours = scene.principal if what == "pca" else seen_colours(scene.splats, scene.cameras.get(view))
-    walk = Walk(antialiased=scene.walk.antialiased)
+    walk = CompositingParams(antialiased=scene.walk.antialiased)
     image = scene.image(view, lambda camera: scene.raster.render(camera, colours, walk))
     levels = image.numpy()  # in place: an image of floats is large
     np.clip(levels, 0.0, 1.0, out=levels)
@@ -93,11 +93,11 @@ def render_clusters(scene: QueryScene, view: str) -> np.ndarray:
     return picture
 
 
-def _mask(look: Look) -> np.ndarray:
+def _mask(look: ViewMask) -> np.ndarray:
     return look.mask.numpy().astype(np.uint8) * 255
 
 
-def _heat(look: Look) -> np.ndarray:
+def _heat(look: ViewMask) -> np.ndarray:
     return heat_colours(look.attention.numpy(), look.row_sums.numpy() > 0)
 
 

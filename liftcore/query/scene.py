@@ -6,13 +6,13 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
-from liftcore.artifact import Lift, load_lift
 from liftcore.errors import InvalidQuery
+from liftcore.io.lift_file import LiftResult, load_lift
 from liftcore.query.in_photo import in_photo
 from liftcore.query.products import norms_of
 from liftcore.query.scores import mean_direction
 from liftcore.query.unchanged import unchanged
-from liftcore.raster.protocol import Walk
+from liftcore.raster.base import CompositingParams
 from liftcore.scene.lens import drawn_by, photo_size
 from liftcore.solve.accumulate import render_walk
 
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
     from torch import Tensor
 
-    from liftcore.observe.pack import FeaturePacks
-    from liftcore.raster.protocol import Raster
+    from liftcore.features.pack import FeaturePacks
+    from liftcore.raster.base import Raster
     from liftcore.scene.cameras import Camera, Cameras
     from liftcore.scene.splats import Splats
 
@@ -37,7 +37,7 @@ class QueryScene:
     checked against their digests when first used, and are loaded once.
     """
 
-    def __init__(self, lift: Lift, path: Path) -> None:
+    def __init__(self, lift: LiftResult, path: Path) -> None:
         self.lift = lift
         self.path = path
         self._packs_at = [Path(file.path) for file in lift.metadata.features]
@@ -105,7 +105,7 @@ class QueryScene:
         Raises:
             InvalidLift: their file moved, or is another than the one that was lifted.
         """
-        from liftcore.scene.load import kernel_named, load_splats
+        from liftcore.io.load import kernel_named, load_splats
 
         return load_splats(self.splat_file, kernel_named(self.lift.metadata.settings.kernel))
 
@@ -121,7 +121,7 @@ class QueryScene:
         Raises:
             InvalidLift: their file moved, or is another than the one that was lifted.
         """
-        from liftcore.scene.load import load_cameras
+        from liftcore.io.load import load_cameras
 
         # Which of several models was meant, the lift knew: its digest tells that the same is read.
         return load_cameras(unchanged("cameras", self.lift.metadata.cameras, self.path), choosing=False)
@@ -151,7 +151,7 @@ class QueryScene:
         Raises:
             InvalidLift: a pack moved, or is another than the one that was lifted.
         """
-        from liftcore.observe.pack import open_packs
+        from liftcore.features.pack import open_packs
 
         files = zip(self.lift.metadata.features, self._packs_at, strict=True)
         moved = [file.model_copy(update={"path": str(path)}) for file, path in files]
@@ -164,11 +164,11 @@ class QueryScene:
     @cached_property
     def raster(self) -> Raster:
         """A for this scene."""
-        from liftcore.raster.cpu import CpuRaster
+        from liftcore.raster.cpu.raster import CpuRaster
 
         return CpuRaster(self.splats, threads=None)
 
     @property
-    def walk(self) -> Walk:
+    def walk(self) -> CompositingParams:
         """How rays walk when scores are rendered: with the lift's rendering gain (App. Tikhonov)."""
         return render_walk(self.lift.metadata.settings)

@@ -13,9 +13,9 @@ import numpy as np
 import torch
 
 from liftcore.errors import InvalidQuery
+from liftcore.io.ply_copy import recoloured, some_rows
 from liftcore.query.colours import NOT_SEEN_COLOUR, constant_terms, heat_colours
 from liftcore.query.objects import objects
-from liftcore.scene.ply_copy import recoloured, some_rows
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

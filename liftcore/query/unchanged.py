@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from liftcore.errors import InvalidLift
-from liftcore.scene.frame import FRAME_FILE
+from liftcore.io.frame import FRAME_FILE
 
 if TYPE_CHECKING:
-    from liftcore.artifact import InputFile
+    from liftcore.io.lift_file import InputFile
 
 COUNTS = {"cameras": f" ({FRAME_FILE} beside them counts too)"}
 
@@ -34,7 +34,7 @@ def unchanged(role: str, remembered: InputFile, lift: Path) -> Path:
             hint=f"move the {role} back to {path}, or lift again from where they are now",
         )
     # The lift's own digest: one definition for files and folders, where it was taken and where it is checked.
-    from liftcore.input_files import camera_input, input_file
+    from liftcore.io.input_files import camera_input, input_file
 
     found = (camera_input if role == "cameras" else input_file)(path)
     if found.sha256 != remembered.sha256:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from liftcore.errors import InvalidQuery
-from liftcore.observe.npy import open_npy
+from liftcore.io.npy import open_npy
 from liftcore.query.example import Vector
 
 if TYPE_CHECKING:

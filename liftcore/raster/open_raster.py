@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from liftcore.raster.cpu import CpuRaster
+from liftcore.raster.cpu.raster import CpuRaster
 
 if TYPE_CHECKING:
     from liftcore.device import Device
-    from liftcore.raster.protocol import Raster
+    from liftcore.raster.base import Raster
     from liftcore.scene.splats import Splats
 
 

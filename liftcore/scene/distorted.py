@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from liftcore.errors import InvalidCameras
-from liftcore.scene.colmap import read_colmap
+from liftcore.io.colmap import read_colmap
 from liftcore.scene.lens import lifted_share
 
 if TYPE_CHECKING:

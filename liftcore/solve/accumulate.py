@@ -11,10 +11,10 @@ import numpy as np
 import torch
 
 from liftcore.device import out_of_memory
-from liftcore.observe.levels import at_levels
-from liftcore.observe.observation import FeatureGrid, Observation, RegionMap
+from liftcore.features.levels import at_levels
+from liftcore.features.views import FeatureGrid, Regions, ViewFeatures
 from liftcore.one_thread import one_thread
-from liftcore.raster.protocol import Look, RayRows, Walk, Weighting
+from liftcore.raster.base import CompositingParams, RayRows, ViewRequest, Weighting
 from liftcore.solve.columns import Columns, as_walked
 from liftcore.solve.readout import Readout, read_pixels, sample_pixels
 from liftcore.solve.totals import Totals
@@ -24,12 +24,12 @@ if TYPE_CHECKING:
 
     from torch import Tensor
 
-    from liftcore.observe.pack import FeaturePacks
+    from liftcore.features.pack import FeaturePacks
     from liftcore.progress import Progress
-    from liftcore.raster.protocol import Raster, RegionWeights
+    from liftcore.raster.base import Raster, RegionWeights
     from liftcore.scene.cameras import Camera, Cameras
     from liftcore.solve.settings import LiftSettings
-    from liftcore.solve.view_weights import ViewWeights
+    from liftcore.solve.view_weights import WeightStore
 
 
 @dataclass(frozen=True)
@@ -55,9 +55,11 @@ class Geometry:
         return tuple(columns.codebook for columns in self.columns)
 
 
-def lift_walk(settings: LiftSettings) -> Walk:
+def lift_walk(settings: LiftSettings) -> CompositingParams:
     """The walk that lifts."""
-    return Walk(settings.lift_gain, settings.alpha_cap, settings.transmittance_stop, settings.antialiased)
+    return CompositingParams(
+        settings.lift_gain, settings.alpha_cap, settings.transmittance_stop, settings.antialiased
+    )
 
 
 def weighting_of(settings: LiftSettings) -> Weighting:
@@ -65,19 +67,21 @@ def weighting_of(settings: LiftSettings) -> Weighting:
     return Weighting(settings.power, settings.selection, settings.k, settings.mass, settings.weight_floor)
 
 
-def strided_walk(walk: Walk, settings: LiftSettings, camera: Camera, number: int) -> Walk:
+def strided_walk(walk: CompositingParams, settings: LiftSettings, camera: Camera, number: int) -> CompositingParams:
     """The walk with the stride, its first pixel drawn for view ``number``: no pixel is left out in all views."""
     rng = np.random.default_rng((settings.seed, number, settings.stride))
     left, top = (int(rng.integers(min(settings.stride, side))) for side in (camera.width, camera.height))
     return replace(walk, stride=settings.stride, offset=(left, top))
 
 
-def render_walk(settings: LiftSettings) -> Walk:
+def render_walk(settings: LiftSettings) -> CompositingParams:
     """The walk that renders attention maps and masks."""
-    return Walk(settings.render_gain, settings.alpha_cap, settings.transmittance_stop, settings.antialiased)
+    return CompositingParams(
+        settings.render_gain, settings.alpha_cap, settings.transmittance_stop, settings.antialiased
+    )
 
 
-def as_read(observation: Observation, settings: LiftSettings, view: str) -> Observation:
+def as_read(observation: ViewFeatures, settings: LiftSettings, view: str) -> ViewFeatures:
     """The observation as the settings read it: its levels, and with ``nearest`` a grid as regions of one cell each.
 
     Raises:
@@ -88,7 +92,7 @@ def as_read(observation: Observation, settings: LiftSettings, view: str) -> Obse
         return observation
     rows, columns = observation.grid.shape[:2]
     cells = torch.arange(rows * columns, dtype=torch.int32).reshape(1, rows, columns)
-    return RegionMap(cells, observation.codebook)
+    return Regions(cells, observation.codebook)
 
 
 @one_thread()
@@ -98,10 +102,10 @@ def accumulate(
     packs: FeaturePacks,
     views: Sequence[str],
     settings: LiftSettings,
-    store: ViewWeights,
+    store: WeightStore,
     progress: Progress,
 ) -> Geometry:
-    """Walk every view once: ``W_v`` into the store, evidence, denominators, and sampled rows of A.
+    """CompositingParams every view once: ``W_v`` into the store, evidence, denominators, and sampled rows of A.
 
     Args:
         scene: the number of splats and the cameras.
@@ -112,7 +116,7 @@ def accumulate(
     totals = Totals(count, store.place)
     samples, readouts, columns = [], deque[Readout](), []
 
-    def looks() -> Iterator[Look]:
+    def looks() -> Iterator[ViewRequest]:
         rays = -(-settings.certificate_rays // len(views))
         for number, name in enumerate(views):
             camera, observation = cameras.get(name), as_read(packs.observation(name), settings, name)
@@ -121,9 +125,9 @@ def accumulate(
             readouts.append(read_pixels(observation, camera, pixels))
             walked, own = as_walked(observation, settings)
             columns.append(own)
-            yield Look(camera, walked, walk, weighting_of(settings), pixels)
+            yield ViewRequest(camera, walked, walk, weighting_of(settings), pixels)
 
-    with closing(raster.walk_views(looks())) as walked_views:
+    with closing(raster.iterate_views(looks())) as walked_views:
         for walked in walked_views:
             weights = _add(totals, walked.weights, columns[len(samples)], float(settings.stride**2), store)
             store.append(weights)
@@ -133,7 +137,7 @@ def accumulate(
     return Geometry(*totals.found(), tuple(samples), tuple(columns))
 
 
-def _add(totals: Totals, walked: RegionWeights, columns: Columns, rays: float, store: ViewWeights) -> RegionWeights:
+def _add(totals: Totals, walked: RegionWeights, columns: Columns, rays: float, store: WeightStore) -> RegionWeights:
     """The view's W, added to the totals; earlier W on the card is brought home when nothing else makes room there."""
     try:
         weights = columns.weighted(walked)

@@ -20,8 +20,8 @@ import numpy as np
 import torch
 from scipy.sparse import csr_matrix
 
-from liftcore.observe.levels import at_levels
-from liftcore.observe.observation import RegionMap
+from liftcore.features.levels import at_levels
+from liftcore.features.views import Regions
 from liftcore.solve.accumulate import render_walk
 from liftcore.solve.clustering import BLOCK, NO_CLUSTER, Clustering, cluster_splats
 from liftcore.solve.region_filter import match_regions
@@ -31,10 +31,10 @@ if TYPE_CHECKING:
 
     from torch import Tensor
 
-    from liftcore.observe.observation import Observation
-    from liftcore.observe.pack import FeaturePacks
+    from liftcore.features.pack import FeaturePacks
+    from liftcore.features.views import ViewFeatures
     from liftcore.progress import Progress
-    from liftcore.raster.protocol import Raster
+    from liftcore.raster.base import Raster
     from liftcore.scene.cameras import Cameras
     from liftcore.solve.settings import LiftSettings
 
@@ -127,7 +127,7 @@ def filter_regions(
     walk = render_walk(settings)
     for number, name in enumerate(names):
         observation = masks_of(packs.observation(name), settings, name)
-        if isinstance(observation, RegionMap):
+        if isinstance(observation, Regions):
             kappa = raster.strongest_labels(cameras.get(name), clustering.labels, walk).numpy()
             rows = observation.codebook.shape[0]
             matches = match_regions(observation.labels.numpy(), kappa, rows, clustering.count)
@@ -139,7 +139,7 @@ def filter_regions(
     return kept
 
 
-def masks_of(observation: Observation, settings: LiftSettings, view: str) -> Observation:
+def masks_of(observation: ViewFeatures, settings: LiftSettings, view: str) -> ViewFeatures:
     """The masks that are filtered: those of one level where it was lifted alone, else all.
 
     Composite regions are pieces of masks; no cluster's footprint would match them.

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from liftcore.features.views import NO_LABEL, Regions, ViewFeatures
 from liftcore.jit import kernel
-from liftcore.observe.observation import NO_LABEL, Observation, RegionMap
 from liftcore.progress import Progress, silent
-from liftcore.raster.protocol import Weighting
+from liftcore.raster.base import Weighting
 from liftcore.solve.readout import Readout, read_pixels
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from torch import Tensor
 
-    from liftcore.raster.protocol import Raster, Walk
+    from liftcore.raster.base import CompositingParams, Raster
     from liftcore.scene.cameras import Camera
 
 _FEW = 255  # levels whose count fits a byte
@@ -44,8 +44,8 @@ class AllRays:
         raster: Raster,
         count: int,
         views: Sequence[Camera],
-        observed: Callable[[int], Observation],
-        walk: Walk,
+        observed: Callable[[int], ViewFeatures],
+        walk: CompositingParams,
         progress: Progress = silent,
     ) -> None:
         self.count = count
@@ -127,14 +127,14 @@ def subtract_rows(rays, columns, shares, codebook, rendered, rest):
     return squares
 
 
-def _readout(observation: Observation, camera: Camera) -> Readout:
+def _readout(observation: ViewFeatures, camera: Camera) -> Readout:
     """S of all pixels of a view."""
     y, x = np.mgrid[: camera.height, : camera.width].astype(np.int32)
     return read_pixels(observation, camera, torch.from_numpy(np.stack([x.ravel(), y.ravel()], axis=1)))
 
 
-def _labelled(observation: Observation) -> RegionMap:
+def _labelled(observation: ViewFeatures) -> Regions:
     """The observation with one region for all that is labelled: its region weights are sums over the rows of B."""
-    if isinstance(observation, RegionMap):
-        return RegionMap(observation.labels.clamp(NO_LABEL, 0), torch.ones(1, 1))
-    return RegionMap(torch.zeros(1, 1, 1, dtype=torch.int32), torch.ones(1, 1))
+    if isinstance(observation, Regions):
+        return Regions(observation.labels.clamp(NO_LABEL, 0), torch.ones(1, 1))
+    return Regions(torch.zeros(1, 1, 1, dtype=torch.int32), torch.ones(1, 1))

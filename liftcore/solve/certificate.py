@@ -96,7 +96,7 @@ def measure_samples(
 
 def measure_view(sample: SampledRays, features: Tensor, codebook: Tensor) -> ViewMeasures:
     """Row sums, residuals, surrogates and betas of one view's sampled rays."""
-    starts = sample.rows.row_starts.numpy()
+    starts = sample.rows.indptr.numpy()
     lengths = np.diff(starts)
     ray_of_entry = np.repeat(np.arange(lengths.size), lengths)
     weights = sample.rows.weights.numpy().astype(np.float64)

@@ -28,22 +28,22 @@ from llvmlite.binding import get_host_cpu_name
 from safetensors import SafetensorError, safe_open
 
 from liftcore import __version__
-from liftcore.observe.observation import RegionMap
-from liftcore.raster.protocol import RayRows, RegionWeights, Walked
-from liftcore.raster.weights_home import on_host
-from liftcore.safetensors_file import tensor_bytes, write_tensors
+from liftcore.features.views import Regions
+from liftcore.io.safetensors_file import tensor_bytes, write_tensors
+from liftcore.raster.base import RayRows, RegionWeights, ViewWeights
+from liftcore.raster.cpu.weights_home import on_host
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Iterable, Iterator, Mapping
 
     from torch import Tensor
 
-    from liftcore.raster.protocol import Look, Raster
+    from liftcore.raster.base import Raster, ViewRequest
     from liftcore.scene.kernel import Kernel
 
 FORMAT = "splatlift-checkpoint/3"
 _BLOCK = re.compile(r"\d{6,}\.safetensors|\.\d{6,}\.safetensors\.[0-9a-f]+\.part")  # by name, and its drafts
-_PARTS = {"weights": RegionWeights, "rows": RayRows}  # of Walked
+_PARTS = {"weights": RegionWeights, "rows": RayRows}  # of ViewWeights
 BLOCK_BYTES = 1 << 28  # a block is written when so much has come together, however little time went by
 
 
@@ -73,13 +73,13 @@ def identity(splats: str, kernel: Kernel, device: Mapping[str, Any]) -> str:
     return digest.hexdigest()
 
 
-def question(look: Look) -> str:
+def question(look: ViewRequest) -> str:
     """What is asked of one view, in hex: all that its answer depends on beside the splats."""
     camera, observed = look.camera, look.observation
     told: list[Any] = [camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy]
-    told += [asdict(look.walk), asdict(look.weighting), observed.codebook.shape[0]]
+    told += [asdict(look.params), asdict(look.weighting), observed.codebook.shape[0]]
     parts = [torch.from_numpy(camera.world_to_camera.copy()), look.pixels]
-    if isinstance(observed, RegionMap):
+    if isinstance(observed, Regions):
         parts.append(observed.labels)
     else:
         told.append(observed.grid.shape[:2])
@@ -112,10 +112,10 @@ class _ResumedRaster:
         self._raster = raster
         self._journal = journal
 
-    def walk_views(self, looks: Iterable[Look]) -> Generator[Walked]:
+    def iterate_views(self, looks: Iterable[ViewRequest]) -> Generator[ViewWeights]:
         looks, asked = iter(looks), deque[str]()
 
-        def noted(look: Look) -> Look:
+        def noted(look: ViewRequest) -> ViewRequest:
             asked.append(question(look))
             return look
 
@@ -124,7 +124,7 @@ class _ResumedRaster:
             if known is not None:
                 yield known
                 continue
-            with closing(self._raster.walk_views(map(noted, chain([look], looks)))) as rest:
+            with closing(self._raster.iterate_views(map(noted, chain([look], looks)))) as rest:
                 for walked in rest:
                     self._journal.keep(asked.popleft(), walked)
                     yield walked
@@ -147,7 +147,7 @@ class _Journal:
         self._since = time.monotonic()
         self._keeping = True
 
-    def known(self, asked: str) -> Walked | None:
+    def known(self, asked: str) -> ViewWeights | None:
         """The answer to the next question, if it is on the disk."""
         if not self._known:
             return None
@@ -160,9 +160,9 @@ class _Journal:
             {name: block.get_tensor(f"{number}/{part}/{name}") for name in _names(kind)}
             for part, kind in _PARTS.items()
         )
-        return Walked(RegionWeights(**weights), RayRows(**rows))
+        return ViewWeights(RegionWeights(**weights), RayRows(**rows))
 
-    def keep(self, asked: str, walked: Walked) -> None:
+    def keep(self, asked: str, walked: ViewWeights) -> None:
         """Note the answer to the next question."""
         walked = replace(walked, weights=on_host(walked.weights))
         tensors = {

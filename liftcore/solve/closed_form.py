@@ -19,11 +19,11 @@ from numba import types
 from numba.extending import overload
 
 from liftcore.jit import kernel
-from liftcore.lanes import LANES, copy_values, keep_halves, lanes_at, no_lanes, plus_product, sum_of_lanes
-from liftcore.lanes_rows import WIDE
 from liftcore.one_thread import one_thread
 from liftcore.progress import silent
-from liftcore.raster.protocol import RegionWeights
+from liftcore.raster.base import RegionWeights
+from liftcore.raster.cpu.lanes import LANES, copy_values, keep_halves, lanes_at, no_lanes, plus_product, sum_of_lanes
+from liftcore.raster.cpu.lanes_rows import WIDE
 from liftcore.solve.columns import Columns, rows_of
 from liftcore.solve.curve import places_along_curve
 from liftcore.solve.gathering import Gathering
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 
     from liftcore.progress import Progress
     from liftcore.solve.host import EachShare
-    from liftcore.solve.view_weights import ViewWeights
+    from liftcore.solve.view_weights import WeightStore
     from liftcore.solve.weighted_sums import Strips
 
 BLOCK_ENTRIES = 1 << 12  # summed strip by strip, before their splats' rows are copied to X
@@ -115,7 +115,7 @@ def _store_singles(source, width, begin, features):
 
 @one_thread()
 def solve_closed_form(
-    store: Sequence[RegionWeights] | ViewWeights,
+    store: Sequence[RegionWeights] | WeightStore,
     columns: Sequence[Columns],
     denominators: np.ndarray,
     dtype: torch.dtype,

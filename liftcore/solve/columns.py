@@ -14,15 +14,15 @@ from typing import TYPE_CHECKING
 import torch
 from torch.nn.functional import embedding_bag
 
-from liftcore.observe.label_tuples import label_tuples
-from liftcore.observe.observation import NO_LABEL, Observation, RegionMap
+from liftcore.features.label_tuples import label_tuples
+from liftcore.features.views import NO_LABEL, Regions, ViewFeatures
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from torch import Tensor
 
-    from liftcore.raster.protocol import RegionWeights
+    from liftcore.raster.base import RegionWeights
     from liftcore.solve.settings import LiftSettings
 
 
@@ -75,29 +75,29 @@ def by_rows(settings: LiftSettings) -> bool:
     return bool(settings.robust_steps or settings.aggregation_resolve)
 
 
-def as_walked(observation: Observation, settings: LiftSettings) -> tuple[Observation, Columns]:
+def as_walked(observation: ViewFeatures, settings: LiftSettings) -> tuple[ViewFeatures, Columns]:
     """The observation for a walk, and the columns that its W has then."""
     return (observation, Columns(observation.codebook)) if by_rows(settings) else by_tuples(observation)
 
 
 def warm_up_tuples() -> None:
     """Compile what numbers them, or load it from the disk cache."""
-    by_tuples(RegionMap(torch.zeros(2, 1, 1, dtype=torch.int32), torch.zeros(1, 1)))
+    by_tuples(Regions(torch.zeros(2, 1, 1, dtype=torch.int32), torch.zeros(1, 1)))
 
 
-def by_tuples(observation: Observation) -> tuple[Observation, Columns]:
+def by_tuples(observation: ViewFeatures) -> tuple[ViewFeatures, Columns]:
     """The observation for a walk, one level of tuples in place of several of rows, and its columns.
 
     Grids and single levels stay as they are, and maps of more than L tuples for each row of the codebook: strips of
     those would grow too much. The walk meets no channel, so what it is given has none.
     """
     columns = Columns(observation.codebook)
-    if not isinstance(observation, RegionMap) or observation.labels.shape[0] == 1:
+    if not isinstance(observation, Regions) or observation.labels.shape[0] == 1:
         return observation, columns
     most = observation.labels.shape[0] * columns.count
     labels = observation.labels.to(torch.int32).contiguous().numpy()
     numbers, tuples = label_tuples(labels, min(most, labels[0].size))
     if not 0 < tuples.shape[0] <= most:
         return observation, columns
-    regions = RegionMap(torch.from_numpy(numbers)[None], observation.codebook.new_empty(tuples.shape[0], 0))
+    regions = Regions(torch.from_numpy(numbers)[None], observation.codebook.new_empty(tuples.shape[0], 0))
     return regions, replace(columns, tuples=torch.from_numpy(tuples))

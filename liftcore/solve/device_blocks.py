@@ -13,8 +13,8 @@ import torch
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from liftcore.raster.protocol import RegionWeights
-    from liftcore.solve.view_weights import ViewWeights
+    from liftcore.raster.base import RegionWeights
+    from liftcore.solve.view_weights import WeightStore
 
 GRAIN = 256  # splats; blocks end at their multiples
 SLICE = 512  # channels at most
@@ -49,7 +49,7 @@ def block_room(free: int | None, rows: int, width: int, unit: bool) -> int:
 
 
 def splat_blocks(
-    store: Sequence[RegionWeights] | ViewWeights, count: int, width: int, room: int
+    store: Sequence[RegionWeights] | WeightStore, count: int, width: int, room: int
 ) -> list[tuple[int, int]]:
     """(first, last) of the blocks: whole grains, as many as ``room`` bytes hold, at least one."""
     edges = np.append(np.arange(0, count, GRAIN), count)
@@ -64,7 +64,7 @@ def splat_blocks(
     return [*blocks, (int(edges[first]), count)]
 
 
-def _entries_between(store: Sequence[RegionWeights] | ViewWeights, edges: np.ndarray) -> np.ndarray:
+def _entries_between(store: Sequence[RegionWeights] | WeightStore, edges: np.ndarray) -> np.ndarray:
     """[n] i64, the entries of W of the splats between edges [n + 1], summed where they lie."""
     sums: dict[torch.device, tuple[torch.Tensor, torch.Tensor]] = {}
     for view in store:
@@ -73,11 +73,11 @@ def _entries_between(store: Sequence[RegionWeights] | ViewWeights, edges: np.nda
             own = torch.from_numpy(edges).to(place, torch.int32)
             sums[place] = own, torch.zeros(edges.size - 1, dtype=torch.int64, device=place)
         own, total = sums[place]
-        total += view.row_starts[torch.searchsorted(view.splats, own)].diff()
+        total += view.indptr[torch.searchsorted(view.splats, own)].diff()
     return sum((total.cpu().numpy() for _, total in sums.values()), np.zeros(edges.size - 1, np.int64))
 
 
-def bounds_of(store: Sequence[RegionWeights] | ViewWeights, splats: tuple[int, int]) -> list[list[int]]:
+def bounds_of(store: Sequence[RegionWeights] | WeightStore, splats: tuple[int, int]) -> list[list[int]]:
     """[V, 4]: first and last + 1 row of some splats in every view, and first and last + 1 entry; one wait a card."""
     edges: dict[torch.device, torch.Tensor] = {}
     found: dict[torch.device, list[torch.Tensor]] = {}
@@ -86,6 +86,6 @@ def bounds_of(store: Sequence[RegionWeights] | ViewWeights, splats: tuple[int, i
         if place not in edges:
             edges[place] = torch.tensor(splats, dtype=torch.int32, device=place)
         rows = torch.searchsorted(view.splats, edges[place])
-        found.setdefault(place, []).append(torch.cat([rows, view.row_starts[rows]]))
+        found.setdefault(place, []).append(torch.cat([rows, view.indptr[rows]]))
     told = {place: iter(torch.stack(parts).tolist()) for place, parts in found.items()}
     return [next(told[view.splats.device]) for view in store]

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from liftcore.lanes_rows import AHEAD
+from liftcore.raster.cpu.lanes_rows import AHEAD
 from liftcore.solve.weighted_sums import Entries, entries_before, gather_entries
 
 if TYPE_CHECKING:

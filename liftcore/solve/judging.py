@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from liftcore.jit import kernel
-from liftcore.lanes import LANES, in_all_lanes, keep_lanes, lanes_at, no_lanes, plus, plus_product
-from liftcore.lanes_rows import AHEAD, WIDE, add_row_products
+from liftcore.raster.cpu.lanes import LANES, in_all_lanes, keep_lanes, lanes_at, no_lanes, plus, plus_product
+from liftcore.raster.cpu.lanes_rows import AHEAD, WIDE, add_row_products
 from liftcore.solve.weight_tables import floats_at, rows_between, table_at
 from liftcore.solve.weighted_sums import LONG, MOST_ROWS, Entries, block_end, sum_strip
 
@@ -125,30 +125,30 @@ def scatter_judged(splats, cursors, tables, targets, judged):
     addresses, rows = tables
     first = splats[0]
     for view in range(addresses.shape[0]):
-        ids, row_starts, _, weights = table_at(addresses[view], rows[view])
+        ids, indptr, _, weights = table_at(addresses[view], rows[view])
         products, squares = floats_at(targets[view, 0], weights.shape[0]), floats_at(targets[view, 1], ids.shape[0])
         begin, end = rows_between(ids, splats)
         for row in range(begin, end):
             at = cursors[ids[row] - first]
             squares[row] += judged.squares[at]
-            for k in range(row_starts[row], row_starts[row + 1]):
+            for k in range(indptr[row], indptr[row + 1]):
                 products[k] += judged.products[at]
                 at += 1
             cursors[ids[row] - first] = at
 
 
 @kernel
-def to_cosines(row_starts, squares, least, weights, products):
+def to_cosines(indptr, squares, least, weights, products):
     """Products of a view become the cosines c; gives ``(W . c, sum of W)``.
 
     Args:
-        row_starts: [n + 1] i64. squares: [n] f32. least: of a length that has a direction.
+        indptr: [n + 1] i64. squares: [n] f32. least: of a length that has a direction.
         weights: [nnz] f32. products: [nnz] f32, changed.
     """
     agreeing, everything = 0.0, 0.0
     for row in range(squares.shape[0]):
         length = np.sqrt(np.float64(squares[row]))
-        for k in range(row_starts[row], row_starts[row + 1]):
+        for k in range(indptr[row], indptr[row + 1]):
             cosine = min(max(products[k] / length, 0.0), 1.0) if length > least else 0.0
             products[k] = cosine
             agreeing += weights[k] * cosine
@@ -157,25 +157,25 @@ def to_cosines(row_starts, squares, least, weights, products):
 
 
 @kernel
-def to_weights(row_starts, shares, usual, weights, cosines):
+def to_weights(indptr, shares, usual, weights, cosines):
     """Cosines of a view become ``W ((1 - p) c_m + p c)``; gives their row sums [n] f64.
 
     Args:
-        row_starts: [n + 1] i64. shares: [n] f64, p. usual: c.
+        indptr: [n + 1] i64. shares: [n] f64, p. usual: c.
         weights: [nnz] f32, W. cosines: [nnz] f32, changed.
     """
     totals = np.zeros(shares.shape[0])
     for row in range(shares.shape[0]):
         own = min(max(shares[row], 0.0), 1.0)
-        for k in range(row_starts[row], row_starts[row + 1]):
+        for k in range(indptr[row], indptr[row + 1]):
             cosines[k] = weights[k] * ((1.0 - own) * cosines[k] + own * usual)
             totals[row] += cosines[k]
     return totals
 
 
 @kernel
-def to_old_sums(row_starts, gains, first, weights):
+def to_old_sums(indptr, gains, first, weights):
     """Weights of a view times the gain [n] f64 of their row; where that is zero, the first ones again."""
     for row in range(gains.shape[0]):
-        for k in range(row_starts[row], row_starts[row + 1]):
+        for k in range(indptr[row], indptr[row + 1]):
             weights[k] = weights[k] * gains[row] if gains[row] > 0 else first[k]

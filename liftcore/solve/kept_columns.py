@@ -12,10 +12,10 @@ from liftcore.solve.totals import row_totals
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from liftcore.solve.view_weights import ViewWeights
+    from liftcore.solve.view_weights import WeightStore
 
 
-def kept_columns(store: ViewWeights, kept: Sequence[np.ndarray | None], count: int) -> tuple[ViewWeights, np.ndarray]:
+def kept_columns(store: WeightStore, kept: Sequence[np.ndarray | None], count: int) -> tuple[WeightStore, np.ndarray]:
     """The weights of the kept regions alone, and their sums a splat, [P] f64.
 
     Args:

@@ -9,7 +9,7 @@ from liftcore.scene.lens import photo_size
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from liftcore.observe.pack import FeaturePacks
+    from liftcore.features.pack import FeaturePacks
     from liftcore.scene.cameras import Camera
 
 FEW_CELLS = 4  # on a side; of fewer a shape says little

@@ -30,10 +30,10 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from liftcore.progress import Progress
-    from liftcore.raster.protocol import RegionWeights
+    from liftcore.raster.base import RegionWeights
     from liftcore.solve.columns import Columns
     from liftcore.solve.feature_room import FeatureRoom
-    from liftcore.solve.view_weights import ViewWeights
+    from liftcore.solve.view_weights import WeightStore
 
 LONG = 256  # entries that float32 adds up one by one
 
@@ -56,7 +56,7 @@ class BlockRows:
 
 
 def solve_on_device(
-    store: Sequence[RegionWeights] | ViewWeights,
+    store: Sequence[RegionWeights] | WeightStore,
     columns: Sequence[Columns],
     denominators: np.ndarray,
     dtype: torch.dtype,
@@ -99,7 +99,7 @@ def solve_on_device(
 class _Work:
     """What all blocks and slices share. X and squares are on the host; each block and slice fills its part."""
 
-    store: Sequence[RegionWeights] | ViewWeights
+    store: Sequence[RegionWeights] | WeightStore
     counts: Sequence[int]  # columns of every view's W
     scale: Tensor  # [P] f64, one by the sums of rows
     place: torch.device
@@ -147,7 +147,7 @@ def _solve_block(work: _Work, own: _Slice, splats: tuple[int, int]) -> None:
 
 
 def block_rows(
-    store: Sequence[RegionWeights] | ViewWeights,
+    store: Sequence[RegionWeights] | WeightStore,
     counts: Sequence[int],
     splats: tuple[int, int],
     scale: Tensor,
@@ -161,7 +161,7 @@ def block_rows(
     offset, base, gathered = splats[0], 0, []
     for weights, count, (first, last, begin, end) in zip(store, counts, bounds_of(store, splats), strict=True):
         if begin < end:
-            own = weights.splats[first:last], weights.row_starts[first : last + 1], weights.columns[begin:end]
+            own = weights.splats[first:last], weights.indptr[first : last + 1], weights.columns[begin:end]
             ids, starts, columns, values = (part.to(place) for part in (*own, weights.weights[begin:end]))
             gathered.append((ids, torch.diff(starts), columns + base, values))
         base += count

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from liftcore.observe.observation import Observation, RegionMap
+from liftcore.features.views import Regions, ViewFeatures
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from liftcore.raster.protocol import Walk
+    from liftcore.raster.base import CompositingParams
     from liftcore.scene.cameras import Camera
 
 
@@ -35,7 +35,7 @@ class Readout:
         return (taken * torch.from_numpy(self.shares).to(torch.float32)[:, :, None]).sum(dim=1)
 
 
-def sample_pixels(camera: Camera, count: int, seed: tuple[int, int], walk: Walk) -> Tensor:
+def sample_pixels(camera: Camera, count: int, seed: tuple[int, int], walk: CompositingParams) -> Tensor:
     """[n, 2] i32: up to ``count`` different pixels (x, y) that the walk sees, in image order, by an explicit seed."""
     left, top = walk.offset
     columns, rows = np.arange(left, camera.width, walk.stride), np.arange(top, camera.height, walk.stride)
@@ -46,10 +46,10 @@ def sample_pixels(camera: Camera, count: int, seed: tuple[int, int], walk: Walk)
     return torch.from_numpy(places.astype(np.int32))
 
 
-def read_pixels(observation: Observation, camera: Camera, pixels: Tensor) -> Readout:
+def read_pixels(observation: ViewFeatures, camera: Camera, pixels: Tensor) -> Readout:
     """The rows of S of the given pixels [n, 2] (x, y)."""
     x, y = pixels.numpy().astype(np.int64).T
-    if isinstance(observation, RegionMap):
+    if isinstance(observation, Regions):
         _, rows, columns = observation.labels.shape
         label_y = (2 * y + 1) * rows // (2 * camera.height)
         label_x = (2 * x + 1) * columns // (2 * camera.width)

@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from liftcore.progress import Progress
     from liftcore.solve.gathering import Chunk
     from liftcore.solve.host import EachShare
-    from liftcore.solve.view_weights import ViewWeights
+    from liftcore.solve.view_weights import WeightStore
     from liftcore.solve.weighted_sums import Strips
 
 CHUNK_VALUES = 1 << 20  # of a codebook in float64 at a time
@@ -79,7 +79,7 @@ class Directions:
         return torch.from_numpy(found)
 
 
-def directions_of(pool: ThreadPoolExecutor, store: ViewWeights, books: Sequence[Tensor]) -> Directions:
+def directions_of(pool: ThreadPoolExecutor, store: WeightStore, books: Sequence[Tensor]) -> Directions:
     """The scene's mean of unit vectors, each weighted by its column sum of W, and what divides the rows."""
 
     def measure(view: int) -> tuple[np.ndarray, np.ndarray, float]:
@@ -108,13 +108,13 @@ def directions_of(pool: ThreadPoolExecutor, store: ViewWeights, books: Sequence[
 
 @one_thread()
 def robust_weights(
-    store: ViewWeights,
+    store: WeightStore,
     codebooks: Sequence[Tensor],
     denominators: np.ndarray,
     steps: int,
     progress: Progress,
     host: Host = ALL_CORES,
-) -> ViewWeights:
+) -> WeightStore:
     """W after so many robust steps: the store itself for none, else new weights on its sparsity.
 
     Args:
@@ -140,10 +140,10 @@ def robust_weights(
 
 def _judge(
     workers: tuple[ThreadPoolExecutor, EachShare],
-    current: ViewWeights,
+    current: WeightStore,
     directions: Directions,
     splats: tuple[np.ndarray, np.ndarray | None],
-    target: ViewWeights,
+    target: WeightStore,
 ) -> list[np.ndarray]:
     """``e_m . r_jv`` of every entry into the weights of the target; gives ``|r_jv|^2`` [n] f32 of every view.
 
@@ -184,8 +184,8 @@ def _judge_chunk(
 
 def _write(
     pool: ThreadPoolExecutor,
-    sources: tuple[ViewWeights, ViewWeights],
-    target: ViewWeights,
+    sources: tuple[WeightStore, WeightStore],
+    target: WeightStore,
     squares: Sequence[np.ndarray],
     denominators: np.ndarray,
 ) -> None:
@@ -197,7 +197,7 @@ def _write(
     """
     first, current = sources
     scale, views = _over(np.ones(denominators.size), denominators), range(len(target))
-    starts, splats = ([getattr(view, name).numpy() for view in target] for name in ("row_starts", "splats"))
+    starts, splats = ([getattr(view, name).numpy() for view in target] for name in ("indptr", "splats"))
     before, values = ([view.weights.numpy() for view in store] for store in (first, target))
 
     def find(view: int) -> tuple[float, float]:

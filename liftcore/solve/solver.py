@@ -9,7 +9,7 @@ import torch
 from liftcore.device import out_of_memory
 from liftcore.solve.closed_form import solve_closed_form
 from liftcore.solve.on_device import Place, solve_on_device
-from liftcore.solve.view_weights import ViewWeights
+from liftcore.solve.view_weights import WeightStore
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -18,14 +18,14 @@ if TYPE_CHECKING:
 
     from liftcore.device import Device
     from liftcore.progress import Progress
-    from liftcore.raster.protocol import RegionWeights
+    from liftcore.raster.base import RegionWeights
     from liftcore.solve.closed_form import Solution
     from liftcore.solve.columns import Columns
     from liftcore.solve.host import Host
 
 
 def closed_form(
-    store: Sequence[RegionWeights] | ViewWeights,
+    store: Sequence[RegionWeights] | WeightStore,
     columns: Sequence[Columns],
     denominators: np.ndarray,
     dtype: torch.dtype,
@@ -51,6 +51,6 @@ def closed_form(
         try:
             return solve_on_device(store, columns, denominators, dtype, progress, place, host.room)
         except RuntimeError as error:
-            if not (out_of_memory(error) and isinstance(store, ViewWeights) and store.card_bytes):
+            if not (out_of_memory(error) and isinstance(store, WeightStore) and store.card_bytes):
                 raise
         store.bring_home()

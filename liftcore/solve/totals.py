@@ -11,7 +11,7 @@ from torch.nn.functional import embedding_bag
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from liftcore.raster.protocol import RegionWeights
+    from liftcore.raster.base import RegionWeights
 
 
 class Totals:
@@ -41,7 +41,7 @@ class Totals:
         place = self._evidence.device
         met, seen = weights.evidence_splats.to(place).long(), weights.splats.to(place).long()
         evidence = self._evidence[met] + weights.evidence.to(place).double() * rays
-        values, starts = weights.weights.to(place).double(), weights.row_starts.to(place)
+        values, starts = weights.weights.to(place).double(), weights.indptr.to(place)
         denominators = self._denominators[seen] + sums_in_order(values, starts)
         self._evidence[met] = evidence  # from here on nothing is allocated
         self._denominators[seen] = denominators
@@ -55,7 +55,7 @@ def row_totals(weights: RegionWeights) -> np.ndarray:
     """[n] f64, ``W 1``: the sum of each row, of weights on the host."""
     if weights.splats.numel() == 0:
         return np.zeros(0)
-    return np.add.reduceat(weights.weights.numpy().astype(np.float64), weights.row_starts.numpy()[:-1])
+    return np.add.reduceat(weights.weights.numpy().astype(np.float64), weights.indptr.numpy()[:-1])
 
 
 def sums_in_order(values: Tensor, starts: Tensor) -> Tensor:

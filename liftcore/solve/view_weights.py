@@ -14,8 +14,8 @@ import torch
 
 from liftcore.device import indexed
 from liftcore.errors import Unavailable
-from liftcore.raster.protocol import RegionWeights
-from liftcore.raster.weights_home import on_host
+from liftcore.raster.base import RegionWeights
+from liftcore.raster.cpu.weights_home import on_host
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 MEMORY_LIMIT = 1 << 28  # bytes of W that stay in memory; later views go to files
 
 
-class ViewWeights:
+class WeightStore:
     """The region weights of every view, in view order. A context manager: leaving it removes the files.
 
     Args:
@@ -79,12 +79,12 @@ class ViewWeights:
         self.mapped_bytes += size
         return self._to_file(weights, number)
 
-    def blank(self) -> ViewWeights:
+    def blank(self) -> WeightStore:
         """The same sparsity with weights of their own, zero until they are written: columns are shared, not copied.
 
         The new weights stay in memory while there is room, else in files of this store, which must stay open.
         """
-        copy = ViewWeights(self._limit)
+        copy = WeightStore(self._limit)
         for number, weights in enumerate(self._views):
             copy._views.append(replace(weights, weights=self._zeros(number, weights.weights)))
         return copy

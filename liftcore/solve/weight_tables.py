@@ -12,12 +12,12 @@ from numba import types
 from numba.np.numpy_support import carray
 
 from liftcore.jit import inlined
-from liftcore.lanes import compiled
+from liftcore.raster.cpu.lanes import compiled
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from liftcore.raster.protocol import RegionWeights
+    from liftcore.raster.base import RegionWeights
 
 _SPLATS, _ROW_STARTS, _COLUMNS, _WEIGHTS = range(4)
 _TYPES = (np.int32, np.int64, np.int32, np.float32)
@@ -31,7 +31,7 @@ class WeightTables:
     """
 
     def __init__(self, store: Iterable[RegionWeights]) -> None:
-        views = [(view.splats, view.row_starts, view.columns, view.weights) for view in store]
+        views = [(view.splats, view.indptr, view.columns, view.weights) for view in store]
         self._kept = [  # compiled code takes the types for granted
             tuple(np.ascontiguousarray(part.numpy(), kind) for part, kind in zip(view, _TYPES, strict=True))
             for view in views
@@ -79,13 +79,13 @@ def _floats_at(typingctx, address):
 
 @inlined
 def table_at(addresses, rows):
-    """(splats, row_starts, columns, weights) of one view that has so many rows."""
-    row_starts = carray(_counts_at(addresses[_ROW_STARTS]), (rows + 1,))
+    """(splats, indptr, columns, weights) of one view that has so many rows."""
+    indptr = carray(_counts_at(addresses[_ROW_STARTS]), (rows + 1,))
     splats = carray(_integers_at(addresses[_SPLATS]), (rows,))
-    entries = int(row_starts[rows])
+    entries = int(indptr[rows])
     columns = carray(_integers_at(addresses[_COLUMNS]), (entries,))
     weights = carray(_floats_at(addresses[_WEIGHTS]), (entries,))
-    return splats, row_starts, columns, weights
+    return splats, indptr, columns, weights
 
 
 @inlined

@@ -18,8 +18,8 @@ import torch
 
 from liftcore.errors import Unavailable
 from liftcore.jit import kernel
-from liftcore.lanes import fetch_place
-from liftcore.lanes_rows import WIDE, add_weighted_row, add_weighted_row_twice
+from liftcore.raster.cpu.lanes import fetch_place
+from liftcore.raster.cpu.lanes_rows import WIDE, add_weighted_row, add_weighted_row_twice
 from liftcore.solve.weight_tables import rows_between, table_at
 
 if TYPE_CHECKING:
@@ -124,10 +124,10 @@ def entries_before(splats, tables):
     first, last = splats
     starts = np.zeros(last - first + 1, np.int64)
     for view in range(addresses.shape[0]):
-        ids, row_starts, _, _ = table_at(addresses[view], rows[view])
+        ids, indptr, _, _ = table_at(addresses[view], rows[view])
         row = np.searchsorted(ids, first)
         while row < ids.shape[0] and ids[row] < last:
-            starts[ids[row] - first + 1] += row_starts[row + 1] - row_starts[row]
+            starts[ids[row] - first + 1] += indptr[row + 1] - indptr[row]
             row += 1
     return np.cumsum(starts)
 
@@ -154,7 +154,7 @@ def gather_entries(splats, cursors, tables, columns, entries):
     bases, scale = columns
     first = splats[0]
     for view in range(addresses.shape[0]):
-        ids, row_starts, own, weights = table_at(addresses[view], rows[view])
+        ids, indptr, own, weights = table_at(addresses[view], rows[view])
         begin, end = rows_between(ids, splats)
         for row in range(begin, end):
             splat = ids[row]
@@ -163,7 +163,7 @@ def gather_entries(splats, cursors, tables, columns, entries):
                 fetch_place(entries.rows, soon)
                 fetch_place(entries.shares, soon)
             at = cursors[splat - first]
-            for k in range(row_starts[row], row_starts[row + 1]):
+            for k in range(indptr[row], indptr[row + 1]):
                 entries.rows[at] = bases[view] + own[k]
                 entries.shares[at] = weights[k] * scale[splat]
                 at += 1

@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from liftcore.device import Device, choose_device
-from liftcore.measure.tradeoff.compare import compare
-from liftcore.measure.tradeoff.order import CANDIDATES, EXACT, Scene
-from liftcore.measure.tradeoff.report import page_of, save
+from liftcore.evaluate.tradeoff.compare import compare
+from liftcore.evaluate.tradeoff.order import CANDIDATES, EXACT, Scene
+from liftcore.evaluate.tradeoff.report import page_of, save
+from liftcore.io.strict_json import finite
 from liftcore.progress import Progress, one_step
 from liftcore.scene.splats import Kernel
 from liftcore.solve.settings import LiftSettings
-from liftcore.strict_json import finite
 from liftcore.warm_up import warm_up_lift
 
 SHOWN_DIGITS = 12  # of the splats' digest, by which the chart names the scene
@@ -27,7 +27,7 @@ def compare_as_ordered(order: dict[str, Any], progress: Progress) -> dict[str, A
         What the job's last message tells of it: ``document`` and ``page``.
 
     Raises:
-        SplatliftError: as `liftcore.measure.tradeoff.compare.compare` has it.
+        SplatliftError: as `liftcore.evaluate.tradeoff.compare.compare` has it.
     """
     scene, settings, parameters = _scene(order), order["settings"], order["parameters"]
     device = choose_device(settings.get("device", "auto"))

@@ -25,7 +25,7 @@ def look(asked: str) -> dict[str, object]:
 
 
 def main() -> None:
-    """Look for the device that the command line names."""
+    """ViewMask for the device that the command line names."""
     out = own_stdout()
     out.write(json.dumps(look(sys.argv[1])).encode() + b"\n")
     out.flush()

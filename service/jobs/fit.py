@@ -6,11 +6,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from liftcore.errors import InvalidFeatures, InvalidSettings, InvalidSplats
+from liftcore.io.ply_dialect import model_slots
+from liftcore.io.ply_header import read_header
 from liftcore.query.encoders.words import nearest, plain
 from liftcore.raster.antialiased import check_antialiased
 from liftcore.scene.kernel import Kernel
-from liftcore.scene.ply_dialect import model_slots
-from liftcore.scene.ply_header import read_header
 from liftcore.scene.view_pairs import cameras_of_views, require_pairs, some_of
 from liftcore.solve.settings import LiftSettings
 from service.errors import InvalidRequest

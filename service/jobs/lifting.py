@@ -8,15 +8,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from liftcore.artifact import InputFile, LiftMetadata, save_lift
-from liftcore.input_files import sha256_of
+from liftcore.io.input_files import sha256_of
+from liftcore.io.lift_file import InputFile, LiftMetadata, save_lift
+from liftcore.io.strict_json import finite
 from liftcore.lift import lift
 from liftcore.listener import Listener, log_warnings
 from liftcore.plan.plan import Plan
 from liftcore.progress import one_step
 from liftcore.solve.checkpoint import Checkpoint
 from liftcore.solve.settings import LiftSettings
-from liftcore.strict_json import finite
 from service.faults import renamed
 from service.jobs.reporter import Reporter
 

@@ -18,7 +18,7 @@ LOOK_SECONDS = 0.25  # between looks for new events
 BREATH_SECONDS = 15.0  # of silence, then a comment shows that the line is open
 LOOKERS = 2  # threads that look, however many follow: streams must not starve the other routes
 
-Look = Callable[[int], list[Event]]  # the events after a number
+ViewMask = Callable[[int], list[Event]]  # the events after a number
 Shape = Callable[[Event], str]  # the JSON of an event
 
 
@@ -35,7 +35,7 @@ class EventStreams:
         """Let every stream end soon: the server stops."""
         self._closing = True
 
-    def answer(self, look: Look, shape: Shape, after: int) -> StreamingResponse:
+    def answer(self, look: ViewMask, shape: Shape, after: int) -> StreamingResponse:
         """The events after a number as they come, until the last state.
 
         Raises:
@@ -47,7 +47,7 @@ class EventStreams:
             )
         return _Stream(self, self._follow(look, shape, after))
 
-    async def _follow(self, look: Look, shape: Shape, after: int) -> AsyncIterator[str]:
+    async def _follow(self, look: ViewMask, shape: Shape, after: int) -> AsyncIterator[str]:
         if self._lookers is None:
             self._lookers = anyio.CapacityLimiter(LOOKERS)
         spoke = time.monotonic()

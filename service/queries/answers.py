@@ -15,13 +15,13 @@ from typing import Any
 
 import torch
 
-from liftcore.artifact import load_lift
 from liftcore.errors import SplatliftError
+from liftcore.io.lift_file import load_lift
+from liftcore.io.strict_json import finite
 from liftcore.query.ask import Answer, Point, Question, answers, question, top
 from liftcore.query.encoders import TextEncoder, open_encoder
 from liftcore.query.encoders.remembering import RememberingEncoder
 from liftcore.query.example import Example, Vector, parse_example
-from liftcore.query.look import Look, look
 from liftcore.query.objects import Objects, objects
 from liftcore.query.pictures import attention_png, mask_png, render_png
 from liftcore.query.products import cosines_of, norms_of
@@ -29,9 +29,9 @@ from liftcore.query.query import Query
 from liftcore.query.scene import QueryScene
 from liftcore.query.splat_files import coloured_ply, object_ply, scores_npy
 from liftcore.query.touching import warm_up_touching
-from liftcore.raster.warm_up import warm_up
+from liftcore.query.view_mask import ViewMask, view_mask
+from liftcore.raster.cpu.warm_up import warm_up
 from liftcore.scene.splats import Kernel
-from liftcore.strict_json import finite
 from service.errors import NoSpace
 from service.queries.frames import Frame
 from service.queries.kept import Kept
@@ -55,7 +55,7 @@ class Answers:
 
     def __init__(self, *, scenes: int, cache_bytes: int) -> None:
         self._scenes: Kept[QueryScene] = Kept(scenes)
-        self._cache: Kept[Answer | Objects | Look] = Kept(cache_bytes, bytes_of)
+        self._cache: Kept[Answer | Objects | ViewMask] = Kept(cache_bytes, bytes_of)
         self._encoders: dict[str, tuple[object, TextEncoder]] = {}  # spec -> version of its file, encoder
         self._opening = threading.RLock()  # of encoders, which the warm-up opens too
         self._warm: set[Kernel] = set()  # kernels of splats whose compiled code is loaded, or being loaded
@@ -155,14 +155,14 @@ class Answers:
         assert isinstance(made, Answer)
         return made
 
-    def _look(self, request: dict[str, Any]) -> Look:
+    def _look(self, request: dict[str, Any]) -> ViewMask:
         answer, view = self._answer(request), request["view"]
 
-        def make() -> Look:
-            return look(self._scene(request), answer, view, group=lambda *_: self._grouped(request))
+        def make() -> ViewMask:
+            return view_mask(self._scene(request), answer, view, group=lambda *_: self._grouped(request))
 
         made = self._cache.get((_key(request), "view", view), make)
-        assert isinstance(made, Look)
+        assert isinstance(made, ViewMask)
         return made
 
     def _grouped(self, request: dict[str, Any]) -> Objects:
@@ -229,7 +229,7 @@ def _key(request: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps([request[name] for name in names]).encode()).hexdigest()
 
 
-def bytes_of(made: Answer | Objects | Look) -> int:
+def bytes_of(made: Answer | Objects | ViewMask) -> int:
     """The memory that an answer, with its question, the objects of one or a view of one takes."""
     if isinstance(made, Answer):
         tensors = made.scores.nbytes + made.seen.nbytes + made.selected.nbytes

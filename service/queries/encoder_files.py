@@ -13,7 +13,7 @@ from typing import Any
 from safetensors import SafetensorError, safe_open
 
 from liftcore.errors import InvalidInput
-from liftcore.observe.header import check_header
+from liftcore.features.header import check_header
 from liftcore.query.encoders.specs import ENCODER_SPECS
 from service.errors import Misconfigured
 from service.settings import ServiceSettings, encoder_file, encoder_label
@@ -50,7 +50,7 @@ def _require_readable(argument: str, path: Path) -> None:
 
 
 def _require_table(argument: str, path: Path) -> None:
-    """Look at the header alone: the values are read, and judged, where the table is opened."""
+    """ViewMask at the header alone: the values are read, and judged, where the table is opened."""
     try:
         check_header(path, str(path), InvalidInput, expected=TABLE)
         handle: Any

@@ -18,8 +18,8 @@ def list_lifts(here: Here) -> wire.Lifts:
     return wire.Lifts(lifts=[shape(lift) for lift in here.store.lifts.all()])
 
 
-@router.get("/{lift}", response_model=wire.Lift)
-def get_lift(lift: str, here: Here) -> wire.Lift:
+@router.get("/{lift}", response_model=wire.LiftResult)
+def get_lift(lift: str, here: Here) -> wire.LiftResult:
     """One lift: its settings, certificate and timings."""
     return shape(here.store.lifts.get(lift))
 
@@ -31,10 +31,10 @@ def get_features(lift: str, request: Request, here: Here) -> Response:
     return file_answer(request, StoredFile(found.path, found.bytes, found.sha256, f"lift-{found.id}.safetensors"))
 
 
-def shape(lift: LiftRecord) -> wire.Lift:
+def shape(lift: LiftRecord) -> wire.LiftResult:
     """A lift as the wire has it; paths of this machine stay here."""
     metadata = lift.metadata
-    return wire.Lift(
+    return wire.LiftResult(
         id=lift.id,
         bytes=lift.bytes,
         sha256=lift.sha256,

@@ -106,7 +106,7 @@ ALTER TABLE jobs ADD COLUMN parameters TEXT NOT NULL DEFAULT '{}';  -- JSON: wha
 CREATE TABLE tradeoffs (            -- small enough to lie here, so that no file can be without its row
     id TEXT PRIMARY KEY REFERENCES jobs (id),
     bytes INTEGER NOT NULL,
-    document TEXT NOT NULL,         -- JSON, as liftcore.measure.tradeoff.compare gives it
+    document TEXT NOT NULL,         -- JSON, as liftcore.evaluate.tradeoff.compare gives it
     page TEXT NOT NULL,             -- Markdown
     chart BLOB NOT NULL,            -- PNG
     sha256 TEXT NOT NULL,           -- of the chart

@@ -19,7 +19,7 @@ from service.store.owners import SEEN, Owned
 class FinishedTradeoff:
     """What a job's process found."""
 
-    document: dict[str, Any]  # as liftcore.measure.tradeoff.compare gives it
+    document: dict[str, Any]  # as liftcore.evaluate.tradeoff.compare gives it
     page: str  # Markdown
     chart: bytes  # PNG
 

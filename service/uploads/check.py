@@ -14,13 +14,13 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from liftcore.errors import InvalidCameras, InvalidInput, SplatliftError
-from liftcore.inspect_file import describe_packs, describe_table
-from liftcore.observe.masks import describe_masks
-from liftcore.observe.pack import open_packs
+from liftcore.features.masks import describe_masks
+from liftcore.features.pack import open_packs
+from liftcore.io.inspect import describe_packs, describe_table
+from liftcore.io.inspect_scene import describe_camera_file, describe_splats
+from liftcore.io.load import load_splats
+from liftcore.io.strict_json import finite
 from liftcore.query.encoders.table import TableEncoder
-from liftcore.scene.inspect import describe_camera_file, describe_splats
-from liftcore.scene.load import load_splats
-from liftcore.strict_json import finite
 from service.faults import fault_of
 from service.own_stdout import own_stdout
 from service.uploads.checking import INVALID

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
-from liftcore.raster.warm_up import warm_up
+from liftcore.raster.cpu.warm_up import warm_up
 from liftcore.scene.splats import Kernel
 
 from .conftest import Uploaded

@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
-from liftcore.measure.tradeoff.child import measured
-from liftcore.measure.tradeoff.order import Order, Scene
+from liftcore.evaluate.tradeoff.child import measured
+from liftcore.evaluate.tradeoff.order import Order, Scene
 from service.store.assets import CheckedUpload
 from service.store.jobs import fingerprint
 from service.store.owners import Owner

@@ -18,7 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from liftcore.errors import NotFound
-from liftcore.inspect_file import inspect_file
+from liftcore.io.inspect import inspect_file
 from service.content import StoredFile, file_answer
 from service.uploads.decoding import GZIP, ZSTD, Coding, Decoding
 from service.wire import AssetKind

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from liftcore.observe.write_pack import write_pack
+from liftcore.features.write_pack import write_pack
+from liftcore.io.inria import write_inria_cameras
+from liftcore.io.ply import write_splats
 from liftcore.scene.cameras import Cameras
-from liftcore.scene.inria import write_inria_cameras
-from liftcore.scene.ply import write_splats
 from service.store.assets import CheckedUpload
 from service.store.store import Store
 from service.wire import AssetKind

@@ -14,7 +14,7 @@ import tempfile
 from datetime import UTC, datetime
 from pathlib import Path
 
-from liftcore.raster.warm_up import warm_up
+from liftcore.raster.cpu.warm_up import warm_up
 
 from .loops import ALL_POINTS, POOLED, fault_points, kill_loop, leak_loop, scene_files
 

@@ -10,11 +10,11 @@ import pytest
 import torch
 from PIL import Image
 
+from liftcore.features.mask_folder import mask_views
+from liftcore.features.pack import open_packs
+from liftcore.features.views import Regions
+from liftcore.features.write_pack import write_pack
 from liftcore.lift import lift
-from liftcore.observe.mask_folder import mask_views
-from liftcore.observe.observation import RegionMap
-from liftcore.observe.pack import open_packs
-from liftcore.observe.write_pack import write_pack
 from liftcore.solve.settings import LiftSettings
 from tests.run_lengths import sam_records
 
@@ -25,14 +25,14 @@ EVERY = 9  # of 52 views six are enough
 
 
 @pytest.fixture(scope="module")
-def views(shared_data: Path) -> dict[str, RegionMap]:
+def views(shared_data: Path) -> dict[str, Regions]:
     packs = open_packs([shared_data / "tabletop" / "features_hard.safetensors"])
     found = {view: packs.observation(view) for view in packs.views[::EVERY]}
-    return {view: regions for view, regions in found.items() if isinstance(regions, RegionMap)}
+    return {view: regions for view, regions in found.items() if isinstance(regions, Regions)}
 
 
-def test_a_level_as_pictures_is_the_same_pack(views: dict[str, RegionMap], tmp_path: Path) -> None:
-    whole = {view: RegionMap(regions.labels[:1], regions.codebook) for view, regions in views.items()}
+def test_a_level_as_pictures_is_the_same_pack(views: dict[str, Regions], tmp_path: Path) -> None:
+    whole = {view: Regions(regions.labels[:1], regions.codebook) for view, regions in views.items()}
     (tmp_path / "masks").mkdir()
     for view, regions in whole.items():
         Image.fromarray(np.where(regions.labels[0] < 0, 255, regions.labels[0]).astype(np.uint8)).save(
@@ -46,7 +46,7 @@ def test_a_level_as_pictures_is_the_same_pack(views: dict[str, RegionMap], tmp_p
 
 @pytest.mark.parametrize("kind", ["booleans", "run lengths"])
 def test_regions_of_all_levels_as_masks_make_the_same_lift(
-    kind: str, views: dict[str, RegionMap], shared_data: Path, tmp_path: Path
+    kind: str, views: dict[str, Regions], shared_data: Path, tmp_path: Path
 ) -> None:
     (tmp_path / "masks").mkdir()
     for view, regions in views.items():

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from liftcore.lift import lift
-from liftcore.measure.tabletop import Tabletop
 from liftcore.query.ask import ask
 from liftcore.query.example import OneSplat
 from liftcore.query.query import Query
 from liftcore.query.scene import QueryScene
 from liftcore.query.scores import relevancy
 from liftcore.solve.settings import LiftSettings
+from tests.benchmarks.tabletop import Tabletop
 
 if TYPE_CHECKING:
     from pathlib import Path

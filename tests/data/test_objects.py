@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from liftcore.measure.objects import measure_tabletop
+from tests.benchmarks.objects import measure_tabletop
 
 
 def test_the_objects_of_hard_masks_are_the_things_of_the_scene(shared_data: Path) -> None:

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 import pytest
 import torch
 
+from liftcore.features.pack import open_packs
+from liftcore.features.views import FeatureGrid
+from liftcore.features.write_pack import write_pack
 from liftcore.lift import lift
-from liftcore.observe.observation import FeatureGrid
-from liftcore.observe.pack import open_packs
-from liftcore.observe.write_pack import write_pack
 from liftcore.solve.settings import LiftSettings
 
 if TYPE_CHECKING:

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import torch
 
+from liftcore.features.pack import open_packs
+from liftcore.features.views import FeatureGrid
+from liftcore.io.load import load_cameras, load_splats
 from liftcore.lift import lift
-from liftcore.observe.observation import FeatureGrid
-from liftcore.observe.pack import open_packs
-from liftcore.raster.cpu import CpuRaster
-from liftcore.raster.protocol import Walk
-from liftcore.scene.load import load_cameras, load_splats
+from liftcore.raster.base import CompositingParams
+from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.solve.accumulate import render_walk
 from liftcore.solve.settings import LiftSettings
 
@@ -57,13 +57,15 @@ def test_colmap_and_inria_files_describe_the_same_cameras(plush, cameras):
 def test_rays_are_as_full_as_the_training_measured(plush, cameras, raster):
     stats = json.loads((plush / "stats.json").read_text())
     names = sorted(camera.name for camera in cameras)[:: len(cameras) // SAMPLE]
-    sums = torch.stack([raster.row_sums(cameras.get(name), Walk()) for name in names])
+    sums = torch.stack([raster.row_sums(cameras.get(name), CompositingParams()) for name in names])
     assert float(sums.mean()) == pytest.approx(stats["row_sum_mean"], abs=1e-3)  # of all views
     assert float(sums.std()) == pytest.approx(stats["row_sum_std"], abs=2e-2)
     assert float(sums.max()) <= 1 + 1e-5
 
 
-def rendered_cosine(raster: CpuRaster, camera: Camera, features: Tensor, grid: Tensor, walk: Walk) -> float:
+def rendered_cosine(
+    raster: CpuRaster, camera: Camera, features: Tensor, grid: Tensor, walk: CompositingParams
+) -> float:
     """Mean cosine of the rendered features, read at the centres of the grid's cells, with the grid."""
     image = raster.render(camera, features, walk)
     rows, columns = grid.shape[:2]

@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from liftcore.measure.tabletop import CASES, Case, Tabletop
+from tests.benchmarks.tabletop import CASES, Case, Tabletop
 
 if TYPE_CHECKING:
     from pathlib import Path
 
 ROUNDING = 0.0005 + 1e-9  # of three printed digits
-SHORT = ("features", "features_hard", "grids")  # python -m liftcore.measure.tabletop measures all
+SHORT = ("features", "features_hard", "grids")  # python -m tests.benchmarks.tabletop measures all
 BARS = [case for case in CASES if case.pack in SHORT and case.accuracy is not None and case.power == 1]
 
 

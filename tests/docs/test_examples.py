@@ -20,9 +20,9 @@ from PIL import Image
 from pydantic import BaseModel
 
 from liftcore.cli import main
-from liftcore.observe.pack import open_packs
-from liftcore.observe.rle import mask_of_runs, read_runs
-from liftcore.scene.load import load_splats
+from liftcore.features.pack import open_packs
+from liftcore.features.rle import mask_of_runs, read_runs
+from liftcore.io.load import load_splats
 from service import wire
 from service.routes import assets, jobs, lifts, operations, queries, tradeoffs
 from tests.api.tiny_scene import WIDTH, WORDS, codebook, colmap_zip, labels, make_scene

@@ -17,7 +17,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from liftcore.cli import main
-from liftcore.scene.load import load_cameras
+from liftcore.io.load import load_cameras
 from tests.api.tiny_scene import WIDTH, cameras_document, colmap_zip, make_scene
 
 from .readme import SCENES, blocks, text

@@ -24,9 +24,9 @@ from triton.backends.compiler import BaseBackend, GPUTarget
 from triton.compiler import ASTSource, make_backend
 
 from liftcore.device import Device
+from liftcore.raster.base import CompositingParams, Selection, Weighting
+from liftcore.raster.cpu.warm_up import warm_up
 from liftcore.raster.gpu import launching, raster, rendering, selecting, sums, tracing, weighing
-from liftcore.raster.protocol import Selection, Walk, Weighting
-from liftcore.raster.warm_up import warm_up
 from liftcore.scene.splats import Kernel
 from tests.scenes import random_camera, random_grid, random_regions, random_splats
 
@@ -122,7 +122,7 @@ def launches_of(work: Callable[[], None]) -> dict[Launch, None]:
     return found
 
 
-def _views(kernel: Kernel, walk: Walk, weighting: Weighting) -> None:
+def _views(kernel: Kernel, walk: CompositingParams, weighting: Weighting) -> None:
     """A lift's questions about two views that have no size in common; of grids for 3DGS alone."""
     splats = random_splats(3, kernel=kernel)
     gpu = raster.GpuRaster(splats, torch.device("cpu"))
@@ -138,11 +138,11 @@ def _every_product() -> None:
     """One of each for 3DGS."""
     splats, camera = random_splats(3), random_camera(3)
     gpu = raster.GpuRaster(splats, torch.device("cpu"))
-    gpu.region_weights(camera, random_regions(3), Walk(), Weighting(2, Selection.CENTRE))
-    gpu.render(camera, torch.zeros(splats.count, rendering.WIDEST), Walk())
-    gpu.adjoint(camera, torch.zeros(camera.height, camera.width, weighing.WIDEST), Walk())
-    gpu.strongest_labels(camera, torch.zeros(splats.count, dtype=torch.int32), Walk())
-    gpu.row_sums(random_camera(3, 1, 1), Walk())
+    gpu.region_weights(camera, random_regions(3), CompositingParams(), Weighting(2, Selection.CENTRE))
+    gpu.render(camera, torch.zeros(splats.count, rendering.WIDEST), CompositingParams())
+    gpu.adjoint(camera, torch.zeros(camera.height, camera.width, weighing.WIDEST), CompositingParams())
+    gpu.strongest_labels(camera, torch.zeros(splats.count, dtype=torch.int32), CompositingParams())
+    gpu.row_sums(random_camera(3, 1, 1), CompositingParams())
 
 
 def main() -> None:
@@ -150,7 +150,9 @@ def main() -> None:
     raster.check_device = lambda _device: None
     every: dict[Launch, None] = {}
     for kernel in Kernel:
-        how = (Walk(gain=1.2), TOP) if kernel is Kernel.GAUSSIAN_3D else (Walk(), Weighting())
+        how = (
+            (CompositingParams(gain=1.2), TOP) if kernel is Kernel.GAUSSIAN_3D else (CompositingParams(), Weighting())
+        )
         warm = launches_of(partial(warm_up, kernel, _CARD, *how))
         lift = launches_of(partial(_views, kernel, *how))
         later = sorted({launch.name for launch in lift if launch not in warm})

@@ -14,13 +14,13 @@ import pytest
 import torch
 
 from liftcore.errors import InvalidInput, InvalidSettings, Unavailable
-from liftcore.observe.observation import RegionMap
-from liftcore.raster.cpu import CpuRaster
+from liftcore.features.views import Regions
+from liftcore.raster.base import CompositingParams, RegionWeights, Selection, Weighting
+from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.raster.gpu import selecting
 from liftcore.raster.gpu.frame import Frame
 from liftcore.raster.gpu.sums import Pieces, sums_by_unit
-from liftcore.raster.oracle import OracleRaster
-from liftcore.raster.protocol import RegionWeights, Selection, Walk, Weighting
+from liftcore.raster.reference import OracleRaster
 from liftcore.scene.splats import Kernel
 from tests.backends import gpu_raster, needs_triton
 from tests.properties.test_raster_conformance import INSIDE, dense
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from liftcore.scene.cameras import Camera
 
 pytestmark = [needs_triton, pytest.mark.usefixtures("every_kernel")]
-WALK = Walk(gain=1.2)
+WALK = CompositingParams(gain=1.2)
 WEIGHTINGS = (
     Weighting(),
     Weighting(0, Selection.TOP_K, count=2, floor=0.02),
@@ -53,9 +53,9 @@ def as_parts(weights: RegionWeights) -> list[torch.Tensor]:
 def test_both_backends_list_the_same_splats_in_every_tile(kernel):
     splats, camera = random_splats(7, 3_000, kernel=kernel), random_camera(7, 200, 150)
     ours, theirs = gpu_raster(splats), CpuRaster(splats, threads=2)
-    own = ours._frame(camera, Walk())
+    own = ours._frame(camera, CompositingParams())
     lists = own.lists_of(own.bands[0])
-    (frame,) = theirs._bands(camera, Walk())
+    (frame,) = theirs._bands(camera, CompositingParams())
     assert np.array_equal(lists.starts.cpu().numpy(), frame.starts)
     assert np.array_equal(lists.ids[lists.items.long()].cpu().numpy(), frame.ids[frame.items])
 
@@ -63,7 +63,10 @@ def test_both_backends_list_the_same_splats_in_every_tile(kernel):
 @pytest.mark.parametrize("weighting", WEIGHTINGS, ids=lambda weighting: str(weighting.selection))
 def test_both_backends_give_the_same_region_weights(weighting):
     splats, camera = random_splats(5, 50), random_camera(5, 40, 24)
-    for observation, walk in ((random_regions(5), WALK), (random_grid(5), Walk(stride=3, offset=(1, 2)))):
+    for observation, walk in (
+        (random_regions(5), WALK),
+        (random_grid(5), CompositingParams(stride=3, offset=(1, 2))),
+    ):
         ours, theirs = (
             raster.region_weights(camera, observation, walk, weighting)
             for raster in (gpu_raster(splats), CpuRaster(splats, threads=1))
@@ -101,7 +104,7 @@ def every_product(raster: GpuRaster, camera: Camera) -> list[torch.Tensor]:
     labels = torch.arange(16, dtype=torch.int32) - 1
     return [
         *top_two(raster, camera), *as_parts(raster.region_weights(camera, random_regions(8), WALK, Weighting(2))),
-        rows.row_starts, rows.splats, rows.weights, raster.row_sums(camera, WALK),
+        rows.indptr, rows.splats, rows.weights, raster.row_sums(camera, WALK),
         raster.adjoint(camera, image, WALK), raster.strongest_labels(camera, labels, WALK),
     ]  # fmt: skip
 
@@ -223,7 +226,9 @@ def test_depth_ties_keep_the_order_of_the_file():
     splats, camera = random_splats(2, 20), random_camera(2, 20, 20)
     alike = replace(splats, means=torch.zeros(20, 3), opacity_logits=torch.linspace(-2, 1, 20))
     pixel = torch.tensor([[10, 10]], dtype=torch.int32)
-    ours, theirs = (raster.ray_rows(camera, pixel, Walk()) for raster in (gpu_raster(alike), CpuRaster(alike)))
+    ours, theirs = (
+        raster.ray_rows(camera, pixel, CompositingParams()) for raster in (gpu_raster(alike), CpuRaster(alike))
+    )
     assert ours.splats.numel() > 2
     assert torch.equal(ours.splats, theirs.splats)
     assert torch.equal(ours.splats, torch.sort(ours.splats).values)
@@ -236,18 +241,24 @@ def test_a_view_that_sees_nothing_gives_empty_products(kernel):
     raster = gpu_raster(splats)
     weights = raster.region_weights(away, random_regions(1), WALK, Weighting(1, Selection.TOP_K))
     assert [part.numel() for part in as_parts(weights)] == [0, 1, 0, 0, 0, 0]
-    assert not raster.row_sums(away, Walk()).any()
-    assert not raster.adjoint(away, torch.ones(18, 20, 2), Walk()).any()
-    assert (raster.strongest_labels(away, torch.zeros(5, dtype=torch.int32), Walk()) == -1).all()
-    assert raster.ray_rows(away, torch.zeros(2, 2, dtype=torch.int32), Walk()).row_starts.tolist() == [0, 0, 0]
+    assert not raster.row_sums(away, CompositingParams()).any()
+    assert not raster.adjoint(away, torch.ones(18, 20, 2), CompositingParams()).any()
+    assert (raster.strongest_labels(away, torch.zeros(5, dtype=torch.int32), CompositingParams()) == -1).all()
+    assert raster.ray_rows(away, torch.zeros(2, 2, dtype=torch.int32), CompositingParams()).indptr.tolist() == [
+        0,
+        0,
+        0,
+    ]
 
 
 def test_an_image_of_one_pixel_and_labels_of_none():
     splats, camera = random_splats(4, 30), random_camera(4, 1, 1)
     raster, plain = gpu_raster(splats), OracleRaster(splats)
-    assert torch.allclose(raster.row_sums(camera, Walk()), plain.row_sums(camera, Walk()), atol=INSIDE)
-    nothing = RegionMap(torch.full((2, 1, 1), -1, dtype=torch.int32), torch.ones(3, 1))
-    weights = raster.region_weights(camera, nothing, Walk(), Weighting())
+    assert torch.allclose(
+        raster.row_sums(camera, CompositingParams()), plain.row_sums(camera, CompositingParams()), atol=INSIDE
+    )
+    nothing = Regions(torch.full((2, 1, 1), -1, dtype=torch.int32), torch.ones(3, 1))
+    weights = raster.region_weights(camera, nothing, CompositingParams(), Weighting())
     assert weights.weights.numel() == 0
     assert weights.evidence.numel() > 0
 
@@ -257,7 +268,7 @@ def test_more_levels_than_one_key_holds_are_told_apart():
     splats, camera = random_splats(3, 20), random_camera(3, 20, 17)
     regions = random_regions(3, levels=9, rows=200)
     ours, theirs = (
-        raster.region_weights(camera, regions, Walk(), Weighting())
+        raster.region_weights(camera, regions, CompositingParams(), Weighting())
         for raster in (gpu_raster(splats), CpuRaster(splats, threads=1))
     )
     assert torch.equal(ours.columns, theirs.columns)
@@ -268,7 +279,8 @@ def test_strongest_labels_are_those_of_the_oracle_with_more_labels_than_a_block(
     splats, camera = random_splats(9, 60), random_camera(9, 30, 20)
     labels = torch.arange(60, dtype=torch.int32) % 35 - 1
     ours, theirs = (
-        raster.strongest_labels(camera, labels, Walk()) for raster in (gpu_raster(splats), OracleRaster(splats))
+        raster.strongest_labels(camera, labels, CompositingParams())
+        for raster in (gpu_raster(splats), OracleRaster(splats))
     )
     assert theirs.unique().numel() > 5
     assert (ours != theirs).float().mean() < 0.01
@@ -278,15 +290,15 @@ def test_bad_arguments_are_refused_in_words():
     splats, camera = random_splats(0, 4, kernel=Kernel.GAUSSIAN_2D), random_camera(0)
     raster = gpu_raster(splats)
     with pytest.raises(InvalidInput, match="values"):
-        raster.render(camera, torch.zeros(3, 1), Walk())
+        raster.render(camera, torch.zeros(3, 1), CompositingParams())
     with pytest.raises(InvalidInput, match="values"):
-        raster.adjoint(camera, torch.zeros(3, 4, 1), Walk())
+        raster.adjoint(camera, torch.zeros(3, 4, 1), CompositingParams())
     with pytest.raises(InvalidInput, match="labels"):
-        raster.strongest_labels(camera, torch.zeros(3, dtype=torch.int32), Walk())
+        raster.strongest_labels(camera, torch.zeros(3, dtype=torch.int32), CompositingParams())
     with pytest.raises(InvalidInput, match="stride"):
-        raster.region_weights(camera, random_grid(0), Walk(stride=0), Weighting())
+        raster.region_weights(camera, random_grid(0), CompositingParams(stride=0), Weighting())
     with pytest.raises(InvalidSettings, match="antialiased"):
-        raster.row_sums(camera, Walk(antialiased=True))
+        raster.row_sums(camera, CompositingParams(antialiased=True))
 
 
 @pytest.mark.parametrize("error", [torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB."), FULL])
@@ -297,11 +309,11 @@ def test_memory_that_runs_out_for_good_is_told_in_words(monkeypatch, error):
     raster = gpu_raster(random_splats(0, 4))
     monkeypatch.setattr("liftcore.raster.gpu.raster.Frame", full)
     with pytest.raises(Unavailable, match="footprints and lists of a row of tiles") as caught:
-        raster.row_sums(random_camera(0), Walk())
+        raster.row_sums(random_camera(0), CompositingParams())
     assert caught.value.got == str(error) and caught.value.hint
     monkeypatch.setattr("liftcore.raster.gpu.raster.Frame", lambda *_: broken())
     with pytest.raises(RuntimeError, match="illegal"):  # what is no lack of memory is not told as one
-        raster.row_sums(random_camera(0), Walk())
+        raster.row_sums(random_camera(0), CompositingParams())
 
 
 def broken() -> None:
@@ -328,6 +340,6 @@ def test_without_a_card_or_the_interpreter_the_backend_says_so():
 
 
 def test_nothing_else_loads_triton():
-    code = "import sys, liftcore.lift, liftcore.raster.cpu, liftcore.cli; print('triton' in sys.modules)"
+    code = "import sys, liftcore.lift, liftcore.raster.cpu.raster, liftcore.cli; print('triton' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=True)
     assert done.stdout.strip() == "False"

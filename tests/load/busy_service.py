@@ -20,13 +20,13 @@ import httpx
 import torch
 from safetensors.torch import save_file
 
-from liftcore.artifact import load_lift
-from liftcore.measure.query_bench import write_random_lift
+from liftcore.io.lift_file import load_lift
 from service.store.assets import CheckedUpload
 from service.store.jobs import JobOrder
 from service.store.lifts import FinishedLift
 from service.store.store import Store
 from service.wire import AssetKind
+from tests.benchmarks.query_bench import write_random_lift
 
 ROOT = Path(__file__).parents[2]
 VIEW = (320, 240)  # of the scene that is queried

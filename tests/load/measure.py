@@ -12,7 +12,7 @@ import platform
 import sys
 from datetime import UTC, datetime
 
-from liftcore.raster.warm_up import warm_up
+from liftcore.raster.cpu.warm_up import warm_up
 
 from .queries import query_loop
 from .slow_clients import slow_loop

@@ -8,9 +8,9 @@ import torch
 from hypothesis import strategies as st
 
 from liftcore.errors import InvalidInput
-from liftcore.raster.cpu import CpuRaster
-from liftcore.raster.oracle import OracleRaster, dense_view
-from liftcore.raster.protocol import Walk
+from liftcore.raster.base import CompositingParams
+from liftcore.raster.cpu.raster import CpuRaster
+from liftcore.raster.reference import OracleRaster, dense_view
 from tests.backends import every_backend
 from tests.properties.test_raster_conformance import INSIDE, WALKS
 from tests.scenes import random_camera, random_splats, scenes
@@ -62,12 +62,12 @@ def test_the_number_of_threads_changes_no_bit_of_an_adjoint(walk):
 def test_the_oracle_gives_the_same_adjoint():
     splats, camera = random_splats(3, 30), random_camera(3)
     Y = random_image(camera, 2)
-    Y[torch.from_numpy(dense_view(splats, camera, Walk()).cut.reshape(camera.height, camera.width))] = 0
-    fast, plain = (raster(splats).adjoint(camera, Y, Walk()) for raster in (CpuRaster, OracleRaster))
+    Y[torch.from_numpy(dense_view(splats, camera, CompositingParams()).cut.reshape(camera.height, camera.width))] = 0
+    fast, plain = (raster(splats).adjoint(camera, Y, CompositingParams()) for raster in (CpuRaster, OracleRaster))
     assert torch.allclose(fast, plain, atol=1e-4)
 
 
 def test_an_image_of_another_size_is_refused():
     splats, camera = random_splats(3, 5), random_camera(3)
     with pytest.raises(InvalidInput, match="values"):
-        CpuRaster(splats).adjoint(camera, torch.zeros(3, 4, 1), Walk())
+        CpuRaster(splats).adjoint(camera, torch.zeros(3, 4, 1), CompositingParams())

@@ -13,11 +13,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from liftcore.jit import kernel
-from liftcore.lanes import LANES, PLAIN_TRANSMITTANCE, TRANSMITTANCE, WEIGHTS, keep_lanes
-from liftcore.lanes_blend import BetaLanes, GaussianLanes, blend_lanes, blend_twice, new_state
+from liftcore.raster.base import CompositingParams
 from liftcore.raster.constants import ALPHA_FLOOR
-from liftcore.raster.cpu import CpuRaster
-from liftcore.raster.protocol import Walk
+from liftcore.raster.cpu.lanes import LANES, PLAIN_TRANSMITTANCE, TRANSMITTANCE, WEIGHTS, keep_lanes
+from liftcore.raster.cpu.lanes_blend import BetaLanes, GaussianLanes, blend_lanes, blend_twice, new_state
+from liftcore.raster.cpu.raster import CpuRaster
 from tests.scenes import random_camera, random_splats
 
 CAP, STOP = 0.99, 1e-4
@@ -109,10 +109,10 @@ def test_rays_end_at_the_same_splat_in_every_product_where_opaque_ones_leave_jus
     camera = replace(camera, cx=2.5, cy=2.5, fx=5.0, fy=5.0, world_to_camera=np.eye(4))
     means = torch.tensor([[0.0, 0.0, 2.0 + 0.1 * k] for k in range(6)])
     splats = replace(splats, means=means, opacity_logits=torch.full((6,), 30.0), log_scales=torch.full((6, 3), 2.0))
-    walk = Walk(alpha_cap=cap, transmittance_stop=stop)
+    walk = CompositingParams(alpha_cap=cap, transmittance_stop=stop)
     raster = CpuRaster(splats)
     image = raster.render(camera, torch.ones(6, 1), walk)[..., 0]
     places = torch.tensor([[x, y] for y in range(5) for x in range(5)], dtype=torch.int32)
     rows = raster.ray_rows(camera, places, walk)
-    sums = [float(part.sum()) for part in rows.weights.split(rows.row_starts.diff().tolist())]
+    sums = [float(part.sum()) for part in rows.weights.split(rows.indptr.diff().tolist())]
     assert image.ravel().tolist() == pytest.approx(sums, rel=1e-6, abs=1e-7)

@@ -14,14 +14,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from liftcore.errors import InvalidCameras, InvalidFeatures, InvalidSplats
-from liftcore.observe.npy import open_npy
-from liftcore.observe.observation import FeatureGrid, RegionMap
-from liftcore.observe.pack import open_packs
-from liftcore.observe.write_pack import write_pack
-from liftcore.scene.load import load_cameras
-from liftcore.scene.ply import read_splats, write_splats
-from liftcore.scene.ply_dialect import usual_layout
-from liftcore.scene.ply_header import parse_header
+from liftcore.features.pack import open_packs
+from liftcore.features.views import FeatureGrid, Regions
+from liftcore.features.write_pack import write_pack
+from liftcore.io.load import load_cameras
+from liftcore.io.npy import open_npy
+from liftcore.io.ply import read_splats, write_splats
+from liftcore.io.ply_dialect import usual_layout
+from liftcore.io.ply_header import parse_header
 from liftcore.scene.splats import Kernel
 
 LINES = [
@@ -190,7 +190,7 @@ def test_any_damage_to_a_sparse_model_is_cameras_or_an_error_of_ours(kind, image
 @settings(max_examples=200, deadline=None)
 def test_any_damage_to_a_pack_is_a_pack_or_an_error_of_ours(changes, keep, noise) -> None:
     labels = torch.tensor([[[0, -1], [1, 0]]], dtype=torch.int32)
-    views = {"a": RegionMap(labels, torch.eye(2, 3)), "b": FeatureGrid(torch.ones(1, 2, 3))}
+    views = {"a": Regions(labels, torch.eye(2, 3)), "b": FeatureGrid(torch.ones(1, 2, 3))}
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "pack"
         write_pack(path, views, {"encoder": "e"})

@@ -7,9 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from liftcore.jit import kernel
-from liftcore.lanes import BASES, HALVES, LANES, ROWS, STARTS
-from liftcore.lanes_blend import STATE
-from liftcore.lanes_halves import (
+from liftcore.raster.constants import TILE
+from liftcore.raster.cpu.lanes import BASES, HALVES, LANES, ROWS, STARTS
+from liftcore.raster.cpu.lanes_blend import STATE
+from liftcore.raster.cpu.lanes_halves import (
     both,
     either,
     ellipse_halves,
@@ -20,7 +21,6 @@ from liftcore.lanes_halves import (
     without_lowest,
     without_lowest_rank,
 )
-from liftcore.raster.constants import TILE
 
 places = st.floats(-40, 56)
 curvatures = st.sampled_from([0.0, 1e-6, 1e-3, 1.0, 1e6]) | st.floats(1e-4, 10)

@@ -10,11 +10,11 @@ import pytest
 import torch
 from hypothesis import strategies as st
 
-from liftcore.observe.observation import Observation, RegionMap
-from liftcore.raster.cpu import CpuRaster
-from liftcore.raster.oracle import OracleRaster, dense_view, reading_matrix
-from liftcore.raster.oracle_weights import counted_weights, walked_rays
-from liftcore.raster.protocol import Look, RayRows, RegionWeights, Selection, Walk, Weighting
+from liftcore.features.views import Regions, ViewFeatures
+from liftcore.raster.base import CompositingParams, RayRows, RegionWeights, Selection, ViewRequest, Weighting
+from liftcore.raster.cpu.raster import CpuRaster
+from liftcore.raster.reference import OracleRaster, dense_view, reading_matrix
+from liftcore.raster.reference_weights import counted_weights, walked_rays
 from liftcore.scene.splats import Kernel, Splats
 from tests.backends import every_backend
 from tests.scenes import random_camera, random_grid, random_regions, random_splats, scenes
@@ -24,7 +24,12 @@ if TYPE_CHECKING:
 
 INSIDE = 1e-5  # absolute, on weights
 FLIPS = 1e-2  # of rays: on tiny random images one ray in a hundred; the pooled test below holds 1e-4
-WALKS = (Walk(), Walk(gain=1.2), Walk(gain=0.5), Walk(alpha_cap=0.999, transmittance_stop=0.05))
+WALKS = (
+    CompositingParams(),
+    CompositingParams(gain=1.2),
+    CompositingParams(gain=0.5),
+    CompositingParams(alpha_cap=0.999, transmittance_stop=0.05),
+)
 SELECTIONS = (
     Weighting(1, Selection.TOP_K, count=2),
     Weighting(2, Selection.FRONT_MASS, mass=0.6, floor=0.02),
@@ -41,23 +46,23 @@ pytestmark = pytest.mark.usefixtures("every_kernel")
 every_footprint = pytest.mark.parametrize("footprint", FOOTPRINTS)
 
 
-def drawn(data: st.DataObject, footprint: str) -> tuple[Splats, Camera, Observation, Walk]:
+def drawn(data: st.DataObject, footprint: str) -> tuple[Splats, Camera, ViewFeatures, CompositingParams]:
     """A scene of the kernel, a view, what it observes, and a walk."""
     kernel, antialiased = FOOTPRINTS[footprint]
     splats, camera, observation = data.draw(scenes(kernel))
     return splats, camera, observation, replace(data.draw(st.sampled_from(WALKS)), antialiased=antialiased)
 
 
-def seeded(footprint: str, seed: int, count: int) -> tuple[Splats, Walk]:
+def seeded(footprint: str, seed: int, count: int) -> tuple[Splats, CompositingParams]:
     """A random scene of the kernel, and its plain walk."""
     kernel, antialiased = FOOTPRINTS[footprint]
-    return random_splats(seed, count, kernel=kernel), Walk(antialiased=antialiased)
+    return random_splats(seed, count, kernel=kernel), CompositingParams(antialiased=antialiased)
 
 
 def dense(weights: RegionWeights, splats: int, rows: int) -> np.ndarray:
     """W as a dense [P, M] matrix."""
     W = np.zeros((splats, rows))
-    lengths = np.diff(weights.row_starts.numpy())
+    lengths = np.diff(weights.indptr.numpy())
     W[np.repeat(weights.splats.numpy(), lengths), weights.columns.numpy()] = weights.weights.numpy()
     return W
 
@@ -102,10 +107,10 @@ def test_a_region_or_a_cell_for_every_pixel_is_weighed_as_the_oracle_weighs_it(r
     if reading == "grid":
         observation = random_grid(3, (camera.height + 4, camera.width - 4))
     else:
-        observation = RegionMap(torch.cat([labels, labels // 200]), torch.ones(pixels, 1))
-    view = dense_view(splats, camera, Walk())
+        observation = Regions(torch.cat([labels, labels // 200]), torch.ones(pixels, 1))
+    view = dense_view(splats, camera, CompositingParams())
     S, ray = reading_matrix(observation, camera.width, camera.height)
-    weights = backend.open(splats).region_weights(camera, observation, Walk(), Weighting())
+    weights = backend.open(splats).region_weights(camera, observation, CompositingParams(), Weighting())
     W = dense(weights, splats.count, observation.codebook.shape[0])
     assert not view.cut.any() and (W > 0).sum() > 2 * pixels
     assert np.abs(W - view.A[ray].T @ S).max() < INSIDE
@@ -116,9 +121,9 @@ def test_a_region_or_a_cell_for_every_pixel_is_weighed_as_the_oracle_weighs_it(r
 def test_grids_finer_than_pixels_and_of_one_cell_are_read_as_the_oracle_reads_them(size, backend):
     camera, splats = random_camera(3, 20, 18), random_splats(3, 60)  # (72, 80): four cells of its own for each pixel
     observation = random_grid(3, size)
-    view = dense_view(splats, camera, Walk())
+    view = dense_view(splats, camera, CompositingParams())
     S, ray = reading_matrix(observation, camera.width, camera.height)
-    weights = backend.open(splats).region_weights(camera, observation, Walk(), Weighting(2))
+    weights = backend.open(splats).region_weights(camera, observation, CompositingParams(), Weighting(2))
     W = dense(weights, splats.count, observation.codebook.shape[0])
     assert not view.cut.any() and W.max() > 0
     assert np.abs(W - (view.A**2)[ray].T @ S).max() < INSIDE
@@ -150,7 +155,7 @@ def test_selections_and_strides_equal_the_oracle(footprint, backend):
         chosen, hard = counted_weights(view.A, splats, camera, walk, weighting)
         rays = camera.width * camera.height
         labels = torch.arange(rays, dtype=torch.int32).reshape(1, camera.height, camera.width)
-        one_a_ray = RegionMap(labels, torch.ones(rays, 1))
+        one_a_ray = Regions(labels, torch.ones(rays, 1))
         W = dense(backend.open(splats).region_weights(camera, one_a_ray, walk, weighting), splats.count, rays)
         walked = walked_rays(camera, walk)
         assert W[:, ~walked].max(initial=0) == 0
@@ -185,9 +190,7 @@ def test_ray_rows_are_rows_of_a(footprint, backend):
         pixels = torch.tensor(np.stack([x.ravel(), y.ravel()], axis=1), dtype=torch.int32)
         rows = backend.open(splats).ray_rows(camera, pixels, walk)
         A = np.zeros_like(view.A)
-        A[np.repeat(np.arange(A.shape[0]), np.diff(rows.row_starts.numpy())), rows.splats.numpy()] = (
-            rows.weights.numpy()
-        )
+        A[np.repeat(np.arange(A.shape[0]), np.diff(rows.indptr.numpy())), rows.splats.numpy()] = rows.weights.numpy()
         assert np.abs(A - view.A)[~view.cut].max(initial=0) < INSIDE
 
 
@@ -202,7 +205,7 @@ def test_views_walked_in_a_row_are_those_walked_alone_to_the_bit(footprint, back
     splats, walk = seeded(footprint, 7, 12)
     pixels = (torch.tensor([[3, 4], [10, 11]], dtype=torch.int32), torch.empty(0, 2, dtype=torch.int32))
     looks = [
-        Look(
+        ViewRequest(
             random_camera(k, 14, 13),
             random_regions(k),
             replace(walk, gain=1.0 + k % 2 / 5),
@@ -211,15 +214,15 @@ def test_views_walked_in_a_row_are_those_walked_alone_to_the_bit(footprint, back
         )
         for k in range(3)
     ]
-    walked = list(backend.open(splats).walk_views(iter(looks)))
+    walked = list(backend.open(splats).iterate_views(iter(looks)))
     assert len(walked) == len(looks)
     alone = backend.open(splats)
     for look, found in zip(looks, walked, strict=True):
-        assert same_bits(found.weights, alone.region_weights(look.camera, look.observation, look.walk, Weighting()))
+        assert same_bits(found.weights, alone.region_weights(look.camera, look.observation, look.params, Weighting()))
         if len(look.pixels):
-            assert same_bits(found.rows, alone.ray_rows(look.camera, look.pixels, look.walk))
+            assert same_bits(found.rows, alone.ray_rows(look.camera, look.pixels, look.params))
         else:
-            assert found.rows.row_starts.tolist() == [0]
+            assert found.rows.indptr.tolist() == [0]
 
 
 @every_footprint

@@ -11,11 +11,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from liftcore.errors import InvalidInput
-from liftcore.observe.observation import RegionMap
-from liftcore.raster.cpu import CpuRaster
-from liftcore.raster.oracle import OracleRaster, dense_view
-from liftcore.raster.oracle_weights import counted_weights, walked_rays
-from liftcore.raster.protocol import RegionWeights, Selection, Walk, Weighting
+from liftcore.features.views import Regions
+from liftcore.raster.base import CompositingParams, RegionWeights, Selection, Weighting
+from liftcore.raster.cpu.raster import CpuRaster
+from liftcore.raster.reference import OracleRaster, dense_view
+from liftcore.raster.reference_weights import counted_weights, walked_rays
 from tests.scenes import random_camera, random_grid, random_regions, random_splats, scenes
 
 INSIDE = 1e-5  # absolute, on weights away from cut-offs, ties and borders
@@ -39,20 +39,20 @@ NAMES = [f"{w.selection}-{w.count if w.selection is Selection.TOP_K else w.mass}
 
 hypothesis_settings = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 weightings = st.sampled_from(WEIGHTINGS)
-gains = st.sampled_from([Walk(), Walk(gain=1.2)])
+gains = st.sampled_from([CompositingParams(), CompositingParams(gain=1.2)])
 
 
-def every_ray(camera) -> RegionMap:
+def every_ray(camera) -> Regions:
     """A region a pixel, so that W^T is A' itself."""
     rays = camera.width * camera.height
     labels = torch.arange(rays, dtype=torch.int32).reshape(1, camera.height, camera.width)
-    return RegionMap(labels, torch.ones(rays, 1))
+    return Regions(labels, torch.ones(rays, 1))
 
 
 def matrix(weights: RegionWeights, splats: int, rows: int) -> np.ndarray:
     """W^T as a dense [M, P] matrix."""
     W = np.zeros((rows, splats))
-    lengths = np.diff(weights.row_starts.numpy())
+    lengths = np.diff(weights.indptr.numpy())
     W[weights.columns.numpy(), np.repeat(weights.splats.numpy(), lengths)] = weights.weights.numpy()
     return W
 
@@ -85,9 +85,9 @@ def test_few_rays_are_too_close_to_call(weighting):
     rays, undecided, wrong = 0, 0, 0
     for seed in range(4):
         splats, camera = random_splats(seed, 60), random_camera(seed)
-        view = dense_view(splats, camera, Walk())
-        expected, close = counted_weights(view.A, splats, camera, Walk(), weighting)
-        off = np.abs(chosen_of(splats, camera, Walk(), weighting) - expected).max(axis=1) > INSIDE
+        view = dense_view(splats, camera, CompositingParams())
+        expected, close = counted_weights(view.A, splats, camera, CompositingParams(), weighting)
+        off = np.abs(chosen_of(splats, camera, CompositingParams(), weighting) - expected).max(axis=1) > INSIDE
         rays += off.size
         undecided += int((close & ~view.cut).sum())
         wrong += int((off & ~close & ~view.cut).sum())
@@ -100,7 +100,7 @@ def test_few_rays_are_too_close_to_call(weighting):
 def test_strided_rays_are_rays_of_the_full_view(data, scene, weighting):
     splats, camera, _ = scene
     stride, offset = data.draw(strides(camera))
-    walk = Walk(stride=stride, offset=offset)
+    walk = CompositingParams(stride=stride, offset=offset)
     view = dense_view(splats, camera, walk)
     expected, undecided = counted_weights(view.A, splats, camera, walk, weighting)
     walked = walked_rays(camera, walk)
@@ -114,7 +114,7 @@ def test_strided_rays_are_rays_of_the_full_view(data, scene, weighting):
 def test_strided_pixels_read_what_they_read_at_full_resolution(data, scene):
     splats, camera, observation = scene
     stride, offset = data.draw(strides(camera))
-    walk = Walk(stride=stride, offset=offset)
+    walk = CompositingParams(stride=stride, offset=offset)
     if dense_view(splats, camera, walk).cut.any():
         return
     rows = observation.codebook.shape[0]
@@ -132,14 +132,14 @@ def test_strided_pixels_read_what_they_read_at_full_resolution(data, scene):
 @pytest.mark.parametrize("weighting", WEIGHTINGS, ids=NAMES)
 def test_the_evidence_is_the_same_in_every_weighting(weighting):
     splats, camera = random_splats(3, 400), random_camera(3, 90, 70)
-    for walk in (Walk(), Walk(gain=1.2)):
+    for walk in (CompositingParams(), CompositingParams(gain=1.2)):
         usual, own = (CpuRaster(splats).region_weights(camera, random_regions(3), walk, w) for w in (ALL, weighting))
         assert torch.equal(usual.evidence_splats, own.evidence_splats)
         assert torch.allclose(usual.evidence, own.evidence, rtol=1e-6)
 
 
 @pytest.mark.parametrize("count", [1, 2, 5, 64])
-@pytest.mark.parametrize("walk", [Walk(), Walk(gain=1.2)], ids=["plain", "gain"])
+@pytest.mark.parametrize("walk", [CompositingParams(), CompositingParams(gain=1.2)], ids=["plain", "gain"])
 def test_exactly_k_weights_of_a_ray_count(count, walk):
     splats, camera = random_splats(11, 500), random_camera(11, 90, 70)
     every = chosen_of(splats, camera, walk, Weighting(0)).sum(axis=1)
@@ -157,19 +157,24 @@ def test_of_equal_weights_the_nearest_counts():
         behind = np.float32(np.log(0.5)) + step * np.spacing(np.float32(0.5))
         logits = torch.tensor([behind, np.log(1 / 3)], dtype=torch.float32)
         splats = replace(random_splats(0, 2), means=means, opacity_logits=logits, log_scales=scales)
-        far, near = chosen_of(splats, camera, Walk())[ray]
+        far, near = chosen_of(splats, camera, CompositingParams())[ray]
         if far == near:
             ties += 1
-            kept = chosen_of(splats, camera, Walk(), Weighting(1, Selection.TOP_K, count=1))[ray]
+            kept = chosen_of(splats, camera, CompositingParams(), Weighting(1, Selection.TOP_K, count=1))[ray]
             assert kept.tolist() == [0.0, near]
             assert (
-                np.count_nonzero(chosen_of(splats, camera, Walk(), Weighting(1, Selection.TOP_K, count=2))[ray]) == 2
+                np.count_nonzero(
+                    chosen_of(splats, camera, CompositingParams(), Weighting(1, Selection.TOP_K, count=2))[ray]
+                )
+                == 2
             )
     assert ties > 0
 
 
 @pytest.mark.parametrize("weighting", [ALL, *WEIGHTINGS], ids=["all", *NAMES])
-@pytest.mark.parametrize("walk", [Walk(gain=1.2), Walk(stride=3, offset=(1, 2))], ids=["full", "strided"])
+@pytest.mark.parametrize(
+    "walk", [CompositingParams(gain=1.2), CompositingParams(stride=3, offset=(1, 2))], ids=["full", "strided"]
+)
 def test_the_number_of_threads_changes_no_bit(weighting, walk):
     splats, camera = random_splats(7, 2_000), random_camera(7, 200, 150)
     for observation in (random_regions(7, 4, 30, (75, 100)), random_grid(7, (10, 13))):
@@ -181,11 +186,11 @@ def test_the_number_of_threads_changes_no_bit(weighting, walk):
 
 def test_images_and_traced_rays_are_whole_whatever_the_stride():
     splats, camera = random_splats(5, 300), random_camera(5, 61, 47)
-    raster, walk = CpuRaster(splats), Walk(stride=4, offset=(3, 1))
-    assert torch.equal(raster.row_sums(camera, walk), raster.row_sums(camera, Walk()))
+    raster, walk = CpuRaster(splats), CompositingParams(stride=4, offset=(3, 1))
+    assert torch.equal(raster.row_sums(camera, walk), raster.row_sums(camera, CompositingParams()))
     pixels = torch.tensor([[3, 1], [7, 5], [59, 45]], dtype=torch.int32)
     for asked in (pixels, torch.cat([pixels, torch.tensor([[0, 0]], dtype=torch.int32)])):
-        got, full = (raster.ray_rows(camera, asked, own) for own in (walk, Walk()))
+        got, full = (raster.ray_rows(camera, asked, own) for own in (walk, CompositingParams()))
         assert torch.equal(got.splats, full.splats)
         assert torch.allclose(got.weights, full.weights, atol=1e-6)
 
@@ -193,15 +198,15 @@ def test_images_and_traced_rays_are_whole_whatever_the_stride():
 @pytest.mark.parametrize(
     ("weighting", "walk"),
     [
-        (Weighting(3), Walk()),
-        (Weighting(1, Selection.TOP_K, count=0), Walk()),
-        (Weighting(1, Selection.TOP_K, count=65), Walk()),
-        (Weighting(1, Selection.FRONT_MASS, mass=0.0), Walk()),
-        (Weighting(floor=-1.0), Walk()),
-        (Weighting(floor=float("nan")), Walk()),
-        (ALL, Walk(stride=0)),
-        (ALL, Walk(stride=2, offset=(2, 0))),
-        (ALL, Walk(stride=100, offset=(0, 40))),
+        (Weighting(3), CompositingParams()),
+        (Weighting(1, Selection.TOP_K, count=0), CompositingParams()),
+        (Weighting(1, Selection.TOP_K, count=65), CompositingParams()),
+        (Weighting(1, Selection.FRONT_MASS, mass=0.0), CompositingParams()),
+        (Weighting(floor=-1.0), CompositingParams()),
+        (Weighting(floor=float("nan")), CompositingParams()),
+        (ALL, CompositingParams(stride=0)),
+        (ALL, CompositingParams(stride=2, offset=(2, 0))),
+        (ALL, CompositingParams(stride=100, offset=(0, 40))),
     ],
 )
 def test_knobs_out_of_range_are_refused(weighting, walk):

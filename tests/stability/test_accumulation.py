@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from liftcore.measure.stability.accumulation import (
+from tests.benchmarks.stability.accumulation import (
     added_one_by_one,
     robust_sums,
     sums_of_entries,

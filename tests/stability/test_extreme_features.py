@@ -8,20 +8,20 @@ import numpy as np
 import pytest
 import torch
 
-from liftcore.artifact import Lift, load_lift, save_lift
+from liftcore.features.views import FeatureGrid, Regions, ViewFeatures
+from liftcore.features.write_pack import write_pack
+from liftcore.io.inria import write_inria_cameras
+from liftcore.io.lift_file import LiftResult, load_lift, save_lift
+from liftcore.io.ply import write_splats
 from liftcore.lift import lift
-from liftcore.measure.stability.of_features import checkerboard
-from liftcore.measure.stability.scenes import splats_at
-from liftcore.measure.stability.weights import exact_view
-from liftcore.observe.observation import FeatureGrid, Observation, RegionMap
-from liftcore.observe.write_pack import write_pack
-from liftcore.raster.oracle import reading_matrix
-from liftcore.raster.protocol import Walk
+from liftcore.raster.base import CompositingParams
+from liftcore.raster.reference import reading_matrix
 from liftcore.scene.cameras import Camera, Cameras
-from liftcore.scene.inria import write_inria_cameras
-from liftcore.scene.ply import write_splats
 from liftcore.scene.splats import Splats
 from liftcore.solve.settings import LiftSettings
+from tests.benchmarks.stability.of_features import checkerboard
+from tests.benchmarks.stability.scenes import splats_at
+from tests.benchmarks.stability.weights import exact_view
 from tests.scenes import random_splats
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ def camera(name: str = "v0", back: float = 4.0) -> Camera:
     return Camera(name, WIDTH, HEIGHT, 16.0, 16.0, WIDTH / 2, HEIGHT / 2, pose)
 
 
-def lifted(folder: Path, views: dict[str, Observation], splats: Splats = SCENE, **values: object) -> Lift:
+def lifted(folder: Path, views: dict[str, ViewFeatures], splats: Splats = SCENE, **values: object) -> LiftResult:
     """Through the files and back; a view named ``away`` looks where nothing is."""
     write_splats(splats, folder / "splats.ply")
     cameras = Cameras(tuple(camera(name, back=-1e6 if name == "away" else 4.0) for name in views))
@@ -48,10 +48,10 @@ def lifted(folder: Path, views: dict[str, Observation], splats: Splats = SCENE, 
     return load_lift(folder / "lift.safetensors")
 
 
-def assert_sound(got: Lift, observation: Observation, splats: Splats = SCENE, stop: float = 1e-4) -> None:
+def assert_sound(got: LiftResult, observation: ViewFeatures, splats: Splats = SCENE, stop: float = 1e-4) -> None:
     """Row-sum features equal the dense definition, relative to the longest input; everything is finite."""
     S, ray = reading_matrix(observation, WIDTH, HEIGHT)
-    A = exact_view(splats, camera(), Walk(transmittance_stop=stop)).A[ray]
+    A = exact_view(splats, camera(), CompositingParams(transmittance_stop=stop)).A[ray]
     total = A.sum(axis=0)
     book = observation.codebook.double().numpy()
     X = np.divide(
@@ -80,12 +80,12 @@ def test_agreement_is_the_same_at_any_length_of_the_vectors(tmp_path):
     assert torch.allclose(runs[0], runs[2], atol=1e-5)
 
 
-def maps() -> dict[str, Observation]:
+def maps() -> dict[str, ViewFeatures]:
     large = torch.arange(100 * 130, dtype=torch.int32).reshape(1, 100, 130) % 4
     rng = np.random.default_rng(0)
     return {
-        "1x1 labels": RegionMap(torch.full((2, 1, 1), 2, dtype=torch.int32), torch.eye(4, 6)),
-        "labels larger than the image": RegionMap(large, torch.eye(4, 6)),
+        "1x1 labels": Regions(torch.full((2, 1, 1), 2, dtype=torch.int32), torch.eye(4, 6)),
+        "labels larger than the image": Regions(large, torch.eye(4, 6)),
         "grid of one row": FeatureGrid(torch.tensor(rng.uniform(size=(1, 9, 6)), dtype=torch.float32)),
     }
 
@@ -100,7 +100,7 @@ def test_maps_of_any_size_equal_the_dense_definition(tmp_path, name):
 def test_the_nearest_reading_of_a_grid_takes_the_cell_under_the_pixel(tmp_path, size):
     vectors = np.random.default_rng(1).uniform(size=(*size, 6))
     grid = FeatureGrid(torch.tensor(vectors, dtype=torch.float32))
-    cells = RegionMap(torch.arange(size[0] * size[1], dtype=torch.int32).reshape(1, *size), grid.codebook)
+    cells = Regions(torch.arange(size[0] * size[1], dtype=torch.int32).reshape(1, *size), grid.codebook)
     got = lifted(tmp_path, {"v0": grid}, preset="row-sum", grid_reading="nearest")
     assert_sound(got, cells)
     as_regions = lifted(tmp_path, {"v0": cells}, preset="row-sum")
@@ -110,7 +110,7 @@ def test_the_nearest_reading_of_a_grid_takes_the_cell_under_the_pixel(tmp_path, 
 
 def test_a_lift_without_any_label_succeeds_with_nothing_seen(tmp_path):
     for name in ("v0", "away"):
-        blank = RegionMap(torch.full((2, 3, 4), -1, dtype=torch.int32), torch.ones(2, 5))
+        blank = Regions(torch.full((2, 3, 4), -1, dtype=torch.int32), torch.ones(2, 5))
         got = lifted(tmp_path, {name: blank})
         assert not got.seen.any()
         assert not got.features.any()

@@ -10,13 +10,13 @@ import pytest
 import torch
 
 from liftcore.errors import InvalidSettings
-from liftcore.measure.stability.scenes import camera_at_origin, splats_at
-from liftcore.measure.stability.weights import traced, weights_of
-from liftcore.raster.cpu import CpuRaster
-from liftcore.raster.oracle import dense_view
-from liftcore.raster.protocol import Walk
+from liftcore.raster.base import CompositingParams
+from liftcore.raster.cpu.raster import CpuRaster
+from liftcore.raster.reference import dense_view
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Kernel
+from tests.benchmarks.stability.scenes import camera_at_origin, splats_at
+from tests.benchmarks.stability.weights import traced, weights_of
 from tests.scenes import random_camera, random_splats
 from tests.stability.extremes import assert_equals_the_oracle
 
@@ -41,7 +41,7 @@ def test_a_ray_that_has_stopped_takes_nothing_of_the_discs_behind():
     means = [(0.0, 0.0, 1.0 + 0.01 * k) for k in range(700)]
     splats = splats_at(means, log_scales=1.0, logits=[2.0] * 8 + [-2.0] * 692, kernel=DISC)
     A = assert_equals_the_oracle(splats, camera_at_origin())
-    got = weights_of(splats, camera_at_origin(), Walk())[0]
+    got = weights_of(splats, camera_at_origin(), CompositingParams())[0]
     last = (A > 0).sum(axis=1).max()
     assert last < 12
     assert got[:, last:].max() == 0
@@ -59,7 +59,9 @@ def test_scales_from_dust_to_worlds_equal_the_oracle(kernel, scale):
 @both
 @pytest.mark.parametrize("log_scale", [-80.0, 80.0])
 def test_scales_beyond_all_bounds_stay_finite(kernel, log_scale):
-    A, evidence = weights_of(splats_at(ROW, log_scales=log_scale, kernel=kernel), camera_at_origin(), Walk())
+    A, evidence = weights_of(
+        splats_at(ROW, log_scales=log_scale, kernel=kernel), camera_at_origin(), CompositingParams()
+    )
     assert np.isfinite(A).all()
     assert evidence.max() > 0
 
@@ -133,10 +135,10 @@ def test_beta_from_a_cylinder_to_a_point_equals_the_oracle(b):
 def test_a_beta_of_zero_is_a_cylinder_and_of_four_a_bell():
     camera = camera_at_origin(41, 41, focal=60.0)
     centre, flat = [(0.0, 0.0, 2.0)], math.log(0.4)
-    cylinder = traced(splats_at(centre, flat, betas=-200.0, kernel=BETA), camera, Walk())
+    cylinder = traced(splats_at(centre, flat, betas=-200.0, kernel=BETA), camera, CompositingParams())
     alpha = 1 / (1 + math.exp(-1.0))
     assert set(np.unique(cylinder.round(5))) == {0.0, round(alpha, 5)}
-    bell = traced(splats_at(centre, flat, betas=0.0, kernel=BETA), camera, Walk()).reshape(41, 41)
+    bell = traced(splats_at(centre, flat, betas=0.0, kernel=BETA), camera, CompositingParams()).reshape(41, 41)
     radius = 0.4 * 60 / 2
     row = alpha * np.maximum(1 - (np.arange(41) - 20) ** 2 / (radius**2 + 0.3), 0) ** 4
     assert np.abs(bell[20] - row).max() < 1e-6
@@ -144,7 +146,7 @@ def test_a_beta_of_zero_is_a_cylinder_and_of_four_a_bell():
 
 @both
 def test_the_opacity_compensation_is_refused_where_it_means_nothing(kernel):
-    splats, camera, walk = random_splats(0, 5, kernel=kernel), random_camera(0), Walk(antialiased=True)
+    splats, camera, walk = random_splats(0, 5, kernel=kernel), random_camera(0), CompositingParams(antialiased=True)
     for make in (lambda: CpuRaster(splats).row_sums(camera, walk), lambda: dense_view(splats, camera, walk)):
         with pytest.raises(InvalidSettings, match="3D Gaussians"):
             make()
@@ -155,7 +157,7 @@ def test_the_opacity_compensation_fades_small_splats_and_leaves_large_ones():
     for log_scale, share in ((small, 0.0), (large, 1.0)):
         splats = splats_at([(0.0, 0.0, 2.0)], log_scale)
         plain, faded = (
-            float(CpuRaster(splats).row_sums(camera_at_origin(focal=160.0), Walk(antialiased=on))[6, 8])
+            float(CpuRaster(splats).row_sums(camera_at_origin(focal=160.0), CompositingParams(antialiased=on))[6, 8])
             for on in (False, True)
         )
         assert plain == pytest.approx(1 / (1 + math.exp(-1.0)), abs=1e-4)
@@ -167,6 +169,6 @@ def test_flat_gaussians_and_discs_agree_where_the_low_pass_is_small():
     flat = splats_at([(0.0, 0.0, 2.0)], log_scales=[-0.7, -1.2, -12.0])
     disc = replace(flat, kernel=DISC, log_scales=flat.log_scales[:, :2].contiguous())
     camera = camera_at_origin(64, 48, focal=120.0)
-    images = [CpuRaster(splats).row_sums(camera, Walk()) for splats in (flat, disc)]
+    images = [CpuRaster(splats).row_sums(camera, CompositingParams()) for splats in (flat, disc)]
     assert float((images[0] - images[1]).abs().max()) < 5e-3
     assert torch.isfinite(images[1]).all()

@@ -7,13 +7,13 @@ import math
 import numpy as np
 import pytest
 
-from liftcore.measure.stability.scenes import camera_at_origin, splats_at
-from liftcore.measure.stability.weights import exact_view, traced, weights_of
+from liftcore.raster.base import CompositingParams
 from liftcore.raster.constants import ALPHA_FLOOR
-from liftcore.raster.cpu import CpuRaster
-from liftcore.raster.oracle_footprints import projected_gaussian
-from liftcore.raster.protocol import Walk
+from liftcore.raster.cpu.raster import CpuRaster
+from liftcore.raster.reference_footprints import projected_gaussian
 from liftcore.scene.cameras import Camera
+from tests.benchmarks.stability.scenes import camera_at_origin, splats_at
+from tests.benchmarks.stability.weights import exact_view, traced, weights_of
 from tests.scenes import random_splats
 from tests.stability.extremes import TOLERANCE, assert_equals_the_oracle
 
@@ -29,7 +29,7 @@ def test_scales_from_dust_to_worlds_equal_the_oracle(scale):
 
 @pytest.mark.parametrize("log_scale", [-80.0, -60.0, 60.0, 80.0])
 def test_scales_beyond_all_bounds_stay_finite(log_scale):
-    A, evidence = weights_of(splats_at(ROW, log_scales=log_scale), camera_at_origin(), Walk())
+    A, evidence = weights_of(splats_at(ROW, log_scales=log_scale), camera_at_origin(), CompositingParams())
     assert np.isfinite(A).all()
     assert evidence.min() > 0
 
@@ -43,8 +43,8 @@ def test_dust_and_long_axes_in_one_splat_equal_the_oracle():
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 40), (40, 1), (17, 33)])
 def test_images_of_any_shape_equal_the_oracle(size):
-    assert_equals_the_oracle(random_splats(1), camera_at_origin(*size), Walk())
-    assert_equals_the_oracle(splats_at(ROW), camera_at_origin(*size), Walk())
+    assert_equals_the_oracle(random_splats(1), camera_at_origin(*size), CompositingParams())
+    assert_equals_the_oracle(splats_at(ROW), camera_at_origin(*size), CompositingParams())
 
 
 @pytest.mark.parametrize("turn", [(1.0, 0.0, 0.0, 0.0), (0.707, 0.0, 0.707, 0.0), (0.707, 0.707, 0.0, 0.0), TURNED])
@@ -60,7 +60,7 @@ def test_a_hundred_thousand_splats_on_one_ray_follow_the_geometric_series_withou
     means = np.zeros((count, 3))
     means[:, 2] = np.linspace(1.0, 1_000.0, count)
     splats = splats_at(means.tolist(), log_scales=-1.0, logits=logit)
-    A, evidence = weights_of(splats, camera_at_origin(1, 1), Walk(transmittance_stop=0.0))
+    A, evidence = weights_of(splats, camera_at_origin(1, 1), CompositingParams(transmittance_stop=0.0))
     alpha = 1 / (1 + math.exp(-logit))
     light = (1 - alpha) ** np.arange(count + 1)
     expected = alpha * light[:-1]
@@ -73,22 +73,22 @@ def test_a_hundred_thousand_splats_on_one_ray_follow_the_geometric_series_withou
 @pytest.mark.parametrize("stop", [0.0, 1e-30, 1e-4, 0.5])
 def test_any_cap_and_any_stop_equal_the_oracle(cap, stop):
     splats = splats_at([(0.0, 0.0, 1.0 + k) for k in range(30)], log_scales=1.0, logits=[1e4, 3.0, -2.0] * 10)
-    assert_equals_the_oracle(splats, camera_at_origin(), Walk(1.0, cap, stop))
+    assert_equals_the_oracle(splats, camera_at_origin(), CompositingParams(1.0, cap, stop))
 
 
 @pytest.mark.parametrize("gain", [0.1, 0.5, 1.2, 4.0, 16.0])
 def test_any_gain_equals_the_oracle_and_leaves_the_evidence_plain(gain):
     splats, camera = random_splats(3, 60), camera_at_origin(24, 18)
-    assert_equals_the_oracle(splats, camera, Walk(gain))
-    plain = exact_view(splats, camera, Walk())
+    assert_equals_the_oracle(splats, camera, CompositingParams(gain))
+    plain = exact_view(splats, camera, CompositingParams())
     if not plain.cut.any():
-        assert np.abs(weights_of(splats, camera, Walk(gain))[1] - plain.A.sum(axis=0)).max() < 1e-4
+        assert np.abs(weights_of(splats, camera, CompositingParams(gain))[1] - plain.A.sum(axis=0)).max() < 1e-4
 
 
 def test_a_huge_image_equals_the_oracle_ray_by_ray():
     splats = splats_at([(0.1 * k, -0.07 * k, 2.0 + k) for k in range(6)], log_scales=-1.5)
     camera = Camera("v0", 4_000, 3_000, 3_000.0, 3_000.0, 2_000.5, 1_500.5, np.eye(4))
-    sums = CpuRaster(splats).row_sums(camera, Walk()).numpy()
+    sums = CpuRaster(splats).row_sums(camera, CompositingParams()).numpy()
     assert sums.shape == (3_000, 4_000)
     assert np.isfinite(sums).all()
     gaussians = [projected_gaussian(splats, j, camera)[:2] for j in range(splats.count)]
@@ -104,5 +104,5 @@ def test_a_huge_image_equals_the_oracle_ray_by_ray():
 def test_two_saturated_splats_weigh_the_same_in_the_lift_and_in_its_certificate():
     # (1 - cap)^2 is the stop itself with the field's constants: every way to A must fall on the same side.
     splats, camera = splats_at([(0.0, 0.0, 2.0), (0.0, 0.0, 3.0)], log_scales=2.0, logits=1e4), camera_at_origin()
-    lifted = weights_of(splats, camera, Walk())[0]
-    assert np.abs(lifted - traced(splats, camera, Walk())).max() < TOLERANCE
+    lifted = weights_of(splats, camera, CompositingParams())[0]
+    assert np.abs(lifted - traced(splats, camera, CompositingParams())).max() < TOLERANCE

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from liftcore.measure.stability.case import Extreme, Found
-from liftcore.measure.stability.page import EXTREMES, TABLES, table_of
-from liftcore.measure.stability.wide import BOUND, survey
 from liftcore.scene.splats import Kernel
+from tests.benchmarks.stability.case import Extreme, Found
+from tests.benchmarks.stability.page import EXTREMES, TABLES, table_of
+from tests.benchmarks.stability.wide import BOUND, survey
 
 pytestmark = pytest.mark.usefixtures("every_kernel")
 PAGE = Path(__file__).parents[2] / "docs" / "stability.md"

@@ -7,13 +7,13 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from liftcore.measure.stability.scenes import splats_at
-from liftcore.measure.stability.walks import View
-from liftcore.measure.stability.weights import traced, weights_of
-from liftcore.measure.stability.wide import judgeable
-from liftcore.raster.protocol import Walk
+from liftcore.raster.base import CompositingParams
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Kernel
+from tests.benchmarks.stability.scenes import splats_at
+from tests.benchmarks.stability.walks import View
+from tests.benchmarks.stability.weights import traced, weights_of
+from tests.benchmarks.stability.wide import judgeable
 from tests.stability.extremes import assert_equals_the_oracle
 
 pytestmark = pytest.mark.usefixtures("every_kernel")
@@ -39,7 +39,9 @@ def wide_views(draw: st.DrawFn, kernel: Kernel) -> View:
     shapes = [[draw(log_scales) * 0.5 + np.log(z / focal) for _ in range(3)] for z in depths]
     every = [[draw(strategy) for _ in means] for strategy in (logits, turns, betas)]
     splats = splats_at(means, shapes, every[0], every[1], kernel, every[2])
-    walk = Walk(draw(st.sampled_from([0.01, 1.0, 1.2, 16.0])), draw(st.sampled_from([0.5, 0.99, 0.9999])))
+    walk = CompositingParams(
+        draw(st.sampled_from([0.01, 1.0, 1.2, 16.0])), draw(st.sampled_from([0.5, 0.99, 0.9999]))
+    )
     return View(splats, camera, walk)
 
 

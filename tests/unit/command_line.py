@@ -10,11 +10,11 @@ import numpy as np
 import torch
 
 from liftcore import cli
-from liftcore.observe.observation import RegionMap
-from liftcore.observe.write_pack import write_pack
+from liftcore.features.views import Regions
+from liftcore.features.write_pack import write_pack
+from liftcore.io.inria import write_inria_cameras
+from liftcore.io.ply import write_splats
 from liftcore.scene.cameras import Camera, Cameras
-from liftcore.scene.inria import write_inria_cameras
-from liftcore.scene.ply import write_splats
 from liftcore.scene.splats import Splats
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ def write_toy_scene(folder: Path) -> Path:
     write_inria_cameras(Cameras((camera,)), folder / "cameras.json")
     labels = torch.zeros(1, 16, 32, dtype=torch.int32)
     labels[..., 16:] = 1
-    regions = RegionMap(labels, torch.eye(2, 3))
+    regions = Regions(labels, torch.eye(2, 3))
     metadata = {"encoder": "toy", "text_space": "none"}
     write_pack(folder / "pack.safetensors", {"front": regions, "lost": regions}, metadata)
     return folder

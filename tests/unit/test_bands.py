@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from liftcore.raster import bands
-from liftcore.raster.cpu import CpuRaster
-from liftcore.raster.protocol import Selection, Walk, Weighting
+from liftcore.raster.base import CompositingParams, Selection, Weighting
+from liftcore.raster.cpu import bands
+from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.splats import Kernel
 from tests.scenes import random_camera, random_grid, random_regions, random_splats
 
@@ -27,23 +27,26 @@ def cut(monkeypatch):
 def products(raster: CpuRaster) -> dict[str, tuple[torch.Tensor, ...]]:
     """All that tiles give by themselves."""
     rng = np.random.default_rng(0)
-    count, walk = raster.splats.count, Walk(gain=1.2)
+    count, walk = raster.splats.count, CompositingParams(gain=1.2)
     values = torch.tensor(rng.normal(0, 1, (count, 35)), dtype=torch.float32)
     labels = torch.tensor(rng.integers(-1, 4, count), dtype=torch.int32)
     rows = raster.ray_rows(CAMERA, PIXELS, walk)
     return {
         "render": (raster.render(CAMERA, values, walk),),
         "labels": (raster.strongest_labels(CAMERA, labels, walk),),
-        "rows": (rows.row_starts, rows.splats, rows.weights),
+        "rows": (rows.indptr, rows.splats, rows.weights),
     }
 
 
 def weights_of(raster: CpuRaster, weighting: Weighting) -> list[tuple[torch.Tensor, ...]]:
     """Region weights of labels on two levels and of a grid, strided."""
-    looks = ((random_regions(3), Walk(gain=1.2)), (random_grid(3), Walk(stride=2, offset=(1, 0))))
+    looks = (
+        (random_regions(3), CompositingParams(gain=1.2)),
+        (random_grid(3), CompositingParams(stride=2, offset=(1, 0))),
+    )
     found = [raster.region_weights(CAMERA, observation, walk, weighting) for observation, walk in looks]
     return [
-        (w.splats, w.row_starts, w.columns, w.evidence_splats, w.weights, w.evidence) for w in found
+        (w.splats, w.indptr, w.columns, w.evidence_splats, w.weights, w.evidence) for w in found
     ]  # what is the same, then what is summed in another order
 
 
@@ -51,7 +54,7 @@ def weights_of(raster: CpuRaster, weighting: Weighting) -> list[tuple[torch.Tens
 def test_what_tiles_give_by_themselves_is_the_same_to_the_bit(kernel, cut, monkeypatch):
     splats = random_splats(3, 300, kernel=kernel)
     banded = CpuRaster(splats, threads=2)
-    assert len(list(banded._bands(CAMERA, Walk()))) > 2
+    assert len(list(banded._bands(CAMERA, CompositingParams()))) > 2
     own = products(banded)
     monkeypatch.undo()
     whole = products(CpuRaster(splats, threads=2))
@@ -64,7 +67,10 @@ def test_what_tiles_give_by_themselves_is_the_same_to_the_bit(kernel, cut, monke
 def test_weights_and_the_adjoint_are_summed_over_bands(selection, cut, monkeypatch):
     splats, weighting = random_splats(4, 300), Weighting(1, selection)
     image = torch.tensor(np.random.default_rng(1).normal(0, 1, (70, 100, 35)), dtype=torch.float32)
-    own, back = weights_of(CpuRaster(splats, 2), weighting), CpuRaster(splats, 2).adjoint(CAMERA, image, Walk())
+    own, back = (
+        weights_of(CpuRaster(splats, 2), weighting),
+        CpuRaster(splats, 2).adjoint(CAMERA, image, CompositingParams()),
+    )
     again = weights_of(CpuRaster(splats, 1), weighting)
     monkeypatch.undo()
     whole = weights_of(CpuRaster(splats, 2), weighting)
@@ -73,11 +79,13 @@ def test_weights_and_the_adjoint_are_summed_over_bands(selection, cut, monkeypat
         assert all(torch.equal(a, b) for a, b in zip(mine[:4], theirs[:4], strict=True))
         for a, b in zip(mine[4:], theirs[4:], strict=True):
             torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-7)
-    torch.testing.assert_close(back, CpuRaster(splats, 2).adjoint(CAMERA, image, Walk()), rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(
+        back, CpuRaster(splats, 2).adjoint(CAMERA, image, CompositingParams()), rtol=1e-4, atol=1e-4
+    )
 
 
 def test_a_band_holds_no_more_than_it_may(cut):
-    frames = list(CpuRaster(random_splats(5, 300), threads=1)._bands(CAMERA, Walk()))
+    frames = list(CpuRaster(random_splats(5, 300), threads=1)._bands(CAMERA, CompositingParams()))
     lengths = np.array([np.diff(frame.starts) for frame in frames])
     assert ((lengths > 0).sum(axis=0) <= 1).all()  # each tile in one band
     assert all(own.sum() <= MOST or np.count_nonzero(own) == 1 for own in lengths)
@@ -87,13 +95,13 @@ def test_a_band_holds_no_more_than_it_may(cut):
 @pytest.mark.parametrize("threads", [1, 2, 3])
 def test_a_view_is_cut_where_all_its_lists_together_are_too_long(threads, monkeypatch):
     splats = random_splats(5, 300)
-    (whole,) = CpuRaster(splats, threads)._bands(CAMERA, Walk())
+    (whole,) = CpuRaster(splats, threads)._bands(CAMERA, CompositingParams())
     for most, cut in ((len(whole.items), False), (len(whole.items) - 1, True), (0, True)):
         monkeypatch.setattr(bands, "MOST_LISTED", most)
-        assert (CpuRaster(splats, threads)._bands(CAMERA, Walk())._whole is None) is cut
+        assert (CpuRaster(splats, threads)._bands(CAMERA, CompositingParams())._whole is None) is cut
 
 
 def test_a_view_of_usual_lists_is_one_band():
     raster = CpuRaster(random_splats(5, 300), threads=1)
-    (first,), (again,) = raster._bands(CAMERA, Walk()), raster._bands(CAMERA, Walk())
+    (first,), (again,) = raster._bands(CAMERA, CompositingParams()), raster._bands(CAMERA, CompositingParams())
     assert first is again

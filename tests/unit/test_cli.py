@@ -15,13 +15,13 @@ import torch
 from safetensors.torch import save_file
 
 from liftcore import cli
-from liftcore.artifact import load_lift
-from liftcore.commands import bars, reply
-from liftcore.commands.lift import pairs_of
+from liftcore.cli import bars, reply
+from liftcore.cli.lift import pairs_of
 from liftcore.errors import InvalidFeatures, InvalidSettings, SplatliftError
+from liftcore.features.views import FeatureGrid
+from liftcore.features.write_pack import write_pack
+from liftcore.io.lift_file import load_lift
 from liftcore.lift import lift
-from liftcore.observe.observation import FeatureGrid
-from liftcore.observe.write_pack import write_pack
 from liftcore.query.threshold import METHODS
 from liftcore.solve.settings import LiftSettings, Preset
 
@@ -256,7 +256,7 @@ def test_our_own_fault_exits_1_with_one_line(
     def broken(path: Path) -> dict[str, Any]:
         raise RuntimeError("two\nlines")
 
-    monkeypatch.setattr("liftcore.inspect_file.inspect_file", broken)
+    monkeypatch.setattr("liftcore.io.inspect.inspect_file", broken)
     status, out, err = run(capsys, "inspect", scene, "--json")
     assert (status, out) == (1, "")
     assert_one_line(err)
@@ -280,7 +280,7 @@ def test_demo_and_bench_pass_their_options_on(
     seen: list[Any] = []
     fakes = {
         "liftcore.demo.run": {"run_demo": lambda *arguments: seen.append(arguments) or 0},
-        "liftcore.measure.bench": {"run_bench": lambda options: seen.append(options) or {"seconds": 1.0}},
+        "liftcore.evaluate.bench": {"run_bench": lambda options: seen.append(options) or {"seconds": 1.0}},
     }
     for name, functions in fakes.items():
         module = type(sys)(name)

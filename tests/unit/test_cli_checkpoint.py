@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 import torch
 
-from liftcore.artifact import load_lift
-from liftcore.raster.cpu import CpuRaster
+from liftcore.io.lift_file import load_lift
+from liftcore.raster.cpu.raster import CpuRaster
 
 from .command_line import assert_one_line, lift_arguments, run, write_toy_scene
 

@@ -9,8 +9,8 @@ import pytest
 import torch
 from PIL import ExifTags, Image
 
-from liftcore.observe.observation import FeatureGrid
-from liftcore.observe.pack import open_packs
+from liftcore.features.pack import open_packs
+from liftcore.features.views import FeatureGrid
 
 from .command_line import run
 
@@ -92,7 +92,7 @@ def test_encoded_photos_are_lifted_and_asked_in_the_text_space_of_their_pack(
 
 
 def test_backbones_without_words_say_so(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from liftcore.observe.encoders.timm_backbone import TimmEncoder
+    from liftcore.features.encoders.timm_backbone import TimmEncoder
 
     torch.manual_seed(6)
     weights, pack = tmp_path / "resnet.pt", tmp_path / "pack.safetensors"

@@ -12,7 +12,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from liftcore.artifact import load_lift, save_lift
+from liftcore.io.lift_file import load_lift, save_lift
 from tests.labelled_scene import FRAMES, LIFTED, isat, rectangle, write_3d_ovs_labels, write_lerf_labels, write_lift
 
 from .command_line import run

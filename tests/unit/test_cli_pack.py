@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from PIL import Image
 
-from liftcore.observe.observation import RegionMap
-from liftcore.observe.pack import open_packs
+from liftcore.features.pack import open_packs
+from liftcore.features.views import Regions
 
 from .command_line import assert_one_line, run
 
@@ -112,7 +112,7 @@ def test_masks_and_their_vectors_are_packed(tmp_path: Path, capsys: pytest.Captu
     assert (status, err) == (0, "")
     assert "1 views, 5 channels" in out and "1 levels of 2x2" in out and "a.jpg.npy is 'a'" in out
     regions = open_packs([pack]).observation("a")
-    assert isinstance(regions, RegionMap)
+    assert isinstance(regions, Regions)
     assert regions.labels.tolist() == [[[-1, 0], [1, 1]]]
     status, out, _ = run(capsys, "pack", "masks", folder, "-o", pack, "--unlabelled", 255, *options, "--json")
     document = json.loads(out)

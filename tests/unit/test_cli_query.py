@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from liftcore import cli
-from liftcore.artifact import load_lift, save_lift
-from liftcore.scene.ply import read_splats
+from liftcore.io.lift_file import load_lift, save_lift
+from liftcore.io.ply import read_splats
 
 from .command_line import assert_one_line, lift_arguments, run, write_toy_scene
 

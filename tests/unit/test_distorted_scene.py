@@ -11,18 +11,18 @@ import pytest
 import torch
 from PIL import Image
 
-from liftcore.artifact import Lift, save_lift
 from liftcore.errors import InvalidCameras, InvalidQuery
+from liftcore.io.inria import write_inria_cameras
+from liftcore.io.lift_file import LiftResult, save_lift
+from liftcore.io.load import load_cameras
 from liftcore.lift import lift
 from liftcore.query.ask import ask
 from liftcore.query.example import Pixel, Region
-from liftcore.query.look import look
 from liftcore.query.pictures import render_png
 from liftcore.query.query import Query
 from liftcore.query.scene import QueryScene
+from liftcore.query.view_mask import view_mask
 from liftcore.scene.cameras import Camera
-from liftcore.scene.inria import write_inria_cameras
-from liftcore.scene.load import load_cameras
 from liftcore.solve.settings import LiftSettings
 from tests.distorted_scene import (
     BARREL,
@@ -40,12 +40,12 @@ from tests.distorted_scene import (
 CLEAR = 0.1  # from the border of a quarter: two standard deviations of a splat, or three pixels
 
 
-def lifted(folder: Path, lens: str, *, grids: bool = False) -> Lift:
+def lifted(folder: Path, lens: str, *, grids: bool = False) -> LiftResult:
     splats, cameras, features = write_distorted_scene(folder, lens, grids=grids)
     return lift(splats, cameras, [features], LiftSettings.of(preset="row-sum"))
 
 
-def share_of_own_quarter(made: Lift) -> torch.Tensor:
+def share_of_own_quarter(made: LiftResult) -> torch.Tensor:
     """Of each seen splat that lies clear of borders, the share of its own quarter in its feature."""
     x, y = (axis.numpy() for axis in wall().means.T[:2])
     clear = is_clear(x, y, CLEAR) & made.seen.numpy()
@@ -89,13 +89,13 @@ def test_masks_lie_over_the_photo(lens: str, tmp_path: Path) -> None:
         for part in np.unique(photo[photo >= 0]):
             y, x = np.argwhere(photo == part)[len(np.argwhere(photo == part)) // 2]
             answer = ask(scene, Query((Pixel(view, int(x), int(y)),), threshold=0.5))
-            seen = look(scene, answer, view)
+            seen = view_mask(scene, answer, view)
             assert seen.mask.shape == photo.shape
             found, truth = seen.mask.numpy() & (photo >= 0), photo == part
             assert (found & truth).sum() / (found | truth).sum() > 0.99
     answer = ask(scene, Query((Region("left", 0, 1),), threshold=0.5))
     shown = is_lifted(scene.cameras.get("left")) & (photo_of("left", lens, CLEAR) == 1)
-    assert look(scene, answer, "left").mask.numpy()[shown].all()
+    assert view_mask(scene, answer, "left").mask.numpy()[shown].all()
     with pytest.raises(InvalidQuery, match=rf"x in 0\.\.{WIDTH - 1} and y in 0\.\.{HEIGHT - 1}, got {WIDTH},0"):
         ask(scene, Query((Pixel("left", WIDTH, 0),)))
     for what in ("rgb", "pca", "depth"):

@@ -11,14 +11,14 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from liftcore.artifact import InputFile, Lift, LiftMetadata, save_lift
 from liftcore.errors import InvalidInput, InvalidSplats, SplatliftError
-from liftcore.inspect_file import inspect_file
-from liftcore.observe.observation import FeatureGrid, RegionMap
-from liftcore.observe.write_pack import write_pack
+from liftcore.features.views import FeatureGrid, Regions
+from liftcore.features.write_pack import write_pack
+from liftcore.io.inria import write_inria_cameras
+from liftcore.io.inspect import inspect_file
+from liftcore.io.lift_file import InputFile, LiftMetadata, LiftResult, save_lift
+from liftcore.io.ply import write_splats
 from liftcore.scene.cameras import Camera, Cameras
-from liftcore.scene.inria import write_inria_cameras
-from liftcore.scene.ply import write_splats
 from liftcore.scene.splats import Splats
 from liftcore.solve.settings import LiftSettings
 
@@ -117,7 +117,7 @@ def test_cameras_are_described(tmp_path: Path) -> None:
 def test_features_are_described_and_their_faults_counted(tmp_path: Path) -> None:
     codebook = torch.tensor([[3.0, 4.0], [0.0, 0.0], [1.0, 0.0]])
     labels = torch.tensor([[[0, 1], [-1, -1]]], dtype=torch.int32)
-    views = {"a": RegionMap(labels, codebook), "b": FeatureGrid(torch.ones(1, 2, 2))}
+    views = {"a": Regions(labels, codebook), "b": FeatureGrid(torch.ones(1, 2, 2))}
     write_pack(tmp_path / "p", views, {"normalised": "true"})
     found = inspected(tmp_path / "p")
     assert (found["kind"], found["views"], found["region_maps"], found["grids"]) == ("features", 2, 1, 1)
@@ -146,7 +146,9 @@ def test_lift_is_described(tmp_path: Path) -> None:
         timings={},
     )
     seen = torch.tensor([True, False])
-    save_lift(Lift(torch.ones(2, 3), torch.tensor([2.0, 0]), torch.tensor([0.5, 0]), seen, metadata), tmp_path / "l")
+    save_lift(
+        LiftResult(torch.ones(2, 3), torch.tensor([2.0, 0]), torch.tensor([0.5, 0]), seen, metadata), tmp_path / "l"
+    )
     found = inspected(tmp_path / "l")
     assert (found["kind"], found["splats"], found["channels"], found["seen_share"]) == ("lift", 2, 3, 0.5)
     assert found["settings"]["preset"] == "tikhonov"

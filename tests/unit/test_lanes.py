@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numba import njit
 
-from liftcore import lanes, lanes_rows
-from liftcore.lanes import LANES, copy_values, keep_halves, lanes_at
-from liftcore.lanes_rows import AHEAD, WIDE, add_row_products, add_weighted_row
+from liftcore.raster.cpu import lanes, lanes_rows
+from liftcore.raster.cpu.lanes import LANES, copy_values, keep_halves, lanes_at
+from liftcore.raster.cpu.lanes_rows import AHEAD, WIDE, add_row_products, add_weighted_row
 
 
 @pytest.fixture(params=["as it is", "does not convert"])

@@ -7,8 +7,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numba import njit
 
-from liftcore.lanes import LANES, keep_lanes, lanes_at
-from liftcore.lanes_select import any_above, larger, only_lane, smaller, where_above, where_equal, where_reached
+from liftcore.raster.cpu.lanes import LANES, keep_lanes, lanes_at
+from liftcore.raster.cpu.lanes_select import (
+    any_above,
+    larger,
+    only_lane,
+    smaller,
+    where_above,
+    where_equal,
+    where_reached,
+)
 
 EIGHT = st.lists(
     st.sampled_from([0.0, -0.0, 1.0, -1.0, 0.25, np.inf, -np.inf, 1e-45]), min_size=LANES, max_size=LANES

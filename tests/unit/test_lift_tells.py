@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from liftcore import lift as pipeline
-from liftcore.commands import bars
+from liftcore.cli import bars
 from liftcore.lift import lift
 from liftcore.listener import Listener
 from liftcore.solve.settings import LiftSettings

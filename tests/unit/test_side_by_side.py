@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any, cast
 import pytest
 import torch
 
-from liftcore.raster.protocol import Look, Walk, Weighting
-from liftcore.raster.side_by_side import side_by_side, views_at_a_time
+from liftcore.raster.base import CompositingParams, ViewRequest, Weighting
+from liftcore.raster.cpu.side_by_side import side_by_side, views_at_a_time
 from tests.scenes import random_camera, random_regions
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from liftcore.raster.protocol import Raster
+    from liftcore.raster.base import Raster
 
 
 class Slow:
@@ -43,9 +43,12 @@ class Slow:
         self.forgotten = True
 
 
-def looks(*names: str) -> Iterator[Look]:
+def looks(*names: str) -> Iterator[ViewRequest]:
     nowhere = torch.empty(0, 2, dtype=torch.int32)
-    return (Look(random_camera(1, name=name), random_regions(1), Walk(), Weighting(), nowhere) for name in names)
+    return (
+        ViewRequest(random_camera(1, name=name), random_regions(1), CompositingParams(), Weighting(), nowhere)
+        for name in names
+    )
 
 
 def beside(raster: Slow, count: int) -> list[Raster]:

@@ -1,4 +1,4 @@
-"""Discs to footprints on the device: ``liftcore.raster.projection_2dgs``, written for all discs at once."""
+"""Discs to footprints on the device: ``liftcore.raster.cpu.projection_2dgs``, written for all discs at once."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from liftcore.raster.constants import EDGE_ON, LOW_PASS
+from liftcore.raster.cpu.projection import HALF_LOG2_E
 from liftcore.raster.gpu.scene import (
     CENTRE_X,
     CENTRE_Y,
@@ -32,14 +33,13 @@ from liftcore.raster.gpu.scene import (
     Footprints,
     Outlines,
 )
-from liftcore.raster.projection import HALF_LOG2_E
 
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from liftcore.raster.cpu.projection import View
     from liftcore.raster.gpu.projection import Seen
     from liftcore.raster.gpu.scene import Block
-    from liftcore.raster.projection import View
 
 _MARGIN = 1e-3  # px that an outline is wider than the crossings, for float32 at its edge
 _RELATIVE = 1e-4  # and this share of its size
@@ -119,7 +119,7 @@ def _circle(mx: Tensor, my: Tensor, near: Tensor) -> Ellipse:
 
 
 def _outline(seen: Seen, middle: tuple[Tensor, Tensor], view: View) -> Ellipse:
-    """All pixels whose ray can cross the disc; see ``liftcore.raster.projection_2dgs._write_outline``."""
+    """All pixels whose ray can cross the disc; see ``liftcore.raster.cpu.projection_2dgs._write_outline``."""
     fx, fy = view.intrinsics.tolist()[:2]
     z, largest = seen.z, seen.reach / HALF_LOG2_E
     a, b = seen.axes.unbind(2)
@@ -151,7 +151,7 @@ def _box(left: Tensor, right: Tensor, top: Tensor, bottom: Tensor) -> Ellipse:
 
 
 def _reached(origin: Tensor, p: Tensor, q: Tensor, room: Tensor, size: int) -> tuple[Tensor, Tensor]:
-    """See ``liftcore.raster.projection_2dgs._reached``."""
+    """See ``liftcore.raster.cpu.projection_2dgs._reached``."""
     square = p * p + room * q
     met, root = square >= 0, torch.sqrt(square.clamp(min=0.0))
     high = torch.where(met & (p + root > 0), q / (p + root), math.inf)

@@ -17,10 +17,10 @@ from liftcore.raster.gpu.walk import PART, PARTS
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from liftcore.raster.base import CompositingParams
     from liftcore.raster.gpu.projection import Projection
     from liftcore.raster.gpu.room import Room
     from liftcore.raster.gpu.tile_lists import Lists
-    from liftcore.raster.protocol import Walk
 
 UNIT = 16  # tiles in a row whose sums are made together; launches begin and end with them
 
@@ -35,7 +35,7 @@ class Frame:
         projection: of the scene. walk: how its rays go. room: for the pieces.
     """
 
-    def __init__(self, projection: Projection, walk: Walk, room: Room) -> None:
+    def __init__(self, projection: Projection, walk: CompositingParams, room: Room) -> None:
         view, kernel = projection.view, projection.kernel
         self.device, self.room = projection.device, room
         self.width, self.height = view.width, view.height

@@ -1,4 +1,4 @@
-"""Splats to footprints on the device: ``liftcore.raster.projection``, written for all splats at once.
+"""Splats to footprints on the device: ``liftcore.raster.cpu.projection``, written for all splats at once.
 
 The arithmetic is float64 and the formulas, their order included, are those of the CPU backend. It is a few dozen
 operations a splat, so plain tensor operations serve; they run on the CPU as well, which is how they are tested.
@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 
 from liftcore.raster.constants import NEAR_PLANE
+from liftcore.raster.cpu.projection import HALF_LOG2_E
 from liftcore.raster.gpu.discs import project_discs
 from liftcore.raster.gpu.scene import (
     BETA,
@@ -27,14 +28,13 @@ from liftcore.raster.gpu.scene import (
     Outlines,
     block_of,
 )
-from liftcore.raster.projection import HALF_LOG2_E
 from liftcore.scene.splats import Kernel
 
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from liftcore.raster.cpu.projection import View
     from liftcore.raster.gpu.scene import Block, DeviceScene
-    from liftcore.raster.projection import View
 
 
 class Projection(NamedTuple):

@@ -18,7 +18,13 @@ import torch
 from liftcore.device import indexed, out_of_memory
 from liftcore.errors import Unavailable
 from liftcore.raster.antialiased import check_antialiased
-from liftcore.raster.arguments import check_image, check_labels, check_rows
+from liftcore.raster.base import CompositingParams, RayRows, RegionWeights, ViewRequest, ViewWeights, Weighting
+from liftcore.raster.cpu.arguments import check_image, check_labels, check_rows
+from liftcore.raster.cpu.kernels import activated, with_gain
+from liftcore.raster.cpu.projection import view_of
+from liftcore.raster.cpu.selection import choice_of
+from liftcore.raster.cpu.strided import check_stride, every_pixel, places_on, strided
+from liftcore.raster.cpu.weights_home import on_host
 from liftcore.raster.gpu import rendering, weighing
 from liftcore.raster.gpu.ahead import made_ahead
 from liftcore.raster.gpu.frame import Frame
@@ -29,19 +35,13 @@ from liftcore.raster.gpu.room import SCENE_SHARE, room_within, scene_bytes
 from liftcore.raster.gpu.scene import scene_on, with_opacity
 from liftcore.raster.gpu.slots import DeviceReading
 from liftcore.raster.gpu.tracing import ray_rows
-from liftcore.raster.kernels import activated, with_gain
-from liftcore.raster.projection import view_of
-from liftcore.raster.protocol import Look, RayRows, RegionWeights, Walk, Walked, Weighting
-from liftcore.raster.selection import choice_of
-from liftcore.raster.strided import check_stride, every_pixel, places_on, strided
-from liftcore.raster.weights_home import on_host
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Iterable
 
     from torch import Tensor
 
-    from liftcore.observe.observation import Observation
+    from liftcore.features.views import ViewFeatures
     from liftcore.raster.gpu.scene import DeviceScene
     from liftcore.scene.cameras import Camera
     from liftcore.scene.splats import Splats
@@ -80,7 +80,7 @@ def _within_memory(product: Callable[Concatenate[GpuRaster, Arguments], Result])
 
 
 class GpuRaster:
-    """A for one scene, of any kernel (``liftcore.raster.protocol.Raster``). Tensors come and go on the CPU.
+    """A for one scene, of any kernel (``liftcore.raster.base.Raster``). Tensors come and go on the CPU.
 
     One call at a time: the view at hand is kept for the next product.
 
@@ -103,7 +103,7 @@ class GpuRaster:
         self._size = scene_bytes(splats.count, splats.kernel)
         self._gain = 1.0  # of the scene
         self._scene: DeviceScene | None = None
-        self._kept: tuple[Camera, Walk, Frame] | None = None
+        self._kept: tuple[Camera, CompositingParams, Frame] | None = None
 
     def take_less(self) -> bool:
         """Let go of everything and cut the work for half of the memory; False where it cannot be cut any more."""
@@ -116,13 +116,15 @@ class GpuRaster:
         return True
 
     def region_weights(
-        self, camera: Camera, observation: Observation, walk: Walk, weighting: Weighting
+        self, camera: Camera, observation: ViewFeatures, walk: CompositingParams, weighting: Weighting
     ) -> RegionWeights:
         """``A'^T S`` of a view and the evidence of plain weights. See the protocol."""
         return self._brought(self._weighed(self._read(observation, camera, walk), camera, walk, weighting))
 
     @_within_memory
-    def _weighed(self, reading: DeviceReading, camera: Camera, walk: Walk, weighting: Weighting) -> RegionWeights:
+    def _weighed(
+        self, reading: DeviceReading, camera: Camera, walk: CompositingParams, weighting: Weighting
+    ) -> RegionWeights:
         choice, frame = choice_of(weighting), self._frame(camera, walk, reading.levels)
         return weighing.region_weights(frame, reading, choice, walk.gain != 1.0, self.splats.count)
 
@@ -130,28 +132,28 @@ class GpuRaster:
         """Where they are wanted. A host without room for them is no reason for smaller pieces on the device."""
         return weights if self._stays else on_host(weights)
 
-    def walk_views(self, looks: Iterable[Look]) -> Generator[Walked]:
+    def iterate_views(self, looks: Iterable[ViewRequest]) -> Generator[ViewWeights]:
         """``region_weights`` and ``ray_rows`` of views, one at a time; the next one is read while the card walks."""
 
-        def read(look: Look) -> DeviceReading:
-            return self._read(look.observation, look.camera, look.walk)
+        def read(look: ViewRequest) -> DeviceReading:
+            return self._read(look.observation, look.camera, look.params)
 
         try:
             with closing(made_ahead(looks, read)) as ahead:
                 for look, reading in ahead:
-                    yield Walked(  # without a name, which would hold it beside the next one
-                        self._brought(self._weighed(reading, look.camera, look.walk, look.weighting)),
-                        self.ray_rows(look.camera, look.pixels, look.walk),
+                    yield ViewWeights(  # without a name, which would hold it beside the next one
+                        self._brought(self._weighed(reading, look.camera, look.params, look.weighting)),
+                        self.ray_rows(look.camera, look.pixels, look.params),
                     )
         finally:
             self.forget()
 
-    def _read(self, observation: Observation, camera: Camera, walk: Walk) -> DeviceReading:
+    def _read(self, observation: ViewFeatures, camera: Camera, walk: CompositingParams) -> DeviceReading:
         check_stride(walk, camera)
         return DeviceReading(observation, camera, walk, self.device)
 
     @_within_memory
-    def render(self, camera: Camera, values: Tensor, walk: Walk) -> Tensor:
+    def render(self, camera: Camera, values: Tensor, walk: CompositingParams) -> Tensor:
         """``A X``: values [P, C] f32 -> [H, W, C] f32. See the protocol."""
         check_rows(values, self.splats.count)
         frame = self._frame(camera, every_pixel(walk))
@@ -162,7 +164,7 @@ class GpuRaster:
         return image
 
     @_within_memory
-    def adjoint(self, camera: Camera, values: Tensor, walk: Walk) -> Tensor:
+    def adjoint(self, camera: Camera, values: Tensor, walk: CompositingParams) -> Tensor:
         """``A^T Y``: values [H, W, C] f32 -> [P, C] f32. See the protocol."""
         check_image(values, camera)
         frame = self._frame(camera, every_pixel(walk))
@@ -172,19 +174,19 @@ class GpuRaster:
             result[:, begin : begin + weighing.WIDEST] = weighing.adjoint(frame, block, self.splats.count)
         return result
 
-    def row_sums(self, camera: Camera, walk: Walk) -> Tensor:
+    def row_sums(self, camera: Camera, walk: CompositingParams) -> Tensor:
         """``A 1``: [H, W] f32."""
         return self.render(camera, torch.ones(self.splats.count, 1), walk)[:, :, 0]
 
     @_within_memory
-    def strongest_labels(self, camera: Camera, labels: Tensor, walk: Walk) -> Tensor:
+    def strongest_labels(self, camera: Camera, labels: Tensor, walk: CompositingParams) -> Tensor:
         """``argmax(A onehot(labels))``: labels [P] i32 in -1..K - 1 -> [H, W] i32. See the protocol."""
         check_labels(labels, self.splats.count)
         frame = self._frame(camera, every_pixel(walk))
         return rendering.strongest_labels(frame, labels.to(torch.int32)).cpu()
 
     @_within_memory
-    def ray_rows(self, camera: Camera, pixels: Tensor, walk: Walk) -> RayRows:
+    def ray_rows(self, camera: Camera, pixels: Tensor, walk: CompositingParams) -> RayRows:
         """Rows of A for single pixels [n, 2] (x, y). See the protocol."""
         places = places_on(walk, pixels)
         if places is None:  # not all of them are rays of the strided view
@@ -195,7 +197,7 @@ class GpuRaster:
         """Drop the projected view that is kept for the next product."""
         self._kept = None
 
-    def _frame(self, camera: Camera, walk: Walk, levels: int = USUAL_LEVELS) -> Frame:
+    def _frame(self, camera: Camera, walk: CompositingParams, levels: int = USUAL_LEVELS) -> Frame:
         """The view projected, with room for labels of so many levels; the last one is kept."""
         if self._kept is not None and self._kept[0] is camera and self._kept[1] == walk:
             return self._kept[2]

@@ -9,11 +9,11 @@ import torch
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from liftcore.raster.projection import Scene
+    from liftcore.raster.cpu.projection import Scene
 
 # What the walk reads of a splat. PLACES [n, PLACE] f64 holds what is taken at a row's first pixel, where large
 # numbers are subtracted; INKS [n, INK] f32 what every pixel needs. A row a splat that the view may see, near to far.
-MX, MY, SLOPE, KY = range(4)  # 3DGS and DBS, as in liftcore.raster.records
+MX, MY, SLOPE, KY = range(4)  # 3DGS and DBS, as in cpu.records
 CENTRE_X, CENTRE_Y, S_X, S_Y, T_X, T_Y, D_ZERO, D_X, D_Y = range(9)  # 2DGS, likewise
 PLACE = 9
 
@@ -23,7 +23,7 @@ INK = 10
 
 
 class DeviceScene(NamedTuple):
-    """``liftcore.raster.projection.Scene`` as tensors, a row a splat; on the device, or on the host."""
+    """``liftcore.raster.cpu.projection.Scene`` as tensors, a row a splat; on the device, or on the host."""
 
     means: Tensor  # [P, 3] f32, world
     axes: Tensor  # [P, 3, 3] f64 ([P, 3, 2] for 2DGS), scaled axes in columns, world
@@ -36,7 +36,7 @@ class DeviceScene(NamedTuple):
 class Outlines(NamedTuple):
     """What the tile lists need of the footprints, a row a splat, near to far; all f64."""
 
-    mx: Tensor  # [n] the outline ``(root_x (x - mx - slope dy))^2 + ky dy^2 <= reach``, as in liftcore.raster.records
+    mx: Tensor  # [n] the outline ``(root_x (x - mx - slope dy))^2 + ky dy^2 <= reach``, as in cpu.records
     my: Tensor
     slope: Tensor
     root_x: Tensor

@@ -1,4 +1,4 @@
-"""Which weights count, in Triton: ``liftcore.raster.selection`` on a tile's rays, and each ray's largest weights."""
+"""Which weights count, in Triton: ``cpu.selection`` on a tile's rays, and each ray's largest weights."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import torch
 import triton.language as tl
 
 from liftcore.raster.constants import TILE
+from liftcore.raster.cpu.selection import CENTRAL, FRONT, LARGEST
 from liftcore.raster.gpu import scene
 from liftcore.raster.gpu.launching import WARPS, jit, lang, launch
 from liftcore.raster.gpu.room import A_PIXEL
 from liftcore.raster.gpu.walk import CHUNK, PART, PARTS, blend, blend_chunk, fill_alphas, start_rays
-from liftcore.raster.selection import CENTRAL, FRONT, LARGEST
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -1,6 +1,6 @@
 """S on the device: which slots the pixels of each tile read, and how much.
 
-As on the CPU (``liftcore.raster.readings``), a slot of a region map is a distinct tuple of labels on all levels, a
+As on the CPU (``cpu.readings``), a slot of a region map is a distinct tuple of labels on all levels, a
 slot of a grid is a cell, and both become the same thing: one or four taps a pixel, a slot and a share each. A sort of
 every tile's keys finds its slots, so their numbers do not depend on who is first.
 """
@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 
 from liftcore.raster.constants import TILE
-from liftcore.raster.readings import reading_of
+from liftcore.raster.cpu.readings import reading_of
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from liftcore.observe.observation import Observation
-    from liftcore.raster.protocol import Walk
-    from liftcore.raster.readings import Reading
+    from liftcore.features.views import ViewFeatures
+    from liftcore.raster.base import CompositingParams
+    from liftcore.raster.cpu.readings import Reading
     from liftcore.scene.cameras import Camera
 
 PIXELS = TILE * TILE
@@ -39,7 +39,9 @@ class Slots(NamedTuple):
 class DeviceReading:
     """S of one view, by pixel. It is made on the host, by any thread, and comes to the device when first asked."""
 
-    def __init__(self, observation: Observation, camera: Camera, walk: Walk, device: torch.device) -> None:
+    def __init__(
+        self, observation: ViewFeatures, camera: Camera, walk: CompositingParams, device: torch.device
+    ) -> None:
         reading = reading_of(observation, camera.width, camera.height, walk)
         self.codebook_rows, self.levels = reading.codebook_rows, reading.levels
         self.taps = 4 if reading.is_grid else 1

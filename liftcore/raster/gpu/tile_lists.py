@@ -1,4 +1,4 @@
-"""Which splats touch which tile, on the device: ``liftcore.raster.tiles`` for all footprints at once.
+"""Which splats touch which tile, on the device: ``liftcore.raster.cpu.tiles`` for all footprints at once.
 
 Every footprint is cut into spans, one a tile row, by the same bounds as on the CPU. Counts and prefix sums say where
 each span's tiles go, in the order of depth; a stable sort by tile then keeps that order inside a tile. A view whose

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 import torch
 import triton.language as tl
 
+from liftcore.raster.base import RayRows
 from liftcore.raster.constants import TILE
 from liftcore.raster.gpu.launching import jit, lang, launch
 from liftcore.raster.gpu.walk import CHUNK, PART, PARTS, blend_chunk, fill_alphas, start_rays
-from liftcore.raster.protocol import RayRows
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -110,7 +110,7 @@ def _in_order(numbers: Tensor, lengths: Tensor, splats: Tensor, weights: Tensor)
     """Rows of the rays ``numbers`` [n], put into the order of the rays."""
     order = torch.sort(numbers).indices
     begins = torch.cumsum(lengths, 0) - lengths
-    row_starts = torch.zeros(len(numbers) + 1, dtype=torch.int64)
-    torch.cumsum(lengths[order], 0, out=row_starts[1:])
-    own = torch.repeat_interleave(begins[order] - row_starts[:-1], lengths[order]) + torch.arange(len(splats))
-    return RayRows(row_starts, splats[own], weights[own])
+    indptr = torch.zeros(len(numbers) + 1, dtype=torch.int64)
+    torch.cumsum(lengths[order], 0, out=indptr[1:])
+    own = torch.repeat_interleave(begins[order] - indptr[:-1], lengths[order]) + torch.arange(len(splats))
+    return RayRows(indptr, splats[own], weights[own])

@@ -13,23 +13,23 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 import triton.language as tl
 
+from liftcore.raster.base import RegionWeights
 from liftcore.raster.constants import TILE
+from liftcore.raster.cpu.selection import FRONT, LARGEST
 from liftcore.raster.gpu.launching import jit, lang, launch
 from liftcore.raster.gpu.selecting import blend_chosen, counted, marks_of
 from liftcore.raster.gpu.sums import Pieces, Sums, sums_by_unit
 from liftcore.raster.gpu.walk import CHUNK, PART, PARTS, blend_chunk, fill_alphas, start_rays, weights_of
-from liftcore.raster.protocol import RegionWeights
-from liftcore.raster.selection import FRONT, LARGEST
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from torch import Tensor
 
+    from liftcore.raster.cpu.selection import Choice
     from liftcore.raster.gpu.frame import Frame
     from liftcore.raster.gpu.slots import DeviceReading, Slots
     from liftcore.raster.gpu.tile_lists import Lists
-    from liftcore.raster.selection import Choice
 
 COLUMNS = 16  # of a tile's matrix at a time
 BLOCK = 64  # of its rows: a thread has what it multiplies in registers, which are few
@@ -201,12 +201,12 @@ def _put_together(found: list[_Rows], met: list[tuple[Tensor, Tensor]], frame: F
     ints, floats = torch.empty(0, dtype=torch.int32, device=place), torch.empty(0, device=place)
     found = found or [_Rows(ints, ints.long(), ints, floats)]
     splats, counts, columns, weights = (torch.cat(column) for column in zip(*found, strict=True))
-    row_starts = torch.zeros(splats.shape[0] + 1, dtype=torch.int64, device=place)
-    torch.cumsum(counts, 0, out=row_starts[1:])
+    indptr = torch.zeros(splats.shape[0] + 1, dtype=torch.int64, device=place)
+    torch.cumsum(counts, 0, out=indptr[1:])
     ids, evidence = (
         torch.cat([part.to(place) for part in column]) for column in zip(*met or [(ints, floats)], strict=True)
     )
-    return RegionWeights(splats, row_starts, columns, weights, ids, evidence)
+    return RegionWeights(splats, indptr, columns, weights, ids, evidence)
 
 
 class _Run(NamedTuple):

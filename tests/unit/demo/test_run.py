@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from liftcore.artifact import load_lift
 from liftcore.demo.run import run_demo
 from liftcore.demo.still_life import still_life
+from liftcore.io.lift_file import load_lift
 
 
 def test_the_demo_finds_what_it_asks_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

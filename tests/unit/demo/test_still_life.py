@@ -10,8 +10,8 @@ import torch
 
 from liftcore.demo.masks import Mistakes, observe, true_labels
 from liftcore.demo.still_life import StillLife, still_life
-from liftcore.raster.cpu import CpuRaster
-from liftcore.raster.protocol import Walk
+from liftcore.raster.base import CompositingParams
+from liftcore.raster.cpu.raster import CpuRaster
 
 NONE = Mistakes(merged=0, split=0, misnamed=0, unlabelled=1e-9, displacement=0, noise=0)
 
@@ -48,7 +48,7 @@ def test_the_same_seed_gives_the_same_scene(scene: StillLife) -> None:
 
 def test_every_ray_ends_in_the_scene(scene: StillLife, raster: CpuRaster) -> None:
     for camera in scene.cameras:
-        sums = raster.row_sums(camera, Walk())
+        sums = raster.row_sums(camera, CompositingParams())
         assert float(sums.mean()) > 0.99
         assert float(sums.min()) > 0.85
 

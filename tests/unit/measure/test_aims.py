@@ -9,11 +9,11 @@ import pytest
 import torch
 
 from liftcore import cli
-from liftcore.measure import aims
-from liftcore.measure.aims import CHANNELS, FEW, MANY, USUAL, Figure, inputs_bytes
-from liftcore.measure.bench import Workload
-from liftcore.measure.synthetic import room_cameras, room_splats
-from liftcore.observe.observation import RegionMap
+from liftcore.evaluate import aims
+from liftcore.evaluate.aims import CHANNELS, FEW, MANY, USUAL, Figure, inputs_bytes
+from liftcore.evaluate.bench import Workload
+from liftcore.evaluate.synthetic import room_cameras, room_splats
+from liftcore.features.views import Regions
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -69,7 +69,7 @@ def test_the_solution_is_timed_for_each_number_of_channels_on_one_walk(monkeypat
 
 def test_inputs_are_splats_without_colour_label_maps_and_codebooks() -> None:
     (camera,) = room_cameras(1, 8, 6)
-    observed = RegionMap(torch.zeros(2, 6, 8, dtype=torch.int32), torch.zeros(3, 1))
+    observed = Regions(torch.zeros(2, 6, 8, dtype=torch.int32), torch.zeros(3, 1))
     work = Workload("room", room_splats(500), [(camera, observed)])
     assert inputs_bytes(work, 10) == 500 * 4 * (3 + 4 + 3 + 1) + 2 * 6 * 8 * 4 + 2 * 3 * 10
 

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from liftcore.measure import anonymous_memory
-from liftcore.measure.anonymous_memory import Most, anonymous_bytes, watched
+from liftcore.evaluate import anonymous_memory
+from liftcore.evaluate.anonymous_memory import Most, anonymous_bytes, watched
 
 SIZE = 1 << 27
 

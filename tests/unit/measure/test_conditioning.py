@@ -7,10 +7,10 @@ import pytest
 import torch
 from scipy.sparse import csr_array
 
-from liftcore.measure.conditioning import coupling, neighbourhood, noise_gain, rays_of, self_share, spectrum
-from liftcore.measure.stability.weights import exact_view
-from liftcore.raster.cpu import CpuRaster
-from liftcore.raster.protocol import Walk
+from liftcore.raster.base import CompositingParams
+from liftcore.raster.cpu.raster import CpuRaster
+from tests.benchmarks.conditioning import coupling, neighbourhood, noise_gain, rays_of, self_share, spectrum
+from tests.benchmarks.stability.weights import exact_view
 from tests.scenes import random_camera, random_splats
 
 EVERY = np.arange(7)
@@ -66,7 +66,7 @@ def test_hidden_splats_are_counted_and_left_out():
 
 def test_rays_are_rows_of_the_scenes_matrix():
     splats, camera = random_splats(5), random_camera(5)
-    dense = exact_view(splats, camera, Walk(gain=2.0)).A
+    dense = exact_view(splats, camera, CompositingParams(gain=2.0)).A
     all_rays = rays_of(CpuRaster(splats), [camera], 2.0, camera.width * camera.height).toarray()
     assert np.abs(all_rays - dense).max() < 1e-5
     fewer = rays_of(CpuRaster(splats), [camera], 2.0, camera.width * camera.height // 9).toarray()

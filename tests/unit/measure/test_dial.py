@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from liftcore.measure.dial import main, measure_dial
-from liftcore.measure.room_scene import Room, write_room
-from liftcore.measure.room_scene import main as room_main
 from liftcore.solve.settings import Preset, Speed
+from tests.benchmarks.dial import main, measure_dial
+from tests.benchmarks.room_scene import Room, write_room
+from tests.benchmarks.room_scene import main as room_main
 
 
 @pytest.fixture

@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from liftcore.errors import InvalidFeatures
-from liftcore.measure import enlarged
-from liftcore.observe.observation import FeatureGrid
-from liftcore.observe.pack import open_packs
-from liftcore.observe.write_pack import write_pack
+from liftcore.features.pack import open_packs
+from liftcore.features.views import FeatureGrid
+from liftcore.features.write_pack import write_pack
+from tests.benchmarks import enlarged
 from tests.scenes import random_grid, random_regions
 
 

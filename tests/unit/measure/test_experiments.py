@@ -11,8 +11,8 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from liftcore.cli import EXPERIMENTS, main
-from liftcore.measure.experiments.report import page_of
-from liftcore.scene.load import load_cameras
+from liftcore.io.load import load_cameras
+from tests.benchmarks.experiments.report import page_of
 from tests.truth_scene import write_truth_scene
 
 
@@ -42,7 +42,7 @@ def test_every_experiment_has_a_title_a_source_and_rows(scene, tmp_path, name, m
 
 def _keep_it_short(monkeypatch):
     """Fewer points a curve; each kind of point stays."""
-    from liftcore.measure.experiments import conditioning, fidelity, lambda_sweep, mask_noise, overfitting, pose_noise
+    from tests.benchmarks.experiments import conditioning, fidelity, lambda_sweep, mask_noise, overfitting, pose_noise
 
     monkeypatch.setattr(conditioning, "GAINS", (1.0, 4.0))
     monkeypatch.setattr(conditioning, "RAYS", 3_000)
@@ -79,7 +79,7 @@ def test_wrong_masks_cost_accuracy(scene, tmp_path, monkeypatch):
 
 def test_wrong_poses_cost_accuracy(scene, tmp_path, monkeypatch):
     _keep_it_short(monkeypatch)
-    monkeypatch.setattr("liftcore.measure.noise.POSE_DEGREES", 15.0)
+    monkeypatch.setattr("tests.benchmarks.noise.POSE_DEGREES", 15.0)
     rows = {(row["method"], row["noisy_of_100"]): row for row in run("pose_noise", scene, tmp_path)["rows"]}
     assert rows["tikhonov", 100]["miou"] < rows["tikhonov", 0]["miou"]
 
@@ -152,7 +152,7 @@ def test_truth_of_distorted_photos_is_told_what_takes_it(scene, tmp_path, capsys
 
 @pytest.mark.parametrize("name", ["fidelity", "ablation"])
 def test_a_scene_without_any_of_the_packs_is_told_which(scene, tmp_path, capsys, monkeypatch, name):
-    monkeypatch.setattr(f"liftcore.measure.experiments.{name}.PACKS", ("other", "more"))
+    monkeypatch.setattr(f"tests.benchmarks.experiments.{name}.PACKS", ("other", "more"))
     assert main(["experiment", name, str(scene), "-o", str(tmp_path)]) == 2
     assert "one of other.safetensors, more.safetensors" in capsys.readouterr().err
 

@@ -12,21 +12,21 @@ from typing import Any
 import pytest
 import torch
 
-from liftcore.artifact import Lift
 from liftcore.device import CPU, Device
-from liftcore.measure.gpu import __main__ as gpu
-from liftcore.measure.gpu import figures, gsplat_lift
-from liftcore.measure.gpu.figures import both_ways
-from liftcore.measure.gpu.gsplat_lift import SideBySide, at_pixels, beside_gsplat, lift_ours, lift_theirs
-from liftcore.measure.gpu.page import page
-from liftcore.measure.gpu.room_files import RoomSize, write_room
-from liftcore.measure.synthetic import room_cameras, room_regions, room_splats
-from liftcore.raster.oracle import dense_view
-from liftcore.raster.protocol import Walk
+from liftcore.evaluate.synthetic import room_cameras, room_regions, room_splats
+from liftcore.io.lift_file import LiftResult
+from liftcore.raster.base import CompositingParams
+from liftcore.raster.reference import dense_view
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Splats
 from liftcore.solve.settings import LiftSettings
 from tests.backends import needs_triton
+from tests.benchmarks.gpu import __main__ as gpu
+from tests.benchmarks.gpu import figures, gsplat_lift
+from tests.benchmarks.gpu.figures import both_ways
+from tests.benchmarks.gpu.gsplat_lift import SideBySide, at_pixels, beside_gsplat, lift_ours, lift_theirs
+from tests.benchmarks.gpu.page import page
+from tests.benchmarks.gpu.room_files import RoomSize, write_room
 
 TINY = RoomSize(300, 40, 30, 2, 8)
 ROOT = Path(__file__).parents[3]
@@ -53,7 +53,7 @@ def test_page_holds_every_part_with_what_was_measured(tmp_path: Path) -> None:
 def test_lifts_that_differ_in_a_bit_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made, numbers = figures.lift, count()
 
-    def lift(*given: Any) -> Lift:
+    def lift(*given: Any) -> LiftResult:
         lifted = made(*given)
         lifted.features.view(torch.int16)[0, 0] ^= next(numbers)
         return lifted
@@ -88,7 +88,7 @@ def test_agreement_tells_lifts_that_differ(tmp_path: Path, monkeypatch: pytest.M
     answers = iter([{}, {"preset": "centre"}])
     made = figures.lift
 
-    def lift(splats: Path, cameras: Path, features: list[Path], settings: LiftSettings) -> Lift:
+    def lift(splats: Path, cameras: Path, features: list[Path], settings: LiftSettings) -> LiftResult:
         return made(splats, cameras, features, LiftSettings.of(certificate_rays=0, **next(answers)))
 
     monkeypatch.setattr(figures, "lift", lift)
@@ -109,7 +109,7 @@ def dense_rasterization(splats: Splats, cameras: list[Camera]) -> Any:
         torch.testing.assert_close(torch.logit(opacities), splats.opacity_logits, rtol=1e-3, atol=1e-3)
         torch.testing.assert_close(pose[0].double(), torch.tensor(camera.world_to_camera), rtol=1e-5, atol=1e-5)
         assert intrinsics[0, 0, 0] == pytest.approx(camera.fx) and intrinsics[0, 1, 2] == pytest.approx(camera.cy)
-        A = torch.tensor(dense_view(splats, camera, Walk()).A, dtype=torch.float32)
+        A = torch.tensor(dense_view(splats, camera, CompositingParams()).A, dtype=torch.float32)
         return (A @ colors).reshape(1, height, width, -1), None, None
 
     return rasterization

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from liftcore.measure.noise import POSE_SHIFT, noisy_masks, noisy_poses, scene_scale
-from liftcore.observe.observation import RegionMap
+from liftcore.features.views import Regions
 from liftcore.scene.cameras import Cameras
+from tests.benchmarks.noise import POSE_SHIFT, noisy_masks, noisy_poses, scene_scale
 from tests.scenes import random_camera, random_regions
 
 CAMERAS = Cameras(tuple(random_camera(k, name=f"v{k}") for k in range(400)))
@@ -33,10 +33,10 @@ def test_pose_noise_leaves_the_other_views_alone():
     assert changed == ["v3", "v7"]
 
 
-def two_halves() -> RegionMap:
+def two_halves() -> Regions:
     """A left and a right region with orthogonal vectors, and a column that nobody labelled."""
     labels = torch.tensor([[[0, 0, 1, 1, -1]] * 4], dtype=torch.int32)
-    return RegionMap(labels, torch.eye(2))
+    return Regions(labels, torch.eye(2))
 
 
 def test_without_noise_the_masks_stay():
@@ -62,7 +62,7 @@ def test_each_way_of_going_wrong_occurs_and_is_what_it_says():
 
 def test_the_rate_is_the_share_of_regions_that_change():
     labels = torch.arange(900, dtype=torch.int32).reshape(1, 30, 30).repeat_interleave(2, 1).repeat_interleave(2, 2)
-    regions = RegionMap(labels, torch.nn.functional.normalize(torch.randn(900, 8), dim=1))
+    regions = Regions(labels, torch.nn.functional.normalize(torch.randn(900, 8), dim=1))
     noisy = noisy_masks({"a": regions}, 0.1, seed=2)["a"]
     changed = 900 - torch.isin(torch.arange(900), noisy.labels).sum().item()
     assert 60 < changed < 200  # a merge takes a neighbour along

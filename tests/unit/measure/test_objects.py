@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from liftcore.measure.objects import box_iou
+from tests.benchmarks.objects import box_iou
 
 
 def test_boxes_share_what_lies_in_both() -> None:

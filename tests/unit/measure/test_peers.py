@@ -14,29 +14,29 @@ import numpy as np
 import pytest
 import torch
 
-from liftcore.measure.peers import __main__ as command
-from liftcore.measure.peers import side_by_side, torch_autograd
-from liftcore.measure.peers.agreement import agreement
-from liftcore.measure.peers.dense_numba import DenseNumba
-from liftcore.measure.peers.everybody import PEERS, SIZES
-from liftcore.measure.peers.metal_gauss import MetalGauss
-from liftcore.measure.peers.ours import Ours
-from liftcore.measure.peers.side_by_side import Axis, Comparison, Limits, Sizes
-from liftcore.measure.peers.torch_autograd import TorchAutograd
-from liftcore.measure.peers.work import Answer, Size, Work, room
-from liftcore.raster.oracle import dense_view, reading_matrix
-from liftcore.raster.protocol import Walk
+from liftcore.raster.base import CompositingParams
+from liftcore.raster.reference import dense_view, reading_matrix
+from tests.benchmarks.peers import __main__ as command
+from tests.benchmarks.peers import side_by_side, torch_autograd
+from tests.benchmarks.peers.agreement import agreement
+from tests.benchmarks.peers.dense_numba import DenseNumba
+from tests.benchmarks.peers.everybody import PEERS, SIZES
+from tests.benchmarks.peers.metal_gauss import MetalGauss
+from tests.benchmarks.peers.ours import Ours
+from tests.benchmarks.peers.side_by_side import Axis, Comparison, Limits, Sizes
+from tests.benchmarks.peers.torch_autograd import TorchAutograd
+from tests.benchmarks.peers.work import Answer, Size, Work, room
 from tests.scenes import random_camera, random_regions, random_splats
 
 if TYPE_CHECKING:
-    from liftcore.measure.peers.peer import Peer
+    from tests.benchmarks.peers.peer import Peer
 
 EXACT = (Ours(), DenseNumba(), TorchAutograd())
-WALKS = (Walk(), Walk(alpha_cap=0.9, transmittance_stop=0.05))
+WALKS = (CompositingParams(), CompositingParams(alpha_cap=0.9, transmittance_stop=0.05))
 TINY = Size(splats=300, width=40, height=30, views=1, channels=3)
 
 
-def small_work(walk: Walk = WALKS[0]) -> Work:
+def small_work(walk: CompositingParams = WALKS[0]) -> Work:
     """Two views of 80 splats, some pixels without a label, no side a multiple of a tile."""
     views = tuple((random_camera(seed, name=f"v{seed}"), random_regions(seed, levels=3, F=5)) for seed in (1, 2))
     return Work(random_splats(3, 80), views, threads=2, walk=walk)
@@ -57,7 +57,7 @@ def oracle(work: Work) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("walk", WALKS, ids=["usual", "early stop"])
 @pytest.mark.parametrize("peer", EXACT, ids=lambda peer: peer.name)
-def test_a_peers_features_equal_the_oracles(peer: Peer, walk: Walk) -> None:
+def test_a_peers_features_equal_the_oracles(peer: Peer, walk: CompositingParams) -> None:
     work = small_work(walk)
     features, totals, clear = oracle(work)
     answer = peer.lift(work)
@@ -178,8 +178,8 @@ class Large:
 ROOT = Path(__file__).parents[3]
 ALONE = """
 import json, sys
-from liftcore.measure.peers import child
-from liftcore.measure.peers.everybody import TINY
+from tests.benchmarks.peers import child
+from tests.benchmarks.peers.everybody import TINY
 from tests.unit.measure.test_peers import Large
 child.PEERS = (Large(),)
 print(json.dumps(child.measured("large", vars(TINY))))

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from liftcore.measure.plan_memory import MIB, measure_lift, table_of
+from tests.benchmarks.plan_memory import MIB, measure_lift, table_of
 from tests.unit.solve.test_lift_equals_dense import write_scene
 
 

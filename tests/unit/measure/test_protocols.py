@@ -11,21 +11,21 @@ import torch
 from PIL import Image
 
 from liftcore.errors import InvalidInput
-from liftcore.measure.protocols import EvaluationProtocol, LabelledObject, Prediction, own_masks
-from liftcore.measure.protocols.evaluation import EvaluationSettings, open_segmenter
-from liftcore.measure.protocols.judging import judge, mean_of_scenes, means, pooled_ious
-from liftcore.measure.protocols.lerf_ovs import lerf_scenes
-from liftcore.measure.protocols.rendered_features import RenderedFeatures, segment
-from liftcore.measure.protocols.rendered_scores import RenderedScores
-from liftcore.measure.protocols.selected_splats import SelectedSplats
-from liftcore.measure.protocols.three_d_ovs import three_d_ovs_scenes
+from liftcore.evaluate.protocols import EvaluationProtocol, LabelledObject, Prediction, own_masks
+from liftcore.evaluate.protocols.evaluation import EvaluationSettings, open_segmenter
+from liftcore.evaluate.protocols.judging import judge, mean_of_scenes, means, pooled_ious
+from liftcore.evaluate.protocols.lerf_ovs import lerf_scenes
+from liftcore.evaluate.protocols.rendered_features import RenderedFeatures, segment
+from liftcore.evaluate.protocols.rendered_scores import RenderedScores
+from liftcore.evaluate.protocols.selected_splats import SelectedSplats
+from liftcore.evaluate.protocols.three_d_ovs import three_d_ovs_scenes
 from liftcore.query.ask import Answer, ask
 from liftcore.query.encoders import open_encoder
-from liftcore.query.look import look
 from liftcore.query.objects import objects
 from liftcore.query.query import Query
 from liftcore.query.scene import QueryScene
 from liftcore.query.threshold import find_threshold
+from liftcore.query.view_mask import view_mask
 from tests.labelled_scene import HEIGHT, WIDTH, isat, rectangle, write_lift
 
 P1, P2, P3, OWN = EvaluationProtocol
@@ -141,7 +141,7 @@ def test_p1_compares_rendered_features(scene: QueryScene) -> None:
 def test_p2_sees_the_selected_splats_alone(scene: QueryScene) -> None:
     from dataclasses import replace
 
-    from liftcore.raster.cpu import CpuRaster
+    from liftcore.raster.cpu.raster import CpuRaster
 
     texts, encoder = ["red apple", "unicorn"], words(scene)
     protocol = SelectedSplats(scene, texts, encoder, threshold=0.5)
@@ -163,7 +163,7 @@ def test_p3_cuts_the_rendered_scores_of_a_query(scene: QueryScene, threshold: st
     texts, encoder = ["book", "red apple"], words(scene)
     found = RenderedScores(scene, texts, encoder, threshold).look("frame_00002")
     for text in texts:
-        seen = look(scene, ask(scene, Query((text,), threshold=threshold), encoder), "frame_00002")
+        seen = view_mask(scene, ask(scene, Query((text,), threshold=threshold), encoder), "frame_00002")
         met = seen.row_sums >= 0.5
         cut = find_threshold(seen.attention[met], threshold).value
         assert (found[text].mask == (met & (seen.attention >= cut)).numpy()).all() and found[text].mask.any()
@@ -179,7 +179,7 @@ def test_our_own_protocol_makes_the_masks_of_a_query(scene: QueryScene, monkeypa
     for view in ("frame_00001", "frame_00002"):
         found = judged.look(view)
         for text in texts:
-            seen = look(scene, ask(scene, Query((text,), ("wall",)), encoder), view)
+            seen = view_mask(scene, ask(scene, Query((text,), ("wall",)), encoder), view)
             assert (found[text].mask == seen.mask.numpy()).all() and found[text].mask.any()
             assert found[text].peak is None
     assert [answer.query.positives for answer in made] == [("book",), ("red apple",)]  # once for all views

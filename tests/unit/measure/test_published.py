@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from liftcore.measure.published import Published, published
+from liftcore.evaluate.published import Published, published
 
 SPELLING = {
     "LeRF": "LERF",

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 import torch
 
 from liftcore import cli
-from liftcore.measure import stages
-from liftcore.measure.peers.work import Size, room
-from liftcore.measure.stages import STAGES, Clock, TimedRaster
-from liftcore.raster.cpu import CpuRaster
-from liftcore.raster.protocol import Walk, Weighting
+from liftcore.evaluate import stages
+from liftcore.evaluate.stages import STAGES, Clock, TimedRaster
+from liftcore.raster.base import CompositingParams, Weighting
+from liftcore.raster.cpu.raster import CpuRaster
+from tests.benchmarks.peers.work import Size, room
 
 if TYPE_CHECKING:
     import pytest
@@ -31,8 +31,8 @@ def test_a_stage_within_a_stage_is_counted_once(monkeypatch: pytest.MonkeyPatch)
 def test_the_timed_raster_gives_the_same_weights_and_names_every_step() -> None:
     work = room(Size(splats=2_000, width=64, height=48, views=1, channels=2), threads=1)
     raster = TimedRaster(work.splats)
-    timed = raster.region_weights(*work.views[0], Walk(), Weighting())
-    plain = CpuRaster(work.splats, threads=2).region_weights(*work.views[0], Walk(), Weighting())
+    timed = raster.region_weights(*work.views[0], CompositingParams(), Weighting())
+    plain = CpuRaster(work.splats, threads=2).region_weights(*work.views[0], CompositingParams(), Weighting())
     assert all(torch.equal(getattr(timed, field.name), getattr(plain, field.name)) for field in fields(timed))
     assert set(raster.clock.wall) == set(STAGES) - {"rest", "solution"}
     assert all(seconds > 0 for seconds in raster.clock.wall.values())

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from liftcore.measure.accuracy import mask_iou
-from liftcore.measure.examples import deepest_pixel
-from liftcore.measure.thresholds import best_iou
+from liftcore.evaluate.accuracy import mask_iou
+from tests.benchmarks.examples import deepest_pixel
+from tests.benchmarks.thresholds import best_iou
 
 
 def test_no_threshold_beats_the_best_one() -> None:

@@ -14,13 +14,13 @@ from safetensors.torch import save, save_file
 
 from liftcore import cli
 from liftcore.errors import InvalidInput
-from liftcore.measure.tradeoff import compare as comparison
-from liftcore.measure.tradeoff import report
-from liftcore.measure.tradeoff.child import measured
-from liftcore.measure.tradeoff.choice import choose, pareto
-from liftcore.measure.tradeoff.judge import cosine_figures
-from liftcore.measure.tradeoff.order import CANDIDATES, Order, Scene
-from liftcore.measure.tradeoff.report import table_of
+from liftcore.evaluate.tradeoff import compare as comparison
+from liftcore.evaluate.tradeoff import report
+from liftcore.evaluate.tradeoff.child import measured
+from liftcore.evaluate.tradeoff.choice import choose, pareto
+from liftcore.evaluate.tradeoff.judge import cosine_figures
+from liftcore.evaluate.tradeoff.order import CANDIDATES, Order, Scene
+from liftcore.evaluate.tradeoff.report import table_of
 from liftcore.progress import silent
 from tests.unit.solve.test_lift_equals_dense import write_scene
 

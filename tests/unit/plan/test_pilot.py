@@ -9,21 +9,21 @@ import numpy as np
 import pytest
 import torch
 
+from liftcore.evaluate.tradeoff.judge import cosine_figures
+from liftcore.features.pack import open_packs
+from liftcore.features.views import Regions
+from liftcore.features.write_pack import write_pack
+from liftcore.io.inria import write_inria_cameras
+from liftcore.io.load import load_cameras
+from liftcore.io.ply import write_splats
 from liftcore.lift import lift, open_sources
-from liftcore.measure.room_scene import Room, write_room
-from liftcore.measure.tradeoff.judge import cosine_figures
-from liftcore.observe.observation import RegionMap
-from liftcore.observe.pack import open_packs
-from liftcore.observe.write_pack import write_pack
 from liftcore.plan.pilot import PILOT_VIEWS, Pilot, fly_pilot
 from liftcore.plan.plan import FEW_VIEWS
 from liftcore.plan.visibility import visibility
 from liftcore.scene.cameras import Cameras
-from liftcore.scene.inria import write_inria_cameras
-from liftcore.scene.load import load_cameras
-from liftcore.scene.ply import write_splats
 from liftcore.solve.accumulate import lift_walk
 from liftcore.solve.settings import LiftSettings
+from tests.benchmarks.room_scene import Room, write_room
 from tests.scenes import centred, random_splats
 from tests.unit.plan.test_views import ring
 
@@ -41,7 +41,7 @@ def disagreeing(folder, error: float, gap: bool = False, labelled: bool = True):
     errors = torch.randn(VIEWS, CHANNELS, generator=generator)
     errors *= error / CHANNELS**0.5
     cameras = [centred(camera) for camera in ring(VIEWS)]
-    observed = {camera.name: RegionMap(labels, truth + one) for camera, one in zip(cameras, errors, strict=True)}
+    observed = {camera.name: Regions(labels, truth + one) for camera, one in zip(cameras, errors, strict=True)}
     paths = folder / "splats.ply", folder / "cameras.json", folder / "features.safetensors"
     write_splats(random_splats(1, 80, 0.4), paths[0])
     write_inria_cameras(Cameras(tuple(cameras)), paths[1])
@@ -172,7 +172,7 @@ def test_a_room_is_written_the_same_twice_and_its_views_disagree_as_told(tmp_pat
     assert set(packs.views) == set(cameras.by_name)
     for view in packs.views:
         observed = packs.observation(view)
-        assert isinstance(observed, RegionMap)
+        assert isinstance(observed, Regions)
         labels = observed.labels
         sizes = [len(level.unique()) for level in labels]
         assert labels.shape == (4, 24, 32)

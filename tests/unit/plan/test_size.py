@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 import torch
 
-from liftcore.artifact import load_lift, save_lift
 from liftcore.device import CPU
 from liftcore.errors import InvalidSettings, Unavailable
+from liftcore.features.pack import open_packs
+from liftcore.features.views import Regions
+from liftcore.features.write_pack import write_pack
+from liftcore.io.lift_file import load_lift, save_lift
 from liftcore.lift import lift, open_sources, planned
-from liftcore.observe.observation import RegionMap
-from liftcore.observe.pack import open_packs
-from liftcore.observe.write_pack import write_pack
 from liftcore.plan.memory import (
     CONTROL_GROUPS,
     LIBRARIES,
@@ -53,7 +53,7 @@ def test_nothing_has_no_rank():
 def test_rank_of_packs_of_two_types_is_above_the_coarser_rounding(tmp_path):
     rows = torch.rand(100, 3, generator=torch.manual_seed(0)) @ torch.rand(3, 40, generator=torch.manual_seed(1))
     labels = torch.zeros(1, 2, 2, dtype=torch.int32)
-    write_pack(tmp_path / "p", {"v0": RegionMap(labels, rows), "v1": RegionMap(labels, rows.half())}, {})
+    write_pack(tmp_path / "p", {"v0": Regions(labels, rows), "v1": Regions(labels, rows.half())}, {})
     packs = open_packs([tmp_path / "p"])
     assert codebook_rank(packs, packs.views).rank == 3
 

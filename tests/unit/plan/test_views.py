@@ -9,8 +9,8 @@ import torch
 from liftcore.lift import lift
 from liftcore.plan.coverage import ORDER_SPLATS, SIDES, WELL_COVERED, side_of, spare_views, view_order, views_to_show
 from liftcore.plan.visibility import Visibility, visibility
-from liftcore.raster.cpu import CpuRaster
-from liftcore.raster.protocol import Walk, Weighting
+from liftcore.raster.base import CompositingParams, Weighting
+from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.splats import Kernel
 from liftcore.solve.settings import LiftSettings
 from tests.scenes import look_at, random_camera, random_regions, random_splats
@@ -34,10 +34,12 @@ def seen_as(in_view: list[list[int]]) -> Visibility:
 @pytest.mark.usefixtures("every_kernel")
 def test_whatever_a_view_blends_is_in_its_field(kernel):
     splats, cameras = random_splats(3, 60, spread=2.0, kernel=kernel), [random_camera(k) for k in range(4)]
-    seen = visibility(splats, cameras, Walk())
+    seen = visibility(splats, cameras, CompositingParams())
     raster = CpuRaster(splats, threads=1)
     for k, camera in enumerate(cameras):
-        met = raster.region_weights(camera, random_regions(k), Walk(), Weighting()).evidence_splats.numpy()
+        met = raster.region_weights(
+            camera, random_regions(k), CompositingParams(), Weighting()
+        ).evidence_splats.numpy()
         assert met.size
         assert seen.in_view[k][met].all()
     assert not seen.in_view.all()
@@ -50,7 +52,7 @@ def test_every_direction_has_one_of_the_sides():
 
 
 def test_chosen_views_look_from_all_sides():
-    seen = visibility(random_splats(0, 80, 0.3), ring(24), Walk())
+    seen = visibility(random_splats(0, 80, 0.3), ring(24), CompositingParams())
     order = list(view_order(seen))
     chosen = sorted(order[: views_to_show(seen, order, 6)])
     gaps = np.diff([*chosen, chosen[0] + 24])
@@ -59,7 +61,7 @@ def test_chosen_views_look_from_all_sides():
 
 
 def test_views_are_added_until_each_splat_is_shown_often_enough_and_the_choice_repeats():
-    seen = visibility(random_splats(1, 80, 1.0), [random_camera(k) for k in range(12)], Walk())
+    seen = visibility(random_splats(1, 80, 1.0), [random_camera(k) for k in range(12)], CompositingParams())
     order = list(view_order(seen))
     assert order == list(view_order(seen))
     shown = seen.in_view[:, seen.in_view.any(axis=0)]
@@ -71,7 +73,7 @@ def test_views_are_added_until_each_splat_is_shown_often_enough_and_the_choice_r
 
 
 def test_looking_at_gains_lazily_finds_the_order_of_looking_at_all():
-    seen = visibility(random_splats(2, 120, 0.8), [random_camera(k) for k in range(14)], Walk())
+    seen = visibility(random_splats(2, 120, 0.8), [random_camera(k) for k in range(14)], CompositingParams())
     shares = seen.areas / seen.areas.sum(axis=0).clip(min=1e-30)
     sides = [side_of(centre - seen.means) for centre in seen.centres]
     held, every = np.zeros((shares.shape[1], SIDES)), np.arange(shares.shape[1])
@@ -99,9 +101,9 @@ def test_of_many_splats_a_part_makes_the_order():
 
 
 def test_some_views_alone_are_what_they_were_among_all():
-    seen = visibility(random_splats(4, 60, 1.0), [random_camera(k) for k in range(5)], Walk())
+    seen = visibility(random_splats(4, 60, 1.0), [random_camera(k) for k in range(5)], CompositingParams())
     some = seen.of([3, 1])
-    again = visibility(random_splats(4, 60, 1.0), [random_camera(k) for k in (3, 1)], Walk())
+    again = visibility(random_splats(4, 60, 1.0), [random_camera(k) for k in (3, 1)], CompositingParams())
     assert all(np.array_equal(getattr(some, name), getattr(again, name)) for name in ("areas", "centres", "means"))
 
 

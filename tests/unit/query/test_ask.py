@@ -12,18 +12,18 @@ import pytest
 import torch
 from PIL import Image
 
-from liftcore.artifact import Lift, LiftMetadata, load_lift, save_lift
 from liftcore.errors import InvalidLift, InvalidQuery
-from liftcore.input_files import input_file
+from liftcore.io.input_files import input_file
+from liftcore.io.inria import write_inria_cameras
+from liftcore.io.lift_file import LiftMetadata, LiftResult, load_lift, save_lift
+from liftcore.io.ply import write_splats
 from liftcore.query.ask import ask, top
 from liftcore.query.colours import NO_CLUSTER_COLOUR, SH_C0, cluster_colours, seen_colours
-from liftcore.query.look import look
 from liftcore.query.pictures import attention_png, mask_png, overlay, render, render_png
 from liftcore.query.query import Query
 from liftcore.query.scene import QueryScene
+from liftcore.query.view_mask import view_mask
 from liftcore.scene.cameras import Cameras
-from liftcore.scene.inria import write_inria_cameras
-from liftcore.scene.ply import write_splats
 from liftcore.scene.splats import Kernel, Splats
 from liftcore.solve.settings import LiftSettings
 from tests.scenes import look_at, random_splats
@@ -58,7 +58,7 @@ def lift_file(tmp_path: Path) -> Path:
         views=("front",), certificate={}, timings={},
     )  # fmt: skip
     seen = torch.arange(COUNT) < COUNT - 1
-    lift = Lift(features.half(), torch.ones(COUNT), torch.ones(COUNT), seen, metadata)
+    lift = LiftResult(features.half(), torch.ones(COUNT), torch.ones(COUNT), seen, metadata)
     save_lift(lift, tmp_path / "scene.lift")
     return tmp_path / "scene.lift"
 
@@ -85,7 +85,7 @@ def test_splats_that_hardly_a_ray_met_do_not_decide_the_threshold(lift_file: Pat
     plain = ask(scene, "x", Axes())
     stray = torch.zeros(COUNT, 3)
     stray[:, 0], stray[:, 1] = 1.0, torch.linspace(0.0, 3.0, COUNT)  # scores all over the range
-    crowd = Lift(
+    crowd = LiftResult(
         torch.cat([scene.lift.features, stray.half()]),
         torch.cat([scene.lift.evidence, torch.full((COUNT,), 1e-4)]),
         torch.ones(2 * COUNT),
@@ -147,7 +147,7 @@ def test_a_scene_that_changed_is_not_taken_for_the_old_one(lift_file: Path) -> N
 
 def test_pictures_have_the_size_of_the_view(lift_file: Path) -> None:
     scene = QueryScene.open(lift_file)
-    seen = look(scene, ask(scene, "x", Axes()), "front")
+    seen = view_mask(scene, ask(scene, "x", Axes()), "front")
     assert overlay(render(scene, "front"), seen.mask.numpy()).shape == (30, 40, 3)
     contents = {
         "L": [mask_png(seen)],

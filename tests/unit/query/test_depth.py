@@ -10,13 +10,13 @@ import pytest
 import torch
 from PIL import Image
 
-from liftcore.artifact import Lift, LiftMetadata
-from liftcore.input_files import InputFile
+from liftcore.io.input_files import InputFile
+from liftcore.io.lift_file import LiftMetadata, LiftResult
 from liftcore.query.depth import expected_depth, shown_depth
 from liftcore.query.pictures import render_png
 from liftcore.query.scene import QueryScene
-from liftcore.raster.oracle import OracleRaster
-from liftcore.raster.protocol import Walk
+from liftcore.raster.base import CompositingParams
+from liftcore.raster.reference import OracleRaster
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.splats import Kernel, Splats
 from liftcore.solve.settings import LiftSettings
@@ -33,7 +33,7 @@ def scene_of(splats: Splats, camera: Camera) -> QueryScene:
         text_space="none", views=(), certificate={}, timings={},
     )  # fmt: skip
     ones = torch.ones(splats.count)
-    scene = QueryScene(Lift(torch.ones(splats.count, 1), ones, ones, ones > 0, metadata), Path("nowhere"))
+    scene = QueryScene(LiftResult(torch.ones(splats.count, 1), ones, ones, ones > 0, metadata), Path("nowhere"))
     scene.__dict__.update(splats=splats, cameras=Cameras((camera,)))
     return scene
 
@@ -68,12 +68,12 @@ def test_depth_is_the_weighted_mean_of_what_the_ray_meets(kernel: Kernel) -> Non
     splats, camera = random_splats(5, 40, kernel=kernel), random_camera(5)
     depths, covered = expected_depth(scene_of(splats, camera), "v0")
     pixels = torch.tensor([(x, y) for y in range(camera.height) for x in range(camera.width)], dtype=torch.int32)
-    rows = OracleRaster(splats).ray_rows(camera, pixels, Walk())
+    rows = OracleRaster(splats).ray_rows(camera, pixels, CompositingParams())
     z = splats.means.double() @ torch.from_numpy(camera.world_to_camera[2, :3].copy()) + camera.world_to_camera[2, 3]
     expected = torch.zeros(len(pixels), dtype=torch.float64)
     weighed = torch.zeros(len(pixels), dtype=torch.float64)
     for i in range(len(pixels)):
-        met = slice(int(rows.row_starts[i]), int(rows.row_starts[i + 1]))
+        met = slice(int(rows.indptr[i]), int(rows.indptr[i + 1]))
         weights = rows.weights[met].double()
         weighed[i] = weights.sum()
         expected[i] = (weights * z[rows.splats[met].long()]).sum() / weighed[i] if len(weights) else 0.0

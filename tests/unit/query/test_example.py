@@ -13,17 +13,17 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from liftcore.artifact import load_lift, save_lift
 from liftcore.errors import InvalidLift, InvalidQuery, NotFound, SplatliftError
+from liftcore.io.lift_file import load_lift, save_lift
 from liftcore.lift import lift
 from liftcore.query.ask import ask
 from liftcore.query.directions import directions
 from liftcore.query.example import Example, OneSplat, Pixel, Region, Vector, parse_example
-from liftcore.query.look import look
 from liftcore.query.query import Query
 from liftcore.query.scene import QueryScene
 from liftcore.query.threshold import find_threshold
 from liftcore.query.vector_file import read_vector
+from liftcore.query.view_mask import view_mask
 from liftcore.solve.settings import LiftSettings
 from tests.api.tiny_scene import CHANNELS, HEIGHT, SPLATS_A_CLUSTER, WIDTH, make_scene
 
@@ -127,7 +127,7 @@ def test_positives_and_negatives_together_make_one_query(scene: QueryScene) -> N
 
 
 def test_a_query_by_example_is_seen_like_any_other(scene: QueryScene) -> None:
-    columns = look(scene, ask(scene, Query((Pixel("left", 6, 12),))), "middle").mask.nonzero()[:, 1]
+    columns = view_mask(scene, ask(scene, Query((Pixel("left", 6, 12),))), "middle").mask.nonzero()[:, 1]
     assert len(columns) > 0 and int(columns.max()) < WIDTH // 2
 
 

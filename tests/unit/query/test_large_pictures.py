@@ -6,17 +6,17 @@ from pathlib import Path
 
 import pytest
 
-from liftcore.artifact import save_lift
 from liftcore.errors import InvalidQuery
+from liftcore.io.lift_file import save_lift
 from liftcore.lift import lift
 from liftcore.query import scene as scenes
 from liftcore.query.ask import ask
 from liftcore.query.example import OneSplat
-from liftcore.query.look import look
 from liftcore.query.pictures import render_png
 from liftcore.query.query import Query
 from liftcore.query.scene import QueryScene
 from liftcore.query.scores import rows_at_a_time
+from liftcore.query.view_mask import view_mask
 from liftcore.solve.settings import LiftSettings
 from tests.api.tiny_scene import HEIGHT, WIDTH, make_scene
 
@@ -36,7 +36,7 @@ def test_pictures_have_a_limit(scene: QueryScene, monkeypatch: pytest.MonkeyPatc
     answer = ask(scene, Query((OneSplat(0),)))
 
     def draw(what: str) -> object:
-        return look(scene, answer, "middle") if what == "mask" else render_png(scene, "middle", what)
+        return view_mask(scene, answer, "middle") if what == "mask" else render_png(scene, "middle", what)
 
     for what in ("mask", "rgb", "pca", "depth"):
         monkeypatch.setattr(scenes, "MOST_PIXELS", WIDTH * HEIGHT)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from liftcore.artifact import save_lift
 from liftcore.errors import InvalidQuery
+from liftcore.io.lift_file import save_lift
 from liftcore.lift import lift
 from liftcore.query import objects as module
 from liftcore.query.ask import Answer, ask

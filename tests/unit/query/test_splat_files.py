@@ -10,19 +10,19 @@ import pytest
 import torch
 from PIL import Image
 
-from liftcore.artifact import save_lift
 from liftcore.errors import InvalidLift, InvalidQuery
+from liftcore.io.lift_file import save_lift
+from liftcore.io.load import load_splats
 from liftcore.lift import lift
 from liftcore.query.ask import Answer, ask
 from liftcore.query.colours import NOT_SEEN_COLOUR, SH_C0, colour_map
 from liftcore.query.example import Region
-from liftcore.query.look import look
 from liftcore.query.pictures import attention_png, render
 from liftcore.query.query import Query
 from liftcore.query.scene import QueryScene
 from liftcore.query.splat_files import coloured_ply, object_ply
-from liftcore.raster.cpu import CpuRaster
-from liftcore.scene.load import load_splats
+from liftcore.query.view_mask import view_mask
+from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.solve.settings import LiftSettings
 from tests.api.tiny_scene import SPLATS_A_CLUSTER, WIDTH, make_scene, ply, splat_rows
 
@@ -92,7 +92,7 @@ def test_scores_have_the_colours_of_the_map_and_what_was_not_seen_is_grey(scene:
 
 def test_the_coloured_scene_looks_like_the_attention(scene: QueryScene, tmp_path: Path) -> None:
     answer = of_lamp(scene)
-    seen = look(scene, answer, "middle")
+    seen = view_mask(scene, answer, "middle")
     (tmp_path / "scores.ply").write_bytes(b"".join(coloured_ply(scene, answer)))
     coloured = QueryScene(scene.lift, scene.path)
     coloured.__dict__["splats"] = load_splats(tmp_path / "scores.ply")

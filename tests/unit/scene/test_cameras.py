@@ -15,13 +15,13 @@ from camera_documents import assert_same, with_json
 from colmap_files import IMAGES, binary_files, text_files, write_files
 
 from liftcore.errors import InvalidCameras, InvalidSplats
-from liftcore.scene import camera_zip, json_file
+from liftcore.io import camera_zip, json_file
+from liftcore.io.inria import write_inria_cameras
+from liftcore.io.inspect_scene import describe_camera_file
+from liftcore.io.load import load_cameras, load_splats, other_models
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.distortion import Brown, Fisheye
-from liftcore.scene.inria import write_inria_cameras
-from liftcore.scene.inspect import describe_camera_file
 from liftcore.scene.lens import Lens
-from liftcore.scene.load import load_cameras, load_splats, other_models
 
 
 @pytest.fixture

@@ -13,9 +13,9 @@ import pytest
 from colmap_files import CAMERAS, IMAGES, binary_files, text_files, write_files
 
 from liftcore.errors import InvalidCameras
-from liftcore.scene.inspect import inspect_file
-from liftcore.scene.load import load_cameras, other_models
-from liftcore.scene.model_folders import MODEL_FOLDERS
+from liftcore.io.inspect_scene import inspect_file
+from liftcore.io.load import load_cameras, other_models
+from liftcore.io.model_folders import MODEL_FOLDERS
 
 if TYPE_CHECKING:
     from collections.abc import Callable

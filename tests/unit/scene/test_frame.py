@@ -16,13 +16,13 @@ from colmap_files import CAMERAS, binary_files, write_files
 from scipy.spatial.transform import Rotation
 
 from liftcore.errors import InvalidCameras, Unavailable
-from liftcore.input_files import camera_input
-from liftcore.scene import camera_zip
+from liftcore.io import camera_zip
+from liftcore.io.frame import FRAME_FILE, Similarity
+from liftcore.io.input_files import camera_input
+from liftcore.io.inria import write_inria_cameras
+from liftcore.io.inspect_scene import inspect_file
+from liftcore.io.load import load_cameras
 from liftcore.scene.cameras import Camera, Cameras
-from liftcore.scene.frame import FRAME_FILE, Similarity
-from liftcore.scene.inria import write_inria_cameras
-from liftcore.scene.inspect import inspect_file
-from liftcore.scene.load import load_cameras
 
 APPLIED = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])  # of nerfstudio's converter
 SCALE, APPLIED_SCALE = 0.37, 4.0

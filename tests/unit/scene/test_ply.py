@@ -12,7 +12,7 @@ import torch
 from ply_files import DIALECTS, INRIA, ply_bytes, ply_rows, with_ply
 
 from liftcore.errors import InvalidSplats
-from liftcore.scene.ply import read_splats, write_splats
+from liftcore.io.ply import read_splats, write_splats
 from liftcore.scene.splats import Kernel, Splats
 from tests.scenes import random_splats
 

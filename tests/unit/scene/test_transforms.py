@@ -12,9 +12,9 @@ from camera_documents import assert_same, transforms_of, with_json
 from colmap_files import binary_files, write_files
 
 from liftcore.errors import InvalidCameras
+from liftcore.io.load import load_cameras
 from liftcore.scene.distortion import Brown, Fisheye
 from liftcore.scene.lens import Lens
-from liftcore.scene.load import load_cameras
 
 
 def test_transforms_and_colmap_mean_the_same(tmp_path: Path) -> None:

@@ -14,9 +14,9 @@ from colmap_files import CAMERAS, IMAGES, binary_files, text_files, write_files
 from rapidfuzz import process
 
 from liftcore.errors import InvalidCameras, NotFound
+from liftcore.io.inria import write_inria_cameras
+from liftcore.io.load import load_cameras
 from liftcore.scene.cameras import Camera, Cameras
-from liftcore.scene.inria import write_inria_cameras
-from liftcore.scene.load import load_cameras
 from liftcore.scene.view_names import view_names
 
 
@@ -86,7 +86,7 @@ def test_more_views_than_a_scene_may_have_are_refused_before_they_are_read(
     kind: str, tmp_path: Path, model: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("liftcore.scene.cameras.MAX_VIEWS", 2)
-    monkeypatch.setattr("liftcore.scene.colmap._camera", None)
+    monkeypatch.setattr("liftcore.io.colmap._camera", None)
     path = write_files(tmp_path / "many", (text_files if kind == "text" else binary_files)())
     if kind == "binary":
         announced = struct.pack("<Q", 3) + b"\0" * 3 * 73  # nothing that could be read

@@ -7,23 +7,23 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from liftcore.observe.observation import Observation
-from liftcore.raster.cpu import CpuRaster
-from liftcore.raster.oracle import reading_matrix
-from liftcore.raster.protocol import Walk
+from liftcore.features.views import ViewFeatures
+from liftcore.raster.base import CompositingParams
+from liftcore.raster.cpu.raster import CpuRaster
+from liftcore.raster.reference import reading_matrix
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Splats
 from liftcore.solve.all_rays import AllRays
 from tests.scenes import random_camera, random_grid, random_regions, random_splats
 
 
-def dense_view(raster: CpuRaster, camera: Camera, walk: Walk) -> np.ndarray:
+def dense_view(raster: CpuRaster, camera: Camera, walk: CompositingParams) -> np.ndarray:
     """A [H * W, P] f64 as the raster traces it."""
     y, x = np.mgrid[: camera.height, : camera.width]
     pixels = torch.tensor(np.stack([x.ravel(), y.ravel()], axis=1), dtype=torch.int32)
     rows = raster.ray_rows(camera, pixels, walk)
     A = np.zeros((len(pixels), raster.splats.count))
-    A[np.repeat(np.arange(len(A)), np.diff(rows.row_starts.numpy())), rows.splats.numpy()] = rows.weights.numpy()
+    A[np.repeat(np.arange(len(A)), np.diff(rows.indptr.numpy())), rows.splats.numpy()] = rows.weights.numpy()
     return A
 
 
@@ -35,11 +35,11 @@ class SmallScene:
         seed: int,
         grids: bool = False,
         splats: Splats | None = None,
-        walk: Walk | None = None,
+        walk: CompositingParams | None = None,
         views: Sequence[Camera] | None = None,
-        observations: Sequence[Observation] | None = None,
+        observations: Sequence[ViewFeatures] | None = None,
     ) -> None:
-        self.walk = walk or Walk()
+        self.walk = walk or CompositingParams()
         self.splats = splats or random_splats(seed, 25)
         around = [random_camera(seed + k, 22 + 3 * k, 17 + 2 * k, name=f"v{k}") for k in range(3)]
         self.views = list(views or around)
@@ -54,7 +54,7 @@ class SmallScene:
         self.closed_form = torch.tensor(self.A.T @ self.B / safe[:, None], dtype=torch.float32)
         self.codebooks = [observation.codebook for observation in self.observations]
 
-    def _rows(self, view: Camera, observation: Observation) -> tuple[np.ndarray, np.ndarray]:
+    def _rows(self, view: Camera, observation: ViewFeatures) -> tuple[np.ndarray, np.ndarray]:
         S, ray = reading_matrix(observation, view.width, view.height)
         return dense_view(self.raster, view, self.walk)[ray], S @ observation.codebook.double().numpy()
 

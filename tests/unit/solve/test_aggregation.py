@@ -10,19 +10,19 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from liftcore.artifact import CLUSTER_TENSORS, load_lift, save_lift
 from liftcore.errors import InvalidLift
+from liftcore.features.pack import open_packs
+from liftcore.features.views import FeatureGrid, Regions
+from liftcore.features.write_pack import write_pack
+from liftcore.io.inria import write_inria_cameras
+from liftcore.io.lift_file import CLUSTER_TENSORS, load_lift, save_lift
+from liftcore.io.load import load_cameras, load_splats
+from liftcore.io.ply import write_splats
 from liftcore.lift import LEAST_KEPT, lift
-from liftcore.observe.observation import FeatureGrid, RegionMap
-from liftcore.observe.pack import open_packs
-from liftcore.observe.write_pack import write_pack
 from liftcore.progress import silent
-from liftcore.raster.cpu import CpuRaster
-from liftcore.raster.oracle import OracleRaster, dense_view
+from liftcore.raster.cpu.raster import CpuRaster
+from liftcore.raster.reference import OracleRaster, dense_view
 from liftcore.scene.cameras import Cameras
-from liftcore.scene.inria import write_inria_cameras
-from liftcore.scene.load import load_cameras, load_splats
-from liftcore.scene.ply import write_splats
 from liftcore.solve.accumulate import lift_walk, render_walk, weighting_of
 from liftcore.solve.aggregation import KeptRegions, evidence_means, filter_regions, kept_means, spread
 from liftcore.solve.clustering import Clustering
@@ -120,13 +120,13 @@ def write_scene(folder, kind: str):
     for k in range(3):
         base = centred(random_camera(0, 40 + 8 * k, 30, name=f"v{k}"))
         views.append(replace(base, fx=40.0, fy=40.0, world_to_camera=pose))
-    maps: dict[str, RegionMap | FeatureGrid] = {}
+    maps: dict[str, Regions | FeatureGrid] = {}
     for k, camera in enumerate(views):
         labels = torch.zeros(1, 15, 20, dtype=torch.int32)
         labels[:, :, 10:] = 1
         noise = np.random.default_rng(k).normal(0, 0.05, (2, 6))
         codebook = torch.tensor(np.eye(2, 6) + noise, dtype=torch.float32)
-        maps[camera.name] = RegionMap(labels, codebook)
+        maps[camera.name] = Regions(labels, codebook)
         if kind == "grids":
             maps[camera.name] = FeatureGrid(codebook[labels[0].long()])
     maps["nowhere"] = maps["v0"]
@@ -178,10 +178,10 @@ def test_what_takes_no_cluster_is_solved_again_as_if_the_other_regions_had_never
     packs = open_packs([features])
     maps = {name: packs.observation(name) for name in packs.views}
     first = maps["v0"]
-    assert isinstance(first, RegionMap)
+    assert isinstance(first, Regions)
     labels = first.labels.clone()
     labels[:, :, 7:13] = 2
-    wrong = RegionMap(labels, torch.cat([first.codebook, torch.eye(6)[5:].to(first.codebook.dtype)]))
+    wrong = Regions(labels, torch.cat([first.codebook, torch.eye(6)[5:].to(first.codebook.dtype)]))
     write_pack(features, maps | {"v0": wrong}, {"encoder": "random"})
     knobs = KNOBS | {"aggregation_iou": 0.3, "dtype": "float32"}
     result = lift(splats, cameras, [features], LiftSettings.of(aggregation=True, aggregation_resolve=True, **knobs))
@@ -195,7 +195,7 @@ def test_what_takes_no_cluster_is_solved_again_as_if_the_other_regions_had_never
     clustering = clustering_of(result.cluster.numpy(), result.cluster_features.shape[0])
     kept = filter_regions(clustering, 6, lifted, LiftSettings.of(aggregation=True, **knobs), silent).masks
     for name, observation in (maps | {"v0": wrong}).items():
-        if name in kept and isinstance(observation, RegionMap):
+        if name in kept and isinstance(observation, Regions):
             dropped = torch.from_numpy(~kept[name])
             observation.labels[(observation.labels >= 0) & dropped[observation.labels.clamp_min(0).long()]] = -1
             maps[name] = observation

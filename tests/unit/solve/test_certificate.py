@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from liftcore.io.load import load_cameras
 from liftcore.lift import lift
-from liftcore.raster.oracle import dense_view, reading_matrix
-from liftcore.raster.protocol import Walk
-from liftcore.scene.load import load_cameras
+from liftcore.raster.base import CompositingParams
+from liftcore.raster.reference import dense_view, reading_matrix
 from liftcore.solve.settings import LiftSettings
 from tests.scenes import observed, random_splats
 from tests.unit.solve.test_lift_equals_dense import write_scene
@@ -23,7 +23,7 @@ def dense_measures(X: np.ndarray, seed: int, cameras, gain: float, grids: bool) 
         observation = observed(seed, k, grids)
         S, ray = reading_matrix(observation, camera.width, camera.height)
         B = S @ observation.codebook.double().numpy()
-        A = dense_view(random_splats(seed, 50), camera, Walk(gain)).A
+        A = dense_view(random_splats(seed, 50), camera, CompositingParams(gain)).A
         sums.append(A.sum(axis=1))
         rows = A[ray]
         squares = ((X[None] - B[:, None]) ** 2).sum(axis=2)

@@ -11,17 +11,17 @@ import numpy as np
 import pytest
 import torch
 
-from liftcore.artifact import TENSORS, Lift
 from liftcore.device import CPU, Device
+from liftcore.features.views import NO_LABEL, FeatureGrid, Regions
+from liftcore.features.write_pack import write_pack
+from liftcore.io.lift_file import TENSORS, LiftResult
+from liftcore.io.load import load_cameras
 from liftcore.lift import lift
 from liftcore.listener import Listener
-from liftcore.observe.observation import NO_LABEL, FeatureGrid, RegionMap
-from liftcore.observe.write_pack import write_pack
-from liftcore.raster.cpu import CpuRaster
-from liftcore.raster.protocol import Look, Walk, Weighting
+from liftcore.raster.base import CompositingParams, ViewRequest, Weighting
+from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.cameras import Camera
 from liftcore.scene.kernel import Kernel
-from liftcore.scene.load import load_cameras
 from liftcore.solve.checkpoint import Checkpoint, identity, question
 from liftcore.solve.settings import LiftSettings
 
@@ -56,7 +56,7 @@ def killing(stage: str, at: int) -> Callable[..., None]:
     return progress
 
 
-def assert_same(one: Lift, other: Lift) -> None:
+def assert_same(one: LiftResult, other: LiftResult) -> None:
     for name in TENSORS:
         first, second = getattr(one, name), getattr(other, name)
         assert first.dtype == second.dtype
@@ -91,7 +91,7 @@ def test_views_that_meet_no_label_are_kept_and_not_walked_again(
     views = {camera.name: observed(3, k, grids=False) for k, camera in enumerate(load_cameras(cameras))}
     for name in blank:
         regions = views[name]
-        assert isinstance(regions, RegionMap)
+        assert isinstance(regions, Regions)
         views[name] = replace(regions, labels=torch.full_like(regions.labels, NO_LABEL))
     write_pack(features, views, {"encoder": "random"})
     settings, checkpoint = LiftSettings.of(certificate_rays=50), Checkpoint(tmp_path / "kept", seconds=0)
@@ -167,7 +167,7 @@ def test_other_features_of_the_same_regions_walk_no_view_again(tmp_path: Path, w
 def test_an_answer_is_to_one_question_alone(changed: str) -> None:
     look = _look()
     camera, regions = look.camera, look.observation
-    assert isinstance(regions, RegionMap)
+    assert isinstance(regions, Regions)
     pose = camera.world_to_camera.copy()
     pose[0, 3] += 1e-9
     labels = regions.labels.clone()
@@ -177,7 +177,7 @@ def test_an_answer_is_to_one_question_alone(changed: str) -> None:
         "focal": replace(look, camera=replace(camera, fx=camera.fx + 1e-9)),
         "labels": replace(look, observation=replace(regions, labels=labels)),
         "codebook": replace(look, observation=replace(regions, codebook=torch.zeros(4, 2))),
-        "stride": replace(look, walk=Walk(stride=2)),
+        "stride": replace(look, walk=CompositingParams(stride=2)),
         "power": replace(look, weighting=Weighting(power=2)),
         "pixels": replace(look, pixels=look.pixels + 1),
     }[changed]
@@ -203,23 +203,23 @@ def test_files_that_are_no_blocks_stay_in_the_folder(tmp_path: Path) -> None:
     assert not any(path.exists() for path in stale)
 
 
-def _views(cameras: Path, seed: int, grids: bool) -> list[tuple[str, RegionMap | FeatureGrid]]:
+def _views(cameras: Path, seed: int, grids: bool) -> list[tuple[str, Regions | FeatureGrid]]:
     """What `write_scene` put into its pack."""
     return [(camera.name, observed(seed, k, grids=grids)) for k, camera in enumerate(load_cameras(cameras))]
 
 
-def _other_encoder(seen: RegionMap | FeatureGrid) -> RegionMap | FeatureGrid:
+def _other_encoder(seen: Regions | FeatureGrid) -> Regions | FeatureGrid:
     """The same regions or cells with features of 5 channels."""
     drawn = torch.randn(*seen.codebook.shape[:1], 5, generator=torch.Generator().manual_seed(0))
-    if isinstance(seen, RegionMap):
+    if isinstance(seen, Regions):
         return replace(seen, codebook=drawn)
     return FeatureGrid(drawn.reshape(*seen.grid.shape[:2], 5))
 
 
-def _look() -> Look:
+def _look() -> ViewRequest:
     camera = Camera("v", 8, 6, 9.0, 9.0, 4.0, 3.0, np.eye(4))
-    regions = RegionMap(torch.zeros(1, 6, 8, dtype=torch.int32), torch.zeros(3, 2))
-    return Look(camera, regions, Walk(), Weighting(), torch.zeros(2, 2, dtype=torch.int32))
+    regions = Regions(torch.zeros(1, 6, 8, dtype=torch.int32), torch.zeros(3, 2))
+    return ViewRequest(camera, regions, CompositingParams(), Weighting(), torch.zeros(2, 2, dtype=torch.int32))
 
 
 def test_checkpoint_of_another_device_is_never_used(

@@ -8,9 +8,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from liftcore.lanes_rows import WIDE
 from liftcore.progress import silent
-from liftcore.raster.protocol import RegionWeights
+from liftcore.raster.base import RegionWeights
+from liftcore.raster.cpu.lanes_rows import WIDE
 from liftcore.solve.closed_form import solve_closed_form
 from liftcore.solve.columns import rows_of
 from liftcore.solve.host import Host

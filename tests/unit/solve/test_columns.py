@@ -8,11 +8,11 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from liftcore.observe.label_tuples import label_tuples
-from liftcore.observe.observation import NO_LABEL, FeatureGrid, RegionMap
+from liftcore.features.label_tuples import label_tuples
+from liftcore.features.views import NO_LABEL, FeatureGrid, Regions
 from liftcore.progress import silent
-from liftcore.raster.cpu import CpuRaster
-from liftcore.raster.protocol import Walk, Weighting
+from liftcore.raster.base import CompositingParams, Weighting
+from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.solve.closed_form import Solution, solve_closed_form
 from liftcore.solve.columns import Columns, by_rows, by_tuples
 from liftcore.solve.host import Host
@@ -26,20 +26,20 @@ RASTER = CpuRaster(random_splats(7, 60), threads=1)
 CAMERA = random_camera(3, SIZE, SIZE)
 
 
-def region_map(seed: int, levels: int, size: float = 1.0, kind: torch.dtype = torch.float32) -> RegionMap:
+def region_map(seed: int, levels: int, size: float = 1.0, kind: torch.dtype = torch.float32) -> Regions:
     """Blobs, each level coarser than the one before; some lack labels. Rows of many lengths."""
     rng = np.random.default_rng(seed)
     blobs = np.repeat(np.repeat(rng.integers(0, 9, (6, 6)), 4, axis=0), 4, axis=1)
     named = [np.where(rng.random(9) < 0.8, np.arange(9) // (level + 1), NO_LABEL) for level in range(levels)]
     rows = rng.normal(size=(9, 40)) * rng.uniform(0.1, 1.0, (9, 1)) * size
-    return RegionMap(torch.from_numpy(np.stack(named)[:, blobs].astype(np.int32)), torch.from_numpy(rows).to(kind))
+    return Regions(torch.from_numpy(np.stack(named)[:, blobs].astype(np.int32)), torch.from_numpy(rows).to(kind))
 
 
 def solved(views, weighting: Weighting, dtype: torch.dtype, on_device: bool = False) -> tuple[Solution, np.ndarray]:
     """X of (observation, columns) of every view, and the denominators."""
     totals, store = np.zeros(RASTER.splats.count), []
     for walked, columns in views:
-        store.append(columns.weighted(RASTER.region_weights(CAMERA, walked, Walk(), weighting)))
+        store.append(columns.weighted(RASTER.region_weights(CAMERA, walked, CompositingParams(), weighting)))
         totals[store[-1].splats.numpy()] += row_totals(store[-1])
     own = [columns for _, columns in views]
     arguments = (store, own, totals, dtype, silent)
@@ -72,8 +72,8 @@ def test_means_of_float16_rows_are_rounded_as_the_features_are(on_device):
 
 
 def test_splats_that_no_view_labels_have_zeros_wherever_x_lies():
-    own = RegionMap(torch.full((2, 4, 4), NO_LABEL, dtype=torch.int32), torch.ones(1, 9))
-    weights = RASTER.region_weights(CAMERA, own, Walk(), Weighting())
+    own = Regions(torch.full((2, 4, 4), NO_LABEL, dtype=torch.int32), torch.ones(1, 9))
+    weights = RASTER.region_weights(CAMERA, own, CompositingParams(), Weighting())
 
     def used(splats: int, channels: int, dtype: torch.dtype) -> torch.Tensor:
         return torch.full((splats, channels), 7.0, dtype=dtype)
@@ -96,8 +96,8 @@ def test_tuples_are_the_distinct_ones_in_the_order_of_the_pixels(seed, levels, h
 
 def test_a_map_is_left_as_it_is_where_tuples_save_nothing():
     rng = torch.Generator().manual_seed(0)
-    noise = RegionMap(torch.randint(0, 7, (2, 30, 30), generator=rng, dtype=torch.int32), torch.ones(7, 3))
-    none = RegionMap(torch.full((2, 4, 4), NO_LABEL, dtype=torch.int32), torch.ones(1, 3))
+    noise = Regions(torch.randint(0, 7, (2, 30, 30), generator=rng, dtype=torch.int32), torch.ones(7, 3))
+    none = Regions(torch.full((2, 4, 4), NO_LABEL, dtype=torch.int32), torch.ones(1, 3))
     for own in (noise, none, region_map(0, 1), FeatureGrid(torch.ones(2, 2, 3))):
         walked, columns = by_tuples(own)
         assert walked is own and columns.tuples is None and columns.count == own.codebook.shape[0]
@@ -112,8 +112,8 @@ def test_single_regions_count_for_themselves_in_robust_steps_and_when_some_are_d
 def test_columns_are_fewer_and_entries_too():
     own = region_map(5, 4)
     walked, columns = by_tuples(own)
-    by_row = RASTER.region_weights(CAMERA, own, Walk(), Weighting())
-    by_tuple = RASTER.region_weights(CAMERA, walked, Walk(), Weighting())
+    by_row = RASTER.region_weights(CAMERA, own, CompositingParams(), Weighting())
+    by_tuple = RASTER.region_weights(CAMERA, walked, CompositingParams(), Weighting())
     assert columns.count == walked.codebook.shape[0] == columns.means(own.codebook).shape[0]
     assert len(by_tuple.columns) < len(by_row.columns)
     assert torch.equal(by_tuple.evidence, by_row.evidence)

@@ -8,9 +8,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from liftcore.features.views import Regions, ViewFeatures
 from liftcore.lift import lift
 from liftcore.listener import Listener
-from liftcore.observe.observation import Observation, RegionMap
 from liftcore.progress import silent
 from liftcore.solve.channels import BLOCK, blocks, codebook_axes, random_axes
 from liftcore.solve.least_squares import Refinement, refine
@@ -28,9 +28,9 @@ def refined(scene: SmallScene, dtype: torch.dtype = torch.float32, **chosen: flo
     return refine(scene.rays(), features, scene.seen, scene.codebooks, knobs, silent)
 
 
-def with_codebook(observation: Observation, codebook: torch.Tensor) -> RegionMap:
-    assert isinstance(observation, RegionMap)
-    return RegionMap(observation.labels, codebook)
+def with_codebook(observation: ViewFeatures, codebook: torch.Tensor) -> Regions:
+    assert isinstance(observation, Regions)
+    return Regions(observation.labels, codebook)
 
 
 @few

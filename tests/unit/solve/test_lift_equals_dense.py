@@ -8,22 +8,22 @@ import numpy as np
 import pytest
 import torch
 
-from liftcore.artifact import load_lift, save_lift
+from liftcore.features.views import Regions
+from liftcore.features.write_pack import write_pack
+from liftcore.io.inria import write_inria_cameras
+from liftcore.io.lift_file import load_lift, save_lift
+from liftcore.io.load import load_cameras
+from liftcore.io.ply import write_splats
 from liftcore.lift import lift, open_sources
-from liftcore.observe.observation import RegionMap
-from liftcore.observe.write_pack import write_pack
 from liftcore.progress import silent
-from liftcore.raster.cpu import CpuRaster
-from liftcore.raster.oracle import dense_view, reading_matrix
-from liftcore.raster.oracle_weights import counted_weights
-from liftcore.raster.protocol import Selection, Walk, Weighting
+from liftcore.raster.base import CompositingParams, Selection, Weighting
+from liftcore.raster.cpu.raster import CpuRaster
+from liftcore.raster.reference import dense_view, reading_matrix
+from liftcore.raster.reference_weights import counted_weights
 from liftcore.scene.cameras import Cameras
-from liftcore.scene.inria import write_inria_cameras
-from liftcore.scene.load import load_cameras
-from liftcore.scene.ply import write_splats
 from liftcore.solve.accumulate import accumulate
 from liftcore.solve.settings import LiftSettings
-from liftcore.solve.view_weights import ViewWeights
+from liftcore.solve.view_weights import WeightStore
 from tests.scenes import centred, observed, random_camera, random_splats
 
 PRESETS = {  # lambda, and what counts as a weight
@@ -53,7 +53,7 @@ def dense_lift(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """X, evidence, seen, and whose rays float32 may decide otherwise, by the definitions, in float64."""
     gain, weighting = PRESETS[preset]
-    splats, walk = random_splats(seed, 50), Walk(gain)
+    splats, walk = random_splats(seed, 50), CompositingParams(gain)
     numerator, denominator, evidence, undecided = np.zeros((50, 6)), np.zeros(50), np.zeros(50), np.zeros(50, bool)
     for k, camera in enumerate(cameras):
         observation = observed(seed, k, grids)
@@ -65,7 +65,7 @@ def dense_lift(
         weights = chosen[ray]
         numerator += weights.T @ B
         denominator += weights.sum(axis=0)
-        evidence += dense_view(splats, camera, Walk()).A.sum(axis=0)
+        evidence += dense_view(splats, camera, CompositingParams()).A.sum(axis=0)
     seen = denominator > 0
     X = np.divide(numerator, denominator[:, None], out=np.zeros_like(numerator), where=seen[:, None])
     return X, evidence, seen, undecided
@@ -99,7 +99,7 @@ def test_a_lift_has_views_by_tuples_of_labels_and_views_by_rows(tmp_path):
     paths, settings = write_scene(tmp_path, 5), LiftSettings.of()
     sources = open_sources(paths[0], paths[1], [paths[2]], settings)
     for robust, expected in ((0, [False, True, False]), (1, [False] * 3)):
-        with ViewWeights() as store:
+        with WeightStore() as store:
             scene = sources.splats.count, sources.cameras
             raster, own = CpuRaster(sources.splats, threads=1), LiftSettings.of(robust_steps=robust)
             geometry = accumulate(raster, scene, sources.packs, sources.views, own, store, silent)
@@ -110,8 +110,8 @@ def test_agreement_does_not_depend_on_the_length_of_inputs(tmp_path):
     splats, cameras, features = write_scene(tmp_path, 6)
     plain = lift(splats, cameras, [features], LiftSettings.of(preset="row-sum"))
     maps = [observed(6, k) for k in range(3)]
-    regions = [own for own in maps if isinstance(own, RegionMap)]
-    longer = {f"v{k}": RegionMap(own.labels, own.codebook * 7.0) for k, own in enumerate(regions)}
+    regions = [own for own in maps if isinstance(own, Regions)]
+    longer = {f"v{k}": Regions(own.labels, own.codebook * 7.0) for k, own in enumerate(regions)}
     write_pack(tmp_path / "longer.safetensors", longer, {})
     scaled = lift(splats, cameras, [tmp_path / "longer.safetensors"], LiftSettings.of(preset="row-sum"))
     assert torch.allclose(plain.agreement, scaled.agreement, atol=1e-4)

@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 import torch
 
-from liftcore.artifact import save_lift
 from liftcore.errors import InvalidSettings, InvalidSplats
+from liftcore.features.write_pack import write_pack
+from liftcore.io.inria import write_inria_cameras
+from liftcore.io.lift_file import save_lift
+from liftcore.io.load import load_cameras, load_splats
+from liftcore.io.ply import write_splats
 from liftcore.lift import lift
-from liftcore.observe.write_pack import write_pack
 from liftcore.query.scene import QueryScene
-from liftcore.raster.oracle import dense_view, reading_matrix
-from liftcore.raster.protocol import Walk
+from liftcore.raster.base import CompositingParams
+from liftcore.raster.reference import dense_view, reading_matrix
 from liftcore.scene.cameras import Cameras
-from liftcore.scene.inria import write_inria_cameras
-from liftcore.scene.load import load_cameras, load_splats
-from liftcore.scene.ply import write_splats
 from liftcore.scene.splats import Kernel, Splats
 from liftcore.solve.settings import LiftSettings
 from tests.scenes import centred, random_camera, random_regions, random_splats
@@ -71,7 +71,7 @@ def test_a_lift_of_any_kernel_equals_the_dense_definition(tmp_path, kernel, anti
         observation = random_regions(k)
         S, ray = reading_matrix(observation, camera.width, camera.height)
         # The gain of 1.2 acts on the logits of every kernel; the released code leaves DBS out.
-        weights = dense_view(splats, camera, Walk(1.2, antialiased=antialiased)).A[ray] ** 2
+        weights = dense_view(splats, camera, CompositingParams(1.2, antialiased=antialiased)).A[ray] ** 2
         numerator += weights.T @ (S @ observation.codebook.double().numpy())
         denominator += weights.sum(axis=0)
     clear = denominator > 1e-6

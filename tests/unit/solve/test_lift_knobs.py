@@ -9,16 +9,16 @@ import pytest
 import torch
 
 from liftcore.errors import InvalidFeatures, InvalidSettings
+from liftcore.features.views import Regions
+from liftcore.features.write_pack import write_pack
+from liftcore.io.load import load_cameras
 from liftcore.lift import lift
-from liftcore.observe.observation import RegionMap
-from liftcore.observe.write_pack import write_pack
-from liftcore.raster.oracle import dense_view, reading_matrix
-from liftcore.raster.oracle_weights import walked_rays
-from liftcore.scene.load import load_cameras
+from liftcore.raster.reference import dense_view, reading_matrix
+from liftcore.raster.reference_weights import walked_rays
 from liftcore.solve.accumulate import lift_walk, strided_walk
 from liftcore.solve.settings import LiftSettings, Preset
 from tests.scenes import observed, random_camera, random_splats
-from tests.unit.observe.test_levels import dense_sums
+from tests.unit.features.test_levels import dense_sums
 from tests.unit.solve.test_lift_equals_dense import write_scene
 
 ROW_SUM = {"preset": "row-sum", "dtype": "float32"}
@@ -74,16 +74,16 @@ def test_every_nth_view_is_lifted_from_the_first_on(tmp_path):
     assert torch.equal(got.features, two.features)
 
 
-def per_pixel(regions: RegionMap) -> RegionMap:
+def per_pixel(regions: Regions) -> Regions:
     """A row a pixel: the normalised sum of its levels, as released code builds its dense maps."""
     _, rows, columns = regions.labels.shape
     own = torch.arange(rows * columns, dtype=torch.int32).reshape(1, rows, columns)
     unlabelled = (regions.labels < 0).all(dim=0, keepdim=True)
-    return RegionMap(own.masked_fill(unlabelled, -1), torch.tensor(dense_sums(regions), dtype=torch.float32))
+    return Regions(own.masked_fill(unlabelled, -1), torch.tensor(dense_sums(regions), dtype=torch.float32))
 
 
-def one_level(regions: RegionMap) -> RegionMap:
-    return RegionMap(regions.labels[1:2], regions.codebook)
+def one_level(regions: Regions) -> Regions:
+    return Regions(regions.labels[1:2], regions.codebook)
 
 
 @pytest.mark.parametrize(("levels", "reference"), [("composite", per_pixel), (1, one_level)])

@@ -11,22 +11,22 @@ import pytest
 import torch
 
 from liftcore import lift as lifting
-from liftcore.artifact import TENSORS, Lift
 from liftcore.device import CPU, Device
 from liftcore.errors import Unavailable
-from liftcore.input_files import input_files
+from liftcore.io.input_files import input_files
+from liftcore.io.lift_file import TENSORS, LiftResult
+from liftcore.io.load import load_splats
 from liftcore.lift import Run, lift_sources, open_sources, planned
 from liftcore.listener import NOBODY
 from liftcore.plan import plan
 from liftcore.plan.on_device import ROOM_SPARE
 from liftcore.progress import silent
-from liftcore.raster.cpu import CpuRaster
-from liftcore.scene.load import load_splats
+from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.splats import Kernel
 from liftcore.solve.accumulate import Geometry, accumulate
 from liftcore.solve.settings import LiftSettings
 from liftcore.solve.totals import Totals
-from liftcore.solve.view_weights import ViewWeights
+from liftcore.solve.view_weights import WeightStore
 from liftcore.timings import Timings
 from tests.backends import needs_triton
 
@@ -35,7 +35,7 @@ from .test_lift_equals_dense import write_scene
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from liftcore.raster.protocol import Look, Walked
+    from liftcore.raster.base import ViewRequest, ViewWeights
 
 pytestmark = needs_triton
 
@@ -43,7 +43,7 @@ CARD = Device("cuda", torch.device("cuda", 0) if torch.cuda.is_available() else 
 SETTINGS = LiftSettings.of(certificate_rays=20, view_stride=2, robust_steps=1)  # two views of three
 
 
-def lifted(scene: tuple[Path, Path, Path], device: Device, settings: LiftSettings = SETTINGS) -> Lift:
+def lifted(scene: tuple[Path, Path, Path], device: Device, settings: LiftSettings = SETTINGS) -> LiftResult:
     sources = open_sources(scene[0], scene[1], [scene[2]], settings)
     run = Run(settings, 1, NOBODY, Timings(), device)
     return lift_sources(run, sources, input_files(scene[0], scene[1], [scene[2]]))
@@ -95,8 +95,8 @@ def test_solution_has_the_memory_of_the_last_view(tmp_path: Path, monkeypatch: p
     assert told == [None]
 
 
-def geometry_of(scene: tuple[Path, Path, Path], store: ViewWeights, raster: Any = None) -> Geometry:
-    """Walked on the processor."""
+def geometry_of(scene: tuple[Path, Path, Path], store: WeightStore, raster: Any = None) -> Geometry:
+    """ViewWeights on the processor."""
     sources = open_sources(scene[0], scene[1], [scene[2]], SETTINGS)
     seen = sources.splats.count, sources.cameras
     raster = raster or CpuRaster(sources.splats, threads=1)
@@ -107,7 +107,7 @@ def test_sums_without_room_beside_the_weights_bring_them_home(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scene = write_scene(tmp_path, 3)
-    with ViewWeights() as plain:
+    with WeightStore() as plain:
         ours = geometry_of(scene, plain)
     add = Totals.add
 
@@ -117,12 +117,12 @@ def test_sums_without_room_beside_the_weights_bring_them_home(
         add(self, *given)
 
     monkeypatch.setattr(Totals, "add", crowded)
-    with ViewWeights(card=(CPU.place, 1 << 40)) as store:
+    with WeightStore(card=(CPU.place, 1 << 40)) as store:
         enough = 0
         theirs = geometry_of(scene, store)
         assert store.card_bytes == 0 < store.bytes
     assert (theirs.denominators == ours.denominators).all() and (theirs.evidence == ours.evidence).all()
-    with ViewWeights(card=(CPU.place, 1 << 40)) as store, pytest.raises(torch.OutOfMemoryError):
+    with WeightStore(card=(CPU.place, 1 << 40)) as store, pytest.raises(torch.OutOfMemoryError):
         enough = -1  # nothing is left to bring home
         geometry_of(scene, store)
 
@@ -131,15 +131,15 @@ def test_a_views_weights_are_let_go_before_the_next_view_is_walked(tmp_path: Pat
     scene, gone = write_scene(tmp_path, 3), []
 
     class Watching:
-        def walk_views(self, looks: Iterable[Look]) -> Iterator[Walked]:
-            for walked in CpuRaster(load_splats(scene[0]), threads=1).walk_views(looks):
+        def iterate_views(self, looks: Iterable[ViewRequest]) -> Iterator[ViewWeights]:
+            for walked in CpuRaster(load_splats(scene[0]), threads=1).iterate_views(looks):
                 own = replace(walked, weights=replace(walked.weights))
                 known = weakref.ref(own.weights)
                 yield own
                 del own
                 gone.append(known() is None)
 
-    with ViewWeights(memory_limit=0) as store:  # all of them go to files
+    with WeightStore(memory_limit=0) as store:  # all of them go to files
         geometry_of(scene, store, Watching())
     assert gone == [True, True]
 

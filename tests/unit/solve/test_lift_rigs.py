@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from liftcore.artifact import save_lift
+from liftcore.features.pack import open_packs
+from liftcore.features.views import Regions
+from liftcore.features.write_pack import write_pack
+from liftcore.io.lift_file import save_lift
 from liftcore.lift import lift
-from liftcore.observe.observation import RegionMap
-from liftcore.observe.pack import open_packs
-from liftcore.observe.write_pack import write_pack
 from liftcore.query.directions import directions
 from liftcore.query.example import Region
 from liftcore.query.query import Query
@@ -42,7 +42,7 @@ def test_folders_before_the_names_of_views_change_no_bit(tmp_path: Path) -> None
     save_lift(made, tmp_path / "rig.lift")
     scene, packs = QueryScene.open(tmp_path / "rig.lift"), open_packs([features])
     observation = packs.observation("v1")
-    assert isinstance(observation, RegionMap)
+    assert isinstance(observation, Regions)
     label = int(observation.labels[0].max())  # the region is asked for by the lift's name of the view
     (direction,) = directions(scene, Query((Region("v1", 0, label),)), None)
     assert torch.allclose(

@@ -9,21 +9,21 @@ import pytest
 import torch
 
 from liftcore.device import CPU
-from liftcore.inspect_file import inspect_file
+from liftcore.features.pack import open_packs, pair
+from liftcore.features.views import FeatureGrid, Regions, ViewFeatures
+from liftcore.features.write_pack import write_pack
+from liftcore.io.inspect import inspect_file
+from liftcore.io.load import load_cameras
 from liftcore.lift import lift, open_sources, planned
-from liftcore.measure.scene_files import cameras_of
-from liftcore.observe.observation import FeatureGrid, Observation, RegionMap
-from liftcore.observe.pack import open_packs, pair
-from liftcore.observe.write_pack import write_pack
 from liftcore.scene.cameras import Camera
-from liftcore.scene.load import load_cameras
 from liftcore.solve.map_shapes import shape_warnings
 from liftcore.solve.settings import LiftSettings
+from tests.benchmarks.scene_files import cameras_of
 
 from .test_lift_equals_dense import write_scene
 
 
-def told(tmp_path: Path, observation: Observation, size: tuple[int, int]) -> list[str]:
+def told(tmp_path: Path, observation: ViewFeatures, size: tuple[int, int]) -> list[str]:
     """What is said of a view of that width and height."""
     path = tmp_path / "pack.safetensors"
     write_pack(path, {"v": observation}, {"encoder": "e"})
@@ -88,7 +88,7 @@ def test_maps_of_another_shape_are_told(tmp_path: Path, cells: tuple[int, int], 
 
 def test_turned_labels_are_told_by_the_lift(tmp_path: Path) -> None:
     splats, cameras, _ = write_scene(tmp_path, 3)
-    labels = RegionMap(torch.zeros(1, 32, 24, dtype=torch.int32), torch.ones(1, 4))
+    labels = Regions(torch.zeros(1, 32, 24, dtype=torch.int32), torch.ones(1, 4))
     write_pack(tmp_path / "turned.safetensors", {"v0": labels}, {"encoder": "e"})
     made = lift(splats, cameras, [tmp_path / "turned.safetensors"], LiftSettings.of(certificate_rays=10))
     assert any(

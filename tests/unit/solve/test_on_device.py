@@ -11,7 +11,7 @@ from torch import Tensor
 
 from liftcore.device import CPU, Device, indexed
 from liftcore.progress import silent
-from liftcore.raster.protocol import RegionWeights
+from liftcore.raster.base import RegionWeights
 from liftcore.solve import on_device, solver
 from liftcore.solve.closed_form import Solution, solve_closed_form
 from liftcore.solve.columns import Columns, rows_of
@@ -20,7 +20,7 @@ from liftcore.solve.host import Host
 from liftcore.solve.on_device import Place, solve_on_device, squared_lengths
 from liftcore.solve.solver import closed_form
 from liftcore.solve.totals import Totals, row_totals, sums_in_order
-from liftcore.solve.view_weights import ViewWeights
+from liftcore.solve.view_weights import WeightStore
 
 HERE = torch.device("cuda:0" if torch.cuda.is_available() else "cpu")
 SPLATS = 700  # three grains, the last not full
@@ -59,7 +59,7 @@ def dense(store: list[RegionWeights], books: list[Tensor], splats: int = SPLATS)
     """``D^-1 W E`` by its definition, [P, F] f64; zero rows where D is zero."""
     X, totals = np.zeros((splats, books[0].shape[1])), np.zeros(splats)
     for view, book in zip(store, books, strict=True):
-        starts, columns, weights = (t.numpy() for t in (view.row_starts, view.columns, view.weights.double()))
+        starts, columns, weights = (t.numpy() for t in (view.indptr, view.columns, view.weights.double()))
         for row, splat in enumerate(view.splats.tolist()):
             own = slice(starts[row], starts[row + 1])
             X[splat] += weights[own] @ book.double().numpy()[columns[own]]
@@ -186,7 +186,7 @@ def test_norms_are_added_in_one_order_whatever_the_rows() -> None:
 
 def test_blocks_are_whole_grains_that_fit_and_cover_all_splats() -> None:
     store = [random_view(k, 9, splats=10 * GRAIN + 5) for k in range(4)]
-    starts = [view.row_starts[torch.searchsorted(view.splats, torch.tensor([0, 2 * GRAIN]))] for view in store]
+    starts = [view.indptr[torch.searchsorted(view.splats, torch.tensor([0, 2 * GRAIN]))] for view in store]
     entries = sum(int(pair[1] - pair[0]) for pair in starts)
     room = block_bytes(2 * GRAIN, entries, 16)
     blocks = splat_blocks(store, 10 * GRAIN + 5, 16, room)
@@ -209,7 +209,7 @@ def test_weights_stay_on_the_card_while_there_is_room_and_come_home_when_asked()
     views = [random_view(k, 9) for k in range(4)]
     there = [RegionWeights(*(part.to(HERE) for part in vars(view).values())) for view in views]
     sizes = [sum(part.nbytes for part in vars(view).values()) for view in views]
-    with ViewWeights(memory_limit=sizes[2], card=(HERE, sizes[0] + sizes[1])) as store:
+    with WeightStore(memory_limit=sizes[2], card=(HERE, sizes[0] + sizes[1])) as store:
         for view in there:
             store.append(view)
         assert store.place == HERE and store.card_bytes == sizes[0] + sizes[1]
@@ -233,7 +233,7 @@ def test_weights_stay_on_the_card_while_there_is_room_and_come_home_when_asked()
 def test_solution_without_room_beside_the_weights_brings_them_home(monkeypatch: pytest.MonkeyPatch) -> None:
     tries = []
 
-    def crowded(store: ViewWeights, *rest: object) -> str:
+    def crowded(store: WeightStore, *rest: object) -> str:
         tries.append(store.card_bytes)
         if store.card_bytes or len(tries) > 2:
             raise RuntimeError("Triton Error [CUDA]: out of memory")
@@ -241,7 +241,7 @@ def test_solution_without_room_beside_the_weights_brings_them_home(monkeypatch: 
 
     monkeypatch.setattr(solver, "solve_on_device", crowded)
     rest = (rows_of([torch.zeros(1, 1)]), np.zeros(1), torch.float32, silent, Device("cuda", HERE), Host())
-    with ViewWeights(card=(HERE, 1 << 20)) as store:
+    with WeightStore(card=(HERE, 1 << 20)) as store:
         store.append(random_view(0, 3))
         if HERE.type == "cpu":  # a view of the host is no card's
             assert closed_form(store, *rest) == "solved" and tries[0] > 0 == tries[1]
@@ -254,7 +254,7 @@ def test_a_card_without_a_number_is_the_one_that_tensors_name(monkeypatch: pytes
     assert indexed(torch.device("cuda")) == torch.device("cuda", 1)
     assert indexed(torch.device("cuda", 0)) == torch.device("cuda", 0) and indexed(CPU.place) == CPU.place
     for free in (0, 1 << 20):  # the place of the sums knows nothing of the room for W
-        assert ViewWeights(card=(torch.device("cuda"), free)).place == torch.device("cuda", 1)
+        assert WeightStore(card=(torch.device("cuda"), free)).place == torch.device("cuda", 1)
 
 
 def test_both_ways_to_sum_over_views_are_one_sum() -> None:
@@ -279,7 +279,7 @@ def test_sums_over_views_are_those_of_the_definition(place: torch.device) -> Non
     np.testing.assert_allclose(denominators, sums_of(views), rtol=1e-12)
     assert evidence.sum() == 4.0 * sum(view.evidence.numel() for view in views)
     for view in views:
-        own = sums_in_order(view.weights.double(), view.row_starts).numpy()  # what a card does
+        own = sums_in_order(view.weights.double(), view.indptr).numpy()  # what a card does
         np.testing.assert_allclose(own, row_totals(view), rtol=1e-12)
     nothing = view_of([], [], [], [])
-    assert sums_in_order(nothing.weights.double(), nothing.row_starts).shape == (0,)
+    assert sums_in_order(nothing.weights.double(), nothing.indptr).shape == (0,)

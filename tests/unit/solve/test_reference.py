@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from liftcore.lift import lift
 from liftcore.progress import silent
-from liftcore.raster.protocol import Walk
+from liftcore.raster.base import CompositingParams
 from liftcore.scene.splats import Splats
 from liftcore.solve.accumulate import SampledRays
 from liftcore.solve.certificate import ViewMeasures, measure_rows
@@ -22,7 +22,7 @@ from tests.unit.solve.dense_rays import SmallScene
 from tests.unit.solve.test_lift_equals_dense import write_scene
 
 SEEDS = st.integers(0, 2**16)
-OPAQUE = Walk(alpha_cap=LARGEST_ALPHA, transmittance_stop=0.0)
+OPAQUE = CompositingParams(alpha_cap=LARGEST_ALPHA, transmittance_stop=0.0)
 ALL_RAYS = 10_000
 
 

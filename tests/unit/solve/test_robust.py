@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 
 from liftcore.lift import lift
 from liftcore.progress import silent
-from liftcore.raster.protocol import RegionWeights
+from liftcore.raster.base import RegionWeights
 from liftcore.solve import gathering, host, judging, robust, weighted_sums
 from liftcore.solve.host import ALL_CORES, Host
 from liftcore.solve.robust import NO_CONSENSUS, robust_weights
 from liftcore.solve.settings import LiftSettings
-from liftcore.solve.view_weights import ViewWeights
+from liftcore.solve.view_weights import WeightStore
 from liftcore.solve.weighted_sums import LONG
 from tests.unit.solve.test_lift_equals_dense import write_scene
 
@@ -34,8 +34,8 @@ class Scene:
     def denominators(self) -> np.ndarray:
         return np.sum([view.sum(axis=1, dtype=np.float64) for view in self.weights], axis=0)
 
-    def store(self, memory_limit: int | None = None) -> ViewWeights:
-        store = ViewWeights(memory_limit)
+    def store(self, memory_limit: int | None = None) -> WeightStore:
+        store = WeightStore(memory_limit)
         for view in self.weights:
             store.append(sparse(view))
         return store
@@ -58,7 +58,7 @@ def sparse(view: np.ndarray) -> RegionWeights:
 
 
 def dense(weights: RegionWeights, like: np.ndarray) -> np.ndarray:
-    rows = np.repeat(weights.splats.numpy(), np.diff(weights.row_starts.numpy()))
+    rows = np.repeat(weights.splats.numpy(), np.diff(weights.indptr.numpy()))
     result = np.zeros_like(like)
     result[rows, weights.columns.numpy()] = weights.weights.numpy()
     return result

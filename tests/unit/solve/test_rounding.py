@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from liftcore.lanes_rows import WIDE
+from liftcore.raster.cpu.lanes_rows import WIDE
 from liftcore.solve.closed_form import finish_rows
 
 CHANNELS = 13  # one whole set of lanes, and a rest

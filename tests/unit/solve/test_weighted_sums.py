@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from liftcore.errors import Unavailable
-from liftcore.lanes_rows import WIDE
 from liftcore.progress import silent
-from liftcore.raster.protocol import RegionWeights
+from liftcore.raster.base import RegionWeights
+from liftcore.raster.cpu.lanes_rows import WIDE
 from liftcore.solve import weighted_sums
 from liftcore.solve.closed_form import BLOCK_ENTRIES, solve_closed_form
 from liftcore.solve.columns import rows_of
@@ -39,7 +39,7 @@ def view(seed: int, lengths: np.ndarray, rows: int) -> RegionWeights:
 
 def dense(weights: RegionWeights, splats: int, rows: int) -> np.ndarray:
     found = np.zeros((splats, rows))
-    splat = np.repeat(weights.splats.numpy(), np.diff(weights.row_starts.numpy()))
+    splat = np.repeat(weights.splats.numpy(), np.diff(weights.indptr.numpy()))
     found[splat, weights.columns.numpy()] = weights.weights.numpy()
     return found
 

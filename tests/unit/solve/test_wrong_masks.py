@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from liftcore.measure.experiments.overfitting import Truth, closed_form, follow, scored
-from liftcore.observe.observation import RegionMap
-from liftcore.raster.cpu import CpuRaster
-from liftcore.raster.protocol import Walk
+from liftcore.features.views import Regions
+from liftcore.raster.base import CompositingParams
+from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Splats
 from liftcore.solve.all_rays import AllRays
+from tests.benchmarks.experiments.overfitting import Truth, closed_form, follow, scored
 from tests.scenes import random_camera, random_splats
 
 CLASSES = 4
@@ -26,14 +26,14 @@ def soft_splats() -> Splats:
     return Splats(splats.means, splats.quats, splats.log_scales.clamp(-2.5, -1.5), faint)
 
 
-def wrong_masks(raster: CpuRaster, camera: Camera, objects: torch.Tensor, seed: int) -> RegionMap:
+def wrong_masks(raster: CpuRaster, camera: Camera, objects: torch.Tensor, seed: int) -> Regions:
     """The classes as the view shows them, a vector a region, some of them another class's."""
     rng = np.random.default_rng(seed)
-    shown = raster.render(camera, torch.nn.functional.one_hot(objects.long(), CLASSES).float(), Walk())
+    shown = raster.render(camera, torch.nn.functional.one_hot(objects.long(), CLASSES).float(), CompositingParams())
     labels = torch.where(shown.sum(dim=2) > 0.3, shown.argmax(dim=2), -1).to(torch.int32)
     told = np.where(rng.random(CLASSES) < WRONG, rng.integers(0, CLASSES, CLASSES), np.arange(CLASSES))
     noise = rng.normal(0, 0.1, (CLASSES, CLASSES))
-    return RegionMap(labels[None], torch.tensor(np.eye(CLASSES)[told] + noise, dtype=torch.float32))
+    return Regions(labels[None], torch.tensor(np.eye(CLASSES)[told] + noise, dtype=torch.float32))
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +44,7 @@ def paths() -> dict[float, dict]:
     views = [random_camera(k, 40, 32, name=f"v{k}") for k in range(12)]
     classes = torch.eye(CLASSES)
     seen = [scored(wrong_masks(raster, camera, objects, k), classes) for k, camera in enumerate(views)]
-    rays = AllRays(raster, splats.count, views, seen.__getitem__, Walk())
+    rays = AllRays(raster, splats.count, views, seen.__getitem__, CompositingParams())
     truth = Truth(classes, objects, torch.from_numpy(rays.row_sums > 0.5))
     first = closed_form(rays, CLASSES)
     return {damping: follow(rays, first, truth, damping, 60)[0] for damping in (0.0, 1.0)}

@@ -1,0 +1,60 @@
+"""``splatlift encode``: images become a feature pack, through an image encoder."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from liftcore.cli.bars import progress_bars
+from liftcore.cli.reply import free_output, reply, writing
+from liftcore.cli.sub_folders import folders_of, told_folders
+
+if TYPE_CHECKING:
+    import argparse
+
+    from liftcore.features.encoders import ImageEncoder
+    from liftcore.features.encoders.encode import Encoded
+
+
+def run(options: argparse.Namespace) -> int:
+    """Write the pack whole or not at all, and say what is in it."""
+    from liftcore.features.encoders import open_image_encoder
+    from liftcore.features.encoders.encode import EncodeSettings, encode_images
+    from liftcore.features.encoders.images import find_images
+
+    images = find_images(options.images)
+    out = free_output(options.output, list(images.values()))
+    encoder = open_image_encoder(options.encoder, options.device)
+    settings = EncodeSettings(options.size, options.batch, options.normalised)
+    with progress_bars() as progress, writing(out):
+        encoded = encode_images(images, encoder, out, settings, progress)
+    document = {
+        "out": str(out),
+        "bytes": out.stat().st_size,
+        "views": encoded.views,
+        "folders": folders_of(images),
+        "channels": encoder.channels,
+        "patch": encoder.pixels.patch,
+        "size": options.size or encoder.pixels.shorter,
+        "encoder": encoder.name,
+        "text_space": encoder.text_space,
+        "normalised": options.normalised,
+        "warnings": _warnings(encoded, encoder),
+    }
+    line = f"{out}: {encoded.views} views, {encoder.channels} channels, {document['bytes']} bytes"
+    lines = [line, *told_folders(document["folders"])]
+    reply(document, as_json=options.json, lines=[*lines, *(f"warning: {text}" for text in document["warnings"])])
+    return 0
+
+
+def _warnings(encoded: Encoded, encoder: ImageEncoder) -> list[str]:
+    found: list[Any] = []
+    if encoded.turned:
+        found.append(
+            f"{len(encoded.turned)} images were turned upright as their EXIF says ({encoded.turned[0]}): "
+            "their cameras must be of the upright images too"
+        )
+    if encoded.wide:
+        found.append(f"{len(encoded.wide)} views have features beyond float16 and are stored as float32")
+    if encoder.text_space == "none":
+        found.append("these features have no words: a lift of them is asked by example")
+    return found

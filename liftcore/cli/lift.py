@@ -1,0 +1,175 @@
+"""``splatlift lift``: features on splats, from three kinds of files to one."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from typing import TYPE_CHECKING, Any
+
+from liftcore.cli.bars import progress_bars
+from liftcore.cli.reply import free_output, reply, shown, writing
+from liftcore.errors import InvalidInput, InvalidSettings
+from liftcore.nearest import nearest
+from liftcore.progress import one_step
+from liftcore.solve.settings import LiftSettings
+
+if TYPE_CHECKING:
+    import argparse
+    from collections.abc import Iterable, Sequence
+    from pathlib import Path
+
+    from liftcore.io.lift_file import LiftResult
+    from liftcore.plan.plan import Plan
+    from liftcore.solve.checkpoint import Checkpoint
+
+
+def run(options: argparse.Namespace) -> int:
+    """Lift, write the lift whole or not at all, and say what came of it."""
+    settings = settings_of(options)
+    from liftcore.io.camera_source import camera_source
+    from liftcore.io.lift_file import save_lift
+    from liftcore.lift import lift
+    from liftcore.listener import Listener
+
+    views = camera_source(options.cameras).files
+    out = free_output(options.output, [options.splats, *views, *options.features])
+    checkpoint = checkpoint_in(options.checkpoint) if options.checkpoint else None
+
+    plans: list[Plan] = []
+
+    def take(plan: Plan) -> None:
+        plans.append(plan)
+        if not options.json:
+            print(*(plan.lines() if options.explain else _in_short(plan)), sep="\n", flush=True)
+
+    with progress_bars() as progress:
+        result = lift(
+            options.splats,
+            options.cameras,
+            options.features,
+            settings,
+            threads=options.threads,
+            listener=Listener(progress, take),
+            checkpoint=checkpoint,
+        )
+        with writing(out), one_step(progress, "save"):
+            save_lift(result, out)
+    (plan,) = plans
+    warnings = result.metadata.certificate["warnings"]
+    document = {"out": str(out), **_summary(result), "warnings": [*plan.warnings, *warnings]}
+    new = [warning for warning in warnings if warning not in plan.told]  # the others were printed with the plan
+    reply(document, as_json=options.json, lines=_lines(document | {"warnings": new}))
+    return 0
+
+
+def checkpoint_in(folder: Path) -> Checkpoint:
+    """A checkpoint in that folder, which is made if need be: a lift itself would go on without one.
+
+    Raises:
+        InvalidInput: it is no folder, or nothing can be written there.
+    """
+    from liftcore.solve.checkpoint import Checkpoint
+
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return Checkpoint(folder)
+    except OSError as error:
+        got = f"{folder} ({error.strerror or error})"
+        raise InvalidInput("checkpoint", expected="a folder that can be written", got=got) from None
+
+
+def settings_of(options: argparse.Namespace) -> LiftSettings:
+    """Settings of ``--preset``, ``--speed``, ``--device`` and ``--set key=value``.
+
+    Raises:
+        InvalidSettings: a pair without ``=``, an unknown name, one with two values or a value out of range.
+    """
+    named = {"preset": options.preset, "speed": options.speed, "device": options.device}
+    values = pairs_of(options.set)
+    for name, value in named.items():
+        if value is not None and values.setdefault(name, value) != value:
+            raise _contradiction(name, f"--{name} {value}", f"--set {name}={values[name]}")
+    return LiftSettings.of(**values)
+
+
+def pairs_of(pairs: Sequence[str]) -> dict[str, Any]:
+    """Names and values of ``key=value``; a value is JSON, or else a word.
+
+    Raises:
+        InvalidSettings: a pair without ``=``, an unknown name or one with two values.
+    """
+    values: dict[str, Any] = {}
+    for pair in pairs:
+        key, equals, text = pair.partition("=")
+        if not equals or not key:
+            raise InvalidSettings("--set", expected="key=value", got=repr(pair))
+        if key not in LiftSettings.model_fields:
+            raise _unknown(key)
+        value = _value(text)
+        if key in values and values[key] != value:
+            raise _contradiction(key, f"--set {key}={values[key]}", f"--set {pair}")
+        values[key] = value
+    return values
+
+
+def _value(text: str) -> Any:
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError):
+        return text
+
+
+def _unknown(name: str) -> InvalidSettings:
+    hint = nearest(name.replace("-", "_"), LiftSettings.model_fields, 3)
+    return InvalidSettings("--set", expected="a setting of a lift", got=f"the unknown {name[:80]!r}", hint=hint)
+
+
+def _contradiction(name: str, one: str, other: str) -> InvalidSettings:
+    hint = "leave one of them out"
+    return InvalidSettings(name, expected="one value", got=f"{one} and {other}"[:200], hint=hint)
+
+
+def plan_of(options: argparse.Namespace, settings: LiftSettings) -> Plan:
+    """The plan of the lift that the options describe."""
+    from liftcore.device import choose_device
+    from liftcore.lift import open_sources, planned
+
+    device = choose_device(settings.device)
+    sources = open_sources(options.splats, options.cameras, options.features, settings)
+    return planned(sources, settings, device, options.threads)
+
+
+def _in_short(plan: Plan) -> Iterable[str]:
+    head, *rest = plan.summary()
+    yield f"plan: {head}"
+    yield from (f"  {line}" for line in rest)
+    yield from (f"warning: {warning}" for warning in (*plan.warnings, *plan.told))
+
+
+def _summary(result: LiftResult) -> dict[str, Any]:
+    metadata = result.metadata
+    return {
+        "splats": result.features.shape[0],
+        "seen_share": float(result.seen.float().mean()),
+        "channels": result.features.shape[1],
+        "views": len(metadata.views),
+        "encoder": metadata.encoder,
+        "text_space": metadata.text_space,
+        "certificate": metadata.certificate,
+        "timings": metadata.timings,
+        "settings": metadata.settings.model_dump(mode="json"),
+    }
+
+
+def _lines(document: dict[str, Any]) -> Iterable[str]:
+    yield (
+        f"{document['out']}: {document['splats']} splats x {document['channels']} channels "
+        f"from {document['views']} views, {document['seen_share']:.1%} of the splats seen"
+    )
+    for key, value in document["certificate"].items():
+        if key not in ("plan", "warnings"):  # the plan in full is what --explain prints
+            yield f"  {key}: {shown(value)}"
+    yield "timings:"
+    yield from (f"  {stage}: {seconds:.3f} s" for stage, seconds in document["timings"].items())
+    yield from (f"warning: {warning}" for warning in document["warnings"])

@@ -1,0 +1,170 @@
+"""``splatlift query``: where in a lifted scene is what the words say, or what is like this example?"""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from liftcore.cli.reply import free_output, reply, writing
+from liftcore.cli.text_encoder import encoder_spec
+from liftcore.errors import InvalidQuery
+from liftcore.io.whole_file import whole_file
+
+if TYPE_CHECKING:
+    import argparse
+    from collections.abc import Callable, Iterable
+
+    from liftcore.query.ask import Answer
+    from liftcore.query.encoders import TextEncoder
+    from liftcore.query.example import Example
+    from liftcore.query.query import Query
+    from liftcore.query.scene import QueryScene
+    from liftcore.query.view_mask import ViewMask
+
+
+OUTPUTS = ("object", "coloured", "scores", "mask", "attention")  # options that name a file to write
+
+
+def run(options: argparse.Namespace) -> int:
+    """Ask, look where a view is named, write what was asked for, and say what was found."""
+    if (options.mask or options.attention) and not options.view:
+        raise InvalidQuery("--mask and --attention", expected="a view to see them from", got="no --view")
+    outputs = [path.absolute() for kind in OUTPUTS if (path := getattr(options, kind)) is not None]
+    if len(set(outputs)) < len(outputs):
+        raise InvalidQuery(f"--{', --'.join(OUTPUTS)}", expected="a file each", got="the same file twice")
+    for path in outputs:
+        free_output(path, [options.lift, *([options.table] if options.table else [])])
+    from liftcore.query.ask import ask, top
+    from liftcore.query.objects import objects
+    from liftcore.query.query import texts_of
+    from liftcore.query.scene import QueryScene
+    from liftcore.query.view_mask import view_mask
+
+    query = _query(options)
+    scene = QueryScene.open(options.lift)
+    made_from = scene.lift.metadata
+    for path in outputs:
+        free_output(path, [Path(file.path) for file in (made_from.splats, made_from.cameras, *made_from.features)])
+    encoder = _encoder(options, scene) if texts_of(query.terms) else None
+    answer = ask(scene, query, encoder)
+    seen = view_mask(scene, answer, options.view) if options.view else None
+    document = _document(answer, seen, encoder)
+    if options.top:
+        best = top(answer, scene, options.top)
+        document |= {"top": [asdict(splat) for splat in best.best], "box": best.box}
+    if options.objects:
+        found = objects(scene, answer)
+        document |= {"objects": [asdict(thing) for thing in found.found], "strays": found.strays}
+    document["files"] = _write(options, scene, answer, seen)
+    reply(document, as_json=options.json, lines=_lines(document))
+    return 0
+
+
+def _query(options: argparse.Namespace) -> Query:
+    from liftcore.query.query import Query
+
+    if options.text is None and not options.like and options.negative:
+        raise InvalidQuery(
+            "text",
+            expected="what to look for, before --negative",
+            got=f"--negative {' '.join(options.negative)} alone",
+            hint="--negative takes all words up to the next option",
+        )
+    return Query(
+        positives=(*([options.text] if options.text is not None else []), *_examples(options.like, "--like")),
+        negatives=(*options.negative, *_examples(options.unlike, "--unlike")),
+        threshold=_threshold(options.threshold),
+        instances=options.instances,
+        keep=options.keep,
+    )
+
+
+def _examples(notations: list[str], argument: str) -> list[Example]:
+    from liftcore.query.example import parse_example
+    from liftcore.query.vector_file import read_vector
+
+    return [
+        read_vector(Path(notation)) if notation.endswith(".npy") else parse_example(notation, argument)
+        for notation in notations
+    ]
+
+
+def _encoder(options: argparse.Namespace, scene: QueryScene) -> TextEncoder:
+    from liftcore.query.encoders import open_encoder
+
+    return open_encoder(encoder_spec(options, scene.lift.metadata.text_space, hint="or ask by example, with --like"))
+
+
+def _threshold(text: str) -> str | float:
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+def _document(answer: Answer, seen: ViewMask | None, encoder: TextEncoder | None) -> dict[str, Any]:
+    document: dict[str, Any] = {
+        "query": [str(term) for term in answer.query.positives],
+        "negatives": [str(term) for term in answer.query.negatives],
+        "encoder": encoder.name if encoder else None,
+        "splats": len(answer.scores),
+        "selected": int(answer.selected.sum()),
+        "threshold": answer.threshold,
+        "threshold_method": answer.threshold_method,
+        "explanation": answer.explanation,
+        "statistics": dict(answer.statistics),
+    }
+    if seen is not None:
+        document["view"] = {
+            "name": seen.view,
+            "explanation": seen.explanation,
+            "mask_share": float(seen.mask.float().mean()),
+        }
+    return document
+
+
+def _write(options: argparse.Namespace, scene: QueryScene, answer: Answer, seen: ViewMask | None) -> dict[str, str]:
+    """Write what was asked for, the object first: when nothing was found, nothing is written."""
+    from liftcore.query.pictures import attention_png, mask_png
+    from liftcore.query.splat_files import coloured_ply, object_ply, scores_npy
+
+    blocks: dict[str, Callable[[], Iterable[bytes]]] = {
+        "object": lambda: object_ply(scene, answer),
+        "coloured": lambda: coloured_ply(scene, answer),
+        "scores": lambda: [scores_npy(answer)],
+    }
+    if seen is not None:
+        blocks |= {"mask": lambda: [mask_png(seen)], "attention": lambda: [attention_png(seen)]}
+    files = {kind: path for kind in OUTPUTS if (path := getattr(options, kind)) is not None}
+    for kind, path in files.items():
+        with writing(path):
+            content = blocks[kind]()  # before there is a draft, or a folder for it: nothing found is no file
+            with whole_file(path) as handle:
+                handle.writelines(content)
+    return {kind: str(path) for kind, path in files.items()}
+
+
+def _lines(document: dict[str, Any]) -> Iterable[str]:
+    yield (
+        f"{', '.join(map(repr, document['query']))}: {document['selected']} of {document['splats']} splats "
+        f"at or above {document['threshold']:.4g} ({document['explanation']})"
+    )
+    if "view" in document:
+        view = document["view"]
+        yield f"  view {view['name']}: {view['mask_share']:.2%} of the image ({view['explanation']})"
+    for best in document.get("top", []):
+        yield f"  splat {best['splat']}: score {best['score']:.4g} at {_place(best['position'])}"
+    for number, thing in enumerate(document.get("objects", []), 1):
+        low, high = thing["box"]
+        yield (
+            f"  object {number}: {thing['splats']} splats, {thing['share']:.1%} of the evidence, score "
+            f"{thing['score']:.4g}, at {_place(thing['centre'])}, from {_place(low)} to {_place(high)}"
+        )
+    if document.get("strays"):
+        yield f"  {document['strays']} splats are strays: single or in specks, and of no object"
+    yield from (f"  {kind}: {path}" for kind, path in document["files"].items())
+
+
+def _place(point: tuple[float, ...]) -> str:
+    return f"({', '.join(f'{value:.4g}' for value in point)})"

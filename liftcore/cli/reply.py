@@ -1,0 +1,85 @@
+"""How commands answer: one JSON object, or lines for people."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+from liftcore.errors import InvalidInput
+from liftcore.io.strict_json import finite
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+    from pathlib import Path
+
+SHOWN_ITEMS = 6  # of a list, for people
+
+
+def reply(document: Mapping[str, Any], *, as_json: bool, lines: Iterable[str] | None = None) -> None:
+    """Print one JSON object, or else ``lines``, or else the document's entries, a line each."""
+    if as_json:
+        print(json.dumps(finite(document), allow_nan=False))
+        return
+    for line in lines if lines is not None else _entries(document):
+        print(line)
+
+
+def free_output(path: Path, inputs: Sequence[Path]) -> Path:
+    """An output path that can be written, and is no folder and none of the inputs.
+
+    Checked before the work, so that an hour of it is not lost over a misspelt name.
+
+    Raises:
+        InvalidInput: it is one of these, or no file can be made there.
+    """
+    with writing(path):
+        if path.is_dir():
+            raise InvalidInput("output", expected="a file to write", got=f"the folder {path}")
+        if any(path.exists() and source.exists() and path.samefile(source) for source in inputs):
+            raise InvalidInput("output", expected="another file than the inputs", got=str(path))
+        folder = next(parent for parent in path.absolute().parents if os.path.lexists(parent))
+        if not folder.is_dir() or not os.access(folder, os.W_OK | os.X_OK):
+            raise InvalidInput("output", expected="a folder that can be written", got=str(folder))
+    return path
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Say which output failed, and why, when the disk is full or the folder is not for us to write.
+
+    Raises:
+        InvalidInput: the operating system refused.
+    """
+    try:
+        yield
+    except OSError as error:
+        got = f"{path} ({error.strerror or error})"
+        raise InvalidInput("output", expected="a file that can be written", got=got) from None
+
+
+def _entries(document: Mapping[str, Any]) -> Iterable[str]:
+    width = max((len(str(key)) for key in document), default=0)
+    for key, value in document.items():
+        if key == "warnings":
+            yield from (f"warning: {warning}" for warning in value)
+        else:
+            yield f"{str(key).replace('_', ' '):<{width}}  {shown(value)}"
+
+
+def shown(value: Any) -> str:
+    """A value in short, for people."""
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {_nested(item)}" for key, item in value.items()) or "-"
+    if isinstance(value, list | tuple):
+        more = [f"... ({len(value)})"] if len(value) > SHOWN_ITEMS else []
+        return ", ".join([*map(_nested, value[:SHOWN_ITEMS]), *more]) or "-"
+    return "-" if value is None or value == "" else str(value)
+
+
+def _nested(value: Any) -> str:
+    return f"({shown(value)})" if isinstance(value, Mapping | list | tuple) else shown(value)

@@ -1,1 +1,0 @@
-"""The commands of ``splatlift``, one a file: ``run(options)`` works and returns the exit status."""

@@ -1,0 +1,139 @@
+"""``splatlift bench --stages``: wall and processor seconds of every step of a view, on one thread.
+
+A raster that times its own steps: nothing else about it differs, so the kernels are those of every lift. On one
+thread a step's processor time is its own, and near its wall time on an idle machine; how far two cores share the work
+is what ``splatlift bench`` without ``--stages`` shows.
+"""
+
+from __future__ import annotations
+
+import os
+import statistics
+import time
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from liftcore.progress import silent
+from liftcore.raster.cpu.raster import CpuRaster
+from liftcore.solve.accumulate import lift_walk, weighting_of
+from liftcore.solve.closed_form import solve_closed_form
+from liftcore.solve.columns import by_tuples
+from liftcore.solve.host import Host
+from liftcore.solve.settings import LiftSettings
+from liftcore.solve.totals import row_totals
+from liftcore.solve.view_weights import WeightStore
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from liftcore.evaluate.bench import Workload
+    from liftcore.raster.base import CompositingParams, RegionWeights
+    from liftcore.raster.cpu.bands import Bands
+    from liftcore.raster.cpu.projection import View
+    from liftcore.raster.cpu.walk import Frame
+    from liftcore.scene.splats import Splats
+    from liftcore.solve.settings import Preset
+
+STAGES = ("projection", "order", "lists", "walk", "merge", "rest", "solution")
+
+
+@dataclass
+class Clock:
+    """Wall and processor seconds by stage, without what stages inside a stage took."""
+
+    wall: dict[str, float] = field(default_factory=dict)
+    cpu: dict[str, float] = field(default_factory=dict)
+    _inner: list[list[float]] = field(default_factory=list, repr=False)  # of the open stages: wall, cpu within them
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Time the block under that name, less the stages within it."""
+        self._inner.append([0.0, 0.0])
+        wall, cpu = time.perf_counter(), time.process_time()
+        yield
+        spent = [time.perf_counter() - wall, time.process_time() - cpu]
+        inner = self._inner.pop()
+        if self._inner:
+            self._inner[-1] = [mine + its for mine, its in zip(self._inner[-1], spent, strict=True)]
+        self.wall[name] = self.wall.get(name, 0.0) + spent[0] - inner[0]
+        self.cpu[name] = self.cpu.get(name, 0.0) + spent[1] - inner[1]
+
+
+class TimedRaster(CpuRaster):
+    """The CPU raster on one thread, each step of a view under its name in ``clock``."""
+
+    def __init__(self, splats: Splats) -> None:
+        super().__init__(splats, threads=1)
+        self.clock = Clock()
+        self._projecting = False
+
+    def _project(self, view: View, walk: CompositingParams) -> tuple[np.ndarray, np.ndarray]:
+        with self.clock.stage("order"):  # what it does beside its shares of splats
+            self._projecting = True
+            return super()._project(view, walk)
+
+    def _map(self, work: Callable, shares: list) -> list:
+        if not self._projecting:
+            return super()._map(work, shares)
+        self._projecting = False
+        with self.clock.stage("projection"):
+            return super()._map(work, shares)
+
+    def _bin(self, view: View, walk: CompositingParams, ids: np.ndarray, order: np.ndarray) -> Bands:
+        with self.clock.stage("lists"):
+            return super()._bin(view, walk, ids, order)
+
+    def _over_tiles(self, frame: Frame, work: Callable) -> list:
+        with self.clock.stage("walk"):
+            return super()._over_tiles(frame, work)
+
+    def _merge(self, frame: Frame, entries: list, codebook_rows: int) -> RegionWeights:
+        with self.clock.stage("merge"):
+            return super()._merge(frame, entries, codebook_rows)
+
+
+def time_stages(work: Workload, preset: Preset) -> dict[str, Any]:
+    """Seconds a view of each of STAGES on one thread: medians and minima over the views; the solution once for all.
+
+    ``rest`` is what a view takes beside the named steps: its tuples of labels, its reading, row totals, keeping W.
+    """
+    settings = LiftSettings.of(preset=preset)
+    raster, walk, weighting = TimedRaster(work.splats), lift_walk(settings), weighting_of(settings)
+    denominators, views, columns = np.zeros(work.splats.count), [], []
+    with WeightStore() as store:
+        raster.region_weights(*work.views[0], walk, weighting)  # warm caches, not counted
+        for camera, observation in work.views:
+            raster.forget()
+            raster.clock = Clock()
+            with raster.clock.stage("rest"):
+                tuples, own = by_tuples(observation)
+                weights = own.weighted(raster.region_weights(camera, tuples, walk, weighting))
+                denominators[weights.splats.numpy()] += row_totals(weights)
+                store.append(weights)
+            columns.append(own)
+            views.append(raster.clock)
+        clock = Clock()
+        with clock.stage("solution"):
+            host = Host(1, means=work.splats.means)
+            solve_closed_form(store, columns, denominators, torch.float16, silent, host)
+    share = 1 / len(views)
+    solution = Clock({"solution": clock.wall["solution"] * share}, {"solution": clock.cpu["solution"] * share})
+    return {
+        "threads": 1,
+        "load": os.getloadavg()[0],
+        "stages": {name: _figures(name, [solution] if name == "solution" else views) for name in STAGES},
+    }
+
+
+def _figures(name: str, clocks: list[Clock]) -> dict[str, float]:
+    wall, cpu = [clock.wall[name] for clock in clocks], [clock.cpu[name] for clock in clocks]
+    return {
+        "wall_s": statistics.median(wall),
+        "wall_s_min": min(wall),
+        "cpu_s": statistics.median(cpu),
+        "cpu_s_min": min(cpu),
+    }

@@ -1,0 +1,106 @@
+"""The chart: accuracy over time, the front of what is worth its time, and how near the dial stays to exact."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+from liftcore.evaluate.tradeoff.choice import NAMES
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+COLOURS = {"dial": "#1b6ca8", "preset": "#b5651d"}
+SIZE = (10.0, 4.6)  # inches
+CLOSE, WIDE = 0.055, 0.22  # of the axes' height and width: labels nearer than both would meet
+
+
+def draw(figure: Figure, document: Mapping[str, Any]) -> None:
+    """Two panels: accuracy against seconds for all runs, and the dial's cosine against the exact run."""
+    figure.set_size_inches(*SIZE)
+    left, right = figure.subplots(1, 2, width_ratios=(3, 2))
+    choice = document["choice"]
+    _accuracy(left, document["runs"], choice)
+    _faithful(right, document["runs"])
+    views = document["views"]
+    figure.suptitle(
+        f"{document['scene']}: {views['lifted']} views lifted, take {choice['name']!r}", fontsize="medium"
+    )
+
+
+def _accuracy(axes: Axes, runs: Sequence[Mapping[str, Any]], choice: Mapping[str, Any]) -> None:
+    accuracy = choice["accuracy"]
+    shown = [run for run in runs if run[accuracy] is not None]
+    front = [run for name in choice["front"] for run in shown if run["name"] == name]
+    axes.plot([run["cpu_s"] for run in front], [run[accuracy] for run in front], color="#999999", lw=1, zorder=1)
+    for kind, marker in (("dial", "o"), ("preset", "s")):
+        own = [run for run in shown if run["kind"] == kind]
+        places = [run["cpu_s"] for run in own], [run[accuracy] for run in own]
+        axes.scatter(*places, color=COLOURS[kind], marker=marker, s=34, zorder=2, label=kind)
+    taken = next(run for run in shown if run["name"] == choice["name"])
+    ring = {"facecolors": "none", "edgecolors": "#222222", "s": 130, "zorder": 3}
+    axes.scatter([taken["cpu_s"]], [taken[accuracy]], label="taken", **ring)
+    axes.set_xscale("log")
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.xaxis.set_minor_formatter(_few_ticks)
+    axes.margins(x=0.22, y=0.12)
+    _label(axes, shown, accuracy)
+    _finish(axes, "processor seconds of the lift, without reading", NAMES[accuracy])
+    axes.legend(fontsize="small", loc="lower right", frameon=False)
+
+
+def _faithful(axes: Axes, runs: Sequence[Mapping[str, Any]]) -> None:
+    dial = sorted((run for run in runs if run["kind"] == "dial"), key=lambda run: run["cpu_ratio"])
+    ratios = [run["cpu_ratio"] for run in dial]
+    for name, label, style in (
+        ("cosine", "mean by evidence", "o-"),
+        ("cosine_plain", "mean over splats", "^--"),
+        ("cosine_q05", "5 % of splats below", "v:"),
+    ):
+        axes.plot(ratios, [run[name] for run in dial], style, label=label, color=COLOURS["dial"], ms=5, lw=1)
+    for number, (run, ratio) in enumerate(zip(dial, ratios, strict=True)):
+        place = {"textcoords": "offset points", "ha": "center", "fontsize": 8}
+        axes.annotate(run["name"], (ratio, run["cosine"]), (0, 7 + 11 * (number % 2)), **place)
+    axes.margins(x=0.14)
+    lowest = min((run[name] for run in dial for name in ("cosine", "cosine_plain")), default=0.0)
+    room = max(1.0 - lowest, 1e-3)
+    axes.set_ylim(lowest - 0.6 * room, 1.0 + 0.3 * room)  # the worst splats may lie far below
+    _finish(axes, "times less processor time than exact", NAMES["cosine"])
+    axes.legend(fontsize="small", loc="lower left", edgecolor="none", framealpha=1.0)
+
+
+def _label(axes: Axes, runs: Sequence[Mapping[str, Any]], accuracy: str) -> None:
+    """Names beside their points, moved apart where they would meet."""
+    from matplotlib.patheffects import withStroke
+
+    halo = withStroke(linewidth=2.5, foreground="white")  # so that lines do not strike names out
+    low, high = axes.get_ylim()
+    least, most = axes.get_xlim()
+    placed: list[tuple[float, float]] = []
+    for run in sorted(runs, key=lambda run: -run[accuracy]):
+        across = math.log(run["cpu_s"] / least) / math.log(most / least)
+        at = (run[accuracy] - low) / (high - low)
+        height = at
+        while any(abs(height - other) < CLOSE and abs(across - there) < WIDE for there, other in placed):
+            height -= 0.2 * CLOSE
+        placed.append((across, height))
+        place = {"xycoords": "axes fraction", "textcoords": "axes fraction", "va": "center", "fontsize": 8}
+        line = {"arrowstyle": "-", "color": "#bbbbbb", "lw": 0.6} if height < at else None
+        spot = (across + 0.02, height)
+        name = axes.annotate(run["name"], (across, at), spot, color=COLOURS[run["kind"]], arrowprops=line, **place)
+        name.set_path_effects([halo])
+
+
+def _few_ticks(value: float, _: float) -> str:
+    """Twos and fives between the powers of ten."""
+    return f"{value:g}" if f"{value:e}"[0] in "25" else ""
+
+
+def _finish(axes: Axes, x: str, y: str) -> None:
+    axes.set_xlabel(x, fontsize="small")
+    axes.set_ylabel(y, fontsize="small")
+    axes.grid(alpha=0.3)
+    axes.spines[["top", "right"]].set_visible(False)

@@ -1,0 +1,102 @@
+"""Image encoders behind one protocol: photos in, grids of features out, a cell a patch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+from liftcore.errors import InvalidInput, Unavailable
+
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
+
+IMAGE_ENCODERS = (
+    "maskclip:MODEL/TAG",
+    "maskclip:MODEL@FILE",
+    "clip:MODEL/TAG",
+    "clip:MODEL@FILE",
+    "timm:NAME",
+    "timm:NAME@FILE",
+)
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """How an encoder wants its images."""
+
+    patch: int  # pixels, the side of a grid cell
+    shorter: int  # pixels of an image's shorter side, unless asked otherwise: what the model was trained at
+    mean: tuple[float, ...]  # of red, green and blue in 0..1, taken off
+    std: tuple[float, ...]  # divided by
+    interpolation: str  # bicubic, bilinear, lanczos or nearest
+
+
+class ImageEncoder(Protocol):
+    """Maps images to dense features; cell (r, c) of a grid covers its patch of the image."""
+
+    @property
+    def name(self) -> str:
+        """What the encoder is, for the pack."""
+        ...
+
+    @property
+    def text_space(self) -> str:
+        """The text encoder that shares the space, as ``query --encoder`` opens it; "none" when there is none."""
+        ...
+
+    @property
+    def pixels(self) -> Pixels:
+        """How images are prepared."""
+        ...
+
+    @property
+    def channels(self) -> int:
+        """F."""
+        ...
+
+    def encode(self, images: Tensor) -> Tensor:
+        """Images [n, 3, h p, w p] f32, prepared as `pixels` says -> grids [n, h, w, F] f32 on the CPU."""
+        ...
+
+
+def open_image_encoder(spec: str, device: str = "cpu") -> ImageEncoder:
+    """Open an image encoder by its specification.
+
+    | specification | features of a patch |
+    |---|---|
+    | ``maskclip:...`` | MaskCLIP (Zhou et al., ECCV 2022): what the last attention reads there, projected |
+    | ``clip:...`` | the last block's token through the layers that the class token goes through |
+    | ``timm:...`` | the normed token of the last block, or the last feature map of a convolutional network |
+
+    Args:
+        spec: one of ``IMAGE_ENCODERS``; weights by name are fetched by the library, or read from its cache.
+        device: as torch names it.
+
+    Raises:
+        InvalidInput: the specification is none of these, or a file is not weights of the model.
+        Unavailable: the weights, or the device, are not on this machine.
+    """
+    kind, _, rest = spec.partition(":")
+    if not rest or kind not in ("maskclip", "clip", "timm"):
+        raise InvalidInput("--encoder", expected=f"one of {', '.join(IMAGE_ENCODERS)}", got=repr(spec))
+    where = _device(device)
+    if kind == "timm":
+        from liftcore.features.encoders.timm_backbone import TimmEncoder
+
+        return TimmEncoder.open(rest, where)
+    from liftcore.features.encoders.clip import ClipImageEncoder
+
+    return ClipImageEncoder.open(kind, rest, where)
+
+
+def _device(name: str) -> torch.device:
+    import torch
+
+    try:
+        device = torch.device(name)
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError, NotImplementedError) as error:  # torch's kinds for a device it lacks
+        got = f"{name!r} ({str(error).splitlines()[0][:120]})"
+        raise Unavailable("--device", expected="a device that torch has here, as cpu", got=got) from None
+    return device

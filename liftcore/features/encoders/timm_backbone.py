@@ -1,0 +1,179 @@
+"""Backbones of timm (DINO, DINOv2, ViT, ResNet and their kin): features that have no words."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+import torch
+
+from liftcore.errors import InvalidInput, Unavailable
+from liftcore.features.encoders import Pixels
+from liftcore.features.encoders.cell_shift import cell_shift, kept, shifted
+from liftcore.nearest import nearest
+from liftcore.query.encoders.open_clip_models import WEIGHT_SUFFIXES
+from liftcore.query.encoders.torchvision_ops import import_torchvision
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from torch import Tensor
+
+# What checkpoints hold beside the backbone: classifiers, and what only the training needed.
+_LEFT_OVER = ("mask_token",)
+_PROBE = (2, 3)  # rows and columns of the grid that a new encoder must give
+
+
+class TimmEncoder:
+    """Normed patch tokens of the last block, or the last feature map (``ImageEncoder``)."""
+
+    text_space = "none"
+
+    def __init__(self, name: str, model: Any, device: torch.device) -> None:
+        self.name = f"timm:{name}"
+        self._model = model.to(device).float().eval()
+        self._device = device
+        self.pixels = _pixels(model)
+        self._shift = 0.0
+        self.channels = self._probe()
+
+    @classmethod
+    def open(cls, spec: str, device: torch.device) -> Self:
+        """Load ``NAME`` (cached or downloaded by timm) or ``NAME@WEIGHTS_FILE`` (tensors only).
+
+        Raises:
+            InvalidInput: an unknown model, one that takes a single image size, or a file that is not its weights.
+            Unavailable: there are no weights of that name, or they cannot be had here.
+        """
+        name, at, file = spec.partition("@")
+        label = f"encoder timm:{spec}"
+        _check_name(label, name)
+        model = _from_file(label, name, Path(file)) if at else _by_name(label, name)
+        return cls(name, model, device)
+
+    @classmethod
+    def _with_random_weights(cls, name: str) -> Self:
+        """A model of the right shape that knows nothing: tests of plumbing only."""
+        return cls(f"{name} (random)", _create(name, pretrained=False), torch.device("cpu"))
+
+    def encode(self, images: Tensor) -> Tensor:
+        """Images [n, 3, h p, w p] f32 -> grids [n, h, w, F] f32 on the CPU."""
+        with torch.inference_mode():
+            images = images.to(self._device)
+            if self._shift == 0:
+                return self._cells(images)
+            return kept(self._cells(shifted(images, self._shift, self.pixels.patch)), self._shift).contiguous()
+
+    def _cells(self, images: Tensor) -> Tensor:
+        (cells,) = self._model.forward_intermediates(images, indices=1, norm=True, intermediates_only=True)
+        return cells.permute(0, 2, 3, 1).to("cpu", torch.float32).clone(memory_format=torch.contiguous_format)
+
+    def _probe(self) -> int:
+        """F; a model that does not give a cell a patch for images of any size is refused here."""
+        rows, columns = _PROBE
+        try:
+            images = torch.zeros(1, 3, rows * self.pixels.patch, columns * self.pixels.patch, device=self._device)
+            shift = cell_shift(self._model, images)
+            self._shift = shift if abs(shift) >= 1 else 0.0
+            shape = tuple(self.encode(images).shape)
+            if shape[:3] == (1, rows, columns):
+                return shape[3]
+            got = f"a grid of {shape[1:3]} for {rows}x{columns} patches"
+        except (AssertionError, RuntimeError, ValueError, AttributeError) as error:
+            got = str(error)
+        raise InvalidInput(
+            "--encoder",
+            expected="a backbone that takes images of any size and gives a map of features",
+            got=f"{self.name} ({got[:120]})",
+            hint="ViT, DINO, DINOv2, ResNet, ConvNeXt and EfficientNet do",
+        )
+
+
+def _check_name(label: str, name: str) -> None:
+    timm = _library()
+    if not timm.is_model(name):
+        hint = nearest(name, timm.list_models(), 3)
+        raise InvalidInput(label, expected="a model that timm knows", got=repr(name), hint=hint)
+
+
+def _by_name(label: str, name: str) -> Any:
+    known = _library().models.get_pretrained_cfg(name, allow_unregistered=False)
+    if known is None or not known.has_weights:
+        raise Unavailable(
+            label, expected="weights: a name that timm has them for, or a file", got="none", hint=f"timm:{name}@FILE"
+        )
+    try:
+        return _create(name, pretrained=True)
+    except Exception as error:  # the hub's clients raise their own, urllib's and OSError's kinds
+        raise Unavailable(
+            label,
+            expected="weights in the cache or a network to fetch them",
+            got=str(error)[:200],
+            hint=f"download them elsewhere and use timm:{name}@FILE",
+        ) from None
+
+
+def _from_file(label: str, name: str, path: Path) -> Any:
+    if not path.is_file():
+        raise Unavailable(label, expected="a file of weights", got=f"nothing at {path}")
+    if path.suffix not in WEIGHT_SUFFIXES:
+        raise InvalidInput(label, expected=f"a file ending in {', '.join(WEIGHT_SUFFIXES)}", got=path.name)
+    model = _create(name, pretrained=False)
+    try:
+        stored = _library().models.load_state_dict(str(path), device="cpu", weights_only=True)
+        # Each family of timm translates the names of its authors' checkpoints.
+        translate = getattr(sys.modules[type(model).__module__], "checkpoint_filter_fn", None)
+        state = translate(stored, model) if translate else stored
+        missing, unexpected = model.load_state_dict(state, strict=False)
+    except Exception as error:  # unpickling and state dicts fail in many kinds; all mean "not these weights"
+        raise _not_weights(label, name, path, str(error)) from None
+    unexpected = _unexplained(model, unexpected)
+    if missing or unexpected:
+        part = ", ".join([*(f"no {key}" for key in missing[:2]), *(f"a strange {key}" for key in unexpected[:2])])
+        raise _not_weights(label, name, path, part)
+    return model
+
+
+def _not_weights(label: str, name: str, path: Path, got: str) -> InvalidInput:
+    return InvalidInput(label, expected=f"tensors of {name} and nothing else in {path.name}", got=got[:200])
+
+
+def _unexplained(model: Any, keys: Iterable[str]) -> list[str]:
+    heads = model.pretrained_cfg.get("classifier") or ()
+    heads = (heads,) if isinstance(heads, str) else tuple(heads)
+    explained = (*_LEFT_OVER, *(f"{head}." for head in heads), "fc_norm.")
+    return [key for key in keys if not key.startswith(explained)]
+
+
+def _create(name: str, *, pretrained: bool) -> Any:
+    timm = _library()
+    try:
+        # Vision transformers resample their positions to the images' grid when they are told so.
+        return timm.create_model(name, pretrained=pretrained, num_classes=0, dynamic_img_size=True)
+    except TypeError:
+        return timm.create_model(name, pretrained=pretrained, num_classes=0)
+
+
+def _pixels(model: Any) -> Pixels:
+    from timm.data.config import resolve_data_config
+
+    settings = resolve_data_config({}, model=model)
+    return Pixels(
+        patch=int(model.feature_info[-1]["reduction"]),
+        shorter=min(settings["input_size"][1:]),
+        mean=tuple(settings["mean"]),
+        std=tuple(settings["std"]),
+        interpolation=settings["interpolation"],
+    )
+
+
+def _library() -> Any:
+    try:
+        import_torchvision()
+        import timm
+    except ImportError as error:
+        raise Unavailable(
+            "encoder timm", expected="the package timm", got=str(error), hint="pip install it"
+        ) from None
+    return timm

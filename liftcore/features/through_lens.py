@@ -1,0 +1,122 @@
+"""What a camera's pinhole observes of a distorted photo: its maps, carried from the photo's pixels to its own."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import torch
+
+from liftcore.features.views import FeatureGrid, Regions, ViewFeatures
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from torch import Tensor
+
+    from liftcore.scene.cameras import Camera
+    from liftcore.scene.lens import Lens
+
+BAND_VALUES = 1 << 22  # of a grid, carried at a time in float32
+BAND_PIXELS = 1 << 15  # whose rays are bent at a time: what that takes stays in the cache
+PLACE_BYTES = 4
+KEPT_PINHOLES = 2  # whose labels' places are kept: mostly one lens took all photos, and labels are of one size
+
+
+def as_pinhole_sees(observation: ViewFeatures, camera: Camera) -> ViewFeatures:
+    """The observation of a camera's photo as one of its pinhole; itself where the camera has no lens.
+
+    A pixel of the pinhole reads the label of the pixel of the photo that shows the same ray, so labels get the
+    pinhole's size. A grid keeps the size of its cells, and each is read bilinearly where the ray of its centre
+    meets the photo: smoother than the given one by less than a cell.
+    """
+    if camera.lens is None:
+        return observation
+    if isinstance(observation, Regions):
+        return Regions(_labels(observation.labels, camera), observation.codebook)
+    return FeatureGrid(_grid(observation.grid, camera))
+
+
+def grid_sides(height: int, width: int, camera: Camera) -> tuple[int, int]:
+    """Rows and columns of a grid [height, width] of the camera's photo, as its pinhole sees it."""
+    if camera.lens is None:
+        return height, width
+    rows, columns = height * camera.height / camera.lens.height, width * camera.width / camera.lens.width
+    return max(1, round(rows)), max(1, round(columns))
+
+
+def kept_bytes(cameras: Iterable[Camera]) -> int:
+    """What is kept of labels' places for the largest of some cameras' pinholes."""
+    pixels = [camera.width * camera.height for camera in cameras if camera.lens is not None]
+    return KEPT_PINHOLES * PLACE_BYTES * max(pixels, default=0)
+
+
+def _labels(labels: Tensor, camera: Camera) -> Tensor:
+    """[L, H, W] i32 of labels [L, h, w] of the photo."""
+    places = _label_places(_pinhole(camera), labels.shape[1], labels.shape[2])
+    return labels.flatten(1).index_select(1, places).reshape(labels.shape[0], camera.height, camera.width)
+
+
+@lru_cache(maxsize=KEPT_PINHOLES)
+def _label_places(pinhole: _Pinhole, height: int, width: int) -> Tensor:
+    """[H * W] i32, of a huge map i64: the place among the photo's labels [height, width] that each pixel reads."""
+    places = np.empty((pinhole.height, pinhole.width), np.int32 if height * width < 1 << 31 else np.int64)
+    band = max(1, BAND_PIXELS // pinhole.width)
+    columns = np.arange(pinhole.width) + 0.5
+    for first in range(0, pinhole.height, band):
+        here = slice(first, first + band)
+        u, v = np.meshgrid(columns, np.arange(pinhole.height)[here] + 0.5)
+        x, y = _shares(u, v, pinhole)
+        rows, own = (y * height).astype(np.int64), (x * width).astype(np.int64)
+        places[here] = rows.clip(0, height - 1) * width + own.clip(0, width - 1)
+    return torch.from_numpy(places.ravel())
+
+
+def _grid(grid: Tensor, camera: Camera) -> Tensor:
+    """[rows, columns, F] of a grid [h, w, F] of the photo, of its dtype."""
+    height, width, channels = grid.shape
+    rows, columns = grid_sides(height, width, camera)
+    centres = np.meshgrid(
+        (np.arange(columns) + 0.5) * camera.width / columns, (np.arange(rows) + 0.5) * camera.height / rows
+    )
+    x, y = _shares(*centres, _pinhole(camera))
+    u, v = (x * width - 0.5).clip(0, width - 1), (y * height - 0.5).clip(0, height - 1)
+    left, top = np.floor(u).astype(np.int64), np.floor(v).astype(np.int64)
+    cells = grid.reshape(-1, channels)
+    carried = torch.empty((*x.shape, channels), dtype=grid.dtype)
+    band = max(1, BAND_VALUES // (x.shape[1] * channels))
+    for first in range(0, x.shape[0], band):
+        here = slice(first, first + band)
+        total = torch.zeros((*x[here].shape, channels))
+        for row in (0, 1):
+            for column in (0, 1):
+                share = (1 - np.abs(u - left - column)) * (1 - np.abs(v - top - row))
+                place = (top + row).clip(max=height - 1) * width + (left + column).clip(max=width - 1)
+                taken = cells[torch.from_numpy(place[here])].to(torch.float32)
+                total += taken * torch.from_numpy(share[here].astype(np.float32))[..., None]
+        carried[here] = total.to(grid.dtype)
+    return carried
+
+
+class _Pinhole(NamedTuple):
+    """A camera with a lens, by what its maps depend on."""
+
+    lens: Lens
+    width: int
+    height: int
+    cx: float
+    cy: float
+
+
+def _pinhole(camera: Camera) -> _Pinhole:
+    if camera.lens is None:
+        raise ValueError("the camera has no lens")
+    return _Pinhole(camera.lens, camera.width, camera.height, camera.cx, camera.cy)
+
+
+def _shares(u: np.ndarray, v: np.ndarray, pinhole: _Pinhole) -> tuple[np.ndarray, np.ndarray]:
+    """Where on the photo the rays of places (u, v) of a pinhole lie, as shares of its sides."""
+    lens = pinhole.lens
+    x, y = lens.on_photo((u - pinhole.cx) / lens.fx, (v - pinhole.cy) / lens.fy)
+    return x / lens.width, y / lens.height

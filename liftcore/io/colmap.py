@@ -1,0 +1,246 @@
+"""COLMAP sparse models, binary and text: cameras and poses; the points are not read."""
+
+from __future__ import annotations
+
+import math
+import mmap
+import struct
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+
+from liftcore.errors import InvalidCameras
+from liftcore.io.camera_models import (
+    COLMAP_MODELS,
+    MODELS_BY_NAME,
+    READ_MODELS,
+    UNDISTORT,
+    CameraModel,
+    calibration,
+)
+from liftcore.io.foreign import refuse_pointer
+from liftcore.scene.cameras import Camera, Cameras, check_count, told_of
+from liftcore.scene.lens import behind_lens
+from liftcore.scene.view_names import view_names
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+    from pathlib import Path
+
+MAX_TEXT_LINE = 64 * 1024 * 1024  # bytes; a line of an image's points runs to a few MB
+MAX_NAME_BYTES = 4096
+POINT_BYTES = 24  # x, y and the id of its 3D point
+MODEL_FILES = ("cameras.bin", "cameras.txt", "images.bin", "images.txt")
+RE_EXPORT = "export the sparse model again"
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class _Sensor:
+    width: int
+    height: int
+    model: CameraModel
+    parameters: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class _Image:
+    name: str
+    camera: int
+    quaternion: tuple[float, ...]  # w x y z, world to camera
+    translation: tuple[float, ...]
+
+
+def has_model(folder: Path) -> bool:
+    """Whether the folder itself holds a file of a sparse model."""
+    return any((folder / name).is_file() for name in MODEL_FILES)
+
+
+def is_whole(folder: Path) -> bool:
+    """Whether the folder itself holds both files of a sparse model."""
+    return all(path.is_file() for path in model_files(folder))
+
+
+def model_files(folder: Path) -> list[Path]:
+    """Its cameras and its images: of a whole model, and binary files before text, as in COLMAP, if there are any."""
+    kinds = [[folder / f"cameras.{kind}", folder / f"images.{kind}"] for kind in ("bin", "txt")]
+    return max(kinds, key=lambda files: sum(path.is_file() for path in files))
+
+
+def read_colmap(folder: Path) -> Cameras:
+    """The cameras of a sparse model, by image name.
+
+    Raises:
+        InvalidCameras: a file is missing or malformed, or a camera is distorted in a way that is not read.
+    """
+    camera_file, image_file = model_files(folder)
+    for path in (camera_file, image_file):
+        if not path.is_file():
+            raise InvalidCameras(str(folder), expected=f"the file {path.name}", got="a folder without it")
+    if camera_file.suffix == ".bin":
+        sensors, images = _read_binary(camera_file, image_file)
+    else:
+        sensors = dict(_counted(_text_sensors(camera_file), camera_file))
+        images = list(_counted(_text_images(image_file), image_file))
+    with told_of(str(folder)):
+        names = view_names([image.name for image in images])
+        pairs = zip(names, images, strict=True)
+        return Cameras(tuple(_camera(name, image, sensors, (camera_file, image_file)) for name, image in pairs))
+
+
+def _camera(name: str, image: _Image, sensors: Mapping[int, _Sensor], files: tuple[Path, Path]) -> Camera:
+    """The view of an image; only a camera that an image uses has to be of a model that is read."""
+    sensor, source = sensors.get(image.camera), str(files[1])
+    if sensor is None:
+        raise InvalidCameras(source, expected="images of known cameras", got=f"{name!r} of camera {image.camera}")
+    intrinsics, distortion = calibration(sensor.model, sensor.parameters, f"{files[0]} camera {image.camera}")
+    pose = np.eye(4)
+    pose[:3, :3] = _rotation(np.array(image.quaternion), f"{source} image {name!r}")
+    pose[:3, 3] = image.translation
+    camera = Camera(name, sensor.width, sensor.height, *intrinsics, world_to_camera=pose)
+    return camera if distortion is None else behind_lens(camera, distortion)
+
+
+def _rotation(quaternion: np.ndarray, source: str) -> np.ndarray:
+    """[3, 3] of a quaternion w x y z of any length but zero."""
+    length = math.hypot(*quaternion)  # which squares nothing that could overflow
+    if not math.isfinite(length) or length == 0:
+        raise InvalidCameras(source, expected="a finite quaternion that is not zero", got=str(quaternion.tolist()))
+    w, x, y, z = quaternion / length
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+class _Bytes:
+    """A mapped binary file, read forward; every read is checked against its end."""
+
+    def __init__(self, path: Path) -> None:
+        self.source = str(path)
+        with path.open("rb") as handle:
+            size = handle.seek(0, 2)
+            # An empty file cannot be mapped.
+            self.data: Any = mmap.mmap(handle.fileno(), 0, access=mmap.ACCESS_READ) if size else b""
+        refuse_pointer(self.source, bytes(self.data[:64]))
+        self.offset = 0
+
+    def take(self, layout: str) -> tuple[Any, ...]:
+        start = self.offset
+        self.skip(struct.calcsize(layout))
+        return struct.unpack_from(layout, self.data, start)
+
+    def views(self, what: str, least_bytes: int) -> range:
+        """As many views or their cameras as the file announces, which a scene may have."""
+        count = self.count(what, least_bytes)
+        check_count(count, self.source)
+        return range(count)
+
+    def count(self, what: str, least_bytes: int) -> int:
+        """A number of records, which the rest of the file must have room for."""
+        (count,) = self.take("<Q")
+        if count * least_bytes > len(self.data) - self.offset:
+            rest = len(self.data) - self.offset
+            raise InvalidCameras(
+                self.source,
+                expected=f"{count} {what}",
+                got=f"a file that ends {rest} bytes after their number",
+                hint=RE_EXPORT,
+            )
+        return count
+
+    def name(self) -> str:
+        end = self.data.find(b"\0", self.offset, self.offset + MAX_NAME_BYTES)
+        if end < 0:
+            raise InvalidCameras(self.source, expected="an image name that ends", got="none", hint=RE_EXPORT)
+        raw, self.offset = bytes(self.data[self.offset : end]), end + 1
+        return raw.decode("utf-8", errors="replace")
+
+    def skip(self, count: int) -> None:
+        if count > len(self.data) - self.offset:
+            got = f"a file that ends after {len(self.data)}"
+            raise InvalidCameras(
+                self.source, expected=f"{self.offset + count} bytes or more", got=got, hint=RE_EXPORT
+            )
+        self.offset += count
+
+
+def _read_binary(camera_file: Path, image_file: Path) -> tuple[dict[int, _Sensor], list[_Image]]:
+    cameras = _Bytes(camera_file)
+    sensors = dict(_binary_sensor(cameras) for _ in cameras.views("cameras", 24 + 3 * 8))
+    images = _Bytes(image_file)
+    return sensors, [_binary_image(images) for _ in images.views("images", 64 + 1 + 8)]
+
+
+def _binary_sensor(data: _Bytes) -> tuple[int, _Sensor]:
+    number, model, width, height = data.take("<IiQQ")
+    if not 0 <= model < len(COLMAP_MODELS):
+        got = f"camera model id {model}"
+        raise InvalidCameras(data.source, expected=f"a camera of {READ_MODELS}", got=got, hint=UNDISTORT)
+    parameters = data.take(f"<{COLMAP_MODELS[model].parameters}d")
+    return number, _Sensor(width, height, COLMAP_MODELS[model], parameters)
+
+
+def _binary_image(data: _Bytes) -> _Image:
+    _, *pose, camera = data.take("<I7dI")
+    name = data.name()
+    data.skip(data.count("points", POINT_BYTES) * POINT_BYTES)
+    return _Image(name, camera, tuple(pose[:4]), tuple(pose[4:]))
+
+
+def _text_lines(path: Path) -> Iterator[str]:
+    with path.open("rb") as handle:
+        refuse_pointer(str(path), handle.read(64))
+        handle.seek(0)
+        while line := handle.readline(MAX_TEXT_LINE):
+            if len(line) == MAX_TEXT_LINE:
+                raise InvalidCameras(str(path), expected=f"lines under {MAX_TEXT_LINE} bytes", got="a longer one")
+            yield line.decode("utf-8", errors="replace").strip().lstrip("\ufeff")
+
+
+def _text_sensors(path: Path) -> Iterator[tuple[int, _Sensor]]:
+    for line in _text_lines(path):
+        if not line or line.startswith("#"):
+            continue
+        try:
+            number, model, width, height, *values = line.split()
+            parameters = tuple(float(value) for value in values)
+            camera, size = int(number), (int(width), int(height))
+        except ValueError:
+            raise _bad_line(path, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]", line) from None
+        unknown = CameraModel(model[:60], len(parameters), 0, None)
+        yield camera, _Sensor(*size, MODELS_BY_NAME.get(model, unknown), parameters)
+
+
+def _text_images(path: Path) -> Iterator[_Image]:
+    lines = _text_lines(path)
+    for line in lines:
+        if not line or line.startswith("#"):
+            continue
+        try:
+            _, *numbers, camera, name = line.split(maxsplit=9)
+            pose = tuple(float(number) for number in numbers)
+            if len(pose) != 7:
+                raise ValueError(line)
+            yield _Image(name, int(camera), pose[:4], pose[4:])
+        except ValueError:
+            raise _bad_line(path, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", line) from None
+        points = next(lines, "").split()  # of the image before: X Y POINT3D_ID, any number of times
+        if len(points) % 3 or (points and not points[-1].lstrip("-").isdigit()):
+            expected = "X Y POINT3D_ID of each point of an image after its line, or an empty line"
+            raise InvalidCameras(str(path), expected=expected, got=repr(" ".join(points)[:80]), hint=RE_EXPORT)
+
+
+def _counted(records: Iterator[T], path: Path) -> Iterator[T]:
+    """The records of a text, which announces no number, as long as a scene may have so many."""
+    for count, record in enumerate(records, start=1):
+        check_count(count, str(path))
+        yield record
+
+
+def _bad_line(path: Path, expected: str, line: str) -> InvalidCameras:
+    return InvalidCameras(str(path), expected=f"lines {expected!r}", got=repr(line[:80]), hint=RE_EXPORT)

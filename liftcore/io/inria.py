@@ -1,0 +1,77 @@
+"""The cameras.json that Inria's trainer writes beside its splats."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Any
+
+from liftcore.errors import InvalidCameras
+from liftcore.io.json_file import FORMATS, entry, matrix, number, pixels
+from liftcore.io.whole_file import whole_file
+from liftcore.scene.cameras import Camera, Cameras, check_count, world_to_camera
+from liftcore.scene.view_names import view_names
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+CENTRE_TOLERANCE = 1e-6  # pixels
+KEEP = "keep these cameras as a COLMAP model or transforms.json"
+
+
+def parse_inria(document: Any, source: str) -> Cameras:
+    """The cameras of a cameras.json document; the format puts the principal point at the image's centre.
+
+    Raises:
+        InvalidCameras: a key is missing or malformed.
+    """
+    if not isinstance(document, list):
+        raise InvalidCameras(source, expected="a list of cameras", got=type(document).__name__)
+    if document and not (isinstance(document[0], dict) and "img_name" in document[0]):
+        got = f"a list of {type(document[0]).__name__}"
+        if isinstance(document[0], dict):
+            got = f"a list of objects with {', '.join(list(document[0])[:5])}"
+        raise InvalidCameras(source, expected=FORMATS, got=got)
+    check_count(len(document), source)
+    images = [str(entry(record, "img_name", f"{source} camera {i}")) for i, record in enumerate(document)]
+    views = zip(view_names(images), document, strict=True)
+    return Cameras(tuple(_camera(name, record, source) for name, record in views))
+
+
+def _camera(name: str, record: dict[str, Any], source: str) -> Camera:
+    where = f"{source} camera {name!r}"
+    width, height = (pixels(entry(record, key, where), f"{where} {key}") for key in ("width", "height"))
+    fx, fy = (number(entry(record, key, where), f"{where} {key}") for key in ("fx", "fy"))
+    rotation = matrix(entry(record, "rotation", where), (3,), 3, f"{where} rotation")
+    (position,) = matrix([entry(record, "position", where)], (1,), 3, f"{where} position")
+    pose = world_to_camera(rotation, position)
+    return Camera(name, width, height, fx, fy, width / 2, height / 2, world_to_camera=pose)
+
+
+def write_inria_cameras(cameras: Cameras, path: Path) -> None:
+    """Write cameras.json, whole or not at all.
+
+    Raises:
+        InvalidCameras: a photo is distorted, or its principal point off the centre, which the format cannot say.
+    """
+    records = [_record(i, camera) for i, camera in enumerate(cameras)]
+    with whole_file(path) as handle:
+        handle.write(json.dumps(records, indent=1).encode())
+
+
+def _record(index: int, camera: Camera) -> dict[str, Any]:
+    if camera.lens is not None:
+        raise InvalidCameras("cameras.json", expected="cameras without distortion", got=repr(camera.name), hint=KEEP)
+    off = max(abs(camera.cx - camera.width / 2), abs(camera.cy - camera.height / 2))
+    if off > CENTRE_TOLERANCE:
+        got = f"one {off:g} pixels off in {camera.name!r}"
+        raise InvalidCameras("cameras.json", expected="principal points at the centre", got=got, hint=KEEP)
+    return {
+        "id": index,
+        "img_name": camera.name,
+        "width": camera.width,
+        "height": camera.height,
+        "position": camera.centre.tolist(),
+        "rotation": camera.world_to_camera[:3, :3].T.tolist(),
+        "fy": camera.fy,
+        "fx": camera.fx,
+    }

@@ -1,0 +1,74 @@
+"""Camera files in JSON, read under a limit, with numbers that say where they were wrong."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from liftcore.errors import InvalidCameras
+from liftcore.io.foreign import refuse_pointer
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+MAX_JSON_BYTES = 64 * 1024 * 1024
+FORMATS = "an object with 'frames' (nerfstudio) or a list of cameras with 'img_name' (Inria)"
+
+
+def read_json(path: Path) -> Any:
+    """The document in a JSON file of at most 64 MiB.
+
+    Raises:
+        InvalidCameras: the file does not open, is too large or is not JSON.
+    """
+    try:
+        with path.open("rb") as handle:
+            content = handle.read(MAX_JSON_BYTES + 1)
+        if len(content) > MAX_JSON_BYTES:
+            raise InvalidCameras(str(path), expected=f"JSON of at most {MAX_JSON_BYTES} bytes", got="a larger file")
+        refuse_pointer(str(path), content)
+        return json.loads(content)
+    except OSError as error:
+        got = f"one that does not open ({error.strerror})"
+        raise InvalidCameras(str(path), expected="a camera file", got=got) from None
+    except (ValueError, RecursionError) as error:
+        got = f"a file that does not parse ({str(error)[:120]})"
+        raise InvalidCameras(str(path), expected="cameras as JSON", got=got) from None
+
+
+def entry(record: Any, key: str, source: str) -> Any:
+    """The value of a key that must be there."""
+    if not isinstance(record, dict) or key not in record:
+        got = "an object without it" if isinstance(record, dict) else type(record).__name__
+        raise InvalidCameras(source, expected=f"an object with {key!r}", got=got)
+    return record[key]
+
+
+def number(value: Any, source: str) -> float:
+    """A finite number."""
+    try:
+        if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
+            return float(value)
+    except OverflowError:
+        pass  # an integer beyond every float is as wrong as infinity
+    raise InvalidCameras(source, expected="a finite number", got=repr(value)[:60])
+
+
+def pixels(value: Any, source: str) -> int:
+    """A whole number of pixels; 990.0 counts as 990."""
+    count = number(value, source)
+    if count != int(count):
+        raise InvalidCameras(source, expected="a whole number of pixels", got=repr(value)[:60])
+    return int(count)
+
+
+def matrix(value: Any, rows: tuple[int, ...], columns: int, source: str) -> np.ndarray:
+    """[r, columns] f64 of nested lists, for any allowed number of rows r."""
+    shaped = isinstance(value, list) and len(value) in rows
+    if not shaped or not all(isinstance(row, list) and len(row) == columns for row in value):
+        wanted = " or ".join(f"{count}x{columns}" for count in rows)
+        raise InvalidCameras(source, expected=f"a {wanted} matrix as nested lists", got=repr(value)[:60])
+    return np.array([[number(cell, source) for cell in row] for row in value])

@@ -1,0 +1,154 @@
+"""nerfstudio's transforms.json: camera-to-world poses with OpenGL axes, shared or own intrinsics."""
+
+from __future__ import annotations
+
+import math
+from collections import ChainMap
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from liftcore.errors import InvalidCameras
+from liftcore.io.camera_models import Intrinsics, distortion_of
+from liftcore.io.json_file import FORMATS, entry, matrix, number, pixels
+from liftcore.scene.cameras import Camera, Cameras, check_count, world_to_camera
+from liftcore.scene.lens import behind_lens
+from liftcore.scene.view_names import view_names
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from liftcore.scene.distortion import Distortion
+
+PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
+FISHEYE = "OPENCV_FISHEYE"
+LISTED = ("k1", "k2", "k3", "k4", "p1", "p2")  # nerfstudio's distortion_params
+READ = {True: ("k1", "k2", "k3", "k4"), False: ("k1", "k2", "k3", "p1", "p2")}  # of a fisheye, and of others
+DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4")
+OTHER_LENSES = (
+    "latlong",
+    "equirectangular",
+    "ftheta_p0",
+    "ftheta_p1",
+    "ftheta_p2",
+    "ftheta_p3",
+    "ftheta_p4",
+)
+OTHER_FOCALS = ("fx", "fy", "focal", "focal_length", "K", "intrinsics")  # of other programs' files
+UNDISTORT = (
+    "undistort the photos first (OpenCV does it, or 'colmap image_undistorter' where there is a COLMAP model), train "
+    "and lift on them, and write their fl_x, fl_y, cx and cy without distortion"
+)
+LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])  # of a rigid pose
+OF_NERFSTUDIO = ("applied_transform", "ply_file_path")  # what its own converter writes, and others do not
+OPENGL_TO_OPENCV = np.array([1.0, -1.0, -1.0])  # a camera's y up and z back become down and ahead
+
+
+def parse_transforms(document: Any, source: str) -> Cameras:
+    """The cameras of a transforms.json document, in the frame that its poses are in.
+
+    A frame's own intrinsics come before the shared ones. A scene trained in another frame (nerfstudio
+    normalises poses unless told not to) must be exported together with its cameras.
+
+    Raises:
+        InvalidCameras: a key is missing or malformed, or a camera is distorted in a way that is not read.
+    """
+    if not isinstance(document, dict) or "frames" not in document:
+        some = ", ".join(list(document)[:5]) if isinstance(document, dict) else type(document).__name__
+        raise InvalidCameras(
+            source, expected=FORMATS, got=f"an object with {some}" if document else "an empty object"
+        )
+    frames = document["frames"]
+    if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
+        raise InvalidCameras(f"{source} frames", expected="a list of objects", got=repr(frames)[:60])
+    check_count(len(frames), f"{source} frames")
+    files = [str(entry(frame, "file_path", f"{source} frame {i}")) for i, frame in enumerate(frames)]
+    views = zip(view_names(files), frames, strict=True)
+    cameras = tuple(_camera(name, ChainMap(frame, document), source) for name, frame in views)
+    return Cameras(cameras, of_nerfstudio=any(key in document for key in OF_NERFSTUDIO))
+
+
+def _camera(name: str, keys: ChainMap[str, Any], source: str) -> Camera:
+    where = f"{source} frame {name!r}"
+    distortion = _distortion(keys, where)
+    if "w" not in keys or "h" not in keys:
+        hint = 'add the size of the photos as "w" and "h" at the top level of the file'
+        raise InvalidCameras(where, expected="an image size, w and h", got="none", hint=hint)
+    width, height = pixels(keys["w"], f"{where} w"), pixels(keys["h"], f"{where} h")
+    given = matrix(keys.get("transform_matrix"), (3, 4), 4, f"{where} transform_matrix")
+    if len(given) == 4 and np.abs(given[3] - LAST_ROW).max() > 1e-6:
+        got = " ".join(f"{value:g}" for value in given[3])
+        raise InvalidCameras(f"{where} transform_matrix", expected="0 0 0 1 as the last row", got=got)
+    pose = world_to_camera(given[:3, :3] * OPENGL_TO_OPENCV, given[:3, 3])
+    intrinsics = _intrinsics(keys, width, height, where)
+    camera = Camera(name, width, height, *intrinsics, world_to_camera=pose)
+    return camera if distortion is None else behind_lens(camera, distortion)
+
+
+def _intrinsics(keys: Mapping[str, Any], width: int, height: int, where: str) -> Intrinsics:
+    fx = _focal(keys, "x", width, where)
+    fy = _focal(keys, "y", height, where)
+    fx = fy if fx is None else fx
+    fy = fx if fy is None else fy
+    if fx is None or fy is None:
+        found = next((key for key in OTHER_FOCALS if key in keys), None)
+        got = "neither" if found is None else f"neither, but {found!r}"
+        hint = "add the focal length in pixels as fl_x and fl_y"
+        raise InvalidCameras(where, expected="fl_x or camera_angle_x", got=got, hint=hint)
+    cx = number(keys.get("cx", width / 2), f"{where} cx")
+    cy = number(keys.get("cy", height / 2), f"{where} cy")
+    return Intrinsics(fx, fy, cx, cy)
+
+
+def _focal(keys: Mapping[str, Any], axis: str, side: int, where: str) -> float | None:
+    if f"fl_{axis}" in keys:
+        return number(keys[f"fl_{axis}"], f"{where} fl_{axis}")
+    if f"camera_angle_{axis}" not in keys:
+        return None
+    angle = number(keys[f"camera_angle_{axis}"], f"{where} camera_angle_{axis}")
+    if not 0 < angle < math.pi:
+        raise InvalidCameras(f"{where} camera_angle_{axis}", expected="an angle in 0..pi", got=f"{angle:g}")
+    return 0.5 * side / math.tan(0.5 * angle)
+
+
+def _distortion(keys: ChainMap[str, Any], where: str) -> Distortion | None:
+    """How a frame's photo is distorted; None where it is not."""
+    model = keys.get("camera_model", "PINHOLE")
+    other = next((key for scope in keys.maps for key in OTHER_LENSES if scope.get(key)), None)
+    if model not in (*PERSPECTIVE, FISHEYE) or other:
+        got = other or repr(model)[:60]
+        raise InvalidCameras(where, expected=f"a perspective camera or {FISHEYE}", got=got, hint=UNDISTORT)
+    fisheye = model == FISHEYE or bool(keys.get("is_fisheye"))
+    found = [given for scope in keys.maps if (given := _given(scope, where)) is not None]
+    if any(given != found[0] for given in found):  # programs differ in which of them counts
+        told = " and ".join(_told(given) for given in found)
+        raise InvalidCameras(where, expected="the same distortion as that of all frames", got=told)
+    values = found[0] if found else {}
+    unread = next((key for key in values if key not in READ[fisheye]), None)
+    if unread:
+        kind = "a fisheye" if fisheye else "a perspective camera"
+        expected = f"{', '.join(READ[fisheye])} alone of {kind}"
+        raise InvalidCameras(where, expected=expected, got=f"{unread} = {values[unread]:g}", hint=UNDISTORT)
+    return distortion_of(values, fisheye=fisheye)
+
+
+def _given(scope: Mapping[str, Any], where: str) -> dict[str, float] | None:
+    """The parameters that are not zero, by name; None where none is named."""
+    listed = scope.get("distortion_params")
+    if listed is not None and (not isinstance(listed, list) or len(listed) not in (0, len(LISTED))):
+        expected = f"a list of the {len(LISTED)} numbers {', '.join(LISTED)}"
+        raise InvalidCameras(f"{where} distortion_params", expected=expected, got=repr(listed)[:60])
+    if not listed and not any(key in scope for key in DISTORTION):
+        return None
+    given = {key: number(scope[key], f"{where} {key}") for key in DISTORTION if key in scope}
+    named = {key: value for key, value in given.items() if value != 0}
+    values = [number(value, f"{where} distortion_params[{i}]") for i, value in enumerate(listed or [])]
+    of_list = {key: value for key, value in zip(LISTED, values, strict=False) if value != 0}
+    if named and of_list and named != of_list:
+        got = f"{_told(named)} and {_told(of_list)}"
+        raise InvalidCameras(f"{where} distortion_params", expected="what the single parameters say", got=got)
+    return of_list or named
+
+
+def _told(values: Mapping[str, float]) -> str:
+    return ", ".join(f"{key} = {value:g}" for key, value in values.items()) or "none"

@@ -1,0 +1,1 @@
+"""The raster on the processor: kernels that numba compiles."""

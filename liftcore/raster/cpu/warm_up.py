@@ -1,0 +1,49 @@
+"""Compile a device's kernels, or load them from the disk cache, before anything is timed."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from liftcore.device import CPU, Device
+from liftcore.features.views import FeatureGrid, Regions
+from liftcore.io.ply_dialect import scale_count
+from liftcore.raster.base import CompositingParams, Weighting
+from liftcore.raster.open_raster import open_raster
+from liftcore.scene.cameras import Camera
+from liftcore.scene.splats import Kernel, Splats
+
+PLAIN, ALL = CompositingParams(), Weighting()
+
+
+def warm_up(
+    kernel: Kernel = Kernel.GAUSSIAN_3D,
+    device: Device = CPU,
+    walk: CompositingParams = PLAIN,
+    weighting: Weighting = ALL,
+) -> None:
+    """Run every product once on one splat of the kernel. The first run on a machine compiles, later ones load.
+
+    Each kernel is compiled for itself, so a scene waits for its own alone; so is the walk without a gain, and of all
+    weights; a card compiles each way of weighing.
+
+    Args:
+        walk: that will lift. weighting: likewise.
+    """
+    splats = Splats(
+        torch.tensor([[0.0, 0.0, 2.0]]),
+        torch.zeros(1, 4),
+        torch.zeros(1, scale_count(kernel)),
+        torch.zeros(1),
+        kernel=kernel,
+        beta=torch.zeros(1) if kernel is Kernel.BETA else None,
+    )
+    camera = Camera("warm-up", 16, 16, 16.0, 16.0, 8.0, 8.0, np.eye(4))
+    raster = open_raster(splats, device, threads=1)
+    regions = Regions(torch.zeros(1, 1, 1, dtype=torch.int32), torch.ones(1, 1))
+    for observation in (regions, FeatureGrid(torch.ones(1, 1, 1))):
+        raster.region_weights(camera, observation, walk, weighting)
+    raster.adjoint(camera, torch.ones(16, 16, 1), CompositingParams())
+    raster.row_sums(camera, CompositingParams())
+    raster.strongest_labels(camera, torch.zeros(1, dtype=torch.int32), CompositingParams())
+    raster.ray_rows(camera, torch.zeros(1, 2, dtype=torch.int32), CompositingParams())

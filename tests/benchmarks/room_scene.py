@@ -1,0 +1,153 @@
+"""A synthetic room of many views as a scene folder: what a long video of one place gives, with known mistakes.
+
+python -m tests.benchmarks.room_scene FOLDER --splats 500000 --views 160
+
+Every view has regions on four levels, from walls and balls to their parts, seen with occlusion. A part has a random
+unit vector; what a view says of it has noise of norm NOISE. Of all regions a tenth say another part's vector, and of
+three tenths the vector is mixed with another's, unless ``--clean`` leaves the noise alone. With ``--alike C`` the
+vectors of parts have the cosine C to one another in the mean, as those of an encoder lie in a narrow cone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from liftcore.evaluate.synthetic import PART_LEVELS, room_cameras, room_parts, room_splats
+from liftcore.features.views import NO_LABEL, Regions, ViewFeatures
+from liftcore.features.write_pack import write_pack
+from liftcore.io.inria import write_inria_cameras
+from liftcore.io.ply import write_splats
+from liftcore.raster.base import CompositingParams
+from liftcore.raster.cpu.raster import CpuRaster
+from liftcore.scene.cameras import Cameras
+
+if TYPE_CHECKING:
+    from liftcore.scene.cameras import Camera
+
+NOISE = 0.45
+WRONG, MIXED = 0.1, 0.3  # shares of a view's regions
+SHRUNK = 2  # label maps have every other pixel
+
+
+@dataclass(frozen=True)
+class RoomViews(Mapping[str, ViewFeatures]):
+    """What each view observes, made when it is asked for: the same each time."""
+
+    cameras: dict[str, Camera]
+    raster: CpuRaster
+    parts: np.ndarray  # [P, PART_LEVELS] i64
+    vectors: np.ndarray  # [parts of all levels, F] f32, level by level
+    seed: int
+    clean: bool  # no region is wrong or mixed
+
+    def __getitem__(self, name: str) -> ViewFeatures:
+        number = list(self.cameras).index(name)
+        rng = np.random.default_rng((self.seed, number))
+        camera = _shrunk(self.cameras[name])
+        fine = torch.from_numpy(self.parts[:, -1].astype(np.int32))
+        seen = self.raster.strongest_labels(camera, fine, CompositingParams()).numpy()
+        levels = [np.append(table, NO_LABEL)[seen] for table in self._rows()]  # none is -1, the last
+        rows, labels = np.unique(np.stack(levels), return_inverse=True)
+        first = int(rows[0] == NO_LABEL)
+        book = self.vectors[rows[first:]]
+        said = _noisy(book if self.clean else _mistaken(book, self.vectors, rng), rng)
+        return Regions(torch.from_numpy((labels - first).astype(np.int32)), torch.from_numpy(said).half())
+
+    def _rows(self) -> Iterator[np.ndarray]:
+        """For each level, the row of ``vectors`` that a finest part has there."""
+        fine, begin = self.parts[:, -1], 0
+        for level in range(PART_LEVELS):
+            table = np.zeros(fine.max() + 1, np.int64)
+            table[fine] = begin + self.parts[:, level]
+            begin += int(self.parts[:, level].max()) + 1
+            yield table
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.cameras)
+
+    def __len__(self) -> int:
+        return len(self.cameras)
+
+
+@dataclass(frozen=True)
+class Room:
+    """What to make."""
+
+    splats: int
+    views: int
+    size: tuple[int, int]  # width and height of the views, pixels
+    channels: int
+    clean: bool = False
+    alike: float = 0.0  # cosine of two parts' vectors, in the mean
+    seed: int = 0
+
+
+def write_room(folder: Path, room: Room) -> None:
+    """Write ``point_cloud.ply``, ``cameras.json`` and ``features.safetensors``."""
+    folder.mkdir(parents=True, exist_ok=True)
+    scene, cameras = room_splats(room.splats, room.seed), room_cameras(room.views, *room.size)
+    parts = room_parts(room.splats, room.seed)
+    total = int((parts.max(axis=0) + 1).sum())
+    vectors = _vectors(total, room)
+    named = {camera.name: camera for camera in cameras}
+    observed = RoomViews(named, CpuRaster(scene), parts, vectors, room.seed, room.clean)
+    write_splats(scene, folder / "point_cloud.ply")
+    write_inria_cameras(Cameras(tuple(cameras)), folder / "cameras.json")
+    write_pack(folder / "features.safetensors", observed, {"encoder": "random parts", "normalised": "true"})
+
+
+def _vectors(count: int, room: Room) -> np.ndarray:
+    rng = np.random.default_rng((room.seed, 1))
+    own, common = _unit(rng.standard_normal((count, room.channels))), _unit(rng.standard_normal((1, room.channels)))
+    return _unit(np.sqrt(1.0 - room.alike) * own + np.sqrt(room.alike) * common)
+
+
+def _mistaken(book: np.ndarray, vectors: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    others = vectors[rng.integers(0, len(vectors), len(book))]
+    fate = rng.uniform(size=(len(book), 1))
+    return _unit(np.where(fate < WRONG, others, np.where(fate < WRONG + MIXED, book + others, book)))
+
+
+def _noisy(book: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    return _unit(book + NOISE * _unit(rng.standard_normal(book.shape)))
+
+
+def _unit(rows: np.ndarray) -> np.ndarray:
+    return (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
+
+
+def _shrunk(camera: Camera) -> Camera:
+    sizes = {"width": camera.width // SHRUNK, "height": camera.height // SHRUNK}
+    lengths = {name: getattr(camera, name) / SHRUNK for name in ("fx", "fy", "cx", "cy")}
+    return replace(camera, **sizes, **lengths)
+
+
+def main(arguments: list[str]) -> int:
+    """Write the folder that the arguments name."""
+    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.room_scene", description=__doc__)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--splats", type=int, default=500_000)
+    parser.add_argument("--views", type=int, default=160)
+    parser.add_argument("--width", type=int, default=986)
+    parser.add_argument("--height", type=int, default=728)
+    parser.add_argument("--channels", type=int, default=512)
+    parser.add_argument("--clean", action="store_true")
+    parser.add_argument("--alike", type=float, default=0.0, metavar="C")
+    given = parser.parse_args(arguments)
+    if not 0.0 <= given.alike < 1.0:
+        parser.error(f"--alike: expected a cosine from 0 to below 1, got {given.alike}")
+    size = given.width, given.height
+    write_room(given.folder, Room(given.splats, given.views, size, given.channels, given.clean, given.alike))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,201 @@
+"""Masks on the tabletop scene: mean IoU in the views that were not lifted, a phrase at a time.
+
+    python -m tests.benchmarks.thresholds DIR [--json]
+
+Each phrase is asked alone, no other phrase and no truth is known to the threshold. A column a method: masks of the
+objects that it finds. ``rendered`` cuts the rendered scores of each view by an ``auto`` of its own instead (protocol
+P3), and ``best`` by the best possible threshold of each mask, which needs the truth. ``absent`` and ``absent
+rendered`` are the mean shares of the image that masks cover where nothing of the phrase is to be seen.
+
+The scene is where the constants of ``valley`` were tuned; those of ``auto`` were not tuned. ``--still-life`` judges
+the same on the demo's scene with three kinds of mistakes. Examples in place of words: ``tests.benchmarks.examples``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from liftcore.evaluate.accuracy import mask_iou
+from liftcore.evaluate.hardware import hardware, machine_line
+from liftcore.io.lift_file import save_lift
+from liftcore.lift import lift
+from liftcore.query.ask import ask
+from liftcore.query.directions import MINIMUM_ROW_SUM
+from liftcore.query.encoders import open_encoder
+from liftcore.query.objects import objects
+from liftcore.query.query import Query
+from liftcore.query.scene import QueryScene
+from liftcore.query.threshold import METHODS, find_threshold
+from liftcore.query.view_mask import view_mask
+from liftcore.solve.settings import LiftSettings
+from tests.benchmarks.tabletop import Tabletop
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from torch import Tensor
+
+    from liftcore.query.encoders import TextEncoder
+
+PACKS = ("features", "features_hard", "features_clean", "grids")
+PRESETS = ("row-sum", "tikhonov")
+COLUMNS = (*METHODS, "rendered", "best", "absent", "absent rendered")
+
+
+def best_iou(attention: Tensor, met: Tensor, truth: Tensor) -> float:
+    """The largest IoU that any threshold on the attention gives, over the distinct scores of the met pixels.
+
+    Args:
+        attention: [H, W] f32. met: [H, W] bool, the pixels that a mask may take. truth: [H, W] bool.
+    """
+    scores, order = torch.sort(attention[met], descending=True)
+    hits = torch.cumsum(truth[met][order].double(), dim=0)
+    chosen = torch.arange(1, len(scores) + 1, dtype=torch.float64)
+    ious = hits / (chosen + int(truth.sum()) - hits)
+    last = torch.cat([scores[1:] != scores[:-1], torch.ones(1, dtype=torch.bool)])  # of equal scores: all or none
+    return float(ious[last].max())
+
+
+def measure_phrases(
+    scene: QueryScene, phrases: Sequence[str], encoder: TextEncoder, held_out: Mapping[str, Tensor]
+) -> dict[str, float]:
+    """Mean IoU over phrases and views, by method and for cuts of the rendered scores.
+
+    Args:
+        scene: an opened lift.
+        phrases: [K], asked one at a time.
+        encoder: of the lift's text space.
+        held_out: view -> [H, W] int, the phrase that each pixel shows.
+    """
+    rows: dict[str, list[float]] = {name: [] for name in COLUMNS}
+    for number, phrase in enumerate(phrases):
+        for method in METHODS:
+            answer = ask(scene, Query((phrase,), threshold=method), encoder)
+            found = objects(scene, answer)  # once for all views
+            for view, labels in held_out.items():
+                truth = labels == number
+                seen = view_mask(scene, answer, view, group=lambda *_, found=found: found)
+                if truth.any():
+                    rows[method].append(mask_iou(seen.mask, truth))
+                if method != "auto":
+                    continue
+                met = seen.row_sums >= MINIMUM_ROW_SUM
+                rendered = met & (seen.attention >= find_threshold(seen.attention[met], method).value)
+                if truth.any():
+                    rows["rendered"].append(mask_iou(rendered, truth))
+                    rows["best"].append(best_iou(seen.attention, met, truth))
+                else:
+                    rows["absent"].append(float(seen.mask.float().mean()))
+                    rows["absent rendered"].append(float(rendered.float().mean()))
+    return {name: float(np.mean(values)) for name, values in rows.items() if values}
+
+
+def measure_tabletop(
+    folder: Path, packs: Sequence[str] = PACKS, presets: Sequence[str] = PRESETS
+) -> list[dict[str, Any]]:
+    """One row a lift of the tabletop scene."""
+    scene, rows = Tabletop(folder), []
+    phrases = [thing["class"] for thing in json.loads((folder / "truth.json").read_text())["objects"]]
+    encoder = open_encoder(f"table:{folder / 'text_table.safetensors'}")
+    for pack in packs:
+        for preset in presets:
+            files = [folder / name for name in ("point_cloud.ply", "cameras.json", f"{pack}.safetensors")]
+            opened = lifted(files, preset, scene.raster)
+            row = measure_phrases(opened, phrases, encoder, scene.held_out)
+            rows.append({"scene": "tabletop", "features": pack, "preset": preset, **row})
+    return rows
+
+
+def measure_still_life(presets: Sequence[str] = PRESETS) -> list[dict[str, Any]]:
+    """The demo's scene with its usual mistakes, with hard ones, and with hard ones in a narrow cone of vectors."""
+    from liftcore.demo.masks import Mistakes, observe, true_labels
+    from liftcore.demo.still_life import still_life
+    from liftcore.features.write_pack import write_pack
+    from liftcore.io.inria import write_inria_cameras
+    from liftcore.io.ply import write_splats
+    from liftcore.raster.cpu.raster import CpuRaster
+
+    encoder, rows = open_encoder("minilm"), []
+    hard = Mistakes(merged=0.30, split=0.15, misnamed=0.10, unlabelled=0.06, noise=0.45)
+    for seed, (name, mistakes, cone) in enumerate(
+        (("usual", Mistakes(), 0.0), ("hard", hard, 0.0), ("cone", hard, 0.9))
+    ):
+        made = still_life(7 + seed)
+        raster = CpuRaster(made.splats)
+        held_out = {view: torch.from_numpy(true_labels(made, raster, view)[0]) for view in made.held_out}
+        observed = observe(made, raster, encoder, mistakes, 7 + seed)
+        with tempfile.TemporaryDirectory() as place:
+            files = [Path(place) / part for part in ("point_cloud.ply", "cameras.json", "features.safetensors")]
+            write_splats(made.splats, files[0])
+            write_inria_cameras(made.cameras, files[1])
+            moved = {view: replace(part, codebook=_in_cone(part.codebook, cone)) for view, part in observed.items()}
+            write_pack(files[2], moved, {"encoder": "generated", "text_space": "minilm", "normalised": "true"})
+            for preset in presets:
+                opened = lifted(files, preset, raster)
+                row = measure_phrases(opened, made.things, encoder, held_out)
+                rows.append({"scene": "still life", "features": name, "preset": preset, **row})
+    return rows
+
+
+def _in_cone(codebook: Tensor, share: float) -> Tensor:
+    """Unit vectors drawn towards one fixed random direction, as CLIP's image vectors are: that much of each is it."""
+    axis = torch.randn(codebook.shape[1], generator=torch.Generator().manual_seed(1))
+    drawn = (1 - share**2) ** 0.5 * codebook.float() + share * torch.nn.functional.normalize(axis, dim=0)
+    return torch.nn.functional.normalize(drawn, dim=1).half() if share else codebook
+
+
+def lifted(files: list[Path], preset: str, raster: Any) -> QueryScene:
+    """The files lifted and opened, with the splats of a raster that is there already."""
+    made = lift(files[0], files[1], files[2:], LiftSettings.of(preset=preset, certificate_rays=0))
+    with tempfile.TemporaryDirectory() as place:
+        save_lift(made, Path(place) / "lift.safetensors")
+        scene = QueryScene(made, Path(place) / "lift.safetensors")
+        scene.raster = raster
+        _ = scene.cameras
+    return scene
+
+
+def table_of(document: dict[str, Any]) -> str:
+    """The rows and the machine, for people."""
+    names = COLUMNS
+    lines = [f"{'scene, features, preset':<36}" + "".join(f"{name:>{_wide(name)}}" for name in names)]
+    for row in document["rows"]:
+        head = ", ".join(row[key] for key in ("scene", "features", "preset"))
+        lines.append(f"{head:<36}" + "".join(_cell(row, name) for name in names))
+    lines.append(machine_line(document["hardware"]))
+    return "\n".join(lines)
+
+
+def _wide(name: str) -> int:
+    return max(10, len(name) + 2)
+
+
+def _cell(row: Mapping[str, Any], name: str) -> str:
+    return f"{row[name]:>{_wide(name)}.3f}" if name in row else f"{'-':>{_wide(name)}}"
+
+
+def main() -> None:
+    """Print the table, or one JSON object."""
+    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.thresholds", description=__doc__)
+    parser.add_argument("folder", type=Path, metavar="DIR", help="the tabletop scene")
+    parser.add_argument("--still-life", action="store_true", help="the demo's scene too, which nothing was tuned on")
+    parser.add_argument("--features", nargs="+", default=PACKS, choices=PACKS, help="which feature packs")
+    parser.add_argument("--presets", nargs="+", default=PRESETS, metavar="NAME", help="which weights")
+    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
+    options = parser.parse_args()
+    rows = measure_tabletop(options.folder, options.features, options.presets)
+    rows += measure_still_life(options.presets) if options.still_life else []
+    document = {"rows": rows, "hardware": hardware()}
+    print(json.dumps(document) if options.json else table_of(document))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,308 @@
+"""Image encoders against what their libraries compute, and the places that their cells look at."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import nn
+
+from liftcore.errors import InvalidInput, Unavailable
+from liftcore.features.encoders import open_image_encoder
+from liftcore.features.encoders.cell_shift import cell_shift
+from liftcore.features.encoders.clip import ClipImageEncoder
+from liftcore.features.encoders.clip_towers import resnet_values, vit_patches, vit_values
+from liftcore.features.encoders.timm_backbone import TimmEncoder
+from liftcore.query.encoders.open_clip_models import OpenedModel, library
+
+PATCH, SIDE, WIDTH, F = 8, 32, 24, 10
+
+
+def small_vit(**more: Any) -> Any:
+    library()
+    from open_clip.transformer import VisionTransformer
+
+    torch.manual_seed(3)
+    return VisionTransformer(SIDE, PATCH, WIDTH, 3, 2, 2.0, output_dim=F, **more).eval()
+
+
+def small_resnet() -> Any:
+    library()
+    from open_clip.modified_resnet import ModifiedResNet
+
+    torch.manual_seed(4)
+    tower = ModifiedResNet([1, 1, 1, 1], output_dim=F, heads=2, image_size=64, width=4).eval()
+    for name, weight in tower.named_parameters():
+        if name.endswith("bn3.weight"):  # zero at first, which would hide the blocks' own paths
+            nn.init.ones_(weight)
+    return tower
+
+
+class Holder(nn.Module):
+    """As much of a CLIP model as an image encoder needs."""
+
+    def __init__(self, visual: Any) -> None:
+        super().__init__()
+        self.visual = visual
+
+
+def small_encoder(kind: str, tower: Any) -> ClipImageEncoder:
+    opened = OpenedModel("open_clip:small/tag", "small", Holder(tower))
+    return ClipImageEncoder(kind, opened, opened.name, torch.device("cpu"))
+
+
+@cache
+def backbone(name: str) -> TimmEncoder:
+    torch.manual_seed(5)
+    return TimmEncoder._with_random_weights(name)
+
+
+@pytest.fixture
+def resnet() -> TimmEncoder:
+    return backbone("resnet18")
+
+
+@pytest.fixture
+def vit() -> TimmEncoder:
+    return backbone("vit_tiny_patch16_224")
+
+
+def test_maskclip_is_the_last_attention_when_each_token_sees_itself_alone() -> None:
+    tower = small_vit()
+    images = torch.randn(2, 3, SIDE, SIDE)
+    with torch.no_grad():
+        tokens = tower._embeds(images)
+        *blocks, last = tower.transformer.resblocks
+        for block in blocks:
+            tokens = block(tokens)
+        alone = ~torch.eye(tokens.shape[1], dtype=torch.bool)
+        normed = last.ln_1(tokens)
+        seen, _ = last.attn(normed, normed, normed, attn_mask=alone)
+        expected = (tower.ln_post(seen) @ tower.proj)[:, 1:].reshape(2, 4, 4, F)
+        torch.testing.assert_close(vit_values(tower, images), expected)
+
+
+def test_clip_patches_are_the_tokens_that_open_clip_gives_projected() -> None:
+    tower = small_vit(output_tokens=True)
+    images = torch.randn(2, 3, SIDE, SIDE)
+    with torch.no_grad():
+        _, tokens = tower(images)
+        torch.testing.assert_close(vit_patches(tower, images), (tokens @ tower.proj).reshape(2, 4, 4, F))
+
+
+def test_resnet_values_are_what_the_pool_gives_for_equal_cells() -> None:
+    tower = small_resnet()
+    nn.init.zeros_(tower.attnpool.positional_embedding)
+    cells = torch.randn(2, 128, 1, 1)
+    pool = tower.attnpool
+    with torch.no_grad():
+        pooled = pool(cells.expand(-1, -1, 2, 2))
+        dense = pool.c_proj(pool.v_proj(cells[:, :, 0, 0]))
+        torch.testing.assert_close(pooled, dense)
+        grid = resnet_values(tower, torch.randn(1, 3, 64, 96))
+    assert grid.shape == (1, 2, 3, F)
+
+
+def test_positions_follow_the_grid_when_the_size_changes() -> None:
+    tower = small_vit()
+    ramp = torch.arange(4.0).repeat(4)  # the column of a cell
+    with torch.no_grad():
+        tower.positional_embedding.zero_()
+        tower.positional_embedding[1:, 0] = ramp
+        from liftcore.features.encoders.clip_towers import _positions
+
+        wide = _positions(tower, 4, 8)[1:, 0].reshape(4, 8)
+        assert torch.equal(_positions(tower, 4, 4), tower.positional_embedding)
+    # Twice as many columns, half a cell apart: bicubic keeps a ramp a ramp, inside.
+    torch.testing.assert_close(wide[:, 2:6], (torch.arange(2, 6) / 2 - 0.25).expand(4, 4), atol=0.06, rtol=0)
+
+
+ENCODERS = {
+    "maskclip ViT": lambda: small_encoder("maskclip", small_vit()),
+    "clip ViT": lambda: small_encoder("clip", small_vit()),
+    "maskclip ResNet": lambda: small_encoder("maskclip", small_resnet()),
+    "timm ViT": lambda: backbone("vit_tiny_patch16_224"),
+    "timm ResNet": lambda: backbone("resnet18"),
+}
+
+
+@pytest.mark.parametrize("kind", ENCODERS)
+def test_a_change_in_a_patch_moves_its_own_cell_most(kind: str) -> None:
+    torch.manual_seed(0)
+    encoder = ENCODERS[kind]()
+    patch, (rows, columns) = encoder.pixels.patch, (4, 5)
+    images = torch.randn(1, 3, rows * patch, columns * patch)
+    before = encoder.encode(images)
+    assert before.shape == (1, rows, columns, encoder.channels)
+    assert before.dtype == torch.float32
+    assert torch.equal(before, encoder.encode(images))
+    for row, column in ((1, 3), (2, 1)):
+        spotted = images.clone()
+        spotted[..., row * patch : (row + 1) * patch, column * patch : (column + 1) * patch] *= -1
+        moved = (encoder.encode(spotted) - before).norm(dim=-1)[0]
+        assert divmod(int(moved.argmax()), columns) == (row, column)
+
+
+@pytest.mark.parametrize("kind", ["maskclip ViT", "maskclip ResNet", "timm ViT"])
+def test_an_image_does_not_know_its_batch(kind: str) -> None:
+    encoder = ENCODERS[kind]()
+    images = torch.randn(3, 3, 2 * encoder.pixels.patch, 3 * encoder.pixels.patch)
+    together = encoder.encode(images)
+    apart = torch.cat([encoder.encode(image[None]) for image in images])
+    torch.testing.assert_close(together, apart, atol=1e-4, rtol=1e-4)
+
+
+def test_cells_of_a_resnet_are_brought_back_to_their_patches(resnet: TimmEncoder) -> None:
+    """Without it they look 15.5 pixels up and left, so a patch moves the cell below and right of it as well."""
+    assert resnet._shift == 15.5
+    images = torch.randn(4, 3, 5 * 32, 5 * 32)
+    spotted = images.clone()
+    spotted[..., 64:96, 64:96] += torch.randn(4, 3, 32, 32)
+
+    def middle() -> torch.Tensor:
+        moved = (resnet.encode(spotted) - resnet.encode(images)).square().sum(dim=(0, 3))
+        places = torch.arange(5.0)
+        return torch.stack([(moved.sum(dim=1 - axis) * places).sum() / moved.sum() for axis in (0, 1)])
+
+    try:
+        assert (middle() - 2).abs().max() < 0.1
+        resnet._shift = 0.0
+        assert (middle() - 2).min() > 0.25
+    finally:
+        resnet._shift = 15.5
+
+
+@pytest.mark.parametrize(
+    ("layers", "shift"),
+    [
+        ([nn.Conv2d(3, 2, 4, 4)], 0.0),  # patches
+        ([nn.Conv2d(3, 2, 3, 2, 1)], 0.5),
+        ([nn.Conv2d(3, 2, 3, 1, 1), nn.AvgPool2d(2)], 0.0),
+        ([nn.Conv2d(3, 2, 7, 2, 3), nn.MaxPool2d(3, 2, 1)], 1.5),
+    ],
+)
+def test_shift_of_cells_is_counted_from_strides_and_paddings(layers: list[nn.Module], shift: float) -> None:
+    class Net(nn.Sequential):
+        def forward_intermediates(self, x: torch.Tensor, **_: object) -> list[torch.Tensor]:
+            return [self(x)]
+
+    net = Net(*layers)
+    images = torch.zeros(1, 3, 32, 32)
+    assert cell_shift(net, images) == shift
+    images[..., 16:, :] = 1.0  # an edge: the middle of the cells' answer to it lies where they look
+    rows = torch.linspace(0, 1, 32).expand(1, 3, 32, 32).transpose(2, 3)
+    for module in net:
+        if isinstance(module, nn.Conv2d):
+            nn.init.constant_(module.weight, 1 / module.weight[0].numel())
+            nn.init.zeros_(module.bias if module.bias is not None else torch.empty(0))
+    if not any(isinstance(module, nn.MaxPool2d) for module in net):  # which takes the largest, not the middle
+        (cells,) = net.forward_intermediates(rows)
+        stride = 32 // cells.shape[-2]
+        inside = torch.arange(1, cells.shape[-2] - 1)
+        looks_at = cells[0, 0, 1:-1, cells.shape[-1] // 2] * 31
+        torch.testing.assert_close(looks_at + shift, inside * stride + (stride - 1) / 2, atol=1e-3, rtol=0)
+
+
+def test_weights_from_a_file_give_the_same_features(tmp_path: Path, vit: TimmEncoder) -> None:
+    from safetensors.torch import save_file
+
+    state = {key: value.contiguous() for key, value in vit._model.state_dict().items()}
+    head = {"head.weight": torch.zeros(1000, 192), "head.bias": torch.zeros(1000)}
+    save_file(state | head, str(tmp_path / "vit.safetensors"))
+    torch.save({"model": state}, tmp_path / "vit.pth")
+    images = torch.randn(1, 3, 32, 48)
+    for name in ("vit.safetensors", "vit.pth"):
+        opened = open_image_encoder(f"timm:vit_tiny_patch16_224@{tmp_path / name}")
+        assert torch.equal(opened.encode(images), vit.encode(images))
+        assert (opened.name, opened.text_space) == ("timm:vit_tiny_patch16_224", "none")
+    save_file({**state, "blocks.99.weight": torch.zeros(1)}, str(tmp_path / "more.safetensors"))
+    del state["cls_token"]
+    save_file(state, str(tmp_path / "less.safetensors"))
+    for name, what in (("more", "a strange blocks.99"), ("less", "cls_token")):
+        with pytest.raises(InvalidInput, match=what):
+            open_image_encoder(f"timm:vit_tiny_patch16_224@{tmp_path / name}.safetensors")
+
+
+def test_clip_from_a_file_has_the_text_space_that_opens_it(tmp_path: Path) -> None:
+    from liftcore.query.encoders import open_encoder
+    from liftcore.query.encoders.open_clip_models import create_model
+
+    torch.manual_seed(1)
+    torch.save(create_model("ViT-S-32-alt", None).state_dict(), tmp_path / "clip.pt")
+    spec = f"ViT-S-32-alt@{tmp_path / 'clip.pt'}"
+    encoder = open_image_encoder(f"maskclip:{spec}")
+    assert encoder.text_space == f"open_clip:{spec}"
+    assert encoder.name == "maskclip:ViT-S-32-alt"
+    assert open_encoder(encoder.text_space).channels == encoder.channels == 256
+    assert encoder.encode(torch.zeros(1, 3, 32, 64)).shape == (1, 1, 2, 256)
+
+
+@pytest.mark.parametrize(
+    ("spec", "message"),
+    [
+        ("", "one of maskclip"),
+        ("maskclip", "one of maskclip"),
+        ("sam:vit", "one of maskclip"),
+        ("maskclip:ViT-B-33/openai", "ViT-B-32"),
+        ("clip:ViT-B-32/nothing", "one of the tags"),
+        ("timm:resnet19", "resnet18"),
+        (f"timm:resnet18@{__file__}", "ending in"),
+    ],
+)
+def test_a_specification_that_is_none_is_refused(spec: str, message: str) -> None:
+    with pytest.raises(InvalidInput, match=message):
+        open_image_encoder(spec)
+
+
+@pytest.mark.parametrize(
+    ("spec", "message"),
+    [
+        ("maskclip:ViT-B-32", "tag or a file"),
+        ("clip:ViT-B-32@/no/such.pt", "nothing at"),
+        ("timm:resnet18@/no/such.pth", "nothing at"),
+    ],
+)
+def test_missing_weights_are_unavailable_and_never_random(spec: str, message: str) -> None:
+    with pytest.raises(Unavailable, match=message):
+        open_image_encoder(spec)
+
+
+@pytest.mark.parametrize("spec", ["maskclip:ViT-B-32/openai", "timm:resnet18.a1_in1k"])
+def test_weights_that_cannot_be_fetched_say_how_to_go_on(spec: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def offline(*_: object, **__: object) -> None:
+        raise OSError("no route to host")
+
+    import timm
+
+    monkeypatch.setattr(timm, "create_model", offline)
+    monkeypatch.setattr(library(), "create_model", offline)
+    with pytest.raises(Unavailable, match=r"no route to host; download them elsewhere and use .*@FILE"):
+        open_image_encoder(spec)
+
+
+@pytest.mark.parametrize("spec", ["maskclip:ViT-S-32-alt", "timm:resnet18"])
+def test_a_pickle_that_holds_code_is_refused(spec: str, tmp_path: Path) -> None:
+    torch.save({"state_dict": Path("code")}, tmp_path / "weights.pt")
+    with pytest.raises(InvalidInput, match="nothing else"):
+        open_image_encoder(f"{spec}@{tmp_path / 'weights.pt'}")
+
+
+def test_towers_without_a_value_path_are_refused() -> None:
+    with pytest.raises(InvalidInput, match="attention pooler"):
+        small_encoder("maskclip", small_vit(attentional_pool=True, attn_pooler_heads=2))
+    with pytest.raises(InvalidInput, match="ResNet's dense features"):
+        small_encoder("clip", small_resnet())
+
+
+def test_a_backbone_of_one_size_is_refused() -> None:
+    with pytest.raises(InvalidInput, match="any size"):
+        TimmEncoder._with_random_weights("mixer_s32_224")
+
+
+def test_a_device_that_is_not_there_is_unavailable() -> None:
+    for device in ("cuda:99", "nonsense"):
+        with pytest.raises(Unavailable, match="--device"):
+            open_image_encoder("timm:resnet18", device)

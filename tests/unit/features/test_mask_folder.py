@@ -1,0 +1,287 @@
+"""Masks with a vector each become region maps, the same from every kind of file; what does not fit is named."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from liftcore.errors import InvalidFeatures
+from liftcore.features.mask_folder import mask_views
+from liftcore.features.pack import open_packs
+from liftcore.features.views import Regions
+from liftcore.features.write_pack import write_pack
+from tests.run_lengths import sam_records
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+LABELS = np.array([[-1, 0, 0, 2], [1, 1, -1, 2], [1, 1, -1, -1]])
+MASKS = np.stack([k == LABELS for k in range(3)])
+VECTORS = np.arange(15, dtype=np.float32).reshape(3, 5)
+OVERLAPPING = np.stack([MASKS[0] | MASKS[1], MASKS[1], MASKS[2]])
+
+
+def save_picture(path: Path, values: np.ndarray, mode: str = "") -> None:
+    image = Image.fromarray(values)
+    if mode == "P":
+        image.putpalette([255, 0, 0, 0, 255, 0, 0, 0, 255])
+    image.save(path)
+
+
+def save_text(path: Path, content: object) -> None:
+    path.write_text(json.dumps(content), encoding="utf-8")
+
+
+def palette(folder: Path) -> None:
+    save_picture(folder / "a.png", (LABELS + 1).astype(np.uint8), "P")
+
+
+WRITERS = {
+    "grey of 8 bits": lambda folder: save_picture(folder / "a.png", (LABELS + 1).astype(np.uint8)),
+    "grey of 16 bits": lambda folder: save_picture(folder / "a.png", (LABELS + 1).astype(np.uint16)),
+    "palette": palette,
+    "ids": lambda folder: np.save(folder / "a_masks.npy", LABELS),
+    "ids on a level": lambda folder: np.save(folder / "a_masks.npy", LABELS[None].astype(np.int16)),
+    "ids as floats": lambda folder: np.save(folder / "a_masks.npy", LABELS.astype(np.float32)),
+    "booleans": lambda folder: np.save(folder / "a_masks.npy", MASKS),
+    "booleans down the columns": lambda folder: np.save(folder / "a_masks.npy", np.asfortranarray(MASKS)),
+    "uncompressed_rle": lambda folder: save_text(folder / "a.json", sam_records(MASKS)),
+    "coco_rle": lambda folder: save_text(folder / "a.json", sam_records(MASKS, as_string=True)),
+    "SA-1B": lambda folder: save_text(
+        folder / "a.json", {"image": {"image_id": 1}, "annotations": sam_records(MASKS, as_string=True)}
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+def test_every_kind_of_masks_makes_the_same_regions(kind: str, tmp_path: Path) -> None:
+    WRITERS[kind](tmp_path)
+    np.save(tmp_path / "a.npy", VECTORS)
+    write_pack(tmp_path / "pack.safetensors", mask_views(tmp_path), {})
+    packs = open_packs([tmp_path / "pack.safetensors"])
+    assert packs.views == ("a",)
+    view = packs.observation("a")
+    assert isinstance(view, Regions)
+    assert view.labels.tolist() == [LABELS.tolist()]
+    assert view.codebook.tolist() == VECTORS.tolist()
+
+
+@pytest.mark.parametrize(
+    ("unlabelled", "dtype"), [(255, np.uint8), (65_535, np.uint16), (255, np.uint16), (3, np.uint8)]
+)
+def test_pictures_with_another_value_for_none_number_masks_from_zero(unlabelled, dtype, tmp_path: Path) -> None:
+    save_picture(tmp_path / "a.png", np.where(LABELS < 0, unlabelled, LABELS).astype(dtype))
+    np.save(tmp_path / "a.npy", VECTORS)
+    assert mask_views(tmp_path, unlabelled).read("a").labels.tolist() == [LABELS.tolist()]
+
+
+@pytest.mark.parametrize("kind", ["booleans", "rle"])
+def test_masks_that_overlap_are_laid_on_levels(kind: str, tmp_path: Path) -> None:
+    if kind == "booleans":
+        np.save(tmp_path / "a_masks.npy", OVERLAPPING)
+    else:
+        save_text(tmp_path / "a.json", sam_records(OVERLAPPING))
+    np.save(tmp_path / "a.npy", VECTORS.astype(np.float16))
+    first = np.where(OVERLAPPING[0], 0, np.where(OVERLAPPING[2], 2, -1))
+    second = np.where(OVERLAPPING[1], 1, -1)
+    assert mask_views(tmp_path).read("a").labels.tolist() == [first.tolist(), second.tolist()]
+
+
+def test_views_are_named_as_their_cameras_are(tmp_path: Path) -> None:
+    for name in ("a.jpg", "frame.0001", "c"):
+        np.save(tmp_path / f"{name}.npy", VECTORS)
+    np.save(tmp_path / "a.jpg_masks.npy", MASKS)
+    save_text(tmp_path / "frame.0001.json", sam_records(MASKS))
+    save_picture(tmp_path / "c.PNG", (LABELS + 1).astype(np.uint8))
+    (tmp_path / "notes.txt").write_text("passed over", encoding="utf-8")
+    views = mask_views(tmp_path)
+    assert [*views] == ["a", "c", "frame.0001"]
+    assert {views.read(view).labels.tolist() == [LABELS.tolist()] for view in views} == {True}
+
+
+@pytest.mark.parametrize(
+    ("files", "message"),
+    [
+        (("a.npy",), r"masks in a\.json, a_masks\.npy or a\.png, got a\.npy alone"),
+        (
+            ("a_f.npy", "a_s.npy"),
+            r"got a_f\.npy alone; folders of LangSplat are packed by 'splatlift pack langsplat'",
+        ),
+        (("a.npy", "a.json", "b.json"), r"vectors in b\.npy, got b\.json alone; .*belong in another folder"),
+        (("a_masks.npy",), r"vectors in a\.npy, got a_masks\.npy alone"),
+        (("a.npy", "a.json", "a.png"), r"one file of masks a view, got a\.json and a\.png.*photos belong"),
+        (("a.npy", "a.jpg.npy", "a.json"), r"one file of vectors a view, got a\.jpg\.npy and a\.npy, both of"),
+        (("a.json",), r"\*\.npy files"),
+        (("a.pt",), "pickles"),
+    ],
+)
+def test_files_without_their_partners_are_told(files: tuple[str, ...], message: str, tmp_path: Path) -> None:
+    for name in files:
+        (tmp_path / name).write_bytes(b"not opened yet")
+    with pytest.raises(InvalidFeatures, match=message):
+        mask_views(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("vectors", "message"),
+    [
+        (np.zeros(3, np.float32), r"floats \[M, F\]"),
+        (np.zeros((3, 5), np.int32), r"floats \[M, F\], got int32"),
+        (np.array([[None]], dtype=object), "Python objects, which may run code"),
+        (VECTORS[:2], r"ids in -1\.\.1, got ids from -1 to 2"),
+    ],
+)
+def test_vectors_that_do_not_fit_are_refused(vectors: np.ndarray, message: str, tmp_path: Path) -> None:
+    np.save(tmp_path / "a_masks.npy", LABELS)
+    np.save(tmp_path / "a.npy", vectors)
+    with pytest.raises(InvalidFeatures, match=message):
+        mask_views(tmp_path)["a"]
+
+
+@pytest.mark.parametrize("bad", [np.nan, 1e300])
+def test_vectors_that_are_not_finite_in_a_pack_are_refused_with_their_view(bad: float, tmp_path: Path) -> None:
+    np.save(tmp_path / "a_masks.npy", LABELS)
+    np.save(tmp_path / "a.npy", np.where(VECTORS == 7, bad, VECTORS.astype(np.float64)))
+    with pytest.raises(InvalidFeatures, match=r"view 'a' features.*1 of 15"):
+        write_pack(tmp_path / "pack.safetensors", mask_views(tmp_path), {})
+    assert not (tmp_path / "pack.safetensors").exists()
+
+
+@pytest.mark.parametrize(
+    ("masks", "message"),
+    [
+        (MASKS[:2], r"3 masks, one a vector, got bool \[2, 3, 4\]; row k of the vectors is of mask k"),
+        (
+            OVERLAPPING.transpose(2, 0, 1),
+            r"got bool \[4, 3, 3\]; row k .*, and masks come first: \[M, H, W\]",
+        ),
+        (MASKS[0], r"booleans \[M, H, W\], got bool \[3, 4\]"),
+        (MASKS.astype(np.uint8), r"zeros and ones; .*astype\(bool\)"),
+        (np.full((3, 4), 3), r"ids in -1\.\.2"),
+        (np.full((3, 4), -2), r"ids in -1\.\.2"),
+        (np.full((3, 4), 255, np.uint8), r"got ids from 255 to 255"),
+        (np.full((3, 4), 0.5), "whole numbers"),
+        (np.zeros((1, 1, 3, 4), np.int32), r"mask ids \[L, H, W\]"),
+        (np.array([{}], dtype=object), "Python objects, which may run code"),
+        (np.array(["a"]), "an array of numbers"),
+    ],
+)
+def test_arrays_that_are_no_masks_are_refused(masks: np.ndarray, message: str, tmp_path: Path) -> None:
+    np.save(tmp_path / "a_masks.npy", masks)
+    np.save(tmp_path / "a.npy", VECTORS)
+    with pytest.raises(InvalidFeatures, match=message) as caught:
+        mask_views(tmp_path)["a"]
+    assert "a_masks.npy" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("", "no JSON"),
+        ('[{"segmentation": {"size": [3', "no JSON"),
+        ("\ufeffx", "no JSON"),
+        ("[" * 100_000, "no JSON"),
+        ("3", r"a list of masks, or \{'annotations': \[\.\.\.\]\}, got none"),
+        ('{"frames": [], "w": 3}', "an object of 'frames', 'w'; files of no views belong elsewhere"),
+        ("[]", "3 masks, one a vector, got 0; leave out views without masks"),
+        (json.dumps(sam_records(MASKS[:2])), "3 masks, one a vector, got 2; row k of the vectors is of mask k"),
+        (json.dumps([*sam_records(MASKS), *sam_records(MASKS)]), "got 6"),
+        (json.dumps([*sam_records(MASKS[:2]), 3]), r"a\.json mask 2: expected run lengths"),
+        (
+            json.dumps([*sam_records(MASKS[:2]), *sam_records(MASKS[2:, :2])]),
+            "one size, got 3 x 4 of mask 0 and 2 x 4 of mask 2",
+        ),
+    ],
+)
+def test_json_that_holds_no_such_masks_is_refused(content: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text(content, encoding="utf-8")
+    np.save(tmp_path / "a.npy", VECTORS)
+    with pytest.raises(InvalidFeatures, match=message) as caught:
+        mask_views(tmp_path)["a"]
+    assert "a.json" in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_json_beyond_the_limit_is_refused_unread(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("liftcore.features.sam_json.MAX_BYTES", 10)
+    save_text(tmp_path / "a.json", sam_records(MASKS))
+    np.save(tmp_path / "a.npy", VECTORS)
+    with pytest.raises(InvalidFeatures, match=r"at most 10 bytes, got \d+ bytes; .*coco_rle"):
+        mask_views(tmp_path)["a"]
+
+
+@pytest.mark.parametrize(
+    ("values", "unlabelled", "message"),
+    [
+        (LABELS + 2, 0, r"values 1\.\.3 for 3 vectors, and 0 for none, got values up to 4; name the value"),
+        (np.where(LABELS < 0, 255, LABELS), 0, r"got values up to 255; .*--unlabelled \(255, 65535\)"),
+        (LABELS.clip(0), 0, r"got values up to 2; is there a vector for 0 too"),
+        (np.zeros((3, 4)), 0, "got values up to 0"),
+        (LABELS + 1, 255, r"values 0\.\.2 for 3 vectors, and 255 for none, got the value 3; .*--unlabelled 0"),
+    ],
+)
+def test_values_that_do_not_end_with_the_vectors_are_refused(
+    values: np.ndarray, unlabelled: int, message: str, tmp_path: Path
+) -> None:
+    save_picture(tmp_path / "a.png", values.astype(np.uint8))
+    np.save(tmp_path / "a.npy", VECTORS)
+    with pytest.raises(InvalidFeatures, match=message):
+        mask_views(tmp_path, unlabelled)["a"]
+
+
+@pytest.mark.parametrize(
+    ("mode", "message"),
+    [
+        ("RGB", "red, green and blue of 8 bits; a photo belongs in another folder"),
+        ("RGBA", "colours with transparency of 8 bits"),
+        ("LA", "grey with transparency of 8 bits"),
+        ("1", "grey of 1 bits"),  # Pillow spreads fewer bits of grey over 0 to 255
+    ],
+)
+def test_pictures_of_other_kinds_are_refused(mode: str, message: str, tmp_path: Path) -> None:
+    Image.new(mode, (4, 3)).save(tmp_path / "a.png")
+    np.save(tmp_path / "a.npy", VECTORS)
+    with pytest.raises(InvalidFeatures, match=message):
+        mask_views(tmp_path)["a"]
+
+
+@pytest.mark.parametrize("kept", [0, 8, 20, 30, 60, 2000])
+def test_pictures_that_are_cut_off_are_refused(kept: int, tmp_path: Path) -> None:
+    save_picture(tmp_path / "a.png", np.random.default_rng(0).integers(0, 4, (128, 128), np.uint8))
+    content = (tmp_path / "a.png").read_bytes()
+    assert len(content) > 4000
+    (tmp_path / "a.png").write_bytes(content[:kept])
+    np.save(tmp_path / "a.npy", VECTORS)
+    with pytest.raises(InvalidFeatures, match=r"a\.png: expected a PNG of one channel"):
+        mask_views(tmp_path)["a"]
+
+
+def test_pictures_beyond_pillows_limit_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    palette(tmp_path)
+    np.save(tmp_path / "a.npy", VECTORS)
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 11)
+    assert mask_views(tmp_path).read("a").labels.tolist() == [LABELS.tolist()]
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 5)
+    with pytest.raises(InvalidFeatures, match="at most 10 pixels, got a larger picture"):
+        mask_views(tmp_path)["a"]
+
+
+def test_one_mask_over_the_whole_photo_is_one(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", VECTORS[:1])
+    np.save(tmp_path / "a_masks.npy", np.zeros((1, 3, 4), np.int32))
+    assert not mask_views(tmp_path).read("a").labels.any()
+
+
+def test_masks_of_sub_folders_are_views_with_their_folders(tmp_path: Path) -> None:
+    for camera, ids in (("camA", LABELS), ("camB", LABELS[::-1])):
+        (tmp_path / camera).mkdir()
+        np.save(tmp_path / camera / "0.jpg.npy", VECTORS)
+        np.save(tmp_path / camera / "0_masks.npy", ids)
+    (tmp_path / ".thumbnails").mkdir()
+    (tmp_path / ".thumbnails" / "0.png").write_bytes(b"no mask")
+    views = mask_views(tmp_path)
+    assert list(views) == ["camA/0", "camB/0"]
+    assert np.array_equal(views.read("camB/0").labels.numpy()[0], LABELS[::-1])
