@@ -177,7 +177,7 @@ def test_an_answer_is_to_one_question_alone(changed: str) -> None:
         "focal": replace(look, camera=replace(camera, fx=camera.fx + 1e-9)),
         "labels": replace(look, observation=replace(regions, labels=labels)),
         "codebook": replace(look, observation=replace(regions, codebook=torch.zeros(4, 2))),
-        "stride": replace(look, walk=CompositingParams(stride=2)),
+        "stride": replace(look, params=CompositingParams(stride=2)),
         "power": replace(look, weighting=Weighting(power=2)),
         "pixels": replace(look, pixels=look.pixels + 1),
     }[changed]
