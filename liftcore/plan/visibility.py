@@ -58,7 +58,7 @@ class Visibility:
 def visibility(splats: Splats, cameras: Sequence[Camera], walk: CompositingParams) -> Visibility:
     """Project evenly spaced splats, SAMPLE at most, into every camera."""
     sample = spread_splats(splats, min(SAMPLE, splats.count))
-    scene, count = activated(sample, walk.gain), sample.count
+    scene, count = activated(sample, walk.opacity_logit_scale), sample.count
     areas = np.zeros((len(cameras), count), np.float32)
     records = np.empty((count, RECORDS[splats.kernel]))
     targets = Targets(records, np.empty(count, np.float32), np.empty(count, np.int32))

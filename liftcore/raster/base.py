@@ -33,7 +33,7 @@ __all__ = [
 class CompositingParams:
     """How a ray walks through the splats, front to back."""
 
-    gain: float = 1.0  # lambda: alpha~ = sigmoid(lambda theta)
+    opacity_logit_scale: float = 1.0  # lambda: alpha~ = sigmoid(lambda theta)
     alpha_cap: float = 0.99  # the largest alpha of a splat on a ray
     transmittance_stop: float = 1e-4  # exclusive: the splat that would bring T to it or below adds nothing
     antialiased: bool = False  # the mip filter's opacity compensation, 3DGS only
@@ -53,7 +53,7 @@ class RegionWeights:
     columns: Tensor  # [nnz] i32 ascending in a row, rows of the codebook
     weights: Tensor  # [nnz] f32, sums over rays of the selected w^p times the reading S
     evidence_splats: Tensor  # [m] i32 ascending, the splats that any ray met, labelled or not
-    evidence: Tensor  # [m] f32, sum of plain weights w (gain 1, power 1), each ray once
+    evidence: Tensor  # [m] f32, sum of plain weights w (opacity_logit_scale 1, power 1), each ray once
 
 
 @dataclass(frozen=True)

@@ -108,7 +108,7 @@ class OracleRaster:
         walked = walked_rays(camera, walk)
         chosen = counted_weights(A, self.splats, camera, walk, weighting)[0]
         W = chosen[ray[walked[ray]]].T @ S[walked[ray]]
-        plain = dense_view(self.splats, camera, replace(walk, gain=1.0)).A[walked].sum(axis=0)
+        plain = dense_view(self.splats, camera, replace(walk, opacity_logit_scale=1.0)).A[walked].sum(axis=0)
         rows, columns = np.nonzero(W)
         splats, counts = np.unique(rows, return_counts=True)
         met = np.flatnonzero(plain)

@@ -73,7 +73,7 @@ def alphas(
     splats: Splats, j: int, camera: Camera, walk: CompositingParams, pixels: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Alpha of splat j on rays through ``pixels`` [R, 2], before the cap, and the rays [R] hard to decide."""
-    opacity = 1 / (1 + np.exp(-walk.gain * float(splats.opacity_logits[j])))
+    opacity = 1 / (1 + np.exp(-walk.opacity_logit_scale * float(splats.opacity_logits[j])))
     if splats.kernel is Kernel.GAUSSIAN_2D:
         g, hard = disc_exponents(splats, j, camera, pixels)
         return _above_the_floor(opacity * np.exp(-g / 2), hard)

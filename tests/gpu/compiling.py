@@ -151,7 +151,9 @@ def main() -> None:
     every: dict[Launch, None] = {}
     for kernel in Kernel:
         how = (
-            (CompositingParams(gain=1.2), TOP) if kernel is Kernel.GAUSSIAN_3D else (CompositingParams(), Weighting())
+            (CompositingParams(opacity_logit_scale=1.2), TOP)
+            if kernel is Kernel.GAUSSIAN_3D
+            else (CompositingParams(), Weighting())
         )
         warm = launches_of(partial(warm_up, kernel, _CARD, *how))
         lift = launches_of(partial(_views, kernel, *how))

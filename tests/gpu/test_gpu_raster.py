@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from liftcore.scene.cameras import Camera
 
 pytestmark = [needs_triton, pytest.mark.usefixtures("every_kernel")]
-WALK = CompositingParams(gain=1.2)
+WALK = CompositingParams(opacity_logit_scale=1.2)
 WEIGHTINGS = (
     Weighting(),
     Weighting(0, Selection.TOP_K, count=2, floor=0.02),
@@ -126,7 +126,7 @@ def test_no_bit_depends_on_the_memory_that_is_free(monkeypatch, kernel):
     assert frame.bands == [(0, 1), (1, 2), (2, 3)] and frame.room.splats == 7
     every = [frame.lists_of(band) for band in frame.bands]
     assert [len(frame.tile_runs(lists)) for lists in every] == [2, 2, 2]
-    assert tight._scene_with(WALK.gain).means.device.type == "cpu"  # it comes in blocks
+    assert tight._scene_with(WALK.opacity_logit_scale).means.device.type == "cpu"  # it comes in blocks
     assert all(lists.ids.numel() < splats.count for lists in every)  # a strip's own splats alone
 
 

@@ -26,8 +26,8 @@ INSIDE = 1e-5  # absolute, on weights
 FLIPS = 1e-2  # of rays: on tiny random images one ray in a hundred; the pooled test below holds 1e-4
 WALKS = (
     CompositingParams(),
-    CompositingParams(gain=1.2),
-    CompositingParams(gain=0.5),
+    CompositingParams(opacity_logit_scale=1.2),
+    CompositingParams(opacity_logit_scale=0.5),
     CompositingParams(alpha_cap=0.999, transmittance_stop=0.05),
 )
 SELECTIONS = (
@@ -90,7 +90,7 @@ def test_region_weights_equal_the_oracle(footprint, backend):
         splats, camera, observation, walk = drawn(data, footprint)
         view = dense_view(splats, camera, walk)
         S, ray = reading_matrix(observation, camera.width, camera.height)
-        if dense_view(splats, camera, replace(walk, gain=1.0)).cut.any() or view.cut.any():
+        if dense_view(splats, camera, replace(walk, opacity_logit_scale=1.0)).cut.any() or view.cut.any():
             return  # the pooled test counts the flips
         expected = np.where(view.A > 0, view.A**power, 0.0)[ray].T @ S
         weights = backend.open(splats).region_weights(camera, observation, walk, Weighting(power))
@@ -135,7 +135,7 @@ def test_evidence_is_the_sum_of_plain_weights_whatever_the_gain(footprint, backe
     @backend.holds(st.data())
     def check(data) -> None:
         splats, camera, observation, walk = drawn(data, footprint)
-        view = dense_view(splats, camera, replace(walk, gain=1.0))
+        view = dense_view(splats, camera, replace(walk, opacity_logit_scale=1.0))
         weights = backend.open(splats).region_weights(camera, observation, walk, Weighting(2))
         evidence = np.zeros(splats.count)
         evidence[weights.evidence_splats.numpy()] = weights.evidence.numpy()
@@ -208,7 +208,7 @@ def test_views_walked_in_a_row_are_those_walked_alone_to_the_bit(footprint, back
         ViewRequest(
             random_camera(k, 14, 13),
             random_regions(k),
-            replace(walk, gain=1.0 + k % 2 / 5),
+            replace(walk, opacity_logit_scale=1.0 + k % 2 / 5),
             Weighting(),
             pixels[k % 2],
         )
@@ -229,7 +229,7 @@ def test_views_walked_in_a_row_are_those_walked_alone_to_the_bit(footprint, back
 @pytest.mark.parametrize("gain", [1.0, 1.2])
 def test_the_number_of_threads_changes_no_bit(footprint, gain):
     (splats, walk), camera = seeded(footprint, 7, 3_000), random_camera(7, 200, 150)
-    walk = replace(walk, gain=gain)
+    walk = replace(walk, opacity_logit_scale=gain)
     for observation in (random_regions(7, 4, 30, (75, 100)), random_grid(7, (10, 13))):
         runs = [
             CpuRaster(splats, threads=n).region_weights(camera, observation, walk, Weighting(2)) for n in (1, 2, 5)

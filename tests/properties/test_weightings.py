@@ -39,7 +39,7 @@ NAMES = [f"{w.selection}-{w.count if w.selection is Selection.TOP_K else w.mass}
 
 hypothesis_settings = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 weightings = st.sampled_from(WEIGHTINGS)
-gains = st.sampled_from([CompositingParams(), CompositingParams(gain=1.2)])
+gains = st.sampled_from([CompositingParams(), CompositingParams(opacity_logit_scale=1.2)])
 
 
 def every_ray(camera) -> Regions:
@@ -132,14 +132,16 @@ def test_strided_pixels_read_what_they_read_at_full_resolution(data, scene):
 @pytest.mark.parametrize("weighting", WEIGHTINGS, ids=NAMES)
 def test_the_evidence_is_the_same_in_every_weighting(weighting):
     splats, camera = random_splats(3, 400), random_camera(3, 90, 70)
-    for walk in (CompositingParams(), CompositingParams(gain=1.2)):
+    for walk in (CompositingParams(), CompositingParams(opacity_logit_scale=1.2)):
         usual, own = (CpuRaster(splats).region_weights(camera, random_regions(3), walk, w) for w in (ALL, weighting))
         assert torch.equal(usual.evidence_splats, own.evidence_splats)
         assert torch.allclose(usual.evidence, own.evidence, rtol=1e-6)
 
 
 @pytest.mark.parametrize("count", [1, 2, 5, 64])
-@pytest.mark.parametrize("walk", [CompositingParams(), CompositingParams(gain=1.2)], ids=["plain", "gain"])
+@pytest.mark.parametrize(
+    "walk", [CompositingParams(), CompositingParams(opacity_logit_scale=1.2)], ids=["plain", "gain"]
+)
 def test_exactly_k_weights_of_a_ray_count(count, walk):
     splats, camera = random_splats(11, 500), random_camera(11, 90, 70)
     every = chosen_of(splats, camera, walk, Weighting(0)).sum(axis=1)
@@ -173,7 +175,9 @@ def test_of_equal_weights_the_nearest_counts():
 
 @pytest.mark.parametrize("weighting", [ALL, *WEIGHTINGS], ids=["all", *NAMES])
 @pytest.mark.parametrize(
-    "walk", [CompositingParams(gain=1.2), CompositingParams(stride=3, offset=(1, 2))], ids=["full", "strided"]
+    "walk",
+    [CompositingParams(opacity_logit_scale=1.2), CompositingParams(stride=3, offset=(1, 2))],
+    ids=["full", "strided"],
 )
 def test_the_number_of_threads_changes_no_bit(weighting, walk):
     splats, camera = random_splats(7, 2_000), random_camera(7, 200, 150)

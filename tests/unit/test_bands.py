@@ -27,7 +27,7 @@ def cut(monkeypatch):
 def products(raster: CpuRaster) -> dict[str, tuple[torch.Tensor, ...]]:
     """All that tiles give by themselves."""
     rng = np.random.default_rng(0)
-    count, walk = raster.splats.count, CompositingParams(gain=1.2)
+    count, walk = raster.splats.count, CompositingParams(opacity_logit_scale=1.2)
     values = torch.tensor(rng.normal(0, 1, (count, 35)), dtype=torch.float32)
     labels = torch.tensor(rng.integers(-1, 4, count), dtype=torch.int32)
     rows = raster.ray_rows(CAMERA, PIXELS, walk)
@@ -41,7 +41,7 @@ def products(raster: CpuRaster) -> dict[str, tuple[torch.Tensor, ...]]:
 def weights_of(raster: CpuRaster, weighting: Weighting) -> list[tuple[torch.Tensor, ...]]:
     """Region weights of labels on two levels and of a grid, strided."""
     looks = (
-        (random_regions(3), CompositingParams(gain=1.2)),
+        (random_regions(3), CompositingParams(opacity_logit_scale=1.2)),
         (random_grid(3), CompositingParams(stride=2, offset=(1, 0))),
     )
     found = [raster.region_weights(CAMERA, observation, walk, weighting) for observation, walk in looks]

@@ -84,7 +84,7 @@ class CpuRaster:
         bands = self._bands(camera, walk)
         reading = reading_of(observation, camera.width, camera.height, walk)
         squared, gate = choice.power == 2, choice if choice.gated else None
-        plain = True if walk.gain != 1.0 else None
+        plain = True if walk.opacity_logit_scale != 1.0 else None
 
         def weigh(frame: Frame, first: int, last: int) -> tuple[np.ndarray, ...]:
             return weigh_tiles(first, last, frame, reading, squared, gate, plain)
@@ -103,7 +103,7 @@ class CpuRaster:
         first = list(islice(looks, views_at_a_time(self.threads)))  # fewer views than that have more threads each
         if not first:
             return
-        self._activated(first[0].params.gain)  # once for all: the views of a lift have one gain
+        self._activated(first[0].params.opacity_logit_scale)  # once for all: the views of a lift have one gain
         rasters = [self._beside(end - begin) for begin, end in _shares(self.threads, len(first))]
         try:
             yield from side_by_side(rasters, chain(first, looks))
@@ -197,7 +197,7 @@ class CpuRaster:
     def _project(self, view: View, walk: CompositingParams) -> tuple[np.ndarray, np.ndarray]:
         """Fill the records; give the splat of every record [P] i32 and the depth order [n] i32."""
         targets = Targets(self._records, self._depths, np.full(self.splats.count, -1, np.int32))
-        scene, kernel = self._activated(walk.gain), self.splats.kernel
+        scene, kernel = self._activated(walk.opacity_logit_scale), self.splats.kernel
         bounds = _shares(self.splats.count, SPLAT_SHARES)
         counts = self._map(
             lambda first, last: project((first, last), scene, view, kernel, walk.antialiased, targets), bounds

@@ -126,7 +126,7 @@ class GpuRaster:
         self, reading: DeviceReading, camera: Camera, walk: CompositingParams, weighting: Weighting
     ) -> RegionWeights:
         choice, frame = choice_of(weighting), self._frame(camera, walk, reading.levels)
-        return weighing.region_weights(frame, reading, choice, walk.gain != 1.0, self.splats.count)
+        return weighing.region_weights(frame, reading, choice, walk.opacity_logit_scale != 1.0, self.splats.count)
 
     def _brought(self, weights: RegionWeights) -> RegionWeights:
         """Where they are wanted. A host without room for them is no reason for smaller pieces on the device."""
@@ -208,7 +208,7 @@ class GpuRaster:
         levels = max(levels, USUAL_LEVELS)  # one level may stand for tuples of several, and has as many sums
         need = raster_bytes(self.splats.count, view.width, view.height, self.splats.kernel, levels)
         room = room_within(self._free, self.splats.kernel, need)
-        scene = self._scene_with(walk.gain)
+        scene = self._scene_with(walk.opacity_logit_scale)
         projection = Projection(scene, view, self.splats.kernel, walk.antialiased, self.device, room.splats)
         frame = Frame(projection, walk, room)
         self._kept = camera, walk, frame

@@ -131,13 +131,17 @@ OPACITIES: tuple[Extreme, ...] = (
     walked(
         "the gain lambda at 0.01",
         "every opacity near a half",
-        lambda kernel: _row(kernel, logits=[5.0, -5.0, 1.0, 0.0, -1.0], walk=CompositingParams(gain=0.01)),
+        lambda kernel: _row(
+            kernel, logits=[5.0, -5.0, 1.0, 0.0, -1.0], walk=CompositingParams(opacity_logit_scale=0.01)
+        ),
         lambda A: 0.3 < A[:, 1].max() < 0.6,
     ),
     walked(
         "the gain lambda at 16",
         "every opacity near nought or one",
-        lambda kernel: _row(kernel, logits=[5.0, -5.0, 1.0, 0.0, -1.0], walk=CompositingParams(gain=16.0)),
+        lambda kernel: _row(
+            kernel, logits=[5.0, -5.0, 1.0, 0.0, -1.0], walk=CompositingParams(opacity_logit_scale=16.0)
+        ),
         lambda A: A[:, [1, 4]].max() == 0,
         kernels=FLOORED,
     ),

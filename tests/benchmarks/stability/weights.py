@@ -75,7 +75,9 @@ def compare(splats: Splats, camera: Camera, walk: CompositingParams | None = Non
     errors = np.abs(np.concatenate([weights - exact.A, single - exact.A, squares - exact.A**2], axis=1)).max(axis=1)
     errors = np.maximum(errors, np.abs(sums - exact.A.sum(axis=1)))
     worst = float(errors[~exact.cut].max(initial=0))
-    plain = exact if walk.gain == 1 else exact_view(splats, camera, replace(walk, gain=1.0))
+    plain = (
+        exact if walk.opacity_logit_scale == 1 else exact_view(splats, camera, replace(walk, opacity_logit_scale=1.0))
+    )
     if not plain.cut.any():
         total = plain.A.sum(axis=0)
         worst = max(worst, float((np.abs(evidence - total) / np.maximum(total, 1)).max()))

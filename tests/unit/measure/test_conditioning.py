@@ -66,7 +66,7 @@ def test_hidden_splats_are_counted_and_left_out():
 
 def test_rays_are_rows_of_the_scenes_matrix():
     splats, camera = random_splats(5), random_camera(5)
-    dense = exact_view(splats, camera, CompositingParams(gain=2.0)).A
+    dense = exact_view(splats, camera, CompositingParams(opacity_logit_scale=2.0)).A
     all_rays = rays_of(CpuRaster(splats), [camera], 2.0, camera.width * camera.height).toarray()
     assert np.abs(all_rays - dense).max() < 1e-5
     fewer = rays_of(CpuRaster(splats), [camera], 2.0, camera.width * camera.height // 9).toarray()

@@ -63,7 +63,7 @@ def test_attention_is_the_scores_rendered_with_the_lifts_gain(scene: QueryScene)
     scores = torch.where(answer.seen, answer.scores, 0.0)[:, None]
     torch.testing.assert_close(seen.attention, scene.raster.render(camera, scores, scene.walk)[:, :, 0])
     torch.testing.assert_close(seen.row_sums, scene.raster.row_sums(camera, scene.walk))
-    assert scene.walk.gain == scene.lift.metadata.settings.render_gain == 1.2
+    assert scene.walk.opacity_logit_scale == scene.lift.metadata.settings.render_gain == 1.2
 
 
 def test_a_mask_is_where_most_of_a_ray_is_of_what_was_found(scene: QueryScene) -> None:
