@@ -21,7 +21,7 @@ from liftcore.plan.plan import plan_lift
 from liftcore.progress import Progress, one_step
 from liftcore.raster.antialiased import check_antialiased
 from liftcore.raster.open_raster import open_raster
-from liftcore.solve.accumulate import Geometry, accumulate, as_read, lift_walk
+from liftcore.solve.accumulate import Geometry, accumulate, as_read
 from liftcore.solve.aggregation import Aggregation, aggregate
 from liftcore.solve.all_rays import AllRays
 from liftcore.solve.certificate import certify
@@ -46,8 +46,8 @@ if TYPE_CHECKING:
     from liftcore.raster.base import Raster
     from liftcore.scene.cameras import Cameras
     from liftcore.scene.splats import Kernel, Splats
+    from liftcore.settings import LiftSettings
     from liftcore.solve.closed_form import Solution
-    from liftcore.solve.settings import LiftSettings
 
 LEAST_KEPT = 0.5  # of a splat's weight, in regions that the aggregation kept, for it to be solved for again
 
@@ -231,7 +231,7 @@ def _refine(
             sources.splats.count,
             [sources.cameras.get(name) for name in names],
             lambda view: as_read(sources.packs.observation(names[view]), settings, names[view]),
-            lift_walk(settings),
+            settings.lift_params,
             progress,
         )
     if settings.cg_steps:

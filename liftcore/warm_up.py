@@ -10,7 +10,6 @@ import torch
 from liftcore.progress import silent
 from liftcore.raster.base import RegionWeights
 from liftcore.raster.cpu.warm_up import warm_up
-from liftcore.solve.accumulate import lift_walk, weighting_of
 from liftcore.solve.closed_form import warm_up_solution
 from liftcore.solve.columns import warm_up_tuples
 from liftcore.solve.host import Host
@@ -20,12 +19,12 @@ from liftcore.solve.view_weights import WeightStore
 if TYPE_CHECKING:
     from liftcore.device import Device
     from liftcore.scene.splats import Kernel
-    from liftcore.solve.settings import LiftSettings
+    from liftcore.settings import LiftSettings
 
 
 def warm_up_lift(kernel: Kernel, device: Device, settings: LiftSettings) -> None:
     """Compile what a lift with these settings runs, or load it from the disk cache; aggregation's sums excepted."""
-    warm_up(kernel, device, lift_walk(settings), weighting_of(settings))
+    warm_up(kernel, device, settings.lift_params, settings.weighting)
     warm_up_tuples()
     if device.kind == "cpu":
         warm_up_solution()

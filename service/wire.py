@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from liftcore.solve.settings import LiftSettings
+from liftcore.settings import LiftSettings
 from service.fields import Body, NoBoolean, Published, at_most, takes
 
 ASSET_ID = r"^sha256:[0-9a-f]{64}$"

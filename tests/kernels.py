@@ -12,7 +12,7 @@ from pathlib import Path
 from liftcore.lift import lift
 from liftcore.raster.cpu.warm_up import warm_up
 from liftcore.scene.splats import Kernel
-from liftcore.solve.settings import LiftSettings
+from liftcore.settings import LiftSettings
 from tests.api.tiny_scene import make_scene
 
 

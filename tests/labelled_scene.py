@@ -20,7 +20,7 @@ from liftcore.io.lift_file import LiftMetadata, LiftResult, save_lift
 from liftcore.io.ply import write_splats
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.splats import Splats
-from liftcore.solve.settings import LiftSettings
+from liftcore.settings import LiftSettings
 
 WIDTH, HEIGHT, FOCAL, DISTANCE = 160, 120, 100.0, 4.0
 SPACING = 0.08  # units between splats: 2 pixels

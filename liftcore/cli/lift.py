@@ -11,7 +11,7 @@ from liftcore.cli.reply import free_output, reply, shown, writing
 from liftcore.errors import InvalidInput, InvalidSettings
 from liftcore.nearest import nearest
 from liftcore.progress import one_step
-from liftcore.solve.settings import LiftSettings
+from liftcore.settings import LiftSettings
 
 if TYPE_CHECKING:
     import argparse

@@ -9,7 +9,7 @@ from liftcore.cli.bars import progress_bars
 from liftcore.cli.lift import pairs_of
 from liftcore.cli.reply import free_output, reply, writing
 from liftcore.errors import InvalidSettings
-from liftcore.solve.settings import LiftSettings
+from liftcore.settings import LiftSettings
 
 if TYPE_CHECKING:
     import argparse

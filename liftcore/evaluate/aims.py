@@ -21,9 +21,8 @@ from liftcore.evaluate.region_walk import walk_regions
 from liftcore.features.views import Regions
 from liftcore.progress import silent
 from liftcore.raster.open_raster import open_raster
-from liftcore.solve.accumulate import lift_walk, weighting_of
+from liftcore.settings import LiftSettings
 from liftcore.solve.host import Host
-from liftcore.solve.settings import LiftSettings
 from liftcore.solve.solver import closed_form
 from liftcore.solve.view_weights import WeightStore
 
@@ -32,8 +31,8 @@ if TYPE_CHECKING:
 
     from liftcore.device import Device
     from liftcore.evaluate.bench import Workload
+    from liftcore.settings import Preset
     from liftcore.solve.columns import Columns
-    from liftcore.solve.settings import Preset
 
 CHANNELS = FEW, USUAL, MANY = 64, 512, 1024
 PASSES = 3  # of which the median counts
@@ -68,7 +67,7 @@ def measure_aims(work: Workload, preset: Preset, device: Device, threads: int | 
         peak without pages of files where the system tells it.
     """
     settings, count = LiftSettings.of(preset=preset), work.splats.count
-    looking, raster = (lift_walk(settings), weighting_of(settings)), open_raster(work.splats, device, threads)
+    looking, raster = (settings.lift_params, settings.weighting), open_raster(work.splats, device, threads)
     geometry, solution = [], {channels: [] for channels in CHANNELS}
     peaks: dict[int, int] = {}
     host = Host(threads, means=work.splats.means)

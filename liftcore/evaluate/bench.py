@@ -18,9 +18,8 @@ from liftcore.evaluate.synthetic import room_cameras, room_regions, room_splats
 from liftcore.features.views import Regions, ViewFeatures
 from liftcore.progress import silent
 from liftcore.raster.open_raster import open_raster
-from liftcore.solve.accumulate import lift_walk, weighting_of
+from liftcore.settings import LiftSettings, Preset
 from liftcore.solve.host import Host
-from liftcore.solve.settings import LiftSettings, Preset
 from liftcore.solve.solver import closed_form
 from liftcore.solve.view_weights import WeightStore
 from liftcore.warm_up import warm_up_lift
@@ -103,7 +102,7 @@ def time_lift(work: Workload, preset: Preset, device: Device, threads: int | Non
     ``geometry_s_per_view_min`` is that of the shortest pass.
     """
     settings, count = LiftSettings.of(preset=preset), work.splats.count
-    looking, raster = (lift_walk(settings), weighting_of(settings)), open_raster(work.splats, device, threads)
+    looking, raster = (settings.lift_params, settings.weighting), open_raster(work.splats, device, threads)
     with WeightStore() as store:  # for the caches alone
         walk_regions(raster, work.views[:1], looking, count, store)
     geometry, solution, entries = [], [], 0

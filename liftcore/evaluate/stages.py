@@ -19,11 +19,10 @@ import torch
 
 from liftcore.progress import silent
 from liftcore.raster.cpu.raster import CpuRaster
-from liftcore.solve.accumulate import lift_walk, weighting_of
+from liftcore.settings import LiftSettings
 from liftcore.solve.closed_form import solve_closed_form
 from liftcore.solve.columns import by_tuples
 from liftcore.solve.host import Host
-from liftcore.solve.settings import LiftSettings
 from liftcore.solve.totals import row_totals
 from liftcore.solve.view_weights import WeightStore
 
@@ -36,7 +35,7 @@ if TYPE_CHECKING:
     from liftcore.raster.cpu.projection import View
     from liftcore.raster.cpu.walk import Frame
     from liftcore.scene.splats import Splats
-    from liftcore.solve.settings import Preset
+    from liftcore.settings import Preset
 
 STAGES = ("projection", "order", "lists", "walk", "merge", "rest", "solution")
 
@@ -102,7 +101,7 @@ def time_stages(work: Workload, preset: Preset) -> dict[str, Any]:
     ``rest`` is what a view takes beside the named steps: its tuples of labels, its reading, row totals, keeping W.
     """
     settings = LiftSettings.of(preset=preset)
-    raster, walk, weighting = TimedRaster(work.splats), lift_walk(settings), weighting_of(settings)
+    raster, walk, weighting = TimedRaster(work.splats), settings.lift_params, settings.weighting
     denominators, views, columns = np.zeros(work.splats.count), [], []
     with WeightStore() as store:
         raster.region_weights(*work.views[0], walk, weighting)  # warm caches, not counted

@@ -16,7 +16,7 @@ import torch
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from liftcore.errors import InvalidLift
-from liftcore.solve.settings import LiftSettings
+from liftcore.settings import LiftSettings
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from liftcore.features.pack import FeaturePacks
     from liftcore.plan.visibility import Visibility
     from liftcore.scene.cameras import Camera
-    from liftcore.solve.settings import LiftSettings
+    from liftcore.settings import LiftSettings
 
 OPEN, MET, BEND = 0.24, 0.68, 0.45
 MORE_ENTRIES = 0.6  # of a level's for each further level, where columns are tuples; as many where they are rows

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from liftcore.plan.entries import PlannedEntries
     from liftcore.scene.cameras import Camera
     from liftcore.scene.splats import Splats
-    from liftcore.solve.settings import LiftSettings
+    from liftcore.settings import LiftSettings
 
 LIBRARIES = 450_000_000  # of torch, numba, numpy and the compiled kernels, before anything is read
 ENTRY_BYTES, ROW_BYTES = 8, 20  # column and weight; a splat's ids, row start and evidence

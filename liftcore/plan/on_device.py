@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from liftcore.plan.entries import PlannedEntries
     from liftcore.scene.cameras import Camera
     from liftcore.scene.splats import Splats
-    from liftcore.solve.settings import LiftSettings
+    from liftcore.settings import LiftSettings
 
 MIB = 2**20
 ROOM_SPARE = 0.9  # of the free memory, as liftcore.raster.gpu.room has it (which loads triton)

@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from liftcore.raster.base import RegionWeights
     from liftcore.scene.cameras import Cameras
     from liftcore.scene.splats import Splats
-    from liftcore.solve.settings import LiftSettings
+    from liftcore.settings import LiftSettings
 
 PILOT_SIDE = 160  # pixels of an image's longer side, about
 PILOT_CHANNELS = 64

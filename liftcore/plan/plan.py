@@ -27,7 +27,6 @@ from liftcore.plan.rank import ENOUGH, Rank, codebook_rank
 from liftcore.plan.visibility import visibility
 from liftcore.raster.cpu.side_by_side import views_at_a_time
 from liftcore.scene.distorted import distortion_warning
-from liftcore.solve.accumulate import lift_walk
 from liftcore.solve.map_shapes import shape_warnings
 
 if TYPE_CHECKING:
@@ -40,7 +39,7 @@ if TYPE_CHECKING:
     from liftcore.plan.visibility import Visibility
     from liftcore.scene.cameras import Cameras
     from liftcore.scene.splats import Splats
-    from liftcore.solve.settings import LiftSettings
+    from liftcore.settings import LiftSettings
 
 FEW_VIEWS = 32  # and below, view_cosine takes all: a pilot would cost what it saves
 SHOWN_VIEWS = 6  # names in a line for people
@@ -175,7 +174,7 @@ def plan_lift(
             the lift was sent to has none.
     """
     by_name = {name: cameras.get(name) for name in names}
-    seen = visibility(splats, list(by_name.values()), lift_walk(settings))
+    seen = visibility(splats, list(by_name.values()), settings.lift_params)
     chosen, expected = _choose_views(
         seen, settings, lambda: fly_pilot(splats, cameras, packs, names, settings, seen, threads)
     )

@@ -14,7 +14,6 @@ from liftcore.query.scores import mean_direction
 from liftcore.query.unchanged import unchanged
 from liftcore.raster.base import CompositingParams
 from liftcore.scene.lens import drawn_by, photo_size
-from liftcore.solve.accumulate import render_walk
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -171,4 +170,4 @@ class QueryScene:
     @property
     def walk(self) -> CompositingParams:
         """How rays walk when scores are rendered: with the lift's rendering gain (App. Tikhonov)."""
-        return render_walk(self.lift.metadata.settings)
+        return self.lift.metadata.settings.render_params

@@ -14,7 +14,7 @@ from liftcore.device import out_of_memory
 from liftcore.features.levels import at_levels
 from liftcore.features.views import FeatureGrid, Regions, ViewFeatures
 from liftcore.one_thread import one_thread
-from liftcore.raster.base import CompositingParams, RayRows, ViewRequest, Weighting
+from liftcore.raster.base import CompositingParams, RayRows, ViewRequest
 from liftcore.solve.columns import Columns, as_walked
 from liftcore.solve.readout import Readout, read_pixels, sample_pixels
 from liftcore.solve.totals import Totals
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from liftcore.progress import Progress
     from liftcore.raster.base import Raster, RegionWeights
     from liftcore.scene.cameras import Camera, Cameras
-    from liftcore.solve.settings import LiftSettings
+    from liftcore.settings import LiftSettings
     from liftcore.solve.view_weights import WeightStore
 
 
@@ -55,30 +55,11 @@ class Geometry:
         return tuple(columns.codebook for columns in self.columns)
 
 
-def lift_walk(settings: LiftSettings) -> CompositingParams:
-    """The walk that lifts."""
-    return CompositingParams(
-        settings.lift_gain, settings.alpha_cap, settings.transmittance_stop, settings.antialiased
-    )
-
-
-def weighting_of(settings: LiftSettings) -> Weighting:
-    """What counts as a weight when lifting."""
-    return Weighting(settings.power, settings.selection, settings.k, settings.mass, settings.weight_floor)
-
-
 def strided_walk(walk: CompositingParams, settings: LiftSettings, camera: Camera, number: int) -> CompositingParams:
     """The walk with the stride, its first pixel drawn for view ``number``: no pixel is left out in all views."""
     rng = np.random.default_rng((settings.seed, number, settings.stride))
     left, top = (int(rng.integers(min(settings.stride, side))) for side in (camera.width, camera.height))
     return replace(walk, stride=settings.stride, offset=(left, top))
-
-
-def render_walk(settings: LiftSettings) -> CompositingParams:
-    """The walk that renders attention maps and masks."""
-    return CompositingParams(
-        settings.render_gain, settings.alpha_cap, settings.transmittance_stop, settings.antialiased
-    )
 
 
 def as_read(observation: ViewFeatures, settings: LiftSettings, view: str) -> ViewFeatures:
@@ -120,12 +101,12 @@ def accumulate(
         rays = -(-settings.certificate_rays // len(views))
         for number, name in enumerate(views):
             camera, observation = cameras.get(name), as_read(packs.observation(name), settings, name)
-            walk = strided_walk(lift_walk(settings), settings, camera, number)
+            walk = strided_walk(settings.lift_params, settings, camera, number)
             pixels = sample_pixels(camera, rays, (settings.seed, number), walk)
             readouts.append(read_pixels(observation, camera, pixels))
             walked, own = as_walked(observation, settings)
             columns.append(own)
-            yield ViewRequest(camera, walked, walk, weighting_of(settings), pixels)
+            yield ViewRequest(camera, walked, walk, settings.weighting, pixels)
 
     with closing(raster.iterate_views(looks())) as walked_views:
         for walked in walked_views:

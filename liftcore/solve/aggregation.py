@@ -22,7 +22,6 @@ from scipy.sparse import csr_matrix
 
 from liftcore.features.levels import at_levels
 from liftcore.features.views import Regions
-from liftcore.solve.accumulate import render_walk
 from liftcore.solve.clustering import BLOCK, NO_CLUSTER, Clustering, cluster_splats
 from liftcore.solve.region_filter import match_regions
 
@@ -36,7 +35,7 @@ if TYPE_CHECKING:
     from liftcore.progress import Progress
     from liftcore.raster.base import Raster
     from liftcore.scene.cameras import Cameras
-    from liftcore.solve.settings import LiftSettings
+    from liftcore.settings import LiftSettings
 
 
 @dataclass(frozen=True)
@@ -124,7 +123,7 @@ def filter_regions(
     """Render the clusters to every lifted view and keep the regions that match one by ``aggregation_iou``."""
     raster, cameras, packs, names = views
     kept = KeptRegions(np.zeros((clustering.count, channels)), np.zeros(clustering.count, np.int64))
-    walk = render_walk(settings)
+    walk = settings.render_params
     for number, name in enumerate(names):
         observation = masks_of(packs.observation(name), settings, name)
         if isinstance(observation, Regions):

@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 
     from torch import Tensor
 
+    from liftcore.settings import LiftSettings
     from liftcore.solve.accumulate import Geometry, SampledRays
-    from liftcore.solve.settings import LiftSettings
 
 _CHUNK_VALUES = 1 << 21  # float32 values gathered at a time: 8 MB, as larger ones are fresh pages every time
 _READS_A_RAY = 8  # levels or taps of a ray; few scenes have more

@@ -19,7 +19,7 @@ from liftcore.solve.principal_axes import one_blas_thread, principal_axes
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from liftcore.solve.settings import LiftSettings
+    from liftcore.settings import LiftSettings
 
 NO_CLUSTER = -1
 BLOCK = 8_192  # rows widened to float32 at once; fixed, so that products have one shape on any machine

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from liftcore.raster.base import RegionWeights
-    from liftcore.solve.settings import LiftSettings
+    from liftcore.settings import LiftSettings
 
 
 @dataclass(frozen=True)

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from liftcore.progress import Progress
+    from liftcore.settings import LiftSettings
     from liftcore.solve.all_rays import AllRays
-    from liftcore.solve.settings import LiftSettings
 
 TOLERANCE = 1e-4  # of the gradient, relative to the closed form's; float32 products give little more
 _FAINTEST = 1e-30  # a diagonal entry below this says nothing of its splat, and its inverse would overflow

@@ -33,10 +33,10 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from liftcore.progress import Progress
+    from liftcore.settings import LiftSettings
     from liftcore.solve.accumulate import SampledRays
     from liftcore.solve.all_rays import AllRays
     from liftcore.solve.conjugate_gradients import Watch
-    from liftcore.solve.settings import LiftSettings
 
 STEPS = 100  # of conjugate gradients, unless the gradient has vanished before
 

@@ -14,7 +14,7 @@ from liftcore.evaluate.tradeoff.report import page_of, save
 from liftcore.io.strict_json import finite
 from liftcore.progress import Progress, one_step
 from liftcore.scene.splats import Kernel
-from liftcore.solve.settings import LiftSettings
+from liftcore.settings import LiftSettings
 from liftcore.warm_up import warm_up_lift
 
 SHOWN_DIGITS = 12  # of the splats' digest, by which the chart names the scene

@@ -12,7 +12,7 @@ from liftcore.query.encoders.words import nearest, plain
 from liftcore.raster.antialiased import check_antialiased
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.view_pairs import cameras_of_views, require_pairs, some_of
-from liftcore.solve.settings import LiftSettings
+from liftcore.settings import LiftSettings
 from service.errors import InvalidRequest
 from service.store.assets import AssetRecord, kernel_of
 from service.store.jobs import JobOrder

@@ -15,8 +15,8 @@ from liftcore.lift import lift
 from liftcore.listener import Listener, log_warnings
 from liftcore.plan.plan import Plan
 from liftcore.progress import one_step
+from liftcore.settings import LiftSettings
 from liftcore.solve.checkpoint import Checkpoint
-from liftcore.solve.settings import LiftSettings
 from service.faults import renamed
 from service.jobs.reporter import Reporter
 

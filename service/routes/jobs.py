@@ -10,7 +10,7 @@ import anyio
 from fastapi import APIRouter, Header, Query, Response
 from fastapi.responses import JSONResponse
 
-from liftcore.solve.settings import LiftSettings
+from liftcore.settings import LiftSettings
 from service import request_id, wire
 from service.faults import error_of
 from service.jobs.fit import check_fit, check_kernel, check_labels, scratch_bytes

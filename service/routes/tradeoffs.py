@@ -7,7 +7,7 @@ from typing import Any
 from fastapi import APIRouter, Request, Response
 
 from liftcore.errors import InvalidSettings
-from liftcore.solve.settings import LiftSettings
+from liftcore.settings import LiftSettings
 from service import request_id, wire
 from service.content import TAGGED, tagged, unchanged
 from service.errors import InvalidRequest

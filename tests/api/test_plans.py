@@ -15,7 +15,7 @@ from liftcore.device import CPU
 from liftcore.errors import Unavailable
 from liftcore.lift import open_sources, planned
 from liftcore.plan.plan import Plan
-from liftcore.solve.settings import LiftSettings
+from liftcore.settings import LiftSettings
 from service.jobs import child
 from service.jobs.lifting import plan_document
 from service.jobs.reporter import Reporter

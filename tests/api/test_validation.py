@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
-from liftcore.solve.settings import LiftSettings
+from liftcore.settings import LiftSettings
 from service.wire import COMPARED
 
 from .test_problems import NO_ASSET, assert_problem

@@ -23,7 +23,7 @@ from liftcore.evaluate.hardware import hardware, machine_line, peak_memory
 from liftcore.features.pack import open_packs
 from liftcore.io.lift_file import save_lift
 from liftcore.lift import lift, open_sources, planned
-from liftcore.solve.settings import LiftSettings
+from liftcore.settings import LiftSettings
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

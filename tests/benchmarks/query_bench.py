@@ -34,7 +34,7 @@ from liftcore.query.pictures import mask_png
 from liftcore.query.scene import QueryScene
 from liftcore.query.view_mask import view_mask
 from liftcore.scene.cameras import Cameras
-from liftcore.solve.settings import LiftSettings
+from liftcore.settings import LiftSettings
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

@@ -28,8 +28,7 @@ from liftcore.io.load import load_cameras, load_splats
 from liftcore.lift import lift
 from liftcore.raster.base import CompositingParams, Weighting
 from liftcore.raster.cpu.raster import CpuRaster
-from liftcore.solve.accumulate import render_walk
-from liftcore.solve.settings import LiftSettings
+from liftcore.settings import LiftSettings
 from tests.benchmarks.scene_files import cameras_of
 
 if TYPE_CHECKING:
@@ -179,7 +178,7 @@ class Tabletop:
         """Each held-out view's rendered class scores [H, W, K] f32."""
         for view in self.held_out:
             camera = self.cameras.get(view)
-            yield rendered_scores(raster, camera, features, self.classes, render_walk(settings))
+            yield rendered_scores(raster, camera, features, self.classes, settings.render_params)
 
 
 def _no_truth(folder: Path, got: str) -> InvalidInput:

@@ -35,7 +35,7 @@ from liftcore.query.query import Query
 from liftcore.query.scene import QueryScene
 from liftcore.query.threshold import METHODS, find_threshold
 from liftcore.query.view_mask import view_mask
-from liftcore.solve.settings import LiftSettings
+from liftcore.settings import LiftSettings
 from tests.benchmarks.tabletop import Tabletop
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from liftcore.features.pack import open_packs
 from liftcore.features.views import Regions
 from liftcore.features.write_pack import write_pack
 from liftcore.lift import lift
-from liftcore.solve.settings import LiftSettings
+from liftcore.settings import LiftSettings
 from tests.run_lengths import sam_records
 
 if TYPE_CHECKING:

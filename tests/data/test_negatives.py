@@ -13,7 +13,7 @@ from liftcore.query.example import OneSplat
 from liftcore.query.query import Query
 from liftcore.query.scene import QueryScene
 from liftcore.query.scores import relevancy
-from liftcore.solve.settings import LiftSettings
+from liftcore.settings import LiftSettings
 from tests.benchmarks.tabletop import Tabletop
 
 if TYPE_CHECKING:

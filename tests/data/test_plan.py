@@ -11,7 +11,7 @@ from liftcore.features.pack import open_packs
 from liftcore.features.views import FeatureGrid
 from liftcore.features.write_pack import write_pack
 from liftcore.lift import lift
-from liftcore.solve.settings import LiftSettings
+from liftcore.settings import LiftSettings
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -15,8 +15,7 @@ from liftcore.io.load import load_cameras, load_splats
 from liftcore.lift import lift
 from liftcore.raster.base import CompositingParams
 from liftcore.raster.cpu.raster import CpuRaster
-from liftcore.solve.accumulate import render_walk
-from liftcore.solve.settings import LiftSettings
+from liftcore.settings import LiftSettings
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -84,7 +83,7 @@ def test_lifted_cnn_features_render_like_those_of_unseen_photos(plush, cameras, 
     for name in HELD_OUT:
         observed = held_out.observation(name)
         assert isinstance(observed, FeatureGrid)
-        walk, camera = render_walk(settings), cameras.get(name)
+        walk, camera = settings.render_params, cameras.get(name)
         cosine = rendered_cosine(raster, camera, features, observed.grid, walk)
         mirrored = rendered_cosine(raster, camera, features, observed.grid.flip(1), walk)
         assert cosine > 0.08

@@ -11,7 +11,7 @@ from importlib.util import find_spec
 import pytest
 
 from liftcore.cli import build_parser
-from liftcore.solve.settings import LiftSettings, Preset
+from liftcore.settings import LiftSettings, Preset
 from service.settings import ServiceSettings
 
 from .readme import (

@@ -18,7 +18,7 @@ from liftcore.raster.base import CompositingParams
 from liftcore.raster.reference import reading_matrix
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.splats import Splats
-from liftcore.solve.settings import LiftSettings
+from liftcore.settings import LiftSettings
 from tests.benchmarks.stability.of_features import checkerboard
 from tests.benchmarks.stability.scenes import splats_at
 from tests.benchmarks.stability.weights import exact_view

@@ -23,7 +23,7 @@ from liftcore.features.write_pack import write_pack
 from liftcore.io.lift_file import load_lift
 from liftcore.lift import lift
 from liftcore.query.threshold import METHODS
-from liftcore.solve.settings import LiftSettings, Preset
+from liftcore.settings import LiftSettings, Preset
 
 from .command_line import assert_one_line, lift_arguments, programs_become, run, write_toy_scene
 

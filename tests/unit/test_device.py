@@ -13,7 +13,7 @@ from liftcore.device import CPU, Device, choose_device, driver_version, processo
 from liftcore.errors import InvalidSettings, Unavailable
 from liftcore.lift import lift
 from liftcore.plan.on_device import DevicePlan, check_device_room
-from liftcore.solve.settings import LiftSettings
+from liftcore.settings import LiftSettings
 from service.jobs import device as device_process
 from tests.unit.solve.test_lift_equals_dense import write_scene
 

@@ -23,7 +23,7 @@ from liftcore.query.query import Query
 from liftcore.query.scene import QueryScene
 from liftcore.query.view_mask import view_mask
 from liftcore.scene.cameras import Camera
-from liftcore.solve.settings import LiftSettings
+from liftcore.settings import LiftSettings
 from tests.distorted_scene import (
     BARREL,
     HEIGHT,

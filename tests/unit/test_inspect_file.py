@@ -20,7 +20,7 @@ from liftcore.io.lift_file import InputFile, LiftMetadata, LiftResult, save_lift
 from liftcore.io.ply import write_splats
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.splats import Splats
-from liftcore.solve.settings import LiftSettings
+from liftcore.settings import LiftSettings
 
 if TYPE_CHECKING:
     from pathlib import Path

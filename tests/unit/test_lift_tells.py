@@ -13,7 +13,7 @@ from liftcore import lift as pipeline
 from liftcore.cli import bars
 from liftcore.lift import lift
 from liftcore.listener import Listener
-from liftcore.solve.settings import LiftSettings
+from liftcore.settings import LiftSettings
 
 from .command_line import lift_arguments, run, write_toy_scene
 from .solve.test_lift_equals_dense import write_scene

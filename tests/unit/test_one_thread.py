@@ -9,8 +9,8 @@ import torch
 
 from liftcore.lift import lift
 from liftcore.one_thread import one_thread
+from liftcore.settings import LiftSettings
 from liftcore.solve import accumulate, robust
-from liftcore.solve.settings import LiftSettings
 from tests.unit.solve.test_lift_equals_dense import write_scene
 
 

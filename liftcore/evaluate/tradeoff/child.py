@@ -20,7 +20,7 @@ from liftcore.evaluate.tradeoff.order import Order
 from liftcore.io.input_files import input_files
 from liftcore.lift import Run, lift_sources, open_sources
 from liftcore.listener import NOBODY
-from liftcore.solve.settings import LiftSettings
+from liftcore.settings import LiftSettings
 from liftcore.timings import Timings
 from liftcore.warm_up import warm_up_lift
 

@@ -19,7 +19,7 @@ from liftcore.evaluate.tradeoff.judge import class_vectors, labelled_masks
 from liftcore.evaluate.tradeoff.order import CANDIDATES, DRAFT, EXACT, HOLD_OUT, Candidate, Order, Scene
 from liftcore.features.pack import open_packs, pair
 from liftcore.io.load import load_cameras
-from liftcore.solve.settings import LiftSettings
+from liftcore.settings import LiftSettings
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -14,7 +14,6 @@ from liftcore.query.encoders.table import TableEncoder
 from liftcore.query.in_photo import in_photo
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.view_pairs import cameras_of_views
-from liftcore.solve.accumulate import render_walk
 from tests.benchmarks.experiments.fidelity import view_cosines
 
 if TYPE_CHECKING:
@@ -36,7 +35,7 @@ def judge(order: Order, sources: Sources, reference: tuple[Tensor, Tensor], made
         reference: features [P, F] and evidence [P] of the exact run, empty before it.
     """
     figures = cosine_figures(made.features, *reference)
-    raster, walk = CpuRaster(sources.splats, order.threads), render_walk(made.metadata.settings)
+    raster, walk = CpuRaster(sources.splats, order.threads), made.metadata.settings.render_params
     rows = [
         view_cosines(raster, sources.cameras.get(view), sources.packs.observation(view), made.features, walk)
         for view in order.held_out

@@ -15,7 +15,6 @@ import torch
 from liftcore.evaluate.accuracy import mask_iou
 from liftcore.query.directions import MINIMUM_ROW_SUM
 from liftcore.query.threshold import find_threshold
-from liftcore.solve.accumulate import render_walk
 from tests.benchmarks.tabletop import Tabletop
 
 if TYPE_CHECKING:
@@ -24,7 +23,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from torch import Tensor
 
-    from liftcore.solve.settings import LiftSettings
+    from liftcore.settings import LiftSettings
     from tests.benchmarks.experiments.subject import Subject
 
 TITLE = "Ablation"
@@ -60,7 +59,7 @@ def phrase_ious(truth: Tabletop, features: Tensor, settings: LiftSettings) -> tu
     ious: list[tuple[float, float]] = []
     maps = truth.maps(features, settings, truth.raster)
     for (view, mask), scores in zip(truth.held_out.items(), maps, strict=True):
-        met = truth.raster.row_sums(truth.cameras.get(view), render_walk(settings)) >= MINIMUM_ROW_SUM
+        met = truth.raster.row_sums(truth.cameras.get(view), settings.render_params) >= MINIMUM_ROW_SUM
         for k in mask[mask >= 0].unique().tolist():
             attention, real = scores[:, :, k], mask == k
             known = attention[met]

@@ -15,9 +15,8 @@ from scipy.sparse import csr_array
 from liftcore.features.pack import open_packs, pair
 from liftcore.io.load import load_cameras, load_splats
 from liftcore.raster.cpu.raster import CpuRaster
-from liftcore.solve.accumulate import render_walk
+from liftcore.settings import Preset
 from liftcore.solve.readout import read_pixels, sample_pixels
-from liftcore.solve.settings import Preset
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -51,7 +50,7 @@ def measure(subject: Subject) -> dict[str, Any]:
     for pack in subject.packs(*PACKS):
         for preset in PRESETS:
             made = subject.lift(pack, preset=preset)
-            walk = render_walk(made.metadata.settings)
+            walk = made.metadata.settings.render_params
             row: dict[str, Any] = {"pack": pack, "preset": preset}
             row["cosine"], row["views"] = rendered_cosine(
                 raster, cameras, subject.pack(pack), made.features, walk, subject.every

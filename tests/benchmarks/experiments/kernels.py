@@ -12,7 +12,6 @@ import numpy as np
 
 from liftcore.io.load import load_splats
 from liftcore.raster.cpu.raster import CpuRaster
-from liftcore.solve.accumulate import render_walk
 from tests.benchmarks.converted import to_betas, to_discs
 from tests.benchmarks.tabletop import Tabletop
 
@@ -52,7 +51,7 @@ def measure(subject: Subject) -> dict[str, Any]:
                 made = subject.lift_of(splats, pack, preset=preset, **knobs)
                 settings = made.metadata.settings
                 figures = truth.judge(made.features, settings, raster=raster)
-                sums = [raster.row_sums(truth.cameras.get(v), render_walk(settings)).mean() for v in truth.held_out]
+                sums = [raster.row_sums(truth.cameras.get(v), settings.render_params).mean() for v in truth.held_out]
                 row = {"pack": pack, "kernel": kernel, "preset": preset, "row_sum_mean": float(np.mean(sums))}
                 rows.append(row | {"accuracy": figures.accuracy, "miou": figures.miou})
     return {"columns": COLUMNS, "rows": rows, "note": NOTE}

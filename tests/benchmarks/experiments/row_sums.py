@@ -14,7 +14,7 @@ import numpy as np
 from liftcore.io.load import load_cameras, load_splats
 from liftcore.raster.base import CompositingParams
 from liftcore.raster.cpu.raster import CpuRaster
-from liftcore.solve.settings import TIKHONOV_GAIN
+from liftcore.settings import TIKHONOV_GAIN
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -12,7 +12,7 @@ from liftcore.features.views import ViewFeatures
 from liftcore.features.write_pack import write_pack
 from liftcore.io.inria import write_inria_cameras
 from liftcore.lift import lift
-from liftcore.solve.settings import LiftSettings
+from liftcore.settings import LiftSettings
 from tests.benchmarks.scene_files import cameras_of
 
 if TYPE_CHECKING:

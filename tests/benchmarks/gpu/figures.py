@@ -14,7 +14,7 @@ from liftcore.evaluate.synthetic import room_cameras, room_regions, room_splats
 from liftcore.io.lift_file import TENSORS, save_lift
 from liftcore.lift import lift
 from liftcore.raster.base import CompositingParams, RegionWeights, Weighting
-from liftcore.solve.settings import LiftSettings
+from liftcore.settings import LiftSettings
 from tests.benchmarks.gpu.room_files import write_room
 from tests.benchmarks.tabletop import CASES, Tabletop
 

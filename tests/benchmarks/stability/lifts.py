@@ -21,9 +21,8 @@ from liftcore.lift import lift
 from liftcore.raster.reference import reading_matrix
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.splats import Splats
-from liftcore.solve.accumulate import lift_walk
+from liftcore.settings import LiftSettings
 from liftcore.solve.lift_warnings import FAINT
-from liftcore.solve.settings import LiftSettings
 from tests.benchmarks.stability.case import Extreme, Found, always
 from tests.benchmarks.stability.scenes import of_kernel, splats_at
 from tests.benchmarks.stability.weights import exact_view
@@ -105,7 +104,7 @@ def dense_features(task: Task, splats: Splats, settings: LiftSettings) -> tuple[
     sums, totals = 0.0, np.zeros(splats.count)
     for name, observation in task.views.items():
         S, ray = reading_matrix(observation, WIDTH, HEIGHT)
-        weights = exact_view(splats, camera(name), lift_walk(settings)).A[ray] ** settings.power
+        weights = exact_view(splats, camera(name), settings.lift_params).A[ray] ** settings.power
         sums = sums + weights.T @ (S @ observation.codebook.double().numpy())
         totals += weights.sum(axis=0)
     X = np.asarray(sums)

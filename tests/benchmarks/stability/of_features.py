@@ -10,7 +10,7 @@ import torch
 from liftcore.features.views import FeatureGrid, Regions, ViewFeatures
 from liftcore.scene.cameras import Cameras
 from liftcore.scene.splats import Kernel
-from liftcore.solve.settings import LiftSettings
+from liftcore.settings import LiftSettings
 from tests.benchmarks.stability.case import GAUSSIAN, Extreme
 from tests.benchmarks.stability.lifts import AWAY, HEIGHT, WIDTH, Task, cloud, lifted, refused, run
 from tests.benchmarks.stability.scenes import splats_at

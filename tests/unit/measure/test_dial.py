@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from liftcore.solve.settings import Preset, Speed
+from liftcore.settings import Preset, Speed
 from tests.benchmarks.dial import main, measure_dial
 from tests.benchmarks.room_scene import Room, write_room
 from tests.benchmarks.room_scene import main as room_main

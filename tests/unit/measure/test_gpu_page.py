@@ -19,7 +19,7 @@ from liftcore.raster.base import CompositingParams
 from liftcore.raster.reference import dense_view
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Splats
-from liftcore.solve.settings import LiftSettings
+from liftcore.settings import LiftSettings
 from tests.backends import needs_triton
 from tests.benchmarks.gpu import __main__ as gpu
 from tests.benchmarks.gpu import figures, gsplat_lift

@@ -21,8 +21,7 @@ from liftcore.plan.pilot import PILOT_VIEWS, Pilot, fly_pilot
 from liftcore.plan.plan import FEW_VIEWS
 from liftcore.plan.visibility import visibility
 from liftcore.scene.cameras import Cameras
-from liftcore.solve.accumulate import lift_walk
-from liftcore.solve.settings import LiftSettings
+from liftcore.settings import LiftSettings
 from tests.benchmarks.room_scene import Room, write_room
 from tests.scenes import centred, random_splats
 from tests.unit.plan.test_views import ring
@@ -185,7 +184,7 @@ def test_a_room_is_written_the_same_twice_and_its_views_disagree_as_told(tmp_pat
 def flown(splats, cameras, pack, threads=1) -> Pilot:
     settings = LiftSettings.of()
     sources = open_sources(splats, cameras, [pack], settings)
-    seen = visibility(sources.splats, [sources.cameras.get(view) for view in sources.views], lift_walk(settings))
+    seen = visibility(sources.splats, [sources.cameras.get(view) for view in sources.views], settings.lift_params)
     return fly_pilot(sources.splats, sources.cameras, sources.packs, sources.views, settings, seen, threads)
 
 

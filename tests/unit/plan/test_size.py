@@ -26,9 +26,9 @@ from liftcore.plan.memory import (
     group_memory,
 )
 from liftcore.plan.rank import ROUNDING, Rank, codebook_rank, rank_of
+from liftcore.settings import LiftSettings, Speed
 from liftcore.solve.columns import as_walked
 from liftcore.solve.feature_room import file_system, in_file, room_within
-from liftcore.solve.settings import LiftSettings, Speed
 from tests.scenes import observed
 from tests.unit.solve.test_lift_equals_dense import write_scene
 

@@ -12,7 +12,7 @@ from liftcore.plan.visibility import Visibility, visibility
 from liftcore.raster.base import CompositingParams, Weighting
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.splats import Kernel
-from liftcore.solve.settings import LiftSettings
+from liftcore.settings import LiftSettings
 from tests.scenes import look_at, random_camera, random_regions, random_splats
 from tests.unit.solve.test_lift_equals_dense import write_scene
 

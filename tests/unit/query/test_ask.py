@@ -25,7 +25,7 @@ from liftcore.query.scene import QueryScene
 from liftcore.query.view_mask import view_mask
 from liftcore.scene.cameras import Cameras
 from liftcore.scene.splats import Kernel, Splats
-from liftcore.solve.settings import LiftSettings
+from liftcore.settings import LiftSettings
 from tests.scenes import look_at, random_splats
 
 COUNT = 60

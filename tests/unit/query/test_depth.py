@@ -19,7 +19,7 @@ from liftcore.raster.base import CompositingParams
 from liftcore.raster.reference import OracleRaster
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.splats import Kernel, Splats
-from liftcore.solve.settings import LiftSettings
+from liftcore.settings import LiftSettings
 from tests.scenes import random_camera, random_splats
 
 NEAR, FAR = 2.0, 5.0

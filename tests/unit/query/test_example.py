@@ -24,7 +24,7 @@ from liftcore.query.scene import QueryScene
 from liftcore.query.threshold import find_threshold
 from liftcore.query.vector_file import read_vector
 from liftcore.query.view_mask import view_mask
-from liftcore.solve.settings import LiftSettings
+from liftcore.settings import LiftSettings
 from tests.api.tiny_scene import CHANNELS, HEIGHT, SPLATS_A_CLUSTER, WIDTH, make_scene
 
 NAMES = st.text(st.characters(exclude_categories=["Cs"]), min_size=1, max_size=12)

@@ -17,7 +17,7 @@ from liftcore.query.query import Query
 from liftcore.query.scene import QueryScene
 from liftcore.query.scores import rows_at_a_time
 from liftcore.query.view_mask import view_mask
-from liftcore.solve.settings import LiftSettings
+from liftcore.settings import LiftSettings
 from tests.api.tiny_scene import HEIGHT, WIDTH, make_scene
 
 

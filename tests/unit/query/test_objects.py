@@ -18,7 +18,7 @@ from liftcore.query.objects import objects
 from liftcore.query.query import Query
 from liftcore.query.scene import QueryScene
 from liftcore.query.splat_files import object_ply
-from liftcore.solve.settings import LiftSettings
+from liftcore.settings import LiftSettings
 from tests.api.tiny_scene import SPLATS_A_CLUSTER, make_scene, ply, splat_rows
 
 

@@ -23,7 +23,7 @@ from liftcore.query.scene import QueryScene
 from liftcore.query.splat_files import coloured_ply, object_ply
 from liftcore.query.view_mask import view_mask
 from liftcore.raster.cpu.raster import CpuRaster
-from liftcore.solve.settings import LiftSettings
+from liftcore.settings import LiftSettings
 from tests.api.tiny_scene import SPLATS_A_CLUSTER, WIDTH, make_scene, ply, splat_rows
 
 

@@ -21,7 +21,7 @@ from liftcore.query.scene import QueryScene
 from liftcore.query.view_mask import view_mask
 from liftcore.raster.reference import OracleRaster
 from liftcore.scene.cameras import Cameras
-from liftcore.solve.settings import LiftSettings
+from liftcore.settings import LiftSettings
 from tests.api.tiny_scene import HEIGHT, SPLATS_A_CLUSTER, WIDTH, make_scene
 
 STRAY = 2 * SPLATS_A_CLUSTER + 5  # a splat of the third cluster

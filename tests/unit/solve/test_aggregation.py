@@ -23,10 +23,9 @@ from liftcore.progress import silent
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.raster.reference import OracleRaster, dense_view
 from liftcore.scene.cameras import Cameras
-from liftcore.solve.accumulate import lift_walk, render_walk, weighting_of
+from liftcore.settings import LiftSettings
 from liftcore.solve.aggregation import KeptRegions, evidence_means, filter_regions, kept_means, spread
 from liftcore.solve.clustering import Clustering
-from liftcore.solve.settings import LiftSettings
 from liftcore.solve.totals import row_totals
 from tests.scenes import centred, random_camera, random_grid, random_regions, random_splats
 
@@ -51,7 +50,7 @@ def test_kept_regions_are_those_of_the_paper_pixel_by_pixel(tmp_path_factory, se
     kept = filter_regions(clustering_of(labels), 6, lifted, SETTINGS, silent)
 
     onehot = np.array([[float(label == k) for k in range(-1, K)] for label in labels])
-    A = dense_view(splats, views[0], render_walk(SETTINGS)).A
+    A = dense_view(splats, views[0], SETTINGS.render_params).A
     kappa = ((A @ onehot).argmax(axis=1) - 1).reshape(17, 21)
     sums, counts, present = np.zeros((K, 6)), np.zeros(K, int), 0
     for row, vector in enumerate(maps["v0"].codebook.double().numpy()):
@@ -165,7 +164,7 @@ def weights_of(splats, cameras, maps, settings) -> np.ndarray:
     raster, views = CpuRaster(load_splats(splats)), load_cameras(cameras)
     total = np.zeros(raster.splats.count)
     for name in maps.keys() & views.by_name.keys():
-        weights = raster.region_weights(views.get(name), maps[name], lift_walk(settings), weighting_of(settings))
+        weights = raster.region_weights(views.get(name), maps[name], settings.lift_params, settings.weighting)
         total[weights.splats.numpy()] += row_totals(weights)
     return total
 
@@ -264,7 +263,7 @@ def test_the_strongest_labels_are_those_of_the_one_hot_render():
     for seed in range(6):
         splats, camera = random_splats(seed, 80), random_camera(seed, 50, 37)
         labels = torch.tensor(np.random.default_rng(seed).integers(-1, 60, 80), dtype=torch.int32)
-        walk = render_walk(SETTINGS)
+        walk = SETTINGS.render_params
         view = dense_view(splats, camera, walk)
         sums = view.A @ np.eye(61)[labels.numpy() + 1]
         ranked = np.sort(sums, axis=1)

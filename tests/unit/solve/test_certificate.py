@@ -9,7 +9,7 @@ from liftcore.io.load import load_cameras
 from liftcore.lift import lift
 from liftcore.raster.base import CompositingParams
 from liftcore.raster.reference import dense_view, reading_matrix
-from liftcore.solve.settings import LiftSettings
+from liftcore.settings import LiftSettings
 from tests.scenes import observed, random_splats
 from tests.unit.solve.test_lift_equals_dense import write_scene
 

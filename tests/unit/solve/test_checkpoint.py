@@ -22,8 +22,8 @@ from liftcore.raster.base import CompositingParams, ViewRequest, Weighting
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.cameras import Camera
 from liftcore.scene.kernel import Kernel
+from liftcore.settings import LiftSettings
 from liftcore.solve.checkpoint import Checkpoint, identity, question
-from liftcore.solve.settings import LiftSettings
 
 from .test_lift_equals_dense import observed, write_scene
 

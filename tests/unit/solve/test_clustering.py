@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from liftcore.settings import LiftSettings
 from liftcore.solve.clustering import NO_CLUSTER, cluster_splats, draw
 from liftcore.solve.principal_axes import principal_axes
-from liftcore.solve.settings import LiftSettings
 
 SETTINGS = LiftSettings.of(aggregation=True, aggregation_cluster_size=20, aggregation_neighbours=5)
 

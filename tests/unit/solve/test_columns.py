@@ -13,11 +13,11 @@ from liftcore.features.views import NO_LABEL, FeatureGrid, Regions
 from liftcore.progress import silent
 from liftcore.raster.base import CompositingParams, Weighting
 from liftcore.raster.cpu.raster import CpuRaster
+from liftcore.settings import LiftSettings
 from liftcore.solve.closed_form import Solution, solve_closed_form
 from liftcore.solve.columns import Columns, by_rows, by_tuples
 from liftcore.solve.host import Host
 from liftcore.solve.on_device import Place, solve_on_device
-from liftcore.solve.settings import LiftSettings
 from liftcore.solve.totals import row_totals
 from tests.scenes import random_camera, random_splats
 

@@ -12,9 +12,9 @@ from liftcore.features.views import Regions, ViewFeatures
 from liftcore.lift import lift
 from liftcore.listener import Listener
 from liftcore.progress import silent
+from liftcore.settings import LiftSettings
 from liftcore.solve.channels import BLOCK, blocks, codebook_axes, random_axes
 from liftcore.solve.least_squares import Refinement, refine
-from liftcore.solve.settings import LiftSettings
 from tests.unit.solve.dense_rays import SmallScene
 from tests.unit.solve.test_lift_equals_dense import write_scene
 

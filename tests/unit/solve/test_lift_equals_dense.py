@@ -21,8 +21,8 @@ from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.raster.reference import dense_view, reading_matrix
 from liftcore.raster.reference_weights import counted_weights
 from liftcore.scene.cameras import Cameras
+from liftcore.settings import LiftSettings
 from liftcore.solve.accumulate import accumulate
-from liftcore.solve.settings import LiftSettings
 from liftcore.solve.view_weights import WeightStore
 from tests.scenes import centred, observed, random_camera, random_splats
 

@@ -20,7 +20,7 @@ from liftcore.raster.base import CompositingParams
 from liftcore.raster.reference import dense_view, reading_matrix
 from liftcore.scene.cameras import Cameras
 from liftcore.scene.splats import Kernel, Splats
-from liftcore.solve.settings import LiftSettings
+from liftcore.settings import LiftSettings
 from tests.scenes import centred, random_camera, random_regions, random_splats
 
 if TYPE_CHECKING:

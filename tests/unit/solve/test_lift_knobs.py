@@ -15,8 +15,8 @@ from liftcore.io.load import load_cameras
 from liftcore.lift import lift
 from liftcore.raster.reference import dense_view, reading_matrix
 from liftcore.raster.reference_weights import walked_rays
-from liftcore.solve.accumulate import lift_walk, strided_walk
-from liftcore.solve.settings import LiftSettings, Preset
+from liftcore.settings import LiftSettings, Preset
+from liftcore.solve.accumulate import strided_walk
 from tests.scenes import observed, random_camera, random_splats
 from tests.unit.features.test_levels import dense_sums
 from tests.unit.solve.test_lift_equals_dense import write_scene
@@ -37,7 +37,7 @@ def test_a_strided_lift_is_that_of_its_rays_and_its_evidence_speaks_for_all_of_t
     numerator, denominator, evidence, cut = np.zeros((50, 6)), np.zeros(50), np.zeros(50), np.zeros(50, bool)
     for k, camera in enumerate(load_cameras(paths[1])):
         observation = observed(2, k, grids)
-        walk = strided_walk(lift_walk(settings), settings, camera, k)
+        walk = strided_walk(settings.lift_params, settings, camera, k)
         view, walked = dense_view(splats, camera, walk), walked_rays(camera, walk)
         S, ray = reading_matrix(observation, camera.width, camera.height)
         weights = view.A[ray[walked[ray]]]
@@ -49,20 +49,20 @@ def test_a_strided_lift_is_that_of_its_rays_and_its_evidence_speaks_for_all_of_t
     assert np.abs(got.features.numpy() - X)[~cut].max() < 1e-3
     assert np.abs(got.evidence.numpy() - evidence)[~cut].max() < 1e-3
     assert got.metadata.certificate["rays"] == sum(
-        int(walked_rays(camera, strided_walk(lift_walk(settings), settings, camera, k)).sum())
+        int(walked_rays(camera, strided_walk(settings.lift_params, settings, camera, k)).sum())
         for k, camera in enumerate(load_cameras(paths[1]))
     )
 
 
 def test_first_pixels_differ_between_views_and_repeat_with_the_seed():
     camera, settings = random_camera(0), LiftSettings.of(stride=4)
-    offsets = [strided_walk(lift_walk(settings), settings, camera, k).offset for k in range(40)]
+    offsets = [strided_walk(settings.lift_params, settings, camera, k).offset for k in range(40)]
     assert len(set(offsets)) > 8
-    assert offsets == [strided_walk(lift_walk(settings), settings, camera, k).offset for k in range(40)]
+    assert offsets == [strided_walk(settings.lift_params, settings, camera, k).offset for k in range(40)]
     other = LiftSettings.of(stride=4, seed=1)
-    assert offsets != [strided_walk(lift_walk(other), other, camera, k).offset for k in range(40)]
+    assert offsets != [strided_walk(other.lift_params, other, camera, k).offset for k in range(40)]
     slim = replace(camera, width=2)
-    assert all(strided_walk(lift_walk(settings), settings, slim, k).offset[0] < 2 for k in range(20))
+    assert all(strided_walk(settings.lift_params, settings, slim, k).offset[0] < 2 for k in range(20))
 
 
 def test_every_nth_view_is_lifted_from_the_first_on(tmp_path):

@@ -23,8 +23,8 @@ from liftcore.plan.on_device import ROOM_SPARE
 from liftcore.progress import silent
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.splats import Kernel
+from liftcore.settings import LiftSettings
 from liftcore.solve.accumulate import Geometry, accumulate
-from liftcore.solve.settings import LiftSettings
 from liftcore.solve.totals import Totals
 from liftcore.solve.view_weights import WeightStore
 from liftcore.timings import Timings

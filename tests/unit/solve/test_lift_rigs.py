@@ -16,7 +16,7 @@ from liftcore.query.directions import directions
 from liftcore.query.example import Region
 from liftcore.query.query import Query
 from liftcore.query.scene import QueryScene
-from liftcore.solve.settings import LiftSettings
+from liftcore.settings import LiftSettings
 
 from .test_lift_equals_dense import write_scene
 

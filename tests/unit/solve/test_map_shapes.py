@@ -16,8 +16,8 @@ from liftcore.io.inspect import inspect_file
 from liftcore.io.load import load_cameras
 from liftcore.lift import lift, open_sources, planned
 from liftcore.scene.cameras import Camera
+from liftcore.settings import LiftSettings
 from liftcore.solve.map_shapes import shape_warnings
-from liftcore.solve.settings import LiftSettings
 from tests.benchmarks.scene_files import cameras_of
 
 from .test_lift_equals_dense import write_scene

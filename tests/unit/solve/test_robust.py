@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 from liftcore.lift import lift
 from liftcore.progress import silent
 from liftcore.raster.base import RegionWeights
+from liftcore.settings import LiftSettings
 from liftcore.solve import gathering, host, judging, robust, weighted_sums
 from liftcore.solve.host import ALL_CORES, Host
 from liftcore.solve.robust import NO_CONSENSUS, robust_weights
-from liftcore.solve.settings import LiftSettings
 from liftcore.solve.view_weights import WeightStore
 from liftcore.solve.weighted_sums import LONG
 from tests.unit.solve.test_lift_equals_dense import write_scene

@@ -14,7 +14,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from pydantic_core import PydanticCustomError
 
 from liftcore.errors import InvalidSettings
-from liftcore.raster.weighting import MOST_OF_A_RAY, Selection
+from liftcore.raster.base import CompositingParams
+from liftcore.raster.weighting import MOST_OF_A_RAY, Selection, Weighting
 
 TIKHONOV_GAIN = 1.2  # lambda of the paper's Tikhonov Guidance (App. Tikhonov, lambda sweep)
 LARGEST_ALPHA = 0.9999999  # nearer to one, float32 says one, and the ray has no light left to go on with
@@ -163,6 +164,24 @@ class LiftSettings(BaseModel):
             told = "other levels than composite, which cut to pieces the regions that aggregation_resolve drops"
             raise PydanticCustomError("whole_regions", "{expected}", {"expected": told})
         return self
+
+    @property
+    def lift_params(self) -> CompositingParams:
+        """How rays meet splats while lifting, at every pixel."""
+        return self._compositing(self.lift_gain)
+
+    @property
+    def render_params(self) -> CompositingParams:
+        """How rays meet splats when attention maps and masks are rendered."""
+        return self._compositing(self.render_gain)
+
+    @property
+    def weighting(self) -> Weighting:
+        """What counts as a weight while lifting."""
+        return Weighting(self.power, self.selection, self.k, self.mass, self.weight_floor)
+
+    def _compositing(self, opacity_logit_scale: float) -> CompositingParams:
+        return CompositingParams(opacity_logit_scale, self.alpha_cap, self.transmittance_stop, self.antialiased)
 
     @classmethod
     def of(cls, /, **values: Any) -> Self:
