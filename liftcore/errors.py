@@ -107,8 +107,8 @@ class InvalidTable(InvalidQuery):
     kind = "invalid-table"
 
 
-class NotFound(SplatliftError):
-    """A named thing does not exist."""
+class NotFound(SplatliftError, KeyError):
+    """A named thing does not exist; a KeyError, too, so that mappings may raise it."""
 
     kind = "not-found"
 

@@ -13,9 +13,10 @@ from liftcore import __version__
 from liftcore.device import Device, choose_device, within_memory
 from liftcore.errors import InvalidFeatures
 from liftcore.features.pack import FeaturePacks, open_packs, pair
+from liftcore.io.cameras import read_cameras
 from liftcore.io.input_files import input_files
 from liftcore.io.lift_file import LiftMetadata, LiftResult
-from liftcore.io.load import kernel_named, load_cameras, load_splats
+from liftcore.io.ply import read_splats
 from liftcore.listener import NOBODY, Listener
 from liftcore.plan.plan import plan_lift
 from liftcore.progress import Progress, one_step
@@ -172,7 +173,7 @@ def _lift_on(
             "plan": plan.facts(),
             "views_without_splats": _blind(sources.views, store),
         }
-    lifted = [sources.cameras.get(name) for name in sources.views]
+    lifted = [sources.cameras[name] for name in sources.views]
     told = lift_warnings(sources.splats, lifted, geometry.denominators, settings.dtype, X.dtype, facts)
     facts["warnings"] = [*told, *plan.told]
     with run.stage("certify"):
@@ -190,7 +191,7 @@ def _lift_on(
 
 def open_sources(splats: Path, cameras: Path, features: Sequence[Path], settings: LiftSettings) -> Sources:
     """Open what a lift is made from; views are paired by name, and every ``view_stride``-th is taken."""
-    scene, views = load_splats(splats, kernel_named(settings.kernel), colour=False), load_cameras(cameras)
+    scene, views = read_splats(splats, settings.kernel, colour=False), read_cameras(cameras)
     check_antialiased(scene.kernel, settings.antialiased)
     packs, unpaired = pair(open_packs(features), views)
     return Sources(scene, views, packs, list(packs.views[:: settings.view_stride]), unpaired)
@@ -229,7 +230,7 @@ def _refine(
         rays = AllRays(
             raster,
             sources.splats.count,
-            [sources.cameras.get(name) for name in names],
+            [sources.cameras[name] for name in names],
             lambda view: as_read(sources.packs.observation(names[view]), settings, names[view]),
             settings.lift_params,
             progress,

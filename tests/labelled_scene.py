@@ -52,7 +52,7 @@ def write_lift(folder: Path, name: str = "kitchen.lift.safetensors") -> Path:
     for frame, left in FRAMES.items():
         pose = np.eye(4)
         pose[0, 3] = -left * DISTANCE / FOCAL
-        cameras.append(Camera(frame, WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, pose))
+        cameras.append(Camera.pinhole(frame, WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, pose))
     write_inria_cameras(Cameras(tuple(cameras)), folder / "cameras.json")
     words = torch.eye(len(WORDS))
     save_file({"embeddings": words}, str(folder / "words.safetensors"), metadata={"words": json.dumps(WORDS)})

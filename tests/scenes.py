@@ -36,7 +36,7 @@ def look_at(name: str, centre: np.ndarray, width: int, height: int, focal: float
     pose = np.eye(4)
     pose[:3, :3] = rotation
     pose[:3, 3] = -rotation @ centre
-    return Camera(name, width, height, focal, focal * 1.1, width / 2 + 0.7, height / 2 - 0.4, pose)
+    return Camera.pinhole(name, width, height, focal, focal * 1.1, width / 2 + 0.7, height / 2 - 0.4, pose)
 
 
 def random_camera(seed: int, width: int = 37, height: int = 29, name: str = "v0") -> Camera:
@@ -87,7 +87,7 @@ def scenes(draw: st.DrawFn, kernel: Kernel = Kernel.GAUSSIAN_3D) -> tuple[Splats
 
 def centred(camera: Camera) -> Camera:
     """The camera with its principal point at the image's centre, as Inria's files assume."""
-    return Camera(
+    return Camera.pinhole(
         camera.name, camera.width, camera.height, camera.fx, camera.fy,
-        camera.width / 2, camera.height / 2, camera.world_to_camera,
+        camera.width / 2, camera.height / 2, camera.viewmat,
     )  # fmt: skip

@@ -56,7 +56,7 @@ def write_truth_scene(folder: Path) -> Path:
     )
     vectors = torch.nn.functional.normalize(torch.randn(CLASSES, CHANNELS, generator=torch.manual_seed(0)), dim=1)
     raster = CpuRaster(splats)
-    masks = {camera.name: _mask(raster, camera, classes) for camera in cameras}
+    masks = {camera.name: _mask(raster, camera, classes) for camera in cameras.values()}
     held_out = [f"v{k}" for k in HELD_OUT]
     maps = {name: Regions(mask[None].int(), vectors) for name, mask in masks.items() if name not in held_out}
     write_splats(splats, folder / "point_cloud.ply")

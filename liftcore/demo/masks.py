@@ -39,7 +39,7 @@ class Mistakes:
 def true_labels(scene: StillLife, raster: Raster, view: str) -> np.ndarray:
     """What every ray shows: [2, H, W] i32, objects and parts; -1 where the ray misses the scene."""
     onehot = torch.nn.functional.one_hot(torch.from_numpy(scene.splat_parts).long(), len(scene.parts))
-    sums = raster.render(scene.cameras.get(view), onehot.to(torch.float32), CompositingParams()).numpy()
+    sums = raster.render(scene.cameras[view], onehot.to(torch.float32), CompositingParams()).numpy()
     owner = np.array(scene.thing_of_part)
     things = np.zeros((*sums.shape[:2], len(scene.things)), np.float32)
     for part, thing in enumerate(owner):
@@ -64,7 +64,7 @@ def observe(
     rng = np.random.default_rng(seed)
     vectors = (encoder.encode(scene.things).numpy(), encoder.encode(scene.parts).numpy())
     observed = {}
-    for camera in scene.cameras:
+    for camera in scene.cameras.values():
         if camera.name in scene.held_out:
             continue
         levels = true_labels(scene, raster, camera.name)

@@ -165,7 +165,7 @@ def _phrases_of(truth: Truth | None) -> tuple[str, ...]:
 
 
 def _some_views(cameras: Path) -> tuple[str, ...]:
-    from liftcore.io.load import load_cameras
+    from liftcore.io.cameras import read_cameras
 
-    views = [camera.name for camera in load_cameras(cameras)]
+    views = [camera.name for camera in read_cameras(cameras).values()]
     return (views[len(views) // 2],)

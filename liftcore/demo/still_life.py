@@ -63,7 +63,7 @@ def still_life(seed: int = 7, views: int = 22, density: float = 1.0) -> StillLif
     return StillLife(
         splats=_splats(pieces, samples, rng),
         cameras=cameras,
-        held_out=tuple(camera.name for camera in list(cameras)[2::5]),
+        held_out=tuple(camera.name for camera in list(cameras.values())[2::5]),
         things=things,
         parts=parts,
         thing_of_part=tuple(owner[part] for part in parts),
@@ -79,7 +79,7 @@ def arc(views: int) -> Cameras:
         lift = np.radians(24.0 if k % 2 == 0 else 36.0)
         offset = np.array([np.sin(angle) * np.cos(lift), -np.cos(angle) * np.cos(lift), np.sin(lift)])
         pose = _look_at(TARGET + 10.5 * offset)
-        cameras.append(Camera(f"view_{k:02d}", WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, pose))
+        cameras.append(Camera.pinhole(f"view_{k:02d}", WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, pose))
     return Cameras(tuple(cameras))
 
 

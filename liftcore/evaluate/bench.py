@@ -144,13 +144,14 @@ def _workload(options: dict[str, Any]) -> Workload:
 def _real(folder: Path, channels: int, levels: int, count: int) -> Workload:
     """A scene folder with point_cloud.ply, cameras and regions.safetensors or features.safetensors."""
     from liftcore.features.pack import open_packs, pair
-    from liftcore.io.load import load_cameras, load_splats
+    from liftcore.io.cameras import read_cameras
+    from liftcore.io.ply import read_splats
     from tests.benchmarks.scene_files import cameras_of
 
     packs = [folder / name for name in ("regions.safetensors", "features.safetensors") if (folder / name).is_file()]
     if not packs:
         raise InvalidInput("scene", expected="a folder with regions.safetensors", got=str(folder))
-    cameras = load_cameras(cameras_of(folder))
+    cameras = read_cameras(cameras_of(folder))
     features = pair(open_packs(packs[:1]), cameras)[0]
     views = []
     for number, name in enumerate(features.views[:count]):
@@ -162,8 +163,8 @@ def _real(folder: Path, channels: int, levels: int, count: int) -> Workload:
         generator = torch.Generator().manual_seed(number)
         codebook = torch.randn(observed.codebook.shape[0], channels, generator=generator)
         codebook = torch.nn.functional.normalize(codebook, dim=1).half()
-        views.append((cameras.get(name), Regions(labels, codebook)))
-    return Workload(folder.name, load_splats(folder / "point_cloud.ply"), views)
+        views.append((cameras[name], Regions(labels, codebook)))
+    return Workload(folder.name, read_splats(folder / "point_cloud.ply"), views)
 
 
 def _size(text: str) -> tuple[int, int]:

@@ -61,7 +61,7 @@ def room_cameras(count: int, width: int, height: int) -> list[Camera]:
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = rotation, -rotation @ centre
         focal = 0.8 * width
-        cameras.append(Camera(f"room_{k:03d}", width, height, focal, focal, width / 2, height / 2, pose))
+        cameras.append(Camera.pinhole(f"room_{k:03d}", width, height, focal, focal, width / 2, height / 2, pose))
     return cameras
 
 

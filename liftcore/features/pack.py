@@ -186,8 +186,8 @@ def pair(packs: FeaturePacks, cameras: Cameras) -> tuple[FeaturePacks, list[str]
     Raises:
         InvalidFeatures: no view has a camera.
     """
-    names = require_pairs(packs.views, cameras.by_name)
-    return packs.seen_by(names, cameras.by_name), [view for view in packs.views if view not in names]
+    names = require_pairs(packs.views, cameras)
+    return packs.seen_by(names, cameras), [view for view in packs.views if view not in names]
 
 
 def _spread(length: int, count: int) -> list[int]:

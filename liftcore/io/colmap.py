@@ -98,7 +98,7 @@ def _camera(name: str, image: _Image, sensors: Mapping[int, _Sensor], files: tup
     pose = np.eye(4)
     pose[:3, :3] = _rotation(np.array(image.quaternion), f"{source} image {name!r}")
     pose[:3, 3] = image.translation
-    camera = Camera(name, sensor.width, sensor.height, *intrinsics, world_to_camera=pose)
+    camera = Camera.pinhole(name, sensor.width, sensor.height, *intrinsics, viewmat=pose)
     return camera if distortion is None else behind_lens(camera, distortion)
 
 

@@ -59,11 +59,11 @@ class Similarity:
         x' is scale x.
         """
         views = []
-        for camera in cameras:
+        for camera in cameras.values():
             pose = np.eye(4)
-            pose[:3, :3] = camera.world_to_camera[:3, :3] @ self.rotation.T
-            pose[:3, 3] = self.scale * camera.world_to_camera[:3, 3] - pose[:3, :3] @ self.translation
-            views.append(replace(camera, world_to_camera=pose))
+            pose[:3, :3] = camera.viewmat[:3, :3] @ self.rotation.T
+            pose[:3, 3] = self.scale * camera.viewmat[:3, 3] - pose[:3, :3] @ self.translation
+            views.append(replace(camera, viewmat=pose))
         return Cameras(tuple(views), frame=FRAME_FILE)
 
 

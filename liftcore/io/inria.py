@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from liftcore.errors import InvalidCameras
 from liftcore.io.json_file import FORMATS, entry, matrix, number, pixels
 from liftcore.io.whole_file import whole_file
-from liftcore.scene.cameras import Camera, Cameras, check_count, world_to_camera
+from liftcore.scene.cameras import Camera, Cameras, check_count, viewmat_of
 from liftcore.scene.view_names import view_names
 
 if TYPE_CHECKING:
@@ -43,8 +43,8 @@ def _camera(name: str, record: dict[str, Any], source: str) -> Camera:
     fx, fy = (number(entry(record, key, where), f"{where} {key}") for key in ("fx", "fy"))
     rotation = matrix(entry(record, "rotation", where), (3,), 3, f"{where} rotation")
     (position,) = matrix([entry(record, "position", where)], (1,), 3, f"{where} position")
-    pose = world_to_camera(rotation, position)
-    return Camera(name, width, height, fx, fy, width / 2, height / 2, world_to_camera=pose)
+    pose = viewmat_of(rotation, position)
+    return Camera.pinhole(name, width, height, fx, fy, width / 2, height / 2, viewmat=pose)
 
 
 def write_inria_cameras(cameras: Cameras, path: Path) -> None:
@@ -53,7 +53,7 @@ def write_inria_cameras(cameras: Cameras, path: Path) -> None:
     Raises:
         InvalidCameras: a photo is distorted, or its principal point off the centre, which the format cannot say.
     """
-    records = [_record(i, camera) for i, camera in enumerate(cameras)]
+    records = [_record(i, camera) for i, camera in enumerate(cameras.values())]
     with whole_file(path) as handle:
         handle.write(json.dumps(records, indent=1).encode())
 
@@ -71,7 +71,7 @@ def _record(index: int, camera: Camera) -> dict[str, Any]:
         "width": camera.width,
         "height": camera.height,
         "position": camera.centre.tolist(),
-        "rotation": camera.world_to_camera[:3, :3].T.tolist(),
+        "rotation": camera.viewmat[:3, :3].T.tolist(),
         "fy": camera.fy,
         "fx": camera.fx,
     }

@@ -10,9 +10,10 @@ import torch
 
 from liftcore.io.camera_source import TRANSFORMS, camera_source, found_near, is_of_nerfstudio
 from liftcore.io.camera_zip import has_transforms
+from liftcore.io.cameras import other_models, read_cameras
 from liftcore.io.foreign import SUFFIXES
 from liftcore.io.frame import FRAME_FILE, frame_warning
-from liftcore.io.load import load_cameras, load_splats, other_models
+from liftcore.io.ply import read_splats
 from liftcore.io.ply_dialect import nearest_dialect
 from liftcore.raster.constants import ALPHA_FLOOR
 from liftcore.scene.distorted import distortion_warning
@@ -52,7 +53,7 @@ def inspect_file(path: Path) -> dict[str, Any]:
         InvalidSplats, InvalidCameras: the file is malformed.
     """
     if is_splats(path):
-        return {"kind": "splats", "bytes": path.stat().st_size, **describe_splats(load_splats(path))}
+        return {"kind": "splats", "bytes": path.stat().st_size, **describe_splats(read_splats(path))}
     found = describe_camera_file(path)  # first: which of its files are there is told better by who reads them
     size = sum(file.stat().st_size for file in camera_source(path).files)
     return {"kind": "cameras", "bytes": size, **found}
@@ -92,7 +93,7 @@ def describe_camera_file(path: Path) -> dict[str, Any]:
     Raises:
         InvalidCameras: the file is malformed.
     """
-    found, others = describe_cameras(load_cameras(path)), other_models(path)
+    found, others = describe_cameras(read_cameras(path)), other_models(path)
     if others:
         found["warnings"].append(f"{len(others)} more COLMAP models were not read: {', '.join(others[:SHOWN])}")
     if found["frame"] is None:
@@ -102,12 +103,12 @@ def describe_camera_file(path: Path) -> dict[str, Any]:
 
 def describe_cameras(cameras: Cameras) -> dict[str, Any]:
     """Counts, ranges and warnings of cameras."""
-    centres = np.stack([camera.centre for camera in cameras])
-    sizes = sorted({"{}x{}".format(*photo_size(camera)) for camera in cameras})
-    focals = [focal for camera in cameras for focal in (camera.fx, camera.fy)]
+    centres = np.stack([camera.centre for camera in cameras.values()])
+    sizes = sorted({"{}x{}".format(*photo_size(camera)) for camera in cameras.values()})
+    focals = [focal for camera in cameras.values() for focal in (camera.fx, camera.fy)]
     return {
         "views": len(cameras),
-        "names": [camera.name for camera in cameras],
+        "names": list(cameras),
         "sizes": sizes,
         "distorted": len(cameras.distorted),
         "frame": cameras.frame,
@@ -173,13 +174,13 @@ def _reading_warnings(splats: Splats) -> list[str]:
 
 
 def _camera_warnings(cameras: Cameras, centres: np.ndarray) -> list[str]:
-    photos = {camera.name: camera.lens or camera for camera in cameras}
+    photos = {camera.name: camera.lens or camera for camera in cameras.values()}
     off = [
         name
         for name, photo in photos.items()
         if abs(photo.cx / photo.width - 0.5) > OFF_CENTRE or abs(photo.cy / photo.height - 0.5) > OFF_CENTRE
     ]
-    warnings = distortion_warning(cameras.views) + frame_warning(cameras)
+    warnings = distortion_warning(list(cameras.values())) + frame_warning(cameras)
     if off:
         warnings.append(f"{len(off)} views have their principal point far off the centre, such as {off[0]!r}")
     places = len(np.unique(centres, axis=0))

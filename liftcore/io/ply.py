@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from liftcore.errors import InvalidSplats
+from liftcore.io.foreign import LFS_POINTER
 from liftcore.io.ply_dialect import NORMALS, Slot, model_slots, recognise_kernel, usual_layout
 from liftcore.io.ply_header import SCALAR_TYPES, PlyHeader, PlyProperty, parse_header, read_header
 from liftcore.io.whole_file import whole_file
+from liftcore.scene.kernel import Kernel, kernel_named
 from liftcore.scene.mip_filter import FILTER, filtered
-from liftcore.scene.splats import Kernel, Splats
+from liftcore.scene.splats import Splats
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
-    from pathlib import Path
 
     from torch import Tensor
 
@@ -27,10 +29,17 @@ COLOUR = ("sh", "sb_params")  # fields that a lift has no use for, and most of a
 _SPELLING = {code: name for name, code in reversed(SCALAR_TYPES.items())}  # the C names: "float", "uchar"
 
 
-def read_splats(path: Path, kernel: Kernel | None = None, *, colour: bool = True) -> Splats:
+EXPORT = (
+    "export the splats as PLY from the program that trained them (nerfstudio: ns-export gaussian-splat; gsplat's "
+    "simple_trainer: --save-ply)"
+)
+PICKLED = (".pt", ".pth", ".ckpt", ".pkl")
+
+
+def read_splats(path: Path | str, kernel: Kernel | str = "auto", *, colour: bool = True) -> Splats:
     """Read trained splats from a binary little-endian PLY of any dialect.
 
-    The kernel is recognised from the properties unless it is given. Columns that the model does not know are
+    With the kernel ``auto`` it is recognised from the properties. Columns that the model does not know are
     kept as extras in their own type; ``double`` columns of the model become float32. Without ``colour`` neither
     colours nor extras are read or allocated, and what comes cannot be written back. A ``filter_3D`` becomes part of
     scales and opacities (`mip_filter`), which are then written as plain splats; elements behind the vertices are
@@ -39,9 +48,13 @@ def read_splats(path: Path, kernel: Kernel | None = None, *, colour: bool = True
     Raises:
         InvalidSplats: the file is malformed, lacks a property of the kernel, or holds NaN or no splats.
     """
+    path = Path(path)
+    if path.suffix.lower() in PICKLED and not _begins(path, LFS_POINTER):
+        got = "a Python pickle, which may run code when it is opened"
+        raise InvalidSplats(str(path), expected="a PLY file", got=got, hint=EXPORT)
     header = read_header(path)
     names = [column.name for column in header.properties]
-    kernel = recognise_kernel(names) if kernel is None else kernel
+    kernel = recognise_kernel(names) if kernel == "auto" else kernel_named(kernel)
     slots = model_slots(names, kernel, str(path))
     for column in header.properties:
         if column.name in slots and column.code not in ("f4", "f8"):
@@ -64,6 +77,14 @@ def read_splats(path: Path, kernel: Kernel | None = None, *, colour: bool = True
             lines, layout = (), tuple(name for name in layout if name != FILTER)
             fields |= _filtered(fields, extras.pop(FILTER))
         return Splats(**fields, kernel=kernel, extras=extras, layout=layout, header=lines)
+
+
+def _begins(path: Path, first: bytes) -> bool:
+    try:
+        with path.open("rb") as handle:
+            return handle.read(len(first)) == first
+    except OSError:
+        return False
 
 
 def write_splats(splats: Splats, path: Path) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from liftcore.errors import InvalidCameras
 from liftcore.io.camera_models import Intrinsics, distortion_of
 from liftcore.io.json_file import FORMATS, entry, matrix, number, pixels
-from liftcore.scene.cameras import Camera, Cameras, check_count, world_to_camera
+from liftcore.scene.cameras import Camera, Cameras, check_count, viewmat_of
 from liftcore.scene.lens import behind_lens
 from liftcore.scene.view_names import view_names
 
@@ -79,9 +79,9 @@ def _camera(name: str, keys: ChainMap[str, Any], source: str) -> Camera:
     if len(given) == 4 and np.abs(given[3] - LAST_ROW).max() > 1e-6:
         got = " ".join(f"{value:g}" for value in given[3])
         raise InvalidCameras(f"{where} transform_matrix", expected="0 0 0 1 as the last row", got=got)
-    pose = world_to_camera(given[:3, :3] * OPENGL_TO_OPENCV, given[:3, 3])
+    pose = viewmat_of(given[:3, :3] * OPENGL_TO_OPENCV, given[:3, 3])
     intrinsics = _intrinsics(keys, width, height, where)
-    camera = Camera(name, width, height, *intrinsics, world_to_camera=pose)
+    camera = Camera.pinhole(name, width, height, *intrinsics, viewmat=pose)
     return camera if distortion is None else behind_lens(camera, distortion)
 
 

@@ -98,7 +98,7 @@ def fly_pilot(
     total, count = len(names), min(PILOT_VIEWS, len(names))
     flown: list[int] = spread(total, count).tolist()
     chosen = [names[view] for view in flown]
-    longest = max(max(camera.width, camera.height) for camera in map(cameras.get, chosen))
+    longest = max(max(camera.width, camera.height) for camera in (cameras[view] for view in chosen))
     coarse = {"stride": max(1, longest // PILOT_SIDE), "certificate_rays": 0, "robust_steps": 0}
     own = settings.model_copy(update=coarse)
     axes = random_axes(packs.channels, min(PILOT_CHANNELS, packs.channels), settings.seed)

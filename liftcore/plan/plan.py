@@ -173,7 +173,7 @@ def plan_lift(
         Unavailable: this machine has no room for the codebooks, or for the features in no place; or the card that
             the lift was sent to has none.
     """
-    by_name = {name: cameras.get(name) for name in names}
+    by_name = {name: cameras[name] for name in names}
     seen = visibility(splats, list(by_name.values()), settings.lift_params)
     chosen, expected = _choose_views(
         seen, settings, lambda: fly_pilot(splats, cameras, packs, names, settings, seen, threads)

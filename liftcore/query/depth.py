@@ -48,7 +48,7 @@ def expected_depth(scene: QueryScene, view: str) -> tuple[Tensor, Tensor]:
         InvalidQuery: its image is larger than pictures may be.
         InvalidLift: the splats or the cameras moved or changed since the lift.
     """
-    pose = torch.from_numpy(scene.cameras.get(view).world_to_camera[2].copy())
+    pose = torch.from_numpy(scene.cameras[view].viewmat[2].copy())
     depths = (scene.splats.means.double() @ pose[:3] + pose[3]).to(torch.float32)
     values = torch.stack([depths, torch.ones_like(depths)], dim=1)
     walk = CompositingParams(antialiased=scene.walk.antialiased)

@@ -109,7 +109,7 @@ def _of_example(scene: QueryScene, example: Pixel | OneSplat | Vector) -> Tensor
 
 def _rendered(scene: QueryScene, pixel: Pixel) -> Tensor:
     """``sum_j A_ij x_j`` of the pixel's ray, [F] f64, walked as scores are rendered."""
-    camera = scene.cameras.get(pixel.view)
+    camera = scene.cameras[pixel.view]
     width, height = photo_size(camera)
     if not (0 <= pixel.x < width and 0 <= pixel.y < height):
         expected = f"x in 0..{width - 1} and y in 0..{height - 1}"

@@ -63,7 +63,7 @@ def render(scene: QueryScene, view: str, what: str = "rgb") -> np.ndarray:
     """
     if what == "cluster":
         return render_clusters(scene, view)
-    colours = scene.principal if what == "pca" else seen_colours(scene.splats, scene.cameras.get(view))
+    colours = scene.principal if what == "pca" else seen_colours(scene.splats, scene.cameras[view])
     walk = CompositingParams(antialiased=scene.walk.antialiased)
     image = scene.image(view, lambda camera: scene.raster.render(camera, colours, walk))
     levels = image.numpy()  # in place: an image of floats is large

@@ -104,9 +104,9 @@ class QueryScene:
         Raises:
             InvalidLift: their file moved, or is another than the one that was lifted.
         """
-        from liftcore.io.load import kernel_named, load_splats
+        from liftcore.io.ply import read_splats
 
-        return load_splats(self.splat_file, kernel_named(self.lift.metadata.settings.kernel))
+        return read_splats(self.splat_file, self.lift.metadata.settings.kernel)
 
     @cached_property
     def axes(self) -> Tensor:
@@ -120,10 +120,10 @@ class QueryScene:
         Raises:
             InvalidLift: their file moved, or is another than the one that was lifted.
         """
-        from liftcore.io.load import load_cameras
+        from liftcore.io.cameras import read_cameras
 
         # Which of several models was meant, the lift knew: its digest tells that the same is read.
-        return load_cameras(unchanged("cameras", self.lift.metadata.cameras, self.path), choosing=False)
+        return read_cameras(unchanged("cameras", self.lift.metadata.cameras, self.path), choosing=False)
 
     def image(self, view: str, draw: Callable[[Camera], Tensor]) -> Tensor:
         """A picture [H, W, ..] of a view in its photo's pixels, from what draws one of a pinhole (`in_photo`).
@@ -133,7 +133,7 @@ class QueryScene:
             InvalidQuery: its image is larger than pictures may be.
             InvalidLift: the cameras moved or changed since the lift.
         """
-        camera = self.cameras.get(view)
+        camera = self.cameras[view]
         for width, height in (photo_size(camera), photo_size(drawn_by(camera))):
             if width * height > MOST_PIXELS:
                 raise InvalidQuery(

@@ -53,7 +53,7 @@ def view_mask(
         InvalidQuery: the view's image is larger than pictures may be; or the largest of more splats than are grouped.
         InvalidLift: the splats or the cameras moved or changed since the lift.
     """
-    scene.cameras.get(view)  # a name that is not there is told before anything is grouped
+    scene.cameras[view]  # a name that is not there is told before anything is grouped
     if answer.count > MOST_GROUPED and answer.query.keep == "all":
         members, shown = answer.selected, f"all {answer.count} selected splats, too many to tell strays apart"
     else:

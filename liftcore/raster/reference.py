@@ -47,7 +47,7 @@ def dense_view(splats: Splats, camera: Camera, walk: CompositingParams) -> Dense
     y, x = np.mgrid[: camera.height, : camera.width]
     pixels = np.stack([x.ravel() + 0.5, y.ravel() + 0.5], axis=1)
     rays = pixels.shape[0]
-    z = (splats.means.double().numpy() @ camera.world_to_camera[2, :3]) + camera.world_to_camera[2, 3]
+    z = (splats.means.double().numpy() @ camera.viewmat[2, :3]) + camera.viewmat[2, 3]
     A = np.zeros((rays, splats.count))
     cut = np.zeros(rays, bool)
     T = np.ones(rays)

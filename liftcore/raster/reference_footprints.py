@@ -39,12 +39,12 @@ def camera_axes(splats: Splats, j: int, camera: Camera) -> np.ndarray:
     A scale of zero is the limit of small ones: a disc that has become a line keeps its plane.
     """
     scales = np.exp(splats.log_scales[j].double().numpy().clip(min=-MAX_LOG_SCALE))
-    return camera.world_to_camera[:3, :3] @ rotation(splats.quats[j].double().numpy())[:, : len(scales)] * scales
+    return camera.viewmat[:3, :3] @ rotation(splats.quats[j].double().numpy())[:, : len(scales)] * scales
 
 
 def camera_mean(splats: Splats, j: int, camera: Camera) -> np.ndarray:
     """[3] f64, the centre of splat j in the camera's frame."""
-    return camera.world_to_camera[:3, :3] @ splats.means[j].double().numpy() + camera.world_to_camera[:3, 3]
+    return camera.viewmat[:3, :3] @ splats.means[j].double().numpy() + camera.viewmat[:3, 3]
 
 
 def projected_gaussian(splats: Splats, j: int, camera: Camera) -> tuple[np.ndarray, np.ndarray, float]:

@@ -22,7 +22,7 @@ def counted_weights(
     A: np.ndarray, splats: Splats, camera: Camera, walk: CompositingParams, weighting: Weighting
 ) -> tuple[np.ndarray, np.ndarray]:
     """A' [H * W, P], the weights of A [H * W, P] that count, to their power; and the rays [H * W] hard to decide."""
-    depths = splats.means.double().numpy() @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
+    depths = splats.means.double().numpy() @ camera.viewmat[2, :3] + camera.viewmat[2, 3]
     order = np.argsort(depths.astype(np.float32), kind="stable")
     w = A[:, order]  # near to far
     if weighting.selection is Selection.TOP_K:
@@ -64,7 +64,7 @@ def _largest(w: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
 def _centres(A: np.ndarray, splats: Splats, camera: Camera, walk: CompositingParams) -> tuple[np.ndarray, np.ndarray]:
     """[H * W, P] bool: the walked ray nearest to the splat's projected centre; and rays of centres near a border."""
     counts, cut = np.zeros_like(A, bool), np.zeros_like(A, bool)
-    pose = camera.world_to_camera
+    pose = camera.viewmat
     for j, mean in enumerate(splats.means.double().numpy()):
         x, y, z = pose[:3, :3] @ mean + pose[:3, 3]
         if z <= 0:

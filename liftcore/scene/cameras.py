@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
-from functools import cached_property
-from typing import TYPE_CHECKING
+from dataclasses import KW_ONLY, dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,11 +15,10 @@ from liftcore.nearest import nearest
 from liftcore.scene.view_pairs import cameras_of_views
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-
     from liftcore.scene.lens import Lens
 
 MAX_SIDE = 32_768  # pixels; larger images are a broken header, not a photo
+ROUNDING = 1e-6  # of the last row of a pose
 MIN_FOCAL, MAX_FOCAL = 1e-3, 1e9  # pixels; float64 squares of what they project stay finite
 MAX_OFF_CENTRE = 1e9  # pixels of the principal point
 MAX_REACH = 1e12  # scene units from the origin; float32 has no detail left long before
@@ -35,33 +34,34 @@ SAME_NAMES = (
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """One pinhole view. OpenCV axes (x right, y down, z forward), pixel centres at +0.5."""
+    """One pinhole view, in gsplat's conventions: OpenCV axes (x right, y down, z forward), pixel centres at +0.5.
 
-    name: str  # the image's name without its extension; pairs the view with its features
+    A point p of the world lies at ``viewmat @ (p, 1)`` in the camera, and a point x of the camera at the pixel
+    ``K @ x / x_z``. Matrices may be of numpy or torch, on the CPU or a card; they are kept as float64 on the CPU.
+
+    Raises:
+        InvalidCameras: a size, an intrinsic or the pose is out of range; the error names which.
+    """
+
+    viewmat: np.ndarray  # [4, 4] f64, world to camera, rigid
+    K: np.ndarray  # [3, 3] f64, pixels, (fx 0 cx; 0 fy cy; 0 0 1)
     width: int  # pixels
     height: int  # pixels
-    fx: float  # pixels
-    fy: float  # pixels
-    cx: float  # pixels, from the left edge of the first pixel
-    cy: float  # pixels, from the top edge of the first pixel
-    world_to_camera: np.ndarray  # [4, 4] f64, rigid
+    _: KW_ONLY
     lens: Lens | None = None  # of a distorted photo, which this pinhole stands for; None: the photo is as it says
+    name: str = ""  # the image's name without its extension; pairs the view with its features
 
     def __post_init__(self) -> None:
-        pose = np.array(self.world_to_camera, dtype=np.float64)
-        pose.setflags(write=False)
-        object.__setattr__(self, "world_to_camera", pose)
+        pose, intrinsics = _matrix(self.viewmat), _matrix(self.K)
+        object.__setattr__(self, "viewmat", pose)
+        object.__setattr__(self, "K", intrinsics)
         if not (0 < self.width <= MAX_SIDE and 0 < self.height <= MAX_SIDE):
             self._refuse("size", f"width and height in 1..{MAX_SIDE}", f"{self.width}x{self.height}")
-        intrinsics = (self.fx, self.fy, self.cx, self.cy)
-        if not all(math.isfinite(value) for value in intrinsics) or self.fx <= 0 or self.fy <= 0:
-            self._refuse("intrinsics", "finite fx, fy, cx, cy with positive focal lengths", str(intrinsics))
-        if not (min(intrinsics[:2]) >= MIN_FOCAL and max(intrinsics[:2]) <= MAX_FOCAL):
-            self._refuse("intrinsics", f"focal lengths in {MIN_FOCAL:g}..{MAX_FOCAL:g} pixels", str(intrinsics))
-        if max(abs(self.cx), abs(self.cy)) > MAX_OFF_CENTRE:
-            self._refuse("intrinsics", f"a principal point within {MAX_OFF_CENTRE:g} pixels", str(intrinsics))
+        self._check_intrinsics()
         if pose.shape != (4, 4) or not np.isfinite(pose).all():
             self._refuse("pose", "a finite 4x4 matrix", f"shape {list(pose.shape)}")
+        if np.abs(pose[3] - (0.0, 0.0, 0.0, 1.0)).max() > ROUNDING:
+            self._refuse("pose", "0 0 0 1 as the last row", " ".join(f"{value:g}" for value in pose[3]))
         rotation = pose[:3, :3]
         # Large entries are refused before the product, which they could overflow.
         error = float(np.abs(rotation).max())
@@ -73,13 +73,83 @@ class Camera:
         if reach > MAX_REACH:
             self._refuse("pose", f"a translation within {MAX_REACH:g}", f"{reach:.2g}")
 
+    @classmethod
+    def pinhole(
+        cls,
+        name: str,
+        width: int,
+        height: int,
+        fx: float,
+        fy: float,
+        cx: float,
+        cy: float,
+        viewmat: np.ndarray,
+        lens: Lens | None = None,
+    ) -> Camera:
+        """A camera of its intrinsics in pixels, the principal point from the left and top edge of the image."""
+        K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        return cls(viewmat, K, width, height, lens=lens, name=name)
+
+    def replace(self, **changes: Any) -> Camera:
+        """The same camera with other fields, or with another ``fx``, ``fy``, ``cx`` or ``cy``."""
+        K = np.array(changes.pop("K", self.K))
+        for place, key in (((0, 0), "fx"), ((1, 1), "fy"), ((0, 2), "cx"), ((1, 2), "cy")):
+            K[place] = changes.pop(key, K[place])
+        return replace(self, K=K, **changes)
+
+    def _check_intrinsics(self) -> None:
+        K = self.K
+        if K.shape != (3, 3) or (K[1, 0], *K[2].tolist()) != (0.0, 0.0, 0.0, 1.0) or K[0, 1] != 0:
+            rows = "fx 0 cx; 0 fy cy; 0 0 1"
+            got = "; ".join(" ".join(f"{value:g}" for value in row) for row in np.atleast_2d(K)[:3])
+            self._refuse("K", f"a 3x3 matrix ({rows}) without skew", got[:SHOWN])
+        intrinsics = (self.fx, self.fy, self.cx, self.cy)
+        if not all(math.isfinite(value) for value in intrinsics) or self.fx <= 0 or self.fy <= 0:
+            self._refuse("intrinsics", "finite fx, fy, cx, cy with positive focal lengths", str(intrinsics))
+        if not (min(intrinsics[:2]) >= MIN_FOCAL and max(intrinsics[:2]) <= MAX_FOCAL):
+            self._refuse("intrinsics", f"focal lengths in {MIN_FOCAL:g}..{MAX_FOCAL:g} pixels", str(intrinsics))
+        if max(abs(self.cx), abs(self.cy)) > MAX_OFF_CENTRE:
+            self._refuse("intrinsics", f"a principal point within {MAX_OFF_CENTRE:g} pixels", str(intrinsics))
+
     def _refuse(self, part: str, expected: str, got: str) -> None:
         raise InvalidCameras(f"camera {self.name!r} {part}", expected=expected, got=got)
 
     @property
+    def fx(self) -> float:
+        """Focal length in x, pixels."""
+        return float(self.K[0, 0])
+
+    @property
+    def fy(self) -> float:
+        """Focal length in y, pixels."""
+        return float(self.K[1, 1])
+
+    @property
+    def cx(self) -> float:
+        """Principal point, pixels from the left edge of the first pixel."""
+        return float(self.K[0, 2])
+
+    @property
+    def cy(self) -> float:
+        """Principal point, pixels from the top edge of the first pixel."""
+        return float(self.K[1, 2])
+
+    @property
     def centre(self) -> np.ndarray:
         """[3] f64, the camera's centre in the world frame."""
-        return -self.world_to_camera[:3, :3].T @ self.world_to_camera[:3, 3]
+        return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
+
+
+def _matrix(values: Any) -> np.ndarray:
+    """A read-only copy as f64 on the CPU, of numpy, nested lists or torch, which is not imported for it."""
+    if hasattr(values, "detach"):
+        values = values.detach().cpu().numpy()
+    try:
+        found = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        found = np.full((0,), np.nan)  # no numbers: refused by its shape
+    found.setflags(write=False)
+    return found
 
 
 def _what_it_is(matrix: np.ndarray, error: float) -> str:
@@ -89,7 +159,7 @@ def _what_it_is(matrix: np.ndarray, error: float) -> str:
     return f"a matrix off by {error:.2g}"
 
 
-def world_to_camera(camera_to_world: np.ndarray, centre: np.ndarray) -> np.ndarray:
+def viewmat_of(camera_to_world: np.ndarray, centre: np.ndarray) -> np.ndarray:
     """[4, 4] f64 of a camera's axes in the world, [3, 3], and its centre, [3]; a ``Camera`` validates it."""
     pose = np.eye(4)
     pose[:3, :3] = camera_to_world.T
@@ -121,50 +191,64 @@ def check_count(count: int, source: str) -> None:
         raise InvalidCameras(source, expected=f"at most {MAX_VIEWS} views", got=f"{count} or more", hint=hint)
 
 
-@dataclass(frozen=True)
-class Cameras:
-    """The views of a scene, in file order, looked up by name."""
+class Cameras(Mapping[str, Camera]):
+    """The views of a scene by their names, in file order.
 
-    views: tuple[Camera, ...]
-    frame: str | None = None  # the name of the file by which they were moved to the frame of the splats
-    of_nerfstudio: bool = False  # as its own converter writes them, and not moved
+    Args:
+        views: a mapping of names to cameras, whose names win over those of the cameras; or named cameras.
+        frame: the name of the file by which they were moved to the frame of the splats.
+        of_nerfstudio: as nerfstudio's own converter writes them, and not moved.
 
-    def __post_init__(self) -> None:
-        if not self.views:
+    Raises:
+        InvalidCameras: there are none, more than MAX_VIEWS, or two of one name.
+    """
+
+    def __init__(
+        self,
+        views: Mapping[str, Camera] | Iterable[Camera],
+        *,
+        frame: str | None = None,
+        of_nerfstudio: bool = False,
+    ) -> None:
+        self.frame = frame
+        self.of_nerfstudio = of_nerfstudio
+        if isinstance(views, Mapping):
+            named = [view if view.name == name else view.replace(name=name) for name, view in views.items()]
+        else:
+            named = list(views)
+        if not named:
             raise InvalidCameras("cameras", expected="at least one view", got="none")
-        check_count(len(self.views), "cameras")
-        seen: set[str] = set()
-        for camera in self.views:
-            if camera.name in seen:
-                raise InvalidCameras(
-                    "cameras", expected="one view a name", got=f"{camera.name!r} twice", hint=SAME_NAMES
-                )
-            seen.add(camera.name)
+        check_count(len(named), "cameras")
+        self._by_name: dict[str, Camera] = {}
+        for camera in named:
+            if camera.name in self._by_name:
+                got = f"{camera.name!r} twice"
+                raise InvalidCameras("cameras", expected="one view a name", got=got, hint=SAME_NAMES)
+            self._by_name[camera.name] = camera
+
+    def __getitem__(self, name: str) -> Camera:
+        """The view of that name, or of a name that pairs with it (`view_pairs`): lifts of before name rigs otherwise.
+
+        Raises:
+            NotFound: no view has it; the error, which is a KeyError, names the nearest ones.
+        """
+        found = self._by_name.get(name) or self._by_name.get(cameras_of_views([name], self).get(name, ""))
+        if found is None:
+            got, hint = repr(name[:SHOWN]), nearest(name, self, NEAREST)
+            raise NotFound("view", expected="the name of a camera", got=got, hint=hint)
+        return found
+
+    def __contains__(self, name: object) -> bool:
+        """Whether a view has exactly that name."""
+        return name in self._by_name
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._by_name)
+
+    def __len__(self) -> int:
+        return len(self._by_name)
 
     @property
     def distorted(self) -> tuple[str, ...]:
         """The names of the views whose photos are distorted."""
-        return tuple(camera.name for camera in self.views if camera.lens is not None)
-
-    @cached_property
-    def by_name(self) -> Mapping[str, Camera]:
-        """Name -> camera."""
-        return {camera.name: camera for camera in self.views}
-
-    def get(self, name: str) -> Camera:
-        """The view of that name, or of a name that pairs with it (`view_pairs`): lifts of before name rigs otherwise.
-
-        Raises:
-            NotFound: no view has it; the error names the nearest ones.
-        """
-        found = self.by_name.get(name) or self.by_name.get(cameras_of_views([name], self.by_name).get(name, ""))
-        if found is None:
-            got, hint = repr(name[:SHOWN]), nearest(name, self.by_name, NEAREST)
-            raise NotFound("view", expected="the name of a camera", got=got, hint=hint)
-        return found
-
-    def __len__(self) -> int:
-        return len(self.views)
-
-    def __iter__(self) -> Iterator[Camera]:
-        return iter(self.views)
+        return tuple(name for name, camera in self._by_name.items() if camera.lens is not None)

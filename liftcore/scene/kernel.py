@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from enum import StrEnum
 
+from liftcore.errors import InvalidSplats
+
 
 class Kernel(StrEnum):
     """The footprint that a splat leaves on a ray."""
@@ -11,3 +13,15 @@ class Kernel(StrEnum):
     GAUSSIAN_3D = "3dgs"
     GAUSSIAN_2D = "2dgs"
     BETA = "dbs"
+
+
+def kernel_named(name: Kernel | str) -> Kernel:
+    """The kernel of a name.
+
+    Raises:
+        InvalidSplats: there is none of that name.
+    """
+    try:
+        return Kernel(name)
+    except ValueError:
+        raise InvalidSplats("kernel", expected=" or ".join(Kernel), got=repr(name)[:60]) from None

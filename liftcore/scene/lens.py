@@ -9,7 +9,7 @@ wider one, which sees all that the photo shows, and carried to the photo's pixel
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -114,7 +114,7 @@ def lifted_share(camera: Camera) -> float:
 def _pinhole(camera: Camera, lens: Lens, box: _Box) -> Camera:
     width, height = box.right - box.left, box.bottom - box.top
     cx, cy = lens.cx - box.left, lens.cy - box.top
-    return replace(camera, width=width, height=height, cx=cx, cy=cy, lens=lens)
+    return camera.replace(width=width, height=height, cx=cx, cy=cy, lens=lens)
 
 
 class _Frames(NamedTuple):

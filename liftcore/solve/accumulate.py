@@ -100,7 +100,7 @@ def accumulate(
     def looks() -> Iterator[ViewRequest]:
         rays = -(-settings.certificate_rays // len(views))
         for number, name in enumerate(views):
-            camera, observation = cameras.get(name), as_read(packs.observation(name), settings, name)
+            camera, observation = cameras[name], as_read(packs.observation(name), settings, name)
             walk = strided_walk(settings.lift_params, settings, camera, number)
             pixels = sample_pixels(camera, rays, (settings.seed, number), walk)
             readouts.append(read_pixels(observation, camera, pixels))

@@ -127,7 +127,7 @@ def filter_regions(
     for number, name in enumerate(names):
         observation = masks_of(packs.observation(name), settings, name)
         if isinstance(observation, Regions):
-            kappa = raster.strongest_labels(cameras.get(name), clustering.labels, walk).numpy()
+            kappa = raster.strongest_labels(cameras[name], clustering.labels, walk).numpy()
             rows = observation.codebook.shape[0]
             matches = match_regions(observation.labels.numpy(), kappa, rows, clustering.count)
             reliable = (matches.clusters >= 0) & (matches.ious >= settings.aggregation_iou)

@@ -78,7 +78,7 @@ def question(look: ViewRequest) -> str:
     camera, observed = look.camera, look.observation
     told: list[Any] = [camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy]
     told += [asdict(look.params), asdict(look.weighting), observed.codebook.shape[0]]
-    parts = [torch.from_numpy(camera.world_to_camera.copy()), look.pixels]
+    parts = [torch.from_numpy(camera.viewmat.copy()), look.pixels]
     if isinstance(observed, Regions):
         parts.append(observed.labels)
     else:

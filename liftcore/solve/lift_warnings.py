@@ -70,7 +70,7 @@ def order_warnings(splats: Splats, views: Sequence[Camera]) -> list[str]:
     means = splats.means[::step].double().numpy()
     coarse = []
     for camera in views:
-        z = means @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
+        z = means @ camera.viewmat[2, :3] + camera.viewmat[2, 3]
         ahead = z > 0
         blur = math.sqrt(LOW_PASS) * z / max(camera.fx, camera.fy)
         steps = np.spacing(z.astype(np.float32))

@@ -174,7 +174,7 @@ class Answers:
     def _query(self, request: dict[str, Any]) -> Frame:
         scene, answer = self._scene(request), self._answer(request)
         if request["view"] is not None:
-            scene.cameras.get(request["view"])  # links to pictures of a view that is not there help nobody
+            scene.cameras[request["view"]]  # links to pictures of a view that is not there help nobody
         return Frame(describe(scene, answer, request["top"]))
 
     def _objects(self, request: dict[str, Any]) -> Frame:

@@ -18,7 +18,7 @@ from liftcore.features.masks import describe_masks
 from liftcore.features.pack import open_packs
 from liftcore.io.inspect import describe_packs, describe_table
 from liftcore.io.inspect_scene import describe_camera_file, describe_splats
-from liftcore.io.load import load_splats
+from liftcore.io.ply import read_splats
 from liftcore.io.strict_json import finite
 from liftcore.query.encoders.table import TableEncoder
 from service.faults import fault_of
@@ -29,7 +29,7 @@ from service.wire import VIEW_CHARACTERS, AssetKind
 
 def check_splats(path: Path) -> dict[str, Any]:
     """Read and describe every splat."""
-    return {"suffix": ".ply", "found": describe_splats(load_splats(path))}
+    return {"suffix": ".ply", "found": describe_splats(read_splats(path))}
 
 
 def check_cameras(path: Path) -> dict[str, Any]:

@@ -95,7 +95,7 @@ def test_lift_and_its_files_are_found_where_they_were_downloaded(
     assert str(data).encode() not in made.read_bytes()  # paths of the server are nobody's business
     monkeypatch.chdir(tmp_path)
     scene = QueryScene.open(made)
-    assert scene.splats.count == COUNT and {camera.name for camera in scene.cameras} == set(VIEWS)
+    assert scene.splats.count == COUNT and {camera.name for camera in scene.cameras.values()} == set(VIEWS)
     assert set(scene.packs.views) == set(VIEWS)
 
 

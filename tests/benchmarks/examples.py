@@ -27,7 +27,7 @@ from liftcore.errors import InvalidQuery
 from liftcore.evaluate.accuracy import mask_iou
 from liftcore.evaluate.hardware import hardware, machine_line
 from liftcore.features.views import Regions
-from liftcore.io.load import load_splats
+from liftcore.io.ply import read_splats
 from liftcore.query.ask import Answer, ask
 from liftcore.query.directions import MINIMUM_ROW_SUM
 from liftcore.query.example import Pixel
@@ -109,7 +109,7 @@ def objects_of(truth: Tabletop) -> Iterator[Case]:
 def regions_of(scene: QueryScene, level: int) -> Iterator[Case]:
     """The regions of a level, and where their own views show them."""
     for view in scene.lift.metadata.views[::VIEW_STRIDE]:
-        camera = scene.cameras.get(view)
+        camera = scene.cameras[view]
         observed = scene.packs.observation(view)
         assert isinstance(observed, Regions)
         labels = torch.as_tensor(observed.labels[level]).float()
@@ -127,7 +127,7 @@ def measure_folder(
     """One row a lift of a scene with truth, a lift and a level of one with regions alone."""
     splats, cameras = folder / "point_cloud.ply", folder / "cameras.json"
     truth = Tabletop(folder) if (folder / "truth.json").exists() else None
-    raster = truth.raster if truth else CpuRaster(load_splats(splats))
+    raster = truth.raster if truth else CpuRaster(read_splats(splats))
     for pack in packs if truth else ("regions",):
         for preset in presets:
             scene = lifted([splats, cameras, folder / f"{pack}.safetensors"], preset, raster)

@@ -17,7 +17,7 @@ POSE_SHIFT = 0.01  # standard deviation of each coordinate of the centre, in sce
 
 def scene_scale(cameras: Cameras) -> float:
     """The largest distance of a camera's centre from the mean of all, scene units."""
-    centres = np.stack([camera.centre for camera in cameras])
+    centres = np.stack([camera.centre for camera in cameras.values()])
     return float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
 
 
@@ -25,7 +25,8 @@ def noisy_poses(cameras: Cameras, wrong: Sequence[str], seed: int) -> Cameras:
     """The cameras, those named in ``wrong`` turned and moved by Gaussian noise of the paper's size."""
     scale, chosen = scene_scale(cameras), set(wrong)
     random = np.random.default_rng(seed)
-    return Cameras(tuple(_moved(camera, random, scale) if camera.name in chosen else camera for camera in cameras))
+    moved = (_moved(view, random, scale) if name in chosen else view for name, view in cameras.items())
+    return Cameras(moved)
 
 
 def _moved(camera: Camera, random: np.random.Generator, scale: float) -> Camera:
@@ -33,9 +34,9 @@ def _moved(camera: Camera, random: np.random.Generator, scale: float) -> Camera:
     turn = _about(2, roll) @ _about(0, pitch) @ _about(1, yaw)
     centre = camera.centre + random.normal(0, POSE_SHIFT * scale, 3)
     pose = np.eye(4)
-    pose[:3, :3] = turn @ camera.world_to_camera[:3, :3]
+    pose[:3, :3] = turn @ camera.viewmat[:3, :3]
     pose[:3, 3] = -pose[:3, :3] @ centre
-    return replace(camera, world_to_camera=pose)
+    return replace(camera, viewmat=pose)
 
 
 def _about(axis: int, angle: float) -> np.ndarray:

@@ -94,7 +94,7 @@ def run(splats: int, channels: int, repeats: int, size: tuple[int, int] | None =
         result["first_ask_ms"] = 1e3 * (time.perf_counter() - begin)
         result["ask_ms"] = _times(lambda k: ask(scene, str(k), encoder), repeats)
         if size is not None:
-            view = next(iter(scene.cameras)).name
+            view = next(iter(scene.cameras))
             view_mask(scene, answer, view)
             result["ask_and_mask_ms"] = _times(
                 lambda k: mask_png(view_mask(scene, ask(scene, str(k), encoder), view)), repeats

@@ -13,7 +13,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -127,7 +127,7 @@ def _unit(rows: np.ndarray) -> np.ndarray:
 def _shrunk(camera: Camera) -> Camera:
     sizes = {"width": camera.width // SHRUNK, "height": camera.height // SHRUNK}
     lengths = {name: getattr(camera, name) / SHRUNK for name in ("fx", "fy", "cx", "cy")}
-    return replace(camera, **sizes, **lengths)
+    return camera.replace(**sizes, **lengths)
 
 
 def main(arguments: list[str]) -> int:

@@ -24,7 +24,8 @@ from liftcore.evaluate.accuracy import class_ious, class_scores, rendered_scores
 from liftcore.evaluate.hardware import hardware, machine_line
 from liftcore.features.pack import open_packs
 from liftcore.features.views import NO_LABEL, Regions
-from liftcore.io.load import load_cameras, load_splats
+from liftcore.io.cameras import read_cameras
+from liftcore.io.ply import read_splats
 from liftcore.lift import lift
 from liftcore.raster.base import CompositingParams, Weighting
 from liftcore.raster.cpu.raster import CpuRaster
@@ -127,14 +128,14 @@ class Tabletop:
         except (OSError, ValueError, LookupError, TypeError, SafetensorError) as error:
             raise _no_truth(folder, f"files that do not hold that ({type(error).__name__}: {error})") from None
         self.classes: Tensor = torch.nn.functional.normalize(vectors.float(), dim=1)  # [K, F]
-        self.cameras: Cameras = load_cameras(cameras_of(folder))
+        self.cameras: Cameras = read_cameras(cameras_of(folder))
         if self.cameras.distorted:
             raise InvalidInput(
                 str(folder), expected="undistorted cameras beside its truth",
                 got=f"{len(self.cameras.distorted)} distorted ones",
                 hint="'splatlift tradeoff --labels' takes them, or undistort photos and masks",
             )  # fmt: skip
-        self.raster = CpuRaster(load_splats(folder / "point_cloud.ply"))
+        self.raster = CpuRaster(read_splats(folder / "point_cloud.ply"))
         self.counted = self._counted_splats()
 
     def _counted_splats(self) -> Tensor:
@@ -142,7 +143,7 @@ class Tabletop:
         nothing = Regions(torch.full((1, 1, 1), NO_LABEL, dtype=torch.int32), torch.ones(1, 1))
         evidence = np.zeros(self.raster.splats.count)
         for view in open_packs([self.folder / f"{EVIDENCE_PACK}.safetensors"]).views:
-            weights = self.raster.region_weights(self.cameras.get(view), nothing, CompositingParams(), Weighting())
+            weights = self.raster.region_weights(self.cameras[view], nothing, CompositingParams(), Weighting())
             evidence[weights.evidence_splats.numpy()] += weights.evidence.numpy()
         return torch.from_numpy(evidence > EVIDENCE_OVER)
 
@@ -177,7 +178,7 @@ class Tabletop:
     def maps(self, features: Tensor, settings: LiftSettings, raster: Raster) -> Iterator[Tensor]:
         """Each held-out view's rendered class scores [H, W, K] f32."""
         for view in self.held_out:
-            camera = self.cameras.get(view)
+            camera = self.cameras[view]
             yield rendered_scores(raster, camera, features, self.classes, settings.render_params)
 
 

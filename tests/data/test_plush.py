@@ -11,7 +11,8 @@ import torch
 
 from liftcore.features.pack import open_packs
 from liftcore.features.views import FeatureGrid
-from liftcore.io.load import load_cameras, load_splats
+from liftcore.io.cameras import read_cameras
+from liftcore.io.ply import read_splats
 from liftcore.lift import lift
 from liftcore.raster.base import CompositingParams
 from liftcore.raster.cpu.raster import CpuRaster
@@ -35,28 +36,28 @@ def plush(shared_data: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def cameras(plush: Path) -> Cameras:
-    return load_cameras(plush / "cameras.json")
+    return read_cameras(plush / "cameras.json")
 
 
 @pytest.fixture(scope="module")
 def raster(plush: Path) -> CpuRaster:
-    return CpuRaster(load_splats(plush / "point_cloud.ply"))
+    return CpuRaster(read_splats(plush / "point_cloud.ply"))
 
 
 def test_colmap_and_inria_files_describe_the_same_cameras(plush, cameras):
-    model = load_cameras(plush / "sparse" / "0")
-    assert {camera.name for camera in model} == {camera.name for camera in cameras}
-    for camera in model:
-        other = cameras.get(camera.name)
+    model = read_cameras(plush / "sparse" / "0")
+    assert set(model) == set(cameras)
+    for camera in model.values():
+        other = cameras[camera.name]
         assert (camera.width, camera.height) == (other.width, other.height) == (990, 742)
         assert np.allclose([camera.fx, camera.fy], [other.fx, other.fy], rtol=1e-6)
-        assert np.allclose(camera.world_to_camera, other.world_to_camera, atol=1e-5)
+        assert np.allclose(camera.viewmat, other.viewmat, atol=1e-5)
 
 
 def test_rays_are_as_full_as_the_training_measured(plush, cameras, raster):
     stats = json.loads((plush / "stats.json").read_text())
-    names = sorted(camera.name for camera in cameras)[:: len(cameras) // SAMPLE]
-    sums = torch.stack([raster.row_sums(cameras.get(name), CompositingParams()) for name in names])
+    names = sorted(cameras)[:: len(cameras) // SAMPLE]
+    sums = torch.stack([raster.row_sums(cameras[name], CompositingParams()) for name in names])
     assert float(sums.mean()) == pytest.approx(stats["row_sum_mean"], abs=1e-3)  # of all views
     assert float(sums.std()) == pytest.approx(stats["row_sum_std"], abs=2e-2)
     assert float(sums.max()) <= 1 + 1e-5
@@ -83,7 +84,7 @@ def test_lifted_cnn_features_render_like_those_of_unseen_photos(plush, cameras, 
     for name in HELD_OUT:
         observed = held_out.observation(name)
         assert isinstance(observed, FeatureGrid)
-        walk, camera = settings.render_params, cameras.get(name)
+        walk, camera = settings.render_params, cameras[name]
         cosine = rendered_cosine(raster, camera, features, observed.grid, walk)
         mirrored = rendered_cosine(raster, camera, features, observed.grid.flip(1), walk)
         assert cosine > 0.08

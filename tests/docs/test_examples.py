@@ -22,7 +22,7 @@ from pydantic import BaseModel
 from liftcore.cli import main
 from liftcore.features.pack import open_packs
 from liftcore.features.rle import mask_of_runs, read_runs
-from liftcore.io.load import load_splats
+from liftcore.io.ply import read_splats
 from service import wire
 from service.routes import assets, jobs, lifts, operations, queries, tradeoffs
 from tests.api.tiny_scene import WIDTH, WORDS, codebook, colmap_zip, labels, make_scene
@@ -111,7 +111,7 @@ def test_pack_of_ones_own_program_makes_a_lift_that_python_reads(
     names = run_example(SCENES, 'load_file("scene.lift.safetensors")')
     assert len(capsys.readouterr().out.splitlines()) >= 3
     places, features, sure = names["places"], names["lift"]["features"], names["sure"]
-    assert np.array_equal(places, load_splats(scene_folder / "scene.ply").means.numpy())
+    assert np.array_equal(places, read_splats(scene_folder / "scene.ply").means.numpy())
     clusters = np.digitize(places[sure, 0], [-0.6, 0.6])  # 0 apple, 1 book, 2 lamp
     assert len(set(clusters)) == 3 and np.array_equal(features[sure].argmax(axis=1), clusters)
 
@@ -183,8 +183,8 @@ def test_command_line_example_writes_its_files(scene_folder: Path) -> None:
     commands = [line.split()[1:] for line in lines if line.startswith("splatlift ")]
     assert [main(command) for command in commands] == [0] * len(commands)
     assert (scene_folder / "apple.png").is_file()
-    apple, scores = (load_splats(scene_folder / name) for name in ("apple.ply", "scores.ply"))
-    assert 0 < apple.count < scores.count == load_splats(scene_folder / "scene.ply").count
+    apple, scores = (read_splats(scene_folder / name) for name in ("apple.ply", "scores.ply"))
+    assert 0 < apple.count < scores.count == read_splats(scene_folder / "scene.ply").count
     assert float(apple.means[:, 0].max()) < 0  # the apple is the cluster on the left
 
 

@@ -17,7 +17,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from liftcore.cli import main
-from liftcore.io.load import load_cameras
+from liftcore.io.cameras import read_cameras
 from tests.api.tiny_scene import WIDTH, cameras_document, colmap_zip, make_scene
 
 from .readme import SCENES, blocks, text
@@ -81,19 +81,20 @@ def test_lift_of_nerfstudios_scene_finds_the_apple(folder: Path, capsys: pytest.
     with zipfile.ZipFile(packed[4], "w") as archive:
         for name in packed[5:]:
             archive.write(name, Path(name).name)
-    both = [load_cameras(Path(path)) for path in ("data", packed[4])]
-    assert [view.world_to_camera.tolist() for view in both[0]] == [view.world_to_camera.tolist() for view in both[1]]
+    one, other = (read_cameras(Path(path)).values() for path in ("data", packed[4]))
+    assert [view.viewmat.tolist() for view in one] == [view.viewmat.tolist() for view in other]
 
 
 def test_transform_of_gsplat_is_written_and_read(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with zipfile.ZipFile(io.BytesIO(colmap_zip())) as archive:
         archive.extractall(folder / "data/garden")
-    before = load_cameras(folder / "data/garden")
+    before = read_cameras(folder / "data/garden")
     module = ModuleType("datasets.colmap")
     vars(module)["Parser"] = lambda path, factor, normalize: SimpleNamespace(transform=similarity())
     monkeypatch.setitem(sys.modules, "datasets", ModuleType("datasets"))
     monkeypatch.setitem(sys.modules, "datasets.colmap", module)
     (example,) = (block for block in blocks(SCENES, "python") if "datasets.colmap" in block)
     exec(compile(example, SCENES, "exec"), {})
-    for old, new in zip(before, load_cameras(folder / "data/garden"), strict=True):
+    after = read_cameras(folder / "data/garden")
+    for old, new in zip(before.values(), after.values(), strict=True):
         assert np.allclose(new.centre, (similarity() @ [*old.centre, 1])[:3])

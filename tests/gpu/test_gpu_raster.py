@@ -237,7 +237,7 @@ def test_depth_ties_keep_the_order_of_the_file():
 @pytest.mark.parametrize("kernel", Kernel)
 def test_a_view_that_sees_nothing_gives_empty_products(kernel):
     splats, camera = random_splats(1, 5, kernel=kernel), random_camera(1, 20, 18)
-    away = replace(camera, world_to_camera=np.diag([-1.0, 1.0, -1.0, 1.0]) @ camera.world_to_camera)
+    away = replace(camera, viewmat=np.diag([-1.0, 1.0, -1.0, 1.0]) @ camera.viewmat)
     raster = gpu_raster(splats)
     weights = raster.region_weights(away, random_regions(1), WALK, Weighting(1, Selection.TOP_K))
     assert [part.numel() for part in as_parts(weights)] == [0, 1, 0, 0, 0, 0]

@@ -106,7 +106,7 @@ def test_a_faint_beta_splat_counts_as_far_as_float32_goes():
 @pytest.mark.parametrize(("cap", "stop"), [(0.9, 0.1), (0.95, 0.0025), (0.999, 1e-6), (0.99, 1e-6), (0.99, 1e-4)])
 def test_rays_end_at_the_same_splat_in_every_product_where_opaque_ones_leave_just_the_stop(cap, stop):
     splats, camera = random_splats(0, 6), random_camera(0, 5, 5)
-    camera = replace(camera, cx=2.5, cy=2.5, fx=5.0, fy=5.0, world_to_camera=np.eye(4))
+    camera = camera.replace(cx=2.5, cy=2.5, fx=5.0, fy=5.0, viewmat=np.eye(4))
     means = torch.tensor([[0.0, 0.0, 2.0 + 0.1 * k] for k in range(6)])
     splats = replace(splats, means=means, opacity_logits=torch.full((6,), 30.0), log_scales=torch.full((6, 3), 2.0))
     walk = CompositingParams(alpha_cap=cap, transmittance_stop=stop)

@@ -152,7 +152,7 @@ def test_exactly_k_weights_of_a_ray_count(count, walk):
 
 def test_of_equal_weights_the_nearest_counts():
     """Behind an alpha of 1/4, an alpha of 1/3 weighs 1/4 too; some float near log 1/2 makes it so to the bit."""
-    camera = replace(random_camera(0, 9, 9), cx=4.5, cy=4.5, fx=9.0, fy=9.0, world_to_camera=np.eye(4))
+    camera = random_camera(0, 9, 9).replace(cx=4.5, cy=4.5, fx=9.0, fy=9.0, viewmat=np.eye(4))
     means, scales = torch.tensor([[0.0, 0.0, 3.0], [0.0, 0.0, 2.0]]), torch.ones(2, 3)  # the second is the nearer
     ray, ties = 4 * 9 + 4, 0
     for step in range(-8, 9):

@@ -34,7 +34,9 @@ def scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     write_splats(random_splats(1, 20), tmp_path / "splats.ply")
     pose = np.eye(4)
     pose[2, 3] = 4.0
-    write_inria_cameras(Cameras((Camera("v0", 16, 12, 16.0, 16.0, 8.0, 6.0, pose),)), tmp_path / "cameras.json")
+    write_inria_cameras(
+        Cameras((Camera.pinhole("v0", 16, 12, 16.0, 16.0, 8.0, 6.0, pose),)), tmp_path / "cameras.json"
+    )
     write_pack(tmp_path / "pack.safetensors", {"v0": random_regions(1)}, {})
     save_file({"embeddings": torch.eye(2, 6)}, str(tmp_path / "table"), metadata={"words": '["cat", "dog"]'})
     monkeypatch.chdir(tmp_path)

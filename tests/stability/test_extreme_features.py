@@ -34,7 +34,7 @@ SCENE = random_splats(11, 30)
 def camera(name: str = "v0", back: float = 4.0) -> Camera:
     pose = np.eye(4)
     pose[2, 3] = back
-    return Camera(name, WIDTH, HEIGHT, 16.0, 16.0, WIDTH / 2, HEIGHT / 2, pose)
+    return Camera.pinhole(name, WIDTH, HEIGHT, 16.0, 16.0, WIDTH / 2, HEIGHT / 2, pose)
 
 
 def lifted(folder: Path, views: dict[str, ViewFeatures], splats: Splats = SCENE, **values: object) -> LiftResult:

@@ -104,7 +104,7 @@ def test_discs_that_pass_the_camera_end_at_their_horizon(height, tilt):
 def test_crossings_behind_the_camera_do_not_count():
     # The plane rises towards the camera and passes behind it: rays upwards meet it only backwards.
     splats = splats_at([(0.0, 0.2, 0.1)], log_scales=3.0, quats=about_x(math.pi / 2 + 1e-3), kernel=DISC)
-    camera = Camera("v0", 21, 21, 10.0, 10.0, 10.5, 10.5, np.eye(4))
+    camera = Camera.pinhole("v0", 21, 21, 10.0, 10.0, 10.5, 10.5, np.eye(4))
     A = assert_equals_the_oracle(splats, camera).reshape(21, 21)
     assert A[:5, 10].max() == 0
     assert A[14:, 10].min() > 0.5

@@ -87,7 +87,7 @@ def test_any_gain_equals_the_oracle_and_leaves_the_evidence_plain(gain):
 
 def test_a_huge_image_equals_the_oracle_ray_by_ray():
     splats = splats_at([(0.1 * k, -0.07 * k, 2.0 + k) for k in range(6)], log_scales=-1.5)
-    camera = Camera("v0", 4_000, 3_000, 3_000.0, 3_000.0, 2_000.5, 1_500.5, np.eye(4))
+    camera = Camera.pinhole("v0", 4_000, 3_000, 3_000.0, 3_000.0, 2_000.5, 1_500.5, np.eye(4))
     sums = CpuRaster(splats).row_sums(camera, CompositingParams()).numpy()
     assert sums.shape == (3_000, 4_000)
     assert np.isfinite(sums).all()

@@ -30,7 +30,9 @@ def wide_views(draw: st.DrawFn, kernel: Kernel) -> View:
     """Up to eight splats somewhere in the cone of a camera, near or far, with any shape."""
     width, height = draw(st.integers(1, 24)), draw(st.integers(1, 20))
     focal = width * 10.0 ** draw(st.floats(-1, 3))
-    camera = Camera("v0", width, height, focal, focal * draw(st.floats(0.5, 2)), width * 0.4, height * 0.6, np.eye(4))
+    camera = Camera.pinhole(
+        "v0", width, height, focal, focal * draw(st.floats(0.5, 2)), width * 0.4, height * 0.6, np.eye(4)
+    )
     count = draw(st.integers(1, 8))
     depths = [10.0 ** draw(st.floats(-2.5, 6)) for _ in range(count)]
     sides = [(draw(st.floats(-1.5, 1.5)), draw(st.floats(-1.5, 1.5))) for _ in range(count)]

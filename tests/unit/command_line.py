@@ -59,7 +59,7 @@ def write_toy_scene(folder: Path) -> Path:
         sh=torch.zeros(2, 1, 3),
     )
     write_splats(splats, folder / "splats.ply")
-    camera = Camera("front", 32, 16, 16.0, 16.0, 16.0, 8.0, np.eye(4))
+    camera = Camera.pinhole("front", 32, 16, 16.0, 16.0, 16.0, 8.0, np.eye(4))
     write_inria_cameras(Cameras((camera,)), folder / "cameras.json")
     labels = torch.zeros(1, 16, 32, dtype=torch.int32)
     labels[..., 16:] = 1

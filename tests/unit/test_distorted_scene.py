@@ -12,9 +12,9 @@ import torch
 from PIL import Image
 
 from liftcore.errors import InvalidCameras, InvalidQuery
+from liftcore.io.cameras import read_cameras
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.lift_file import LiftResult, save_lift
-from liftcore.io.load import load_cameras
 from liftcore.lift import lift
 from liftcore.query.ask import ask
 from liftcore.query.example import Pixel, Region
@@ -85,7 +85,7 @@ def test_masks_lie_over_the_photo(lens: str, tmp_path: Path) -> None:
     save_lift(lifted(tmp_path, lens), tmp_path / "made.safetensors")
     scene = QueryScene.open(tmp_path / "made.safetensors")
     for view in VIEWS:
-        photo = np.where(is_lifted(scene.cameras.get(view)), photo_of(view, lens, CLEAR), -1)
+        photo = np.where(is_lifted(scene.cameras[view]), photo_of(view, lens, CLEAR), -1)
         for part in np.unique(photo[photo >= 0]):
             y, x = np.argwhere(photo == part)[len(np.argwhere(photo == part)) // 2]
             answer = ask(scene, Query((Pixel(view, int(x), int(y)),), threshold=0.5))
@@ -94,7 +94,7 @@ def test_masks_lie_over_the_photo(lens: str, tmp_path: Path) -> None:
             found, truth = seen.mask.numpy() & (photo >= 0), photo == part
             assert (found & truth).sum() / (found | truth).sum() > 0.99
     answer = ask(scene, Query((Region("left", 0, 1),), threshold=0.5))
-    shown = is_lifted(scene.cameras.get("left")) & (photo_of("left", lens, CLEAR) == 1)
+    shown = is_lifted(scene.cameras["left"]) & (photo_of("left", lens, CLEAR) == 1)
     assert view_mask(scene, answer, "left").mask.numpy()[shown].all()
     with pytest.raises(InvalidQuery, match=rf"x in 0\.\.{WIDTH - 1} and y in 0\.\.{HEIGHT - 1}, got {WIDTH},0"):
         ask(scene, Query((Pixel("left", WIDTH, 0),)))
@@ -110,7 +110,7 @@ def test_a_pixel_at_the_rim_of_a_wide_photo_has_no_pinhole(tmp_path: Path) -> No
     scene = QueryScene.open(tmp_path / "made.safetensors")
     frame = {"file_path": "wide.jpg", "transform_matrix": np.diag([1.0, -1.0, -1.0, 1.0]).tolist()}
     (tmp_path / "wide.json").write_text(json.dumps({**document, "frames": [frame]}))
-    scene.__dict__["cameras"] = load_cameras(tmp_path / "wide.json")
+    scene.__dict__["cameras"] = read_cameras(tmp_path / "wide.json")
     assert len(ask(scene, Query((Pixel("wide", 200, 20),), threshold=0.5)).scores) == 3600
     with pytest.raises(InvalidQuery, match="a pixel that a pinhole sees, got one at the rim of a wide lens; pick"):
         ask(scene, Query((Pixel("wide", 2, 20),)))
@@ -132,12 +132,12 @@ def test_a_model_that_comes_later_changes_no_lift(tmp_path: Path) -> None:
                 lift(splats, scene, [features], LiftSettings.of(preset="row-sum")), tmp_path / "made.safetensors"
             )
     with pytest.raises(InvalidCameras, match="not both"):
-        load_cameras(scene)
+        read_cameras(scene)
     opened = QueryScene.open(tmp_path / "made.safetensors")
     assert opened.cameras.distorted == tuple(VIEWS)
 
 
 def test_what_cannot_say_a_lens_is_not_written(tmp_path: Path) -> None:
-    cameras = load_cameras(write_distorted_scene(tmp_path / "scene", "barrel")[1])
+    cameras = read_cameras(write_distorted_scene(tmp_path / "scene", "barrel")[1])
     with pytest.raises(InvalidCameras, match="cameras without distortion, got 'left'; keep these"):
         write_inria_cameras(cameras, tmp_path / "cameras.json")

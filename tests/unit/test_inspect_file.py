@@ -101,7 +101,7 @@ def test_discs_with_a_third_scale_are_noticed(tmp_path: Path) -> None:
 
 
 def test_cameras_are_described(tmp_path: Path) -> None:
-    views = tuple(Camera(name, 40, 30, 5.0, 6.0, 20.0, 15.0, np.eye(4)) for name in "ab")
+    views = tuple(Camera.pinhole(name, 40, 30, 5.0, 6.0, 20.0, 15.0, np.eye(4)) for name in "ab")
     write_inria_cameras(Cameras(views), tmp_path / "cameras.json")
     found = inspected(tmp_path)
     assert (found["kind"], found["views"], found["sizes"]) == ("cameras", 2, ["40x30"])
@@ -110,7 +110,7 @@ def test_cameras_are_described(tmp_path: Path) -> None:
     assert found["warnings"] == ["2 views share 1 places"]
     pose = np.eye(4)
     pose[:3, 3] = [1.0, -2.0, 3.0]  # of the world in the camera: its centre is the negative
-    write_inria_cameras(Cameras((views[0], replace(views[1], world_to_camera=pose))), tmp_path / "cameras.json")
+    write_inria_cameras(Cameras((views[0], replace(views[1], viewmat=pose))), tmp_path / "cameras.json")
     assert inspected(tmp_path)["box"] == [[-1.0, 0.0, -3.0], [0.0, 2.0, 0.0]]
 
 

@@ -151,7 +151,7 @@ def _truth(
     if not wanted:
         got = f"{_named(labels.views)}" if labels.views else "none"
         raise InvalidInput(f"labelled frames of {labels.name}", expected="some of the held-out ones", got=got)
-    cameras = scene.cameras.by_name
+    cameras = scene.cameras
     paired = [view for view in wanted if view in cameras]
     if not paired:
         raise InvalidInput(

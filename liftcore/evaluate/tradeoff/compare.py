@@ -18,7 +18,7 @@ from liftcore.evaluate.tradeoff.choice import choose
 from liftcore.evaluate.tradeoff.judge import class_vectors, labelled_masks
 from liftcore.evaluate.tradeoff.order import CANDIDATES, DRAFT, EXACT, HOLD_OUT, Candidate, Order, Scene
 from liftcore.features.pack import open_packs, pair
-from liftcore.io.load import load_cameras
+from liftcore.io.cameras import read_cameras
 from liftcore.settings import LiftSettings
 
 if TYPE_CHECKING:
@@ -78,7 +78,7 @@ def compare(
 
 def _order(scene: Scene, settings: Mapping[str, Any], threads: int | None, folder: Path) -> Order:
     """The views of each kind. Every HOLD_OUT-th view is held out, and what has masks is."""
-    cameras = load_cameras(scene.cameras)
+    cameras = read_cameras(scene.cameras)
     stride = LiftSettings.of(**settings).view_stride
     packs = pair(open_packs(scene.features), cameras)[0]
     names = packs.views[::stride]

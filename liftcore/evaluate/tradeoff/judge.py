@@ -37,7 +37,7 @@ def judge(order: Order, sources: Sources, reference: tuple[Tensor, Tensor], made
     figures = cosine_figures(made.features, *reference)
     raster, walk = CpuRaster(sources.splats, order.threads), made.metadata.settings.render_params
     rows = [
-        view_cosines(raster, sources.cameras.get(view), sources.packs.observation(view), made.features, walk)
+        view_cosines(raster, sources.cameras[view], sources.packs.observation(view), made.features, walk)
         for view in order.held_out
     ]
     cosines = np.concatenate(rows) if rows else np.zeros(0)
@@ -49,7 +49,7 @@ def judge(order: Order, sources: Sources, reference: tuple[Tensor, Tensor], made
         found = []
         for view in order.labelled:
             scores = in_photo(
-                sources.cameras.get(view),
+                sources.cameras[view],
                 lambda camera: rendered_scores(raster, camera, made.features, classes, walk),
             )
             found.append(_resized(scores.argmax(dim=2), masks[view]))
@@ -97,7 +97,7 @@ def labelled_masks(scene: Scene, cameras: Cameras) -> dict[str, Tensor]:
     if scene.labels is None:
         raise ValueError("there are no labels")
     masks = read_masks(scene.labels, len(scene.classes))
-    return {camera: masks[view] for view, camera in cameras_of_views(masks, cameras.by_name).items()}
+    return {camera: masks[view] for view, camera in cameras_of_views(masks, cameras).items()}
 
 
 def _resized(labels: Tensor, mask: Tensor) -> Tensor:

@@ -61,7 +61,7 @@ def view_of(camera: Camera) -> View:
         ]
     )
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-    pose = np.ascontiguousarray(camera.world_to_camera[:3])
+    pose = np.ascontiguousarray(camera.viewmat[:3])
     return View(pose, intrinsics, limits, camera.width, camera.height, LOW_PASS)
 
 

@@ -38,7 +38,7 @@ def warm_up(
         kernel=kernel,
         beta=torch.zeros(1) if kernel is Kernel.BETA else None,
     )
-    camera = Camera("warm-up", 16, 16, 16.0, 16.0, 8.0, 8.0, np.eye(4))
+    camera = Camera.pinhole("warm-up", 16, 16, 16.0, 16.0, 8.0, 8.0, np.eye(4))
     raster = open_raster(splats, device, threads=1)
     regions = Regions(torch.zeros(1, 1, 1, dtype=torch.int32), torch.ones(1, 1))
     for observation in (regions, FeatureGrid(torch.ones(1, 1, 1))):

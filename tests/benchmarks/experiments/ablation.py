@@ -59,7 +59,7 @@ def phrase_ious(truth: Tabletop, features: Tensor, settings: LiftSettings) -> tu
     ious: list[tuple[float, float]] = []
     maps = truth.maps(features, settings, truth.raster)
     for (view, mask), scores in zip(truth.held_out.items(), maps, strict=True):
-        met = truth.raster.row_sums(truth.cameras.get(view), settings.render_params) >= MINIMUM_ROW_SUM
+        met = truth.raster.row_sums(truth.cameras[view], settings.render_params) >= MINIMUM_ROW_SUM
         for k in mask[mask >= 0].unique().tolist():
             attention, real = scores[:, :, k], mask == k
             known = attention[met]

@@ -21,7 +21,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from liftcore.evaluate.synthetic import room_cameras, room_splats
-from liftcore.io.load import load_cameras, load_splats
+from liftcore.io.cameras import read_cameras
+from liftcore.io.ply import read_splats
 from liftcore.raster.cpu.raster import CpuRaster
 from tests.benchmarks.conditioning import coupling, neighbourhood, noise_gain, rays_of, self_share, spectrum
 
@@ -49,8 +50,8 @@ COLUMNS = (
 
 def measure(subject: Subject) -> dict[str, Any]:
     """The figures of the scene, over every n-th camera, and of the room, for every gain."""
-    splats = load_splats(subject.folder / "point_cloud.ply")
-    cameras = list(load_cameras(subject.cameras))[:: subject.every]
+    splats = read_splats(subject.folder / "point_cloud.ply")
+    cameras = list(read_cameras(subject.cameras).values())[:: subject.every]
     betas = _betas(subject)
     rows = [
         *_rows(subject.folder.resolve().name, splats, cameras, betas),

@@ -13,7 +13,8 @@ import torch
 from scipy.sparse import csr_array
 
 from liftcore.features.pack import open_packs, pair
-from liftcore.io.load import load_cameras, load_splats
+from liftcore.io.cameras import read_cameras
+from liftcore.io.ply import read_splats
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.settings import Preset
 from liftcore.solve.readout import read_pixels, sample_pixels
@@ -44,8 +45,8 @@ COLUMNS = ("pack", "preset", "views", "cosine", "held_out_views", "held_out_cosi
 
 def measure(subject: Subject) -> dict[str, Any]:
     """The mean cosine for every pack of the scene and every preset."""
-    cameras = load_cameras(subject.cameras)
-    raster = CpuRaster(load_splats(subject.folder / "point_cloud.ply"))
+    cameras = read_cameras(subject.cameras)
+    raster = CpuRaster(read_splats(subject.folder / "point_cloud.ply"))
     rows = []
     for pack in subject.packs(*PACKS):
         for preset in PRESETS:
@@ -74,7 +75,7 @@ def rendered_cosine(
     """
     packs = pair(open_packs([pack]), cameras)[0]
     names = packs.views[::every]
-    totals = [view_cosines(raster, cameras.get(name), packs.observation(name), features, walk) for name in names]
+    totals = [view_cosines(raster, cameras[name], packs.observation(name), features, walk) for name in names]
     cosines = np.concatenate(totals)
     return float(cosines.mean()), len(names)
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from liftcore.io.load import load_splats
+from liftcore.io.ply import read_splats
 from liftcore.raster.cpu.raster import CpuRaster
 from tests.benchmarks.converted import to_betas, to_discs
 from tests.benchmarks.tabletop import Tabletop
@@ -36,7 +36,7 @@ COLUMNS = ("pack", "kernel", "preset", "row_sum_mean", "accuracy", "miou")
 def measure(subject: Subject) -> dict[str, Any]:
     """Row sums, accuracy and held-out mIoU of every kernel."""
     truth = Tabletop(subject.folder)
-    trained = load_splats(subject.folder / "point_cloud.ply")
+    trained = read_splats(subject.folder / "point_cloud.ply")
     forms = {
         "3dgs": (trained, {}),
         "3dgs antialiased": (trained, {"antialiased": True}),
@@ -51,7 +51,7 @@ def measure(subject: Subject) -> dict[str, Any]:
                 made = subject.lift_of(splats, pack, preset=preset, **knobs)
                 settings = made.metadata.settings
                 figures = truth.judge(made.features, settings, raster=raster)
-                sums = [raster.row_sums(truth.cameras.get(v), settings.render_params).mean() for v in truth.held_out]
+                sums = [raster.row_sums(truth.cameras[v], settings.render_params).mean() for v in truth.held_out]
                 row = {"pack": pack, "kernel": kernel, "preset": preset, "row_sum_mean": float(np.mean(sums))}
                 rows.append(row | {"accuracy": figures.accuracy, "miou": figures.miou})
     return {"columns": COLUMNS, "rows": rows, "note": NOTE}

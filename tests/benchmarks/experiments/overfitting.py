@@ -95,7 +95,7 @@ def measure(subject: Subject) -> dict[str, Any]:
     scene = Tabletop(subject.folder)
     packs = open_packs([subject.folder / f"{PACK}.safetensors"])
     names = packs.views[:: subject.every]
-    views = [scene.cameras.get(name) for name in names]
+    views = [scene.cameras[name] for name in names]
     rays = AllRays(
         scene.raster,
         scene.raster.splats.count,
@@ -120,7 +120,7 @@ def measure(subject: Subject) -> dict[str, Any]:
 def _miou(scene: Tabletop, scores: Tensor) -> float:
     """Mean IoU of the rendered scores' argmax in the held-out views."""
     return scene.miou(
-        scene.raster.render(scene.cameras.get(view), scores, CompositingParams()) for view in scene.held_out
+        scene.raster.render(scene.cameras[view], scores, CompositingParams()) for view in scene.held_out
     )
 
 

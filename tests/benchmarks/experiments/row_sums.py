@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from liftcore.io.load import load_cameras, load_splats
+from liftcore.io.cameras import read_cameras
+from liftcore.io.ply import read_splats
 from liftcore.raster.base import CompositingParams
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.settings import TIKHONOV_GAIN
@@ -32,8 +33,8 @@ COLUMNS = ("gain", "views", "mean", "std", "lowest_view_mean", "below_0.9", "min
 
 def measure(subject: Subject) -> dict[str, Any]:
     """Statistics of the row sums over every pixel of every n-th camera, without and with the opacity gain."""
-    raster = CpuRaster(load_splats(subject.folder / "point_cloud.ply"))
-    cameras = list(load_cameras(subject.cameras))[:: subject.every]
+    raster = CpuRaster(read_splats(subject.folder / "point_cloud.ply"))
+    cameras = list(read_cameras(subject.cameras).values())[:: subject.every]
     rows, counts = [], {}
     for gain in GAINS:
         sums = [raster.row_sums(camera, CompositingParams(gain)).numpy().ravel() for camera in cameras]

@@ -109,7 +109,7 @@ def lift_theirs(rasterization: Any, splats: Splats, views: Views, place: torch.d
     X = torch.zeros(splats.count, channels + 1, device=place, requires_grad=True)
     for camera, regions in views:
         intrinsics = torch.tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
-        pose = torch.tensor(camera.world_to_camera, dtype=torch.float32)
+        pose = torch.tensor(camera.viewmat, dtype=torch.float32)
         rendered, _, _ = rasterization(
             means, quats, scales, opacities, X, pose[None].to(place), intrinsics.float()[None].to(place),
             camera.width, camera.height, packed=False,

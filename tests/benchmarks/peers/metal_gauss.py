@@ -47,7 +47,7 @@ class MetalGauss:
             for camera, regions in work.views:
                 target = dense_target(camera, regions)
                 intrinsics = torch.tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
-                pose = torch.tensor(camera.world_to_camera, dtype=torch.float32)
+                pose = torch.tensor(camera.viewmat, dtype=torch.float32)
                 view = intrinsics, pose, camera.width, camera.height
                 for first in range(0, target.shape[2], CHANNELS):
                     part = target[:, :, first : first + CHANNELS]

@@ -90,7 +90,7 @@ class _Slab(NamedTuple):
 
 def _project(splats: Splats, camera: Camera) -> _Footprints:
     """EWA projection of all splats at once (float64: it costs little here), those out of sight left out."""
-    pose = torch.tensor(camera.world_to_camera[:3])
+    pose = torch.tensor(camera.viewmat[:3])
     point = splats.means.double() @ pose[:, :3].T + pose[:, 3]
     opacity = torch.sigmoid(splats.opacity_logits.double())
     kept = torch.nonzero((point[:, 2] >= NEAR_PLANE) & (opacity >= ALPHA_FLOOR))[:, 0]

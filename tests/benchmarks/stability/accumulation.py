@@ -39,7 +39,7 @@ def sums_of_rays(side: int) -> dict[str, float]:
         by name: region weights, squared region weights, evidence, ``A^T 1``.
     """
     splats = splats_at([(0.0, 0.0, 2.0)], log_scales=[0.3, 0.1, 0.0], logits=-2.0)
-    camera = Camera("v0", side, side, 0.7 * side, 0.7 * side, side / 2, side / 2, np.eye(4))
+    camera = Camera.pinhole("v0", side, side, 0.7 * side, 0.7 * side, side / 2, side / 2, np.eye(4))
     exact, squares = _exact_sums(splats, camera)
     raster, region = CpuRaster(splats), Regions(torch.zeros(1, 1, 1, dtype=torch.int32), torch.ones(1, 1))
     plain = raster.region_weights(camera, region, CompositingParams(), Weighting(1))

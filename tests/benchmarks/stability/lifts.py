@@ -84,7 +84,7 @@ def camera(name: str = "v0") -> Camera:
     """Four units before the origin; AWAY a million behind it."""
     pose = np.eye(4)
     pose[2, 3] = -1e6 if name == AWAY else 4.0
-    return Camera(name, WIDTH, HEIGHT, 16.0, 16.0, WIDTH / 2, HEIGHT / 2, pose)
+    return Camera.pinhole(name, WIDTH, HEIGHT, 16.0, 16.0, WIDTH / 2, HEIGHT / 2, pose)
 
 
 def run(task: Task, splats: Splats) -> tuple[LiftResult, list[str]]:

@@ -35,7 +35,9 @@ TOLD = "features must be of the photos as they were taken"
 
 
 def _behind(distortion: Distortion, focal: float = FOCAL) -> Camera:
-    return behind_lens(Camera("v0", WIDTH, HEIGHT, focal, focal, WIDTH / 2, HEIGHT / 2, np.eye(4)), distortion)
+    return behind_lens(
+        Camera.pinhole("v0", WIDTH, HEIGHT, focal, focal, WIDTH / 2, HEIGHT / 2, np.eye(4)), distortion
+    )
 
 
 def photographed(
@@ -72,7 +74,8 @@ def _moved(scale: float, kernel: Kernel, digits: type = np.float64) -> View:
     """The row of splats turned, shifted and scaled, and the camera moved to where they are."""
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = scale * TURN, scale * np.array([3.0, -2.0, 1.0])
-    [camera] = Similarity.of(matrix.astype(digits).astype(np.float64), "here").moved(Cameras((camera_at_origin(),)))
+    similarity = Similarity.of(matrix.astype(digits).astype(np.float64), "here")
+    [camera] = similarity.moved(Cameras((camera_at_origin(),))).values()
     splats = _row(kernel)
     means = splats.means.double() @ torch.from_numpy(matrix[:3, :3].T) + torch.from_numpy(matrix[:3, 3])
     return View(

@@ -40,7 +40,9 @@ def _far_away(kernel: Kernel, offset: float) -> View:
     pose = np.eye(4)
     pose[:3, 3] = [-offset, offset, 20.0 - offset]
     means = [(offset + 4 * k - 8, -offset + 2 * k, offset + 4 * k) for k in range(5)]
-    return View(splats_at(means, log_scales=1.0, kernel=kernel), Camera("v0", 16, 12, 16.0, 16.0, 8.5, 6.5, pose))
+    return View(
+        splats_at(means, log_scales=1.0, kernel=kernel), Camera.pinhole("v0", 16, 12, 16.0, 16.0, 8.5, 6.5, pose)
+    )
 
 
 def _opaque_or_absent(A: np.ndarray) -> bool:
@@ -59,7 +61,7 @@ def _unordered(kernel: Kernel) -> Found:
     splats = splats_at(np.stack([0 * z, 0 * z, z], axis=1), log_scales=-1.0, kernel=kernel)
     pose = np.eye(4)
     pose[2, 3] = distance
-    camera = Camera("v0", 1, 1, distance, distance, 0.5, 0.5, pose)
+    camera = Camera.pinhole("v0", 1, 1, distance, distance, 0.5, 0.5, pose)
     got = weights_of(splats, camera, CompositingParams())[0][0]
     exact = ALPHA * (1 - ALPHA) ** np.arange(count)[::-1]
     error = float(np.abs(got - exact).max())

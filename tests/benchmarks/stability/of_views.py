@@ -18,7 +18,7 @@ def _rolled(kernel: Kernel, angle: float) -> View:
     pose = np.eye(4)
     c, s = math.cos(angle), math.sin(angle)
     pose[:2, :2] = [[c, -s], [s, c]]
-    return View(splats_at(ROW, -1.0, kernel=kernel), Camera("v0", 15, 15, 16.0, 16.0, 7.5, 7.5, pose))
+    return View(splats_at(ROW, -1.0, kernel=kernel), Camera.pinhole("v0", 15, 15, 16.0, 16.0, 7.5, 7.5, pose))
 
 
 def _image_rolled(kernel: Kernel) -> np.ndarray:
@@ -31,7 +31,7 @@ def _turned_back(kernel: Kernel) -> View:
     """A camera beyond the splats that looks back, upside down."""
     pose = np.diag([1.0, -1.0, -1.0, 1.0])
     pose[2, 3] = 5.0
-    return View(splats_at(ROW, -1.0, kernel=kernel), Camera("v0", 16, 12, 16.0, 16.0, 8.5, 6.5, pose))
+    return View(splats_at(ROW, -1.0, kernel=kernel), Camera.pinhole("v0", 16, 12, 16.0, 16.0, 8.5, 6.5, pose))
 
 
 def _last_alone(kernel: Kernel) -> np.ndarray:
@@ -48,7 +48,7 @@ def _one_ray(kernel: Kernel) -> View:
 
 
 def _narrow(width: int, height: int) -> Camera:
-    return Camera("v0", width, height, 3_000.0, 3_000.0, width / 2, height / 2, np.eye(4))
+    return Camera.pinhole("v0", width, height, 3_000.0, 3_000.0, width / 2, height / 2, np.eye(4))
 
 
 VIEWS: tuple[Extreme, ...] = (
@@ -86,7 +86,7 @@ VIEWS: tuple[Extreme, ...] = (
         "rays far aside: they meet what lies there",
         lambda kernel: View(
             splats_at([*ROW, (-2e6 / 16 + 1.0, 0.0, 2.0)], 0.5, kernel=kernel),
-            Camera("v0", 16, 12, 16.0, 16.0, 1e6, 6.5, np.eye(4)),
+            Camera.pinhole("v0", 16, 12, 16.0, 16.0, 1e6, 6.5, np.eye(4)),
         ),
         lambda A: A[:, 5].max() > 0.1,
         told="principal point far off the centre",

@@ -56,4 +56,4 @@ def of_kernel(splats: Splats, kernel: Kernel, betas: Tensor) -> Splats:
 def camera_at_origin(width: int = 16, height: int = 12, focal: float = 16.0, name: str = "v0") -> Camera:
     """A camera that looks along +z, with the middle of a pixel on its axis."""
     centre = (width // 2 + 0.5, height // 2 + 0.5)
-    return Camera(name, width, height, focal, focal, *centre, np.eye(4))
+    return Camera.pinhole(name, width, height, focal, focal, *centre, np.eye(4))

@@ -56,7 +56,7 @@ def wide_view(seed: int, kernel: Kernel) -> View:
     focal = width * 10.0 ** rng.uniform(-1, 3)
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = _rotation(rng), rng.uniform(-100, 100, 3)
-    camera = Camera("v0", width, height, focal, focal * rng.uniform(0.5, 2), width * 0.4, height * 0.6, pose)
+    camera = Camera.pinhole("v0", width, height, focal, focal * rng.uniform(0.5, 2), width * 0.4, height * 0.6, pose)
     z = 10.0 ** rng.uniform(-2.5, 6, count)
     sides = rng.uniform(-1.5, 1.5, (count, 2)) * (width, height) / focal * z[:, None]
     means = (np.column_stack([sides, z]) - pose[:3, 3]) @ pose[:3, :3]
@@ -90,7 +90,7 @@ def judgeable(view: View) -> bool:
     splats, camera = view.splats, view.camera
     if splats.kernel is Kernel.GAUSSIAN_2D:
         return True
-    z = splats.means.double().numpy() @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
+    z = splats.means.double().numpy() @ camera.viewmat[2, :3] + camera.viewmat[2, 3]
     ahead = np.flatnonzero(z >= NEAR_PLANE)
     return all(np.linalg.cond(projected_gaussian(splats, int(j), camera)[1]) < CONDITION for j in ahead)
 

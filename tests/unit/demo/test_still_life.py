@@ -47,7 +47,7 @@ def test_the_same_seed_gives_the_same_scene(scene: StillLife) -> None:
 
 
 def test_every_ray_ends_in_the_scene(scene: StillLife, raster: CpuRaster) -> None:
-    for camera in scene.cameras:
+    for camera in scene.cameras.values():
         sums = raster.row_sums(camera, CompositingParams())
         assert float(sums.mean()) > 0.99
         assert float(sums.min()) > 0.85
@@ -60,7 +60,7 @@ def test_every_object_is_seen(scene: StillLife, raster: CpuRaster) -> None:
 
 def test_masks_without_mistakes_are_the_truth(scene: StillLife, raster: CpuRaster) -> None:
     observed = observe(scene, raster, Letters(), NONE, seed=1)
-    assert set(observed) == {camera.name for camera in scene.cameras} - set(scene.held_out)
+    assert set(observed) == {camera.name for camera in scene.cameras.values()} - set(scene.held_out)
     view, regions = next(iter(observed.items()))
     truth = true_labels(scene, raster, view)
     words = [Letters().encode(names) for names in (scene.things, scene.parts)]

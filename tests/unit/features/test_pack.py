@@ -15,7 +15,7 @@ from liftcore.errors import InvalidFeatures
 from liftcore.features.pack import open_packs, pair
 from liftcore.features.views import FeatureGrid, Regions
 from liftcore.features.write_pack import write_pack
-from liftcore.io.load import load_cameras
+from liftcore.io.cameras import read_cameras
 from liftcore.scene.cameras import Camera, Cameras
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ def saved(path: Path, tensors: dict[str, torch.Tensor], **metadata: str) -> Path
 
 
 def cameras(*names: str) -> Cameras:
-    return Cameras(tuple(Camera(name, 4, 4, 5.0, 5.0, 2.0, 2.0, np.eye(4)) for name in names))
+    return Cameras(tuple(Camera.pinhole(name, 4, 4, 5.0, 5.0, 2.0, 2.0, np.eye(4)) for name in names))
 
 
 def test_regions_and_grids_are_read_as_they_are(tmp_path: Path) -> None:
@@ -258,7 +258,7 @@ def test_pack_that_cannot_be_right_is_not_written(tmp_path: Path) -> None:
 def test_real_packs_pair_with_their_cameras(shared_data: Path) -> None:
     plush = shared_data / "plush"
     packs = open_packs([plush / "grids.safetensors", plush / "grids_test.safetensors"])
-    paired, without = pair(packs, load_cameras(plush))
+    paired, without = pair(packs, read_cameras(plush))
     assert (len(paired.views), without, packs.channels, packs.text_space) == (97, [], 320, "none")
     found = open_packs([plush / "regions.safetensors"])
     view = found.observation(found.views[0])

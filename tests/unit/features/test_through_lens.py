@@ -23,7 +23,7 @@ WIDE = Fisheye(k1=0.02)
 
 
 def camera(distortion: Distortion, name: str = "v") -> Camera:
-    return behind_lens(Camera(name, 60, 44, 48.0, 47.0, 29.0, 23.0, np.eye(4)), distortion)
+    return behind_lens(Camera.pinhole(name, 60, 44, 48.0, 47.0, 29.0, 23.0, np.eye(4)), distortion)
 
 
 def photo_place(view: Camera, row: float, column: float) -> tuple[float, float]:
@@ -82,7 +82,7 @@ def test_large_grids_are_carried_in_bands_to_the_same_bits(monkeypatch: pytest.M
 
 
 def test_what_has_no_lens_is_seen_as_it_is() -> None:
-    view = Camera("v", 60, 44, 48.0, 47.0, 29.0, 23.0, np.eye(4))
+    view = Camera.pinhole("v", 60, 44, 48.0, 47.0, 29.0, 23.0, np.eye(4))
     observation = Regions(torch.zeros(1, 4, 5, dtype=torch.int32), torch.ones(1, 2))
     assert as_pinhole_sees(observation, view) is observation
 
@@ -94,7 +94,7 @@ def test_packs_tell_before_a_map_is_read_what_size_it_will_have(tmp_path: Path) 
         "plain": Regions(torch.zeros(1, 22, 30, dtype=torch.int32), torch.ones(1, 3)),
     }
     write_pack(tmp_path / "f.safetensors", maps, {})
-    plain = Camera("plain", 60, 44, 48.0, 47.0, 29.0, 23.0, np.eye(4))
+    plain = Camera.pinhole("plain", 60, 44, 48.0, 47.0, 29.0, 23.0, np.eye(4))
     cameras = Cameras((camera(BARREL, "bent"), camera(PINCUSHION, "cells"), plain))
     packs, unpaired = pair(open_packs([tmp_path / "f.safetensors"]), cameras)
     assert unpaired == []
@@ -119,6 +119,6 @@ def test_bands_make_no_difference_to_labels(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_places_of_labels_are_kept_for_the_largest_pinhole_behind_a_lens() -> None:
-    view, plain = camera(BARREL), Camera("p", 500, 400, 48.0, 47.0, 29.0, 23.0, np.eye(4))
+    view, plain = camera(BARREL), Camera.pinhole("p", 500, 400, 48.0, 47.0, 29.0, 23.0, np.eye(4))
     assert through_lens.kept_bytes([plain]) == 0
     assert through_lens.kept_bytes([plain, view]) == 2 * 4 * view.width * view.height

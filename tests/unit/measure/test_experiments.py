@@ -11,7 +11,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from liftcore.cli import EXPERIMENTS, main
-from liftcore.io.load import load_cameras
+from liftcore.io.cameras import read_cameras
 from tests.benchmarks.experiments.report import page_of
 from tests.truth_scene import write_truth_scene
 
@@ -103,10 +103,10 @@ def test_cameras_are_read_in_any_format(scene, tmp_path):
     folder = tmp_path / "colmap"
     (folder / "sparse" / "0").mkdir(parents=True)
     (folder / "point_cloud.ply").symlink_to(scene / "point_cloud.ply")
-    lines, cameras = [], list(load_cameras(scene / "cameras.json"))
+    lines, cameras = [], list(read_cameras(scene / "cameras.json").values())
     for number, camera in enumerate(cameras, start=1):
-        x, y, z, w = Rotation.from_matrix(camera.world_to_camera[:3, :3]).as_quat()
-        place = " ".join(map(str, (w, x, y, z, *camera.world_to_camera[:3, 3])))
+        x, y, z, w = Rotation.from_matrix(camera.viewmat[:3, :3]).as_quat()
+        place = " ".join(map(str, (w, x, y, z, *camera.viewmat[:3, 3])))
         lines += [f"{number} {place} 1 {camera.name}.jpg", ""]
     lens = cameras[0]
     sides = (lens.width, lens.height, lens.fx, lens.fy, lens.cx, lens.cy)
@@ -140,8 +140,8 @@ def test_truth_of_distorted_photos_is_told_what_takes_it(scene, tmp_path, capsys
         (tmp_path / file.name).symlink_to(file)
     (tmp_path / "cameras.json").unlink()
     frames = []
-    for camera in load_cameras(scene / "cameras.json"):
-        pose = np.linalg.inv(camera.world_to_camera) @ np.diag([1.0, -1.0, -1.0, 1.0])
+    for camera in read_cameras(scene / "cameras.json").values():
+        pose = np.linalg.inv(camera.viewmat) @ np.diag([1.0, -1.0, -1.0, 1.0])
         photo = {"w": camera.width, "h": camera.height, "fl_x": camera.fx, "k1": -0.1}
         frames.append({"file_path": f"{camera.name}.jpg", "transform_matrix": pose.tolist(), **photo})
     (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))

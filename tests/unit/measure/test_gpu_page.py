@@ -107,7 +107,7 @@ def dense_rasterization(splats: Splats, cameras: list[Camera]) -> Any:
         assert torch.equal(means, splats.means) and torch.equal(quats, splats.quats)
         torch.testing.assert_close(scales.log(), splats.log_scales)
         torch.testing.assert_close(torch.logit(opacities), splats.opacity_logits, rtol=1e-3, atol=1e-3)
-        torch.testing.assert_close(pose[0].double(), torch.tensor(camera.world_to_camera), rtol=1e-5, atol=1e-5)
+        torch.testing.assert_close(pose[0].double(), torch.tensor(camera.viewmat), rtol=1e-5, atol=1e-5)
         assert intrinsics[0, 0, 0] == pytest.approx(camera.fx) and intrinsics[0, 1, 2] == pytest.approx(camera.cy)
         A = torch.tensor(dense_view(splats, camera, CompositingParams()).A, dtype=torch.float32)
         return (A @ colors).reshape(1, height, width, -1), None, None

@@ -15,21 +15,21 @@ CAMERAS = Cameras(tuple(random_camera(k, name=f"v{k}") for k in range(400)))
 
 def turns_in_degrees(one: Cameras, other: Cameras) -> np.ndarray:
     """How far each camera of one set is turned from its twin in the other."""
-    products = [a.world_to_camera[:3, :3] @ b.world_to_camera[:3, :3].T for a, b in zip(one, other, strict=True)]
+    products = [a.viewmat[:3, :3] @ b.viewmat[:3, :3].T for a, b in zip(one.values(), other.values(), strict=True)]
     return np.rad2deg(np.arccos([np.clip((np.trace(product) - 1) / 2, -1, 1) for product in products]))
 
 
 def test_pose_noise_has_one_degree_and_a_hundredth_of_the_scene_an_axis():
-    noisy = noisy_poses(CAMERAS, [camera.name for camera in CAMERAS], seed=1)
+    noisy = noisy_poses(CAMERAS, list(CAMERAS), seed=1)
     turns = turns_in_degrees(noisy, CAMERAS)
-    shifts = np.stack([a.centre - b.centre for a, b in zip(noisy, CAMERAS, strict=True)])
+    shifts = np.stack([a.centre - b.centre for a, b in zip(noisy.values(), CAMERAS.values(), strict=True)])
     assert abs(np.sqrt((turns**2).mean() / 3) - 1) < 0.06
     assert abs(shifts.std() / (POSE_SHIFT * scene_scale(CAMERAS)) - 1) < 0.06
 
 
 def test_pose_noise_leaves_the_other_views_alone():
     noisy = noisy_poses(CAMERAS, ["v3", "v7"], seed=1)
-    changed = [a.name for a, b in zip(noisy, CAMERAS, strict=True) if a is not b]
+    changed = [a.name for a, b in zip(noisy.values(), CAMERAS.values(), strict=True) if a is not b]
     assert changed == ["v3", "v7"]
 
 

@@ -132,7 +132,7 @@ def test_p1_segments_a_map_as_langsplat_does(height: int, width: int) -> None:
 def test_p1_compares_rendered_features(scene: QueryScene) -> None:
     texts = ["red apple", "book"]
     found = RenderedFeatures(scene, texts, words(scene)).cosines("frame_00002")
-    rendered = scene.raster.render(scene.cameras.get("frame_00002"), scene.lift.features.float(), scene.walk)
+    rendered = scene.raster.render(scene.cameras["frame_00002"], scene.lift.features.float(), scene.walk)
     unit = torch.nn.functional.normalize(rendered, dim=-1)
     vectors = words(scene).encode([*texts, "object", "things", "stuff", "texture"])
     torch.testing.assert_close(found, unit @ vectors.T, atol=1e-5, rtol=0)
@@ -152,7 +152,7 @@ def test_p2_sees_the_selected_splats_alone(scene: QueryScene) -> None:
         **{name: getattr(splats, name)[chosen] for name in ("means", "quats", "log_scales", "opacity_logits", "sh")},
         extras={},
     )
-    alone = CpuRaster(few).row_sums(scene.cameras.get("frame_00001"), scene.walk)
+    alone = CpuRaster(few).row_sums(scene.cameras["frame_00001"], scene.walk)
     found = protocol.look("frame_00001")
     assert (found["red apple"].mask == (alone > 0.7).numpy()).all() and found["red apple"].mask.any()
     assert not found["unicorn"].mask.any() and found["unicorn"].peak is None

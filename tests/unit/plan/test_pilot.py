@@ -13,8 +13,8 @@ from liftcore.evaluate.tradeoff.judge import cosine_figures
 from liftcore.features.pack import open_packs
 from liftcore.features.views import Regions
 from liftcore.features.write_pack import write_pack
+from liftcore.io.cameras import read_cameras
 from liftcore.io.inria import write_inria_cameras
-from liftcore.io.load import load_cameras
 from liftcore.io.ply import write_splats
 from liftcore.lift import lift, open_sources
 from liftcore.plan.pilot import PILOT_VIEWS, Pilot, fly_pilot
@@ -167,8 +167,8 @@ def test_a_room_is_written_the_same_twice_and_its_views_disagree_as_told(tmp_pat
     files = [(tmp_path / name / "features.safetensors").read_bytes() for name in ("one", "two")]
     assert files[0] == files[1]
     packs = open_packs([tmp_path / "one" / "features.safetensors"])
-    cameras = load_cameras(tmp_path / "one" / "cameras.json")
-    assert set(packs.views) == set(cameras.by_name)
+    cameras = read_cameras(tmp_path / "one" / "cameras.json")
+    assert set(packs.views) == set(cameras)
     for view in packs.views:
         observed = packs.observation(view)
         assert isinstance(observed, Regions)
@@ -184,7 +184,7 @@ def test_a_room_is_written_the_same_twice_and_its_views_disagree_as_told(tmp_pat
 def flown(splats, cameras, pack, threads=1) -> Pilot:
     settings = LiftSettings.of()
     sources = open_sources(splats, cameras, [pack], settings)
-    seen = visibility(sources.splats, [sources.cameras.get(view) for view in sources.views], settings.lift_params)
+    seen = visibility(sources.splats, [sources.cameras[view] for view in sources.views], settings.lift_params)
     return fly_pilot(sources.splats, sources.cameras, sources.packs, sources.views, settings, seen, threads)
 
 

@@ -47,7 +47,7 @@ class Axes:
 def lift_file(tmp_path: Path) -> Path:
     splats = random_splats(3, COUNT)
     camera = look_at("front", np.array([0.0, -4.0, 0.5]), 40, 30, 40.0)
-    camera = type(camera)("front", 40, 30, 40.0, 40.0, 20.0, 15.0, camera.world_to_camera)
+    camera = type(camera).pinhole("front", 40, 30, 40.0, 40.0, 20.0, 15.0, camera.viewmat)
     write_splats(splats, tmp_path / "splats.ply")
     write_inria_cameras(Cameras((camera,)), tmp_path / "cameras.json")
     features = torch.eye(3)[torch.arange(COUNT) % 3] + 0.01
@@ -212,8 +212,8 @@ def test_clusters_are_shown_in_their_colours_and_the_rest_in_grey(lift_file: Pat
     save_lift(replace(plain, cluster=clusters, cluster_features=torch.ones(2, 3).half()), tmp_path / "clustered")
     scene = QueryScene.open(tmp_path / "clustered")
     shown = render(scene, "front", "cluster")
-    labels = scene.raster.strongest_labels(scene.cameras.get("front"), clusters, scene.walk).numpy()
-    met = scene.raster.row_sums(scene.cameras.get("front"), scene.walk).numpy() > 0
+    labels = scene.raster.strongest_labels(scene.cameras["front"], clusters, scene.walk).numpy()
+    met = scene.raster.row_sums(scene.cameras["front"], scene.walk).numpy() > 0
     assert {-1, 0, 1} == set(labels[met].tolist())
     for label, colour in zip((0, 1, -1), cluster_colours(2), strict=True):
         assert (shown[met & (labels == label)] == colour).all()

@@ -49,7 +49,7 @@ def two() -> QueryScene:
         log_scales=torch.tensor([[0.12] * 3, [0.3] * 3]).log(),
         opacity_logits=torch.full((2,), 4.0),
     )
-    return scene_of(splats, Camera("front", 48, 24, 24.0, 24.0, 24.0, 12.0, pose))
+    return scene_of(splats, Camera.pinhole("front", 48, 24, 24.0, 24.0, 24.0, 12.0, pose))
 
 
 def test_what_is_near_is_bright_and_what_is_nowhere_is_black(two: QueryScene) -> None:
@@ -69,7 +69,7 @@ def test_depth_is_the_weighted_mean_of_what_the_ray_meets(kernel: Kernel) -> Non
     depths, covered = expected_depth(scene_of(splats, camera), "v0")
     pixels = torch.tensor([(x, y) for y in range(camera.height) for x in range(camera.width)], dtype=torch.int32)
     rows = OracleRaster(splats).ray_rows(camera, pixels, CompositingParams())
-    z = splats.means.double() @ torch.from_numpy(camera.world_to_camera[2, :3].copy()) + camera.world_to_camera[2, 3]
+    z = splats.means.double() @ torch.from_numpy(camera.viewmat[2, :3].copy()) + camera.viewmat[2, 3]
     expected = torch.zeros(len(pixels), dtype=torch.float64)
     weighed = torch.zeros(len(pixels), dtype=torch.float64)
     for i in range(len(pixels)):
@@ -96,13 +96,13 @@ def test_a_picture_tells_its_depths_and_can_be_read_back(two: QueryScene) -> Non
 
 
 def test_a_flat_scene_is_bright_and_an_empty_view_says_nothing(two: QueryScene) -> None:
-    splats, camera = two.splats, two.cameras.get("front")
+    splats, camera = two.splats, two.cameras["front"]
     one = Splats(splats.means[:1], splats.quats[:1], splats.log_scales[:1], splats.opacity_logits[:1])
     flat = shown_depth(scene_of(one, camera), "front")
     assert set(np.unique(flat.levels)) == {0, 255}
     behind = np.eye(4)
     behind[2, 3] = -100.0
-    away = scene_of(one, Camera("front", 48, 24, 24.0, 24.0, 24.0, 12.0, behind))
+    away = scene_of(one, Camera.pinhole("front", 48, 24, 24.0, 24.0, 24.0, 12.0, behind))
     assert shown_depth(away, "front").span is None
     with Image.open(io.BytesIO(render_png(away, "front", "depth"))) as picture:
         assert not np.asarray(picture).any() and "depth-near" not in picture.info

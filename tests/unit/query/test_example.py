@@ -68,7 +68,7 @@ def test_what_points_nowhere_is_refused(notation: str) -> None:
 
 def test_a_pixel_is_the_feature_rendered_there(scene: QueryScene) -> None:
     features = scene.lift.features.float()
-    image = scene.raster.render(scene.cameras.get("middle"), features, scene.walk)
+    image = scene.raster.render(scene.cameras["middle"], features, scene.walk)
     for x, y in ((5, 12), (16, 12), (26, 10)):
         (found,) = directions(scene, Query((Pixel("middle", x, y),)), None)
         torch.testing.assert_close(found, torch.nn.functional.normalize(image[y, x], dim=0), atol=1e-5, rtol=0)

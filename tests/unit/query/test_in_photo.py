@@ -13,7 +13,7 @@ from liftcore.scene.lens import behind_lens, drawn_by, photo_places
 
 BARREL = Brown(k1=-0.25, k2=0.04, p1=0.002, p2=-0.001)
 PINCUSHION = Brown(k1=0.2)
-PLAIN = Camera("v", 60, 44, 48.0, 47.0, 29.0, 23.0, np.eye(4))
+PLAIN = Camera.pinhole("v", 60, 44, 48.0, 47.0, 29.0, 23.0, np.eye(4))
 
 
 def places(of: Camera) -> torch.Tensor:
@@ -51,7 +51,7 @@ def test_a_photo_without_a_lens_is_as_drawn() -> None:
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.int32])
 def test_the_rim_that_no_pinhole_sees_is_empty(dtype: torch.dtype) -> None:
-    whole = Camera("v", 160, 160, 50.0, 50.0, 80.0, 80.0, np.eye(4))
+    whole = Camera.pinhole("v", 160, 160, 50.0, 50.0, 80.0, 80.0, np.eye(4))
     camera = behind_lens(whole, Fisheye())
     picture = in_photo(camera, lambda of: torch.ones(of.height, of.width, dtype=dtype))
     assert float(picture[80, 80]) == 1

@@ -12,7 +12,7 @@ from PIL import Image
 
 from liftcore.errors import InvalidLift, InvalidQuery
 from liftcore.io.lift_file import save_lift
-from liftcore.io.load import load_splats
+from liftcore.io.ply import read_splats
 from liftcore.lift import lift
 from liftcore.query.ask import Answer, ask
 from liftcore.query.colours import NOT_SEEN_COLOUR, SH_C0, colour_map
@@ -58,8 +58,8 @@ def test_the_object_is_what_was_selected_and_can_be_lifted_again(scene: QuerySce
 
 def test_the_object_rendered_alone_lies_where_the_object_is(scene: QueryScene, tmp_path: Path) -> None:
     (tmp_path / "lamp.ply").write_bytes(b"".join(object_ply(scene, of_lamp(scene))))
-    alone = CpuRaster(load_splats(tmp_path / "lamp.ply"))
-    columns = (alone.row_sums(scene.cameras.get("middle"), scene.walk) > 0.5).nonzero()[:, 1]
+    alone = CpuRaster(read_splats(tmp_path / "lamp.ply"))
+    columns = (alone.row_sums(scene.cameras["middle"], scene.walk) > 0.5).nonzero()[:, 1]
     assert len(columns) > 0 and int(columns.min()) >= WIDTH // 2
 
 
@@ -80,7 +80,7 @@ def test_scores_have_the_colours_of_the_map_and_what_was_not_seen_is_grey(scene:
     answer = of_lamp(scene)
     assert not answer.seen[-1]
     (tmp_path / "scores.ply").write_bytes(b"".join(coloured_ply(scene, answer)))
-    sh = load_splats(tmp_path / "scores.ply").sh
+    sh = read_splats(tmp_path / "scores.ply").sh
     assert sh is not None
     colours = np.round(255 * (0.5 + SH_C0 * sh[:, 0].double().numpy())).astype(int)
     assert tuple(colours[-1]) == NOT_SEEN_COLOUR
@@ -95,7 +95,7 @@ def test_the_coloured_scene_looks_like_the_attention(scene: QueryScene, tmp_path
     seen = view_mask(scene, answer, "middle")
     (tmp_path / "scores.ply").write_bytes(b"".join(coloured_ply(scene, answer)))
     coloured = QueryScene(scene.lift, scene.path)
-    coloured.__dict__["splats"] = load_splats(tmp_path / "scores.ply")
+    coloured.__dict__["splats"] = read_splats(tmp_path / "scores.ply")
     shown = render(coloured, "middle").astype(int)
     heat = np.asarray(Image.open(io.BytesIO(attention_png(seen)))).astype(int)
     met = seen.row_sums.numpy() > 0.95

@@ -50,7 +50,7 @@ def of(scene: QueryScene, *clusters: int, keep: str = "all", rows: tuple[int, ..
 
 def mostly(scene: QueryScene, members: torch.Tensor) -> torch.Tensor:
     """[H, W] bool, where these splats have at least half of a ray that meets the scene, by the oracle."""
-    camera, oracle = scene.cameras.get("middle"), OracleRaster(scene.splats)
+    camera, oracle = scene.cameras["middle"], OracleRaster(scene.splats)
     weights = oracle.render(camera, members.float()[:, None], scene.walk)[..., 0]
     row_sums = oracle.row_sums(camera, scene.walk)
     assert not ((weights / row_sums.clamp_min(1e-9) - 0.5).abs() < 1e-5).any()  # no pixel is in doubt
@@ -58,7 +58,7 @@ def mostly(scene: QueryScene, members: torch.Tensor) -> torch.Tensor:
 
 
 def test_attention_is_the_scores_rendered_with_the_lifts_gain(scene: QueryScene) -> None:
-    answer, camera = of(scene, 0), scene.cameras.get("middle")
+    answer, camera = of(scene, 0), scene.cameras["middle"]
     seen = view_mask(scene, answer, "middle")
     scores = torch.where(answer.seen, answer.scores, 0.0)[:, None]
     torch.testing.assert_close(seen.attention, scene.raster.render(camera, scores, scene.walk)[:, :, 0])
@@ -90,9 +90,9 @@ def test_strays_are_not_in_a_mask(scene: QueryScene) -> None:
 
 def test_a_view_that_sees_nothing_of_it_has_an_empty_mask(scene: QueryScene) -> None:
     shown = view_mask(scene, of(scene, 0), "middle").mask
-    camera = scene.cameras.get("middle")
+    camera = scene.cameras["middle"]
     left = int(shown.any(dim=0).nonzero().max()) + 1  # what lies to the right of the cluster
-    cut = replace(camera, width=camera.width - left, cx=camera.cx - left)
+    cut = camera.replace(width=camera.width - left, cx=camera.cx - left)
     scene.__dict__["cameras"] = Cameras((cut,))
     seen = view_mask(scene, of(scene, 0), "middle")
     assert not seen.mask.any() and (seen.row_sums >= 0.5).any()
@@ -103,7 +103,7 @@ def test_what_hides_it_is_not_in_its_mask(scene: QueryScene) -> None:
     """The middle cluster, moved before the first one, hides it: both are found, one is seen."""
     moved = scene.splats.means.clone()
     first, second = (slice(k * SPLATS_A_CLUSTER, (k + 1) * SPLATS_A_CLUSTER) for k in range(2))
-    eye = torch.from_numpy(np.linalg.inv(scene.cameras.get("middle").world_to_camera)[:3, 3]).float()
+    eye = torch.from_numpy(np.linalg.inv(scene.cameras["middle"].viewmat)[:3, 3]).float()
     before = view_mask(scene, of(scene, 0), "middle").mask
     moved[second] = eye + 0.7 * (moved[first] - eye)
     scene.__dict__["splats"] = replace(scene.splats, means=moved)

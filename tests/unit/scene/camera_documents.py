@@ -15,8 +15,8 @@ FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
 def transforms_of(cameras: Cameras) -> dict[str, Any]:
     frames = []
-    for camera in cameras:
-        pose = np.linalg.inv(camera.world_to_camera) @ FLIP
+    for camera in cameras.values():
+        pose = np.linalg.inv(camera.viewmat) @ FLIP
         size = {"w": camera.width, "h": camera.height}
         lens = {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
         frames.append({"file_path": f"images/{camera.name}.png", "transform_matrix": pose.tolist(), **size, **lens})
@@ -30,8 +30,8 @@ def with_json(tmp_path: Path, document: Any) -> Path:
 
 
 def assert_same(one: Cameras, other: Cameras) -> None:
-    assert [view.name for view in one] == [view.name for view in other]
-    for a, b in zip(one, other, strict=True):
+    assert list(one) == list(other)
+    for a, b in zip(one.values(), other.values(), strict=True):
         assert (a.width, a.height) == (b.width, b.height)
         assert np.allclose([a.fx, a.fy, a.cx, a.cy], [b.fx, b.fy, b.cx, b.cy], atol=1e-9)
-        assert np.allclose(a.world_to_camera, b.world_to_camera, atol=1e-12)
+        assert np.allclose(a.viewmat, b.viewmat, atol=1e-12)

@@ -16,9 +16,10 @@ from colmap_files import IMAGES, binary_files, text_files, write_files
 
 from liftcore.errors import InvalidCameras, InvalidSplats
 from liftcore.io import camera_zip, json_file
+from liftcore.io.cameras import other_models, read_cameras
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.inspect_scene import describe_camera_file
-from liftcore.io.load import load_cameras, load_splats, other_models
+from liftcore.io.ply import read_splats
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.distortion import Brown, Fisheye
 from liftcore.scene.lens import Lens
@@ -30,24 +31,24 @@ def model(tmp_path: Path) -> Path:
 
 
 def test_binary_and_text_models_mean_the_same(model: Path, tmp_path: Path) -> None:
-    assert_same(load_cameras(model), load_cameras(write_files(tmp_path / "text", text_files())))
+    assert_same(read_cameras(model), read_cameras(write_files(tmp_path / "text", text_files())))
 
 
 def test_colmap_poses_are_world_to_camera(model: Path) -> None:
-    cameras = load_cameras(model)
-    assert [view.name for view in cameras] == ["frame 1", "frame_2", "frame.0003"]
-    first, second, third = cameras
+    cameras = read_cameras(model)
+    assert list(cameras) == ["frame 1", "frame_2", "frame.0003"]
+    first, second, third = cameras.values()
     assert (first.fx, first.fy, first.cx, first.cy) == (500.0, 510.0, 320.5, 239.5)
     assert (second.fx, second.fy) == (400.0, 400.0)
     assert np.allclose(first.centre, [0, 0, -2])
-    assert np.allclose(second.world_to_camera[:3, :3] @ [1, 0, 0], [0, 1, 0])  # a third of a turn about (1, 1, 1)
-    assert np.allclose(third.world_to_camera[:3, :3], np.diag([-1, 1, -1]))  # the quaternion is normalised
+    assert np.allclose(second.viewmat[:3, :3] @ [1, 0, 0], [0, 1, 0])  # a third of a turn about (1, 1, 1)
+    assert np.allclose(third.viewmat[:3, :3], np.diag([-1, 1, -1]))  # the quaternion is normalised
 
 
 @pytest.mark.parametrize("place", [".", "sparse/0", "sparse", "0"])
 def test_model_is_found_in_a_scene_folder(place: str, tmp_path: Path, model: Path) -> None:
     write_files(tmp_path / "scene" / place, binary_files())
-    assert_same(load_cameras(tmp_path / "scene"), load_cameras(model))
+    assert_same(read_cameras(tmp_path / "scene"), read_cameras(model))
 
 
 @pytest.mark.parametrize("root", ["", "scene/sparse/0/", "../../"])
@@ -59,7 +60,7 @@ def test_zipped_model_is_read_at_any_depth(root: str, files: Any, tmp_path: Path
         for name, content in files().items():
             archive.writestr(root + name, content)
     before = sorted(tmp_path.rglob("*"))
-    assert_same(load_cameras(path), load_cameras(model))
+    assert_same(read_cameras(path), read_cameras(model))
     assert sorted(tmp_path.rglob("*")) == before
 
 
@@ -82,10 +83,10 @@ def test_zip_bomb_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         archive.writestr("cameras.bin", bytes(100_000))
         archive.writestr("images.bin", b"")
     with pytest.raises(InvalidCameras, match="at most 1000 bytes unzipped"):
-        load_cameras(path)
+        read_cameras(path)
     monkeypatch.setattr(camera_zip, "MAX_ZIP_MEMBERS", 1)
     with pytest.raises(InvalidCameras, match="at most 1 files, got 2"):
-        load_cameras(path)
+        read_cameras(path)
 
 
 def test_zip_without_a_model_is_refused(tmp_path: Path) -> None:
@@ -93,7 +94,7 @@ def test_zip_without_a_model_is_refused(tmp_path: Path) -> None:
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("readme.txt", "hello")
     with pytest.raises(InvalidCameras, match="COLMAP model"):
-        load_cameras(path)
+        read_cameras(path)
 
 
 def test_error_in_a_zip_names_the_zip(tmp_path: Path) -> None:
@@ -102,7 +103,7 @@ def test_error_in_a_zip_names_the_zip(tmp_path: Path) -> None:
         archive.writestr("cameras.bin", binary_files()["cameras.bin"])
         archive.writestr("images.bin", b"")
     with pytest.raises(InvalidCameras) as caught:
-        load_cameras(path)
+        read_cameras(path)
     assert str(caught.value).startswith(f"{path}/images.bin")
 
 
@@ -121,13 +122,13 @@ def test_perspective_models_are_pinholes_without_distortion_and_have_a_lens_with
     lens = Brown(**dict(zip(("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"), distortion, strict=False)))
     for files in (binary_files, text_files):
         sensor = {1: (number, name, (*parameters, *[0.0] * len(distortion)))}
-        straight = load_cameras(write_files(tmp_path / files.__name__, files(sensor, IMAGES[:1])))
+        straight = read_cameras(write_files(tmp_path / files.__name__, files(sensor, IMAGES[:1])))
         assert straight.distorted == ()
-        assert (straight.views[0].fx, straight.views[0].fy, straight.views[0].cx) == (500.0, 500.0, 320.0)
+        assert (straight["frame 1"].fx, straight["frame 1"].fy, straight["frame 1"].cx) == (500.0, 500.0, 320.0)
         sensor = {1: (number, name, (*parameters, *distortion))}
-        bent = load_cameras(write_files(tmp_path / files.__name__, files(sensor, IMAGES[:1])))
+        bent = read_cameras(write_files(tmp_path / files.__name__, files(sensor, IMAGES[:1])))
         assert bent.distorted == ("frame 1",)
-        assert bent.views[0].lens == Lens(640, 480, 500.0, 500.0, 320.0, 240.0, lens)
+        assert bent["frame 1"].lens == Lens(640, 480, 500.0, 500.0, 320.0, 240.0, lens)
 
 
 @pytest.mark.parametrize(
@@ -144,7 +145,7 @@ def test_a_fisheye_always_has_a_lens(
 ) -> None:
     for files in (binary_files, text_files):
         sensor = {1: (number, name, parameters)}
-        [view] = load_cameras(write_files(tmp_path / files.__name__, files(sensor, IMAGES[:1])))
+        [view] = read_cameras(write_files(tmp_path / files.__name__, files(sensor, IMAGES[:1]))).values()
         assert view.lens is not None
         assert view.lens.distortion == Fisheye(*k)
         assert (view.lens.fx, view.lens.cx, view.lens.cy) == (500.0, 320.0, 240.0)
@@ -158,7 +159,7 @@ def test_models_that_are_not_read_are_refused(number: int, name: str, count: int
     sensor = {1: (number, name, (500.0, 500.0, 320.0, 240.0, *[0.0] * (count - 4)))}
     for files in (binary_files, text_files):
         with pytest.raises(InvalidCameras, match=rf"SIMPLE_PINHOLE, .*, got {name}; .*image_undistorter"):
-            load_cameras(write_files(tmp_path / files.__name__, files(sensor, IMAGES[:1])))
+            read_cameras(write_files(tmp_path / files.__name__, files(sensor, IMAGES[:1])))
 
 
 DAMAGED = {
@@ -184,7 +185,7 @@ DAMAGED = {
 def test_damaged_binary_model_is_refused(case: str, tmp_path: Path) -> None:
     files, message = DAMAGED[case]
     with pytest.raises(InvalidCameras, match=message) as caught:
-        load_cameras(write_files(tmp_path, binary_files() | files))
+        read_cameras(write_files(tmp_path, binary_files() | files))
     assert "\n" not in str(caught.value)
 
 
@@ -202,30 +203,30 @@ def test_damaged_binary_model_is_refused(case: str, tmp_path: Path) -> None:
 )
 def test_damaged_text_model_is_refused(name: str, content: bytes, message: str, tmp_path: Path) -> None:
     with pytest.raises(InvalidCameras, match=message):
-        load_cameras(write_files(tmp_path, text_files() | {name: content}))
+        read_cameras(write_files(tmp_path, text_files() | {name: content}))
 
 
 def test_missing_images_file_is_named(tmp_path: Path) -> None:
     write_files(tmp_path, {"cameras.bin": binary_files()["cameras.bin"]})
     with pytest.raises(InvalidCameras, match=r"images\.bin"):
-        load_cameras(tmp_path)
+        read_cameras(tmp_path)
 
 
 def test_inria_cameras_survive_a_round_trip(model: Path, tmp_path: Path) -> None:
     centred = Cameras(
         tuple(
-            Camera(view.name, 640, 480, view.fx, view.fy, 320.0, 240.0, view.world_to_camera)
-            for view in load_cameras(model)
+            Camera.pinhole(view.name, 640, 480, view.fx, view.fy, 320.0, 240.0, view.viewmat)
+            for view in read_cameras(model).values()
         )
     )
     write_inria_cameras(centred, tmp_path / "cameras.json")
-    assert_same(load_cameras(tmp_path / "cameras.json"), centred)
-    assert_same(load_cameras(tmp_path), centred)
+    assert_same(read_cameras(tmp_path / "cameras.json"), centred)
+    assert_same(read_cameras(tmp_path), centred)
 
 
 def test_inria_format_refuses_a_principal_point_off_the_centre(model: Path, tmp_path: Path) -> None:
     with pytest.raises(InvalidCameras, match="frame 1"):
-        write_inria_cameras(load_cameras(model), tmp_path / "cameras.json")
+        write_inria_cameras(read_cameras(model), tmp_path / "cameras.json")
     assert not (tmp_path / "cameras.json").exists()
 
 
@@ -250,39 +251,41 @@ def test_malformed_json_is_refused(content: bytes, message: str, tmp_path: Path)
     path = tmp_path / "cameras.json"
     path.write_bytes(content)
     with pytest.raises(InvalidCameras, match=message) as caught:
-        load_cameras(path)
+        read_cameras(path)
     assert len(str(caught.value)) < 600
 
 
 def test_large_json_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(json_file, "MAX_JSON_BYTES", 100)
     with pytest.raises(InvalidCameras, match="at most 100 bytes"):
-        load_cameras(with_json(tmp_path, [1] * 200))
+        read_cameras(with_json(tmp_path, [1] * 200))
 
 
 def test_what_is_no_camera_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InvalidCameras, match="no such file"):
-        load_cameras(tmp_path / "nowhere")
+        read_cameras(tmp_path / "nowhere")
     with pytest.raises(InvalidCameras, match="a folder without any of them"):
-        load_cameras(tmp_path)
+        read_cameras(tmp_path)
 
 
 def test_pickled_splats_are_refused_unopened(tmp_path: Path) -> None:
     with pytest.raises(InvalidSplats, match="may run code"):
-        load_splats(tmp_path / "ckpt.pt")
+        read_splats(tmp_path / "ckpt.pt")
 
 
 def test_real_cameras_agree_in_both_formats(shared_data: Path) -> None:
-    one = load_cameras(shared_data / "plush" / "cameras.json")
-    other = load_cameras(shared_data / "plush" / "sparse" / "0")
+    one = read_cameras(shared_data / "plush" / "cameras.json")
+    other = read_cameras(shared_data / "plush" / "sparse" / "0")
     assert len(one) == 97
-    names = sorted(view.name for view in one)
-    assert_same(Cameras(tuple(map(one.get, names))), Cameras(tuple(map(other.get, names))))
-    assert len(load_cameras(shared_data / "tabletop")) == 60
+    names = sorted(one)
+    assert_same(Cameras([one[name] for name in names]), Cameras([other[name] for name in names]))
+    assert len(read_cameras(shared_data / "tabletop")) == 60
 
 
 def test_json_beside_a_model_is_read_where_it_is_named(tmp_path: Path) -> None:
     folder = write_files(tmp_path / "model", binary_files())
-    write_inria_cameras(Cameras((Camera("v", 64, 48, 50.0, 50.0, 32.0, 24.0, np.eye(4)),)), folder / "cameras.json")
-    assert [view.name for view in load_cameras(folder / "cameras.json")] == ["v"]
-    assert "v" not in [view.name for view in load_cameras(folder)]
+    write_inria_cameras(
+        Cameras((Camera.pinhole("v", 64, 48, 50.0, 50.0, 32.0, 24.0, np.eye(4)),)), folder / "cameras.json"
+    )
+    assert list(read_cameras(folder / "cameras.json")) == ["v"]
+    assert "v" not in read_cameras(folder)

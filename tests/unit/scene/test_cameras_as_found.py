@@ -13,8 +13,8 @@ import pytest
 from colmap_files import CAMERAS, IMAGES, binary_files, text_files, write_files
 
 from liftcore.errors import InvalidCameras
+from liftcore.io.cameras import other_models, read_cameras
 from liftcore.io.inspect_scene import inspect_file
-from liftcore.io.load import load_cameras, other_models
 from liftcore.io.model_folders import MODEL_FOLDERS
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ def zipped(root: Path, folder: str) -> Path:
 
 
 def names(path: Path) -> list[str]:
-    return [view.name for view in load_cameras(path)]
+    return list(read_cameras(path))
 
 
 @pytest.mark.parametrize("place", ["dense/0/sparse", "dense/sparse"])
@@ -95,18 +95,18 @@ def test_distorted_cameras_beside_undistorted_ones_are_refused(packed: bool, tmp
         return tmp_path / shutil.make_archive(str(scene), "zip", scene) if packed else scene
 
     write_files(scene / "sparse/0", binary_files(DISTORTED))
-    assert len(load_cameras(given()).distorted) == 2
+    assert len(read_cameras(given()).distorted) == 2
     write_files(scene / "sparse/1", binary_files(DISTORTED))  # COLMAP's second component, of the same lens
     write_files(scene / "sparse/2", {**binary_files(), "images.bin": b"cut"})
-    assert len(load_cameras(given()).distorted) == 2
+    assert len(read_cameras(given()).distorted) == 2
     write_files(scene / "dense/0/sparse", binary_files())
     how = "zip the one alone" if packed else "name the one"
     both = rf"distorted ones in (.*/)?sparse/0 and undistorted ones in (.*/)?dense/0/sparse; {how} whose photos"
     with pytest.raises(InvalidCameras, match=both):
-        load_cameras(given())
+        read_cameras(given())
     if not packed:
-        assert len(load_cameras(scene / "sparse/0").distorted) == 2
-        assert load_cameras(scene / "dense/0/sparse").distorted == ()
+        assert len(read_cameras(scene / "sparse/0").distorted) == 2
+        assert read_cameras(scene / "dense/0/sparse").distorted == ()
 
 
 def test_distorted_photos_are_told(tmp_path: Path) -> None:
@@ -154,7 +154,7 @@ def test_json_is_preferred_to_half_a_model(tmp_path: Path) -> None:
 def test_missing_half_of_a_model_is_told(there: str, missing: str, named: bool, tmp_path: Path) -> None:
     write_files(tmp_path, {there: binary_files()[there]})
     with pytest.raises(InvalidCameras, match=f"the file {missing}, got a folder without it"):
-        load_cameras(tmp_path / there if named else tmp_path)
+        read_cameras(tmp_path / there if named else tmp_path)
 
 
 def test_hidden_and_broken_models_are_not_told(tmp_path: Path) -> None:
@@ -173,9 +173,9 @@ def test_half_a_model_is_inspected_with_a_clear_word(tmp_path: Path) -> None:
 def test_folder_without_a_usual_name_says_what_can_be_named(tmp_path: Path) -> None:
     (tmp_path / "transforms_train.json").write_text("{}")
     with pytest.raises(InvalidCameras, match=r"name what is meant, such as .*transforms_train\.json"):
-        load_cameras(tmp_path)
+        read_cameras(tmp_path)
     with pytest.raises(InvalidCameras, match=r"a folder without any of them$"):
-        load_cameras(write_files(tmp_path / "empty", {}))
+        read_cameras(write_files(tmp_path / "empty", {}))
 
 
 def test_camera_that_no_image_uses_may_be_of_any_model(tmp_path: Path) -> None:
@@ -196,7 +196,7 @@ def test_pointers_of_git_lfs_are_told(kind: str, part: str, tmp_path: Path) -> N
     files = binary_files() if kind == "bin" else text_files()
     folder = write_files(tmp_path / "model", {**files, f"{part}.{kind}": POINTER})
     with pytest.raises(InvalidCameras, match=rf"{part}\.{kind}: .*Git LFS pointer.*git lfs pull"):
-        load_cameras(folder)
+        read_cameras(folder)
 
 
 @pytest.mark.parametrize("root", ["sparse\\0\\", "./sparse/0/", ".\\sparse\\0\\"])
@@ -223,14 +223,14 @@ def test_zip_without_a_model_says_what_it_has(name: str, message: str, tmp_path:
     with zipfile.ZipFile(tmp_path / "scene.zip", "w") as archive:
         archive.writestr(name, b"")
     with pytest.raises(InvalidCameras, match=message):
-        load_cameras(tmp_path / "scene.zip")
+        read_cameras(tmp_path / "scene.zip")
 
 
 def test_one_file_of_a_model_is_told_to_come_with_the_other(tmp_path: Path) -> None:
     path = tmp_path / "upload"
     path.write_bytes(binary_files()["cameras.bin"])
     with pytest.raises(InvalidCameras, match=r"a zip of its cameras\.\* and images\.\* together"):
-        load_cameras(path)
+        read_cameras(path)
 
 
 def test_views_of_one_name_say_what_to_do(tmp_path: Path) -> None:
@@ -238,28 +238,28 @@ def test_views_of_one_name_say_what_to_do(tmp_path: Path) -> None:
     record["rotation"] = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
     (tmp_path / "cameras.json").write_text(json.dumps([record, record]))
     with pytest.raises(InvalidCameras, match=r"cameras\.json cameras: expected one view a name.*test views first"):
-        load_cameras(tmp_path)
+        read_cameras(tmp_path)
 
 
 def test_what_is_wrong_with_a_view_of_a_model_names_the_model(tmp_path: Path) -> None:
     images = [(1, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, place), "a.jpg") for place in (1.0, 2.0)]
     folder = write_files(tmp_path / "model", binary_files(images=images))
     with pytest.raises(InvalidCameras, match=r"model cameras: expected one view a name, got 'a' twice; .*train/r_0"):
-        load_cameras(folder)
+        read_cameras(folder)
 
 
 def test_fisheyes_of_new_colmap_are_read(tmp_path: Path) -> None:
     for number, parameters in ((14, (500.0, 320.0, 240.0)), (15, (500.0, 500.0, 320.0, 240.0))):
         files = binary_files({**CAMERAS, 1: (number, "", parameters)})
-        assert len(load_cameras(write_files(tmp_path / str(number), files)).distorted) == 2
+        assert len(read_cameras(write_files(tmp_path / str(number), files)).distorted) == 2
     with pytest.raises(InvalidCameras, match=r"expected a camera of .*FISHEYE, got EUCM; undistort"):
-        load_cameras(write_files(tmp_path / "other", binary_files({**CAMERAS, 1: (16, "", (1.0,) * 6)})))
+        read_cameras(write_files(tmp_path / "other", binary_files({**CAMERAS, 1: (16, "", (1.0,) * 6)})))
 
 
 def test_distortion_that_is_no_number_is_told(tmp_path: Path) -> None:
     files = text_files({**CAMERAS, 1: (2, "SIMPLE_RADIAL", (500.0, 320.0, 240.0, float("nan")))})
     with pytest.raises(InvalidCameras, match="camera 1: expected finite k1, got nan"):
-        load_cameras(write_files(tmp_path / "model", files))
+        read_cameras(write_files(tmp_path / "model", files))
 
 
 def test_zip_of_damaged_lzma_is_told(tmp_path: Path) -> None:
@@ -271,4 +271,4 @@ def test_zip_of_damaged_lzma_is_told(tmp_path: Path) -> None:
     content[60:100] = bytes(40)
     path.write_bytes(content)
     with pytest.raises(InvalidCameras, match="a zip of a COLMAP sparse model, got one that does not open"):
-        load_cameras(path)
+        read_cameras(path)

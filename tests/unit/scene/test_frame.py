@@ -17,11 +17,11 @@ from scipy.spatial.transform import Rotation
 
 from liftcore.errors import InvalidCameras, Unavailable
 from liftcore.io import camera_zip
+from liftcore.io.cameras import read_cameras
 from liftcore.io.frame import FRAME_FILE, Similarity
 from liftcore.io.input_files import camera_input
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.inspect_scene import inspect_file
-from liftcore.io.load import load_cameras
 from liftcore.scene.cameras import Camera, Cameras
 
 APPLIED = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])  # of nerfstudio's converter
@@ -50,7 +50,7 @@ def model(tmp_path: Path) -> Path:
 @pytest.fixture
 def run(tmp_path: Path, model: Path) -> Path:
     """A folder with the transforms.json of the model's poses, and the file of a run."""
-    document, poses = transforms_of(load_cameras(model)), {}
+    document, poses = transforms_of(read_cameras(model)), {}
     for record in document["frames"]:
         poses[record["file_path"]] = APPLIED @ np.array(record["transform_matrix"])
         record["transform_matrix"] = poses[record["file_path"]].tolist()
@@ -67,21 +67,21 @@ def expected(run: Path, model: Path) -> Cameras:
     """The model's cameras with the poses that nerfstudio trains on."""
     poses = json.loads((run.parent / "trained.json").read_text())
     views = []
-    for camera, pose in zip(load_cameras(model), poses.values(), strict=True):
+    for camera, pose in zip(read_cameras(model).values(), poses.values(), strict=True):
         sizes = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-        views.append(Camera(camera.name, *sizes, world_to_camera=np.linalg.inv(np.array(pose) @ FLIP)))
+        views.append(Camera.pinhole(camera.name, *sizes, viewmat=np.linalg.inv(np.array(pose) @ FLIP)))
     return Cameras(tuple(views))
 
 
 def test_poses_of_a_transforms_json_are_moved_as_nerfstudio_moves_them(run: Path, expected: Cameras) -> None:
     for path in (run, run / "transforms.json"):
-        cameras = load_cameras(path)
+        cameras = read_cameras(path)
         assert cameras.frame == FRAME_FILE
         assert_same(cameras, expected)
     (run / FRAME_FILE).unlink()
-    assert load_cameras(run).frame is None
+    assert read_cameras(run).frame is None
     with pytest.raises(AssertionError):
-        assert_same(load_cameras(run), expected)
+        assert_same(read_cameras(run), expected)
 
 
 def test_scale_that_was_applied_before_is_not_applied_twice(run: Path, expected: Cameras) -> None:
@@ -89,7 +89,7 @@ def test_scale_that_was_applied_before_is_not_applied_twice(run: Path, expected:
     (run / "transforms.json").write_text(json.dumps({**document, "applied_scale": APPLIED_SCALE}))
     told = json.loads((run / FRAME_FILE).read_text())
     (run / FRAME_FILE).write_text(json.dumps({**told, "scale": SCALE * APPLIED_SCALE}))  # what nerfstudio then writes
-    assert_same(load_cameras(run), expected)
+    assert_same(read_cameras(run), expected)
 
 
 @pytest.mark.parametrize("place", [".", "sparse/0", "colmap/sparse/0"])
@@ -100,8 +100,8 @@ def test_models_are_moved_to_the_same_frame(
     shutil.copytree(model, scene / place)
     shutil.copy(run / FRAME_FILE, scene)
     for path in (scene, scene / place, scene / place / "images.bin"):
-        assert_same(load_cameras(path), expected)
-    assert_same(load_cameras(Path(shutil.make_archive(str(scene), "zip", scene))), expected)
+        assert_same(read_cameras(path), expected)
+    assert_same(read_cameras(Path(shutil.make_archive(str(scene), "zip", scene))), expected)
 
 
 def test_transforms_json_comes_before_a_model_where_the_frame_is_told(
@@ -113,7 +113,7 @@ def test_transforms_json_comes_before_a_model_where_the_frame_is_told(
     (run / FRAME_FILE).write_text(json.dumps({"transform": oriented()[:3].tolist(), "scale": SCALE}))
     shutil.copytree(model, run / "colmap/sparse/0")
     for path in (run, Path(shutil.make_archive(str(run), "zip", run))):
-        assert_same(load_cameras(path), expected)
+        assert_same(read_cameras(path), expected)
 
 
 @pytest.mark.parametrize("flat", [False, True])
@@ -124,7 +124,7 @@ def test_zip_of_the_two_files_is_read(flat: bool, run: Path, expected: Cameras, 
     shutil.copy(run / "transforms.json", scene)
     shutil.copy(run / FRAME_FILE, inner)
     path = Path(shutil.make_archive(str(scene), "zip", scene))
-    assert_same(load_cameras(path), expected)
+    assert_same(read_cameras(path), expected)
     assert inspect_file(path)["warnings"] == []
 
 
@@ -134,10 +134,10 @@ def test_pixels_show_what_they_showed(model: Path) -> None:
     matrix = np.eye(4)
     matrix[:3] = 2.5 * oriented()[:3]
     moved = points @ matrix.T
-    for before, after in zip(
-        load_cameras(model), Similarity.of(matrix, "here").moved(load_cameras(model)), strict=True
-    ):
-        assert np.allclose((moved @ after.world_to_camera.T)[:, :3], 2.5 * (points @ before.world_to_camera.T)[:, :3])
+    cameras = read_cameras(model)
+    shifted = Similarity.of(matrix, "here").moved(cameras)
+    for before, after in zip(cameras.values(), shifted.values(), strict=True):
+        assert np.allclose((moved @ after.viewmat.T)[:, :3], 2.5 * (points @ before.viewmat.T)[:, :3])
 
 
 def test_transform_of_gsplat_holds_its_scale(run: Path, expected: Cameras, model: Path, tmp_path: Path) -> None:
@@ -147,16 +147,16 @@ def test_transform_of_gsplat_holds_its_scale(run: Path, expected: Cameras, model
     scene = tmp_path / "scene"
     shutil.copytree(model, scene / "sparse/0")
     (scene / FRAME_FILE).write_text(json.dumps({"transform": transform[:3].tolist(), "scale": 1.0}))
-    assert_same(load_cameras(scene), expected)
+    assert_same(read_cameras(scene), expected)
 
 
 def test_lenses_stay_as_they_are(run: Path, tmp_path: Path) -> None:
     scene = tmp_path / "scene"
     write_files(scene / "sparse/0", binary_files({**CAMERAS, 1: (2, "SIMPLE_RADIAL", (500.0, 320.0, 240.0, 0.1))}))
-    before = load_cameras(scene)
+    before = read_cameras(scene)
     shutil.copy(run / FRAME_FILE, scene)
-    after = load_cameras(scene)
-    assert [view.lens for view in after] == [view.lens for view in before]
+    after = read_cameras(scene)
+    assert [view.lens for view in after.values()] == [view.lens for view in before.values()]
     assert len(after.distorted) == 2
 
 
@@ -182,7 +182,7 @@ def test_lenses_stay_as_they_are(run: Path, tmp_path: Path) -> None:
 def test_frame_that_is_none_is_refused(told: Any, message: str, run: Path) -> None:
     (run / FRAME_FILE).write_text(json.dumps(told))
     with pytest.raises(InvalidCameras, match=rf"dataparser_transforms\.json.*{message}"):
-        load_cameras(run)
+        read_cameras(run)
 
 
 @pytest.mark.parametrize(
@@ -197,18 +197,18 @@ def test_what_was_applied_before_is_checked(key: str, value: Any, message: str, 
     document = json.loads((run / "transforms.json").read_text())
     (run / "transforms.json").write_text(json.dumps({**document, key: value}))
     with pytest.raises(InvalidCameras, match=rf"transforms\.json {message}"):
-        load_cameras(run)
+        read_cameras(run)
 
 
 def test_inria_cameras_are_in_the_frame_of_their_splats(run: Path, tmp_path: Path) -> None:
     folder = tmp_path / "inria"
     folder.mkdir()
-    camera = Camera("a", 9, 9, 5, 5, 4.5, 4.5, np.eye(4))
+    camera = Camera.pinhole("a", 9, 9, 5, 5, 4.5, 4.5, np.eye(4))
     write_inria_cameras(Cameras((camera,)), folder / "cameras.json")
     shutil.copy(run / FRAME_FILE, folder)
     for path in (folder, folder / "cameras.json"):
         with pytest.raises(InvalidCameras, match=r"cameras that are still to be moved, got Inria's.*; take .* away"):
-            load_cameras(path)
+            read_cameras(path)
 
 
 @pytest.mark.parametrize("name", [FRAME_FILE, "transforms.json"])
@@ -217,13 +217,13 @@ def test_zip_of_several_runs_is_refused(name: str, run: Path) -> None:
     shutil.copy(run / name, run / "other")
     path = Path(shutil.make_archive(str(run), "zip", run))
     with pytest.raises(InvalidCameras, match=rf"expected one {name}, got {name} and other/{name}; zip those of one"):
-        load_cameras(path)
+        read_cameras(path)
 
 
 def test_folder_with_the_frame_alone_has_no_cameras(run: Path) -> None:
     (run / "transforms.json").unlink()
     with pytest.raises(InvalidCameras, match="got a folder without any of them"):
-        load_cameras(run)
+        read_cameras(run)
 
 
 def test_the_frame_is_told_and_counts(run: Path, model: Path, tmp_path: Path) -> None:
@@ -263,7 +263,7 @@ def test_link_counts_where_it_lies_in_the_lift_and_after(run: Path, expected: Ca
     (run / FRAME_FILE).unlink()
     (scene / FRAME_FILE).write_text(json.dumps(told))
     remembered = camera_input(scene / "transforms.json")
-    assert_same(load_cameras(Path(remembered.path)), expected)
+    assert_same(read_cameras(Path(remembered.path)), expected)
     (scene / FRAME_FILE).write_text(json.dumps({**told, "scale": 2 * SCALE}))
     assert camera_input(Path(remembered.path)).sha256 != remembered.sha256
 
@@ -279,19 +279,19 @@ def test_frame_that_is_no_file_is_told(kind: str, run: Path, model: Path) -> Non
     said = "a link that leads to none" if kind == "link" else "none"
     for path in (run, run / "transforms.json", run / "sparse/0"):
         with pytest.raises(InvalidCameras, match=rf"{FRAME_FILE}: expected a file, got {said}; copy the file itself"):
-            load_cameras(path)
+            read_cameras(path)
 
 
 def test_frame_beside_a_zip_counts_where_the_zip_has_none(run: Path, expected: Cameras, tmp_path: Path) -> None:
     told = json.loads((run / FRAME_FILE).read_text())
     path = Path(shutil.make_archive(str(tmp_path / "scene"), "zip", run))
     (tmp_path / FRAME_FILE).write_text(json.dumps({**told, "scale": 5 * SCALE}))
-    assert_same(load_cameras(path), expected)
+    assert_same(read_cameras(path), expected)
     (run / FRAME_FILE).unlink()
     path = Path(shutil.make_archive(str(tmp_path / "scene"), "zip", run))
     (tmp_path / FRAME_FILE).write_text(json.dumps(told))
     before = camera_input(path)
-    assert_same(load_cameras(path), expected)
+    assert_same(read_cameras(path), expected)
     (tmp_path / FRAME_FILE).unlink()
     assert camera_input(path).sha256 != before.sha256
 
@@ -304,21 +304,21 @@ def test_frame_of_another_model_of_a_zip_is_refused(
         shutil.copytree(model, scenes / name / "sparse/0")
     shutil.copy(run / FRAME_FILE, scenes / "b")
     with pytest.raises(InvalidCameras, match=r"got one of b and the model a/sparse/0; zip those of one run alone"):
-        load_cameras(Path(shutil.make_archive(str(scenes), "zip", scenes)))
+        read_cameras(Path(shutil.make_archive(str(scenes), "zip", scenes)))
     shutil.copy(run / FRAME_FILE, scenes / "a")
-    assert_same(load_cameras(Path(shutil.make_archive(str(scenes), "zip", scenes))), expected)
+    assert_same(read_cameras(Path(shutil.make_archive(str(scenes), "zip", scenes))), expected)
 
 
 def test_hidden_files_of_a_zip_do_not_count(run: Path, expected: Cameras) -> None:
     (run / ".ipynb_checkpoints").mkdir()
     shutil.copy(run / "transforms.json", run / ".ipynb_checkpoints")
-    assert_same(load_cameras(Path(shutil.make_archive(str(run), "zip", run))), expected)
+    assert_same(read_cameras(Path(shutil.make_archive(str(run), "zip", run))), expected)
 
 
 def test_transforms_of_another_name_are_zipped_with_their_frame(run: Path, expected: Cameras) -> None:
     (run / "transforms.json").rename(run / "transforms_train.json")
-    assert_same(load_cameras(run / "transforms_train.json"), expected)
-    assert_same(load_cameras(Path(shutil.make_archive(str(run), "zip", run))), expected)
+    assert_same(read_cameras(run / "transforms_train.json"), expected)
+    assert_same(read_cameras(Path(shutil.make_archive(str(run), "zip", run))), expected)
 
 
 def test_transforms_of_another_frame_are_told_beside_a_model(run: Path, model: Path) -> None:
@@ -343,7 +343,7 @@ def test_frame_that_lies_elsewhere_in_a_zip_is_of_its_only_model(
     shutil.copytree(model, scene / "sparse/0")
     (scene / "outputs").mkdir()
     shutil.copy(run / FRAME_FILE, scene / "outputs")
-    assert_same(load_cameras(Path(shutil.make_archive(str(scene), "zip", scene))), expected)
+    assert_same(read_cameras(Path(shutil.make_archive(str(scene), "zip", scene))), expected)
 
 
 def test_full_disk_is_no_broken_zip(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -353,4 +353,4 @@ def test_full_disk_is_no_broken_zip(run: Path, monkeypatch: pytest.MonkeyPatch) 
     path = Path(shutil.make_archive(str(run), "zip", run))
     monkeypatch.setattr(camera_zip, "_unzip_one", full)
     with pytest.raises(Unavailable, match=r"expected room in .* for what is in the zip, got a full disk; make room"):
-        load_cameras(path)
+        read_cameras(path)

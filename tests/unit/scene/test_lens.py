@@ -21,7 +21,7 @@ LENSES = {"barrel": BARREL, "pincushion": PINCUSHION, "fisheye": WIDE}
 
 
 def camera(distortion: Distortion, width: int = 64, height: int = 48, focal: float = 50.0) -> Camera:
-    plain = Camera("v", width, height, focal, 1.02 * focal, 0.49 * width, 0.52 * height, np.eye(4))
+    plain = Camera.pinhole("v", width, height, focal, 1.02 * focal, 0.49 * width, 0.52 * height, np.eye(4))
     return behind_lens(plain, distortion)
 
 
@@ -50,10 +50,10 @@ def test_the_pinhole_of_a_photo_is_the_largest_that_it_shows_whole(name: str) ->
 
     assert outside(view) < 1e-9
     wider = [
-        replace(view, width=view.width + 1, cx=view.cx + 1),
-        replace(view, width=view.width + 1),
-        replace(view, height=view.height + 1, cy=view.cy + 1),
-        replace(view, height=view.height + 1),
+        view.replace(width=view.width + 1, cx=view.cx + 1),
+        view.replace(width=view.width + 1),
+        view.replace(height=view.height + 1, cy=view.cy + 1),
+        view.replace(height=view.height + 1),
     ]
     assert all(outside(other) > 0 for other in wider)
 
@@ -72,7 +72,7 @@ def test_every_pixel_of_a_perspective_photo_is_drawn(name: str) -> None:
 
 
 def test_a_camera_without_a_lens_is_its_own_pinhole() -> None:
-    plain = Camera("v", 64, 48, 50.0, 50.0, 32.0, 24.0, np.eye(4))
+    plain = Camera.pinhole("v", 64, 48, 50.0, 50.0, 32.0, 24.0, np.eye(4))
     assert drawn_by(plain) is plain
     assert photo_size(plain) == (64, 48)
     assert pixel_of(plain, 3, 4) == (3, 4)
@@ -117,7 +117,7 @@ def test_what_no_lens_does_is_refused(distortion: Distortion, message: str) -> N
 def test_a_photo_whose_corners_show_no_ray_is_lifted_as_far_as_it_shows_some(
     distortion: Distortion, width: int, height: int, focal: float
 ) -> None:
-    view = behind_lens(Camera("v", width, height, focal, focal, width / 2, height / 2, np.eye(4)), distortion)
+    view = behind_lens(Camera.pinhole("v", width, height, focal, focal, width / 2, height / 2, np.eye(4)), distortion)
     lens = view.lens
     assert lens is not None and lifted_share(view) > 0.3
     u, v = np.meshgrid(np.linspace(0, view.width, 65), np.linspace(0, view.height, 65))

@@ -277,12 +277,6 @@ def test_a_lift_reads_no_colours_and_no_extras(tmp_path, kernel):
         assert torch.equal(getattr(bare, name), getattr(whole, name))
 
 
-def test_arrays_of_numpy_are_refused_in_words() -> None:
-    means = np.zeros((5, 3), np.float32)
-    with pytest.raises(InvalidSplats, match="a tensor of torch, got ndarray"):
-        Splats(means, torch.ones(5, 4), torch.zeros(5, 3), torch.zeros(5))  # pyright: ignore[reportArgumentType]
-
-
 def test_elements_behind_the_vertices_are_passed_over(tmp_path: Path) -> None:
     plain = ply_bytes(INRIA, head="comment kept\n")
     others = b"element camera 2\nproperty float focal\nproperty uchar id\nelement version 3\nproperty uchar number\n"

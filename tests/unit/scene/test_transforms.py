@@ -12,14 +12,14 @@ from camera_documents import assert_same, transforms_of, with_json
 from colmap_files import binary_files, write_files
 
 from liftcore.errors import InvalidCameras
-from liftcore.io.load import load_cameras
+from liftcore.io.cameras import read_cameras
 from liftcore.scene.distortion import Brown, Fisheye
 from liftcore.scene.lens import Lens
 
 
 def test_transforms_and_colmap_mean_the_same(tmp_path: Path) -> None:
-    cameras = load_cameras(write_files(tmp_path / "model", binary_files()))
-    assert_same(load_cameras(with_json(tmp_path, transforms_of(cameras))), cameras)
+    cameras = read_cameras(write_files(tmp_path / "model", binary_files()))
+    assert_same(read_cameras(with_json(tmp_path, transforms_of(cameras))), cameras)
 
 
 def test_opengl_camera_looks_along_its_negative_z(tmp_path: Path) -> None:
@@ -27,19 +27,19 @@ def test_opengl_camera_looks_along_its_negative_z(tmp_path: Path) -> None:
     pose[:3, 3] = [0, 0, 5]
     frame = {"file_path": "./train/r_0", "transform_matrix": pose.tolist()}
     document = {"camera_angle_x": math.pi / 2, "w": 100, "h": 50, "frames": [frame]}
-    camera = load_cameras(with_json(tmp_path, document)).views[0]
+    [camera] = read_cameras(with_json(tmp_path, document)).values()
     assert camera.name == "r_0"
     assert camera.fx == pytest.approx(50)
     assert camera.fy == camera.fx
     assert (camera.cx, camera.cy) == (50, 25)
-    ahead = camera.world_to_camera @ [0, 1, 0, 1]  # below the camera along -z, and above it along y
+    ahead = camera.viewmat @ [0, 1, 0, 1]  # below the camera along -z, and above it along y
     assert np.allclose(ahead, [0, -1, 5, 1])
 
 
 def test_frame_intrinsics_come_before_shared_ones(tmp_path: Path) -> None:
     frame = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist(), "fl_x": 70.0, "w": 20.0}
     document = {"fl_x": 50.0, "w": 100, "h": 50, "frames": [frame, {**frame, "file_path": "b.png", "w": 30}]}
-    first, second = load_cameras(with_json(tmp_path, document))
+    first, second = read_cameras(with_json(tmp_path, document)).values()
     assert (first.fx, first.fy, first.width, second.width, second.height) == (70.0, 70.0, 20, 30, 50)
 
 
@@ -150,7 +150,7 @@ def test_distortion_of_transforms(
     shared: dict[str, Any], own: dict[str, Any], lens: Brown | Fisheye | None, tmp_path: Path
 ) -> None:
     document = {"fl_x": 90, "fl_y": 80, "w": 100, "h": 64, **shared, "frames": [{**GOOD_FRAME, **own}]}
-    [view] = load_cameras(with_json(tmp_path, document))
+    [view] = read_cameras(with_json(tmp_path, document)).values()
     assert view.lens == (None if lens is None else Lens(100, 64, 90.0, 80.0, 50.0, 32.0, lens))
 
 
@@ -158,4 +158,4 @@ def test_distortion_of_transforms(
 def test_bad_transforms_are_refused(case: str, tmp_path: Path) -> None:
     document, message = BAD_TRANSFORMS[case]
     with pytest.raises(InvalidCameras, match=message):
-        load_cameras(with_json(tmp_path, document))
+        read_cameras(with_json(tmp_path, document))

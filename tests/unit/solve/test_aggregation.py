@@ -14,10 +14,10 @@ from liftcore.errors import InvalidLift
 from liftcore.features.pack import open_packs
 from liftcore.features.views import FeatureGrid, Regions
 from liftcore.features.write_pack import write_pack
+from liftcore.io.cameras import read_cameras
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.lift_file import CLUSTER_TENSORS, load_lift, save_lift
-from liftcore.io.load import load_cameras, load_splats
-from liftcore.io.ply import write_splats
+from liftcore.io.ply import read_splats, write_splats
 from liftcore.lift import LEAST_KEPT, lift
 from liftcore.progress import silent
 from liftcore.raster.cpu.raster import CpuRaster
@@ -118,7 +118,7 @@ def write_scene(folder, kind: str):
     views = []
     for k in range(3):
         base = centred(random_camera(0, 40 + 8 * k, 30, name=f"v{k}"))
-        views.append(replace(base, fx=40.0, fy=40.0, world_to_camera=pose))
+        views.append(base.replace(fx=40.0, fy=40.0, viewmat=pose))
     maps: dict[str, Regions | FeatureGrid] = {}
     for k, camera in enumerate(views):
         labels = torch.zeros(1, 15, 20, dtype=torch.int32)
@@ -161,10 +161,10 @@ def test_a_lift_with_aggregation_has_one_feature_a_cluster_and_says_so(tmp_path,
 
 def weights_of(splats, cameras, maps, settings) -> np.ndarray:
     """[P] f64, the sum of each splat's weights on the labelled rays of all views."""
-    raster, views = CpuRaster(load_splats(splats)), load_cameras(cameras)
+    raster, views = CpuRaster(read_splats(splats)), read_cameras(cameras)
     total = np.zeros(raster.splats.count)
-    for name in maps.keys() & views.by_name.keys():
-        weights = raster.region_weights(views.get(name), maps[name], settings.lift_params, settings.weighting)
+    for name in maps.keys() & views.keys():
+        weights = raster.region_weights(views[name], maps[name], settings.lift_params, settings.weighting)
         total[weights.splats.numpy()] += row_totals(weights)
     return total
 
@@ -189,7 +189,7 @@ def test_what_takes_no_cluster_is_solved_again_as_if_the_other_regions_had_never
     plain = lift(splats, cameras, [features], LiftSettings.of(aggregation=True, **knobs))
     whole = weights_of(splats, cameras, maps | {"v0": wrong}, plain.metadata.settings)
 
-    lifted = (CpuRaster(load_splats(splats)), load_cameras(cameras), open_packs([features]), result.metadata.views)
+    lifted = (CpuRaster(read_splats(splats)), read_cameras(cameras), open_packs([features]), result.metadata.views)
     assert result.cluster is not None and result.cluster_features is not None
     clustering = clustering_of(result.cluster.numpy(), result.cluster_features.shape[0])
     kept = filter_regions(clustering, 6, lifted, LiftSettings.of(aggregation=True, **knobs), silent).masks

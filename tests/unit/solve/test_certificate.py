@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from liftcore.io.load import load_cameras
+from liftcore.io.cameras import read_cameras
 from liftcore.lift import lift
 from liftcore.raster.base import CompositingParams
 from liftcore.raster.reference import dense_view, reading_matrix
@@ -50,7 +50,7 @@ def test_a_certificate_over_all_rays_equals_the_papers_definitions(tmp_path, pre
     paths = write_scene(tmp_path, 3, grids)
     settings = LiftSettings.of(preset=preset, certificate_rays=ALL_RAYS, dtype="float32")
     result = lift(paths[0], paths[1], [paths[2]], settings)
-    expected = dense_measures(result.features.double().numpy(), 3, load_cameras(paths[1]), settings.lift_gain, grids)
+    expected = dense_measures(result.features.double().numpy(), 3, read_cameras(paths[1]), settings.lift_gain, grids)
     certificate = result.metadata.certificate
     for name, value in expected.items():
         assert certificate[name] == pytest.approx(value, rel=1e-3, abs=1e-6), name
@@ -60,7 +60,7 @@ def test_the_closed_form_minimises_the_surrogate(tmp_path):
     paths = write_scene(tmp_path, 4)
     settings = LiftSettings.of(preset="row-sum", certificate_rays=ALL_RAYS, dtype="float32")
     X = lift(paths[0], paths[1], [paths[2]], settings).features.double().numpy()
-    cameras = load_cameras(paths[1])
+    cameras = read_cameras(paths[1])
     least = dense_measures(X, 4, cameras, 1.0, grids=False)["surrogate"]
     for seed in range(5):
         other = X + np.random.default_rng(seed).normal(0, 1e-2, X.shape)

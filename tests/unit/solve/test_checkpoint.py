@@ -14,8 +14,8 @@ import torch
 from liftcore.device import CPU, Device
 from liftcore.features.views import NO_LABEL, FeatureGrid, Regions
 from liftcore.features.write_pack import write_pack
+from liftcore.io.cameras import read_cameras
 from liftcore.io.lift_file import TENSORS, LiftResult
-from liftcore.io.load import load_cameras
 from liftcore.lift import lift
 from liftcore.listener import Listener
 from liftcore.raster.base import CompositingParams, ViewRequest, Weighting
@@ -88,7 +88,7 @@ def test_views_that_meet_no_label_are_kept_and_not_walked_again(
 ) -> None:
     splats, cameras, _ = write_scene(tmp_path, 3)
     features = tmp_path / "blank.safetensors"
-    views = {camera.name: observed(3, k, grids=False) for k, camera in enumerate(load_cameras(cameras))}
+    views = {camera.name: observed(3, k, grids=False) for k, camera in enumerate(read_cameras(cameras).values())}
     for name in blank:
         regions = views[name]
         assert isinstance(regions, Regions)
@@ -168,13 +168,13 @@ def test_an_answer_is_to_one_question_alone(changed: str) -> None:
     look = _look()
     camera, regions = look.camera, look.observation
     assert isinstance(regions, Regions)
-    pose = camera.world_to_camera.copy()
+    pose = camera.viewmat.copy()
     pose[0, 3] += 1e-9
     labels = regions.labels.clone()
     labels[0, 1, 2] += 1
     other = {
-        "pose": replace(look, camera=replace(camera, world_to_camera=pose)),
-        "focal": replace(look, camera=replace(camera, fx=camera.fx + 1e-9)),
+        "pose": replace(look, camera=replace(camera, viewmat=pose)),
+        "focal": replace(look, camera=camera.replace(fx=camera.fx + 1e-9)),
         "labels": replace(look, observation=replace(regions, labels=labels)),
         "codebook": replace(look, observation=replace(regions, codebook=torch.zeros(4, 2))),
         "stride": replace(look, params=CompositingParams(stride=2)),
@@ -205,7 +205,7 @@ def test_files_that_are_no_blocks_stay_in_the_folder(tmp_path: Path) -> None:
 
 def _views(cameras: Path, seed: int, grids: bool) -> list[tuple[str, Regions | FeatureGrid]]:
     """What `write_scene` put into its pack."""
-    return [(camera.name, observed(seed, k, grids=grids)) for k, camera in enumerate(load_cameras(cameras))]
+    return [(camera.name, observed(seed, k, grids=grids)) for k, camera in enumerate(read_cameras(cameras).values())]
 
 
 def _other_encoder(seen: Regions | FeatureGrid) -> Regions | FeatureGrid:
@@ -217,7 +217,7 @@ def _other_encoder(seen: Regions | FeatureGrid) -> Regions | FeatureGrid:
 
 
 def _look() -> ViewRequest:
-    camera = Camera("v", 8, 6, 9.0, 9.0, 4.0, 3.0, np.eye(4))
+    camera = Camera.pinhole("v", 8, 6, 9.0, 9.0, 4.0, 3.0, np.eye(4))
     regions = Regions(torch.zeros(1, 6, 8, dtype=torch.int32), torch.zeros(3, 2))
     return ViewRequest(camera, regions, CompositingParams(), Weighting(), torch.zeros(2, 2, dtype=torch.int32))
 

@@ -10,9 +10,9 @@ import torch
 
 from liftcore.features.views import Regions
 from liftcore.features.write_pack import write_pack
+from liftcore.io.cameras import read_cameras
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.lift_file import load_lift, save_lift
-from liftcore.io.load import load_cameras
 from liftcore.io.ply import write_splats
 from liftcore.lift import lift, open_sources
 from liftcore.progress import silent
@@ -55,7 +55,7 @@ def dense_lift(
     gain, weighting = PRESETS[preset]
     splats, walk = random_splats(seed, 50), CompositingParams(gain)
     numerator, denominator, evidence, undecided = np.zeros((50, 6)), np.zeros(50), np.zeros(50), np.zeros(50, bool)
-    for k, camera in enumerate(cameras):
+    for k, camera in enumerate(cameras.values()):
         observation = observed(seed, k, grids)
         S, ray = reading_matrix(observation, camera.width, camera.height)
         B = S @ observation.codebook.double().numpy()
@@ -78,7 +78,7 @@ def test_a_lift_equals_the_dense_definition(tmp_path, preset, grids, seed):
     splats, cameras, features = write_scene(tmp_path, seed, grids)
     save_lift(lift(splats, cameras, [features], LiftSettings.of(preset=preset)), tmp_path / "lift.safetensors")
     got = load_lift(tmp_path / "lift.safetensors")
-    X, evidence, seen, undecided = dense_lift(seed, load_cameras(cameras), preset, grids)
+    X, evidence, seen, undecided = dense_lift(seed, read_cameras(cameras), preset, grids)
     assert np.array_equal(got.seen.numpy()[~undecided], seen[~undecided])
     error = np.linalg.norm(got.features.double().numpy() - X, axis=1)
     assert (error <= 1e-3 * np.linalg.norm(X, axis=1) + 1e-7)[~undecided].all()

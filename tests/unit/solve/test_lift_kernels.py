@@ -10,10 +10,10 @@ import torch
 
 from liftcore.errors import InvalidSettings, InvalidSplats
 from liftcore.features.write_pack import write_pack
+from liftcore.io.cameras import read_cameras
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.lift_file import save_lift
-from liftcore.io.load import load_cameras, load_splats
-from liftcore.io.ply import write_splats
+from liftcore.io.ply import read_splats, write_splats
 from liftcore.lift import lift
 from liftcore.query.scene import QueryScene
 from liftcore.raster.base import CompositingParams
@@ -41,7 +41,7 @@ def write_scene(folder: Path, kernel: Kernel) -> tuple[Path, Path, Path]:
 
 def test_discs_written_with_three_scales_are_discs_where_the_settings_say_so(tmp_path):
     discs, cameras, features = write_scene(tmp_path, Kernel.GAUSSIAN_2D)
-    flat, solid = load_splats(discs), tmp_path / "three.ply"
+    flat, solid = read_splats(discs), tmp_path / "three.ply"
     scales = torch.cat([flat.log_scales, torch.full((flat.count, 1), -1.0)], dim=1)  # of no account
     write_splats(Splats(flat.means, flat.quats, scales, flat.opacity_logits, sh=flat.sh), solid)
     settings = LiftSettings.of(kernel="2dgs")
@@ -64,10 +64,10 @@ def test_a_lift_of_any_kernel_equals_the_dense_definition(tmp_path, kernel, anti
     paths = write_scene(tmp_path, kernel)
     settings = LiftSettings.of(preset="tikhonov", antialiased=antialiased, dtype="float32")
     got = lift(paths[0], paths[1], [paths[2]], settings)
-    splats = load_splats(paths[0])
+    splats = read_splats(paths[0])
     assert splats.kernel is kernel
     numerator, denominator = np.zeros((50, 6)), np.zeros(50)
-    for k, camera in enumerate(load_cameras(paths[1])):
+    for k, camera in enumerate(read_cameras(paths[1]).values()):
         observation = random_regions(k)
         S, ray = reading_matrix(observation, camera.width, camera.height)
         # The gain of 1.2 acts on the logits of every kernel; the released code leaves DBS out.

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -11,7 +9,7 @@ import torch
 from liftcore.errors import InvalidFeatures, InvalidSettings
 from liftcore.features.views import Regions
 from liftcore.features.write_pack import write_pack
-from liftcore.io.load import load_cameras
+from liftcore.io.cameras import read_cameras
 from liftcore.lift import lift
 from liftcore.raster.reference import dense_view, reading_matrix
 from liftcore.raster.reference_weights import walked_rays
@@ -35,7 +33,7 @@ def test_a_strided_lift_is_that_of_its_rays_and_its_evidence_speaks_for_all_of_t
     got = lifted(paths, stride=stride)
     settings, splats = LiftSettings.of(**ROW_SUM, stride=stride), random_splats(2, 50)
     numerator, denominator, evidence, cut = np.zeros((50, 6)), np.zeros(50), np.zeros(50), np.zeros(50, bool)
-    for k, camera in enumerate(load_cameras(paths[1])):
+    for k, camera in enumerate(read_cameras(paths[1]).values()):
         observation = observed(2, k, grids)
         walk = strided_walk(settings.lift_params, settings, camera, k)
         view, walked = dense_view(splats, camera, walk), walked_rays(camera, walk)
@@ -50,7 +48,7 @@ def test_a_strided_lift_is_that_of_its_rays_and_its_evidence_speaks_for_all_of_t
     assert np.abs(got.evidence.numpy() - evidence)[~cut].max() < 1e-3
     assert got.metadata.certificate["rays"] == sum(
         int(walked_rays(camera, strided_walk(settings.lift_params, settings, camera, k)).sum())
-        for k, camera in enumerate(load_cameras(paths[1]))
+        for k, camera in enumerate(read_cameras(paths[1]).values())
     )
 
 

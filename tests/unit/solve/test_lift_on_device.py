@@ -15,7 +15,7 @@ from liftcore.device import CPU, Device
 from liftcore.errors import Unavailable
 from liftcore.io.input_files import input_files
 from liftcore.io.lift_file import TENSORS, LiftResult
-from liftcore.io.load import load_splats
+from liftcore.io.ply import read_splats
 from liftcore.lift import Run, lift_sources, open_sources, planned
 from liftcore.listener import NOBODY
 from liftcore.plan import plan
@@ -132,7 +132,7 @@ def test_a_views_weights_are_let_go_before_the_next_view_is_walked(tmp_path: Pat
 
     class Watching:
         def iterate_views(self, looks: Iterable[ViewRequest]) -> Iterator[ViewWeights]:
-            for walked in CpuRaster(load_splats(scene[0]), threads=1).iterate_views(looks):
+            for walked in CpuRaster(read_splats(scene[0]), threads=1).iterate_views(looks):
                 own = replace(walked, weights=replace(walked.weights))
                 known = weakref.ref(own.weights)
                 yield own

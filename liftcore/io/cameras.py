@@ -5,10 +5,10 @@ from __future__ import annotations
 import zipfile
 from typing import TYPE_CHECKING
 
-from liftcore.errors import InvalidCameras, InvalidSplats
+from liftcore.errors import InvalidCameras
 from liftcore.io.camera_source import camera_source
 from liftcore.io.camera_zip import models_in_zip, read_camera_zip
-from liftcore.io.foreign import LFS_POINTER, refuse_pointer
+from liftcore.io.foreign import refuse_pointer
 from liftcore.io.model_folders import models_below
 from liftcore.scene.distorted import is_undistorted, refuse_both
 
@@ -16,50 +16,11 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from liftcore.scene.cameras import Cameras
-    from liftcore.scene.splats import Kernel, Splats
 
 CAMERA_FORMATS = "a COLMAP sparse model (folder or .zip), a transforms.json or a cameras.json"
-EXPORT = (
-    "export the splats as PLY from the program that trained them (nerfstudio: ns-export gaussian-splat; gsplat's "
-    "simple_trainer: --save-ply)"
-)
-PICKLED = (".pt", ".pth", ".ckpt", ".pkl")
 
 
-def kernel_named(name: str) -> Kernel | None:
-    """The kernel that the setting ``kernel`` names, None for ``auto``: the file tells."""
-    from liftcore.scene.splats import Kernel
-
-    return None if name == "auto" else Kernel(name)
-
-
-def load_splats(path: Path, kernel: Kernel | None = None, *, colour: bool = True) -> Splats:
-    """Read trained splats from a PLY of any dialect (``liftcore.io.ply``), with or without their colours.
-
-    Raises:
-        InvalidSplats: the file is no splat PLY, or what it holds is malformed.
-    """
-    from liftcore.io.ply import read_splats
-
-    if path.suffix.lower() in PICKLED and not _begins(path, LFS_POINTER):
-        raise InvalidSplats(
-            str(path),
-            expected="a PLY file",
-            got="a Python pickle, which may run code when it is opened",
-            hint=EXPORT,
-        )
-    return read_splats(path, kernel, colour=colour)
-
-
-def _begins(path: Path, first: bytes) -> bool:
-    try:
-        with path.open("rb") as handle:
-            return handle.read(len(first)) == first
-    except OSError:
-        return False
-
-
-def load_cameras(path: Path, *, choosing: bool = True) -> Cameras:
+def read_cameras(path: Path, *, choosing: bool = True) -> Cameras:
     """Read cameras from a folder, a JSON file or a zip, recognised by content (`camera_source`).
 
     Args:
