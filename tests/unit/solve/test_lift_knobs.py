@@ -59,7 +59,7 @@ def test_first_pixels_differ_between_views_and_repeat_with_the_seed():
     assert offsets == [strided_walk(settings.lift_params, settings, camera, k).offset for k in range(40)]
     other = LiftSettings.of(stride=4, seed=1)
     assert offsets != [strided_walk(other.lift_params, other, camera, k).offset for k in range(40)]
-    slim = replace(camera, width=2)
+    slim = camera.replace(width=2)
     assert all(strided_walk(settings.lift_params, settings, slim, k).offset[0] < 2 for k in range(20))
 
 
