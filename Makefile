@@ -28,26 +28,26 @@ kernels: $(READY)
 	$(BIN)/python -m tests.kernels
 
 soak: $(READY)  ## the long proofs of docs/reliability.md: prints their figures, takes an hour or so
-	$(BIN)/python -m tests.crash.soak
+	$(BIN)/python -m tests.benchmarks.soak
 
 contract: $(READY)  ## every operation against the OpenAPI document, without keys and with them; some minutes
 	$(BIN)/python -m tests.api.contract
 
 load: $(READY)  ## what clients wait for under load (docs/reliability.md): prints figures, takes some minutes
-	$(BIN)/python -m tests.load.measure
+	$(BIN)/python -m tests.benchmarks.load
 
 # Another torch than the lock's build brings the triton that it was made with: that one stays.
-gpu:  ## all that a card is for: CUDA's torch, conformance, speed, accuracy, gsplat beside; writes docs/benchmarks_gpu.md
+gpu:  ## all that a card is for: CUDA's torch, conformance, speed, accuracy, gsplat beside; prints figures
 	@nvidia-smi -L 2>/dev/null | grep -q GPU || { echo "make gpu: nvidia-smi lists no card here, so nothing was run" >&2; exit 2; }
 	@$(MAKE) --no-print-directory setup
 	@$(BIN)/python -c 'import sys, torch; sys.exit(torch.version.cuda is None)' || { echo "installing torch's CUDA build" \
 	&& $(BIN)/python -m pip install --quiet --force-reinstall $(CUDA_TORCH_PIP) $$(grep -E '^torch(vision)?==' requirements.lock) \
 	&& grep -vE '^(torch|torchvision|triton)==' requirements.lock | $(BIN)/python -m pip install --quiet -r /dev/stdin; }
 	@$(BIN)/python -m tests.benchmarks.gpu --look
-	@$(BIN)/python -m pip install --quiet gsplat==1.5.3 ninja || echo "gsplat does not install here: the page will say so"
+	@$(BIN)/python -m pip install --quiet gsplat==1.5.3 ninja || echo "gsplat does not install here"
 	@held=0; env -u TRITON_INTERPRET $(BIN)/python -m pytest -rs tests/gpu tests/properties tests/unit/solve/test_on_device.py \
 	tests/unit/solve/test_lift_on_device.py || held=$$?; \
-	env -u TRITON_INTERPRET $(BIN)/python -m tests.benchmarks.gpu docs/benchmarks_gpu.md --shared $(SHARED) && exit $$held
+	env -u TRITON_INTERPRET $(BIN)/python -m tests.benchmarks.gpu --shared $(SHARED) && exit $$held
 
 lint: $(READY)
 	$(BIN)/ruff check .

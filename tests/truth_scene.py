@@ -17,7 +17,7 @@ from liftcore.raster.base import CompositingParams
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.splats import Splats
-from tests.benchmarks.noise import noisy_masks
+from tests.benchmarks.experiments import noisy_masks
 from tests.scenes import centred, look_at
 
 CLASSES = 4

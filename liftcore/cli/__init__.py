@@ -19,11 +19,6 @@ from liftcore.errors import SplatliftError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-EXPERIMENTS = (
-    "ablation", "conditioning", "fidelity", "kernels", "lambda_sweep", "mask_noise", "overfitting", "pose_noise",
-    "row_sums",
-)  # fmt: skip
-
 PRESETS = "row-sum, tikhonov (default), argmax, top-k, front-mass, centre or mean"
 THRESHOLDS = "auto, valley, paper, otsu, stability or a number"
 
@@ -111,7 +106,6 @@ def build_parser() -> argparse.ArgumentParser:
     _add_evaluate(commands.add_parser("evaluate", parents=[shared], help="lifts against the field's labels"))
     _add_bench(commands.add_parser("bench", parents=[shared], help="how fast this machine lifts"))
     _add_tradeoff(commands.add_parser("tradeoff", parents=[shared], help="speed against accuracy on your scene"))
-    _add_experiment(commands.add_parser("experiment", parents=[shared], help="what the paper measured, on a scene"))
     return parser
 
 
@@ -308,21 +302,6 @@ def _add_bench(parser: argparse.ArgumentParser) -> None:
     only.add_argument("--stages", action="store_true", help="every step of a view apart, on one thread")
     only.add_argument("--aims", action="store_true", help="the project's aims beside what this machine does")
     _add_device(parser)
-
-
-def _add_experiment(parser: argparse.ArgumentParser) -> None:
-    parser.epilog = (
-        "row_sums needs splats and cameras alone; conditioning too, and measures beta where features, regions or "
-        "features_clean (.safetensors) are; fidelity one of those, features_hard or grids. The others need truth in "
-        "the layout of tabletop (truth.json, truth.safetensors, text_table.safetensors; docs/accuracy.md, "
-        "Experiments) and features; lambda_sweep and overfitting features_hard beside it, mask_noise features_clean."
-    )
-    parser.add_argument("name", choices=EXPERIMENTS, metavar="NAME", help=", ".join(EXPERIMENTS))
-    parser.add_argument(
-        "scene", type=Path, metavar="SCENE", help="a folder: point_cloud.ply, cameras and feature packs"
-    )
-    parser.add_argument("-o", "--out", type=Path, default=Path("experiments"), metavar="DIR", help="of JSON and plot")
-    parser.add_argument("--every", type=_count, default=1, metavar="N", help="take every n-th feature view only")
 
 
 def _seconds(text: str) -> float:

@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from PIL import Image
 
-from liftcore.demo.client import Client
+from liftcore.demo.client import Client, Server
 from liftcore.demo.scene_folder import DemoScene, Truth, find_scene
-from liftcore.demo.server import Server
 from liftcore.demo.write_scene import write_still_life
 from liftcore.query.encoders.specs import NO_WORDS
 from liftcore.query.pictures import overlay

@@ -1,16 +1,16 @@
-"""Accuracy against exact truth: classes of splats, and masks of held-out views."""
+"""How good lifted features are: classes of splats, masks of held-out views, rendered features beside given ones."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
+import numpy as np
 import torch
+from scipy.sparse import csr_array
+from torch import Tensor
 
-if TYPE_CHECKING:
-    from torch import Tensor
+from liftcore.features.views import ViewFeatures
+from liftcore.raster.base import CompositingParams, Raster
+from liftcore.scene.cameras import Camera
+from liftcore.solve.readout import read_pixels, sample_pixels
 
-    from liftcore.raster.base import CompositingParams, Raster
-    from liftcore.scene.cameras import Camera
+PIXELS = 1_000  # of a view, whose rendered features are compared with the given ones
 
 
 def class_scores(features: Tensor, classes: Tensor) -> Tensor:
@@ -53,3 +53,23 @@ def mask_iou(mask: Tensor, truth: Tensor) -> float:
     """Intersection over union of two masks [H, W] bool; one where both are empty."""
     union = int((mask | truth).sum())
     return int((mask & truth).sum()) / union if union else 1.0
+
+
+def view_cosines(
+    raster: Raster, camera: Camera, observation: ViewFeatures, features: Tensor, walk: CompositingParams
+) -> np.ndarray:
+    """Cosine of ``A x`` with every row of B that PIXELS sampled pixels of a view read, [n] f32.
+
+    A pixel has a row of B a labelled level, or one of a grid. One whose ray meets nothing counts as zero.
+
+    Args:
+        features: [P, F].
+    """
+    pixels = sample_pixels(camera, PIXELS, (0, 0), walk)
+    rays = raster.ray_rows(camera, pixels, walk)
+    readout = read_pixels(observation, camera, pixels)
+    used, places = np.unique(rays.splats.numpy(), return_inverse=True)
+    entries = (rays.weights.numpy(), places, rays.indptr.numpy())
+    A = csr_array(entries, shape=(len(pixels), len(used)))
+    rendered = torch.from_numpy((A @ features[torch.from_numpy(used).long()].float().numpy())[readout.rays])
+    return torch.nn.functional.cosine_similarity(rendered, readout.observed(observation.codebook), dim=1).numpy()

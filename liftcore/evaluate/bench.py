@@ -146,12 +146,12 @@ def _real(folder: Path, channels: int, levels: int, count: int) -> Workload:
     from liftcore.features.pack import open_packs, pair
     from liftcore.io.cameras import read_cameras
     from liftcore.io.ply import read_splats
-    from tests.benchmarks.scene_files import cameras_of
 
     packs = [folder / name for name in ("regions.safetensors", "features.safetensors") if (folder / name).is_file()]
     if not packs:
         raise InvalidInput("scene", expected="a folder with regions.safetensors", got=str(folder))
-    cameras = read_cameras(cameras_of(folder))
+    inria = folder / "cameras.json"
+    cameras = read_cameras(inria if inria.is_file() else folder)
     features = pair(open_packs(packs[:1]), cameras)[0]
     views = []
     for number, name in enumerate(features.views[:count]):

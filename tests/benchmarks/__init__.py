@@ -1,1 +1,1 @@
-"""What splatlift measures about itself: run by hand (`python -m tests.benchmarks...`), never collected by pytest."""
+"""What splatlift measures about itself: scripts run by hand (`python -m tests.benchmarks.NAME`), never by pytest."""

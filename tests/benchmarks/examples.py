@@ -1,6 +1,6 @@
 """Masks by example: mean IoU of what one pixel of a thing finds.
 
-    python -m tests.benchmarks.examples DIR [--json]
+    python -m tests.benchmarks.examples DIR [--features NAME...] [--presets NAME...] [--json]
 
 With truth (``tabletop``) each object is asked for by the pixel deepest inside it, farthest from its border, in the
 first held-out view, and judged in the other ones. Without it (``plush``) regions of the pack ``regions`` stand for
@@ -12,60 +12,46 @@ A column a threshold: masks of the objects that it finds, ``anywhere`` those of 
 possible threshold of each mask, which needs the truth.
 """
 
-from __future__ import annotations
-
-import argparse
-import json
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from scipy.ndimage import distance_transform_edt
+from torch import Tensor
 
 from liftcore.errors import InvalidQuery
 from liftcore.evaluate.accuracy import mask_iou
-from liftcore.evaluate.hardware import hardware, machine_line
 from liftcore.features.views import Regions
 from liftcore.io.ply import read_splats
-from liftcore.query.ask import Answer, ask
+from liftcore.query.ask import ask
 from liftcore.query.directions import MINIMUM_ROW_SUM
 from liftcore.query.example import Pixel
 from liftcore.query.objects import objects
 from liftcore.query.query import Query
+from liftcore.query.scene import QueryScene
 from liftcore.query.threshold import METHODS, find_threshold
 from liftcore.query.view_mask import view_mask
 from liftcore.raster.cpu.raster import CpuRaster
+from tests.benchmarks.base import PACKS, PRESETS, command_line, lift_files, opened, scene_files, tell
 from tests.benchmarks.tabletop import Tabletop
-from tests.benchmarks.thresholds import PACKS, PRESETS, best_iou, lifted
+from tests.benchmarks.thresholds import best_iou
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
-
-    from torch import Tensor
-
-    from liftcore.query.scene import QueryScene
-
-COLUMNS = (*METHODS, "anywhere", "rendered", "best")
-LEVELS = (0, 1, 2)  # of the regions
-VIEW_STRIDE = 3  # of the views with regions
-LEAST_AREA, MOST_AREA = 0.02, 0.5  # of the view, that a region covers
-
-Case = tuple[Pixel, list[tuple[str, "Tensor"]]]  # an example, and what it shows: views, and [H, W] bool in each
+Case = tuple[Pixel, list[tuple[str, Tensor]]]  # an example, and what it shows: views, and [H, W] bool in each
 
 
 def deepest_pixel(truth: Tensor) -> tuple[int, int]:
     """x and y of the pixel farthest from the border of a mask [H, W] bool, the topmost of equals."""
-    from scipy.ndimage import distance_transform_edt
-
     depth = np.asarray(distance_transform_edt(np.pad(truth.numpy(), 1)))[1:-1, 1:-1]
     y, x = np.unravel_index(int(depth.argmax()), depth.shape)
     return int(x), int(y)
 
 
-def measure_examples(scene: QueryScene, cases: Iterable[Case]) -> dict[str, float]:
+def measure(scene: QueryScene, cases: Iterable[Case]) -> dict[str, float]:
     """Mean IoU over examples and views by column, how many were asked, and how many had no feature."""
-    rows: dict[str, list[float]] = {name: [] for name in COLUMNS}
+    rows: dict[str, list[float]] = {name: [] for name in (*METHODS, "anywhere", "rendered", "best")}
     asked = refused = 0
     for example, truths in cases:
         asked += 1
@@ -74,7 +60,9 @@ def measure_examples(scene: QueryScene, cases: Iterable[Case]) -> dict[str, floa
         except InvalidQuery:
             refused += 1
             continue
-        answers["anywhere"] = _anywhere(scene, answers["auto"])
+        auto = answers["auto"]
+        cut = find_threshold(auto.scores[auto.seen], "auto", scene.weights).value
+        answers["anywhere"] = replace(auto, threshold=cut, selected=auto.seen & (auto.scores >= cut))
         found = {name: (answer, objects(scene, answer)) for name, answer in answers.items()}  # once for all views
         for view, truth in truths:
             looks = {
@@ -83,17 +71,10 @@ def measure_examples(scene: QueryScene, cases: Iterable[Case]) -> dict[str, floa
             }
             for name, seen in looks.items():
                 rows[name].append(mask_iou(seen.mask, truth))
-            seen = looks["auto"]
-            met = seen.row_sums >= MINIMUM_ROW_SUM
-            cut = find_threshold(seen.attention[met]).value
-            rows["rendered"].append(mask_iou(met & (seen.attention >= cut), truth))
-            rows["best"].append(best_iou(seen.attention, met, truth))
-    return {name: float(np.mean(values)) for name, values in rows.items()} | {"asked": asked, "refused": refused}
-
-
-def _anywhere(scene: QueryScene, answer: Answer) -> Answer:
-    found = find_threshold(answer.scores[answer.seen], "auto", scene.weights)
-    return replace(answer, threshold=found.value, selected=answer.seen & (answer.scores >= found.value))
+            attention, met = looks["auto"].attention, looks["auto"].row_sums >= MINIMUM_ROW_SUM
+            rows["rendered"].append(mask_iou(met & (attention >= find_threshold(attention[met]).value), truth))
+            rows["best"].append(best_iou(attention, met, truth))
+    return {"asked": asked, "refused": refused} | {name: float(np.mean(values)) for name, values in rows.items()}
 
 
 def objects_of(truth: Tabletop) -> Iterator[Case]:
@@ -107,59 +88,44 @@ def objects_of(truth: Tabletop) -> Iterator[Case]:
 
 
 def regions_of(scene: QueryScene, level: int) -> Iterator[Case]:
-    """The regions of a level, and where their own views show them."""
-    for view in scene.lift.metadata.views[::VIEW_STRIDE]:
-        camera = scene.cameras[view]
-        observed = scene.packs.observation(view)
+    """The regions of a level of every third view, and where their own views show them."""
+    for view in scene.lift.metadata.views[::3]:
+        camera, observed = scene.cameras[view], scene.packs.observation(view)
         assert isinstance(observed, Regions)
-        labels = torch.as_tensor(observed.labels[level]).float()
+        labels = torch.as_tensor(observed.labels[level]).float()[None, None]
         size = (camera.height, camera.width)
-        of_pixels = torch.nn.functional.interpolate(labels[None, None], size=size, mode="nearest")[0, 0]
+        of_pixels = torch.nn.functional.interpolate(labels, size=size, mode="nearest")[0, 0]
         for region in of_pixels.unique().tolist():
             shown = of_pixels == region
-            if region >= 0 and LEAST_AREA <= float(shown.float().mean()) <= MOST_AREA:
+            if region >= 0 and 0.02 <= float(shown.float().mean()) <= 0.5:
                 yield Pixel(view, *deepest_pixel(shown)), [(view, shown)]
 
 
-def measure_folder(
-    folder: Path, packs: Sequence[str] = PACKS, presets: Sequence[str] = PRESETS
-) -> Iterator[dict[str, Any]]:
-    """One row a lift of a scene with truth, a lift and a level of one with regions alone."""
-    splats, cameras = folder / "point_cloud.ply", folder / "cameras.json"
-    truth = Tabletop(folder) if (folder / "truth.json").exists() else None
-    raster = truth.raster if truth else CpuRaster(read_splats(splats))
-    for pack in packs if truth else ("regions",):
-        for preset in presets:
-            scene = lifted([splats, cameras, folder / f"{pack}.safetensors"], preset, raster)
-            row = {"scene": folder.name, "features": pack, "preset": preset}
-            if truth:
-                yield row | measure_examples(scene, objects_of(truth))
-                continue
-            for level in LEVELS:
-                yield row | {"features": f"{pack} {level}"} | measure_examples(scene, regions_of(scene, level))
-
-
-def table_of(document: dict[str, Any]) -> str:
-    """The rows and the machine, for people."""
-    lines = [f"{'scene, features, preset':<36}{'asked':>6}" + "".join(f"{name:>10}" for name in COLUMNS)]
-    for row in document["rows"]:
-        head = ", ".join(row[key] for key in ("scene", "features", "preset"))
-        lines.append(f"{head:<36}{row['asked']:>6}" + "".join(f"{row[name]:>10.3f}" for name in COLUMNS))
-    lines.append(machine_line(document["hardware"]))
-    return "\n".join(lines)
-
-
 def main() -> None:
-    """Print the table, or one JSON object."""
-    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.examples", description=__doc__)
-    parser.add_argument("folder", type=Path, metavar="DIR", help="a scene with truth, or with the pack regions")
-    parser.add_argument("--features", nargs="+", default=PACKS, choices=PACKS, help="which packs, with truth")
-    parser.add_argument("--presets", nargs="+", default=PRESETS, metavar="NAME", help="which weights")
-    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
+    """Print the table: a row a lift of a scene with truth, a lift and a level of one with regions alone."""
+    packs = {"nargs": "+", "default": PACKS, "choices": PACKS, "help": "which packs, with truth"}
+    presets = {"nargs": "+", "default": PRESETS, "metavar": "NAME"}
+    parser = command_line(
+        "tests.benchmarks.examples",
+        __doc__,
+        ("folder", {"type": Path}),
+        ("--features", packs),
+        ("--presets", presets),
+    )
     options = parser.parse_args()
-    rows = list(measure_folder(options.folder, options.features, options.presets))
-    document = {"rows": rows, "hardware": hardware()}
-    print(json.dumps(document) if options.json else table_of(document))
+    folder, rows = options.folder, []
+    truth = Tabletop(folder) if (folder / "truth.json").exists() else None
+    raster = truth.raster if truth else CpuRaster(read_splats(folder / "point_cloud.ply"))
+    for pack, preset in product(options.features if truth else ("regions",), options.presets):
+        scene = opened(lift_files(scene_files(folder, pack), preset=preset), raster)
+        head = {"scene": folder.name, "features": pack, "preset": preset}
+        if truth:
+            rows.append(head | measure(scene, objects_of(truth)))
+            continue
+        rows += [
+            head | {"features": f"{pack} {level}"} | measure(scene, regions_of(scene, level)) for level in range(3)
+        ]
+    tell(rows, as_json=options.json)
 
 
 if __name__ == "__main__":

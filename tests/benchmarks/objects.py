@@ -9,29 +9,21 @@ middles of the two boxes, as a share of the true one's diagonal; ``pairs`` of ho
 together, exactly two objects are found, one in each. Table and curtain, which hold the things, are not asked for.
 """
 
-from __future__ import annotations
-
-import argparse
 import json
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from itertools import combinations
+from itertools import combinations, product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from liftcore.evaluate.hardware import hardware, machine_line
-from liftcore.query.ask import ask
+from liftcore.query.ask import Answer, ask
 from liftcore.query.encoders import open_encoder
 from liftcore.query.objects import objects
+from liftcore.query.scene import QueryScene
+from tests.benchmarks.base import PACKS, PRESETS, command_line, lift_files, opened, scene_files, tell
 from tests.benchmarks.tabletop import Tabletop
-from tests.benchmarks.thresholds import PACKS, PRESETS, lifted
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from liftcore.query.ask import Answer
-    from liftcore.query.scene import QueryScene
 
 PROCEDURAL = "(procedural)"  # the source of what the things stand on and before
 
@@ -45,13 +37,7 @@ def box_iou(one: np.ndarray, other: np.ndarray) -> float:
 
 
 def measure_lift(scene: QueryScene, answers: dict[int, Answer], owners: np.ndarray) -> dict[str, Any]:
-    """The figures of one lift.
-
-    Args:
-        scene: the lift.
-        answers: a thing's number -> the answer to its word.
-        owners: [P] int, the thing that each splat belongs to.
-    """
+    """The figures of one lift: answers by a thing's number, owners [P] int, the thing of each splat."""
     means, ious, of_all, middles, alone = scene.splats.means.numpy(), [], [], [], 0
     for thing, answer in answers.items():
         true = _bounds(means[owners == thing])
@@ -81,46 +67,26 @@ def _bounds(means: np.ndarray) -> np.ndarray:
     return np.stack([means.min(axis=0), means.max(axis=0)]).astype(np.float64)
 
 
-def measure_tabletop(
-    folder: Path, packs: Sequence[str] = PACKS, presets: Sequence[str] = PRESETS
-) -> list[dict[str, Any]]:
+def rows_of(folder: Path, packs: Iterable[str] = PACKS, presets: Iterable[str] = PRESETS) -> Iterator[dict[str, Any]]:
     """One row a lift of the tabletop scene."""
-    truth, rows = Tabletop(folder), []
+    truth = Tabletop(folder)
     known = json.loads((folder / "truth.json").read_text())["objects"]
     words = {number: thing["class"] for number, thing in enumerate(known) if thing["source"] != PROCEDURAL}
     encoder = open_encoder(f"table:{folder / 'text_table.safetensors'}")
-    for pack in packs:
-        for preset in presets:
-            files = [folder / name for name in ("point_cloud.ply", "cameras.json", f"{pack}.safetensors")]
-            scene = lifted(files, preset, truth.raster)
-            answers = {thing: ask(scene, word, encoder) for thing, word in words.items()}
-            rows.append({"features": pack, "preset": preset, **measure_lift(scene, answers, truth.objects.numpy())})
-    return rows
-
-
-def table_of(document: dict[str, Any]) -> str:
-    """The rows and the machine, for people."""
-    lines = [f"{'features, preset':<28}{'one':>8}{'box':>8}{'worst':>8}{'all':>8}{'middle':>8}{'pairs':>10}"]
-    for row in document["rows"]:
-        lines.append(
-            f"{row['features'] + ', ' + row['preset']:<28}{row['one']:>5}/{row['things']:<2}{row['box']:>8.3f}"
-            f"{row['worst']:>8.3f}{row['all']:>8.3f}{row['middle']:>8.3f}{row['apart']:>7}/{row['pairs']}"
-        )
-    lines.append(machine_line(document["hardware"]))
-    return "\n".join(lines)
+    for pack, preset in product(packs, presets):
+        scene = opened(lift_files(scene_files(folder, pack), preset=preset), truth.raster)
+        answers = {thing: ask(scene, word, encoder) for thing, word in words.items()}
+        yield {"features": pack, "preset": preset, **measure_lift(scene, answers, truth.objects.numpy())}
 
 
 def main() -> None:
     """Print the table, or one JSON object."""
-    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.objects", description=__doc__)
-    parser.add_argument("folder", type=Path, metavar="DIR", help="the tabletop scene")
-    parser.add_argument("--features", nargs="+", default=PACKS, choices=PACKS, help="which feature packs")
-    parser.add_argument("--presets", nargs="+", default=PRESETS, metavar="NAME", help="which weights")
-    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
+    packs, presets = {"nargs": "+", "default": PACKS, "choices": PACKS}, {"nargs": "+", "default": PRESETS}
+    parser = command_line(
+        "tests.benchmarks.objects", __doc__, ("folder", {"type": Path}), ("--features", packs), ("--presets", presets)
+    )
     options = parser.parse_args()
-    rows = measure_tabletop(options.folder, options.features, options.presets)
-    document = {"rows": rows, "hardware": hardware()}
-    print(json.dumps(document) if options.json else table_of(document))
+    tell(rows_of(options.folder, options.features, options.presets), as_json=options.json)
 
 
 if __name__ == "__main__":

@@ -7,19 +7,19 @@ random lift that nothing is grouped, and ``ask_and_objects_mask_ms`` with a tent
 they are more than masks group. Prints one JSON object.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import statistics
 import sys
 import tempfile
 import time
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
+from torch import Tensor
 
 from liftcore import __version__
 from liftcore.errors import InvalidInput
@@ -35,11 +35,6 @@ from liftcore.query.scene import QueryScene
 from liftcore.query.view_mask import view_mask
 from liftcore.scene.cameras import Cameras
 from liftcore.settings import LiftSettings
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from torch import Tensor
 
 SEED = 0
 BLOCK = 65_536  # rows of random features made at once

@@ -7,38 +7,28 @@ the splats whose evidence from the 52 views of ``features.safetensors`` exceeds 
 argmax over the class scores, rendered in the held-out views with the opacity gain of the lift.
 """
 
-from __future__ import annotations
-
-import argparse
 import json
 import time
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from liftcore.errors import InvalidInput
 from liftcore.evaluate.accuracy import class_ious, class_scores, rendered_scores, splat_accuracy
-from liftcore.evaluate.hardware import hardware, machine_line
 from liftcore.features.pack import open_packs
 from liftcore.features.views import NO_LABEL, Regions
 from liftcore.io.cameras import read_cameras
 from liftcore.io.ply import read_splats
-from liftcore.lift import lift
-from liftcore.raster.base import CompositingParams, Weighting
+from liftcore.raster.base import CompositingParams, Raster, Weighting
 from liftcore.raster.cpu.raster import CpuRaster
+from liftcore.scene.cameras import Cameras
 from liftcore.settings import LiftSettings
-from tests.benchmarks.scene_files import cameras_of
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
-
-    from torch import Tensor
-
-    from liftcore.raster.base import Raster
-    from liftcore.scene.cameras import Cameras
+from tests.benchmarks.base import cameras_of, command_line, lift_files, scene_files, tell
 
 EVIDENCE_PACK = "features"  # its views say which splats count
 EVIDENCE_OVER = 0.5
@@ -58,17 +48,16 @@ class Case:
     robust_steps: int = 0
 
     @property
+    def values(self) -> dict[str, Any]:
+        """The settings of the row, by name."""
+        gains = {"lift_gain": self.gain, "render_gain": self.gain}
+        reading = {"grid_reading": self.grid_reading, "robust_steps": self.robust_steps}
+        return {"preset": "row-sum", "power": self.power, **gains, **reading}
+
+    @property
     def settings(self) -> LiftSettings:
-        """The weights of the row, without a certificate."""
-        return LiftSettings.of(
-            preset="row-sum",
-            power=self.power,
-            lift_gain=self.gain,
-            render_gain=self.gain,
-            grid_reading=self.grid_reading,
-            robust_steps=self.robust_steps,
-            certificate_rays=0,
-        )
+        """The same, as a lift has them."""
+        return LiftSettings.of(**self.values)
 
     @property
     def name(self) -> str:
@@ -150,8 +139,7 @@ class Tabletop:
     def measure(self, case: Case) -> Figures:
         """Lift, classify the splats, and look from the held-out views."""
         start = time.perf_counter()
-        splats, pack = self.folder / "point_cloud.ply", self.folder / f"{case.pack}.safetensors"
-        features = lift(splats, cameras_of(self.folder), [pack], case.settings).features
+        features = lift_files(scene_files(self.folder, case.pack), **case.values).features
         return self.judge(features, case.settings, time.perf_counter() - start)
 
     def judge(
@@ -189,37 +177,25 @@ def _no_truth(folder: Path, got: str) -> InvalidInput:
     )  # fmt: skip
 
 
-def measure_all(folder: Path, cases: Sequence[Case] = CASES) -> dict[str, Any]:
-    """All cases as plain numbers, with the hardware that took the seconds."""
-    scene = Tabletop(folder)
-    rows = [{"name": case.name, "baseline": asdict(case), **asdict(scene.measure(case))} for case in cases]
-    counted = int(scene.counted.sum())
-    return {"splats": scene.raster.splats.count, "evidence_over_half": counted, "rows": rows, "hardware": hardware()}
-
-
-def table_of(document: dict[str, Any]) -> str:
-    """The rows beside their baselines, and the machine, for people."""
-    head = f"{'features, weights':<38}{'accuracy':>9}{'base':>7}{'mIoU':>8}{'base':>7}{'lift s':>8}"
-    lines = [head]
-    for row in document["rows"]:
-        base = [f"{row['baseline'][key]:.3f}" if row["baseline"][key] else "-" for key in ("accuracy", "miou")]
-        lines.append(
-            f"{row['name']:<38}{row['accuracy']:>9.4f}{base[0]:>7}"
-            f"{row['miou']:>8.4f}{base[1]:>7}{row['seconds']:>8.1f}"
-        )
-    lines.append(machine_line(document["hardware"]))
-    return "\n".join(lines)
+def rows_of(scene: Tabletop, cases: Iterable[Case]) -> Iterator[dict[str, Any]]:
+    """One row a lift, beside the figures of the data README."""
+    for case in cases:
+        found = scene.measure(case)
+        yield {
+            "features, weights": case.name, "accuracy": found.accuracy, "README accuracy": case.accuracy,
+            "mIoU": found.miou, "README mIoU": case.miou, "lift s": found.seconds,
+        }  # fmt: skip
 
 
 def main() -> None:
     """Print the table, or one JSON object."""
-    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.tabletop", description=__doc__)
-    parser.add_argument("folder", type=Path, metavar="DIR", help="the tabletop scene")
-    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
-    parser.add_argument("--robust", type=int, default=0, metavar="N", help="lift with N robust steps")
+    robust = {"type": int, "default": 0, "metavar": "N", "help": "lift with N robust steps"}
+    parser = command_line("tests.benchmarks.tabletop", __doc__, ("folder", {"type": Path}), ("--robust", robust))
     options = parser.parse_args()
-    document = measure_all(options.folder, [replace(case, robust_steps=options.robust) for case in CASES])
-    print(json.dumps(document) if options.json else table_of(document))
+    scene = Tabletop(options.folder)
+    note = f"{int(scene.counted.sum())} of {len(scene.counted)} splats count"
+    cases = (replace(case, robust_steps=options.robust) for case in CASES)
+    tell(rows_of(scene, cases), as_json=options.json, note=note)
 
 
 if __name__ == "__main__":

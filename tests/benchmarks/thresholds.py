@@ -11,42 +11,30 @@ The scene is where the constants of ``valley`` were tuned; those of ``auto`` wer
 the same on the demo's scene with three kinds of mistakes. Examples in place of words: ``tests.benchmarks.examples``.
 """
 
-from __future__ import annotations
-
-import argparse
 import json
 import tempfile
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from liftcore.evaluate.accuracy import mask_iou
-from liftcore.evaluate.hardware import hardware, machine_line
-from liftcore.io.lift_file import save_lift
-from liftcore.lift import lift
 from liftcore.query.ask import ask
 from liftcore.query.directions import MINIMUM_ROW_SUM
-from liftcore.query.encoders import open_encoder
+from liftcore.query.encoders import TextEncoder, open_encoder
 from liftcore.query.objects import objects
 from liftcore.query.query import Query
 from liftcore.query.scene import QueryScene
 from liftcore.query.threshold import METHODS, find_threshold
 from liftcore.query.view_mask import view_mask
-from liftcore.settings import LiftSettings
+from tests.benchmarks.base import PACKS, PRESETS, command_line, lift_files, opened, scene_files, tell
 from tests.benchmarks.tabletop import Tabletop
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from torch import Tensor
-
-    from liftcore.query.encoders import TextEncoder
-
-PACKS = ("features", "features_hard", "features_clean", "grids")
-PRESETS = ("row-sum", "tikhonov")
 COLUMNS = (*METHODS, "rendered", "best", "absent", "absent rendered")
 
 
@@ -98,23 +86,18 @@ def measure_phrases(
     return {name: float(np.mean(values)) for name, values in rows.items() if values}
 
 
-def measure_tabletop(
-    folder: Path, packs: Sequence[str] = PACKS, presets: Sequence[str] = PRESETS
-) -> list[dict[str, Any]]:
+def rows_of(folder: Path, packs: Iterable[str], presets: Iterable[str]) -> Iterator[dict[str, Any]]:
     """One row a lift of the tabletop scene."""
-    scene, rows = Tabletop(folder), []
+    scene = Tabletop(folder)
     phrases = [thing["class"] for thing in json.loads((folder / "truth.json").read_text())["objects"]]
     encoder = open_encoder(f"table:{folder / 'text_table.safetensors'}")
-    for pack in packs:
-        for preset in presets:
-            files = [folder / name for name in ("point_cloud.ply", "cameras.json", f"{pack}.safetensors")]
-            opened = lifted(files, preset, scene.raster)
-            row = measure_phrases(opened, phrases, encoder, scene.held_out)
-            rows.append({"scene": "tabletop", "features": pack, "preset": preset, **row})
-    return rows
+    for pack, preset in product(packs, presets):
+        lifted = opened(lift_files(scene_files(folder, pack), preset=preset), scene.raster)
+        head = {"scene": "tabletop", "features": pack, "preset": preset}
+        yield head | measure_phrases(lifted, phrases, encoder, scene.held_out)
 
 
-def measure_still_life(presets: Sequence[str] = PRESETS) -> list[dict[str, Any]]:
+def still_life_rows(presets: Iterable[str]) -> Iterator[dict[str, Any]]:
     """The demo's scene with its usual mistakes, with hard ones, and with hard ones in a narrow cone of vectors."""
     from liftcore.demo.masks import Mistakes, observe, true_labels
     from liftcore.demo.still_life import still_life
@@ -123,7 +106,7 @@ def measure_still_life(presets: Sequence[str] = PRESETS) -> list[dict[str, Any]]
     from liftcore.io.ply import write_splats
     from liftcore.raster.cpu.raster import CpuRaster
 
-    encoder, rows = open_encoder("minilm"), []
+    encoder = open_encoder("minilm")
     hard = Mistakes(merged=0.30, split=0.15, misnamed=0.10, unlabelled=0.06, noise=0.45)
     for seed, (name, mistakes, cone) in enumerate(
         (("usual", Mistakes(), 0.0), ("hard", hard, 0.0), ("cone", hard, 0.9))
@@ -139,10 +122,9 @@ def measure_still_life(presets: Sequence[str] = PRESETS) -> list[dict[str, Any]]
             moved = {view: replace(part, codebook=_in_cone(part.codebook, cone)) for view, part in observed.items()}
             write_pack(files[2], moved, {"encoder": "generated", "text_space": "minilm", "normalised": "true"})
             for preset in presets:
-                opened = lifted(files, preset, raster)
-                row = measure_phrases(opened, made.things, encoder, held_out)
-                rows.append({"scene": "still life", "features": name, "preset": preset, **row})
-    return rows
+                lifted = opened(lift_files(files, preset=preset), raster)
+                head = {"scene": "still life", "features": name, "preset": preset}
+                yield head | measure_phrases(lifted, made.things, encoder, held_out)
 
 
 def _in_cone(codebook: Tensor, share: float) -> Tensor:
@@ -152,49 +134,20 @@ def _in_cone(codebook: Tensor, share: float) -> Tensor:
     return torch.nn.functional.normalize(drawn, dim=1).half() if share else codebook
 
 
-def lifted(files: list[Path], preset: str, raster: Any) -> QueryScene:
-    """The files lifted and opened, with the splats of a raster that is there already."""
-    made = lift(files[0], files[1], files[2:], LiftSettings.of(preset=preset, certificate_rays=0))
-    with tempfile.TemporaryDirectory() as place:
-        save_lift(made, Path(place) / "lift.safetensors")
-        scene = QueryScene(made, Path(place) / "lift.safetensors")
-        scene.raster = raster
-        _ = scene.cameras
-    return scene
-
-
-def table_of(document: dict[str, Any]) -> str:
-    """The rows and the machine, for people."""
-    names = COLUMNS
-    lines = [f"{'scene, features, preset':<36}" + "".join(f"{name:>{_wide(name)}}" for name in names)]
-    for row in document["rows"]:
-        head = ", ".join(row[key] for key in ("scene", "features", "preset"))
-        lines.append(f"{head:<36}" + "".join(_cell(row, name) for name in names))
-    lines.append(machine_line(document["hardware"]))
-    return "\n".join(lines)
-
-
-def _wide(name: str) -> int:
-    return max(10, len(name) + 2)
-
-
-def _cell(row: Mapping[str, Any], name: str) -> str:
-    return f"{row[name]:>{_wide(name)}.3f}" if name in row else f"{'-':>{_wide(name)}}"
-
-
 def main() -> None:
     """Print the table, or one JSON object."""
-    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.thresholds", description=__doc__)
-    parser.add_argument("folder", type=Path, metavar="DIR", help="the tabletop scene")
-    parser.add_argument("--still-life", action="store_true", help="the demo's scene too, which nothing was tuned on")
-    parser.add_argument("--features", nargs="+", default=PACKS, choices=PACKS, help="which feature packs")
-    parser.add_argument("--presets", nargs="+", default=PRESETS, metavar="NAME", help="which weights")
-    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
+    parser = command_line(
+        "tests.benchmarks.thresholds",
+        __doc__,
+        ("folder", {"type": Path}),
+        ("--still-life", {"action": "store_true", "help": "the demo's scene too, which nothing was tuned on"}),
+        ("--features", {"nargs": "+", "default": PACKS, "choices": PACKS}),
+        ("--presets", {"nargs": "+", "default": PRESETS, "metavar": "NAME"}),
+    )
     options = parser.parse_args()
-    rows = measure_tabletop(options.folder, options.features, options.presets)
-    rows += measure_still_life(options.presets) if options.still_life else []
-    document = {"rows": rows, "hardware": hardware()}
-    print(json.dumps(document) if options.json else table_of(document))
+    rows = list(rows_of(options.folder, options.features, options.presets))
+    rows += still_life_rows(options.presets) if options.still_life else []
+    tell(rows, as_json=options.json, columns=("scene", "features", "preset", *COLUMNS))
 
 
 if __name__ == "__main__":

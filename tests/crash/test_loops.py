@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from .loops import POOLED, fault_points, kill_loop, leak_loop, scene_files
+from tests.benchmarks.soak import POOLED, fault_points, kill_loop, leak_loop, scene_files
 
 IN_SHORT = (
     "after the job is in line, before the 202",

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tests.benchmarks.objects import measure_tabletop
+from tests.benchmarks.objects import rows_of
 
 
 def test_the_objects_of_hard_masks_are_the_things_of_the_scene(shared_data: Path) -> None:
-    (row,) = measure_tabletop(shared_data / "tabletop", ["features_hard"], ["tikhonov"])
+    (row,) = rows_of(shared_data / "tabletop", ["features_hard"], ["tikhonov"])
     assert row["one"] == row["things"] == 12
     assert row["box"] > 0.93 and row["worst"] > 0.85  # .943 and .865; .059 around all selected splats
     assert row["middle"] < 0.01

@@ -20,9 +20,8 @@ from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.splats import Splats
 from liftcore.settings import LiftSettings
 from tests.benchmarks.stability.of_features import checkerboard
-from tests.benchmarks.stability.scenes import splats_at
 from tests.benchmarks.stability.weights import exact_view
-from tests.scenes import random_splats
+from tests.scenes import random_splats, splats_at
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -15,9 +15,8 @@ from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.raster.reference import dense_view
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Kernel
-from tests.benchmarks.stability.scenes import camera_at_origin, splats_at
 from tests.benchmarks.stability.weights import traced, weights_of
-from tests.scenes import random_camera, random_splats
+from tests.scenes import camera_at_origin, random_camera, random_splats, splats_at
 from tests.stability.extremes import assert_equals_the_oracle
 
 pytestmark = pytest.mark.usefixtures("every_kernel")

@@ -12,9 +12,8 @@ from liftcore.raster.constants import ALPHA_FLOOR
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.raster.reference_footprints import projected_gaussian
 from liftcore.scene.cameras import Camera
-from tests.benchmarks.stability.scenes import camera_at_origin, splats_at
 from tests.benchmarks.stability.weights import exact_view, traced, weights_of
-from tests.scenes import random_splats
+from tests.scenes import camera_at_origin, random_splats, splats_at
 from tests.stability.extremes import TOLERANCE, assert_equals_the_oracle
 
 ROW = [(0.3 * k - 0.6, 0.1 * k, 2.0 + 0.2 * k) for k in range(5)]

@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from liftcore.evaluate.accuracy import class_ious, rendered_scores
+from liftcore.evaluate.accuracy import class_ious, rendered_scores, view_cosines
 from liftcore.features.masks import read_masks
 from liftcore.query.encoders.table import TableEncoder
 from liftcore.query.in_photo import in_photo
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.view_pairs import cameras_of_views
-from tests.benchmarks.experiments.fidelity import view_cosines
 
 if TYPE_CHECKING:
     from torch import Tensor

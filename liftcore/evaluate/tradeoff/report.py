@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import json
 from typing import TYPE_CHECKING, Any
 
 from liftcore.evaluate.hardware import machine_line
 from liftcore.evaluate.tradeoff.chart import draw
 from liftcore.io.whole_file import whole_file
-from tests.benchmarks.experiments.figure import save_experiment
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -23,11 +23,20 @@ KEY = (
 
 def save(document: Mapping[str, Any], out: Path) -> list[Path]:
     """Write the three files; their paths."""
-    chart = save_experiment("tradeoff", document, draw, out)
-    table = out / "tradeoff.md"
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    out.mkdir(parents=True, exist_ok=True)
+    data, chart, table = (out / f"tradeoff.{ending}" for ending in ("json", "png", "md"))
+    with whole_file(data) as handle:
+        handle.write((json.dumps(document, indent=1, allow_nan=False) + "\n").encode())
+    figure = Figure(dpi=150, layout="constrained")  # no window is opened, no display is needed
+    draw(figure, document)
+    with whole_file(chart) as handle:
+        FigureCanvasAgg(figure).print_png(handle)
     with whole_file(table) as handle:
         handle.write(("\n".join(page_of(document)) + "\n").encode())
-    return [*chart, table]
+    return [data, chart, table]
 
 
 def page_of(document: Mapping[str, Any]) -> list[str]:

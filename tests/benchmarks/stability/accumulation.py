@@ -22,7 +22,7 @@ from liftcore.solve.columns import Columns
 from liftcore.solve.host import Host
 from liftcore.solve.robust import robust_weights
 from liftcore.solve.view_weights import WeightStore
-from tests.benchmarks.stability.scenes import splats_at
+from tests.scenes import splats_at
 
 SIDES = (32, 100, 316, 1_000, 3_162)  # pixels of square images: 10^3 .. 10^7 rays
 ROWS = 1_000  # of the codebook, which the entries read in turn

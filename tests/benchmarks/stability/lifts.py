@@ -24,8 +24,8 @@ from liftcore.scene.splats import Splats
 from liftcore.settings import LiftSettings
 from liftcore.solve.lift_warnings import FAINT
 from tests.benchmarks.stability.case import Extreme, Found, always
-from tests.benchmarks.stability.scenes import of_kernel, splats_at
 from tests.benchmarks.stability.weights import exact_view
+from tests.scenes import of_kernel, splats_at
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping

@@ -13,7 +13,7 @@ from liftcore.scene.splats import Kernel
 from liftcore.settings import LiftSettings
 from tests.benchmarks.stability.case import GAUSSIAN, Extreme
 from tests.benchmarks.stability.lifts import AWAY, HEIGHT, WIDTH, Task, cloud, lifted, refused, run
-from tests.benchmarks.stability.scenes import splats_at
+from tests.scenes import splats_at
 
 FLOAT16 = {"dtype": "float16"}
 STEP = 1e-3  # of the longest value, for what is stored in float16

@@ -18,8 +18,8 @@ from liftcore.scene.distortion import Brown, Distortion, Fisheye
 from liftcore.scene.lens import behind_lens, drawn_by, lifted_share, photo_places
 from tests.benchmarks.stability.case import GAUSSIAN, Extreme, Found, always
 from tests.benchmarks.stability.lifts import refused
-from tests.benchmarks.stability.scenes import ROW, camera_at_origin, splats_at
 from tests.benchmarks.stability.walks import View, exact_weights, walked
+from tests.scenes import ROW, camera_at_origin, splats_at
 
 if TYPE_CHECKING:
     from collections.abc import Callable

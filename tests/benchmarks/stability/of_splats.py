@@ -11,9 +11,9 @@ from liftcore.raster.base import CompositingParams
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Kernel
 from tests.benchmarks.stability.case import FLOORED, GAUSSIAN, Extreme, Found
-from tests.benchmarks.stability.scenes import ROW, TURNED, camera_at_origin, splats_at
 from tests.benchmarks.stability.walks import View, exact_weights, told_of, walked
 from tests.benchmarks.stability.weights import weights_of
+from tests.scenes import ROW, TURNED, camera_at_origin, splats_at
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike

@@ -9,8 +9,8 @@ import numpy as np
 from liftcore.scene.cameras import MAX_FOCAL, MAX_SIDE, MIN_FOCAL, Camera
 from liftcore.scene.splats import Kernel
 from tests.benchmarks.stability.case import FLOORED, GAUSSIAN, Extreme
-from tests.benchmarks.stability.scenes import ROW, camera_at_origin, splats_at
 from tests.benchmarks.stability.walks import View, exact_weights, walked
+from tests.scenes import ROW, camera_at_origin, splats_at
 
 
 def _rolled(kernel: Kernel, angle: float) -> View:

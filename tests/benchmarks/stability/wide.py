@@ -20,9 +20,9 @@ from liftcore.raster.reference_footprints import projected_gaussian
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Kernel
 from tests.benchmarks.stability.case import WEIGHTS
-from tests.benchmarks.stability.scenes import IDENTITY, splats_at
 from tests.benchmarks.stability.walks import View
 from tests.benchmarks.stability.weights import compare
+from tests.scenes import IDENTITY, splats_at
 
 SEEDS = range(300)
 BOUND = WEIGHTS

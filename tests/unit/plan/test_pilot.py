@@ -22,7 +22,7 @@ from liftcore.plan.plan import FEW_VIEWS
 from liftcore.plan.visibility import visibility
 from liftcore.scene.cameras import Cameras
 from liftcore.settings import LiftSettings
-from tests.benchmarks.room_scene import Room, write_room
+from tests.benchmarks.scenes import Room, write_room
 from tests.scenes import centred, random_splats
 from tests.unit.plan.test_views import ring
 

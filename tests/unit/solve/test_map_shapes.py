@@ -18,7 +18,7 @@ from liftcore.lift import lift, open_sources, planned
 from liftcore.scene.cameras import Camera
 from liftcore.settings import LiftSettings
 from liftcore.solve.map_shapes import shape_warnings
-from tests.benchmarks.scene_files import cameras_of
+from tests.benchmarks.base import cameras_of
 
 from .test_lift_equals_dense import write_scene
 

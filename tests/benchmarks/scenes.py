@@ -1,36 +1,33 @@
-"""A synthetic room of many views as a scene folder: what a long video of one place gives, with known mistakes.
+"""Scenes to measure on: a synthetic room of many views, with known mistakes, and feature grids of more cells.
 
-python -m tests.benchmarks.room_scene FOLDER --splats 500000 --views 160
+    python -m tests.benchmarks.scenes room FOLDER --splats 500000 --views 160 [--alike C] [--clean]
+    python -m tests.benchmarks.scenes enlarge PACK --rows H --columns W -o FILE
 
-Every view has regions on four levels, from walls and balls to their parts, seen with occlusion. A part has a random
-unit vector; what a view says of it has noise of norm NOISE. Of all regions a tenth say another part's vector, and of
+Every view of the room has regions on four levels, from walls and balls to their parts, seen with occlusion. A part
+has a random unit vector; what a view says of it has noise of norm NOISE. Of all regions a tenth say another part's
+vector, and of
 three tenths the vector is mixed with another's, unless ``--clean`` leaves the noise alone. With ``--alike C`` the
 vectors of parts have the cosine C to one another in the mean, as those of an encoder lie in a narrow cone.
 """
 
-from __future__ import annotations
-
 import argparse
-import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
-from liftcore.evaluate.synthetic import PART_LEVELS, room_cameras, room_parts, room_splats
-from liftcore.features.views import NO_LABEL, Regions, ViewFeatures
+from liftcore.errors import InvalidFeatures
+from liftcore.evaluate.synthetic import PART_LEVELS, room_cameras, room_parts, room_regions, room_splats
+from liftcore.features.pack import FeaturePacks, open_packs
+from liftcore.features.views import NO_LABEL, FeatureGrid, Regions, ViewFeatures
 from liftcore.features.write_pack import write_pack
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.ply import write_splats
 from liftcore.raster.base import CompositingParams
 from liftcore.raster.cpu.raster import CpuRaster
-from liftcore.scene.cameras import Cameras
-
-if TYPE_CHECKING:
-    from liftcore.scene.cameras import Camera
+from liftcore.scene.cameras import Camera, Cameras
 
 NOISE = 0.45
 WRONG, MIXED = 0.1, 0.3  # shares of a view's regions
@@ -130,24 +127,71 @@ def _shrunk(camera: Camera) -> Camera:
     return camera.replace(**sizes, **lengths)
 
 
-def main(arguments: list[str]) -> int:
-    """Write the folder that the arguments name."""
-    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.room_scene", description=__doc__)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--splats", type=int, default=500_000)
-    parser.add_argument("--views", type=int, default=160)
-    parser.add_argument("--width", type=int, default=986)
-    parser.add_argument("--height", type=int, default=728)
-    parser.add_argument("--channels", type=int, default=512)
-    parser.add_argument("--clean", action="store_true")
-    parser.add_argument("--alike", type=float, default=0.0, metavar="C")
-    given = parser.parse_args(arguments)
-    if not 0.0 <= given.alike < 1.0:
-        parser.error(f"--alike: expected a cosine from 0 to below 1, got {given.alike}")
-    size = given.width, given.height
-    write_room(given.folder, Room(given.splats, given.views, size, given.channels, given.clean, given.alike))
-    return 0
+def write_bench_room(folder: Path, size: Room, different: int = 12) -> tuple[Path, Path, Path]:
+    """The room of ``splatlift bench`` as files: Voronoi regions over random vectors, and no part is seen twice.
+
+    Args:
+        different: label maps that views take in turn, as making one takes longer than lifting it.
+    """
+    paths = folder / "point_cloud.ply", folder / "cameras.json", folder / "features.safetensors"
+    cameras = room_cameras(size.views, *size.size)
+    write_splats(room_splats(size.splats), paths[0])
+    write_inria_cameras(Cameras(tuple(cameras)), paths[1])
+    maps = [room_regions(camera, k, 4, 1).labels for k, camera in enumerate(cameras[:different])]
+    views: dict[str, ViewFeatures] = {}
+    for k, camera in enumerate(cameras):
+        labels, generator = maps[k % len(maps)], torch.Generator().manual_seed(k)
+        rows = torch.randn(int(labels.max()) + 1, size.channels, generator=generator)
+        views[camera.name] = Regions(labels, torch.nn.functional.normalize(rows, dim=1).half())
+    write_pack(paths[2], views, {"encoder": "random", "normalised": "true"})
+    return paths
+
+
+@dataclass(frozen=True)
+class Enlarged(Mapping[str, ViewFeatures]):
+    """The feature grids of packs with so many (rows, columns) of cells, bilinearly, each made when asked for."""
+
+    packs: FeaturePacks
+    cells: tuple[int, int]
+
+    def __getitem__(self, view: str) -> FeatureGrid:
+        observation = self.packs.observation(view)
+        if not isinstance(observation, FeatureGrid):
+            raise InvalidFeatures("features", expected="grids in all views", got=f"regions in {view}")
+        first = observation.grid.float().permute(2, 0, 1)[None]
+        larger = torch.nn.functional.interpolate(first, size=self.cells, mode="bilinear", align_corners=False)
+        return FeatureGrid(larger[0].permute(1, 2, 0).to(observation.grid.dtype).contiguous())
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.packs.views)
+
+    def __len__(self) -> int:
+        return len(self.packs.views)
+
+
+def main() -> None:
+    """Write the scene or the pack."""
+    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.scenes", description=__doc__)
+    kinds = parser.add_subparsers(dest="kind", required=True)
+    room, grids = kinds.add_parser("room"), kinds.add_parser("enlarge")
+    room.add_argument("folder", type=Path)
+    for name, default in (("splats", 500_000), ("views", 160), ("width", 986), ("height", 728), ("channels", 512)):
+        room.add_argument(f"--{name}", type=int, default=default)
+    room.add_argument("--clean", action="store_true")
+    room.add_argument("--alike", type=float, default=0.0, metavar="C")
+    grids.add_argument("pack", type=Path)
+    grids.add_argument("--rows", type=int, required=True)
+    grids.add_argument("--columns", type=int, required=True)
+    grids.add_argument("-o", "--output", type=Path, required=True)
+    given = parser.parse_args()
+    if given.kind == "room":
+        size = given.width, given.height
+        write_room(given.folder, Room(given.splats, given.views, size, given.channels, given.clean, given.alike))
+        return
+    packs = open_packs([given.pack])
+    metadata = {"encoder": packs.encoder, "text_space": packs.text_space, "normalised": "false"}
+    write_pack(given.output, Enlarged(packs, (given.rows, given.columns)), metadata)
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    main()

@@ -1,12 +1,21 @@
-"""The long proofs, each a loop that gives figures: short in the tests, long in ``make soak``."""
+"""``make soak``: the long proofs of docs/reliability.md, and their figures as one JSON object on stdout.
 
-from __future__ import annotations
+    python -m tests.benchmarks.soak [--kills N] [--seconds S] [--jobs N]
 
+Each proof is a loop that gives figures; ``tests/crash/test_loops.py`` runs them for a short time.
+"""
+
+import argparse
 import hashlib
+import json
+import os
+import platform
 import random
+import sys
 import tempfile
 import time
 from collections import Counter
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -15,19 +24,17 @@ import numpy as np
 from liftcore.features.write_pack import write_pack
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.ply import write_splats
+from liftcore.raster.cpu.warm_up import warm_up
 from liftcore.scene.cameras import Cameras
 from service.store.assets import CheckedUpload
 from service.store.store import Store
 from service.wire import AssetKind
+from tests.crash.server import POINTS
+from tests.crash.service_process import ServiceProcess, kill_processes_of, usage
 from tests.scenes import centred, random_camera, random_regions, random_splats
 
-from .server import POINTS
-from .service_process import ServiceProcess, kill_processes_of, usage
-
 KILLS_A_JOB = 2  # the third attempt is the last
-POOLED = (
-    6  # descriptors of read connections that a server may come to hold after the first look; a leak has one a job
-)
+POOLED = 6  # descriptors of read connections that a server may come to hold later; a leak has one a job
 WARM_UP_JOBS = 5  # before the first look at what a server holds
 SUFFIXES = {"splats": ".ply", "cameras": ".json", "features": ".safetensors"}
 NOTHING = {kind: kind.encode() for kind in SUFFIXES}  # a scene for stand-ins, which look at none
@@ -177,4 +184,29 @@ def leak_loop(jobs: int) -> dict[str, Any]:
     return {"jobs": jobs, "first": seen[0], "last": seen[-1], "growth": growth, "left_over": left}
 
 
-ALL_POINTS = list(POINTS)
+def main() -> int:
+    """Run the loops; 1 when a promise was broken."""
+    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.soak", description=__doc__)
+    parser.add_argument("--kills", type=int, default=200)
+    parser.add_argument("--seconds", type=float, default=7_200, help="no job of the kill loop begins after these")
+    parser.add_argument("--jobs", type=int, default=50, help="of the leak test")
+    given = parser.parse_args()
+    warm_up()  # the undisturbed lift is timed, and kernels that it compiled first would stretch its time
+    with tempfile.TemporaryDirectory() as folder:
+        files = scene_files(Path(folder), views=30, splats=20_000, width=320)
+    figures = {
+        "date": datetime.now(UTC).date().isoformat(),
+        "machine": f"{os.cpu_count()} cores, Python {platform.python_version()}",
+        "leaks": leak_loop(given.jobs),
+        "points": fault_points(list(POINTS)),
+        "kills": kill_loop(files, kills=given.kills, seconds=given.seconds),
+    }
+    print(json.dumps(figures, indent=2))
+    kills, growth = figures["kills"], figures["leaks"]["growth"]
+    kept = kills["lost"] == kills["doubled"] == 0 and kills["digests_equal"] == kills["jobs"]
+    level = growth["descriptors"] <= POOLED and growth["threads"] <= 1
+    return 0 if kept and level and set(figures["points"].values()) == {"finished once"} else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

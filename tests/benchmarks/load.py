@@ -1,0 +1,239 @@
+"""``make load``: what clients wait for under load, as one JSON object on stdout. Talks to 127.0.0.1 only.
+
+    python -m tests.benchmarks.load [--seconds S] [--rounds N] [--splats P]
+
+``/healthz`` over new connections beside 200 sockets that trickle, 20 clients that hardly read and a running lift; and
+rounds of 16 different questions at the same moment to a large lift, first alone, then beside lifts of another scene.
+Half of the trickling sockets upload, every other one at twice the least speed, the rest a byte at a time; a quarter
+trickles headers and a quarter JSON bodies. Whoever is cut off comes back at once.
+"""
+
+import argparse
+import asyncio
+import contextlib
+import json
+import os
+import platform
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from itertools import islice
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import numpy as np
+import torch
+from safetensors.torch import save_file
+
+from liftcore.demo.client import Client, Server
+from liftcore.raster.cpu.warm_up import warm_up
+from tests.benchmarks.scenes import Room, write_bench_room
+
+HEALTH_MS, QUERY_SECONDS = 100.0, 2.0  # the most that is promised of an otherwise idle machine
+OTHER = Room(200_000, 60, (640, 480), 32)  # what is lifted meanwhile; it takes a minute or more
+QUESTIONS = 16  # at the same moment
+PAUSE = 0.5  # seconds of a slow client
+HEAD = " HTTP/1.1\r\nHost: 127.0.0.1\r\n"
+UPLOAD = f"PUT /assets/splats{HEAD}Content-Length: 50000000\r\n\r\nply\n"
+ORDER = f"POST /lift{HEAD}Content-Type: application/json\r\nContent-Length: 50000\r\n\r\n{{"
+SLOW = {  # what a client says first, and at each pause; of each kind a quarter of the sockets
+    "upload": (UPLOAD, " "),
+    "steady upload": (UPLOAD, " " * 1024),
+    "headers": (f"GET /healthz{HEAD}X-Slow: ", "a"),
+    "body": (ORDER, " "),
+}
+
+
+def measure(seconds: float, rounds: int, splats: int) -> dict[str, Any]:
+    """Both figures, of one server."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        words = iter(_write_words(folder / "words.safetensors", 2 * rounds * QUESTIONS + 1))
+        with Server(folder / "data", f"table:{folder / 'words.safetensors'}") as server:
+            client = Client(server.url)
+            large = _upload(client, folder / "large", Room(splats, 4, (640, 480), 512))
+            job, _ = client.lift(large, lambda _: None)
+            other = _upload(client, folder / "other", OTHER)
+            client.ask(job["id"], next(words))
+            alone = _questions(server.url, job["id"], words, rounds)
+            quiet = _probe(server.url, seconds / 4)
+            stop = threading.Event()
+            lifts = threading.Thread(target=_keep_lifting, args=(server.url, other, stop))
+            lifts.start()
+            _wait_for_lift(client)
+            with _slow_clients(server.url, f"/assets/{large['splats']}/content") as told:
+                slow = _probe(server.url, seconds)
+            beside = _questions(server.url, job["id"], words, rounds)
+            ran = lifts.is_alive()
+            stop.set()
+            lifts.join()
+            client.close()
+        return {
+            "healthz_ms": {"quiet": quiet, "beside_slow_clients_and_a_lift": slow},
+            "slow_clients": told,
+            "questions_s": {"splats": splats, "alone": alone, "beside_a_lift": beside},
+            "lifts_ran": ran,
+            "drafts_left": len(list((folder / "data" / "tmp").iterdir())),
+        }
+
+
+def _write_words(path: Path, count: int) -> list[str]:
+    rows = torch.nn.functional.normalize(torch.randn(count, 512, generator=torch.Generator().manual_seed(1)), dim=1)
+    words = [f"word{number}" for number in range(count)]
+    save_file({"embeddings": rows}, str(path), metadata={"words": json.dumps(words)})
+    return words
+
+
+def _upload(client: Client, folder: Path, size: Room) -> dict[str, Any]:
+    """Write a room and upload it; the body of an order of its lift."""
+    folder.mkdir()
+    kinds = ("splats", "cameras", "features")
+    ids = {
+        kind: client.upload(kind, path)["id"]
+        for kind, path in zip(kinds, write_bench_room(folder, size), strict=True)
+    }
+    return {**ids, "features": [ids["features"]]}
+
+
+def _keep_lifting(url: str, body: dict[str, Any], stop: threading.Event) -> None:
+    """Lift one after the other, each of another seed."""
+    client, seed = Client(url), 0
+    while not stop.is_set():
+        seed += 1
+        client.lift(body | {"settings": {"seed": seed}}, lambda _: None)
+    client.close()
+
+
+def _wait_for_lift(client: Client) -> None:
+    while not any(job["state"] == "running" and job["plan"] for job in client.get("/jobs")["jobs"]):
+        time.sleep(0.05)
+
+
+def _questions(url: str, lift: str, words: Iterator[str], rounds: int) -> dict[str, Any]:
+    """Ask rounds of different questions, those of a round at the same moment; how long they took."""
+    slowest, every, load = [], [], []
+    for _ in range(rounds):
+        chosen, clients = list(islice(words, QUESTIONS)), [Client(url) for _ in range(QUESTIONS)]
+        load.append(round(os.getloadavg()[0], 1))
+        gate, times = threading.Barrier(QUESTIONS), [0.0] * QUESTIONS
+
+        def ask(k: int, own: tuple[Any, ...] = (gate, times, clients, chosen)) -> None:
+            own[0].wait()
+            own[1][k] = own[2][k].ask(lift, own[3][k])[1] / 1e3
+
+        threads = [threading.Thread(target=ask, args=(k,)) for k in range(QUESTIONS)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        for client in clients:
+            client.close()
+        slowest.append(round(max(times), 2))
+        every += times
+    return {"median": round(float(np.median(every)), 2), "slowest_of_each_round": slowest, "load": load}
+
+
+def _probe(url: str, seconds: float) -> dict[str, Any]:
+    """Milliseconds of ``/healthz`` over new connections."""
+    times, wrong, end = [], 0, time.monotonic() + seconds
+    while time.monotonic() < end:
+        begun, said = time.perf_counter(), b""
+        with socket.create_connection(("127.0.0.1", urlsplit(url).port or 80), timeout=60) as client:
+            client.sendall(f"GET /healthz{HEAD}Connection: close\r\n\r\n".encode())
+            while piece := client.recv(1 << 12):
+                said += piece
+        wrong += not said.startswith(b"HTTP/1.1 200 ")
+        times.append(1e3 * (time.perf_counter() - begun))
+        time.sleep(0.02)
+    p50, p99 = np.percentile(times, [50, 99])
+    return {"probes": len(times), "wrong": wrong, "p50": round(float(p50), 1), "p99": round(float(p99), 1)}
+
+
+@contextlib.contextmanager
+def _slow_clients(url: str, path: str, sockets: int = 200, readers: int = 20) -> Iterator[dict[str, Any]]:
+    """Run them in a process of their own; what they tell at their end is in the dict then."""
+    command = [sys.executable, "-m", "tests.benchmarks.load", "--slow", str(urlsplit(url).port), path]
+    command += [str(sockets), str(readers)]
+    told: dict[str, Any] = {}
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None and process.stdout.readline().strip() == "all have come"
+            yield told
+            told.update(json.loads(process.communicate("")[0]))
+        finally:
+            process.kill()
+
+
+async def _be_slow(port: int, path: str, sockets: int, readers: int) -> None:
+    """Trickle until stdin ends; then say how many connections are open, and how often each kind was cut off."""
+    kinds = [name for name in SLOW for _ in range(sockets // len(SLOW))] + ["download"] * readers
+    cut: Counter[str] = Counter()
+    live: Counter[str] = Counter()
+    came = [asyncio.Event() for _ in kinds]
+
+    async def keep_coming(kind: str, first: asyncio.Event) -> None:
+        begin, drop = SLOW.get(kind, (f"GET {path}{HEAD}\r\n", ""))
+        while True:
+            with contextlib.suppress(OSError):
+                reader, writer = await asyncio.open_connection("127.0.0.1", port, limit=1 << 12)
+                live[kind] += 1
+                first.set()
+                try:
+                    writer.write(begin.encode())
+                    while not (reader.at_eof() or writer.is_closing()):
+                        await asyncio.sleep(PAUSE)
+                        if not drop and not await reader.read(2_000):
+                            break
+                        writer.write(drop.encode())
+                        await writer.drain()
+                finally:
+                    live[kind] -= 1
+                    cut[kind] += 1
+                    writer.close()
+            await asyncio.sleep(0.05)
+
+    tasks = [asyncio.create_task(keep_coming(kind, first)) for kind, first in zip(kinds, came, strict=True)]
+    for first in came:
+        await first.wait()
+    print("all have come", flush=True)
+    await asyncio.to_thread(sys.stdin.read)
+    told = {"open": dict(live), "cut_off": dict(cut)}
+    for task in tasks:
+        task.cancel()
+    print(json.dumps(told), flush=True)
+
+
+def main() -> int:
+    """Measure; 1 when a promise was missed, which a busy machine does too, or no lift ran beside."""
+    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.load", description=__doc__)
+    parser.add_argument("--seconds", type=float, default=60, help="of probing beside slow clients")
+    parser.add_argument("--rounds", type=int, default=5, help="of 16 questions at once")
+    parser.add_argument("--splats", type=int, default=1_000_000, help="of the lift that is asked")
+    parser.add_argument("--slow", nargs=4, metavar="N", help="be the slow clients: PORT PATH SOCKETS READERS")
+    given = parser.parse_args()
+    if given.slow:
+        port, path, sockets, readers = given.slow
+        asyncio.run(_be_slow(int(port), path, int(sockets), int(readers)))
+        return 0
+    warm_up()
+    begun = {
+        "date": datetime.now(UTC).isoformat(timespec="minutes"),
+        "machine": f"{os.cpu_count()} cores, Python {platform.python_version()}",
+        "load_before": [round(load, 1) for load in os.getloadavg()],
+    }
+    found = measure(given.seconds, given.rounds, given.splats)
+    print(json.dumps({**begun, **found}, indent=2))
+    health, asked = found["healthz_ms"]["beside_slow_clients_and_a_lift"], found["questions_s"]["beside_a_lift"]
+    quick = health["p99"] < HEALTH_MS and max(asked["slowest_of_each_round"]) < QUERY_SECONDS
+    return 0 if quick and health["wrong"] == found["drafts_left"] == 0 and found["lifts_ran"] else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

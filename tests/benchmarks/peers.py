@@ -1,0 +1,467 @@
+"""Other ways to lift the same features onto the same splats, on the CPU, beside ours.
+
+    python -m tests.benchmarks.peers [--sizes small base large splats pixels views channels] [--rounds N] [--json]
+
+All lift ``X = (A^T B) / (A^T n)`` of a synthetic room with label maps of 4 levels over random unit codebooks: B sums
+the codebook rows that a ray's levels read, n counts them. Each starts from splats, cameras, label maps and codebooks;
+the others make an image of all channels a view first. Seconds are the median of the rounds, taken in turns; a peer
+whose lift takes longer than LONG is not asked for more. Cosine: of a splat's feature with ours, the mean by evidence.
+``peak MiB`` is what the lift adds in a process of its own, and ``first s`` what its first lift took there.
+
+- ours: region weights ``A^T S`` in one walk a view, then the closed form for all channels.
+- dense numba: for each weight of a pixel, ``w b`` of all channels onto the splat's own, compiled. Its projection,
+  lists and bounds are ours: what differs is the accumulation alone.
+- torch autograd: ``d/dx sum(render(x) B) = A^T B`` with a tiled renderer of torch operations.
+"""
+
+import json
+import math
+import os
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numba import njit
+from torch import Tensor
+from torch.nn.functional import cosine_similarity, embedding, embedding_bag, normalize, pad, threshold
+
+from liftcore.evaluate.hardware import peak_memory
+from liftcore.evaluate.region_walk import walk_regions
+from liftcore.evaluate.synthetic import room_cameras, room_regions, room_splats
+from liftcore.features.views import Regions
+from liftcore.progress import silent
+from liftcore.raster.base import CompositingParams, Weighting
+from liftcore.raster.constants import ALPHA_FLOOR, FIELD_MARGIN, LOW_PASS, NEAR_PLANE
+from liftcore.raster.constants import TILE as OUR_TILE
+from liftcore.raster.cpu.raster import CpuRaster
+from liftcore.raster.cpu.records import KY, MX, MY, OPACITY, REACH, ROOT_X, SLOPE
+from liftcore.scene.cameras import Camera
+from liftcore.scene.splats import Splats
+from liftcore.solve.closed_form import solve_closed_form
+from liftcore.solve.host import Host
+from liftcore.solve.view_weights import WeightStore
+from tests.benchmarks.base import command_line, tell
+
+LONG = 60.0  # seconds
+THREADS = len(os.sched_getaffinity(0))
+
+
+@dataclass(frozen=True)
+class Size:
+    """How much there is to lift."""
+
+    splats: int
+    width: int  # pixels
+    height: int  # pixels
+    views: int
+    channels: int
+
+
+TINY = Size(500, 64, 48, 1, 4)  # to load kernels and start threads
+BASE = Size(20_000, 200, 150, 4, 64)
+SIZES = {
+    "small": [Size(5_000, 100, 75, 2, 8)],
+    "base": [BASE],
+    "large": [Size(200_000, 640, 480, 2, 512)],
+    "splats": [replace(BASE, splats=1_000 * n) for n in (5, 20, 80, 320)],
+    "pixels": [replace(BASE, width=4 * n, height=3 * n) for n in (25, 50, 100, 200)],
+    "views": [replace(BASE, views=n) for n in (1, 4, 12, 32)],
+    "channels": [replace(BASE, channels=n) for n in (4, 16, 64, 256, 1024)],
+}
+
+
+@dataclass(frozen=True)
+class Work:
+    """One scene, its views with label maps and codebooks, and how rays are composited."""
+
+    splats: Splats
+    views: tuple[tuple[Camera, Regions], ...]
+    walk: CompositingParams = field(default_factory=CompositingParams)
+
+    @property
+    def channels(self) -> int:
+        """F."""
+        return self.views[0][1].codebook.shape[1]
+
+
+Answer = tuple[Tensor, Tensor]  # X [P, F] f32, zero where no ray met the splat; A^T n [P] f64 over all views
+
+
+def room(size: Size) -> Work:
+    """The synthetic room of ``splatlift bench`` at a size, always the same."""
+    cameras = room_cameras(size.views, size.width, size.height)
+    views = tuple((camera, room_regions(camera, k, 4, size.channels)) for k, camera in enumerate(cameras))
+    return Work(room_splats(size.splats), views)
+
+
+def dense_target(camera: Camera, regions: Regions) -> Tensor:
+    """B and n of a view as an image [H, W, F + 1] f32, n last; levels are added up, a quarter of a peer's work."""
+    rows, columns = regions.labels.shape[1:]
+    y = (2 * torch.arange(camera.height) + 1) * rows // (2 * camera.height)
+    x = (2 * torch.arange(camera.width) + 1) * columns // (2 * camera.width)
+    labels = regions.labels[:, y][:, :, x].reshape(len(regions.labels), -1).T
+    count, channels = regions.codebook.shape
+    book = torch.zeros(count + 1, channels + 1)  # its last row is what an unlabelled level reads
+    book[:count, :channels] = regions.codebook
+    book[:count, channels] = 1.0
+    target = embedding_bag(torch.where(labels >= 0, labels, count), book, mode="sum")
+    return target.reshape(camera.height, camera.width, channels + 1)
+
+
+def answer_of(sums: Tensor) -> Answer:
+    """X from ``A^T [B n]`` [P, F + 1] f32."""
+    totals = sums[:, -1:]
+    return torch.where(totals > 0, sums[:, :-1] / totals, 0.0), totals[:, 0].double()
+
+
+def ours(work: Work) -> Answer:
+    """As ``splatlift lift --preset row-sum --set dtype=float32`` has it."""
+    raster, looking = CpuRaster(work.splats, THREADS), (work.walk, Weighting())
+    with WeightStore() as store:
+        totals, columns = walk_regions(raster, work.views, looking, work.splats.count, store)
+        host = Host(THREADS, means=work.splats.means)
+        solution = solve_closed_form(store, columns, totals, torch.float32, silent, host)
+    return solution.features, torch.from_numpy(totals)
+
+
+# --- dense numba ---
+
+SHARES = 32  # of the tiles, dealt out to the threads in turn
+
+
+def dense_numba(work: Work) -> Answer:
+    """Tile by tile, splat by splat, pixel by pixel, channel by channel; each thread has sums of its own."""
+    raster = CpuRaster(work.splats, THREADS)
+    own = np.zeros((THREADS, work.splats.count, work.channels + 1), np.float32)
+    with ThreadPoolExecutor(THREADS) as pool:
+        for camera, regions in work.views:
+            (frame,) = raster._bands(camera, work.walk)
+            target = dense_target(camera, regions).numpy()
+            marks = np.linspace(0, frame.starts[-1], SHARES + 1)  # about as many list items a share
+            edges = np.searchsorted(frame.starts, marks).clip(0, frame.columns * frame.rows)
+            parts = [pool.submit(_add_shares, k, THREADS, edges, frame, target, own[k]) for k in range(THREADS)]
+            for part in parts:
+                part.result()
+    return answer_of(torch.from_numpy(own.sum(axis=0)))
+
+
+@njit(nogil=True, cache=True)
+def _add_shares(thread, threads, edges, frame, target, sums):
+    """``A^T [B n]`` of every ``threads``-th share of the tiles; target [H, W, F + 1], sums [P, F + 1] f32, grows."""
+    light = np.empty((OUR_TILE, OUR_TILE), np.float32)
+    for share in range(thread, edges.shape[0] - 1, threads):
+        for tile in range(edges[share], edges[share + 1]):
+            x0, y0 = tile % frame.columns * OUR_TILE, tile // frame.columns * OUR_TILE
+            width, height = min(OUR_TILE, frame.width - x0), min(OUR_TILE, frame.height - y0)
+            light[:] = 0
+            light[:height, :width] = 1
+            for step in range(frame.starts[tile], frame.starts[tile + 1]):
+                if (step - frame.starts[tile]) % 16 == 0 and light.max() <= 0:
+                    break
+                place = frame.items[step]
+                box = x0, y0, width, height
+                _add_splat(frame, frame.records[place], box, light, target, sums[frame.ids[place]])
+
+
+@njit(nogil=True, cache=True)
+def _add_splat(frame, record, box, light, target, row):
+    """One splat's weights on one tile, times the pixels, onto its row of sums [F + 1]; light ends at 0."""
+    x0, y0, width, height = box
+    opacity, kx, cap = np.float32(record[OPACITY]), np.float32(record[ROOT_X] ** 2), np.float32(frame.cap)
+    for y in range(height):
+        dy = y0 + y + 0.5 - record[MY]
+        base = record[KY] * dy * dy
+        if base > record[REACH]:
+            continue
+        centre = record[MX] + record[SLOPE] * dy - x0 - 0.5
+        half = math.sqrt(record[REACH] - base) / record[ROOT_X]
+        for x in range(max(0, math.ceil(centre - half)), min(width - 1, math.floor(centre + half)) + 1):
+            before = light[y, x]
+            if before <= 0:
+                continue
+            dx = np.float32(x - centre)
+            alpha = opacity * np.exp2(-(kx * dx * dx + np.float32(base)))
+            if alpha < np.float32(ALPHA_FLOOR):
+                continue
+            alpha = min(alpha, cap)
+            after = before * (np.float32(1) - alpha)
+            if after <= np.float32(frame.stop):
+                light[y, x] = 0
+                continue
+            light[y, x] = after
+            _add_scaled(row, alpha * before, target[y0 + y, x0 + x])
+
+
+@njit(nogil=True, cache=True, fastmath={"contract"})
+def _add_scaled(row, weight, pixel):
+    """``row += weight pixel``, all channels: the inner loop, eight channels an instruction."""
+    for channel in range(row.shape[0]):
+        row[channel] += weight * pixel[channel]
+
+
+# --- torch autograd ---
+
+TILE = 8  # pixels; 16 takes a quarter longer
+SLAB = 128  # splats along the depth of a tile at a time
+WEIGHTS = 1 << 20  # of a batch of slabs: 4 MiB an intermediate
+CHANNELS = 128  # a chunk
+
+
+@contextmanager
+def torch_threads(count: int) -> Iterator[None]:
+    """Torch's operations on so many threads, inside the block."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def torch_autograd(work: Work) -> Answer:
+    """View by view, slab by slab, chunk by chunk of channels; each thread has tiles and sums of its own."""
+    own = torch.zeros(THREADS, work.splats.count, work.channels + 1)
+    one_each = {"initializer": torch.set_num_threads, "initargs": (1,)}
+    with torch_threads(1), ThreadPoolExecutor(THREADS, **one_each) as pool:
+        for camera, regions in work.views:
+            footprints = _project(work.splats, camera)
+            lists, target = _lists(footprints, camera), by_tile(dense_target(camera, regions))
+            view = _View(camera, work.walk, footprints, lists, target)
+            tiles = torch.arange(len(target))
+            parts = [pool.submit(_add_view, view, tiles[k::THREADS], sums) for k, sums in enumerate(own)]
+            for part in parts:
+                part.result()
+    return answer_of(own.sum(dim=0))
+
+
+class _Footprints(NamedTuple):
+    """The splats that a view may see, near to far; n of them."""
+
+    splats: Tensor  # [n] i64
+    mean: Tensor  # [n, 2] f32, px
+    conic: Tensor  # [n, 3] f32: xx, xy, yy of the inverse covariance
+    opacity: Tensor  # [n] f32
+    extent: Tensor  # [n, 2] f32, px from the mean to where alpha falls below its floor
+
+
+class _View(NamedTuple):
+    """A view to lift from."""
+
+    camera: Camera
+    walk: CompositingParams
+    footprints: _Footprints
+    lists: tuple[Tensor, Tensor]  # starts [tiles + 1] and items of every tile's list of footprints, near to far
+    target: Tensor  # [tiles, TILE * TILE, F + 1] f32
+
+
+class _Slab(NamedTuple):
+    """Weights of some splats on some tiles."""
+
+    tiles: Tensor  # [t] i64
+    splats: Tensor  # [t, k] i64
+    weights: Tensor  # [t, TILE * TILE, k] f32
+
+
+def _project(splats: Splats, camera: Camera) -> _Footprints:
+    """EWA projection of all splats at once (float64: it costs little here), those out of sight left out."""
+    pose = torch.tensor(camera.viewmat[:3])
+    point = splats.means.double() @ pose[:, :3].T + pose[:, 3]
+    opacity = torch.sigmoid(splats.opacity_logits.double())
+    kept = torch.nonzero((point[:, 2] >= NEAR_PLANE) & (opacity >= ALPHA_FLOOR))[:, 0]
+    kept = kept[torch.argsort(point[kept, 2].float(), stable=True)]
+    (x, y, z), opacity = point[kept].T, opacity[kept]
+    bounds = [
+        (-c / f - FIELD_MARGIN * 0.5 * size / f, (size - c) / f + FIELD_MARGIN * 0.5 * size / f)
+        for f, c, size in ((camera.fx, camera.cx, camera.width), (camera.fy, camera.cy, camera.height))
+    ]
+    u, v = (x / z).clamp(*bounds[0]), (y / z).clamp(*bounds[1])
+    axes = pose[:, :3] @ _rotations(splats.quats[kept].double()) * splats.log_scales[kept].double().exp()[:, None]
+    across = (axes[:, 0] - u[:, None] * axes[:, 2]) * (camera.fx / z)[:, None]
+    down = (axes[:, 1] - v[:, None] * axes[:, 2]) * (camera.fy / z)[:, None]
+    xx, xy, yy = (across**2).sum(1) + LOW_PASS, (across * down).sum(1), (down**2).sum(1) + LOW_PASS
+    conic = torch.stack([yy, -xy, xx], dim=1) / (xx * yy - xy**2)[:, None]
+    mean = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], dim=1)
+    extent = (2 * torch.log(opacity / ALPHA_FLOOR)).sqrt()[:, None] * torch.stack([xx, yy], dim=1).sqrt()
+    limits = torch.tensor([camera.width, camera.height])
+    seen = ((mean + extent >= 0.5) & (mean - extent <= limits - 0.5)).all(dim=1)
+    return _Footprints(kept[seen], *(part[seen].float() for part in (mean, conic, opacity, extent)))
+
+
+def _rotations(quats: Tensor) -> Tensor:
+    """[n, 3, 3] of quaternions w x y z of any length."""
+    w, x, y, z = normalize(quats, dim=1).T
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
+
+
+def _lists(footprints: _Footprints, camera: Camera) -> tuple[Tensor, Tensor]:
+    """Starts [tiles + 1] and items of every tile's list of footprints, near to far."""
+    columns, rows = -(-camera.width // TILE), -(-camera.height // TILE)
+    most = torch.tensor([columns - 1, rows - 1])
+    low = ((footprints.mean - footprints.extent - 0.5).ceil() // TILE).long().clamp(min=0)
+    high = torch.minimum(((footprints.mean + footprints.extent - 0.5).floor() // TILE).long(), most)
+    span = (high - low + 1).clamp(min=0)
+    counts = span.prod(dim=1)
+    items = torch.repeat_interleave(torch.arange(len(counts)), counts)
+    within = torch.arange(len(items)) - (counts.cumsum(0) - counts)[items]
+    across = span[items, 0]
+    tiles = (low[items, 1] + within // across) * columns + low[items, 0] + within % across
+    tiles, order = torch.sort(tiles.int(), stable=True)
+    lengths = torch.bincount(tiles, minlength=rows * columns)
+    return pad(lengths.cumsum(0), (1, 0)), items[order]
+
+
+def _add_view(view: _View, tiles: Tensor, sums: Tensor) -> None:
+    """``A^T [B n]`` of some tiles of a view onto ``sums`` [P, F + 1]."""
+    for slab in _slabs(view, tiles):
+        _add_gradient(slab, view.target, sums)
+
+
+def _slabs(view: _View, own: Tensor) -> Iterator[_Slab]:
+    """The weights of a view's tiles ``own``, a slab of splats on a batch of tiles at a time, near to far on each."""
+    camera, walk, footprints, (starts, items), _ = view
+    lengths, columns = starts.diff(), -(-camera.width // TILE)
+    light = by_tile(torch.ones(camera.height, camera.width, 1))[:, :, 0]
+    depth = 0
+    while True:
+        left = own[(lengths[own] > depth) & (light[own].amax(dim=1) > walk.transmittance_stop)]
+        if len(left) == 0:
+            return
+        left = left[torch.argsort(lengths[left], descending=True)]  # so that few slabs of a batch are padded
+        for tiles in left.split(max(1, WEIGHTS // (SLAB * TILE * TILE))):
+            offsets = torch.arange(depth, min(depth + SLAB, int(lengths[tiles[0]])))
+            members = items[(starts[tiles, None] + offsets).clamp(max=len(items) - 1)]
+            corners = torch.stack([tiles % columns, tiles // columns]) * TILE
+            alphas = _alphas(footprints, members, offsets < lengths[tiles, None], corners)
+            weights, light[tiles] = _composite(alphas.clamp_(max=walk.alpha_cap), light[tiles], walk)
+            yield _Slab(tiles, footprints.splats[members], weights)
+        depth += SLAB
+
+
+def _alphas(footprints: _Footprints, members: Tensor, there: Tensor, corners: Tensor) -> Tensor:
+    """[t, TILE * TILE, k] f32, the alphas of footprints ``members`` [t, k] on tiles from ``corners`` [2, t] px on.
+
+    The quadratic form is a part by column, a part by row, and one product of both. ``there`` [t, k]: no padding.
+    """
+    dx, dy = (
+        (corners[axis, :, None] + torch.arange(TILE) + 0.5)[:, :, None] - footprints.mean[:, axis][members][:, None]
+        for axis in (0, 1)
+    )
+    xx, xy, yy = footprints.conic[members].permute(2, 0, 1)[:, :, None]
+    level = torch.where(there, footprints.opacity[members].log(), -torch.inf)[:, None]
+    by_column, by_row = -0.5 * xx * dx * dx, level - 0.5 * yy * dy * dy
+    exponents = by_column[:, None] + by_row[:, :, None]
+    exponents.addcmul_((-xy * dx)[:, None], dy[:, :, None])
+    return threshold(exponents.exp_(), ALPHA_FLOOR, 0.0, inplace=True).flatten(1, 2)
+
+
+def _composite(alphas: Tensor, light: Tensor, walk: CompositingParams) -> tuple[Tensor, Tensor]:
+    """Weights [t, TILE * TILE, k] f32, made in place of the alphas, and the light [t, TILE * TILE] behind them."""
+    after = 1 - alphas
+    after[:, :, 0] *= light
+    torch.cumprod(after, dim=2, out=after)
+    alphas[:, :, 1:] *= after[:, :, :-1]
+    alphas[:, :, 0] *= light
+    if after[:, :, -1].amin() <= walk.transmittance_stop:
+        alphas *= after > walk.transmittance_stop
+    return alphas, after[:, :, -1]
+
+
+def _add_gradient(slab: _Slab, target: Tensor, sums: Tensor) -> None:
+    """The gradient of ``sum(render(x) B)`` for the splats of the slab onto ``sums`` [P, F + 1]."""
+    distinct, places = torch.unique(slab.splats, return_inverse=True)
+    first = 0
+    pixels = target[slab.tiles]
+    for part in pixels.tensor_split(-(-pixels.shape[2] // CHANNELS), dim=2):
+        x = torch.zeros(len(distinct), part.shape[2], requires_grad=True)  # any x: the render is linear in it
+        rendered = torch.bmm(slab.weights, embedding(places, x))
+        (gradient,) = torch.autograd.grad(rendered, x, grad_outputs=part)
+        sums[distinct, first : first + part.shape[2]] += gradient
+        first += part.shape[2]
+
+
+def by_tile(image: Tensor) -> Tensor:
+    """[H, W, C] -> [tiles, TILE * TILE, C], zero beyond the image."""
+    height, width, channels = image.shape
+    padded = pad(image, (0, 0, 0, -width % TILE, 0, -height % TILE))
+    tiles = padded.reshape(padded.shape[0] // TILE, TILE, padded.shape[1] // TILE, TILE, channels).transpose(1, 2)
+    return tiles.reshape(-1, TILE * TILE, channels)
+
+
+# --- side by side ---
+
+PEERS: dict[str, Callable[[Work], Answer]] = {
+    "splatlift": ours, "dense numba": dense_numba, "torch autograd": torch_autograd,
+}  # fmt: skip
+
+
+def side_by_side(size: Size, rounds: int) -> Iterator[dict[str, Any]]:
+    """A row a peer: all lift the work in turns, a round of all, then the next; each is held to our X."""
+    work, seconds = room(size), {name: [] for name in PEERS}
+    answers: dict[str, Answer] = {}
+    for _ in range(rounds):
+        for name, lift in PEERS.items():
+            if max(seconds[name], default=0.0) < LONG:
+                start = time.perf_counter()
+                answers[name] = lift(work)
+                seconds[name].append(time.perf_counter() - start)
+    features, evidence = answers["splatlift"]
+    usual = statistics.median(seconds["splatlift"])
+    for name, (theirs, _) in answers.items():
+        median = statistics.median(seconds[name])
+        cosines = cosine_similarity(features, theirs, dim=1).double()
+        yield {
+            "splats": size.splats, "image": f"{size.width}x{size.height}", "views": size.views,
+            "channels": size.channels, "peer": name, "seconds": median, "fastest": min(seconds[name]),
+            "times ours": median / usual, "cosine": float((cosines * evidence).sum() / evidence.sum()),
+        }  # fmt: skip
+
+
+def alone(name: str, size: Size) -> dict[str, float]:
+    """What a peer's lift adds to a process of its own, MiB, and the seconds of its first lift there."""
+    command = [sys.executable, "-m", "tests.benchmarks.peers", "--alone", name, json.dumps(vars(size))]
+    return json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+
+
+def _measured(name: str, size: Size) -> dict[str, float]:
+    start = time.perf_counter()
+    PEERS[name](room(TINY))
+    first, work, before = time.perf_counter() - start, room(size), peak_memory()
+    PEERS[name](work)
+    return {"first s": first, "peak MiB": (peak_memory() - before) / 2**20}
+
+
+def main() -> None:
+    """Print the table."""
+    parser = command_line(
+        "tests.benchmarks.peers",
+        __doc__,
+        ("--sizes", {"nargs": "+", "choices": list(SIZES), "default": ["small", "base"], "help": "what grows"}),
+        ("--rounds", {"type": int, "default": 3}),
+        ("--alone", {"nargs": 2, "metavar": ("PEER", "SIZE"), "help": "one lift in this process, as JSON"}),
+    )
+    options = parser.parse_args()
+    if options.alone:
+        print(json.dumps(_measured(options.alone[0], Size(**json.loads(options.alone[1])))))
+        return
+    for lift in PEERS.values():
+        lift(room(TINY))
+    sizes = dict.fromkeys(size for name in options.sizes for size in SIZES[name])
+    rows = [row | alone(row["peer"], size) for size in sizes for row in side_by_side(size, options.rounds)]
+    tell(rows, as_json=options.json)
+
+
+if __name__ == "__main__":
+    main()

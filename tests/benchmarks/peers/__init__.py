@@ -1,1 +1,0 @@
-"""Ways to lift that others take, on the same work as ours: side by side, checked and timed."""

@@ -1,0 +1,55 @@
+"""The setting ``speed`` on one scene: processor seconds of whole lifts by turns, and how near to exact they come.
+
+    python -m tests.benchmarks.speeds FOLDER [--features NAME] [--speeds NAME...] [--rounds N] [--json]
+
+All views are lifted, on one thread, in one process; seconds are the fewest of the rounds, with reading, without
+compiling. ``splatlift tradeoff`` measures more, with views held out. FOLDER as `tests.benchmarks.scenes` makes it.
+"""
+
+import time
+from pathlib import Path
+
+from liftcore.evaluate.tradeoff.judge import cosine_figures
+from liftcore.io.lift_file import LiftResult
+from liftcore.lift import lift
+from liftcore.settings import LiftSettings, Speed
+from tests.benchmarks.base import command_line, scene_files, tell
+
+
+def main() -> None:
+    """Print the table."""
+    parser = command_line(
+        "tests.benchmarks.speeds",
+        __doc__,
+        ("folder", {"type": Path}),
+        ("--features", {"default": "features", "metavar": "NAME", "help": "the pack in FOLDER"}),
+        ("--speeds", {"nargs": "+", "default": list(map(str, Speed)), "choices": list(map(str, Speed))}),
+        ("--rounds", {"type": int, "default": 2}),
+    )
+    options = parser.parse_args()
+    splats, cameras, pack = scene_files(options.folder, options.features)
+    seconds: dict[str, float] = {}
+    made: dict[str, LiftResult] = {}
+    for number in range(1 + max(1, options.rounds)):  # the first round compiles
+        for speed in dict.fromkeys(["exact", *options.speeds]):
+            start = time.process_time()
+            made[speed] = lift(splats, cameras, [pack], LiftSettings.of(speed=speed, device="cpu"), threads=1)
+            if number:
+                seconds[speed] = min(seconds.get(speed, float("inf")), time.process_time() - start)
+    exact = made["exact"]
+    rows = [
+        {
+            "speed": speed,
+            "views": len(one.metadata.views),
+            "processor s": seconds[speed],
+            "times less": seconds["exact"] / seconds[speed],
+            **cosine_figures(one.features, exact.features, exact.evidence),
+            "expected of the views": one.metadata.certificate["plan"]["view_cosine"],
+        }
+        for speed, one in made.items()
+    ]
+    tell(rows, as_json=options.json)
+
+
+if __name__ == "__main__":
+    main()
