@@ -2,15 +2,38 @@
 
 from __future__ import annotations
 
+import argparse
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from liftcore.cli.options import Parser, add_device, count
 from liftcore.cli.reply import reply
 
 if TYPE_CHECKING:
-    import argparse
     from collections.abc import Iterator
 
 _OPTIONS = ("scene", "splats", "size", "channels", "levels", "views", "threads", "preset", "stages", "aims", "device")
+
+
+def add_arguments(parser: Parser) -> None:
+    """The options of the command."""
+    parser.add_argument(
+        "--scene",
+        type=Path,
+        metavar="DIR",
+        help="point_cloud.ply, cameras and regions or features (.safetensors); else a synthetic room",
+    )
+    parser.add_argument("--splats", type=count, metavar="N", help="splats of the synthetic scene")
+    parser.add_argument("--size", metavar="WxH", help="image size of the synthetic scene")
+    parser.add_argument("--channels", type=count, metavar="F", help="of the features; else 512")
+    parser.add_argument("--levels", type=count, metavar="L", help="label levels; else 4")
+    parser.add_argument("--views", type=count, metavar="N", help="at most; else 8")
+    parser.add_argument("--threads", type=count, metavar="N", help="else as many as there are cores")
+    parser.add_argument("--preset", metavar="NAME", help="one of lift's presets alone; else all")
+    only = parser.add_mutually_exclusive_group()
+    only.add_argument("--stages", action="store_true", help="every step of a view apart, on one thread")
+    only.add_argument("--aims", action="store_true", help="the project's aims beside what this machine does")
+    add_device(parser)
 
 
 def run(options: argparse.Namespace) -> int:

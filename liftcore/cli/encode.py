@@ -2,17 +2,35 @@
 
 from __future__ import annotations
 
+import argparse
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from liftcore.cli.bars import progress_bars
-from liftcore.cli.reply import free_output, reply, writing
-from liftcore.cli.sub_folders import folders_of, told_folders
+from liftcore.cli.options import Parser, count
+from liftcore.cli.reply import folders_of, free_output, progress_bars, reply, told_folders, writing
 
 if TYPE_CHECKING:
-    import argparse
-
     from liftcore.features.encoders import ImageEncoder
     from liftcore.features.encoders.encode import Encoded
+
+
+def add_arguments(parser: Parser) -> None:
+    """The options of the command."""
+    parser.add_argument("images", type=Path, nargs="+", help="images, or folders of them")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="PACK", help="the pack to write")
+    parser.add_argument(
+        "--encoder",
+        required=True,
+        metavar="SPEC",
+        help="maskclip:MODEL/TAG, clip:MODEL/TAG or timm:NAME; with weights of a file maskclip:MODEL@FILE, "
+        "clip:MODEL@FILE or timm:NAME@FILE",
+    )
+    parser.add_argument("--size", type=count, metavar="PX", help="the images' shorter side; else the model's own")
+    parser.add_argument("--batch", type=count, default=1, metavar="N", help="images that are encoded together")
+    parser.add_argument("--device", default="cpu", metavar="NAME", help="where the model runs, as torch names it")
+    parser.add_argument(
+        "--normalised", action=argparse.BooleanOptionalAction, default=True, help="unit vectors, or as they come"
+    )
 
 
 def run(options: argparse.Namespace) -> int:

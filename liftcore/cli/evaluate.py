@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
+import argparse
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from liftcore.cli.bars import progress_bars
-from liftcore.cli.reply import reply
-from liftcore.cli.text_encoder import encoder_spec
+from liftcore.cli.options import THRESHOLDS, Parser, add_negative, encoder_spec
+from liftcore.cli.reply import progress_bars, reply
 from liftcore.errors import InvalidInput
 
 if TYPE_CHECKING:
-    import argparse
     from collections.abc import Collection, Iterable, Mapping, Sequence
 
     from liftcore.evaluate.protocols import EvaluationProtocol, LabelledScene
@@ -27,6 +26,22 @@ _SHOWN = {  # the means of a protocol that a table shows, and their names there
     "P3": _IOUS | {"localised": "mAcc, in the mask"},
     "own": _IOUS | {"accuracy_25": "mAcc@0.25", "accuracy_50": "mAcc@0.5"},
 }
+
+
+def add_arguments(parser: Parser) -> None:
+    """The options of the command."""
+    parser.add_argument("dataset", choices=("lerf-ovs", "3d-ovs"), help="whose labels")
+    parser.add_argument(
+        "lifts", nargs="+", metavar="LIFT", help="SCENE=LIFT, SCENE.lift.safetensors, or a folder of those"
+    )
+    parser.add_argument("--data", type=Path, required=True, metavar="DIR", help="the dataset, or its labels")
+    words = parser.add_mutually_exclusive_group()
+    words.add_argument("--table", type=Path, metavar="FILE", help="precomputed text embeddings")
+    words.add_argument("--encoder", metavar="NAME", help="else the one that the lift's text space names")
+    parser.add_argument("--protocol", nargs="+", choices=("P1", "P2", "P3", "own"), help="else all")
+    parser.add_argument("--threshold", default="auto", metavar="T", help=f"of P2, P3 and own: {THRESHOLDS}")
+    add_negative(parser)
+    parser.add_argument("--held-out", type=Path, metavar="FILE", help="the only frames to judge, a name a line")
 
 
 def run(options: argparse.Namespace) -> int:

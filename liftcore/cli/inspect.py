@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import argparse
+from pathlib import Path
 
+from liftcore.cli.options import Parser
 from liftcore.cli.reply import reply
 
-if TYPE_CHECKING:
-    import argparse
+
+def add_arguments(parser: Parser) -> None:
+    """The options of the command."""
+    parser.add_argument("file", type=Path, help="splats, cameras, features, a lift, masks or a text table")
 
 
 def run(options: argparse.Namespace) -> int:

@@ -1,31 +1,37 @@
 """``splatlift keys``: the keys of the HTTP service, in a process of the service's own."""
 
-from __future__ import annotations
+import argparse
+from pathlib import Path
 
-import os
-import sys
-from importlib.util import find_spec
-from typing import TYPE_CHECKING
+from liftcore.cli.options import Parser, whole
+from liftcore.cli.serve import become
 
-from liftcore.errors import Unavailable
+QUOTAS = {
+    "max_bytes": "most bytes stored, of its assets and lifts",
+    "max_queued": "most jobs in line",
+    "max_uploads": "most uploads at once",
+}
 
-if TYPE_CHECKING:
-    import argparse
 
-_OPTIONS = ("name", "scopes", "max_bytes", "max_queued", "max_uploads", "data")
+def add_arguments(parser: Parser, shared: Parser) -> None:
+    """The options of the command, which ``python -m service.keys`` takes too."""
+    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION", parser_class=Parser)
+    create = actions.add_parser("create", parents=[shared], help="make a key and show it, once")
+    create.add_argument("--name", required=True, metavar="NAME", help="whose it is, or what for")
+    create.add_argument("--scopes", required=True, metavar="SCOPES", help="read,write,metrics,admin: what it may do")
+    for name, limit in QUOTAS.items():
+        option = f"--{name.replace('_', '-')}"
+        create.add_argument(option, type=whole, metavar="N", help=f"{limit}; else as the server is set")
+    listing = actions.add_parser("list", parents=[shared], help="all keys, without their secrets")
+    revoke = actions.add_parser("revoke", parents=[shared], help="end a key; what it made stays, for admins")
+    revoke.add_argument("id", metavar="ID", help="as keys list shows it")
+    for action in (create, listing, revoke):
+        action.add_argument("--data", type=Path, metavar="DIR", help="the service's directory")
 
 
 def run(options: argparse.Namespace) -> int:
-    """Become ``python -m service.keys``; the library itself knows neither HTTP nor its database."""
-    if find_spec("service") is None:
-        raise Unavailable("keys", expected="the package 'service'", got="an installation without it")
-    arguments = [options.action]
-    for name in _OPTIONS:
-        value = getattr(options, name, None)
-        if value is not None:
-            arguments.append(f"--{name.replace('_', '-')}={value}")
+    """Become ``python -m service.keys``."""
+    given = {name: getattr(options, name, None) for name in ("name", "scopes", *QUOTAS, "data")}
+    arguments = [f"--{name.replace('_', '-')}={value}" for name, value in given.items() if value is not None]
     arguments += ["--json"] if options.json else []
-    arguments += ["--", options.id] if options.action == "revoke" else []
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os.execv(sys.executable, [sys.executable, "-m", "service.keys", *arguments])
+    become("service.keys", [options.action, *arguments, *(["--", options.id] if options.action == "revoke" else [])])

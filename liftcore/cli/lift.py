@@ -2,25 +2,36 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import tempfile
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from liftcore.cli.bars import progress_bars
-from liftcore.cli.reply import free_output, reply, shown, writing
+from liftcore.cli.options import Parser, add_settings, add_sources, count
+from liftcore.cli.reply import free_output, progress_bars, reply, shown, writing
 from liftcore.errors import InvalidInput, InvalidSettings
 from liftcore.nearest import nearest
 from liftcore.progress import one_step
-from liftcore.settings import LiftSettings
 
 if TYPE_CHECKING:
-    import argparse
     from collections.abc import Iterable, Sequence
-    from pathlib import Path
 
     from liftcore.io.lift_file import LiftResult
     from liftcore.plan.plan import Plan
+    from liftcore.settings import LiftSettings
     from liftcore.solve.checkpoint import Checkpoint
+
+
+def add_arguments(parser: Parser) -> None:
+    """The options of the command."""
+    add_sources(parser)
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="LIFT", help="the lift to write")
+    add_settings(parser)
+    parser.add_argument("--explain", action="store_true", help="print the plan before the work")
+    goes_on = "a killed lift goes on from there, and one of the same regions with other features walks none again"
+    parser.add_argument("--checkpoint", type=Path, metavar="DIR", help=f"keep walked views there: {goes_on}")
+    parser.add_argument("--threads", type=count, metavar="N", help="else as many as there are cores")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -85,6 +96,8 @@ def settings_of(options: argparse.Namespace) -> LiftSettings:
     Raises:
         InvalidSettings: a pair without ``=``, an unknown name, one with two values or a value out of range.
     """
+    from liftcore.settings import LiftSettings
+
     named = {"preset": options.preset, "speed": options.speed, "device": options.device}
     values = pairs_of(options.set)
     for name, value in named.items():
@@ -99,13 +112,16 @@ def pairs_of(pairs: Sequence[str]) -> dict[str, Any]:
     Raises:
         InvalidSettings: a pair without ``=``, an unknown name or one with two values.
     """
+    from liftcore.settings import LiftSettings
+
     values: dict[str, Any] = {}
     for pair in pairs:
         key, equals, text = pair.partition("=")
         if not equals or not key:
             raise InvalidSettings("--set", expected="key=value", got=repr(pair))
         if key not in LiftSettings.model_fields:
-            raise _unknown(key)
+            hint = nearest(key.replace("-", "_"), LiftSettings.model_fields, 3)
+            raise InvalidSettings("--set", expected="a setting of a lift", got=f"the unknown {key[:80]!r}", hint=hint)
         value = _value(text)
         if key in values and values[key] != value:
             raise _contradiction(key, f"--set {key}={values[key]}", f"--set {pair}")
@@ -118,11 +134,6 @@ def _value(text: str) -> Any:
         return json.loads(text)
     except (ValueError, RecursionError):
         return text
-
-
-def _unknown(name: str) -> InvalidSettings:
-    hint = nearest(name.replace("-", "_"), LiftSettings.model_fields, 3)
-    return InvalidSettings("--set", expected="a setting of a lift", got=f"the unknown {name[:80]!r}", hint=hint)
 
 
 def _contradiction(name: str, one: str, other: str) -> InvalidSettings:

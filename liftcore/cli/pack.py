@@ -2,18 +2,59 @@
 
 from __future__ import annotations
 
+import argparse
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from liftcore.cli.bars import progress_bars
-from liftcore.cli.reply import free_output, reply, shown, writing
-from liftcore.cli.sub_folders import folders_of, told_folders
+from liftcore.cli.options import Parser
+from liftcore.cli.reply import folders_of, free_output, progress_bars, reply, shown, told_folders, writing
 
 if TYPE_CHECKING:
-    import argparse
     from collections.abc import Iterator
-    from pathlib import Path
 
     from liftcore.features.folder import ViewFolder
+
+
+LARGEST_GREY = 65_535  # of a picture of 16 bits
+
+
+def add_arguments(parser: Parser, shared: Parser) -> None:
+    """The options of the command."""
+    formats = parser.add_subparsers(dest="format", required=True, metavar="FORMAT", parser_class=Parser)
+    langsplat = formats.add_parser("langsplat", parents=[shared], help="IMG_s.npy and IMG_f.npy")
+    arrays = formats.add_parser("npy", parents=[shared], help="IMG.npy, a dense map a view")
+    arrays.add_argument("--layout", choices=("hwc", "chw"), default="hwc", help="the order of the axes")
+    masks = formats.add_parser(
+        "masks", parents=[shared], help="IMG.npy, a vector a mask, with IMG.json (SAM's), IMG_masks.npy or IMG.png"
+    )
+    masks.add_argument(
+        "--unlabelled",
+        type=_grey,
+        default=0,
+        metavar="VALUE",
+        help="of label pictures, the value that means no mask: 0, and value 1 is of the first vector; with another "
+        "(255) value 0 is of the first",
+    )
+    space = (
+        "the text encoder whose words lie in the space of the features, as query's --encoder names it "
+        "(open_clip:ViT-B-32/openai): query opens it where no encoder is given, and a service takes the one that it "
+        "has under that name; 'none': no text encoder shares it, so a lift is asked by example. Packs of one lift "
+        "must agree"
+    )
+    unit = "say that the vectors are unit vectors, or are not; this changes none of them"
+    for command in (langsplat, arrays, masks):
+        command.add_argument("folder", type=Path, help="the folder of the files")
+        command.add_argument("-o", "--output", type=Path, required=True, metavar="PACK", help="the pack to write")
+        command.add_argument("--encoder-name", metavar="NAME", help="the 2D encoder that made the features")
+        command.add_argument("--text-space", metavar="NAME", help=space)
+        command.add_argument("--normalised", action=argparse.BooleanOptionalAction, help=unit)
+
+
+def _grey(text: str) -> int:
+    value = int(text) if text.isascii() and text.isdigit() and len(text) <= 5 else LARGEST_GREY + 1
+    if value > LARGEST_GREY:
+        raise argparse.ArgumentTypeError(f"expected a whole number from 0 to {LARGEST_GREY}, got {text!r}")
+    return value
 
 
 def run(options: argparse.Namespace) -> int:

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import argparse
 
 from liftcore.cli.lift import plan_of, settings_of
+from liftcore.cli.options import Parser, add_settings, add_sources, count
 from liftcore.cli.reply import reply
 
-if TYPE_CHECKING:
-    import argparse
+
+def add_arguments(parser: Parser) -> None:
+    """The options of the command."""
+    add_sources(parser)
+    add_settings(parser)
+    parser.add_argument("--threads", type=count, metavar="N", help="of the lift; else as many as there are cores")
 
 
 def run(options: argparse.Namespace) -> int:

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+import argparse
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from liftcore.cli.options import THRESHOLDS, Parser, add_negative, count, encoder_spec
 from liftcore.cli.reply import free_output, reply, writing
-from liftcore.cli.text_encoder import encoder_spec
 from liftcore.errors import InvalidQuery
 from liftcore.io.whole_file import whole_file
 
 if TYPE_CHECKING:
-    import argparse
     from collections.abc import Callable, Iterable
 
     from liftcore.query.ask import Answer
@@ -24,6 +24,34 @@ if TYPE_CHECKING:
 
 
 OUTPUTS = ("object", "coloured", "scores", "mask", "attention")  # options that name a file to write
+
+
+def add_arguments(parser: Parser) -> None:
+    """The options of the command."""
+    parser.last = "text"
+    parser.add_argument("lift", type=Path, help="a lift (.safetensors)")
+    parser.add_argument("text", nargs="?", help="what to look for, in quotes; may be left out beside --like")
+    like = "VIEW:x,y (a pixel), region:VIEW:LEVEL:ID, splat:J or a vector FILE.npy; may be given several times"
+    parser.add_argument("--like", action="append", default=[], metavar="EXAMPLE", help=f"more of this: {like}")
+    parser.add_argument("--unlike", action="append", default=[], metavar="EXAMPLE", help="less of that, likewise")
+    words = parser.add_mutually_exclusive_group()
+    words.add_argument("--table", type=Path, metavar="FILE", help="precomputed text embeddings")
+    words.add_argument(
+        "--encoder", metavar="NAME", help="minilm, open_clip:MODEL/TAG, open_clip:MODEL@FILE or table:FILE"
+    )
+    add_negative(parser, ", so TEXT goes before it")
+    parser.add_argument("--threshold", default="auto", metavar="T", help=THRESHOLDS)
+    parser.add_argument("--instances", type=count, metavar="N", help="how many there are, if you know")
+    keep = "of what was found, all or the largest alone: in the mask, in --object and in --objects"
+    parser.add_argument("--keep", choices=("all", "largest"), default="all", help=keep)
+    parser.add_argument("--top", type=count, default=0, metavar="N", help="name the best N splats")
+    parser.add_argument("--objects", action="store_true", help="name the things found, with their places and boxes")
+    parser.add_argument("--view", metavar="NAME", help="the camera to see the answer from")
+    parser.add_argument("--mask", type=Path, metavar="PNG", help="write the mask of the view")
+    parser.add_argument("--attention", type=Path, metavar="PNG", help="write the attention map of the view")
+    parser.add_argument("--scores", type=Path, metavar="NPY", help="write the scores [P], float32")
+    parser.add_argument("--object", type=Path, metavar="PLY", help="write the splats that were found, and no others")
+    parser.add_argument("--coloured", type=Path, metavar="PLY", help="write all splats, coloured by their scores")
 
 
 def run(options: argparse.Namespace) -> int:

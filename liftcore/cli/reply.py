@@ -1,21 +1,19 @@
-"""How commands answer: one JSON object, or lines for people."""
-
-from __future__ import annotations
+"""How commands answer: one JSON object, or lines for people; and bars on stderr for somebody who watches."""
 
 import json
 import os
-from collections.abc import Mapping, Sequence
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 from liftcore.errors import InvalidInput
 from liftcore.io.strict_json import finite
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
-    from pathlib import Path
+from liftcore.progress import Progress, silent
 
 SHOWN_ITEMS = 6  # of a list, for people
+SHOWN_FOLDERS = 8
 
 
 def reply(document: Mapping[str, Any], *, as_json: bool, lines: Iterable[str] | None = None) -> None:
@@ -83,3 +81,51 @@ def shown(value: Any) -> str:
 
 def _nested(value: Any) -> str:
     return f"({shown(value)})" if isinstance(value, Mapping | list | tuple) else shown(value)
+
+
+def folders_of(views: Iterable[str]) -> list[str]:
+    """The folders that are part of names like ``camA/000``, sorted."""
+    return sorted({view.rpartition("/")[0] for view in views if "/" in view})
+
+
+def told_folders(folders: Sequence[str]) -> list[str]:
+    """A line about them, if there are any."""
+    shown = ", ".join(folders[:SHOWN_FOLDERS]) + (" ..." if len(folders) > SHOWN_FOLDERS else "")
+    return [f"  of sub-folders, whose names are part of their views': {shown}"] if folders else []
+
+
+@contextmanager
+def progress_bars() -> Iterator[Progress]:
+    """Progress that draws one bar a stage on a terminal, and nothing elsewhere."""
+    if not sys.stderr.isatty():
+        yield silent
+        return
+    bars = _Bars()
+    try:
+        yield bars
+    finally:
+        bars.close()
+
+
+class _Bars:
+    def __init__(self) -> None:
+        self.stage = ""
+        self.bar: Any = None
+
+    def __call__(self, stage: str, done: int, total: int, unit: str) -> None:
+        if self.bar is None or stage != self.stage:
+            from tqdm import tqdm
+
+            self.close()
+            self.stage = stage
+            look = {"leave": total > 1, "file": sys.stderr, "dynamic_ncols": True}
+            self.bar = tqdm(total=total, desc=stage, unit=f" {unit}", **look)
+        self.bar.total = total
+        self.bar.update(done - self.bar.n)
+        if done >= total == 1:  # one step is shown while it lasts: the plan is printed where its bar was
+            self.close()
+
+    def close(self) -> None:
+        if self.bar is not None:
+            self.bar.close()
+            self.bar = None

@@ -1,28 +1,40 @@
 """``splatlift serve``: the HTTP service, in place of this process."""
 
-from __future__ import annotations
-
+import argparse
 import os
 import sys
+from collections.abc import Sequence
 from importlib.util import find_spec
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import NoReturn
 
+from liftcore.cli.options import Parser
 from liftcore.errors import Unavailable
 
-if TYPE_CHECKING:
-    import argparse
 
-_OPTIONS = ("host", "port", "data", "encoder")
+def add_arguments(parser: Parser) -> None:
+    """The options of the command."""
+    parser.add_argument("--host", help="the address to bind")
+    parser.add_argument("--port", type=int, help="the port to bind; 0 picks a free one")
+    parser.add_argument("--data", type=Path, metavar="DIR", help="for the database and all files")
+    parser.add_argument("--encoder", metavar="NAME", help="the default text encoder")
 
 
 def run(options: argparse.Namespace) -> int:
-    """Become the service; the library itself knows no HTTP, so it is started by name."""
-    if find_spec("service") is None:
-        raise Unavailable("serve", expected="the package 'service'", got="an installation without it")
-    given = {name: getattr(options, name) for name in _OPTIONS}
+    """Become the service."""
+    given = {name: getattr(options, name) for name in ("host", "port", "data", "encoder")}
     arguments = [part for name, value in given.items() if value is not None for part in (f"--{name}", str(value))]
-    if options.json:
-        arguments.append("--json")
+    become("service", [*arguments, "--json"] if options.json else arguments)
+
+
+def become(program: str, arguments: Sequence[str]) -> NoReturn:
+    """Go on as ``python -m PROGRAM``: the library itself knows neither HTTP nor the service's database.
+
+    Raises:
+        Unavailable: the service is not installed.
+    """
+    if find_spec("service") is None:
+        raise Unavailable(program, expected="the package 'service'", got="an installation without it")
     sys.stdout.flush()
     sys.stderr.flush()
-    os.execv(sys.executable, [sys.executable, "-m", "service", *arguments])
+    os.execv(sys.executable, [sys.executable, "-m", program, *arguments])

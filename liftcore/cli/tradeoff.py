@@ -2,23 +2,44 @@
 
 from __future__ import annotations
 
+import argparse
 import shlex
-from typing import TYPE_CHECKING
+from pathlib import Path
 
-from liftcore.cli.bars import progress_bars
 from liftcore.cli.lift import pairs_of
-from liftcore.cli.reply import free_output, reply, writing
+from liftcore.cli.options import Parser, add_sources, count
+from liftcore.cli.reply import free_output, progress_bars, reply, writing
 from liftcore.errors import InvalidSettings
-from liftcore.settings import LiftSettings
-
-if TYPE_CHECKING:
-    import argparse
 
 COMPARED = ("preset", "speed")
 
 
+def add_arguments(parser: Parser) -> None:
+    """The options of the command."""
+    add_sources(parser)
+    parser.add_argument("--budget", type=_seconds, default=600.0, metavar="SECONDS", help="what it may take; 600")
+    parser.add_argument("-o", "--out", type=Path, default=Path("tradeoff"), metavar="DIR", help="of chart and table")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting of all runs")
+    parser.add_argument("--labels", type=Path, metavar="MASKS", help="VIEW/mask [h, w], numbers of classes")
+    parser.add_argument("--table", type=Path, metavar="FILE", help="text embeddings of the classes")
+    parser.add_argument("--classes", nargs="+", default=[], metavar="WORD", help="the classes, from number 0 on")
+    parser.add_argument("--threads", type=count, metavar="N", help="else as many as there are cores")
+
+
+def _seconds(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"expected seconds, got {text!r}")
+    return value
+
+
 def run(options: argparse.Namespace) -> int:
     """Compare, write the chart, the table and the JSON, and say what to take."""
+    from liftcore.settings import LiftSettings
+
     settings = pairs_of(options.set)
     LiftSettings.of(**settings)
     for name in COMPARED:

@@ -13,7 +13,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from liftcore.cli import build_parser
 from liftcore.errors import NotFound, SplatliftError
 from service.__main__ import parse
 from service.errors import InvalidRequest
@@ -27,7 +26,7 @@ MAX_NAME = 100
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Do what the command line says; the exit status."""
-    given = build_parser().parse_args(["keys", *(sys.argv[1:] if arguments is None else arguments)])
+    given = _parser().parse_args(arguments)
     try:
         data = parse([] if given.data is None else ["--data", str(given.data)]).data
         with opened(data, make=given.action == "create") as keys:
@@ -39,6 +38,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"splatlift: data: expected a directory to write to, got {error}", file=sys.stderr)
         return 2
     return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    """What ``splatlift keys`` hands over."""
+    shared = argparse.ArgumentParser(add_help=False)
+    shared.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
+    shared.add_argument("--data", help="the service's directory")
+    parser = argparse.ArgumentParser(prog="splatlift keys")
+    actions = parser.add_subparsers(dest="action", required=True)
+    create = actions.add_parser("create", parents=[shared])
+    create.add_argument("--name", required=True)
+    create.add_argument("--scopes", required=True, help="read,write,metrics,admin")
+    for limit in ("--max-bytes", "--max-queued", "--max-uploads"):
+        create.add_argument(limit, type=int)
+    actions.add_parser("list", parents=[shared])
+    actions.add_parser("revoke", parents=[shared]).add_argument("id")
+    return parser
 
 
 @contextmanager

@@ -15,7 +15,7 @@ import torch
 from safetensors.torch import save_file
 
 from liftcore import cli
-from liftcore.cli import bars, reply
+from liftcore.cli import reply
 from liftcore.cli.lift import pairs_of
 from liftcore.errors import InvalidFeatures, InvalidSettings, SplatliftError
 from liftcore.features.views import FeatureGrid
@@ -308,7 +308,7 @@ def test_progress_is_drawn_only_on_a_terminal(
 ) -> None:
     for watched in (False, True):
         monkeypatch.setattr(sys.stderr, "isatty", lambda watched=watched: watched)
-        with bars.progress_bars() as progress:
+        with reply.progress_bars() as progress:
             for done in range(4):
                 progress("geometry", done, 3, "views")
             progress("solve", 1, 1, "slices")

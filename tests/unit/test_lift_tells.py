@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from liftcore import lift as pipeline
-from liftcore.cli import bars
+from liftcore.cli import reply
 from liftcore.lift import lift
 from liftcore.listener import Listener
 from liftcore.settings import LiftSettings
@@ -145,7 +145,7 @@ def test_bar_of_one_step_leaves_no_line_to_print_over(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-    with bars.progress_bars() as progress:
+    with reply.progress_bars() as progress:
         progress("compile", 0, 1, "steps")
         assert "compile:   0%" in capsys.readouterr().err
         progress("compile", 1, 1, "steps")

@@ -1,0 +1,7 @@
+"""``python -m liftcore.cli``: as ``splatlift``."""
+
+import sys
+
+from liftcore.cli import main
+
+sys.exit(main())

@@ -1,0 +1,106 @@
+"""What commands' parsers share: one line for wrong arguments, kinds of values, and options that many take."""
+
+import argparse
+from pathlib import Path
+from typing import Any, NoReturn
+
+from liftcore.errors import InvalidQuery
+
+BAD_INPUT = 2
+PRESETS = "row-sum, tikhonov (default), argmax, top-k, front-mass, centre or mean"
+THRESHOLDS = "auto, valley, paper, otsu, stability or a number"
+
+
+class Parser(argparse.ArgumentParser):
+    """Argument errors are bad input like any other: one line, exit 2."""
+
+    last = ""  # the argument that may be left out, and then come after options
+
+    def parse_known_args(  # pyright: ignore[reportIncompatibleMethodOverride]: it has overloads
+        self, args: Any = None, namespace: Any = None
+    ) -> tuple[Any, list[str]]:
+        """Parse, with the last argument wherever it stands: argparse gives it up where an option comes before it."""
+        options, rest = super().parse_known_args(args, namespace)
+        if not self.last or not rest or (rest[0].startswith("-") and rest[0] != "--"):
+            return options, rest
+        words = rest[1:] if rest[0] == "--" else rest
+        if words and getattr(options, self.last) is None:
+            setattr(options, self.last, words.pop(0))
+        if words and not any(word.startswith("-") for word in words):
+            self.error(f"unrecognized arguments: {' '.join(words)}; a text of several words is one, in quotes")
+        return options, words
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(BAD_INPUT, f"{self.prog}: {' '.join(message.split())}; see '{self.prog} --help'\n")
+
+
+def shared_options() -> Parser:
+    """A parent of every command's parser: ``--json`` and ``--debug``."""
+    shared = Parser(add_help=False)
+    shared.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
+    shared.add_argument("--debug", action="store_true", help="show the traceback of our own faults")
+    return shared
+
+
+def add_sources(parser: argparse.ArgumentParser) -> None:
+    """Splats, cameras and feature packs."""
+    parser.add_argument("splats", type=Path, help="trained splats (.ply)")
+    parser.add_argument("cameras", type=Path, help="COLMAP folder or .zip, transforms.json or cameras.json")
+    parser.add_argument("features", type=Path, nargs="+", help="feature packs (.safetensors)")
+
+
+def add_settings(parser: argparse.ArgumentParser) -> None:
+    """The settings of a lift."""
+    parser.add_argument("--preset", metavar="NAME", help=f"a published choice of weights: {PRESETS}")
+    parser.add_argument("--speed", metavar="NAME", help="the dial: exact, balanced, fast or draft")
+    add_device(parser)
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="one setting")
+
+
+def add_device(parser: argparse.ArgumentParser) -> None:
+    """Where to compute."""
+    parser.add_argument("--device", metavar="NAME", help="what walks and solves: auto, cpu or cuda")
+
+
+def add_negative(parser: argparse.ArgumentParser, order: str = "") -> None:
+    """Texts against which a question competes."""
+    competitors = f"texts to compete with: all up to the next option{order}; may be given several times"
+    parser.add_argument("--negative", nargs="+", action="extend", default=[], metavar="WORD", help=competitors)
+
+
+def count(text: str) -> int:
+    """A whole number of one or more."""
+    value = int(text) if text.isascii() and text.isdigit() else 0
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"expected a whole number of one or more, got {text!r}")
+    return value
+
+
+def whole(text: str) -> int:
+    """A whole number that a database holds."""
+    if not (text.isascii() and text.isdigit()) or int(text) >= 2**63:
+        raise argparse.ArgumentTypeError(f"expected a whole number, got {text[:80]!r}")
+    return int(text)
+
+
+def encoder_spec(options: argparse.Namespace, text_space: str, hint: str = "") -> str:
+    """The specification of the encoder that ``--table`` or ``--encoder`` names, else of the lift's text space.
+
+    Args:
+        hint: what else the command can do.
+
+    Raises:
+        InvalidQuery: neither is given, and the lift's text space names no encoder.
+    """
+    from liftcore.query.encoders.specs import NO_WORDS
+
+    if options.table:
+        return f"table:{options.table}"
+    spec = options.encoder or text_space
+    if spec in ("", NO_WORDS):
+        space = f"is {NO_WORDS!r}: its features share no space with words" if spec else "is not named"
+        raise InvalidQuery(
+            "encoder", expected="--table FILE or --encoder NAME", got=f"neither, and the lift's text space {space}",
+            hint=hint,
+        )  # fmt: skip
+    return spec
