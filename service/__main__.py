@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import logging
 import math
 import os
 import signal
@@ -29,8 +30,12 @@ from service.logs import start_logging
 from service.queries.encoder_files import require_encoder_files
 from service.settings import ServiceSettings
 from service.stopping import Stopping
+from service.store.database import require_database
 from service.store.keys import any_key
+from service.store.markers import keys_were_made
 from service.store.store import DATABASE, Store
+
+log = logging.getLogger(__name__)
 
 
 class AnnouncingServer(uvicorn.Server):
@@ -76,7 +81,7 @@ def parse(arguments: Sequence[str]) -> ServiceSettings:
     Raises:
         Misconfigured: a value that a setting does not take.
     """
-    given = {name: value for name, value in options(arguments).items() if name != "json"}
+    given = {name: value for name, value in options(arguments).items() if name not in ("json", "new")}
     if "text_spaces" in given:
         pairs = [text.partition("=") for text in given["text_spaces"]]
         for name, _, spec in pairs:
@@ -106,6 +111,10 @@ def options(arguments: Sequence[str]) -> dict[str, Any]:
         "--text-space", action="append", dest="text_spaces", metavar="NAME=SPEC",
         help="the text encoder of a text space; may be given several times",
     )  # fmt: skip
+    parser.add_argument(
+        "--new", action="store_true",
+        help="where the database is gone or older than the files, move these to quarantine and begin an empty one",
+    )  # fmt: skip
     parser.add_argument("--json", action="store_true", help="say in one JSON object where it listens")
     return vars(parser.parse_args(arguments))
 
@@ -126,7 +135,13 @@ def require_keys(settings: ServiceSettings) -> None:
     Raises:
         Misconfigured: the address is not loopback, and there is no key.
     """
-    if not is_loopback(settings.host) and not any_key(settings.data / DATABASE):
+    if is_loopback(settings.host) or settings.keys == "required":
+        return
+    if settings.keys == "none":
+        raise Misconfigured(
+            "host", expected="a loopback address such as 127.0.0.1, as SPLATLIFT_KEYS is none", got=settings.host
+        )
+    if not any_key(settings.data / DATABASE):
         raise Misconfigured(
             "host", expected="a loopback address such as 127.0.0.1, as there are no keys", got=settings.host,
             hint=f"make one first: splatlift keys create --name NAME --scopes read,write --data {settings.data}",
@@ -166,11 +181,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = sys.argv[1:] if arguments is None else arguments
     try:
         settings = parse(given)
+        new = "new" in options(given)
+        if not new:
+            require_database(settings.data / DATABASE)
         require_keys(settings)
         require_encoder_files(settings)
         listener = bind(settings.host, settings.port)
         try:
-            store = Store.open(settings.data, floor_bytes=settings.disk_floor_bytes)
+            store = Store.open(settings.data, floor_bytes=settings.disk_floor_bytes, new=new)
         except BaseException:
             listener.close()
             raise
@@ -178,6 +196,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"splatlift: {error}", file=sys.stderr)
         return 2
     start_logging(settings.log_format)
+    if settings.keys == "none" and keys_were_made(settings.data):
+        log.warning("SPLATLIFT_KEYS is none: nobody needs a key, though keys were made for %s", settings.data)
     try:
         app = assemble(settings, store)
         announce = partial(say_in_json, data=settings.data) if "json" in options(given) else say

@@ -43,7 +43,10 @@ def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, work
     metrics = Metrics(store, worker, streams, build=versions(settings.commit))
     runner.tell(metrics.attempted)
     worker.tell(metrics.queried)
-    collector = Collector(store, every_seconds=settings.garbage_seconds, grace_seconds=settings.garbage_grace_seconds)
+    collector = Collector(
+        store, every_seconds=settings.garbage_seconds, grace_seconds=settings.garbage_grace_seconds,
+        quarantine_seconds=settings.quarantine_seconds,
+    )  # fmt: skip
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
@@ -85,7 +88,7 @@ def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, work
     app.include_router(operations.router)  # probes and links to the page may carry what they like
     for module in (assets, jobs, lifts, tradeoffs, queries):
         app.include_router(module.router, dependencies=[KnownParameters])
-    describe_keys(app, store.keys)
+    describe_keys(app, store.keys.under(settings.keys))
     return app
 
 

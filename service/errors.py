@@ -24,6 +24,7 @@ SplatliftError
     ├── TimedOut             a query that took longer than the operator allows 504
     ├── Crashed              a process of ours died without an answer          500
     └── Misconfigured        the operator's settings or data directory         (start-up only)
+        └── StaleDatabase    files whose database is gone, or an older one     (start-up only)
 """
 
 from __future__ import annotations
@@ -183,3 +184,15 @@ class Misconfigured(ServiceError):
     """Settings or a data directory with which the service does not start."""
 
     kind = "misconfigured"
+
+
+class StaleDatabase(Misconfigured):
+    """A data directory whose database is gone or older than its files: over it they would be garbage."""
+
+    def __init__(self, data: object, got: str) -> None:
+        super().__init__(
+            "data", expected="the database that the files beside it were stored with", got=f"{got} in {data}",
+            hint="put its newest backup there, with the -wal file if it has one; or make one of the files with"
+            f" splatlift store rebuild --data {data}; or begin anew with splatlift serve --new, which moves the files"
+            " to quarantine",
+        )  # fmt: skip

@@ -29,6 +29,9 @@ class ServiceSettings(BaseSettings):
         (), description="names in Host and Origin beside those of loopback and the bound address, with commas between"
     )
 
+    keys: Literal["required", "none"] | None = Field(
+        None, description="whether requests need a key: required, none; not set = required once one was made"
+    )
     key_bytes: int = Field(100 * GiB, ge=0, description="bytes of assets and results that a key may store")
     key_queued: int = Field(20, ge=0, description="jobs of a key that may wait in line; more are answered 429")
     key_uploads: int = Field(4, ge=0, description="uploads of a key at the same time; more are answered 429")
@@ -65,6 +68,9 @@ class ServiceSettings(BaseSettings):
     )
     garbage_seconds: float = Field(3600, gt=0, description="time between collections of garbage; one is at start-up")
     garbage_grace_seconds: float = Field(3600, ge=0, description="how long a file without an owner is left alone")
+    quarantine_seconds: float = Field(
+        604_800, ge=0, description="how long it is then kept in quarantine/ before it is removed"
+    )
 
     lift_threads: int | None = Field(
         None, ge=1, description="threads of a job; not set = the cores shared out among the parallel jobs"

@@ -18,6 +18,7 @@ COMMANDS = {
     "demo": "the whole job, through the real service",
     "serve": "run the HTTP service",
     "keys": "who may use the HTTP service",
+    "store": "mend the HTTP service's data directory",
     "lift": "lift features onto splats",
     "plan": "what a lift would do and need",
     "query": "find words and examples in a lift",
@@ -28,7 +29,7 @@ COMMANDS = {
     "bench": "how fast this machine lifts",
     "tradeoff": "speed against accuracy on your scene",
 }
-WITH_ACTIONS = ("keys", "pack")  # whose actions take the shared options
+WITH_ACTIONS = ("keys", "pack", "store")  # whose actions take the shared options
 OUR_FAULT = 1
 INTERRUPTED = 130
 

@@ -18,13 +18,16 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument("--port", type=int, help="the port to bind; 0 picks a free one")
     parser.add_argument("--data", type=Path, metavar="DIR", help="for the database and all files")
     parser.add_argument("--encoder", metavar="NAME", help="the default text encoder")
+    anew = "where the database is gone or older than the files, begin an empty one; the files go to quarantine"
+    parser.add_argument("--new", action="store_true", help=anew)
 
 
 def run(options: argparse.Namespace) -> int:
     """Become the service."""
     given = {name: getattr(options, name) for name in ("host", "port", "data", "encoder")}
     arguments = [part for name, value in given.items() if value is not None for part in (f"--{name}", str(value))]
-    become("service", [*arguments, "--json"] if options.json else arguments)
+    arguments += [f"--{name}" for name in ("new", "json") if getattr(options, name)]
+    become("service", arguments)
 
 
 def become(program: str, arguments: Sequence[str]) -> NoReturn:

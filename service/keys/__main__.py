@@ -63,6 +63,7 @@ def opened(data: Path, *, make: bool) -> Iterator[KeyStore]:
 
     Raises:
         NotFound: there is no database, and none is to be made.
+        StaleDatabase: it is gone, or older than the files.
         Misconfigured: a server of an older release holds it, or a later one wrote it.
     """
     path = data / DATABASE
@@ -72,7 +73,7 @@ def opened(data: Path, *, make: bool) -> Iterator[KeyStore]:
         raise NotFound("data", expected="the data directory of a service", got=str(data), hint="name it with --data")
     database = Database(path, migrate=not _held(data))
     try:
-        yield KeyStore(database)
+        yield KeyStore(database, data)
     finally:
         database.close()
 
@@ -110,7 +111,9 @@ def _list(keys: KeyStore, given: argparse.Namespace) -> None:
             "  ".join([key.id, _when(key.created), _state(key), ",".join(sorted(key.scopes)), _limits(key), key.name])
         )
     if not found:
-        print("no keys: the service is open to this machine, and to no other", file=sys.stderr)
+        lost = "no keys, but there were some: nobody is let in until one is made"
+        none = "no keys: the service is open to this machine, and to no other"
+        print(lost if keys.required() else none, file=sys.stderr)
 
 
 def _revoke(keys: KeyStore, given: argparse.Namespace) -> None:

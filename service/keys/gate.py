@@ -44,7 +44,7 @@ class Gate:
 
     def __init__(self, app: ASGIApp, keys: KeyStore, settings: ServiceSettings) -> None:
         self._app = app
-        self._keys = keys
+        self._keys = keys.under(settings.keys)
         self._settings = settings
         self._hosts = Hosts(settings.host, settings.allowed_hosts)
         self._uploads: Counter[str] = Counter()  # by key, those that are on their way

@@ -88,7 +88,7 @@ class AssetStore(Owned):
             OverQuota: it would be more than the owner may store.
         """
         asset = f"sha256:{upload.sha256}"
-        with self._blobs, self._database.write() as connection:
+        with self._blobs, self._database.write(counted=True) as connection:
             owned = connection.execute(
                 "SELECT 1 FROM asset_owners WHERE asset = ? AND owner = ?", (asset, self._owner.key)
             ).fetchone()
@@ -167,7 +167,7 @@ class AssetStore(Owned):
         with self._blobs:
             found = self.get(asset)
             terms = self._owner.terms(asset=asset)
-            with self._database.write() as connection:
+            with self._database.write(counted=True) as connection:
                 users = connection.execute(
                     f"SELECT id FROM jobs WHERE {SEEN} AND (splats = :asset OR cameras = :asset OR EXISTS"
                     " (SELECT 1 FROM job_features WHERE job = id AND asset = :asset) OR EXISTS"
@@ -190,23 +190,20 @@ class AssetStore(Owned):
                 found.path.unlink(missing_ok=True)
 
     def collect(self, older_than: float) -> list[Path]:
-        """Remove bytes that no asset has: what a crash between a blob and its row left.
+        """Move bytes that no asset has to quarantine: what a crash between a blob and its row left.
 
         Args:
             older_than: seconds since 1970; younger files stay.
 
         Returns:
-            What was removed.
+            What was moved.
         """
-        removed = []
         with self._blobs:  # so no upload is between its blob and its row
             with self._database.read() as connection:
                 known = {row["file"] for row in connection.execute("SELECT file FROM assets")}
-            for path in (self._files.root / "blobs").glob("*/*"):
-                if self._files.relative(path) not in known and path.stat().st_mtime < older_than:
-                    path.unlink()
-                    removed.append(path)
-        return removed
+            found = (self._files.root / "blobs").glob("*/*")
+            lost = [path for path in found if self._files.relative(path) not in known]
+            return self._files.quarantine(path for path in lost if path.stat().st_mtime < older_than)
 
     def _record(self, row: sqlite3.Row) -> AssetRecord:
         return AssetRecord(

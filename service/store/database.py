@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import queue
 import sqlite3
 import threading
@@ -9,22 +10,39 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from service.errors import Misconfigured
+from service.errors import Misconfigured, StaleDatabase
+from service.store.markers import expected_generation, remember_generation
 from service.store.schema import MIGRATIONS
 
 MOST_IDLE = 4  # connections kept for the next readers; those of a rush are closed after it
 
+log = logging.getLogger(__name__)
+
 
 class Database:
-    """SQLite in WAL mode: an acknowledged write is on the disk (as far as the disk tells the truth)."""
+    """SQLite in WAL mode: an acknowledged write is on the disk (as far as the disk tells the truth).
 
-    def __init__(self, path: Path, *, migrate: bool = True) -> None:
+    Args:
+        path: the file; made when it is not there.
+        migrate: whether the schema may be changed.
+        rebuilding: whether it may be gone or older than the files beside it.
+
+    Raises:
+        StaleDatabase: it is, and may not; then it is left as it was.
+        Misconfigured: a later release wrote it, or it needs a migration that may not be.
+    """
+
+    def __init__(self, path: Path, *, migrate: bool = True, rebuilding: bool = False) -> None:
         self._path = path
+        # Looked at before the database is: a server that runs may count on meanwhile, there first.
+        least = None if rebuilding else expected_generation(path.parent)
+        if least is not None:
+            require_database(path)
         self._write_lock = threading.Lock()
         self._idle: queue.LifoQueue[sqlite3.Connection] = queue.LifoQueue()
         self._writer = self._connect()
         try:
-            self._migrate(migrate)
+            self._migrate(migrate, least)
         except BaseException:
             self._writer.close()
             raise
@@ -37,9 +55,11 @@ class Database:
         connection.execute("PRAGMA foreign_keys = ON")
         return connection
 
-    def _migrate(self, allowed: bool) -> None:
+    def _migrate(self, allowed: bool, least: int | None) -> None:
         with self.write() as connection:  # all steps or none
             version = connection.execute("PRAGMA user_version").fetchone()[0]
+            if version == 0 and least is not None:
+                raise StaleDatabase(self._path.parent, "an empty one")
             if version > len(MIGRATIONS):
                 raise Misconfigured(
                     "data", expected=f"a database of schema version {len(MIGRATIONS)} or less", got=f"{version}",
@@ -54,19 +74,39 @@ class Database:
                 for statement in _statements(step):
                     connection.execute(statement)
             connection.execute(f"PRAGMA user_version = {len(MIGRATIONS)}")
+            generation = connection.execute("SELECT number FROM generation").fetchone()[0]
+            if least is not None and generation < least:
+                raise StaleDatabase(self._path.parent, f"an older one (generation {generation}, not {least})")
 
     @contextmanager
-    def write(self) -> Iterator[sqlite3.Connection]:
-        """One write transaction: committed when the block ends, rolled back when it raises."""
+    def write(self, *, counted: bool = False) -> Iterator[sqlite3.Connection]:
+        """One write transaction: committed when the block ends, rolled back when it raises.
+
+        Args:
+            counted: a start must not go on without what it writes, so the data directory remembers its generation.
+        """
         with self._write_lock:
             self._writer.execute("BEGIN IMMEDIATE")
             try:
+                generation = self._next_generation() if counted else None
                 yield self._writer
                 self._writer.execute("COMMIT")
             except BaseException:
                 if self._writer.in_transaction:  # on a full disk SQLite has rolled back by itself
                     self._writer.execute("ROLLBACK")
                 raise
+            if generation is not None:
+                self._remember(generation)
+
+    def _next_generation(self) -> int:
+        return self._writer.execute("UPDATE generation SET number = number + 1 RETURNING number").fetchone()[0]
+
+    def _remember(self, generation: int) -> None:
+        """After the commit, which stands whatever happens here: a marker that lags only knows less of the past."""
+        try:
+            remember_generation(self._path.parent, generation)
+        except (OSError, Misconfigured) as error:
+            log.warning("the generation of the database is not remembered outside of it: %s", error)
 
     @contextmanager
     def read(self) -> Iterator[sqlite3.Connection]:
@@ -82,6 +122,12 @@ class Database:
                 self._idle.put(connection)
             else:
                 connection.close()
+
+    def catch_up(self) -> None:
+        """Say that this is the newest database of its directory: what was lost of it was made again."""
+        with self.write(counted=True) as connection:
+            expected = expected_generation(self._path.parent)
+            connection.execute("UPDATE generation SET number = max(number, ?)", (expected or 0,))
 
     def prove_writable(self) -> None:
         """Write what is there already, as far as the disk.
@@ -99,6 +145,16 @@ class Database:
             self._writer.close()
         while not self._idle.empty():
             self._idle.get_nowait().close()
+
+
+def require_database(path: Path) -> None:
+    """See that there is a database, or nothing that one belongs to; it is not opened.
+
+    Raises:
+        StaleDatabase: it is gone.
+    """
+    if not path.exists() and expected_generation(path.parent) is not None:
+        raise StaleDatabase(path.parent, "none")
 
 
 def unusable(path: Path, error: sqlite3.Error) -> Misconfigured:

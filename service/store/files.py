@@ -7,21 +7,25 @@ import os
 import secrets
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TextIO
 
 from service.errors import Misconfigured, NoSpace
 
 LOCK_SECONDS = 0.5  # for another process to let go of the directory
+ROOMS = ("blobs", "lifts", "work")
+MOVED = "%Y%m%dT%H%M%SZ"  # how a folder of the quarantine tells since when it is there
 
 
 class DataDirectory:
     """One directory, held by one server at a time.
 
     ``blobs/ab/abcd....ply`` are assets by digest, ``lifts/ID.safetensors`` lifts by job, ``work/ID/`` what a job
-    that was interrupted goes on from, ``tmp/`` drafts.
+    that was interrupted goes on from, ``tmp/`` drafts, ``quarantine/TIME-RANDOM/`` what nothing reached at that time,
+    under the path that it had.
 
     Args:
         root: the directory; made when it is not there.
@@ -32,7 +36,7 @@ class DataDirectory:
         self.root = root.absolute()
         self._floor = floor_bytes
         self._live: set[str] = set()  # names below tmp/ that are in use; adding and removing one is atomic
-        for name in ("blobs", "lifts", "work", "tmp"):
+        for name in (*ROOMS, "tmp"):
             (self.root / name).mkdir(parents=True, exist_ok=True)
         self._lock = (self.root / "lock").open("w")
         if not _locked(self._lock):
@@ -119,6 +123,45 @@ class DataDirectory:
         """The path as the database keeps it."""
         return str(path.relative_to(self.root))
 
+    def quarantine(self, paths: Iterable[Path]) -> list[Path]:
+        """Move files and folders away from where they are seen, to be removed after a time or moved back.
+
+        Returns:
+            What was moved, where it was.
+        """
+        # A folder for each time that something is moved, so that nothing replaces what is there.
+        now = datetime.now(UTC).strftime(MOVED)
+        folder = self.root / "quarantine" / f"{now}-{secrets.token_hex(4)}"
+        moved = []
+        for path in paths:
+            target = folder / path.relative_to(self.root)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                path.rename(target)
+            except FileNotFoundError:  # its owner was quicker
+                continue
+            moved.append(path)
+        return moved
+
+    def quarantined(self) -> list[tuple[Path, float]]:
+        """The folders of the quarantine, and since when each is there; those with other names are nobody's."""
+        found = []
+        for folder in (self.root / "quarantine").glob("*-*"):
+            try:
+                since = datetime.strptime(folder.name.partition("-")[0], MOVED).replace(tzinfo=UTC)
+            except ValueError:
+                continue
+            found.append((folder, since.timestamp()))
+        return found
+
+    def begin_anew(self, database: str, marker: str) -> None:
+        """Move all that is here to quarantine, with the database and what is remembered of its generation."""
+        names = (*ROOMS, *(f"{database}{part}" for part in ("", "-wal", "-shm")))
+        # The marker last: as long as it is here, a start that was cut off is refused and not half done.
+        self.quarantine(path for name in (*names, marker) if (path := self.root / name).exists())
+        for name in ROOMS:
+            (self.root / name).mkdir()
+
     def publish(self, draft: Path, path: Path) -> None:
         """Make a draft the file at ``path``: on the disk first, then there at once or not at all."""
         path.parent.mkdir(exist_ok=True)
@@ -126,7 +169,7 @@ class DataDirectory:
             os.fsync(handle.fileno())
         draft.replace(path)
         for directory in (path.parent, path.parent.parent):
-            _sync_directory(directory)
+            sync_directory(directory)
 
     def close(self) -> None:
         """Let another server have the directory."""
@@ -155,7 +198,8 @@ def _locked(lock: TextIO) -> bool:
             return True
 
 
-def _sync_directory(path: Path) -> None:
+def sync_directory(path: Path) -> None:
+    """See that what was renamed in a directory is on the disk."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)

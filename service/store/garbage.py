@@ -8,6 +8,7 @@ import threading
 import time
 from pathlib import Path
 
+from service.store.files import DataDirectory
 from service.store.store import Store
 from service.wire import ENDED
 
@@ -15,27 +16,48 @@ log = logging.getLogger(__name__)
 
 
 def collect(store: Store, older_than: float) -> list[Path]:
-    """Remove what crashes left behind: blobs and lifts without a row, drafts without a writer, work of ended jobs.
+    """Clear away what crashes left behind: blobs and lifts without a row, drafts without a writer, unused work.
+
+    What the database does not know goes to quarantine: it may be that the database is wrong. Drafts, which nobody was
+    told of, and the work of jobs that it says have ended are removed.
 
     Args:
         store: whose files are looked through.
         older_than: seconds since 1970; what was changed later stays.
 
     Returns:
-        What was removed.
+        What was moved or removed.
     """
-    removed = store.assets.collect(older_than) + store.lifts.collect(older_than)
-    for path in _unused_work(store) + store.files.left_over():
-        if _changed(path) < older_than:
-            shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
-            removed.append(path)
+    moved = store.assets.collect(older_than) + store.lifts.collect(older_than)
+    ended, unknown = _unused_work(store)
+    moved += store.files.quarantine(path for path in unknown if _changed(path) < older_than)
+    removed = [path for path in ended + store.files.left_over() if _changed(path) < older_than]
+    for path in removed:
+        shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+    return moved + removed
+
+
+def empty_quarantine(files: DataDirectory, since_before: float) -> list[Path]:
+    """Remove what was moved to quarantine long ago.
+
+    Args:
+        files: whose quarantine it is.
+        since_before: seconds since 1970; what was moved later stays.
+
+    Returns:
+        The folders that were removed.
+    """
+    removed = [folder for folder, since in files.quarantined() if since < since_before]
+    for folder in removed:
+        shutil.rmtree(folder)
     return removed
 
 
-def _unused_work(store: Store) -> list[Path]:
-    """Folders of jobs that have ended or were deleted. A job that has ended never runs again."""
-    folders = (store.files.root / "work").iterdir()
-    return [folder for folder in folders if (store.attempts.state(folder.name) or "deleted") in {*ENDED, "deleted"}]
+def _unused_work(store: Store) -> tuple[list[Path], list[Path]]:
+    """Folders of jobs that have ended, which never run again, and of jobs that the database does not know."""
+    states = {folder: store.attempts.state(folder.name) for folder in (store.files.root / "work").iterdir()}
+    ended = [folder for folder, state in states.items() if state in ENDED]
+    return ended, [folder for folder, state in states.items() if state is None]
 
 
 def _changed(path: Path) -> float:
@@ -48,10 +70,13 @@ def _changed(path: Path) -> float:
 class Collector:
     """A thread that collects at start-up and now and then."""
 
-    def __init__(self, store: Store, *, every_seconds: float, grace_seconds: float) -> None:
+    def __init__(
+        self, store: Store, *, every_seconds: float, grace_seconds: float, quarantine_seconds: float
+    ) -> None:
         self._store = store
         self._every = every_seconds
         self._grace = grace_seconds
+        self._quarantine = quarantine_seconds
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._loop, name="collector", daemon=True)
 
@@ -68,7 +93,9 @@ class Collector:
         while True:
             try:
                 for path in collect(self._store, time.time() - self._grace):
-                    log.info("removed %s, which nothing refers to", path)
+                    log.info("moved %s away, which nothing refers to", path)
+                for path in empty_quarantine(self._store.files, time.time() - self._quarantine):
+                    log.info("removed %s, whose time in quarantine is over", path)
             except Exception:  # a full disk today must not stop the collection of tomorrow
                 log.exception("the collection of garbage stumbled")
             if self._stopping.wait(self._every):

@@ -96,7 +96,7 @@ class JobStore(Owned):
             KeyReused: the key came with another order before.
         """
         job = secrets.token_hex(16)
-        with self._database.write() as connection:
+        with self._database.write(counted=True) as connection:
             known = _of_key(connection, order, self._owner)
             if known is not None:
                 return known, False
@@ -176,7 +176,7 @@ class JobStore(Owned):
             NotFound: there is none.
             Conflict: it has not ended, or it has a result that was not given up.
         """
-        with self._database.write() as connection:
+        with self._database.write(counted=True) as connection:
             row = row_of(connection, job, self._owner)
             if row["state"] not in ENDED:
                 raise Conflict(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import hmac
 import secrets
@@ -9,13 +10,17 @@ import sqlite3
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal, Self
 
 from liftcore.errors import NotFound
 from service.keys.scopes import Scope, parse_scopes
 from service.store.database import Database, unusable
+from service.store.markers import keys_were_made, remember_keys
 
 PREFIX = "splatlift_"  # by which people, and scanners for leaked secrets, know what it is
 SECRET_BYTES = 32
+
+Rule = Literal["required", "none"]  # what the operator says of keys; not said = required once one was made
 
 
 @dataclass(frozen=True)
@@ -40,10 +45,24 @@ class KeyRecord:
 
 
 class KeyStore:
-    """Keys in the database. Every look is a look at the disk's truth: what another process did counts at once."""
+    """Keys in the database. Every look is a look at the disk's truth: what another process did counts at once.
 
-    def __init__(self, database: Database) -> None:
+    Args:
+        database: that holds them.
+        data: the data directory, which remembers that there was a key when the database does not.
+    """
+
+    _rule: Rule | None = None
+
+    def __init__(self, database: Database, data: Path) -> None:
         self._database = database
+        self._data = data
+
+    def under(self, rule: Rule | None) -> Self:
+        """The same keys under the operator's word on whether requests need one."""
+        ruled = copy.copy(self)
+        ruled._rule = rule
+        return ruled
 
     def create(self, name: str, scopes: frozenset[Scope], quota: Quota) -> tuple[KeyRecord, str]:
         """Make a key.
@@ -53,7 +72,8 @@ class KeyStore:
         """
         secret = PREFIX + secrets.token_urlsafe(SECRET_BYTES)
         key = KeyRecord(secrets.token_hex(6), name, scopes, quota, time.time(), None)
-        with self._database.write() as connection:
+        remember_keys(self._data)  # first: a key whose database is lost must not leave the door open
+        with self._database.write(counted=True) as connection:
             connection.execute(
                 "INSERT INTO keys (id, name, digest, scopes, max_bytes, max_queued, max_uploads, created)"
                 " VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
@@ -76,7 +96,7 @@ class KeyStore:
         Raises:
             NotFound: there is none of that id.
         """
-        with self._database.write() as connection:
+        with self._database.write(counted=True) as connection:
             row = connection.execute(
                 "UPDATE keys SET revoked = coalesce(revoked, ?) WHERE id = ? RETURNING *", (time.time(), key)
             ).fetchone()
@@ -91,20 +111,25 @@ class KeyStore:
         return [_record(row) for row in rows]
 
     def required(self) -> bool:
-        """Whether requests need a key: from the first one that was ever made, revoked or not."""
+        """Whether requests need a key: from the first one that was ever made, revoked, lost or not."""
         with self._database.read() as connection:
-            return _any(connection)
+            return self._required(connection)
 
     def admit(self, secret: str | None) -> tuple[bool, KeyRecord | None]:
         """Whether requests need a key, and the valid key of that secret."""
         with self._database.read() as connection:
             if secret is None:
-                return _any(connection), None
+                return self._required(connection), None
             digest = digest_of(secret)
             row = connection.execute("SELECT * FROM keys WHERE digest = ? AND revoked IS NULL", (digest,)).fetchone()
             if row is None or not hmac.compare_digest(row["digest"], digest):
-                return _any(connection), None
-            return True, _record(row)
+                return self._required(connection), None
+            return self._rule != "none", _record(row)
+
+    def _required(self, connection: sqlite3.Connection) -> bool:
+        if self._rule is not None:
+            return self._rule == "required"
+        return _any(connection) or keys_were_made(self._data)
 
 
 def digest_of(secret: str) -> str:

@@ -11,9 +11,11 @@ from typing import Any
 
 from liftcore.errors import NotFound
 from service.errors import InvalidRequest
-from service.store.attempts import succeed
+from service.store.assets import own
+from service.store.attempts import succeed, told
 from service.store.database import Database
 from service.store.files import DataDirectory
+from service.store.jobs import JobOrder
 from service.store.owners import SEEN, Owned
 
 
@@ -68,25 +70,61 @@ class LiftStore(Owned):
         """
         path = self._files.lift(job)
         size = made.draft.stat().st_size
-        with self._database.write() as connection:
+        with self._database.write(counted=True) as connection:
             if not succeed(connection, job, attempt):
                 return False
             self._files.publish(made.draft, path)
-            connection.execute(
-                "INSERT INTO lifts (id, bytes, sha256, file, count, channels, metadata, created)"
-                " VALUES (?,?,?,?,?,?,?,?)",
-                (
-                    job,
-                    size,
-                    made.sha256,
-                    self._files.relative(path),
-                    made.count,
-                    made.channels,
-                    json.dumps(made.metadata),
-                    time.time(),
-                ),
-            )
+            self._insert(connection, job, made, size, time.time())
         return True
+
+    def adopt(self, job: str, order: JobOrder, made: FinishedLift) -> None:
+        """Keep a lift whose file lies where it belongs and whose row, and perhaps its job, was lost.
+
+        Args:
+            job: its id.
+            order: what it was made of; the assets are here.
+            made: of the file itself, not of a draft.
+        """
+        status = made.draft.stat()
+        with self._database.write(counted=True) as connection:
+            row = connection.execute(
+                "INSERT INTO jobs (id, owner, state, attempt, splats, cameras, settings, created, started, ended)"
+                " VALUES (:id, :owner, 'succeeded', 1, :splats, :cameras, :settings, :time, :time, :time)"
+                " ON CONFLICT (id) DO UPDATE SET state = 'succeeded', ended = :time, problem = NULL,"
+                " leased_until = NULL RETURNING *",
+                {
+                    "id": job,
+                    "owner": self._owner.key,
+                    "splats": order.splats,
+                    "cameras": order.cameras,
+                    "settings": json.dumps(order.settings),
+                    "time": status.st_mtime,
+                },
+            ).fetchone()
+            for place, asset in enumerate(order.features):
+                connection.execute("INSERT OR IGNORE INTO job_features VALUES (?, ?, ?)", (job, place, asset))
+            for asset, _ in order.assets():
+                own(connection, asset, row["owner"])
+            told(connection, row)
+            self._insert(connection, job, made, status.st_size, status.st_mtime)
+
+    def _insert(
+        self, connection: sqlite3.Connection, job: str, made: FinishedLift, size: int, created: float
+    ) -> None:
+        connection.execute(
+            "INSERT INTO lifts (id, bytes, sha256, file, count, channels, metadata, created)"
+            " VALUES (?,?,?,?,?,?,?,?)",
+            (
+                job,
+                size,
+                made.sha256,
+                self._files.relative(self._files.lift(job)),
+                made.count,
+                made.channels,
+                json.dumps(made.metadata),
+                created,
+            ),
+        )
 
     def find(self, lift: str) -> LiftRecord | None:
         """The lift of that id, None when there is none."""
@@ -137,22 +175,19 @@ class LiftStore(Owned):
         return [self._record(row) for row in rows]
 
     def collect(self, older_than: float) -> list[Path]:
-        """Remove files that no lift has: what a crash between a file and its row left.
+        """Move files that no lift has to quarantine: what a crash between a file and its row left.
 
         Args:
             older_than: seconds since 1970; younger files stay.
 
         Returns:
-            What was removed.
+            What was moved.
         """
-        removed = []
         with self._database.write() as connection:  # so no lift is between its file and its row
             known = {row["file"] for row in connection.execute("SELECT file FROM lifts")}
-            for path in (self._files.root / "lifts").iterdir():
-                if self._files.relative(path) not in known and path.stat().st_mtime < older_than:
-                    path.unlink()
-                    removed.append(path)
-        return removed
+            found = (self._files.root / "lifts").iterdir()
+            lost = [path for path in found if self._files.relative(path) not in known]
+            return self._files.quarantine(path for path in lost if path.stat().st_mtime < older_than)
 
     def _record(self, row: sqlite3.Row) -> LiftRecord:
         return LiftRecord(

@@ -124,4 +124,10 @@ CREATE INDEX job_labels_of_asset ON job_labels (asset);
     """
 ALTER TABLE jobs ADD COLUMN plan TEXT;              -- JSON: what the latest attempt that planned set out to do
 """,
+    """
+CREATE TABLE generation (           -- one row: how many transactions were counted, as the data directory knows too
+    number INTEGER NOT NULL
+) STRICT;
+INSERT INTO generation VALUES (0);
+""",
 )

@@ -64,7 +64,7 @@ class TradeoffStore(Owned):
         document = json.dumps(made.document)
         size = len(document) + len(made.page.encode()) + len(made.chart)
         digest = hashlib.sha256(made.chart).hexdigest()
-        with self._database.write() as connection:
+        with self._database.write(counted=True) as connection:
             if not succeed(connection, job, attempt):
                 return False
             connection.execute(

@@ -62,7 +62,7 @@ def test_nothing_young_and_nothing_in_use_goes(store: Store) -> None:
 
 
 def test_collector_collects_at_once_and_again(store: Store) -> None:
-    collector = Collector(store, every_seconds=0.02, grace_seconds=0.0)
+    collector = Collector(store, every_seconds=0.02, grace_seconds=0.0, quarantine_seconds=HOUR)
     first = old(store.files.lift("0" * 32))
     collector.start()
     until(lambda: not first.exists())

@@ -1,0 +1,227 @@
+"""A lost database is made again of the files, and a lost key opens no door."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fastapi.testclient import TestClient
+
+from liftcore import cli
+from service.__main__ import main as serve
+from service.__main__ import require_keys
+from service.errors import Misconfigured, StaleDatabase
+from service.settings import ServiceSettings
+from service.store.__main__ import main
+from service.store.garbage import collect
+from service.store.store import DATABASE, Store
+from tests.unit.command_line import programs_become
+
+from .conftest import Uploaded, serving
+from .following import ended
+from .guarded import Guarded, address, bearer, every_route, guarded, make_key
+from .tiny_scene import TinyScene, colmap_zip, labels, masks
+
+
+@pytest.fixture
+def filled(tmp_path: Path, scene: TinyScene, table: Path) -> tuple[Path, dict[str, Any]]:
+    """A data directory with an asset of each kind and a lift, and what the service told of them."""
+    data = tmp_path / "data"
+    with serving(data, table) as client:
+        contents = {"splats": scene.splats, "cameras": scene.cameras, "features": scene.features}
+        ids = [client.put(f"/assets/{kind}", content=body).json()["id"] for kind, body in contents.items()]
+        for kind, body in {"cameras": colmap_zip(), "masks": masks({"left": labels()["left"][0]}),
+                           "table": scene.table}.items():  # fmt: skip
+            assert client.put(f"/assets/{kind}", content=body).status_code == 201
+        job = ended(client, client.post("/lift", json=Uploaded(*ids).order()).headers["location"])
+        assert job["state"] == "succeeded", job
+        told = all_told(client)
+    return data, told
+
+
+def all_told(client: TestClient) -> dict[str, Any]:
+    """Assets, lift and an answer, without the times at which they were made."""
+    assets = {asset["id"]: asset for asset in client.get("/assets").json()["assets"]}
+    (lift,) = client.get("/lifts").json()["lifts"]
+    job = client.get(f"/jobs/{lift['id']}").json()
+    answer = client.get("/query", params={"text": "lamp", "top": 3}).json()
+    for each in (*assets.values(), lift):
+        del each["created"]
+    return {"assets": assets, "lift": lift, "settings": job["settings"], "state": job["state"], "answer": answer}
+
+
+def test_rebuild_makes_the_database_of_the_files(
+    filled: tuple[Path, dict[str, Any]], table: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data, told = filled
+    (data / DATABASE).unlink()
+    broken = data / "blobs" / "ab" / f"{'ab' * 32}.ply"
+    broken.parent.mkdir(exist_ok=True)
+    broken.write_bytes(b"half of a file")
+    strange = data / "lifts" / f"{'0' * 32}.safetensors"
+    strange.write_bytes(b"no lift")
+    assert main(["rebuild", "--data", str(data), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["lifts"], found["assets"]) == (
+        1, {"splats": 1, "cameras": 2, "features": 1, "masks": 1, "table": 1}
+    )  # fmt: skip
+    assert [left["file"] for left in found["left"]] == [str(path.relative_to(data)) for path in (broken, strange)]
+    assert "trade-offs" in found["lost"] and "keys" in found["lost"]
+    with serving(data, table) as client:
+        assert all_told(client) == told
+    store = Store.open(data)
+    assert set(collect(store, 1e12)) == {broken, strange}  # all else has its row
+    store.close()
+
+
+def test_rebuild_brings_an_older_database_up_to_its_files(filled: tuple[Path, dict[str, Any]], table: Path) -> None:
+    data, told = filled
+    store = Store.open(data)
+    lift = told["lift"]["id"]
+    with store.database.write() as connection:  # as it was while the job was in line
+        connection.execute("DELETE FROM lifts")
+        connection.execute("UPDATE jobs SET state = 'queued', ended = NULL, owner = 'somebody'")
+        connection.execute("UPDATE generation SET number = 3")
+    store.close()
+    with pytest.raises(StaleDatabase, match=r"an older one \(generation 3"):
+        Store.open(data)
+    assert main(["rebuild", "--data", str(data)]) == 0
+    store = Store.open(data)
+    assert store.jobs.get(lift).state == "succeeded" and store.attempts.claim(60) is None
+    with store.database.read() as connection:
+        assert connection.execute("SELECT owner FROM jobs").fetchone()["owner"] == "somebody"
+    store.close()
+    with serving(data, table) as client:
+        assert all_told(client) == told
+
+
+def test_rebuild_that_was_cut_off_does_not_let_the_server_start(
+    filled: tuple[Path, dict[str, Any]], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data, _ = filled
+    for name in (DATABASE, "generation"):
+        (data / name).unlink()
+
+    def cut_off(*given: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("service.store.__main__._add_lift", cut_off)
+    with pytest.raises(KeyboardInterrupt):
+        main(["rebuild", "--data", str(data)])
+    monkeypatch.undo()
+    assert serve(["--data", str(data), "--port", "0"]) == 2
+    assert main(["rebuild", "--data", str(data)]) == 0
+    assert "0 assets" in capsys.readouterr().out
+    Store.open(data).close()
+
+
+def test_lift_whose_splats_are_gone_is_left_out(
+    filled: tuple[Path, dict[str, Any]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    data, _ = filled
+    (data / DATABASE).unlink()
+    (splats,) = data.glob("blobs/*/*.ply")
+    splats.unlink()
+    assert main(["rebuild", "--data", str(data)]) == 0
+    said = capsys.readouterr().out
+    assert "0 lifts" in said and "left out" in said and splats.stem in said
+
+
+def test_rebuild_beside_a_server_or_nowhere_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    store = Store.open(tmp_path)
+    assert main(["rebuild", "--data", str(tmp_path)]) == 2
+    store.close()
+    assert not (tmp_path / "generation").exists()
+    assert main(["rebuild", "--data", str(tmp_path / "nowhere")]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 2 and all(line.startswith("splatlift: data: expected") for line in lines)
+    assert not (tmp_path / "nowhere").exists()
+
+
+def test_store_and_new_reach_the_programs_of_the_service(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = programs_become(monkeypatch)
+    cli.main(["store", "rebuild", "--data=-d", "--json"])
+    cli.main(["serve", "--new"])
+    assert calls == [["-m", "service.store", "rebuild", "--data=-d", "--json"], ["-m", "service", "--new"]]
+
+
+def without_keys(house: Guarded) -> None:
+    """As after the loss of the database that held them."""
+    with house.store.database.write() as connection:
+        connection.execute("DELETE FROM keys")
+
+
+def statuses(house: Guarded, secret: str | None = None) -> dict[str, int]:
+    """What each route answers that needs a key; no body, so what is let in is refused for that or found missing."""
+    routes = [
+        (method, address(path, "0" * 32, "sha256:" + "0" * 64)) for method, path in every_route(house.client.app)
+    ]
+    headers = {} if secret is None else bearer(secret)
+    open_ = {"/", "/healthz", "/readyz", "/version", "/openapi.json", "/docs"}
+    return {
+        f"{method} {path}": house.client.request(method, path, headers=headers).status_code
+        for method, path in routes
+        if path not in open_ and not path.startswith("/page")
+    }
+
+
+def test_lost_keys_open_no_door(tmp_path: Path) -> None:
+    with guarded(tmp_path / "data", allowed_hosts="proxy.example") as house:
+        without_keys(house)
+        found = statuses(house, house.secrets["boss"])
+        assert len(found) > 20 and set(found.values()) == {401}, found
+        assert house.client.get("/assets", headers={"Host": "proxy.example"}).status_code == 401
+        assert "securitySchemes" in house.client.get("/openapi.json").json()["components"]
+        _, secret = make_key(house.store, "read")
+        assert house.client.get("/assets", headers=bearer(secret)).status_code == 200
+
+
+def test_database_of_a_release_that_did_not_remember_keys_is_remembered(tmp_path: Path) -> None:
+    store = Store.open(tmp_path)
+    make_key(store, "read")
+    store.close()
+    (tmp_path / "keys.required").unlink()
+    Store.open(tmp_path).close()
+    assert (tmp_path / "keys.required").exists()
+
+
+def test_keys_required_closes_a_service_that_never_had_one(tmp_path: Path) -> None:
+    with guarded(tmp_path / "data", keys="required") as house:
+        without_keys(house)
+        (tmp_path / "data" / "keys.required").unlink()
+        assert set(statuses(house).values()) == {401}
+    require_keys(ServiceSettings.model_validate({"data": tmp_path / "x", "host": "0.0.0.0", "keys": "required"}))
+
+
+def test_keys_none_asks_nobody_for_one_and_stays_on_this_machine(tmp_path: Path) -> None:
+    with guarded(tmp_path / "data", keys="none") as house:
+        for secret in (None, house.secrets["bob"], "no-key"):
+            assert not {401, 403} & set(statuses(house, secret).values())
+        assert len(house.client.get("/jobs").json()["jobs"]) == 3
+    with pytest.raises(Misconfigured, match="SPLATLIFT_KEYS is none"):
+        require_keys(ServiceSettings.model_validate({"data": tmp_path / "data", "host": "0.0.0.0", "keys": "none"}))
+
+
+def test_key_that_could_not_be_remembered_is_not_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(data: Path) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("service.store.keys.remember_keys", full)
+    store = Store.open(tmp_path)
+    with pytest.raises(OSError, match="No space"):
+        make_key(store, "read")
+    assert store.keys.all() == []
+    store.close()
+
+
+def test_directory_copied_without_its_database_stays_closed(tmp_path: Path) -> None:
+    store = Store.open(tmp_path / "data")
+    make_key(store, "read")
+    store.close()
+    shutil.copytree(tmp_path / "data", tmp_path / "copy", ignore=shutil.ignore_patterns(f"{DATABASE}*"))
+    store = Store.open(tmp_path / "copy", new=True)
+    assert store.keys.required()
+    store.close()

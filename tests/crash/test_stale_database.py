@@ -1,0 +1,227 @@
+"""A database that is gone, empty or older than the files beside it: the start is refused, and nothing is lost."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sqlite3
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from service import __main__ as server
+from service.errors import StaleDatabase
+from service.keys.__main__ import main as keys
+from service.keys.scopes import Scope
+from service.store import markers
+from service.store.files import DataDirectory
+from service.store.garbage import Collector, collect, empty_quarantine
+from service.store.keys import Quota
+from service.store.store import DATABASE, Store
+from service.wire import AssetKind
+
+from .conftest import asset_of, until
+
+DAY = 86_400.0
+
+
+@pytest.fixture
+def data(tmp_path: Path) -> Path:
+    """A data directory with one asset, and a database beside it that knows of it."""
+    store = Store.open(tmp_path / "data")
+    asset_of(store, AssetKind.SPLATS, {})
+    store.close()
+    return tmp_path / "data"
+
+
+def blobs(folder: Path) -> list[Path]:
+    return [path for path in folder.rglob("blobs/*/*") if path.is_file()]
+
+
+def gone(data: Path) -> None:
+    (data / DATABASE).unlink()
+
+
+def gone_under_a_release_without_markers(data: Path) -> None:
+    gone(data)
+    (data / markers.GENERATION).unlink()
+
+
+def empty(data: Path) -> None:
+    (data / DATABASE).write_bytes(b"")
+
+
+def without_its_wal(data: Path) -> None:
+    """A copy of the main file of a server that runs: what it holds has not come from the WAL yet."""
+    gone(data)
+    shutil.rmtree(data / "blobs")
+    (data / markers.GENERATION).unlink()
+    store = Store.open(data)
+    asset_of(store, AssetKind.SPLATS, {})
+    shutil.copy(data / DATABASE, data / "copy")
+    store.close()
+    (data / "copy").replace(data / DATABASE)
+
+
+def older(data: Path) -> None:
+    """A whole backup from before the last upload."""
+    shutil.copy(data / DATABASE, data / "backup")
+    store = Store.open(data)
+    asset_of(store, AssetKind.CAMERAS, {})
+    store.close()
+    (data / "backup").replace(data / DATABASE)
+
+
+def of_an_older_release(data: Path) -> None:
+    """One that has no generation yet."""
+    database = sqlite3.connect(data / DATABASE)
+    database.executescript("DROP TABLE generation; PRAGMA user_version = 7;")
+    database.close()
+
+
+LOSSES = [gone, gone_under_a_release_without_markers, empty, without_its_wal, older, of_an_older_release]
+
+
+@pytest.mark.parametrize("lose", LOSSES)
+def test_start_over_files_without_their_database_is_refused_in_one_line(
+    lose: Callable[[Path], None], data: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lose(data)
+    before = blobs(data)
+    assert before
+    for _ in range(2):  # a refused start makes nothing that the next would take for a database
+        assert server.main(["--data", str(data), "--port", "0"]) == 2
+        said = capsys.readouterr().err
+        assert said.startswith("splatlift: data: expected the database that the files beside it were stored with")
+        assert "splatlift store rebuild" in said and "serve --new" in said and said.count("\n") == 1
+    assert keys(["create", "--name", "a", "--scopes", "read", "--data", str(data)]) == 2  # makes no database either
+    assert "splatlift store rebuild" in capsys.readouterr().err
+    assert blobs(data) == before
+
+
+def test_missing_database_is_told_beyond_loopback_too(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    gone(data)
+    assert server.main(["--data", str(data), "--host", "0.0.0.0", "--port", "0"]) == 2
+    assert "splatlift store rebuild" in capsys.readouterr().err
+
+
+def test_crash_between_a_file_and_its_row_does_not_keep_the_server_from_starting(data: Path) -> None:
+    files = DataDirectory(data)
+    with files.draft(".ply") as draft:
+        draft.write_bytes(b"published, and the server died before its row")
+        files.publish(draft, files.blob("ab" * 32, ".ply"))
+    files.close()
+    Store.open(data).close()
+
+
+def test_crash_between_a_commit_and_the_marker_does_not_either(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = Store.open(data)
+    monkeypatch.setattr("service.store.database.remember_generation", lambda data, number: None)
+    asset_of(store, AssetKind.CAMERAS, {})
+    monkeypatch.undo()
+    store.close()
+    store = Store.open(data)
+    assert len(store.assets.all()) == 2
+    asset_of(store, AssetKind.FEATURES, {})
+    store.close()
+    assert (data / markers.GENERATION).read_text() == "3\n"
+
+
+def test_marker_on_a_full_disk_fails_no_upload(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(data: Path, number: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    store = Store.open(data)
+    monkeypatch.setattr("service.store.database.remember_generation", full)
+    asset = asset_of(store, AssetKind.CAMERAS, {})
+    assert store.assets.get(asset).whole
+    store.close()
+
+
+def test_first_start_and_one_over_a_directory_without_files_are_not_refused(tmp_path: Path) -> None:
+    for _ in range(2):
+        Store.open(tmp_path).close()
+        (tmp_path / DATABASE).unlink()
+
+
+def test_new_moves_the_files_to_quarantine_and_begins_an_empty_database(data: Path) -> None:
+    gone(data)
+    (blob,) = blobs(data)
+    store = Store.open(data, new=True)
+    assert store.assets.all() == [] and blobs(data / "blobs") == []
+    (kept,) = blobs(data / "quarantine")
+    assert kept.relative_to(data / "quarantine").parts[1:] == blob.relative_to(data).parts
+    asset = asset_of(store, AssetKind.SPLATS, {})
+    store.close()
+    store = Store.open(data, new=True)  # a service that is started so each time begins anew but once
+    assert [found.id for found in store.assets.all()] == [asset]
+    store.close()
+
+
+def test_new_keeps_the_database_and_remembers_its_keys(data: Path) -> None:
+    store = Store.open(data)
+    store.keys.create("a", frozenset({Scope.READ}), Quota())
+    store.close()
+    (data / markers.KEYS_REQUIRED).unlink()
+    (data / markers.GENERATION).write_text("100\n")
+    with pytest.raises(StaleDatabase):
+        Store.open(data)
+    store = Store.open(data, new=True)
+    assert store.keys.all() == [] and store.keys.required()
+    store.close()
+    assert [*data.glob(f"quarantine/*/{DATABASE}")]
+
+
+def test_collector_moves_to_quarantine_and_removes_from_there_after_its_time(data: Path) -> None:
+    store = Store.open(data)
+    lost = [store.files.blob("ab" * 32, ".ply"), store.files.lift("0" * 32), store.files.work("1" * 32) / "block"]
+    for path in lost:
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(path.name.encode())
+        os.utime(path, (1.0, 1.0))
+    os.utime(store.files.work("1" * 32), (1.0, 1.0))
+    collector = Collector(store, every_seconds=0.02, grace_seconds=0.0, quarantine_seconds=DAY)
+    collector.start()
+    until(lambda: not any(path.exists() for path in lost))
+    collector.stop()
+    moved = {path.name: path.read_bytes() for path in (data / "quarantine").rglob("*") if path.is_file()}
+    assert moved == {path.name: path.name.encode() for path in lost}
+    (data / "quarantine" / "an-operator's own folder").mkdir()
+    assert empty_quarantine(store.files, time.time() - DAY) == []
+    assert empty_quarantine(store.files, time.time() + 2)
+    assert [path.name for path in (data / "quarantine").iterdir()] == ["an-operator's own folder"]
+    store.close()
+
+
+def test_quarantine_replaces_nothing(data: Path) -> None:
+    store = Store.open(data)
+    for content in (b"first", b"second"):
+        path = store.files.lift("0" * 32)
+        path.write_bytes(content)
+        assert collect(store, time.time() + 1) == [path]
+    kept = sorted(path.read_bytes() for path in (data / "quarantine").rglob("*.safetensors"))
+    assert kept == [b"first", b"second"]
+    store.close()
+
+
+def test_what_a_user_deletes_frees_its_room_at_once(data: Path) -> None:
+    store = Store.open(data)
+    (asset,) = store.assets.all()
+    store.assets.delete(asset.id)
+    assert blobs(data) == [] and collect(store, time.time() + 1) == []
+    store.close()
+
+
+def test_marker_never_goes_back(data: Path) -> None:
+    for number in (9, 7):  # as a server and `splatlift keys` may come in the other order
+        markers.remember_generation(data, number)
+    assert markers.expected_generation(data) == 9
+
+
+def test_marker_that_holds_no_number_is_one_line(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (data / markers.GENERATION).write_text("")
+    assert server.main(["--data", str(data), "--port", "0"]) == 2
+    said = capsys.readouterr().err
+    assert "expected a whole number in the file 'generation'" in said and said.count("\n") == 1
