@@ -34,6 +34,7 @@ class Database:
 
     def __init__(self, path: Path, *, migrate: bool = True, rebuilding: bool = False) -> None:
         self._path = path
+        self._rebuilding = rebuilding  # until `catch_up`, and so long nothing counts
         # Looked at before the database is: a server that runs may count on meanwhile, there first.
         least = None if rebuilding else expected_generation(path.parent)
         if least is not None:
@@ -88,7 +89,7 @@ class Database:
         with self._write_lock:
             self._writer.execute("BEGIN IMMEDIATE")
             try:
-                generation = self._next_generation() if counted else None
+                generation = self._next_generation() if counted and not self._rebuilding else None
                 yield self._writer
                 self._writer.execute("COMMIT")
             except BaseException:
@@ -125,6 +126,7 @@ class Database:
 
     def catch_up(self) -> None:
         """Say that this is the newest database of its directory: what was lost of it was made again."""
+        self._rebuilding = False
         with self.write(counted=True) as connection:
             expected = expected_generation(self._path.parent)
             connection.execute("UPDATE generation SET number = max(number, ?)", (expected or 0,))

@@ -27,6 +27,16 @@ from .conftest import asset_of, until
 DAY = 86_400.0
 
 
+@pytest.fixture(autouse=True)
+def no_server(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A start that is not refused ends here, and not with the test run."""
+
+    def started(*given: object) -> None:
+        raise AssertionError("the server started")
+
+    monkeypatch.setattr(server, "server_of", started)
+
+
 @pytest.fixture
 def data(tmp_path: Path) -> Path:
     """A data directory with one asset, and a database beside it that knows of it."""
