@@ -148,7 +148,8 @@ def _tell(found: dict[str, Any], given: argparse.Namespace) -> None:
         print(json.dumps({**found, "lost": LOST}))
         return
     added = [f"{count} of kind {kind}" for kind, count in sorted(found["assets"].items())]
-    print(f"added to {DATABASE}: {sum(found['assets'].values())} assets ({', '.join(added)}), {found['lifts']} lifts")
+    kinds = f" ({', '.join(added)})" if added else ""
+    print(f"added to {DATABASE}: {sum(found['assets'].values())} assets{kinds}, {found['lifts']} lifts")
     for left in found["left"]:
         print(f"left out, and to be moved to quarantine by the server: {left['file']}: {left['why']}")
     print(LOST)
