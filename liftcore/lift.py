@@ -12,7 +12,7 @@ import torch
 from liftcore import __version__
 from liftcore.device import Device, choose_device, within_memory
 from liftcore.errors import InvalidFeatures
-from liftcore.features.pack import FeaturePacks, open_packs, pair
+from liftcore.features.pack import FeaturePacks, pair, read_features
 from liftcore.io.cameras import read_cameras
 from liftcore.io.input_files import input_files
 from liftcore.io.lift_file import LiftMetadata, LiftResult
@@ -193,7 +193,7 @@ def open_sources(splats: Path, cameras: Path, features: Sequence[Path], settings
     """Open what a lift is made from; views are paired by name, and every ``view_stride``-th is taken."""
     scene, views = read_splats(splats, settings.kernel, colour=False), read_cameras(cameras)
     check_antialiased(scene.kernel, settings.antialiased)
-    packs, unpaired = pair(open_packs(features), views)
+    packs, unpaired = pair(read_features(*features), views)
     return Sources(scene, views, packs, list(packs.views[:: settings.view_stride]), unpaired)
 
 
@@ -231,7 +231,7 @@ def _refine(
             raster,
             sources.splats.count,
             [sources.cameras[name] for name in names],
-            lambda view: as_read(sources.packs.observation(names[view]), settings, names[view]),
+            lambda view: as_read(sources.packs[names[view]], settings, names[view]),
             settings.lift_params,
             progress,
         )

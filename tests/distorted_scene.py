@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from liftcore.features.pack import write_pack
 from liftcore.features.views import FeatureGrid, Regions, ViewFeatures
-from liftcore.features.write_pack import write_pack
 from liftcore.io.ply import write_splats
 from liftcore.scene.distortion import Brown, Distortion, Fisheye
 from liftcore.scene.lens import Lens

@@ -59,15 +59,14 @@ def _grey(text: str) -> int:
 
 def run(options: argparse.Namespace) -> int:
     """Write the pack whole or not at all, and say what is in it."""
-    from liftcore.features.pack import open_packs
-    from liftcore.features.write_pack import write_pack
+    from liftcore.features.pack import read_features, write_pack
     from liftcore.io.inspect import describe_packs
 
     views = _views(options)
     out = free_output(options.output, views.inputs)
     with progress_bars() as progress, writing(out):
         write_pack(out, views, _metadata(options), progress)
-    packs = open_packs([out])
+    packs = read_features(out)
     described = describe_packs(packs)
     document = {
         "out": str(out),

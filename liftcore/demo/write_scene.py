@@ -31,7 +31,7 @@ def write_still_life(folder: Path, phrases: Sequence[str], scene: StillLife | No
     Raises:
         Unavailable: the sentence encoder is not installed.
     """
-    from liftcore.features.write_pack import write_pack
+    from liftcore.features.pack import write_pack
     from liftcore.io.inria import write_inria_cameras
     from liftcore.io.ply import write_splats
     from liftcore.query.encoders import open_encoder

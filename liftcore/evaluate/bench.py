@@ -143,7 +143,7 @@ def _workload(options: dict[str, Any]) -> Workload:
 
 def _real(folder: Path, channels: int, levels: int, count: int) -> Workload:
     """A scene folder with point_cloud.ply, cameras and regions.safetensors or features.safetensors."""
-    from liftcore.features.pack import open_packs, pair
+    from liftcore.features.pack import pair, read_features
     from liftcore.io.cameras import read_cameras
     from liftcore.io.ply import read_splats
 
@@ -152,10 +152,10 @@ def _real(folder: Path, channels: int, levels: int, count: int) -> Workload:
         raise InvalidInput("scene", expected="a folder with regions.safetensors", got=str(folder))
     inria = folder / "cameras.json"
     cameras = read_cameras(inria if inria.is_file() else folder)
-    features = pair(open_packs(packs[:1]), cameras)[0]
+    features = pair(read_features(*packs[:1]), cameras)[0]
     views = []
     for number, name in enumerate(features.views[:count]):
-        observed = features.observation(name)
+        observed = features[name]
         if not isinstance(observed, Regions):
             raise InvalidInput("scene", expected="a pack of region maps", got=f"grids in {packs[0].name}")
         repeats = -(-levels // observed.labels.shape[0])

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-import torch
 
 from liftcore.errors import InvalidFeatures
 from liftcore.features.folder import ViewFolder, npy_files
@@ -42,7 +41,7 @@ class ArrayViews(ViewFolder):
         grid = stored.transpose(1, 2, 0) if self.layout == "chw" else stored
         dtype = np.float16 if stored.dtype.itemsize == 2 else np.float32
         with np.errstate(over="ignore"):  # becomes infinite, and is refused as such where packs are written
-            return FeatureGrid(torch.from_numpy(grid.astype(dtype, order="C")))
+            return FeatureGrid(grid.astype(dtype, order="C"), where=f"view {view!r}")
 
 
 def array_views(folder: Path, layout: Layout = "hwc") -> ArrayViews:

@@ -5,38 +5,42 @@ codebook, the sum of the embeddings of its labels, normalised; an unlabelled lev
 row, as dense maps of summed embeddings have it, and the walk still meets no channel.
 """
 
-from __future__ import annotations
-
 from typing import Literal
 
 import numpy as np
 import torch
 
 from liftcore.errors import InvalidFeatures
-from liftcore.features.label_tuples import label_tuples
 from liftcore.features.views import NO_LABEL, Regions, ViewFeatures
 
 COMPOSITE_BYTES = 1 << 28  # of a view's codebook of tuples; real maps have some thousands of them
-_BLOCK_FLOATS = 1 << 22  # summed at once
+BLOCK_FLOATS = 1 << 22  # summed at once
 
 Levels = Literal["rows", "composite"] | int
 
 
-def at_levels(observation: ViewFeatures, levels: Levels, view: str) -> ViewFeatures:
-    """The observation as ``levels`` takes it; a grid is its own level 0.
+def at_levels(features: ViewFeatures, levels: Levels, view: str) -> ViewFeatures:
+    """The features as ``levels`` takes them; a grid is its own level 0.
 
     Args:
-        levels: "rows" as it is, "composite" one region a distinct tuple of labels, a number that level alone.
+        levels: "rows" as they are, "composite" one region a distinct tuple of labels, a number that level alone.
         view: named in an error.
 
     Raises:
         InvalidFeatures: the view lacks the level, or has more tuples of labels than there is room for.
     """
     if levels == "rows":
-        return observation
-    if levels != "composite":
-        return _one_level(observation, levels, view)
-    return composite(observation, view) if isinstance(observation, Regions) else observation
+        return features
+    if levels == "composite":
+        return composite(features, view) if isinstance(features, Regions) else features
+    count = features.labels.shape[0] if isinstance(features, Regions) else 1
+    if not 0 <= levels < count:
+        got = f"levels 0 to {count - 1}" if count > 1 else "level 0 only"
+        hint = "set levels to rows, composite or a level that every view has"
+        raise InvalidFeatures(f"view {view!r}", expected=f"level {levels}", got=got, hint=hint)
+    if not isinstance(features, Regions):
+        return features
+    return Regions.unchecked(features.labels[levels : levels + 1], features.codebook)
 
 
 def composite(regions: Regions, view: str) -> Regions:
@@ -45,49 +49,57 @@ def composite(regions: Regions, view: str) -> Regions:
     Raises:
         InvalidFeatures: their codebook would take more than COMPOSITE_BYTES.
     """
-    labels = regions.labels.to(torch.int32).contiguous().numpy()
-    numbers, tuples = label_tuples(labels, labels[0].size)
-    if not tuples.size:
-        return Regions(regions.labels[:1], regions.codebook)
-    size = tuples.shape[0] * regions.codebook[0].nbytes
+    numbers, tuples = label_tuples(regions.labels.numpy())
+    if not len(tuples):
+        return Regions.unchecked(regions.labels[:1], regions.codebook)
+    size = len(tuples) * regions.codebook[0].nbytes
     if size > COMPOSITE_BYTES:
         raise InvalidFeatures(
             f"view {view!r}", expected=f"tuples of labels whose sums take at most {COMPOSITE_BYTES >> 20} MiB",
-            got=f"{tuples.shape[0]} tuples of {regions.codebook.shape[1]} channels, {size >> 20} MiB",
+            got=f"{len(tuples)} tuples of {regions.codebook.shape[1]} channels, {size >> 20} MiB",
             hint="set levels to rows, which takes no room for tuples, or smooth the label maps",
         )  # fmt: skip
     order = np.lexsort(tuples.T[::-1])
     place = np.append(np.argsort(order), NO_LABEL).astype(np.int32)  # of each tuple; of none, which is -1, the last
-    return Regions(torch.from_numpy(place[numbers][None]), _summed(tuples[order].T, regions.codebook))
+    return Regions.unchecked(torch.from_numpy(place[numbers][None]), _unit_sums(tuples[order].T, regions.codebook))
 
 
-def _one_level(observation: ViewFeatures, level: int, view: str) -> ViewFeatures:
-    count = observation.labels.shape[0] if isinstance(observation, Regions) else 1
-    if not 0 <= level < count:
-        got = f"levels 0 to {count - 1}" if count > 1 else "level 0 only"
-        hint = "set levels to rows, composite or a level that every view has"
-        raise InvalidFeatures(f"view {view!r}", expected=f"level {level}", got=got, hint=hint)
-    if not isinstance(observation, Regions):
-        return observation
-    return Regions(observation.labels[level : level + 1], observation.codebook)
+def label_tuples(labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Number the distinct tuples of labels that pixels carry over the levels, in the order of the pixels.
+
+    Args:
+        labels: [L, h, w] i32, -1 for none.
+
+    Returns:
+        numbers [h, w] i32, -1 where no level has a label; tuples [T, L] i32.
+    """
+    flat = labels.reshape(len(labels), -1)
+    starts = np.ones(flat.shape[1], bool)  # of runs of pixels that have their neighbour's tuple: most have
+    starts[1:] = False
+    for level in flat:
+        starts[1:] |= level[1:] != level[:-1]
+    runs = flat[:, starts]
+    keys = runs[0].astype(np.int64)
+    for level in runs[1:]:  # numbered anew at each level, so that keys do not overflow
+        keys = np.unique(keys, return_inverse=True)[1] * (int(level.max()) + 2) + level + 1
+    _, first, of_run = np.unique(keys, return_index=True, return_inverse=True)
+    labelled = np.flatnonzero((runs[:, first] != NO_LABEL).any(axis=0))
+    order = labelled[np.argsort(first[labelled])]
+    number = np.full(len(first), NO_LABEL, np.int32)
+    number[order] = np.arange(len(order), dtype=np.int32)
+    lengths = np.diff(np.flatnonzero(starts), append=flat.shape[1])
+    return np.repeat(number[of_run], lengths).reshape(labels.shape[1:]), np.ascontiguousarray(runs[:, first[order]].T)
 
 
-def _summed(tuples: np.ndarray, codebook: torch.Tensor) -> torch.Tensor:
+def _unit_sums(tuples: np.ndarray, codebook: torch.Tensor) -> torch.Tensor:
     """[n, F]: the unit sums of the embeddings of each tuple [L, n], zero where they cancel; the codebook's dtype."""
     largest = codebook.abs().amax().double().clamp_min(torch.finfo(torch.float64).tiny)  # squares cannot overflow
-    sums = torch.empty(tuples.shape[1], codebook.shape[1], dtype=codebook.dtype)
-    at_a_time = max(1, _BLOCK_FLOATS // codebook.shape[1])
-    for first in range(0, sums.shape[0], at_a_time):
-        block = slice(first, first + at_a_time)
-        sums[block] = _unit_sums(tuples[:, block], codebook, largest)
-    return sums
-
-
-def _unit_sums(tuples: np.ndarray, codebook: torch.Tensor, largest: torch.Tensor) -> torch.Tensor:
-    sums = torch.zeros(tuples.shape[1], codebook.shape[1], dtype=torch.float32)
-    for level in tuples:
-        labelled = torch.from_numpy(np.flatnonzero(level != NO_LABEL))
-        rows = codebook[torch.from_numpy(level.astype(np.int64))[labelled]]
-        sums[labelled] += (rows.double() / largest).float()
-    norms = torch.linalg.vector_norm(sums.double(), dim=1, keepdim=True).clamp_min(torch.finfo(torch.float32).tiny)
-    return sums / norms
+    found = torch.empty(tuples.shape[1], codebook.shape[1], dtype=codebook.dtype)
+    for block in torch.arange(len(found)).split(max(1, BLOCK_FLOATS // codebook.shape[1])):
+        sums = torch.zeros(len(block), codebook.shape[1])
+        for level in torch.from_numpy(tuples.astype(np.int64))[:, block]:
+            labelled = level != NO_LABEL
+            sums[labelled] += (codebook[level[labelled]].double() / largest).float()
+        norms = torch.linalg.vector_norm(sums.double(), dim=1, keepdim=True)
+        found[block] = (sums / norms.clamp_min(torch.finfo(torch.float32).tiny)).to(codebook.dtype)
+    return found

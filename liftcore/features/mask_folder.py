@@ -9,8 +9,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import torch
-
 from liftcore.errors import InvalidFeatures
 from liftcore.features.folder import ViewFolder, files_below, npy_files
 from liftcore.features.label_picture import picture_labels
@@ -53,7 +51,7 @@ class MaskViews(ViewFolder):
         """
         vectors = mask_vectors(self.files[view])
         labels = _labels(self.masks[view], len(vectors), self.unlabelled)
-        return Regions(torch.from_numpy(labels), vectors)
+        return Regions(labels, vectors, where=f"view {view!r}")
 
 
 def mask_views(folder: Path, unlabelled: int = 0) -> MaskViews:

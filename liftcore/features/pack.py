@@ -1,34 +1,31 @@
-"""Feature packs: what 2D encoders saw, view by view, in one file that can be mapped and holds no code.
+"""Views of features by name: from feature packs, from values in memory or from an iterator, read alike.
 
-A pack is a ``.safetensors`` file. A view ``V`` is either regions, ``V/labels`` [L, h, w] (u8 with 255 for
-none, i16 or i32 with -1) with ``V/codebook`` [M, F], or a grid, ``V/grid`` [h, w, F].
+A feature pack is a ``.safetensors`` file of what 2D encoders saw: it can be mapped and holds no code. A view ``V``
+is either regions, ``V/labels`` [L, h, w] (u8 with 255 for none, i16 or i32 with -1) with ``V/codebook`` [M, F], or a
+grid, ``V/grid`` [h, w, F].
 """
 
-from __future__ import annotations
-
 import math
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import IO, Any, Protocol
 
 import torch
+from torch import Tensor
 
 from liftcore.errors import InvalidFeatures
-from liftcore.features.finite import check_finite
-from liftcore.features.header import check_header
-from liftcore.features.through_lens import as_pinhole_sees, grid_sides
-from liftcore.features.views import NO_LABEL, FeatureGrid, Regions, ViewFeatures
+from liftcore.features.lens import as_pinhole_sees, grid_sides
+from liftcore.features.views import MAX_CHANNELS, NO_LABEL, FeatureGrid, Regions, ViewFeatures
+from liftcore.io.safetensors_file import MAX_HEADER_BYTES, TYPES, check_header, safetensors_header, tensor_bytes
+from liftcore.io.whole_file import whole_file
+from liftcore.progress import Progress, silent
+from liftcore.scene.cameras import Camera
 from liftcore.scene.view_pairs import require_pairs
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-    from pathlib import Path
-
-    from torch import Tensor
-
-    from liftcore.scene.cameras import Camera, Cameras
-
-MAX_CHANNELS = 1 << 16
 U8_NO_LABEL = 255
+LARGEST_I16 = 32_767
 LABEL_TYPES = ("U8", "I16", "I32")
 FEATURE_TYPES = ("F16", "F32", "BF16")
 PARTS = ("labels", "codebook", "grid")
@@ -36,10 +33,281 @@ PARTS = ("labels", "codebook", "grid")
 
 @dataclass(frozen=True)
 class TensorSpec:
-    """What a header says of a tensor."""
+    """What is known of a tensor before it is read."""
 
     dtype: str  # safetensors' name: "F16"
     shape: tuple[int, ...]
+
+
+class _Source(Protocol):
+    """Where one view is."""
+
+    @property
+    def specs(self) -> Mapping[str, TensorSpec]: ...  # by part: labels and codebook, or grid
+    def read(self) -> ViewFeatures: ...
+    def part(self, part: str) -> Any: ...  # a tensor, or what can be sliced like one
+
+
+@dataclass(frozen=True, eq=False)
+class Views(Mapping[str, ViewFeatures]):
+    """View name -> `Regions` or `FeatureGrid`, names sorted; each view is read and checked when it is asked for.
+
+    Of packs, headers are checked at once. Reading a view raises InvalidFeatures where there is none of that name, a
+    label is out of the codebook, or a feature is not finite. Paired with cameras (`pair`), a view is what the
+    camera's pinhole sees.
+    """
+
+    channels: int  # F
+    encoder: str  # the 2D encoder as the packs tell it, "" when they do not
+    text_space: str  # the text encoder that shares the space; "" unknown, "none" when there is none
+    normalised: bool | None  # whether codebook rows and grid cells are unit vectors; None when not told
+    paths: tuple[Path, ...]  # the packs; () of values in memory
+    _sources: Mapping[str, _Source] = field(repr=False)
+    _cameras: Mapping[str, Camera] = field(default_factory=dict, repr=False)
+
+    @property
+    def views(self) -> tuple[str, ...]:
+        """The names, sorted."""
+        return tuple(sorted(self._sources))
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.views)
+
+    def __len__(self) -> int:
+        return len(self._sources)
+
+    def __contains__(self, view: object) -> bool:
+        return view in self._sources
+
+    def __getitem__(self, view: str) -> ViewFeatures:
+        found = self._find(view).read()
+        if found.codebook.shape[1] != self.channels:
+            got = f"{found.codebook.shape[1]} in {view!r}"
+            raise InvalidFeatures("features", expected=f"{self.channels} channels in every view", got=got)
+        return as_pinhole_sees(found, self._cameras[view]) if view in self._cameras else found
+
+    def is_regions(self, view: str) -> bool:
+        """Whether the view is a region map; else it is a grid."""
+        return "labels" in self._find(view).specs
+
+    def specs(self, view: str) -> dict[str, TensorSpec]:
+        """The tensors of a view by part (labels and codebook, or grid), from the header alone."""
+        specs = dict(self._find(view).specs)
+        camera = self._cameras.get(view)
+        if camera is None or camera.lens is None:
+            return specs
+        if "grid" in specs:
+            height, width, channels = specs["grid"].shape
+            return {"grid": replace(specs["grid"], shape=(*grid_sides(height, width, camera), channels))}
+        levels = math.prod(specs["labels"].shape[:-2])
+        return specs | {"labels": replace(specs["labels"], shape=(levels, camera.height, camera.width))}
+
+    def map_size(self, view: str) -> tuple[int, int]:
+        """Width and height of a view's labels or grid as they are stored, from the header alone."""
+        specs = self._find(view).specs
+        height, width = specs["labels"].shape[-2:] if "labels" in specs else specs["grid"].shape[:2]
+        return width, height
+
+    def sample_rows(self, view: str, count: int) -> Tensor:
+        """Some rows [n, F] of the view's codebook, ``count`` at most; nothing else of it is read or checked.
+
+        The first rows of a codebook, or evenly spaced cells of a grid as it is stored.
+        """
+        source = self._find(view)
+        if "grid" not in source.specs:
+            return source.part("codebook")[:count]
+        height, width = source.specs["grid"].shape[:2]
+        lines = _spread(height, round(count**0.5))
+        cells, grid = _spread(width, count // len(lines)), source.part("grid")
+        return torch.cat([grid[line][cells] for line in lines])
+
+    def seen_by(self, names: Mapping[str, str], cameras: Mapping[str, Camera]) -> "Views":
+        """The views that ``names`` gives the name of a camera, under it and as it sees them, and no others."""
+        sources = {name: self._find(view) for view, name in names.items()}
+        return replace(self, _sources=sources, _cameras={name: cameras[name] for name in sources})
+
+    def _find(self, view: str) -> _Source:
+        if view not in self._sources:
+            raise InvalidFeatures("view", expected="a view of the features", got=repr(view))
+        return self._sources[view]
+
+
+FeaturePacks = Views
+
+
+def as_views(
+    views: Mapping[str, ViewFeatures] | Iterable[tuple[str, ViewFeatures]], scratch: Path | None = None
+) -> Views:
+    """What `lift` reads of any views: as they are, a mapping's when they are asked for, an iterator's from the disk.
+
+    An iterator is consumed once, a view at a time: each is written to a file that has no name any more once this
+    returns, so a lift that reads views again never holds all of them.
+
+    Args:
+        views: `Views`, a mapping of names, which may read its values lazily, or pairs of a name and a value.
+        scratch: the folder for an iterator's views; None: the system's for temporary files.
+
+    Raises:
+        InvalidFeatures: there are none, one is neither regions nor a grid, a name comes twice, channels differ.
+    """
+    if isinstance(views, Views):
+        return views
+    if not isinstance(views, Mapping):
+        return _spooled(views, scratch)
+    sources = {name: _Given(views, name) for name in views}
+    if not sources:
+        raise InvalidFeatures("features", expected="at least one view", got="none")
+    if isinstance(views, dict):  # other mappings may read files: theirs are checked one by one
+        _check_channels((name, source.read()) for name, source in sources.items())
+    channels = next(iter(sources.values())).read().codebook.shape[1]
+    return Views(channels, "", "", None, (), sources)
+
+
+def read_features(*paths: str | Path) -> Views:
+    """Open feature packs as one set of views; only headers are read.
+
+    Raises:
+        InvalidFeatures: a file is no feature pack, a view is malformed or in two packs, or the packs do not
+            share their channels and their encoder.
+    """
+    packs = [_open(Path(path)) for path in paths]
+    sources: dict[str, _Stored] = {}
+    channels: dict[int, str] = {}
+    for pack in packs:
+        for view in _views(pack):
+            if view in sources:
+                got = f"{view!r} in {sources[view].pack.path} and {pack.path}"
+                raise InvalidFeatures("features", expected="each view in one pack", got=got)
+            sources[view] = _Stored(pack, view)
+            channels.setdefault(_check_specs(sources[view]), sources[view].where)
+    if not sources:
+        raise InvalidFeatures("features", expected="at least one view", got=f"{len(packs)} packs without any")
+    if len(channels) > 1:
+        (one, here), (other, there) = list(channels.items())[:2]
+        got = f"{one} in {here} and {other} in {there}"
+        raise InvalidFeatures("features", expected="the same channels in every view", got=got)
+    normalised = {"true": True, "false": False}.get(_agreed(packs, "normalised").lower())
+    encoder, text_space = _agreed(packs, "encoder"), _agreed(packs, "text_space")
+    return Views(next(iter(channels)), encoder, text_space, normalised, tuple(map(Path, paths)), sources)
+
+
+def pair(views: Views, cameras: Mapping[str, Camera]) -> tuple[Views, list[str]]:
+    """The views that have a camera, named like it, and the names of those that have none, to be skipped and told.
+
+    Raises:
+        InvalidFeatures: no view has a camera.
+    """
+    names = require_pairs(views.views, cameras)
+    return views.seen_by(names, cameras), [view for view in views if view not in names]
+
+
+def write_pack(
+    path: Path, views: Mapping[str, ViewFeatures], metadata: Mapping[str, str], progress: Progress = silent
+) -> None:
+    """Write views as a feature pack, whole or not at all.
+
+    ``views`` may read its views when they are asked for: each is asked for twice, once for its shape and once for
+    its bytes, and forgotten in between. Labels are stored as int16 where the codebook allows.
+
+    Args:
+        path: the file to write.
+        views: view name -> what it observes.
+        metadata: ``encoder``, ``text_space``, ``normalised`` ("true" or "false") and what else to keep.
+        progress: told about the stages "check" and "pack", in views.
+
+    Raises:
+        InvalidFeatures: there are no views, or their channels differ.
+    """
+    if not views:
+        raise InvalidFeatures(str(path), expected="at least one view", got="none")
+    with whole_file(path) as handle:
+        _write(handle, views, metadata, progress)
+
+
+def _write(
+    handle: IO[bytes], views: Mapping[str, ViewFeatures], metadata: Mapping[str, str], progress: Progress
+) -> None:
+    specs: list[tuple[str, torch.dtype, tuple[int, ...]]] = []
+
+    def checked() -> Iterator[tuple[str, ViewFeatures]]:
+        for done, (view, features) in enumerate(views.items(), start=1):
+            yield view, features
+            specs.extend((f"{view}/{part}", one.dtype, tuple(one.shape)) for part, one in _parts(features))
+            progress("check", done, len(views), "views")
+
+    _check_channels(checked())
+    header, offsets = safetensors_header(specs, metadata)
+    if len(header) > MAX_HEADER_BYTES:
+        raise InvalidFeatures("views", expected="fewer views in a pack", got=str(len(views)))
+    handle.write(header)
+    for done, (view, features) in enumerate(views.items(), start=1):
+        for part, tensor in _parts(features):
+            handle.seek(len(header) + offsets[f"{view}/{part}"])
+            handle.write(tensor_bytes(tensor))
+        progress("pack", done, len(views), "views")
+
+
+def _parts(features: ViewFeatures) -> Iterator[tuple[str, Tensor]]:
+    """The tensors of a view as they are stored."""
+    if isinstance(features, Regions):
+        narrow = len(features.codebook) <= LARGEST_I16
+        yield "labels", features.labels.to(torch.int16 if narrow else torch.int32)
+        yield "codebook", features.codebook
+    else:
+        yield "grid", features.grid
+
+
+def _check_channels(views: Iterable[tuple[str, ViewFeatures]]) -> None:
+    channels: dict[int, str] = {}
+    for view, features in views:
+        channels.setdefault(features.codebook.shape[1], view)
+    if len(channels) > 1:
+        got = ", ".join(f"{count} in {view!r}" for count, view in list(channels.items())[:3])
+        raise InvalidFeatures("features", expected="the same channels in every view", got=got)
+
+
+def _spooled(pairs: Iterable[tuple[str, ViewFeatures]], scratch: Path | None) -> Views:
+    with tempfile.TemporaryDirectory(dir=scratch, prefix="splatlift-views-") as folder:
+        files: dict[str, Path] = {}
+        for name, features in pairs:
+            if name in files:
+                raise InvalidFeatures("features", expected="each view once", got=f"{name!r} twice")
+            files[name] = Path(folder, f"{len(files)}.safetensors")
+            with files[name].open("wb") as handle:
+                _write(handle, {name: _Given({name: features}, name).read()}, {}, silent)
+        if not files:
+            raise InvalidFeatures("features", expected="at least one view", got="none")
+        return replace(read_features(*files.values()), paths=())  # mapped: the files may lose their names
+
+
+def _spread(length: int, count: int) -> list[int]:
+    """At most ``count`` places of so many, evenly spaced and off the ends; one at least."""
+    steps = max(1, min(count, length))
+    return [(2 * k + 1) * length // (2 * steps) for k in range(steps)]
+
+
+@dataclass(frozen=True)
+class _Given:
+    """A view of a mapping of values."""
+
+    views: Mapping[str, ViewFeatures]
+    name: str
+
+    @property
+    def specs(self) -> Mapping[str, TensorSpec]:
+        return {part: TensorSpec(TYPES[str(one.dtype)], tuple(one.shape)) for part, one in _parts(self.read())}
+
+    def read(self) -> ViewFeatures:
+        found = self.views[self.name]
+        if isinstance(found, Regions | FeatureGrid):
+            return found
+        hint = "make FeatureGrid(map [h, w, F]) or Regions(labels [L, h, w], codebook [M, F]) of arrays"
+        raise InvalidFeatures(
+            f"view {self.name!r}", expected="Regions or FeatureGrid", got=type(found).__name__, hint=hint
+        )
+
+    def part(self, part: str) -> Tensor:
+        return dict(_parts(self.read()))[part]
 
 
 @dataclass(frozen=True)
@@ -52,157 +320,39 @@ class _PackFile:
 
 @dataclass(frozen=True)
 class _Stored:
-    """Where a view is: its pack, and its name in it."""
+    """A view of a pack."""
 
     pack: _PackFile
     name: str
 
-    def has(self, part: str) -> bool:
-        return f"{self.name}/{part}" in self.pack.specs
+    @property
+    def where(self) -> str:
+        return f"{self.pack.path} view {self.name!r}"
 
-    def spec(self, part: str) -> TensorSpec:
-        return self.pack.specs[f"{self.name}/{part}"]
+    @property
+    def specs(self) -> dict[str, TensorSpec]:
+        keys = {part: f"{self.name}/{part}" for part in PARTS}
+        return {part: self.pack.specs[key] for part, key in keys.items() if key in self.pack.specs}
 
-    def where(self, part: str) -> str:
-        return f"{self.pack.path} view {self.name!r} {part}"
+    def part(self, part: str) -> Any:
+        return self.pack.handle.get_slice(f"{self.name}/{part}")
 
-
-@dataclass(frozen=True)
-class FeaturePacks:
-    """One or more packs that make one set of views. Headers are checked; tensors are read when asked for."""
-
-    views: tuple[str, ...]  # sorted
-    channels: int  # F
-    encoder: str  # the 2D encoder as the packs tell it, "" when they do not
-    text_space: str  # the text encoder that shares the space; "" unknown, "none" when there is none
-    normalised: bool | None  # whether codebook rows and grid cells are unit vectors; None when not told
-    paths: tuple[Path, ...]
-    _stored: Mapping[str, _Stored]
-    _cameras: Mapping[str, Camera] = field(default_factory=dict)  # of views that are seen as their pinholes see them
-
-    def is_regions(self, view: str) -> bool:
-        """Whether the view is a region map; else it is a grid."""
-        return self._find(view).has("labels")
-
-    def specs(self, view: str) -> dict[str, TensorSpec]:
-        """The tensors of a view's observation by part (labels, codebook, grid), from the header alone."""
-        stored = self._find(view)
-        specs = {part: stored.spec(part) for part in PARTS if stored.has(part)}
-        camera = self._cameras.get(view)
-        if camera is None or camera.lens is None:
-            return specs
-        if "grid" in specs:
-            height, width, channels = specs["grid"].shape
-            return {"grid": replace(specs["grid"], shape=(*grid_sides(height, width, camera), channels))}
-        levels = math.prod(specs["labels"].shape[:-2])
-        labels = replace(specs["labels"], shape=(levels, camera.height, camera.width))
-        return specs | {"labels": labels}
-
-    def map_size(self, view: str) -> tuple[int, int]:
-        """Width and height of a view's labels or grid as they lie in the file, from the header alone."""
-        stored = self._find(view)
-        height, width = stored.spec("labels").shape[-2:] if stored.has("labels") else stored.spec("grid").shape[:2]
-        return width, height
-
-    def observation(self, view: str) -> ViewFeatures:
-        """Read and check one view; of packs that were paired with cameras as its pinhole sees it.
-
-        Raises:
-            InvalidFeatures: no such view, a label out of the codebook, or a feature that is not finite.
-        """
-        stored = self._find(view)
-        if stored.has("labels"):
-            codebook = _features(stored, "codebook")
-            found = Regions(_labels(stored, rows=codebook.shape[0]), codebook)
-        else:
-            found = FeatureGrid(_features(stored, "grid"))
-        return as_pinhole_sees(found, self._cameras[view]) if view in self._cameras else found
-
-    def sample_rows(self, view: str, count: int) -> Tensor:
-        """Some rows [n, F] of the view's codebook, ``count`` at most; nothing else of it is read or checked.
-
-        The first rows of a codebook, or evenly spaced cells of a grid as it lies in the file.
-        """
-        part = "codebook" if self.is_regions(view) else "grid"
-        found = self._find(view)
-        stored = found.pack.handle.get_slice(f"{found.name}/{part}")
-        if part == "codebook":
-            return stored[:count]
-        height, width = found.spec(part).shape[:2]
-        lines = _spread(height, round(count**0.5))
-        cells = _spread(width, count // len(lines))
-        return torch.cat([stored[line][cells] for line in lines])
-
-    def seen_by(self, names: Mapping[str, str], cameras: Mapping[str, Camera]) -> FeaturePacks:
-        """The views that ``names`` gives the name of a camera, under it and as it sees them, and no others."""
-        stored = {name: self._find(view) for view, name in names.items()}
-        used = {name: cameras[name] for name in stored}
-        return replace(self, views=tuple(sorted(stored)), _stored=stored, _cameras=used)
-
-    def _find(self, view: str) -> _Stored:
-        if view not in self._stored:
-            raise InvalidFeatures("view", expected="a view of the feature packs", got=repr(view))
-        return self._stored[view]
-
-
-def open_packs(paths: Sequence[Path]) -> FeaturePacks:
-    """Open packs as one; only headers are read.
-
-    Raises:
-        InvalidFeatures: a file is no feature pack, a view is malformed or in two packs, or the packs do not
-            share their channels and their encoder.
-    """
-    files: dict[str, _PackFile] = {}
-    channels: dict[int, str] = {}
-    packs = [_open(path) for path in paths]
-    for pack in packs:
-        for view in _views(pack):
-            if view in files:
-                got = f"{view!r} in {files[view].path} and {pack.path}"
-                raise InvalidFeatures("features", expected="each view in one pack", got=got)
-            channels.setdefault(_check_view(pack, view), f"{pack.path} view {view!r}")
-            files[view] = pack
-    if not files:
-        raise InvalidFeatures("features", expected="at least one view", got=f"{len(packs)} packs without any")
-    if len(channels) > 1:
-        (one, here), (other, there) = list(channels.items())[:2]
-        got = f"{one} in {here} and {other} in {there}"
-        raise InvalidFeatures("features", expected="the same channels in every view", got=got)
-    normalised = _agreed(packs, "normalised").lower()
-    return FeaturePacks(
-        views=tuple(sorted(files)),
-        channels=next(iter(channels)),
-        encoder=_agreed(packs, "encoder"),
-        text_space=_agreed(packs, "text_space"),
-        normalised={"true": True, "false": False}.get(normalised),
-        paths=tuple(paths),
-        _stored={view: _Stored(pack, view) for view, pack in files.items()},
-    )
-
-
-def pair(packs: FeaturePacks, cameras: Cameras) -> tuple[FeaturePacks, list[str]]:
-    """The views that have a camera, named like it, and the names of those that have none, to be skipped and told.
-
-    Raises:
-        InvalidFeatures: no view has a camera.
-    """
-    names = require_pairs(packs.views, cameras)
-    return packs.seen_by(names, cameras), [view for view in packs.views if view not in names]
-
-
-def _spread(length: int, count: int) -> list[int]:
-    """At most ``count`` places of so many, evenly spaced and off the ends; one at least."""
-    steps = max(1, min(count, length))
-    return [(2 * k + 1) * length // (2 * steps) for k in range(steps)]
+    def read(self) -> ViewFeatures:
+        tensor = self.pack.handle.get_tensor
+        if "grid" in self.specs:
+            return FeatureGrid(tensor(f"{self.name}/grid"), where=self.where)
+        stored = tensor(f"{self.name}/labels")
+        labels = stored.to(torch.int32)
+        if stored.dtype == torch.uint8:
+            labels[stored == U8_NO_LABEL] = NO_LABEL
+        return Regions(labels, tensor(f"{self.name}/codebook"), where=self.where)
 
 
 def _open(path: Path) -> _PackFile:
     from safetensors import SafetensorError, safe_open
 
-    check_header(
-        path, str(path), InvalidFeatures, expected="a feature pack (.safetensors)",
-        hint="make packs with 'splatlift pack'",
-    )  # fmt: skip
+    expected, hint = "a feature pack (.safetensors)", "make packs with 'splatlift pack'"
+    check_header(path, str(path), InvalidFeatures, expected=expected, hint=hint)
     try:
         handle: Any = safe_open(str(path), framework="pt")
         slices = {name: handle.get_slice(name) for name in tuple(handle.keys())}
@@ -210,7 +360,7 @@ def _open(path: Path) -> _PackFile:
         return _PackFile(path, handle, specs, handle.metadata() or {})
     except (SafetensorError, OSError) as error:
         got = f"a file that does not open as one ({str(error)[:120]})"
-        raise InvalidFeatures(str(path), expected="a feature pack (.safetensors)", got=got) from None
+        raise InvalidFeatures(str(path), expected=expected, got=got) from None
 
 
 def _views(pack: _PackFile) -> list[str]:
@@ -225,25 +375,21 @@ def _views(pack: _PackFile) -> list[str]:
     return list(views)
 
 
-def _check_view(pack: _PackFile, view: str) -> int:
+def _check_specs(stored: _Stored) -> int:
     """Check the header of one view; its channels."""
-    parts = {part: pack.specs[f"{view}/{part}"] for part in PARTS if f"{view}/{part}" in pack.specs}
-    where = f"{pack.path} view {view!r}"
-    if set(parts) not in ({"grid"}, {"labels", "codebook"}):
-        raise InvalidFeatures(where, expected="labels with a codebook, or a grid", got=" with ".join(parts))
-    if "grid" in parts:
-        return _check_tensor(parts["grid"], FEATURE_TYPES, "h w F", f"{where} grid")[-1]
-    labels = parts["labels"]
-    _check_tensor(labels, LABEL_TYPES, "h w" if len(labels.shape) == 2 else "L h w", f"{where} labels")
-    return _check_tensor(parts["codebook"], FEATURE_TYPES, "M F", f"{where} codebook")[-1]
-
-
-def _check_tensor(spec: TensorSpec, types: tuple[str, ...], axes: str, where: str) -> tuple[int, ...]:
-    fits = len(spec.shape) == len(axes.split()) and all(spec.shape) and spec.dtype in types
-    if not fits or (axes.endswith("F") and spec.shape[-1] > MAX_CHANNELS):
-        expected = f"{' or '.join(types)} [{axes.replace(' ', ', ')}], no side empty"
-        raise InvalidFeatures(where, expected=expected, got=f"{spec.dtype} {list(spec.shape)}")
-    return spec.shape
+    specs = stored.specs
+    if set(specs) not in ({"grid"}, {"labels", "codebook"}):
+        raise InvalidFeatures(stored.where, expected="labels with a codebook, or a grid", got=" with ".join(specs))
+    axes = {"grid": "h w F", "codebook": "M F", "labels": "L h w"}
+    for part, spec in specs.items():
+        wanted = "h w" if part == "labels" and len(spec.shape) == 2 else axes[part]
+        types = LABEL_TYPES if part == "labels" else FEATURE_TYPES
+        fits = len(spec.shape) == len(wanted.split()) and all(spec.shape) and spec.dtype in types
+        if not fits or (part != "labels" and spec.shape[-1] > MAX_CHANNELS):
+            expected = f"{' or '.join(types)} [{wanted.replace(' ', ', ')}], no side empty"
+            got = f"{spec.dtype} {list(spec.shape)}"
+            raise InvalidFeatures(f"{stored.where} {part}", expected=expected, got=got)
+    return specs["grid" if "grid" in specs else "codebook"].shape[-1]
 
 
 def _agreed(packs: Sequence[_PackFile], key: str) -> str:
@@ -254,27 +400,3 @@ def _agreed(packs: Sequence[_PackFile], key: str) -> str:
         hint = "features of different spaces cannot make one lift"
         raise InvalidFeatures("features", expected=f"one {key} in all packs", got=got, hint=hint)
     return next(iter(told), "")
-
-
-def _features(stored: _Stored, part: str) -> Tensor:
-    """[.., F] f16 or f32, finite."""
-    values: Tensor = stored.pack.handle.get_tensor(f"{stored.name}/{part}")
-    values = values.float() if values.dtype == torch.bfloat16 else values
-    check_finite(values, stored.where(part))
-    return values
-
-
-def _labels(stored: _Stored, rows: int) -> Tensor:
-    """[L, h, w] i32 with -1 for none, all below ``rows``."""
-    raw: Tensor = stored.pack.handle.get_tensor(f"{stored.name}/labels")
-    labels = raw.to(torch.int32)
-    if raw.dtype == torch.uint8:
-        labels[raw == U8_NO_LABEL] = NO_LABEL
-    low, high = (int(value) for value in torch.aminmax(labels))
-    if low < NO_LABEL or high >= rows:
-        raise InvalidFeatures(
-            stored.where("labels"),
-            expected=f"rows of its codebook (0..{rows - 1}) or {NO_LABEL} for none",
-            got=f"the label {low if low < NO_LABEL else high}",
-        )
-    return labels if labels.ndim == 3 else labels[None]

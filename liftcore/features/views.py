@@ -4,39 +4,88 @@ S is never built. A region map says for every pixel which codebook row each leve
 read by bilinear interpolation, four rows a pixel.
 """
 
-from __future__ import annotations
+import warnings
+from dataclasses import InitVar, dataclass
+from typing import Self
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+import numpy as np
+import torch
+from torch import Tensor
 
-if TYPE_CHECKING:
-    from torch import Tensor
+from liftcore.errors import InvalidFeatures
 
 NO_LABEL = -1  # a pixel that a level leaves unlabelled
+LARGEST = 1e15  # of a feature; float32 sums of squares over all channels stay finite far beyond
+MAX_CHANNELS = 1 << 16
+INTEGERS = (torch.int32, torch.int16, torch.int64, torch.int8, torch.uint8)
+FLOATS = (torch.float16, torch.float32, torch.float64, torch.bfloat16)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Regions:
     """Regions with one embedding each; every labelled level of a ray is a row of its own.
 
     The map may have another size than the image: pixel (x, y) of a W x H image reads
     ``labels[:, floor((y + 0.5) h / H), floor((x + 0.5) w / W)]``.
+
+    Args:
+        labels: [L, h, w], or [h, w] for one level, of integers: rows of the codebook, -1 for none.
+        codebook: [M, F] of floats; float16 and float32 stay as they are, others become float32.
+        where: what errors name before the argument.
+
+    Both come from numpy or torch, on the CPU or a card, without a copy where type and order allow.
+
+    Raises:
+        InvalidFeatures: another shape or type, a label out of the codebook, or a value that is not finite.
     """
 
-    labels: Tensor  # [L, h, w] i32, rows of the codebook, -1 = none
+    labels: Tensor  # [L, h, w] i32
     codebook: Tensor  # [M, F] f16 or f32
+    where: InitVar[str] = ""
+
+    def __post_init__(self, where: str) -> None:
+        codebook = _features(self.codebook, "M, F", f"{where} codebook".strip())
+        labels = _labels(self.labels, len(codebook), f"{where} labels".strip())
+        object.__setattr__(self, "codebook", codebook)
+        object.__setattr__(self, "labels", labels)
+
+    @classmethod
+    def unchecked(cls, labels: Tensor, codebook: Tensor) -> Self:
+        """Regions of tensors that are right by how they were made."""
+        made = object.__new__(cls)
+        object.__setattr__(made, "labels", labels)
+        object.__setattr__(made, "codebook", codebook)
+        return made
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FeatureGrid:
     """A dense feature map, read bilinearly with half-pixel centres and clamped borders.
 
     Pixel (x, y) of a W x H image samples the grid at ``u = (x + 0.5) w / W - 0.5`` and
     ``v = (y + 0.5) h / H - 0.5``, clamped to the grid (``align_corners=False``).
     Cell (r, c) is codebook row ``r * w + c``.
+
+    Args:
+        grid: [h, w, F] of floats, as the codebook of `Regions`. Maps [F, h, w] of torch are ``permute(1, 2, 0)``.
+        where: what errors name before the argument.
+
+    Raises:
+        InvalidFeatures: another shape or type, or a value that is not finite.
     """
 
     grid: Tensor  # [h, w, F] f16 or f32
+    where: InitVar[str] = ""
+
+    def __post_init__(self, where: str) -> None:
+        object.__setattr__(self, "grid", _features(self.grid, "h, w, F", f"{where} grid".strip()))
+
+    @classmethod
+    def unchecked(cls, grid: Tensor) -> Self:
+        """A grid of a tensor that is right by how it was made."""
+        made = object.__new__(cls)
+        object.__setattr__(made, "grid", grid)
+        return made
 
     @property
     def codebook(self) -> Tensor:
@@ -45,3 +94,64 @@ class FeatureGrid:
 
 
 ViewFeatures = Regions | FeatureGrid
+
+
+def check_finite(values: Tensor, where: str) -> None:
+    """Refuse NaN, infinity, and what no encoder gives and whose squares would be infinite.
+
+    Raises:
+        InvalidFeatures: some value is not finite or too large; the error says where and how many.
+    """
+    # The extremes carry NaN and infinity along, and cost a tenth of testing every value.
+    low, high = torch.aminmax(values) if values.numel() else (torch.zeros(()), torch.zeros(()))
+    if not (float(low) >= -LARGEST and float(high) <= LARGEST):  # in float64: float16 would take the bound for inf
+        bad = int((~(values.float().abs() <= LARGEST)).sum())
+        got = f"{bad} of {values.numel()} that are NaN, infinite or larger"
+        raise InvalidFeatures(where, expected=f"finite values within +-{LARGEST:g}", got=got)
+
+
+def _tensor(values: object) -> Tensor:
+    """A tensor over the same memory where torch can have it; a mapped file or a reversed array is copied."""
+    if isinstance(values, Tensor):
+        return values.detach()
+    array = np.asarray(values)
+    if not array.dtype.isnative:
+        array = array.astype(array.dtype.newbyteorder("="))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of arrays that must not be written to: nobody does
+        return torch.from_numpy(np.ascontiguousarray(array))
+
+
+def _features(values: object, axes: str, where: str) -> Tensor:
+    """[.., F] f16 or f32, contiguous and finite."""
+    try:
+        found = _tensor(values)
+    except (TypeError, ValueError):
+        raise InvalidFeatures(where, expected=f"floats [{axes}]", got=type(values).__name__) from None
+    fits = found.ndim == len(axes.split()) and found.numel() and found.dtype in FLOATS
+    if not fits or found.shape[-1] > MAX_CHANNELS:
+        hint = f"at most {MAX_CHANNELS} channels, no side empty"
+        raise InvalidFeatures(where, expected=f"floats [{axes}]", got=_kind(found), hint=hint)
+    found = found if found.dtype in (torch.float16, torch.float32) else found.float()
+    check_finite(found, where)
+    return found.contiguous()
+
+
+def _labels(values: object, rows: int, where: str) -> Tensor:
+    """[L, h, w] i32, contiguous, each -1 or below ``rows``."""
+    try:
+        found = _tensor(values)
+    except (TypeError, ValueError):
+        raise InvalidFeatures(where, expected="integers [L, h, w]", got=type(values).__name__) from None
+    if found.ndim not in (2, 3) or not found.numel() or found.dtype not in INTEGERS:
+        raise InvalidFeatures(where, expected="integers [L, h, w], no side empty", got=_kind(found))
+    low, high = (int(value) for value in torch.aminmax(found))
+    if low < NO_LABEL or high >= rows:
+        expected = f"rows of its codebook (0..{rows - 1}) or {NO_LABEL} for none"
+        got = f"the label {low if low < NO_LABEL else high}"
+        raise InvalidFeatures(where, expected=expected, got=got)
+    return found.to(torch.int32).reshape(-1, *found.shape[-2:]).contiguous()
+
+
+def _kind(tensor: Tensor) -> str:
+    return f"{str(tensor.dtype).removeprefix('torch.')} {list(tensor.shape)}"

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from liftcore.errors import InvalidInput, InvalidTable
-from liftcore.features.masks import describe_masks
-from liftcore.features.pack import open_packs
+from liftcore.features.pack import read_features
 from liftcore.features.views import NO_LABEL, Regions
+from liftcore.io.class_masks import describe_masks
 from liftcore.io.inspect_scene import inspect_file as inspect_scene
 from liftcore.io.inspect_scene import is_splats
 from liftcore.query.encoders.words import plain
@@ -50,7 +50,7 @@ def inspect_file(path: Path) -> dict[str, Any]:
         return {"kind": "table", "bytes": size, **describe_table(path)}
     if any(key.endswith("/mask") for key in keys):
         return {"kind": "masks", "bytes": size, **describe_masks(path)}
-    return {"kind": "features", "bytes": size, **describe_packs(open_packs([path]))}
+    return {"kind": "features", "bytes": size, **describe_packs(read_features(path))}
 
 
 def _looks_like_safetensors(path: Path) -> bool:
@@ -72,7 +72,7 @@ def _keys(path: Path) -> tuple[set[str], dict[str, str]]:
 
 def describe_packs(packs: FeaturePacks) -> dict[str, Any]:
     """Read every view: counts, ranges and warnings of feature packs."""
-    found = [_describe_view(packs.observation(view), packs.is_regions(view)) for view in packs.views]
+    found = [_describe_view(packs[view], packs.is_regions(view)) for view in packs.views]
     regions = [view for view in found if view["regions"]]
     low = min((view["norms"][0] for view in found if view["norms"]), default=0.0)
     high = max((view["norms"][1] for view in found if view["norms"]), default=0.0)

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import torch
-
 from liftcore.errors import InvalidFeatures
 from liftcore.features.folder import ViewFolder, npy_files
 from liftcore.features.mask_ids import mask_ids
@@ -38,7 +36,7 @@ class LangSplatViews(ViewFolder):
         labels_file = self.files[view]
         codebook = mask_vectors(_codebook_file(labels_file))
         labels = mask_ids(open_npy(labels_file), len(codebook), labels_file)
-        return Regions(torch.from_numpy(labels), codebook)
+        return Regions(labels, codebook, where=f"view {view!r}")
 
 
 def langsplat_views(folder: Path) -> LangSplatViews:

@@ -1,34 +1,86 @@
-"""Safetensors files written whole or not at all, their tensors one by one, with no copy in memory."""
+"""Safetensors files: looked at before a reader parses them, and written whole, with no copy in memory.
 
-from __future__ import annotations
+Torch is imported only where tensors are written, so that processes without it can look at files.
+"""
 
 import json
-from typing import TYPE_CHECKING
+import math
+import struct
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-import torch
-
+from liftcore.errors import InvalidInput
 from liftcore.io.whole_file import whole_file
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
-    from pathlib import Path
-
+    import torch
     from torch import Tensor
 
     Spec = tuple[str, torch.dtype, tuple[int, ...]]  # a tensor's name, type and shape
 
 TYPES = {
-    torch.float64: "F64",
-    torch.int64: "I64",
-    torch.float32: "F32",
-    torch.int32: "I32",
-    torch.float16: "F16",
-    torch.int16: "I16",
-    torch.bool: "BOOL",
+    "torch.float64": "F64",
+    "torch.int64": "I64",
+    "torch.float32": "F32",
+    "torch.int32": "I32",
+    "torch.float16": "F16",
+    "torch.int16": "I16",
+    "torch.bool": "BOOL",
 }
+MAX_HEADER_BYTES = 32 * 1024 * 1024
+_START = 9  # bytes: the header's length, and the brace that it begins with
 
 
-def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
+def check_header(path: Path, name: str, fault: type[InvalidInput], *, expected: str, hint: str = "") -> None:
+    """Refuse what is no safetensors file, headers of absurd length, and those that say a name twice.
+
+    Args:
+        path: the file.
+        name: what errors call it.
+        fault: what is raised.
+        expected: what the file should have been.
+        hint: how to make one.
+    """
+    try:
+        with path.open("rb") as handle:
+            start = handle.read(_START)
+    except OSError as error:
+        got = "a folder" if path.is_dir() else f"a file that does not open ({error.strerror})"
+        raise fault(name, expected=expected, got=got, hint=hint) from None
+    length = struct.unpack("<Q", start[:8])[0] if len(start) == _START else 0
+    # A header may be as long as such a signature reads as a number: 640 bytes are b"\x80\x02". Then it is JSON.
+    signed = start[:2] in (b"PK", b"\x80\x02") and not (start[8:] == b"{" and length <= MAX_HEADER_BYTES)
+    if signed or path.suffix.lower() in (".pt", ".pth", ".pkl"):
+        raise fault(
+            name,
+            expected=expected,
+            got="a Python pickle or a zip, which may run code when it is opened",
+            hint="save its arrays as .npy files ('splatlift pack npy' makes packs of those), or as safetensors",
+        )
+    if len(start) < _START or start[8:] != b"{":
+        got = f"a file that begins with {start!r}" if start else "an empty file"
+        raise fault(name, expected=expected, got=got, hint=hint)
+    if length > MAX_HEADER_BYTES:
+        raise fault(name, expected=f"a header of at most {MAX_HEADER_BYTES} bytes", got=f"{length} bytes")
+    _check_names(path, name, fault, length)
+
+
+def _check_names(path: Path, name: str, fault: type[InvalidInput], length: int) -> None:
+    """Refuse headers that say a name twice, of which each reader believes another; safetensors refuses bad JSON."""
+
+    def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        if len(dict(pairs)) < len(pairs):
+            raise fault(name, expected="a header that says each name once", got="one twice")
+        return dict(pairs)
+
+    with path.open("rb") as handle, suppress(ValueError, RecursionError):
+        handle.seek(8)
+        json.loads(handle.read(length), object_pairs_hook=once)
+
+
+def write_tensors(path: Path, tensors: "Mapping[str, Tensor]", metadata: Mapping[str, str]) -> None:
     """Write tensors of any strides and place."""
     specs = [(name, tensor.dtype, tuple(tensor.shape)) for name, tensor in tensors.items()]
     header, offsets = safetensors_header(specs, metadata)
@@ -39,7 +91,7 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[s
             handle.write(tensor_bytes(tensors[name]))
 
 
-def safetensors_header(specs: Iterable[Spec], metadata: Mapping[str, str]) -> tuple[bytes, dict[str, int]]:
+def safetensors_header(specs: "Iterable[Spec]", metadata: Mapping[str, str]) -> tuple[bytes, dict[str, int]]:
     """The bytes before the first tensor, and where each tensor begins behind them."""
     header: dict[str, object] = {"__metadata__": dict(metadata)}
     offsets: dict[str, int] = {}
@@ -47,15 +99,17 @@ def safetensors_header(specs: Iterable[Spec], metadata: Mapping[str, str]) -> tu
     # Wide types first keeps every tensor aligned to its own width, which a mapping needs.
     for key, dtype, shape in sorted(specs, key=lambda spec: -spec[1].itemsize):
         offsets[key] = end
-        end += torch.Size(shape).numel() * dtype.itemsize
-        header[key] = {"dtype": TYPES[dtype], "shape": shape, "data_offsets": (offsets[key], end)}
+        end += math.prod(shape) * dtype.itemsize
+        header[key] = {"dtype": TYPES[str(dtype)], "shape": shape, "data_offsets": (offsets[key], end)}
     text = json.dumps(header, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 8)
     return len(text).to_bytes(8, "little") + text, offsets
 
 
-def tensor_bytes(tensor: Tensor) -> memoryview:
+def tensor_bytes(tensor: "Tensor") -> memoryview:
     """A tensor's bytes in row order, without a copy where it lies so already; from a card, if it lies there."""
+    import torch
+
     if not tensor.numel():  # an empty one of numpy's may have strides of zero, of which torch makes no bytes
         return memoryview(b"")
     return tensor.cpu().contiguous().flatten().view(torch.uint8).numpy().data

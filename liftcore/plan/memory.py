@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from liftcore.errors import Unavailable
-from liftcore.features.through_lens import kept_bytes
+from liftcore.features.lens import kept_bytes
 from liftcore.raster.constants import TILE
 from liftcore.raster.cpu.kernels import RECORDS
 from liftcore.solve.channels import BLOCK

@@ -134,7 +134,7 @@ def _observation(scene: QueryScene, example: Region) -> Regions:
     view = cameras_of_views([example.view], packs.views).get(example.view)  # named as the pack or its camera is
     if view is None:
         raise NotFound(str(example), expected="a view of the lift's feature packs", got=repr(example.view))
-    observation = packs.observation(view)
+    observation = packs[view]
     if not isinstance(observation, Regions):
         hint = "ask by a pixel, VIEW:x,y"
         raise InvalidQuery(str(example), expected="a view with regions", got="a feature grid", hint=hint)

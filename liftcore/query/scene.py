@@ -150,11 +150,11 @@ class QueryScene:
         Raises:
             InvalidLift: a pack moved, or is another than the one that was lifted.
         """
-        from liftcore.features.pack import open_packs
+        from liftcore.features.pack import read_features
 
         files = zip(self.lift.metadata.features, self._packs_at, strict=True)
         moved = [file.model_copy(update={"path": str(path)}) for file, path in files]
-        return open_packs([unchanged("features", file, self.path) for file in moved])
+        return read_features(*(unchanged("features", file, self.path) for file in moved))
 
     def find_packs(self, paths: Sequence[Path]) -> None:
         """Say where the feature packs lie now, when they moved since the lift; in the lift's order."""

@@ -2,7 +2,7 @@
 
 Splats are drawn by pinholes, so a camera with a lens has the pinhole of the same place, pose and focal lengths
 whose image is the largest upright rectangle all of which the photo shows: what gsplat and nerfstudio train on.
-Features of the photo are carried to it (`liftcore.features.through_lens`), and pictures of answers are drawn by a
+Features of the photo are carried to it (`liftcore.features.lens`), and pictures of answers are drawn by a
 wider one, which sees all that the photo shows, and carried to the photo's pixels (`liftcore.query.in_photo`).
 """
 

@@ -73,7 +73,7 @@ def as_read(observation: ViewFeatures, settings: LiftSettings, view: str) -> Vie
         return observation
     rows, columns = observation.grid.shape[:2]
     cells = torch.arange(rows * columns, dtype=torch.int32).reshape(1, rows, columns)
-    return Regions(cells, observation.codebook)
+    return Regions.unchecked(cells, observation.codebook)
 
 
 @one_thread()
@@ -100,7 +100,7 @@ def accumulate(
     def looks() -> Iterator[ViewRequest]:
         rays = -(-settings.certificate_rays // len(views))
         for number, name in enumerate(views):
-            camera, observation = cameras[name], as_read(packs.observation(name), settings, name)
+            camera, observation = cameras[name], as_read(packs[name], settings, name)
             walk = strided_walk(settings.lift_params, settings, camera, number)
             pixels = sample_pixels(camera, rays, (settings.seed, number), walk)
             readouts.append(read_pixels(observation, camera, pixels))

@@ -125,7 +125,7 @@ def filter_regions(
     kept = KeptRegions(np.zeros((clustering.count, channels)), np.zeros(clustering.count, np.int64))
     walk = settings.render_params
     for number, name in enumerate(names):
-        observation = masks_of(packs.observation(name), settings, name)
+        observation = masks_of(packs[name], settings, name)
         if isinstance(observation, Regions):
             kappa = raster.strongest_labels(cameras[name], clustering.labels, walk).numpy()
             rows = observation.codebook.shape[0]

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch.nn.functional import embedding_bag
 
-from liftcore.features.label_tuples import label_tuples
+from liftcore.features.levels import label_tuples
 from liftcore.features.views import NO_LABEL, Regions, ViewFeatures
 
 if TYPE_CHECKING:
@@ -96,8 +96,8 @@ def by_tuples(observation: ViewFeatures) -> tuple[ViewFeatures, Columns]:
         return observation, columns
     most = observation.labels.shape[0] * columns.count
     labels = observation.labels.to(torch.int32).contiguous().numpy()
-    numbers, tuples = label_tuples(labels, min(most, labels[0].size))
+    numbers, tuples = label_tuples(labels)
     if not 0 < tuples.shape[0] <= most:
         return observation, columns
-    regions = Regions(torch.from_numpy(numbers)[None], observation.codebook.new_empty(tuples.shape[0], 0))
+    regions = Regions.unchecked(torch.from_numpy(numbers)[None], observation.codebook.new_empty(tuples.shape[0], 0))
     return regions, replace(columns, tuples=torch.from_numpy(tuples))

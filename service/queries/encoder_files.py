@@ -13,7 +13,7 @@ from typing import Any
 from safetensors import SafetensorError, safe_open
 
 from liftcore.errors import InvalidInput
-from liftcore.features.header import check_header
+from liftcore.io.safetensors_file import check_header
 from liftcore.query.encoders.specs import ENCODER_SPECS
 from service.errors import Misconfigured
 from service.settings import ServiceSettings, encoder_file, encoder_label

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from liftcore.errors import InvalidCameras, InvalidInput, SplatliftError
-from liftcore.features.masks import describe_masks
-from liftcore.features.pack import open_packs
+from liftcore.features.pack import read_features
+from liftcore.io.class_masks import describe_masks
 from liftcore.io.inspect import describe_packs, describe_table
 from liftcore.io.inspect_scene import describe_camera_file, describe_splats
 from liftcore.io.ply import read_splats
@@ -47,7 +47,7 @@ def check_cameras(path: Path) -> dict[str, Any]:
 
 def check_features(path: Path) -> dict[str, Any]:
     """Read and describe every observation."""
-    return {"suffix": ".safetensors", "found": describe_packs(open_packs([path]))}
+    return {"suffix": ".safetensors", "found": describe_packs(read_features(path))}
 
 
 def check_masks(path: Path) -> dict[str, Any]:

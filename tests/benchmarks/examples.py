@@ -90,7 +90,7 @@ def objects_of(truth: Tabletop) -> Iterator[Case]:
 def regions_of(scene: QueryScene, level: int) -> Iterator[Case]:
     """The regions of a level of every third view, and where their own views show them."""
     for view in scene.lift.metadata.views[::3]:
-        camera, observed = scene.cameras[view], scene.packs.observation(view)
+        camera, observed = scene.cameras[view], scene.packs[view]
         assert isinstance(observed, Regions)
         labels = torch.as_tensor(observed.labels[level]).float()[None, None]
         size = (camera.height, camera.width)

@@ -25,9 +25,8 @@ from torch.nn.functional import cosine_similarity, normalize
 from liftcore.errors import SplatliftError
 from liftcore.evaluate.accuracy import mask_iou, splat_accuracy, view_cosines
 from liftcore.evaluate.synthetic import room_cameras, room_splats
-from liftcore.features.pack import FeaturePacks, open_packs, pair
+from liftcore.features.pack import FeaturePacks, pair, read_features, write_pack
 from liftcore.features.views import NO_LABEL, Regions, ViewFeatures
-from liftcore.features.write_pack import write_pack
 from liftcore.io.cameras import read_cameras
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.lift_file import LiftResult
@@ -62,7 +61,7 @@ class Subject:
 
     def open(self, name: str, cameras: Cameras) -> FeaturePacks:
         """A pack, its views paired with the cameras."""
-        return pair(open_packs([self.folder / f"{name}.safetensors"]), cameras)[0]
+        return pair(read_features(self.folder / f"{name}.safetensors"), cameras)[0]
 
     def lift(
         self,
@@ -145,10 +144,7 @@ def fidelity(subject: Subject) -> Rows:
                 if subject.packs(name):
                     packs, walk = subject.open(name, known), made.metadata.settings.render_params
                     views = packs.views[:: subject.every]
-                    cosines = [
-                        view_cosines(raster, known[view], packs.observation(view), made.features, walk)
-                        for view in views
-                    ]
+                    cosines = [view_cosines(raster, known[view], packs[view], made.features, walk) for view in views]
                     row |= {f"{key}views": len(views), f"{key}cosine": float(np.concatenate(cosines).mean())}
             yield row
 
@@ -186,7 +182,7 @@ def mask_noise(subject: Subject) -> Rows:
     """Wrong masks: a growing share of exact regions merged, mislabelled or dropped; the same for all methods."""
     truth = Tabletop(subject.folder)
     packs = subject.open("features_clean", truth.cameras)
-    seen = {name: packs.observation(name) for name in packs.views}
+    seen = {name: packs[name] for name in packs.views}
     maps = {name: observed for name, observed in seen.items() if isinstance(observed, Regions)}
     methods: dict[str, dict[str, Any]] = {
         "row-sum": {"preset": "row-sum"},
@@ -329,13 +325,13 @@ def overfitting(subject: Subject) -> Rows:
     are exactly the class scores of the full solutions, at the cost of 14 channels.
     """
     scene = Tabletop(subject.folder)
-    packs = open_packs([subject.folder / "features_hard.safetensors"])
+    packs = read_features(subject.folder / "features_hard.safetensors")
     names = packs.views[:: subject.every]
     rays = AllRays(
         scene.raster,
         scene.raster.splats.count,
         [scene.cameras[name] for name in names],
-        lambda view: scored(packs.observation(names[view]), scene.classes),
+        lambda view: scored(packs[names[view]], scene.classes),
         CompositingParams(),
     )
     truth = Truth(scene.classes, scene.objects, scene.counted & torch.from_numpy(rays.row_sums > 0))

@@ -18,7 +18,7 @@ from typing import Any
 from liftcore.device import choose_device
 from liftcore.evaluate.anonymous_memory import PAUSE, Most, anonymous_bytes
 from liftcore.evaluate.hardware import peak_memory
-from liftcore.features.pack import open_packs
+from liftcore.features.pack import read_features
 from liftcore.io.lift_file import save_lift
 from liftcore.lift import lift, open_sources, planned
 from liftcore.settings import LiftSettings
@@ -34,7 +34,7 @@ MIB = 2**20
 
 def rows_of(splats: Path, cameras: Path, pack: Path) -> Iterator[dict[str, Any]]:
     """One row a setting."""
-    packs = open_packs([pack])
+    packs = read_features(pack)
     for own in REGIONS if packs.is_regions(packs.views[0]) else GRIDS:
         name = ", ".join(f"{key}={value}" for key, value in own.items()) or "as they come"
         yield {"features": pack.stem, "settings": name} | measure((splats, cameras, pack), own)

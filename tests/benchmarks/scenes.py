@@ -20,9 +20,8 @@ import torch
 
 from liftcore.errors import InvalidFeatures
 from liftcore.evaluate.synthetic import PART_LEVELS, room_cameras, room_parts, room_regions, room_splats
-from liftcore.features.pack import FeaturePacks, open_packs
+from liftcore.features.pack import FeaturePacks, read_features, write_pack
 from liftcore.features.views import NO_LABEL, FeatureGrid, Regions, ViewFeatures
-from liftcore.features.write_pack import write_pack
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.ply import write_splats
 from liftcore.raster.base import CompositingParams
@@ -155,7 +154,7 @@ class Enlarged(Mapping[str, ViewFeatures]):
     cells: tuple[int, int]
 
     def __getitem__(self, view: str) -> FeatureGrid:
-        observation = self.packs.observation(view)
+        observation = self.packs[view]
         if not isinstance(observation, FeatureGrid):
             raise InvalidFeatures("features", expected="grids in all views", got=f"regions in {view}")
         first = observation.grid.float().permute(2, 0, 1)[None]
@@ -188,7 +187,7 @@ def main() -> None:
         size = given.width, given.height
         write_room(given.folder, Room(given.splats, given.views, size, given.channels, given.clean, given.alike))
         return
-    packs = open_packs([given.pack])
+    packs = read_features(given.pack)
     metadata = {"encoder": packs.encoder, "text_space": packs.text_space, "normalised": "false"}
     write_pack(given.output, Enlarged(packs, (given.rows, given.columns)), metadata)
 

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from liftcore.features.write_pack import write_pack
+from liftcore.features.pack import write_pack
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.ply import write_splats
 from liftcore.raster.cpu.warm_up import warm_up

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from liftcore.errors import InvalidInput
 from liftcore.evaluate.accuracy import class_ious, class_scores, rendered_scores, splat_accuracy
-from liftcore.features.pack import open_packs
+from liftcore.features.pack import read_features
 from liftcore.features.views import NO_LABEL, Regions
 from liftcore.io.cameras import read_cameras
 from liftcore.io.ply import read_splats
@@ -131,7 +131,7 @@ class Tabletop:
         """[P] bool: splats with evidence over 0.5 in the views of EVIDENCE_PACK."""
         nothing = Regions(torch.full((1, 1, 1), NO_LABEL, dtype=torch.int32), torch.ones(1, 1))
         evidence = np.zeros(self.raster.splats.count)
-        for view in open_packs([self.folder / f"{EVIDENCE_PACK}.safetensors"]).views:
+        for view in read_features(self.folder / f"{EVIDENCE_PACK}.safetensors").views:
             weights = self.raster.region_weights(self.cameras[view], nothing, CompositingParams(), Weighting())
             evidence[weights.evidence_splats.numpy()] += weights.evidence.numpy()
         return torch.from_numpy(evidence > EVIDENCE_OVER)

@@ -101,7 +101,7 @@ def still_life_rows(presets: Iterable[str]) -> Iterator[dict[str, Any]]:
     """The demo's scene with its usual mistakes, with hard ones, and with hard ones in a narrow cone of vectors."""
     from liftcore.demo.masks import Mistakes, observe, true_labels
     from liftcore.demo.still_life import still_life
-    from liftcore.features.write_pack import write_pack
+    from liftcore.features.pack import write_pack
     from liftcore.io.inria import write_inria_cameras
     from liftcore.io.ply import write_splats
     from liftcore.raster.cpu.raster import CpuRaster

@@ -11,9 +11,8 @@ import torch
 from PIL import Image
 
 from liftcore.features.mask_folder import mask_views
-from liftcore.features.pack import open_packs
+from liftcore.features.pack import read_features, write_pack
 from liftcore.features.views import Regions
-from liftcore.features.write_pack import write_pack
 from liftcore.lift import lift
 from liftcore.settings import LiftSettings
 from tests.run_lengths import sam_records
@@ -26,8 +25,8 @@ EVERY = 9  # of 52 views six are enough
 
 @pytest.fixture(scope="module")
 def views(shared_data: Path) -> dict[str, Regions]:
-    packs = open_packs([shared_data / "tabletop" / "features_hard.safetensors"])
-    found = {view: packs.observation(view) for view in packs.views[::EVERY]}
+    packs = read_features(shared_data / "tabletop" / "features_hard.safetensors")
+    found = {view: packs[view] for view in packs.views[::EVERY]}
     return {view: regions for view, regions in found.items() if isinstance(regions, Regions)}
 
 

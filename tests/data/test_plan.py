@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 import torch
 
-from liftcore.features.pack import open_packs
+from liftcore.features.pack import read_features, write_pack
 from liftcore.features.views import FeatureGrid
-from liftcore.features.write_pack import write_pack
 from liftcore.lift import lift
 from liftcore.settings import LiftSettings
 
@@ -22,7 +21,7 @@ FINE = (120, 160)  # cells: four pixels of tabletop each
 @pytest.fixture(scope="module")
 def fine_maps(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Dense maps of eight views: as many cells as an encoder of small strides makes, of few channels."""
-    packs = open_packs([shared_data / "tabletop" / "grids.safetensors"])
+    packs = read_features(shared_data / "tabletop" / "grids.safetensors")
     maps = {view: FeatureGrid(torch.rand(*FINE, 4)) for view in packs.views[:8]}
     path = tmp_path_factory.mktemp("fine") / "fine.safetensors"
     write_pack(path, maps, {})

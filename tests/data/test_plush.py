@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from liftcore.features.pack import open_packs
+from liftcore.features.pack import read_features
 from liftcore.features.views import FeatureGrid
 from liftcore.io.cameras import read_cameras
 from liftcore.io.ply import read_splats
@@ -80,9 +80,9 @@ def test_lifted_cnn_features_render_like_those_of_unseen_photos(plush, cameras, 
     settings = LiftSettings.of(preset="row-sum", certificate_rays=0, view_stride=4)
     paths = [plush / name for name in ("point_cloud.ply", "cameras.json", "grids.safetensors")]
     features = lift(paths[0], paths[1], paths[2:], settings).features
-    held_out = open_packs([plush / "grids_test.safetensors"])
+    held_out = read_features(plush / "grids_test.safetensors")
     for name in HELD_OUT:
-        observed = held_out.observation(name)
+        observed = held_out[name]
         assert isinstance(observed, FeatureGrid)
         walk, camera = settings.render_params, cameras[name]
         cosine = rendered_cosine(raster, camera, features, observed.grid, walk)

@@ -20,7 +20,7 @@ from PIL import Image
 from pydantic import BaseModel
 
 from liftcore.cli import main
-from liftcore.features.pack import open_packs
+from liftcore.features.pack import read_features
 from liftcore.features.rle import mask_of_runs, read_runs
 from liftcore.io.ply import read_splats
 from service import wire
@@ -91,7 +91,7 @@ def test_langsplats_files_become_a_pack(scene_folder: Path) -> None:
         np.save(scene_folder / "language_features" / f"{view}_f.npy", codebook().astype(np.float16))
     (command,) = commands_between(SCENES, "## From LangSplat's folders", "\n## ", scene_folder)
     assert main(command) == 0
-    packs = open_packs([scene_folder / "features.safetensors"])
+    packs = read_features(scene_folder / "features.safetensors")
     assert packs.views == tuple(sorted(labels())) and packs.text_space == command[-1]
 
 

@@ -14,9 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from liftcore.errors import InvalidCameras, InvalidFeatures, InvalidSplats
-from liftcore.features.pack import open_packs
+from liftcore.features.pack import read_features, write_pack
 from liftcore.features.views import FeatureGrid, Regions
-from liftcore.features.write_pack import write_pack
 from liftcore.io.cameras import read_cameras
 from liftcore.io.npy import open_npy
 from liftcore.io.ply import read_splats, write_splats
@@ -198,9 +197,9 @@ def test_any_damage_to_a_pack_is_a_pack_or_an_error_of_ours(changes, keep, noise
         for damaged_content in (content, noise, content[:8] + noise):
             path.write_bytes(damaged_content)
             try:
-                packs = open_packs([path])
+                packs = read_features(path)
                 for view in packs.views:
-                    assert packs.observation(view).codebook.shape[-1] == packs.channels
+                    assert packs[view].codebook.shape[-1] == packs.channels
             except InvalidFeatures as error:
                 assert "\n" not in str(error)
 

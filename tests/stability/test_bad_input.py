@@ -15,7 +15,7 @@ import torch
 from safetensors.torch import save_file
 
 from liftcore import cli
-from liftcore.features.write_pack import write_pack
+from liftcore.features.pack import write_pack
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.ply import write_splats
 from liftcore.scene.cameras import Camera, Cameras

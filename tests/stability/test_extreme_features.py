@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
+from liftcore.features.pack import write_pack
 from liftcore.features.views import FeatureGrid, Regions, ViewFeatures
-from liftcore.features.write_pack import write_pack
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.lift_file import LiftResult, load_lift, save_lift
 from liftcore.io.ply import write_splats

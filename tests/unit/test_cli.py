@@ -18,8 +18,8 @@ from liftcore import cli
 from liftcore.cli import reply
 from liftcore.cli.lift import pairs_of
 from liftcore.errors import InvalidFeatures, InvalidSettings, SplatliftError
+from liftcore.features.pack import write_pack
 from liftcore.features.views import FeatureGrid
-from liftcore.features.write_pack import write_pack
 from liftcore.io.lift_file import load_lift
 from liftcore.lift import lift
 from liftcore.query.threshold import METHODS

@@ -9,7 +9,7 @@ import pytest
 import torch
 from PIL import ExifTags, Image
 
-from liftcore.features.pack import open_packs
+from liftcore.features.pack import read_features
 from liftcore.features.views import FeatureGrid
 
 from .command_line import run
@@ -47,7 +47,7 @@ def test_sub_folders_are_told_as_they_are_part_of_the_names(
     status, out, err = run(capsys, "encode", rig, "-o", pack, *options)
     assert (status, err) == (0, "")
     assert out.splitlines()[1:] == ["  of sub-folders, whose names are part of their views': camA"]
-    assert open_packs([pack]).views == ("camA/000",)
+    assert read_features(pack).views == ("camA/000",)
 
 
 def test_photos_that_were_turned_are_told(
@@ -77,9 +77,9 @@ def test_encoded_photos_are_lifted_and_asked_in_the_text_space_of_their_pack(
     assert (document["views"], document["channels"], document["patch"], document["size"]) == (3, 256, 32, 64)
     assert document["text_space"] == f"open_clip:ViT-S-32-alt@{weights}"
     assert document["warnings"] == []
-    packs = open_packs([pack])
+    packs = read_features(pack)
     assert (packs.views, packs.normalised) == (("left", "middle", "right"), True)
-    observed = packs.observation("left")
+    observed = packs["left"]
     assert isinstance(observed, FeatureGrid)
     assert observed.grid.shape == (2, 3, 256)
     scene = make_scene()
@@ -102,7 +102,7 @@ def test_backbones_without_words_say_so(photos: Path, tmp_path: Path, capsys: py
     )
     assert (status, err) == (0, "")
     assert "1 views, 512 channels" in out and "no words" in out
-    packs = open_packs([pack])
+    packs = read_features(pack)
     assert (packs.text_space, packs.normalised, packs.encoder) == ("none", False, "timm:resnet18")
 
 

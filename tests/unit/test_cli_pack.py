@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from PIL import Image
 
-from liftcore.features.pack import open_packs
+from liftcore.features.pack import read_features
 from liftcore.features.views import Regions
 
 from .command_line import assert_one_line, run
@@ -45,7 +45,7 @@ def test_arrays_are_packed_in_either_layout(tmp_path: Path, capsys: pytest.Captu
         status, text, _ = run(capsys, "pack", "npy", tmp_path / "maps", "-o", out, "--layout", layout)
         assert status == 0
         assert f"1 views, {channels} channels" in text
-        assert open_packs([out]).channels == channels
+        assert read_features(out).channels == channels
 
 
 def test_maps_named_after_whole_images_are_packed_under_their_cameras_names(
@@ -63,7 +63,7 @@ def test_maps_named_after_whole_images_are_packed_under_their_cameras_names(
     document = json.loads(out)
     assert document["renamed"] == {"a.jpg.npy": "a", "b.PNG.npy": "b"}
     assert [text.split(":")[0] for text in document["warnings"]] == ["unnormalised vectors"]
-    assert open_packs([tmp_path / "p.safetensors"]).views == ("a", "b", "frame.0001")
+    assert read_features(tmp_path / "p.safetensors").views == ("a", "b", "frame.0001")
 
 
 def test_maps_of_a_rig_keep_their_folders(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -73,7 +73,7 @@ def test_maps_of_a_rig_keep_their_folders(tmp_path: Path, capsys: pytest.Capture
     arguments = ["pack", "npy", tmp_path / "maps", "-o", tmp_path / "p.safetensors", "--json"]
     status, out, _ = run(capsys, *arguments)
     assert (status, json.loads(out)["renamed"]) == (0, {"camB/000.jpg.npy": "camB/000"})
-    assert open_packs([tmp_path / "p.safetensors"]).views == ("camA/000", "camB/000")
+    assert read_features(tmp_path / "p.safetensors").views == ("camA/000", "camB/000")
     arguments[4] = tmp_path / "maps" / "camA" / "000.npy"
     status, out, err = run(capsys, *arguments)
     assert (status, out) == (2, "")
@@ -87,7 +87,7 @@ def test_masks_of_a_rig_keep_their_folders(tmp_path: Path, capsys: pytest.Captur
         np.save(tmp_path / "rig" / folder / "000_f.npy", np.ones((1, 5), np.float32))
     status, _, _ = run(capsys, "pack", "langsplat", tmp_path / "rig", "-o", tmp_path / "p.safetensors")
     assert status == 0
-    assert open_packs([tmp_path / "p.safetensors"]).views == ("camA/000", "camB/000")
+    assert read_features(tmp_path / "p.safetensors").views == ("camA/000", "camB/000")
 
 
 def test_two_maps_of_one_view_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -111,7 +111,7 @@ def test_masks_and_their_vectors_are_packed(tmp_path: Path, capsys: pytest.Captu
     status, out, err = run(capsys, "pack", "masks", folder, "-o", pack, "--unlabelled", 255, *options)
     assert (status, err) == (0, "")
     assert "1 views, 5 channels" in out and "1 levels of 2x2" in out and "a.jpg.npy is 'a'" in out
-    regions = open_packs([pack]).observation("a")
+    regions = read_features(pack)["a"]
     assert isinstance(regions, Regions)
     assert regions.labels.tolist() == [[[-1, 0], [1, 1]]]
     status, out, _ = run(capsys, "pack", "masks", folder, "-o", pack, "--unlabelled", 255, *options, "--json")

@@ -12,8 +12,8 @@ import torch
 from safetensors.torch import save_file
 
 from liftcore.errors import InvalidInput, InvalidSplats, SplatliftError
+from liftcore.features.pack import write_pack
 from liftcore.features.views import FeatureGrid, Regions
-from liftcore.features.write_pack import write_pack
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.inspect import inspect_file
 from liftcore.io.lift_file import InputFile, LiftMetadata, LiftResult, save_lift

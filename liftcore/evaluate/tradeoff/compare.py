@@ -17,7 +17,7 @@ from liftcore.evaluate.hardware import hardware
 from liftcore.evaluate.tradeoff.choice import choose
 from liftcore.evaluate.tradeoff.judge import class_vectors, labelled_masks
 from liftcore.evaluate.tradeoff.order import CANDIDATES, DRAFT, EXACT, HOLD_OUT, Candidate, Order, Scene
-from liftcore.features.pack import open_packs, pair
+from liftcore.features.pack import pair, read_features
 from liftcore.io.cameras import read_cameras
 from liftcore.settings import LiftSettings
 
@@ -80,7 +80,7 @@ def _order(scene: Scene, settings: Mapping[str, Any], threads: int | None, folde
     """The views of each kind. Every HOLD_OUT-th view is held out, and what has masks is."""
     cameras = read_cameras(scene.cameras)
     stride = LiftSettings.of(**settings).view_stride
-    packs = pair(open_packs(scene.features), cameras)[0]
+    packs = pair(read_features(*scene.features), cameras)[0]
     names = packs.views[::stride]
     labelled: list[str] = []
     if scene.labels is not None:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from liftcore.evaluate.accuracy import class_ious, rendered_scores, view_cosines
-from liftcore.features.masks import read_masks
+from liftcore.io.class_masks import read_masks
 from liftcore.query.encoders.table import TableEncoder
 from liftcore.query.in_photo import in_photo
 from liftcore.raster.cpu.raster import CpuRaster
@@ -36,7 +36,7 @@ def judge(order: Order, sources: Sources, reference: tuple[Tensor, Tensor], made
     figures = cosine_figures(made.features, *reference)
     raster, walk = CpuRaster(sources.splats, order.threads), made.metadata.settings.render_params
     rows = [
-        view_cosines(raster, sources.cameras[view], sources.packs.observation(view), made.features, walk)
+        view_cosines(raster, sources.cameras[view], sources.packs[view], made.features, walk)
         for view in order.held_out
     ]
     cosines = np.concatenate(rows) if rows else np.zeros(0)
@@ -92,7 +92,7 @@ def class_vectors(scene: Scene) -> Tensor:
 
 
 def labelled_masks(scene: Scene, cameras: Cameras) -> dict[str, Tensor]:
-    """Camera -> its [h, w] i64 of class numbers, as `liftcore.features.masks.read_masks` has it."""
+    """Camera -> its [h, w] i64 of class numbers, as `liftcore.io.class_masks.read_masks` has it."""
     if scene.labels is None:
         raise ValueError("there are no labels")
     masks = read_masks(scene.labels, len(scene.classes))

@@ -13,8 +13,8 @@ import torch
 from liftcore.errors import InvalidInput
 from liftcore.features.arrays import ArrayViews
 from liftcore.features.encoders.images import prepare, read_image
-from liftcore.features.finite import check_finite
-from liftcore.features.write_pack import write_pack
+from liftcore.features.pack import write_pack
+from liftcore.features.views import check_finite
 from liftcore.progress import Progress, silent
 
 if TYPE_CHECKING:

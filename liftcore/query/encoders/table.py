@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Self
 import torch
 
 from liftcore.errors import InvalidQuery, InvalidTable
-from liftcore.features.header import check_header
+from liftcore.io.safetensors_file import check_header
 from liftcore.query.encoders.words import nearest, plain
 
 if TYPE_CHECKING:

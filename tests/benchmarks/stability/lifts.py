@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from liftcore.errors import SplatliftError
-from liftcore.features.pack import open_packs
-from liftcore.features.write_pack import write_pack
+from liftcore.features.pack import read_features, write_pack
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.inspect import describe_packs
 from liftcore.io.ply import write_splats
@@ -96,7 +95,7 @@ def run(task: Task, splats: Splats) -> tuple[LiftResult, list[str]]:
         write_inria_cameras(Cameras(tuple(camera(view) for view in task.views)), paths[1])
         write_pack(paths[2], task.views, {"encoder": "by hand", "normalised": "false"})
         made = lift(paths[0], paths[1], paths[2:], LiftSettings.of(**{"preset": "row-sum", **task.settings}))
-        return made, describe_packs(open_packs(paths[2:]))["warnings"]
+        return made, describe_packs(read_features(*paths[2:]))["warnings"]
 
 
 def dense_features(task: Task, splats: Splats, settings: LiftSettings) -> tuple[np.ndarray, np.ndarray]:

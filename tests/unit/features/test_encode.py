@@ -16,7 +16,7 @@ from liftcore.errors import InvalidFeatures, InvalidInput
 from liftcore.features.encoders import Pixels
 from liftcore.features.encoders.encode import Encoded, EncodeSettings, encode_images
 from liftcore.features.encoders.images import MAX_CELLS, find_images, grid_size, read_image
-from liftcore.features.pack import open_packs
+from liftcore.features.pack import read_features
 from liftcore.features.views import FeatureGrid
 
 ORIENTATION = 0x0112
@@ -47,10 +47,10 @@ def encode(tmp_path: Path) -> Encode:
         chosen = EncodeSettings(**{"normalised": False, **settings})
         done = encode_images(find_images([folder]), encoder or MeanColour(), out, chosen)
         assert [path.name for path in out.parent.iterdir()] == [out.name]
-        packs = open_packs([out])
+        packs = read_features(out)
         grids = {}
         for view in packs.views:
-            observed = packs.observation(view)
+            observed = packs[view]
             assert isinstance(observed, FeatureGrid)
             grids[view] = observed.grid
         return done, grids

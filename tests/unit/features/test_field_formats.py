@@ -10,9 +10,8 @@ import torch
 
 from liftcore.errors import InvalidFeatures
 from liftcore.features.arrays import array_views
-from liftcore.features.pack import open_packs
+from liftcore.features.pack import read_features, write_pack
 from liftcore.features.views import Regions
-from liftcore.features.write_pack import write_pack
 from liftcore.io.langsplat import langsplat_views
 from liftcore.io.npy import open_npy
 
@@ -36,9 +35,9 @@ def test_langsplat_folder_becomes_a_pack(ids: str, features: str, tmp_path: Path
     folder.mkdir()
     langsplat(folder, IDS.astype(ids), CODEBOOK.astype(features))
     write_pack(tmp_path / "pack", langsplat_views(folder), {})
-    packs = open_packs([tmp_path / "pack"])
+    packs = read_features(tmp_path / "pack")
     assert packs.views == ("frame_1",)
-    view = packs.observation("frame_1")
+    view = packs["frame_1"]
     assert isinstance(view, Regions)
     assert view.labels.tolist() == IDS.tolist()
     assert torch.equal(view.codebook.float(), torch.from_numpy(CODEBOOK))
@@ -80,10 +79,10 @@ def test_array_folder_becomes_a_pack(layout, tmp_path: Path) -> None:
     np.save(folder / "a.npy", grid if layout == "hwc" else grid.transpose(2, 0, 1))
     np.save(folder / "b.npy", np.asfortranarray(grid if layout == "hwc" else grid.transpose(2, 0, 1)))
     write_pack(tmp_path / "pack", array_views(folder, layout), {})
-    packs = open_packs([tmp_path / "pack"])
+    packs = read_features(tmp_path / "pack")
     assert packs.channels == 4
     for view in ("a", "b"):
-        assert np.array_equal(packs.observation(view).codebook.numpy(), grid.reshape(6, 4))
+        assert np.array_equal(packs[view].codebook.numpy(), grid.reshape(6, 4))
 
 
 def test_arrays_of_another_shape_are_refused(tmp_path: Path) -> None:
@@ -96,7 +95,7 @@ def test_arrays_of_another_shape_are_refused(tmp_path: Path) -> None:
 
 def test_numbers_beyond_what_a_pack_holds_are_refused_with_their_view(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", np.array([[[1.0, 1e300]]]))
-    with pytest.raises(InvalidFeatures, match=r"'a' features: expected finite values .*got 1 of 2"):
+    with pytest.raises(InvalidFeatures, match=r"'a' grid: expected finite values .*got 1 of 2"):
         write_pack(tmp_path / "pack", array_views(tmp_path), {})
 
 

@@ -11,9 +11,8 @@ from PIL import Image
 
 from liftcore.errors import InvalidFeatures
 from liftcore.features.mask_folder import mask_views
-from liftcore.features.pack import open_packs
+from liftcore.features.pack import read_features, write_pack
 from liftcore.features.views import Regions
-from liftcore.features.write_pack import write_pack
 from tests.run_lengths import sam_records
 
 if TYPE_CHECKING:
@@ -62,9 +61,9 @@ def test_every_kind_of_masks_makes_the_same_regions(kind: str, tmp_path: Path) -
     WRITERS[kind](tmp_path)
     np.save(tmp_path / "a.npy", VECTORS)
     write_pack(tmp_path / "pack.safetensors", mask_views(tmp_path), {})
-    packs = open_packs([tmp_path / "pack.safetensors"])
+    packs = read_features(tmp_path / "pack.safetensors")
     assert packs.views == ("a",)
-    view = packs.observation("a")
+    view = packs["a"]
     assert isinstance(view, Regions)
     assert view.labels.tolist() == [LABELS.tolist()]
     assert view.codebook.tolist() == VECTORS.tolist()
@@ -146,7 +145,7 @@ def test_vectors_that_do_not_fit_are_refused(vectors: np.ndarray, message: str, 
 def test_vectors_that_are_not_finite_in_a_pack_are_refused_with_their_view(bad: float, tmp_path: Path) -> None:
     np.save(tmp_path / "a_masks.npy", LABELS)
     np.save(tmp_path / "a.npy", np.where(VECTORS == 7, bad, VECTORS.astype(np.float64)))
-    with pytest.raises(InvalidFeatures, match=r"view 'a' features.*1 of 15"):
+    with pytest.raises(InvalidFeatures, match=r"view 'a' codebook.*1 of 15"):
         write_pack(tmp_path / "pack.safetensors", mask_views(tmp_path), {})
     assert not (tmp_path / "pack.safetensors").exists()
 

@@ -12,9 +12,8 @@ import torch
 from safetensors.torch import save_file
 
 from liftcore.errors import InvalidFeatures
-from liftcore.features.pack import open_packs, pair
+from liftcore.features.pack import pair, read_features, write_pack
 from liftcore.features.views import FeatureGrid, Regions
-from liftcore.features.write_pack import write_pack
 from liftcore.io.cameras import read_cameras
 from liftcore.scene.cameras import Camera, Cameras
 
@@ -44,17 +43,17 @@ def cameras(*names: str) -> Cameras:
 def test_regions_and_grids_are_read_as_they_are(tmp_path: Path) -> None:
     grid = torch.arange(24, dtype=torch.float16).reshape(2, 4, 3)
     tensors = {**regions(-1, 0, 3), "scenes/b.1/grid": grid}
-    packs = open_packs([saved(tmp_path / "p", tensors, encoder="clip", text_space="none", normalised="True")])
+    packs = read_features(saved(tmp_path / "p", tensors, encoder="clip", text_space="none", normalised="True"))
     assert packs.views == ("a", "scenes/b.1")
     assert (packs.channels, packs.encoder, packs.text_space, packs.normalised) == (3, "clip", "none", True)
     assert packs.is_regions("a")
     assert not packs.is_regions("scenes/b.1")
-    view = packs.observation("a")
+    view = packs["a"]
     assert isinstance(view, Regions)
     assert view.labels.tolist() == [[[-1, 0, 3]]]
     assert view.labels.dtype == torch.int32
     assert torch.equal(view.codebook, CODEBOOK)
-    other = packs.observation("scenes/b.1")
+    other = packs["scenes/b.1"]
     assert isinstance(other, FeatureGrid)
     assert torch.equal(other.grid, grid)
 
@@ -64,20 +63,20 @@ def test_all_label_types_mean_the_same(tmp_path: Path) -> None:
     for name, dtype in kinds.items():
         none = 255 if name == "u8" else -1
         tensors = {"a/labels": labels(none, 2, dtype=dtype)[0], "a/codebook": CODEBOOK}  # [h, w] is one level
-        view = open_packs([saved(tmp_path / name, tensors)]).observation("a")
+        view = read_features(saved(tmp_path / name, tensors))["a"]
         assert isinstance(view, Regions)
         assert view.labels.tolist() == [[[-1, 2]]]
 
 
 def test_bfloat16_is_read_as_float32(tmp_path: Path) -> None:
-    view = open_packs([saved(tmp_path / "p", {"a/grid": torch.ones(1, 1, 2, dtype=torch.bfloat16)})])
-    assert view.observation("a").codebook.dtype == torch.float32
+    view = read_features(saved(tmp_path / "p", {"a/grid": torch.ones(1, 1, 2, dtype=torch.bfloat16)}))
+    assert view["a"].codebook.dtype == torch.float32
 
 
 def test_several_packs_make_one_set_of_views(tmp_path: Path) -> None:
     one = saved(tmp_path / "one", regions(0), encoder="clip")
     other = saved(tmp_path / "other", {"B/grid": torch.ones(1, 1, 3)})
-    packs = open_packs([one, other])
+    packs = read_features(one, other)
     assert packs.views == ("B", "a")
     assert packs.encoder == "clip"
     assert packs.normalised is None
@@ -107,7 +106,7 @@ BAD_HEADERS: dict[str, tuple[dict[str, torch.Tensor], str]] = {
 def test_bad_header_is_refused_when_the_pack_is_opened(case: str, tmp_path: Path) -> None:
     tensors, message = BAD_HEADERS[case]
     with pytest.raises(InvalidFeatures, match=message):
-        open_packs([saved(tmp_path / "pack", tensors)])
+        read_features(saved(tmp_path / "pack", tensors))
 
 
 def test_packs_that_do_not_fit_together_are_refused(tmp_path: Path) -> None:
@@ -115,13 +114,13 @@ def test_packs_that_do_not_fit_together_are_refused(tmp_path: Path) -> None:
     wide = saved(tmp_path / "wide", {"b/grid": torch.ones(1, 1, 4)})
     dino = saved(tmp_path / "dino", {"b/grid": torch.ones(1, 1, 3)}, encoder="dino")
     with pytest.raises(InvalidFeatures, match=r"each view in one pack, got 'a' in"):
-        open_packs([one, one])
+        read_features(one, one)
     with pytest.raises(InvalidFeatures, match="the same channels"):
-        open_packs([one, wide])
+        read_features(one, wide)
     with pytest.raises(InvalidFeatures, match="one encoder in all packs"):
-        open_packs([one, dino])
+        read_features(one, dino)
     with pytest.raises(InvalidFeatures, match="at least one view"):
-        open_packs([])
+        read_features()
 
 
 @pytest.mark.parametrize(
@@ -139,24 +138,24 @@ def test_what_is_no_safetensors_file_is_refused(content: bytes, message: str, tm
     path = tmp_path / "pack.safetensors"
     path.write_bytes(content)
     with pytest.raises(InvalidFeatures, match=message) as caught:
-        open_packs([path])
+        read_features(path)
     assert "\n" not in str(caught.value)
 
 
 def test_missing_and_truncated_packs_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InvalidFeatures, match="No such file"):
-        open_packs([tmp_path / "nowhere"])
+        read_features(tmp_path / "nowhere")
     path = saved(tmp_path / "pack", {"a/grid": GRID})
     path.write_bytes(path.read_bytes()[:-1])
     with pytest.raises(InvalidFeatures, match="does not open as one"):
-        open_packs([path])
+        read_features(path)
 
 
 @pytest.mark.parametrize("value", [4, -2, 32_767])
 def test_label_out_of_the_codebook_is_named_with_its_view(value: int, tmp_path: Path) -> None:
-    packs = open_packs([saved(tmp_path / "pack", regions(0, value, -1))])
+    packs = read_features(saved(tmp_path / "pack", regions(0, value, -1)))
     with pytest.raises(InvalidFeatures, match=rf"'a' labels: .*0\.\.3.*the label {value}$"):
-        packs.observation("a")
+        packs["a"]
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), float("-inf")])
@@ -164,21 +163,21 @@ def test_feature_that_is_not_finite_is_named_with_its_view(bad: float, tmp_path:
     codebook = CODEBOOK.clone()
     codebook[2, 1] = bad
     tensors = {"a/labels": labels(0), "a/codebook": codebook, "b/grid": codebook[None].half()}
-    packs = open_packs([saved(tmp_path / "pack", tensors)])
+    packs = read_features(saved(tmp_path / "pack", tensors))
     for view, part in (("a", "codebook"), ("b", "grid")):
         with pytest.raises(InvalidFeatures, match=rf"'{view}' {part}: expected finite values within .*, got 1 of 12"):
-            packs.observation(view)
+            packs[view]
 
 
 def test_unknown_view_is_refused(tmp_path: Path) -> None:
-    packs = open_packs([saved(tmp_path / "pack", regions(0))])
+    packs = read_features(saved(tmp_path / "pack", regions(0)))
     with pytest.raises(InvalidFeatures, match="'ghost'"):
-        packs.observation("ghost")
+        packs["ghost"]
 
 
 def test_views_without_a_camera_are_reported_and_no_pair_at_all_is_refused(tmp_path: Path) -> None:
     tensors = {**regions(0), "b/grid": torch.ones(1, 1, 3)}
-    packs = open_packs([saved(tmp_path / "pack", tensors)])
+    packs = read_features(saved(tmp_path / "pack", tensors))
     paired, without = pair(packs, cameras("c", "b"))
     assert (paired.views, without) == (("b",), ["a"])
     with pytest.raises(InvalidFeatures, match=r"views 'a', 'b' and cameras 'x', 'y', none in common"):
@@ -187,14 +186,14 @@ def test_views_without_a_camera_are_reported_and_no_pair_at_all_is_refused(tmp_p
 
 def test_paired_views_are_named_like_their_cameras_and_tell_their_own_names(tmp_path: Path) -> None:
     tensors = {**regions(0, 9), "camB/b/grid": torch.ones(1, 2, 3), "c/grid": torch.ones(1, 1, 3)}
-    packs = open_packs([saved(tmp_path / "pack", tensors)])
+    packs = read_features(saved(tmp_path / "pack", tensors))
     paired, without = pair(packs, cameras("camA/a", "b", "camA/x"))
     assert (paired.views, without) == (("b", "camA/a"), ["c"])
     assert (paired.is_regions("camA/a"), paired.map_size("b"), list(paired.specs("b"))) == (True, (2, 1), ["grid"])
-    assert torch.equal(paired.observation("b").codebook, torch.ones(2, 3))
+    assert torch.equal(paired["b"].codebook, torch.ones(2, 3))
     assert torch.equal(paired.sample_rows("camA/a", 2), CODEBOOK[:2])
     with pytest.raises(InvalidFeatures, match=r"view 'a' labels: .*the label 9"):
-        paired.observation("camA/a")
+        paired["camA/a"]
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.float32])
@@ -208,13 +207,13 @@ def test_written_pack_is_read_back(dtype: torch.dtype, tmp_path: Path) -> None:
         "few": Regions(torch.tensor([[[-1, 1, 0]]], dtype=torch.int32), CODEBOOK.to(dtype)),
     }
     write_pack(tmp_path / "pack", views, {"encoder": "random", "normalised": "false"})
-    packs = open_packs([tmp_path / "pack"])
+    packs = read_features(tmp_path / "pack")
     assert packs.views == ("few", "many", "odd")
     assert packs.normalised is False
     assert packs.specs("many")["labels"].dtype == "I32"
     assert packs.specs("few")["labels"].dtype == "I16"
     for name, expected in views.items():
-        found = packs.observation(name)
+        found = packs[name]
         assert torch.equal(found.codebook, expected.codebook)
         if isinstance(expected, Regions):
             assert isinstance(found, Regions)
@@ -239,15 +238,14 @@ def test_views_are_written_one_at_a_time(tmp_path: Path) -> None:
     views = Counting()
     write_pack(tmp_path / "pack", views, {})
     assert views.reads == 6
-    packs = open_packs([tmp_path / "pack"])
-    assert [packs.observation(view).codebook[0, 0].item() for view in packs.views] == [1, 2, 3]
+    packs = read_features(tmp_path / "pack")
+    assert [packs[view].codebook[0, 0].item() for view in packs.views] == [1, 2, 3]
 
 
 def test_pack_that_cannot_be_right_is_not_written(tmp_path: Path) -> None:
     bad = {
         "at least one view": {},
         "the same channels": {"a": FeatureGrid(torch.ones(1, 1, 2)), "b": FeatureGrid(torch.ones(1, 1, 3))},
-        "finite values": {"a": FeatureGrid(torch.full((1, 1, 2), torch.nan))},
     }
     for message, views in bad.items():
         with pytest.raises(InvalidFeatures, match=message):
@@ -257,11 +255,11 @@ def test_pack_that_cannot_be_right_is_not_written(tmp_path: Path) -> None:
 
 def test_real_packs_pair_with_their_cameras(shared_data: Path) -> None:
     plush = shared_data / "plush"
-    packs = open_packs([plush / "grids.safetensors", plush / "grids_test.safetensors"])
+    packs = read_features(plush / "grids.safetensors", plush / "grids_test.safetensors")
     paired, without = pair(packs, read_cameras(plush))
     assert (len(paired.views), without, packs.channels, packs.text_space) == (97, [], 320, "none")
-    found = open_packs([plush / "regions.safetensors"])
-    view = found.observation(found.views[0])
+    found = read_features(plush / "regions.safetensors")
+    view = found[found.views[0]]
     assert isinstance(view, Regions)
     assert view.labels.shape == (4, 371, 495)
-    assert len(open_packs([shared_data / "tabletop" / "features_hard.safetensors"]).views) == 52
+    assert len(read_features(shared_data / "tabletop" / "features_hard.safetensors").views) == 52

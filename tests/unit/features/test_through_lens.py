@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from liftcore.features import through_lens
-from liftcore.features.pack import open_packs, pair
-from liftcore.features.through_lens import as_pinhole_sees
+from liftcore.features import lens
+from liftcore.features.lens import as_pinhole_sees
+from liftcore.features.pack import pair, read_features, write_pack
 from liftcore.features.views import FeatureGrid, Regions
-from liftcore.features.write_pack import write_pack
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.distortion import Brown, Distortion, Fisheye
 from liftcore.scene.lens import behind_lens
@@ -74,7 +73,7 @@ def test_a_cell_reads_the_grid_where_its_ray_lies(distortion: Distortion, dtype:
 def test_large_grids_are_carried_in_bands_to_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
     view, grid = camera(BARREL), FeatureGrid(torch.rand(11, 15, 4, generator=torch.Generator().manual_seed(0)))
     whole = as_pinhole_sees(grid, view)
-    monkeypatch.setattr("liftcore.features.through_lens.BAND_VALUES", 1)
+    monkeypatch.setattr("liftcore.features.lens.BAND_VALUES", 1)
     parts = as_pinhole_sees(grid, view)
     assert isinstance(whole, FeatureGrid)
     assert isinstance(parts, FeatureGrid)
@@ -96,13 +95,13 @@ def test_packs_tell_before_a_map_is_read_what_size_it_will_have(tmp_path: Path) 
     write_pack(tmp_path / "f.safetensors", maps, {})
     plain = Camera.pinhole("plain", 60, 44, 48.0, 47.0, 29.0, 23.0, np.eye(4))
     cameras = Cameras((camera(BARREL, "bent"), camera(PINCUSHION, "cells"), plain))
-    packs, unpaired = pair(open_packs([tmp_path / "f.safetensors"]), cameras)
+    packs, unpaired = pair(read_features(tmp_path / "f.safetensors"), cameras)
     assert unpaired == []
     for name in maps:
-        specs, observation = packs.specs(name), packs.observation(name)
+        specs, observation = packs.specs(name), packs[name]
         part = observation.labels if isinstance(observation, Regions) else observation.grid
         assert next(iter(specs.values())).shape == part.shape
-    assert packs.observation("bent").codebook.shape == (1, 3)
+    assert packs["bent"].codebook.shape == (1, 3)
     assert [packs.map_size(name) for name in maps] == [(30, 22), (15, 11), (30, 22)]  # of the photos, as they lie
     assert tuple(packs.specs("plain")["labels"].shape) == (1, 22, 30)
 
@@ -111,8 +110,8 @@ def test_bands_make_no_difference_to_labels(monkeypatch: pytest.MonkeyPatch) -> 
     view = camera(BARREL)
     labels = Regions(torch.arange(44 * 60, dtype=torch.int32).reshape(1, 44, 60), torch.ones(44 * 60, 1))
     whole = as_pinhole_sees(labels, view)
-    monkeypatch.setattr(through_lens, "BAND_PIXELS", 7 * view.width)
-    through_lens._label_places.cache_clear()
+    monkeypatch.setattr(lens, "BAND_PIXELS", 7 * view.width)
+    lens._label_places.cache_clear()
     parts = as_pinhole_sees(labels, view)
     assert isinstance(whole, Regions) and isinstance(parts, Regions)
     assert torch.equal(parts.labels, whole.labels)
@@ -120,5 +119,5 @@ def test_bands_make_no_difference_to_labels(monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_places_of_labels_are_kept_for_the_largest_pinhole_behind_a_lens() -> None:
     view, plain = camera(BARREL), Camera.pinhole("p", 500, 400, 48.0, 47.0, 29.0, 23.0, np.eye(4))
-    assert through_lens.kept_bytes([plain]) == 0
-    assert through_lens.kept_bytes([plain, view]) == 2 * 4 * view.width * view.height
+    assert lens.kept_bytes([plain]) == 0
+    assert lens.kept_bytes([plain, view]) == 2 * 4 * view.width * view.height

@@ -10,9 +10,8 @@ import pytest
 import torch
 
 from liftcore.evaluate.tradeoff.judge import cosine_figures
-from liftcore.features.pack import open_packs
+from liftcore.features.pack import read_features, write_pack
 from liftcore.features.views import Regions
-from liftcore.features.write_pack import write_pack
 from liftcore.io.cameras import read_cameras
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.ply import write_splats
@@ -166,11 +165,11 @@ def test_a_room_is_written_the_same_twice_and_its_views_disagree_as_told(tmp_pat
         write_room(tmp_path / name, Room(splats=2_000, views=3, size=(64, 48), channels=16))
     files = [(tmp_path / name / "features.safetensors").read_bytes() for name in ("one", "two")]
     assert files[0] == files[1]
-    packs = open_packs([tmp_path / "one" / "features.safetensors"])
+    packs = read_features(tmp_path / "one" / "features.safetensors")
     cameras = read_cameras(tmp_path / "one" / "cameras.json")
     assert set(packs.views) == set(cameras)
     for view in packs.views:
-        observed = packs.observation(view)
+        observed = packs[view]
         assert isinstance(observed, Regions)
         labels = observed.labels
         sizes = [len(level.unique()) for level in labels]

@@ -12,9 +12,8 @@ import torch
 
 from liftcore.device import CPU
 from liftcore.errors import InvalidSettings, Unavailable
-from liftcore.features.pack import open_packs
+from liftcore.features.pack import read_features, write_pack
 from liftcore.features.views import Regions
-from liftcore.features.write_pack import write_pack
 from liftcore.io.lift_file import load_lift, save_lift
 from liftcore.lift import lift, open_sources, planned
 from liftcore.plan.memory import (
@@ -54,7 +53,7 @@ def test_rank_of_packs_of_two_types_is_above_the_coarser_rounding(tmp_path):
     rows = torch.rand(100, 3, generator=torch.manual_seed(0)) @ torch.rand(3, 40, generator=torch.manual_seed(1))
     labels = torch.zeros(1, 2, 2, dtype=torch.int32)
     write_pack(tmp_path / "p", {"v0": Regions(labels, rows), "v1": Regions(labels, rows.half())}, {})
-    packs = open_packs([tmp_path / "p"])
+    packs = read_features(tmp_path / "p")
     assert codebook_rank(packs, packs.views).rank == 3
 
 
@@ -73,7 +72,7 @@ def test_rank_as_large_as_its_sample_is_told_as_a_bound(tmp_path, rank, bound):
 
 @pytest.mark.parametrize("grids", [False, True])
 def test_rank_of_packs_looks_at_all_their_views(tmp_path, grids):
-    packs = open_packs([write_scene(tmp_path, 2, grids)[2]])
+    packs = read_features(write_scene(tmp_path, 2, grids)[2])
     found = codebook_rank(packs, packs.views)
     assert (found.channels, found.rank) == (6, 6)
     assert found.rows >= 6
@@ -82,7 +81,7 @@ def test_rank_of_packs_looks_at_all_their_views(tmp_path, grids):
 def test_tuples_of_labels_are_planned_with_no_fewer_columns_than_there_are(tmp_path):
     maps = {f"v{k}": observed(2, k) for k in (1, 3)}
     write_pack(tmp_path / "p", maps, {})
-    packs, tuples, rows = open_packs([tmp_path / "p"]), LiftSettings.of(), LiftSettings.of(robust_steps=1)
+    packs, tuples, rows = read_features(tmp_path / "p"), LiftSettings.of(), LiftSettings.of(robust_steps=1)
     made = [as_walked(own, tuples)[1] for own in maps.values()]
     assert all(columns.tuples is not None for columns in made)
     assert all_columns(packs, maps, rows) == sum(own.codebook.shape[0] for own in maps.values())

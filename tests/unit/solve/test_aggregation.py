@@ -11,9 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from liftcore.errors import InvalidLift
-from liftcore.features.pack import open_packs
+from liftcore.features.pack import read_features, write_pack
 from liftcore.features.views import FeatureGrid, Regions
-from liftcore.features.write_pack import write_pack
 from liftcore.io.cameras import read_cameras
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.lift_file import CLUSTER_TENSORS, load_lift, save_lift
@@ -46,7 +45,7 @@ def test_kept_regions_are_those_of_the_paper_pixel_by_pixel(tmp_path_factory, se
     path = tmp_path_factory.mktemp("pack") / "features.safetensors"
     write_pack(path, maps, {"encoder": "random"})
     labels = np.random.default_rng(seed).integers(-1, K, P)
-    lifted = (OracleRaster(splats), Cameras(views), open_packs([path]), ("v0", "v1"))
+    lifted = (OracleRaster(splats), Cameras(views), read_features(path), ("v0", "v1"))
     kept = filter_regions(clustering_of(labels), 6, lifted, SETTINGS, silent)
 
     onehot = np.array([[float(label == k) for k in range(-1, K)] for label in labels])
@@ -174,8 +173,8 @@ def test_what_takes_no_cluster_is_solved_again_as_if_the_other_regions_had_never
     monkeypatch.setattr("liftcore.lift.LEAST_KEPT", least)
     (splats, cameras, features), _ = write_scene(tmp_path, "regions")
     # A third of the first view is a region that no cluster confirms.
-    packs = open_packs([features])
-    maps = {name: packs.observation(name) for name in packs.views}
+    packs = read_features(features)
+    maps = {name: packs[name] for name in packs.views}
     first = maps["v0"]
     assert isinstance(first, Regions)
     labels = first.labels.clone()
@@ -189,7 +188,7 @@ def test_what_takes_no_cluster_is_solved_again_as_if_the_other_regions_had_never
     plain = lift(splats, cameras, [features], LiftSettings.of(aggregation=True, **knobs))
     whole = weights_of(splats, cameras, maps | {"v0": wrong}, plain.metadata.settings)
 
-    lifted = (CpuRaster(read_splats(splats)), read_cameras(cameras), open_packs([features]), result.metadata.views)
+    lifted = (CpuRaster(read_splats(splats)), read_cameras(cameras), read_features(features), result.metadata.views)
     assert result.cluster is not None and result.cluster_features is not None
     clustering = clustering_of(result.cluster.numpy(), result.cluster_features.shape[0])
     kept = filter_regions(clustering, 6, lifted, LiftSettings.of(aggregation=True, **knobs), silent).masks

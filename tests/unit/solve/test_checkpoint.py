@@ -12,8 +12,8 @@ import pytest
 import torch
 
 from liftcore.device import CPU, Device
+from liftcore.features.pack import write_pack
 from liftcore.features.views import NO_LABEL, FeatureGrid, Regions
-from liftcore.features.write_pack import write_pack
 from liftcore.io.cameras import read_cameras
 from liftcore.io.lift_file import TENSORS, LiftResult
 from liftcore.lift import lift

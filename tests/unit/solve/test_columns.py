@@ -8,7 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from liftcore.features.label_tuples import label_tuples
+from liftcore.features.levels import label_tuples
 from liftcore.features.views import NO_LABEL, FeatureGrid, Regions
 from liftcore.progress import silent
 from liftcore.raster.base import CompositingParams, Weighting
@@ -48,7 +48,7 @@ def solved(views, weighting: Weighting, dtype: torch.dtype, on_device: bool = Fa
     return solve_closed_form(*arguments, Host(1)), totals
 
 
-@given(st.integers(0, 2**31), st.integers(2, 4), st.sampled_from([1, 2]), st.sampled_from([1e-30, 1.0, 1e37]))
+@given(st.integers(0, 2**31), st.integers(2, 4), st.sampled_from([1, 2]), st.sampled_from([1e-30, 1.0, 1e14]))
 def test_tuples_give_what_rows_give(seed, levels, power, size):
     maps = [region_map(seed + view, levels, size) for view in range(2)]
     rows, sums = solved([(own, Columns(own.codebook)) for own in maps], Weighting(power), torch.float32)
@@ -86,7 +86,7 @@ def test_splats_that_no_view_labels_have_zeros_wherever_x_lies():
 @given(st.integers(0, 2**31), st.integers(1, 4), st.integers(-1, 3))
 def test_tuples_are_the_distinct_ones_in_the_order_of_the_pixels(seed, levels, highest):
     labels = np.random.default_rng(seed).integers(-1, highest + 1, (levels, 7, 9)).astype(np.int32)
-    numbers, tuples = label_tuples(labels, 63)
+    numbers, tuples = label_tuples(labels)
     assert len(np.unique(tuples, axis=0)) == len(tuples)
     first = [number for k, number in enumerate(numbers.reshape(-1)) if number not in numbers.reshape(-1)[:k]]
     assert [number for number in first if number != NO_LABEL] == list(range(len(tuples)))

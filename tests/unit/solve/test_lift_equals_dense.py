@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
+from liftcore.features.pack import write_pack
 from liftcore.features.views import Regions
-from liftcore.features.write_pack import write_pack
 from liftcore.io.cameras import read_cameras
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.lift_file import load_lift, save_lift

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from liftcore.errors import InvalidSettings, InvalidSplats
-from liftcore.features.write_pack import write_pack
+from liftcore.features.pack import write_pack
 from liftcore.io.cameras import read_cameras
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.lift_file import save_lift

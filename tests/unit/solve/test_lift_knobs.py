@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from liftcore.errors import InvalidFeatures, InvalidSettings
+from liftcore.features.pack import write_pack
 from liftcore.features.views import Regions
-from liftcore.features.write_pack import write_pack
 from liftcore.io.cameras import read_cameras
 from liftcore.lift import lift
 from liftcore.raster.reference import dense_view, reading_matrix

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from liftcore.features.pack import open_packs
+from liftcore.features.pack import read_features, write_pack
 from liftcore.features.views import Regions
-from liftcore.features.write_pack import write_pack
 from liftcore.io.lift_file import save_lift
 from liftcore.lift import lift
 from liftcore.query.directions import directions
@@ -27,8 +26,8 @@ SETTINGS = LiftSettings.of(certificate_rays=10)
 
 
 def repacked(features: Path, names: dict[str, str], out: Path) -> Path:
-    packs = open_packs([features])
-    write_pack(out, {name: packs.observation(view) for view, name in names.items()}, {"encoder": "random"})
+    packs = read_features(features)
+    write_pack(out, {name: packs[view] for view, name in names.items()}, {"encoder": "random"})
     return out
 
 
@@ -40,8 +39,8 @@ def test_folders_before_the_names_of_views_change_no_bit(tmp_path: Path) -> None
     assert made.metadata.views == plain.metadata.views == ("v0", "v1", "v2")
     assert made.metadata.certificate["warnings"] == plain.metadata.certificate["warnings"]
     save_lift(made, tmp_path / "rig.lift")
-    scene, packs = QueryScene.open(tmp_path / "rig.lift"), open_packs([features])
-    observation = packs.observation("v1")
+    scene, packs = QueryScene.open(tmp_path / "rig.lift"), read_features(features)
+    observation = packs["v1"]
     assert isinstance(observation, Regions)
     label = int(observation.labels[0].max())  # the region is asked for by the lift's name of the view
     (direction,) = directions(scene, Query((Region("v1", 0, label),)), None)

@@ -9,9 +9,8 @@ import pytest
 import torch
 
 from liftcore.device import CPU
-from liftcore.features.pack import open_packs, pair
+from liftcore.features.pack import pair, read_features, write_pack
 from liftcore.features.views import FeatureGrid, Regions, ViewFeatures
-from liftcore.features.write_pack import write_pack
 from liftcore.io.cameras import read_cameras
 from liftcore.io.inspect import inspect_file
 from liftcore.lift import lift, open_sources, planned
@@ -27,7 +26,8 @@ def told(tmp_path: Path, observation: ViewFeatures, size: tuple[int, int]) -> li
     """What is said of a view of that width and height."""
     path = tmp_path / "pack.safetensors"
     write_pack(path, {"v": observation}, {"encoder": "e"})
-    return shape_warnings(open_packs([path]), [Camera.pinhole("v", *size, 500.0, 500.0, 1.0, 1.0, viewmat=np.eye(4))])
+    camera = Camera.pinhole("v", *size, 500.0, 500.0, 1.0, 1.0, viewmat=np.eye(4))
+    return shape_warnings(read_features(path), [camera])
 
 
 def grid(height: int, width: int, channels: int = 3) -> FeatureGrid:
@@ -76,7 +76,7 @@ def test_a_crop_is_told_by_the_lift_and_by_its_plan(tmp_path: Path) -> None:
 def test_real_maps_are_not_told(scene: str, packs: tuple[str, ...], shared_data: Path) -> None:
     cameras = read_cameras(cameras_of(shared_data / scene))
     for name in packs:
-        paired = pair(open_packs([shared_data / scene / f"{name}.safetensors"]), cameras)[0]
+        paired = pair(read_features(shared_data / scene / f"{name}.safetensors"), cameras)[0]
         assert shape_warnings(paired, [cameras[view] for view in paired.views]) == []
 
 

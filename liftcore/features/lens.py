@@ -34,8 +34,8 @@ def as_pinhole_sees(observation: ViewFeatures, camera: Camera) -> ViewFeatures:
     if camera.lens is None:
         return observation
     if isinstance(observation, Regions):
-        return Regions(_labels(observation.labels, camera), observation.codebook)
-    return FeatureGrid(_grid(observation.grid, camera))
+        return Regions.unchecked(_labels(observation.labels, camera), observation.codebook)
+    return FeatureGrid.unchecked(_grid(observation.grid, camera))
 
 
 def grid_sides(height: int, width: int, camera: Camera) -> tuple[int, int]:

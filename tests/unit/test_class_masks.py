@@ -8,7 +8,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from liftcore.features.masks import read_masks
+from liftcore.io.class_masks import read_masks
 from liftcore.io.inspect import inspect_file
 
 

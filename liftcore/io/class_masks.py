@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from liftcore.errors import InvalidMasks
-from liftcore.features.header import check_header
 from liftcore.features.pack import U8_NO_LABEL
+from liftcore.io.safetensors_file import check_header
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
