@@ -15,8 +15,7 @@ import torch
 from liftcore.features.pack import write_pack
 from liftcore.features.views import FeatureGrid, Regions, ViewFeatures
 from liftcore.io.ply import write_splats
-from liftcore.scene.distortion import Brown, Distortion, Fisheye
-from liftcore.scene.lens import Lens
+from liftcore.scene.distortion import Brown, Distortion, Fisheye, Lens
 from liftcore.scene.splats import Splats
 
 AWAY, MEETING = 4.0, (1.9, -1.3)  # of the wall, and of its quarters

@@ -127,7 +127,7 @@ def _settings(options: argparse.Namespace) -> EvaluationSettings:
 
 def _names(path: Path) -> frozenset[str]:
     """View names, one a line, with or without an image's extension."""
-    from liftcore.scene.view_names import view_names
+    from liftcore.scene.views import view_names
 
     try:
         lines = [line.strip() for line in path.read_text(encoding="utf-8").splitlines()]

@@ -37,7 +37,7 @@ def add_arguments(parser: Parser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Lift, write the lift whole or not at all, and say what came of it."""
     settings = settings_of(options)
-    from liftcore.io.camera_source import camera_source
+    from liftcore.io.cameras import camera_source
     from liftcore.io.lift_file import save_lift
     from liftcore.lift import lift
     from liftcore.listener import Listener

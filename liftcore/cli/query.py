@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from liftcore.cli.options import THRESHOLDS, Parser, add_negative, count, encoder_spec
 from liftcore.cli.reply import free_output, reply, writing
 from liftcore.errors import InvalidQuery
-from liftcore.io.whole_file import whole_file
+from liftcore.io.files import whole_file
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable

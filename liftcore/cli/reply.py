@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from liftcore.errors import InvalidInput
-from liftcore.io.strict_json import finite
+from liftcore.io.json_file import finite
 from liftcore.progress import Progress, silent
 
 SHOWN_ITEMS = 6  # of a list, for people

@@ -100,7 +100,7 @@ def _first(folder: Path, pattern: str, what: str) -> Path:
 
 def _cameras(folder: Path, scratch: Path) -> Path:
     """The one file of the cameras; of several, such as a COLMAP model's, a zip in ``scratch``."""
-    from liftcore.io.camera_source import camera_source
+    from liftcore.io.cameras import camera_source
 
     named = [folder / name for name in _CAMERA_FILES if (folder / name).is_file()]
     files = [file for file in camera_source(named[0] if named else folder).files if file.is_file()]

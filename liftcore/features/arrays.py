@@ -10,7 +10,7 @@ from liftcore.errors import InvalidFeatures
 from liftcore.features.folder import ViewFolder, npy_files
 from liftcore.features.views import FeatureGrid
 from liftcore.io.npy import open_npy
-from liftcore.scene.view_names import without_image_suffix
+from liftcore.scene.views import without_image_suffix
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

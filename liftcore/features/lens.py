@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from liftcore.scene.cameras import Camera
-    from liftcore.scene.lens import Lens
+    from liftcore.scene.distortion import Lens
 
 BAND_VALUES = 1 << 22  # of a grid, carried at a time in float32
 BAND_PIXELS = 1 << 15  # whose rays are bent at a time: what that takes stays in the cache

@@ -18,7 +18,7 @@ from liftcore.features.mask_vectors import mask_vectors
 from liftcore.features.sam_json import sam_masks
 from liftcore.features.views import Regions
 from liftcore.io.npy import NUMBERS, open_npy
-from liftcore.scene.view_names import without_image_suffix
+from liftcore.scene.views import without_image_suffix
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping

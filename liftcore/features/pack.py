@@ -18,11 +18,11 @@ from torch import Tensor
 from liftcore.errors import InvalidFeatures
 from liftcore.features.lens import as_pinhole_sees, grid_sides
 from liftcore.features.views import MAX_CHANNELS, NO_LABEL, FeatureGrid, Regions, ViewFeatures
+from liftcore.io.files import whole_file
 from liftcore.io.safetensors_file import MAX_HEADER_BYTES, TYPES, check_header, safetensors_header, tensor_bytes
-from liftcore.io.whole_file import whole_file
 from liftcore.progress import Progress, silent
 from liftcore.scene.cameras import Camera
-from liftcore.scene.view_pairs import require_pairs
+from liftcore.scene.views import require_pairs
 
 U8_NO_LABEL = 255
 LARGEST_I16 = 32_767

@@ -1,26 +1,94 @@
-"""Open scenes by what is in their files, whatever they are called."""
+"""Cameras from a folder, a JSON file or a zip: which of its files are read, and reading them.
 
-from __future__ import annotations
+A folder or zip may hold COLMAP models, a transforms.json or cameras.json, and nerfstudio's ``FRAME_FILE``, which
+tells the frame of the splats. A zip is read as the folder that was zipped, under limits.
+"""
 
+import errno
+import lzma
+import os
+import tempfile
 import zipfile
-from typing import TYPE_CHECKING
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from itertools import islice
+from pathlib import Path, PurePath, PurePosixPath
+from typing import TypeVar
 
-from liftcore.errors import InvalidCameras
-from liftcore.io.camera_source import camera_source
-from liftcore.io.camera_zip import models_in_zip, read_camera_zip
-from liftcore.io.foreign import refuse_pointer
-from liftcore.io.model_folders import models_below
-from liftcore.scene.distorted import is_undistorted, refuse_both
+from liftcore.errors import InvalidCameras, Unavailable
+from liftcore.io.colmap import MODEL_FILES, has_model, is_whole, model_files, read_colmap
+from liftcore.io.files import refuse_pointer
+from liftcore.io.inria import parse_inria
+from liftcore.io.json_file import read_json
+from liftcore.io.transforms import FRAME_FILE, OF_NERFSTUDIO, parse_transforms, read_frame
+from liftcore.scene.cameras import Cameras, cameras_from
 
-if TYPE_CHECKING:
-    from pathlib import Path
+TRANSFORMS = "transforms.json"
+JSON_FILES = (TRANSFORMS, "cameras.json")
+FORMATS = "a COLMAP sparse model (folder or .zip), a transforms.json or a cameras.json"
+# As trainers, COLMAP's reconstructor and its undistorter lay models out; the first that is there is read.
+MODEL_FOLDERS = (".", "sparse/0", "sparse", "colmap/sparse/0", "0", "dense/0/sparse", "dense/sparse")
+DEPTH = 4  # folders down that models are looked for, if only to be named
+MAX_FOLDERS = 10_000  # that are looked into for it
+MAX_UNZIPPED_BYTES = 512 * 1024 * 1024
+MAX_ZIP_MEMBERS = 100_000
+MOST_MODELS = 8  # of a zip that are looked at
+ONE_RUN = "zip those of one run alone"
+# What zipfile and its decompressors raise of a broken or foreign file.
+BROKEN = (
+    zipfile.BadZipFile,
+    zlib.error,
+    lzma.LZMAError,
+    EOFError,
+    NotImplementedError,
+    OSError,
+    RuntimeError,
+    ValueError,
+)
+Files = Mapping[str, zipfile.ZipInfo]  # by their names in the zip
+P = TypeVar("P", bound=PurePath)
 
-    from liftcore.scene.cameras import Cameras
 
-CAMERA_FORMATS = "a COLMAP sparse model (folder or .zip), a transforms.json or a cameras.json"
+@dataclass(frozen=True)
+class CameraSource:
+    """What cameras are read from: a COLMAP model or one file, and the file that tells the frame of the splats."""
+
+    model: Path | None = None  # a folder
+    file: Path | None = None  # a JSON document or a zip
+    frame: Path | None = None  # a FRAME_FILE
+
+    @property
+    def files(self) -> list[Path]:
+        """All files that are read."""
+        cameras = [self.file] if self.file else model_files(self.model) if self.model else []
+        return cameras + ([self.frame] if self.frame else [])
+
+    def read(self) -> Cameras:
+        """The cameras, in the frame of the splats where a file tells it.
+
+        Raises:
+            InvalidCameras: a file is missing or malformed.
+        """
+        if self.model is not None:
+            source, document, cameras = str(self.model), {}, read_colmap(self.model)
+        else:
+            assert self.file is not None
+            source, document = str(self.file), read_json(self.file)
+            with cameras_from(source):
+                cameras = (parse_inria if isinstance(document, list) else parse_transforms)(document, source)
+        if self.frame is None:
+            return cameras
+        if isinstance(document, list):
+            expected, got = "cameras that are still to be moved", "Inria's, which are in the frame of their splats"
+            hint = f"take {source} or {FRAME_FILE} away, whichever is of another run"
+            raise InvalidCameras(str(self.frame), expected=expected, got=got, hint=hint)
+        similarity = read_frame(self.frame, document, source)
+        with cameras_from(str(self.frame)):
+            return similarity.moved(cameras)
 
 
-def read_cameras(path: Path, *, choosing: bool = True) -> Cameras:
+def read_cameras(path: Path | str, *, choosing: bool = True) -> Cameras:
     """Read cameras from a folder, a JSON file or a zip, recognised by content (`camera_source`).
 
     Args:
@@ -31,25 +99,46 @@ def read_cameras(path: Path, *, choosing: bool = True) -> Cameras:
         InvalidCameras: nothing here is a camera format that we know, or what it holds is malformed.
         Unavailable: the temporary folder has no room for what is in a zip.
     """
+    path = Path(path)
     if path.is_dir():
         return _from_folder(path, choosing=choosing)
     if not path.is_file():
-        raise InvalidCameras(str(path), expected=CAMERA_FORMATS, got="no such file or folder")
+        raise InvalidCameras(str(path), expected=FORMATS, got="no such file or folder")
     try:
         if zipfile.is_zipfile(path):
-            return read_camera_zip(path, camera_source(path).frame, choosing=choosing)
+            return _from_zip(path, camera_source(path).frame, choosing=choosing)
         with path.open("rb") as handle:
             start = handle.read(64).lstrip(b"\xef\xbb\xbf \t\r\n")
     except OSError as error:
         got = f"a file that does not open ({error.strerror})"
-        raise InvalidCameras(str(path), expected=CAMERA_FORMATS, got=got) from None
+        raise InvalidCameras(str(path), expected=FORMATS, got=got) from None
     source = camera_source(path)
     if source.model is None and start[:1] not in (b"[", b"{"):
         refuse_pointer(str(path), start)
         got = f"a file that begins with {start[:8]!r}" if start else "an empty file"
         hint = "of a COLMAP model give the folder, or a zip of its cameras.* and images.* together"
-        raise InvalidCameras(str(path), expected=CAMERA_FORMATS, got=got, hint=hint)
+        raise InvalidCameras(str(path), expected=FORMATS, got=got, hint=hint)
     return source.read()
+
+
+def camera_source(path: Path) -> CameraSource:
+    """The source of a path: of a folder a whole model, else a JSON file, else half a model; of a file itself.
+
+    A ``FRAME_FILE`` counts in the folder, beside the file, and from a model's folder up to its scene's. In a folder
+    with one a transforms.json comes first: nerfstudio trains on its intrinsics.
+    """
+    if not path.is_dir():
+        if path.name in MODEL_FILES and has_model(path.parent):
+            return _of_model(path.parent)
+        return CameraSource(file=path, frame=_frame_in(path.parent))
+    frame, models = _frame_in(path), [path / name for name in MODEL_FOLDERS if has_model(path / name)]
+    documents = [path / name for name in JSON_FILES if (path / name).is_file()]
+    if frame and (path / TRANSFORMS).is_file():
+        return CameraSource(file=path / TRANSFORMS, frame=frame)
+    whole = [model for model in models if is_whole(model)]
+    if whole or (models and not documents):
+        return _of_model((whole + models)[0])
+    return CameraSource(file=next(iter(documents), None), frame=frame)
 
 
 def other_models(path: Path) -> list[str]:
@@ -59,27 +148,270 @@ def other_models(path: Path) -> list[str]:
     """
     if path.is_dir():
         read = camera_source(path).model
-        return [] if read is None else [str(model) for model in models_below(path) if path / model != read]
-    return models_in_zip(path)[1:] if zipfile.is_zipfile(path) else []
+        return [] if read is None else [str(model) for model in _models_below(path) if path / model != read]
+    return _models_in_zip(path)[1:] if zipfile.is_zipfile(path) else []
+
+
+def has_nerfstudio_beside(path: Path) -> bool:
+    """Whether poses of nerfstudio's own frame lie beside the COLMAP model that is read from a folder, file or zip."""
+    source = camera_source(path)
+    if source.model is not None:
+        beside = (folder / TRANSFORMS for folder in _up_to_scene(source.model))
+        return any(_is_of_nerfstudio(document) for document in beside if document.is_file())
+    if source.file is None or not zipfile.is_zipfile(source.file):
+        return False
+    with zipfile.ZipFile(source.file) as archive:
+        return bool(_named(_files(archive), lambda name: name == TRANSFORMS))
+
+
+def _is_of_nerfstudio(document: Path) -> bool:
+    """Whether a transforms.json reads, and was written by nerfstudio's own converter."""
+    try:
+        found = read_json(document)
+    except InvalidCameras:
+        return False
+    return isinstance(found, dict) and any(key in found for key in OF_NERFSTUDIO)
+
+
+# ---- folders
 
 
 def _from_folder(folder: Path, *, choosing: bool) -> Cameras:
     source = camera_source(folder)
     if source.model is None and source.file is None:
-        others = _cameras_below(folder)
-        hint = f"name what is meant, such as {_some(others)}" if others else ""
+        others = [folder / model for model in _models_below(folder)] + sorted(folder.glob("transforms*.json"))
+        hint = f"name what is meant, such as {' or '.join(map(str, others[:2]))}" if others else ""
         got = "a folder without any of them" + (" at the usual places" if others else "")
-        raise InvalidCameras(str(folder), expected=CAMERA_FORMATS, got=got, hint=hint)
+        raise InvalidCameras(str(folder), expected=FORMATS, got=got, hint=hint)
     cameras = source.read()
     if choosing and source.model is not None and cameras.distorted:
-        straight = [str(folder / model) for model in other_models(folder) if is_undistorted(folder / model)]
-        refuse_both(str(folder), str(source.model), straight, "name the one")
+        straight = [str(folder / model) for model in other_models(folder) if _is_undistorted(folder / model)]
+        _refuse_both(str(folder), str(source.model), straight, "name the one")
     return cameras
 
 
-def _cameras_below(scene: Path) -> list[Path]:
-    return [scene / model for model in models_below(scene)] + sorted(scene.glob("transforms*.json"))
+def _is_undistorted(model: Path) -> bool:
+    """Whether a folder has a model that reads, of pinholes alone."""
+    try:
+        return not read_colmap(model).distorted
+    except InvalidCameras:
+        return False
 
 
-def _some(paths: list[Path]) -> str:
-    return " or ".join(str(path) for path in paths[:2])
+def _refuse_both(source: str, read: str, undistorted: list[str], choose: str) -> None:
+    """Refuse the distorted model that was read where undistorted ones lie beside it: which is meant is no guess."""
+    if undistorted:
+        got = f"distorted ones in {read} and undistorted ones in {undistorted[0]}"
+        hint = f"{choose} whose photos the features were made of"
+        raise InvalidCameras(source, expected="distorted or undistorted cameras, not both", got=got, hint=hint)
+
+
+def _of_model(model: Path) -> CameraSource:
+    frames = filter(None, map(_frame_in, _up_to_scene(model)))
+    return CameraSource(model=model, frame=next(frames, None))
+
+
+def _up_to_scene(model: Path) -> list[Path]:
+    """The folders from a model's up to its scene's."""
+    folder = Path(os.path.abspath(model))  # links stay: files lie where somebody put them
+    return [folder, *(parent for parent in folder.parents if parent.is_relative_to(_scene_of(folder)))]
+
+
+def _frame_in(folder: Path) -> Path | None:
+    """The frame's file in a folder, if there is one.
+
+    Raises:
+        InvalidCameras: there is something else of that name, such as a link that leads nowhere.
+    """
+    path = folder / FRAME_FILE
+    if path.is_file():
+        return path
+    if os.path.lexists(path):
+        got = "a link that leads to none" if path.is_symlink() else "none"
+        raise InvalidCameras(str(path), expected="a file", got=got, hint="copy the file itself, or take it away")
+    return None
+
+
+def _models_below(folder: Path) -> list[PurePosixPath]:
+    """Folders with whole models below one, relative to it, in the order of ``_preference``.
+
+    Hidden folders, links and what lies deep down are left out, so that a folder of many scenes costs little.
+    """
+    names: list[str] = []
+    for parent, inner, files in islice(os.walk(folder), MAX_FOLDERS):
+        here = Path(parent).relative_to(folder)
+        names += [(here / name).as_posix() for name in files if name in MODEL_FILES]
+        inner[:] = [name for name in sorted(inner) if not name.startswith(".") and len(here.parts) < DEPTH]
+    return [root for root, _ in _whole_models(names)]
+
+
+def _whole_models(names: Iterable[str]) -> Iterator[tuple[PurePosixPath, str]]:
+    """The folders with both files of a model among such names, and of which kind, the preferred first."""
+    known = set(names)
+    found: dict[PurePosixPath, str] = {}
+    for kind in ("txt", "bin"):  # of two kinds in a folder the binary one
+        for name in known:
+            path = PurePosixPath(name)
+            if path.name == f"cameras.{kind}" and str(path.with_name(f"images.{kind}")) in known:
+                found[path.parent] = kind
+    yield from sorted(found.items(), key=lambda item: _preference(item[0]))
+
+
+def _preference(model: PurePosixPath) -> tuple[bool, int, str, int]:
+    """What models are sorted by: as if folders were opened as scenes one by one, the outermost first.
+
+    So the first model of a zip is the one that is read from the same files in a folder. What lies in a folder
+    ``distorted`` comes last: 3DGS's ``convert.py`` keeps there what it has undistorted.
+    """
+    scene = _scene_of(model)
+    place = MODEL_FOLDERS.index(str(model.relative_to(scene)))
+    return "distorted" in model.parts, len(scene.parts), str(scene), place
+
+
+def _scene_of(model: P) -> P:
+    """The outermost folder in which a model has one of the usual places; its own folder at least."""
+    places = [PurePosixPath(place).parts for place in MODEL_FOLDERS]
+    cut = max(len(place) for place in places if model.parts[len(model.parts) - len(place) :] == place)
+    return type(model)(*model.parts[: len(model.parts) - cut])
+
+
+# ---- zips
+
+
+def _from_zip(path: Path, beside: Path | None, *, choosing: bool) -> Cameras:
+    """The cameras of the preferred model in a zip; with a frame's file in it or ``beside``, a transforms.json first."""
+    with tempfile.TemporaryDirectory(prefix="splatlift-") as folder:
+        _unzip(path, lambda files: _camera_members(files, path, framed=beside is not None), Path(folder))
+        source = camera_source(Path(folder))
+        source = replace(source, frame=source.frame or beside)
+        try:
+            cameras = source.read()
+        except InvalidCameras as error:
+            argument, got, hint = (
+                text.replace(folder, str(path)) for text in (error.argument, error.got, error.hint)
+            )
+            raise InvalidCameras(argument, expected=error.expected, got=got, hint=hint) from None
+    if choosing and source.model is not None and cameras.distorted:
+        read, *others = _models_in_zip(path)[:MOST_MODELS]
+        straight = [name for place, name in enumerate(others, start=1) if _is_undistorted_in_zip(path, place)]
+        _refuse_both(str(path), read, straight, "zip the one alone")
+    return cameras
+
+
+def _models_in_zip(path: Path) -> list[str]:
+    """The folders of all whole models in a zip, the one that is read first."""
+    with zipfile.ZipFile(path) as archive:
+        return [str(root) for root, _ in _whole_models(_files(archive))]
+
+
+def _is_undistorted_in_zip(path: Path, place: int) -> bool:
+    """Whether the zip's model of this place among all reads, and is of pinholes alone."""
+    with tempfile.TemporaryDirectory(prefix="splatlift-") as folder:
+        try:
+            _unzip(path, lambda files: _model_members(files, path, place), Path(folder))
+        except InvalidCameras:
+            return False
+        return _is_undistorted(Path(folder))
+
+
+def _files(archive: zipfile.ZipFile) -> Files:
+    """The files by their names, with slashes: Windows' own programs write backslashes, others ``./`` before all.
+
+    What is hidden, or below a hidden folder, is left out, as it is of folders.
+    """
+    members = {PurePosixPath(m.filename.replace("\\", "/")): m for m in archive.infolist() if not m.is_dir()}
+    return {
+        str(name): member
+        for name, member in members.items()
+        if not any(part.startswith(".") and part != ".." for part in name.parts)
+    }
+
+
+def _unzip(path: Path, pick: Callable[[Files], Files], folder: Path) -> None:
+    """Unzip what is picked of all files, under the names that are picked."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            count, budget = len(archive.infolist()), MAX_UNZIPPED_BYTES
+            if count > MAX_ZIP_MEMBERS:
+                raise InvalidCameras(str(path), expected=f"at most {MAX_ZIP_MEMBERS} files", got=str(count))
+            for name, member in pick(_files(archive)).items():
+                budget -= _unzip_one(archive, member, folder / name, budget)
+    except BROKEN as error:
+        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+            expected, hint = f"room in {tempfile.gettempdir()} for what is in the zip", "make room, or set TMPDIR"
+            raise Unavailable(str(path), expected=expected, got="a full disk", hint=hint) from None
+        got = f"one that does not open ({str(error)[:120]})"
+        raise InvalidCameras(str(path), expected="a zip of a COLMAP sparse model", got=got) from None
+
+
+def _unzip_one(archive: zipfile.ZipFile, member: zipfile.ZipInfo, target: Path, budget: int) -> int:
+    written = 0
+    with archive.open(member) as source, target.open("wb") as sink:
+        while block := source.read(min(1 << 20, budget - written + 1)):
+            written += len(block)
+            if written > budget:
+                limit = f"at most {MAX_UNZIPPED_BYTES} bytes unzipped"
+                raise InvalidCameras(member.filename, expected=limit, got="more", hint="leave points out of the zip")
+            sink.write(block)
+    return written
+
+
+def _camera_members(files: Files, path: Path, *, framed: bool) -> Files:
+    """What the cameras are read from, with the frame of the splats if the zip tells it, wherever it lies."""
+    frames = _named(files, lambda name: name == FRAME_FILE)
+    if not (frames or framed):
+        return _model_members(files, path, 0)
+    documents = _named(files, lambda name: name == TRANSFORMS) or _named(files, _is_transforms)
+    if documents:
+        chosen = {TRANSFORMS: files[_only(documents, TRANSFORMS, path)]}
+    else:
+        chosen = dict(_model_members(files, path, 0))
+        model = next(_whole_models(files))[0]
+        above = [name for name in frames if model.is_relative_to(PurePosixPath(name).parent)]
+        if frames and not above and len({_scene_of(root) for root, _ in _whole_models(files)}) > 1:
+            got = f"one of {PurePosixPath(frames[0]).parent} and the model {model}"
+            raise InvalidCameras(str(path), expected=f"the {FRAME_FILE} of the model", got=got, hint=ONE_RUN)
+        frames = sorted(above, key=lambda name: -name.count("/"))[:1] or frames
+    return {**chosen, **({FRAME_FILE: files[_only(frames, FRAME_FILE, path)]} if frames else {})}
+
+
+def _model_members(files: Files, path: Path, place: int) -> Files:
+    """The cameras and images of the model of this place among all."""
+    for root, kind in islice(_whole_models(files), place, None):
+        return {f"{part}.{kind}": files[str(root / f"{part}.{kind}")] for part in ("cameras", "images")}
+    got, hint = _what_else(files)
+    expected = "a COLMAP model (cameras and images, .bin or .txt) in the zip"
+    raise InvalidCameras(str(path), expected=expected, got=got, hint=hint)
+
+
+def _named(files: Files, fits: Callable[[str], bool]) -> list[str]:
+    found = [place for place in files if fits(PurePosixPath(place).name)]
+    return sorted(found, key=lambda place: (place.count("/"), place))
+
+
+def _is_transforms(name: str) -> bool:
+    return name.startswith("transforms") and name.endswith(".json")
+
+
+def _only(found: list[str], name: str, path: Path) -> str:
+    """The one file of these.
+
+    Raises:
+        InvalidCameras: there are several.
+    """
+    if len(found) > 1:
+        raise InvalidCameras(str(path), expected=f"one {name}", got=" and ".join(found[:2]), hint=ONE_RUN)
+    return found[0]
+
+
+def _what_else(names: Iterable[str]) -> tuple[str, str]:
+    """What a zip without a whole model has, and what to do."""
+    for name in sorted(names):
+        file = PurePosixPath(name).name
+        if file in MODEL_FILES:
+            parts = ("cameras", "images") if file.startswith("cameras") else ("images", "cameras")
+            return f"{name!r} without {file.replace(*parts)!r}", "zip both files together"
+        if file == "cameras.json" or _is_transforms(file):
+            framed = "" if file == "cameras.json" else f", or zip it with its run's {FRAME_FILE}"
+            return f"{name!r}", f"give the JSON file itself{framed}"
+    return "none", "zip the folder that has cameras.bin and images.bin"

@@ -1,32 +1,20 @@
 """COLMAP sparse models, binary and text: cameras and poses; the points are not read."""
 
-from __future__ import annotations
-
-import math
 import mmap
 import struct
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeVar
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
 from liftcore.errors import InvalidCameras
-from liftcore.io.camera_models import (
-    COLMAP_MODELS,
-    MODELS_BY_NAME,
-    READ_MODELS,
-    UNDISTORT,
-    CameraModel,
-    calibration,
-)
-from liftcore.io.foreign import refuse_pointer
-from liftcore.scene.cameras import Camera, Cameras, check_count, told_of
-from liftcore.scene.lens import behind_lens
-from liftcore.scene.view_names import view_names
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-    from pathlib import Path
+from liftcore.io.files import refuse_pointer
+from liftcore.scene.cameras import Camera, Cameras, behind_lens, cameras_from, check_count
+from liftcore.scene.distortion import Brown, Distortion, Fisheye
+from liftcore.scene.quaternions import rotation_matrices
+from liftcore.scene.views import view_names
 
 MAX_TEXT_LINE = 64 * 1024 * 1024  # bytes; a line of an image's points runs to a few MB
 MAX_NAME_BYTES = 4096
@@ -34,6 +22,53 @@ POINT_BYTES = 24  # x, y and the id of its 3D point
 MODEL_FILES = ("cameras.bin", "cameras.txt", "images.bin", "images.txt")
 RE_EXPORT = "export the sparse model again"
 T = TypeVar("T")
+
+
+UNDISTORT = "undistort the photos first, with 'colmap image_undistorter', and train and lift on its output"
+
+
+class Intrinsics(NamedTuple):
+    """A pinhole: focal lengths and principal point in pixels, from the top left corner of the image."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+
+class CameraModel(NamedTuple):
+    """A model: its name, how many of its parameters are focal lengths, and what those behind the centre are."""
+
+    name: str
+    parameters: int
+    focals: int
+    distortion: tuple[str, ...] | None  # the names of the distortion's parameters; None: a model that is not read
+    fisheye: bool = False
+
+
+# By COLMAP's model id (src/colmap/sensor/models.h).
+COLMAP_MODELS = (
+    CameraModel("SIMPLE_PINHOLE", 3, 1, ()),
+    CameraModel("PINHOLE", 4, 2, ()),
+    CameraModel("SIMPLE_RADIAL", 4, 1, ("k1",)),
+    CameraModel("RADIAL", 5, 1, ("k1", "k2")),
+    CameraModel("OPENCV", 8, 2, ("k1", "k2", "p1", "p2")),
+    CameraModel("OPENCV_FISHEYE", 8, 2, ("k1", "k2", "k3", "k4"), fisheye=True),
+    CameraModel("FULL_OPENCV", 12, 2, ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")),
+    CameraModel("FOV", 5, 2, None),
+    CameraModel("SIMPLE_RADIAL_FISHEYE", 4, 1, ("k1",), fisheye=True),
+    CameraModel("RADIAL_FISHEYE", 5, 1, ("k1", "k2"), fisheye=True),
+    CameraModel("THIN_PRISM_FISHEYE", 12, 2, None),
+    CameraModel("RAD_TAN_THIN_PRISM_FISHEYE", 16, 2, None),
+    CameraModel("SIMPLE_DIVISION", 4, 1, None),
+    CameraModel("DIVISION", 5, 2, None),
+    CameraModel("SIMPLE_FISHEYE", 3, 1, (), fisheye=True),
+    CameraModel("FISHEYE", 4, 2, (), fisheye=True),
+    CameraModel("EUCM", 6, 2, None),
+    CameraModel("EQUIRECTANGULAR", 2, 0, None),
+)
+MODELS_BY_NAME = {model.name: model for model in COLMAP_MODELS}
+READ_MODELS = ", ".join(model.name for model in COLMAP_MODELS if model.distortion is not None)
 
 
 @dataclass(frozen=True)
@@ -83,7 +118,7 @@ def read_colmap(folder: Path) -> Cameras:
     else:
         sensors = dict(_counted(_text_sensors(camera_file), camera_file))
         images = list(_counted(_text_images(image_file), image_file))
-    with told_of(str(folder)):
+    with cameras_from(str(folder)):
         names = view_names([image.name for image in images])
         pairs = zip(names, images, strict=True)
         return Cameras(tuple(_camera(name, image, sensors, (camera_file, image_file)) for name, image in pairs))
@@ -96,25 +131,13 @@ def _camera(name: str, image: _Image, sensors: Mapping[int, _Sensor], files: tup
         raise InvalidCameras(source, expected="images of known cameras", got=f"{name!r} of camera {image.camera}")
     intrinsics, distortion = calibration(sensor.model, sensor.parameters, f"{files[0]} camera {image.camera}")
     pose = np.eye(4)
-    pose[:3, :3] = _rotation(np.array(image.quaternion), f"{source} image {name!r}")
+    if not np.isfinite(image.quaternion).all() or not any(image.quaternion):
+        expected, got = "a finite quaternion that is not zero", str(list(image.quaternion))
+        raise InvalidCameras(f"{source} image {name!r}", expected=expected, got=got)
+    pose[:3, :3] = rotation_matrices(np.array(image.quaternion))
     pose[:3, 3] = image.translation
     camera = Camera.pinhole(name, sensor.width, sensor.height, *intrinsics, viewmat=pose)
     return camera if distortion is None else behind_lens(camera, distortion)
-
-
-def _rotation(quaternion: np.ndarray, source: str) -> np.ndarray:
-    """[3, 3] of a quaternion w x y z of any length but zero."""
-    length = math.hypot(*quaternion)  # which squares nothing that could overflow
-    if not math.isfinite(length) or length == 0:
-        raise InvalidCameras(source, expected="a finite quaternion that is not zero", got=str(quaternion.tolist()))
-    w, x, y, z = quaternion / length
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
 
 
 class _Bytes:
@@ -244,3 +267,31 @@ def _counted(records: Iterator[T], path: Path) -> Iterator[T]:
 
 def _bad_line(path: Path, expected: str, line: str) -> InvalidCameras:
     return InvalidCameras(str(path), expected=f"lines {expected!r}", got=repr(line[:80]), hint=RE_EXPORT)
+
+
+def calibration(model: CameraModel, parameters: Sequence[float], source: str) -> tuple[Intrinsics, Distortion | None]:
+    """The intrinsics of a camera of this model, and how it is distorted; None where it is not.
+
+    Raises:
+        InvalidCameras: a parameter is missing, too many or not finite, or the model is one that is not read.
+    """
+    if model.distortion is None:
+        raise InvalidCameras(source, expected=f"a camera of {READ_MODELS}", got=model.name, hint=UNDISTORT)
+    if len(parameters) != model.parameters:
+        raise InvalidCameras(
+            source, expected=f"{model.parameters} parameters of {model.name}", got=str(len(parameters))
+        )
+    centre = model.focals + 2
+    if not np.isfinite(parameters[centre:]).all():
+        got = " ".join(f"{value:g}" for value in parameters[centre:])
+        raise InvalidCameras(source, expected=f"finite {', '.join(model.distortion)}", got=got)
+    intrinsics = Intrinsics(parameters[0], parameters[model.focals - 1], *parameters[model.focals : centre])
+    named = dict(zip(model.distortion, parameters[centre:], strict=True))
+    return intrinsics, distortion_of(named, fisheye=model.fisheye)
+
+
+def distortion_of(named: Mapping[str, float], *, fisheye: bool) -> Distortion | None:
+    """The distortion of parameters by name, those that are missing zero; None for a perspective without any."""
+    if fisheye:
+        return Fisheye(**named)
+    return Brown(**named) if any(named.values()) else None

@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from liftcore.io.camera_source import camera_source
+from liftcore.io.cameras import camera_source
 from liftcore.io.lift_file import InputFile
 
 if TYPE_CHECKING:

@@ -1,18 +1,14 @@
 """The cameras.json that Inria's trainer writes beside its splats."""
 
-from __future__ import annotations
-
 import json
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 from liftcore.errors import InvalidCameras
+from liftcore.io.files import whole_file
 from liftcore.io.json_file import FORMATS, entry, matrix, number, pixels
-from liftcore.io.whole_file import whole_file
 from liftcore.scene.cameras import Camera, Cameras, check_count, viewmat_of
-from liftcore.scene.view_names import view_names
-
-if TYPE_CHECKING:
-    from pathlib import Path
+from liftcore.scene.views import view_names
 
 CENTRE_TOLERANCE = 1e-6  # pixels
 KEEP = "keep these cameras as a COLMAP model or transforms.json"

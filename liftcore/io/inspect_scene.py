@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import zipfile
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
-from liftcore.io.camera_source import TRANSFORMS, camera_source, found_near, is_of_nerfstudio
-from liftcore.io.camera_zip import has_transforms
-from liftcore.io.cameras import other_models, read_cameras
-from liftcore.io.foreign import SUFFIXES
-from liftcore.io.frame import FRAME_FILE, frame_warning
+from liftcore.io.cameras import TRANSFORMS, camera_source, has_nerfstudio_beside, other_models, read_cameras
+from liftcore.io.files import SUFFIXES
 from liftcore.io.ply import read_splats
 from liftcore.io.ply_dialect import nearest_dialect
+from liftcore.io.transforms import FRAME_FILE, frame_warning
 from liftcore.raster.constants import ALPHA_FLOOR
-from liftcore.scene.distorted import distortion_warning
-from liftcore.scene.lens import photo_size
+from liftcore.scene.cameras import distortion_warning, photo_size
 from liftcore.scene.splats import Kernel
 
 if TYPE_CHECKING:
@@ -97,7 +93,7 @@ def describe_camera_file(path: Path) -> dict[str, Any]:
     if others:
         found["warnings"].append(f"{len(others)} more COLMAP models were not read: {', '.join(others[:SHOWN])}")
     if found["frame"] is None:
-        found["warnings"] += _frame_warnings(path)
+        found["warnings"] += [OTHER_FRAME] if has_nerfstudio_beside(path) else []
     return found
 
 
@@ -116,15 +112,6 @@ def describe_cameras(cameras: Cameras) -> dict[str, Any]:
         "box": [centres.min(axis=0).tolist(), centres.max(axis=0).tolist()],
         "warnings": _camera_warnings(cameras, centres),
     }
-
-
-def _frame_warnings(path: Path) -> list[str]:
-    """What is to be said where other cameras than those of nerfstudio were read beside its own."""
-    source = camera_source(path)
-    if source.model is not None:
-        return [OTHER_FRAME] if any(map(is_of_nerfstudio, found_near(source.model, TRANSFORMS))) else []
-    in_zip = source.file is not None and zipfile.is_zipfile(source.file) and has_transforms(source.file)
-    return [OTHER_FRAME] if in_zip else []
 
 
 def _quantiles(values: Tensor) -> dict[str, float]:

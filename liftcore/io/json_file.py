@@ -1,18 +1,15 @@
-"""Camera files in JSON, read under a limit, with numbers that say where they were wrong."""
-
-from __future__ import annotations
+"""JSON: camera files read under a limit, with numbers that say where they were wrong, and numbers that it can say."""
 
 import json
 import math
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from liftcore.errors import InvalidCameras
-from liftcore.io.foreign import refuse_pointer
-
-if TYPE_CHECKING:
-    from pathlib import Path
+from liftcore.io.files import refuse_pointer
 
 MAX_JSON_BYTES = 64 * 1024 * 1024
 FORMATS = "an object with 'frames' (nerfstudio) or a list of cameras with 'img_name' (Inria)"
@@ -72,3 +69,14 @@ def matrix(value: Any, rows: tuple[int, ...], columns: int, source: str) -> np.n
         wanted = " or ".join(f"{count}x{columns}" for count in rows)
         raise InvalidCameras(source, expected=f"a {wanted} matrix as nested lists", got=repr(value)[:60])
     return np.array([[number(cell, source) for cell in row] for row in value])
+
+
+def finite(value: Any) -> Any:
+    """The value with null for infinities and what is no number, at any depth of mappings, lists and tuples."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {str(name): finite(inner) for name, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(inner) for inner in value]
+    return value

@@ -10,10 +10,9 @@ import numpy as np
 import torch
 
 from liftcore.errors import InvalidSplats
-from liftcore.io.foreign import LFS_POINTER
+from liftcore.io.files import LFS_POINTER, whole_file
 from liftcore.io.ply_dialect import NORMALS, Slot, model_slots, recognise_kernel, usual_layout
 from liftcore.io.ply_header import SCALAR_TYPES, PlyHeader, PlyProperty, parse_header, read_header
-from liftcore.io.whole_file import whole_file
 from liftcore.scene.kernel import Kernel, kernel_named
 from liftcore.scene.mip_filter import FILTER, filtered
 from liftcore.scene.splats import Splats

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from liftcore.errors import InvalidSplats
-from liftcore.io.foreign import CONVERT, foreign_format
+from liftcore.io.files import CONVERT, foreign_format
 
 MAX_HEADER_BYTES = 256 * 1024
 MAX_HEADER_LINES = 4096

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from liftcore.errors import InvalidInput
-from liftcore.io.whole_file import whole_file
+from liftcore.io.files import whole_file
 
 if TYPE_CHECKING:
     import torch

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from liftcore.device import CPU
-from liftcore.io.frame import frame_warning
+from liftcore.io.transforms import frame_warning
 from liftcore.plan.coverage import WELL_COVERED, spare_views, view_order, views_to_show
 from liftcore.plan.entries import planned_entries
 from liftcore.plan.memory import (
@@ -26,7 +26,7 @@ from liftcore.plan.pilot import PILOT_VIEWS, fly_pilot
 from liftcore.plan.rank import ENOUGH, Rank, codebook_rank
 from liftcore.plan.visibility import visibility
 from liftcore.raster.cpu.side_by_side import views_at_a_time
-from liftcore.scene.distorted import distortion_warning
+from liftcore.scene.cameras import distortion_warning
 from liftcore.solve.map_shapes import shape_warnings
 
 if TYPE_CHECKING:

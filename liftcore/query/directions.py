@@ -12,8 +12,8 @@ import torch
 from liftcore.errors import InvalidQuery, NotFound
 from liftcore.features.views import Regions
 from liftcore.query.example import OneSplat, Pixel, Region, Vector
-from liftcore.scene.lens import drawn_by, photo_size, pixel_of
-from liftcore.scene.view_pairs import cameras_of_views
+from liftcore.scene.cameras import drawn_by, photo_size, pixel_of
+from liftcore.scene.views import cameras_of_views
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from liftcore.scene.lens import drawn_by, photo_places
+from liftcore.scene.cameras import drawn_by
+from liftcore.scene.distortion import photo_places
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -13,7 +13,7 @@ from liftcore.query.products import norms_of
 from liftcore.query.scores import mean_direction
 from liftcore.query.unchanged import unchanged
 from liftcore.raster.base import CompositingParams
-from liftcore.scene.lens import drawn_by, photo_size
+from liftcore.scene.cameras import drawn_by, photo_size
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

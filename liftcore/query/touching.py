@@ -11,6 +11,7 @@ import torch
 
 from liftcore.jit import kernel
 from liftcore.raster.constants import MAX_LOG_SCALE
+from liftcore.scene.quaternions import rotation_matrices
 from liftcore.scene.splats import Splats
 
 NEIGHBOURS = 16  # that each splat looks at, the nearest by their centres
@@ -96,16 +97,7 @@ def find_touching(means, spreads, first, near, touch):
 def _spreads(splats: Splats, rows: np.ndarray) -> np.ndarray:
     """[n, 6] f64, Sigma of each splat: xx, yy, zz, and twice xy, xz, yz."""
     scales = np.exp(splats.log_scales.numpy()[rows].astype(np.float64).clip(-MAX_LOG_SCALE, MAX_LOG_SCALE))
-    quats = splats.quats.numpy()[rows].astype(np.float64)
-    lengths = np.linalg.norm(quats, axis=1, keepdims=True)
-    w, x, y, z = np.where(lengths > 0, quats / np.maximum(lengths, np.finfo(float).tiny), [1.0, 0, 0, 0]).T
-    axes = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)],
-            [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)],
-            [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )[: scales.shape[1]]  # [axis, coordinate, n]; a disc has two
-    x, y, z = (axes * scales.T[:, None]).transpose(1, 0, 2)
+    turned = rotation_matrices(splats.quats.numpy()[rows])[:, :, : scales.shape[1]]  # a disc has two axes
+    x, y, z = (turned * scales[:, None]).transpose(1, 2, 0)
     products = (x * x, y * y, z * z, 2 * x * y, 2 * x * z, 2 * y * z)
     return np.stack([product.sum(axis=0) for product in products], axis=1)

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from liftcore.errors import InvalidLift
-from liftcore.io.frame import FRAME_FILE
+from liftcore.io.transforms import FRAME_FILE
 
 if TYPE_CHECKING:
     from liftcore.io.lift_file import InputFile

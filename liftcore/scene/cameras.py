@@ -3,27 +3,25 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import KW_ONLY, dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from liftcore.errors import InvalidCameras, NotFound
 from liftcore.nearest import nearest
-from liftcore.scene.view_pairs import cameras_of_views
+from liftcore.scene.distortion import MAX_SIDE, Distortion, Lens, Rectangle, shared_lens
+from liftcore.scene.views import cameras_of_views
 
-if TYPE_CHECKING:
-    from liftcore.scene.lens import Lens
-
-MAX_SIDE = 32_768  # pixels; larger images are a broken header, not a photo
 ROUNDING = 1e-6  # of the last row of a pose
 MIN_FOCAL, MAX_FOCAL = 1e-3, 1e9  # pixels; float64 squares of what they project stay finite
 MAX_OFF_CENTRE = 1e9  # pixels of the principal point
 MAX_REACH = 1e12  # scene units from the origin; float32 has no detail left long before
 MAX_VIEWS = 100_000  # of a scene: many times what anybody lifts, and read and checked in seconds
 NEAREST = 3  # views named when one is unknown
+NEARLY_ALL = 0.995  # a share that would be told as 100%
 SHOWN = 120  # characters of a name that is unknown
 SAME_NAMES = (
     "a view is known by its photo's name without the suffix: rename photos, or, where training and test photos share "
@@ -159,38 +157,6 @@ def _what_it_is(matrix: np.ndarray, error: float) -> str:
     return f"a matrix off by {error:.2g}"
 
 
-def viewmat_of(camera_to_world: np.ndarray, centre: np.ndarray) -> np.ndarray:
-    """[4, 4] f64 of a camera's axes in the world, [3, 3], and its centre, [3]; a ``Camera`` validates it."""
-    pose = np.eye(4)
-    pose[:3, :3] = camera_to_world.T
-    with np.errstate(over="ignore", invalid="ignore"):  # what overflows is not finite, and is refused as such
-        pose[:3, 3] = -camera_to_world.T @ centre
-    return pose
-
-
-@contextmanager
-def told_of(source: str) -> Iterator[None]:
-    """Name the file in what its cameras themselves find wrong, where the error does not name it."""
-    try:
-        yield
-    except InvalidCameras as error:
-        if source in error.argument:
-            raise
-        argument = f"{source} {error.argument}"
-        raise InvalidCameras(argument, expected=error.expected, got=error.got, hint=error.hint) from None
-
-
-def check_count(count: int, source: str) -> None:
-    """Refuse more views than a scene may have, by their number alone.
-
-    Raises:
-        InvalidCameras: there are more than MAX_VIEWS.
-    """
-    if count > MAX_VIEWS:
-        hint = "lift fewer photos, such as every second one"
-        raise InvalidCameras(source, expected=f"at most {MAX_VIEWS} views", got=f"{count} or more", hint=hint)
-
-
 class Cameras(Mapping[str, Camera]):
     """The views of a scene by their names, in file order.
 
@@ -252,3 +218,92 @@ class Cameras(Mapping[str, Camera]):
     def distorted(self) -> tuple[str, ...]:
         """The names of the views whose photos are distorted."""
         return tuple(name for name, camera in self._by_name.items() if camera.lens is not None)
+
+
+def viewmat_of(camera_to_world: np.ndarray, centre: np.ndarray) -> np.ndarray:
+    """[4, 4] f64 of a camera's axes in the world, [3, 3], and its centre, [3]; a ``Camera`` validates it."""
+    pose = np.eye(4)
+    pose[:3, :3] = camera_to_world.T
+    with np.errstate(over="ignore", invalid="ignore"):  # what overflows is not finite, and is refused as such
+        pose[:3, 3] = -camera_to_world.T @ centre
+    return pose
+
+
+@contextmanager
+def cameras_from(source: str) -> Iterator[None]:
+    """Name the file in what its cameras themselves find wrong, where the error does not name it."""
+    try:
+        yield
+    except InvalidCameras as error:
+        if source in error.argument:
+            raise
+        argument = f"{source} {error.argument}"
+        raise InvalidCameras(argument, expected=error.expected, got=error.got, hint=error.hint) from None
+
+
+def check_count(count: int, source: str) -> None:
+    """Refuse more views than a scene may have, by their number alone.
+
+    Raises:
+        InvalidCameras: there are more than MAX_VIEWS.
+    """
+    if count > MAX_VIEWS:
+        hint = "lift fewer photos, such as every second one"
+        raise InvalidCameras(source, expected=f"at most {MAX_VIEWS} views", got=f"{count} or more", hint=hint)
+
+
+def behind_lens(camera: Camera, distortion: Distortion) -> Camera:
+    """The camera of a distorted photo, from a camera with the photo's size and intrinsics.
+
+    Raises:
+        InvalidCameras: a pinhole would see hardly anything of the photo.
+    """
+    photo = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+    lens = shared_lens(Lens(*photo, distortion))
+    try:
+        return _pinhole(camera, lens, lens.inner)
+    except ValueError as error:
+        hint = "calibrate the camera again, or undistort the photos, and train and lift on them"
+        raise InvalidCameras(
+            f"camera {camera.name!r} distortion", expected="one that a lens may have", got=str(error), hint=hint
+        ) from None
+
+
+def photo_size(camera: Camera) -> tuple[int, int]:
+    """Width and height in pixels of the photo that a camera stands for."""
+    whole = camera.lens or camera
+    return whole.width, whole.height
+
+
+def drawn_by(camera: Camera) -> Camera:
+    """The pinhole that draws pictures of a camera: its own, or one that sees all that its lens's photo shows."""
+    return camera if camera.lens is None else _pinhole(camera, camera.lens, camera.lens.outer)
+
+
+def pixel_of(camera: Camera, x: int, y: int) -> tuple[int, int] | None:
+    """The pixel of ``drawn_by`` that shows what the photo's pixel does; None where it shows none of it."""
+    if camera.lens is None:
+        return x, y
+    pinhole, lens = drawn_by(camera), camera.lens
+    across, down = lens.on_plane(np.array([x + 0.5]), np.array([y + 0.5]))
+    column, row = (float(np.floor(at)) for at in (across[0] * lens.fx + pinhole.cx, down[0] * lens.fy + pinhole.cy))
+    inside = 0 <= column < pinhole.width and 0 <= row < pinhole.height
+    return (int(column), int(row)) if inside else None
+
+
+def distortion_warning(views: Sequence[Camera]) -> list[str]:
+    """What is to be said of distorted views, if there are some."""
+    shares = [camera.lens.share for camera in views if camera.lens is not None]
+    if not shares:
+        return []
+    least = min(shares)
+    lifted = "nearly all" if least > NEARLY_ALL else f"{least:.0%} or more"
+    return [
+        f"{len(shares)} of {len(views)} views are of distorted photos, of each of which {lifted} is "
+        "lifted: features must be of the photos as they were taken, not of undistorted ones"
+    ]
+
+
+def _pinhole(camera: Camera, lens: Lens, seen: Rectangle) -> Camera:
+    width, height = seen.right - seen.left, seen.bottom - seen.top
+    return camera.replace(width=width, height=height, cx=lens.cx - seen.left, cy=lens.cy - seen.top, lens=lens)

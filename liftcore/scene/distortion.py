@@ -1,13 +1,19 @@
-"""How a lens bends rays, and back: the models of OpenCV and COLMAP, on the plane one unit before the camera.
+"""How a lens bends rays, and what a pinhole sees of its photo: the models of OpenCV and COLMAP.
 
-A pinhole meets a ray at (x, y) on this plane, the lens at (x', y'). Where a model turns back, so that two rays
-would meet in one place, it has no way back, and ``straight`` gives NaN.
+Rays are told by where they pass the plane one unit before the camera: a pinhole sees the ray (x, y) at (x, y), the
+lens at (x', y'). Where a model turns back, so that two rays would meet in one place, it has no inverse, and
+``straight`` gives NaN.
+
+Splats are drawn by pinholes, so a lens has the pinhole of the same focal lengths whose image is the largest upright
+rectangle all of which the photo shows (``Lens.inner``): what gsplat and nerfstudio train on. Pictures of answers are
+drawn by a wider one, which sees all that the photo shows (``Lens.outer``), and carried to the photo's pixels.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -15,6 +21,13 @@ ITERATIONS = 30  # of Newton's method, which needs four to six where a lens is o
 TOLERANCE = 1e-9  # on the plane: a millionth of a pixel
 RADII, DIRECTIONS = 513, 16  # at which it is looked whether a lens turns back
 FARTHEST = 1e3  # on the plane: what a fisheye sees beside or behind the camera is put so far out
+MAX_SIDE = 32_768  # pixels; larger images are a broken header, not a photo
+WIDEST = float(np.tan(np.radians(60)))  # of a pinhole's image from its axis, in x and in y, on the plane
+GROWTH = 0.5  # of the photo's sides, by which a pinhole's image is larger on each side at most
+LEAST_SHARE = 0.1  # of the photo that its pinhole has to see: with less the calibration is broken
+ROUNDING = 1e-3  # pixels
+BORDER_PLACES = 33  # on each side of the photo
+BAND_PIXELS = 1 << 15  # carried at a time: what that takes stays in the cache
 
 
 @dataclass(frozen=True)
@@ -136,3 +149,147 @@ def _first_back(forth: np.ndarray, radii: np.ndarray) -> float:
 
 
 Distortion = Brown | Fisheye
+
+
+@dataclass(frozen=True)
+class Rectangle:
+    """Whole pixels of a pinhole with a lens's focal lengths and principal point; the first ones may be negative."""
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+
+
+@dataclass(frozen=True)
+class Lens:
+    """The lens of a photo, and the photo's own intrinsics; pixel centres at +0.5."""
+
+    width: int  # pixels
+    height: int  # pixels
+    fx: float  # pixels
+    fy: float  # pixels
+    cx: float  # pixels
+    cy: float  # pixels
+    distortion: Distortion
+
+    def on_photo(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where on the photo, in pixels, rays lie that pass (x, y) on the plane one unit before the camera."""
+        u, v = self.distortion.bent(x, y)
+        return self.fx * u + self.cx, self.fy * v + self.cy
+
+    def on_plane(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The inverse: where on that plane the rays pass that the photo shows at pixels (u, v); else NaN."""
+        x, y = self.distortion.straight((u - self.cx) / self.fx, (v - self.cy) / self.fy)
+        with np.errstate(invalid="ignore"):
+            shown = np.hypot(x, y) <= self._reach
+        return np.where(shown, x, np.nan), np.where(shown, y, np.nan)
+
+    @cached_property
+    def inner(self) -> Rectangle:
+        """The largest rectangle all of which the photo shows.
+
+        Raises:
+            ValueError: a pinhole sees hardly anything of the photo; the message says why.
+        """
+        left, top, right, bottom = self._sides
+        found = self._within_reach([np.max(left), np.max(top), np.min(right), np.min(bottom)])
+        if found.left >= found.right or found.top >= found.bottom:
+            raise ValueError("one that leaves a pinhole nothing of the photo")
+        share = self._share_of(found)
+        if math.isnan(share):
+            raise ValueError("one that turns back within the photo, so that two of its places show the same ray")
+        if share < LEAST_SHARE:
+            raise ValueError(f"one by which a pinhole sees {share:.1%} of the photo")
+        return found
+
+    @cached_property
+    def outer(self) -> Rectangle:
+        """The rectangle that shows all of the photo that pinholes may see.
+
+        Where the photo's border shows no ray, because the lens turns back before it, what has rays ends there.
+        """
+        left, top, right, bottom = self._sides
+        first = (int(np.floor(side.min())) for side in (left, top))
+        return Rectangle(*first, *(int(np.ceil(side.max())) for side in (right, bottom)))
+
+    @cached_property
+    def share(self) -> float:
+        """How much of the photo's area ``inner`` sees."""
+        return self._share_of(self.inner)
+
+    @cached_property
+    def _reach(self) -> float:
+        """How far from the axis rays have places of their own, on the plane; infinity: all that pinholes may see."""
+        return self.distortion.reach(2 * WIDEST)
+
+    @cached_property
+    def _sides(self) -> list[np.ndarray]:
+        """The photo's left, top, right and bottom side [BORDER_PLACES] in pixels of the pinhole, x or y.
+
+        Where a side shows no ray, the last one in its direction stands for it.
+        """
+        across, down = np.linspace(0, self.width, BORDER_PLACES), np.linspace(0, self.height, BORDER_PLACES)
+        u = np.stack([0 * down, across, 0 * down + self.width, across])
+        v = np.stack([down, 0 * across, down, 0 * across + self.height])
+        x, y = self.on_plane(u, v)
+        towards = np.stack([(u - self.cx) / self.fx, (v - self.cy) / self.fy])
+        last = min(self._reach, 2 * WIDEST) * towards / np.maximum(np.hypot(*towards), np.finfo(np.float32).tiny)
+        x, y = np.where(np.isnan(x), last[0], x), np.where(np.isnan(y), last[1], y)
+        of_x, of_y = (self.fx, self.cx, self.width), (self.fy, self.cy, self.height)
+        return [_pixels(x[0], *of_x), _pixels(y[1], *of_y), _pixels(x[2], *of_x), _pixels(y[3], *of_y)]
+
+    def _within_reach(self, sides: list[float]) -> Rectangle:
+        """The whole pixels within such sides, drawn towards the axis until rays at the corners have places."""
+        left, top, right, bottom = sides
+        corner = np.hypot(
+            max(abs(left - self.cx), abs(right - self.cx)) / self.fx,
+            max(abs(top - self.cy), abs(bottom - self.cy)) / self.fy,
+        )
+        nearer = min(1.0, self._reach / corner) if corner > 0 else 1.0
+        left, right = (self.cx + nearer * (side - self.cx) for side in (left, right))
+        top, bottom = (self.cy + nearer * (side - self.cy) for side in (top, bottom))
+        return Rectangle(int(np.ceil(left)), int(np.ceil(top)), int(np.floor(right)), int(np.floor(bottom)))
+
+    def _share_of(self, box: Rectangle) -> float:
+        """How much of the photo's area a rectangle sees; NaN where it sees beyond the photo."""
+        steps = np.linspace(0, 1, BORDER_PLACES)[:-1]
+        width, height = box.right - box.left, box.bottom - box.top
+        along, back, still = box.left + width * steps, box.right - width * steps, 0 * steps
+        u = np.concatenate([along, still + box.right, back, still + box.left])
+        v = np.concatenate(
+            [still + box.top, box.top + height * steps, still + box.bottom, box.bottom - height * steps]
+        )
+        x, y = self.on_photo((u - self.cx) / self.fx, (v - self.cy) / self.fy)
+        past = max(-x.min(), -y.min(), x.max() - self.width, y.max() - self.height)
+        if not past <= ROUNDING:
+            return math.nan
+        area = 0.5 * abs(float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y)))
+        return area / (self.width * self.height)
+
+
+def _pixels(places: np.ndarray, focal: float, centre: float, length: int) -> np.ndarray:
+    """A side of the photo on the plane as pixels of the pinhole, kept to what a pinhole should draw."""
+    margin = min(GROWTH * length, (MAX_SIDE - length) / 2)
+    return np.clip(np.clip(places, -WIDEST, WIDEST) * focal + centre, -margin, length + margin)
+
+
+@lru_cache(maxsize=256)
+def shared_lens(lens: Lens) -> Lens:
+    """The first lens that was equal to this one, which knows its rectangles already."""
+    return lens
+
+
+@lru_cache(maxsize=1)  # 8 bytes a pixel: mostly one lens took all photos
+def photo_places(lens: Lens) -> tuple[np.ndarray, np.ndarray]:
+    """Two arrays [H, W] f32: where in the image of ``lens.outer`` the photo's pixels lie, in its pixels."""
+    columns = np.arange(lens.width) + 0.5
+    places = (np.empty((lens.height, lens.width), np.float32), np.empty((lens.height, lens.width), np.float32))
+    rows = max(1, BAND_PIXELS // lens.width)
+    for first in range(0, lens.height, rows):
+        here = slice(first, first + rows)
+        v, u = np.meshgrid(np.arange(lens.height)[here] + 0.5, columns, indexing="ij")
+        x, y = lens.on_plane(u, v)
+        places[0][here] = x * lens.fx + lens.cx - lens.outer.left
+        places[1][here] = y * lens.fy + lens.cy - lens.outer.top
+    return places

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from liftcore.scene.lens import photo_size
+from liftcore.scene.cameras import photo_size
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

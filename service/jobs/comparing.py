@@ -11,7 +11,7 @@ from liftcore.device import Device, choose_device
 from liftcore.evaluate.tradeoff.compare import compare
 from liftcore.evaluate.tradeoff.order import CANDIDATES, EXACT, Scene
 from liftcore.evaluate.tradeoff.report import page_of, save
-from liftcore.io.strict_json import finite
+from liftcore.io.json_file import finite
 from liftcore.progress import Progress, one_step
 from liftcore.scene.splats import Kernel
 from liftcore.settings import LiftSettings

@@ -11,7 +11,7 @@ from liftcore.io.ply_header import read_header
 from liftcore.query.encoders.words import nearest, plain
 from liftcore.raster.antialiased import check_antialiased
 from liftcore.scene.kernel import Kernel
-from liftcore.scene.view_pairs import cameras_of_views, require_pairs, some_of
+from liftcore.scene.views import cameras_of_views, require_pairs, some_of
 from liftcore.settings import LiftSettings
 from service.errors import InvalidRequest
 from service.store.assets import AssetRecord, kernel_of

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from liftcore.io.input_files import sha256_of
+from liftcore.io.json_file import finite
 from liftcore.io.lift_file import InputFile, LiftMetadata, save_lift
-from liftcore.io.strict_json import finite
 from liftcore.lift import lift
 from liftcore.listener import Listener, log_warnings
 from liftcore.plan.plan import Plan

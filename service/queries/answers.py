@@ -16,8 +16,8 @@ from typing import Any
 import torch
 
 from liftcore.errors import SplatliftError
+from liftcore.io.json_file import finite
 from liftcore.io.lift_file import load_lift
-from liftcore.io.strict_json import finite
 from liftcore.query.ask import Answer, Point, Question, answers, question, top
 from liftcore.query.encoders import TextEncoder, open_encoder
 from liftcore.query.encoders.remembering import RememberingEncoder

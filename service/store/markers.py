@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from liftcore.io.whole_file import whole_file
+from liftcore.io.files import whole_file
 from service.errors import Misconfigured
 from service.store.files import sync_directory
 

@@ -18,8 +18,8 @@ from liftcore.features.pack import read_features
 from liftcore.io.class_masks import describe_masks
 from liftcore.io.inspect import describe_packs, describe_table
 from liftcore.io.inspect_scene import describe_camera_file, describe_splats
+from liftcore.io.json_file import finite
 from liftcore.io.ply import read_splats
-from liftcore.io.strict_json import finite
 from liftcore.query.encoders.table import TableEncoder
 from service.faults import fault_of
 from service.own_stdout import own_stdout

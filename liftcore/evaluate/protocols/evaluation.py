@@ -10,7 +10,7 @@ from liftcore.evaluate.protocols import EvaluationProtocol
 from liftcore.evaluate.protocols.judging import Judged, Means, judge, mean_of_scenes, means, pooled_ious
 from liftcore.progress import Progress, silent
 from liftcore.query.scores import DEFAULT_NEGATIVES
-from liftcore.scene.lens import photo_size
+from liftcore.scene.cameras import photo_size
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence

@@ -13,7 +13,7 @@ from liftcore.io.class_masks import read_masks
 from liftcore.query.encoders.table import TableEncoder
 from liftcore.query.in_photo import in_photo
 from liftcore.raster.cpu.raster import CpuRaster
-from liftcore.scene.view_pairs import cameras_of_views
+from liftcore.scene.views import cameras_of_views
 
 if TYPE_CHECKING:
     from torch import Tensor

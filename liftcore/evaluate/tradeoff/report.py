@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from liftcore.evaluate.hardware import machine_line
 from liftcore.evaluate.tradeoff.chart import draw
-from liftcore.io.whole_file import whole_file
+from liftcore.io.files import whole_file
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

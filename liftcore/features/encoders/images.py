@@ -12,7 +12,7 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 
 from liftcore.errors import InvalidInput
 from liftcore.features.folder import files_below
-from liftcore.scene.view_names import IMAGE_SUFFIXES, without_image_suffix
+from liftcore.scene.views import IMAGE_SUFFIXES, without_image_suffix
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from liftcore.io.whole_file import whole_file
+from liftcore.io.files import whole_file
 from liftcore.raster.cpu.warm_up import warm_up
 from liftcore.scene.splats import Kernel
 from tests.benchmarks.stability.page import page

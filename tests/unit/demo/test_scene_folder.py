@@ -14,7 +14,7 @@ from safetensors.torch import save_file
 
 from liftcore.demo.scene_folder import find_scene
 from liftcore.errors import InvalidInput
-from liftcore.io.frame import FRAME_FILE
+from liftcore.io.transforms import FRAME_FILE
 
 INRIA_CAMERA = {
     "id": 0, "img_name": "v", "width": 4, "height": 3, "fx": 4.0, "fy": 4.0,

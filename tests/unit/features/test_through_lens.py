@@ -12,9 +12,8 @@ from liftcore.features import lens
 from liftcore.features.lens import as_pinhole_sees
 from liftcore.features.pack import pair, read_features, write_pack
 from liftcore.features.views import FeatureGrid, Regions
-from liftcore.scene.cameras import Camera, Cameras
+from liftcore.scene.cameras import Camera, Cameras, behind_lens
 from liftcore.scene.distortion import Brown, Distortion, Fisheye
-from liftcore.scene.lens import behind_lens
 
 BARREL = Brown(k1=-0.25, k2=0.04, p1=0.002, p2=-0.001)
 PINCUSHION = Brown(k1=0.2)

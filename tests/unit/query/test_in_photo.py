@@ -7,9 +7,8 @@ import pytest
 import torch
 
 from liftcore.query.in_photo import _read, in_photo
-from liftcore.scene.cameras import Camera
-from liftcore.scene.distortion import Brown, Distortion, Fisheye
-from liftcore.scene.lens import behind_lens, drawn_by, photo_places
+from liftcore.scene.cameras import Camera, behind_lens, drawn_by
+from liftcore.scene.distortion import Brown, Distortion, Fisheye, photo_places
 
 BARREL = Brown(k1=-0.25, k2=0.04, p1=0.002, p2=-0.001)
 PINCUSHION = Brown(k1=0.2)

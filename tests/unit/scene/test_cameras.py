@@ -15,14 +15,13 @@ from camera_documents import assert_same, with_json
 from colmap_files import IMAGES, binary_files, text_files, write_files
 
 from liftcore.errors import InvalidCameras, InvalidSplats
-from liftcore.io import camera_zip, json_file
+from liftcore.io import cameras, json_file
 from liftcore.io.cameras import other_models, read_cameras
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.inspect_scene import describe_camera_file
 from liftcore.io.ply import read_splats
 from liftcore.scene.cameras import Camera, Cameras
-from liftcore.scene.distortion import Brown, Fisheye
-from liftcore.scene.lens import Lens
+from liftcore.scene.distortion import Brown, Fisheye, Lens
 
 
 @pytest.fixture
@@ -77,14 +76,14 @@ def test_models_that_are_not_read_are_told(packed: bool, tmp_path: Path) -> None
 
 
 def test_zip_bomb_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(camera_zip, "MAX_UNZIPPED_BYTES", 1000)
+    monkeypatch.setattr(cameras, "MAX_UNZIPPED_BYTES", 1000)
     path = tmp_path / "bomb.zip"
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("cameras.bin", bytes(100_000))
         archive.writestr("images.bin", b"")
     with pytest.raises(InvalidCameras, match="at most 1000 bytes unzipped"):
         read_cameras(path)
-    monkeypatch.setattr(camera_zip, "MAX_ZIP_MEMBERS", 1)
+    monkeypatch.setattr(cameras, "MAX_ZIP_MEMBERS", 1)
     with pytest.raises(InvalidCameras, match="at most 1 files, got 2"):
         read_cameras(path)
 

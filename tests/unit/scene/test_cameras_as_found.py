@@ -13,9 +13,8 @@ import pytest
 from colmap_files import CAMERAS, IMAGES, binary_files, text_files, write_files
 
 from liftcore.errors import InvalidCameras
-from liftcore.io.cameras import other_models, read_cameras
+from liftcore.io.cameras import MODEL_FOLDERS, other_models, read_cameras
 from liftcore.io.inspect_scene import inspect_file
-from liftcore.io.model_folders import MODEL_FOLDERS
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from liftcore.io.camera_models import MODELS_BY_NAME, calibration
+from liftcore.io.colmap import MODELS_BY_NAME, calibration
 from liftcore.scene.distortion import FARTHEST, Brown, Distortion, Fisheye
 
 POINTS = np.array([[0.1, 0.2], [-0.6, 0.45], [0.7, -0.5], [0.0, 0.55]])

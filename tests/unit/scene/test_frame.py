@@ -16,12 +16,12 @@ from colmap_files import CAMERAS, binary_files, write_files
 from scipy.spatial.transform import Rotation
 
 from liftcore.errors import InvalidCameras, Unavailable
-from liftcore.io import camera_zip
+from liftcore.io import cameras
 from liftcore.io.cameras import read_cameras
-from liftcore.io.frame import FRAME_FILE, Similarity
 from liftcore.io.input_files import camera_input
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.inspect_scene import inspect_file
+from liftcore.io.transforms import FRAME_FILE, Similarity
 from liftcore.scene.cameras import Camera, Cameras
 
 APPLIED = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])  # of nerfstudio's converter
@@ -351,6 +351,6 @@ def test_full_disk_is_no_broken_zip(run: Path, monkeypatch: pytest.MonkeyPatch) 
         raise OSError(errno.ENOSPC, "No space left on device")
 
     path = Path(shutil.make_archive(str(run), "zip", run))
-    monkeypatch.setattr(camera_zip, "_unzip_one", full)
+    monkeypatch.setattr(cameras, "_unzip_one", full)
     with pytest.raises(Unavailable, match=r"expected room in .* for what is in the zip, got a full disk; make room"):
         read_cameras(path)

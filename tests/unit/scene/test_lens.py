@@ -9,10 +9,8 @@ import numpy as np
 import pytest
 
 from liftcore.errors import InvalidCameras
-from liftcore.scene.cameras import Camera
-from liftcore.scene.distorted import distortion_warning
-from liftcore.scene.distortion import Brown, Distortion, Fisheye
-from liftcore.scene.lens import Lens, behind_lens, drawn_by, lifted_share, photo_places, photo_size, pixel_of
+from liftcore.scene.cameras import Camera, behind_lens, distortion_warning, drawn_by, photo_size, pixel_of
+from liftcore.scene.distortion import Brown, Distortion, Fisheye, Lens, photo_places
 
 BARREL = Brown(k1=-0.2, k2=0.03, p1=0.001, p2=-0.002)
 PINCUSHION = Brown(k1=0.15)
@@ -119,7 +117,7 @@ def test_a_photo_whose_corners_show_no_ray_is_lifted_as_far_as_it_shows_some(
 ) -> None:
     view = behind_lens(Camera.pinhole("v", width, height, focal, focal, width / 2, height / 2, np.eye(4)), distortion)
     lens = view.lens
-    assert lens is not None and lifted_share(view) > 0.3
+    assert lens is not None and lens.share > 0.3
     u, v = np.meshgrid(np.linspace(0, view.width, 65), np.linspace(0, view.height, 65))
     x, y = (u - view.cx) / view.fx, (v - view.cy) / view.fy
     on_photo = lens.on_photo(x, y)
@@ -139,7 +137,7 @@ def test_share_of_a_photo_that_is_lifted_is_what_its_pinhole_sees() -> None:
     x, y = view.lens.on_plane(u, v)
     x, y = x * view.fx + view.cx, y * view.fy + view.cy
     seen = (x >= 0) & (x <= view.width) & (y >= 0) & (y <= view.height)
-    assert lifted_share(view) == pytest.approx(seen.mean(), abs=0.01)
+    assert view.lens.share == pytest.approx(seen.mean(), abs=0.01)
 
 
 def test_a_pixel_alone_is_found_where_all_are() -> None:
@@ -158,7 +156,8 @@ def test_warning_tells_the_least_share_and_knows_no_hundred_percent_or_more() ->
     )
     (told,) = distortion_warning([slight, barrel, plain])
     assert (
-        f"2 of 3 views are of distorted photos, of each of which {lifted_share(barrel):.0%} or more is lifted" in told
+        f"2 of 3 views are of distorted photos, of each of which {lens_of(barrel).share:.0%} or more is lifted"
+        in told
     )
     (told,) = distortion_warning([slight])
     assert "of each of which nearly all is lifted: features" in told

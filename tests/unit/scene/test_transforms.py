@@ -13,8 +13,7 @@ from colmap_files import binary_files, write_files
 
 from liftcore.errors import InvalidCameras
 from liftcore.io.cameras import read_cameras
-from liftcore.scene.distortion import Brown, Fisheye
-from liftcore.scene.lens import Lens
+from liftcore.scene.distortion import Brown, Fisheye, Lens
 
 
 def test_transforms_and_colmap_mean_the_same(tmp_path: Path) -> None:

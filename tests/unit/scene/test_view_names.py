@@ -16,7 +16,7 @@ from liftcore.errors import InvalidCameras, NotFound
 from liftcore.io.cameras import read_cameras
 from liftcore.io.inria import write_inria_cameras
 from liftcore.scene.cameras import Camera, Cameras
-from liftcore.scene.view_names import view_names
+from liftcore.scene.views import view_names
 
 
 @pytest.fixture

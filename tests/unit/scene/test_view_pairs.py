@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from liftcore.scene.view_pairs import cameras_of_views
+from liftcore.scene.views import cameras_of_views
 
 
 @pytest.mark.parametrize(

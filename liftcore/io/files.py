@@ -1,8 +1,11 @@
-"""What a file is that should have been a splat PLY (or a camera file) and is none, and the way from it to one."""
+"""Files that are written whole or not at all, and what a file is that should have been another."""
 
-from __future__ import annotations
-
-from typing import NamedTuple
+import os
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, NamedTuple
 
 from liftcore.errors import InvalidCameras
 
@@ -57,3 +60,18 @@ def foreign_format(head: bytes, suffix: str) -> Foreign | None:
     if named and (found is None or found.what in ("a gzip file", "a zip")):  # .spz and .sog are such files inside
         return Foreign(named, CONVERT)
     return found
+
+
+@contextmanager
+def whole_file(path: Path) -> Iterator[IO[bytes]]:
+    """Write ``path`` through a draft beside it: synced and renamed at the end, removed after an error."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draft = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+    try:
+        with draft.open("wb") as handle:
+            yield handle
+            handle.flush()
+            os.fsync(handle.fileno())
+        draft.replace(path)
+    finally:
+        draft.unlink(missing_ok=True)

@@ -1,0 +1,24 @@
+"""Rotations as quaternions."""
+
+import numpy as np
+
+
+def rotation_matrices(quats: np.ndarray) -> np.ndarray:
+    """The rotations of quaternions of any length; zero counts as identity.
+
+    Args:
+        quats: [..., 4], w x y z.
+
+    Returns:
+        [..., 3, 3] f64; its columns are the turned axes.
+    """
+    quats = np.asarray(quats, np.float64)
+    largest = np.abs(quats).max(axis=-1, keepdims=True)  # first by this: squares of the largest would overflow
+    quats = np.where(largest > 0, quats / np.where(largest > 0, largest, 1.0), [1.0, 0.0, 0.0, 0.0])
+    w, x, y, z = np.moveaxis(quats / np.linalg.norm(quats, axis=-1, keepdims=True), -1, 0)
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
