@@ -279,7 +279,7 @@ def _scene_of(model: P) -> P:
 
 
 def _from_zip(path: Path, beside: Path | None, *, choosing: bool) -> Cameras:
-    """The cameras of the preferred model in a zip; with a frame's file in it or ``beside``, a transforms.json first."""
+    """The cameras of the preferred model in a zip; with a frame's file in it or ``beside`` it, a transforms first."""
     with tempfile.TemporaryDirectory(prefix="splatlift-") as folder:
         _unzip(path, lambda files: _camera_members(files, path, framed=beside is not None), Path(folder))
         source = camera_source(Path(folder))
