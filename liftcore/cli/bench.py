@@ -48,12 +48,15 @@ def run(options: argparse.Namespace) -> int:
 
 def _aims(document: dict[str, Any]) -> Iterator[str]:
     """The aims and what was found, for people."""
-    from liftcore.evaluate.aims import lines_of
-
     yield _told(document)
     for preset, found in document["presets"].items():
         yield f"{preset}, load {found['load']:.1f}:"
-        yield from (f"  {line}" for line in lines_of(found))
+        for figure in found["aims"]:
+            aim = figure["aim"]
+            told = "no aim here" if aim is None else f"aim {aim:g}, {'met' if figure['met'] else 'not met'}"
+            yield f"  {figure['name']}: {figure['found']:.4g} ({told})"
+        solved = ", ".join(f"{channels} channels {each:.4f}" for channels, each in found["solve_s_per_view"].items())
+        yield f"  seconds a view: geometry {found['geometry_s_per_view']:.4f}; solution {solved}"
 
 
 def _told(document: dict[str, Any]) -> str:

@@ -14,8 +14,9 @@ from liftcore.errors import InvalidInput
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Mapping, Sequence
 
-    from liftcore.evaluate.protocols import EvaluationProtocol, LabelledScene
-    from liftcore.evaluate.protocols.evaluation import EvaluationSettings, SceneResult
+    from liftcore.evaluate.judging import EvaluationSettings, SceneResult
+    from liftcore.evaluate.labels import LabelledScene
+    from liftcore.evaluate.protocols import EvaluationProtocol
     from liftcore.evaluate.published import Published
 
 _LIFT_SUFFIX = ".safetensors"
@@ -46,7 +47,7 @@ def add_arguments(parser: Parser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Judge every lift whose scene is labelled, and print what was measured beside what was published."""
-    from liftcore.evaluate.protocols.evaluation import evaluate_scene
+    from liftcore.evaluate.judging import evaluate_scene
     from liftcore.evaluate.published import published
     from liftcore.query.encoders import open_encoder
     from liftcore.query.scene import QueryScene
@@ -105,15 +106,14 @@ def _named_lifts(path: Path, scenes: Collection[str]) -> list[tuple[str, Path]]:
 
 
 def _labelled(dataset: str, data: Path) -> Mapping[str, LabelledScene]:
-    from liftcore.evaluate.protocols.lerf_ovs import lerf_scenes
-    from liftcore.evaluate.protocols.three_d_ovs import three_d_ovs_scenes
+    from liftcore.evaluate.labels import lerf_scenes, three_d_ovs_scenes
 
     return lerf_scenes(data) if dataset == "lerf-ovs" else three_d_ovs_scenes(data)
 
 
 def _settings(options: argparse.Namespace) -> EvaluationSettings:
+    from liftcore.evaluate.judging import EvaluationSettings
     from liftcore.evaluate.protocols import EvaluationProtocol
-    from liftcore.evaluate.protocols.evaluation import EvaluationSettings
 
     try:
         threshold = float(options.threshold)
@@ -146,7 +146,7 @@ def _document(
     results: Sequence[SceneResult],
     rows: Sequence[Published],
 ) -> dict[str, Any]:
-    from liftcore.evaluate.protocols.evaluation import mean_over_scenes
+    from liftcore.evaluate.judging import mean_over_scenes
 
     return {
         "dataset": options.dataset,
@@ -179,7 +179,7 @@ def _document(
 
 def _table(results: Sequence[SceneResult], rows: Sequence[Published]) -> Iterable[str]:
     """Percentages: what was measured, a protocol and a metric a row; then what was published."""
-    from liftcore.evaluate.protocols.evaluation import mean_over_scenes
+    from liftcore.evaluate.judging import mean_over_scenes
 
     scenes = tuple(dict.fromkeys(result.scene for result in results))
     columns = tuple(dict.fromkeys([*scenes, *(name for row in rows for name in row.scenes)]))
@@ -212,7 +212,7 @@ def _percent(share: float | None) -> str:
 
 
 def _lifted(results: Sequence[SceneResult], protocol: EvaluationProtocol, group: str) -> str:
-    from liftcore.evaluate.protocols.evaluation import ALL
+    from liftcore.evaluate.judging import ALL
 
     count = sum(len(result.lifted) for result in results if result.protocol == protocol)
     total = sum(len(result.frames) for result in results if result.protocol == protocol)

@@ -45,9 +45,8 @@ def run(options: argparse.Namespace) -> int:
     for name in COMPARED:
         if name in settings:
             raise InvalidSettings("--set", expected="settings that are the same in all runs", got=name)
-    from liftcore.evaluate.tradeoff.compare import compare
-    from liftcore.evaluate.tradeoff.order import Scene
-    from liftcore.evaluate.tradeoff.report import page_of, save
+    from liftcore.evaluate.tradeoff import Scene, compare
+    from liftcore.evaluate.tradeoff_report import page_of, save
 
     free_output(options.out / "tradeoff.json", [])
     scene = Scene(

@@ -6,13 +6,8 @@ the methods' official code. Its ablation table swaps the columns Teatime and Ram
 those of the main table, which the appendix confirms.
 """
 
-from __future__ import annotations
-
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
 
 LERF_OVS, THREE_D_OVS = "lerf-ovs", "3d-ovs"
 _LERF_SCENES: tuple[str, ...] = ("figurines", "teatime", "ramen", "waldo_kitchen")

@@ -5,37 +5,31 @@ thread a step's processor time is its own, and near its wall time on an idle mac
 is what ``splatlift bench`` without ``--stages`` shows.
 """
 
-from __future__ import annotations
-
 import os
 import statistics
 import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 
+from liftcore.evaluate.bench import Workload
 from liftcore.progress import silent
+from liftcore.raster.base import CompositingParams, RegionWeights
+from liftcore.raster.cpu.bands import Bands
+from liftcore.raster.cpu.projection import View
 from liftcore.raster.cpu.raster import CpuRaster
-from liftcore.settings import LiftSettings
+from liftcore.raster.cpu.walk import Frame
+from liftcore.scene.splats import Splats
+from liftcore.settings import LiftSettings, Preset
 from liftcore.solve.closed_form import solve_closed_form
 from liftcore.solve.columns import by_tuples
 from liftcore.solve.host import Host
 from liftcore.solve.totals import row_totals
 from liftcore.solve.view_weights import WeightStore
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    from liftcore.evaluate.bench import Workload
-    from liftcore.raster.base import CompositingParams, RegionWeights
-    from liftcore.raster.cpu.bands import Bands
-    from liftcore.raster.cpu.projection import View
-    from liftcore.raster.cpu.walk import Frame
-    from liftcore.scene.splats import Splats
-    from liftcore.settings import Preset
 
 STAGES = ("projection", "order", "lists", "walk", "merge", "rest", "solution")
 

@@ -1,7 +1,5 @@
 """A synthetic room of any size for speed measurements: flat splats on walls, floor and a few balls."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 

@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from liftcore.device import Device, choose_device
-from liftcore.evaluate.tradeoff.compare import compare
-from liftcore.evaluate.tradeoff.order import CANDIDATES, EXACT, Scene
-from liftcore.evaluate.tradeoff.report import page_of, save
+from liftcore.evaluate.tradeoff import CANDIDATES, EXACT, Scene, compare
+from liftcore.evaluate.tradeoff_report import page_of, save
 from liftcore.io.json_file import finite
 from liftcore.progress import Progress, one_step
 from liftcore.scene.splats import Kernel
@@ -27,7 +26,7 @@ def compare_as_ordered(order: dict[str, Any], progress: Progress) -> dict[str, A
         What the job's last message tells of it: ``document`` and ``page``.
 
     Raises:
-        SplatliftError: as `liftcore.evaluate.tradeoff.compare.compare` has it.
+        SplatliftError: as `liftcore.evaluate.tradeoff.compare` has it.
     """
     scene, settings, parameters = _scene(order), order["settings"], order["parameters"]
     device = choose_device(settings.get("device", "auto"))

@@ -12,8 +12,7 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
-from liftcore.evaluate.tradeoff.child import measured
-from liftcore.evaluate.tradeoff.order import Order, Scene
+from liftcore.evaluate.tradeoff import RunSpec, Scene, measured
 from service.store.assets import CheckedUpload
 from service.store.jobs import fingerprint
 from service.store.owners import Owner
@@ -81,7 +80,7 @@ def test_masks_judge_over_http_as_they_do_on_the_command_line(
         tuple(CLASSES),
     )  # fmt: skip
     settings = {"certificate_rays": 0, "speed": "exact"}
-    exact = measured(Order(files, settings, ("left",), ("middle",), ("right",), 1, tmp_path, exact=True))
+    exact = measured(RunSpec(files, settings, ("left",), ("middle",), ("right",), 1, tmp_path, exact=True))
     assert exact["mask_iou"] > 0.5
     run = found["runs"][0]
     assert (run["name"], run["mask_iou"]) == ("exact", exact["mask_iou"])

@@ -25,9 +25,8 @@ from torch.nn.functional import cosine_similarity
 
 from liftcore.device import Device, choose_device
 from liftcore.errors import SplatliftError
-from liftcore.evaluate.bench import run_bench
+from liftcore.evaluate.bench import run_bench, walk_regions
 from liftcore.evaluate.hardware import hardware, machine_line
-from liftcore.evaluate.region_walk import walk_regions
 from liftcore.evaluate.synthetic import room_cameras, room_regions, room_splats
 from liftcore.features.views import Regions
 from liftcore.io.lift_file import TENSORS, LiftResult, save_lift

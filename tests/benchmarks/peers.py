@@ -33,8 +33,8 @@ from numba import njit
 from torch import Tensor
 from torch.nn.functional import cosine_similarity, embedding, embedding_bag, normalize, pad, threshold
 
+from liftcore.evaluate.bench import walk_regions
 from liftcore.evaluate.hardware import peak_memory
-from liftcore.evaluate.region_walk import walk_regions
 from liftcore.evaluate.synthetic import room_cameras, room_regions, room_splats
 from liftcore.features.views import Regions
 from liftcore.progress import silent

@@ -16,8 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from liftcore.device import choose_device
-from liftcore.evaluate.anonymous_memory import PAUSE, Most, anonymous_bytes
-from liftcore.evaluate.hardware import peak_memory
+from liftcore.evaluate.hardware import PAUSE, Most, anonymous_bytes, peak_memory
 from liftcore.features.pack import read_features
 from liftcore.io.lift_file import save_lift
 from liftcore.lift import lift, open_sources, planned

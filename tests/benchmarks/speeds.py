@@ -9,7 +9,7 @@ compiling. ``splatlift tradeoff`` measures more, with views held out. FOLDER as 
 import time
 from pathlib import Path
 
-from liftcore.evaluate.tradeoff.judge import cosine_figures
+from liftcore.evaluate.tradeoff import cosine_figures
 from liftcore.io.lift_file import LiftResult
 from liftcore.lift import lift
 from liftcore.settings import LiftSettings, Speed

@@ -11,14 +11,18 @@ import torch
 from PIL import Image
 
 from liftcore.errors import InvalidInput
-from liftcore.evaluate.protocols import EvaluationProtocol, LabelledObject, Prediction, own_masks
-from liftcore.evaluate.protocols.evaluation import EvaluationSettings, open_segmenter
-from liftcore.evaluate.protocols.judging import judge, mean_of_scenes, means, pooled_ious
-from liftcore.evaluate.protocols.lerf_ovs import lerf_scenes
-from liftcore.evaluate.protocols.rendered_features import RenderedFeatures, segment
-from liftcore.evaluate.protocols.rendered_scores import RenderedScores
-from liftcore.evaluate.protocols.selected_splats import SelectedSplats
-from liftcore.evaluate.protocols.three_d_ovs import three_d_ovs_scenes
+from liftcore.evaluate import protocols
+from liftcore.evaluate.judging import judge, mean_of_scenes, means, pooled_ious
+from liftcore.evaluate.labels import LabelledObject, lerf_scenes, three_d_ovs_scenes
+from liftcore.evaluate.protocols import (
+    EvaluationProtocol,
+    OwnMasks,
+    Prediction,
+    RenderedFeatures,
+    RenderedScores,
+    SelectedSplats,
+    segment,
+)
 from liftcore.query.ask import Answer, ask
 from liftcore.query.encoders import open_encoder
 from liftcore.query.objects import objects
@@ -28,7 +32,7 @@ from liftcore.query.threshold import find_threshold
 from liftcore.query.view_mask import view_mask
 from tests.labelled_scene import HEIGHT, WIDTH, isat, rectangle, write_lift
 
-P1, P2, P3, OWN = EvaluationProtocol
+P1, P2, P3, _ = EvaluationProtocol
 
 
 @pytest.fixture(scope="module")
@@ -173,9 +177,9 @@ def test_p3_cuts_the_rendered_scores_of_a_query(scene: QueryScene, threshold: st
 
 def test_our_own_protocol_makes_the_masks_of_a_query(scene: QueryScene, monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[Answer] = []
-    monkeypatch.setattr(own_masks, "objects", lambda *asked: made.append(asked[1]) or objects(*asked))
+    monkeypatch.setattr(protocols, "objects", lambda *asked: made.append(asked[1]) or objects(*asked))
     texts, encoder = ["book", "red apple"], words(scene)
-    judged = open_segmenter(OWN, scene, texts, encoder, EvaluationSettings(negatives=("wall",)))
+    judged = OwnMasks(scene, texts, encoder, negatives=("wall",))
     for view in ("frame_00001", "frame_00002"):
         found = judged.look(view)
         for text in texts:

@@ -14,13 +14,10 @@ from safetensors.torch import save, save_file
 
 from liftcore import cli
 from liftcore.errors import InvalidInput
-from liftcore.evaluate.tradeoff import compare as comparison
-from liftcore.evaluate.tradeoff import report
-from liftcore.evaluate.tradeoff.child import measured
-from liftcore.evaluate.tradeoff.choice import choose, pareto
-from liftcore.evaluate.tradeoff.judge import cosine_figures
-from liftcore.evaluate.tradeoff.order import CANDIDATES, Order, Scene
-from liftcore.evaluate.tradeoff.report import table_of
+from liftcore.evaluate import tradeoff as comparison
+from liftcore.evaluate import tradeoff_report as report
+from liftcore.evaluate.tradeoff import CANDIDATES, RunSpec, Scene, choose, cosine_figures, measured, pareto
+from liftcore.evaluate.tradeoff_report import table_of
 from liftcore.progress import silent
 from tests.unit.solve.test_lift_equals_dense import write_scene
 
@@ -62,15 +59,14 @@ def test_cosines_count_splats_that_the_exact_run_saw():
     assert found["cosine_q05"] == 0
 
 
-def order_of(folder: Path, **parts) -> Order:
+def order_of(folder: Path, **parts) -> RunSpec:
     paths = write_scene(folder, 2)
     scene = Scene(paths[0], paths[1], (paths[2],), **parts)
-    return Order(scene, {"certificate_rays": 0}, ("v0", "v1"), ("v2",), (), 1, folder, exact=True)
+    return RunSpec(scene, {"certificate_rays": 0}, ("v0", "v1"), ("v2",), (), 1, folder, exact=True)
 
 
 def test_a_run_is_judged_by_views_that_it_did_not_lift(tmp_path):
     order = order_of(tmp_path)
-    assert Order.of(json.loads(json.dumps(order.document()))) == order
     exact = measured(order)
     assert (exact["views"], exact["mask_iou"]) == (2, None)
     assert [exact["cosine"], exact["cosine_plain"]] == pytest.approx([1.0, 1.0])

@@ -1,0 +1,217 @@
+"""How the field measures open-vocabulary segmentation: three protocols whose numbers cannot be compared, and our own.
+
+- P1 (LangSplat): features are rendered, a relevancy map is made in 2D and cut at 0.4. Localised when its peak lies in
+  a box of the object.
+- P2 (OpenGaussian): splats are selected in 3D and their silhouette is rendered alone. Localised at an IoU of at least
+  0.25 (and 0.5).
+- P3 (LaGa, Splat Feature Solver): splats are scored in 3D, scores are rendered and cut in 2D. Localised when the peak
+  of the map lies in the object's mask.
+- own: splats are selected in 3D, and a mask is where they are at least half of a ray, as a query makes it.
+  Localised as P2 is.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from enum import StrEnum
+
+import numpy as np
+import torch
+from scipy.ndimage import uniform_filter
+from torch import Tensor
+
+from liftcore.query.ask import Answer, ask
+from liftcore.query.directions import MINIMUM_ROW_SUM
+from liftcore.query.encoders import TextEncoder
+from liftcore.query.objects import Objects, objects
+from liftcore.query.query import Query
+from liftcore.query.scene import QueryScene
+from liftcore.query.scores import DEFAULT_NEGATIVES, relevancy
+from liftcore.query.threshold import find_threshold
+from liftcore.query.view_mask import view_mask
+from liftcore.raster.cpu.raster import CpuRaster
+from liftcore.scene.cameras import Camera
+
+MEAN_FILTER = 30  # pixels
+CUT = 0.4  # of the map stretched to -1..1
+MAJORITY = 7  # pixels of the square that votes on a mask's pixel
+SOLID = 0.7  # of a ray: from here on the selected splats alone make a silhouette
+CHANNELS = 32  # rendered at a time
+
+
+class EvaluationProtocol(StrEnum):
+    """Which way a number was measured."""
+
+    P1 = "P1"
+    P2 = "P2"
+    P3 = "P3"
+    OWN = "own"
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What a protocol finds for a text in a view."""
+
+    mask: np.ndarray  # [H, W] bool
+    peak: tuple[int, int] | None  # x y of the highest value; None where the protocol has no such pixel
+
+
+class Segmenter:
+    """One protocol at work on one lift, for fixed texts.
+
+    Args:
+        threshold: a method or a number; P1 has its own.
+        negatives: of each question; of P1 in place of LangSplat's four.
+    """
+
+    def __init__(
+        self,
+        scene: QueryScene,
+        texts: Sequence[str],
+        encoder: TextEncoder,
+        threshold: str | float = "auto",
+        negatives: Sequence[str] = (),
+    ) -> None:
+        self.scene, self.texts, self.encoder = scene, tuple(texts), encoder
+        self.threshold, self.negatives = threshold, tuple(negatives)
+        self.prepare()
+
+    def prepare(self) -> None:
+        """What is done once for all views."""
+
+    def look(self, view: str) -> dict[str, Prediction]:
+        """What each text finds in a view."""
+        raise NotImplementedError
+
+    def answers(self) -> dict[str, Answer]:
+        """Each text asked of the splats."""
+        return {
+            text: ask(self.scene, Query((text,), self.negatives, self.threshold), self.encoder) for text in self.texts
+        }
+
+
+class RenderedFeatures(Segmenter):
+    """P1: features are rendered, and words are asked of the picture.
+
+    A pixel's feature is ``sum_j A_ij x_j``, made a unit vector; its relevancy for a text is the least softmax
+    against the negatives, sharpened tenfold.
+    """
+
+    def prepare(self) -> None:
+        """The products of splats and words, for all views."""
+        vectors = self.encoder.encode([*self.texts, *(self.negatives or DEFAULT_NEGATIVES)])
+        # <A X, t> = A (X t): the products with the texts are rendered, not the features again for each.
+        blocks = [block.float() @ vectors.T for block in self.scene.lift.features.split(65_536)]
+        self._products = torch.cat(blocks)  # [P, n + N]
+
+    def look(self, view: str) -> dict[str, Prediction]:
+        """What each text finds in a view."""
+        cosines = self.cosines(view)
+        shape, count, flat = cosines.shape[:2], len(self.texts), cosines.flatten(0, 1)
+        found = {}
+        for k, text in enumerate(self.texts):
+            against = torch.cat([flat[:, k : k + 1], flat[:, count:]], dim=1)
+            found[text] = segment(relevancy(against, 1).reshape(shape).numpy())
+        return found
+
+    def cosines(self, view: str) -> Tensor:
+        """[H, W, n + N] f32, of the rendered features to the texts and the negatives; 0 where nothing is seen."""
+        return self.scene.image(view, self._cosines)
+
+    def _cosines(self, camera: Camera) -> Tensor:
+        scene = self.scene
+        products = scene.raster.render(camera, self._products, scene.walk)
+        squares = torch.zeros(products.shape[:2])
+        for part in scene.lift.features.split(CHANNELS, dim=1):
+            squares += scene.raster.render(camera, part.float().contiguous(), scene.walk).square().sum(dim=-1)
+        lengths = squares.sqrt()[..., None]
+        return torch.where(lengths > 0, products / lengths, 0.0).clamp(-1, 1)
+
+
+def segment(relevance: np.ndarray) -> Prediction:
+    """LangSplat's mask and peak of a relevancy map [H, W] f32.
+
+    The map is averaged over 30 x 30 pixels; half of that and half of the map itself is stretched to -1..1 and cut
+    at 0.4; each pixel then takes the majority of the 7 x 7 around it. The peak is the averaged map's.
+    """
+    smooth = uniform_filter(relevance.astype(np.float64), MEAN_FILTER, mode="mirror")
+    blend = 0.5 * (smooth + relevance)
+    low, high = blend.min(), blend.max()
+    stretched = 2 * (blend - low) / (high - low + 1e-9) - 1
+    row, column = np.unravel_index(int(smooth.argmax()), smooth.shape)
+    return Prediction(_majority(stretched.clip(0, 1) > CUT), (int(column), int(row)))
+
+
+def _majority(mask: np.ndarray) -> np.ndarray:
+    """[H, W] bool, whether more than half of the square's pixels that lie in the image are set."""
+    share = uniform_filter(mask.astype(np.float64), MAJORITY, mode="constant")
+    inside = uniform_filter(np.ones(mask.shape), MAJORITY, mode="constant")
+    return share > 0.5 * inside + 1e-9
+
+
+class SelectedSplats(Segmenter):
+    """P2: splats are selected in 3D, and their silhouette is seen alone: what stood before them hides nothing."""
+
+    def prepare(self) -> None:
+        """The answers of the splats, for all views."""
+        self._selected = {text: answer.selected for text, answer in self.answers().items()}
+
+    def look(self, view: str) -> dict[str, Prediction]:
+        """What each text finds in a view."""
+        splats, found = self.scene.splats, {}
+        for text, selected in self._selected.items():
+            logits = torch.where(selected, splats.opacity_logits, -1e4)  # an opacity of nothing
+            alone = CpuRaster(replace(splats, opacity_logits=logits))
+            sums = self.scene.image(view, lambda camera, alone=alone: alone.row_sums(camera, self.scene.walk))
+            found[text] = Prediction((sums > SOLID).numpy(), None)
+        return found
+
+
+class RenderedScores(Segmenter):
+    """P3: splats are scored in 3D, and scores are rendered; each map has a threshold of its own."""
+
+    def prepare(self) -> None:
+        """The answers of the splats, for all views."""
+        # A splat without a feature adds nothing to a ray.
+        columns = [torch.where(answer.seen, answer.scores, 0.0) for answer in self.answers().values()]
+        self._values = torch.stack([*columns, torch.ones(self.scene.lift.features.shape[0])], dim=1)  # [P, n + 1]
+
+    def look(self, view: str) -> dict[str, Prediction]:
+        """What each text finds in a view."""
+        scene, found = self.scene, {}
+        image = scene.image(view, lambda camera: scene.raster.render(camera, self._values, scene.walk))
+        met = image[..., -1] >= MINIMUM_ROW_SUM
+        for k, text in enumerate(self.texts):
+            attention = image[..., k].contiguous()
+            threshold = find_threshold(attention[met], self.threshold)
+            row, column = np.unravel_index(int(attention.argmax()), attention.shape)
+            found[text] = Prediction((met & (attention >= threshold.value)).numpy(), (int(column), int(row)))
+        return found
+
+
+class OwnMasks(Segmenter):
+    """Our own way: the masks that ``splatlift query --mask`` makes, of the objects that were found."""
+
+    def prepare(self) -> None:
+        """The answers of the splats, for all views."""
+        self._answers = self.answers()
+        self._objects: dict[str, Objects] = {}  # once for all views
+
+    def look(self, view: str) -> dict[str, Prediction]:
+        """What each text finds in a view."""
+        return {text: self._look(text, view) for text in self._answers}
+
+    def _look(self, text: str, view: str) -> Prediction:
+        def group(scene: QueryScene, answer: Answer) -> Objects:
+            if text not in self._objects:
+                self._objects[text] = objects(scene, answer)
+            return self._objects[text]
+
+        return Prediction(view_mask(self.scene, self._answers[text], view, group).mask.numpy(), None)
+
+
+SEGMENTERS: dict[EvaluationProtocol, type[Segmenter]] = {
+    EvaluationProtocol.P1: RenderedFeatures,
+    EvaluationProtocol.P2: SelectedSplats,
+    EvaluationProtocol.P3: RenderedScores,
+    EvaluationProtocol.OWN: OwnMasks,
+}
