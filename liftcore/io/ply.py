@@ -1,48 +1,57 @@
-"""Splat scenes in PLY files, every dialect of the field: what is read can be written back to the byte."""
+"""Splat scenes in PLY files of every dialect: read, written back to the byte, and copied with one thing changed.
 
-from __future__ import annotations
+Headers are read under limits, and what they say must fit the file's size, before anything trusts their numbers.
+"""
 
+import io
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from plyfile import PlyData, PlyListProperty, PlyParseError
+from torch import Tensor
 
 from liftcore.errors import InvalidSplats
-from liftcore.io.files import LFS_POINTER, whole_file
+from liftcore.io.files import CONVERT, LFS_POINTER, foreign_format, whole_file
 from liftcore.io.ply_dialect import NORMALS, Slot, model_slots, recognise_kernel, usual_layout
-from liftcore.io.ply_header import SCALAR_TYPES, PlyHeader, PlyProperty, parse_header, read_header
 from liftcore.scene.kernel import Kernel, kernel_named
-from liftcore.scene.mip_filter import FILTER, filtered
 from liftcore.scene.splats import Splats
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-
-    from torch import Tensor
-
 BLOCK_ROWS = 16_384  # rows converted at a time: a few MB, so that memory stays near the file's size
+MAX_HEADER_BYTES = 256 * 1024
+MAX_HEADER_LINES = 4096
 COLOUR = ("sh", "sb_params")  # fields that a lift has no use for, and most of a file
-
-_SPELLING = {code: name for name, code in reversed(SCALAR_TYPES.items())}  # the C names: "float", "uchar"
-
-
-EXPORT = (
+FILTER = "filter_3D"  # of Mip-Splatting, the column of its smoothing filter
+LOBE_COLOURS = 3  # r g b, the first channels of a spherical beta lobe
+DARK_LOBE = -10.0  # r g b of a lobe that adds nothing: its softplus of sharpness 10 ln 2 is 1e-31, and of zero 0.1
+PICKLED = (".pt", ".pth", ".ckpt", ".pkl")
+SPLAT_PROPERTIES = ("opacity", "scale_0", "rot_0", "f_dc_0", "sh0_0", "packed_position")  # one at least
+SPELLING = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint"}
+SPELLING |= {"f4": "float", "f8": "double"}
+EXPORT_PLY = (
     "export the splats as PLY from the program that trained them (nerfstudio: ns-export gaussian-splat; gsplat's "
     "simple_trainer: --save-ply)"
 )
-PICKLED = (".pt", ".pth", ".ckpt", ".pkl")
+EXPORT = "export the splats again as binary little-endian PLY"
+REWRITE = (
+    "rewrite it with Python: from plyfile import PlyData; p = PlyData.read('IN.ply'); p.text = False; "
+    "p.byte_order = '<'; p.write('OUT.ply')"
+)
+_END = re.compile(rb"(?:^|\n)end_header(\r?\n)")
+_ELEMENT = re.compile(r"\s*element\s+(\S+)\s+([0-9]{1,18})\s*")
 
 
 def read_splats(path: Path | str, kernel: Kernel | str = "auto", *, colour: bool = True) -> Splats:
     """Read trained splats from a binary little-endian PLY of any dialect.
 
-    With the kernel ``auto`` it is recognised from the properties. Columns that the model does not know are
-    kept as extras in their own type; ``double`` columns of the model become float32. Without ``colour`` neither
-    colours nor extras are read or allocated, and what comes cannot be written back. A ``filter_3D`` becomes part of
-    scales and opacities (`mip_filter`), which are then written as plain splats; elements behind the vertices are
-    neither read nor written.
+    With the kernel ``auto`` it is recognised from the properties. Columns that the model does not know are kept as
+    extras in their own type; ``double`` columns of the model become float32. Without ``colour`` neither colours nor
+    extras are read or allocated, and what comes cannot be written back. A ``filter_3D`` becomes part of scales and
+    opacities, which are then written as plain splats; elements behind the vertices are neither read nor written.
 
     Raises:
         InvalidSplats: the file is malformed, lacks a property of the kernel, or holds NaN or no splats.
@@ -50,40 +59,30 @@ def read_splats(path: Path | str, kernel: Kernel | str = "auto", *, colour: bool
     path = Path(path)
     if path.suffix.lower() in PICKLED and not _begins(path, LFS_POINTER):
         got = "a Python pickle, which may run code when it is opened"
-        raise InvalidSplats(str(path), expected="a PLY file", got=got, hint=EXPORT)
+        raise InvalidSplats(str(path), expected="a PLY file", got=got, hint=EXPORT_PLY)
     header = read_header(path)
-    names = [column.name for column in header.properties]
-    kernel = recognise_kernel(names) if kernel == "auto" else kernel_named(kernel)
-    slots = model_slots(names, kernel, str(path))
-    for column in header.properties:
-        if column.name in slots and column.code not in ("f4", "f8"):
-            raise InvalidSplats(
-                f"{path} property {column.name!r}",
-                expected="float or double",
-                got=_SPELLING[column.code],
-                hint="quantised splats must be exported as plain ones",
-            )
+    kernel = recognise_kernel(header.names) if kernel == "auto" else kernel_named(kernel)
+    slots = model_slots(header.names, kernel, str(path))
+    for name in slots:
+        code = header.dtype[name].str[1:]
+        if code not in ("f4", "f8"):
+            hint = "quantised splats must be exported as plain ones"
+            argument = f"{path} property {name!r}"
+            raise InvalidSplats(argument, expected="float or double", got=SPELLING[code], hint=hint)
     if header.count == 0:
         raise InvalidSplats(str(path), expected="at least one splat", got="an empty scene")
-    others = [column for column in header.properties if column.name not in slots]
+    others = [name for name in header.names if name not in slots]
     if not colour:
         slots = {name: slot for name, slot in slots.items() if slot.field not in COLOUR}
-        others = [column for column in others if column.name == FILTER]
+        others = [name for name in others if name == FILTER]
     fields, extras = _read_columns(path, header, slots, others)
-    layout, lines = (tuple(names), header.lines) if colour else ((), ())
-    with _named(path):
+    layout, lines = (header.names, header.lines) if colour else ((), ())
+    with _splats_from(path):
         if FILTER in extras:
             lines, layout = (), tuple(name for name in layout if name != FILTER)
-            fields |= _filtered(fields, extras.pop(FILTER))
-        return Splats(**fields, kernel=kernel, extras=extras, layout=layout, header=lines)
-
-
-def _begins(path: Path, first: bytes) -> bool:
-    try:
-        with path.open("rb") as handle:
-            return handle.read(len(first)) == first
-    except OSError:
-        return False
+            fields |= _filtered(fields["log_scales"], fields["opacity_logits"], extras.pop(FILTER))
+        tensors = {name: torch.from_numpy(values) for name, values in extras.items()}
+        return Splats(**fields, kernel=kernel, extras=tensors, layout=layout, header=lines)
 
 
 def write_splats(splats: Splats, path: Path) -> None:
@@ -94,10 +93,16 @@ def write_splats(splats: Splats, path: Path) -> None:
     """
     layout = splats.layout or _default_layout(splats)
     columns = _columns_of(splats, layout)
-    codes = _codes(splats, layout)
-    dtype = np.dtype([(name, "<" + codes[name]) for name in layout])
+    source = _source_header(splats)
+    codes = {name: source.dtype[name].str[1:] if source else "f4" for name in layout}
+    codes |= {name: columns[name].dtype.str[1:] for name in layout if name in splats.extras}
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {splats.count}"]
+    lines += [*(f"property {SPELLING[code]} {name}" for name, code in codes.items()), "end_header"]
+    dtype = np.dtype([(name, "<" + code) for name, code in codes.items()])
+    if source is not None and source.dtype == dtype:
+        lines = source.lines_for(splats.count)
     with whole_file(path) as handle:
-        handle.write("".join(f"{line}\n" for line in _header_lines(splats, codes)).encode("ascii"))
+        handle.write(_bytes_of(lines))
         for start in range(0, splats.count, BLOCK_ROWS):
             rows = np.zeros(min(BLOCK_ROWS, splats.count - start), dtype)
             for name, column in columns.items():
@@ -105,56 +110,271 @@ def write_splats(splats: Splats, path: Path) -> None:
             handle.write(rows.tobytes())
 
 
+def some_rows(path: Path, kept: np.ndarray) -> Iterator[bytes]:
+    """A splat file with some of its rows, of its own bytes, a block of rows at a time.
+
+    Args:
+        path: the file.
+        kept: [P] bool, the rows to keep, in the order of the file.
+
+    Yields:
+        The bytes of the copy, in blocks.
+
+    Raises:
+        InvalidSplats: the file is malformed, or has another number of splats.
+    """
+    header = _header_of(path, len(kept))
+    yield _bytes_of(header.lines_for(int(np.count_nonzero(kept))))
+    for first, rows in _blocks(path, header):
+        yield rows[kept[first : first + len(rows)]].tobytes()
+
+
+def recoloured(path: Path, colours: np.ndarray) -> Iterator[bytes]:
+    """A splat file whose splats have one colour each, the same from everywhere; all else is of its own bytes.
+
+    Higher harmonics become zero. The lobes of DBS become dark and not zero: a lobe of zeros shines.
+
+    Args:
+        path: the file.
+        colours: [P, 3] f32, the constant terms of the spherical harmonics (``f_dc_*``, or ``sh0_*`` of DBS).
+
+    Yields:
+        The bytes of the copy, in blocks.
+
+    Raises:
+        InvalidSplats: the file is malformed, has another number of splats, or holds no colours.
+    """
+    header = _header_of(path, len(colours))
+    slots = model_slots(header.names, recognise_kernel(header.names), str(path))
+    harmonics = {name: slot.index for name, slot in slots.items() if slot.field == "sh"}
+    lobes = {name: slot.index for name, slot in slots.items() if slot.field == "sb_params"}
+    if not harmonics:
+        raise InvalidSplats(str(path), expected="colours (f_dc_0, ...) to show scores in", got="a file without any")
+    fixed = {name: 0.0 for name, (row, _) in harmonics.items() if row > 0}
+    fixed |= {name: DARK_LOBE for name, (_, channel) in lobes.items() if channel < LOBE_COLOURS}
+    yield _bytes_of(header.lines)
+    for first, rows in _blocks(path, header):
+        for name, value in fixed.items():
+            rows[name] = value
+        for name, (row, channel) in harmonics.items():
+            if row == 0:
+                rows[name] = colours[first : first + len(rows), channel]
+        yield rows.tobytes()
+
+
+@dataclass(frozen=True)
+class PlyHeader:
+    """A header that fits its file: a vertex element of scalar columns before any other, little-endian."""
+
+    lines: tuple[str, ...]  # verbatim, with end_header, without the line feeds and what describes other elements
+    count: int  # rows
+    dtype: np.dtype  # of a row, a field a column
+    data_offset: int  # bytes before the first row
+    after: int | None = 0  # bytes behind the last row, of other elements; None when their lists make it unknown
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The columns, in the order of the file."""
+        return self.dtype.names or ()
+
+    def lines_for(self, count: int) -> list[str]:
+        """The lines of a file with ``count`` rows of these columns; all but that number stays as it is."""
+        end = "\r" if self.lines[0].endswith("\r") else ""
+        changed = f"element vertex {count}{end}"
+        is_same = count == self.count
+        return [changed if line.split()[:1] == ["element"] and not is_same else line for line in self.lines]
+
+
+def read_header(path: Path) -> PlyHeader:
+    """Read and check the header of a splat PLY, at most 256 KiB of the file.
+
+    Raises:
+        InvalidSplats: the file cannot be opened, is not a binary little-endian PLY that begins with a vertex element
+            of scalar properties, or has another size than the header says.
+    """
+    try:
+        with path.open("rb") as handle:
+            head = handle.read(MAX_HEADER_BYTES)
+            size = handle.seek(0, 2)
+    except OSError as error:
+        got = f"one that does not open ({error.strerror})"
+        raise InvalidSplats(str(path), expected="a splat file", got=got) from None
+    header = parse_header(head, str(path))
+    found, stride = size - header.data_offset, header.dtype.itemsize
+    least = header.count * stride + (header.after or 0)
+    if found < least or (header.after is not None and found > least):
+        hint = "the file has bytes that its header does not describe: export it again"
+        if found < least:
+            hint = "the file is truncated: copy or export it again"
+        others = f" and {header.after} bytes of other elements" if header.after else ""
+        expected = f"{header.count} rows of {stride} bytes{others} = {least} bytes after the header"
+        raise InvalidSplats(str(path), expected=expected, got=f"{found} bytes", hint=hint)
+    return header
+
+
+def parse_header(head: bytes, source: str) -> PlyHeader:
+    """Parse the first bytes of a PLY; ``source`` names the file in errors.
+
+    Raises:
+        InvalidSplats: the bytes are not the header of a splat PLY.
+    """
+
+    def refuse(expected: str, got: str, hint: str = EXPORT) -> InvalidSplats:
+        return InvalidSplats(f"{source} header", expected=expected, got=got, hint=hint)
+
+    lines, offset = _header_lines(head, source)
+    counts: list[int] = []
+    empty: list[str] = []  # the same header of no rows, which plyfile reads without any data
+    for line in lines:
+        words, element = line.split(), _ELEMENT.fullmatch(line)
+        if words[:1] == ["element"] and element is None:
+            expected = "the name of an element and a count of zero or more"
+            raise refuse(expected, repr(" ".join(words)[:60]))
+        counts += [int(element[2])] if element else []
+        empty.append(f"element {element[1]} 0" if element else line.removesuffix("\r"))
+    try:
+        ply = PlyData.read(io.BytesIO(_bytes_of(empty)))
+    except (PlyParseError, ValueError) as error:
+        raise refuse("a header of PLY 1.0", f"one that does not parse ({str(error)[:120]})") from None
+    if ply.text or ply.byte_order != "<":
+        kind = "ascii" if ply.text else "binary_big_endian"
+        raise refuse("'format binary_little_endian 1.0'", f"'format {kind} 1.0'", REWRITE)
+    first = next(iter(ply.elements), None)
+    if first is None or not first.properties:
+        raise refuse("an element 'vertex' with properties", "a header without one")
+    if first.name == "chunk":
+        raise refuse("plain splats", "SuperSplat's compressed PLY", CONVERT)
+    if first.name != "vertex":
+        raise refuse("'vertex' as the first element", repr(first.name[:60]))
+    listed = next((column.name for column in first.properties if isinstance(column, PlyListProperty)), None)
+    if listed is not None:
+        raise refuse("scalar properties ('property float x')", f"a list {listed[:60]!r}")
+    after: int | None = 0
+    for element, count in zip(ply.elements[1:], counts[1:], strict=True):
+        if count and any(isinstance(column, PlyListProperty) for column in element.properties):
+            after = None
+        elif after is not None:
+            after += count * sum(np.dtype(column.val_dtype).itemsize for column in element.properties)
+    own = [i for i, line in enumerate(lines) if line.split()[:1] == ["element"]][1:2] or [len(lines) - 1]
+    dtype = np.dtype([(column.name, "<" + column.val_dtype) for column in first.properties])
+    return PlyHeader((*lines[: own[0]], lines[-1]), counts[0], dtype, offset, after)
+
+
+def _header_lines(head: bytes, source: str) -> tuple[tuple[str, ...], int]:
+    """The lines of a header without their line feeds, and its length in bytes."""
+    if head[:4] not in (b"ply\n", b"ply\r"):
+        foreign = foreign_format(head, Path(source).suffix)
+        begins = f"a file that begins with {head[:8]!r}" if head else "an empty file"
+        got, hint = foreign or (begins, f"{EXPORT}; if it is a .splat or a .ksplat, {CONVERT}")
+        raise InvalidSplats(source, expected="a PLY file (first line 'ply')", got=got, hint=hint)
+    end = _END.search(head)
+    if end is None:
+        limit = f"'end_header' within the first {MAX_HEADER_BYTES} bytes"
+        raise InvalidSplats(source, expected=limit, got=f"none in {len(head)} bytes", hint=EXPORT)
+    text = head[: end.end() - 1]
+    if not text.isascii():
+        hint = "take the comments with other characters out of it"
+        raise InvalidSplats(source, expected="an ASCII header", got="other characters in it", hint=hint)
+    lines = tuple(text.decode("ascii").split("\n"))
+    if len(lines) > MAX_HEADER_LINES:
+        limit, hint = f"at most {MAX_HEADER_LINES} header lines", "leave out properties that are no splat's"
+        raise InvalidSplats(source, expected=limit, got=str(len(lines)), hint=hint)
+    _refuse_clouds(lines, source)
+    return lines, end.end()
+
+
+def _refuse_clouds(lines: tuple[str, ...], source: str) -> None:
+    """Point clouds and meshes: what is wrong with them is not how they are written."""
+    words = [line.split() for line in lines]
+    names = {line[-1] for line in words if line[:1] == ["property"]}
+    if not names.issuperset("xyz") or names.intersection(SPLAT_PROPERTIES):
+        return
+    is_mesh = any(line[:2] == ["element", "face"] for line in words)
+    hint = "give the trained splats; the 3DGS trainers keep them in point_cloud/iteration_N/point_cloud.ply"
+    if any(name.startswith("scalar_") for name in names):
+        hint = "CloudCompare renames properties (scalar_opacity): give the file that it was opened from"
+    expected = "splats (properties such as 'opacity', 'scale_0', 'rot_0')"
+    got = f"a {'mesh' if is_mesh else 'point cloud'} without any of them"
+    raise InvalidSplats(source, expected=expected, got=got, hint=hint)
+
+
+def _bytes_of(lines: Sequence[str]) -> bytes:
+    return "".join(f"{line}\n" for line in lines).encode("ascii")
+
+
+def _begins(path: Path, first: bytes) -> bool:
+    try:
+        with path.open("rb") as handle:
+            return handle.read(len(first)) == first
+    except OSError:
+        return False
+
+
+def _header_of(path: Path, count: int) -> PlyHeader:
+    header = read_header(path)
+    if header.count != count:
+        raise InvalidSplats(str(path), expected=f"{count} splats, as many as were lifted", got=str(header.count))
+    return header
+
+
+def _blocks(path: Path, header: PlyHeader) -> Iterator[tuple[int, np.ndarray]]:
+    """The number of the first row, and rows with a field a column. Read, not mapped: what was copied is let go."""
+    with path.open("rb", buffering=0) as source:
+        source.seek(header.data_offset)
+        for first in range(0, header.count, BLOCK_ROWS):
+            yield first, np.fromfile(source, header.dtype, min(BLOCK_ROWS, header.count - first))
+
+
 def _read_columns(
-    path: Path, header: PlyHeader, slots: Mapping[str, Slot], others: Sequence[PlyProperty]
-) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    fields = {field: np.empty((header.count, *shape), np.float32) for field, shape in _field_shapes(slots).items()}
-    extras = {column.name: np.empty(header.count, column.code) for column in others}
-    targets = {name: fields[slot.field][(slice(None), *slot.index)] for name, slot in slots.items()} | extras
-    table = _mapped_rows(path)
-    with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite and is refused as such
-        for start in range(0, header.count, BLOCK_ROWS):
-            rows = table[start : start + BLOCK_ROWS]
-            for name, target in targets.items():
-                target[start : start + BLOCK_ROWS] = rows[name]
-    return _tensors(fields), _tensors(extras)
-
-
-def _filtered(fields: Mapping[str, Tensor], deviations: Tensor) -> dict[str, Tensor]:
-    scales, logits = filtered(fields["log_scales"].numpy(), fields["opacity_logits"].numpy(), deviations.numpy())
-    return _tensors({"log_scales": scales, "opacity_logits": logits})
-
-
-def _field_shapes(slots: Mapping[str, Slot]) -> dict[str, tuple[int, ...]]:
+    path: Path, header: PlyHeader, slots: Mapping[str, Slot], others: Sequence[str]
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """The model's fields as f32, and the other columns in their own type."""
     shapes: dict[str, tuple[int, ...]] = {}
     for slot in slots.values():
         corner = shapes.get(slot.field, (0,) * len(slot.index))
         shapes[slot.field] = tuple(max(side, i + 1) for side, i in zip(corner, slot.index, strict=True))
-    return shapes
+    fields = {field: np.empty((header.count, *shape), np.float32) for field, shape in shapes.items()}
+    extras = {name: np.empty(header.count, header.dtype[name]) for name in others}
+    targets = {name: fields[slot.field][(slice(None), *slot.index)] for name, slot in slots.items()} | extras
+    table = np.memmap(path, header.dtype, "r", header.data_offset, (header.count,))
+    with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite and is refused as such
+        for first in range(0, header.count, BLOCK_ROWS):
+            rows = table[first : first + BLOCK_ROWS]
+            for name, target in targets.items():
+                target[first : first + BLOCK_ROWS] = rows[name]
+    return fields, extras
 
 
-def _mapped_rows(path: Path) -> np.ndarray:
-    from plyfile import PlyData, PlyParseError
+def _filtered(log_scales: np.ndarray, opacity_logits: np.ndarray, deviations: np.ndarray) -> dict[str, np.ndarray]:
+    """Log scales [P, 3] and opacity logits [P] with the 3D smoothing filter of Mip-Splatting in them.
 
-    try:
-        return PlyData.read(str(path), mmap="r")["vertex"].data
-    except (PlyParseError, ValueError, OSError) as error:
-        raise InvalidSplats(str(path), expected="a PLY file", got=f"one that does not parse ({error})") from None
+    Such a scene (and GOF's) is trained with every Gaussian convolved with one of the standard deviation f [P], its
+    opacity lowered by as much as its volume grew (Yu et al. 2024, Eq. 8)::
 
-
-def _tensors(arrays: Mapping[str, np.ndarray]) -> dict[str, Tensor]:
-    return {name: torch.from_numpy(array) for name, array in arrays.items()}
+        s' = sqrt(s^2 + f^2),   o' = o sqrt(prod s^2 / prod s'^2)
+    """
+    bad = ~(np.isfinite(deviations) & (deviations >= 0))
+    if bad.any():
+        got = f"{float(deviations[bad][0]):g} in splat {int(bad.argmax())}"
+        raise InvalidSplats(FILTER, expected="finite values of zero or more", got=got, hint="export the splats again")
+    scales, theta = log_scales.astype(np.float64), opacity_logits.astype(np.float64)
+    with np.errstate(divide="ignore"):  # a deviation of zero changes nothing; so do logs of it
+        widened = np.logaddexp(2 * scales, 2 * np.log(deviations.astype(np.float64))[:, None]) / 2
+        # log of sigmoid(theta) and of what it loses, then the logit of their product
+        lost = np.where(np.isinf(scales), -np.inf, scales - widened).sum(axis=1)
+        lowered = -np.logaddexp(0.0, -theta) + np.where(deviations > 0, lost, 0.0)
+        logits = lowered - np.log(-np.expm1(lowered))
+    return {"log_scales": widened.astype(np.float32), "opacity_logits": logits.astype(np.float32)}
 
 
 @contextmanager
-def _named(path: Path) -> Iterator[None]:
+def _splats_from(path: Path) -> Iterator[None]:
     """Name the file in what the splats themselves find wrong."""
     try:
         yield
     except InvalidSplats as error:
-        raise InvalidSplats(
-            f"{path} {error.argument}", expected=error.expected, got=error.got, hint=error.hint
-        ) from None
+        argument = f"{path} {error.argument}"
+        raise InvalidSplats(argument, expected=error.expected, got=error.got, hint=error.hint) from None
 
 
 def _default_layout(splats: Splats) -> tuple[str, ...]:
@@ -170,42 +390,22 @@ def _columns_of(splats: Splats, layout: Sequence[str]) -> dict[str, np.ndarray]:
     columns: dict[str, np.ndarray] = {}
     for name in layout:
         if name in slots:
-            columns[name] = _model_column(splats, name, slots[name])
+            values: Tensor | None = getattr(splats, slots[name].field)
+            index = slots[name].index
+            if values is None or any(i >= n for i, n in zip(index, values.shape[1:], strict=True)):
+                expected, hint = "columns of the splats", "clear the layout"
+                raise InvalidSplats("layout", expected=expected, got=repr(name), hint=hint)
+            columns[name] = values.cpu().numpy()[(slice(None), *index)]
         elif name in splats.extras:
-            columns[name] = splats.extras[name].numpy()
+            columns[name] = splats.extras[name].cpu().numpy()
         elif name not in NORMALS:
             raise InvalidSplats("layout", expected="columns of the splats", got=repr(name))
     return columns
-
-
-def _model_column(splats: Splats, name: str, slot: Slot) -> np.ndarray:
-    values: Tensor | None = getattr(splats, slot.field)
-    if values is None or any(i >= n for i, n in zip(slot.index, values.shape[1:], strict=True)):
-        raise InvalidSplats("layout", expected="columns of the splats", got=repr(name), hint="clear the layout")
-    return values.numpy()[(slice(None), *slot.index)]
 
 
 def _source_header(splats: Splats) -> PlyHeader | None:
     """The header that the splats were read with, if it still describes their columns."""
     if not splats.header:
         return None
-    header = parse_header("".join(f"{line}\n" for line in splats.header).encode("ascii"), "header")
-    return header if tuple(column.name for column in header.properties) == splats.layout else None
-
-
-def _codes(splats: Splats, layout: Sequence[str]) -> dict[str, str]:
-    source = _source_header(splats)
-    codes = dict.fromkeys(layout, "f4")
-    if source is not None:
-        codes |= {column.name: column.code for column in source.properties}
-    extras = {name: splats.extras[name].numpy().dtype.str[1:] for name in layout if name in splats.extras}
-    return codes | extras
-
-
-def _header_lines(splats: Splats, codes: Mapping[str, str]) -> list[str]:
-    source = _source_header(splats)
-    if source is not None and {column.name: column.code for column in source.properties} == codes:
-        return list(source.lines_for(splats.count))
-    element = f"element vertex {splats.count}"
-    columns = [f"property {_SPELLING[code]} {name}" for name, code in codes.items()]
-    return ["ply", "format binary_little_endian 1.0", element, *columns, "end_header"]
+    header = parse_header(_bytes_of(splats.header), "header")
+    return header if header.names == splats.layout else None

@@ -5,41 +5,24 @@ One table serves reading and writing, for every dialect: Inria, gsplat (no norma
 stored channel-major: all of red, then green, then blue.
 """
 
-from __future__ import annotations
-
 import re
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from liftcore.errors import InvalidSplats
 from liftcore.scene.kernel import Kernel
 
-if TYPE_CHECKING:
-    from collections.abc import Collection, Sequence
-
 MAX_SH_DEGREE = 4
 LOBE_CHANNELS = 6  # of a spherical beta lobe: r g b theta phi beta
 NORMALS = ("nx", "ny", "nz")
-
 SCAFFOLD = ("f_anchor_feat_0", "f_offset_0")  # of Scaffold-GS, whose networks turn anchors into splats
 
+_GSPLAT = {"x", "y", "z", "f_dc_0", "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_3"}
 _SIGNATURES = {
-    "Inria 3DGS": {
-        "x",
-        "y",
-        "z",
-        "nx",
-        "f_dc_0",
-        "opacity",
-        "scale_0",
-        "scale_1",
-        "scale_2",
-        "rot_0",
-        "rot_3",
-    },
-    "gsplat": {"x", "y", "z", "f_dc_0", "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_3"},
-    "2DGS": {"x", "y", "z", "nx", "f_dc_0", "opacity", "scale_0", "scale_1", "rot_0", "rot_3"},
-    "DBS": {"x", "y", "z", "sh0_0", "opacity", "beta", "scale_0", "scale_1", "scale_2", "rot_0", "rot_3"},
+    "Inria 3DGS": {*_GSPLAT, "nx"},
+    "gsplat": _GSPLAT,
+    "2DGS": {*_GSPLAT, "nx"} - {"scale_2"},
+    "DBS": {*_GSPLAT, "sh0_0", "beta"} - {"f_dc_0"},
     "a point cloud, which has no splats": {"x", "y", "z", "red", "green", "blue", "nx"},
 }
 
@@ -109,12 +92,7 @@ def scale_count(kernel: Kernel) -> int:
 def nearest_dialect(names: Collection[str]) -> str:
     """The dialect that shares most of these columns."""
     found = set(names)
-
-    def likeness(dialect: str) -> float:
-        signature = _SIGNATURES[dialect]
-        return len(signature & found) / len(signature)
-
-    return max(_SIGNATURES, key=likeness)
+    return max(_SIGNATURES, key=lambda dialect: len(_SIGNATURES[dialect] & found) / len(_SIGNATURES[dialect]))
 
 
 def _required(kernel: Kernel) -> dict[str, Slot]:

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from liftcore.errors import InvalidQuery
-from liftcore.io.ply_copy import recoloured, some_rows
+from liftcore.io.ply import recoloured, some_rows
 from liftcore.query.colours import NOT_SEEN_COLOUR, constant_terms, heat_colours
 from liftcore.query.objects import objects
 

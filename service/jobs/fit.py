@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from liftcore.errors import InvalidFeatures, InvalidSettings, InvalidSplats
+from liftcore.io.ply import read_header
 from liftcore.io.ply_dialect import model_slots
-from liftcore.io.ply_header import read_header
 from liftcore.query.encoders.words import nearest, plain
 from liftcore.raster.antialiased import check_antialiased
 from liftcore.scene.kernel import Kernel
@@ -52,7 +52,7 @@ def check_kernel(splats: AssetRecord, settings: Mapping[str, Any]) -> None:
     if kernel == own:
         return
     try:
-        model_slots([column.name for column in read_header(splats.path).properties], Kernel(kernel), splats.id)
+        model_slots(read_header(splats.path).names, Kernel(kernel), splats.id)
     except InvalidSplats as error:
         got, hint = f"{kernel} for {splats.id}, which has {error.got}", f"leave it out: the file speaks of {own}"
         raise InvalidSettings("kernel", expected=f"a kernel with {error.expected}", got=got, hint=hint) from None

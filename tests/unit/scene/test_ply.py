@@ -167,10 +167,7 @@ MALFORMED = {
         f"{HEADER}element vertex 1\nproperty list uchar int a\nend_header\n".encode(),
         "scalar properties",
     ),
-    "unknown type": (
-        f"{HEADER}element vertex 1\nproperty half a\nend_header\n".encode(),
-        "scalar properties",
-    ),
+    "unknown type": (f"{HEADER}element vertex 1\nproperty half a\nend_header\n".encode(), "field type 'half'"),
     "negative count": (f"{HEADER}element vertex -5\nproperty float x\nend_header\n".encode(), "vertex -5"),
     "huge count": (
         f"{HEADER}element vertex 999999999999999\nproperty float x\nend_header\n".encode(),
@@ -184,10 +181,10 @@ MALFORMED = {
     ),
     "same property twice": (
         f"{HEADER}element vertex 1\nproperty float x\nproperty float x\nend_header\n".encode(),
-        "'x' twice",
+        "two properties with same name",
     ),
     "no element": (f"{HEADER}end_header\n".encode(), "a header without one"),
-    "no format": (b"ply\nelement vertex 1\nproperty float x\nend_header\n", "format before"),
+    "no format": (b"ply\nelement vertex 1\nproperty float x\nend_header\n", "expected one of {format"),
     "foreign characters": (HEADER.encode() + b"comment \xff\nend_header\n", "an ASCII header"),
     "truncated": (ply_bytes(INRIA)[:-1], "truncated"),
     "trailing bytes": (ply_bytes(INRIA) + b"x", "does not describe"),

@@ -13,8 +13,7 @@ from ply_files import DIALECTS, INRIA, ply_bytes, with_ply
 from plyfile import PlyData
 
 from liftcore.errors import InvalidSplats
-from liftcore.io.ply import BLOCK_ROWS, read_splats
-from liftcore.io.ply_copy import recoloured, some_rows
+from liftcore.io.ply import BLOCK_ROWS, read_splats, recoloured, some_rows
 from liftcore.query.colours import constant_terms, seen_colours
 from tests.scenes import look_at
 
