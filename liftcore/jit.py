@@ -1,7 +1,8 @@
 """How kernels are compiled: without the interpreter lock, cached on disk by the content of the sources.
 
-numba's cache looks at a kernel's own file only, so a change in a function that it calls would go unseen. Here the
-cache folder is named after a digest of all sources that kernels are made of, so a stale kernel can never be loaded.
+numba's cache looks at a kernel's own file only, so a change in a function that it calls from another file would go
+unseen. The cache folder is therefore named after a digest of the files that kernels of other files call or take
+constants from, so a stale kernel can never be loaded.
 """
 
 from __future__ import annotations
@@ -18,21 +19,22 @@ import numba
 from numba import njit
 from numba.core import config
 
-
-def _kernel_sources() -> list[Path]:
-    """The files whose code or constants kernels are made of: a change in any other compiles nothing anew."""
-    root = Path(__file__).parent
-    cpu = root / "raster" / "cpu"
-    own = [Path(__file__), root / "raster" / "constants.py", cpu / "records.py", *sorted(cpu.glob("lanes*.py"))]
-    packages = [root / package for package in ("features", "raster", "solve", "query")]
-    rooms = [source for package in packages for source in sorted(package.rglob("*.py"))]
-    return own + [source for source in rooms if b"from liftcore.jit import" in source.read_bytes()]
+# What compiled code in other files is made of: a change in any of these compiles all kernels anew.
+SHARED_SOURCES = (
+    "jit.py",
+    "raster/base.py",
+    "raster/cpu/composite.py",
+    "raster/cpu/project.py",
+    "raster/cpu/simd.py",
+    "solve/weight_tables.py",
+    "solve/weighted_sums.py",
+)
 
 
 def _source_digest() -> str:
     digest = hashlib.sha256(numba.__version__.encode())
-    for source in _kernel_sources():
-        digest.update(source.read_bytes())
+    for name in SHARED_SOURCES:
+        digest.update((Path(__file__).parent / name).read_bytes())
     return digest.hexdigest()[:16]
 
 

@@ -20,8 +20,8 @@ from liftcore.io.ply import read_splats
 from liftcore.listener import NOBODY, Listener
 from liftcore.plan.plan import plan_lift
 from liftcore.progress import Progress, one_step
-from liftcore.raster.antialiased import check_antialiased
-from liftcore.raster.open_raster import open_raster
+from liftcore.raster import open_raster
+from liftcore.raster.base import check_antialiased
 from liftcore.solve.accumulate import Geometry, accumulate, as_read
 from liftcore.solve.aggregation import Aggregation, aggregate
 from liftcore.solve.all_rays import AllRays

@@ -14,8 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from pydantic_core import PydanticCustomError
 
 from liftcore.errors import InvalidSettings
-from liftcore.raster.base import CompositingParams
-from liftcore.raster.weighting import MOST_OF_A_RAY, Selection, Weighting
+from liftcore.raster.base import MOST_OF_A_RAY, CompositingParams, Selection, Weighting
 
 TIKHONOV_GAIN = 1.2  # lambda of the paper's Tikhonov Guidance (App. Tikhonov, lambda sweep)
 LARGEST_ALPHA = 0.9999999  # nearer to one, float32 says one, and the ray has no light left to go on with

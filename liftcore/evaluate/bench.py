@@ -18,9 +18,9 @@ from liftcore.evaluate.hardware import hardware, peak_memory, watched
 from liftcore.evaluate.synthetic import room_cameras, room_regions, room_splats
 from liftcore.features.views import Regions, ViewFeatures
 from liftcore.progress import silent
+from liftcore.raster import open_raster
 from liftcore.raster.base import CompositingParams, Raster, ViewRequest, Weighting
 from liftcore.raster.cpu.weights_home import on_host
-from liftcore.raster.open_raster import open_raster
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Splats
 from liftcore.settings import LiftSettings, Preset

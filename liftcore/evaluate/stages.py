@@ -19,10 +19,10 @@ import torch
 from liftcore.evaluate.bench import Workload
 from liftcore.progress import silent
 from liftcore.raster.base import CompositingParams, RegionWeights
-from liftcore.raster.cpu.bands import Bands
-from liftcore.raster.cpu.projection import View
+from liftcore.raster.cpu.composite import Frame
+from liftcore.raster.cpu.project import View
 from liftcore.raster.cpu.raster import CpuRaster
-from liftcore.raster.cpu.walk import Frame
+from liftcore.raster.cpu.tiles import Bands
 from liftcore.scene.splats import Splats
 from liftcore.settings import LiftSettings, Preset
 from liftcore.solve.closed_form import solve_closed_form
@@ -64,10 +64,10 @@ class TimedRaster(CpuRaster):
         self.clock = Clock()
         self._projecting = False
 
-    def _project(self, view: View, walk: CompositingParams) -> tuple[np.ndarray, np.ndarray]:
+    def _project(self, view: View, params: CompositingParams) -> tuple[np.ndarray, np.ndarray]:
         with self.clock.stage("order"):  # what it does beside its shares of splats
             self._projecting = True
-            return super()._project(view, walk)
+            return super()._project(view, params)
 
     def _map(self, work: Callable, shares: list) -> list:
         if not self._projecting:
@@ -76,9 +76,9 @@ class TimedRaster(CpuRaster):
         with self.clock.stage("projection"):
             return super()._map(work, shares)
 
-    def _bin(self, view: View, walk: CompositingParams, ids: np.ndarray, order: np.ndarray) -> Bands:
+    def _bin(self, view: View, params: CompositingParams, ids: np.ndarray, order: np.ndarray) -> Bands:
         with self.clock.stage("lists"):
-            return super()._bin(view, walk, ids, order)
+            return super()._bin(view, params, ids, order)
 
     def _over_tiles(self, frame: Frame, work: Callable) -> list:
         with self.clock.stage("walk"):

@@ -12,7 +12,7 @@ from liftcore.io.files import SUFFIXES
 from liftcore.io.ply import read_splats
 from liftcore.io.ply_dialect import nearest_dialect
 from liftcore.io.transforms import FRAME_FILE, frame_warning
-from liftcore.raster.constants import ALPHA_FLOOR
+from liftcore.raster.base import ALPHA_FLOOR
 from liftcore.scene.cameras import distortion_warning, photo_size
 from liftcore.scene.splats import Kernel
 

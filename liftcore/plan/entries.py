@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from liftcore.raster.constants import TILE
+from liftcore.raster.base import TILE
 from liftcore.solve.columns import by_rows
 
 if TYPE_CHECKING:

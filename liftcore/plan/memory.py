@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 from liftcore.errors import Unavailable
 from liftcore.features.lens import kept_bytes
-from liftcore.raster.constants import TILE
-from liftcore.raster.cpu.kernels import RECORDS
+from liftcore.raster.base import TILE
+from liftcore.raster.cpu.project import COLUMNS
 from liftcore.solve.channels import BLOCK
 from liftcore.solve.clustering import BLOCK as CLUSTERED_ROWS
 from liftcore.solve.columns import by_rows
@@ -70,7 +70,7 @@ def memory_parts(
     largest = max(camera.width * camera.height for camera in cameras.values())
     gathered = min(int(len(cameras) * planned.splats * planned.entries), CHUNK_ENTRIES)
     weights = weight_bytes(planned.splats, planned.entries)
-    seen = 8 * RECORDS[splats.kernel] + LISTED_BYTES * planned.listed + WALKED_BYTES * planned.walked  # of a splat
+    seen = 8 * COLUMNS[splats.kernel] + LISTED_BYTES * planned.listed + WALKED_BYTES * planned.walked  # of a splat
     labels = max(_label_bytes(packs, view) for view in cameras)
     walk = int(planned.splats * seen) + splats.count * WALK_BYTES + 8 * largest // TILE**2
     # Labels of the next one, too, and weights that wait for their turn.

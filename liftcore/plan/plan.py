@@ -25,7 +25,7 @@ from liftcore.plan.on_device import check_device_room, device_plan
 from liftcore.plan.pilot import PILOT_VIEWS, fly_pilot
 from liftcore.plan.rank import ENOUGH, Rank, codebook_rank
 from liftcore.plan.visibility import visibility
-from liftcore.raster.cpu.side_by_side import views_at_a_time
+from liftcore.raster.cpu.raster import views_at_a_time
 from liftcore.scene.cameras import distortion_warning
 from liftcore.solve.map_shapes import shape_warnings
 

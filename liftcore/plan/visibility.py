@@ -12,9 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from liftcore.raster.cpu.kernels import RECORDS, activated, project
-from liftcore.raster.cpu.projection import Targets, view_of
-from liftcore.raster.cpu.records import EXTENT_X, EXTENT_Y
+from liftcore.raster.cpu.project import COLUMNS, EXTENT_X, EXTENT_Y, Targets, activated, project, view_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -60,10 +58,17 @@ def visibility(splats: Splats, cameras: Sequence[Camera], walk: CompositingParam
     sample = spread_splats(splats, min(SAMPLE, splats.count))
     scene, count = activated(sample, walk.opacity_logit_scale), sample.count
     areas = np.zeros((len(cameras), count), np.float32)
-    records = np.empty((count, RECORDS[splats.kernel]))
+    records = np.empty((count, COLUMNS[splats.kernel]))
     targets = Targets(records, np.empty(count, np.float32), np.empty(count, np.int32))
     for row, camera in zip(areas, cameras, strict=True):
-        found = project((0, count), scene, view_of(camera), splats.kernel, walk.antialiased, targets)
+        found = project(
+            (0, count),
+            scene,
+            view_of(camera, replace(walk, stride=1, offset=(0, 0))),
+            splats.kernel,
+            walk.antialiased,
+            targets,
+        )
         outline = math.pi * records[:found, EXTENT_X] * records[:found, EXTENT_Y]
         row[targets.ids[:found]] = outline.clip(np.finfo(np.float32).tiny, camera.width * camera.height)
     centres = np.array([camera.centre for camera in cameras], np.float64).reshape(-1, 3)

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from liftcore.jit import kernel
-from liftcore.raster.constants import MAX_LOG_SCALE
+from liftcore.raster.base import MAX_LOG_SCALE
 from liftcore.scene.quaternions import rotation_matrices
 from liftcore.scene.splats import Splats
 

@@ -1,1 +1,27 @@
-"""A, one view at a time: projection, depth order, binning, blending, and the oracle they are held to."""
+"""A, one view at a time: projection, depth order, compositing; and the reference that every backend is held to."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from liftcore.device import Device
+    from liftcore.raster.base import Raster
+    from liftcore.scene.splats import Splats
+
+
+def open_raster(splats: Splats, device: Device, threads: int | None = None, kept: int = 0) -> Raster:
+    """A for one scene, on the device: compiled kernels on the CPU, Triton's on a card.
+
+    Args:
+        threads: of the CPU; None takes the cores that this process may use. The number changes no bit.
+        kept: bytes of region weights that stay on a card beside the views at work; 0 brings them back.
+    """
+    if device.kind == "cpu":
+        from liftcore.raster.cpu.raster import CpuRaster  # loads numba
+
+        return CpuRaster(splats, threads)
+    from liftcore.raster.gpu.raster import GpuRaster  # loads triton
+
+    free = device.free_bytes()
+    return GpuRaster(splats, device.place, None if free is None else max(0, free - kept), stays=kept > 0)

@@ -1,8 +1,8 @@
-"""The plain float64 rasterizer that every fast path is held to.
+"""The plain float64 rasterizer that every fast path is held to, in one file, nothing shared but the constants.
 
-Read it beside the paper: for each splat its footprint, for each ray the walk of Eq. 1, one splat after the other, and
-A [rays, splats] written out as a dense matrix. It is slow and needs R x P memory; use it on small scenes.
-Nothing is shared with the CPU backend but the constants.
+Read it beside the paper: for each splat its footprint, written as it is defined; for each ray the compositing of
+Eq. 1, one splat after the other; and A [rays, splats] written out as a dense matrix. It is slow and needs R x P
+memory; use it on small scenes.
 """
 
 from __future__ import annotations
@@ -14,12 +14,24 @@ import numpy as np
 import torch
 
 from liftcore.features.views import Regions, ViewFeatures
-from liftcore.raster.antialiased import check_antialiased
-from liftcore.raster.base import CompositingParams, RayRows, RegionWeights, ViewRequest, ViewWeights, Weighting
-from liftcore.raster.constants import NEAR_PLANE
-from liftcore.raster.cpu.side_by_side import one_by_one
-from liftcore.raster.reference_footprints import CUT_BAND, alphas
-from liftcore.raster.reference_weights import counted_weights, walked_rays
+from liftcore.raster.base import (
+    ALPHA_FLOOR,
+    EDGE_ON,
+    FIELD_MARGIN,
+    LARGEST_EXPONENT,
+    LOW_PASS,
+    MAX_LOG_SCALE,
+    NEAR_PLANE,
+    CompositingParams,
+    RayRows,
+    RegionWeights,
+    Selection,
+    ViewRequest,
+    ViewWeights,
+    Weighting,
+    check_antialiased,
+)
+from liftcore.scene.kernel import Kernel
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Iterable
@@ -28,6 +40,126 @@ if TYPE_CHECKING:
 
     from liftcore.scene.cameras import Camera
     from liftcore.scene.splats import Splats
+
+CUT_BAND = 1e-4  # relative distance to a cut-off within which float32 may decide otherwise
+EDGE_BAND = 1e-4  # relative on weights, pixels on centres: nearer to a decision, float32 may decide otherwise
+_HORIZON_BAND = 1e-6  # of a disc's horizon, in the centre's depth over the crossing's
+_SUPPORT_BAND = 1e-5  # of sigma = 1
+_STEEPEST = 16.0  # d alpha / d log(sigma) from which the rounding of sigma to float32 shows in the fifth digit
+
+
+def rotation(quat: np.ndarray) -> np.ndarray:
+    """[3, 3] f64 of a quaternion w x y z of any length; zero counts as identity."""
+    length = np.linalg.norm(quat)
+    w, x, y, z = quat / length if length > 0 else np.array([1.0, 0.0, 0.0, 0.0])
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def camera_axes(splats: Splats, j: int, camera: Camera) -> np.ndarray:
+    """[3, K] f64, the scaled axes of splat j in the camera's frame: three, or two for 2DGS.
+
+    A scale of zero is the limit of small ones: a disc that has become a line keeps its plane.
+    """
+    scales = np.exp(splats.log_scales[j].double().numpy().clip(min=-MAX_LOG_SCALE))
+    return camera.viewmat[:3, :3] @ rotation(splats.quats[j].double().numpy())[:, : len(scales)] * scales
+
+
+def camera_mean(splats: Splats, j: int, camera: Camera) -> np.ndarray:
+    """[3] f64, the centre of splat j in the camera's frame."""
+    return camera.viewmat[:3, :3] @ splats.means[j].double().numpy() + camera.viewmat[:3, 3]
+
+
+def projected_gaussian(splats: Splats, j: int, camera: Camera) -> tuple[np.ndarray, np.ndarray, float]:
+    """Mean [2] in pixels, conic [2, 2] and opacity compensation of splat j (EWA: cov = J W Sigma W^T J^T + 0.3 I).
+
+    The determinant is a sum of squares over pairs of axes (Cauchy-Binet), for products of long axes cancel. The
+    compensation is ``sqrt(det(cov) / det(cov + 0.3 I))``.
+    """
+    x, y, z = camera_mean(splats, j, camera)
+    mean = np.array([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy])
+    margin_x = FIELD_MARGIN * 0.5 * camera.width / camera.fx
+    margin_y = FIELD_MARGIN * 0.5 * camera.height / camera.fy
+    u = np.clip(x / z, -camera.cx / camera.fx - margin_x, (camera.width - camera.cx) / camera.fx + margin_x)
+    v = np.clip(y / z, -camera.cy / camera.fy - margin_y, (camera.height - camera.cy) / camera.fy + margin_y)
+    J = np.array([[camera.fx / z, 0, -camera.fx * u / z], [0, camera.fy / z, -camera.fy * v / z]])
+    L = J @ camera_axes(splats, j, camera)
+    cov = L @ L.T
+    own = sum(np.linalg.det(L[:, [first, second]]) ** 2 for first, second in ((0, 1), (0, 2), (1, 2)))
+    det = own + LOW_PASS * (cov[0, 0] + cov[1, 1]) + LOW_PASS**2
+    cov += LOW_PASS * np.eye(2)
+    conic = np.array([[cov[1, 1], -cov[0, 1]], [-cov[0, 1], cov[0, 0]]]) / det
+    return mean, conic, float(np.sqrt(own / det))
+
+
+def alphas(
+    splats: Splats, j: int, camera: Camera, params: CompositingParams, pixels: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Alpha of splat j on rays through ``pixels`` [R, 2], before the cap, and the rays [R] hard to decide."""
+    opacity = 1 / (1 + np.exp(-params.opacity_logit_scale * float(splats.opacity_logits[j])))
+    if splats.kernel is Kernel.GAUSSIAN_2D:
+        g, hard = disc_exponents(splats, j, camera, pixels)
+        return _above_the_floor(opacity * np.exp(-g / 2), hard)
+    mean, conic, compensation = projected_gaussian(splats, j, camera)
+    sigma = np.einsum("ri,ij,rj->r", pixels - mean, conic, pixels - mean)
+    if splats.kernel is Kernel.BETA:
+        assert splats.beta is not None
+        with np.errstate(over="ignore"):
+            return _beta_kernel(opacity, sigma, 4 * np.exp(float(splats.beta[j])))
+    if params.antialiased:
+        opacity *= compensation
+    return _above_the_floor(opacity * np.exp(-sigma / 2), np.zeros(len(sigma), bool))
+
+
+def disc_exponents(splats: Splats, j: int, camera: Camera, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """``g = min(s^2 + t^2, 2 |p - mu|^2)`` [R] of disc j, and the rays [R] near its horizon.
+
+    ``h_u = p_x w - u``, ``h_v = p_y w - v``, ``z = h_u x h_v``, ``s = z_x / z_z``, ``t = z_y / z_z``, with the rows
+    u, v, w of the homography from (s, t, 1) to the image. A crossing counts where it lies before the camera, and on
+    no ray when the disc is seen edge-on.
+    """
+    axes, centre = camera_axes(splats, j, camera), camera_mean(splats, j, camera)
+    K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    u, v, w = K @ np.column_stack([axes, centre])
+    mu = np.array([u[2], v[2]]) / w[2]
+    nearby = 2 * ((pixels - mu) ** 2).sum(axis=1)
+    normal = np.cross(axes[:, 0], axes[:, 1])
+    if abs(normal @ centre) <= EDGE_ON * np.linalg.norm(normal) * np.linalg.norm(centre):
+        return nearby, np.zeros(len(pixels), bool)
+    z = np.cross(pixels[:, :1] * w - u, pixels[:, 1:] * w - v)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        s, t = z[:, 0] / z[:, 2], z[:, 1] / z[:, 2]
+        depth = s * w[0] + t * w[1] + w[2]
+        crossing = np.where((z[:, 2] != 0) & (depth > 0), s**2 + t**2, np.inf)
+        nearness = w[2] / depth
+    hard = (np.abs(nearness) < _HORIZON_BAND * (1 + np.abs(nearness - 1))) | ~np.isfinite(nearness)
+    return np.minimum(np.where(np.isnan(crossing), np.inf, crossing), nearby), hard
+
+
+def _above_the_floor(raw: np.ndarray, hard: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    near = np.abs(raw / ALPHA_FLOOR - 1) < CUT_BAND
+    return np.where(raw < ALPHA_FLOOR, 0.0, raw), hard | near
+
+
+def _beta_kernel(opacity: float, sigma: np.ndarray, beta: float) -> tuple[np.ndarray, np.ndarray]:
+    """``o (1 - sigma)^beta`` where sigma < 1, and the rays at a steep end or a jump of it: hard to decide.
+
+    Powers below the smallest that float32 holds count as none, in every backend.
+    """
+    inside = sigma < 1
+    within = np.where(inside, sigma, 0.0)
+    logarithm = np.log1p(-within)
+    with np.errstate(invalid="ignore", over="ignore"):  # an infinite beta leaves the point sigma = 0
+        exponent = np.where(within > 0, -beta * logarithm / np.log(2.0), 0.0)
+        steep = opacity * beta * within * np.exp((beta - 1) * logarithm)
+    raw = np.where(inside & (exponent < LARGEST_EXPONENT), opacity * np.exp2(-exponent), 0.0)
+    jump = (beta < 1) & (np.abs(sigma - 1) < _SUPPORT_BAND)
+    return raw, (steep > _STEEPEST) | jump | (np.abs(exponent / LARGEST_EXPONENT - 1) < _SUPPORT_BAND)
 
 
 @dataclass(frozen=True)
@@ -38,12 +170,12 @@ class DenseView:
     cut: np.ndarray  # [H * W] bool: some alpha or T of the ray lies within CUT_BAND of its cut-off
 
 
-def dense_view(splats: Splats, camera: Camera, walk: CompositingParams) -> DenseView:
+def dense_view(splats: Splats, camera: Camera, params: CompositingParams) -> DenseView:
     """A of one view (paper Eq. 1): ``w = alpha T``, front to back, with the field's cut-offs.
 
     The order is by camera depth rounded to float32, ties by row; the stop is exclusive.
     """
-    check_antialiased(splats.kernel, walk.antialiased)
+    check_antialiased(splats.kernel, params.antialiased)
     y, x = np.mgrid[: camera.height, : camera.width]
     pixels = np.stack([x.ravel() + 0.5, y.ravel() + 0.5], axis=1)
     rays = pixels.shape[0]
@@ -55,13 +187,13 @@ def dense_view(splats: Splats, camera: Camera, walk: CompositingParams) -> Dense
     for j in np.argsort(z.astype(np.float32), kind="stable"):
         if z[j] < NEAR_PLANE:
             continue
-        raw, hard = alphas(splats, int(j), camera, walk, pixels)
-        alpha = np.minimum(raw, walk.alpha_cap)
+        raw, hard = alphas(splats, int(j), camera, params, pixels)
+        alpha = np.minimum(raw, params.alpha_cap)
         after = T * (1 - alpha)
-        stops = (after <= walk.transmittance_stop) & ~done
+        stops = (after <= params.transmittance_stop) & ~done
         cut |= ~done & hard
-        if walk.transmittance_stop > 0:
-            cut |= ~done & (alpha > 0) & (np.abs(after / walk.transmittance_stop - 1) < CUT_BAND)
+        if params.transmittance_stop > 0:
+            cut |= ~done & (alpha > 0) & (np.abs(after / params.transmittance_stop - 1) < CUT_BAND)
         done |= stops
         A[:, j] = np.where(done, 0.0, alpha * T)
         T = np.where(done, T, after)
@@ -93,22 +225,85 @@ def reading_matrix(observation: ViewFeatures, width: int, height: int) -> tuple[
     return S, rays
 
 
-class OracleRaster:
+def counted_weights(
+    A: np.ndarray, splats: Splats, camera: Camera, params: CompositingParams, weighting: Weighting
+) -> tuple[np.ndarray, np.ndarray]:
+    """A' [H * W, P], the weights of A [H * W, P] that count, to their power; and the rays [H * W] hard to decide."""
+    depths = splats.means.double().numpy() @ camera.viewmat[2, :3] + camera.viewmat[2, 3]
+    order = np.argsort(depths.astype(np.float32), kind="stable")
+    w = A[:, order]  # near to far
+    if weighting.selection is Selection.TOP_K:
+        counts, cut = _largest(w, weighting.count)
+    elif weighting.selection is Selection.FRONT_MASS:
+        taken = np.cumsum(w, axis=1) - w  # 1 - T before the splat
+        counts = taken < weighting.mass
+        cut = ((np.abs(taken - weighting.mass) < EDGE_BAND) & (w > 0)).any(axis=1)
+    elif weighting.selection is Selection.CENTRE:
+        counts, cut = (part[:, order] for part in _centres(A, splats, camera, params))
+        cut = cut.any(axis=1)
+    else:
+        counts, cut = np.ones_like(w, bool), np.zeros(w.shape[0], bool)
+    counts &= (w > 0) & (w >= weighting.floor)
+    cut = cut | (np.abs(w - weighting.floor) < EDGE_BAND * weighting.floor).any(axis=1)
+    chosen = np.zeros_like(A)
+    chosen[:, order] = np.where(counts, w**weighting.power, 0.0)
+    return chosen, np.asarray(cut)
+
+
+def strided_rays(camera: Camera, params: CompositingParams) -> np.ndarray:
+    """[H * W] bool, the rays that the stride leaves."""
+    y, x = np.mgrid[: camera.height, : camera.width]
+    left, top = params.offset
+    return (((x - left) % params.stride == 0) & ((y - top) % params.stride == 0)).ravel()
+
+
+def _largest(w: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
+    """The k largest of every row, of equal ones the first; and the rows whose k-th and next are too close to call."""
+    order = np.argsort(-w, axis=1, kind="stable")
+    counts = np.zeros_like(w, bool)
+    np.put_along_axis(counts, order[:, :k], values=True, axis=1)
+    if w.shape[1] <= k:
+        return counts, np.zeros(w.shape[0], bool)
+    last, following = (np.take_along_axis(w, order[:, [at]], axis=1)[:, 0] for at in (k - 1, k))
+    return counts, (following > 0) & (last - following < EDGE_BAND * last)
+
+
+def _centres(
+    A: np.ndarray, splats: Splats, camera: Camera, params: CompositingParams
+) -> tuple[np.ndarray, np.ndarray]:
+    """[H * W, P] bool: the strided ray nearest to the splat's projected centre; and rays of centres near a border."""
+    counts, cut = np.zeros_like(A, bool), np.zeros_like(A, bool)
+    pose = camera.viewmat
+    for j, mean in enumerate(splats.means.double().numpy()):
+        x, y, z = pose[:3, :3] @ mean + pose[:3, 3]
+        if z <= 0:
+            continue
+        centre = np.array([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy])
+        steps = (centre - 0.5 - np.array(params.offset)) / params.stride + 0.5  # whole numbers at the cells' borders
+        column, row = np.floor(steps).astype(int) * params.stride + np.array(params.offset)
+        if 0 <= column < camera.width and 0 <= row < camera.height:
+            counts[row * camera.width + column, j] = True
+        if (np.abs(steps - np.round(steps)) < EDGE_BAND).any():
+            cut[:, j] = A[:, j] > 0
+    return counts, cut
+
+
+class ReferenceRaster:
     """The dense reference as a backend (``liftcore.raster.base.Raster``), for conformance tests."""
 
     def __init__(self, splats: Splats) -> None:
         self.splats = splats
 
     def region_weights(
-        self, camera: Camera, observation: ViewFeatures, walk: CompositingParams, weighting: Weighting
+        self, camera: Camera, observation: ViewFeatures, params: CompositingParams, weighting: Weighting
     ) -> RegionWeights:
         """``A'^T S`` by dense products, and the evidence of plain weights."""
         S, ray = reading_matrix(observation, camera.width, camera.height)
-        A = dense_view(self.splats, camera, walk).A
-        walked = walked_rays(camera, walk)
-        chosen = counted_weights(A, self.splats, camera, walk, weighting)[0]
-        W = chosen[ray[walked[ray]]].T @ S[walked[ray]]
-        plain = dense_view(self.splats, camera, replace(walk, opacity_logit_scale=1.0)).A[walked].sum(axis=0)
+        A = dense_view(self.splats, camera, params).A
+        strided = strided_rays(camera, params)
+        chosen = counted_weights(A, self.splats, camera, params, weighting)[0]
+        W = chosen[ray[strided[ray]]].T @ S[strided[ray]]
+        plain = dense_view(self.splats, camera, replace(params, opacity_logit_scale=1.0)).A[strided].sum(axis=0)
         rows, columns = np.nonzero(W)
         splats, counts = np.unique(rows, return_counts=True)
         met = np.flatnonzero(plain)
@@ -121,36 +316,38 @@ class OracleRaster:
             torch.from_numpy(plain[met].astype(np.float32)),
         )
 
-    def iterate_views(self, looks: Iterable[ViewRequest]) -> Generator[ViewWeights]:
+    def iterate_views(self, requests: Iterable[ViewRequest]) -> Generator[ViewWeights]:
         """``region_weights`` and ``ray_rows`` of views, one at a time."""
-        return one_by_one(self, looks)
+        for one in requests:
+            weights = self.region_weights(one.camera, one.observation, one.params, one.weighting)
+            yield ViewWeights(weights, self.ray_rows(one.camera, one.pixels, one.params))
 
-    def render(self, camera: Camera, values: Tensor, walk: CompositingParams) -> Tensor:
+    def render(self, camera: Camera, values: Tensor, params: CompositingParams) -> Tensor:
         """``A X`` by a dense product."""
-        image = dense_view(self.splats, camera, walk).A @ values.double().numpy()
+        image = dense_view(self.splats, camera, params).A @ values.double().numpy()
         return torch.from_numpy(image.astype(np.float32)).reshape(camera.height, camera.width, -1)
 
-    def adjoint(self, camera: Camera, values: Tensor, walk: CompositingParams) -> Tensor:
+    def adjoint(self, camera: Camera, values: Tensor, params: CompositingParams) -> Tensor:
         """``A^T Y`` by a dense product."""
         Y = values.double().numpy().reshape(camera.height * camera.width, -1)
-        return torch.from_numpy((dense_view(self.splats, camera, walk).A.T @ Y).astype(np.float32))
+        return torch.from_numpy((dense_view(self.splats, camera, params).A.T @ Y).astype(np.float32))
 
-    def row_sums(self, camera: Camera, walk: CompositingParams) -> Tensor:
+    def row_sums(self, camera: Camera, params: CompositingParams) -> Tensor:
         """``A 1``."""
-        return self.render(camera, torch.ones(self.splats.count, 1), walk)[:, :, 0]
+        return self.render(camera, torch.ones(self.splats.count, 1), params)[:, :, 0]
 
-    def strongest_labels(self, camera: Camera, labels: Tensor, walk: CompositingParams) -> Tensor:
+    def strongest_labels(self, camera: Camera, labels: Tensor, params: CompositingParams) -> Tensor:
         """``argmax(A Gamma) - 1`` with the one-hot matrix Gamma [P, K + 1] written out, its first column for -1."""
         onehot = np.eye(int(labels.max()) + 2)[labels.numpy() + 1]
-        sums = dense_view(self.splats, camera, walk).A @ onehot
+        sums = dense_view(self.splats, camera, params).A @ onehot
         return torch.from_numpy(sums.argmax(axis=1).astype(np.int32) - 1).reshape(camera.height, camera.width)
 
     def forget(self) -> None:
         """Nothing: no view is kept."""
 
-    def ray_rows(self, camera: Camera, pixels: Tensor, walk: CompositingParams) -> RayRows:
+    def ray_rows(self, camera: Camera, pixels: Tensor, params: CompositingParams) -> RayRows:
         """Rows of A, read off the dense matrix (in row order, not in depth order)."""
-        A = dense_view(self.splats, camera, walk).A
+        A = dense_view(self.splats, camera, params).A
         rows = A[(pixels[:, 1] * camera.width + pixels[:, 0]).numpy()]
         ray, splats = np.nonzero(rows)
         starts = np.concatenate([[0], np.cumsum(np.bincount(ray, minlength=rows.shape[0]))])

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from liftcore.raster.constants import LOW_PASS, MAX_LOG_SCALE
+from liftcore.raster.base import LOW_PASS, MAX_LOG_SCALE
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -9,7 +9,7 @@ from liftcore.errors import InvalidFeatures, InvalidSettings, InvalidSplats
 from liftcore.io.ply import read_header
 from liftcore.io.ply_dialect import model_slots
 from liftcore.query.encoders.words import nearest, plain
-from liftcore.raster.antialiased import check_antialiased
+from liftcore.raster.base import check_antialiased
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.views import cameras_of_views, require_pairs, some_of
 from liftcore.settings import LiftSettings

@@ -32,8 +32,8 @@ from liftcore.features.views import Regions
 from liftcore.io.lift_file import TENSORS, LiftResult, save_lift
 from liftcore.lift import lift
 from liftcore.progress import silent
+from liftcore.raster import open_raster
 from liftcore.raster.base import CompositingParams, Weighting
-from liftcore.raster.open_raster import open_raster
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Splats
 from liftcore.settings import LiftSettings

@@ -38,11 +38,10 @@ from liftcore.evaluate.hardware import peak_memory
 from liftcore.evaluate.synthetic import room_cameras, room_regions, room_splats
 from liftcore.features.views import Regions
 from liftcore.progress import silent
-from liftcore.raster.base import CompositingParams, Weighting
-from liftcore.raster.constants import ALPHA_FLOOR, FIELD_MARGIN, LOW_PASS, NEAR_PLANE
-from liftcore.raster.constants import TILE as OUR_TILE
+from liftcore.raster.base import ALPHA_FLOOR, FIELD_MARGIN, LOW_PASS, NEAR_PLANE, CompositingParams, Weighting
+from liftcore.raster.base import TILE as OUR_TILE
+from liftcore.raster.cpu.project import CUTOFF, KY, MX, MY, OPACITY, ROOT_X, SLOPE
 from liftcore.raster.cpu.raster import CpuRaster
-from liftcore.raster.cpu.records import KY, MX, MY, OPACITY, REACH, ROOT_X, SLOPE
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Splats
 from liftcore.solve.closed_form import solve_closed_form
@@ -168,21 +167,21 @@ def _add_shares(thread, threads, edges, frame, target, sums):
                     break
                 place = frame.items[step]
                 box = x0, y0, width, height
-                _add_splat(frame, frame.records[place], box, light, target, sums[frame.ids[place]])
+                _add_splat(frame, frame.projected[place], box, light, target, sums[frame.ids[place]])
 
 
 @njit(nogil=True, cache=True)
 def _add_splat(frame, record, box, light, target, row):
     """One splat's weights on one tile, times the pixels, onto its row of sums [F + 1]; light ends at 0."""
     x0, y0, width, height = box
-    opacity, kx, cap = np.float32(record[OPACITY]), np.float32(record[ROOT_X] ** 2), np.float32(frame.cap)
+    opacity, kx, cap = np.float32(record[OPACITY]), np.float32(record[ROOT_X] ** 2), np.float32(frame.alpha_cap)
     for y in range(height):
         dy = y0 + y + 0.5 - record[MY]
         base = record[KY] * dy * dy
-        if base > record[REACH]:
+        if base > record[CUTOFF]:
             continue
         centre = record[MX] + record[SLOPE] * dy - x0 - 0.5
-        half = math.sqrt(record[REACH] - base) / record[ROOT_X]
+        half = math.sqrt(record[CUTOFF] - base) / record[ROOT_X]
         for x in range(max(0, math.ceil(centre - half)), min(width - 1, math.floor(centre + half)) + 1):
             before = light[y, x]
             if before <= 0:
@@ -193,7 +192,7 @@ def _add_splat(frame, record, box, light, target, row):
                 continue
             alpha = min(alpha, cap)
             after = before * (np.float32(1) - alpha)
-            if after <= np.float32(frame.stop):
+            if after <= np.float32(frame.transmittance_stop):
                 light[y, x] = 0
                 continue
             light[y, x] = after

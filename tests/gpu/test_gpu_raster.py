@@ -20,7 +20,7 @@ from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.raster.gpu import selecting
 from liftcore.raster.gpu.frame import Frame
 from liftcore.raster.gpu.sums import Pieces, sums_by_unit
-from liftcore.raster.reference import OracleRaster
+from liftcore.raster.reference import ReferenceRaster
 from liftcore.scene.splats import Kernel
 from tests.backends import gpu_raster, needs_triton
 from tests.properties.test_raster_conformance import INSIDE, dense
@@ -253,7 +253,7 @@ def test_a_view_that_sees_nothing_gives_empty_products(kernel):
 
 def test_an_image_of_one_pixel_and_labels_of_none():
     splats, camera = random_splats(4, 30), random_camera(4, 1, 1)
-    raster, plain = gpu_raster(splats), OracleRaster(splats)
+    raster, plain = gpu_raster(splats), ReferenceRaster(splats)
     assert torch.allclose(
         raster.row_sums(camera, CompositingParams()), plain.row_sums(camera, CompositingParams()), atol=INSIDE
     )
@@ -280,7 +280,7 @@ def test_strongest_labels_are_those_of_the_oracle_with_more_labels_than_a_block(
     labels = torch.arange(60, dtype=torch.int32) % 35 - 1
     ours, theirs = (
         raster.strongest_labels(camera, labels, CompositingParams())
-        for raster in (gpu_raster(splats), OracleRaster(splats))
+        for raster in (gpu_raster(splats), ReferenceRaster(splats))
     )
     assert theirs.unique().numel() > 5
     assert (ours != theirs).float().mean() < 0.01

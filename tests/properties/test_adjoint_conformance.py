@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from liftcore.errors import InvalidInput
 from liftcore.raster.base import CompositingParams
 from liftcore.raster.cpu.raster import CpuRaster
-from liftcore.raster.reference import OracleRaster, dense_view
+from liftcore.raster.reference import ReferenceRaster, dense_view
 from tests.backends import every_backend
 from tests.properties.test_raster_conformance import INSIDE, WALKS
 from tests.scenes import random_camera, random_splats, scenes
@@ -63,7 +63,7 @@ def test_the_oracle_gives_the_same_adjoint():
     splats, camera = random_splats(3, 30), random_camera(3)
     Y = random_image(camera, 2)
     Y[torch.from_numpy(dense_view(splats, camera, CompositingParams()).cut.reshape(camera.height, camera.width))] = 0
-    fast, plain = (raster(splats).adjoint(camera, Y, CompositingParams()) for raster in (CpuRaster, OracleRaster))
+    fast, plain = (raster(splats).adjoint(camera, Y, CompositingParams()) for raster in (CpuRaster, ReferenceRaster))
     assert torch.allclose(fast, plain, atol=1e-4)
 
 

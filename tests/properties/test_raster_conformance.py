@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from liftcore.features.views import Regions, ViewFeatures
 from liftcore.raster.base import CompositingParams, RayRows, RegionWeights, Selection, ViewRequest, Weighting
 from liftcore.raster.cpu.raster import CpuRaster
-from liftcore.raster.reference import OracleRaster, dense_view, reading_matrix
-from liftcore.raster.reference_weights import counted_weights, walked_rays
+from liftcore.raster.reference import ReferenceRaster, counted_weights, dense_view, reading_matrix, strided_rays
 from liftcore.scene.splats import Kernel, Splats
 from tests.backends import every_backend
 from tests.scenes import random_camera, random_grid, random_regions, random_splats, scenes
@@ -157,7 +156,7 @@ def test_selections_and_strides_equal_the_oracle(footprint, backend):
         labels = torch.arange(rays, dtype=torch.int32).reshape(1, camera.height, camera.width)
         one_a_ray = Regions(labels, torch.ones(rays, 1))
         W = dense(backend.open(splats).region_weights(camera, one_a_ray, walk, weighting), splats.count, rays)
-        walked = walked_rays(camera, walk)
+        walked = strided_rays(camera, walk)
         assert W[:, ~walked].max(initial=0) == 0
         clear = walked & ~view.cut & ~hard
         assert np.abs(W.T - chosen)[clear].max(initial=0) < INSIDE
@@ -248,7 +247,7 @@ def test_the_oracle_is_a_backend_that_gives_the_same_products(footprint, backend
     (splats, walk), camera = seeded(footprint, seed, 30), random_camera(seed)
     if dense_view(splats, camera, walk).cut.any():
         camera = random_camera(seed + 100)
-    fast, plain = backend.open(splats), OracleRaster(splats)
+    fast, plain = backend.open(splats), ReferenceRaster(splats)
     observation = random_regions(seed)
     rows = observation.codebook.shape[0]
     ours, theirs = (raster.region_weights(camera, observation, walk, Weighting(2)) for raster in (fast, plain))

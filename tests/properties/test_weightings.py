@@ -14,8 +14,7 @@ from liftcore.errors import InvalidInput
 from liftcore.features.views import Regions
 from liftcore.raster.base import CompositingParams, RegionWeights, Selection, Weighting
 from liftcore.raster.cpu.raster import CpuRaster
-from liftcore.raster.reference import OracleRaster, dense_view
-from liftcore.raster.reference_weights import counted_weights, walked_rays
+from liftcore.raster.reference import ReferenceRaster, counted_weights, dense_view, strided_rays
 from tests.scenes import random_camera, random_grid, random_regions, random_splats, scenes
 
 INSIDE = 1e-5  # absolute, on weights away from cut-offs, ties and borders
@@ -103,7 +102,7 @@ def test_strided_rays_are_rays_of_the_full_view(data, scene, weighting):
     walk = CompositingParams(stride=stride, offset=offset)
     view = dense_view(splats, camera, walk)
     expected, undecided = counted_weights(view.A, splats, camera, walk, weighting)
-    walked = walked_rays(camera, walk)
+    walked = strided_rays(camera, walk)
     got = chosen_of(splats, camera, walk, weighting)
     assert not got[~walked].any()
     assert np.abs(got - expected)[walked & ~(view.cut | undecided)].max(initial=0) < INSIDE
@@ -119,7 +118,7 @@ def test_strided_pixels_read_what_they_read_at_full_resolution(data, scene):
         return
     rows = observation.codebook.shape[0]
     fast, plain = (
-        raster(splats).region_weights(camera, observation, walk, ALL) for raster in (CpuRaster, OracleRaster)
+        raster(splats).region_weights(camera, observation, walk, ALL) for raster in (CpuRaster, ReferenceRaster)
     )
     expected = matrix(plain, splats.count, rows)
     assert np.abs(matrix(fast, splats.count, rows) - expected).max(initial=0) < INSIDE * max(

@@ -7,10 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from liftcore.raster.base import CompositingParams
-from liftcore.raster.constants import ALPHA_FLOOR
+from liftcore.raster.base import ALPHA_FLOOR, CompositingParams
 from liftcore.raster.cpu.raster import CpuRaster
-from liftcore.raster.reference_footprints import projected_gaussian
+from liftcore.raster.reference import projected_gaussian
 from liftcore.scene.cameras import Camera
 from tests.benchmarks.stability.weights import exact_view, traced, weights_of
 from tests.scenes import camera_at_origin, random_splats, splats_at

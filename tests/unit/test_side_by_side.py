@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from liftcore.raster.base import CompositingParams, ViewRequest, Weighting
-from liftcore.raster.cpu.side_by_side import side_by_side, views_at_a_time
+from liftcore.raster.cpu.raster import side_by_side, views_at_a_time
 from tests.scenes import random_camera, random_regions
 
 if TYPE_CHECKING:

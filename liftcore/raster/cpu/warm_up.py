@@ -8,8 +8,8 @@ import torch
 from liftcore.device import CPU, Device
 from liftcore.features.views import FeatureGrid, Regions
 from liftcore.io.ply_dialect import scale_count
+from liftcore.raster import open_raster
 from liftcore.raster.base import CompositingParams, Weighting
-from liftcore.raster.open_raster import open_raster
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Kernel, Splats
 

@@ -1,4 +1,4 @@
-"""Discs to footprints on the device: ``liftcore.raster.cpu.projection_2dgs``, written for all discs at once."""
+"""Discs to footprints on the device: ``liftcore.raster.cpu.project``, written for all discs at once."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from liftcore.raster.constants import EDGE_ON, LOW_PASS
-from liftcore.raster.cpu.projection import HALF_LOG2_E
+from liftcore.raster.base import EDGE_ON, LOW_PASS
+from liftcore.raster.cpu.project import HALF_LOG2_E
 from liftcore.raster.gpu.scene import (
     CENTRE_X,
     CENTRE_Y,
@@ -37,7 +37,7 @@ from liftcore.raster.gpu.scene import (
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from liftcore.raster.cpu.projection import View
+    from liftcore.raster.cpu.project import View
     from liftcore.raster.gpu.projection import Seen
     from liftcore.raster.gpu.scene import Block
 
@@ -54,7 +54,7 @@ def project_discs(block: Block, view: View, seen: Seen) -> tuple[Footprints, Ten
     """The footprints of the discs that touch the image, and their depths [n] f64, in the block's order."""
     fx, fy, cx, cy = view.intrinsics.tolist()
     curvature = 2.0 * HALF_LOG2_E * LOW_PASS / view.low_pass  # of exp(-g / 2), g = 2 |p - mu|^2 in full pixels
-    near = torch.sqrt(seen.reach / curvature)
+    near = torch.sqrt(seen.cutoff / curvature)
     mx, my = fx * seen.x / seen.z + cx, fy * seen.y / seen.z + cy
     crossed, forms = _crossing(seen, fx, fy)
     ellipse = _chosen(crossed, _outline(seen, (mx, my), view), _circle(mx, my, near))
@@ -119,9 +119,9 @@ def _circle(mx: Tensor, my: Tensor, near: Tensor) -> Ellipse:
 
 
 def _outline(seen: Seen, middle: tuple[Tensor, Tensor], view: View) -> Ellipse:
-    """All pixels whose ray can cross the disc; see ``liftcore.raster.cpu.projection_2dgs._write_outline``."""
+    """All pixels whose ray can cross the disc; see ``liftcore.raster.cpu.project._write_outline``."""
     fx, fy = view.intrinsics.tolist()[:2]
-    z, largest = seen.z, seen.reach / HALF_LOG2_E
+    z, largest = seen.z, seen.cutoff / HALF_LOG2_E
     a, b = seen.axes.unbind(2)
     u = [fx * (axis[:, 0] - seen.x / z * axis[:, 2]) for axis in (a, b)]
     v = [fy * (axis[:, 1] - seen.y / z * axis[:, 2]) for axis in (a, b)]
@@ -151,7 +151,7 @@ def _box(left: Tensor, right: Tensor, top: Tensor, bottom: Tensor) -> Ellipse:
 
 
 def _reached(origin: Tensor, p: Tensor, q: Tensor, room: Tensor, size: int) -> tuple[Tensor, Tensor]:
-    """See ``liftcore.raster.cpu.projection_2dgs._reached``."""
+    """See ``liftcore.raster.cpu.project._reached``."""
     square = p * p + room * q
     met, root = square >= 0, torch.sqrt(square.clamp(min=0.0))
     high = torch.where(met & (p + root > 0), q / (p + root), math.inf)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import triton.language as tl
 
-from liftcore.raster.constants import ALPHA_FLOOR, LARGEST_EXPONENT
+from liftcore.raster.base import ALPHA_FLOOR, LARGEST_EXPONENT
 from liftcore.raster.gpu import scene
 from liftcore.raster.gpu.launching import jit
 from liftcore.scene.splats import Kernel

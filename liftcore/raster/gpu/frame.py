@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from liftcore.raster.constants import TILE
+from liftcore.raster.base import TILE
 from liftcore.raster.gpu.falloffs import FLOORS, KINDS
 from liftcore.raster.gpu.projection import project, project_again
 from liftcore.raster.gpu.room import footprint_bytes

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from liftcore.raster.constants import TILE
+from liftcore.raster.base import TILE
 from liftcore.raster.gpu import room
 from liftcore.raster.gpu.sums import A_KEY, A_SUM
 from liftcore.raster.gpu.weighing import A_LEVEL, AN_ENTRY

@@ -1,4 +1,4 @@
-"""Splats to footprints on the device: ``liftcore.raster.cpu.projection``, written for all splats at once.
+"""Splats to footprints on the device: ``liftcore.raster.cpu.project``, written for all splats at once.
 
 The arithmetic is float64 and the formulas, their order included, are those of the CPU backend. It is a few dozen
 operations a splat, so plain tensor operations serve; they run on the CPU as well, which is how they are tested.
@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 
-from liftcore.raster.constants import NEAR_PLANE
-from liftcore.raster.cpu.projection import HALF_LOG2_E
+from liftcore.raster.base import NEAR_PLANE
+from liftcore.raster.cpu.project import HALF_LOG2_E
 from liftcore.raster.gpu.discs import project_discs
 from liftcore.raster.gpu.scene import (
     BETA,
@@ -33,7 +33,7 @@ from liftcore.scene.splats import Kernel
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from liftcore.raster.cpu.projection import View
+    from liftcore.raster.cpu.project import View
     from liftcore.raster.gpu.scene import Block, DeviceScene
 
 
@@ -56,7 +56,7 @@ class Seen(NamedTuple):
     y: Tensor
     z: Tensor
     axes: Tensor  # [n, 3, K] f64, axis k in column k
-    reach: Tensor  # [n] f64
+    cutoff: Tensor  # [n] f64
 
 
 def footprints_of(projection: Projection, rows: slice | Tensor) -> tuple[Footprints, Tensor]:
@@ -106,10 +106,10 @@ def _before_the_camera(block: Block, view: View) -> Seen:
     pose, scene = view.pose.tolist(), block.scene
     px, py, pz = scene.means.double().unbind(1)
     x, y, z = (own[0] * px + own[1] * py + own[2] * pz + own[3] for own in pose)
-    kept = ((scene.reach >= 0) & (z >= NEAR_PLANE)).nonzero()[:, 0]
+    kept = ((scene.cutoff >= 0) & (z >= NEAR_PLANE)).nonzero()[:, 0]
     ax, ay, az = scene.axes[kept].unbind(1)
     axes = torch.stack([own[0] * ax + own[1] * ay + own[2] * az for own in pose], dim=1)
-    return Seen(kept, x[kept], y[kept], z[kept], axes, scene.reach[kept])
+    return Seen(kept, x[kept], y[kept], z[kept], axes, scene.cutoff[kept])
 
 
 def _project_ellipses(

@@ -17,13 +17,22 @@ import torch
 
 from liftcore.device import indexed, out_of_memory
 from liftcore.errors import Unavailable
-from liftcore.raster.antialiased import check_antialiased
-from liftcore.raster.base import CompositingParams, RayRows, RegionWeights, ViewRequest, ViewWeights, Weighting
-from liftcore.raster.cpu.arguments import check_image, check_labels, check_rows
-from liftcore.raster.cpu.kernels import activated, with_gain
-from liftcore.raster.cpu.projection import view_of
-from liftcore.raster.cpu.selection import choice_of
-from liftcore.raster.cpu.strided import check_stride, every_pixel, places_on, strided
+from liftcore.raster.base import (
+    CompositingParams,
+    RayRows,
+    RegionWeights,
+    ViewRequest,
+    ViewWeights,
+    Weighting,
+    check_image,
+    check_labels,
+    check_params,
+    check_rows,
+    every_pixel,
+    strided_places,
+)
+from liftcore.raster.cpu.composite import choice_of
+from liftcore.raster.cpu.project import activated, view_of, with_opacities
 from liftcore.raster.cpu.weights_home import on_host
 from liftcore.raster.gpu import rendering, weighing
 from liftcore.raster.gpu.ahead import made_ahead
@@ -116,47 +125,47 @@ class GpuRaster:
         return True
 
     def region_weights(
-        self, camera: Camera, observation: ViewFeatures, walk: CompositingParams, weighting: Weighting
+        self, camera: Camera, observation: ViewFeatures, params: CompositingParams, weighting: Weighting
     ) -> RegionWeights:
         """``A'^T S`` of a view and the evidence of plain weights. See the protocol."""
-        return self._brought(self._weighed(self._read(observation, camera, walk), camera, walk, weighting))
+        return self._brought(self._weighed(self._read(observation, camera, params), camera, params, weighting))
 
     @_within_memory
     def _weighed(
-        self, reading: DeviceReading, camera: Camera, walk: CompositingParams, weighting: Weighting
+        self, reading: DeviceReading, camera: Camera, params: CompositingParams, weighting: Weighting
     ) -> RegionWeights:
-        choice, frame = choice_of(weighting), self._frame(camera, walk, reading.levels)
-        return weighing.region_weights(frame, reading, choice, walk.opacity_logit_scale != 1.0, self.splats.count)
+        choice, frame = choice_of(weighting), self._frame(camera, params, reading.levels)
+        return weighing.region_weights(frame, reading, choice, params.opacity_logit_scale != 1.0, self.splats.count)
 
     def _brought(self, weights: RegionWeights) -> RegionWeights:
         """Where they are wanted. A host without room for them is no reason for smaller pieces on the device."""
         return weights if self._stays else on_host(weights)
 
-    def iterate_views(self, looks: Iterable[ViewRequest]) -> Generator[ViewWeights]:
+    def iterate_views(self, requests: Iterable[ViewRequest]) -> Generator[ViewWeights]:
         """``region_weights`` and ``ray_rows`` of views, one at a time; the next one is read while the card walks."""
 
-        def read(look: ViewRequest) -> DeviceReading:
-            return self._read(look.observation, look.camera, look.params)
+        def read(request: ViewRequest) -> DeviceReading:
+            return self._read(request.observation, request.camera, request.params)
 
         try:
-            with closing(made_ahead(looks, read)) as ahead:
-                for look, reading in ahead:
+            with closing(made_ahead(requests, read)) as ahead:
+                for request, reading in ahead:
                     yield ViewWeights(  # without a name, which would hold it beside the next one
-                        self._brought(self._weighed(reading, look.camera, look.params, look.weighting)),
-                        self.ray_rows(look.camera, look.pixels, look.params),
+                        self._brought(self._weighed(reading, request.camera, request.params, request.weighting)),
+                        self.ray_rows(request.camera, request.pixels, request.params),
                     )
         finally:
             self.forget()
 
-    def _read(self, observation: ViewFeatures, camera: Camera, walk: CompositingParams) -> DeviceReading:
-        check_stride(walk, camera)
-        return DeviceReading(observation, camera, walk, self.device)
+    def _read(self, observation: ViewFeatures, camera: Camera, params: CompositingParams) -> DeviceReading:
+        check_params(self.splats.kernel, camera, params)
+        return DeviceReading(observation, camera, params, self.device)
 
     @_within_memory
-    def render(self, camera: Camera, values: Tensor, walk: CompositingParams) -> Tensor:
+    def render(self, camera: Camera, values: Tensor, params: CompositingParams) -> Tensor:
         """``A X``: values [P, C] f32 -> [H, W, C] f32. See the protocol."""
         check_rows(values, self.splats.count)
-        frame = self._frame(camera, every_pixel(walk))
+        frame = self._frame(camera, every_pixel(params))
         image = torch.empty(camera.height, camera.width, values.shape[1])
         for begin in range(0, values.shape[1], rendering.WIDEST):
             block = values[:, begin : begin + rendering.WIDEST].to(torch.float32).contiguous()
@@ -164,60 +173,59 @@ class GpuRaster:
         return image
 
     @_within_memory
-    def adjoint(self, camera: Camera, values: Tensor, walk: CompositingParams) -> Tensor:
+    def adjoint(self, camera: Camera, values: Tensor, params: CompositingParams) -> Tensor:
         """``A^T Y``: values [H, W, C] f32 -> [P, C] f32. See the protocol."""
         check_image(values, camera)
-        frame = self._frame(camera, every_pixel(walk))
+        frame = self._frame(camera, every_pixel(params))
         result = torch.empty(self.splats.count, values.shape[2])
         for begin in range(0, values.shape[2], weighing.WIDEST):
             block = values[:, :, begin : begin + weighing.WIDEST]
             result[:, begin : begin + weighing.WIDEST] = weighing.adjoint(frame, block, self.splats.count)
         return result
 
-    def row_sums(self, camera: Camera, walk: CompositingParams) -> Tensor:
+    def row_sums(self, camera: Camera, params: CompositingParams) -> Tensor:
         """``A 1``: [H, W] f32."""
-        return self.render(camera, torch.ones(self.splats.count, 1), walk)[:, :, 0]
+        return self.render(camera, torch.ones(self.splats.count, 1), params)[:, :, 0]
 
     @_within_memory
-    def strongest_labels(self, camera: Camera, labels: Tensor, walk: CompositingParams) -> Tensor:
+    def strongest_labels(self, camera: Camera, labels: Tensor, params: CompositingParams) -> Tensor:
         """``argmax(A onehot(labels))``: labels [P] i32 in -1..K - 1 -> [H, W] i32. See the protocol."""
         check_labels(labels, self.splats.count)
-        frame = self._frame(camera, every_pixel(walk))
+        frame = self._frame(camera, every_pixel(params))
         return rendering.strongest_labels(frame, labels.to(torch.int32)).cpu()
 
     @_within_memory
-    def ray_rows(self, camera: Camera, pixels: Tensor, walk: CompositingParams) -> RayRows:
+    def ray_rows(self, camera: Camera, pixels: Tensor, params: CompositingParams) -> RayRows:
         """Rows of A for single pixels [n, 2] (x, y). See the protocol."""
-        places = places_on(walk, pixels)
+        places = strided_places(params, pixels)
         if places is None:  # not all of them are rays of the strided view
-            places, walk = pixels, every_pixel(walk)
-        return ray_rows(self._frame(camera, walk), places)
+            places, params = pixels, every_pixel(params)
+        return ray_rows(self._frame(camera, params), places)
 
     def forget(self) -> None:
         """Drop the projected view that is kept for the next product."""
         self._kept = None
 
-    def _frame(self, camera: Camera, walk: CompositingParams, levels: int = USUAL_LEVELS) -> Frame:
+    def _frame(self, camera: Camera, params: CompositingParams, levels: int = USUAL_LEVELS) -> Frame:
         """The view projected, with room for labels of so many levels; the last one is kept."""
-        if self._kept is not None and self._kept[0] is camera and self._kept[1] == walk:
+        if self._kept is not None and self._kept[0] is camera and self._kept[1] == params:
             return self._kept[2]
-        check_antialiased(self.splats.kernel, walk.antialiased)
-        check_stride(walk, camera)
+        check_params(self.splats.kernel, camera, params)
         self._kept = None  # before, so that one frame's memory is the most ever held
-        view = strided(view_of(camera), walk)
+        view = view_of(camera, params)
         levels = max(levels, USUAL_LEVELS)  # one level may stand for tuples of several, and has as many sums
         need = raster_bytes(self.splats.count, view.width, view.height, self.splats.kernel, levels)
         room = room_within(self._free, self.splats.kernel, need)
-        scene = self._scene_with(walk.opacity_logit_scale)
-        projection = Projection(scene, view, self.splats.kernel, walk.antialiased, self.device, room.splats)
-        frame = Frame(projection, walk, room)
-        self._kept = camera, walk, frame
+        scene = self._scene_with(params.opacity_logit_scale)
+        projection = Projection(scene, view, self.splats.kernel, params.antialiased, self.device, room.splats)
+        frame = Frame(projection, params, room)
+        self._kept = camera, params, frame
         return frame
 
     def _scene_with(self, gain: float) -> DeviceScene:
         """The splats with that gain on their opacity: on the device, or on the host where they would fill it."""
         if gain != self._gain:
-            self._host, self._gain = with_gain(self._host, self.splats, gain), gain
+            self._host, self._gain = with_opacities(self._host, self.splats, gain), gain
             self._scene = None if self._scene is None else with_opacity(self._scene, self._host)
         if self._scene is None:
             staged = self._free is not None and self._size > SCENE_SHARE * self._free

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 import triton.language as tl
 
-from liftcore.raster.constants import TILE
+from liftcore.raster.base import TILE
 from liftcore.raster.gpu.launching import WARPS, jit, lang, launch
 from liftcore.raster.gpu.walk import CHUNK, PART, PARTS, blend_chunk, fill_alphas, start_rays, weights_of
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from liftcore.raster.constants import TILE
+from liftcore.raster.base import TILE
 from liftcore.raster.gpu.scene import INK, PLACE
 from liftcore.raster.gpu.walk import PART, PARTS
 from liftcore.scene.splats import Kernel

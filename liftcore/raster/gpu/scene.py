@@ -9,11 +9,11 @@ import torch
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from liftcore.raster.cpu.projection import Scene
+    from liftcore.raster.cpu.project import Scene
 
 # What the walk reads of a splat. PLACES [n, PLACE] f64 holds what is taken at a row's first pixel, where large
 # numbers are subtracted; INKS [n, INK] f32 what every pixel needs. A row a splat that the view may see, near to far.
-MX, MY, SLOPE, KY = range(4)  # 3DGS and DBS, as in cpu.records
+MX, MY, SLOPE, KY = range(4)  # 3DGS and DBS, as in cpu.project
 CENTRE_X, CENTRE_Y, S_X, S_Y, T_X, T_Y, D_ZERO, D_X, D_Y = range(9)  # 2DGS, likewise
 PLACE = 9
 
@@ -23,25 +23,25 @@ INK = 10
 
 
 class DeviceScene(NamedTuple):
-    """``liftcore.raster.cpu.projection.Scene`` as tensors, a row a splat; on the device, or on the host."""
+    """``liftcore.raster.cpu.project.Scene`` as tensors, a row a splat; on the device, or on the host."""
 
     means: Tensor  # [P, 3] f32, world
     axes: Tensor  # [P, 3, 3] f64 ([P, 3, 2] for 2DGS), scaled axes in columns, world
     opacity: Tensor  # [P] f64, with the gain
     plain: Tensor  # [P] f64, without it
-    reach: Tensor  # [P] f64, the largest e (or sigma) with a weight; negative for none
+    cutoff: Tensor  # [P] f64, the largest e (or sigma) with a weight; negative for none
     beta: Tensor  # [P] f64, DBS only ([0] otherwise): the exponent
 
 
 class Outlines(NamedTuple):
     """What the tile lists need of the footprints, a row a splat, near to far; all f64."""
 
-    mx: Tensor  # [n] the outline ``(root_x (x - mx - slope dy))^2 + ky dy^2 <= reach``, as in cpu.records
+    mx: Tensor  # [n] the outline ``(root_x (x - mx - slope dy))^2 + ky dy^2 <= cutoff``, as in cpu.project
     my: Tensor
     slope: Tensor
     root_x: Tensor
     ky: Tensor
-    reach: Tensor
+    cutoff: Tensor
     extent_x: Tensor
     extent_y: Tensor
     lean: Tensor
@@ -89,5 +89,5 @@ def block_of(scene: DeviceScene, rows: slice | Tensor, device: torch.device) -> 
 def with_opacity(scene: DeviceScene, changed: Scene) -> DeviceScene:
     """The same splats with the opacities and reaches of ``changed``."""
     device = scene.means.device
-    opacity, reach = (torch.from_numpy(part).to(device) for part in (changed.opacity, changed.reach))
-    return scene._replace(opacity=opacity, reach=reach)
+    opacity, cutoff = (torch.from_numpy(part).to(device) for part in (changed.opacity, changed.cutoff))
+    return scene._replace(opacity=opacity, cutoff=cutoff)

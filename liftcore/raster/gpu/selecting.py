@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import torch
 import triton.language as tl
 
-from liftcore.raster.constants import TILE
-from liftcore.raster.cpu.selection import CENTRAL, FRONT, LARGEST
+from liftcore.raster.base import TILE
+from liftcore.raster.cpu.composite import CENTRAL, FRONT, LARGEST
 from liftcore.raster.gpu import scene
 from liftcore.raster.gpu.launching import WARPS, jit, lang, launch
 from liftcore.raster.gpu.room import A_PIXEL

@@ -1,6 +1,6 @@
 """S on the device: which slots the pixels of each tile read, and how much.
 
-As on the CPU (``cpu.readings``), a slot of a region map is a distinct tuple of labels on all levels, a
+As on the CPU (``cpu.weights``), a slot of a region map is a distinct tuple of labels on all levels, a
 slot of a grid is a cell, and both become the same thing: one or four taps a pixel, a slot and a share each. A sort of
 every tile's keys finds its slots, so their numbers do not depend on who is first.
 """
@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 
-from liftcore.raster.constants import TILE
-from liftcore.raster.cpu.readings import reading_of
+from liftcore.raster.base import TILE
+from liftcore.raster.cpu.weights import reading_of
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from liftcore.features.views import ViewFeatures
     from liftcore.raster.base import CompositingParams
-    from liftcore.raster.cpu.readings import Reading
+    from liftcore.raster.cpu.weights import Reading
     from liftcore.scene.cameras import Camera
 
 PIXELS = TILE * TILE

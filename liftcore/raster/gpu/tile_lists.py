@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 
-from liftcore.raster.constants import TILE
+from liftcore.raster.base import TILE
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -165,5 +165,5 @@ def _outline_columns(own: Outlines, tile_row: Tensor) -> tuple[Tensor, Tensor]:
 
 def _edge(own: Outlines, dy: Tensor, side: float) -> Tensor:
     """x of the outline's left (-1) or right (+1) edge at dy, relative to its centre."""
-    room = (own.reach - own.ky * dy * dy).clamp(min=0.0)
+    room = (own.cutoff - own.ky * dy * dy).clamp(min=0.0)
     return own.slope * dy + side * torch.sqrt(room) / own.root_x

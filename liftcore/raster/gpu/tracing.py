@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 import torch
 import triton.language as tl
 
-from liftcore.raster.base import RayRows
-from liftcore.raster.constants import TILE
+from liftcore.raster.base import TILE, RayRows
 from liftcore.raster.gpu.launching import jit, lang, launch
 from liftcore.raster.gpu.walk import CHUNK, PART, PARTS, blend_chunk, fill_alphas, start_rays
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import triton.language as tl
 
-from liftcore.raster.constants import TILE
+from liftcore.raster.base import TILE
 from liftcore.raster.gpu import scene
 from liftcore.raster.gpu.falloffs import falloff_at
 from liftcore.raster.gpu.launching import jit

@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 import triton.language as tl
 
-from liftcore.raster.base import RegionWeights
-from liftcore.raster.constants import TILE
-from liftcore.raster.cpu.selection import FRONT, LARGEST
+from liftcore.raster.base import TILE, RegionWeights
+from liftcore.raster.cpu.composite import FRONT, LARGEST
 from liftcore.raster.gpu.launching import jit, lang, launch
 from liftcore.raster.gpu.selecting import blend_chosen, counted, marks_of
 from liftcore.raster.gpu.sums import Pieces, Sums, sums_by_unit
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
 
     from torch import Tensor
 
-    from liftcore.raster.cpu.selection import Choice
+    from liftcore.raster.cpu.composite import Choice
     from liftcore.raster.gpu.frame import Frame
     from liftcore.raster.gpu.slots import DeviceReading, Slots
     from liftcore.raster.gpu.tile_lists import Lists
@@ -234,7 +233,7 @@ def _weigh_run(
     launch(
         _weigh, programs, *lists.splats, lists.starts, lists.items, frame.scratch(programs, parts), slots.taps,
         slots.shares, slots.starts, table, starts, evidence, least, room, lists.first_tile, job.tiles[0],
-        job.slots_tile, *frame.size, float(choice.light), float(choice.floor), *frame.cuts, KIND=frame.kind,
+        job.slots_tile, *frame.size, float(choice.transmittance), float(choice.floor), *frame.cuts, KIND=frame.kind,
         TAPS=taps, SELECTION=choice.kind, POWER=choice.power, GAIN=with_plain,
     )  # fmt: skip
     return table, starts

@@ -14,7 +14,7 @@ from liftcore.features.views import Regions
 from liftcore.progress import silent
 from liftcore.raster.base import CompositingParams, RegionWeights, Weighting
 from liftcore.raster.cpu.raster import CpuRaster
-from liftcore.raster.reference_footprints import alphas
+from liftcore.raster.reference import alphas
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Splats
 from liftcore.solve.closed_form import solve_closed_form

@@ -14,9 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from liftcore.raster.base import CompositingParams
-from liftcore.raster.constants import NEAR_PLANE
-from liftcore.raster.reference_footprints import projected_gaussian
+from liftcore.raster.base import NEAR_PLANE, CompositingParams
+from liftcore.raster.reference import projected_gaussian
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Kernel
 from tests.benchmarks.stability.case import WEIGHTS

@@ -16,7 +16,7 @@ from liftcore.query.depth import expected_depth, shown_depth
 from liftcore.query.pictures import render_png
 from liftcore.query.scene import QueryScene
 from liftcore.raster.base import CompositingParams
-from liftcore.raster.reference import OracleRaster
+from liftcore.raster.reference import ReferenceRaster
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.splats import Kernel, Splats
 from liftcore.settings import LiftSettings
@@ -68,7 +68,7 @@ def test_depth_is_the_weighted_mean_of_what_the_ray_meets(kernel: Kernel) -> Non
     splats, camera = random_splats(5, 40, kernel=kernel), random_camera(5)
     depths, covered = expected_depth(scene_of(splats, camera), "v0")
     pixels = torch.tensor([(x, y) for y in range(camera.height) for x in range(camera.width)], dtype=torch.int32)
-    rows = OracleRaster(splats).ray_rows(camera, pixels, CompositingParams())
+    rows = ReferenceRaster(splats).ray_rows(camera, pixels, CompositingParams())
     z = splats.means.double() @ torch.from_numpy(camera.viewmat[2, :3].copy()) + camera.viewmat[2, 3]
     expected = torch.zeros(len(pixels), dtype=torch.float64)
     weighed = torch.zeros(len(pixels), dtype=torch.float64)

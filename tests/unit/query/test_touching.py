@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from liftcore.query import touching as module
 from liftcore.query.touching import NEIGHBOURS, REACH, touching
-from liftcore.raster.reference_footprints import rotation
+from liftcore.raster.reference import rotation
 from liftcore.scene.splats import Kernel, Splats
 from tests.scenes import random_splats
 

@@ -19,7 +19,7 @@ from liftcore.query.objects import objects
 from liftcore.query.query import Query
 from liftcore.query.scene import QueryScene
 from liftcore.query.view_mask import view_mask
-from liftcore.raster.reference import OracleRaster
+from liftcore.raster.reference import ReferenceRaster
 from liftcore.scene.cameras import Cameras
 from liftcore.settings import LiftSettings
 from tests.api.tiny_scene import HEIGHT, SPLATS_A_CLUSTER, WIDTH, make_scene
@@ -50,7 +50,7 @@ def of(scene: QueryScene, *clusters: int, keep: str = "all", rows: tuple[int, ..
 
 def mostly(scene: QueryScene, members: torch.Tensor) -> torch.Tensor:
     """[H, W] bool, where these splats have at least half of a ray that meets the scene, by the oracle."""
-    camera, oracle = scene.cameras["middle"], OracleRaster(scene.splats)
+    camera, oracle = scene.cameras["middle"], ReferenceRaster(scene.splats)
     weights = oracle.render(camera, members.float()[:, None], scene.walk)[..., 0]
     row_sums = oracle.row_sums(camera, scene.walk)
     assert not ((weights / row_sums.clamp_min(1e-9) - 0.5).abs() < 1e-5).any()  # no pixel is in doubt

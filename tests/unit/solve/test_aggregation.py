@@ -20,7 +20,7 @@ from liftcore.io.ply import read_splats, write_splats
 from liftcore.lift import LEAST_KEPT, lift
 from liftcore.progress import silent
 from liftcore.raster.cpu.raster import CpuRaster
-from liftcore.raster.reference import OracleRaster, dense_view
+from liftcore.raster.reference import ReferenceRaster, dense_view
 from liftcore.scene.cameras import Cameras
 from liftcore.settings import LiftSettings
 from liftcore.solve.aggregation import KeptRegions, evidence_means, filter_regions, kept_means, spread
@@ -45,7 +45,7 @@ def test_kept_regions_are_those_of_the_paper_pixel_by_pixel(tmp_path_factory, se
     path = tmp_path_factory.mktemp("pack") / "features.safetensors"
     write_pack(path, maps, {"encoder": "random"})
     labels = np.random.default_rng(seed).integers(-1, K, P)
-    lifted = (OracleRaster(splats), Cameras(views), read_features(path), ("v0", "v1"))
+    lifted = (ReferenceRaster(splats), Cameras(views), read_features(path), ("v0", "v1"))
     kept = filter_regions(clustering_of(labels), 6, lifted, SETTINGS, silent)
 
     onehot = np.array([[float(label == k) for k in range(-1, K)] for label in labels])
@@ -273,5 +273,5 @@ def test_the_strongest_labels_are_those_of_the_one_hot_render():
         assert np.array_equal(shown[clear], (sums.argmax(axis=1) - 1)[clear])
         assert clear.mean() > 0.3
         assert (shown[view.A.sum(axis=1) == 0] == -1).all()
-        reference = OracleRaster(splats).strongest_labels(camera, labels, walk).numpy().ravel()
+        reference = ReferenceRaster(splats).strongest_labels(camera, labels, walk).numpy().ravel()
         assert np.array_equal(shown[clear], reference[clear])

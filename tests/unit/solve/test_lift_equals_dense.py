@@ -18,8 +18,7 @@ from liftcore.lift import lift, open_sources
 from liftcore.progress import silent
 from liftcore.raster.base import CompositingParams, Selection, Weighting
 from liftcore.raster.cpu.raster import CpuRaster
-from liftcore.raster.reference import dense_view, reading_matrix
-from liftcore.raster.reference_weights import counted_weights
+from liftcore.raster.reference import counted_weights, dense_view, reading_matrix
 from liftcore.scene.cameras import Cameras
 from liftcore.settings import LiftSettings
 from liftcore.solve.accumulate import accumulate

@@ -11,8 +11,7 @@ from liftcore.features.pack import write_pack
 from liftcore.features.views import Regions
 from liftcore.io.cameras import read_cameras
 from liftcore.lift import lift
-from liftcore.raster.reference import dense_view, reading_matrix
-from liftcore.raster.reference_weights import walked_rays
+from liftcore.raster.reference import dense_view, reading_matrix, strided_rays
 from liftcore.settings import LiftSettings, Preset
 from liftcore.solve.accumulate import strided_walk
 from tests.scenes import observed, random_camera, random_splats
@@ -36,7 +35,7 @@ def test_a_strided_lift_is_that_of_its_rays_and_its_evidence_speaks_for_all_of_t
     for k, camera in enumerate(read_cameras(paths[1]).values()):
         observation = observed(2, k, grids)
         walk = strided_walk(settings.lift_params, settings, camera, k)
-        view, walked = dense_view(splats, camera, walk), walked_rays(camera, walk)
+        view, walked = dense_view(splats, camera, walk), strided_rays(camera, walk)
         S, ray = reading_matrix(observation, camera.width, camera.height)
         weights = view.A[ray[walked[ray]]]
         numerator += weights.T @ (S[walked[ray]] @ observation.codebook.double().numpy())
@@ -47,7 +46,7 @@ def test_a_strided_lift_is_that_of_its_rays_and_its_evidence_speaks_for_all_of_t
     assert np.abs(got.features.numpy() - X)[~cut].max() < 1e-3
     assert np.abs(got.evidence.numpy() - evidence)[~cut].max() < 1e-3
     assert got.metadata.certificate["rays"] == sum(
-        int(walked_rays(camera, strided_walk(settings.lift_params, settings, camera, k)).sum())
+        int(strided_rays(camera, strided_walk(settings.lift_params, settings, camera, k)).sum())
         for k, camera in enumerate(read_cameras(paths[1]).values())
     )
 

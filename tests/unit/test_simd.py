@@ -6,16 +6,23 @@ import numpy as np
 import pytest
 from numba import njit
 
-from liftcore.raster.cpu import lanes, lanes_rows
-from liftcore.raster.cpu.lanes import LANES, copy_values, keep_halves, lanes_at
-from liftcore.raster.cpu.lanes_rows import AHEAD, WIDE, add_row_products, add_weighted_row
+from liftcore.raster.cpu import simd
+from liftcore.raster.cpu.simd import (
+    AHEAD,
+    LANES,
+    WIDE,
+    add_row_products,
+    add_weighted_row,
+    copy_values,
+    keep_halves,
+    lanes_at,
+)
 
 
 @pytest.fixture(params=["as it is", "does not convert"])
 def processor(request, monkeypatch: pytest.MonkeyPatch) -> None:
     if request.param != "as it is":
-        for module in (lanes, lanes_rows):
-            monkeypatch.setattr(module, "converts", lambda _context: False)
+        monkeypatch.setattr(simd, "converts", lambda _context: False)
 
 
 def every_half() -> np.ndarray:

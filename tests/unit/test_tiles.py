@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from liftcore.raster.base import CompositingParams, Selection, Weighting
-from liftcore.raster.cpu import bands
+from liftcore.raster.cpu import tiles
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.splats import Kernel
 from tests.scenes import random_camera, random_grid, random_regions, random_splats
@@ -20,8 +20,8 @@ PIXELS = torch.tensor([[x, y] for x in range(0, 100, 7) for y in range(0, 70, 5)
 @pytest.fixture
 def cut(monkeypatch):
     """Every view is cut."""
-    monkeypatch.setattr(bands, "MOST_LISTED", 4)
-    monkeypatch.setattr(bands, "BAND_ITEMS", MOST)
+    monkeypatch.setattr(tiles, "MOST_LISTED", 4)
+    monkeypatch.setattr(tiles, "BAND_ITEMS", MOST)
 
 
 def products(raster: CpuRaster) -> dict[str, tuple[torch.Tensor, ...]]:
@@ -51,7 +51,7 @@ def weights_of(raster: CpuRaster, weighting: Weighting) -> list[tuple[torch.Tens
 
 
 @pytest.mark.parametrize("kernel", Kernel)
-def test_what_tiles_give_by_themselves_is_the_same_to_the_bit(kernel, cut, monkeypatch):
+def test_banded_images_labels_and_rays_are_the_same_to_the_bit(kernel, cut, monkeypatch):
     splats = random_splats(3, 300, kernel=kernel)
     banded = CpuRaster(splats, threads=2)
     assert len(list(banded._bands(CAMERA, CompositingParams()))) > 2
@@ -97,7 +97,7 @@ def test_a_view_is_cut_where_all_its_lists_together_are_too_long(threads, monkey
     splats = random_splats(5, 300)
     (whole,) = CpuRaster(splats, threads)._bands(CAMERA, CompositingParams())
     for most, cut in ((len(whole.items), False), (len(whole.items) - 1, True), (0, True)):
-        monkeypatch.setattr(bands, "MOST_LISTED", most)
+        monkeypatch.setattr(tiles, "MOST_LISTED", most)
         assert (CpuRaster(splats, threads)._bands(CAMERA, CompositingParams())._whole is None) is cut
 
 

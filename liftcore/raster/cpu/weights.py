@@ -1,0 +1,662 @@
+"""``W = A'^T S`` of one view: the lift's only look at pixels.
+
+**Reading**: S, tile by tile, as a list of taps. A region map's slots are the distinct label tuples of the tile (a
+ray's labels on all levels), its factors zeros and ones. Bilinear weights are products of a row's share and a
+column's, and all pixels of a row segment have the rows' shares. So a grid's taps are **lines**: a row of cells as one
+side of the tile reads it, two for a segment however many cells it meets, with the row's share in all lanes. The
+columns' shares come once a splat is done: a line's lanes times those of a column add up to what the splat gave that
+cell.
+
+**Weighing**: every tile writes entries (row of a projected splat, slot, weight, evidence) into its share's buffer:
+what a splat gave to the pixels of one slot, and on its first entry of the tile the sum of its plain weights over all
+rays. The pixel loop knows neither labels nor channels.
+
+**Merging**: a counting sort gathers the entries by splat; only then are slots expanded to the codebook rows of all
+levels and summed, in float64. Ranges of splats are merged independently, and what a range gives depends on nothing
+but its entries.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from liftcore.features.views import Regions, ViewFeatures
+from liftcore.jit import inlined, kernel
+from liftcore.raster.base import TILE, CompositingParams, RegionWeights
+from liftcore.raster.cpu.composite import (
+    CENTRAL,
+    CHECK_EVERY,
+    LARGEST,
+    NO_SPOT,
+    Choice,
+    Frame,
+    blend_both,
+    look,
+    meets,
+    new_marks,
+    new_rays,
+    next_splat,
+    rank_tile,
+    selected,
+    spot_of,
+    start_rays,
+)
+from liftcore.raster.cpu.simd import (
+    LANES,
+    PIXELS,
+    ROWS,
+    SEGMENTS,
+    SIDES,
+    TRANSMITTANCE,
+    all_are,
+    any_above,
+    fetch_place,
+    keep_lanes,
+    lanes_at,
+    lowest,
+    no_lanes,
+    plus,
+    plus_product,
+    sum_of_lanes,
+    times,
+    without_lowest,
+)
+
+Run = Callable[[Callable, list], list]
+
+MAX_LINES = 2 * TILE  # rows or columns of cells: every pixel reads two of its own at worst
+MAX_SLOTS = MAX_LINES * MAX_LINES
+MAX_TAPS = SEGMENTS * LANES  # every lane of a segment reads a slot of its own at worst
+NO_SLOT = -1
+LAST_BIT = 63
+SEVERAL = -2  # a segment whose pixels read several slots, or parts of one
+_ROW_BITS = np.uint64((1 << SIDES) - 1)  # of a row of cells, in a set of slots
+_WORD = 64  # columns of a set that a word holds
+_NEAR, _FAR = 12, 24  # entries ahead whose places in memory are asked for, and whose cursors, by which they are known
+
+
+# ----------------------------------------------------------------------------------------------------------- Reading
+
+
+class Reading(NamedTuple):
+    """S of one view as the compiled code takes it. Exactly one of the two kinds is in use."""
+
+    is_grid: bool
+    levels: int  # codebook rows a slot expands to: L of a region map, 1 of a grid
+    labels: np.ndarray  # [L, h, w] i32, region map (else empty)
+    label_x: np.ndarray  # [W] i32, the label column of a pixel column (else empty)
+    label_y: np.ndarray  # [H] i32
+    cell_x: np.ndarray  # [W] i32, the left grid column of a pixel column (else empty)
+    cell_y: np.ndarray  # [H] i32
+    share_x: np.ndarray  # [W] f32, the right column's share
+    share_y: np.ndarray  # [H] f32
+    grid_width: int
+    codebook_rows: int  # M
+
+
+class TileTaps(NamedTuple):
+    """The taps of one tile."""
+
+    starts: np.ndarray  # [33] i32, each segment's taps
+    slots: np.ndarray  # [MAX_TAPS] i32
+    alone: np.ndarray  # [32] i32, the slot that all pixels of a segment read and nothing else; -1 none, -2 see taps
+    several: np.ndarray  # [1] u64, the set of segments that read several slots, or none
+    slot_sets: np.ndarray  # [32] u64, the slots that a segment reads, as ``slot_bit`` has sets of them
+    factors: np.ndarray  # [MAX_TAPS * 8] f32
+    slot_rows: np.ndarray  # [MAX_SLOTS, levels] i32, the codebook rows of a slot, -1 none
+    sizes: np.ndarray  # [3] i32: slots in use; 1 when all pixels read slot 0 alone; columns of a grid in use
+    spans: np.ndarray  # [SIDES, 2] i32, the columns that a side of the tile reads, first and last
+    shares: np.ndarray  # [SIDES * MAX_LINES * 8] f32, what each lane of a side reads of each of the tile's columns
+
+
+def reading_of(observation: ViewFeatures, width: int, height: int, params: CompositingParams) -> Reading:
+    """S of an observation for the pixels that the stride leaves of an image of ``width`` x ``height``."""
+    left, top = (slice(first, None, params.stride) for first in params.offset)
+    no_ints = np.empty(0, np.int32)
+    no_floats = np.empty(0, np.float32)
+    if isinstance(observation, Regions):
+        labels = np.ascontiguousarray(observation.labels.to(torch.int32).numpy())
+        levels, rows, columns = labels.shape
+        label_x = np.ascontiguousarray(_nearest(width, columns)[left])
+        label_y = np.ascontiguousarray(_nearest(height, rows)[top])
+        return Reading(
+            False, levels, labels, label_x, label_y,
+            no_ints, no_ints, no_floats, no_floats, 0, observation.codebook.shape[0],
+        )  # fmt: skip
+    rows, columns = observation.grid.shape[:2]
+    cell_x, share_x = (np.ascontiguousarray(part[left]) for part in _taps(width, columns))
+    cell_y, share_y = (np.ascontiguousarray(part[top]) for part in _taps(height, rows))
+    no_labels = np.empty((0, 0, 0), np.int32)
+    return Reading(True, 1, no_labels, no_ints, no_ints, cell_x, cell_y, share_x, share_y, columns, rows * columns)
+
+
+def _nearest(pixels: int, cells: int) -> np.ndarray:
+    """[pixels] i32: floor((p + 0.5) cells / pixels), in whole numbers."""
+    return ((2 * np.arange(pixels, dtype=np.int64) + 1) * cells // (2 * pixels)).astype(np.int32)
+
+
+def _taps(pixels: int, cells: int) -> tuple[np.ndarray, np.ndarray]:
+    """The left cell and the right cell's share of every pixel, half-pixel centres, clamped borders."""
+    position = ((np.arange(pixels) + 0.5) * cells / pixels - 0.5).clip(0, cells - 1)
+    left = np.minimum(np.floor(position), max(cells - 2, 0)).astype(np.int32)
+    return left, (position - left).astype(np.float32)
+
+
+def new_taps(levels: int) -> TileTaps:
+    """Room for one tile's taps."""
+    return TileTaps(
+        np.zeros(SEGMENTS + 1, np.int32),
+        np.zeros(MAX_TAPS, np.int32),
+        np.full(SEGMENTS, NO_SLOT, np.int32),
+        np.zeros(1, np.uint64),
+        np.zeros(SEGMENTS, np.uint64),
+        np.zeros(MAX_TAPS * LANES, np.float32),
+        np.zeros((MAX_SLOTS, levels), np.int32),
+        np.zeros(3, np.int32),
+        np.zeros((SIDES, 2), np.int32),
+        np.zeros(SIDES * MAX_LINES * LANES, np.float32),
+    )
+
+
+@kernel
+def read_tile(taps, reading, width, height, x0, y0):
+    """Fill ``taps`` with what the pixels of the tile from (x0, y0) on read, in an image of that size."""
+    for k in range(3):
+        taps.sizes[k] = 0
+    if reading.is_grid:
+        _read_grid(taps, reading, width, height, x0, y0)
+    else:
+        _read_regions(taps, reading, width, height, x0, y0)
+    taps.several[0] = 0
+    for segment in range(SEGMENTS):
+        if taps.alone[segment] >= 0:
+            taps.slot_sets[segment] = slot_bit(taps.alone[segment])
+            continue
+        taps.several[0] |= np.uint64(1) << np.uint64(segment)
+        taps.slot_sets[segment] = 0
+        for tap in range(taps.starts[segment], taps.starts[segment + 1]):
+            taps.slot_sets[segment] |= slot_bit(taps.slots[tap])
+
+
+@inlined
+def slot_bit(slot):
+    """A set of one slot; the last bit stands for slot LAST_BIT and all beyond."""
+    return np.uint64(1) << np.uint64(min(slot, LAST_BIT))
+
+
+# Functions that are called for a pixel take the arrays that they read, no tuples of them: each array of a tuple is
+# counted when it is handed on, there and back, by a locked instruction.
+
+
+@kernel
+def _slot_of_labels(labels, slot_rows, sizes, y, x):
+    """The slot of the label tuple at label pixel (y, x); NO_SLOT when no level labels it."""
+    levels = labels.shape[0]
+    labelled = False
+    for level in range(levels):
+        labelled |= labels[level, y, x] >= 0
+    if not labelled:
+        return NO_SLOT
+    known = sizes[0]
+    for slot in range(known - 1, -1, -1):
+        same = True
+        for level in range(levels):
+            same &= slot_rows[slot, level] == labels[level, y, x]
+        if same:
+            return slot
+    for level in range(levels):
+        slot_rows[known, level] = labels[level, y, x]
+    sizes[0] = known + 1
+    return known
+
+
+@kernel
+def _same_labels(labels, y, x, other):
+    """Whether the label pixels (y, x) and (y, other) have the same labels on all levels."""
+    same = True
+    for level in range(labels.shape[0]):
+        same &= labels[level, y, x] == labels[level, y, other]
+    return same
+
+
+@kernel
+def _reads_only(labels, flat, rows, y, first):
+    """Whether the eight label pixels from (y, first) on all have the labels ``rows`` [levels] of one slot."""
+    levels, height, width = labels.shape
+    only = True
+    for level in range(levels):
+        only &= all_are(flat, (level * height + y) * width + first, rows[level])
+    return only
+
+
+@kernel
+def _read_regions(taps, reading, width, height, x0, y0):
+    slots = np.empty(LANES, np.int32)
+    labels, label_x, label_y, flat = reading.labels, reading.label_x, reading.label_y, reading.labels.reshape(-1)
+    slot_rows, sizes, starts, alone = taps.slot_rows, taps.sizes, taps.starts, taps.alone
+    tap_slots, factors = taps.slots, taps.factors
+    count = np.int64(0)  # a literal would be compiled for itself
+    uniform = True
+    guess = NO_SLOT  # what the segment before read: most read the same
+    for segment in range(SEGMENTS):
+        starts[segment] = count
+        alone[segment] = NO_SLOT
+        y = y0 + segment % ROWS
+        left = x0 + segment // ROWS * LANES
+        if y >= height or left >= width:
+            continue
+        row, first = label_y[y], label_x[left]
+        last = min(left + LANES, width) - 1
+        in_line = label_x[last] - first == LANES - 1  # label pixels side by side, as the pixels are
+        if guess != NO_SLOT and in_line and _reads_only(labels, flat, slot_rows[guess], row, first):
+            alone[segment] = guess
+            uniform &= guess == 0
+            continue
+        for lane in range(LANES):
+            # Pixels outside the image are not active; they may read what their neighbour reads.
+            x, before = label_x[min(left + lane, last)], label_x[min(left + max(lane, 1) - 1, last)]
+            if lane > 0 and _same_labels(labels, row, x, before):
+                slots[lane] = slots[lane - 1]
+            else:
+                slots[lane] = _slot_of_labels(labels, slot_rows, sizes, row, x)
+        guess = slots[LANES - 1]
+        same = True
+        for lane in range(LANES):
+            same &= slots[lane] == guess
+        if same:
+            alone[segment] = guess
+        else:
+            alone[segment] = SEVERAL
+            count = _add_taps(tap_slots, factors, slots, count)
+        uniform &= alone[segment] == 0
+    starts[SEGMENTS] = count
+    sizes[1] = uniform and sizes[0] == 1
+
+
+@kernel
+def _add_taps(tap_slots, factors, slots, first):
+    """A tap for each slot that a segment's lanes read, from tap ``first`` on; the first tap after them."""
+    count = first
+    for lane in range(LANES):
+        if slots[lane] == NO_SLOT:
+            continue
+        tap = first
+        while tap < count and tap_slots[tap] != slots[lane]:
+            tap += 1
+        if tap == count:
+            tap_slots[tap] = slots[lane]
+            for other in range(LANES):
+                factors[tap * LANES + other] = 0
+            count += 1
+        factors[tap * LANES + lane] = 1
+    return count
+
+
+@kernel
+def _read_grid(taps, reading, width, height, x0, y0):
+    columns, rows = np.empty(MAX_LINES, np.int32), np.empty(MAX_LINES, np.int32)  # the cells', ascending
+    read = np.empty((TILE, 2), np.int32)  # the lines of each pixel column, then of each row
+    spans, shares, factors = taps.spans, taps.shares, taps.factors
+    for side in range(SIDES):
+        spans[side, 0] = spans[side, 1] = 0
+    for at in range(shares.shape[0]):
+        shares[at] = 0
+    across = down = count = np.int64(0)
+    for x in range(x0, min(x0 + TILE, width)):
+        side, lane = (x - x0) // LANES, (x - x0) % LANES
+        across = _read_lines(read, x - x0, columns, across, reading.cell_x[x], reading.share_x[x])
+        for right in range(2):
+            line = read[x - x0, right]
+            if line == NO_SLOT:
+                continue
+            if spans[side, 1] == 0:
+                spans[side, 0] = line
+            spans[side, 1] = max(spans[side, 1], line + 1)
+            share = reading.share_x[x] if right else 1 - reading.share_x[x]
+            shares[(side * MAX_LINES + line) * LANES + lane] += share
+    for y in range(y0, min(y0 + TILE, height)):
+        down = _read_lines(read, y - y0, rows, down, reading.cell_y[y], reading.share_y[y])
+    for segment in range(SEGMENTS):
+        taps.starts[segment], taps.alone[segment] = count, NO_SLOT
+        side, y = segment // ROWS, y0 + segment % ROWS
+        if y >= height or x0 + side * LANES >= width:
+            continue
+        taps.alone[segment] = SEVERAL
+        for below in range(2):
+            line = read[segment % ROWS, below]
+            if line != NO_SLOT:
+                taps.slots[count] = SIDES * line + side
+                share = reading.share_y[y] if below else 1 - reading.share_y[y]
+                for lane in range(LANES):
+                    factors[count * LANES + lane] = share
+                count += 1
+    taps.starts[SEGMENTS] = count
+    for row in range(down):
+        for column in range(across):
+            taps.slot_rows[row * across + column, 0] = rows[row] * reading.grid_width + columns[column]
+    taps.sizes[0], taps.sizes[2] = down * across, across
+
+
+@kernel
+def _read_lines(read, pixel, lines, known, cell, share):
+    """Number the two lines that a pixel reads, from ``cell`` on, where it reads any of them.
+
+    Args:
+        read: [TILE, 2] i32, row ``pixel`` is written; NO_SLOT where the share is zero.
+        lines: [MAX_LINES] i32, ascending; grows.
+
+    Returns:
+        How many lines there are now.
+    """
+    for after in range(2):
+        read[pixel, after] = NO_SLOT
+        if (share if after else 1 - share) == 0:
+            continue
+        line = max(known - 2, 0)  # pixels come in order: a line is new, or among the last two
+        while line < known and lines[line] != cell + after:
+            line += 1
+        if line == known:
+            lines[known] = cell + after
+            known += 1
+        read[pixel, after] = line
+    return known
+
+
+# ---------------------------------------------------------------------------------------------------------- Weighing
+
+
+def weigh_tiles(
+    first: int, last: int, frame: Frame, reading: Reading, squared: bool, gate: Choice | None, plain: bool | None
+) -> tuple[np.ndarray, ...]:
+    """Entries of tiles ``first..last``.
+
+    What a lift does not ask for is not compiled into its loop: it costs a tenth there even where it is passed over.
+
+    Args:
+        squared: whether a weight counts by its square; a gate sees to that itself.
+        gate: Choice of the weights that count; None for all of them.
+        plain: True when the evidence needs rays of its own, of plain logits; else None.
+
+    Returns:
+        places [n] i32 (rows of projected splats), slots [n] i32 (-1 none), weights [n] f32, evidence [n] f32, near to
+        far tile by tile; and slot_rows [s, levels] i32, the codebook rows of a slot (-1 none).
+    """
+    rays, taps, sums = new_rays(frame), new_taps(reading.levels), np.zeros(MAX_SLOTS * LANES, np.float32)
+    *entries, slot_rows = _weigh(first, last, frame, reading, rays, taps, sums, squared, gate, new_marks(gate), plain)
+    return *entries, slot_rows.reshape(-1, reading.levels)
+
+
+@kernel
+def _weigh(first, last, frame, reading, rays, taps, sums, squared, gate, marks, plain):
+    """One long function: an array that a callee takes from a tuple is counted, by a locked instruction, at a call."""
+    state, levels = rays.state, reading.levels
+    items, starts = frame.items, frame.starts
+    tap_starts, tap_slots, factors = taps.starts, taps.slots, taps.factors
+    alone, slot_sets, spans, shares = taps.alone, taps.slot_sets, taps.spans, taps.shares
+    is_grid = reading.is_grid
+    spot = NO_SPOT
+    # A slot that all pixels read holds just the evidence.
+    reuse = plain is None and gate is None and not squared
+    size = max(1 << 15, 2 * levels)
+    places, slots = np.empty(size, np.int32), np.empty(size, np.int32)
+    weights, evidence = np.empty(size, np.float32), np.empty(size, np.float32)
+    slot_rows = np.empty(size, np.int32)
+    count = slot_count = 0
+    for tile in range(first, last):
+        if starts[tile] == starts[tile + 1]:
+            continue
+        column, row = tile % frame.columns, tile // frame.columns
+        x0, y0 = float(column * TILE), float(row * TILE)
+        if gate is not None and gate.kind == LARGEST:
+            rank_tile(rays, frame, tile, marks, plain)
+        start_rays(state, column * TILE, row * TILE, frame.width, frame.height)
+        read_tile(taps, reading, frame.width, frame.height, column * TILE, row * TILE)
+        used, whole_tile, columns = taps.sizes[0], reuse and taps.sizes[1] == 1, taps.sizes[2]
+        if (slot_count + used) * levels > slot_rows.shape[0]:
+            slot_rows = _longer(slot_rows, max(2 * slot_rows.shape[0], (slot_count + used) * levels))
+        for slot in range(used):
+            for level in range(levels):
+                slot_rows[(slot_count + slot) * levels + level] = taps.slot_rows[slot, level]
+        for near in range(starts[tile], starts[tile + 1], CHECK_EVERY):
+            if not look(rays, plain is not None):
+                break
+            # Here, not where an entry is written: arrays that may be replaced are counted at each use.
+            needed = count + CHECK_EVERY * (used + 1)
+            if needed > places.shape[0]:
+                needed = max(2 * places.shape[0], needed)
+                places, slots = _longer(places, needed), _longer(slots, needed)
+                weights, evidence = _longer(weights, needed), _longer(evidence, needed)
+            for step in range(near, min(near + CHECK_EVERY, starts[tile + 1])):
+                splat = next_splat(frame, tile, step, x0, y0)
+                if gate is not None and gate.kind == CENTRAL:
+                    spot = spot_of(splat)
+                met, seen = np.uint64(0), no_lanes()
+                # Segments of several slots come last: a branch that changes once a splat is foreseen.
+                several, found = taps.several[0], meets(rays, splat)
+                ranked = (found & ~several) | ((found & several) << np.uint64(SEGMENTS))
+                while ranked:
+                    rank = lowest(ranked)
+                    ranked = without_lowest(ranked)
+                    segment = rank & (SEGMENTS - 1)
+                    counted, unscaled = blend_both(rays, splat, segment, plain)
+                    seen = plus(seen, unscaled)
+                    if whole_tile:
+                        continue
+                    if gate is not None:
+                        first_ray, rooms = segment * LANES, gate.k * PIXELS + segment * LANES
+                        behind = lanes_at(state, TRANSMITTANCE + first_ray)
+                        known = lanes_at(marks, rooms - PIXELS), lanes_at(marks, rooms)
+                        counted, room = selected(gate, counted, behind, known, spot - first_ray)
+                        keep_lanes(marks, rooms, room)
+                        if not any_above(counted, no_lanes()):
+                            continue
+                    elif squared:
+                        counted = times(counted, counted)
+                    met |= slot_sets[segment]
+                    if rank < SEGMENTS:
+                        slot = alone[segment]
+                        keep_lanes(sums, slot * LANES, plus(lanes_at(sums, slot * LANES), counted))
+                        continue
+                    for tap in range(tap_starts[segment], tap_starts[segment + 1]):
+                        slot = tap_slots[tap]
+                        before = lanes_at(sums, slot * LANES)
+                        keep_lanes(sums, slot * LANES, plus_product(before, counted, lanes_at(factors, tap * LANES)))
+                total = sum_of_lanes(seen)
+                begun = count
+                if whole_tile and total > 0:
+                    slots[count], weights[count] = slot_count, total
+                    count += 1
+                while met and is_grid:  # a row of cells, as both sides of the tile read it
+                    line = lowest(met) // SIDES
+                    sides = met >> np.uint64(SIDES * line)
+                    met &= ~(_ROW_BITS << np.uint64(SIDES * line))
+                    begin = spans[0, 0] if sides & np.uint64(1) else spans[1, 0]
+                    end = spans[1, 1] if sides & np.uint64(2) else spans[0, 1]
+                    left, right = lanes_at(sums, SIDES * line * LANES), lanes_at(sums, (SIDES * line + 1) * LANES)
+                    keep_lanes(sums, SIDES * line * LANES, no_lanes())
+                    keep_lanes(sums, (SIDES * line + 1) * LANES, no_lanes())
+                    for cell in range(begin, end):
+                        part = times(left, lanes_at(shares, cell * LANES))
+                        part = plus_product(part, right, lanes_at(shares, (MAX_LINES + cell) * LANES))
+                        given = sum_of_lanes(part)
+                        if given > 0:
+                            slots[count], weights[count] = slot_count + line * columns + cell, given
+                            count += 1
+                while met:
+                    slot = lowest(met)
+                    met = without_lowest(met)
+                    beyond = used if slot == LAST_BIT else slot + 1
+                    while slot < beyond:
+                        given = sum_of_lanes(lanes_at(sums, slot * LANES))
+                        keep_lanes(sums, slot * LANES, no_lanes())
+                        if given > 0:
+                            slots[count], weights[count] = slot_count + slot, given
+                            count += 1
+                        slot += 1
+                if count == begun and total > 0:
+                    slots[count], weights[count] = NO_SLOT, 0.0
+                    count += 1
+                for entry in range(begun, count):
+                    places[entry] = items[step]
+                    evidence[entry] = total if entry == begun else 0.0
+        slot_count += used
+    return places[:count], slots[:count], weights[:count], evidence[:count], slot_rows[: slot_count * levels]
+
+
+@kernel
+def _longer(array, size):
+    """A copy with room for more."""
+    longer = np.empty(size, array.dtype)
+    for i in range(array.shape[0]):
+        longer[i] = array[i]
+    return longer
+
+
+# ----------------------------------------------------------------------------------------------------------- Merging
+
+
+def merged(
+    entries: list[tuple[np.ndarray, ...]], ids: np.ndarray, codebook_rows: int, threads: int, run: Run
+) -> tuple:
+    """One sparse row a splat, of the entries of all shares, as ``weigh_tiles`` gives them.
+
+    A range's rows depend on its own entries only, so the number of ranges may follow the threads: fewer reads of all.
+
+    Args:
+        ids: [P] i32, the splat of each row. run: runs a function for each of a list of tuples of arguments.
+
+    Returns:
+        splats, indptr, columns, weights, evidence_splats, evidence of ``RegionWeights``, as arrays.
+    """
+    slot_rows = np.concatenate([share[4] for share in entries])
+    bases = np.cumsum([0, *(share[4].shape[0] for share in entries)])
+
+    def count(first: int, last: int) -> np.ndarray:
+        counts = np.zeros(len(ids), np.int32)
+        for share in entries[first:last]:
+            count_entries(share[0], counts)
+        return counts
+
+    edges = [len(entries) * k // threads for k in range(threads + 1)]
+    ends = np.cumsum(np.sum(run(count, list(pairwise(edges))), axis=0, dtype=np.int64))
+
+    def merge(first: int, last: int) -> tuple[np.ndarray, ...]:
+        before = ends[first - 1] if first else 0
+        starts = np.concatenate([[before], ends[first:last]]) - before
+        words, totals = np.empty((starts[-1], 2), np.int32), np.zeros(last - first)
+        gathered, cursors = (words, words.view(np.float32), totals), starts[:-1].copy()
+        for share, base in zip(entries, bases[:-1], strict=True):
+            gather_entries(first, last, share[:4], base, cursors, gathered)
+        return merge_range(starts, gathered, slot_rows, codebook_rows, ids[first:last])
+
+    marks = np.searchsorted(ends, np.linspace(0, ends[-1], threads + 1)[1:-1], side="right")
+    parts = run(merge, list(pairwise([0, *marks.tolist(), len(ids)])))
+    splats, lengths, columns, weights, met, evidence = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return splats, np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64), columns, weights, met, evidence
+
+
+@kernel
+def count_entries(places, counts):
+    """Add to ``counts`` [P] i32 how many entries each row of projected splats has."""
+    for place in places:
+        counts[place] += np.int32(1)
+
+
+@kernel
+def gather_entries(first, last, entries, slot_base, cursors, gathered):
+    """Scatter the entries of rows ``first..last`` to their places (cursors move on).
+
+    ``entries = (places, slots, weights, evidence)`` of one tile share, its slots counted from ``slot_base``.
+    ``gathered = (words, numbers, totals)``: one table [n, 2] of slot and weight, so that an entry is written at one
+    place in memory, seen as i32 and as f32; and the evidence of each row, [last - first] f64, which grows.
+    """
+    places, slots, weights, evidence = entries
+    words, numbers, totals = gathered
+    flat, end = words.reshape(-1), places.shape[0] - 1
+    for i in range(places.shape[0]):
+        far, near, place = places[min(i + _FAR, end)], places[min(i + _NEAR, end)], places[i]
+        if first <= far < last:
+            fetch_place(cursors, far - first)
+            fetch_place(totals, far - first)
+        if first <= near < last:
+            fetch_place(flat, 2 * cursors[near - first])
+        if first <= place < last:
+            at = cursors[place - first]
+            cursors[place - first] = at + 1
+            words[at, 0] = slots[i] + slot_base if slots[i] >= 0 else -1
+            numbers[at, 1] = weights[i]
+            totals[place - first] += evidence[i]
+
+
+@kernel
+def merge_range(starts, gathered, slot_rows, codebook_rows, ids):
+    """Expand, sum and sort the entries of a range of rows.
+
+    Args:
+        starts: [n + 1] i64, each row's entries in ``gathered``, as ``gather_entries`` writes it.
+        slot_rows: [S, levels] i32. codebook_rows: M. ids: [n] i32, the splat of each row.
+
+    Returns:
+        splats [r] i32, lengths [r] i64, columns [nnz] i32, weights [nnz] f32, and the splats [m] i32 and sums [m] f32
+        of the evidence.
+    """
+    words, numbers, totals = gathered
+    levels = slot_rows.shape[1]
+    size = ids.shape[0]
+    sums = np.zeros(codebook_rows)
+    # The columns that a row has: a set is in order as it is, where rows of fine cells had to be sorted.
+    touched = np.zeros(codebook_rows // _WORD + 1, np.uint64)
+    splats, lengths = np.empty(size, np.int32), np.empty(size, np.int64)
+    met, evidence = np.empty(size, np.int32), np.empty(size, np.float32)
+    most = words.shape[0] * levels  # known before: arrays that may be replaced in a loop are counted at each use
+    columns, weights = np.empty(most, np.int32), np.empty(most, np.float32)
+    found = count = met_count = 0
+    for row in range(size):
+        total, begun, low, high = totals[row], count, touched.shape[0], -1
+        for i in range(starts[row], starts[row + 1]):
+            slot = words[i, 0]
+            if slot < 0:
+                continue
+            for level in range(levels):
+                column = slot_rows[slot, level]
+                if column >= 0:
+                    word = column // _WORD
+                    touched[word] |= np.uint64(1) << np.uint64(column % _WORD)
+                    low, high = min(low, word), max(high, word)
+                    sums[column] += numbers[i, 1]
+        if total > 0:
+            met[met_count], evidence[met_count] = ids[row], total
+            met_count += 1
+        for word in range(low, high + 1):
+            left, touched[word] = touched[word], 0
+            while left:
+                column = word * _WORD + lowest(left)
+                left = without_lowest(left)
+                columns[count], weights[count], sums[column] = column, sums[column], 0
+                count += 1
+        if count > begun:
+            splats[found], lengths[found] = ids[row], count - begun
+            found += 1
+    return splats[:found], lengths[:found], columns[:count], weights[:count], met[:met_count], evidence[:met_count]
+
+
+def entries_of(found: RegionWeights, ids: np.ndarray, codebook_rows: int, levels: int) -> tuple[np.ndarray, ...]:
+    """What other bands have found as a share of entries, as ``weigh_tiles`` gives them: a slot for each column."""
+    used = np.flatnonzero(ids >= 0)
+    records = used[np.searchsorted(ids[used], found.splats.numpy())]
+    met = used[np.searchsorted(ids[used], found.evidence_splats.numpy())]
+    entries, evidence = found.columns.numpy(), found.evidence.numpy()
+    slot_rows = np.full((codebook_rows, levels), -1, np.int32)
+    slot_rows[:, 0] = np.arange(codebook_rows)
+    return (
+        np.concatenate([np.repeat(records, np.diff(found.indptr.numpy())), met]).astype(np.int32),
+        np.concatenate([entries, np.full(len(met), NO_SLOT, np.int32)]),
+        np.concatenate([found.weights.numpy(), np.zeros(len(met), np.float32)]),
+        np.concatenate([np.zeros(len(entries), np.float32), evidence]),
+        slot_rows,
+    )
