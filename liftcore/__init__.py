@@ -1,8 +1,66 @@
-"""liftcore: the rasterizer and the solver of splatlift.
+"""splatlift: image features onto trained Gaussian splats, in closed form.
 
 Lifting solves ``A X = B``: ``A`` [rays x splats] holds the alpha-compositing weights of a trained splat
 scene, ``B`` [rays x channels] the 2D features of its photos, ``X`` [splats x channels] the lifted features
-(*Splat Feature Solver*, Eq. 3). Nothing is imported here, so that light processes stay light.
+(*Splat Feature Solver*, Eq. 3)::
+
+    import liftcore as lc
+
+    splats = lc.read_splats("scene.ply")  # or lc.Splats(...), of torch or numpy
+    cameras = lc.read_cameras("sparse/0")  # or {"0001": lc.Camera(...)}
+    views = lc.read_features("pack.safetensors")  # or {"0001": lc.FeatureGrid(map)}, or an iterator of pairs
+    result = lc.lift(splats, cameras, views, preset="tikhonov")
+    result.save("scene.lift.safetensors")
+
+What is listed here is the public interface. It is loaded when it is asked for: ``import liftcore`` loads neither
+torch nor numba.
 """
 
+from importlib import import_module
+from typing import Any
+
 __version__ = "0.3.0"
+
+_PUBLIC = {
+    "read_splats": "liftcore.io.ply:read_splats",
+    "read_cameras": "liftcore.io.cameras:read_cameras",
+    "read_features": "liftcore.features.pack:read_features",
+    "Splats": "liftcore.scene.splats:Splats",
+    "Camera": "liftcore.scene.cameras:Camera",
+    "Cameras": "liftcore.scene.cameras:Cameras",
+    "Regions": "liftcore.features.views:Regions",
+    "FeatureGrid": "liftcore.features.views:FeatureGrid",
+    "LiftSettings": "liftcore.settings:LiftSettings",
+    "lift": "liftcore.lifting:lift",
+    "plan": "liftcore.lifting:plan",
+    "Plan": "liftcore.planning.plan:Plan",
+    "LiftResult": "liftcore.result:LiftResult",
+    "load_lift": "liftcore.io.lift_file:load_lift",
+    "RegionWeights": "liftcore.raster.base:RegionWeights",
+    "render": "liftcore.operators:render",
+    "SplatliftError": "liftcore.errors:SplatliftError",
+    "InvalidInput": "liftcore.errors:InvalidInput",
+    "InvalidSplats": "liftcore.errors:InvalidSplats",
+    "InvalidCameras": "liftcore.errors:InvalidCameras",
+    "InvalidFeatures": "liftcore.errors:InvalidFeatures",
+    "InvalidLift": "liftcore.errors:InvalidLift",
+    "InvalidSettings": "liftcore.errors:InvalidSettings",
+    "InvalidQuery": "liftcore.errors:InvalidQuery",
+    "NotFound": "liftcore.errors:NotFound",
+    "Unavailable": "liftcore.errors:Unavailable",
+}
+
+__all__ = list(_PUBLIC)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _PUBLIC:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module, _, attribute = _PUBLIC[name].partition(":")
+    found = getattr(import_module(module), attribute)
+    globals()[name] = found
+    return found
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -1,12 +1,11 @@
-"""How long work says where it is."""
+"""How long work says where it is, and how many seconds each of its stages took."""
 
 from __future__ import annotations
 
+import time
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Protocol
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
+from typing import Protocol
 
 
 class Progress(Protocol):
@@ -27,3 +26,24 @@ def one_step(progress: Progress, stage: str) -> Iterator[None]:
     progress(stage, 0, 1, "steps")
     yield
     progress(stage, 1, 1, "steps")
+
+
+class Timings:
+    """Seconds of each stage of a piece of work, of which ``progress`` is told."""
+
+    def __init__(self, progress: Progress | None = None) -> None:
+        self.seconds: dict[str, float] = {}
+        self.progress: Progress = progress or silent
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Time the block, which tells of itself, under that name."""
+        start = time.perf_counter()
+        yield
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+
+    @contextmanager
+    def step(self, name: str) -> Iterator[None]:
+        """Time the block, and tell of it as one step."""
+        with self.stage(name), one_step(self.progress, name):
+            yield

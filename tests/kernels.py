@@ -9,7 +9,7 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
-from liftcore.lift import lift
+from liftcore.io.lift_files import lift_files
 from liftcore.raster.cpu.warm_up import warm_up
 from liftcore.scene.splats import Kernel
 from liftcore.settings import LiftSettings
@@ -26,7 +26,7 @@ def main() -> None:
         paths = [Path(name) / file for file in files]
         for path, content in zip(paths, files.values(), strict=True):
             path.write_bytes(content)
-        lift(paths[0], paths[1], paths[2:], LiftSettings.of())
+        lift_files(paths[0], paths[1], paths[2:], LiftSettings.of())
 
 
 if __name__ == "__main__":

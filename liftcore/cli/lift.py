@@ -17,8 +17,8 @@ from liftcore.progress import one_step
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from liftcore.io.lift_file import LiftResult
-    from liftcore.plan.plan import Plan
+    from liftcore.planning.plan import Plan
+    from liftcore.result import LiftResult
     from liftcore.settings import LiftSettings
     from liftcore.solve.checkpoint import Checkpoint
 
@@ -39,8 +39,7 @@ def run(options: argparse.Namespace) -> int:
     settings = settings_of(options)
     from liftcore.io.cameras import camera_source
     from liftcore.io.lift_file import save_lift
-    from liftcore.lift import lift
-    from liftcore.listener import Listener
+    from liftcore.io.lift_files import lift_files
 
     views = camera_source(options.cameras).files
     out = free_output(options.output, [options.splats, *views, *options.features])
@@ -54,13 +53,14 @@ def run(options: argparse.Namespace) -> int:
             print(*(plan.lines() if options.explain else _in_short(plan)), sep="\n", flush=True)
 
     with progress_bars() as progress:
-        result = lift(
+        result = lift_files(
             options.splats,
             options.cameras,
             options.features,
             settings,
             threads=options.threads,
-            listener=Listener(progress, take),
+            progress=progress,
+            on_plan=take,
             checkpoint=checkpoint,
         )
         with writing(out), one_step(progress, "save"):
@@ -143,12 +143,12 @@ def _contradiction(name: str, one: str, other: str) -> InvalidSettings:
 
 def plan_of(options: argparse.Namespace, settings: LiftSettings) -> Plan:
     """The plan of the lift that the options describe."""
-    from liftcore.device import choose_device
-    from liftcore.lift import open_sources, planned
+    from liftcore.io.lift_files import open_files
+    from liftcore.lifting import plan
 
-    device = choose_device(settings.device)
-    sources = open_sources(options.splats, options.cameras, options.features, settings)
-    return planned(sources, settings, device, options.threads)
+    return plan(
+        *open_files(options.splats, options.cameras, options.features, settings), settings, threads=options.threads
+    )
 
 
 def _in_short(plan: Plan) -> Iterable[str]:

@@ -20,8 +20,7 @@ def run(options: argparse.Namespace) -> int:
     """Print the plan."""
     plan = plan_of(options, settings_of(options))
     views = {"lifted": list(plan.views), "left_out": list(plan.left_out)}
-    today = plan.on_device.today() if plan.on_device else {}
-    device = {"kind": plan.device.kind, "name": plan.device.name, **today}
+    device = {"kind": plan.device.kind, "name": plan.device.name}
     document = {**plan.facts(), "device": device, "views": views, "warnings": [*plan.warnings, *plan.told]}
     reply(document, as_json=options.json, lines=plan.lines())
     return 0

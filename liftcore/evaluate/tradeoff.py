@@ -27,21 +27,20 @@ from liftcore.device import choose_device
 from liftcore.errors import InvalidInput, SplatliftError, Unavailable
 from liftcore.evaluate.accuracy import class_ious, rendered_scores, view_cosines
 from liftcore.evaluate.hardware import hardware, peak_memory
-from liftcore.features.pack import pair, read_features
+from liftcore.features.pack import Views, pair, read_features
 from liftcore.io.cameras import read_cameras
 from liftcore.io.class_masks import read_masks
-from liftcore.io.input_files import input_files
-from liftcore.io.lift_file import LiftResult
-from liftcore.lift import Run, Sources, lift_sources, open_sources
-from liftcore.listener import NOBODY
+from liftcore.io.lift_files import open_files
+from liftcore.lifting import lift
 from liftcore.progress import Progress
 from liftcore.query.encoders.table import TableEncoder
 from liftcore.query.in_photo import in_photo
 from liftcore.raster.cpu.raster import CpuRaster
+from liftcore.result import LiftResult
 from liftcore.scene.cameras import Cameras
+from liftcore.scene.splats import Splats
 from liftcore.scene.views import cameras_of_views
 from liftcore.settings import LiftSettings
-from liftcore.timings import Timings
 from liftcore.warm_up import warm_up_lift
 
 HOLD_OUT = 8  # every n-th view is held out of the lifts
@@ -243,20 +242,15 @@ BAD_INPUT = 2
 
 def measured(spec: RunSpec) -> dict[str, Any]:
     """Lift as ordered, and give the figures of the run and of its features."""
-    settings = LiftSettings.of(**spec.settings)
-    run = Run(settings, spec.threads, NOBODY, Timings(), choose_device(settings.device))
+    settings, scene = LiftSettings.of(**spec.settings), spec.scene
     cpu, wall = time.process_time(), time.perf_counter()
-    with run.timings.stage("read"):
-        sources = open_sources(spec.scene.splats, spec.scene.cameras, spec.scene.features, settings)
-    wanted = set(spec.lifted)
-    sources = replace(sources, views=[view for view in sources.views if view in wanted])
+    splats, cameras, packs = open_files(scene.splats, scene.cameras, scene.features, settings)
+    features = pair(packs, cameras)[0]
+    lifted = features.seen_by({view: view for view in spec.lifted if view in features}, cameras)
     read = {"cpu": time.process_time() - cpu, "wall": time.perf_counter() - wall}
-    with run.timings.stage("digest"):
-        inputs = input_files(spec.scene.splats, spec.scene.cameras, spec.scene.features)
-    with run.timings.stage("compile"):
-        warm_up_lift(sources.splats.kernel, run.device, settings)  # the lift's own then takes no time
+    warm_up_lift(splats.kernel, choose_device(settings.device), settings)  # the lift's own then takes no time
     cpu, wall = time.process_time(), time.perf_counter()
-    made = lift_sources(run, sources, inputs)
+    made = lift(splats, cameras, lifted, settings, threads=spec.threads)
     seconds = {"cpu": time.process_time() - cpu, "wall": time.perf_counter() - wall}
     figures = {
         "cpu_s": seconds["cpu"],
@@ -270,7 +264,7 @@ def measured(spec: RunSpec) -> dict[str, Any]:
         "seen_share": float(made.seen.float().mean()),
         "timings": {name: value for name, value in made.metadata.timings.items() if name not in APART},
     }
-    return figures | judge(spec, sources, _reference(spec, made), made)
+    return figures | judge(spec, splats, cameras, features, _reference(spec, made), made)
 
 
 def _reference(spec: RunSpec, made: LiftResult) -> tuple[torch.Tensor, torch.Tensor]:
@@ -292,28 +286,32 @@ LOW_QUANTILE = 0.05
 ROWS = 1 << 16  # compared at a time
 
 
-def judge(spec: RunSpec, sources: Sources, reference: tuple[Tensor, Tensor], made: LiftResult) -> dict[str, Any]:
+def judge(
+    spec: RunSpec,
+    splats: Splats,
+    cameras: Cameras,
+    features: Views,
+    reference: tuple[Tensor, Tensor],
+    made: LiftResult,
+) -> dict[str, Any]:
     """The figures of accuracy; None where there is nothing to compare with.
 
     Args:
         reference: features [P, F] and evidence [P] of the exact run, empty before it.
     """
     figures = cosine_figures(made.features, *reference)
-    raster, walk = CpuRaster(sources.splats, spec.threads), made.metadata.settings.render_params
-    rows = [
-        view_cosines(raster, sources.cameras[view], sources.packs[view], made.features, walk)
-        for view in spec.held_out
-    ]
+    raster, walk = CpuRaster(splats, spec.threads), made.metadata.settings.render_params
+    rows = [view_cosines(raster, cameras[view], features[view], made.features, walk) for view in spec.held_out]
     cosines = np.concatenate(rows) if rows else np.zeros(0)
     figures["held_out_cosine"] = float(cosines.mean()) if cosines.size else None
     figures["mask_iou"] = None
     if spec.scene.labels is not None and spec.labelled:
         classes = class_vectors(spec.scene)
-        masks = labelled_masks(spec.scene, sources.cameras)
+        masks = labelled_masks(spec.scene, cameras)
         found = []
         for view in spec.labelled:
             scores = in_photo(
-                sources.cameras[view],
+                cameras[view],
                 lambda camera: rendered_scores(raster, camera, made.features, classes, walk),
             )
             found.append(_resized(scores.argmax(dim=2), masks[view]))

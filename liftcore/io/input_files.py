@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from liftcore.io.cameras import camera_source
-from liftcore.io.lift_file import InputFile
+from liftcore.result import InputFile
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

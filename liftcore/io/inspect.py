@@ -20,7 +20,7 @@ from liftcore.solve.lift_warnings import UNSEEN
 if TYPE_CHECKING:
     from liftcore.features.pack import FeaturePacks
     from liftcore.features.views import ViewFeatures
-    from liftcore.io.lift_file import LiftMetadata, LiftResult
+    from liftcore.result import LiftMetadata, LiftResult
 
 NARROW = 4  # times longer than wide, or wider: photos are not
 UNIT_TOLERANCE = 0.01  # a float16 unit vector of 512 channels is within it

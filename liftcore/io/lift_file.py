@@ -8,62 +8,16 @@ metadata hold settings, inputs with digests, the encoder, the certificate, timin
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import torch
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import ValidationError
 
 from liftcore.errors import InvalidLift
-from liftcore.settings import LiftSettings
+from liftcore.result import LiftMetadata, LiftResult
 
-if TYPE_CHECKING:
-    from torch import Tensor
-
-FORMAT = "splatlift-lift/1"
 TENSORS = ("features", "evidence", "agreement", "seen")
 CLUSTER_TENSORS = ("cluster", "cluster_features")  # in lifts with aggregation only
-
-
-class InputFile(BaseModel):
-    """Where an input was, and what it was."""
-
-    model_config = ConfigDict(frozen=True)
-
-    path: str  # absolute, at lift time
-    sha256: str  # of the file's bytes; of the sorted (name, digest) lines for a folder
-
-
-class LiftMetadata(BaseModel):
-    """What a lift remembers of how it was made."""
-
-    model_config = ConfigDict(frozen=True)
-
-    format: str = FORMAT
-    version: str
-    settings: LiftSettings
-    splats: InputFile
-    cameras: InputFile
-    features: tuple[InputFile, ...]
-    encoder: str  # the 2D encoder's name as the pack tells it; "" when unknown
-    text_space: str  # the text encoder that shares the space; "" or "none" when there is none
-    views: tuple[str, ...]  # the views that were lifted
-    certificate: dict[str, Any]
-    timings: dict[str, float]  # seconds a stage
-
-
-@dataclass(frozen=True)
-class LiftResult:
-    """X and what supports it, one row a splat."""
-
-    features: Tensor  # [P, F] f16 or f32; zero rows where not seen
-    evidence: Tensor  # [P] f32, sum of plain weights w over the feature views, each ray once
-    agreement: Tensor  # [P] f32 in 0..1, norm of the weighted mean of unit regions, or of unit cells of grids
-    seen: Tensor  # [P] bool, whether any labelled ray reached the splat
-    metadata: LiftMetadata
-    cluster: Tensor | None = None  # [P] i32, -1 = in no cluster; None without aggregation
-    cluster_features: Tensor | None = None  # [K, F] like features; a zero row: its splats keep their own
 
 
 def save_lift(lift: LiftResult, path: Path | str) -> None:
@@ -75,7 +29,7 @@ def save_lift(lift: LiftResult, path: Path | str) -> None:
     write_tensors(Path(path), tensors, {"splatlift": lift.metadata.model_dump_json()})
 
 
-def load_lift(path: Path) -> LiftResult:
+def load_lift(path: Path | str) -> LiftResult:
     """Open a lift file; the tensors are mapped, not read.
 
     Raises:
@@ -101,7 +55,7 @@ def load_lift(path: Path) -> LiftResult:
     return lift
 
 
-def _check_shapes(lift: LiftResult, path: Path) -> None:
+def _check_shapes(lift: LiftResult, path: Path | str) -> None:
     rows = lift.features.shape[:1]
     fits = lift.features.ndim == 2 and lift.features.dtype in (torch.float16, torch.float32) and lift.features.numel()
     columns = ((lift.evidence, torch.float32), (lift.agreement, torch.float32), (lift.seen, torch.bool))
@@ -111,7 +65,7 @@ def _check_shapes(lift: LiftResult, path: Path) -> None:
     _check_clusters(lift, path)
 
 
-def _check_clusters(lift: LiftResult, path: Path) -> None:
+def _check_clusters(lift: LiftResult, path: Path | str) -> None:
     cluster, means = lift.cluster, lift.cluster_features
     if cluster is None and means is None:
         return

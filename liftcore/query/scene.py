@@ -7,12 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 from liftcore.errors import InvalidQuery
-from liftcore.io.lift_file import LiftResult, load_lift
+from liftcore.io.lift_file import load_lift
 from liftcore.query.in_photo import in_photo
 from liftcore.query.products import norms_of
 from liftcore.query.scores import mean_direction
 from liftcore.query.unchanged import unchanged
 from liftcore.raster.base import CompositingParams
+from liftcore.result import LiftResult
 from liftcore.scene.cameras import drawn_by, photo_size
 
 if TYPE_CHECKING:

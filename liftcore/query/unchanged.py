@@ -9,7 +9,7 @@ from liftcore.errors import InvalidLift
 from liftcore.io.transforms import FRAME_FILE
 
 if TYPE_CHECKING:
-    from liftcore.io.lift_file import InputFile
+    from liftcore.result import InputFile
 
 COUNTS = {"cameras": f" ({FRAME_FILE} beside them counts too)"}
 

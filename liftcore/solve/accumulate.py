@@ -20,16 +20,16 @@ from liftcore.solve.readout import Readout, read_pixels, sample_pixels
 from liftcore.solve.totals import Totals
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator
 
     from torch import Tensor
 
-    from liftcore.features.pack import FeaturePacks
     from liftcore.progress import Progress
     from liftcore.raster.base import Raster, RegionWeights
-    from liftcore.scene.cameras import Camera, Cameras
+    from liftcore.scene.cameras import Camera
     from liftcore.settings import LiftSettings
     from liftcore.solve.view_weights import WeightStore
+    from liftcore.solve.views import LiftViews
 
 
 @dataclass(frozen=True)
@@ -78,43 +78,36 @@ def as_read(observation: ViewFeatures, settings: LiftSettings, view: str) -> Vie
 
 @one_thread()
 def accumulate(
-    raster: Raster,
-    scene: tuple[int, Cameras],
-    packs: FeaturePacks,
-    views: Sequence[str],
-    settings: LiftSettings,
-    store: WeightStore,
-    progress: Progress,
+    raster: Raster, count: int, views: LiftViews, settings: LiftSettings, store: WeightStore, progress: Progress
 ) -> Geometry:
-    """CompositingParams every view once: ``W_v`` into the store, evidence, denominators, and sampled rows of A.
+    """Weigh every view once: ``W_v`` into the store, evidence, denominators, and sampled rows of A.
 
     Args:
-        scene: the number of splats and the cameras.
-        views: the names to lift, in the order of the sums.
+        count: P.
+        views: in the order of the sums.
         store: receives one RegionWeights a view.
     """
-    count, cameras = scene
-    totals = Totals(count, store.place)
+    totals, expected = Totals(count, store.place), len(views)
     samples, readouts, columns = [], deque[Readout](), []
 
-    def looks() -> Iterator[ViewRequest]:
-        rays = -(-settings.certificate_rays // len(views))
-        for number, name in enumerate(views):
-            camera, observation = cameras[name], as_read(packs[name], settings, name)
-            walk = strided_walk(settings.lift_params, settings, camera, number)
-            pixels = sample_pixels(camera, rays, (settings.seed, number), walk)
+    def requests() -> Iterator[ViewRequest]:
+        rays = -(-settings.certificate_rays // expected)
+        for number, (camera, given) in enumerate(views):
+            observation = as_read(given, settings, camera.name)
+            params = strided_walk(settings.lift_params, settings, camera, number)
+            pixels = sample_pixels(camera, rays, (settings.seed, number), params)
             readouts.append(read_pixels(observation, camera, pixels))
             walked, own = as_walked(observation, settings)
             columns.append(own)
-            yield ViewRequest(camera, walked, walk, settings.weighting, pixels)
+            yield ViewRequest(camera, walked, params, settings.weighting, pixels)
 
-    with closing(raster.iterate_views(looks())) as walked_views:
+    with closing(raster.iterate_views(requests())) as walked_views:
         for walked in walked_views:
             weights = _add(totals, walked.weights, columns[len(samples)], float(settings.stride**2), store)
             store.append(weights)
             samples.append(SampledRays(walked.rows, readouts.popleft()))
             del walked, weights  # before the next one is made beside it
-            progress("geometry", len(samples), len(views), "views")
+            progress("geometry", len(samples), expected, "views")
     return Geometry(*totals.found(), tuple(samples), tuple(columns))
 
 

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from liftcore.raster.base import Raster, ViewRequest
-    from liftcore.scene.kernel import Kernel
+    from liftcore.scene.splats import Splats
 
 FORMAT = "splatlift-checkpoint/3"
 _BLOCK = re.compile(r"\d{6,}\.safetensors|\.\d{6,}\.safetensors\.[0-9a-f]+\.part")  # by name, and its drafts
@@ -59,17 +59,18 @@ class Checkpoint:
     seconds: float = 2.0  # between blocks, of work; views in work may be lost too
 
 
-def identity(splats: str, kernel: Kernel, device: Mapping[str, Any]) -> str:
-    """What all answers of a checkpoint are of, in hex: the splats, the code, and what runs it.
+def identity(splats: Splats, device: Mapping[str, Any]) -> str:
+    """What all answers of a checkpoint are of, in hex: the splats, the code that walks, and what runs it.
 
     Args:
-        splats: the digest of their file. kernel: that they are taken for.
         device: the facts of the device that walks, whatever the settings ask for: devices agree within rounding only.
     """
-    told = [FORMAT, __version__, get_host_cpu_name(), device, splats, kernel.value]
-    digest = hashlib.sha256(json.dumps(told).encode())
-    for source in sorted(Path(__file__).parents[1].rglob("*.py")):
+    digest = hashlib.sha256(json.dumps([FORMAT, __version__, get_host_cpu_name(), device]).encode())
+    for source in sorted((Path(__file__).parents[1] / "raster").rglob("*.py")):
         digest.update(source.read_bytes())
+    digest.update(splats.kernel.value.encode())
+    for part in (splats.means, splats.quats, splats.log_scales, splats.opacity_logits, splats.beta):
+        digest.update(b"" if part is None else tensor_bytes(part))
     return digest.hexdigest()
 
 

@@ -10,11 +10,12 @@ from typing import Any
 
 from liftcore.io.input_files import sha256_of
 from liftcore.io.json_file import finite
-from liftcore.io.lift_file import InputFile, LiftMetadata, save_lift
-from liftcore.lift import lift
-from liftcore.listener import Listener, log_warnings
-from liftcore.plan.plan import Plan
+from liftcore.io.lift_file import save_lift
+from liftcore.io.lift_files import lift_files
+from liftcore.lifting import log_warnings
+from liftcore.planning.plan import Plan
 from liftcore.progress import one_step
+from liftcore.result import InputFile, LiftMetadata
 from liftcore.settings import LiftSettings
 from liftcore.solve.checkpoint import Checkpoint
 from service.faults import renamed
@@ -28,20 +29,21 @@ def lift_as_ordered(order: dict[str, Any], report: Reporter) -> dict[str, Any]:
         What the job's last message tells of it.
 
     Raises:
-        SplatliftError: as `liftcore.lift.lift` has it.
+        SplatliftError: as `liftcore.lift` has it.
     """
 
     def planned(plan: Plan) -> None:
         log_warnings(plan)  # the operator's log has them too
         report.plan(plan_document(plan, order["names"]))
 
-    made = lift(
+    made = lift_files(
         Path(order["splats"]),
         Path(order["cameras"]),
         [Path(path) for path in order["features"]],
         LiftSettings.of(**order["settings"]),
         threads=order["threads"],
-        listener=Listener(report, planned),
+        progress=report,
+        on_plan=planned,
         checkpoint=Checkpoint(Path(order["work"]), order["checkpoint_seconds"]),
     )
     made = replace(made, metadata=_as_clients_know(made.metadata, order["file_names"]))

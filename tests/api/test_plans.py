@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
-from liftcore.device import CPU
 from liftcore.errors import Unavailable
-from liftcore.lift import open_sources, planned
-from liftcore.plan.plan import Plan
+from liftcore.io.lift_files import open_files
+from liftcore.lifting import plan as plan_of
+from liftcore.planning.plan import Plan
 from liftcore.settings import LiftSettings
 from service.jobs import child
 from service.jobs.lifting import plan_document
@@ -33,9 +33,9 @@ def plan(scene: TinyScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> P
     files = [tmp_path / name for name in ("splats.ply", "cameras.json", "features.safetensors")]
     for file, content in zip(files, (scene.splats, scene.cameras, scene.features), strict=True):
         file.write_bytes(content)
-    monkeypatch.setattr("liftcore.plan.memory.MEMORY_LIMIT", 0)
-    monkeypatch.setattr("liftcore.plan.memory.lack_of_disk", lambda size: "0.0 GiB of disk")
-    return planned(open_sources(files[0], files[1], files[2:], LiftSettings.of()), LiftSettings.of(), CPU)
+    monkeypatch.setattr("liftcore.planning.plan.MEMORY_LIMIT", 0)
+    monkeypatch.setattr("liftcore.planning.plan.lack_of_disk", lambda size: "0.0 GiB of disk")
+    return plan_of(*open_files(files[0], files[1], files[2:], LiftSettings.of()), LiftSettings.of(device="cpu"))
 
 
 def test_plan_is_there_while_the_job_runs_and_after_it_has_ended(quick: Quick) -> None:

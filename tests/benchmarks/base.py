@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from liftcore.evaluate.hardware import hardware, machine_line
-from liftcore.io.lift_file import LiftResult, save_lift
-from liftcore.lift import lift
+from liftcore.io.lift_file import save_lift
+from liftcore.io.lift_files import lift_files as lift_paths
 from liftcore.query.scene import QueryScene
 from liftcore.raster.base import Raster
+from liftcore.result import LiftResult
 from liftcore.settings import LiftSettings
 
 PACKS = ("features", "features_hard", "features_clean", "grids")  # of tabletop
@@ -31,7 +32,7 @@ def scene_files(folder: Path, pack: str = "features") -> tuple[Path, Path, Path]
 
 def lift_files(files: Sequence[Path], **settings: Any) -> LiftResult:
     """A lift of splats, cameras and packs, without the certificate unless the settings ask for it."""
-    return lift(files[0], files[1], list(files[2:]), LiftSettings.of(**{"certificate_rays": 0, **settings}))
+    return lift_paths(files[0], files[1], list(files[2:]), LiftSettings.of(**{"certificate_rays": 0, **settings}))
 
 
 def opened(made: LiftResult, raster: Raster | None = None) -> QueryScene:

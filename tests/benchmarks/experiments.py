@@ -29,12 +29,12 @@ from liftcore.features.pack import FeaturePacks, pair, read_features, write_pack
 from liftcore.features.views import NO_LABEL, Regions, ViewFeatures
 from liftcore.io.cameras import read_cameras
 from liftcore.io.inria import write_inria_cameras
-from liftcore.io.lift_file import LiftResult
 from liftcore.io.ply import read_splats, write_splats
 from liftcore.query.directions import MINIMUM_ROW_SUM
 from liftcore.query.threshold import find_threshold
 from liftcore.raster.base import CompositingParams
 from liftcore.raster.cpu.raster import CpuRaster
+from liftcore.result import LiftResult
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.splats import Kernel, Splats
 from liftcore.settings import TIKHONOV_GAIN, LiftSettings, Preset

@@ -29,11 +29,12 @@ from liftcore.evaluate.bench import run_bench, walk_regions
 from liftcore.evaluate.hardware import hardware, machine_line
 from liftcore.evaluate.synthetic import room_cameras, room_regions, room_splats
 from liftcore.features.views import Regions
-from liftcore.io.lift_file import TENSORS, LiftResult, save_lift
-from liftcore.lift import lift
+from liftcore.io.lift_file import TENSORS, save_lift
+from liftcore.io.lift_files import lift_files as lift_paths
 from liftcore.progress import silent
 from liftcore.raster import open_raster
 from liftcore.raster.base import CompositingParams, Weighting
+from liftcore.result import LiftResult
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Splats
 from liftcore.settings import LiftSettings
@@ -59,7 +60,7 @@ def whole_lift(size: Room, device: Device) -> tuple[list[dict[str, Any]], list[s
             if device.place.type == "cuda":
                 torch.cuda.reset_peak_memory_stats(device.place)
             start = time.perf_counter()
-            made.append(lift(files[0], files[1], [files[2]], settings))
+            made.append(lift_paths(files[0], files[1], [files[2]], settings))
         lifted = time.perf_counter()
         save_lift(made[1], Path(folder) / "lift.safetensors")
         saved = time.perf_counter()

@@ -27,12 +27,13 @@ from liftcore.evaluate.hardware import hardware
 from liftcore.evaluate.synthetic import room_cameras, room_splats
 from liftcore.io.input_files import input_file
 from liftcore.io.inria import write_inria_cameras
-from liftcore.io.lift_file import InputFile, LiftMetadata, LiftResult, save_lift
+from liftcore.io.lift_file import save_lift
 from liftcore.io.ply import write_splats
 from liftcore.query.ask import Answer, ask
 from liftcore.query.pictures import mask_png
 from liftcore.query.scene import QueryScene
 from liftcore.query.view_mask import view_mask
+from liftcore.result import InputFile, LiftMetadata, LiftResult
 from liftcore.scene.cameras import Cameras
 from liftcore.settings import LiftSettings
 

@@ -10,8 +10,8 @@ import time
 from pathlib import Path
 
 from liftcore.evaluate.tradeoff import cosine_figures
-from liftcore.io.lift_file import LiftResult
-from liftcore.lift import lift
+from liftcore.io.lift_files import lift_files
+from liftcore.result import LiftResult
 from liftcore.settings import LiftSettings, Speed
 from tests.benchmarks.base import command_line, scene_files, tell
 
@@ -33,7 +33,7 @@ def main() -> None:
     for number in range(1 + max(1, options.rounds)):  # the first round compiles
         for speed in dict.fromkeys(["exact", *options.speeds]):
             start = time.process_time()
-            made[speed] = lift(splats, cameras, [pack], LiftSettings.of(speed=speed, device="cpu"), threads=1)
+            made[speed] = lift_files(splats, cameras, [pack], LiftSettings.of(speed=speed, device="cpu"), threads=1)
             if number:
                 seconds[speed] = min(seconds.get(speed, float("inf")), time.process_time() - start)
     exact = made["exact"]

@@ -13,7 +13,7 @@ from PIL import Image
 from liftcore.features.mask_folder import mask_views
 from liftcore.features.pack import read_features, write_pack
 from liftcore.features.views import Regions
-from liftcore.lift import lift
+from liftcore.io.lift_files import lift_files
 from liftcore.settings import LiftSettings
 from tests.run_lengths import sam_records
 
@@ -60,7 +60,9 @@ def test_regions_of_all_levels_as_masks_make_the_same_lift(
     write_pack(tmp_path / "after", mask_views(tmp_path / "masks"), {})
     scene = shared_data / "tabletop"
     before, after = (
-        lift(scene / "point_cloud.ply", scene / "cameras.json", [tmp_path / name], LiftSettings.of(dtype="float32"))
+        lift_files(
+            scene / "point_cloud.ply", scene / "cameras.json", [tmp_path / name], LiftSettings.of(dtype="float32")
+        )
         for name in ("before", "after")
     )
     assert torch.equal(before.seen, after.seen)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from liftcore.lift import lift
+from liftcore.io.lift_files import lift_files
 from liftcore.query.ask import ask
 from liftcore.query.example import OneSplat
 from liftcore.query.query import Query
@@ -26,7 +26,7 @@ class Asked:
     """The scene, asked by the splat of each class that was seen best."""
 
     def __init__(self, folder: Path) -> None:
-        made = lift(
+        made = lift_files(
             folder / "point_cloud.ply",
             folder / "cameras.json",
             [folder / "features.safetensors"],

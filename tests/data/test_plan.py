@@ -9,7 +9,7 @@ import torch
 
 from liftcore.features.pack import read_features, write_pack
 from liftcore.features.views import FeatureGrid
-from liftcore.lift import lift
+from liftcore.io.lift_files import lift_files
 from liftcore.settings import LiftSettings
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ def fine_maps(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
 def told(scene: Path, pack: Path, own: dict[str, Any]) -> tuple[float, float]:
     """Entries of W that the plan expects of a splat in a view that can see it, and those that the lift made."""
     settings = LiftSettings.of(**own, certificate_rays=100, device="cpu")
-    certificate = lift(scene / "point_cloud.ply", scene / "cameras.json", [pack], settings).metadata.certificate
+    certificate = lift_files(scene / "point_cloud.ply", scene / "cameras.json", [pack], settings).metadata.certificate
     plan = certificate["plan"]
     return plan["entries_a_splat"], certificate["weights_entries"] / plan["views"] / plan["splats_a_view"]
 

@@ -12,8 +12,8 @@ import torch
 from liftcore.features.pack import read_features
 from liftcore.features.views import FeatureGrid
 from liftcore.io.cameras import read_cameras
+from liftcore.io.lift_files import lift_files
 from liftcore.io.ply import read_splats
-from liftcore.lift import lift
 from liftcore.raster.base import CompositingParams
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.settings import LiftSettings
@@ -79,7 +79,7 @@ def test_lifted_cnn_features_render_like_those_of_unseen_photos(plush, cameras, 
     # views, every fourth of them. What must hold is that the right cells are met, not their mirror images.
     settings = LiftSettings.of(preset="row-sum", certificate_rays=0, view_stride=4)
     paths = [plush / name for name in ("point_cloud.ply", "cameras.json", "grids.safetensors")]
-    features = lift(paths[0], paths[1], paths[2:], settings).features
+    features = lift_files(paths[0], paths[1], paths[2:], settings).features
     held_out = read_features(plush / "grids_test.safetensors")
     for name in HELD_OUT:
         observed = held_out[name]

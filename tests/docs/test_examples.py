@@ -56,7 +56,7 @@ def scene_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_python_example_finds_the_apple(scene_folder: Path) -> None:
-    names = run_example(COMMANDS, "from liftcore.lift import lift")
+    names = run_example(COMMANDS, "from liftcore.io.lift_files import lift_files")
     made, scene, mask, more = (names[name] for name in ("made", "scene", "mask", "more"))
     columns = mask.nonzero()[:, 1]
     assert len(columns) > 0

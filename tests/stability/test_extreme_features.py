@@ -11,11 +11,12 @@ import torch
 from liftcore.features.pack import write_pack
 from liftcore.features.views import FeatureGrid, Regions, ViewFeatures
 from liftcore.io.inria import write_inria_cameras
-from liftcore.io.lift_file import LiftResult, load_lift, save_lift
+from liftcore.io.lift_file import load_lift, save_lift
+from liftcore.io.lift_files import lift_files
 from liftcore.io.ply import write_splats
-from liftcore.lift import lift
 from liftcore.raster.base import CompositingParams
 from liftcore.raster.reference import reading_matrix
+from liftcore.result import LiftResult
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.splats import Splats
 from liftcore.settings import LiftSettings
@@ -43,7 +44,7 @@ def lifted(folder: Path, views: dict[str, ViewFeatures], splats: Splats = SCENE,
     write_inria_cameras(cameras, folder / "cameras.json")
     write_pack(folder / "pack.safetensors", views, {})
     paths = folder / "splats.ply", folder / "cameras.json", folder / "pack.safetensors"
-    save_lift(lift(paths[0], paths[1], paths[2:], LiftSettings.of(**values)), folder / "lift.safetensors")
+    save_lift(lift_files(paths[0], paths[1], paths[2:], LiftSettings.of(**values)), folder / "lift.safetensors")
     return load_lift(folder / "lift.safetensors")
 
 

@@ -21,7 +21,7 @@ from liftcore.errors import InvalidFeatures, InvalidSettings, SplatliftError
 from liftcore.features.pack import write_pack
 from liftcore.features.views import FeatureGrid
 from liftcore.io.lift_file import load_lift
-from liftcore.lift import lift
+from liftcore.io.lift_files import lift_files
 from liftcore.query.threshold import METHODS
 from liftcore.settings import LiftSettings, Preset
 
@@ -150,11 +150,11 @@ def test_output_is_never_an_input_or_a_folder(scene: Path, capsys: pytest.Captur
 
 def test_a_lift_takes_its_files_as_texts_and_its_packs_as_a_list(scene: Path) -> None:
     files = [str(scene / name) for name in ("splats.ply", "cameras.json", "pack.safetensors")]
-    made = lift(files[0], files[1], files[2:], LiftSettings.of())
+    made = lift_files(files[0], files[1], files[2:], LiftSettings.of())
     assert made.metadata.splats.path == str((scene / "splats.ply").resolve())
     for alone in (files[2], scene / "pack.safetensors"):
         with pytest.raises(InvalidFeatures, match="a list of feature packs"):
-            lift(files[0], files[1], alone, LiftSettings.of())  # pyright: ignore[reportArgumentType]
+            lift_files(files[0], files[1], alone, LiftSettings.of())  # pyright: ignore[reportArgumentType]
 
 
 def test_settings_are_json_or_words() -> None:

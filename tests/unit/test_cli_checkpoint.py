@@ -35,7 +35,7 @@ def test_a_second_lift_walks_no_view_and_gives_the_same_bits(
         raise AssertionError(f"{camera.name} was walked again")
 
     monkeypatch.setattr(CpuRaster, "region_weights", never)
-    monkeypatch.setattr("liftcore.lift._warm_up", lambda *_: None)  # which walks a scene of its own
+    monkeypatch.setattr("liftcore.lifting.warm_up_lift", lambda *_: None)  # which walks a scene of its own
     assert run(capsys, *arguments)[0] == 0
     assert torch.equal(load_lift(scene / "lift.safetensors").features, features)
 

@@ -11,8 +11,8 @@ import torch
 
 from liftcore.device import CPU, Device, choose_device, driver_version, processor, within_memory
 from liftcore.errors import InvalidSettings, Unavailable
-from liftcore.lift import lift
-from liftcore.plan.on_device import DevicePlan, check_device_room
+from liftcore.io.lift_files import lift_files
+from liftcore.planning.plan import check_card
 from liftcore.settings import LiftSettings
 from service.jobs import device as device_process
 from tests.unit.solve.test_lift_equals_dense import write_scene
@@ -88,7 +88,7 @@ def test_facts_of_a_card_name_it_and_all_versions(card: pytest.MonkeyPatch) -> N
 
 def test_certificate_tells_the_device_that_lifted(tmp_path: Path) -> None:
     scene = write_scene(tmp_path, 3)
-    made = lift(scene[0], scene[1], [scene[2]], LiftSettings.of(device="cpu", certificate_rays=10))
+    made = lift_files(scene[0], scene[1], [scene[2]], LiftSettings.of(device="cpu", certificate_rays=10))
     told = made.metadata.certificate["device"]
     assert (told["kind"], told["name"]) == ("cpu", processor())
     assert told["versions"]["torch"] == torch.__version__ and told["versions"].keys() == {"torch", "numba", "numpy"}
@@ -123,27 +123,10 @@ def test_room_that_ends_in_the_middle_is_said_in_words(card: pytest.MonkeyPatch)
         raise RuntimeError("Triton Error [CUDA]: an illegal memory access was encountered")
 
 
-def device_plan_with(free: int | None) -> DevicePlan:
-    return DevicePlan("Card", 2 * GIB, GIB, 3 * GIB, GIB, 10 * GIB, GIB // 2, 1, free)
-
-
-def test_plan_cuts_what_is_larger_than_the_card() -> None:
-    roomy, tight, without = device_plan_with(64 * GIB), device_plan_with(4 * GIB), device_plan_with(None)
-    assert (roomy.fits, roomy.blocks, roomy.kept, roomy.peak) == (True, 1, 3 * GIB, 14 * GIB)
-    assert (without.fits, without.blocks, without.kept) == (True, 1, 3 * GIB)
-    assert (tight.fits, tight.blocks, tight.whole_views) == (True, 8, True)
-    assert 0 < tight.kept < 3 * GIB and tight.peak <= 0.9 * 4 * GIB
-    assert "8 blocks" in tight.line() and "4096 MiB free" in tight.line() and "views in one piece" in tight.line()
-    strips = device_plan_with(2 * GIB)
-    assert (strips.fits, strips.whole_views, strips.kept) == (True, False, 0)
-    assert "views in strips" in strips.line() and strips.peak <= 0.9 * 2 * GIB
-    assert roomy.facts() == tight.facts()  # equal inputs give equal certificates
-
-
-def test_plan_that_cannot_be_cut_to_fit_is_refused_or_left_to_the_processor() -> None:
-    small = device_plan_with(int(0.9 * GIB))
-    assert not small.fits and "too little room" in small.line()
-    with pytest.raises(Unavailable, match=r"1\.9 GiB of free memory on Card, got 0\.9 GiB"):
-        check_device_room(small, "cuda")
-    assert "the processor lifts" in check_device_room(small, "auto")[0]
-    assert check_device_room(device_plan_with(4 * GIB), "cuda") == []
+def test_scene_without_room_on_the_card_is_refused_or_left_to_the_processor(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Device, "free_bytes", lambda device: GIB)
+    monkeypatch.setattr(Device, "name", "Card")
+    assert check_card(CARD, 1_000_000, "cuda") == []
+    with pytest.raises(Unavailable, match=r"3\.7 GiB of free memory on Card, got 1\.0 GiB"):
+        check_card(CARD, 10_000_000, "cuda")
+    assert "the processor lifts" in check_card(CARD, 10_000_000, "auto")[0]

@@ -14,14 +14,15 @@ from PIL import Image
 from liftcore.errors import InvalidCameras, InvalidQuery
 from liftcore.io.cameras import read_cameras
 from liftcore.io.inria import write_inria_cameras
-from liftcore.io.lift_file import LiftResult, save_lift
-from liftcore.lift import lift
+from liftcore.io.lift_file import save_lift
+from liftcore.io.lift_files import lift_files
 from liftcore.query.ask import ask
 from liftcore.query.example import Pixel, Region
 from liftcore.query.pictures import render_png
 from liftcore.query.query import Query
 from liftcore.query.scene import QueryScene
 from liftcore.query.view_mask import view_mask
+from liftcore.result import LiftResult
 from liftcore.scene.cameras import Camera
 from liftcore.settings import LiftSettings
 from tests.distorted_scene import (
@@ -42,7 +43,7 @@ CLEAR = 0.1  # from the border of a quarter: two standard deviations of a splat,
 
 def lifted(folder: Path, lens: str, *, grids: bool = False) -> LiftResult:
     splats, cameras, features = write_distorted_scene(folder, lens, grids=grids)
-    return lift(splats, cameras, [features], LiftSettings.of(preset="row-sum"))
+    return lift_files(splats, cameras, [features], LiftSettings.of(preset="row-sum"))
 
 
 def share_of_own_quarter(made: LiftResult) -> torch.Tensor:
@@ -66,7 +67,7 @@ def test_features_reach_the_splats_that_the_photo_shows(lens: str, grids: bool, 
     plain = {key: value for key, value in document.items() if key not in LENSES[lens][0]}
     (tmp_path / "transforms.json").write_text(json.dumps(plain))
     paths = tmp_path / "splats.ply", tmp_path / "transforms.json"
-    ignored = lift(*paths, [tmp_path / "features.safetensors"], LiftSettings.of(preset="row-sum"))
+    ignored = lift_files(*paths, [tmp_path / "features.safetensors"], LiftSettings.of(preset="row-sum"))
     assert float(share_of_own_quarter(ignored).min()) < 0.5
     assert not any("distorted photos" in text for text in ignored.metadata.certificate["warnings"])
 
@@ -129,7 +130,8 @@ def test_a_model_that_comes_later_changes_no_lift(tmp_path: Path) -> None:
         (folder / "images.txt").write_text(lines[0])
         if place == "sparse/0":
             save_lift(
-                lift(splats, scene, [features], LiftSettings.of(preset="row-sum")), tmp_path / "made.safetensors"
+                lift_files(splats, scene, [features], LiftSettings.of(preset="row-sum")),
+                tmp_path / "made.safetensors",
             )
     with pytest.raises(InvalidCameras, match="not both"):
         read_cameras(scene)

@@ -16,8 +16,9 @@ from liftcore.features.pack import write_pack
 from liftcore.features.views import FeatureGrid, Regions
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.inspect import inspect_file
-from liftcore.io.lift_file import InputFile, LiftMetadata, LiftResult, save_lift
+from liftcore.io.lift_file import save_lift
 from liftcore.io.ply import write_splats
+from liftcore.result import InputFile, LiftMetadata, LiftResult
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.splats import Splats
 from liftcore.settings import LiftSettings

@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 import torch
 
-from liftcore.lift import lift
+from liftcore.io.lift_files import lift_files
 from liftcore.one_thread import one_thread
 from liftcore.settings import LiftSettings
 from liftcore.solve import accumulate, robust
@@ -52,6 +52,6 @@ def test_a_lift_has_no_threads_of_torch(tmp_path, monkeypatch):
     watch(robust, "directions_of")
     watch(robust, "judge_share")
     splats, cameras, features = write_scene(tmp_path, 3)[:3]
-    lift(splats, cameras, [features], LiftSettings.of(robust_steps=1))
+    lift_files(splats, cameras, [features], LiftSettings.of(robust_steps=1))
     assert seen == {"as_walked": 1, "directions_of": 1, "judge_share": 1}
     assert torch.get_num_threads() == 3

@@ -15,8 +15,8 @@ from liftcore.errors import SplatliftError
 from liftcore.features.pack import read_features, write_pack
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.inspect import describe_packs
+from liftcore.io.lift_files import lift_files
 from liftcore.io.ply import write_splats
-from liftcore.lift import lift
 from liftcore.raster.reference import reading_matrix
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.splats import Splats
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from liftcore.features.views import ViewFeatures
-    from liftcore.io.lift_file import LiftResult
+    from liftcore.result import LiftResult
     from liftcore.scene.splats import Kernel
 
 FOLDER = "splatlift-extreme-"
@@ -94,7 +94,7 @@ def run(task: Task, splats: Splats) -> tuple[LiftResult, list[str]]:
         write_splats(splats, paths[0])
         write_inria_cameras(Cameras(tuple(camera(view) for view in task.views)), paths[1])
         write_pack(paths[2], task.views, {"encoder": "by hand", "normalised": "false"})
-        made = lift(paths[0], paths[1], paths[2:], LiftSettings.of(**{"preset": "row-sum", **task.settings}))
+        made = lift_files(paths[0], paths[1], paths[2:], LiftSettings.of(**{"preset": "row-sum", **task.settings}))
         return made, describe_packs(read_features(*paths[2:]))["warnings"]
 
 

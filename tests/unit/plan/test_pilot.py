@@ -14,13 +14,14 @@ from liftcore.features.pack import read_features, write_pack
 from liftcore.features.views import Regions
 from liftcore.io.cameras import read_cameras
 from liftcore.io.inria import write_inria_cameras
+from liftcore.io.lift_files import lift_files, open_files
 from liftcore.io.ply import write_splats
-from liftcore.lift import lift, open_sources
-from liftcore.plan.pilot import PILOT_VIEWS, Pilot, fly_pilot
-from liftcore.plan.plan import FEW_VIEWS
-from liftcore.plan.visibility import visibility
+from liftcore.planning.pilot import PILOT_VIEWS, Pilot, fly_pilot
+from liftcore.planning.plan import FEW_VIEWS
+from liftcore.planning.visibility import visibility
 from liftcore.scene.cameras import Cameras
 from liftcore.settings import LiftSettings
+from liftcore.solve.views import LiftViews
 from tests.benchmarks.scenes import Room, write_room
 from tests.scenes import centred, random_splats
 from tests.unit.plan.test_views import ring
@@ -50,8 +51,8 @@ def disagreeing(folder, error: float, gap: bool = False, labelled: bool = True):
 @pytest.mark.parametrize("error", [0.3, 1.0, 2.0])
 def test_a_pilot_foresees_how_near_fewer_views_come(tmp_path, error):
     splats, cameras, pack = disagreeing(tmp_path / "scene", error)
-    whole = lift(splats, cameras, [pack], LiftSettings.of())
-    fewer = lift(splats, cameras, [pack], LiftSettings.of(view_cosine=0.98))
+    whole = lift_files(splats, cameras, [pack], LiftSettings.of())
+    fewer = lift_files(splats, cameras, [pack], LiftSettings.of(view_cosine=0.98))
     expected = fewer.metadata.certificate["plan"]["view_cosine"]
     found = cosine_figures(fewer.features, whole.features, whole.evidence)["cosine"]
     assert expected >= 0.98
@@ -63,7 +64,7 @@ def test_the_more_views_disagree_the_more_are_lifted(tmp_path):
     counts = []
     for error in (0.0, 0.5, 1.0, 4.0):
         splats, cameras, pack = disagreeing(tmp_path / str(error), error)
-        lifted = lift(splats, cameras, [pack], LiftSettings.of(view_cosine=0.99))
+        lifted = lift_files(splats, cameras, [pack], LiftSettings.of(view_cosine=0.99))
         counts.append(len(lifted.metadata.views))
     assert counts == sorted(set(counts))
     assert counts[0] <= 2
@@ -107,7 +108,7 @@ def test_rays_without_labels_are_no_disagreement(tmp_path):
     counts = []
     for gap in (False, True):
         splats, cameras, pack = disagreeing(tmp_path / str(gap), 0.5, gap)
-        lifted = lift(splats, cameras, [pack], LiftSettings.of(view_cosine=0.98))
+        lifted = lift_files(splats, cameras, [pack], LiftSettings.of(view_cosine=0.98))
         counts.append(len(lifted.metadata.views))
     assert abs(counts[0] - counts[1]) <= 3
 
@@ -131,9 +132,9 @@ def test_where_no_ray_meets_a_splat_all_views_are_taken_and_nothing_is_expected_
 def test_in_a_room_where_views_share_few_splats_a_pilot_is_right_too(tmp_path):
     write_room(tmp_path, Room(splats=6_000, views=72, size=(160, 120), channels=32))
     paths = tmp_path / "point_cloud.ply", tmp_path / "cameras.json", tmp_path / "features.safetensors"
-    whole = lift(*paths[:2], [paths[2]], LiftSettings.of())
+    whole = lift_files(*paths[:2], [paths[2]], LiftSettings.of())
     for wanted in (0.9, 0.97):
-        fewer = lift(*paths[:2], [paths[2]], LiftSettings.of(view_cosine=wanted))
+        fewer = lift_files(*paths[:2], [paths[2]], LiftSettings.of(view_cosine=wanted))
         plan = fewer.metadata.certificate["plan"]
         found = cosine_figures(fewer.features, whole.features, whole.evidence)["cosine"]
         assert found is not None
@@ -145,7 +146,7 @@ def test_with_coverage_beside_it_a_cosine_takes_no_fewer_views_and_no_pilot_flie
     paths = disagreeing(tmp_path / "scene", 0.3)
     counts, expected = [], []
     for coverage in (0, 12, 20, VIEWS - PILOT_VIEWS):
-        made = lift(*paths[:2], [paths[2]], LiftSettings.of(view_cosine=0.95, coverage=coverage))
+        made = lift_files(*paths[:2], [paths[2]], LiftSettings.of(view_cosine=0.95, coverage=coverage))
         counts.append(len(made.metadata.views))
         expected.append(made.metadata.certificate["plan"]["view_cosine"])
     assert counts[0] < 12
@@ -156,7 +157,7 @@ def test_with_coverage_beside_it_a_cosine_takes_no_fewer_views_and_no_pilot_flie
 
 def test_few_views_are_all_taken(tmp_path):
     splats, cameras, pack = disagreeing(tmp_path / "scene", 0.0)
-    lifted = lift(splats, cameras, [pack], LiftSettings.of(view_cosine=0.5, view_stride=2))
+    lifted = lift_files(splats, cameras, [pack], LiftSettings.of(view_cosine=0.5, view_stride=2))
     assert len(lifted.metadata.views) == VIEWS // 2 <= FEW_VIEWS
 
 
@@ -182,9 +183,10 @@ def test_a_room_is_written_the_same_twice_and_its_views_disagree_as_told(tmp_pat
 
 def flown(splats, cameras, pack, threads=1) -> Pilot:
     settings = LiftSettings.of()
-    sources = open_sources(splats, cameras, [pack], settings)
-    seen = visibility(sources.splats, [sources.cameras[view] for view in sources.views], settings.lift_params)
-    return fly_pilot(sources.splats, sources.cameras, sources.packs, sources.views, settings, seen, threads)
+    scene, views, packs = open_files(splats, cameras, [pack], settings)
+    found = LiftViews.of(packs, views, settings)
+    seen = visibility(scene, [found.camera(k) for k in range(len(found.names))], settings.lift_params)
+    return fly_pilot(scene, found, settings, seen, threads)
 
 
 def test_a_pilot_repeats_on_any_number_of_threads(tmp_path):

@@ -6,9 +6,17 @@ import numpy as np
 import pytest
 import torch
 
-from liftcore.lift import lift
-from liftcore.plan.coverage import ORDER_SPLATS, SIDES, WELL_COVERED, side_of, spare_views, view_order, views_to_show
-from liftcore.plan.visibility import Visibility, visibility
+from liftcore.io.lift_files import lift_files
+from liftcore.planning.coverage import (
+    ORDER_SPLATS,
+    SIDES,
+    WELL_COVERED,
+    side_of,
+    spare_views,
+    view_order,
+    views_to_show,
+)
+from liftcore.planning.visibility import Visibility, visibility
 from liftcore.raster.base import CompositingParams, Weighting
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.splats import Kernel
@@ -122,9 +130,9 @@ def test_a_view_that_sees_nothing_is_spare():
 
 def test_a_lift_with_coverage_is_the_lift_of_the_chosen_views(tmp_path):
     paths = write_scene(tmp_path, 2)
-    made = lift(paths[0], paths[1], [paths[2]], LiftSettings.of(coverage=1, preset="row-sum"))
+    made = lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of(coverage=1, preset="row-sum"))
     plan = made.metadata.certificate["plan"]
     assert len(made.metadata.views) == plan["views"] == 3 - plan["views_left_out"] < 3
-    whole = lift(paths[0], paths[1], [paths[2]], LiftSettings.of(preset="row-sum"))
+    whole = lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of(preset="row-sum"))
     assert not torch.equal(made.features, whole.features)
     assert bool((made.evidence <= whole.evidence + 1e-4).all())

@@ -15,7 +15,7 @@ from PIL import Image
 from liftcore.errors import InvalidLift, InvalidQuery
 from liftcore.io.input_files import input_file
 from liftcore.io.inria import write_inria_cameras
-from liftcore.io.lift_file import LiftMetadata, LiftResult, load_lift, save_lift
+from liftcore.io.lift_file import load_lift, save_lift
 from liftcore.io.ply import write_splats
 from liftcore.query.ask import ask, top
 from liftcore.query.colours import NO_CLUSTER_COLOUR, SH_C0, cluster_colours, seen_colours
@@ -23,6 +23,7 @@ from liftcore.query.pictures import attention_png, mask_png, overlay, render, re
 from liftcore.query.query import Query
 from liftcore.query.scene import QueryScene
 from liftcore.query.view_mask import view_mask
+from liftcore.result import LiftMetadata, LiftResult
 from liftcore.scene.cameras import Cameras
 from liftcore.scene.splats import Kernel, Splats
 from liftcore.settings import LiftSettings

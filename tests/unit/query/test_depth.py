@@ -11,12 +11,12 @@ import torch
 from PIL import Image
 
 from liftcore.io.input_files import InputFile
-from liftcore.io.lift_file import LiftMetadata, LiftResult
 from liftcore.query.depth import expected_depth, shown_depth
 from liftcore.query.pictures import render_png
 from liftcore.query.scene import QueryScene
 from liftcore.raster.base import CompositingParams
 from liftcore.raster.reference import ReferenceRaster
+from liftcore.result import LiftMetadata, LiftResult
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.splats import Kernel, Splats
 from liftcore.settings import LiftSettings

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from liftcore.errors import InvalidLift, InvalidQuery, NotFound, SplatliftError
 from liftcore.io.lift_file import load_lift, save_lift
-from liftcore.lift import lift
+from liftcore.io.lift_files import lift_files
 from liftcore.query.ask import ask
 from liftcore.query.directions import directions
 from liftcore.query.example import Example, OneSplat, Pixel, Region, Vector, parse_example
@@ -37,7 +37,9 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> QueryScene:
     tiny = make_scene()
     for name, content in (("s.ply", tiny.splats), ("c.json", tiny.cameras), ("f.safetensors", tiny.features)):
         (folder / name).write_bytes(content)
-    made = lift(folder / "s.ply", folder / "c.json", [folder / "f.safetensors"], LiftSettings.of(preset="row-sum"))
+    made = lift_files(
+        folder / "s.ply", folder / "c.json", [folder / "f.safetensors"], LiftSettings.of(preset="row-sum")
+    )
     save_lift(made, folder / "scene.lift")
     return QueryScene.open(folder / "scene.lift")
 

@@ -8,7 +8,7 @@ import pytest
 
 from liftcore.errors import InvalidQuery
 from liftcore.io.lift_file import save_lift
-from liftcore.lift import lift
+from liftcore.io.lift_files import lift_files
 from liftcore.query import scene as scenes
 from liftcore.query.ask import ask
 from liftcore.query.example import OneSplat
@@ -27,7 +27,7 @@ def scene(tmp_path: Path) -> QueryScene:
     for name, content in (("s.ply", tiny.splats), ("c.json", tiny.cameras), ("f.safetensors", tiny.features)):
         (tmp_path / name).write_bytes(content)
     settings = LiftSettings.of(preset="row-sum")
-    made = lift(tmp_path / "s.ply", tmp_path / "c.json", [tmp_path / "f.safetensors"], settings)
+    made = lift_files(tmp_path / "s.ply", tmp_path / "c.json", [tmp_path / "f.safetensors"], settings)
     save_lift(made, tmp_path / "scene.lift")
     return QueryScene.open(tmp_path / "scene.lift")
 

@@ -10,7 +10,7 @@ import torch
 
 from liftcore.errors import InvalidQuery
 from liftcore.io.lift_file import save_lift
-from liftcore.lift import lift
+from liftcore.io.lift_files import lift_files
 from liftcore.query import objects as module
 from liftcore.query.ask import Answer, ask
 from liftcore.query.example import Region
@@ -28,7 +28,9 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> QueryScene:
     tiny, folder = make_scene(), tmp_path_factory.mktemp("objects")
     for name, content in (("s.ply", tiny.splats), ("c.json", tiny.cameras), ("f.safetensors", tiny.features)):
         (folder / name).write_bytes(content)
-    made = lift(folder / "s.ply", folder / "c.json", [folder / "f.safetensors"], LiftSettings.of(preset="row-sum"))
+    made = lift_files(
+        folder / "s.ply", folder / "c.json", [folder / "f.safetensors"], LiftSettings.of(preset="row-sum")
+    )
     save_lift(made, folder / "scene.lift")
     return QueryScene.open(folder / "scene.lift")
 

@@ -10,7 +10,7 @@ import torch
 
 from liftcore.errors import InvalidQuery, NotFound
 from liftcore.io.lift_file import save_lift
-from liftcore.lift import lift
+from liftcore.io.lift_files import lift_files
 from liftcore.query import objects as grouping
 from liftcore.query import view_mask as module
 from liftcore.query.ask import Answer, ask
@@ -33,7 +33,9 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> QueryScene:
     tiny, folder = make_scene(), tmp_path_factory.mktemp("look")
     for name, content in (("s.ply", tiny.splats), ("c.json", tiny.cameras), ("f.safetensors", tiny.features)):
         (folder / name).write_bytes(content)
-    made = lift(folder / "s.ply", folder / "c.json", [folder / "f.safetensors"], LiftSettings.of(preset="tikhonov"))
+    made = lift_files(
+        folder / "s.ply", folder / "c.json", [folder / "f.safetensors"], LiftSettings.of(preset="tikhonov")
+    )
     save_lift(made, folder / "scene.lift")
     return QueryScene.open(folder / "scene.lift")
 

@@ -16,8 +16,9 @@ from liftcore.features.views import FeatureGrid, Regions
 from liftcore.io.cameras import read_cameras
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.lift_file import CLUSTER_TENSORS, load_lift, save_lift
+from liftcore.io.lift_files import lift_files
 from liftcore.io.ply import read_splats, write_splats
-from liftcore.lift import LEAST_KEPT, lift
+from liftcore.lifting import LEAST_KEPT
 from liftcore.progress import silent
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.raster.reference import ReferenceRaster, dense_view
@@ -141,7 +142,9 @@ KNOBS = {"aggregation_cluster_size": 40, "certificate_rays": 10, "aggregation_io
 @pytest.mark.parametrize("kind", ["regions", "grids"])
 def test_a_lift_with_aggregation_has_one_feature_a_cluster_and_says_so(tmp_path, kind):
     (splats, cameras, features), side = write_scene(tmp_path, kind)
-    runs = [lift(splats, cameras, [features], LiftSettings.of(aggregation=True, **KNOBS), threads=n) for n in (1, 3)]
+    runs = [
+        lift_files(splats, cameras, [features], LiftSettings.of(aggregation=True, **KNOBS), threads=n) for n in (1, 3)
+    ]
     result = runs[0]
     assert torch.equal(result.features, runs[1].features)
     save_lift(result, tmp_path / "lift")
@@ -170,7 +173,7 @@ def weights_of(splats, cameras, maps, settings) -> np.ndarray:
 
 @pytest.mark.parametrize("least", [LEAST_KEPT, 0.7])
 def test_what_takes_no_cluster_is_solved_again_as_if_the_other_regions_had_never_been(tmp_path, monkeypatch, least):
-    monkeypatch.setattr("liftcore.lift.LEAST_KEPT", least)
+    monkeypatch.setattr("liftcore.lifting.LEAST_KEPT", least)
     (splats, cameras, features), _ = write_scene(tmp_path, "regions")
     # A third of the first view is a region that no cluster confirms.
     packs = read_features(features)
@@ -182,10 +185,12 @@ def test_what_takes_no_cluster_is_solved_again_as_if_the_other_regions_had_never
     wrong = Regions(labels, torch.cat([first.codebook, torch.eye(6)[5:].to(first.codebook.dtype)]))
     write_pack(features, maps | {"v0": wrong}, {"encoder": "random"})
     knobs = KNOBS | {"aggregation_iou": 0.3, "dtype": "float32"}
-    result = lift(splats, cameras, [features], LiftSettings.of(aggregation=True, aggregation_resolve=True, **knobs))
+    result = lift_files(
+        splats, cameras, [features], LiftSettings.of(aggregation=True, aggregation_resolve=True, **knobs)
+    )
     facts = result.metadata.certificate["aggregation"]
     assert facts["kept_regions"] < facts["regions"] and facts["resolved"] > 0
-    plain = lift(splats, cameras, [features], LiftSettings.of(aggregation=True, **knobs))
+    plain = lift_files(splats, cameras, [features], LiftSettings.of(aggregation=True, **knobs))
     whole = weights_of(splats, cameras, maps | {"v0": wrong}, plain.metadata.settings)
 
     lifted = (CpuRaster(read_splats(splats)), read_cameras(cameras), read_features(features), result.metadata.views)
@@ -198,7 +203,7 @@ def test_what_takes_no_cluster_is_solved_again_as_if_the_other_regions_had_never
             observation.labels[(observation.labels >= 0) & dropped[observation.labels.clamp_min(0).long()]] = -1
             maps[name] = observation
     write_pack(tmp_path / "kept.safetensors", maps, {"encoder": "random"})
-    without = lift(
+    without = lift_files(
         splats, cameras, [tmp_path / "kept.safetensors"], LiftSettings.of(**(knobs | {"aggregation_iou": 0.75}))
     )
     own = ~(result.cluster_features != 0).any(dim=1)[result.cluster.long()] | (result.cluster < 0)
@@ -213,8 +218,8 @@ def test_what_takes_no_cluster_is_solved_again_as_if_the_other_regions_had_never
 
 def test_a_lift_without_clusters_is_the_lift_without_aggregation_and_says_so(tmp_path):
     (splats, cameras, features), _ = write_scene(tmp_path, "regions")
-    plain = lift(splats, cameras, [features], LiftSettings.of(certificate_rays=10))
-    none = lift(splats, cameras, [features], LiftSettings.of(aggregation=True, certificate_rays=10))
+    plain = lift_files(splats, cameras, [features], LiftSettings.of(certificate_rays=10))
+    none = lift_files(splats, cameras, [features], LiftSettings.of(aggregation=True, certificate_rays=10))
     assert none.metadata.certificate["aggregation"]["clusters"] == 0
     assert none.metadata.certificate["aggregation"]["changed"] == 0
     assert torch.equal(plain.features, none.features)
@@ -238,7 +243,7 @@ def test_a_lift_without_clusters_is_the_lift_without_aggregation_and_says_so(tmp
 )
 def test_a_lift_whose_clusters_do_not_fit_is_refused(tmp_path, changed):
     (splats, cameras, features), _ = write_scene(tmp_path, "regions")
-    plain = lift(splats, cameras, [features], LiftSettings.of(certificate_rays=10))
+    plain = lift_files(splats, cameras, [features], LiftSettings.of(certificate_rays=10))
     parts = {"cluster": torch.zeros(400, dtype=torch.int32), "cluster_features": torch.zeros(3, 6).half()}
     assert set(parts) == set(CLUSTER_TENSORS)
     save_lift(replace(plain, **parts | changed), tmp_path / "lift")
@@ -253,7 +258,7 @@ def test_one_splat_is_aggregated_without_harm(tmp_path, channels):
     write_inria_cameras(Cameras((camera,)), tmp_path / "cameras.json")
     write_pack(tmp_path / "f.safetensors", {"v0": random_regions(0, F=channels)}, {"encoder": "random"})
     paths = tmp_path / "splats.ply", tmp_path / "cameras.json"
-    result = lift(*paths, [tmp_path / "f.safetensors"], LiftSettings.of(aggregation=True, certificate_rays=10))
+    result = lift_files(*paths, [tmp_path / "f.safetensors"], LiftSettings.of(aggregation=True, certificate_rays=10))
     assert result.cluster is not None and result.cluster.tolist() == [-1]
     assert bool(torch.isfinite(result.features).all())
 

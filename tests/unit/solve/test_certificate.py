@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from liftcore.io.cameras import read_cameras
-from liftcore.lift import lift
+from liftcore.io.lift_files import lift_files
 from liftcore.raster.base import CompositingParams
 from liftcore.raster.reference import dense_view, reading_matrix
 from liftcore.settings import LiftSettings
@@ -49,7 +49,7 @@ def dense_measures(X: np.ndarray, seed: int, cameras, gain: float, grids: bool) 
 def test_a_certificate_over_all_rays_equals_the_papers_definitions(tmp_path, preset, grids):
     paths = write_scene(tmp_path, 3, grids)
     settings = LiftSettings.of(preset=preset, certificate_rays=ALL_RAYS, dtype="float32")
-    result = lift(paths[0], paths[1], [paths[2]], settings)
+    result = lift_files(paths[0], paths[1], [paths[2]], settings)
     expected = dense_measures(result.features.double().numpy(), 3, read_cameras(paths[1]), settings.lift_gain, grids)
     certificate = result.metadata.certificate
     for name, value in expected.items():
@@ -59,7 +59,7 @@ def test_a_certificate_over_all_rays_equals_the_papers_definitions(tmp_path, pre
 def test_the_closed_form_minimises_the_surrogate(tmp_path):
     paths = write_scene(tmp_path, 4)
     settings = LiftSettings.of(preset="row-sum", certificate_rays=ALL_RAYS, dtype="float32")
-    X = lift(paths[0], paths[1], [paths[2]], settings).features.double().numpy()
+    X = lift_files(paths[0], paths[1], [paths[2]], settings).features.double().numpy()
     cameras = read_cameras(paths[1])
     least = dense_measures(X, 4, cameras, 1.0, grids=False)["surrogate"]
     for seed in range(5):
@@ -69,7 +69,7 @@ def test_the_closed_form_minimises_the_surrogate(tmp_path):
 
 def test_a_lift_without_sampled_rays_says_that_nothing_was_measured(tmp_path):
     paths = write_scene(tmp_path, 5)
-    certificate = lift(paths[0], paths[1], [paths[2]], LiftSettings.of(certificate_rays=0)).metadata.certificate
+    certificate = lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of(certificate_rays=0)).metadata.certificate
     assert certificate["rays"] == 0
     assert certificate["residual"] is None
     assert certificate["bound"] is None

@@ -15,15 +15,14 @@ from liftcore.device import CPU, Device
 from liftcore.features.pack import write_pack
 from liftcore.features.views import NO_LABEL, FeatureGrid, Regions
 from liftcore.io.cameras import read_cameras
-from liftcore.io.lift_file import TENSORS, LiftResult
-from liftcore.lift import lift
-from liftcore.listener import Listener
+from liftcore.io.lift_file import TENSORS
+from liftcore.io.lift_files import lift_files
 from liftcore.raster.base import CompositingParams, ViewRequest, Weighting
 from liftcore.raster.cpu.raster import CpuRaster
+from liftcore.result import LiftResult
 from liftcore.scene.cameras import Camera
-from liftcore.scene.kernel import Kernel
 from liftcore.settings import LiftSettings
-from liftcore.solve.checkpoint import Checkpoint, identity, question
+from liftcore.solve.checkpoint import Checkpoint, question
 
 from .test_lift_equals_dense import observed, write_scene
 
@@ -44,7 +43,7 @@ def walks(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         return walk(self, camera, *rest, **named)
 
     monkeypatch.setattr(CpuRaster, "region_weights", counted)
-    monkeypatch.setattr("liftcore.lift.choose_device", lambda _: CPU)  # on machines with a card too
+    monkeypatch.setattr("liftcore.lifting.choose_device", lambda _: CPU)  # on machines with a card too
     return walked
 
 
@@ -71,13 +70,13 @@ def test_killed_lift_goes_on_from_its_last_block_to_the_same_bits(
 ) -> None:
     scene = write_scene(tmp_path, 3, grids)
     inputs, settings = (scene[0], scene[1], [scene[2]]), LiftSettings.of(certificate_rays=50)
-    whole = lift(*inputs, settings, threads=1)
+    whole = lift_files(*inputs, settings, threads=1)
     walks.clear()
     checkpoint = Checkpoint(tmp_path / "kept", seconds=0)
     for at in kills:
         with pytest.raises(Killed):
-            lift(*inputs, settings, threads=1, listener=Listener(killing("geometry", at)), checkpoint=checkpoint)
-    again = lift(*inputs, settings, threads=1, checkpoint=checkpoint)
+            lift_files(*inputs, settings, threads=1, progress=killing("geometry", at), checkpoint=checkpoint)
+    again = lift_files(*inputs, settings, threads=1, checkpoint=checkpoint)
     assert walks == ["v0", "v1", "v2"]  # none twice
     assert_same(whole, again)
 
@@ -95,20 +94,20 @@ def test_views_that_meet_no_label_are_kept_and_not_walked_again(
         views[name] = replace(regions, labels=torch.full_like(regions.labels, NO_LABEL))
     write_pack(features, views, {"encoder": "random"})
     settings, checkpoint = LiftSettings.of(certificate_rays=50), Checkpoint(tmp_path / "kept", seconds=0)
-    whole = lift(splats, cameras, [features], settings, threads=1)
+    whole = lift_files(splats, cameras, [features], settings, threads=1)
     walks.clear()
     for at in (1, 2):
         with pytest.raises(Killed):
-            lift(
+            lift_files(
                 splats,
                 cameras,
                 [features],
                 settings,
                 threads=1,
-                listener=Listener(killing("geometry", at)),
+                progress=killing("geometry", at),
                 checkpoint=checkpoint,
             )
-    again = lift(splats, cameras, [features], settings, threads=1, checkpoint=checkpoint)
+    again = lift_files(splats, cameras, [features], settings, threads=1, checkpoint=checkpoint)
     assert walks == ["v0", "v1", "v2"]
     assert_same(whole, again)
 
@@ -116,12 +115,12 @@ def test_views_that_meet_no_label_are_kept_and_not_walked_again(
 def test_lift_killed_beside_views_in_work_walks_them_again_to_the_same_bits(tmp_path: Path, walks: list[str]) -> None:
     scene = write_scene(tmp_path, 3)
     inputs, settings = (scene[0], scene[1], [scene[2]]), LiftSettings.of()
-    whole = lift(*inputs, settings, threads=2)
+    whole = lift_files(*inputs, settings, threads=2)
     walks.clear()
     checkpoint = Checkpoint(tmp_path / "kept", seconds=0)
     with pytest.raises(Killed):
-        lift(*inputs, settings, threads=2, listener=Listener(killing("geometry", 1)), checkpoint=checkpoint)
-    again = lift(*inputs, settings, threads=2, checkpoint=checkpoint)
+        lift_files(*inputs, settings, threads=2, progress=killing("geometry", 1), checkpoint=checkpoint)
+    again = lift_files(*inputs, settings, threads=2, checkpoint=checkpoint)
     assert walks.count("v0") == 1
     assert {"v1", "v2"} <= set(walks)
     assert_same(whole, again)
@@ -131,36 +130,34 @@ def test_lift_killed_while_it_solves_walks_no_view_again(tmp_path: Path, walks: 
     scene = write_scene(tmp_path, 4)
     settings, checkpoint = LiftSettings.of(), Checkpoint(tmp_path / "kept")
     with pytest.raises(Killed):
-        lift(scene[0], scene[1], [scene[2]], settings, listener=Listener(killing("solve", 1)), checkpoint=checkpoint)
-    again = lift(scene[0], scene[1], [scene[2]], settings, checkpoint=checkpoint)
+        lift_files(scene[0], scene[1], [scene[2]], settings, progress=killing("solve", 1), checkpoint=checkpoint)
+    again = lift_files(scene[0], scene[1], [scene[2]], settings, checkpoint=checkpoint)
     assert sorted(walks) == ["v0", "v1", "v2"]
-    assert_same(lift(scene[0], scene[1], [scene[2]], settings), again)
+    assert_same(lift_files(scene[0], scene[1], [scene[2]], settings), again)
 
 
 def test_checkpoint_of_another_walk_or_other_splats_is_never_used(tmp_path: Path, walks: list[str]) -> None:
     scene = write_scene(tmp_path, 5)
     checkpoint = Checkpoint(tmp_path / "kept", seconds=0)
-    lift(scene[0], scene[1], [scene[2]], LiftSettings.of(preset="row-sum"), checkpoint=checkpoint)
-    other = lift(scene[0], scene[1], [scene[2]], LiftSettings.of(preset="tikhonov"), checkpoint=checkpoint)
+    lift_files(scene[0], scene[1], [scene[2]], LiftSettings.of(preset="row-sum"), checkpoint=checkpoint)
+    other = lift_files(scene[0], scene[1], [scene[2]], LiftSettings.of(preset="tikhonov"), checkpoint=checkpoint)
     assert len(walks) == 6
-    assert_same(lift(scene[0], scene[1], [scene[2]], LiftSettings.of(preset="tikhonov")), other)
-    assert identity("a", Kernel.GAUSSIAN_3D, {}) != identity("b", Kernel.GAUSSIAN_3D, {})
-    assert identity("a", Kernel.GAUSSIAN_3D, {}) != identity("a", Kernel.BETA, {})
+    assert_same(lift_files(scene[0], scene[1], [scene[2]], LiftSettings.of(preset="tikhonov")), other)
 
 
 @pytest.mark.parametrize("grids", [False, True])
 def test_other_features_of_the_same_regions_walk_no_view_again(tmp_path: Path, walks: list[str], grids: bool) -> None:
     splats, cameras, features = write_scene(tmp_path, 8, grids)
     checkpoint, settings = Checkpoint(tmp_path / "kept"), LiftSettings.of(certificate_rays=50)
-    lift(splats, cameras, [features], settings, checkpoint=checkpoint)
+    lift_files(splats, cameras, [features], settings, checkpoint=checkpoint)
     walks.clear()
     other = tmp_path / "other.safetensors"
     write_pack(other, {name: _other_encoder(seen) for name, seen in _views(cameras, 8, grids)}, {"encoder": "other"})
     stored = settings.model_copy(update={"dtype": "float32"})
-    again = lift(splats, cameras, [other], stored, checkpoint=checkpoint)
+    again = lift_files(splats, cameras, [other], stored, checkpoint=checkpoint)
     assert walks == []
     assert again.features.shape[1] == 5
-    assert_same(lift(splats, cameras, [other], stored), again)
+    assert_same(lift_files(splats, cameras, [other], stored), again)
 
 
 @pytest.mark.parametrize("changed", ["pose", "focal", "labels", "codebook", "stride", "power", "pixels"])
@@ -198,7 +195,7 @@ def test_files_that_are_no_blocks_stay_in_the_folder(tmp_path: Path) -> None:
     stale = [checkpoint.folder / name for name in ("000007.safetensors", ".000007.safetensors.0123abcd.part")]
     for path in [*kept, *stale]:
         path.write_bytes(b"words")
-    lift(scene[0], scene[1], [scene[2]], LiftSettings.of(), checkpoint=checkpoint)
+    lift_files(scene[0], scene[1], [scene[2]], LiftSettings.of(), checkpoint=checkpoint)
     assert all(path.read_bytes() == b"words" for path in kept)
     assert not any(path.exists() for path in stale)
 
@@ -227,12 +224,12 @@ def test_checkpoint_of_another_device_is_never_used(
 ) -> None:
     scene = write_scene(tmp_path, 5)
     checkpoint = Checkpoint(tmp_path / "kept", seconds=0)
-    lift(scene[0], scene[1], [scene[2]], LiftSettings.of(device="cpu"), checkpoint=checkpoint)
-    lift(scene[0], scene[1], [scene[2]], LiftSettings.of(device="cpu"), checkpoint=checkpoint)
+    lift_files(scene[0], scene[1], [scene[2]], LiftSettings.of(device="cpu"), checkpoint=checkpoint)
+    lift_files(scene[0], scene[1], [scene[2]], LiftSettings.of(device="cpu"), checkpoint=checkpoint)
     assert len(walks) == 3
     facts = {**CPU.facts(), "name": "another"}
     monkeypatch.setattr(Device, "facts", lambda _: facts)
-    made = lift(scene[0], scene[1], [scene[2]], LiftSettings.of(device="cpu"), checkpoint=checkpoint)
+    made = lift_files(scene[0], scene[1], [scene[2]], LiftSettings.of(device="cpu"), checkpoint=checkpoint)
     assert len(walks) == 6
     assert made.metadata.certificate["device"] == facts
 
@@ -241,11 +238,11 @@ def test_checkpoint_of_another_device_is_never_used(
 def test_block_that_is_not_whole_is_walked_again(tmp_path: Path, walks: list[str], length: int) -> None:
     scene = write_scene(tmp_path, 6)
     settings, checkpoint = LiftSettings.of(), Checkpoint(tmp_path / "kept", seconds=0)
-    whole = lift(scene[0], scene[1], [scene[2]], settings, checkpoint=checkpoint)
+    whole = lift_files(scene[0], scene[1], [scene[2]], settings, checkpoint=checkpoint)
     blocks = sorted(checkpoint.folder.iterdir())
     blocks[1].write_bytes(blocks[1].read_bytes()[:length])  # of the second view
     walks.clear()
-    assert_same(whole, lift(scene[0], scene[1], [scene[2]], settings, checkpoint=checkpoint))
+    assert_same(whole, lift_files(scene[0], scene[1], [scene[2]], settings, checkpoint=checkpoint))
     assert sorted(walks) == ["v1", "v2"]
 
 
@@ -255,6 +252,6 @@ def test_lift_without_room_for_its_checkpoint_goes_on(tmp_path: Path) -> None:
     nowhere = Checkpoint(tmp_path / "file" / "kept", seconds=0)
     settings = LiftSettings.of()
     assert_same(
-        lift(scene[0], scene[1], [scene[2]], settings),
-        lift(scene[0], scene[1], [scene[2]], settings, checkpoint=nowhere),
+        lift_files(scene[0], scene[1], [scene[2]], settings),
+        lift_files(scene[0], scene[1], [scene[2]], settings, checkpoint=nowhere),
     )

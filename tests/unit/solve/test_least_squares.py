@@ -9,8 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from liftcore.features.views import Regions, ViewFeatures
-from liftcore.lift import lift
-from liftcore.listener import Listener
+from liftcore.io.lift_files import lift_files
 from liftcore.progress import silent
 from liftcore.settings import LiftSettings
 from liftcore.solve.channels import BLOCK, blocks, codebook_axes, random_axes
@@ -158,7 +157,7 @@ def test_float16_features_that_grow_too_large_become_float32():
 def test_the_number_of_threads_changes_no_bit_of_a_refined_lift(tmp_path):
     paths = write_scene(tmp_path, 7)
     knobs = LiftSettings.of(cg_steps=5, damping=0.1, cg_basis=3, reference_channels=4)
-    runs = [lift(paths[0], paths[1], [paths[2]], knobs, threads=n) for n in (1, 2, 5)]
+    runs = [lift_files(paths[0], paths[1], [paths[2]], knobs, threads=n) for n in (1, 2, 5)]
     for other in runs[1:]:
         assert torch.equal(runs[0].features, other.features)
         assert runs[0].metadata.certificate == other.metadata.certificate
@@ -166,8 +165,8 @@ def test_the_number_of_threads_changes_no_bit_of_a_refined_lift(tmp_path):
 
 def test_all_that_was_seen_is_refined_however_faintly(tmp_path, monkeypatch):
     paths, given = write_scene(tmp_path, 7), []
-    monkeypatch.setattr("liftcore.lift.refine", lambda *told: given.append(told[2]) or refine(*told))
-    made = lift(paths[0], paths[1], [paths[2]], LiftSettings.of(preset="row-sum", cg_steps=1))
+    monkeypatch.setattr("liftcore.lifting.refine", lambda *told: given.append(told[2]) or refine(*told))
+    made = lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of(preset="row-sum", cg_steps=1))
     assert np.array_equal(given[0], made.seen.numpy())
     assert (made.evidence[made.seen] < 0.5).any()  # or it would say nothing of faint ones
 
@@ -179,12 +178,10 @@ def test_a_lift_takes_no_step_unless_asked(tmp_path):
     def progress(stage: str, done: int, total: int, unit: str) -> None:
         said.append((stage, done, total, unit))
 
-    plain = lift(paths[0], paths[1], [paths[2]], LiftSettings.of(), listener=Listener(progress))
+    plain = lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of(), progress=progress)
     assert "refinement" not in plain.metadata.certificate
     assert not any(stage in ("refine", "rays") for stage, *_ in said)
-    steps = lift(
-        paths[0], paths[1], [paths[2]], LiftSettings.of(cg_steps=3, damping=0.1), listener=Listener(progress)
-    )
+    steps = lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of(cg_steps=3, damping=0.1), progress=progress)
     told = steps.metadata.certificate["refinement"]
     assert [word for word in said if word[0] == "refine"][-1] == ("refine", 3, 3, "steps")
     assert told["residuals"][-1] < told["residuals"][0]

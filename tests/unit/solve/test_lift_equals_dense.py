@@ -13,8 +13,8 @@ from liftcore.features.views import Regions
 from liftcore.io.cameras import read_cameras
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.lift_file import load_lift, save_lift
+from liftcore.io.lift_files import lift_files, open_files
 from liftcore.io.ply import write_splats
-from liftcore.lift import lift, open_sources
 from liftcore.progress import silent
 from liftcore.raster.base import CompositingParams, Selection, Weighting
 from liftcore.raster.cpu.raster import CpuRaster
@@ -23,6 +23,7 @@ from liftcore.scene.cameras import Cameras
 from liftcore.settings import LiftSettings
 from liftcore.solve.accumulate import accumulate
 from liftcore.solve.view_weights import WeightStore
+from liftcore.solve.views import LiftViews
 from tests.scenes import centred, observed, random_camera, random_splats
 
 PRESETS = {  # lambda, and what counts as a weight
@@ -75,7 +76,7 @@ def dense_lift(
 @pytest.mark.parametrize("seed", range(4))
 def test_a_lift_equals_the_dense_definition(tmp_path, preset, grids, seed):
     splats, cameras, features = write_scene(tmp_path, seed, grids)
-    save_lift(lift(splats, cameras, [features], LiftSettings.of(preset=preset)), tmp_path / "lift.safetensors")
+    save_lift(lift_files(splats, cameras, [features], LiftSettings.of(preset=preset)), tmp_path / "lift.safetensors")
     got = load_lift(tmp_path / "lift.safetensors")
     X, evidence, seen, undecided = dense_lift(seed, read_cameras(cameras), preset, grids)
     assert np.array_equal(got.seen.numpy()[~undecided], seen[~undecided])
@@ -88,7 +89,7 @@ def test_a_lift_equals_the_dense_definition(tmp_path, preset, grids, seed):
 @pytest.mark.parametrize("preset", ["row-sum", "tikhonov"])
 def test_agreement_is_the_norm_of_the_mean_of_unit_inputs(tmp_path, preset):
     splats, cameras, features = write_scene(tmp_path, 5)
-    got = lift(splats, cameras, [features], LiftSettings.of(preset=preset, dtype="float32"))
+    got = lift_files(splats, cameras, [features], LiftSettings.of(preset=preset, dtype="float32"))
     norms = torch.linalg.vector_norm(got.features, dim=1)  # the codebooks are unit vectors
     assert torch.allclose(got.agreement, norms, atol=1e-5)
     assert float(got.agreement.max()) <= 1.0
@@ -96,29 +97,28 @@ def test_agreement_is_the_norm_of_the_mean_of_unit_inputs(tmp_path, preset):
 
 def test_a_lift_has_views_by_tuples_of_labels_and_views_by_rows(tmp_path):
     paths, settings = write_scene(tmp_path, 5), LiftSettings.of()
-    sources = open_sources(paths[0], paths[1], [paths[2]], settings)
+    splats, cameras, packs = open_files(paths[0], paths[1], [paths[2]], settings)
     for robust, expected in ((0, [False, True, False]), (1, [False] * 3)):
         with WeightStore() as store:
-            scene = sources.splats.count, sources.cameras
-            raster, own = CpuRaster(sources.splats, threads=1), LiftSettings.of(robust_steps=robust)
-            geometry = accumulate(raster, scene, sources.packs, sources.views, own, store, silent)
+            raster, own = CpuRaster(splats, threads=1), LiftSettings.of(robust_steps=robust)
+            geometry = accumulate(raster, splats.count, LiftViews.of(packs, cameras, own), own, store, silent)
         assert [columns.tuples is not None for columns in geometry.columns] == expected
 
 
 def test_agreement_does_not_depend_on_the_length_of_inputs(tmp_path):
     splats, cameras, features = write_scene(tmp_path, 6)
-    plain = lift(splats, cameras, [features], LiftSettings.of(preset="row-sum"))
+    plain = lift_files(splats, cameras, [features], LiftSettings.of(preset="row-sum"))
     maps = [observed(6, k) for k in range(3)]
     regions = [own for own in maps if isinstance(own, Regions)]
     longer = {f"v{k}": Regions(own.labels, own.codebook * 7.0) for k, own in enumerate(regions)}
     write_pack(tmp_path / "longer.safetensors", longer, {})
-    scaled = lift(splats, cameras, [tmp_path / "longer.safetensors"], LiftSettings.of(preset="row-sum"))
+    scaled = lift_files(splats, cameras, [tmp_path / "longer.safetensors"], LiftSettings.of(preset="row-sum"))
     assert torch.allclose(plain.agreement, scaled.agreement, atol=1e-4)
 
 
 def test_the_number_of_threads_changes_no_bit_of_a_lift(tmp_path):
     paths = write_scene(tmp_path, 7)
-    runs = [lift(paths[0], paths[1], [paths[2]], LiftSettings.of(), threads=n) for n in (1, 2, 5)]
+    runs = [lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of(), threads=n) for n in (1, 2, 5)]
     for other in runs[1:]:
         assert torch.equal(runs[0].features, other.features)
         assert torch.equal(runs[0].agreement, other.agreement)
@@ -128,7 +128,7 @@ def test_the_number_of_threads_changes_no_bit_of_a_lift(tmp_path):
 
 def test_weights_in_files_give_the_same_lift_as_weights_in_memory(tmp_path, monkeypatch):
     paths = write_scene(tmp_path, 8)
-    memory = lift(paths[0], paths[1], [paths[2]], LiftSettings.of())
+    memory = lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of())
     monkeypatch.setattr("liftcore.solve.view_weights.MEMORY_LIMIT", 0)
-    files = lift(paths[0], paths[1], [paths[2]], LiftSettings.of())
+    files = lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of())
     assert torch.equal(memory.features, files.features)

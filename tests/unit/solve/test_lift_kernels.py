@@ -13,8 +13,8 @@ from liftcore.features.pack import write_pack
 from liftcore.io.cameras import read_cameras
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.lift_file import save_lift
+from liftcore.io.lift_files import lift_files
 from liftcore.io.ply import read_splats, write_splats
-from liftcore.lift import lift
 from liftcore.query.scene import QueryScene
 from liftcore.raster.base import CompositingParams
 from liftcore.raster.reference import dense_view, reading_matrix
@@ -45,15 +45,15 @@ def test_discs_written_with_three_scales_are_discs_where_the_settings_say_so(tmp
     scales = torch.cat([flat.log_scales, torch.full((flat.count, 1), -1.0)], dim=1)  # of no account
     write_splats(Splats(flat.means, flat.quats, scales, flat.opacity_logits, sh=flat.sh), solid)
     settings = LiftSettings.of(kernel="2dgs")
-    wanted = lift(discs, cameras, [features], LiftSettings.of())
-    got = lift(solid, cameras, [features], settings)
+    wanted = lift_files(discs, cameras, [features], LiftSettings.of())
+    got = lift_files(solid, cameras, [features], settings)
     assert got.metadata.certificate["plan"]["kernel"] == "2dgs"
     assert torch.equal(got.features, wanted.features)
-    assert not torch.equal(lift(solid, cameras, [features], LiftSettings.of()).features, wanted.features)
+    assert not torch.equal(lift_files(solid, cameras, [features], LiftSettings.of()).features, wanted.features)
     save_lift(got, tmp_path / "made.safetensors")
     assert QueryScene.open(tmp_path / "made.safetensors").splats.kernel is Kernel.GAUSSIAN_2D  # in pictures too
     with pytest.raises(InvalidSplats, match="'beta' of a dbs splat"):
-        lift(solid, cameras, [features], LiftSettings.of(kernel="dbs"))
+        lift_files(solid, cameras, [features], LiftSettings.of(kernel="dbs"))
 
 
 @pytest.mark.parametrize(
@@ -63,7 +63,7 @@ def test_discs_written_with_three_scales_are_discs_where_the_settings_say_so(tmp
 def test_a_lift_of_any_kernel_equals_the_dense_definition(tmp_path, kernel, antialiased):
     paths = write_scene(tmp_path, kernel)
     settings = LiftSettings.of(preset="tikhonov", antialiased=antialiased, dtype="float32")
-    got = lift(paths[0], paths[1], [paths[2]], settings)
+    got = lift_files(paths[0], paths[1], [paths[2]], settings)
     splats = read_splats(paths[0])
     assert splats.kernel is kernel
     numerator, denominator = np.zeros((50, 6)), np.zeros(50)
@@ -84,11 +84,13 @@ def test_a_lift_of_any_kernel_equals_the_dense_definition(tmp_path, kernel, anti
 def test_a_lift_refuses_compensation_for_other_kernels_before_it_reads_features(tmp_path):
     paths = write_scene(tmp_path, Kernel.BETA)
     with pytest.raises(InvalidSettings, match="3D Gaussians"):
-        lift(paths[0], paths[1], [tmp_path / "missing.safetensors"], LiftSettings.of(antialiased=True))
+        lift_files(paths[0], paths[1], [tmp_path / "missing.safetensors"], LiftSettings.of(antialiased=True))
 
 
 def test_the_compensation_changes_the_lift_of_small_splats(tmp_path):
     paths = write_scene(tmp_path, Kernel.GAUSSIAN_3D)
-    plain, faded = (lift(paths[0], paths[1], [paths[2]], LiftSettings.of(antialiased=on)) for on in (False, True))
+    plain, faded = (
+        lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of(antialiased=on)) for on in (False, True)
+    )
     assert not torch.equal(plain.evidence, faded.evidence)
     assert float(faded.evidence.sum()) != float(plain.evidence.sum())

@@ -10,7 +10,7 @@ from liftcore.errors import InvalidFeatures, InvalidSettings
 from liftcore.features.pack import write_pack
 from liftcore.features.views import Regions
 from liftcore.io.cameras import read_cameras
-from liftcore.lift import lift
+from liftcore.io.lift_files import lift_files
 from liftcore.raster.reference import dense_view, reading_matrix, strided_rays
 from liftcore.settings import LiftSettings, Preset
 from liftcore.solve.accumulate import strided_walk
@@ -22,7 +22,7 @@ ROW_SUM = {"preset": "row-sum", "dtype": "float32"}
 
 
 def lifted(paths, **knobs):
-    return lift(paths[0], paths[1], [paths[2]], LiftSettings.of(**{**ROW_SUM, **knobs}))
+    return lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of(**{**ROW_SUM, **knobs}))
 
 
 @pytest.mark.parametrize("grids", [False, True])
@@ -67,7 +67,7 @@ def test_every_nth_view_is_lifted_from_the_first_on(tmp_path):
     got = lifted(paths, view_stride=2)
     assert got.metadata.views == ("v0", "v2")
     write_pack(tmp_path / "two.safetensors", {name: observed(4, int(name[1])) for name in ("v0", "v2")}, {})
-    two = lift(paths[0], paths[1], [tmp_path / "two.safetensors"], LiftSettings.of(**ROW_SUM))
+    two = lift_files(paths[0], paths[1], [tmp_path / "two.safetensors"], LiftSettings.of(**ROW_SUM))
     assert torch.equal(got.features, two.features)
 
 
@@ -87,7 +87,7 @@ def one_level(regions: Regions) -> Regions:
 def test_levels_lift_and_certify_as_the_maps_that_they_stand_for(tmp_path, levels, reference):
     paths = write_scene(tmp_path, 6)
     write_pack(tmp_path / "other.safetensors", {f"v{k}": reference(observed(6, k)) for k in range(3)}, {})
-    other = lift(paths[0], paths[1], [tmp_path / "other.safetensors"], LiftSettings.of(**ROW_SUM))
+    other = lift_files(paths[0], paths[1], [tmp_path / "other.safetensors"], LiftSettings.of(**ROW_SUM))
     got = lifted(paths, levels=levels)
     assert torch.equal(got.seen, other.seen)
     assert torch.allclose(got.features, other.features, atol=1e-5)
@@ -130,7 +130,7 @@ def test_knobs_out_of_range_are_refused_by_name(knob):
 )
 def test_the_number_of_threads_changes_no_bit_of_a_lift(tmp_path, knobs):
     paths = write_scene(tmp_path, 7)
-    runs = [lift(paths[0], paths[1], [paths[2]], LiftSettings.of(**knobs), threads=n) for n in (1, 3)]
+    runs = [lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of(**knobs), threads=n) for n in (1, 3)]
     assert torch.equal(runs[0].features, runs[1].features)
     assert torch.equal(runs[0].evidence, runs[1].evidence)
     assert runs[0].metadata.certificate == runs[1].metadata.certificate

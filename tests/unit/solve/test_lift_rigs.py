@@ -10,7 +10,7 @@ import torch
 from liftcore.features.pack import read_features, write_pack
 from liftcore.features.views import Regions
 from liftcore.io.lift_file import save_lift
-from liftcore.lift import lift
+from liftcore.io.lift_files import lift_files
 from liftcore.query.directions import directions
 from liftcore.query.example import Region
 from liftcore.query.query import Query
@@ -34,7 +34,7 @@ def repacked(features: Path, names: dict[str, str], out: Path) -> Path:
 def test_folders_before_the_names_of_views_change_no_bit(tmp_path: Path) -> None:
     splats, cameras, features = write_scene(tmp_path, 3)
     rig = repacked(features, {"v0": "camA/v0", "v1": "camA/v1", "v2": "camB/v2"}, tmp_path / "rig.safetensors")
-    plain, made = (lift(splats, cameras, [pack], SETTINGS) for pack in (features, rig))
+    plain, made = (lift_files(splats, cameras, [pack], SETTINGS) for pack in (features, rig))
     assert torch.equal(plain.features, made.features)
     assert made.metadata.views == plain.metadata.views == ("v0", "v1", "v2")
     assert made.metadata.certificate["warnings"] == plain.metadata.certificate["warnings"]
@@ -56,7 +56,7 @@ def test_the_warning_of_skipped_views_tells_how_a_rig_is_named(tmp_path: Path) -
         record["img_name"] = name
     cameras.write_text(json.dumps(records))
     short = repacked(features, {"v0": "0", "v1": "1"}, tmp_path / "short.safetensors")
-    made = lift(splats, cameras, [short], SETTINGS)
+    made = lift_files(splats, cameras, [short], SETTINGS)
     assert (made.metadata.views, made.metadata.certificate["views_without_camera"]) == (("camA/1",), ["0"])
     [warning] = [text for text in made.metadata.certificate["warnings"] if "skipped" in text]
     assert warning.endswith(

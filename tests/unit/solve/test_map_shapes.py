@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from liftcore.device import CPU
 from liftcore.features.pack import pair, read_features, write_pack
 from liftcore.features.views import FeatureGrid, Regions, ViewFeatures
 from liftcore.io.cameras import read_cameras
 from liftcore.io.inspect import inspect_file
-from liftcore.lift import lift, open_sources, planned
+from liftcore.io.lift_files import lift_files, open_files
+from liftcore.lifting import plan
 from liftcore.scene.cameras import Camera
 from liftcore.settings import LiftSettings
 from liftcore.solve.map_shapes import shape_warnings
@@ -60,9 +60,9 @@ def test_a_crop_is_told_by_the_lift_and_by_its_plan(tmp_path: Path) -> None:
     splats, cameras, _ = write_scene(tmp_path, 3)
     pack, settings = tmp_path / "crops.safetensors", LiftSettings.of(certificate_rays=10)
     write_pack(pack, {"v0": grid(23, 31), "v1": grid(23, 23), "v2": grid(23, 23)}, {"encoder": "e"})
-    [planned_for] = planned(open_sources(splats, cameras, [pack], settings), settings, CPU).told
+    [planned_for] = plan(*open_files(splats, cameras, [pack], settings), settings).told
     assert planned_for.startswith("2 of 3 views have maps of another aspect than their images (v1: 23x23 for 37x27)")
-    warnings = lift(splats, cameras, [pack], settings).metadata.certificate["warnings"]
+    warnings = lift_files(splats, cameras, [pack], settings).metadata.certificate["warnings"]
     assert warnings.count(planned_for) == 1
 
 
@@ -90,7 +90,7 @@ def test_turned_labels_are_told_by_the_lift(tmp_path: Path) -> None:
     splats, cameras, _ = write_scene(tmp_path, 3)
     labels = Regions(torch.zeros(1, 32, 24, dtype=torch.int32), torch.ones(1, 4))
     write_pack(tmp_path / "turned.safetensors", {"v0": labels}, {"encoder": "e"})
-    made = lift(splats, cameras, [tmp_path / "turned.safetensors"], LiftSettings.of(certificate_rays=10))
+    made = lift_files(splats, cameras, [tmp_path / "turned.safetensors"], LiftSettings.of(certificate_rays=10))
     assert any(
         "another shape than their images (v0: 24x32 for" in one for one in made.metadata.certificate["warnings"]
     )

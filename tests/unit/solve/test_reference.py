@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from liftcore.lift import lift
+from liftcore.io.lift_files import lift_files
 from liftcore.progress import silent
 from liftcore.raster.base import CompositingParams
 from liftcore.scene.splats import Splats
@@ -135,12 +135,12 @@ def test_the_reference_of_the_optimum_is_itself():
 
 def test_the_certificate_shows_the_reference_only_when_asked(tmp_path):
     paths = write_scene(tmp_path, 9)
-    plain = lift(paths[0], paths[1], [paths[2]], LiftSettings.of(preset="row-sum")).metadata.certificate
+    plain = lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of(preset="row-sum")).metadata.certificate
     assert "reference" not in plain
     asked = LiftSettings.of(preset="row-sum", reference_channels=3)
-    told = lift(paths[0], paths[1], [paths[2]], asked).metadata.certificate["reference"]
+    told = lift_files(paths[0], paths[1], [paths[2]], asked).metadata.certificate["reference"]
     assert told["ratio"] >= 1.0
     assert told["beta"]["max"] + 1 == told["bound"]
     assert f"{told['ratio']:.3f}" in told["message"]
-    again = lift(paths[0], paths[1], [paths[2]], asked).metadata.certificate["reference"]
+    again = lift_files(paths[0], paths[1], [paths[2]], asked).metadata.certificate["reference"]
     assert told == again

@@ -11,7 +11,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from liftcore.lift import lift
+from liftcore.io.lift_files import lift_files
 from liftcore.progress import silent
 from liftcore.raster.base import RegionWeights
 from liftcore.settings import LiftSettings
@@ -278,7 +278,8 @@ def test_nothing_changes_where_no_vector_has_a_direction(value):
 def test_a_robust_lift_keeps_what_is_seen_and_how_much(tmp_path):
     paths = write_scene(tmp_path, 9)
     plain, robust = (
-        lift(paths[0], paths[1], [paths[2]], LiftSettings.of(robust_steps=steps, dtype="float32")) for steps in (0, 1)
+        lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of(robust_steps=steps, dtype="float32"))
+        for steps in (0, 1)
     )
     assert torch.equal(plain.seen, robust.seen)
     assert torch.equal(plain.evidence, robust.evidence)

@@ -19,7 +19,7 @@ import numpy as np
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from liftcore.plan.visibility import Visibility
+    from liftcore.planning.visibility import Visibility
 
 ORDER_SPLATS = 4_096  # at most: 300 views are in order after .3 s, where 16,384 take 1 s
 SIDES = 24  # directions that a splat is looked at from: the three of each octant

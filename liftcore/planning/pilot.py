@@ -23,7 +23,7 @@ areas. Vectors are compared in PILOT_CHANNELS random projections.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -31,7 +31,7 @@ import torch
 from torch.nn.functional import embedding_bag
 
 from liftcore.one_thread import one_thread
-from liftcore.plan.visibility import spread
+from liftcore.planning.visibility import spread
 from liftcore.progress import silent
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.solve.accumulate import accumulate
@@ -44,12 +44,11 @@ if TYPE_CHECKING:
 
     from torch import Tensor
 
-    from liftcore.features.pack import FeaturePacks
-    from liftcore.plan.visibility import Visibility
+    from liftcore.planning.visibility import Visibility
     from liftcore.raster.base import RegionWeights
-    from liftcore.scene.cameras import Cameras
     from liftcore.scene.splats import Splats
     from liftcore.settings import LiftSettings
+    from liftcore.solve.views import LiftViews
 
 PILOT_SIDE = 160  # pixels of an image's longer side, about
 PILOT_CHANNELS = 64
@@ -86,26 +85,20 @@ class Pilot:
 
 
 def fly_pilot(
-    splats: Splats,
-    cameras: Cameras,
-    packs: FeaturePacks,
-    names: Sequence[str],
-    settings: LiftSettings,
-    seen: Visibility,
-    threads: int | None = None,
+    splats: Splats, views: LiftViews, settings: LiftSettings, seen: Visibility, threads: int | None = None
 ) -> Pilot:
-    """CompositingParams evenly spaced views of ``names``, of which ``seen`` tells, two at least."""
-    total, count = len(names), min(PILOT_VIEWS, len(names))
+    """Weigh evenly spaced views of those of which ``seen`` tells, two at least."""
+    total, count = len(views.names), min(PILOT_VIEWS, len(views.names))
     flown: list[int] = spread(total, count).tolist()
-    chosen = [names[view] for view in flown]
-    longest = max(max(camera.width, camera.height) for camera in (cameras[view] for view in chosen))
+    chosen = replace(views, names=[views.names[view] for view in flown])
+    longest = max(max(chosen.camera(k).width, chosen.camera(k).height) for k in range(count))
     coarse = {"stride": max(1, longest // PILOT_SIDE), "certificate_rays": 0, "robust_steps": 0}
     own = settings.model_copy(update=coarse)
-    axes = random_axes(packs.channels, min(PILOT_CHANNELS, packs.channels), settings.seed)
+    channels = views.features.channels
+    axes = random_axes(channels, min(PILOT_CHANNELS, channels), settings.seed)
     said = _Said(spread(splats.count, seen.areas.shape[1]), splats.count, axes.shape[1])
     with WeightStore() as store, one_thread():
-        raster = CpuRaster(splats, threads)
-        geometry = accumulate(raster, (splats.count, cameras), packs, chosen, own, store, silent)
+        geometry = accumulate(CpuRaster(splats, threads), splats.count, chosen, own, store, silent)
         for weights, columns in zip(store, geometry.columns, strict=True):
             said.add(weights, columns.means(columns.codebook.float() @ axes))
     evidence = _evidence(geometry.evidence[said.rows], seen.areas, seen.areas[flown])

@@ -1,0 +1,72 @@
+"""A lift of files: they are read, lifted as values, and remembered with their digests."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from liftcore.errors import InvalidFeatures
+from liftcore.features.pack import Views, read_features
+from liftcore.io.cameras import read_cameras
+from liftcore.io.input_files import input_files
+from liftcore.io.ply import read_splats
+from liftcore.lifting import lift
+from liftcore.planning.plan import Plan
+from liftcore.progress import Progress, Timings
+from liftcore.raster.base import check_antialiased
+from liftcore.result import LiftResult
+from liftcore.scene.cameras import Cameras
+from liftcore.scene.splats import Splats
+from liftcore.settings import LiftSettings
+from liftcore.solve.checkpoint import Checkpoint
+
+
+def lift_files(
+    splats: Path | str,
+    cameras: Path | str,
+    features: Sequence[Path | str],
+    settings: LiftSettings,
+    *,
+    threads: int | None = None,
+    progress: Progress | None = None,
+    on_plan: Callable[[Plan], None] | None = None,
+    checkpoint: Checkpoint | None = None,
+) -> LiftResult:
+    """Lift the features of packs onto the splats of a file, as `liftcore.lift` does.
+
+    Args:
+        splats: a PLY of any dialect. cameras: COLMAP, transforms.json or cameras.json. features: feature packs.
+
+    Raises:
+        InvalidInput: a file is malformed, or the packs do not fit the cameras.
+    """
+    paths = Path(splats), Path(cameras), _checked(features)
+    timings = Timings(progress)
+    with timings.step("read"):
+        sources = open_files(*paths, settings)
+    with timings.step("digest"):
+        inputs = input_files(*paths)
+    made = lift(*sources, settings, threads=threads, progress=progress, on_plan=on_plan, checkpoint=checkpoint)
+    own = {"splats": inputs[0], "cameras": inputs[1], "features": tuple(inputs[2:])}
+    own["timings"] = timings.seconds | made.metadata.timings
+    return replace(made, metadata=made.metadata.model_copy(update=own))
+
+
+def open_files(
+    splats: Path, cameras: Path, features: Sequence[Path | str], settings: LiftSettings
+) -> tuple[Splats, Cameras, Views]:
+    """What a lift with these settings takes: splats without their colours, cameras, and packs whose headers are read.
+
+    Raises:
+        InvalidInput: a file is malformed.
+    """
+    scene = read_splats(splats, settings.kernel, colour=False)
+    check_antialiased(scene.kernel, settings.antialiased)
+    return scene, read_cameras(cameras), read_features(*_checked(features))
+
+
+def _checked(features: Sequence[Path | str]) -> list[Path]:
+    if isinstance(features, str | Path):  # a text is a sequence too, of letters
+        raise InvalidFeatures("features", expected="a list of feature packs", got=f"{str(features)!r} alone")
+    return [Path(pack) for pack in features]

@@ -1,0 +1,55 @@
+"""A alone, for whoever needs more than a lift: region weights ``A^T S`` and renders ``A X``."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from liftcore.device import choose_device
+from liftcore.errors import InvalidSettings
+from liftcore.raster import open_raster
+from liftcore.raster.base import CompositingParams, check_antialiased
+from liftcore.scene.cameras import Camera
+from liftcore.scene.splats import Splats
+
+DEFAULT = CompositingParams()
+
+
+def render(
+    splats: Splats,
+    camera: Camera,
+    values: Tensor | np.ndarray,
+    params: CompositingParams = DEFAULT,
+    *,
+    normalise: bool = False,
+    device: str = "auto",
+    threads: int | None = None,
+) -> Tensor:
+    """Composite values on splats front to back, as a rasterizer does colours: ``A X``.
+
+    Args:
+        values: [P] or [P, F] of any numbers or booleans, a row a splat, in the splats' order.
+        params: how rays meet splats. The scale of the opacity logits is 1; the background is zero.
+        normalise: whether pixels are divided by the sum of their weights, where that is not zero.
+        device: ``auto``, ``cpu`` or ``cuda``. threads: of the CPU; the number changes no bit.
+
+    Returns:
+        [H, W] or [H, W, F] f32, on the CPU.
+
+    Raises:
+        InvalidSettings: values have another number of rows than there are splats.
+        Unavailable: there is no such device.
+    """
+    given = torch.as_tensor(values).detach().cpu()
+    if given.ndim not in (1, 2) or given.shape[0] != splats.count:
+        expected = f"[{splats.count}] or [{splats.count}, F], a row a splat"
+        raise InvalidSettings("values", expected=expected, got=str(list(given.shape)))
+    check_antialiased(splats.kernel, params.antialiased)
+    raster = open_raster(splats, choose_device(device), threads)
+    rows = given.float()[:, None] if given.ndim == 1 else given.float()
+    image = raster.render(camera, rows, params)
+    if normalise:
+        sums = raster.row_sums(camera, params)[:, :, None]
+        image = torch.where(sums > 0, image / sums.clamp_min(torch.finfo(torch.float32).tiny), 0.0)
+    return (image[:, :, 0] if given.ndim == 1 else image).cpu()

@@ -1,0 +1,80 @@
+"""What a lift gives: features on splats, what supports them, and how they were made."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pydantic import BaseModel, ConfigDict
+
+from liftcore.settings import LiftSettings
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+FORMAT = "splatlift-lift/1"
+
+
+class InputFile(BaseModel):
+    """Where an input was, and what it was."""
+
+    model_config = ConfigDict(frozen=True)
+
+    path: str  # absolute, at lift time; empty for values that came from no file
+    sha256: str  # of the file's bytes; of the sorted (name, digest) lines for a folder
+
+
+NO_FILE = InputFile(path="", sha256="")
+
+
+class LiftMetadata(BaseModel):
+    """What a lift remembers of how it was made."""
+
+    model_config = ConfigDict(frozen=True)
+
+    format: str = FORMAT
+    version: str
+    settings: LiftSettings
+    splats: InputFile = NO_FILE
+    cameras: InputFile = NO_FILE
+    features: tuple[InputFile, ...] = ()
+    encoder: str = ""  # the 2D encoder's name as the pack tells it; "" when unknown
+    text_space: str = ""  # the text encoder that shares the space; "" or "none" when there is none
+    views: tuple[str, ...]  # the views that were lifted
+    certificate: dict[str, Any]
+    timings: dict[str, float]  # seconds a stage
+
+
+@dataclass(frozen=True)
+class LiftResult:
+    """X and what supports it, one row a splat, in the splats' order."""
+
+    features: Tensor  # [P, F] f16 or f32; zero rows where not seen
+    evidence: Tensor  # [P] f32, sum of plain weights w over the feature views, each ray once
+    agreement: Tensor  # [P] f32 in 0..1, norm of the weighted mean of unit regions, or of unit cells of grids
+    seen: Tensor  # [P] bool, whether any labelled ray reached the splat
+    metadata: LiftMetadata
+    cluster: Tensor | None = None  # [P] i32, -1 = in no cluster; None without aggregation
+    cluster_features: Tensor | None = None  # [K, F] like features; a zero row: its splats keep their own
+
+    @property
+    def settings(self) -> LiftSettings:
+        """What the lift was made with."""
+        return self.metadata.settings
+
+    @property
+    def views(self) -> tuple[str, ...]:
+        """The names of the views that were lifted, in the order of the sums."""
+        return self.metadata.views
+
+    @property
+    def diagnostics(self) -> dict[str, Any]:
+        """What the lift measured of itself (residual, bound, row sums, warnings, plan), as plain numbers."""
+        return self.metadata.certificate
+
+    def save(self, path: Path | str) -> None:
+        """Write a lift file (`liftcore.io.lift_file`), whole or not at all."""
+        from liftcore.io.lift_file import save_lift
+
+        save_lift(self, path)

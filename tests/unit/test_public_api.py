@@ -1,0 +1,113 @@
+"""``import liftcore as lc``: its list, what it loads, and lifts of values in memory."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+import liftcore as lc
+from liftcore.io.lift_files import lift_files
+from tests.unit.solve.test_lift_equals_dense import observed, write_scene
+
+PUBLIC = """
+    Camera Cameras FeatureGrid InvalidCameras InvalidFeatures InvalidInput InvalidLift InvalidQuery InvalidSettings
+    InvalidSplats LiftResult LiftSettings NotFound Plan RegionWeights Regions Splats SplatliftError Unavailable lift
+    load_lift plan read_cameras read_features read_splats render
+"""
+
+
+@pytest.fixture
+def scene(tmp_path):
+    """The paths of a scene of three views, and its values."""
+    paths = write_scene(tmp_path, 3)
+    return paths, lc.read_splats(paths[0]), lc.read_cameras(paths[1]), {f"v{k}": observed(3, k) for k in range(3)}
+
+
+def as_numpy(view):
+    if isinstance(view, lc.Regions):
+        return lc.Regions(view.labels.numpy(), view.codebook.numpy())
+    return lc.FeatureGrid(view.grid.numpy())
+
+
+def test_public_names_are_these_and_all_load():
+    assert sorted(lc.__all__) == sorted(PUBLIC.split())
+    assert all(getattr(lc, name) is not None for name in lc.__all__)
+
+
+def test_import_loads_neither_torch_nor_numba():
+    code = (
+        "import sys, json, liftcore; print(json.dumps([m for m in ('torch', 'numba', 'numpy') if m in sys.modules]))"
+    )
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert json.loads(told) == []
+
+
+@pytest.mark.parametrize("given", ["dict", "numpy", "iterator", "pack"])
+def test_lift_of_values_has_the_bits_of_the_lift_of_files(scene, given):
+    (splats, cameras, pack), *values, views = scene
+    forms = {
+        "dict": lambda: views,
+        "numpy": lambda: {name: as_numpy(view) for name, view in views.items()},
+        "iterator": lambda: iter(views.items()),
+        "pack": lambda: lc.read_features(pack),
+    }
+    expected = lift_files(splats, cameras, [pack], lc.LiftSettings.of(preset="row-sum"))
+    found = lc.lift(*values, forms[given](), preset="row-sum")
+    for name in ("features", "evidence", "agreement", "seen"):
+        assert torch.equal(getattr(found, name), getattr(expected, name))
+    assert found.views == expected.views == ("v0", "v1", "v2")
+    assert found.diagnostics["residual"] == pytest.approx(expected.diagnostics["residual"], rel=0.5)
+
+
+def test_iterator_is_taken_one_view_at_a_time_and_once(scene):
+    _, splats, cameras, views = scene
+    taken = []
+
+    def each():
+        for name, view in views.items():
+            taken.append(name)
+            yield name, view
+        yield "nobody", views["v0"]
+
+    found = lc.lift(splats, cameras, each())
+    assert taken == list(views)
+    assert found.diagnostics["views_without_camera"] == ["nobody"]
+
+
+def test_saved_result_opens_as_it_was(scene, tmp_path):
+    _, splats, cameras, views = scene
+    made = lc.lift(splats, cameras, views, robust_steps=1)
+    made.save(tmp_path / "made.safetensors")
+    back = lc.load_lift(tmp_path / "made.safetensors")
+    assert torch.equal(made.features, back.features) and back.settings == made.settings
+    assert made.settings.robust_steps == 1
+
+
+def test_plan_chooses_what_the_lift_takes(scene):
+    _, splats, cameras, views = scene
+    plan = lc.plan(splats, cameras, views, coverage=1)
+    made = lc.lift(splats, cameras, views, coverage=1)
+    assert made.views == plan.views and len(plan.views) + len(plan.left_out) == 3
+
+
+def test_view_of_another_kind_is_refused_by_name(scene):
+    _, splats, cameras, _ = scene
+    with pytest.raises(lc.InvalidFeatures, match="Regions or FeatureGrid") as told:
+        lc.lift(splats, cameras, {"v0": torch.ones(2, 2, 4)})
+    assert "v0" in told.value.argument
+
+
+def test_render_composites_numbers_of_splats(scene):
+    _, splats, cameras, _ = scene
+    camera = cameras["v0"]
+    ones = lc.render(splats, camera, np.ones(splats.count))
+    both = lc.render(splats, camera, torch.ones(splats.count, 2) * torch.tensor([1.0, 3.0]))
+    assert ones.shape == (camera.height, camera.width) and both.shape == (camera.height, camera.width, 2)
+    assert torch.allclose(both[:, :, 1], 3 * ones, atol=1e-6)
+    share = lc.render(splats, camera, torch.ones(splats.count), normalise=True)
+    assert torch.allclose(share[ones > 0], torch.ones(()), atol=1e-6)
+    with pytest.raises(lc.InvalidSettings, match="a row a splat"):
+        lc.render(splats, camera, torch.ones(splats.count + 1))
