@@ -50,16 +50,6 @@ def test_undistorted_model_of_colmap_is_found(place: str, packed: bool, tmp_path
     assert other_models(path) == ["distorted/sparse/0"]
 
 
-@pytest.mark.parametrize("packed", [False, True])
-def test_sparse_0_comes_first_in_folders_and_zips(packed: bool, tmp_path: Path) -> None:
-    scene = tmp_path / "scene"
-    write_files(scene / "sparse/0", text_files())
-    write_files(scene / "dense/sparse", binary_files(DISTORTED))
-    path = tmp_path / shutil.make_archive(str(scene), "zip", scene) if packed else scene
-    assert len(names(path)) == 3
-    assert inspect_file(path)["warnings"] == ["1 more COLMAP models were not read: dense/sparse"]
-
-
 def one_view(place: str) -> dict[str, bytes]:
     """A model of one image, named after where it lies."""
     return binary_files(images=[(*IMAGES[0][:3], f"{place.replace('/', '-').replace('.', 'here')}.jpg")])
@@ -163,12 +153,6 @@ def test_hidden_and_broken_models_are_not_told(tmp_path: Path) -> None:
     assert other_models(tmp_path) == []
 
 
-def test_half_a_model_is_inspected_with_a_clear_word(tmp_path: Path) -> None:
-    folder = write_files(tmp_path / "model", {"cameras.bin": binary_files()["cameras.bin"]})
-    with pytest.raises(InvalidCameras, match=r"the file images\.bin"):
-        inspect_file(folder)
-
-
 def test_folder_without_a_usual_name_says_what_can_be_named(tmp_path: Path) -> None:
     (tmp_path / "transforms_train.json").write_text("{}")
     with pytest.raises(InvalidCameras, match=r"name what is meant, such as .*transforms_train\.json"):
@@ -245,14 +229,6 @@ def test_what_is_wrong_with_a_view_of_a_model_names_the_model(tmp_path: Path) ->
     folder = write_files(tmp_path / "model", binary_files(images=images))
     with pytest.raises(InvalidCameras, match=r"model cameras: expected one view a name, got 'a' twice; .*train/r_0"):
         read_cameras(folder)
-
-
-def test_fisheyes_of_new_colmap_are_read(tmp_path: Path) -> None:
-    for number, parameters in ((14, (500.0, 320.0, 240.0)), (15, (500.0, 500.0, 320.0, 240.0))):
-        files = binary_files({**CAMERAS, 1: (number, "", parameters)})
-        assert len(read_cameras(write_files(tmp_path / str(number), files)).distorted) == 2
-    with pytest.raises(InvalidCameras, match=r"expected a camera of .*FISHEYE, got EUCM; undistort"):
-        read_cameras(write_files(tmp_path / "other", binary_files({**CAMERAS, 1: (16, "", (1.0,) * 6)})))
 
 
 def test_distortion_that_is_no_number_is_told(tmp_path: Path) -> None:

@@ -98,37 +98,12 @@ def test_what_a_lens_cannot_show_has_no_way_back() -> None:
     assert np.isnan(straight(folding, np.array([[0.5, 0.0]]))).all()
     assert folding.reach(0.6) == pytest.approx(1 / math.sqrt(3), rel=0.003)
     assert folding.reach(0.5) == math.inf
+    assert Brown(p2=0.1).reach(3.0) == pytest.approx(1 / 0.6, rel=0.01)  # x + 0.3 x^2 on the axis, to one side
+    assert Brown(k4=-1.0).reach(2.0) == pytest.approx(1.0, rel=0.01)  # at a pole
     assert Fisheye(k1=-0.5).reach(2.0) == pytest.approx(math.tan(math.sqrt(2 / 3)), rel=0.005)  # 1 = 1.5 angle^2
-
-
-def test_tangential_distortion_turns_back_on_one_side() -> None:
-    lens = Brown(p2=0.1)  # x + 0.3 x^2 on the axis
-    assert lens.reach(3.0) == pytest.approx(1 / 0.6, rel=0.01)
-
-
-def test_a_pole_is_no_way_forth() -> None:
-    assert Brown(k4=-1.0).reach(2.0) == pytest.approx(1.0, rel=0.01)
 
 
 def test_a_fisheye_sees_what_no_pinhole_does_far_out() -> None:
     equidistant = Fisheye()
     behind = straight(equidistant, np.array([[2.0, 0.0], [0.0, -1.8], [0.0, 0.0]]))  # 115 and 103 degrees off
     assert behind.tolist() == [[FARTHEST, 0.0], [0.0, -FARTHEST], [0.0, 0.0]]
-
-
-@pytest.mark.parametrize("lens", [RATIONAL, Brown(k1=0.3, k2=-0.2, k3=0.1, p1=-0.02, p2=0.03), Brown(k6=0.4, k5=0.1)])
-def test_slopes_are_the_derivatives_of_a_perspective_lens(lens: Brown) -> None:
-    step, (x, y) = 1e-6, POINTS.T
-    by_x = [(a - b) / (2 * step) for a, b in zip(lens.bent(x + step, y), lens.bent(x - step, y), strict=True)]
-    by_y = [(a - b) / (2 * step) for a, b in zip(lens.bent(x, y + step), lens.bent(x, y - step), strict=True)]
-    slopes = lens._slopes(x, y)
-    for slope, difference in zip(slopes, (by_x[0], by_x[1], by_y[1]), strict=True):
-        assert slope == pytest.approx(difference, abs=1e-8)
-    assert by_y[0] == pytest.approx(by_x[1], abs=1e-8)
-
-
-def test_slopes_are_the_derivatives_of_a_fisheye() -> None:
-    angles, step = np.linspace(0.1, 1.4, 9), 1e-6
-    for lens in (WIDE, Fisheye(k4=0.2)):
-        difference = (lens._bent(angles + step)[0] - lens._bent(angles - step)[0]) / (2 * step)
-        assert lens._bent(angles)[1] == pytest.approx(difference, abs=1e-7)

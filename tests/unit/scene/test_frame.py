@@ -21,7 +21,7 @@ from liftcore.io.cameras import read_cameras
 from liftcore.io.input_files import camera_input
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.inspect_scene import inspect_file
-from liftcore.io.transforms import FRAME_FILE, Similarity
+from liftcore.io.transforms import FRAME_FILE
 from liftcore.scene.cameras import Camera, Cameras
 
 APPLIED = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])  # of nerfstudio's converter
@@ -128,18 +128,6 @@ def test_zip_of_the_two_files_is_read(flat: bool, run: Path, expected: Cameras, 
     assert inspect_file(path)["warnings"] == []
 
 
-def test_pixels_show_what_they_showed(model: Path) -> None:
-    rng = np.random.default_rng(0)
-    points = np.concatenate([rng.normal(size=(50, 3)), np.ones((50, 1))], axis=1)
-    matrix = np.eye(4)
-    matrix[:3] = 2.5 * oriented()[:3]
-    moved = points @ matrix.T
-    cameras = read_cameras(model)
-    shifted = Similarity.of(matrix, "here").moved(cameras)
-    for before, after in zip(cameras.values(), shifted.values(), strict=True):
-        assert np.allclose((moved @ after.viewmat.T)[:, :3], 2.5 * (points @ before.viewmat.T)[:, :3])
-
-
 def test_transform_of_gsplat_holds_its_scale(run: Path, expected: Cameras, model: Path, tmp_path: Path) -> None:
     """Its ``Parser.transform`` written in nerfstudio's layout, as README has it."""
     transform = oriented() @ APPLIED
@@ -218,12 +206,6 @@ def test_zip_of_several_runs_is_refused(name: str, run: Path) -> None:
     path = Path(shutil.make_archive(str(run), "zip", run))
     with pytest.raises(InvalidCameras, match=rf"expected one {name}, got {name} and other/{name}; zip those of one"):
         read_cameras(path)
-
-
-def test_folder_with_the_frame_alone_has_no_cameras(run: Path) -> None:
-    (run / "transforms.json").unlink()
-    with pytest.raises(InvalidCameras, match="got a folder without any of them"):
-        read_cameras(run)
 
 
 def test_the_frame_is_told_and_counts(run: Path, model: Path, tmp_path: Path) -> None:

@@ -47,15 +47,6 @@ def test_rows_are_kept_over_blocks_and_in_their_own_types(tmp_path: Path) -> Non
     assert copy.tobytes() == rows_of(path.read_bytes())[kept].tobytes()
 
 
-def test_carriage_returns_survive_in_a_copy(tmp_path: Path) -> None:
-    head, rows = ply_bytes(INRIA).split(b"end_header\n", maxsplit=1)
-    path = with_ply(tmp_path, (head + b"end_header\n").replace(b"\n", b"\r\n") + rows)
-    copy = b"".join(some_rows(path, np.arange(5) < 2))
-    assert copy.count(b"\r\n") == head.count(b"\n") + 1
-    (tmp_path / "copy.ply").write_bytes(copy)
-    assert read_splats(tmp_path / "copy.ply").count == 2
-
-
 def test_elements_behind_the_vertices_are_no_rows_of_a_copy(tmp_path: Path) -> None:
     plain = ply_bytes(INRIA)
     others = b"element version 200\nproperty uchar number\n"  # as many bytes as two splats and more
@@ -81,15 +72,6 @@ def test_colours_of_every_dialect_are_the_same_from_everywhere(dialect: str, tmp
         assert name.startswith(coloured) or before[name].tobytes() == after[name].tobytes(), name
     directions = [name for name in names if name in {f"sb_params_{i}" for i in range(6, 12)}]
     assert all(before[name].tobytes() == after[name].tobytes() for name in directions)
-
-
-def test_columns_beside_the_colours_keep_their_types(tmp_path: Path) -> None:
-    path = with_ply(tmp_path, ply_bytes(DOUBLES, types=TYPES))
-    copy = rows_of(b"".join(recoloured(path, np.full((5, 3), 0.25, np.float32))))
-    assert copy.dtype == rows_of(path.read_bytes()).dtype
-    assert (copy["f_dc_1"] == 0.25).all()
-    assert not copy["f_rest_44"].any()
-    assert copy["time"].tobytes() == rows_of(path.read_bytes())["time"].tobytes()
 
 
 def test_a_file_without_colours_or_with_another_count_is_refused(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""How views are named in all formats, how many there may be, and what is said of a name that none has."""
+"""How views are named in all formats, how they pair with features, and what is said of a name that none has."""
 
 from __future__ import annotations
 
@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 from camera_documents import transforms_of, with_json
 from colmap_files import CAMERAS, IMAGES, binary_files, text_files, write_files
-from rapidfuzz import process
 
 from liftcore.errors import InvalidCameras, NotFound
 from liftcore.io.cameras import read_cameras
 from liftcore.io.inria import write_inria_cameras
 from liftcore.scene.cameras import Camera, Cameras
-from liftcore.scene.views import view_names
+from liftcore.scene.views import cameras_of_views, view_names
 
 
 @pytest.fixture
@@ -67,15 +66,11 @@ def test_a_view_is_found_by_its_last_part_where_that_is_clear() -> None:
             cameras[unclear]
 
 
-def test_neighbours_of_a_long_name_are_sought_among_few(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_long_unknown_name_gets_a_short_answer() -> None:
     pose = np.eye(4)
-    far = [Camera.pinhole(f"{k:06}" + "x" * 300, 4, 4, 5.0, 5.0, 2.0, 2.0, pose) for k in range(20_000)]
-    cameras = Cameras(tuple(far))
-    compared = []
-    monkeypatch.setattr(process, "extract", lambda text, cut, **_: compared.extend([text, *cut]) or [])
+    far = [Camera.pinhole(f"{k:06}" + "x" * 300, 4, 4, 5.0, 5.0, 2.0, 2.0, pose) for k in range(20)]
     with pytest.raises(NotFound, match="nearest:") as caught:
-        cameras["000001" + "y" * 494]
-    assert len(compared) == 2001 and max(map(len, compared)) == 80
+        Cameras(far)["000001" + "y" * 494]
     assert len(str(caught.value)) < 500
 
 
@@ -84,7 +79,6 @@ def test_more_views_than_a_scene_may_have_are_refused_before_they_are_read(
     kind: str, tmp_path: Path, model: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("liftcore.scene.cameras.MAX_VIEWS", 2)
-    monkeypatch.setattr("liftcore.io.colmap._camera", None)
     path = write_files(tmp_path / "many", (text_files if kind == "text" else binary_files)())
     if kind == "binary":
         announced = struct.pack("<Q", 3) + b"\0" * 3 * 73  # nothing that could be read
@@ -102,3 +96,25 @@ def test_announced_bombs_of_empty_images_are_refused(tmp_path: Path) -> None:
     path = write_files(tmp_path / "bomb", {**binary_files(), "images.bin": images})
     with pytest.raises(InvalidCameras, match=r"images\.bin: expected at most 100000 views, got 300000 or more"):
         read_cameras(path)
+
+
+@pytest.mark.parametrize(
+    ("views", "cameras", "pairs"),
+    [
+        (["a", "b"], ["b", "c"], {"b": "b"}),
+        (["camA/0", "camB/1"], ["0", "1"], {"camA/0": "0", "camB/1": "1"}),  # the scene's names were all unique
+        (["0", "1"], ["camA/0", "camA/1", "camB/0"], {"1": "camA/1"}),  # nobody knows which 0 is meant
+        (["camA/0", "camB/0"], ["0"], {}),
+        (["0", "camA/0"], ["0"], {"0": "0"}),  # the same name comes first
+        (["camA/0"], ["images/camA/0"], {"camA/0": "images/camA/0"}),
+        (["images/camA/0"], ["camA/0"], {"images/camA/0": "camA/0"}),
+        (["train/0"], ["test/0"], {}),  # folders that disagree are other photos
+        (["A/0"], ["camA/0"], {}),  # whole folders only
+    ],
+)
+def test_names_pair_as_they_are_or_by_their_last_part_where_it_is_one_of_a_kind(
+    views: list[str], cameras: list[str], pairs: dict[str, str]
+) -> None:
+    assert cameras_of_views(views, cameras) == pairs
+    back = {camera: view for view, camera in pairs.items()}
+    assert cameras_of_views(cameras, views) == back
