@@ -36,8 +36,7 @@ def add_arguments(parser: Parser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Write the pack whole or not at all, and say what is in it."""
     from liftcore.features.encoders import open_image_encoder
-    from liftcore.features.encoders.encode import EncodeSettings, encode_images
-    from liftcore.features.encoders.images import find_images
+    from liftcore.features.encoders.encode import EncodeSettings, encode_images, find_images
 
     images = find_images(options.images)
     out = free_output(options.output, list(images.values()))

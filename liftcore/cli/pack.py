@@ -12,7 +12,7 @@ from liftcore.cli.reply import folders_of, free_output, progress_bars, reply, sh
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from liftcore.features.folder import ViewFolder
+    from liftcore.io.npy import ViewFolder
 
 
 LARGEST_GREY = 65_535  # of a picture of 16 bits
@@ -106,10 +106,10 @@ def _views(options: argparse.Namespace) -> ViewFolder:
 
         return langsplat_views(options.folder)
     if options.format == "masks":
-        from liftcore.features.mask_folder import mask_views
+        from liftcore.features.masks import mask_views
 
         return mask_views(options.folder, options.unlabelled)
-    from liftcore.features.arrays import array_views
+    from liftcore.io.npy import array_views
 
     return array_views(options.folder, options.layout)
 

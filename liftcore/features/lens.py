@@ -1,22 +1,16 @@
 """What a camera's pinhole observes of a distorted photo: its maps, carried from the photo's pixels to its own."""
 
-from __future__ import annotations
-
+from collections.abc import Iterable
 from functools import lru_cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from liftcore.features.views import FeatureGrid, Regions, ViewFeatures
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from torch import Tensor
-
-    from liftcore.scene.cameras import Camera
-    from liftcore.scene.distortion import Lens
+from liftcore.scene.cameras import Camera
+from liftcore.scene.distortion import Lens
 
 BAND_VALUES = 1 << 22  # of a grid, carried at a time in float32
 BAND_PIXELS = 1 << 15  # whose rays are bent at a time: what that takes stays in the cache
@@ -59,7 +53,7 @@ def _labels(labels: Tensor, camera: Camera) -> Tensor:
 
 
 @lru_cache(maxsize=KEPT_PINHOLES)
-def _label_places(pinhole: _Pinhole, height: int, width: int) -> Tensor:
+def _label_places(pinhole: "_Pinhole", height: int, width: int) -> Tensor:
     """[H * W] i32, of a huge map i64: the place among the photo's labels [height, width] that each pixel reads."""
     places = np.empty((pinhole.height, pinhole.width), np.int32 if height * width < 1 << 31 else np.int64)
     band = max(1, BAND_PIXELS // pinhole.width)

@@ -10,7 +10,7 @@ import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import IO, Any, Protocol
+from typing import IO, Any, Protocol, cast
 
 import torch
 from torch import Tensor
@@ -154,7 +154,8 @@ def as_views(
         return views
     if not isinstance(views, Mapping):
         return _spooled(views, scratch)
-    sources = {name: _Given(views, name) for name in views}
+    given = cast("Mapping[str, ViewFeatures]", views)
+    sources = {name: _Given(given, name) for name in given}
     if not sources:
         raise InvalidFeatures("features", expected="at least one view", got="none")
     if isinstance(views, dict):  # other mappings may read files: theirs are checked one by one

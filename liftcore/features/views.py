@@ -5,7 +5,7 @@ read by bilinear interpolation, four rows a pixel.
 """
 
 import warnings
-from dataclasses import InitVar, dataclass
+from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
@@ -18,10 +18,11 @@ NO_LABEL = -1  # a pixel that a level leaves unlabelled
 LARGEST = 1e15  # of a feature; float32 sums of squares over all channels stay finite far beyond
 MAX_CHANNELS = 1 << 16
 INTEGERS = (torch.int32, torch.int16, torch.int64, torch.int8, torch.uint8)
+Array = Tensor | np.ndarray
 FLOATS = (torch.float16, torch.float32, torch.float64, torch.bfloat16)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False)
 class Regions:
     """Regions with one embedding each; every labelled level of a ray is a row of its own.
 
@@ -41,13 +42,11 @@ class Regions:
 
     labels: Tensor  # [L, h, w] i32
     codebook: Tensor  # [M, F] f16 or f32
-    where: InitVar[str] = ""
 
-    def __post_init__(self, where: str) -> None:
-        codebook = _features(self.codebook, "M, F", f"{where} codebook".strip())
-        labels = _labels(self.labels, len(codebook), f"{where} labels".strip())
-        object.__setattr__(self, "codebook", codebook)
-        object.__setattr__(self, "labels", labels)
+    def __init__(self, labels: Array, codebook: Array, *, where: str = "") -> None:
+        rows = _features(codebook, "M, F", f"{where} codebook".strip())
+        object.__setattr__(self, "codebook", rows)
+        object.__setattr__(self, "labels", _labels(labels, len(rows), f"{where} labels".strip()))
 
     @classmethod
     def unchecked(cls, labels: Tensor, codebook: Tensor) -> Self:
@@ -58,7 +57,7 @@ class Regions:
         return made
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False)
 class FeatureGrid:
     """A dense feature map, read bilinearly with half-pixel centres and clamped borders.
 
@@ -75,10 +74,9 @@ class FeatureGrid:
     """
 
     grid: Tensor  # [h, w, F] f16 or f32
-    where: InitVar[str] = ""
 
-    def __post_init__(self, where: str) -> None:
-        object.__setattr__(self, "grid", _features(self.grid, "h, w, F", f"{where} grid".strip()))
+    def __init__(self, grid: Array, *, where: str = "") -> None:
+        object.__setattr__(self, "grid", _features(grid, "h, w, F", f"{where} grid".strip()))
 
     @classmethod
     def unchecked(cls, grid: Tensor) -> Self:

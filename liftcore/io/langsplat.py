@@ -4,54 +4,34 @@
 ``IMG_f.npy`` [M, F]. Occam's LGS, OpenGaussian, LaGa and VALA write the same files.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from liftcore.errors import InvalidFeatures
-from liftcore.features.folder import ViewFolder, npy_files
-from liftcore.features.mask_ids import mask_ids
-from liftcore.features.mask_vectors import mask_vectors
+from liftcore.features.masks import mask_ids
 from liftcore.features.views import Regions
-from liftcore.io.npy import open_npy
+from liftcore.io.npy import ViewFolder, npy_files, open_npy, read_floats
 
-if TYPE_CHECKING:
-    from pathlib import Path
-
-
-class LangSplatViews(ViewFolder):
-    """The views of a LangSplat folder; ids and embeddings are checked when a view is read."""
-
-    @property
-    def inputs(self) -> list[Path]:
-        """All files that are read."""
-        return [*super().inputs, *map(_codebook_file, super().inputs)]
-
-    def read(self, view: str) -> Regions:
-        """The region map of one view.
-
-        Raises:
-            InvalidFeatures: a file is malformed, an id has no embedding, or an embedding is not finite.
-        """
-        labels_file = self.files[view]
-        codebook = mask_vectors(_codebook_file(labels_file))
-        labels = mask_ids(open_npy(labels_file), len(codebook), labels_file)
-        return Regions(labels, codebook, where=f"view {view!r}")
+LABELS, CODEBOOK = "_s.npy", "_f.npy"
 
 
-def langsplat_views(folder: Path) -> LangSplatViews:
-    """The views of a folder of ``IMG_s.npy`` and ``IMG_f.npy`` files, and of its sub-folders.
+def langsplat_views(folder: Path) -> ViewFolder[Regions]:
+    """The regions of a folder of ``IMG_s.npy`` and ``IMG_f.npy`` files, and of its sub-folders.
 
     Raises:
-        InvalidFeatures: the folder has no such files, or a map lacks its embeddings.
+        InvalidFeatures: the folder has no such files, or a map lacks its embeddings. Reading a view: a file is
+            malformed, an id has no embedding, or an embedding is not finite.
     """
-    files = npy_files(folder, "_s.npy")
-    for path in files.values():
-        if not _codebook_file(path).is_file():
-            expected = f"embeddings in {_codebook_file(path).name}"
-            raise InvalidFeatures(str(folder), expected=expected, got=f"{path.name} alone")
-    return LangSplatViews(files)
+    files = npy_files(folder, LABELS)
+    labels = {path.relative_to(folder).as_posix().removesuffix(LABELS): path for path in files}
+    codebooks = {view: path.with_name(path.name.removesuffix(LABELS) + CODEBOOK) for view, path in labels.items()}
+    for view, path in codebooks.items():
+        if not path.is_file():
+            got = f"{labels[view].name} alone"
+            raise InvalidFeatures(str(folder), expected=f"embeddings in {path.name}", got=got)
 
+    def read(view: str) -> Regions:
+        codebook = read_floats(codebooks[view], "M, F")
+        ids = mask_ids(open_npy(labels[view]), len(codebook), labels[view])
+        return Regions(ids, codebook, where=f"view {view!r}")
 
-def _codebook_file(labels_file: Path) -> Path:
-    return labels_file.with_name(labels_file.name.removesuffix("_s.npy") + "_f.npy")
+    return ViewFolder(labels, read, codebooks.values())

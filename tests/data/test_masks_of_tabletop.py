@@ -10,7 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
-from liftcore.features.mask_folder import mask_views
+from liftcore.features.masks import mask_views
 from liftcore.features.pack import read_features, write_pack
 from liftcore.features.views import Regions
 from liftcore.io.lift_files import lift_files

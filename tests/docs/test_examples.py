@@ -21,7 +21,7 @@ from pydantic import BaseModel
 
 from liftcore.cli import main
 from liftcore.features.pack import read_features
-from liftcore.features.rle import mask_of_runs, read_runs
+from liftcore.features.sam import mask_of_runs, read_runs
 from liftcore.io.ply import read_splats
 from service import wire
 from service.routes import assets, jobs, lifts, operations, queries, tradeoffs

@@ -1,15 +1,12 @@
 """Image encoders behind one protocol: photos in, grids of features out, a cell a patch."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
+
+import torch
+from torch import Tensor
 
 from liftcore.errors import InvalidInput, Unavailable
-
-if TYPE_CHECKING:
-    import torch
-    from torch import Tensor
 
 IMAGE_ENCODERS = (
     "maskclip:MODEL/TAG",
@@ -91,8 +88,6 @@ def open_image_encoder(spec: str, device: str = "cpu") -> ImageEncoder:
 
 
 def _device(name: str) -> torch.device:
-    import torch
-
     try:
         device = torch.device(name)
         torch.empty(0, device=device)

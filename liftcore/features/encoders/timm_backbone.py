@@ -1,28 +1,23 @@
 """Backbones of timm (DINO, DINOv2, ViT, ResNet and their kin): features that have no words."""
 
-from __future__ import annotations
-
 import sys
+from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import torch
+from torch import Tensor, nn
 
 from liftcore.errors import InvalidInput, Unavailable
 from liftcore.features.encoders import Pixels
-from liftcore.features.encoders.cell_shift import cell_shift, kept, shifted
 from liftcore.nearest import nearest
 from liftcore.query.encoders.open_clip_models import WEIGHT_SUFFIXES
 from liftcore.query.encoders.torchvision_ops import import_torchvision
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from torch import Tensor
-
 # What checkpoints hold beside the backbone: classifiers, and what only the training needed.
 _LEFT_OVER = ("mask_token",)
 _PROBE = (2, 3)  # rows and columns of the grid that a new encoder must give
+_STRIDED = (nn.Conv2d, nn.MaxPool2d, nn.AvgPool2d)
 
 
 class TimmEncoder:
@@ -63,7 +58,18 @@ class TimmEncoder:
             images = images.to(self._device)
             if self._shift == 0:
                 return self._cells(images)
-            return kept(self._cells(shifted(images, self._shift, self.pixels.patch)), self._shift).contiguous()
+            return self._shifted_cells(images)
+
+    def _shifted_cells(self, images: Tensor) -> Tensor:
+        """The cells of images whose border's colours go on outside, but the row and column that do not stand on them.
+
+        So the others look where they stand.
+        """
+        patch = self.pixels.patch
+        before = round(-self._shift) % patch
+        wider = nn.functional.pad(images, (before, patch - before, before, patch - before), mode="replicate")
+        cells = self._cells(wider)
+        return (cells[:, 1:, 1:] if self._shift > 0 else cells[:, :-1, :-1]).contiguous()
 
     def _cells(self, images: Tensor) -> Tensor:
         (cells,) = self._model.forward_intermediates(images, indices=1, norm=True, intermediates_only=True)
@@ -177,3 +183,41 @@ def _library() -> Any:
             "encoder timm", expected="the package timm", got=str(error), hint="pip install it"
         ) from None
     return timm
+
+
+def cell_shift(model: nn.Module, images: Tensor) -> float:
+    """Pixels that the cells' middles lie up and left of their patches' middles; negative = down and right.
+
+    A strided layer of kernel k, stride s and padding p before it reads around ``s i + (k - 1) / 2 - p``, while the
+    middle of the pixels that output i covers is ``s i + (s - 1) / 2``. A 3 x 3 convolution of stride 2 and padding 1
+    so looks half a pixel up and left, and five of them, as in a ResNet, add up to 15.5 pixels: half a cell. Layers
+    without a stride are taken as centred, which is what their paddings are for.
+
+    Where layers stand side by side (a block and its shortcut), their mean counts.
+
+    Args:
+        model: called through ``forward_intermediates``, as timm's models are.
+        images: [n, 3, H, W] f32, of any content; H a multiple of the stride of every layer.
+    """
+    at_scale: dict[int, list[float]] = {}  # input pixels a cell -> shifts of the strided layers there, in cells
+
+    def note(module: Any, inputs: tuple[Tensor, ...], _: object) -> None:
+        kernel, stride, padding = (_first(part) for part in (module.kernel_size, module.stride, module.padding))
+        if type(module).__name__.endswith("Same"):  # TensorFlow's padding, which timm adds as the layer is called
+            padding = max(kernel - stride, 0) // 2
+        if stride > 1:
+            scale = round(images.shape[-2] / inputs[0].shape[-2])
+            at_scale.setdefault(scale, []).append((stride - 1) / 2 - ((kernel - 1) / 2 - padding))
+
+    hooks = [module.register_forward_hook(note) for module in model.modules() if isinstance(module, _STRIDED)]
+    try:
+        with torch.inference_mode():
+            model.forward_intermediates(images, indices=1, norm=True, intermediates_only=True)  # pyright: ignore
+    finally:
+        for hook in hooks:
+            hook.remove()
+    return sum(scale * sum(shifts) / len(shifts) for scale, shifts in at_scale.items())
+
+
+def _first(size: Any) -> int:
+    return int(size if isinstance(size, int) else size[0])

@@ -14,8 +14,15 @@ from torch import Tensor
 
 from liftcore.errors import InvalidFeatures, InvalidInput
 from liftcore.features.encoders import Pixels
-from liftcore.features.encoders.encode import Encoded, EncodeSettings, encode_images
-from liftcore.features.encoders.images import MAX_CELLS, find_images, grid_size, read_image
+from liftcore.features.encoders.encode import (
+    MAX_CELLS,
+    Encoded,
+    EncodeSettings,
+    encode_images,
+    find_images,
+    grid_size,
+    read_image,
+)
 from liftcore.features.pack import read_features
 from liftcore.features.views import FeatureGrid
 

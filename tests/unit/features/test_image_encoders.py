@@ -12,10 +12,8 @@ from torch import nn
 
 from liftcore.errors import InvalidInput, Unavailable
 from liftcore.features.encoders import open_image_encoder
-from liftcore.features.encoders.cell_shift import cell_shift
-from liftcore.features.encoders.clip import ClipImageEncoder
-from liftcore.features.encoders.clip_towers import resnet_values, vit_patches, vit_values
-from liftcore.features.encoders.timm_backbone import TimmEncoder
+from liftcore.features.encoders.clip import ClipImageEncoder, resnet_values, vit_patches, vit_values
+from liftcore.features.encoders.timm_backbone import TimmEncoder, cell_shift
 from liftcore.query.encoders.open_clip_models import OpenedModel, library
 
 PATCH, SIDE, WIDTH, F = 8, 32, 24, 10
@@ -112,7 +110,7 @@ def test_positions_follow_the_grid_when_the_size_changes() -> None:
     with torch.no_grad():
         tower.positional_embedding.zero_()
         tower.positional_embedding[1:, 0] = ramp
-        from liftcore.features.encoders.clip_towers import _positions
+        from liftcore.features.encoders.clip import _positions
 
         wide = _positions(tower, 4, 8)[1:, 0].reshape(4, 8)
         assert torch.equal(_positions(tower, 4, 4), tower.positional_embedding)

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from liftcore.errors import InvalidFeatures
-from liftcore.features.layering import MAX_LEVELS, layered
+from liftcore.features.masks import MAX_LEVELS, layered
 
 
 @st.composite

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from liftcore.errors import InvalidFeatures
-from liftcore.features.mask_folder import mask_views
+from liftcore.features.masks import mask_views
 from liftcore.features.pack import read_features, write_pack
 from liftcore.features.views import Regions
 from tests.run_lengths import sam_records
@@ -75,7 +75,7 @@ def test_every_kind_of_masks_makes_the_same_regions(kind: str, tmp_path: Path) -
 def test_pictures_with_another_value_for_none_number_masks_from_zero(unlabelled, dtype, tmp_path: Path) -> None:
     save_picture(tmp_path / "a.png", np.where(LABELS < 0, unlabelled, LABELS).astype(dtype))
     np.save(tmp_path / "a.npy", VECTORS)
-    assert mask_views(tmp_path, unlabelled).read("a").labels.tolist() == [LABELS.tolist()]
+    assert mask_views(tmp_path, unlabelled)["a"].labels.tolist() == [LABELS.tolist()]
 
 
 @pytest.mark.parametrize("kind", ["booleans", "rle"])
@@ -87,7 +87,7 @@ def test_masks_that_overlap_are_laid_on_levels(kind: str, tmp_path: Path) -> Non
     np.save(tmp_path / "a.npy", VECTORS.astype(np.float16))
     first = np.where(OVERLAPPING[0], 0, np.where(OVERLAPPING[2], 2, -1))
     second = np.where(OVERLAPPING[1], 1, -1)
-    assert mask_views(tmp_path).read("a").labels.tolist() == [first.tolist(), second.tolist()]
+    assert mask_views(tmp_path)["a"].labels.tolist() == [first.tolist(), second.tolist()]
 
 
 def test_views_are_named_as_their_cameras_are(tmp_path: Path) -> None:
@@ -99,7 +99,7 @@ def test_views_are_named_as_their_cameras_are(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("passed over", encoding="utf-8")
     views = mask_views(tmp_path)
     assert [*views] == ["a", "c", "frame.0001"]
-    assert {views.read(view).labels.tolist() == [LABELS.tolist()] for view in views} == {True}
+    assert {views[view].labels.tolist() == [LABELS.tolist()] for view in views} == {True}
 
 
 @pytest.mark.parametrize(
@@ -205,7 +205,7 @@ def test_json_that_holds_no_such_masks_is_refused(content: str, message: str, tm
 
 
 def test_json_beyond_the_limit_is_refused_unread(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("liftcore.features.sam_json.MAX_BYTES", 10)
+    monkeypatch.setattr("liftcore.features.sam.MAX_BYTES", 10)
     save_text(tmp_path / "a.json", sam_records(MASKS))
     np.save(tmp_path / "a.npy", VECTORS)
     with pytest.raises(InvalidFeatures, match=r"at most 10 bytes, got \d+ bytes; .*coco_rle"):
@@ -262,7 +262,7 @@ def test_pictures_beyond_pillows_limit_are_refused(tmp_path: Path, monkeypatch: 
     palette(tmp_path)
     np.save(tmp_path / "a.npy", VECTORS)
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 11)
-    assert mask_views(tmp_path).read("a").labels.tolist() == [LABELS.tolist()]
+    assert mask_views(tmp_path)["a"].labels.tolist() == [LABELS.tolist()]
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 5)
     with pytest.raises(InvalidFeatures, match="at most 10 pixels, got a larger picture"):
         mask_views(tmp_path)["a"]
@@ -271,7 +271,7 @@ def test_pictures_beyond_pillows_limit_are_refused(tmp_path: Path, monkeypatch: 
 def test_one_mask_over_the_whole_photo_is_one(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", VECTORS[:1])
     np.save(tmp_path / "a_masks.npy", np.zeros((1, 3, 4), np.int32))
-    assert not mask_views(tmp_path).read("a").labels.any()
+    assert not mask_views(tmp_path)["a"].labels.any()
 
 
 def test_masks_of_sub_folders_are_views_with_their_folders(tmp_path: Path) -> None:
@@ -283,4 +283,4 @@ def test_masks_of_sub_folders_are_views_with_their_folders(tmp_path: Path) -> No
     (tmp_path / ".thumbnails" / "0.png").write_bytes(b"no mask")
     views = mask_views(tmp_path)
     assert list(views) == ["camA/0", "camB/0"]
-    assert np.array_equal(views.read("camB/0").labels.numpy()[0], LABELS[::-1])
+    assert np.array_equal(views["camB/0"].labels.numpy()[0], LABELS[::-1])

@@ -1,0 +1,224 @@
+"""Folders of masks with one vector each: SAM's masks, say, and CLIP's vector of the crop of each.
+
+``IMG.npy`` [M, F] holds the vectors, row k of mask k. The masks are in one of: ``IMG.json``, run lengths as
+segment-anything returns them; ``IMG_masks.npy``, booleans [M, H, W] or ids [H, W] or [L, H, W] with -1 for none;
+``IMG.png``, a label picture of one channel. They need not have the photo's size.
+
+In a label picture where 0 means unlabelled, as most programs have it, value v is mask v - 1. Where another value
+does (255, 65535), value v is mask v. Whoever takes the one for the other is one off in every mask, so with 0 the
+values must end at the number of vectors.
+
+Masks that overlap become levels of labels that do not (`layered`).
+"""
+
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, UnidentifiedImageError
+
+from liftcore.errors import InvalidFeatures
+from liftcore.features.sam import sam_masks
+from liftcore.features.views import NO_LABEL, Regions
+from liftcore.io.npy import NUMBERS, ViewFolder, files_below, files_by_view, npy_files, open_npy, read_floats
+
+VECTORS = ".npy"
+ARRAY, RUNS, PICTURE = "_masks.npy", ".json", ".png"
+MAX_LEVELS = 32  # a hierarchy of four partitions, with masks 1 to 4 pixels over their neighbours, took 13 to 18
+PNG = "a PNG of one channel, 8 or 16 bits of grey or a palette"
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+PNG_HEADER_BYTES = 26  # up to the depth and the kind of colours
+PNG_KINDS = {
+    0: "grey",
+    2: "red, green and blue",
+    3: "a palette",
+    4: "grey with transparency",
+    6: "colours with transparency",
+}
+
+
+def mask_views(folder: Path, unlabelled: int = 0) -> ViewFolder[Regions]:
+    """The regions of a folder and its sub-folders: labels are rows of the vectors, in the order of the masks.
+
+    Args:
+        folder: the folder. unlabelled: what pixels without a mask have in label pictures.
+
+    Raises:
+        InvalidFeatures: the folder has no vectors, vectors lack masks or masks vectors, or a view has two files of
+            one of them. Reading a view: a file is malformed, masks and vectors are not as many, or masks take too
+            many levels.
+    """
+    arrays = npy_files(folder, VECTORS)
+    pictures = [path for path in files_below(folder) if path.suffix.lower() in (RUNS, PICTURE)]
+    overlap = "photos belong in another folder than their masks"
+    found = [*(path for path in arrays if path.name.endswith(ARRAY)), *pictures]
+    masks = files_by_view(found, folder, ARRAY, what="file of masks", hint=overlap)
+    found = [path for path in arrays if not path.name.endswith(ARRAY)]
+    vectors = files_by_view(found, folder, what="file of vectors")
+    for view, path in vectors.items():
+        if view not in masks:
+            expected = f"masks in {view}{RUNS}, {view}{ARRAY} or {view}{PICTURE}"
+            langsplat = path.name.endswith(("_s.npy", "_f.npy"))
+            hint = "folders of LangSplat are packed by 'splatlift pack langsplat'" if langsplat else ""
+            raise InvalidFeatures(str(folder), expected=expected, got=f"{path.name} alone", hint=hint)
+    for view, path in masks.items():
+        if view not in vectors:
+            hint = "photos and other files that are no masks belong in another folder"
+            expected = f"vectors in {view}{VECTORS}"
+            raise InvalidFeatures(str(folder), expected=expected, got=f"{path.name} alone", hint=hint)
+
+    def read(view: str) -> Regions:
+        codebook = read_floats(vectors[view], "M, F")
+        return Regions(_labels(masks[view], len(codebook), unlabelled), codebook, where=f"view {view!r}")
+
+    return ViewFolder(vectors, read, masks.values())
+
+
+def _labels(path: Path, rows: int, unlabelled: int) -> np.ndarray:
+    """[L, h, w] i32 of a view's masks, each a row of its vectors."""
+    if path.suffix.lower() == PICTURE:
+        return picture_labels(path, rows, unlabelled)
+    if path.suffix.lower() == RUNS:
+        return layered(sam_masks(path, rows), str(path))
+    stored = open_npy(path, kinds=NUMBERS + "b")
+    got = f"{stored.dtype} {list(stored.shape)}"
+    if stored.dtype.kind != "b":
+        # Masks of zeros and ones, a plane each, would as ids all be of the first two vectors.
+        if stored.ndim == 3 and len(stored) == rows > 1 and float(stored.min()) >= 0 and float(stored.max()) <= 1:
+            hint = "masks that may overlap are booleans: numpy.save(name, masks.astype(bool))"
+            got = f"{got} of zeros and ones"
+            raise InvalidFeatures(str(path), expected="mask ids, or booleans", got=got, hint=hint)
+        return mask_ids(stored, rows, path)
+    if stored.ndim != 3:
+        raise InvalidFeatures(str(path), expected="booleans [M, H, W]", got=got)
+    if len(stored) != rows:
+        hint = "row k of the vectors is of mask k, and masks come first: [M, H, W]"
+        raise InvalidFeatures(str(path), expected=f"{rows} masks, one a vector", got=got, hint=hint)
+    return layered(list(stored), str(path))  # planes of the mapped file, not read yet
+
+
+def mask_ids(stored: np.ndarray, rows: int, path: Path) -> np.ndarray:
+    """[L, H, W] i32 of ids, -1 for none, stored as integers or as floats.
+
+    Args:
+        stored: [L, H, W], or [H, W] for one level. rows: vectors that there are. path: named in errors.
+
+    Raises:
+        InvalidFeatures: other axes, an id without a vector, or one that is no whole number.
+    """
+    if stored.ndim not in (2, 3):
+        raise InvalidFeatures(str(path), expected="mask ids [L, H, W]", got=str(list(stored.shape)))
+    low, high = float(stored.min()), float(stored.max())
+    # NaN fails every comparison, so it is refused here too.
+    if not (low >= NO_LABEL and high < rows):
+        got = f"ids from {low:g} to {high:g}"
+        hint = "ids are counted on over the levels; those of each level alone must be shifted first"
+        raise InvalidFeatures(str(path), expected=f"ids in -1..{rows - 1}", got=got, hint=hint)
+    labels = stored.astype(np.int32)
+    if stored.dtype.kind == "f" and not np.array_equal(labels, stored):
+        raise InvalidFeatures(str(path), expected="whole numbers as mask ids", got="fractions")
+    return labels if labels.ndim == 3 else labels[None]
+
+
+def layered(masks: Sequence[np.ndarray], where: str) -> np.ndarray:
+    """[L, h, w] i32: label k where mask k is, -1 for none; an empty mask has no label.
+
+    The largest mask comes first, of equals the one that was given first, and each goes to the first level on which
+    none of its pixels is taken. No pixel of any mask is lost, and what lies alone is on level 0. A lift that takes
+    levels as rows of their own asks only which masks lie on a pixel, so there their level does not matter.
+
+    Args:
+        masks: [h, w] bool each, at least one, all of one size; each is asked for twice. where: named in the error.
+
+    Raises:
+        InvalidFeatures: they take more than MAX_LEVELS levels.
+    """
+    boxes, areas = zip(*map(_extent, masks), strict=True)
+    # Space for all levels that there may be: pages of those that are never written take no memory.
+    labels = np.empty((min(MAX_LEVELS, len(masks)), *masks[0].shape), np.int32)
+    labels[0] = NO_LABEL
+    used = 1
+    for number in sorted(range(len(masks)), key=lambda number: -areas[number]):
+        if not areas[number]:
+            break
+        inside, windows = masks[number][boxes[number]], labels[:, *boxes[number]]
+        level = next((k for k in range(used) if not ((windows[k] != NO_LABEL) & inside).any()), used)
+        if level == MAX_LEVELS:
+            depth = np.zeros(masks[0].shape, np.int32)
+            for mask in masks:
+                depth += mask
+            raise InvalidFeatures(
+                where,
+                expected=f"masks that lie on {MAX_LEVELS} levels without overlap",
+                got=f"{len(masks)} masks, up to {depth.max()} of them over one pixel",
+                hint="leave out those that are nearly the same, as SamAutomaticMaskGenerator does by box_nms_thresh",
+            )
+        if level == used:
+            labels[level] = NO_LABEL
+            used += 1
+        windows[level][inside] = number
+    return labels[:used]
+
+
+def _extent(mask: np.ndarray) -> tuple[tuple[slice, slice], int]:
+    """The rows and columns between which a mask's pixels lie, and how many it has."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    if not len(rows):
+        return (slice(0), slice(0)), 0
+    box = slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
+    return box, int(np.count_nonzero(mask[box]))
+
+
+def picture_labels(path: Path, rows: int, unlabelled: int) -> np.ndarray:
+    """[1, h, w] i32 of masks, -1 for none.
+
+    Args:
+        path: the picture. rows: vectors that there are. unlabelled: the value of pixels without a mask.
+
+    Raises:
+        InvalidFeatures: the file is no such PNG, or a value has no vector; with 0 for unlabelled also when vectors
+            are left over at the end.
+    """
+    values = _picture(path)
+    labelled = values != unlabelled
+    high = int(values.max(initial=0, where=labelled))
+    if unlabelled == 0 and high != rows:
+        other = "is there a vector for 0 too, or does another value mean none (--unlabelled 255)?"
+        hint = other if high < rows else "name the value that means none with --unlabelled (255, 65535)"
+        expected = f"values 1..{rows} for {rows} vectors, and 0 for none"
+        raise InvalidFeatures(str(path), expected=expected, got=f"values up to {high}", hint=hint)
+    if unlabelled and high >= rows:
+        expected = f"values 0..{rows - 1} for {rows} vectors, and {unlabelled} for none"
+        hint = "where 0 means none, value 1 has the first vector: --unlabelled 0"
+        raise InvalidFeatures(str(path), expected=expected, got=f"the value {high}", hint=hint)
+    return np.where(labelled, values - (unlabelled == 0), NO_LABEL).astype(np.int32)[None]
+
+
+def _picture(path: Path) -> np.ndarray:
+    """[h, w] i32, the numbers as they are stored."""
+    try:
+        with path.open("rb") as handle:
+            _check_png(handle.read(PNG_HEADER_BYTES), path)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # it opens, up to twice the limit
+            with Image.open(path, formats=["PNG"]) as image:
+                return np.asarray(image).astype(np.int32)
+    except Image.DecompressionBombError:
+        most = 2 * (Image.MAX_IMAGE_PIXELS or 0)
+        raise InvalidFeatures(str(path), expected=f"at most {most} pixels", got="a larger picture") from None
+    except UnidentifiedImageError:
+        raise InvalidFeatures(str(path), expected=PNG, got="one that Pillow does not know") from None
+    except (OSError, SyntaxError, ValueError, EOFError) as error:  # Pillow's kinds for files that are cut or broken
+        got = f"one that does not open ({str(error)[:120]})"
+        raise InvalidFeatures(str(path), expected=PNG, got=got, hint="write it anew") from None
+
+
+def _check_png(header: bytes, path: Path) -> None:
+    """Refuse what Pillow would open as other numbers than are stored: it spreads grey of few bits over 0 to 255."""
+    if len(header) < PNG_HEADER_BYTES or not header.startswith(PNG_SIGNATURE):
+        raise InvalidFeatures(str(path), expected=PNG, got="a file that is no PNG")
+    depth, kind = header[24], PNG_KINDS.get(header[25], "an unknown kind")
+    if kind != "a palette" and not (kind == "grey" and depth in (8, 16)):
+        hint = "a photo belongs in another folder; a picture of colours is one of labels once each has a number"
+        raise InvalidFeatures(str(path), expected=PNG, got=f"{kind} of {depth} bits", hint=hint)
