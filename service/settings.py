@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
-from liftcore.query.encoders.specs import NO_WORDS
+from liftcore.query.text import NO_WORDS
 from service.errors import InvalidRequest
 
 MiB = 1 << 20

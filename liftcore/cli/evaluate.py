@@ -49,8 +49,8 @@ def run(options: argparse.Namespace) -> int:
     """Judge every lift whose scene is labelled, and print what was measured beside what was published."""
     from liftcore.evaluate.judging import evaluate_scene
     from liftcore.evaluate.published import published
-    from liftcore.query.encoders import open_encoder
     from liftcore.query.scene import QueryScene
+    from liftcore.query.text import open_encoder
 
     scenes = _labelled(options.dataset, options.data)
     lifts = find_lifts(options.lifts, scenes)
@@ -60,7 +60,7 @@ def run(options: argparse.Namespace) -> int:
     with progress_bars() as progress:
         for name, path in lifts.items():
             scene = QueryScene.open(path)
-            encoder = open_encoder(encoder_spec(options, scene.lift.metadata.text_space))
+            encoder = open_encoder(encoder_spec(options, scene.metadata.text_space))
             found, said = evaluate_scene(scenes[name], scene, encoder, settings, progress)
             results += found
             warnings += said

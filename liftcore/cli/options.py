@@ -92,7 +92,7 @@ def encoder_spec(options: argparse.Namespace, text_space: str, hint: str = "") -
     Raises:
         InvalidQuery: neither is given, and the lift's text space names no encoder.
     """
-    from liftcore.query.encoders.specs import NO_WORDS
+    from liftcore.query.text import NO_WORDS
 
     if options.table:
         return f"table:{options.table}"

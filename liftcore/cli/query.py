@@ -16,11 +16,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     from liftcore.query.ask import Answer
-    from liftcore.query.encoders import TextEncoder
-    from liftcore.query.example import Example
-    from liftcore.query.query import Query
+    from liftcore.query.render import ViewMask
     from liftcore.query.scene import QueryScene
-    from liftcore.query.view_mask import ViewMask
+    from liftcore.query.terms import Example, Query
+    from liftcore.query.text import TextEncoder
 
 
 OUTPUTS = ("object", "coloured", "scores", "mask", "attention")  # options that name a file to write
@@ -65,18 +64,16 @@ def run(options: argparse.Namespace) -> int:
         free_output(path, [options.lift, *([options.table] if options.table else [])])
     from liftcore.query.ask import ask, top
     from liftcore.query.objects import objects
-    from liftcore.query.query import texts_of
     from liftcore.query.scene import QueryScene
-    from liftcore.query.view_mask import view_mask
 
     query = _query(options)
     scene = QueryScene.open(options.lift)
-    made_from = scene.lift.metadata
+    made_from = scene.metadata
     for path in outputs:
         free_output(path, [Path(file.path) for file in (made_from.splats, made_from.cameras, *made_from.features)])
-    encoder = _encoder(options, scene) if texts_of(query.terms) else None
+    encoder = _encoder(options, scene) if query.texts else None
     answer = ask(scene, query, encoder)
-    seen = view_mask(scene, answer, options.view) if options.view else None
+    seen = _view_mask(scene, answer, options.view) if options.view else None
     document = _document(answer, seen, encoder)
     if options.top:
         best = top(answer, scene, options.top)
@@ -90,7 +87,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _query(options: argparse.Namespace) -> Query:
-    from liftcore.query.query import Query
+    from liftcore.query.terms import Query
 
     if options.text is None and not options.like and options.negative:
         raise InvalidQuery(
@@ -109,8 +106,7 @@ def _query(options: argparse.Namespace) -> Query:
 
 
 def _examples(notations: list[str], argument: str) -> list[Example]:
-    from liftcore.query.example import parse_example
-    from liftcore.query.vector_file import read_vector
+    from liftcore.query.terms import parse_example, read_vector
 
     return [
         read_vector(Path(notation)) if notation.endswith(".npy") else parse_example(notation, argument)
@@ -119,9 +115,15 @@ def _examples(notations: list[str], argument: str) -> list[Example]:
 
 
 def _encoder(options: argparse.Namespace, scene: QueryScene) -> TextEncoder:
-    from liftcore.query.encoders import open_encoder
+    from liftcore.query.text import open_encoder
 
-    return open_encoder(encoder_spec(options, scene.lift.metadata.text_space, hint="or ask by example, with --like"))
+    return open_encoder(encoder_spec(options, scene.metadata.text_space, hint="or ask by example, with --like"))
+
+
+def _view_mask(scene: QueryScene, answer: Answer, view: str) -> ViewMask:
+    from liftcore.query.render import view_mask  # with torch, which numbers do without
+
+    return view_mask(scene, answer, view)
 
 
 def _threshold(text: str) -> str | float:
@@ -137,7 +139,7 @@ def _document(answer: Answer, seen: ViewMask | None, encoder: TextEncoder | None
         "negatives": [str(term) for term in answer.query.negatives],
         "encoder": encoder.name if encoder else None,
         "splats": len(answer.scores),
-        "selected": int(answer.selected.sum()),
+        "selected": answer.count,
         "threshold": answer.threshold,
         "threshold_method": answer.threshold_method,
         "explanation": answer.explanation,
@@ -147,15 +149,14 @@ def _document(answer: Answer, seen: ViewMask | None, encoder: TextEncoder | None
         document["view"] = {
             "name": seen.view,
             "explanation": seen.explanation,
-            "mask_share": float(seen.mask.float().mean()),
+            "mask_share": float(seen.mask.mean()),
         }
     return document
 
 
 def _write(options: argparse.Namespace, scene: QueryScene, answer: Answer, seen: ViewMask | None) -> dict[str, str]:
     """Write what was asked for, the object first: when nothing was found, nothing is written."""
-    from liftcore.query.pictures import attention_png, mask_png
-    from liftcore.query.splat_files import coloured_ply, object_ply, scores_npy
+    from liftcore.query.export import coloured_ply, object_ply, scores_npy
 
     blocks: dict[str, Callable[[], Iterable[bytes]]] = {
         "object": lambda: object_ply(scene, answer),
@@ -163,6 +164,8 @@ def _write(options: argparse.Namespace, scene: QueryScene, answer: Answer, seen:
         "scores": lambda: [scores_npy(answer)],
     }
     if seen is not None:
+        from liftcore.query.render import attention_png, mask_png
+
         blocks |= {"mask": lambda: [mask_png(seen)], "attention": lambda: [attention_png(seen)]}
     files = {kind: path for kind in OUTPUTS if (path := getattr(options, kind)) is not None}
     for kind, path in files.items():

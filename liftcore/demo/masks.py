@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from numpy.random import Generator
 
     from liftcore.demo.still_life import StillLife
-    from liftcore.query.encoders import TextEncoder
+    from liftcore.query.text import TextEncoder
     from liftcore.raster.base import Raster
 
 LEAST_ROW_SUM = 0.5  # a ray below it has no true label
@@ -62,7 +62,7 @@ def observe(
         seed: of the mistakes.
     """
     rng = np.random.default_rng(seed)
-    vectors = (encoder.encode(scene.things).numpy(), encoder.encode(scene.parts).numpy())
+    vectors = (encoder.encode(scene.things), encoder.encode(scene.parts))
     observed = {}
     for camera in scene.cameras.values():
         if camera.name in scene.held_out:

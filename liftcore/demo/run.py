@@ -15,8 +15,8 @@ from PIL import Image
 from liftcore.demo.client import Client, Server
 from liftcore.demo.scene_folder import DemoScene, Truth, find_scene
 from liftcore.demo.write_scene import write_still_life
-from liftcore.query.encoders.specs import NO_WORDS
-from liftcore.query.pictures import overlay
+from liftcore.query.render import overlay
+from liftcore.query.text import NO_WORDS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from liftcore.errors import InvalidInput
-from liftcore.query.encoders.specs import NO_WORDS
+from liftcore.query.text import NO_WORDS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -34,7 +34,7 @@ def write_still_life(folder: Path, phrases: Sequence[str], scene: StillLife | No
     from liftcore.features.pack import write_pack
     from liftcore.io.inria import write_inria_cameras
     from liftcore.io.ply import write_splats
-    from liftcore.query.encoders import open_encoder
+    from liftcore.query.text import open_encoder
     from liftcore.raster.cpu.raster import CpuRaster
 
     scene = scene or still_life(SEED)

@@ -8,8 +8,8 @@ from liftcore.errors import InvalidInput, InvalidQuery
 from liftcore.evaluate.labels import LabelledObject, LabelledScene
 from liftcore.evaluate.protocols import SEGMENTERS, EvaluationProtocol, Prediction
 from liftcore.progress import Progress, silent
-from liftcore.query.encoders import TextEncoder
 from liftcore.query.scene import QueryScene
+from liftcore.query.text import TextEncoder
 from liftcore.scene.cameras import photo_size
 
 
@@ -189,11 +189,11 @@ def evaluate_scene(
         InvalidLift: the splats or the cameras moved or changed since the lift.
     """
     if encoder.channels != scene.channels:
-        space = scene.lift.metadata.text_space or "none"
+        space = scene.metadata.text_space or "none"
         expected = f"{scene.channels} channels as the lift of {labels.name} has (its text space: {space})"
         raise InvalidQuery("encoder", expected=expected, got=f"{encoder.name} with {encoder.channels}")
     truth, warnings = _truth(labels, scene, settings.held_out)
-    lifted = frozenset(scene.lift.metadata.views) & truth.keys()
+    lifted = frozenset(scene.metadata.views) & truth.keys()
     if lifted and settings.held_out is not None:
         warnings.append(f"{labels.name}: {_named(lifted)} were lifted, though the list holds them out")
     elif lifted:

@@ -21,13 +21,13 @@ from torch import Tensor
 
 from liftcore.query.ask import Answer, ask
 from liftcore.query.directions import MINIMUM_ROW_SUM
-from liftcore.query.encoders import TextEncoder
 from liftcore.query.objects import Objects, objects
-from liftcore.query.query import Query
+from liftcore.query.render import view_mask
 from liftcore.query.scene import QueryScene
 from liftcore.query.scores import DEFAULT_NEGATIVES, relevancy
+from liftcore.query.terms import Query
+from liftcore.query.text import TextEncoder
 from liftcore.query.threshold import find_threshold
-from liftcore.query.view_mask import view_mask
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.cameras import Camera
 
@@ -98,7 +98,7 @@ class RenderedFeatures(Segmenter):
 
     def prepare(self) -> None:
         """The products of splats and words, for all views."""
-        vectors = self.encoder.encode([*self.texts, *(self.negatives or DEFAULT_NEGATIVES)])
+        vectors = torch.as_tensor(self.encoder.encode([*self.texts, *(self.negatives or DEFAULT_NEGATIVES)]))
         # <A X, t> = A (X t): the products with the texts are rendered, not the features again for each.
         blocks = [block.float() @ vectors.T for block in self.scene.lift.features.split(65_536)]
         self._products = torch.cat(blocks)  # [P, n + N]
@@ -106,11 +106,11 @@ class RenderedFeatures(Segmenter):
     def look(self, view: str) -> dict[str, Prediction]:
         """What each text finds in a view."""
         cosines = self.cosines(view)
-        shape, count, flat = cosines.shape[:2], len(self.texts), cosines.flatten(0, 1)
+        shape, count, flat = cosines.shape[:2], len(self.texts), cosines.flatten(0, 1).numpy()
         found = {}
         for k, text in enumerate(self.texts):
-            against = torch.cat([flat[:, k : k + 1], flat[:, count:]], dim=1)
-            found[text] = segment(relevancy(against, 1).reshape(shape).numpy())
+            against = np.concatenate([flat[:, k : k + 1], flat[:, count:]], axis=1)
+            found[text] = segment(relevancy(against, 1).reshape(shape))
         return found
 
     def cosines(self, view: str) -> Tensor:
@@ -119,10 +119,10 @@ class RenderedFeatures(Segmenter):
 
     def _cosines(self, camera: Camera) -> Tensor:
         scene = self.scene
-        products = scene.raster.render(camera, self._products, scene.walk)
+        products = scene.raster.render(camera, self._products, scene.compositing)
         squares = torch.zeros(products.shape[:2])
         for part in scene.lift.features.split(CHANNELS, dim=1):
-            squares += scene.raster.render(camera, part.float().contiguous(), scene.walk).square().sum(dim=-1)
+            squares += scene.raster.render(camera, part.float().contiguous(), scene.compositing).square().sum(dim=-1)
         lengths = squares.sqrt()[..., None]
         return torch.where(lengths > 0, products / lengths, 0.0).clamp(-1, 1)
 
@@ -159,9 +159,9 @@ class SelectedSplats(Segmenter):
         """What each text finds in a view."""
         splats, found = self.scene.splats, {}
         for text, selected in self._selected.items():
-            logits = torch.where(selected, splats.opacity_logits, -1e4)  # an opacity of nothing
+            logits = torch.where(torch.from_numpy(selected), splats.opacity_logits, -1e4)  # an opacity of nothing
             alone = CpuRaster(replace(splats, opacity_logits=logits))
-            sums = self.scene.image(view, lambda camera, alone=alone: alone.row_sums(camera, self.scene.walk))
+            sums = self.scene.image(view, lambda camera, alone=alone: alone.row_sums(camera, self.scene.compositing))
             found[text] = Prediction((sums > SOLID).numpy(), None)
         return found
 
@@ -172,13 +172,14 @@ class RenderedScores(Segmenter):
     def prepare(self) -> None:
         """The answers of the splats, for all views."""
         # A splat without a feature adds nothing to a ray.
-        columns = [torch.where(answer.seen, answer.scores, 0.0) for answer in self.answers().values()]
-        self._values = torch.stack([*columns, torch.ones(self.scene.lift.features.shape[0])], dim=1)  # [P, n + 1]
+        columns = [np.where(answer.seen, answer.scores, np.float32(0.0)) for answer in self.answers().values()]
+        columns.append(np.ones(len(self.scene.features), np.float32))
+        self._values = torch.from_numpy(np.stack(columns, axis=1))  # [P, n + 1]
 
     def look(self, view: str) -> dict[str, Prediction]:
         """What each text finds in a view."""
         scene, found = self.scene, {}
-        image = scene.image(view, lambda camera: scene.raster.render(camera, self._values, scene.walk))
+        image = scene.image(view, lambda camera: scene.raster.render(camera, self._values, scene.compositing))
         met = image[..., -1] >= MINIMUM_ROW_SUM
         for k, text in enumerate(self.texts):
             attention = image[..., k].contiguous()
@@ -206,7 +207,7 @@ class OwnMasks(Segmenter):
                 self._objects[text] = objects(scene, answer)
             return self._objects[text]
 
-        return Prediction(view_mask(self.scene, self._answers[text], view, group).mask.numpy(), None)
+        return Prediction(view_mask(self.scene, self._answers[text], view, group).mask, None)
 
 
 SEGMENTERS: dict[EvaluationProtocol, type[Segmenter]] = {

@@ -33,8 +33,8 @@ from liftcore.io.class_masks import read_masks
 from liftcore.io.lift_files import open_files
 from liftcore.lifting import lift
 from liftcore.progress import Progress
-from liftcore.query.encoders.table import TableEncoder
-from liftcore.query.in_photo import in_photo
+from liftcore.query.render import in_photo
+from liftcore.query.text.table import TableEncoder
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.result import LiftResult
 from liftcore.scene.cameras import Cameras

@@ -14,7 +14,7 @@ from liftcore.features.views import NO_LABEL, Regions
 from liftcore.io.class_masks import describe_masks
 from liftcore.io.inspect_scene import inspect_file as inspect_scene
 from liftcore.io.inspect_scene import is_splats
-from liftcore.query.encoders.words import plain
+from liftcore.query.text.table import plain
 from liftcore.solve.lift_warnings import UNSEEN
 
 if TYPE_CHECKING:

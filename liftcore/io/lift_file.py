@@ -7,13 +7,12 @@ metadata hold settings, inputs with digests, the encoder, the certificate, timin
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
-import torch
-from pydantic import ValidationError
+import numpy as np
 
 from liftcore.errors import InvalidLift
+from liftcore.io.safetensors_file import map_tensors
 from liftcore.result import LiftMetadata, LiftResult
 
 TENSORS = ("features", "evidence", "agreement", "seen")
@@ -35,44 +34,54 @@ def load_lift(path: Path | str) -> LiftResult:
     Raises:
         InvalidLift: the file is missing, is not a safetensors file, or is not a lift with a row a splat.
     """
-    from safetensors import SafetensorError, safe_open
+    import torch
+
+    arrays, metadata = read_lift(path)
+    return LiftResult(**{name: torch.from_numpy(array) for name, array in arrays.items()}, metadata=metadata)
+
+
+def read_lift(path: Path | str) -> tuple[dict[str, np.ndarray], LiftMetadata]:
+    """The same as mapped arrays by their names, without torch.
+
+    Raises:
+        InvalidLift: as `load_lift` has it.
+    """
+    from safetensors import SafetensorError
 
     try:
-        with safe_open(str(path), framework="pt") as handle:
-            metadata = (handle.metadata() or {}).get("splatlift")
-            if metadata is None:
-                raise InvalidLift(str(path), expected="a lift file", got="safetensors without lift metadata")
-            clusters = [name for name in CLUSTER_TENSORS if name in tuple(handle.keys())]
-            tensors = {name: handle.get_tensor(name) for name in (*TENSORS, *clusters)}
-        lift = LiftResult(**tensors, metadata=LiftMetadata.model_validate_json(metadata))
+        tensors, told = map_tensors(Path(path))
+        if "splatlift" not in told:
+            raise InvalidLift(str(path), expected="a lift file", got="safetensors without lift metadata")
+        metadata = LiftMetadata.model_validate_json(told["splatlift"])
+        missing = [name for name in TENSORS if name not in tensors]
+        if missing:
+            raise ValueError(f"no {missing[0]} in it")
+        arrays = {name: tensors[name] for name in TENSORS} | {n: tensors[n] for n in CLUSTER_TENSORS if n in tensors}
     except FileNotFoundError:
         raise InvalidLift(str(path), expected="a lift file", got="no such file") from None
-    except (SafetensorError, OSError, ValidationError, json.JSONDecodeError) as error:
+    except (SafetensorError, OSError, ValueError) as error:  # pydantic's and JSON's are ValueErrors
         raise InvalidLift(
             str(path), expected="a lift file (.safetensors)", got=f"a file that does not open as one: {error}"
         ) from None
-    _check_shapes(lift, path)
-    return lift
+    _check_shapes(arrays, path)
+    return arrays, metadata
 
 
-def _check_shapes(lift: LiftResult, path: Path | str) -> None:
-    rows = lift.features.shape[:1]
-    fits = lift.features.ndim == 2 and lift.features.dtype in (torch.float16, torch.float32) and lift.features.numel()
-    columns = ((lift.evidence, torch.float32), (lift.agreement, torch.float32), (lift.seen, torch.bool))
-    if not fits or any(column.shape != rows or column.dtype != dtype for column, dtype in columns):
-        shapes = {name: list(getattr(lift, name).shape) for name in TENSORS}
+def _check_shapes(arrays: dict[str, np.ndarray], path: Path | str) -> None:
+    features = arrays["features"]
+    rows = features.shape[:1]
+    fits = features.ndim == 2 and features.dtype in (np.float16, np.float32) and features.size
+    columns = (("evidence", np.float32), ("agreement", np.float32), ("seen", np.bool_))
+    if not fits or any(arrays[name].shape != rows or arrays[name].dtype != dtype for name, dtype in columns):
+        shapes = {name: list(arrays[name].shape) for name in TENSORS}
         raise InvalidLift(str(path), expected="one row a splat in every tensor of a lift", got=str(shapes))
-    _check_clusters(lift, path)
-
-
-def _check_clusters(lift: LiftResult, path: Path | str) -> None:
-    cluster, means = lift.cluster, lift.cluster_features
+    cluster, means = arrays.get("cluster"), arrays.get("cluster_features")
     if cluster is None and means is None:
         return
     if cluster is None or means is None:
         raise InvalidLift(str(path), expected="cluster and cluster_features, or neither", got="one of them")
-    fits = cluster.shape == lift.features.shape[:1] and cluster.dtype == torch.int32
-    fits &= means.ndim == 2 and means.shape[1:] == lift.features.shape[1:] and means.dtype == lift.features.dtype
-    if not fits or int(cluster.min()) < -1 or int(cluster.max()) >= means.shape[0]:
+    fits = cluster.shape == rows and cluster.dtype == np.int32
+    fits &= means.ndim == 2 and means.shape[1:] == features.shape[1:] and means.dtype == features.dtype
+    if not fits or int(cluster.min()) < -1 or int(cluster.max()) >= len(means):
         got = f"{list(cluster.shape)} {cluster.dtype} and {list(means.shape)} {means.dtype}"
         raise InvalidLift(str(path), expected="a cluster of -1 or a row of cluster_features for each splat", got=got)

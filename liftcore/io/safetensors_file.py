@@ -1,18 +1,26 @@
-"""Safetensors files: looked at before a reader parses them, and written whole, with no copy in memory.
+"""Safetensors files: looked at before a reader parses them, mapped, and written whole, with no copy in memory.
 
 Torch is imported only where tensors are written, so that processes without it can look at files.
 """
 
 import json
 import math
+import mmap
 import struct
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from liftcore.errors import InvalidInput
 from liftcore.io.files import whole_file
+
+DTYPES = {
+    "F64": np.float64, "F32": np.float32, "F16": np.float16, "I64": np.int64, "I32": np.int32, "I16": np.int16,
+    "I8": np.int8, "U8": np.uint8, "BOOL": np.bool_,
+}  # fmt: skip
 
 if TYPE_CHECKING:
     import torch
@@ -113,3 +121,33 @@ def tensor_bytes(tensor: "Tensor") -> memoryview:
     if not tensor.numel():  # an empty one of numpy's may have strides of zero, of which torch makes no bytes
         return memoryview(b"")
     return tensor.cpu().contiguous().flatten().view(torch.uint8).numpy().data
+
+
+def map_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    """The tensors of a safetensors file, and its metadata.
+
+    The mapping is private: what a caller writes into an array stays in memory.
+
+    Raises:
+        SafetensorError: it is no such file. OSError: it does not open.
+        ValueError: a type that NumPy does not have.
+    """
+    from safetensors import safe_open
+
+    with safe_open(str(path), framework="np") as handle:  # which judges the header
+        metadata = handle.metadata() or {}
+    with path.open("rb") as file:
+        start = 8 + int.from_bytes(file.read(8), "little")
+        header = json.loads(file.read(start - 8))
+        mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
+    return {name: _array(mapped, start, told) for name, told in header.items() if name != "__metadata__"}, metadata
+
+
+def _array(mapped: mmap.mmap, start: int, told: dict) -> np.ndarray:
+    if told["dtype"] not in DTYPES:
+        raise ValueError(f"tensors of the type {told['dtype']}")
+    dtype, count = np.dtype(DTYPES[told["dtype"]]), math.prod(told["shape"])
+    if count == 0:
+        return np.empty(told["shape"], dtype)
+    array = np.frombuffer(mapped, dtype, count, start + told["data_offsets"][0]).reshape(told["shape"])
+    return np.require(array, requirements="A")  # a copy where the file was not aligned

@@ -1,1 +1,1 @@
-"""Words to splats: text encoders, scores, thresholds, attention maps and masks."""
+"""Words and examples to splats: text encoders, scores, thresholds, objects, masks and pictures."""

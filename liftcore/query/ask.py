@@ -4,26 +4,26 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 
 from liftcore.query.directions import directions
-from liftcore.query.products import LOWEST_COSINE
-from liftcore.query.query import Query
-from liftcore.query.scores import LEAST_LIKENESS, combine, cosines, cosines_about
+from liftcore.query.objects import Objects, objects
+from liftcore.query.scene import QueryScene, as_numpy
+from liftcore.query.scores import LEAST_LIKENESS, LOWEST_COSINE, combine, cosines, cosines_about
+from liftcore.query.terms import Query, Vector
+from liftcore.query.text import TextEncoder
 from liftcore.query.threshold import find_threshold
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
     from torch import Tensor
 
-    from liftcore.query.encoders import TextEncoder
-    from liftcore.query.scene import QueryScene
+    from liftcore.result import LiftResult
+    from liftcore.scene.splats import Splats
 
 _QUANTILES = (0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
 
@@ -33,7 +33,8 @@ class Question:
     """A query whose terms were found."""
 
     query: Query
-    rows: Tensor  # [n, F] f32, the unit direction of each term
+    rows: np.ndarray  # [n, F] f32, the unit direction of each term
+    plain: np.ndarray  # [n] bool, the terms that are compared by plain cosines: words
 
 
 @dataclass(frozen=True)
@@ -41,13 +42,14 @@ class Answer:
     """How a scene answers a query."""
 
     query: Query
-    scores: Tensor  # [P] f32, in -1..1 (`scores.combine`); the minimum where not seen
-    seen: Tensor  # [P] bool, whether the splat has a feature
+    scores: np.ndarray  # [P] f32, in -1..1 (`scores.combine`); the minimum where not seen
+    seen: np.ndarray  # [P] bool, whether the splat has a feature
     threshold: float  # on the scores
     threshold_method: str  # what was asked for: auto, valley, paper, otsu, stability or fixed
     explanation: str  # one sentence on how the threshold was found
-    selected: Tensor  # [P] bool, seen and at or above the threshold
+    selected: np.ndarray  # [P] bool, seen and at or above the threshold
     statistics: Mapping[str, float]  # min, max, mean and quantiles q01..q99 of the seen scores
+    clear: bool = True  # whether the scores have what the threshold's method looks for
 
     @property
     def count(self) -> int:
@@ -71,8 +73,20 @@ class TopSplat:
 class Found:
     """Where an answer lies in the world."""
 
-    best: tuple[TopSplat, ...]  # descending by score
+    best: tuple[TopSplat, ...]  # descending by score, equal ones by their rows
     box: tuple[Point, Point] | None  # least and greatest corner of the centres of all selected; None = none
+
+
+@dataclass(frozen=True)
+class VectorAnswer:
+    """How a lift answers vectors (`query_vectors`); tensors lie where the lift's features do."""
+
+    scores: Tensor  # [P] f32 in -1..1; -1 where not seen
+    splats: Tensor  # [P] bool, seen and at or above the threshold
+    threshold: float  # on the scores
+    explanation: str  # one sentence on how it was found
+    present: bool  # whether some splats were found that stand apart from the others
+    objects: Objects | None  # the things that they make up, with boxes; None where no splats were given
 
 
 def ask(scene: QueryScene, query: Query | str, encoder: TextEncoder | None = None) -> Answer:
@@ -95,9 +109,52 @@ def ask(scene: QueryScene, query: Query | str, encoder: TextEncoder | None = Non
     return answers(scene, [question(scene, query, encoder)])[0]
 
 
+def query_vectors(
+    result: LiftResult,
+    positives: Any,
+    negatives: Any = (),
+    *,
+    splats: Splats | None = None,
+    threshold: str | float = "auto",
+    instances: int | None = None,
+    keep: str = "all",
+) -> VectorAnswer:
+    """Ask a lift for vectors of its text space, as a text encoder gives them.
+
+    Args:
+        result: the lift.
+        positives: [n, F] or [F], torch or numpy, what is looked for; rows of any length above zero.
+        negatives: [m, F], what takes away from the scores (`scores.combine`).
+        splats: that were lifted; with them the answer has objects.
+        threshold, instances: as in `find_threshold`. keep: of the objects, all or the largest.
+
+    Raises:
+        InvalidQuery: a vector of another length, of zeros or not finite; or what `Query` refuses.
+    """
+    import torch
+
+    scene = QueryScene(result, splats)
+    groups = [_vectors(values) for values in (positives, negatives)]
+    query = Query(*groups, threshold=threshold, instances=instances, keep=keep)
+    rows = directions(scene, query, None)
+    answer = answers(scene, [Question(query, rows, np.ones(len(rows), np.bool_))])[0]
+    scores, selected = (
+        torch.from_numpy(array).to(result.features.device) for array in (answer.scores, answer.selected)
+    )
+    found = None if splats is None else objects(scene, answer)
+    present = answer.clear and answer.count > 0
+    return VectorAnswer(scores, selected, answer.threshold, answer.explanation, present, found)
+
+
+def _vectors(values: Any) -> tuple[Vector, ...]:
+    rows = np.asarray(as_numpy(values), np.float64)
+    return tuple(Vector(tuple(row.tolist())) for row in np.atleast_2d(rows)) if rows.size else ()
+
+
 def question(scene: QueryScene, query: Query, encoder: TextEncoder | None) -> Question:
     """A query with the directions of its terms; what can be wrong with a query is found here (see `ask`)."""
-    return Question(query, directions(scene, query, encoder))
+    words = np.array([isinstance(term, str) for term in query.terms])
+    return Question(query, directions(scene, query, encoder), words)
 
 
 def answers(scene: QueryScene, questions: Sequence[Question]) -> list[Answer]:
@@ -117,46 +174,46 @@ def top(answer: Answer, scene: QueryScene, count: int) -> Found:
     Raises:
         InvalidLift: the splats moved or changed since the lift.
     """
-    means = scene.splats.means
-    ranked = answer.scores if scene.all_seen else torch.where(answer.seen, answer.scores, -torch.inf)
-    scores, order = torch.topk(ranked, min(count, len(ranked)))
-    best = tuple(
-        TopSplat(row, score, _point(means[row]))
-        for row, score in zip(order.tolist(), scores.tolist(), strict=True)
-        if score > -torch.inf
-    )
-    chosen = torch.from_numpy(np.flatnonzero(answer.selected.numpy()))
+    places = scene.axes
+    seen = np.flatnonzero(answer.seen)
+    scores = answer.scores[seen]
+    if 0 < count < len(scores):
+        last = np.partition(scores, len(scores) - count)[len(scores) - count]
+        seen = np.concatenate([seen[scores > last], seen[scores == last]])[:count]
+    best = seen[np.argsort(-answer.scores[seen], kind="stable")][:count]
+    told = tuple(TopSplat(int(row), float(answer.scores[row]), _point(places[:, row])) for row in best)
+    chosen = np.flatnonzero(answer.selected)
     if not len(chosen):
-        return Found(best, None)
-    low, high = torch.aminmax(scene.axes.index_select(1, chosen), dim=1)
-    return Found(best, (_point(low), _point(high)))
+        return Found(told, None)
+    taken = [axis[chosen] for axis in places]
+    low, high = np.array([axis.min() for axis in taken]), np.array([axis.max() for axis in taken])
+    return Found(told, (_point(low), _point(high)))
 
 
-def _similarities(scene: QueryScene, questions: Sequence[Question]) -> list[Tensor]:
+def _similarities(scene: QueryScene, questions: Sequence[Question]) -> list[np.ndarray]:
     """For each query [P, n] f32, how like each of its terms every splat is."""
-    words = [torch.tensor([isinstance(term, str) for term in asked.query.terms]) for asked in questions]
-    of_words = torch.cat([asked.rows[spoken] for asked, spoken in zip(questions, words, strict=True)])
-    features, norms = scene.lift.features, scene.norms
+    features, norms = scene.features, scene.norms
+    of_words = np.concatenate([asked.rows[asked.plain] for asked in questions])
     # Words lie in rows from here on, so that each is read in one piece.
-    columns = iter(cosines(features, norms, of_words).T.contiguous() if len(of_words) else ())
+    columns = iter(np.ascontiguousarray(cosines(features, norms, of_words).T) if len(of_words) else ())
     found = []
-    for asked, spoken in zip(questions, words, strict=True):
-        similar = torch.empty(len(asked.rows), features.shape[0])
-        if not spoken.all():
-            similar[~spoken] = cosines_about(features, norms, scene.mean, asked.rows[~spoken]).T
-        for row in spoken.nonzero():
+    for asked in questions:
+        similar = np.empty((len(asked.rows), len(features)), np.float32)
+        if not asked.plain.all():
+            similar[~asked.plain] = cosines_about(features, norms, scene.mean, asked.rows[~asked.plain]).T
+        for row in np.flatnonzero(asked.plain):
             similar[row] = next(columns)
         found.append(similar.T)
     return found
 
 
-def _answer(scene: QueryScene, asked: Question, similarities: Tensor) -> Answer:
+def _answer(scene: QueryScene, asked: Question, similarities: np.ndarray) -> Answer:
     query, seen = asked.query, scene.seen
     scores = combine(similarities, len(query.positives))
     if not scene.all_seen:
-        scores = torch.where(seen, scores, LOWEST_COSINE)
+        scores = np.where(seen, scores, np.float32(LOWEST_COSINE))
     known = scores if scene.all_seen else scores[seen]
-    least = -math.inf if any(isinstance(term, str) for term in query.positives) else LEAST_LIKENESS
+    least = -math.inf if asked.plain[: len(query.positives)].any() else LEAST_LIKENESS
     found = find_threshold(known, query.threshold, scene.weights, query.instances, least)
     return Answer(
         query=query,
@@ -165,21 +222,21 @@ def _answer(scene: QueryScene, asked: Question, similarities: Tensor) -> Answer:
         threshold=found.value,
         threshold_method=found.method,
         explanation=found.explanation,
-        selected=seen & (scores >= found.value),
+        selected=seen & (scores >= np.float32(found.value)),
         statistics=_statistics(known),
+        clear=found.clear,
     )
 
 
-def _statistics(scores: Tensor) -> dict[str, float]:
+def _statistics(scores: np.ndarray) -> dict[str, float]:
     if len(scores) == 0:
         return {}
-    places = [round(q * (len(scores) - 1)) for q in _QUANTILES]
-    ordered = np.sort(scores.numpy())  # in vector registers, so faster than selecting seven order statistics
-    low, high = torch.aminmax(scores)
-    quantiles = {f"q{round(100 * q):02d}": float(ordered[i]) for q, i in zip(_QUANTILES, places, strict=True)}
-    return {"min": float(low), "max": float(high), "mean": float(scores.mean()), **quantiles}
+    ordered = np.sort(scores)  # in vector registers, so faster than selecting seven order statistics
+    quantiles = {f"q{round(100 * q):02d}": float(ordered[round(q * (len(scores) - 1))]) for q in _QUANTILES}
+    mean = float(scores.mean(dtype=np.float64))
+    return {"min": float(ordered[0]), "max": float(ordered[-1]), "mean": mean, **quantiles}
 
 
-def _point(row: Tensor) -> Point:
+def _point(row: np.ndarray) -> Point:
     x, y, z = row.tolist()
     return x, y, z

@@ -1,39 +1,12 @@
-"""Colours: of splats as a camera sees them, and of scores as people read them."""
-
-from __future__ import annotations
+"""Colours of scores and clusters, as people read them: arcs through OKLab (Ottosson 2020)."""
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from liftcore.scene.cameras import Camera
-    from liftcore.scene.splats import Splats
-
-# Real spherical harmonics, in the field's order and signs (Condon-Shortley phase left in).
-SH_C0 = 0.28209479177387814  # 1 / (2 sqrt(pi))
-SH_C1 = math.sqrt(3 / (4 * math.pi))
-SH_C2 = (
-    math.sqrt(15 / (4 * math.pi)),
-    math.sqrt(5 / (16 * math.pi)),
-    math.sqrt(15 / (16 * math.pi)),
-)
-SH_C3 = (
-    math.sqrt(35 / (32 * math.pi)),
-    math.sqrt(105 / (4 * math.pi)),
-    math.sqrt(21 / (32 * math.pi)),
-    math.sqrt(7 / (16 * math.pi)),
-    math.sqrt(105 / (16 * math.pi)),
-)
+SH_C0 = 0.28209479177387814  # 1 / (2 sqrt(pi)), the constant spherical harmonic
 NO_CLUSTER_COLOUR = (90, 90, 90)  # sRGB of splats in no cluster
 NOT_SEEN_COLOUR = (90, 90, 90)  # sRGB of splats without a score
-_LOBE_SHARPNESS = 10 * math.log(2)
-_LARGEST_POWER = 1e30
-NO_COLOUR = 0.6  # grey of splats whose file holds no colours
 
 # The map runs from dark violet over green to light yellow: its lightness rises evenly, so that equal steps of
 # score look equal, also in grey.
@@ -45,72 +18,6 @@ _HEAT_RANGE = (0.01, 0.999)  # quantiles that the map spans: one hot pixel dims 
 
 _CLUSTER_LIGHTNESS = (0.72, 0.86, 0.58)
 _CLUSTER_CHROMA = 0.13
-
-
-def seen_colours(splats: Splats, camera: Camera) -> Tensor:
-    """The colours of splats from a camera, ``max(0, 0.5 + sum_k SH_k(d) c_k + lobes)`` with d from camera to splat.
-
-    Args:
-        splats: the scene, with spherical harmonics of degree 0 to 3; coefficients above are left out. The lobes of
-            DBS are added where the file has them.
-        camera: where they are seen from.
-
-    Returns:
-        [P, 3] f32, at least zero; grey for splats without colours.
-    """
-    if splats.sh is None:
-        return torch.full((splats.count, 3), NO_COLOUR)
-    centre = torch.from_numpy(np.asarray(camera.centre, dtype=np.float32))
-    directions = torch.nn.functional.normalize(splats.means - centre, dim=1)
-    basis = _sh_basis(directions, min(splats.sh_degree or 0, 3))
-    colours = torch.einsum("pk,pkc->pc", basis, splats.sh[:, : basis.shape[1]])
-    if splats.sb_params is not None:
-        colours += _lobes(directions, splats.sb_params)
-    return (colours + 0.5).clamp_min(0.0)
-
-
-def _lobes(directions: Tensor, sb_params: Tensor) -> Tensor:
-    """Spherical beta lobes (DBS): ``sum_s softplus(rgb_s) max(0, mu_s d)^(4 exp(b_s))``.
-
-    Args:
-        directions: [P, 3] f32, unit, from camera to splat.
-        sb_params: [P, S, 6] f32, r g b theta phi b of each lobe, with
-            ``mu = (sin theta cos phi, sin theta sin phi, cos theta)`` and a softplus of sharpness 10 ln 2.
-
-    Returns:
-        [P, 3] f32.
-    """
-    colour = torch.nn.functional.softplus(sb_params[..., :3], beta=_LOBE_SHARPNESS)
-    theta, phi, b = sb_params[..., 3:].unbind(dim=2)
-    mu = torch.stack([theta.sin() * phi.cos(), theta.sin() * phi.sin(), theta.cos()], dim=2)
-    facing = torch.einsum("psk,pk->ps", mu, directions)
-    # Powers by logarithms: the exponent may be infinite, and a lobe seen from behind gives nothing at any exponent.
-    exponent = (4.0 * b.exp()).clamp_max(_LARGEST_POWER)
-    power = (exponent * facing.clamp(1e-30, 1.0).log()).exp()
-    return torch.einsum("ps,psc->pc", torch.where(facing > 0, power, 0.0), colour)
-
-
-def _sh_basis(directions: Tensor, degree: int) -> Tensor:
-    """[P, 3] unit vectors -> [P, (degree + 1)^2] values of the real spherical harmonics."""
-    x, y, z = directions.unbind(dim=1)
-    terms = [torch.full_like(x, SH_C0)]
-    if degree >= 1:
-        terms += [-SH_C1 * y, SH_C1 * z, -SH_C1 * x]
-    if degree >= 2:
-        a, b, c = SH_C2
-        terms += [a * x * y, -a * y * z, b * (3 * z * z - 1), -a * x * z, c * (x * x - y * y)]
-    if degree >= 3:
-        a, b, c, d, e = SH_C3
-        terms += [
-            -a * y * (3 * x * x - y * y),
-            b * x * y * z,
-            -c * y * (5 * z * z - 1),
-            d * z * (5 * z * z - 3),
-            -c * x * (5 * z * z - 1),
-            e * z * (x * x - y * y),
-            -a * x * (x * x - 3 * y * y),
-        ]
-    return torch.stack(terms, dim=1)
 
 
 def colour_map() -> np.ndarray:

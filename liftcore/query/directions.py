@@ -2,32 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import groupby
 from operator import itemgetter
 from typing import TYPE_CHECKING
 
-import torch
+import numpy as np
 
 from liftcore.errors import InvalidQuery, NotFound
-from liftcore.features.views import Regions
-from liftcore.query.example import OneSplat, Pixel, Region, Vector
-from liftcore.scene.cameras import drawn_by, photo_size, pixel_of
-from liftcore.scene.views import cameras_of_views
+from liftcore.query.scene import QueryScene, as_numpy
+from liftcore.query.terms import OneSplat, Pixel, Query, Region, Vector
+from liftcore.query.text import TextEncoder
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from torch import Tensor
-
-    from liftcore.query.encoders import TextEncoder
-    from liftcore.query.query import Query, Term
-    from liftcore.query.scene import QueryScene
+    from liftcore.features.views import Regions
 
 MINIMUM_ROW_SUM = 0.5  # below it a ray mostly misses the scene: no histogram, no mask and no example takes it
 
 
-def directions(scene: QueryScene, query: Query, encoder: TextEncoder | None) -> Tensor:
+def directions(scene: QueryScene, query: Query, encoder: TextEncoder | None) -> np.ndarray:
     """The unit vector of every term, [n, F] f32; errors name a term as the query does.
 
     Raises:
@@ -40,8 +34,8 @@ def directions(scene: QueryScene, query: Query, encoder: TextEncoder | None) -> 
     for place, term in enumerate(query.terms):
         if isinstance(term, Pixel | OneSplat | Vector):
             with _named(query, place):
-                rows[place] = _of_example(scene, term)
-    return torch.stack([rows[place] for place in range(len(query.terms))])
+                rows[place] = _unit(_feature(scene, term), "vector" if isinstance(term, Vector) else str(term))
+    return np.stack([rows[place] for place in range(len(query.terms))])
 
 
 @contextmanager
@@ -52,28 +46,25 @@ def _named(query: Query, place: int) -> Iterator[None]:
     except (InvalidQuery, NotFound) as error:
         if not query.names:
             raise
-        term: Term = query.terms[place]
+        term = query.terms[place]
         got = error.got if isinstance(term, str | Vector) else f"{error.got} in {term}"
         raise type(error)(query.names[place], expected=error.expected, got=got, hint=error.hint) from None
 
 
-def _encode(scene: QueryScene, query: Query, encoder: TextEncoder | None) -> dict[int, Tensor]:
+def _encode(scene: QueryScene, query: Query, encoder: TextEncoder | None) -> dict[int, np.ndarray]:
     """The unit vector of each text, by its place among the terms."""
     texts = {place: term for place, term in enumerate(query.terms) if isinstance(term, str)}
     if not texts:
         return {}
-    space = scene.lift.metadata.text_space or "not named"
+    space = scene.metadata.text_space or "not named"
     if encoder is None:
         expected = f"a text encoder (the lift's text space: {space})"
         hint = "name a text encoder of the lift's space, or ask by example"
         raise InvalidQuery("encoder", expected=expected, got="no encoder", hint=hint)
     if encoder.channels != scene.channels:
-        raise InvalidQuery(
-            "encoder",
-            expected=f"{scene.channels} channels as the lift has (its text space: {space})",
-            got=f"{encoder.name} with {encoder.channels}",
-            hint="query with the text encoder that belongs to the features' image encoder",
-        )
+        expected = f"{scene.channels} channels as the lift has (its text space: {space})"
+        hint = "query with the text encoder that belongs to the features' image encoder"
+        raise InvalidQuery("encoder", expected=expected, got=f"{encoder.name} with {encoder.channels}", hint=hint)
     try:
         rows = encoder.encode(list(texts.values()))
     except InvalidQuery:
@@ -81,34 +72,66 @@ def _encode(scene: QueryScene, query: Query, encoder: TextEncoder | None) -> dic
             with _named(query, place):
                 encoder.encode([text])
         raise
-    return {place: _unit(row, text) for row, (place, text) in zip(rows, texts.items(), strict=True)}
+    return {place: _unit(row, text) for row, (place, text) in zip(as_numpy(rows), texts.items(), strict=True)}
 
 
-def _regions(scene: QueryScene, query: Query) -> dict[int, Tensor]:
+def _regions(scene: QueryScene, query: Query) -> dict[int, np.ndarray]:
     """The unit row of each region, by its place among the terms; a view is read once for all that are of it."""
     asked = [(term.view, place, term) for place, term in enumerate(query.terms) if isinstance(term, Region)]
-    rows: dict[int, Tensor] = {}
+    rows: dict[int, np.ndarray] = {}
     for _, of_view in groupby(sorted(asked, key=itemgetter(0, 1)), key=itemgetter(0)):
-        observation = None  # one view at a time: maps are large
+        regions = None  # one view at a time: maps are large
         for _, place, term in of_view:
             with _named(query, place):
-                observation = observation or _observation(scene, term)
-                rows[place] = _unit(_codebook_row(observation, term), str(term))
+                regions = regions or _view_regions(scene, term)
+                rows[place] = _unit(_codebook_row(regions, term), str(term))
     return rows
 
 
-def _of_example(scene: QueryScene, example: Pixel | OneSplat | Vector) -> Tensor:
+def _view_regions(scene: QueryScene, example: Region) -> Regions:
+    from liftcore.features.views import Regions
+    from liftcore.scene.views import cameras_of_views
+
+    packs = scene.packs
+    view = cameras_of_views([example.view], packs.views).get(example.view)  # named as the pack or its camera is
+    if view is None:
+        raise NotFound(str(example), expected="a view of the lift's feature packs", got=repr(example.view))
+    found = packs[view]
+    if not isinstance(found, Regions):
+        hint = "ask by a pixel, VIEW:x,y"
+        raise InvalidQuery(str(example), expected="a view with regions", got="a feature grid", hint=hint)
+    return found
+
+
+def _codebook_row(regions: Regions, example: Region) -> np.ndarray:
+    levels = regions.labels.shape[0]
+    if example.level >= levels:
+        raise NotFound(str(example), expected=f"a level in 0..{levels - 1}", got=str(example.level))
+    if not bool((regions.labels[example.level] == example.region).any()):
+        expected = f"a label of level {example.level} in view {example.view!r}"
+        raise NotFound(str(example), expected=expected, got=str(example.region))
+    return as_numpy(regions.codebook[example.region])
+
+
+def _feature(scene: QueryScene, example: Pixel | OneSplat | Vector) -> np.ndarray:
     if isinstance(example, Pixel):
-        return _unit(_rendered(scene, example), str(example))
-    if isinstance(example, OneSplat):
-        return _unit(_splat_row(scene, example), str(example))
-    if len(example.values) != scene.channels:
-        raise InvalidQuery("vector", expected=f"{scene.channels} channels, as the lift has", got=str(example))
-    return _unit(torch.tensor(example.values, dtype=torch.float64), "vector")
+        return _rendered(scene, example)
+    if isinstance(example, Vector):
+        if len(example.values) != scene.channels:
+            raise InvalidQuery("vector", expected=f"{scene.channels} channels, as the lift has", got=str(example))
+        return np.array(example.values)
+    count = len(scene.features)
+    if example.splat >= count:
+        raise InvalidQuery(str(example), expected=f"a splat in 0..{count - 1}", got=str(example.splat))
+    return scene.features[example.splat]
 
 
-def _rendered(scene: QueryScene, pixel: Pixel) -> Tensor:
-    """``sum_j A_ij x_j`` of the pixel's ray, [F] f64, walked as scores are rendered."""
+def _rendered(scene: QueryScene, pixel: Pixel) -> np.ndarray:
+    """``sum_j A_ij x_j`` of the pixel's ray, [F] f64, as scores are rendered."""
+    import torch
+
+    from liftcore.scene.cameras import drawn_by, photo_size, pixel_of
+
     camera = scene.cameras[pixel.view]
     width, height = photo_size(camera)
     if not (0 <= pixel.x < width and 0 <= pixel.y < height):
@@ -119,51 +142,22 @@ def _rendered(scene: QueryScene, pixel: Pixel) -> Tensor:
         hint = "pick a pixel nearer to the middle"
         got = "one at the rim of a wide lens"
         raise InvalidQuery(str(pixel), expected="a pixel that a pinhole sees", got=got, hint=hint)
-    row = scene.raster.ray_rows(drawn_by(camera), torch.tensor([drawn], dtype=torch.int32), scene.walk)
-    met = float(row.weights.sum())
+    row = scene.raster.ray_rows(drawn_by(camera), torch.tensor([drawn], dtype=torch.int32), scene.compositing)
+    weights, splats = as_numpy(row.weights), as_numpy(row.splats)
+    met = float(weights.sum())
     if met < MINIMUM_ROW_SUM:
-        raise InvalidQuery(
-            str(pixel), expected="a pixel that shows the scene", got=f"a ray that splats fill by {met:.1%}",
-            hint="pick a pixel on a surface",
-        )  # fmt: skip
-    return row.weights.double() @ scene.lift.features[row.splats.long()].double()
+        got = f"a ray that splats fill by {met:.1%}"
+        hint = "pick a pixel on a surface"
+        raise InvalidQuery(str(pixel), expected="a pixel that shows the scene", got=got, hint=hint)
+    return weights.astype(np.float64) @ scene.features[splats].astype(np.float64)
 
 
-def _observation(scene: QueryScene, example: Region) -> Regions:
-    packs = scene.packs
-    view = cameras_of_views([example.view], packs.views).get(example.view)  # named as the pack or its camera is
-    if view is None:
-        raise NotFound(str(example), expected="a view of the lift's feature packs", got=repr(example.view))
-    observation = packs[view]
-    if not isinstance(observation, Regions):
-        hint = "ask by a pixel, VIEW:x,y"
-        raise InvalidQuery(str(example), expected="a view with regions", got="a feature grid", hint=hint)
-    return observation
-
-
-def _codebook_row(observation: Regions, example: Region) -> Tensor:
-    levels = observation.labels.shape[0]
-    if example.level >= levels:
-        raise NotFound(str(example), expected=f"a level in 0..{levels - 1}", got=str(example.level))
-    if not bool((observation.labels[example.level] == example.region).any()):
-        expected = f"a label of level {example.level} in view {example.view!r}"
-        raise NotFound(str(example), expected=expected, got=str(example.region))
-    return observation.codebook[example.region].double()
-
-
-def _splat_row(scene: QueryScene, example: OneSplat) -> Tensor:
-    count = scene.lift.features.shape[0]
-    if example.splat >= count:
-        raise InvalidQuery(str(example), expected=f"a splat in 0..{count - 1}", got=str(example.splat))
-    return scene.lift.features[example.splat].double()
-
-
-def _unit(vector: Tensor, name: str) -> Tensor:
+def _unit(vector: np.ndarray, name: str) -> np.ndarray:
     """[F] f32 of length one. Scaled by its largest entry first, so that no square overflows or vanishes."""
-    wide = vector.to(torch.float64)
-    largest = wide.abs().max()
-    if not bool(torch.isfinite(largest)) or float(largest) == 0:
-        got = "nothing but zeros" if float(largest) == 0 else "NaN or infinity"
+    wide = np.asarray(vector, np.float64)
+    largest = np.abs(wide).max()
+    if not np.isfinite(largest) or largest == 0:
+        got = "nothing but zeros" if largest == 0 else "NaN or infinity"
         raise InvalidQuery(name, expected="a finite feature with a direction", got=got)
     scaled = wide / largest
-    return (scaled / torch.linalg.vector_norm(scaled)).to(torch.float32)
+    return (scaled / np.linalg.norm(scaled)).astype(np.float32)

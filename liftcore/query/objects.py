@@ -1,22 +1,28 @@
-"""How many things an answer found, and where each lies."""
+"""How many things an answer found, and where each lies: components of the graph in which splats touch."""
 
-from __future__ import annotations
-
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from liftcore.errors import InvalidQuery
-from liftcore.query.touching import touching
+from liftcore.query.scene import QueryScene, as_numpy
+from liftcore.raster.base import MAX_LOG_SCALE
+from liftcore.scene.quaternions import rotation_matrices
 
 if TYPE_CHECKING:
     from liftcore.query.ask import Answer, Point
-    from liftcore.query.scene import QueryScene
+    from liftcore.scene.splats import Splats
 
 LEAST_EVIDENCE = 0.05  # of an object, as a share of the largest's
 MOST_SPLATS = 1 << 20  # that are grouped: a million take seven seconds of two cores and a gigabyte
+NEIGHBOURS = 16  # that each splat looks at, the nearest by their centres
+REACH = 2.0  # standard deviations to which a splat touches
 _TAIL = 1e-3  # of an object's evidence that its box leaves out at each end of each axis
+_PIECE = 1 << 14  # splats whose neighbours are looked at at once
+_TOLD_APART = 1e-12  # of the farthest coordinate
 
 
 @dataclass(frozen=True)
@@ -26,8 +32,8 @@ class FoundObject:
     splats: int  # how many
     share: float  # of the evidence of all selected splats
     score: float  # the mean of its splats' scores, by their evidence
-    centre: Point  # the middle of its box, world frame, scene units
-    box: tuple[Point, Point]  # least and greatest corner of the splats' centres, but for a thousandth at each end
+    centre: "Point"  # the middle of its box, world frame, scene units
+    box: "tuple[Point, Point]"  # least and greatest corner of the splats' centres, but for a thousandth at each end
 
 
 @dataclass(frozen=True)
@@ -39,7 +45,7 @@ class Objects:
     strays: int  # selected splats that belong to none
 
 
-def objects(scene: QueryScene, answer: Answer) -> Objects:
+def objects(scene: QueryScene, answer: "Answer") -> Objects:
     """Group the selected splats of an answer into the things that they make up.
 
     Things are splats that touch (`touching`). What has less than a twentieth of the evidence of the largest is no
@@ -50,18 +56,14 @@ def objects(scene: QueryScene, answer: Answer) -> Objects:
         InvalidQuery: more splats were selected than are grouped.
         InvalidLift: the splats moved or changed since the lift.
     """
-    rows = np.flatnonzero(answer.selected.numpy())
+    rows = np.flatnonzero(answer.selected)
     if len(rows) > MOST_SPLATS:
-        raise InvalidQuery(
-            "threshold",
-            expected=f"at most {MOST_SPLATS:,} splats at or above it, to make objects of them",
-            got=f"{len(rows):,}",
-            hint="name a higher threshold",
-        )
+        expected = f"at most {MOST_SPLATS:,} splats at or above it, to make objects of them"
+        raise InvalidQuery("threshold", expected=expected, got=f"{len(rows):,}", hint="name a higher threshold")
     numbers = np.full(len(answer.scores), -1, np.int32)
     if not len(rows):
         return Objects((), numbers, 0)
-    evidence = scene.lift.evidence.numpy()[rows].astype(np.float64)
+    evidence = scene.evidence[rows].astype(np.float64)
     weights = evidence if evidence.any() else np.ones(len(rows))
     groups = touching(scene.splats, rows)
     sums = np.bincount(groups, weights)
@@ -70,8 +72,7 @@ def objects(scene: QueryScene, answer: Answer) -> Objects:
     places = np.full(len(sums), -1, np.int32)
     places[order[:large]] = np.arange(large)
     numbers[rows] = places[groups]
-    means, scores = scene.splats.means.numpy(), answer.scores.numpy()
-    found = []
+    means, found = as_numpy(scene.splats.means), []
     for number in range(large):
         inside = numbers[rows] == number
         low, high = _box(means[rows[inside]], weights[inside])
@@ -79,12 +80,74 @@ def objects(scene: QueryScene, answer: Answer) -> Objects:
             FoundObject(
                 splats=int(inside.sum()),
                 share=float(weights[inside].sum() / weights.sum()),
-                score=float(np.average(scores[rows[inside]], weights=weights[inside])),
+                score=float(np.average(answer.scores[rows[inside]], weights=weights[inside])),
                 centre=_point((low + high) / 2),
                 box=(_point(low), _point(high)),
             )
         )
     return Objects(tuple(found), numbers, int((numbers[rows] < 0).sum()))
+
+
+def touching(splats: "Splats", rows: np.ndarray) -> np.ndarray:
+    """Put splats that touch, directly or through others, into one group.
+
+    Two splats touch where ``|m_j - m_k| <= 2 (s_j + s_k)``, with s the standard deviation of each along the line
+    between their centres, ``sqrt(d^T Sigma d)``: a rule without a length of its own, as scenes have no common unit.
+    Each looks at its 16 nearest among the rows.
+
+    Args:
+        splats: the scene. rows: [n] i64, the splats to group; the others do not connect.
+
+    Returns:
+        [n] i32, the number of each row's group, from 0 in the order of their first rows.
+    """
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import KDTree
+
+    count = len(rows)
+    if count < 2:
+        return np.zeros(count, np.int32)
+    means, covariances = as_numpy(splats.means)[rows].astype(np.float64), _covariances(splats, rows)
+    # Points at one place make a leaf that no search can divide: told apart by less than float32 can, they are.
+    extent = float(np.abs(means).max()) or 1.0
+    places = means + _TOLD_APART * extent * np.random.default_rng(0).random(means.shape)
+    tree = KDTree(places)
+
+    def look(first: int) -> tuple[np.ndarray, np.ndarray]:
+        piece = slice(first, first + _PIECE)
+        near = np.asarray(tree.query(places[piece], min(NEIGHBOURS + 1, count))[1])  # itself among them
+        touch = _touch(means, covariances, np.arange(first, first + len(near)), near)
+        return near[touch], touch.sum(axis=1)
+
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        looks = list(pool.map(look, range(0, count, _PIECE)))
+    columns, sizes = (np.concatenate(parts) for parts in zip(*looks, strict=True))
+    indptr = np.concatenate([[0], np.cumsum(sizes)])
+    graph = csr_array((np.ones(len(columns), np.int8), columns, indptr), shape=(count, count))
+    return connected_components(graph, directed=True, connection="weak")[1]
+
+
+def _touch(means: np.ndarray, covariances: np.ndarray, own: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """[m, k] bool, which of the rows ``near`` [m, k] the rows ``own`` [m] touch; means [n, 3], covariances [n, 6]."""
+    x, y, z = (means[near, axis] - means[own, axis, None] for axis in range(3))
+    squares = (x * x, y * y, z * z, x * y, x * z, y * z)
+    # s |d| of both sides, so that nothing is divided by a distance of zero.
+    mine, theirs = np.zeros(near.shape), np.zeros(near.shape)
+    for place, square in enumerate(squares):
+        mine += covariances[own, place, None] * square
+        theirs += covariances[near, place] * square
+    reach = REACH * (np.sqrt(np.maximum(mine, 0.0)) + np.sqrt(np.maximum(theirs, 0.0)))
+    return squares[0] + squares[1] + squares[2] <= reach
+
+
+def _covariances(splats: "Splats", rows: np.ndarray) -> np.ndarray:
+    """[n, 6] f64, Sigma of each splat: xx, yy, zz, and twice xy, xz, yz."""
+    scales = np.exp(as_numpy(splats.log_scales)[rows].astype(np.float64).clip(-MAX_LOG_SCALE, MAX_LOG_SCALE))
+    turned = rotation_matrices(as_numpy(splats.quats)[rows])[:, :, : scales.shape[1]]  # a disc has two axes
+    x, y, z = (turned * scales[:, None]).transpose(1, 2, 0)
+    products = (x * x, y * y, z * z, 2 * x * y, 2 * x * z, 2 * y * z)
+    return np.stack([product.sum(axis=0) for product in products], axis=1)
 
 
 def _box(means: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -98,6 +161,6 @@ def _box(means: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray
     return corners[0], corners[1]
 
 
-def _point(row: np.ndarray) -> Point:
+def _point(row: np.ndarray) -> "Point":
     x, y, z = row.tolist()
     return x, y, z

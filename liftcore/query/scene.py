@@ -1,24 +1,21 @@
-"""A lift opened for queries, with the scene that it was made from."""
+"""A lift opened for queries, with the splats, cameras and packs that it was made from."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
 
-from liftcore.errors import InvalidQuery
-from liftcore.io.lift_file import load_lift
-from liftcore.query.in_photo import in_photo
-from liftcore.query.products import norms_of
-from liftcore.query.scores import mean_direction
-from liftcore.query.unchanged import unchanged
+import numpy as np
+
+from liftcore.errors import InvalidLift, InvalidQuery
+from liftcore.io.lift_file import read_lift
+from liftcore.query.scores import mean_direction, norms_of
 from liftcore.raster.base import CompositingParams
-from liftcore.result import LiftResult
-from liftcore.scene.cameras import drawn_by, photo_size
+from liftcore.result import InputFile, LiftResult
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
+if TYPE_CHECKING:  # these load torch, which scores do without
     from torch import Tensor
 
     from liftcore.features.pack import FeaturePacks
@@ -26,40 +23,84 @@ if TYPE_CHECKING:
     from liftcore.scene.cameras import Camera, Cameras
     from liftcore.scene.splats import Splats
 
-
 MOST_PIXELS = 1 << 26  # of a picture: 67 million take a minute of one core and 2 GB
 
 
 class QueryScene:
-    """Features, and on demand the splats, the cameras and the raster that turn scores into pictures.
+    """What queries read of a lift, and on demand the scene that it was made from.
 
-    Scores need the lift file alone. The scene's own files are found where the lift remembers them, are
-    checked against their digests when first used, and are loaded once.
+    Scores need the lift alone, and no torch. Splats, cameras and packs that are not given are found where the lift
+    remembers them, are checked against their digests when first used, and are loaded once.
+
+    Args:
+        result: the lift. splats: that were lifted. cameras: of the scene. packs: that were lifted.
     """
 
-    def __init__(self, lift: LiftResult, path: Path) -> None:
-        self.lift = lift
-        self.path = path
-        self._packs_at = [Path(file.path) for file in lift.metadata.features]
+    features: np.ndarray  # [P, F] f16 or f32; zero rows where not seen
+    evidence: np.ndarray  # [P] f32
+    cluster: np.ndarray | None  # [P] i32, -1 = in no cluster; None without aggregation
+    cluster_features: np.ndarray | None  # [K, F] like features
+
+    def __init__(
+        self,
+        result: LiftResult,
+        splats: Splats | None = None,
+        cameras: Cameras | None = None,
+        packs: FeaturePacks | None = None,
+    ) -> None:
+        names = ("features", "evidence", "seen", "cluster", "cluster_features")
+        self._hold({name: as_numpy(getattr(result, name)) for name in names})
+        self.path, self.metadata, self.lift = Path("lift"), result.metadata, result
+        given = {"splats": splats, "cameras": cameras, "packs": packs}
+        self.__dict__.update({name: value for name, value in given.items() if value is not None})
+
+    def _hold(self, arrays: dict[str, Any]) -> None:
+        self.features, self.evidence, self._has_feature = (arrays[n] for n in ("features", "evidence", "seen"))
+        self.cluster, self.cluster_features = arrays.get("cluster"), arrays.get("cluster_features")
 
     @classmethod
-    def open(cls, path: Path) -> Self:
-        """Open a lift; its features are mapped, not read.
+    def open(cls, path: Path, *, splats: Path | None = None, cameras: Path | None = None) -> Self:
+        """Open a lift file; its features are mapped, not read.
+
+        Args:
+            path: the lift. splats, cameras: where these lie now, if they moved since the lift.
 
         Raises:
             InvalidLift: the file is missing or is not a lift.
         """
-        return cls(load_lift(path), path)
+        scene = cls.__new__(cls)
+        arrays, metadata = read_lift(path)
+        scene._hold(arrays)
+        moved = {"splats": splats, "cameras": cameras}
+        files = {
+            name: getattr(metadata, name).model_copy(update={"path": str(place)})
+            for name, place in moved.items()
+            if place is not None
+        }
+        scene.path, scene.metadata = path, metadata.model_copy(update=files)
+        return scene
 
     @cached_property
-    def norms(self) -> Tensor:
-        """[P] f32, the features' norms, computed once a lift."""
-        return norms_of(self.lift.features)
+    def lift(self) -> LiftResult:
+        """The lift as torch has it, over the same memory."""
+        from liftcore.io.lift_file import load_lift
+
+        return load_lift(self.path)
+
+    @property
+    def channels(self) -> int:
+        """F."""
+        return int(self.features.shape[1])
 
     @cached_property
-    def seen(self) -> Tensor:
+    def norms(self) -> np.ndarray:
+        """[P] f32, the features' norms."""
+        return norms_of(self.features)
+
+    @cached_property
+    def seen(self) -> np.ndarray:
         """[P] bool, whether a splat has a feature."""
-        return self.lift.seen & (self.norms > 0)
+        return self._has_feature & (self.norms > 0)
 
     @cached_property
     def all_seen(self) -> bool:
@@ -67,27 +108,22 @@ class QueryScene:
         return bool(self.seen.all())
 
     @cached_property
-    def weights(self) -> Tensor | None:
+    def weights(self) -> np.ndarray | None:
         """How much each seen splat counts in a histogram, its evidence; None when none has evidence."""
-        weights = self.lift.evidence[self.seen]
+        weights = self.evidence[self.seen]
         return weights if bool((weights > 0).any()) else None
 
     @cached_property
-    def mean(self) -> Tensor:
+    def mean(self) -> np.ndarray:
         """[F] f32, the mean of the unit features, weighted by evidence: what all the scene's features share."""
-        return mean_direction(self.lift.features, self.norms, self.lift.evidence)
+        return mean_direction(self.features, self.norms, self.evidence)
 
     @cached_property
     def principal(self) -> Tensor:
         """[P, 3] f32 in 0..1, the features as colours."""
-        from liftcore.query.principal import principal_colours
+        from liftcore.query.splat_colours import principal_colours
 
-        return principal_colours(self.lift.features, self.lift.evidence)
-
-    @property
-    def channels(self) -> int:
-        """F."""
-        return int(self.lift.features.shape[1])
+        return principal_colours(self.features, self.evidence)
 
     @cached_property
     def splat_file(self) -> Path:
@@ -96,7 +132,7 @@ class QueryScene:
         Raises:
             InvalidLift: it moved, or is another than the one that was lifted.
         """
-        return unchanged("splats", self.lift.metadata.splats, self.path)
+        return self._unchanged("splats", self.metadata.splats)
 
     @cached_property
     def splats(self) -> Splats:
@@ -107,12 +143,12 @@ class QueryScene:
         """
         from liftcore.io.ply import read_splats
 
-        return read_splats(self.splat_file, self.lift.metadata.settings.kernel)
+        return read_splats(self.splat_file, self.metadata.settings.kernel)
 
     @cached_property
-    def axes(self) -> Tensor:
+    def axes(self) -> np.ndarray:
         """[3, P] f32, the splats' places axis by axis: a box around many of them is found five times faster so."""
-        return self.splats.means.T.contiguous()
+        return np.ascontiguousarray(as_numpy(self.splats.means).T)
 
     @cached_property
     def cameras(self) -> Cameras:
@@ -124,25 +160,7 @@ class QueryScene:
         from liftcore.io.cameras import read_cameras
 
         # Which of several models was meant, the lift knew: its digest tells that the same is read.
-        return read_cameras(unchanged("cameras", self.lift.metadata.cameras, self.path), choosing=False)
-
-    def image(self, view: str, draw: Callable[[Camera], Tensor]) -> Tensor:
-        """A picture [H, W, ..] of a view in its photo's pixels, from what draws one of a pinhole (`in_photo`).
-
-        Raises:
-            NotFound: no camera has this name.
-            InvalidQuery: its image is larger than pictures may be.
-            InvalidLift: the cameras moved or changed since the lift.
-        """
-        camera = self.cameras[view]
-        for width, height in (photo_size(camera), photo_size(drawn_by(camera))):
-            if width * height > MOST_PIXELS:
-                raise InvalidQuery(
-                    "view", expected=f"an image of at most {MOST_PIXELS} pixels to draw",
-                    got=f"{width}x{height} in {view!r}" + (", for its distorted photo" if camera.lens else ""),
-                    hint="give the scene a camera of that pose with width, height, fx, fy, cx and cy divided alike",
-                )  # fmt: skip
-        return in_photo(camera, draw)
+        return read_cameras(self._unchanged("cameras", self.metadata.cameras), choosing=False)
 
     @cached_property
     def packs(self) -> FeaturePacks:
@@ -153,13 +171,13 @@ class QueryScene:
         """
         from liftcore.features.pack import read_features
 
-        files = zip(self.lift.metadata.features, self._packs_at, strict=True)
-        moved = [file.model_copy(update={"path": str(path)}) for file, path in files]
-        return read_features(*(unchanged("features", file, self.path) for file in moved))
+        return read_features(*(self._unchanged("features", file) for file in self.metadata.features))
 
     def find_packs(self, paths: Sequence[Path]) -> None:
         """Say where the feature packs lie now, when they moved since the lift; in the lift's order."""
-        self._packs_at = list(paths)
+        files = zip(self.metadata.features, paths, strict=True)
+        moved = tuple(file.model_copy(update={"path": str(path)}) for file, path in files)
+        self.metadata = self.metadata.model_copy(update={"features": moved})
 
     @cached_property
     def raster(self) -> Raster:
@@ -169,6 +187,58 @@ class QueryScene:
         return CpuRaster(self.splats, threads=None)
 
     @property
-    def walk(self) -> CompositingParams:
-        """How rays walk when scores are rendered: with the lift's rendering gain (App. Tikhonov)."""
-        return self.lift.metadata.settings.render_params
+    def compositing(self) -> CompositingParams:
+        """How scores are rendered: with the lift's rendering scale of the opacity logits."""
+        return self.metadata.settings.render_params
+
+    def image(self, view: str, draw: Callable[[Camera], Tensor]) -> Tensor:
+        """A picture [H, W, ..] of a view in its photo's pixels, from what draws one of a pinhole (`in_photo`).
+
+        Raises:
+            NotFound: no camera has this name.
+            InvalidQuery: its image is larger than pictures may be.
+            InvalidLift: the cameras moved or changed since the lift.
+        """
+        from liftcore.query.render import in_photo
+        from liftcore.scene.cameras import drawn_by, photo_size
+
+        camera = self.cameras[view]
+        for width, height in (photo_size(camera), photo_size(drawn_by(camera))):
+            if width * height > MOST_PIXELS:
+                raise InvalidQuery(
+                    "view", expected=f"an image of at most {MOST_PIXELS} pixels to draw",
+                    got=f"{width}x{height} in {view!r}" + (", for its distorted photo" if camera.lens else ""),
+                    hint="give the scene a camera of that pose with width, height, fx, fy, cx and cy divided alike",
+                )  # fmt: skip
+        return in_photo(camera, draw)
+
+    def _unchanged(self, role: str, remembered: InputFile) -> Path:
+        """The path of an input, once its bytes are known to be those that were lifted."""
+        if not remembered.path:
+            raise InvalidLift(str(self.path), expected=f"a lift that knows its {role}", got="one of values in memory",
+                              hint=f"give the {role} to QueryScene, too")  # fmt: skip
+        path = Path(remembered.path)
+        if not path.exists():
+            raise InvalidLift(
+                str(self.path), expected=f"its {role} at {path}", got="nothing there",
+                hint=f"move the {role} back to {path}, or lift again from where they are now",
+            )  # fmt: skip
+        # The lift's own digest: one definition for files and folders, where it was taken and where it is checked.
+        from liftcore.io.input_files import camera_input, input_file
+        from liftcore.io.transforms import FRAME_FILE
+
+        found = (camera_input if role == "cameras" else input_file)(path)
+        if found.sha256 != remembered.sha256:
+            beside = f" ({FRAME_FILE} beside them counts too)" if role == "cameras" else ""
+            raise InvalidLift(
+                str(self.path), expected=f"the {role} that were lifted at {path}", got="a file with another SHA-256",
+                hint=f"the {role} changed since the lift{beside}: restore them, or lift again",
+            )  # fmt: skip
+        return path
+
+
+def as_numpy(array: Any) -> Any:
+    """A NumPy array over the same memory where it lies on the CPU, else a copy of it; None stays None."""
+    if array is None or isinstance(array, np.ndarray):
+        return array
+    return array.detach().cpu().numpy() if hasattr(array, "detach") else np.asarray(array)

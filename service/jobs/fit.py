@@ -8,7 +8,7 @@ from typing import Any
 from liftcore.errors import InvalidFeatures, InvalidSettings, InvalidSplats
 from liftcore.io.ply import read_header
 from liftcore.io.ply_dialect import model_slots
-from liftcore.query.encoders.words import nearest, plain
+from liftcore.query.text.table import nearest_words, plain
 from liftcore.raster.base import check_antialiased
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.views import cameras_of_views, require_pairs, some_of
@@ -73,7 +73,7 @@ def check_labels(
         if plain(word) not in words:
             raise InvalidRequest(
                 f"labels.classes.{place}", expected=f"one of the {len(words)} words of {table.id}",
-                got=repr(word[:80]), hint=nearest(word, words),
+                got=repr(word[:80]), hint=nearest_words(word, words),
             )  # fmt: skip
     if len(set(map(plain, classes))) < len(classes):
         got = f"{len(classes)} words, some of them the same"

@@ -9,7 +9,7 @@ import itertools
 import json
 import threading
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -17,19 +17,14 @@ import torch
 
 from liftcore.errors import SplatliftError
 from liftcore.io.json_file import finite
-from liftcore.io.lift_file import load_lift
 from liftcore.query.ask import Answer, Point, Question, answers, question, top
-from liftcore.query.encoders import TextEncoder, open_encoder
-from liftcore.query.encoders.remembering import RememberingEncoder
-from liftcore.query.example import Example, Vector, parse_example
+from liftcore.query.export import coloured_ply, object_ply, scores_npy
 from liftcore.query.objects import Objects, objects
-from liftcore.query.pictures import attention_png, mask_png, render_png
-from liftcore.query.products import cosines_of, norms_of
-from liftcore.query.query import Query
+from liftcore.query.render import ViewMask, attention_png, mask_png, render_png, view_mask
 from liftcore.query.scene import QueryScene
-from liftcore.query.splat_files import coloured_ply, object_ply, scores_npy
-from liftcore.query.touching import warm_up_touching
-from liftcore.query.view_mask import ViewMask, view_mask
+from liftcore.query.scores import warm_up as warm_up_scores
+from liftcore.query.terms import Example, Query, Vector, parse_example
+from liftcore.query.text import RememberingEncoder, TextEncoder, open_encoder
 from liftcore.raster.cpu.warm_up import warm_up
 from liftcore.scene.splats import Kernel
 from service.errors import NoSpace
@@ -81,10 +76,7 @@ class Answers:
         """
         with contextlib.suppress(SplatliftError), self._opening:
             self._encoder(encoder, version).encode([WARM_UP_TEXT])
-        for dtype in (torch.float16, torch.float32):
-            row = torch.ones(1, 1, dtype=dtype)
-            cosines_of(row, norms_of(row), row.to(torch.float32))
-        warm_up_touching()
+        warm_up_scores()
         self._warm_kernel(Kernel.GAUSSIAN_3D)
 
     def reply(self, request: dict[str, Any], ahead: Sequence[dict[str, Any]] = ()) -> Frame:
@@ -105,7 +97,7 @@ class Answers:
     def _answer_together(self, requests: Sequence[dict[str, Any]]) -> None:
         """Answer the first question, and more to its lift as far as one pass goes; errors wait for their turn."""
         scene = self._scene(requests[0])
-        splats = scene.lift.features.shape[0]
+        splats = len(scene.features)
         room = min(
             PRODUCT_BYTES // (COSINE_BYTES * splats), self._cache.limit // (ANSWER_BYTES * splats + ENTRY_BYTES)
         )
@@ -267,13 +259,8 @@ def _example(example: str | list[float], argument: str) -> Example:
 
 def open_scene(request: dict[str, Any]) -> QueryScene:
     """The lift, with its splats and cameras where the store has them now: data directories may move."""
-    path = Path(request["lift"])
-    lift = load_lift(path)
-    moved = {
-        name: getattr(lift.metadata, name).model_copy(update={"path": request[name]})
-        for name in ("splats", "cameras")
-    }
-    return QueryScene(replace(lift, metadata=lift.metadata.model_copy(update=moved)), path)
+    splats, cameras = Path(request["splats"]), Path(request["cameras"])
+    return QueryScene.open(Path(request["lift"]), splats=splats, cameras=cameras)
 
 
 def describe(scene: QueryScene, answer: Answer, count: int) -> dict[str, Any]:

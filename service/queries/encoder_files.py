@@ -14,7 +14,7 @@ from safetensors import SafetensorError, safe_open
 
 from liftcore.errors import InvalidInput
 from liftcore.io.safetensors_file import check_header
-from liftcore.query.encoders.specs import ENCODER_SPECS
+from liftcore.query.text import ENCODER_SPECS
 from service.errors import Misconfigured
 from service.settings import ServiceSettings, encoder_file, encoder_label
 

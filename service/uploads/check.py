@@ -20,7 +20,7 @@ from liftcore.io.inspect import describe_packs, describe_table
 from liftcore.io.inspect_scene import describe_camera_file, describe_splats
 from liftcore.io.json_file import finite
 from liftcore.io.ply import read_splats
-from liftcore.query.encoders.table import TableEncoder
+from liftcore.query.text.table import TableEncoder
 from service.faults import fault_of
 from service.own_stdout import own_stdout
 from service.uploads.checking import INVALID

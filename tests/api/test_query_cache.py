@@ -7,8 +7,7 @@ from typing import Any
 import torch
 
 from liftcore.query.ask import Answer
-from liftcore.query.example import Vector
-from liftcore.query.query import Query
+from liftcore.query.terms import Query, Vector
 from service.queries.answers import _key, bytes_of
 from service.queries.kept import Kept
 

@@ -39,7 +39,7 @@ def opened(made: LiftResult, raster: Raster | None = None) -> QueryScene:
     """A lift to ask questions of, with a raster of its splats that is there already."""
     with tempfile.TemporaryDirectory() as place:
         save_lift(made, Path(place) / "lift.safetensors")
-        scene = QueryScene(made, Path(place) / "lift.safetensors")
+        scene = QueryScene(made)
         if raster is not None:
             scene.raster = raster
         _ = scene.cameras

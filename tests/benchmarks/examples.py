@@ -28,12 +28,11 @@ from liftcore.features.views import Regions
 from liftcore.io.ply import read_splats
 from liftcore.query.ask import ask
 from liftcore.query.directions import MINIMUM_ROW_SUM
-from liftcore.query.example import Pixel
 from liftcore.query.objects import objects
-from liftcore.query.query import Query
+from liftcore.query.render import view_mask
 from liftcore.query.scene import QueryScene
+from liftcore.query.terms import Pixel, Query
 from liftcore.query.threshold import METHODS, find_threshold
-from liftcore.query.view_mask import view_mask
 from liftcore.raster.cpu.raster import CpuRaster
 from tests.benchmarks.base import PACKS, PRESETS, command_line, lift_files, opened, scene_files, tell
 from tests.benchmarks.tabletop import Tabletop

@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 
 from liftcore.query.ask import Answer, ask
-from liftcore.query.encoders import open_encoder
 from liftcore.query.objects import objects
 from liftcore.query.scene import QueryScene
+from liftcore.query.text import open_encoder
 from tests.benchmarks.base import PACKS, PRESETS, command_line, lift_files, opened, scene_files, tell
 from tests.benchmarks.tabletop import Tabletop
 

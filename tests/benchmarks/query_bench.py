@@ -30,9 +30,8 @@ from liftcore.io.inria import write_inria_cameras
 from liftcore.io.lift_file import save_lift
 from liftcore.io.ply import write_splats
 from liftcore.query.ask import Answer, ask
-from liftcore.query.pictures import mask_png
+from liftcore.query.render import mask_png, view_mask
 from liftcore.query.scene import QueryScene
-from liftcore.query.view_mask import view_mask
 from liftcore.result import InputFile, LiftMetadata, LiftResult
 from liftcore.scene.cameras import Cameras
 from liftcore.settings import LiftSettings

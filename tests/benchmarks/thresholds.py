@@ -26,12 +26,12 @@ from torch import Tensor
 from liftcore.evaluate.accuracy import mask_iou
 from liftcore.query.ask import ask
 from liftcore.query.directions import MINIMUM_ROW_SUM
-from liftcore.query.encoders import TextEncoder, open_encoder
 from liftcore.query.objects import objects
-from liftcore.query.query import Query
+from liftcore.query.render import view_mask
 from liftcore.query.scene import QueryScene
+from liftcore.query.terms import Query
+from liftcore.query.text import TextEncoder, open_encoder
 from liftcore.query.threshold import METHODS, find_threshold
-from liftcore.query.view_mask import view_mask
 from tests.benchmarks.base import PACKS, PRESETS, command_line, lift_files, opened, scene_files, tell
 from tests.benchmarks.tabletop import Tabletop
 

@@ -9,10 +9,9 @@ import pytest
 
 from liftcore.io.lift_files import lift_files
 from liftcore.query.ask import ask
-from liftcore.query.example import OneSplat
-from liftcore.query.query import Query
 from liftcore.query.scene import QueryScene
 from liftcore.query.scores import relevancy
+from liftcore.query.terms import OneSplat, Query
 from liftcore.settings import LiftSettings
 from tests.benchmarks.tabletop import Tabletop
 
@@ -32,7 +31,7 @@ class Asked:
             [folder / "features.safetensors"],
             LiftSettings.of(view_stride=4, stride=2),
         )
-        self.scene = QueryScene(made, folder / "no.lift.safetensors")
+        self.scene = QueryScene(made)
         self.truth = Tabletop(folder).objects.numpy()
         evidence = made.evidence.numpy()
         self.best = [int(np.argmax(np.where(self.truth == thing, evidence, -1.0))) for thing in range(CURTAIN + 1)]
@@ -40,7 +39,7 @@ class Asked:
     def iou(self, thing: int, *unlike: int) -> float:
         """Of the splats found with those of the thing."""
         like, *against = (OneSplat(self.best[other]) for other in (thing, *unlike))
-        found = ask(self.scene, Query((like,), tuple(against))).selected.numpy()
+        found = ask(self.scene, Query((like,), tuple(against))).selected
         wanted = (self.truth == thing) & self.scene.seen.numpy()
         return float((found & wanted).sum() / (found | wanted).sum())
 

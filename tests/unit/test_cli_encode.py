@@ -26,7 +26,7 @@ def photos(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def weights(tmp_path: Path) -> Path:
-    from liftcore.query.encoders.open_clip_models import create_model
+    from liftcore.query.text.open_clip import create_model
 
     torch.manual_seed(5)
     path = tmp_path / "clip.pt"

@@ -18,7 +18,7 @@ from .command_line import assert_one_line, lift_arguments, run, write_toy_scene
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from liftcore.query.query import Query
+    from liftcore.query.terms import Query
 
 
 @pytest.fixture

@@ -17,11 +17,9 @@ from liftcore.io.inria import write_inria_cameras
 from liftcore.io.lift_file import save_lift
 from liftcore.io.lift_files import lift_files
 from liftcore.query.ask import ask
-from liftcore.query.example import Pixel, Region
-from liftcore.query.pictures import render_png
-from liftcore.query.query import Query
+from liftcore.query.render import render_png, view_mask
 from liftcore.query.scene import QueryScene
-from liftcore.query.view_mask import view_mask
+from liftcore.query.terms import Pixel, Query, Region
 from liftcore.result import LiftResult
 from liftcore.scene.cameras import Camera
 from liftcore.settings import LiftSettings
@@ -92,11 +90,11 @@ def test_masks_lie_over_the_photo(lens: str, tmp_path: Path) -> None:
             answer = ask(scene, Query((Pixel(view, int(x), int(y)),), threshold=0.5))
             seen = view_mask(scene, answer, view)
             assert seen.mask.shape == photo.shape
-            found, truth = seen.mask.numpy() & (photo >= 0), photo == part
+            found, truth = seen.mask & (photo >= 0), photo == part
             assert (found & truth).sum() / (found | truth).sum() > 0.99
     answer = ask(scene, Query((Region("left", 0, 1),), threshold=0.5))
     shown = is_lifted(scene.cameras["left"]) & (photo_of("left", lens, CLEAR) == 1)
-    assert view_mask(scene, answer, "left").mask.numpy()[shown].all()
+    assert view_mask(scene, answer, "left").mask[shown].all()
     with pytest.raises(InvalidQuery, match=rf"x in 0\.\.{WIDTH - 1} and y in 0\.\.{HEIGHT - 1}, got {WIDTH},0"):
         ask(scene, Query((Pixel("left", WIDTH, 0),)))
     for what in ("rgb", "pca", "depth"):

@@ -11,8 +11,8 @@ from torch import Tensor, nn
 from liftcore.errors import InvalidInput, Unavailable
 from liftcore.features.encoders import Pixels
 from liftcore.nearest import nearest
-from liftcore.query.encoders.open_clip_models import WEIGHT_SUFFIXES
-from liftcore.query.encoders.torchvision_ops import import_torchvision
+from liftcore.query.text.open_clip import WEIGHT_SUFFIXES
+from liftcore.query.text.torchvision_ops import import_torchvision
 
 # What checkpoints hold beside the backbone: classifiers, and what only the training needed.
 _LEFT_OVER = ("mask_token",)

@@ -24,12 +24,12 @@ from liftcore.evaluate.protocols import (
     segment,
 )
 from liftcore.query.ask import Answer, ask
-from liftcore.query.encoders import open_encoder
 from liftcore.query.objects import objects
-from liftcore.query.query import Query
+from liftcore.query.render import view_mask
 from liftcore.query.scene import QueryScene
+from liftcore.query.terms import Query
+from liftcore.query.text import open_encoder
 from liftcore.query.threshold import find_threshold
-from liftcore.query.view_mask import view_mask
 from tests.labelled_scene import HEIGHT, WIDTH, isat, rectangle, write_lift
 
 P1, P2, P3, _ = EvaluationProtocol
@@ -136,7 +136,7 @@ def test_p1_segments_a_map_as_langsplat_does(height: int, width: int) -> None:
 def test_p1_compares_rendered_features(scene: QueryScene) -> None:
     texts = ["red apple", "book"]
     found = RenderedFeatures(scene, texts, words(scene)).cosines("frame_00002")
-    rendered = scene.raster.render(scene.cameras["frame_00002"], scene.lift.features.float(), scene.walk)
+    rendered = scene.raster.render(scene.cameras["frame_00002"], scene.lift.features.float(), scene.compositing)
     unit = torch.nn.functional.normalize(rendered, dim=-1)
     vectors = words(scene).encode([*texts, "object", "things", "stuff", "texture"])
     torch.testing.assert_close(found, unit @ vectors.T, atol=1e-5, rtol=0)
@@ -156,7 +156,7 @@ def test_p2_sees_the_selected_splats_alone(scene: QueryScene) -> None:
         **{name: getattr(splats, name)[chosen] for name in ("means", "quats", "log_scales", "opacity_logits", "sh")},
         extras={},
     )
-    alone = CpuRaster(few).row_sums(scene.cameras["frame_00001"], scene.walk)
+    alone = CpuRaster(few).row_sums(scene.cameras["frame_00001"], scene.compositing)
     found = protocol.look("frame_00001")
     assert (found["red apple"].mask == (alone > 0.7).numpy()).all() and found["red apple"].mask.any()
     assert not found["unicorn"].mask.any() and found["unicorn"].peak is None
@@ -184,7 +184,7 @@ def test_our_own_protocol_makes_the_masks_of_a_query(scene: QueryScene, monkeypa
         found = judged.look(view)
         for text in texts:
             seen = view_mask(scene, ask(scene, Query((text,), ("wall",)), encoder), view)
-            assert (found[text].mask == seen.mask.numpy()).all() and found[text].mask.any()
+            assert (found[text].mask == seen.mask).all() and found[text].mask.any()
             assert found[text].peak is None
     assert [answer.query.positives for answer in made] == [("book",), ("red apple",)]  # once for all views
 

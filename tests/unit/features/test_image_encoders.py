@@ -14,7 +14,7 @@ from liftcore.errors import InvalidInput, Unavailable
 from liftcore.features.encoders import open_image_encoder
 from liftcore.features.encoders.clip import ClipImageEncoder, resnet_values, vit_patches, vit_values
 from liftcore.features.encoders.timm_backbone import TimmEncoder, cell_shift
-from liftcore.query.encoders.open_clip_models import OpenedModel, library
+from liftcore.query.text.open_clip import OpenedModel, library
 
 PATCH, SIDE, WIDTH, F = 8, 32, 24, 10
 
@@ -225,8 +225,8 @@ def test_weights_from_a_file_give_the_same_features(tmp_path: Path, vit: TimmEnc
 
 
 def test_clip_from_a_file_has_the_text_space_that_opens_it(tmp_path: Path) -> None:
-    from liftcore.query.encoders import open_encoder
-    from liftcore.query.encoders.open_clip_models import create_model
+    from liftcore.query.text import open_encoder
+    from liftcore.query.text.open_clip import create_model
 
     torch.manual_seed(1)
     torch.save(create_model("ViT-S-32-alt", None).state_dict(), tmp_path / "clip.pt")

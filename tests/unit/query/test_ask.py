@@ -1,233 +1,305 @@
-"""Questions to a lift: what is selected, what is seen, and what is said when the scene moved or changed."""
+"""Questions to a lift: what is selected, by words, examples and vectors, and what is said when it cannot be."""
 
-from __future__ import annotations
-
-import io
-from collections.abc import Sequence
+import math
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from PIL import Image
+from hypothesis import given
+from hypothesis import strategies as st
 
-from liftcore.errors import InvalidLift, InvalidQuery
-from liftcore.io.input_files import input_file
-from liftcore.io.inria import write_inria_cameras
-from liftcore.io.lift_file import load_lift, save_lift
-from liftcore.io.ply import write_splats
-from liftcore.query.ask import ask, top
-from liftcore.query.colours import NO_CLUSTER_COLOUR, SH_C0, cluster_colours, seen_colours
-from liftcore.query.pictures import attention_png, mask_png, overlay, render, render_png
-from liftcore.query.query import Query
+from liftcore.errors import InvalidLift, InvalidQuery, NotFound, SplatliftError
+from liftcore.io.lift_file import LiftResult, load_lift, save_lift
+from liftcore.query.ask import answers, ask, query_vectors, question, top
+from liftcore.query.directions import directions
 from liftcore.query.scene import QueryScene
-from liftcore.query.view_mask import view_mask
-from liftcore.result import LiftMetadata, LiftResult
-from liftcore.scene.cameras import Cameras
-from liftcore.scene.splats import Kernel, Splats
-from liftcore.settings import LiftSettings
-from tests.scenes import look_at, random_splats
+from liftcore.query.terms import Example, OneSplat, Pixel, Query, Region, Vector, parse_example, read_vector
+from liftcore.query.threshold import find_threshold
+from tests.api.tiny_scene import CHANNELS, HEIGHT, SPLATS_A_CLUSTER, WIDTH
 
-COUNT = 60
+COUNT = 3 * SPLATS_A_CLUSTER
+NAMES = st.text(st.characters(exclude_categories=["Cs"]), min_size=1, max_size=12)
 
 
 class Axes:
-    """Encodes "x", "y", "z" as unit axes."""
+    """Encodes "x", "y", "z" as the unit axes of the three clusters."""
 
     name = "axes"
 
-    def __init__(self, channels: int = 3) -> None:
+    def __init__(self, channels: int = CHANNELS) -> None:
         self.channels = channels
 
-    def encode(self, texts: Sequence[str]) -> torch.Tensor:
-        return torch.eye(self.channels)[["xyz".index(text) for text in texts]]
+    def encode(self, texts: Sequence[str]) -> np.ndarray:
+        return np.eye(self.channels, dtype=np.float32)[["xyz".index(text) for text in texts]]
+
+
+def of(scene: QueryScene, rows: np.ndarray, **fields: torch.Tensor) -> QueryScene:
+    """A lift of other features [P, F], all seen, of evidence one."""
+    ones = torch.ones(len(rows))
+    given = {"evidence": ones, "agreement": ones, "seen": ones > 0} | fields
+    return QueryScene(replace(scene.lift, features=torch.from_numpy(rows.astype(np.float32)), **given))
 
 
 @pytest.fixture
-def lift_file(tmp_path: Path) -> Path:
-    splats = random_splats(3, COUNT)
-    camera = look_at("front", np.array([0.0, -4.0, 0.5]), 40, 30, 40.0)
-    camera = type(camera).pinhole("front", 40, 30, 40.0, 40.0, 20.0, 15.0, camera.viewmat)
-    write_splats(splats, tmp_path / "splats.ply")
-    write_inria_cameras(Cameras((camera,)), tmp_path / "cameras.json")
-    features = torch.eye(3)[torch.arange(COUNT) % 3] + 0.01
-    features[-1] = 0
-    metadata = LiftMetadata(
-        version="0", settings=LiftSettings.of(), splats=input_file(tmp_path / "splats.ply"),
-        cameras=input_file(tmp_path / "cameras.json"), features=(), encoder="axes", text_space="axes",
-        views=("front",), certificate={}, timings={},
-    )  # fmt: skip
-    seen = torch.arange(COUNT) < COUNT - 1
-    lift = LiftResult(features.half(), torch.ones(COUNT), torch.ones(COUNT), seen, metadata)
-    save_lift(lift, tmp_path / "scene.lift")
-    return tmp_path / "scene.lift"
+def exact(scene: QueryScene) -> QueryScene:
+    """Splats j, j + 3, .. mean the same axis, and the last one nothing."""
+    rows = np.eye(CHANNELS)[np.arange(COUNT) % 3] + 0.01
+    rows[-1] = 0
+    return of(scene, rows, seen=torch.arange(COUNT) < COUNT - 1)
 
 
-def test_the_splats_that_mean_the_text_are_selected(lift_file: Path) -> None:
-    answer = ask(QueryScene.open(lift_file), "y", Axes())
-    assert answer.selected.nonzero()[:, 0].tolist() == list(range(1, COUNT - 1, 3))
+def test_splats_that_mean_the_text_are_selected(exact: QueryScene) -> None:
+    answer = ask(exact, "y", Axes())
+    assert np.flatnonzero(answer.selected).tolist() == list(range(1, COUNT - 1, 3))
     assert answer.count == len(range(1, COUNT - 1, 3))
     assert answer.statistics["min"] <= answer.statistics["q50"] <= answer.statistics["max"]
-    assert answer.explanation
 
 
-def test_a_splat_that_was_never_seen_is_never_selected(lift_file: Path) -> None:
-    scene = QueryScene.open(lift_file)
+def test_unseen_splat_is_never_selected(exact: QueryScene) -> None:
     for negatives in ((), ("x",)):
-        answer = ask(scene, Query(("z",), negatives, threshold=-5.0), Axes())
-        assert not answer.selected[-1]
-        assert answer.scores[-1] == answer.scores.min()
+        answer = ask(exact, Query(("z",), negatives, threshold=-5.0), Axes())
+        assert not answer.selected[-1] and answer.scores[-1] == answer.scores.min()
         assert answer.count == COUNT - 1
 
 
-def test_splats_that_hardly_a_ray_met_do_not_decide_the_threshold(lift_file: Path) -> None:
-    scene = QueryScene.open(lift_file)
-    plain = ask(scene, "x", Axes())
-    stray = torch.zeros(COUNT, 3)
-    stray[:, 0], stray[:, 1] = 1.0, torch.linspace(0.0, 3.0, COUNT)  # scores all over the range
-    crowd = LiftResult(
-        torch.cat([scene.lift.features, stray.half()]),
-        torch.cat([scene.lift.evidence, torch.full((COUNT,), 1e-4)]),
-        torch.ones(2 * COUNT),
-        torch.cat([scene.lift.seen, torch.ones(COUNT, dtype=torch.bool)]),
-        scene.lift.metadata,
-    )
-    answer = ask(QueryScene(crowd, lift_file), "x", Axes())
-    assert torch.equal(answer.selected[:COUNT], plain.selected)
+def test_splats_without_evidence_do_not_decide_the_threshold(exact: QueryScene) -> None:
+    plain = ask(exact, "x", Axes())
+    stray = np.zeros((COUNT, CHANNELS))
+    stray[:, 0], stray[:, 1] = 1.0, np.linspace(0.0, 3.0, COUNT)  # scores all over the range
+    evidence = torch.cat([torch.ones(COUNT), torch.full((COUNT,), 1e-4)])
+    crowd = of(exact, np.concatenate([exact.features, stray]), evidence=evidence)
+    answer = ask(crowd, "x", Axes())
+    assert np.array_equal(answer.selected[:COUNT], plain.selected)
     assert answer.selected[COUNT] and answer.count > plain.count  # they are selected all the same
 
 
-def test_negatives_take_away_from_the_cosines(lift_file: Path) -> None:
-    scene = QueryScene.open(lift_file)
-    answer = ask(scene, Query(("x",), ("y", "z"), threshold=0.5), Axes())
-    assert (answer.scores <= ask(scene, "x", Axes()).scores).all() and answer.threshold_method == "fixed"
-    assert answer.selected.nonzero()[:, 0].tolist() == list(range(0, COUNT - 1, 3))
+def test_negatives_take_away_from_the_cosines(exact: QueryScene) -> None:
+    answer = ask(exact, Query(("x",), ("y", "z"), threshold=0.5), Axes())
+    assert (answer.scores <= ask(exact, "x", Axes()).scores).all() and answer.threshold_method == "fixed"
+    assert np.flatnonzero(answer.selected).tolist() == list(range(0, COUNT - 1, 3))
 
 
-def test_an_encoder_of_another_space_is_refused_with_both_named(lift_file: Path) -> None:
-    with pytest.raises(InvalidQuery, match=r"3 channels.*axes.*axes with 5"):
-        ask(QueryScene.open(lift_file), "x", Axes(5))
+def test_questions_together_have_the_bits_of_each_alone(scene: QueryScene) -> None:
+    queries = [Query(("x",)), Query(("y", OneSplat(3)), ("z",)), Query((OneSplat(1),)), Query(("z", "x"))]
+    asked = [question(scene, query, Axes()) for query in queries]
+    for together, one in zip(answers(scene, asked), asked, strict=True):
+        (alone,) = answers(scene, [one])
+        assert np.array_equal(together.scores, alone.scores) and together.threshold == alone.threshold
+
+
+def test_encoder_of_another_space_is_refused_with_both_named(scene: QueryScene) -> None:
+    with pytest.raises(InvalidQuery, match=r"8 channels.*axes with 5"):
+        ask(scene, "x", Axes(5))
 
 
 @pytest.mark.parametrize(("space", "told"), [("", "not named"), ("none", "none"), ("axes", "axes")])
-def test_words_without_an_encoder_are_refused_with_the_lifts_text_space(
-    space: str, told: str, lift_file: Path
-) -> None:
-    lift = load_lift(lift_file)
-    lift = replace(lift, metadata=lift.metadata.model_copy(update={"text_space": space}))
+def test_words_without_an_encoder_are_refused(space: str, told: str, scene: QueryScene) -> None:
+    lift = replace(scene.lift, metadata=scene.metadata.model_copy(update={"text_space": space}))
     with pytest.raises(InvalidQuery, match=rf"text space: {told}\), got no encoder"):
-        ask(QueryScene(lift, lift_file), "x")
+        ask(QueryScene(lift), "x")
 
 
-def test_the_best_splats_come_with_their_places_and_a_box(lift_file: Path) -> None:
-    scene = QueryScene.open(lift_file)
-    answer = ask(scene, "x", Axes())
-    found = top(answer, scene, 4)
-    assert [best.splat % 3 for best in found.best] == [0] * 4
-    assert found.best[0].position == pytest.approx(scene.splats.means[found.best[0].splat].tolist())
-    assert found.box is not None
-    assert torch.all(scene.splats.means[answer.selected] >= torch.tensor(found.box[0]))
-    assert top(ask(scene, Query(("x",), threshold=2.0), Axes()), scene, 1).box is None
+def test_best_splats_come_with_places_and_a_box(exact: QueryScene) -> None:
+    answer = ask(exact, "x", Axes())
+    found, means = top(answer, exact, 4), exact.splats.means.numpy()
+    assert [best.splat for best in found.best] == [0, 3, 6, 9]  # of equal scores the first in the file
+    assert found.best[0].position == pytest.approx(means[0].tolist())
+    assert found.box == tuple(tuple(corner.tolist()) for corner in (
+        means[answer.selected].min(axis=0), means[answer.selected].max(axis=0)))  # fmt: skip
+    assert len(top(answer, exact, 1000).best) == COUNT - 1  # none that was not seen
+    assert top(ask(exact, Query(("x",), threshold=2.0), Axes()), exact, 1).box is None
 
 
-def test_a_scene_that_moved_is_said_with_where_it_was(lift_file: Path) -> None:
-    (lift_file.parent / "splats.ply").rename(lift_file.parent / "elsewhere.ply")
-    scene = QueryScene.open(lift_file)
-    assert ask(scene, "x", Axes()).count > 0  # scores need no splats
-    with pytest.raises(InvalidLift, match=r"splats at .*splats\.ply"):
-        _ = scene.splats
+def test_vectors_are_asked_as_their_words_are(scene: QueryScene) -> None:
+    words = ask(scene, Query(("x",), ("y",)), Axes())
+    for positive in (torch.eye(CHANNELS)[0], 7 * np.eye(CHANNELS)[:1]):
+        found = query_vectors(scene.lift, positive, torch.eye(CHANNELS)[1], splats=scene.splats)
+        assert found.scores.numpy().tolist() == words.scores.tolist() and found.threshold == words.threshold
+        assert np.array_equal(found.splats.numpy(), words.selected) and found.present
+        assert found.objects is not None and len(found.objects.found) == 1
+    alike = replace(scene.lift, features=torch.ones(COUNT, CHANNELS))
+    alone = query_vectors(alike, torch.eye(CHANNELS)[0])
+    assert not alone.present and alone.objects is None
+    for wrong in (torch.ones(5), torch.zeros(CHANNELS), torch.empty(0, CHANNELS)):
+        with pytest.raises(InvalidQuery):
+            query_vectors(scene.lift, wrong)
 
 
-def test_a_scene_that_changed_is_not_taken_for_the_old_one(lift_file: Path) -> None:
-    file = lift_file.parent / "cameras.json"
-    file.write_text(file.read_text() + " ")
-    with pytest.raises(InvalidLift, match="cameras changed since the lift"):
-        _ = QueryScene.open(lift_file).cameras
+def test_scene_made_of_values_needs_no_files(scene: QueryScene) -> None:
+    nowhere = scene.metadata.splats.model_copy(update={"path": ""})
+    lift: LiftResult = replace(scene.lift, metadata=scene.metadata.model_copy(update={"splats": nowhere}))
+    bare = QueryScene(lift, scene.splats, scene.cameras, scene.packs)
+    query = Query((Pixel("middle", 6, HEIGHT // 2), Region("left", 0, 1)))
+    assert np.array_equal(ask(bare, query).selected, ask(scene, query).selected)
+    with pytest.raises(InvalidLift, match="give the splats"):
+        _ = QueryScene(lift).splats
 
 
-def test_pictures_have_the_size_of_the_view(lift_file: Path) -> None:
-    scene = QueryScene.open(lift_file)
-    seen = view_mask(scene, ask(scene, "x", Axes()), "front")
-    assert overlay(render(scene, "front"), seen.mask.numpy()).shape == (30, 40, 3)
-    contents = {
-        "L": [mask_png(seen)],
-        "RGB": [attention_png(seen), render_png(scene, "front")],
-    }
-    for mode, pictures in contents.items():
-        for content in pictures:
-            with Image.open(io.BytesIO(content)) as picture:
-                assert (picture.size, picture.mode) == ((40, 30), mode)
-    with Image.open(io.BytesIO(mask_png(seen))) as picture:
-        assert np.array_equal(np.asarray(picture) > 0, seen.mask.numpy())
-
-
-def test_colours_follow_the_spherical_harmonics() -> None:
-    camera = look_at("v", np.array([0.0, 0.0, -3.0]), 8, 8, 8.0)
-    plain = random_splats(0, 5)
-    grey = Splats(plain.means, plain.quats, plain.log_scales, plain.opacity_logits, sh=torch.zeros(5, 16, 3))
-    assert torch.allclose(seen_colours(grey, camera), torch.tensor(0.5))
-    assert plain.sh is not None
-    expected = (0.5 + SH_C0 * plain.sh[:, 0]).clamp_min(0)
-    torch.testing.assert_close(seen_colours(plain, camera), expected)
-
-
-def test_spherical_beta_lobes_add_to_the_base_colour() -> None:
-    camera = look_at("v", np.array([0.0, 0.0, -3.0]), 8, 8, 8.0)
-    bare = random_splats(0, 5, kernel=Kernel.BETA)
-    rng = np.random.default_rng(0)
-    lobes = rng.normal(0, 1, (5, 2, 6)).astype(np.float32)
-    splats = replace(bare, sb_params=torch.from_numpy(lobes))
-    expected = np.zeros((5, 3))
-    for p in range(5):
-        direction = bare.means[p].double().numpy() - np.array([0.0, 0.0, -3.0])
-        direction /= np.linalg.norm(direction)
-        assert bare.sh is not None
-        expected[p] = 0.5 + SH_C0 * bare.sh[p, 0].double().numpy()
-        for r, g, b, theta, phi, beta in lobes[p].astype(np.float64):
-            axis = np.array([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)])
-            sharpness = 10 * np.log(2)
-            colour = np.log1p(np.exp(sharpness * np.array([r, g, b]))) / sharpness
-            expected[p] += colour * max(0.0, axis @ direction) ** (4 * np.exp(beta))
-    torch.testing.assert_close(
-        seen_colours(splats, camera), torch.from_numpy(expected.clip(0)).float(), atol=1e-5, rtol=1e-5
+def test_words_of_a_table_are_asked_without_torch(tiny_lift: Path) -> None:
+    code = (
+        "import sys; from pathlib import Path; from liftcore.query.ask import ask; "
+        "from liftcore.query.scene import QueryScene; from liftcore.query.terms import OneSplat, Query; "
+        "import liftcore.query.text.table; "
+        "ask(QueryScene.open(Path(sys.argv[1])), Query((OneSplat(0),))); assert 'torch' not in sys.modules"
     )
-    wild = torch.tensor([0.0, 0.0, 0.0, 1.0, 1.0, 1e4]).expand(5, 1, 6).contiguous()
-    for sign in (1, -1):
-        assert seen_colours(replace(bare, sb_params=wild * sign), camera).isfinite().all()
+    subprocess.run([sys.executable, "-c", code, str(tiny_lift)], check=True)
 
 
-def test_the_harmonics_are_orthonormal_on_the_sphere() -> None:
-    from liftcore.query.colours import _sh_basis
+def test_scene_that_moved_is_told_with_where_it_was(lift_tiny: Callable[..., Path], tmp_path: Path) -> None:
+    scene = QueryScene.open(lift_tiny(tmp_path))
+    (tmp_path / "s.ply").rename(tmp_path / "elsewhere.ply")
+    assert ask(scene, Query((OneSplat(0),))).count > 0  # scores need no splats
+    with pytest.raises(InvalidLift, match=r"splats at .*s\.ply"):
+        _ = scene.splats
+    moved = QueryScene.open(scene.path, splats=tmp_path / "elsewhere.ply")
+    assert moved.splats.count == COUNT
 
-    generator = torch.Generator().manual_seed(0)
-    directions = torch.nn.functional.normalize(torch.randn(200_000, 3, generator=generator), dim=1)
-    basis = _sh_basis(directions, 3).double()
-    gram = 4 * torch.pi * (basis.T @ basis) / len(basis)
-    torch.testing.assert_close(gram, torch.eye(16, dtype=torch.float64), atol=0.03, rtol=0)
+
+def test_files_that_changed_are_not_taken_for_the_old(lift_tiny: Callable[..., Path], tmp_path: Path) -> None:
+    scene = QueryScene.open(lift_tiny(tmp_path))
+    for name in ("c.json", "f.st"):
+        with (tmp_path / name).open("a") as file:
+            file.write(" ")
+    with pytest.raises(InvalidLift, match="cameras changed since the lift"):
+        _ = scene.cameras
+    with pytest.raises(InvalidLift, match="features changed since the lift"):
+        ask(scene, Query((Region("left", 0, 0),)))
 
 
-def test_clusters_are_shown_in_their_colours_and_the_rest_in_grey(lift_file: Path, tmp_path: Path) -> None:
-    plain = load_lift(lift_file)
+@pytest.mark.parametrize("cluster", range(3))
+def test_every_kind_of_example_finds_its_cluster(scene: QueryScene, cluster: int) -> None:
+    splats = slice(cluster * SPLATS_A_CLUSTER, (cluster + 1) * SPLATS_A_CLUSTER)
+    kinds: list[Example] = [
+        Pixel("middle", (6, 16, 26)[cluster], HEIGHT // 2),
+        Region("left", 0, cluster),
+        OneSplat(cluster * SPLATS_A_CLUSTER + 3),
+        Vector(tuple(1e30 * np.eye(CHANNELS)[cluster])),
+    ]
+    for example in kinds:
+        answer = ask(scene, Query((example,)))
+        assert answer.selected[splats].mean() > 0.7, example
+        assert answer.count <= 1.3 * SPLATS_A_CLUSTER, example
+
+
+def test_pixel_is_the_feature_rendered_there(scene: QueryScene) -> None:
+    features = torch.from_numpy(scene.features).float()
+    image = scene.raster.render(scene.cameras["middle"], features, scene.compositing)
+    for x, y in ((5, 12), (16, 12), (26, 10)):
+        (found,) = directions(scene, Query((Pixel("middle", x, y),)), None)
+        expected = torch.nn.functional.normalize(image[y, x], dim=0)
+        np.testing.assert_allclose(found, expected.numpy(), atol=1e-5)
+
+
+def test_threshold_of_examples_is_above_a_least_likeness(scene: QueryScene) -> None:
+    """Ten splats as the example, fifteen a little like it: together they stand apart most from all others."""
+    rows = np.zeros((COUNT, CHANNELS))
+    rows[:10, 0], rows[10:25, :3], rows[25:, 1] = 1.0, [0.3, 0.3, 0.9], -1.0
+    lifted = of(scene, rows + np.random.default_rng(0).normal(0, 0.01, rows.shape))
+    by_example = ask(lifted, Query((OneSplat(0),)))
+    assert np.flatnonzero(by_example.selected).tolist() == list(range(10))
+    assert by_example.threshold > 0.4 and find_threshold(by_example.scores).value < 0.0
+    in_words = ask(lifted, Query(("x", "y")), Axes())
+    assert in_words.threshold == find_threshold(in_words.scores).value
+    both = ask(lifted, Query((OneSplat(0), "x")), Axes())
+    assert both.threshold == find_threshold(both.scores).value
+    assert ask(lifted, Query((OneSplat(0),), threshold=0.1)).count == 25
+
+
+def test_positives_and_negatives_together_make_one_query(scene: QueryScene) -> None:
+    apple, book, lamp = (Region("left", 0, k) for k in range(3))
+    both = ask(scene, Query((apple, lamp), threshold=0.8))
+    either = ask(scene, Query((apple,), threshold=0.8)).selected | ask(scene, Query((lamp,), threshold=0.8)).selected
+    assert np.array_equal(both.selected, either) and both.count > 1.5 * SPLATS_A_CLUSTER
+    against = ask(scene, Query((apple, lamp), (book,), threshold=0.5))
+    assert not against.selected[SPLATS_A_CLUSTER : 2 * SPLATS_A_CLUSTER].all()
+
+
+@pytest.mark.parametrize(
+    ("example", "error", "said"),
+    [
+        (Pixel("behind", 1, 1), NotFound, "behind"),
+        (Pixel("middle", WIDTH, 0), InvalidQuery, rf"0\.\.{WIDTH - 1}"),
+        (Pixel("middle", 0, -1), InvalidQuery, rf"0\.\.{HEIGHT - 1}"),
+        (Pixel("middle", 0, 0), InvalidQuery, "a ray that splats fill by"),
+        (Region("behind", 0, 0), NotFound, "feature packs"),
+        (Region("left", 1, 0), NotFound, r"0\.\.0"),
+        (Region("left", 0, 3), NotFound, "label"),
+        (OneSplat(60), InvalidQuery, r"0\.\.59"),
+        (Vector((1.0,) * 7), InvalidQuery, "8 channels"),
+        (Vector((0.0,) * CHANNELS), InvalidQuery, "zeros"),
+        (Vector((math.nan,) * CHANNELS), InvalidQuery, "NaN"),
+        ("apple", InvalidQuery, "ask by example"),
+    ],
+)
+def test_term_without_a_feature_says_why_under_its_name(
+    scene: QueryScene, example: Example, error: type[SplatliftError], said: str
+) -> None:
+    with pytest.raises(error, match=said):
+        ask(scene, Query((example,)))
+    if example != "apple":
+        with pytest.raises(error, match=r"unlike\.0"):
+            ask(scene, Query((OneSplat(0),), (example,), names=("like.0", "unlike.0")))
+
+
+def test_view_is_read_once_for_all_its_regions(scene: QueryScene, monkeypatch: pytest.MonkeyPatch) -> None:
+    read, packs = [], scene.packs
+    views = sorted(packs.views)[:2]
+    asked = [Region(view, 0, region) for region in (0, 1, 0) for view in views]
+    alone = [directions(scene, Query((region,)), None)[0] for region in asked]
+    get = type(packs).__getitem__
+    monkeypatch.setattr(type(packs), "__getitem__", lambda packs, view: read.append(view) or get(packs, view))
+    together = directions(scene, Query((asked[0], OneSplat(0), *asked[1:])), None)
+    assert read == views
+    assert np.array_equal(together[[0, 2, 3, 4, 5, 6]], np.stack(alone))
+
+
+@given(view=NAMES, x=st.integers(0, 9999), y=st.integers(0, 9999))
+def test_any_name_of_a_view_can_be_pointed_at(view: str, x: int, y: int) -> None:
+    for example in (Pixel(view, x, y), Region(view, x, y), Pixel(f"region:{view}", x, y), Pixel("splat", x, y)):
+        assert parse_example(str(example)) == example
+
+
+@given(st.text(max_size=40))
+def test_any_other_notation_is_refused(notation: str) -> None:
+    try:
+        example = parse_example(notation)
+    except InvalidQuery as error:
+        assert "VIEW:x,y" in error.expected
+    else:
+        assert isinstance(example, Pixel | Region | OneSplat)
+
+
+@pytest.mark.parametrize(
+    "notation", ["", ":1,2", "v:1.5,2", "v:1", "splat:-1", "splat:x", "region:v:1", "splat:" + "9" * 5000]
+)
+def test_what_points_nowhere_is_refused(notation: str) -> None:
+    with pytest.raises(InvalidQuery, match="like"):
+        parse_example(notation)
+
+
+def test_queries_that_ask_nothing_or_too_much_are_refused() -> None:
+    for wrong in ({"positives": ()}, {"positives": ("a",) * 65}, {"keep": "some"}, {"threshold": "best"}):
+        with pytest.raises(InvalidQuery):
+            Query(**({"positives": ("a",)} | wrong))
+
+
+def test_vectors_come_from_numpy_files(tmp_path: Path) -> None:
+    np.save(tmp_path / "v.npy", np.arange(3, dtype=np.float16)[None])
+    assert read_vector(tmp_path / "v.npy") == Vector((0.0, 1.0, 2.0))
+    np.save(tmp_path / "v.npy", np.ones((2, 2)))
+    with pytest.raises(InvalidQuery, match="one vector"):
+        read_vector(tmp_path / "v.npy")
+
+
+def test_lift_read_as_arrays_and_as_tensors_is_one(scene: QueryScene, tmp_path: Path) -> None:
+    assert torch.equal(load_lift(scene.path).features, torch.from_numpy(scene.features))
     clusters = (torch.arange(COUNT) % 3 - 1).to(torch.int32)
-    save_lift(replace(plain, cluster=clusters, cluster_features=torch.ones(2, 3).half()), tmp_path / "clustered")
-    scene = QueryScene.open(tmp_path / "clustered")
-    shown = render(scene, "front", "cluster")
-    labels = scene.raster.strongest_labels(scene.cameras["front"], clusters, scene.walk).numpy()
-    met = scene.raster.row_sums(scene.cameras["front"], scene.walk).numpy() > 0
-    assert {-1, 0, 1} == set(labels[met].tolist())
-    for label, colour in zip((0, 1, -1), cluster_colours(2), strict=True):
-        assert (shown[met & (labels == label)] == colour).all()
-    assert not shown[~met].any()
-
-
-def test_many_clusters_have_colours_that_can_be_told_apart() -> None:
-    colours = cluster_colours(24).astype(int)
-    assert colours.shape == (25, 3) and tuple(colours[-1]) == NO_CLUSTER_COLOUR
-    apart = np.abs(colours[:, None] - colours[None]).max(axis=2)[~np.eye(25, dtype=bool)]
-    assert apart.min() >= 16
-
-
-def test_a_lift_without_clusters_cannot_show_them(lift_file: Path) -> None:
-    with pytest.raises(InvalidQuery, match="aggregation"):
-        render_png(QueryScene.open(lift_file), "front", "cluster")
+    rows = torch.ones(2, CHANNELS, dtype=scene.lift.features.dtype)
+    save_lift(replace(scene.lift, cluster=clusters, cluster_features=rows), tmp_path / "clustered")
+    opened = QueryScene.open(tmp_path / "clustered")
+    assert opened.cluster is not None and opened.cluster.tolist() == clusters.tolist()

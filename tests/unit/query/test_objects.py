@@ -1,48 +1,34 @@
 """What an answer found, thing by thing."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from liftcore.errors import InvalidQuery
-from liftcore.io.lift_file import save_lift
-from liftcore.io.lift_files import lift_files
 from liftcore.query import objects as module
 from liftcore.query.ask import Answer, ask
-from liftcore.query.example import Region
-from liftcore.query.objects import objects
-from liftcore.query.query import Query
+from liftcore.query.export import object_ply
+from liftcore.query.objects import NEIGHBOURS, REACH, objects, touching
 from liftcore.query.scene import QueryScene
-from liftcore.query.splat_files import object_ply
-from liftcore.settings import LiftSettings
-from tests.api.tiny_scene import SPLATS_A_CLUSTER, make_scene, ply, splat_rows
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> QueryScene:
-    """The tiny scene lifted: three clusters side by side, 1.2 apart."""
-    tiny, folder = make_scene(), tmp_path_factory.mktemp("objects")
-    for name, content in (("s.ply", tiny.splats), ("c.json", tiny.cameras), ("f.safetensors", tiny.features)):
-        (folder / name).write_bytes(content)
-    made = lift_files(
-        folder / "s.ply", folder / "c.json", [folder / "f.safetensors"], LiftSettings.of(preset="row-sum")
-    )
-    save_lift(made, folder / "scene.lift")
-    return QueryScene.open(folder / "scene.lift")
+from liftcore.query.terms import Query, Region
+from liftcore.raster.reference import rotation
+from liftcore.scene.splats import Kernel, Splats
+from tests.api.tiny_scene import SPLATS_A_CLUSTER, ply, splat_rows
+from tests.scenes import random_splats
 
 
 def of(scene: QueryScene, *clusters: int, keep: str = "all", rows: tuple[int, ...] = ()) -> Answer:
     """An answer that selected these clusters and rows, with scores of .5 and more the later they stand."""
     answer = ask(scene, Query((Region("left", 0, 2),), threshold=0.5, keep=keep))
-    selected = torch.zeros(3 * SPLATS_A_CLUSTER, dtype=torch.bool)
+    selected = np.zeros(3 * SPLATS_A_CLUSTER, np.bool_)
     for cluster in clusters:
         selected[cluster * SPLATS_A_CLUSTER : (cluster + 1) * SPLATS_A_CLUSTER] = True
     selected[list(rows)] = True
-    return replace(answer, selected=selected, scores=torch.linspace(0.5, 1.0, len(selected)))
+    return replace(answer, selected=selected, scores=np.linspace(0.5, 1.0, len(selected), dtype=np.float32))
 
 
 def means(scene: QueryScene, cluster: int) -> np.ndarray:
@@ -53,14 +39,14 @@ def test_clusters_that_are_apart_are_objects_with_their_boxes(scene: QueryScene)
     answer = of(scene, 0, 2)
     found = objects(scene, answer)
     assert len(found.found) == 2 and found.strays == 0
-    evidence = scene.lift.evidence.numpy()
+    evidence = scene.evidence
     for number, thing in enumerate(found.found):
         rows = np.flatnonzero(found.numbers == number)
         cluster = rows[0] // SPLATS_A_CLUSTER
         assert rows.tolist() == list(range(cluster * SPLATS_A_CLUSTER, (cluster + 1) * SPLATS_A_CLUSTER))
         assert thing.splats == SPLATS_A_CLUSTER
-        assert thing.share == pytest.approx(evidence[rows].sum() / evidence[answer.selected.numpy()].sum())
-        assert thing.score == pytest.approx(np.average(answer.scores.numpy()[rows], weights=evidence[rows]))
+        assert thing.share == pytest.approx(evidence[rows].sum() / evidence[answer.selected].sum())
+        assert thing.score == pytest.approx(np.average(answer.scores[rows], weights=evidence[rows]))
         low, high = means(scene, cluster).min(axis=0), means(scene, cluster).max(axis=0)
         # So few splats have a thousandth of the evidence each, or more: the box holds all of them, or nearly.
         assert (np.array(thing.box[0]) >= low).all() and (np.array(thing.box[1]) <= high).all()
@@ -94,7 +80,7 @@ def test_nothing_found_is_no_object(scene: QueryScene) -> None:
 
 
 def test_without_evidence_splats_count_alike(scene: QueryScene) -> None:
-    bare = QueryScene(replace(scene.lift, evidence=torch.zeros_like(scene.lift.evidence)), scene.path)
+    bare = QueryScene(replace(scene.lift, evidence=torch.zeros_like(scene.lift.evidence)))
     found = objects(bare, of(scene, 0, rows=(2 * SPLATS_A_CLUSTER, 2 * SPLATS_A_CLUSTER + 1)))
     assert found.found[0].splats == SPLATS_A_CLUSTER
     assert sum(thing.share for thing in found.found) <= 1.0
@@ -122,5 +108,97 @@ def test_a_twentieth_of_the_evidence_of_the_largest_makes_an_object(scene: Query
     for share, count in ((0.049, 1), (0.051, 2)):
         evidence = torch.full_like(scene.lift.evidence, 1.0)
         evidence[2 * SPLATS_A_CLUSTER :] = share
-        weighed = QueryScene(replace(scene.lift, evidence=evidence), scene.path)
+        weighed = QueryScene(replace(scene.lift, evidence=evidence))
         assert len(objects(weighed, of(scene, 0, 2)).found) == count
+
+
+FEW = NEIGHBOURS + 1  # of so many splats, each looks at all others
+
+
+def by_pairs(splats: Splats) -> np.ndarray:
+    """Groups by the rule itself, for so few splats that all are neighbours."""
+    count = splats.count
+    means = splats.means.double().numpy()
+    axes = [
+        rotation(splats.quats[j].double().numpy())[:, : splats.log_scales.shape[1]]
+        * splats.log_scales[j].double().exp().numpy()
+        for j in range(count)
+    ]
+    groups = np.arange(count)
+    for j in range(count):
+        for k in range(j):
+            apart = means[j] - means[k]
+            distance = np.linalg.norm(apart)
+            line = apart / distance if distance else np.zeros(3)
+            if distance <= REACH * sum(np.linalg.norm(axes[i].T @ line) for i in (j, k)):
+                groups[groups == groups[j]] = groups[k]
+    return groups
+
+
+def same_partition(one: np.ndarray, other: np.ndarray) -> bool:
+    return bool(((one[:, None] == one) == (other[:, None] == other)).all())
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    seed=st.integers(0, 10**6), count=st.integers(1, FEW), spread=st.floats(0.2, 5.0),
+    kernel=st.sampled_from(list(Kernel)),
+)  # fmt: skip
+def test_groups_are_those_of_the_rule(seed: int, count: int, spread: float, kernel: Kernel) -> None:
+    splats = random_splats(seed, count, spread, kernel)
+    assert same_partition(touching(splats, np.arange(count)), by_pairs(splats))
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 10**6), power=st.integers(-10, 10))
+def test_groups_know_no_unit_and_no_order(seed: int, power: int) -> None:
+    splats, factor = random_splats(seed, 150, 3.0), 2.0**power
+    scaled = replace(splats, means=factor * splats.means, log_scales=splats.log_scales + float(np.log(factor)))
+    order = np.random.default_rng(seed).permutation(150)
+    groups = touching(splats, np.arange(150))
+    assert same_partition(touching(splats, order), groups[order])
+    assert same_partition(touching(scaled, np.arange(150)), groups)
+
+
+def needle(x: float, y: float) -> Splats:
+    """One as long as 1 along x, two points at x and y on the axes."""
+    means = torch.tensor([[0.0, 0.0, 0.0], [x, 0.0, 0.0], [0.0, y, 0.0]])
+    log_scales = torch.log(torch.tensor([[1.0, 1e-3, 1e-3], [1e-3] * 3, [1e-3] * 3]))
+    return Splats(means, torch.tensor([[1.0, 0.0, 0.0, 0.0]] * 3), log_scales, torch.zeros(3))
+
+
+def test_a_needle_touches_what_lies_along_it_and_nothing_beside() -> None:
+    assert touching(needle(1.9, 0.1), np.arange(3)).tolist() == [0, 0, 1]
+    assert touching(needle(2.1, 0.1), np.arange(3)).tolist() == [0, 1, 2]
+    turned = replace(needle(0.1, 1.9), quats=torch.tensor([[1.0, 0.0, 0.0, 1.0]] * 3))  # now along y
+    assert touching(turned, np.arange(3)).tolist() == [0, 1, 0]
+
+
+def test_others_do_not_connect() -> None:
+    row = needle(1.9, 0.1)
+    assert touching(row, np.array([1, 2])).tolist() == [0, 1]  # the needle between them was not asked for
+    assert touching(row, np.array([1])).tolist() == [0]
+    assert touching(row, np.array([], np.int64)).tolist() == []
+
+
+def test_equal_places_and_extreme_sizes_are_no_trouble() -> None:
+    means = torch.tensor([[0.0, 0.0, 0.0]] * 30 + [[5.0, 0.0, 0.0], [1e4, 0.0, 0.0]])
+    log_scales = torch.full((32, 3), -torch.inf)
+    log_scales[31] = 500.0
+    splats = Splats(means, torch.zeros(32, 4), log_scales, torch.zeros(32))
+    groups = touching(splats, np.arange(32))
+    assert len(set(groups[:30])) == 1 and groups[30] == groups[31]  # one as large as this reaches its neighbours
+
+
+def test_pieces_make_no_difference(monkeypatch) -> None:
+    splats = random_splats(5, 300, 4.0)
+    whole = touching(splats, np.arange(300))
+    assert len(set(whole)) > 3
+    monkeypatch.setattr(module, "_PIECE", 7)
+    assert (touching(splats, np.arange(300)) == whole).all()
+
+
+def test_a_quaternion_of_zero_turns_nothing() -> None:
+    still = replace(needle(1.9, 0.1), quats=torch.zeros(3, 4))
+    assert touching(still, np.arange(3)).tolist() == [0, 0, 1]
+    assert touching(replace(still, means=still.means.roll(1, dims=1)), np.arange(3)).tolist() == [0, 1, 2]

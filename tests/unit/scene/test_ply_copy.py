@@ -14,7 +14,8 @@ from plyfile import PlyData
 
 from liftcore.errors import InvalidSplats
 from liftcore.io.ply import BLOCK_ROWS, read_splats, recoloured, some_rows
-from liftcore.query.colours import constant_terms, seen_colours
+from liftcore.query.colours import constant_terms
+from liftcore.query.splat_colours import seen_colours
 from tests.scenes import look_at
 
 if TYPE_CHECKING:

@@ -12,9 +12,8 @@ from liftcore.features.views import Regions
 from liftcore.io.lift_file import save_lift
 from liftcore.io.lift_files import lift_files
 from liftcore.query.directions import directions
-from liftcore.query.example import Region
-from liftcore.query.query import Query
 from liftcore.query.scene import QueryScene
+from liftcore.query.terms import Query, Region
 from liftcore.settings import LiftSettings
 
 from .test_lift_equals_dense import write_scene

@@ -6,8 +6,6 @@ while it registers shape functions. open_clip and sentence-transformers import t
 never calls these operators: declaring their signatures lets the import pass, and a call would still fail.
 """
 
-from __future__ import annotations
-
 import importlib
 
 import torch

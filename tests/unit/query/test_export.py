@@ -1,44 +1,33 @@
 """Answers as splat files: the object alone, and the scene in the colours of its scores."""
 
-from __future__ import annotations
-
 import io
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 
 from liftcore.errors import InvalidLift, InvalidQuery
-from liftcore.io.lift_file import save_lift
-from liftcore.io.lift_files import lift_files
 from liftcore.io.ply import read_splats
+from liftcore.lift import lift
 from liftcore.query.ask import Answer, ask
 from liftcore.query.colours import NOT_SEEN_COLOUR, SH_C0, colour_map
-from liftcore.query.example import Region
-from liftcore.query.pictures import attention_png, render
-from liftcore.query.query import Query
+from liftcore.query.export import coloured_ply, object_ply
+from liftcore.query.render import attention_png, render, view_mask
 from liftcore.query.scene import QueryScene
-from liftcore.query.splat_files import coloured_ply, object_ply
-from liftcore.query.view_mask import view_mask
+from liftcore.query.terms import Query, Region
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.settings import LiftSettings
-from tests.api.tiny_scene import SPLATS_A_CLUSTER, WIDTH, make_scene, ply, splat_rows
+from tests.api.tiny_scene import SPLATS_A_CLUSTER, WIDTH, ply, splat_rows
 
 
 @pytest.fixture
-def scene(tmp_path: Path) -> QueryScene:
-    """The tiny scene lifted: three clusters side by side, and one splat more that no camera sees."""
-    tiny = make_scene()
+def scene(lift_tiny: Callable[..., Path], tmp_path: Path) -> QueryScene:
+    """The tiny scene lifted, and one splat more that no camera sees."""
     hidden = splat_rows()[:1].copy()
     hidden[0, 2] = 40.0
-    (tmp_path / "s.ply").write_bytes(ply(np.concatenate([splat_rows(), hidden])))
-    (tmp_path / "c.json").write_bytes(tiny.cameras)
-    (tmp_path / "f.safetensors").write_bytes(tiny.features)
-    files = tmp_path / "s.ply", tmp_path / "c.json", [tmp_path / "f.safetensors"]
-    save_lift(lift_files(*files, LiftSettings.of(preset="row-sum")), tmp_path / "scene.lift")
-    return QueryScene.open(tmp_path / "scene.lift")
+    return QueryScene.open(lift_tiny(tmp_path, splats=ply(np.concatenate([splat_rows(), hidden]))))
 
 
 def of_lamp(scene: QueryScene, threshold: float = 0.5) -> Answer:
@@ -48,18 +37,18 @@ def of_lamp(scene: QueryScene, threshold: float = 0.5) -> Answer:
 def test_the_object_is_what_was_selected_and_can_be_lifted_again(scene: QueryScene, tmp_path: Path) -> None:
     answer = of_lamp(scene)
     (tmp_path / "lamp.ply").write_bytes(b"".join(object_ply(scene, answer)))
-    rows = splat_rows()[answer.selected[:-1].numpy()]
+    rows = splat_rows()[answer.selected[:-1]]
     assert SPLATS_A_CLUSTER * 0.8 <= len(rows) <= SPLATS_A_CLUSTER * 1.2
     assert (tmp_path / "lamp.ply").read_bytes() == ply(rows)
-    files = tmp_path / "lamp.ply", tmp_path / "c.json", [tmp_path / "f.safetensors"]
-    again = lift_files(*files, LiftSettings.of(preset="row-sum"))
+    files = tmp_path / "lamp.ply", tmp_path / "c.json", [tmp_path / "f.st"]
+    again = lift(*files, LiftSettings.of(preset="row-sum"))
     assert again.features.shape[0] == len(rows)
 
 
 def test_the_object_rendered_alone_lies_where_the_object_is(scene: QueryScene, tmp_path: Path) -> None:
     (tmp_path / "lamp.ply").write_bytes(b"".join(object_ply(scene, of_lamp(scene))))
     alone = CpuRaster(read_splats(tmp_path / "lamp.ply"))
-    columns = (alone.row_sums(scene.cameras["middle"], scene.walk) > 0.5).nonzero()[:, 1]
+    columns = (alone.row_sums(scene.cameras["middle"], scene.compositing) > 0.5).nonzero()[:, 1]
     assert len(columns) > 0 and int(columns.min()) >= WIDTH // 2
 
 
@@ -67,7 +56,7 @@ def test_every_selected_row_is_in_the_object_whatever_the_threshold(scene: Query
     answer = of_lamp(scene, -1.0)
     (tmp_path / "all.ply").write_bytes(b"".join(object_ply(scene, answer)))
     assert (tmp_path / "all.ply").read_bytes() == ply(splat_rows())
-    assert torch.equal(answer.selected, answer.seen)
+    assert np.array_equal(answer.selected, answer.seen)
 
 
 def test_nothing_selected_is_no_file(scene: QueryScene, tmp_path: Path) -> None:
@@ -94,11 +83,11 @@ def test_the_coloured_scene_looks_like_the_attention(scene: QueryScene, tmp_path
     answer = of_lamp(scene)
     seen = view_mask(scene, answer, "middle")
     (tmp_path / "scores.ply").write_bytes(b"".join(coloured_ply(scene, answer)))
-    coloured = QueryScene(scene.lift, scene.path)
+    coloured = QueryScene(scene.lift)
     coloured.__dict__["splats"] = read_splats(tmp_path / "scores.ply")
     shown = render(coloured, "middle").astype(int)
     heat = np.asarray(Image.open(io.BytesIO(attention_png(seen)))).astype(int)
-    met = seen.row_sums.numpy() > 0.95
+    met = seen.row_sums > 0.95
     assert met.sum() > 50
     assert np.median(np.abs(shown - heat)[met]) < 16
 

@@ -4,24 +4,16 @@ Splat files are copies of the file that was lifted, in its dialect and in the or
 file opens them, and they can be lifted again.
 """
 
-from __future__ import annotations
-
 import io
-from typing import TYPE_CHECKING
+from collections.abc import Iterable
 
 import numpy as np
-import torch
 
 from liftcore.errors import InvalidQuery
-from liftcore.io.ply import recoloured, some_rows
+from liftcore.query.ask import Answer
 from liftcore.query.colours import NOT_SEEN_COLOUR, constant_terms, heat_colours
 from liftcore.query.objects import objects
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from liftcore.query.ask import Answer
-    from liftcore.query.scene import QueryScene
+from liftcore.query.scene import QueryScene
 
 
 def object_ply(scene: QueryScene, answer: Answer) -> Iterable[bytes]:
@@ -33,6 +25,8 @@ def object_ply(scene: QueryScene, answer: Answer) -> Iterable[bytes]:
         InvalidQuery: none was selected: most viewers open no file without splats; or more than objects are made of.
         InvalidLift: the splats moved or changed since the lift.
     """
+    from liftcore.io.ply import some_rows
+
     if answer.count == 0:
         raise InvalidQuery(
             "object",
@@ -40,9 +34,8 @@ def object_ply(scene: QueryScene, answer: Answer) -> Iterable[bytes]:
             got=f"none of {len(answer.scores)}: nothing stands out",
             hint="name a lower threshold, or ask in other words or by example",
         )
-    if answer.query.keep == "largest":
-        return some_rows(scene.splat_file, objects(scene, answer).numbers == 0)
-    return some_rows(scene.splat_file, answer.selected.numpy())
+    largest = answer.query.keep == "largest"
+    return some_rows(scene.splat_file, objects(scene, answer).numbers == 0 if largest else answer.selected)
 
 
 def coloured_ply(scene: QueryScene, answer: Answer) -> Iterable[bytes]:
@@ -55,14 +48,15 @@ def coloured_ply(scene: QueryScene, answer: Answer) -> Iterable[bytes]:
         InvalidLift: the splats moved or changed since the lift.
         InvalidSplats: their file holds no colours; told when the first block is asked for.
     """
-    seen = answer.seen.numpy()
-    colours = heat_colours(answer.scores.numpy(), seen)
-    colours[~seen] = NOT_SEEN_COLOUR
+    from liftcore.io.ply import recoloured
+
+    colours = heat_colours(answer.scores, answer.seen)
+    colours[~answer.seen] = NOT_SEEN_COLOUR
     return recoloured(scene.splat_file, constant_terms(colours))
 
 
 def scores_npy(answer: Answer) -> bytes:
     """The score of every splat, [P] f32, as an ``.npy`` file."""
     content = io.BytesIO()
-    np.save(content, answer.scores.to(torch.float32).numpy())
+    np.save(content, answer.scores)
     return content.getvalue()

@@ -1,21 +1,16 @@
 """all-MiniLM-L6-v2, a sentence encoder whose weights ship in a Python package: words without a network."""
 
-from __future__ import annotations
-
 import os
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import torch
+import numpy as np
 
-from liftcore.errors import InvalidQuery, Unavailable
-from liftcore.query.encoders.torchvision_ops import import_torchvision
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from torch import Tensor
+from liftcore.errors import Unavailable
+from liftcore.query.text import refuse_empty
+from liftcore.query.text.torchvision_ops import import_torchvision
 
 _OFFLINE = ("HF_HUB_OFFLINE", "TRANSFORMERS_OFFLINE")
 
@@ -33,22 +28,18 @@ class MiniLmEncoder:
     def __init__(self) -> None:
         self._model = _load()
 
-    def encode(self, texts: Sequence[str]) -> Tensor:
+    def encode(self, texts: Sequence[str]) -> np.ndarray:
         """n texts -> [n, 384] f32 unit rows.
 
         Raises:
             InvalidQuery: an empty text.
         """
-        for text in texts:
-            if not text.strip():
-                raise InvalidQuery("text", expected="a word or a sentence", got="an empty text")
+        refuse_empty(texts)
         if not texts:
-            return torch.empty(0, self.channels)
-        rows = self._model.encode(
-            list(texts), convert_to_tensor=True, normalize_embeddings=True, show_progress_bar=False
+            return np.empty((0, self.channels), np.float32)
+        return np.asarray(
+            self._model.encode(list(texts), normalize_embeddings=True, show_progress_bar=False), np.float32
         )
-        # Clones leave inference mode, so that callers may write into the result.
-        return rows.detach().to("cpu", torch.float32).clone()
 
 
 def _load() -> Any:

@@ -1,22 +1,23 @@
-"""CLIP models of open_clip, with weights by name or from a local file; their text and image towers use them apart."""
+"""CLIP models of open_clip, with weights by name or from a local file, and their text towers as encoders.
 
-from __future__ import annotations
+The image towers are used by `liftcore.features.encoders.clip`.
+"""
 
 import logging
 import warnings
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Self
+
+import numpy as np
+import torch
 
 from liftcore.errors import InvalidQuery, Unavailable
 from liftcore.nearest import nearest
-from liftcore.query.encoders.torchvision_ops import import_torchvision
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    from torch import Tensor
+from liftcore.query.text import refuse_empty
+from liftcore.query.text.torchvision_ops import import_torchvision
 
 # open_clip and timm read these with weights_only; the loader of big_vision .npz files has no such switch.
 WEIGHT_SUFFIXES = (".safetensors", ".pt", ".pth", ".bin", ".ckpt")
@@ -65,7 +66,7 @@ def create_model(model_name: str, pretrained: str | None) -> Any:
         )
 
 
-def tokenizer_of(model_name: str) -> Callable[[list[str]], Tensor]:
+def tokenizer_of(model_name: str) -> Callable[[list[str]], Any]:
     """The model's tokenizer."""
     with _quiet():
         return library().get_tokenizer(model_name)
@@ -146,3 +147,56 @@ def _quiet() -> Iterator[None]:
             yield
     finally:
         logging.disable(before)
+
+
+class OpenClipEncoder:
+    """Texts to the space that a CLIP model shares with its images.
+
+    Build it with `open`: a model never runs with random weights unless a test asks for them.
+    """
+
+    def __init__(self, name: str, model: Any, tokenizer: Callable[[list[str]], Any]) -> None:
+        self.name = name
+        self._model = model.eval()
+        self._tokenizer = tokenizer
+        self.channels = int(self._encode(["a"]).shape[1])
+
+    @classmethod
+    def open(cls, spec: str) -> Self:
+        """Load ``MODEL/PRETRAINED_TAG`` (cached or downloaded by open_clip) or ``MODEL@WEIGHTS_FILE``.
+
+        Local files are read with ``weights_only``: a pickle that holds more than tensors is refused.
+
+        Raises:
+            InvalidQuery: an unknown model or tag, or a file that is not weights of this model.
+            Unavailable: no weights were named, or they cannot be had here.
+        """
+        opened = open_model("open_clip", spec)
+        return cls(opened.name, _without_images(opened.model), tokenizer_of(opened.model_name))
+
+    @classmethod
+    def _with_random_weights(cls, model_name: str) -> Self:
+        """A model of the right shape that knows nothing: tests of plumbing only."""
+        model = _without_images(create_model(model_name, None))
+        return cls(f"open_clip:{model_name} (random)", model, tokenizer_of(model_name))
+
+    def encode(self, texts: Sequence[str]) -> np.ndarray:
+        """n texts -> [n, F] f32 unit rows.
+
+        Raises:
+            InvalidQuery: an empty text.
+        """
+        refuse_empty(texts)
+        return self._encode(list(texts)) if texts else np.empty((0, self.channels), np.float32)
+
+    def _encode(self, texts: list[str]) -> np.ndarray:
+        with torch.no_grad():
+            rows = self._model.encode_text(self._tokenizer(texts)).to(torch.float32)
+            return (rows / torch.linalg.vector_norm(rows, dim=1, keepdim=True)).numpy()
+
+
+def _without_images(model: Any) -> Any:
+    # The image tower is most of the memory, and texts never pass through it.
+    if hasattr(model, "visual"):
+        model.visual = None
+    return model

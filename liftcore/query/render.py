@@ -1,0 +1,245 @@
+"""A scene and its answers seen from a camera: masks, attention, colours and depths, in the pixels of the photo."""
+
+import io
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from PIL import Image
+from PIL.PngImagePlugin import PngInfo
+from torch import Tensor
+
+from liftcore.errors import InvalidQuery
+from liftcore.query.ask import Answer
+from liftcore.query.colours import cluster_colours, heat_colours
+from liftcore.query.directions import MINIMUM_ROW_SUM
+from liftcore.query.objects import Objects, objects
+from liftcore.query.scene import QueryScene
+from liftcore.query.splat_colours import seen_colours
+from liftcore.raster.base import CompositingParams
+from liftcore.scene.cameras import Camera, drawn_by
+from liftcore.scene.distortion import photo_places
+
+LEAST_SHARE = 0.5  # of a ray's weight, that what was found must have in a mask
+MOST_GROUPED = 1 << 17  # selected splats whose strays a mask leaves out: they take .4 s of two cores
+BAND_PIXELS = 1 << 20  # of a distorted photo, carried at a time
+_SHOWN = (0.01, 0.99)  # quantiles of the covered pixels' depths: a floater before the lens dims no picture
+_LEVELS = 254  # between the farthest covered pixel, at 1, and the nearest, at 255; 0 is for what no splat covers
+_DIM = 0.35  # brightness that an overlay leaves to what was not found
+_OUTLINE = np.array([255, 209, 64], dtype=np.uint8)  # sRGB of the line around what was found
+
+
+@dataclass(frozen=True)
+class ViewMask:
+    """An answer seen from one camera."""
+
+    view: str
+    attention: np.ndarray  # [H, W] f32, A s: the scores rendered with the lift's rendering scale of opacity
+    row_sums: np.ndarray  # [H, W] f32, A 1
+    mask: np.ndarray  # [H, W] bool, where at least half of a ray that meets the scene is of what was found
+    explanation: str  # one sentence on what the mask shows
+
+
+@dataclass(frozen=True)
+class ShownDepth:
+    """Depths as a grey picture: a level of 1 is ``far`` or farther, 255 ``near`` or nearer, and 0 no depth."""
+
+    levels: np.ndarray  # [H, W] u8
+    span: tuple[float, float] | None  # near and far, scene units; None when no pixel is covered
+
+    def text(self) -> dict[str, str]:
+        """What a PNG of it says of itself: ``depth-near`` and ``depth-far``, in decimals that read back exactly."""
+        return {} if self.span is None else dict(zip(("depth-near", "depth-far"), map(repr, self.span), strict=True))
+
+
+def view_mask(
+    scene: QueryScene, answer: Answer, view: str, group: Callable[[QueryScene, Answer], Objects] = objects
+) -> ViewMask:
+    """See an answer from a camera: attention, and a mask of the objects that were found.
+
+    The mask is ``A m >= A 1 / 2``, with m = 1 for the splats of the answer's objects: what was found in the scene,
+    where nothing hides it. It has no threshold of its own, so a view that does not see it has an empty mask. Of more
+    than 131,072 selected splats strays are not told apart, unless the query keeps the largest object.
+
+    Args:
+        scene: the opened lift. answer: of that lift.
+        view: the name of a camera, lifted or not.
+        group: makes the objects of an answer; who has them already gives them so.
+
+    Raises:
+        NotFound: no camera has this name.
+        InvalidQuery: the view's image is larger than pictures may be; or the largest of more splats than are grouped.
+        InvalidLift: the splats or the cameras moved or changed since the lift.
+    """
+    scene.cameras[view]  # a name that is not there is told before anything is grouped
+    if answer.count > MOST_GROUPED and answer.query.keep == "all":
+        members, shown = answer.selected, f"all {answer.count} selected splats, too many to tell strays apart"
+    else:
+        found = group(scene, answer)
+        members, count = found.numbers >= 0, len(found.found)
+        shown = f"the {count} object{'s' * (count != 1)} that {'were' if count != 1 else 'was'} found"
+    # A splat without a feature adds nothing to a ray; its score of -1 would count against its neighbours.
+    scores = np.where(answer.seen, answer.scores, np.float32(0.0))
+    values = torch.from_numpy(np.stack([scores, members.astype(np.float32), np.ones_like(scores)], axis=1))
+    image = scene.image(view, lambda camera: scene.raster.render(camera, values, scene.compositing)).numpy()
+    attention, weights, row_sums = (np.ascontiguousarray(image[..., column]) for column in range(3))
+    mask = (row_sums >= MINIMUM_ROW_SUM) & (weights >= LEAST_SHARE * row_sums)
+    return ViewMask(view, attention, row_sums, mask, f"at least half of the ray is of {shown}")
+
+
+def mask_png(seen: ViewMask) -> bytes:
+    """The mask, white where found, one 8-bit channel [H, W]."""
+    return _png(seen.mask.astype(np.uint8) * 255)
+
+
+def attention_png(seen: ViewMask) -> bytes:
+    """The attention through the colour map, RGB [H, W, 3]; black where the ray misses the scene."""
+    return _png(heat_colours(seen.attention, seen.row_sums > 0))
+
+
+def render_png(scene: QueryScene, view: str, what: str = "rgb") -> bytes:
+    """The scene as a camera sees it, RGB [H, W, 3] on black: its colours, features (``pca``) or clusters.
+
+    Its ``depth`` is one 8-bit channel [H, W], near bright, whose PNG tells its range as text (`ShownDepth`).
+
+    Raises:
+        NotFound, InvalidQuery, InvalidLift: as `render` does.
+    """
+    if what == "depth":
+        depth = shown_depth(scene, view)
+        return _png(depth.levels, depth.text())
+    return _png(render(scene, view, what))
+
+
+def render(scene: QueryScene, view: str, what: str = "rgb") -> np.ndarray:
+    """The colours of a view, [H, W, 3] u8 sRGB on black, with the opacities as trained.
+
+    ``rgb`` takes the splats' own colours, ``pca`` the first three principal components of their features, and
+    ``cluster`` one colour a cluster: that of the most weight on each ray, as aggregation saw it. There, grey is where
+    unclustered splats have the most.
+
+    Raises:
+        NotFound: no camera has this name.
+        InvalidQuery: clusters are asked for, and the lift has none; or the image is larger than pictures may be.
+        InvalidLift: the splats or the cameras moved or changed since the lift.
+    """
+    if what == "cluster":
+        return _render_clusters(scene, view)
+    colours = scene.principal if what == "pca" else seen_colours(scene.splats, scene.cameras[view])
+    levels = scene.image(view, lambda camera: scene.raster.render(camera, colours, _as_trained(scene))).numpy()
+    np.clip(levels, 0.0, 1.0, out=levels)  # in place: an image of floats is large
+    levels *= 255
+    return np.round(levels, out=levels).astype(np.uint8)
+
+
+def _render_clusters(scene: QueryScene, view: str) -> np.ndarray:
+    if scene.cluster is None or scene.cluster_features is None:
+        hint = "lift again with the setting aggregation=true"
+        raise InvalidQuery("what", expected="a lift with clusters", got="a lift without aggregation", hint=hint)
+    clusters = torch.from_numpy(scene.cluster)
+    labels = scene.image(view, lambda camera: scene.raster.strongest_labels(camera, clusters, scene.compositing))
+    picture = cluster_colours(len(scene.cluster_features))[labels.numpy()]  # the last colour is that of label -1
+    sums = scene.image(view, lambda camera: scene.raster.row_sums(camera, scene.compositing))
+    picture[sums.numpy() <= 0] = 0
+    return picture
+
+
+def expected_depth(scene: QueryScene, view: str) -> tuple[np.ndarray, np.ndarray]:
+    """The expected depth of the rays of a view, ``sum_j w_j z_j / sum_j w_j``.
+
+    z_j is the depth of a splat's centre along the camera's axis, not along the ray. Opacities are as trained.
+
+    Returns:
+        Depths [H, W] f32 in scene units, 0 where no splat covers the pixel; and where one does, [H, W] bool.
+
+    Raises:
+        NotFound, InvalidQuery, InvalidLift: as `render` does.
+    """
+    pose = torch.from_numpy(scene.cameras[view].viewmat[2].copy())
+    depths = (scene.splats.means.double() @ pose[:3] + pose[3]).to(torch.float32)
+    values = torch.stack([depths, torch.ones_like(depths)], dim=1)
+    image = scene.image(view, lambda camera: scene.raster.render(camera, values, _as_trained(scene)))
+    covered = image[..., 1] > 0
+    return torch.where(covered, image[..., 0] / image[..., 1], 0.0).numpy(), covered.numpy()
+
+
+def shown_depth(scene: QueryScene, view: str) -> ShownDepth:
+    """The expected depths of a view, near bright, from the 1st to the 99th percentile of the covered pixels.
+
+    Raises:
+        NotFound, InvalidQuery, InvalidLift: as `render` does.
+    """
+    depths, covered = expected_depth(scene, view)
+    levels = np.zeros(depths.shape, dtype=np.uint8)
+    if not covered.any():
+        return ShownDepth(levels, None)
+    near, far = (float(depth) for depth in np.quantile(depths[covered], _SHOWN))
+    nearness = (far - depths[covered]) / (far - near) if far > near else np.ones(int(covered.sum()))
+    levels[covered] = 1 + np.round(_LEVELS * nearness.clip(0.0, 1.0))
+    return ShownDepth(levels, (near, far))
+
+
+def _as_trained(scene: QueryScene) -> CompositingParams:
+    return CompositingParams(antialiased=scene.compositing.antialiased)
+
+
+def in_photo(camera: Camera, draw: Callable[[Camera], Tensor]) -> Tensor:
+    """A picture in the pixels of a camera's photo: what a pinhole drew, seen through the lens.
+
+    Args:
+        camera: of the photo. draw: makes a picture [H, W, ..] of a pinhole.
+
+    Returns:
+        [H, W, ..] of the photo. Where there is no lens it is as drawn; else floats are interpolated between four
+        pixels, and others are the nearest one's. Zero at the rim of a fisheye's photo that no pinhole sees.
+    """
+    image = draw(drawn_by(camera))
+    if camera.lens is None:
+        return image
+    width, height, places = camera.lens.width, camera.lens.height, photo_places(camera.lens)
+    picture = torch.zeros((height, width, *image.shape[2:]), dtype=image.dtype)
+    rows = max(1, BAND_PIXELS // width)
+    for first in range(0, height, rows):
+        u, v = (torch.from_numpy(axis[first : first + rows]) for axis in places)
+        picture[first : first + rows] = _read(image, u, v)
+    return picture
+
+
+def _read(image: Tensor, u: Tensor, v: Tensor) -> Tensor:
+    """[h, w, ..], an image at places [h, w] in its pixels; zero where these lie outside."""
+    height, width = image.shape[:2]
+    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    u, v = torch.where(inside, u, 0.0), torch.where(inside, v, 0.0)
+    shape = (*inside.shape, *(1 for _ in image.shape[2:]))
+    if not image.is_floating_point():
+        return image[v.long(), u.long()] * inside.reshape(shape)
+    found = torch.zeros((*inside.shape, *image.shape[2:]), dtype=image.dtype)
+    left, top = (u - 0.5).floor(), (v - 0.5).floor()
+    for row in (top, top + 1):
+        for column in (left, left + 1):
+            share = (1 - (u - 0.5 - column).abs()) * (1 - (v - 0.5 - row).abs()) * inside
+            taken = image[row.clamp(0, height - 1).long(), column.clamp(0, width - 1).long()]
+            found += taken * share.to(image.dtype).reshape(shape)
+    return found
+
+
+def overlay(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """[H, W, 3] u8: an image with a mask [H, W] bool bright and outlined, and the rest dimmed."""
+    picture = np.where(mask[..., None], image, (_DIM * image).astype(np.uint8))
+    padded, (height, width) = np.pad(mask, 1), mask.shape
+    near = np.zeros_like(mask)  # pixels that touch the mask, sideways or diagonally
+    for dy in range(3):
+        for dx in range(3):
+            near |= padded[dy : dy + height, dx : dx + width]
+    picture[near & ~mask] = _OUTLINE
+    return picture
+
+
+def _png(pixels: np.ndarray, text: Mapping[str, str] | None = None) -> bytes:
+    """A picture [H, W] or [H, W, 3] u8 with text chunks."""
+    buffer, chunks = io.BytesIO(), PngInfo()
+    for name, value in (text or {}).items():
+        chunks.add_text(name, value)
+    Image.fromarray(np.ascontiguousarray(pixels)).save(buffer, format="PNG", pnginfo=chunks)
+    return buffer.getvalue()

@@ -1,0 +1,116 @@
+"""Text encoders behind one protocol: words in, unit vectors out. Importing this loads no torch."""
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from liftcore.errors import InvalidQuery
+
+ENCODER_SPECS = (
+    "table:FILE.safetensors",
+    "minilm",
+    "open_clip:MODEL/PRETRAINED_TAG",
+    "open_clip:MODEL@WEIGHTS_FILE",
+)
+NO_WORDS = "none"  # the text space of features that no text encoder shares
+REMEMBERED = 1_024  # texts; two megabytes at 512 channels
+
+
+class TextEncoder(Protocol):
+    """Maps texts into the space of the lifted features."""
+
+    @property
+    def name(self) -> str:
+        """What the encoder is, for messages and metadata."""
+        ...
+
+    @property
+    def channels(self) -> int:
+        """F, the length of its vectors."""
+        ...
+
+    def encode(self, texts: Sequence[str]) -> np.ndarray:
+        """n texts -> [n, F] f32 with unit rows.
+
+        Raises:
+            InvalidQuery: a text that the encoder cannot read (a word that a table lacks, an empty text).
+        """
+        ...
+
+
+def open_encoder(spec: str) -> TextEncoder:
+    """Open a text encoder by its specification.
+
+    Args:
+        spec: ``table:FILE`` or a path ending in ``.safetensors`` (precomputed embeddings); ``minilm`` (a
+            small sentence encoder, offline); ``open_clip:MODEL/TAG`` or ``open_clip:MODEL@FILE``.
+
+    Raises:
+        InvalidQuery: the specification is none of these, or a table is malformed.
+        Unavailable: the encoder's weights are not on this machine.
+    """
+    kind, _, rest = spec.partition(":")
+    # A bare path may hold a colon itself, so the suffix is asked first.
+    if kind != "table" and spec.endswith(".safetensors") and not spec.startswith("open_clip:"):
+        kind, rest = "table", spec
+    if kind == "table" and rest:
+        from liftcore.query.text.table import TableEncoder
+
+        return TableEncoder.open(Path(rest))
+    if spec == "minilm":
+        from liftcore.query.text.minilm import MiniLmEncoder
+
+        return MiniLmEncoder()
+    if kind == "open_clip" and rest:
+        from liftcore.query.text.open_clip import OpenClipEncoder
+
+        return OpenClipEncoder.open(rest)
+    raise InvalidQuery("encoder", expected=f"one of {', '.join(ENCODER_SPECS)}", got=repr(spec))
+
+
+def refuse_empty(texts: Sequence[str]) -> None:
+    """Refuse texts that say nothing.
+
+    Raises:
+        InvalidQuery: one is empty.
+    """
+    if not all(text.strip() for text in texts):
+        raise InvalidQuery("text", expected="a word or a sentence", got="an empty text")
+
+
+class RememberingEncoder:
+    """Another encoder, asked only for texts that are not among the last ones (``TextEncoder``).
+
+    People ask for a mask after they asked for the words.
+    """
+
+    def __init__(self, encoder: TextEncoder, size: int = REMEMBERED) -> None:
+        self._encoder = encoder
+        self._size = size
+        self._rows: OrderedDict[str, np.ndarray] = OrderedDict()
+
+    @property
+    def name(self) -> str:
+        """The other encoder's."""
+        return self._encoder.name
+
+    @property
+    def channels(self) -> int:
+        """The other encoder's."""
+        return self._encoder.channels
+
+    def encode(self, texts: Sequence[str]) -> np.ndarray:
+        """n texts -> [n, F] f32 unit rows; errors are the other encoder's, and are not remembered."""
+        new = [text for text in dict.fromkeys(texts) if text not in self._rows]
+        rows = dict(zip(new, self._encoder.encode(new), strict=True)) if new else {}
+        for text in texts:
+            if text in self._rows:
+                rows[text] = self._rows[text]
+                self._rows.move_to_end(text)
+        self._rows.update((text, rows[text]) for text in new)
+        while len(self._rows) > self._size:
+            self._rows.popitem(last=False)
+        return np.stack([rows[text] for text in texts]) if texts else np.empty((0, self.channels), np.float32)

@@ -1,0 +1,288 @@
+"""Where a score becomes a yes: thresholds from the scores alone.
+
+No ground truth and no other phrase enters, and no count of instances unless the user gives one. All sizes are shares
+of the scores, so that the resolution of a view does not matter, and all positions are shares of their range, so that
+thresholds move with the scores: ``threshold(a s + b) = a threshold(s) + b`` for a > 0, up to rounding.
+
+| method | the threshold |
+|---|---|
+| `auto` | where the share found changes least, in log-odds; not below ``least`` |
+| `valley` | the paper's appendix: from the top, the first local maximum, then the minimum before it |
+| `paper` | the paper's main text, literally: the largest peak, then the adjacent smaller valley |
+| `otsu` | the split with the largest variance between its sides (Otsu 1979) |
+| `stability` | the least sensitive stretch of a sweep (Occam's LGS) |
+| a number | itself (`fixed`) |
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from liftcore.errors import InvalidQuery
+
+BINS = 300  # a multiple of the sweep's 100 steps
+SMOOTHING = BINS / 64  # bins, standard deviation of the Gaussian that removes a histogram's ripples
+LEAST_SHARE = 3e-4  # of the scores: less than this above a threshold is stray (SAM drops masks this small)
+MOST_INSTANCES = 100  # more hills than a histogram can show
+DEPTH = 0.6  # a valley must fall to this share of its peak, else it is a ripple; tuned on one scene's masks
+# The sweep of Occam's LGS: thresholds in steps, the slope of the share found after a median filter, and how long a
+# stretch, of which slopes and shares, is stable.
+STEPS, FILTER, LEAST_STEPS, MOST_SLOPE, SHARES = 100, 5, 5, 0.4, (0.005, 0.9)
+
+
+@dataclass(frozen=True)
+class Threshold:
+    """A threshold and how it came about."""
+
+    value: float  # scores at or above it answer the query
+    method: str  # auto, valley, paper, otsu, stability or fixed
+    explanation: str  # one sentence for the user
+    clear: bool = True  # whether the scores have what the method looks for
+
+
+@dataclass(frozen=True)
+class Histogram:
+    """Scores counted in equal bins between their least and their greatest."""
+
+    mass: np.ndarray  # [BINS] f64, sums to one
+    low: float  # the left edge of the first bin
+    width: float  # of a bin
+
+    def edge(self, position: float) -> float:
+        """The left edge of a bin; position + 0.5 is its middle."""
+        return self.low + position * self.width
+
+    def smoothed(self) -> np.ndarray:
+        """[BINS] f64, the mass after a Gaussian of SMOOTHING bins, mirrored at both ends."""
+        reach = math.ceil(4 * SMOOTHING)
+        weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / SMOOTHING) ** 2)
+        return np.convolve(np.pad(self.mass, reach, mode="symmetric"), weights / weights.sum(), mode="valid")
+
+    def above(self) -> np.ndarray:
+        """[BINS] f64, the share of the scores in each bin or above it."""
+        return np.cumsum(self.mass[::-1])[::-1]
+
+
+Found = tuple[float, str, bool]  # a threshold, a sentence about it, and whether the method found what it looks for
+
+
+def check_method(method: str | float, instances: int | None = None) -> None:
+    """Refuse a method that `find_threshold` does not know, before any work is done.
+
+    Raises:
+        InvalidQuery: an unknown method, a number that is not finite, or instances that no method can count.
+    """
+    if isinstance(method, int | float):
+        if not math.isfinite(method):
+            raise InvalidQuery("threshold", expected="a finite number", got=str(method))
+    elif method not in METHODS:
+        raise InvalidQuery("threshold", expected=f"a number or one of {', '.join(METHODS)}", got=repr(method))
+    if instances is None:
+        return
+    if not 1 <= instances <= MOST_INSTANCES:
+        raise InvalidQuery("instances", expected=f"1 to {MOST_INSTANCES}", got=str(instances))
+    if method not in ("auto", "valley"):
+        hint = "leave the threshold out, or the instances"
+        raise InvalidQuery("instances", expected="threshold auto or valley", got=f"threshold {method}", hint=hint)
+
+
+def find_threshold(
+    scores: ArrayLike,
+    method: str | float = "auto",
+    weights: ArrayLike | None = None,
+    instances: int | None = None,
+    least: float = -math.inf,
+) -> Threshold:
+    """A threshold on scores by one of the methods above.
+
+    Degenerate maps have a defined answer. No scores at all give infinity: nothing is found. Equal scores give
+    that score: all of them answer alike. Scores without what a method looks for fall back to Otsu's split, and the
+    explanation says so.
+
+    Args:
+        scores: [n] f32, finite.
+        method: one of ``METHODS``, or a number to use as it is.
+        weights: [n] f32, how much each score counts, at least zero: the evidence of splats; None = equally, as the
+            pixels of a view do.
+        instances: how many things the user says there are: the valley is then the one below as many hills, counted
+            from the top. With it ``auto`` takes the valley. Only the user can know it; None = not said.
+        least: ``auto`` takes no lower score, unless too few lie above it.
+
+    Raises:
+        InvalidQuery: what `check_method` refuses, or scores that are not finite.
+    """
+    check_method(method, instances)
+    if isinstance(method, int | float):
+        return Threshold(float(method), "fixed", f"The threshold {method:.4g} was given.")
+    values = np.asarray(scores, np.float32).ravel()
+    if values.size == 0:
+        return Threshold(math.inf, method, "There are no scores: nothing can be found.", clear=False)
+    low, high = float(values.min()), float(values.max())
+    if not (math.isfinite(low) and math.isfinite(high)):
+        raise InvalidQuery("scores", expected="finite values", got="NaN or infinity")
+    histogram = _count(values, low, high, weights)
+    if histogram is None:
+        return Threshold(low, method, f"All scores are {low:.4g}: the histogram has no valley.", clear=False)
+    if instances is not None:
+        value, explanation, clear = valley(histogram, instances)
+    else:
+        value, explanation, clear = steady(histogram, least) if method == "auto" else METHODS[method](histogram)
+    value = min(max(value, low), high)
+    above = np.append(histogram.above(), 0.0)
+    share = float(np.interp((value - low) / histogram.width, np.arange(len(above)), above))
+    told = f"{share:.1%} of the {'pixels' if weights is None else 'evidence'} at or above {value:.4g}"
+    return Threshold(value, method, f"{explanation.removesuffix('.')}; {told}.", clear)
+
+
+def _count(scores: np.ndarray, low: float, high: float, weights: ArrayLike | None) -> Histogram | None:
+    """The histogram of scores; None where they differ by their last bits, or weigh nothing."""
+    width = (high - low) / BINS
+    if not width > 4 * np.spacing(np.float32(max(abs(low), abs(high)))):
+        return None
+    places = np.minimum(((scores.astype(np.float64) - low) * (1.0 / width)).astype(np.int32), BINS - 1)
+    shares = None if weights is None else np.asarray(weights, np.float32).ravel()
+    mass = np.bincount(places, shares, BINS).astype(np.float64)
+    total = mass.sum()
+    return Histogram(mass / total, low, width) if total > 0 else None
+
+
+def steady(histogram: Histogram, least: float = -math.inf) -> Found:
+    """The score at which the log-odds of the share found fall least, no lower than ``least`` if enough lie above it.
+
+    Let ``S(t)`` be the share of the scores at or above t. Raising t past a hill of the histogram loses its scores,
+    between hills it loses hardly any. The valley wanted is not the deepest one: a small object's hill is low on both
+    sides. So the share's log-odds are watched, which count a loss against what is left on either side:
+
+        t* = argmin_t  -d/dt log(S / (1 - S)) = argmin_t  p(t) / (S(t) (1 - S(t)))
+
+    with p the smoothed density. Inside a hill and in its tails the log-odds fall steeply, whatever the hill's size,
+    and between two hills they lie flat. Nothing is tuned: the smoothing takes away ripples (half of it or twice it
+    changes little), and the least share keeps stray scores from being an object.
+    """
+    density = histogram.smoothed()
+    density = density / density.sum()
+    above = np.cumsum(density[::-1])[::-1] - density / 2  # at the middles of the bins
+    counted = np.minimum(above, 1 - above) >= LEAST_SHARE  # some are: no smoothed bin has more than a fifth of all
+    high = counted & (histogram.low + (np.arange(len(density)) + 0.5) * histogram.width >= least)
+    floor = f"Above {least:g} the" if high.any() and not high[counted].all() else "The"
+    counted = high if high.any() else counted
+    slope = np.full(len(density), np.inf)
+    slope[counted] = density[counted] / (above[counted] * (1 - above[counted]))
+    # Empty stretches tie at zero: the middle of the widest keeps clear of both its sides.
+    run = max(_runs(slope <= slope.min() * (1 + 1e-9)), key=len)
+    place = int(run[0] + run[-1]) // 2
+    value = histogram.edge(place + 0.5)
+    found = f"{floor} share found changes least, in log-odds, around {value:.4g}"
+    if density[place] < density[place:].max():
+        return value, f"{found}.", True
+    # Over one hill the log-odds are steadiest near its middle, which means nothing.
+    lack = "but no hill of the histogram lies above it: take it with care, or name a threshold"
+    return value, f"{found}, {lack}.", False
+
+
+def valley(histogram: Histogram, instances: int = 1) -> Found:
+    """From the top down, the first hill, or the one that makes it ``instances``, then the valley before it.
+
+    The paper's code counts the instances in the ground truth; here the user may, else it is one. Where there are
+    fewer hills, the lowest one is taken. Hills are those whose valley is deep and that are large enough.
+    """
+    smooth, above = histogram.smoothed(), histogram.above()
+    peaks, valleys = _extrema(smooth)
+    hills: list[tuple[int, int]] = []
+    for peak in reversed(peaks):
+        place = max((place for place in valleys if place < peak), default=None)
+        if place is None or len(hills) == instances:
+            break
+        if above[place] >= LEAST_SHARE and smooth[place] <= DEPTH * smooth[peak]:
+            hills.append((peak, place))
+    if not hills:
+        return _stand_in(histogram, "no hill with a valley before it")
+    peak, place = hills[-1]
+    value = histogram.edge(place)
+    which = "first hill" if instances == 1 else f"hill {len(hills)}"
+    lack = "" if len(hills) == instances else f" (there are no {instances})"
+    lies = f"lies at {histogram.edge(peak):.4g} and the valley before it at {value:.4g}"
+    return value, f"From the top down, the histogram's {which}{lack} {lies}.", True
+
+
+def paper(histogram: Histogram) -> Found:
+    """The largest peak, then the adjacent smaller valley above it."""
+    smooth = histogram.smoothed()
+    peaks, valleys = _extrema(smooth)
+    peak = max(peaks, key=lambda place: smooth[place])
+    for place in valleys:
+        if place > peak and smooth[place] < smooth[peak]:
+            value = histogram.edge(place)
+            lies = f"lies at {histogram.edge(peak):.4g} and the next valley above it at {value:.4g}"
+            return value, f"The histogram's largest peak {lies}.", True
+    return _stand_in(histogram, "no valley above its largest peak")
+
+
+def otsu(histogram: Histogram) -> Found:
+    """The edge that maximises the variance between its sides."""
+    value = histogram.edge(_split(histogram.mass))
+    return value, f"Otsu's split at {value:.4g} separates the scores best into two groups.", True
+
+
+def stability(histogram: Histogram) -> Found:
+    """The middle of the sweep's least sensitive stable stretch, after the evaluation of Occam's LGS.
+
+    The released code compares label levels and takes the least sensitive one. We have one map, so its least
+    sensitive stable stretch counts.
+    """
+    every = len(histogram.mass) // STEPS
+    shares = histogram.above()[every::every]  # at thresholds 0.01..0.99 of the range
+    around = np.pad(np.abs(np.gradient(shares, 1 / STEPS)), FILTER // 2, mode="edge")
+    slopes = np.median(np.lib.stride_tricks.sliding_window_view(around, FILTER), axis=1)
+    stable = (slopes < MOST_SLOPE) & (shares >= SHARES[0]) & (shares <= SHARES[1])
+    stretches = [run for run in _runs(stable) if len(run) >= LEAST_STEPS]
+    if not stretches:
+        return _stand_in(histogram, "no stretch over which the share found is stable")
+    run = min(stretches, key=lambda run: float(slopes[run].mean()))
+    first, last = (histogram.edge((int(place) + 1) * every) for place in (run[0], run[-1]))
+    told = f"The share found is stable from {first:.4g} to {last:.4g}, and its middle is taken."
+    return (first + last) / 2, told, True
+
+
+METHODS: dict[str, Callable[[Histogram], Found]] = {
+    "auto": steady, "valley": valley, "paper": paper, "otsu": otsu, "stability": stability,
+}  # fmt: skip
+
+
+def _stand_in(histogram: Histogram, lack: str) -> Found:
+    """Otsu's split for a method that found ``lack`` (the histogram has ...)."""
+    value = histogram.edge(_split(histogram.mass))
+    return value, f"The histogram has {lack}; Otsu's split at {value:.4g} stands in.", False
+
+
+def _split(mass: np.ndarray) -> int:
+    """The bin k that maximises the variance between bins 0..k-1 and k.., 1 <= k < BINS."""
+    centres = np.arange(len(mass)) + 0.5
+    below, first = np.cumsum(mass)[:-1], np.cumsum(mass * centres)[:-1]
+    total = float((mass * centres).sum())
+    spread = below * (1 - below)
+    # One score among very many leaves a side without mass, up to rounding: no split is there.
+    between = np.where(spread > 0, (total * below - first) ** 2 / np.where(spread > 0, spread, 1.0), 0.0)
+    # Empty bins between two groups tie: the middle of the best ones keeps clear of both.
+    best = np.flatnonzero(between >= between.max() * (1 - 1e-9))
+    return int(best[len(best) // 2]) + 1
+
+
+def _extrema(curve: np.ndarray) -> tuple[list[int], list[int]]:
+    """Local maxima (ends count) and the minima between each two of them; a plateau counts at its middle."""
+    starts = np.flatnonzero(np.concatenate([[True], curve[1:] != curve[:-1]]))
+    levels = curve[starts]
+    middles = (starts + np.append(starts[1:], len(curve)) - 1) // 2
+    rises = np.concatenate([[True], levels[1:] > levels[:-1]])
+    falls = np.append(levels[1:] < levels[:-1], True)
+    inner = (~rises & ~falls)[1:-1]
+    return middles[rises & falls].tolist(), middles[1:-1][inner].tolist()
+
+
+def _runs(chosen: np.ndarray) -> list[np.ndarray]:
+    """The places of each run of True in [n] bool."""
+    runs = np.split(np.arange(len(chosen)), np.flatnonzero(np.diff(chosen)) + 1)
+    return [run for run in runs if chosen[run[0]]]

@@ -1,0 +1,403 @@
+"""A scene and its answers seen from a camera: masks, colours, depths, in the pixels of the photo."""
+
+import io
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from liftcore.errors import InvalidQuery, NotFound
+from liftcore.query import objects as grouping
+from liftcore.query import render as module
+from liftcore.query import scene as scenes
+from liftcore.query.ask import Answer, ask
+from liftcore.query.colours import NO_CLUSTER_COLOUR, SH_C0, cluster_colours
+from liftcore.query.objects import objects
+from liftcore.query.render import (
+    attention_png,
+    expected_depth,
+    in_photo,
+    mask_png,
+    overlay,
+    render,
+    render_png,
+    shown_depth,
+    view_mask,
+)  # fmt: skip
+from liftcore.query.scene import QueryScene
+from liftcore.query.splat_colours import principal_colours, seen_colours
+from liftcore.query.terms import Query, Region
+from liftcore.raster.base import CompositingParams
+from liftcore.raster.reference import ReferenceRaster
+from liftcore.scene.cameras import Camera, Cameras, behind_lens, drawn_by
+from liftcore.scene.distortion import Brown, Distortion, Fisheye, photo_places
+from liftcore.scene.splats import Kernel, Splats
+from tests.api.tiny_scene import HEIGHT, SPLATS_A_CLUSTER, WIDTH
+from tests.scenes import look_at, random_camera, random_splats
+
+STRAY = 2 * SPLATS_A_CLUSTER + 5  # a splat of the third cluster
+
+
+@pytest.fixture
+def scene(lift_tiny: Callable[..., Path], tmp_path: Path) -> QueryScene:
+    """The tiny scene lifted with a scale of the opacity logits."""
+    return QueryScene.open(lift_tiny(tmp_path, "tikhonov"))
+
+
+def of(scene: QueryScene, *clusters: int, keep: str = "all", rows: tuple[int, ...] = ()) -> Answer:
+    """An answer that selected these clusters and rows."""
+    answer = ask(scene, Query((Region("left", 0, 0),), threshold=0.5, keep=keep))
+    selected = np.zeros_like(answer.selected)
+    for cluster in clusters:
+        selected[cluster * SPLATS_A_CLUSTER : (cluster + 1) * SPLATS_A_CLUSTER] = True
+    selected[list(rows)] = True
+    return replace(answer, selected=selected)
+
+
+def mostly(scene: QueryScene, members: np.ndarray) -> np.ndarray:
+    """[H, W] bool, where these splats have at least half of a ray that meets the scene, by the oracle."""
+    camera, oracle = scene.cameras["middle"], ReferenceRaster(scene.splats)
+    weights = oracle.render(camera, torch.from_numpy(members).float()[:, None], scene.compositing)[..., 0]
+    row_sums = oracle.row_sums(camera, scene.compositing)
+    assert not ((weights / row_sums.clamp_min(1e-9) - 0.5).abs() < 1e-5).any()  # no pixel is in doubt
+    return ((row_sums >= 0.5) & (weights >= 0.5 * row_sums)).numpy()
+
+
+def test_attention_is_the_scores_rendered_with_the_lifts_gain(scene: QueryScene) -> None:
+    answer, camera = of(scene, 0), scene.cameras["middle"]
+    seen = view_mask(scene, answer, "middle")
+    scores = torch.from_numpy(np.where(answer.seen, answer.scores, np.float32(0)))[:, None]
+    assert np.array_equal(seen.attention, scene.raster.render(camera, scores, scene.compositing)[:, :, 0])
+    np.testing.assert_allclose(seen.row_sums, scene.raster.row_sums(camera, scene.compositing), rtol=1e-6)
+    assert scene.compositing.opacity_logit_scale == scene.metadata.settings.render_gain == 1.2
+
+
+def test_a_mask_is_where_most_of_a_ray_is_of_what_was_found(scene: QueryScene) -> None:
+    answer = of(scene, 0, 1)
+    seen = view_mask(scene, answer, "middle")
+    assert seen.mask.shape == (HEIGHT, WIDTH)
+    assert np.array_equal(seen.mask, mostly(scene, answer.selected)) and seen.mask.any()
+    assert "2 objects that were found" in seen.explanation
+
+
+def test_strays_are_not_in_a_mask(scene: QueryScene) -> None:
+    large = scene.splats.log_scales.clone()
+    large[STRAY] = np.log(0.2)
+    opaque = scene.splats.opacity_logits.clone()
+    opaque[STRAY] = 9.0
+    scene.__dict__["splats"] = replace(scene.splats, log_scales=large, opacity_logits=opaque)
+    answer = of(scene, 0, rows=(STRAY,))
+    assert objects(scene, answer).strays == 1
+    assert (mostly(scene, answer.selected) & ~mostly(scene, of(scene, 0).selected)).any()  # it could be seen
+    seen = view_mask(scene, answer, "middle")
+    assert np.array_equal(seen.mask, mostly(scene, of(scene, 0).selected))
+    assert "1 object that was found" in seen.explanation
+
+
+def test_a_view_that_sees_nothing_of_it_has_an_empty_mask(scene: QueryScene) -> None:
+    shown = view_mask(scene, of(scene, 0), "middle").mask
+    camera = scene.cameras["middle"]
+    left = int(np.flatnonzero(shown.any(axis=0)).max()) + 1  # what lies to the right of the cluster
+    cut = camera.replace(width=camera.width - left, cx=camera.cx - left)
+    scene.__dict__["cameras"] = Cameras((cut,))
+    seen = view_mask(scene, of(scene, 0), "middle")
+    assert not seen.mask.any() and (seen.row_sums >= 0.5).any()
+    assert view_mask(scene, of(scene, 2), "middle").mask.any()
+
+
+def test_what_hides_it_is_not_in_its_mask(scene: QueryScene) -> None:
+    """The middle cluster, moved before the first one, hides it: both are found, one is seen."""
+    moved = scene.splats.means.clone()
+    first, second = (slice(k * SPLATS_A_CLUSTER, (k + 1) * SPLATS_A_CLUSTER) for k in range(2))
+    eye = torch.from_numpy(np.linalg.inv(scene.cameras["middle"].viewmat)[:3, 3]).float()
+    before = view_mask(scene, of(scene, 0), "middle").mask
+    moved[second] = eye + 0.7 * (moved[first] - eye)
+    scene.__dict__["splats"] = replace(scene.splats, means=moved)
+    del scene.__dict__["raster"]
+    hidden, shown = view_mask(scene, of(scene, 0), "middle").mask, view_mask(scene, of(scene, 1), "middle").mask
+    assert shown.sum() >= before.sum() > 20
+    assert hidden.sum() < 0.2 * before.sum()
+
+
+def test_the_largest_object_alone_is_seen_when_asked(scene: QueryScene) -> None:
+    answer = of(scene, 0, 2)
+    largest = objects(scene, answer).numbers == 0
+    kept = view_mask(scene, replace(answer, query=replace(answer.query, keep="largest")), "middle")
+    assert np.array_equal(kept.mask, mostly(scene, largest))
+    assert 0 < int(kept.mask.sum()) < int(view_mask(scene, answer, "middle").mask.sum())
+
+
+def test_nothing_found_is_an_empty_mask(scene: QueryScene) -> None:
+    seen = view_mask(scene, of(scene), "middle")
+    assert not seen.mask.any() and "the 0 objects that were found" in seen.explanation
+
+
+def test_of_very_many_splats_strays_stay(scene: QueryScene, monkeypatch: pytest.MonkeyPatch) -> None:
+    answer = of(scene, 0, rows=(STRAY,))
+    monkeypatch.setattr(module, "MOST_GROUPED", answer.count)
+    assert "1 object" in view_mask(scene, answer, "middle").explanation
+    monkeypatch.setattr(module, "MOST_GROUPED", answer.count - 1)
+    seen = view_mask(scene, answer, "middle")
+    assert np.array_equal(seen.mask, mostly(scene, answer.selected))
+    assert f"all {answer.count} selected splats" in seen.explanation
+    largest = replace(answer, query=replace(answer.query, keep="largest"))
+    assert "1 object" in view_mask(scene, largest, "middle").explanation
+    monkeypatch.setattr(grouping, "MOST_SPLATS", answer.count - 1)
+    assert view_mask(scene, answer, "middle").mask.any()
+    with pytest.raises(InvalidQuery, match="at most"):
+        view_mask(scene, largest, "middle")
+
+
+def test_objects_that_are_known_are_not_made_again(scene: QueryScene) -> None:
+    answer, asked = of(scene, 0, 1), []
+    known = objects(scene, of(scene, 1))
+    seen = view_mask(scene, answer, "middle", group=lambda *both: asked.append(both) or known)
+    assert np.array_equal(seen.mask, mostly(scene, of(scene, 1).selected))
+    assert asked == [(scene, answer)]
+
+
+def test_a_view_that_is_not_there_is_told_before_anything_is_grouped(scene: QueryScene) -> None:
+    def never(*_: object) -> grouping.Objects:
+        raise AssertionError
+
+    with pytest.raises(NotFound, match="middle"):
+        view_mask(scene, of(scene, 0), "midle", group=never)
+
+
+def test_clusters_have_their_colours_and_the_rest_is_grey(scene: QueryScene) -> None:
+    with pytest.raises(InvalidQuery, match="aggregation"):
+        render_png(scene, "middle", "cluster")
+    clusters = (torch.arange(3 * SPLATS_A_CLUSTER) // SPLATS_A_CLUSTER - 1).to(torch.int32)
+    features = torch.ones(2, scene.channels, dtype=scene.lift.features.dtype)
+    clustered = QueryScene(replace(scene.lift, cluster=clusters, cluster_features=features))
+    shown = render(clustered, "middle", "cluster")
+    labels = scene.raster.strongest_labels(scene.cameras["middle"], clusters, scene.compositing).numpy()
+    met = scene.raster.row_sums(scene.cameras["middle"], scene.compositing).numpy() > 0
+    assert {-1, 0, 1} == set(labels[met].tolist())
+    for label, colour in zip((0, 1, -1), cluster_colours(2), strict=True):
+        assert (shown[met & (labels == label)] == colour).all()
+    assert not shown[~met].any()
+
+
+def test_pictures_have_the_size_and_the_mode_they_promise(scene: QueryScene) -> None:
+    seen = view_mask(scene, of(scene, 0), "middle")
+    assert overlay(render(scene, "middle"), seen.mask).shape == (HEIGHT, WIDTH, 3)
+    made = {"L": [mask_png(seen)], "RGB": [attention_png(seen), render_png(scene, "middle"),
+                                          render_png(scene, "middle", "pca")]}  # fmt: skip
+    for mode, pictures in made.items():
+        for content in pictures:
+            with Image.open(io.BytesIO(content)) as picture:
+                assert (picture.size, picture.mode) == ((WIDTH, HEIGHT), mode)
+    with Image.open(io.BytesIO(mask_png(seen))) as picture:
+        assert np.array_equal(np.asarray(picture) > 0, seen.mask)
+
+
+def test_pictures_have_a_limit(scene: QueryScene, monkeypatch: pytest.MonkeyPatch) -> None:
+    answer = ask(scene, Query((Region("left", 0, 0),)))
+
+    def draw(what: str) -> object:
+        return view_mask(scene, answer, "middle") if what == "mask" else render_png(scene, "middle", what)
+
+    for what in ("mask", "rgb", "pca", "depth"):
+        monkeypatch.setattr(scenes, "MOST_PIXELS", WIDTH * HEIGHT)
+        assert draw(what)
+        monkeypatch.setattr(scenes, "MOST_PIXELS", WIDTH * HEIGHT - 1)
+        with pytest.raises(InvalidQuery, match=f"{WIDTH}x{HEIGHT}"):
+            draw(what)
+
+
+def test_colours_follow_the_spherical_harmonics() -> None:
+    camera = look_at("v", np.array([0.0, 0.0, -3.0]), 8, 8, 8.0)
+    plain = random_splats(0, 5)
+    grey = Splats(plain.means, plain.quats, plain.log_scales, plain.opacity_logits, sh=torch.zeros(5, 16, 3))
+    assert torch.allclose(seen_colours(grey, camera), torch.tensor(0.5))
+    assert plain.sh is not None
+    expected = (0.5 + SH_C0 * plain.sh[:, 0]).clamp_min(0)
+    torch.testing.assert_close(seen_colours(plain, camera), expected)
+
+
+def test_spherical_beta_lobes_add_to_the_base_colour() -> None:
+    camera = look_at("v", np.array([0.0, 0.0, -3.0]), 8, 8, 8.0)
+    bare = random_splats(0, 5, kernel=Kernel.BETA)
+    rng = np.random.default_rng(0)
+    lobes = rng.normal(0, 1, (5, 2, 6)).astype(np.float32)
+    splats = replace(bare, sb_params=torch.from_numpy(lobes))
+    expected = np.zeros((5, 3))
+    for p in range(5):
+        direction = bare.means[p].double().numpy() - np.array([0.0, 0.0, -3.0])
+        direction /= np.linalg.norm(direction)
+        assert bare.sh is not None
+        expected[p] = 0.5 + SH_C0 * bare.sh[p, 0].double().numpy()
+        for r, g, b, theta, phi, beta in lobes[p].astype(np.float64):
+            axis = np.array([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)])
+            sharpness = 10 * np.log(2)
+            colour = np.log1p(np.exp(sharpness * np.array([r, g, b]))) / sharpness
+            expected[p] += colour * max(0.0, axis @ direction) ** (4 * np.exp(beta))
+    torch.testing.assert_close(
+        seen_colours(splats, camera), torch.from_numpy(expected.clip(0)).float(), atol=1e-5, rtol=1e-5
+    )
+    wild = torch.tensor([0.0, 0.0, 0.0, 1.0, 1.0, 1e4]).expand(5, 1, 6).contiguous()
+    for sign in (1, -1):
+        assert seen_colours(replace(bare, sb_params=wild * sign), camera).isfinite().all()
+
+
+def test_many_clusters_have_colours_that_can_be_told_apart() -> None:
+    colours = cluster_colours(24).astype(int)
+    assert colours.shape == (25, 3) and tuple(colours[-1]) == NO_CLUSTER_COLOUR
+    apart = np.abs(colours[:, None] - colours[None]).max(axis=2)[~np.eye(25, dtype=bool)]
+    assert apart.min() >= 16
+
+
+def test_groups_of_features_get_their_own_colours_at_every_run() -> None:
+    generator = torch.Generator().manual_seed(1)
+    group = torch.arange(3000) % 3
+    features = (torch.eye(16)[group] + 0.02 * torch.randn(3000, 16, generator=generator)).half()
+    features[-1] = 0
+    first, again = (principal_colours(features.numpy(), np.ones(3000, np.float32)) for _ in range(2))
+    assert torch.equal(first, again)
+    assert first.min() >= 0 and first.max() <= 1 and not first[-1].any()
+    means = torch.stack([first[:-1][group[:-1] == k].mean(dim=0) for k in range(3)])
+    assert torch.pdist(means).min() > 0.4
+
+
+def test_fewer_than_three_channels_and_no_evidence_are_fine() -> None:
+    assert principal_colours(np.random.rand(10, 2), np.ones(10)).shape == (10, 3)
+    assert not principal_colours(np.random.rand(10, 4), np.zeros(10)).any()
+
+
+NEAR, FAR = 2.0, 5.0
+
+
+def scene_of(lifted: QueryScene, splats: Splats, camera: Camera) -> QueryScene:
+    """A lift of nothing, over those splats and that camera."""
+    ones = torch.ones(splats.count)
+    made = replace(lifted.lift, features=torch.ones(splats.count, 1), evidence=ones, seen=ones > 0)
+    return QueryScene(made, splats, Cameras((camera,)))
+
+
+@pytest.fixture
+def two(scene: QueryScene) -> QueryScene:
+    """Two opaque balls side by side before a camera, one near and one far, and nothing between them."""
+    pose = np.eye(4)
+    pose[2, 3] = 1.0  # the camera stands at z = -1
+    splats = Splats(
+        means=torch.tensor([[-0.9, 0.0, NEAR - 1], [2.2, 0.0, FAR - 1]]),
+        quats=torch.tensor([[1.0, 0, 0, 0]] * 2),
+        log_scales=torch.tensor([[0.12] * 3, [0.3] * 3]).log(),
+        opacity_logits=torch.full((2,), 4.0),
+    )
+    return scene_of(scene, splats, Camera.pinhole("front", 48, 24, 24.0, 24.0, 24.0, 12.0, pose))
+
+
+def test_what_is_near_is_bright_and_what_is_nowhere_is_black(two: QueryScene) -> None:
+    depths, covered = expected_depth(two, "front")
+    shown = shown_depth(two, "front")
+    assert shown.span == pytest.approx((NEAR, FAR), abs=1e-5)
+    assert depths[12, [13, 34]].tolist() == pytest.approx([NEAR, FAR], rel=1e-5)
+    assert (shown.levels[12, 13], shown.levels[12, 34], shown.levels[0, 0]) == (255, 1, 0)
+    assert not covered[0, 0] and not depths[0, 0]
+    assert np.array_equal(shown.levels > 0, covered)
+
+
+@pytest.mark.parametrize("kernel", Kernel)
+@pytest.mark.usefixtures("every_kernel")
+def test_depth_is_the_weighted_mean_of_what_the_ray_meets(kernel: Kernel, scene: QueryScene) -> None:
+    splats, camera = random_splats(5, 40, kernel=kernel), random_camera(5)
+    depths, covered = expected_depth(scene_of(scene, splats, camera), "v0")
+    pixels = torch.tensor([(x, y) for y in range(camera.height) for x in range(camera.width)], dtype=torch.int32)
+    rows = ReferenceRaster(splats).ray_rows(camera, pixels, CompositingParams())
+    z = splats.means.double() @ torch.from_numpy(camera.viewmat[2, :3].copy()) + camera.viewmat[2, 3]
+    expected = torch.zeros(len(pixels), dtype=torch.float64)
+    weighed = torch.zeros(len(pixels), dtype=torch.float64)
+    for i in range(len(pixels)):
+        met = slice(int(rows.indptr[i]), int(rows.indptr[i + 1]))
+        weights = rows.weights[met].double()
+        weighed[i] = weights.sum()
+        expected[i] = (weights * z[rows.splats[met].long()]).sum() / weighed[i] if len(weights) else 0.0
+    # At a cut-off a faint ray may meet one splat or none.
+    solid = (weighed.reshape(depths.shape) > 0.05) & torch.from_numpy(covered)
+    assert int(solid.sum()) > (90 if kernel is Kernel.BETA else 300)
+    close = (torch.from_numpy(depths).double() - expected.reshape(depths.shape)).abs()[solid] < 1e-3
+    assert float(close.double().mean()) > 0.995
+
+
+def test_a_picture_tells_its_depths_and_can_be_read_back(two: QueryScene) -> None:
+    depths, covered = expected_depth(two, "front")
+    with Image.open(io.BytesIO(render_png(two, "front", "depth"))) as picture:
+        near, far = (float(picture.info[name]) for name in ("depth-near", "depth-far"))
+        levels = np.asarray(picture)
+    assert (near, far) == shown_depth(two, "front").span
+    read = far + (levels[covered] - 1.0) / 254 * (near - far)
+    np.testing.assert_allclose(read, depths[covered].clip(near, far), atol=0.51 * (far - near) / 254)
+
+
+def test_a_flat_scene_is_bright_and_an_empty_view_says_nothing(two: QueryScene) -> None:
+    splats, camera = two.splats, two.cameras["front"]
+    one = Splats(splats.means[:1], splats.quats[:1], splats.log_scales[:1], splats.opacity_logits[:1])
+    flat = shown_depth(scene_of(two, one, camera), "front")
+    assert set(np.unique(flat.levels)) == {0, 255}
+    behind = np.eye(4)
+    behind[2, 3] = -100.0
+    away = scene_of(two, Camera.pinhole("front", 48, 24, 24.0, 24.0, 24.0, 12.0, behind))
+    assert shown_depth(away, "front").span is None
+    with Image.open(io.BytesIO(render_png(away, "front", "depth"))) as picture:
+        assert not np.asarray(picture).any() and "depth-near" not in picture.info
+
+
+BARREL = Brown(k1=-0.25, k2=0.04, p1=0.002, p2=-0.001)
+PINCUSHION = Brown(k1=0.2)
+PLAIN = Camera.pinhole("v", 60, 44, 48.0, 47.0, 29.0, 23.0, np.eye(4))
+
+
+def places(of: Camera) -> torch.Tensor:
+    """[H, W, 2], the places of a pinhole's own pixels."""
+    y, x = torch.meshgrid(torch.arange(of.height) + 0.5, torch.arange(of.width) + 0.5, indexing="ij")
+    return torch.stack([x, y], dim=2)
+
+
+@pytest.mark.parametrize("distortion", [BARREL, PINCUSHION])
+def test_numbers_are_interpolated_where_the_photo_shows_them(distortion: Distortion) -> None:
+    camera = behind_lens(PLAIN, distortion)
+    picture = in_photo(camera, places)  # linear, so interpolation is exact off the very border
+    assert picture.shape == (44, 60, 2)
+    wanted = torch.stack([torch.from_numpy(axis) for axis in photo_places(camera.lens)], dim=2) if camera.lens else 0
+    assert float((picture - wanted)[2:-2, 2:-2].abs().max()) < 1e-4
+    assert float((picture - wanted).abs().max()) <= 0.5
+
+
+def test_labels_are_those_of_the_nearest_pixel() -> None:
+    camera = behind_lens(PLAIN, BARREL)
+
+    def columns(of: Camera) -> torch.Tensor:
+        return torch.arange(of.width, dtype=torch.int32).expand(of.height, -1)
+
+    picture = in_photo(camera, columns)
+    assert picture.dtype == torch.int32
+    assert camera.lens is not None
+    assert torch.equal(picture, torch.from_numpy(np.floor(photo_places(camera.lens)[0])).to(torch.int32))
+
+
+def test_a_photo_without_a_lens_is_as_drawn() -> None:
+    drawn = torch.rand(44, 60)
+    assert in_photo(PLAIN, lambda _: drawn) is drawn
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.int32])
+def test_the_rim_that_no_pinhole_sees_is_empty(dtype: torch.dtype) -> None:
+    whole = Camera.pinhole("v", 160, 160, 50.0, 50.0, 80.0, 80.0, np.eye(4))
+    camera = behind_lens(whole, Fisheye())
+    picture = in_photo(camera, lambda of: torch.ones(of.height, of.width, dtype=dtype))
+    assert float(picture[80, 80]) == 1
+    assert float(picture[0, 0]) == float(picture[80, 0]) == 0
+    assert drawn_by(camera).width < 180
+
+
+def test_large_pictures_are_carried_in_bands_to_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
+    camera = behind_lens(PLAIN, BARREL)
+    whole = in_photo(camera, places)
+    monkeypatch.setattr("liftcore.query.render.BAND_PIXELS", 1)
+    assert torch.equal(in_photo(camera, places), whole)
