@@ -138,7 +138,7 @@ def test_p1_compares_rendered_features(scene: QueryScene) -> None:
     found = RenderedFeatures(scene, texts, words(scene)).cosines("frame_00002")
     rendered = scene.raster.render(scene.cameras["frame_00002"], scene.lift.features.float(), scene.compositing)
     unit = torch.nn.functional.normalize(rendered, dim=-1)
-    vectors = words(scene).encode([*texts, "object", "things", "stuff", "texture"])
+    vectors = torch.as_tensor(words(scene).encode([*texts, "object", "things", "stuff", "texture"]))
     torch.testing.assert_close(found, unit @ vectors.T, atol=1e-5, rtol=0)
 
 
@@ -170,7 +170,7 @@ def test_p3_cuts_the_rendered_scores_of_a_query(scene: QueryScene, threshold: st
         seen = view_mask(scene, ask(scene, Query((text,), threshold=threshold), encoder), "frame_00002")
         met = seen.row_sums >= 0.5
         cut = find_threshold(seen.attention[met], threshold).value
-        assert (found[text].mask == (met & (seen.attention >= cut)).numpy()).all() and found[text].mask.any()
+        assert (found[text].mask == (met & (seen.attention >= cut))).all() and found[text].mask.any()
         x, y = found[text].peak or (0, 0)
         assert seen.attention[y, x] == seen.attention.max()
 

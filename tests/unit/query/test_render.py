@@ -342,7 +342,7 @@ def test_a_flat_scene_is_bright_and_an_empty_view_says_nothing(two: QueryScene) 
     assert set(np.unique(flat.levels)) == {0, 255}
     behind = np.eye(4)
     behind[2, 3] = -100.0
-    away = scene_of(two, Camera.pinhole("front", 48, 24, 24.0, 24.0, 24.0, 12.0, behind))
+    away = scene_of(two, one, Camera.pinhole("front", 48, 24, 24.0, 24.0, 24.0, 12.0, behind))
     assert shown_depth(away, "front").span is None
     with Image.open(io.BytesIO(render_png(away, "front", "depth"))) as picture:
         assert not np.asarray(picture).any() and "depth-near" not in picture.info
