@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from liftcore.io.lift_file import save_lift
-from liftcore.lift import lift
+from liftcore.io.lift_files import lift_files
 from liftcore.query.scene import QueryScene
 from liftcore.settings import LiftSettings
 from tests.api.tiny_scene import make_scene
@@ -20,7 +20,7 @@ def lift_tiny() -> Callable[..., Path]:
         tiny = make_scene()
         for name, content in (("s.ply", splats or tiny.splats), ("c.json", tiny.cameras), ("f.st", tiny.features)):
             (folder / name).write_bytes(content)
-        made = lift(folder / "s.ply", folder / "c.json", [folder / "f.st"], LiftSettings.of(preset=preset))
+        made = lift_files(folder / "s.ply", folder / "c.json", [folder / "f.st"], LiftSettings.of(preset=preset))
         save_lift(made, folder / "scene.lift")
         return folder / "scene.lift"
 

@@ -14,12 +14,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from liftcore.errors import InvalidLift, InvalidQuery, NotFound, SplatliftError
-from liftcore.io.lift_file import LiftResult, load_lift, save_lift
+from liftcore.io.lift_file import load_lift, save_lift
 from liftcore.query.ask import answers, ask, query_vectors, question, top
 from liftcore.query.directions import directions
 from liftcore.query.scene import QueryScene
 from liftcore.query.terms import Example, OneSplat, Pixel, Query, Region, Vector, parse_example, read_vector
 from liftcore.query.threshold import find_threshold
+from liftcore.result import LiftResult
 from tests.api.tiny_scene import CHANNELS, HEIGHT, SPLATS_A_CLUSTER, WIDTH
 
 COUNT = 3 * SPLATS_A_CLUSTER

@@ -9,8 +9,8 @@ import pytest
 from PIL import Image
 
 from liftcore.errors import InvalidLift, InvalidQuery
+from liftcore.io.lift_files import lift_files
 from liftcore.io.ply import read_splats
-from liftcore.lift import lift
 from liftcore.query.ask import Answer, ask
 from liftcore.query.colours import NOT_SEEN_COLOUR, SH_C0, colour_map
 from liftcore.query.export import coloured_ply, object_ply
@@ -41,7 +41,7 @@ def test_the_object_is_what_was_selected_and_can_be_lifted_again(scene: QuerySce
     assert SPLATS_A_CLUSTER * 0.8 <= len(rows) <= SPLATS_A_CLUSTER * 1.2
     assert (tmp_path / "lamp.ply").read_bytes() == ply(rows)
     files = tmp_path / "lamp.ply", tmp_path / "c.json", [tmp_path / "f.st"]
-    again = lift(*files, LiftSettings.of(preset="row-sum"))
+    again = lift_files(*files, LiftSettings.of(preset="row-sum"))
     assert again.features.shape[0] == len(rows)
 
 
