@@ -19,16 +19,16 @@ PLAIN, ALL = CompositingParams(), Weighting()
 def warm_up(
     kernel: Kernel = Kernel.GAUSSIAN_3D,
     device: Device = CPU,
-    walk: CompositingParams = PLAIN,
+    params: CompositingParams = PLAIN,
     weighting: Weighting = ALL,
 ) -> None:
-    """Run every product once on one splat of the kernel. The first run on a machine compiles, later ones load.
+    """Run on one splat what a lift and a query of a kernel need. The first run compiles, later ones load from disk.
 
-    Each kernel is compiled for itself, so a scene waits for its own alone; so is the walk without a gain, and of all
-    weights; a card compiles each way of weighing.
+    Each kernel is compiled for itself, so a scene waits for its own alone; so are plain logits, and selections of the
+    weights. What few ask for (the adjoint, labels) is compiled when first called. A card compiles each weighting.
 
     Args:
-        walk: that will lift. weighting: likewise.
+        params: of the lift. weighting: likewise.
     """
     splats = Splats(
         torch.tensor([[0.0, 0.0, 2.0]]),
@@ -42,8 +42,6 @@ def warm_up(
     raster = open_raster(splats, device, threads=1)
     regions = Regions(torch.zeros(1, 1, 1, dtype=torch.int32), torch.ones(1, 1))
     for observation in (regions, FeatureGrid(torch.ones(1, 1, 1))):
-        raster.region_weights(camera, observation, walk, weighting)
-    raster.adjoint(camera, torch.ones(16, 16, 1), CompositingParams())
+        raster.region_weights(camera, observation, params, weighting)
     raster.row_sums(camera, CompositingParams())
-    raster.strongest_labels(camera, torch.zeros(1, dtype=torch.int32), CompositingParams())
     raster.ray_rows(camera, torch.zeros(1, 2, dtype=torch.int32), CompositingParams())
