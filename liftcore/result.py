@@ -13,6 +13,9 @@ from liftcore.settings import LiftSettings
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from liftcore.query.ask import VectorAnswer
+    from liftcore.scene.splats import Splats
+
 FORMAT = "splatlift-lift/1"
 
 
@@ -72,6 +75,34 @@ class LiftResult:
     def diagnostics(self) -> dict[str, Any]:
         """What the lift measured of itself (residual, bound, row sums, warnings, plan), as plain numbers."""
         return self.metadata.certificate
+
+    def query(
+        self,
+        positives: Any,
+        negatives: Any = (),
+        *,
+        splats: Splats | None = None,
+        threshold: str | float = "auto",
+        instances: int | None = None,
+        keep: str = "all",
+    ) -> VectorAnswer:
+        """Which splats answer vectors of the lift's text space, as a text encoder gives them.
+
+        Args:
+            positives: [n, F] or [F], torch or numpy, what is looked for; rows of any length above zero.
+            negatives: [m, F], what takes away from the scores.
+            splats: that were lifted; with them the answer has objects with boxes.
+            threshold: auto, valley, paper, otsu, stability or a number on the scores.
+            instances: how many things there are, where the caller knows. keep: of the objects, all or the largest.
+
+        Raises:
+            InvalidQuery: a vector of another length, of zeros or not finite, or an unknown threshold.
+        """
+        from liftcore.query.ask import query_vectors
+
+        return query_vectors(
+            self, positives, negatives, splats=splats, threshold=threshold, instances=instances, keep=keep
+        )
 
     def save(self, path: Path | str) -> None:
         """Write a lift file (`liftcore.io.lift_file`), whole or not at all."""

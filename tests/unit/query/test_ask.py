@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from liftcore.errors import InvalidLift, InvalidQuery, NotFound, SplatliftError
 from liftcore.io.lift_file import load_lift, save_lift
-from liftcore.query.ask import answers, ask, query_vectors, question, top
+from liftcore.query.ask import answers, ask, question, top
 from liftcore.query.directions import directions
 from liftcore.query.scene import QueryScene
 from liftcore.query.terms import Example, OneSplat, Pixel, Query, Region, Vector, parse_example, read_vector
@@ -119,16 +119,16 @@ def test_best_splats_come_with_places_and_a_box(exact: QueryScene) -> None:
 def test_vectors_are_asked_as_their_words_are(scene: QueryScene) -> None:
     words = ask(scene, Query(("x",), ("y",)), Axes())
     for positive in (torch.eye(CHANNELS)[0], 7 * np.eye(CHANNELS)[:1]):
-        found = query_vectors(scene.lift, positive, torch.eye(CHANNELS)[1], splats=scene.splats)
+        found = scene.lift.query(positive, torch.eye(CHANNELS)[1], splats=scene.splats)
         assert found.scores.numpy().tolist() == words.scores.tolist() and found.threshold == words.threshold
         assert np.array_equal(found.splats.numpy(), words.selected) and found.present
         assert found.objects is not None and len(found.objects.found) == 1
     alike = replace(scene.lift, features=torch.ones(COUNT, CHANNELS))
-    alone = query_vectors(alike, torch.eye(CHANNELS)[0])
+    alone = alike.query(torch.eye(CHANNELS)[0])
     assert not alone.present and alone.objects is None
     for wrong in (torch.ones(5), torch.zeros(CHANNELS), torch.empty(0, CHANNELS)):
         with pytest.raises(InvalidQuery):
-            query_vectors(scene.lift, wrong)
+            scene.lift.query(wrong)
 
 
 def test_scene_made_of_values_needs_no_files(scene: QueryScene) -> None:
