@@ -68,9 +68,9 @@ def run(options: argparse.Namespace) -> int:
 
     query = _query(options)
     scene = QueryScene.open(options.lift)
-    made_from = scene.metadata
     for path in outputs:
-        free_output(path, [Path(file.path) for file in (made_from.splats, made_from.cameras, *made_from.features)])
+        made_from = (scene.metadata.splats, scene.metadata.cameras, *scene.metadata.features)
+        free_output(path, [Path(file.path) for file in made_from])
     encoder = _encoder(options, scene) if query.texts else None
     answer = ask(scene, query, encoder)
     seen = _view_mask(scene, answer, options.view) if options.view else None
@@ -117,7 +117,11 @@ def _examples(notations: list[str], argument: str) -> list[Example]:
 def _encoder(options: argparse.Namespace, scene: QueryScene) -> TextEncoder:
     from liftcore.query.text import open_encoder
 
-    return open_encoder(encoder_spec(options, scene.metadata.text_space, hint="or ask by example, with --like"))
+    return open_encoder(
+        encoder_spec(
+            options, "" if options.table else scene.metadata.text_space, hint="or ask by example, with --like"
+        )
+    )
 
 
 def _view_mask(scene: QueryScene, answer: Answer, view: str) -> ViewMask:

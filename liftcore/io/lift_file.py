@@ -8,12 +8,15 @@ metadata hold settings, inputs with digests, the encoder, the certificate, timin
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from liftcore.errors import InvalidLift
 from liftcore.io.safetensors_file import map_tensors
-from liftcore.result import LiftMetadata, LiftResult
+
+if TYPE_CHECKING:  # loads pydantic, which a reader of the arrays does without
+    from liftcore.result import LiftMetadata, LiftResult
 
 TENSORS = ("features", "evidence", "agreement", "seen")
 CLUSTER_TENSORS = ("cluster", "cluster_features")  # in lifts with aggregation only
@@ -36,12 +39,15 @@ def load_lift(path: Path | str) -> LiftResult:
     """
     import torch
 
-    arrays, metadata = read_lift(path)
+    from liftcore.result import LiftResult
+
+    arrays, told = read_lift(path)
+    metadata = parse_metadata(told, path)
     return LiftResult(**{name: torch.from_numpy(array) for name, array in arrays.items()}, metadata=metadata)
 
 
-def read_lift(path: Path | str) -> tuple[dict[str, np.ndarray], LiftMetadata]:
-    """The same as mapped arrays by their names, without torch.
+def read_lift(path: Path | str) -> tuple[dict[str, np.ndarray], str]:
+    """The same as mapped arrays by their names, and its metadata as JSON: without torch and pydantic.
 
     Raises:
         InvalidLift: as `load_lift` has it.
@@ -52,19 +58,35 @@ def read_lift(path: Path | str) -> tuple[dict[str, np.ndarray], LiftMetadata]:
         tensors, told = map_tensors(Path(path))
         if "splatlift" not in told:
             raise InvalidLift(str(path), expected="a lift file", got="safetensors without lift metadata")
-        metadata = LiftMetadata.model_validate_json(told["splatlift"])
         missing = [name for name in TENSORS if name not in tensors]
         if missing:
             raise ValueError(f"no {missing[0]} in it")
         arrays = {name: tensors[name] for name in TENSORS} | {n: tensors[n] for n in CLUSTER_TENSORS if n in tensors}
     except FileNotFoundError:
         raise InvalidLift(str(path), expected="a lift file", got="no such file") from None
-    except (SafetensorError, OSError, ValueError) as error:  # pydantic's and JSON's are ValueErrors
-        raise InvalidLift(
-            str(path), expected="a lift file (.safetensors)", got=f"a file that does not open as one: {error}"
-        ) from None
+    except (SafetensorError, OSError, ValueError) as error:
+        raise _no_lift(path, error) from None
     _check_shapes(arrays, path)
-    return arrays, metadata
+    return arrays, told["splatlift"]
+
+
+def parse_metadata(told: str, path: Path | str) -> LiftMetadata:
+    """The metadata of a lift file from its JSON.
+
+    Raises:
+        InvalidLift: they are none.
+    """
+    from liftcore.result import LiftMetadata
+
+    try:
+        return LiftMetadata.model_validate_json(told)
+    except ValueError as error:  # pydantic's
+        raise _no_lift(path, error) from None
+
+
+def _no_lift(path: Path | str, error: Exception) -> InvalidLift:
+    got = f"a file that does not open as one: {error}"
+    return InvalidLift(str(path), expected="a lift file (.safetensors)", got=got)
 
 
 def _check_shapes(arrays: dict[str, np.ndarray], path: Path | str) -> None:

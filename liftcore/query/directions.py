@@ -56,12 +56,13 @@ def _encode(scene: QueryScene, query: Query, encoder: TextEncoder | None) -> dic
     texts = {place: term for place, term in enumerate(query.terms) if isinstance(term, str)}
     if not texts:
         return {}
-    space = scene.metadata.text_space or "not named"
     if encoder is None:
+        space = scene.metadata.text_space or "not named"
         expected = f"a text encoder (the lift's text space: {space})"
         hint = "name a text encoder of the lift's space, or ask by example"
         raise InvalidQuery("encoder", expected=expected, got="no encoder", hint=hint)
     if encoder.channels != scene.channels:
+        space = scene.metadata.text_space or "not named"
         expected = f"{scene.channels} channels as the lift has (its text space: {space})"
         hint = "query with the text encoder that belongs to the features' image encoder"
         raise InvalidQuery("encoder", expected=expected, got=f"{encoder.name} with {encoder.channels}", hint=hint)

@@ -12,14 +12,13 @@ import numpy as np
 from liftcore.errors import InvalidLift, InvalidQuery
 from liftcore.io.lift_file import read_lift
 from liftcore.query.scores import mean_direction, norms_of
-from liftcore.raster.base import CompositingParams
-from liftcore.result import InputFile, LiftResult
 
-if TYPE_CHECKING:  # these load torch, which scores do without
+if TYPE_CHECKING:  # these load torch or pydantic, which scores do without
     from torch import Tensor
 
     from liftcore.features.pack import FeaturePacks
-    from liftcore.raster.base import Raster
+    from liftcore.raster.base import CompositingParams, Raster
+    from liftcore.result import InputFile, LiftMetadata, LiftResult
     from liftcore.scene.cameras import Camera, Cameras
     from liftcore.scene.splats import Splats
 
@@ -40,6 +39,8 @@ class QueryScene:
     evidence: np.ndarray  # [P] f32
     cluster: np.ndarray | None  # [P] i32, -1 = in no cluster; None without aggregation
     cluster_features: np.ndarray | None  # [K, F] like features
+    _told: str  # the metadata of a lift file, as JSON
+    _moved: dict[str, Path | None]  # files that lie elsewhere now, by their roles
 
     def __init__(
         self,
@@ -50,8 +51,8 @@ class QueryScene:
     ) -> None:
         names = ("features", "evidence", "seen", "cluster", "cluster_features")
         self._hold({name: as_numpy(getattr(result, name)) for name in names})
-        self.path, self.metadata, self.lift = Path("lift"), result.metadata, result
-        given = {"splats": splats, "cameras": cameras, "packs": packs}
+        self.path = Path("lift")
+        given = {"lift": result, "metadata": result.metadata, "splats": splats, "cameras": cameras, "packs": packs}
         self.__dict__.update({name: value for name, value in given.items() if value is not None})
 
     def _hold(self, arrays: dict[str, Any]) -> None:
@@ -69,16 +70,27 @@ class QueryScene:
             InvalidLift: the file is missing or is not a lift.
         """
         scene = cls.__new__(cls)
-        arrays, metadata = read_lift(path)
+        arrays, scene._told = read_lift(path)
         scene._hold(arrays)
-        moved = {"splats": splats, "cameras": cameras}
+        scene.path, scene._moved = path, {"splats": splats, "cameras": cameras}
+        return scene
+
+    @cached_property
+    def metadata(self) -> LiftMetadata:
+        """How the lift was made, with its files where they are now; read when first asked for.
+
+        Raises:
+            InvalidLift: the metadata are none of a lift.
+        """
+        from liftcore.io.lift_file import parse_metadata
+
+        metadata = parse_metadata(self._told, self.path)
         files = {
             name: getattr(metadata, name).model_copy(update={"path": str(place)})
-            for name, place in moved.items()
+            for name, place in self._moved.items()
             if place is not None
         }
-        scene.path, scene.metadata = path, metadata.model_copy(update=files)
-        return scene
+        return metadata.model_copy(update=files)
 
     @cached_property
     def lift(self) -> LiftResult:
