@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from liftcore.io.inspect_scene import describe_cameras, describe_splats
+from liftcore.io.inspect import describe_cameras, describe_splats
 from liftcore.raster.base import CompositingParams
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.solve.lift_warnings import order_warnings

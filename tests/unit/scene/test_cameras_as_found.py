@@ -14,7 +14,7 @@ from colmap_files import CAMERAS, IMAGES, binary_files, text_files, write_files
 
 from liftcore.errors import InvalidCameras
 from liftcore.io.cameras import MODEL_FOLDERS, other_models, read_cameras
-from liftcore.io.inspect_scene import inspect_file
+from liftcore.io.inspect import inspect_file
 
 if TYPE_CHECKING:
     from collections.abc import Callable

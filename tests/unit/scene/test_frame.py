@@ -20,7 +20,7 @@ from liftcore.io import cameras
 from liftcore.io.cameras import read_cameras
 from liftcore.io.input_files import camera_input
 from liftcore.io.inria import write_inria_cameras
-from liftcore.io.inspect_scene import inspect_file
+from liftcore.io.inspect import inspect_file
 from liftcore.io.transforms import FRAME_FILE
 from liftcore.scene.cameras import Camera, Cameras
 

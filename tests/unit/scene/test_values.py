@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from liftcore.errors import InvalidCameras, InvalidSplats, NotFound
-from liftcore.io.inspect_scene import describe_splats
+from liftcore.io.inspect import describe_splats
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.splats import Splats
