@@ -26,8 +26,7 @@ SHARED_SOURCES = (
     "raster/cpu/composite.py",
     "raster/cpu/project.py",
     "raster/cpu/simd.py",
-    "solve/weight_tables.py",
-    "solve/weighted_sums.py",
+    "solve/gathering.py",
 )
 
 

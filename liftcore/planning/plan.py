@@ -24,11 +24,10 @@ from liftcore.scene.cameras import Camera, distortion_warning
 from liftcore.scene.splats import Splats
 from liftcore.settings import LiftSettings
 from liftcore.solve.feature_room import check_disk, lack_of_disk
-from liftcore.solve.gathering import CHUNK_ENTRIES
+from liftcore.solve.gathering import CHUNK_ENTRIES, STRIP_BYTES
 from liftcore.solve.map_shapes import shape_warnings
 from liftcore.solve.view_weights import MEMORY_LIMIT
 from liftcore.solve.views import LiftViews
-from liftcore.solve.weighted_sums import STRIP_BYTES
 
 FEW_VIEWS = 32  # and below, view_cosine takes all: a pilot would cost what it saves
 SHOWN_VIEWS = 6  # names in a line for people

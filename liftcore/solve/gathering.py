@@ -1,45 +1,50 @@
-"""W of some splats at a time, gathered from all views in the order of a curve through space.
+"""W of some splats at a time, gathered from all views: one CSR matrix a chunk, its rows the splats in file order.
 
 Splats near to one another are seen in the same regions of the same views, so they read the same rows of the
 codebooks. A trained file has its splats in the order in which training made them: summed in that order, nearly each
-entry waits for a row that others have driven out of the cache.
+entry waits for a row that others have driven out of the cache. So a chunk has an order along a curve through space.
 """
 
-from __future__ import annotations
-
 import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+import torch
+from torch import Tensor
 
-from liftcore.raster.cpu.lanes_rows import AHEAD
-from liftcore.solve.weighted_sums import Entries, entries_before, gather_entries
+from liftcore.errors import Unavailable
+from liftcore.jit import kernel
+from liftcore.raster.base import RegionWeights
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    from liftcore.solve.host import EachShare
-    from liftcore.solve.weight_tables import WeightTables
-
+WIDE = 64  # channels of a strip: what a splat's sum holds in the first cache
 CHUNK_ENTRIES = 1 << 23  # gathered at a time, unless a splat alone has more
 CHUNK_BYTES = 1 << 29  # of X at a time: where it is a mapped file, more might not stay in memory
+STRIP_BYTES = 1 << 28  # of the strips of all codebooks at a time, unless a single one has more
+MOST_ROWS = 2**31 - 1  # of all codebooks: an entry names its row in four bytes
+
+# Does some work for each part of a range, first to last.
+EachShare = Callable[[Callable[[int, int], None], int, int], None]
 
 
 class Chunk(NamedTuple):
-    """Some splats that follow one another in the file, in the order of the curve."""
+    """W of the splats ``first..last``, row by row, the views of a row in their order."""
 
-    splats: np.ndarray  # [B] i64
-    entries: Entries  # of each
+    first: int
+    last: int
+    order: np.ndarray  # [n] i64, in which neighbours follow one another; rows are numbered from 0
+    indptr: np.ndarray  # [n + 1] i64
+    rows: np.ndarray  # [nnz] i32, among the rows of all codebooks
+    shares: np.ndarray  # [nnz] f32, weights times the splat's scale
+    runs: np.ndarray  # [nnz] i32, at the first entry of a view in a row how many of them follow; else not set
 
 
 class Gathering:
     """W of all views, chunk by chunk; to be gone through as often as there are slices of channels.
 
     Args:
-        each_share: does the work on a chunk.
-        weights: W of all views.
-        columns: where each view's columns begin among those of all, [V] i64, and the scale of each splat, [P] f64.
+        store: W of every view. counts: rows of every codebook. scale: [P] f64, what rows of W are multiplied with.
         curve: [P] places along the curve; None keeps the order of the file.
         row_bytes: of a row of X, which is written chunk by chunk too; 0 where none is.
     """
@@ -47,54 +52,62 @@ class Gathering:
     def __init__(
         self,
         each_share: EachShare,
-        weights: WeightTables,
-        columns: tuple[np.ndarray, np.ndarray],
+        store: Iterable[RegionWeights],
+        counts: Sequence[int],
+        scale: np.ndarray,
         curve: np.ndarray | None,
         row_bytes: int,
     ) -> None:
-        self._each_share, self._columns, self._curve = each_share, columns, curve
-        self._weights, self._tables = weights, (weights.addresses, weights.rows)  # addresses of what weights keeps
-        self._counts = self._entry_counts(columns[1].size)
+        if sum(counts) > MOST_ROWS:
+            got, hint = f"{sum(counts)} in {len(counts)} views", "lift fewer views, or smaller maps"
+            raise Unavailable("features", expected=f"at most {MOST_ROWS} rows of codebooks", got=got, hint=hint)
+        self._each_share, self._scale, self._curve = each_share, scale, curve
+        self._views = [
+            tuple(part.numpy() for part in (own.splats, own.indptr, own.columns, own.weights)) for own in store
+        ]
+        self._bases = np.concatenate([[0], np.cumsum(counts)])[:-1].tolist()
+        self._counts = np.zeros(scale.size, np.int64)
+        for ids, indptr, _, _ in self._views:
+            self._counts[ids] += np.diff(indptr)
         self._ranges = chunk_ranges(self._counts, row_bytes)
-        most = max((int(self._counts[first:last].sum()) for first, last in self._ranges), default=0)
-        self._rows, self._shares = np.zeros(most + AHEAD, np.int32), np.empty(most, np.float32)  # of one chunk
 
     def __iter__(self) -> Iterator[Chunk]:
-        """The chunks; each is gone when the next one is asked for."""
-        return (self._gathered(*splats) for splats in self._ranges)
-
-    def _entry_counts(self, splats: int) -> np.ndarray:
-        """[P] i64: how many entries each splat has, over all views."""
-        counts = np.empty(splats, np.int64)
-
-        def count(share: tuple[int, int]) -> None:
-            counts[share[0] : share[1]] = np.diff(entries_before(share, self._tables))
-
-        self._each_share(count, 0, splats)
-        return counts
+        """The chunks."""
+        return (self._gathered(first, last) for first, last in self._ranges)
 
     def _gathered(self, first: int, last: int) -> Chunk:
-        """The splats ``first..last``."""
-        own = np.arange(last - first) if self._curve is None else np.argsort(self._curve[first:last])
-        starts = np.concatenate([[0], np.cumsum(self._counts[first:last][own])])
-        chunk = Chunk(own + first, Entries(starts, self._rows, self._shares))
+        order = np.arange(last - first) if self._curve is None else np.argsort(self._curve[first:last])
+        indptr = np.concatenate([[0], np.cumsum(self._counts[first:last])])
+        total, scale = int(indptr[-1]), self._scale
+        rows, shares, runs = np.empty(total, np.int32), np.empty(total, np.float32), np.empty(total, np.int32)
 
-        def gather(share: tuple[int, int], cursors: np.ndarray) -> None:
-            gather_entries(share, cursors, self._tables, self._columns, chunk.entries)
+        def gather(begin: int, end: int) -> None:
+            cursors = indptr[begin - first : end - first].copy()
+            for view, base in zip(self._views, self._bases, strict=True):
+                gather_view(begin, end, *view, base, scale, cursors, rows, shares, runs)
 
-        self.in_file_order(chunk, gather)
-        return chunk
+        self._each_share(gather, first, last)
+        return Chunk(first, last, order, indptr, rows, shares, runs)
 
-    def in_file_order(self, chunk: Chunk, work: Callable[[tuple[int, int], np.ndarray], None]) -> None:
-        """Do some work for shares of a chunk's splats as the file has them.
+    def scatter(
+        self,
+        chunk: Chunk,
+        found: np.ndarray,
+        marked: np.ndarray,
+        into: Sequence[np.ndarray],
+        marks: Sequence[np.ndarray],
+    ) -> None:
+        """Add what was found of a chunk's entries [nnz] f32 to the views' own [nnz_v], in the order of their W.
 
-        Args:
-            work: given a share, and where the entries of each of its splats begin [n] i64, which it may change.
+        What is ``marked`` [nnz] f32 at the first entry of a run goes to the view's rows in ``marks`` [n_v].
         """
-        first, count = int(chunk.splats.min()), chunk.splats.size
-        places = np.empty(count, np.int64)
-        places[chunk.splats - first] = chunk.entries.starts[:-1]
-        self._each_share(lambda share: work(share, places[share[0] - first : share[1] - first]), first, first + count)
+
+        def give_back(begin: int, end: int) -> None:
+            cursors = chunk.indptr[begin - chunk.first : end - chunk.first].copy()
+            for (ids, starts, _, _), target, squares in zip(self._views, into, marks, strict=True):
+                scatter_view(begin, end, ids, starts, cursors, found, marked, target, squares)
+
+        self._each_share(give_back, chunk.first, chunk.last)
 
 
 def chunk_ranges(counts: np.ndarray, row_bytes: int) -> list[tuple[int, int]]:
@@ -108,3 +121,53 @@ def chunk_ranges(counts: np.ndarray, row_bytes: int) -> list[tuple[int, int]]:
     ends = np.searchsorted(before, before[-1] * np.arange(1, number) / number)
     edges = np.unique([0, *ends, counts.size]).tolist()
     return list(pairwise(edges))
+
+
+def channel_slices(rows: int, channels: int) -> list[tuple[int, int]]:
+    """Channels whose strips lie in memory at a time, of so many rows in all."""
+    step = max(WIDE, STRIP_BYTES // (4 * max(rows, 1)) // WIDE * WIDE)
+    return [(begin, min(begin + step, channels)) for begin in range(0, channels, step)]
+
+
+def strips_of(parts: Iterable[Tensor], rows: int, channels: int) -> np.ndarray:
+    """Codebooks [M_v, channels], one after the other, in strips [S, M, WIDE] f32; zeros beyond the last channel."""
+    strips, base = torch.zeros(-(-channels // WIDE), rows, WIDE), 0
+    for part in parts:
+        for strip in range(strips.shape[0]):
+            own = part[:, strip * WIDE : (strip + 1) * WIDE]
+            strips[strip, base : base + own.shape[0], : own.shape[1]] = own
+        base += part.shape[0]
+    return strips.numpy()
+
+
+@kernel
+def gather_view(first, last, ids, indptr, columns, weights, base, scale, cursors, rows, shares, runs):
+    """Put a view's entries of the splats ``first..last`` to where ``cursors`` i64 say, which move on."""
+    row = np.searchsorted(ids, first)
+    while row < ids.shape[0] and ids[row] < last:
+        splat = ids[row]
+        at = cursors[splat - first]
+        count = indptr[row + 1] - indptr[row]
+        if count > 0:
+            runs[at] = count
+        for k in range(indptr[row], indptr[row + 1]):
+            rows[at] = base + columns[k]
+            shares[at] = weights[k] * scale[splat]
+            at += 1
+        cursors[splat - first] = at
+        row += 1
+
+
+@kernel
+def scatter_view(first, last, ids, indptr, cursors, found, marked, target, squares):
+    """Add a view's part of what was found to its own arrays; the way back of ``gather_view``."""
+    row = np.searchsorted(ids, first)
+    while row < ids.shape[0] and ids[row] < last:
+        at = cursors[ids[row] - first]
+        if indptr[row + 1] > indptr[row]:
+            squares[row] += marked[at]
+        for k in range(indptr[row], indptr[row + 1]):
+            target[k] += found[at]
+            at += 1
+        cursors[ids[row] - first] = at
+        row += 1

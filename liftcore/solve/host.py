@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from liftcore.solve.curve import places_along_curve
 from liftcore.solve.feature_room import in_memory
-from liftcore.solve.weighted_sums import splat_shares
+from liftcore.solve.gathering import EachShare
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -23,8 +23,7 @@ if TYPE_CHECKING:
 
 FEW_CHANNELS = 128  # that are summed sooner than put into another order
 
-# Does some work for each share of the splats from the first to the last.
-EachShare = Callable[[Callable[[tuple[int, int]], None], int, int], None]
+SHARES, LEAST_SHARE = 8, 128  # of each thread, so that none waits long for another; splats of a share
 
 
 @dataclass(frozen=True)
@@ -45,8 +44,10 @@ class Host:
         threads = self.threads or len(os.sched_getaffinity(0))
         with ThreadPoolExecutor(threads) as pool:
 
-            def each_share(work: Callable[[tuple[int, int]], None], first: int, last: int) -> None:
-                list(pool.map(work, splat_shares(first, last, threads)))
+            def each_share(work: Callable[[int, int], None], first: int, last: int) -> None:
+                count = max(1, min(SHARES * threads, (last - first) // LEAST_SHARE))
+                edges = [first + (last - first) * k // count for k in range(count + 1)]
+                list(pool.map(work, edges[:-1], edges[1:]))
 
             yield pool, each_share
 

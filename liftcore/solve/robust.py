@@ -27,33 +27,22 @@ where nothing in the scene has a direction nothing changes. A step goes along th
 channels as the closed form does, and reads each row twice where that reads it once.
 """
 
-from __future__ import annotations
-
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from functools import partial
 
 import numpy as np
 import torch
+from torch import Tensor
 
+from liftcore.jit import kernel, vectorised
 from liftcore.one_thread import one_thread
-from liftcore.solve.gathering import Gathering
+from liftcore.progress import Progress
+from liftcore.solve.gathering import WIDE, EachShare, Gathering, channel_slices, strips_of
 from liftcore.solve.host import ALL_CORES, Host
-from liftcore.solve.judging import Judged, judge_share, scatter_judged, to_cosines, to_old_sums, to_weights
 from liftcore.solve.totals import row_totals
-from liftcore.solve.weight_tables import WeightTables, addresses_of
-from liftcore.solve.weighted_sums import channel_slices, first_columns, strips_of
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-    from concurrent.futures import ThreadPoolExecutor
-
-    from torch import Tensor
-
-    from liftcore.progress import Progress
-    from liftcore.solve.gathering import Chunk
-    from liftcore.solve.host import EachShare
-    from liftcore.solve.view_weights import WeightStore
-    from liftcore.solve.weighted_sums import Strips
+from liftcore.solve.view_weights import WeightStore
 
 CHUNK_VALUES = 1 << 20  # of a codebook in float64 at a time
 NO_CONSENSUS = 1e-6  # of a splat's weight: a shorter r is what rounding leaves of inputs that cancel
@@ -154,32 +143,67 @@ def _judge(
     squares = [np.zeros(weights.splats.numel(), np.float32) for weights in current]
     for weights in target:
         weights.weights.zero_()
-    counts = [book.shape[0] for book in directions.books]
-    scale, tables = _over(np.ones(denominators.size), denominators), WeightTables(current)
-    targets = addresses_of([(view.weights.numpy(), square) for view, square in zip(target, squares, strict=True)])
-    gathering = Gathering(each_share, tables, (first_columns(counts), scale), curve, 0)
-    for begin, end in channel_slices(sum(counts), directions.mean.size, 4):
+    counts, total = [book.shape[0] for book in directions.books], sum(book.shape[0] for book in directions.books)
+    scale = _over(np.ones(denominators.size), denominators)
+    into = [view.weights.numpy() for view in target]
+    gathering = Gathering(each_share, current, counts, scale, curve, 0)
+    for begin, end in channel_slices(total, directions.mean.size):
         parts = pool.map(lambda view, ends=(begin, end): directions.slice_of(view, *ends), range(len(counts)))
-        strips = strips_of(parts, counts, end - begin, torch.float32)
+        strips = strips_of(parts, total, end - begin)
         for chunk in gathering:
-            _judge_chunk(each_share, gathering, chunk, strips, (tables, targets))
+            products, found = np.zeros((2, len(chunk.shares)), np.float32)
+            for strip in strips:
+                each_share(partial(judge_rows, *chunk[2:], strip, products, found), 0, len(chunk.order))
+            gathering.scatter(chunk, products, found, into, squares)
         del strips  # before others are made
     return squares
 
 
-def _judge_chunk(
-    each_share: EachShare,
-    gathering: Gathering,
-    chunk: Chunk,
-    strips: Strips,
-    views: tuple[WeightTables, np.ndarray],
-) -> None:
-    """Judge a chunk over the channels of the strips; what is found goes to the targets [V, 2] beside the tables."""
-    tables, targets = views
-    judged = Judged(*(np.empty(chunk.entries.starts[-1], np.float32) for _ in Judged._fields))
-    each_share(lambda share: judge_share(share, chunk.entries, strips, judged), 0, chunk.splats.size)
-    places = tables.addresses, tables.rows
-    gathering.in_file_order(chunk, lambda share, cursors: scatter_judged(share, cursors, places, targets, judged))
+@vectorised
+def judge_rows(order, indptr, rows, shares, runs, strip, products, squares, first, last):
+    """Add ``e_m . r`` of the entries of the rows ``order[first:last]``, and ``|r|^2`` at the first entry of each run.
+
+    A run is the entries of one view in a row; r is the sum of all other runs.
+
+    Args:
+        order, indptr, rows, shares, runs: as `Chunk` has them. strip: [M, WIDE] f32, of e.
+        products, squares: [nnz] f32, which grow.
+    """
+    own, others, total = np.empty(WIDE, np.float32), np.empty(WIDE, np.float32), np.empty(WIDE)
+    for place in range(first, last):
+        begin, end = indptr[order[place]], indptr[order[place] + 1]
+        total[:] = 0
+        k = begin
+        while k < end:
+            run_sum(rows, shares, k, k + runs[k], strip, own)
+            for c in range(WIDE):
+                total[c] += own[c]
+            k += runs[k]
+        k = begin
+        while k < end:
+            stop = k + runs[k]
+            run_sum(rows, shares, k, stop, strip, own)
+            square = np.float32(0)
+            for c in range(WIDE):
+                others[c] = total[c] - own[c]
+                square += others[c] * others[c]
+            squares[k] += square
+            while k < stop:
+                line, product = strip[rows[k]], np.float32(0)
+                for c in range(WIDE):
+                    product += line[c] * others[c]
+                products[k] += product
+                k += 1
+
+
+@vectorised
+def run_sum(rows, shares, begin, end, strip, own):
+    """``own[c] = sum_k shares[k] strip[rows[k], c]`` of the entries ``begin..end``."""
+    own[:] = 0
+    for k in range(begin, end):
+        line, share = strip[rows[k]], shares[k]
+        for c in range(own.shape[0]):
+            own[c] += share * line[c]
 
 
 def _write(
@@ -232,3 +256,47 @@ def _over(values: np.ndarray, divisors: np.ndarray) -> np.ndarray:
     """Rows divided by their divisors; zero where the divisor is."""
     columns = divisors.reshape(divisors.shape + (1,) * (values.ndim - 1))
     return np.divide(values, columns, out=np.zeros_like(values), where=columns > 0)
+
+
+@kernel
+def to_cosines(indptr, squares, least, weights, products):
+    """Products of a view become the cosines c; gives ``(W . c, sum of W)``.
+
+    Args:
+        indptr: [n + 1] i64. squares: [n] f32. least: of a length that has a direction.
+        weights: [nnz] f32. products: [nnz] f32, changed.
+    """
+    agreeing, everything = 0.0, 0.0
+    for row in range(squares.shape[0]):
+        length = np.sqrt(np.float64(squares[row]))
+        for k in range(indptr[row], indptr[row + 1]):
+            cosine = min(max(products[k] / length, 0.0), 1.0) if length > least else 0.0
+            products[k] = cosine
+            agreeing += weights[k] * cosine
+            everything += weights[k]
+    return agreeing, everything
+
+
+@kernel
+def to_weights(indptr, shares, usual, weights, cosines):
+    """Cosines of a view become ``W ((1 - p) c_m + p c)``; gives their row sums [n] f64.
+
+    Args:
+        indptr: [n + 1] i64. shares: [n] f64, p. usual: c.
+        weights: [nnz] f32, W. cosines: [nnz] f32, changed.
+    """
+    totals = np.zeros(shares.shape[0])
+    for row in range(shares.shape[0]):
+        own = min(max(shares[row], 0.0), 1.0)
+        for k in range(indptr[row], indptr[row + 1]):
+            cosines[k] = weights[k] * ((1.0 - own) * cosines[k] + own * usual)
+            totals[row] += cosines[k]
+    return totals
+
+
+@kernel
+def to_old_sums(indptr, gains, first, weights):
+    """Weights of a view times the gain [n] f64 of their row; where that is zero, the first ones again."""
+    for row in range(gains.shape[0]):
+        for k in range(indptr[row], indptr[row + 1]):
+            weights[k] = weights[k] * gains[row] if gains[row] > 0 else first[k]

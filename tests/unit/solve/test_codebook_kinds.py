@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 from liftcore.progress import silent
 from liftcore.raster.base import RegionWeights
-from liftcore.raster.cpu.lanes_rows import WIDE
 from liftcore.solve.closed_form import solve_closed_form
 from liftcore.solve.columns import rows_of
+from liftcore.solve.gathering import WIDE
 from liftcore.solve.host import Host
 
 ROWS = 5

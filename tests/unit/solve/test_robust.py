@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import weakref
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,11 +14,11 @@ from liftcore.io.lift_files import lift_files
 from liftcore.progress import silent
 from liftcore.raster.base import RegionWeights
 from liftcore.settings import LiftSettings
-from liftcore.solve import gathering, host, judging, robust, weighted_sums
+from liftcore.solve import gathering, host
+from liftcore.solve.closed_form import LONG
 from liftcore.solve.host import ALL_CORES, Host
 from liftcore.solve.robust import NO_CONSENSUS, robust_weights
 from liftcore.solve.view_weights import WeightStore
-from liftcore.solve.weighted_sums import LONG
 from tests.unit.solve.test_lift_equals_dense import write_scene
 
 
@@ -163,33 +162,10 @@ def test_steps_that_change_much_equal_their_definition_to_the_last_digits(seed, 
     assert moved > 0.05
 
 
-def test_what_is_used_no_more_is_freed_before_more_is_made(monkeypatch):
-    strips, products = [], []
-
-    def only(known: list, found: np.ndarray) -> None:
-        """Of those known, none but this one is alive."""
-        alive = [other() for other in known if other() is not None]
-        assert all(other is found for other in alive)
-        known.extend([] if alive else [weakref.ref(found)])
-
-    def judge(share, entries, own, judged):
-        only(strips, own.values)
-        only(products, judged.products)
-        judging.judge_share(share, entries, own, judged)
-
-    monkeypatch.setattr(robust, "judge_share", judge)
-    monkeypatch.setattr(weighted_sums, "STRIP_BYTES", 1)
-    monkeypatch.setattr(gathering, "CHUNK_ENTRIES", 1_000)
-    scene = random_scene(6, count=400)
-    scene.after(1, Host(1))
-    assert len(strips) == 3
-    assert len(products) > 2 * len(strips)
-
-
 def test_slices_of_channels_are_judged_together(monkeypatch):
     scene = random_scene(3, count=500)
     whole = scene.after(2)
-    monkeypatch.setattr(weighted_sums, "STRIP_BYTES", 1)
+    monkeypatch.setattr(gathering, "STRIP_BYTES", 1)
     for sliced, expected in zip(scene.after(2), whole, strict=True):
         np.testing.assert_allclose(sliced, expected, rtol=1e-4, atol=1e-6)
 
