@@ -19,7 +19,7 @@ ALL_RAYS = 1_000_000
 def dense_measures(X: np.ndarray, seed: int, cameras, gain: float, grids: bool) -> dict[str, float]:
     """Row sums, L, J and beta over every labelled row of every view, in float64."""
     sums, residuals, surrogates, betas = [], [], [], []
-    for k, camera in enumerate(cameras):
+    for k, camera in enumerate(cameras.values()):
         observation = observed(seed, k, grids)
         S, ray = reading_matrix(observation, camera.width, camera.height)
         B = S @ observation.codebook.double().numpy()

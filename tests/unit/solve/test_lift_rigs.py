@@ -44,7 +44,9 @@ def test_folders_before_the_names_of_views_change_no_bit(tmp_path: Path) -> None
     label = int(observation.labels[0].max())  # the region is asked for by the lift's name of the view
     (direction,) = directions(scene, Query((Region("v1", 0, label),)), None)
     assert torch.allclose(
-        direction, torch.nn.functional.normalize(observation.codebook[label].float(), dim=0), atol=1e-3
+        torch.as_tensor(direction),
+        torch.nn.functional.normalize(observation.codebook[label].float(), dim=0),
+        atol=1e-3,
     )
 
 
