@@ -10,7 +10,7 @@ OUT ?= demo-output
 TORCH_PIP ?=
 CUDA_TORCH_PIP ?=
 
-.PHONY: demo test kernels soak contract load gpu lint format serve bench setup clean
+.PHONY: demo test check kernels soak contract load gpu lint format serve bench setup clean
 
 demo: $(READY)  ## the whole job through the real service; SCENE=DIR takes a scene of your own, ASK=TEXT a question
 	$(BIN)/splatlift demo --out "$(OUT)" $(if $(SCENE),--scene "$(SCENE)") $(if $(ASK),--ask "$(ASK)")
@@ -23,6 +23,10 @@ test: $(READY)  ## everything that must hold
 	@if [ -d $(SHARED) ]; then echo "real scenes: found in $(SHARED)"; \
 	else echo "real scenes: no $(SHARED) here, so the tests on them are skipped"; fi
 	$(BIN)/python -m pytest -rs --numprocesses=2 --dist=loadfile --no-loadscope-reorder --max-worker-restart=0
+
+# Fast tests: one module at a time, nothing of a server, a second process, a real scene or many kernels.
+check: $(READY) lint  ## before a commit: lint, types and the fast tests, in 90 s once set up
+	$(BIN)/python -m pytest -m "not slow" --numprocesses=2 --dist=loadfile --max-worker-restart=0 tests/unit
 
 kernels: $(READY)
 	$(BIN)/python -m tests.kernels
@@ -75,6 +79,8 @@ $(READY): requirements.lock pyproject.toml
 	$(BIN)/python -m pip install --quiet $(TORCH_PIP) "$$(grep '^torch==' requirements.lock)"
 	$(BIN)/python -m pip install --quiet -r requirements.lock
 	$(BIN)/python -m pip install --quiet --no-deps -e .
+	@echo "compiling the kernels of 3DGS: a minute, once"
+	$(BIN)/python -m tests.kernels 3dgs
 	touch $@
 
 clean:

@@ -1,4 +1,4 @@
-"""Compile what nearly all tests walk with: ``python -m tests.kernels``. `make test` does so beside its lint.
+"""Compile what nearly all tests walk with: ``python -m tests.kernels [KERNEL...]``. `make test` does so beside its lint.
 
 Tests run in two processes, and each would compile the same code for itself. What a few tests alone need is compiled
 there, once.
@@ -6,6 +6,7 @@ there, once.
 
 from __future__ import annotations
 
+import sys
 import tempfile
 from pathlib import Path
 
@@ -17,8 +18,8 @@ from tests.api.tiny_scene import make_scene
 
 
 def main() -> None:
-    """Every kernel's products, and a lift."""
-    for kernel in Kernel:
+    """The kernels that are named, else every one; and a lift."""
+    for kernel in map(Kernel, sys.argv[1:] or Kernel):
         warm_up(kernel)
     scene = make_scene()
     with tempfile.TemporaryDirectory() as name:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from tests.benchmarks.stability.weights import compare
+from tests.benchmarks.extreme_measures import compare
 
 if TYPE_CHECKING:
     import numpy as np

@@ -20,8 +20,8 @@ from liftcore.result import LiftResult
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.splats import Splats
 from liftcore.settings import LiftSettings
-from tests.benchmarks.stability.of_features import checkerboard
-from tests.benchmarks.stability.weights import exact_view
+from tests.benchmarks.extreme_measures import exact_view
+from tests.benchmarks.extremes import checkerboard
 from tests.scenes import random_splats, splats_at
 
 if TYPE_CHECKING:
@@ -108,21 +108,7 @@ def test_the_nearest_reading_of_a_grid_takes_the_cell_under_the_pixel(tmp_path, 
     assert got.metadata.certificate == as_regions.metadata.certificate
 
 
-def test_a_lift_without_any_label_succeeds_with_nothing_seen(tmp_path):
-    for name in ("v0", "away"):
-        blank = Regions(torch.full((2, 3, 4), -1, dtype=torch.int32), torch.ones(2, 5))
-        got = lifted(tmp_path, {name: blank})
-        assert not got.seen.any()
-        assert not got.features.any()
-        assert not got.agreement.any()
-        assert bool((got.evidence > 0).any()) is (name == "v0")
-        assert got.metadata.certificate["residual"] is None
-        assert got.metadata.certificate["row_sum_mean"] is not None
-
-
-@pytest.mark.parametrize("limit", [0, 1 << 30])
-def test_a_view_that_sees_nothing_changes_nothing(tmp_path, monkeypatch, limit):
-    monkeypatch.setattr("liftcore.solve.view_weights.MEMORY_LIMIT", limit)
+def test_a_view_that_sees_nothing_changes_nothing(tmp_path):
     observation = checkerboard(5, 9)
     alone = lifted(tmp_path, {"v0": observation})
     both = lifted(tmp_path, {"away": observation, "v0": observation})
@@ -138,9 +124,3 @@ def test_splats_behind_forty_opaque_ones_stay_finite_without_a_stop(tmp_path, pr
         assert bool(torch.isfinite(tensor).all())
     assert float(got.features.abs().max()) <= 1.001
     assert int(got.seen.sum()) > 5
-
-
-def test_an_opaque_splat_is_lifted_at_the_largest_cap_that_is_allowed(tmp_path):
-    splats = splats_at([(0.0, 0.0, 0.0)], log_scales=2.0, logits=1e4)
-    got = lifted(tmp_path, {"v0": checkerboard(5, 9)}, splats, alpha_cap=0.9999999, transmittance_stop=0)
-    assert float(got.evidence[0]) > 0.9 * WIDTH * HEIGHT

@@ -10,9 +10,7 @@ from hypothesis import strategies as st
 from liftcore.raster.base import CompositingParams
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Kernel
-from tests.benchmarks.stability.walks import View
-from tests.benchmarks.stability.weights import traced, weights_of
-from tests.benchmarks.stability.wide import judgeable
+from tests.benchmarks.extreme_measures import View, judgeable, traced, weights_of
 from tests.scenes import splats_at
 from tests.stability.extremes import assert_equals_the_oracle
 
