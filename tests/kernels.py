@@ -1,4 +1,4 @@
-"""Compile what nearly all tests walk with: ``python -m tests.kernels [KERNEL...]``. `make test` does so beside its lint.
+"""Compile what nearly all tests walk with: ``python -m tests.kernels [KERNEL...]``, which `make test` does first.
 
 Tests run in two processes, and each would compile the same code for itself. What a few tests alone need is compiled
 there, once.

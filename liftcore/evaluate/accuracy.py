@@ -49,8 +49,9 @@ def class_ious(labels: Tensor, truth: Tensor, count: int) -> Tensor:
     return ious
 
 
-def mask_iou(mask: Tensor, truth: Tensor) -> float:
+def mask_iou(mask: Tensor | np.ndarray, truth: Tensor | np.ndarray) -> float:
     """Intersection over union of two masks [H, W] bool; one where both are empty."""
+    mask, truth = torch.as_tensor(mask), torch.as_tensor(truth)
     union = int((mask | truth).sum())
     return int((mask & truth).sum()) / union if union else 1.0
 

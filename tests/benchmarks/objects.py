@@ -45,7 +45,7 @@ def measure_lift(scene: QueryScene, answers: dict[int, Answer], owners: np.ndarr
         alone += len(found) == 1
         box = np.array(found[0].box) if found else np.zeros((2, 3))
         ious.append(box_iou(box, true))
-        of_all.append(box_iou(_bounds(means[answer.selected.numpy()]), true) if found else 0.0)
+        of_all.append(box_iou(_bounds(means[answer.selected]), true) if found else 0.0)
         middles.append(np.linalg.norm(box.mean(axis=0) - true.mean(axis=0)) / np.linalg.norm(true[1] - true[0]))
     pairs = list(combinations(answers, 2))
     apart = sum(_are_two(scene, {thing: answers[thing] for thing in pair}, owners) for pair in pairs)

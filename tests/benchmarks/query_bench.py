@@ -18,8 +18,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
-from torch import Tensor
 
 from liftcore import __version__
 from liftcore.errors import InvalidInput
@@ -48,10 +48,10 @@ class RandomTexts:
     def __init__(self, channels: int) -> None:
         self.channels = channels
 
-    def encode(self, texts: Sequence[str]) -> Tensor:
+    def encode(self, texts: Sequence[str]) -> np.ndarray:
         """n texts -> [n, F] f32 unit rows, seeded by the text."""
         rows = [torch.randn(self.channels, generator=torch.Generator().manual_seed(int(text))) for text in texts]
-        return torch.nn.functional.normalize(torch.stack(rows), dim=1)
+        return torch.nn.functional.normalize(torch.stack(rows), dim=1).numpy()
 
 
 def write_random_lift(folder: Path, splats: int, channels: int, size: tuple[int, int] | None) -> Path:
@@ -102,7 +102,7 @@ def run(splats: int, channels: int, repeats: int, size: tuple[int, int] | None =
 
 def _tenth(answer: Answer) -> Answer:
     """The same with the best tenth of the splats selected."""
-    return replace(answer, selected=answer.scores >= answer.scores.kthvalue(round(0.9 * len(answer.scores))).values)
+    return replace(answer, selected=answer.scores >= np.quantile(answer.scores, 0.9))
 
 
 def _times(work: Callable[[int], object], repeats: int) -> dict[str, float]:

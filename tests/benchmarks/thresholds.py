@@ -38,14 +38,15 @@ from tests.benchmarks.tabletop import Tabletop
 COLUMNS = (*METHODS, "rendered", "best", "absent", "absent rendered")
 
 
-def best_iou(attention: Tensor, met: Tensor, truth: Tensor) -> float:
+def best_iou(attention: np.ndarray, met: np.ndarray, truth: Tensor) -> float:
     """The largest IoU that any threshold on the attention gives, over the distinct scores of the met pixels.
 
     Args:
         attention: [H, W] f32. met: [H, W] bool, the pixels that a mask may take. truth: [H, W] bool.
     """
-    scores, order = torch.sort(attention[met], descending=True)
-    hits = torch.cumsum(truth[met][order].double(), dim=0)
+    seen = torch.from_numpy(met)
+    scores, order = torch.sort(torch.from_numpy(attention)[seen], descending=True)
+    hits = torch.cumsum(truth[seen][order].double(), dim=0)
     chosen = torch.arange(1, len(scores) + 1, dtype=torch.float64)
     ious = hits / (chosen + int(truth.sum()) - hits)
     last = torch.cat([scores[1:] != scores[:-1], torch.ones(1, dtype=torch.bool)])  # of equal scores: all or none
@@ -81,8 +82,8 @@ def measure_phrases(
                     rows["rendered"].append(mask_iou(rendered, truth))
                     rows["best"].append(best_iou(seen.attention, met, truth))
                 else:
-                    rows["absent"].append(float(seen.mask.float().mean()))
-                    rows["absent rendered"].append(float(rendered.float().mean()))
+                    rows["absent"].append(float(seen.mask.mean()))
+                    rows["absent rendered"].append(float(rendered.mean()))
     return {name: float(np.mean(values)) for name, values in rows.items() if values}
 
 

@@ -15,7 +15,7 @@ SCRIPTS = sorted(path.stem for path in (ROOT / "tests" / "benchmarks").glob("*.p
 @pytest.mark.parametrize("name", SCRIPTS)
 def test_every_benchmark_tells_its_command(name: str, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
     module = importlib.import_module(f"tests.benchmarks.{name}")
-    if name != "base":
+    if name not in ("base", "extreme_measures"):  # which the others import
         monkeypatch.setattr("sys.argv", [name, "--help"])
         with pytest.raises(SystemExit, match="0"):
             module.main()
