@@ -18,8 +18,7 @@ from liftcore.errors import SplatliftError
 from liftcore.features.pack import read_features, write_pack
 from liftcore.features.views import Regions, ViewFeatures
 from liftcore.io.inria import write_inria_cameras
-from liftcore.io.inspect import describe_packs
-from liftcore.io.inspect import describe_cameras, describe_splats
+from liftcore.io.inspect import describe_cameras, describe_packs, describe_splats
 from liftcore.io.lift_files import lift_files
 from liftcore.io.ply import write_splats
 from liftcore.progress import silent
