@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 import torch
 from torch import Tensor
 
 from liftcore.device import choose_device
 from liftcore.errors import InvalidSettings
+from liftcore.progress import Progress, silent
 from liftcore.raster import open_raster
 from liftcore.raster.base import CompositingParams, check_antialiased
-from liftcore.scene.cameras import Camera
+from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.splats import Splats
+from liftcore.settings import LiftSettings, Preset
+from liftcore.solve.accumulate import accumulate
+from liftcore.solve.view_weights import WeightStore
+from liftcore.solve.views import Given, LiftViews
+from liftcore.solve.weights import RegionWeights, merged
 
 DEFAULT = CompositingParams()
 
@@ -53,3 +62,36 @@ def render(
         sums = raster.row_sums(camera, params)[:, :, None]
         image = torch.where(sums > 0, image / sums.clamp_min(torch.finfo(torch.float32).tiny), 0.0)
     return (image[:, :, 0] if given.ndim == 1 else image).cpu()
+
+
+def region_weights(
+    splats: Splats,
+    cameras: Cameras | Mapping[str, Camera],
+    views: Given,
+    preset: Preset | str | LiftSettings = Preset.TIKHONOV,
+    *,
+    progress: Progress = silent,
+    threads: int | None = None,
+    **settings: Any,
+) -> RegionWeights:
+    """What each region, or cell of a grid, of each view weighs at each splat: ``W = A^T S``, without any feature.
+
+    Args:
+        splats, cameras, views, preset, threads, settings: as `lift` has them. All views are weighed, whatever the
+            settings' coverage. A label on several levels is a region each time.
+
+    Returns:
+        W on the CPU, in memory. Rows of ``W E`` over the sums of rows of W are the features that `lift` finds.
+
+    Raises:
+        InvalidFeatures, InvalidSettings, Unavailable: as `lift` has it.
+    """
+    chosen = preset if isinstance(preset, LiftSettings) else LiftSettings.of(preset=preset, **settings)
+    check_antialiased(splats.kernel, chosen.antialiased)
+    found = LiftViews.of(views, cameras, chosen)
+    own = chosen.model_copy(update={"robust_steps": 1, "certificate_rays": 0})  # by regions, not tuples of them
+    raster = open_raster(splats, choose_device(chosen.device), threads)
+    with WeightStore() as store:
+        geometry = accumulate(raster, splats.count, found, own, store, progress)
+        counts = [book.shape[0] for book in geometry.codebooks]
+        return merged(store, counts, tuple(found.names), splats.count, threads)

@@ -15,7 +15,7 @@ from tests.unit.solve.test_lift_equals_dense import observed, write_scene
 PUBLIC = """
     Camera Cameras FeatureGrid InvalidCameras InvalidFeatures InvalidInput InvalidLift InvalidQuery InvalidSettings
     InvalidSplats LiftResult LiftSettings NotFound Plan RegionWeights Regions Splats SplatliftError Unavailable lift
-    load_lift plan read_cameras read_features read_splats render
+    load_lift plan read_cameras read_features read_splats region_weights render
 """
 
 
@@ -111,3 +111,18 @@ def test_render_composites_numbers_of_splats(scene):
     assert torch.allclose(share[ones > 0], torch.ones(()), atol=1e-6)
     with pytest.raises(lc.InvalidSettings, match="a row a splat"):
         lc.render(splats, camera, torch.ones(splats.count + 1))
+
+
+def test_region_weights_times_codebooks_are_the_lift(scene):
+    _, splats, cameras, views = scene
+    found = lc.region_weights(splats, cameras, views, preset="row-sum")
+    W = found.matrix(splats.count)
+    E = np.concatenate([views[name].codebook.double().numpy() for name in found.views])
+    assert W.shape == (splats.count, len(E)) and found.offsets.tolist()[0] == 0
+    made = lc.lift(splats, cameras, views, preset="row-sum", dtype="float32")
+    sums = W.sum(axis=1)
+    assert ((sums > 0) == made.seen.numpy()).all()
+    X = np.divide(W @ E, sums[:, None], out=np.zeros((splats.count, E.shape[1])), where=sums[:, None] > 0)
+    np.testing.assert_allclose(made.features.numpy(), X, atol=1e-5)
+    again = lc.region_weights(splats, cameras, iter(views.items()), preset="row-sum", threads=2)
+    assert torch.equal(again.weight, found.weight) and torch.equal(again.region, found.region)
