@@ -7,8 +7,10 @@ import json
 import logging
 import math
 import os
+import resource
 import signal
 import socket
+import sqlite3
 import sys
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -22,18 +24,21 @@ from pydantic import ValidationError
 from pydantic_settings import SettingsError
 
 from liftcore.errors import SplatliftError
-from service.app import assemble, pace_of
-from service.connection import watched
+from service.app import assemble
+from service.auth import is_loopback
+from service.connection import Pace, watched
+from service.encoders import require_encoder_files
 from service.errors import Misconfigured
-from service.keys.hosts import is_loopback
-from service.logs import start_logging
-from service.queries.encoder_files import require_encoder_files
+from service.observe import logging_to_stderr
 from service.settings import ServiceSettings
-from service.stopping import Stopping
+from service.state import Stopping
 from service.store.database import require_database
 from service.store.keys import any_key
 from service.store.markers import keys_were_made
 from service.store.store import DATABASE, Store
+
+FILES_A_CONNECTION = 2  # itself, and what it is sent
+FILES_BESIDE = 128  # of the database, checks, jobs and the query worker
 
 log = logging.getLogger(__name__)
 
@@ -148,6 +153,23 @@ def require_keys(settings: ServiceSettings) -> None:
         )  # fmt: skip
 
 
+def require_files(settings: ServiceSettings) -> None:
+    """See that every connection can have its files, as far as the machine lets us raise what we may have.
+
+    Raises:
+        Misconfigured: there would be too few of them.
+    """
+    needed = FILES_A_CONNECTION * settings.max_connections + FILES_BESIDE
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if 0 <= soft < needed:
+        if 0 <= hard < needed:
+            raise Misconfigured(
+                "max_connections", expected=f"at most {max(0, (hard - FILES_BESIDE) // FILES_A_CONNECTION)}, as a"
+                f" process may open {hard} files here", got=f"{settings.max_connections}", hint="or raise ulimit -n",
+            )  # fmt: skip
+        resource.setrlimit(resource.RLIMIT_NOFILE, (needed, hard))
+
+
 def bind(host: str, port: int) -> socket.socket:
     """A listening socket.
 
@@ -166,12 +188,18 @@ def bind(host: str, port: int) -> socket.socket:
     return listener
 
 
+def pace_of(settings: ServiceSettings) -> Pace:
+    """What the settings ask of clients."""
+    return Pace(
+        settings.min_bytes_per_second, settings.slow_grace_seconds, settings.header_seconds, settings.max_connections
+    )
+
+
 def server_of(app: FastAPI, settings: ServiceSettings, announce: Callable[[str], None] = say) -> AnnouncingServer:
     """The server of an application, which announces the address at which it listens."""
-    connection = watched(pace_of(settings), settings.max_connections)
     config = uvicorn.Config(
-        app, http=connection, log_config=None, log_level="warning", access_log=False, server_header=False, ws="none",
-        timeout_graceful_shutdown=math.ceil(settings.stop_seconds),
+        app, http=watched(pace_of(settings)), log_config=None, log_level="warning", access_log=False,
+        server_header=False, ws="none", timeout_graceful_shutdown=math.ceil(settings.stop_seconds),
     )  # fmt: skip
     return AnnouncingServer(config, app.state.stopping, announce)
 
@@ -186,6 +214,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             require_database(settings.data / DATABASE)
         require_keys(settings)
         require_encoder_files(settings)
+        require_files(settings)
         listener = bind(settings.host, settings.port)
         try:
             store = Store.open(settings.data, floor_bytes=settings.disk_floor_bytes, new=new)
@@ -195,16 +224,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except SplatliftError as error:
         print(f"splatlift: {error}", file=sys.stderr)
         return 2
-    start_logging(settings.log_format)
-    if settings.keys == "none" and keys_were_made(settings.data):
-        log.warning("SPLATLIFT_KEYS is none: nobody needs a key, though keys were made for %s", settings.data)
-    try:
-        app = assemble(settings, store)
-        announce = partial(say_in_json, data=settings.data) if "json" in options(given) else say
-        server_of(app, settings, announce).run(sockets=[listener])
-    finally:
-        store.close()
-        listener.close()
+    except (OSError, sqlite3.Error) as error:  # a full disk, one that may only be read, one that fails
+        print(f"splatlift: data: expected a directory to read and write, got {error}", file=sys.stderr)
+        return 2
+    with logging_to_stderr(settings.log_format):
+        if settings.keys == "none" and keys_were_made(settings.data):
+            log.warning("SPLATLIFT_KEYS is none: nobody needs a key, though keys were made for %s", settings.data)
+        try:
+            app = assemble(settings, store)
+            announce = partial(say_in_json, data=settings.data) if "json" in options(given) else say
+            server_of(app, settings, announce).run(sockets=[listener])
+        finally:
+            store.close()
+            listener.close()
     return 0
 
 

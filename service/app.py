@@ -1,9 +1,8 @@
-"""Wiring: the parts, the routes, the one error table. There is no global application."""
+"""Wiring: the parts, the layers, the routes. There is no global application."""
 
 from __future__ import annotations
 
 import os
-import threading
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
@@ -12,35 +11,29 @@ from fastapi import FastAPI
 
 from liftcore import __version__
 from service import problems
-from service.head import AnswerHead
+from service.auth import Gate
 from service.jobs.devices import Devices
 from service.jobs.limits import JobLimits
-from service.jobs.streams import EventStreams
 from service.jobs.supervisor import Supervisor
-from service.keys.document import describe_keys
-from service.keys.gate import Gate
-from service.limits import BodyLimit, Pace
-from service.metrics import Metrics
-from service.parameters import KnownParameters
-from service.parts import Parts
-from service.queries.warm import QueryLimits, WarmWorker
-from service.readiness import Readiness
-from service.recorder import RecordedApp
-from service.routes import assets, jobs, lifts, operations, queries, reference, tradeoffs
+from service.middleware import AnswerHead, BodyLimit, RefuseWork
+from service.observe import Metrics, RecordedApp, versions
+from service.queries.client import QueryClient, QueryLimits
+from service.requests import KnownParameters
+from service.routes import assets, jobs, lifts, operations, queries, tradeoffs
 from service.settings import ServiceSettings
-from service.stopping import RefuseWork, Stopping
+from service.state import AppState, Readiness, Stopping
 from service.store.garbage import Collector
 from service.store.store import Store
-from service.versions import versions
+from service.streams import EventStreams
 
 
-def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, worker: WarmWorker) -> FastAPI:
+def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, worker: QueryClient) -> FastAPI:
     """The application. It starts and stops the runner and the worker; the store is its caller's to close."""
 
-    streams, devices = EventStreams(settings.max_streams), Devices()
+    streams, build = EventStreams(settings.max_streams), versions(settings.commit)
     stopping = Stopping(streams, runner, notice_seconds=settings.notice_seconds)
+    metrics = Metrics(store, worker, streams, build)
     readiness = Readiness(store, runner, worker, stopping)
-    metrics = Metrics(store, worker, streams, build=versions(settings.commit))
     runner.tell(metrics.attempted)
     worker.tell(metrics.queried)
     collector = Collector(
@@ -50,11 +43,10 @@ def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, work
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        ending = threading.Event()
-        checks, scrapes = anyio.CapacityLimiter(settings.parallel_checks), anyio.CapacityLimiter(1)
-        app.state.parts = Parts(
-            settings, store, runner, devices, worker, streams, checks, metrics=metrics, scrapes=scrapes,
-            readiness=readiness, ending=ending,
+        app.state.deps = deps = AppState(
+            settings=settings, version=build, store=store, runner=runner, devices=Devices(), queries=worker,
+            streams=streams, metrics=metrics, readiness=readiness,
+            checks=anyio.CapacityLimiter(settings.parallel_checks),
         )  # fmt: skip
         await anyio.to_thread.run_sync(worker.start)
         await anyio.to_thread.run_sync(runner.start)
@@ -62,11 +54,10 @@ def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, work
         try:
             yield
         finally:
-            ending.set()
+            deps.ending.set()
             streams.close()
-            await anyio.to_thread.run_sync(collector.stop)
-            await anyio.to_thread.run_sync(runner.stop)
-            await anyio.to_thread.run_sync(worker.stop)
+            for part in (collector, runner, worker):
+                await anyio.to_thread.run_sync(part.stop)
 
     app = RecordedApp(
         title="splatlift",
@@ -74,28 +65,24 @@ def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, work
         description="Lift 2D features onto trained splat scenes and query them in words.",
         lifespan=lifespan,
         responses=problems.RESPONSES,
-        docs_url=None,  # FastAPI's own pages load their scripts from other hosts
-        redoc_url=None,
+        openapi_url=None,  # `service.routes.operations` tells it, and of keys, beside the event loop
         redirect_slashes=False,
     )
     app.state.stopping, app.state.metrics = stopping, metrics
     app.add_middleware(AnswerHead)
-    app.add_middleware(BodyLimit, limit=settings.max_body_bytes, pace=pace_of(settings))
+    app.add_middleware(BodyLimit, limit=settings.max_body_bytes)
     app.add_middleware(RefuseWork, stopping=stopping)
     app.add_middleware(Gate, keys=store.keys, settings=settings)  # outside of it: no body of a stranger is read
     problems.install(app)
-    app.include_router(reference.router)
     app.include_router(operations.router)  # probes and links to the page may carry what they like
     for module in (assets, jobs, lifts, tradeoffs, queries):
         app.include_router(module.router, dependencies=[KnownParameters])
-    describe_keys(app, store.keys.under(settings.keys))
     return app
 
 
 def assemble(settings: ServiceSettings, store: Store) -> FastAPI:
     """The application with the usual runner and query worker."""
-    runner, worker = Supervisor(store, job_limits(settings)), WarmWorker(query_limits(settings))
-    return create_app(settings, store, runner, worker)
+    return create_app(settings, store, Supervisor(store, job_limits(settings)), QueryClient(query_limits(settings)))
 
 
 def query_limits(settings: ServiceSettings) -> QueryLimits:
@@ -107,11 +94,6 @@ def query_limits(settings: ServiceSettings) -> QueryLimits:
         cache_bytes=settings.query_cache_bytes,
         encoder=settings.encoder,
     )
-
-
-def pace_of(settings: ServiceSettings) -> Pace:
-    """What the settings ask of clients."""
-    return Pace(settings.min_bytes_per_second, settings.slow_grace_seconds, settings.header_seconds)
 
 
 def job_limits(settings: ServiceSettings) -> JobLimits:

@@ -1,26 +1,30 @@
-"""Answers with an entity tag: files with ranges, pictures, and files that are made to be sent."""
+"""Answers beside plain JSON: files with ranges and entity tags, pictures, drafts, and long lists."""
 
 from __future__ import annotations
 
 import os
-import re
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Annotated, Any, BinaryIO
 
-from fastapi import Request
+import anyio
+from fastapi import Query, Request
 from fastapi.responses import FileResponse, Response, StreamingResponse
+from pydantic import BaseModel
+from starlette import responses
 from starlette.types import Receive, Scope, Send
 
 from liftcore.errors import NotFound
 from service.errors import RangeNotSatisfiable
 from service.problems import PROBLEM
 from service.store.files import is_whole
+from service.store.pages import CURSOR, Page
 
-ONE_RANGE = re.compile(r"bytes=\s*(?:(\d+)-(\d*)|-(\d+))\s*", re.ASCII)
-MAX_DIGITS = 18  # longer numbers are beyond every file
 BLOCK_BYTES = 256 << 10  # of a draft that is read and sent at a time
-BYTES = {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}
+STREAMED = 200  # records of a long list that are in memory at a time
+BINARY = "application/octet-stream"
+BYTES = {BINARY: {"schema": {"type": "string", "format": "binary"}}}
 
 # For OpenAPI: what a route answers beside 200 when its answers have tags, and all that one that gives a file does.
 TAGGED: dict[int | str, dict[str, Any]] = {304: {"description": "The client has it already (If-None-Match)"}}
@@ -29,6 +33,11 @@ FILE: dict[int | str, dict[str, Any]] = TAGGED | {
     206: {"description": "The range that was asked for", "content": BYTES},
     416: {**PROBLEM, "description": "A range beyond the end"},
 }
+
+Limit = Annotated[
+    int | None, Query(ge=1, le=1000, description="how many to list; left out, all of them are, in one long answer")
+]
+Cursor = Annotated[str | None, Query(pattern=CURSOR, description="the `next` of the page before")]
 
 
 def unchanged(request: Request, etag: str, *, found: bool = True) -> Response | None:
@@ -76,67 +85,84 @@ def file_answer(request: Request, file: StoredFile) -> Response:
             "content", expected=f"a file of {file.bytes} bytes in the data directory", got=there,
             hint="it was deleted a moment ago, or something else wrote there: upload it again, or lift again",
         )  # fmt: skip
-    same = unchanged(request, etag)
-    if same is not None:
-        return same
-    return _FileAnswer(file, etag=etag, keep_range=_keeps_range(request, file.bytes, etag))
-
-
-def draft_answer(draft: Path, *, filename: str, etag: str | None) -> Response:
-    """A file that was made for this answer alone, to be saved under a name.
-
-    The answer holds the file open, so its entry may go as soon as this returns; its room goes with the answer.
-    """
-    return Draft(draft.open("rb"), {"ETag": etag} if etag else {}, filename)
-
-
-def _keeps_range(request: Request, size: int, etag: str) -> bool:
-    """Whether the Range header counts: one range, well-formed, of the entity that the client thinks of."""
-    header = request.headers.get("range", "")
-    match = ONE_RANGE.fullmatch(header)
-    if match is None or request.headers.get("if-range", etag) != etag:
-        return False  # RFC 9110: what is not understood, or is of another version, is ignored
-    first, last, suffix = match.groups()
-    if first and last and _number(first) > _number(last):
-        return False
-    if (first and _number(first) >= size) or (suffix and _number(suffix) == 0):
-        raise RangeNotSatisfiable("Range", expected=f"a range within {size} bytes", got=header[:80], size=size)
-    return not any(len(digits or "") > MAX_DIGITS for digits in match.groups())
-
-
-def _number(digits: str) -> int:
-    return int(digits) if len(digits) <= MAX_DIGITS else 10**MAX_DIGITS
+    headers = {"ETag": etag, "Cache-Control": "private, no-cache"}
+    return unchanged(request, etag) or _FileAnswer(file.path, headers=headers, filename=file.name, media_type=BINARY)
 
 
 class _FileAnswer(FileResponse):
-    """Starlette's file response with our entity tag, blind to Range headers that do not count."""
+    """Starlette's, but that a range which it does not understand is as none, as RFC 9110 has it."""
 
-    def __init__(self, file: StoredFile, *, etag: str, keep_range: bool) -> None:
-        headers = {"ETag": etag, "Cache-Control": "private, no-cache"}
-        super().__init__(file.path, headers=headers, filename=file.name, media_type="application/octet-stream")
-        self._keep_range = keep_range
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if not self._keep_range:
-            headers = [pair for pair in scope["headers"] if pair[0] not in (b"range", b"if-range")]
-            scope = {**scope, "headers": headers}
-        await super().__call__(scope, receive, send)
+    @classmethod
+    def _parse_range_header(cls, http_range: str, file_size: int) -> list[tuple[int, int]]:
+        try:
+            ranges = super()._parse_range_header(http_range, file_size)
+        except responses.MalformedRangeHeader:
+            return []
+        except responses.RangeNotSatisfiable:
+            expected = f"a range within {file_size} bytes"
+            raise RangeNotSatisfiable("Range", expected=expected, got=http_range[:80], size=file_size) from None
+        return ranges if len(ranges) == 1 else []
 
 
 class Draft(StreamingResponse):
-    """An open file, read in blocks by threads of the pool, and closed however the answer ends."""
+    """A file that was made for this answer alone, to be saved under a name.
 
-    def __init__(self, file: BinaryIO, headers: dict[str, str], filename: str) -> None:
-        headers |= {
-            "Content-Length": str(os.fstat(file.fileno()).st_size),
+    It is held open, so its entry may go as soon as this is made; its room goes with the answer, however that ends.
+    """
+
+    def __init__(self, draft: Path, *, filename: str, etag: str | None) -> None:
+        self.file: BinaryIO = draft.open("rb")
+        headers = {
+            "Content-Length": str(os.fstat(self.file.fileno()).st_size),
             "Content-Disposition": f'attachment; filename="{filename}"',
             "Cache-Control": "private, no-cache",
-        }
-        super().__init__(iter(lambda: file.read(BLOCK_BYTES), b""), 200, headers, "application/octet-stream")
-        self.file = file
+        } | ({"ETag": etag} if etag else {})
+        super().__init__(iter(lambda: self.file.read(BLOCK_BYTES), b""), 200, headers, BINARY)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         try:
             await super().__call__(scope, receive, send)
         finally:
-            self.file.close()
+            with anyio.CancelScope(shield=True):
+                await anyio.to_thread.run_sync(self.file.close)  # gigabytes take their time to go
+
+
+def listed(
+    name: str,
+    page: Callable[[int, str | None], Page[Any]],
+    shape: Callable[[Any], BaseModel],
+    *,
+    limit: int | None,
+    cursor: str | None,
+) -> Response:
+    """A list, newest first: one page of it with ``next``, the cursor of the page after it or null; or, without a
+    limit, all that follows, streamed, so that no list is ever in memory whole.
+
+    Args:
+        name: of the list in the JSON object.
+        page: so many records after a cursor.
+        shape: a record as clients get it.
+        limit, cursor: as the client gave them.
+    """
+    first = page(limit or STREAMED, cursor)
+    if limit is not None:
+        following = "null" if first.cursor is None else f'"{first.cursor}"'
+        body = f'{{"{name}":[{_joined(first, shape)}],"next":{following}}}'
+        return Response(body, media_type="application/json")
+
+    def pieces() -> Iterator[str]:
+        yield f'{{"{name}":[{_joined(first, shape)}'
+        following = first.cursor
+        while following is not None:
+            found = page(STREAMED, following)
+            following = found.cursor
+            yield f",{_joined(found, shape)}" if found.records else ""
+        yield "]}"
+
+    if first.cursor is None:
+        return Response("".join(pieces()), media_type="application/json")
+    return StreamingResponse(pieces(), media_type="application/json")
+
+
+def _joined(page: Page[Any], shape: Callable[[Any], BaseModel]) -> str:
+    return ",".join(shape(record).model_dump_json() for record in page.records)

@@ -7,24 +7,27 @@ SplatliftError
     ├── ForeignOrigin        a web page of another site asks                   403
     ├── Misdirected          a Host that is not this service                   421
     ├── OverQuota            more bytes than the key may store                 403
-    ├── TooMany              more jobs in line or uploads than the key may     429 + Retry-After
     ├── InvalidRequest       a parameter or a body that no route understands   422
     ├── DigestMismatch       the body is not what ?sha256= promised            422
     ├── InvalidEncoding      a compressed body that does not decompress        422
     ├── UnsupportedEncoding  a Content-Encoding that is neither gzip nor zstd  415
     ├── TooLarge             more bytes than the operator allows               413
-    ├── RangeNotSatisfiable  a Range beyond the end of the content             416
+    ├── RangeNotSatisfiable  a Range beyond the end of the content             416 + Content-Range
     ├── InUse                an asset that a job or a lift needs               409
     ├── Conflict             a job whose state does not allow that             409
     ├── KeyReused            an Idempotency-Key that came with another order   422
     ├── OverLimit            a job beyond the operator's time or memory        422
     ├── NoSpace              less free disk than the operator wants to keep    507
-    ├── Busy                 too many queries or jobs are waiting              503 + Retry-After
-    ├── NotReady             a check of /readyz that failed                    503 + Retry-After
+    ├── RetryLater
+    │   ├── TooMany          more jobs in line or uploads than the key may     429 + Retry-After
+    │   └── Busy             as much work as the service accepts               503 + Retry-After
+    │       └── NotReady     a check of /readyz that failed                    503 + Retry-After
     ├── TimedOut             a query that took longer than the operator allows 504
     ├── Crashed              a process of ours died without an answer          500
     └── Misconfigured        the operator's settings or data directory         (start-up only)
         └── StaleDatabase    files whose database is gone, or an older one     (start-up only)
+
+Statuses and titles are in `service.problems`, which no child process loads.
 """
 
 from __future__ import annotations
@@ -37,11 +40,22 @@ class ServiceError(SplatliftError):
 
     kind = "service"
 
+    @property
+    def headers(self) -> dict[str, str]:
+        """What an answer with this error tells beside its problem."""
+        return {}
+
 
 class Unauthorized(ServiceError):
     """No key, or one that is not valid (any more)."""
 
     kind = "unauthorized"
+
+    @property
+    def headers(self) -> dict[str, str]:
+        """The scheme, with a code only where a key was sent (RFC 6750, 3.1)."""
+        code = ', error="invalid_token"' if self.got != "none" else ""
+        return {"WWW-Authenticate": f'Bearer realm="splatlift"{code}'}
 
 
 class MissingScope(ServiceError):
@@ -51,7 +65,12 @@ class MissingScope(ServiceError):
 
     def __init__(self, argument: str, *, expected: str, got: str, hint: str = "", scope: str = "") -> None:
         super().__init__(argument, expected=expected, got=got, hint=hint)
-        self.scope = scope  # the one that it lacks, told in WWW-Authenticate
+        self.scope = scope  # the one that it lacks
+
+    @property
+    def headers(self) -> dict[str, str]:
+        """The scope that is missing."""
+        return {"WWW-Authenticate": f'Bearer realm="splatlift", error="insufficient_scope", scope="{self.scope}"'}
 
 
 class ForeignOrigin(ServiceError):
@@ -70,16 +89,6 @@ class OverQuota(ServiceError):
     """More bytes than a key may store."""
 
     kind = "over-quota"
-
-
-class TooMany(ServiceError):
-    """More jobs in line, or uploads at a time, than a key may have."""
-
-    kind = "too-many"
-
-    def __init__(self, argument: str, *, expected: str, got: str, hint: str = "", retry_after: int = 2) -> None:
-        super().__init__(argument, expected=expected, got=got, hint=hint)
-        self.retry_after = retry_after  # seconds, told in Retry-After
 
 
 class InvalidRequest(ServiceError):
@@ -119,7 +128,12 @@ class RangeNotSatisfiable(ServiceError):
 
     def __init__(self, argument: str, *, expected: str, got: str, hint: str = "", size: int = 0) -> None:
         super().__init__(argument, expected=expected, got=got, hint=hint)
-        self.size = size  # bytes of the content, told in Content-Range
+        self.size = size  # bytes of the content
+
+    @property
+    def headers(self) -> dict[str, str]:
+        """The size that there is."""
+        return {"Content-Range": f"bytes */{self.size}"}
 
 
 class InUse(ServiceError):
@@ -152,14 +166,29 @@ class NoSpace(ServiceError):
     kind = "no-space"
 
 
-class Busy(ServiceError):
-    """The service has as much waiting work as it accepts."""
-
-    kind = "busy"
+class RetryLater(ServiceError):
+    """What may go well in a while."""
 
     def __init__(self, argument: str, *, expected: str, got: str, hint: str = "", retry_after: int = 2) -> None:
         super().__init__(argument, expected=expected, got=got, hint=hint)
-        self.retry_after = retry_after  # seconds, told in Retry-After
+        self.retry_after = retry_after  # seconds
+
+    @property
+    def headers(self) -> dict[str, str]:
+        """When to ask again."""
+        return {"Retry-After": str(self.retry_after)}
+
+
+class TooMany(RetryLater):
+    """More jobs in line, or uploads at a time, than a key may have."""
+
+    kind = "too-many"
+
+
+class Busy(RetryLater):
+    """The service has as much waiting work as it accepts."""
+
+    kind = "busy"
 
 
 class NotReady(Busy):

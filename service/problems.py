@@ -18,14 +18,18 @@ from starlette.routing import Match
 
 from liftcore import errors as core
 from liftcore.errors import SplatliftError
-from service import errors, request_id
-from service.validation import refusal
-from service.wire import Problem
+from service import errors
+from service.models import Problem
+from service.observe import current_id
 
 MEDIA_TYPE = "application/problem+json"
 METHODS = ("GET", "POST", "PUT", "PATCH", "DELETE", "OPTIONS")  # and HEAD, where there is GET
 PATH_CHARACTERS = 200  # of what a client asked for, told back
+SHOWN = 120  # characters of a value that came
+SHOWN_OF_JSON = 20  # from where it is none
+CLOSE = {"Connection": "close"}  # what is still to come of the body would be taken for the next request
 NO_SPACE = "There is no room left"
+BUSY = "The server is busy"
 
 # Exception -> status and title. The nearest class in the exception's ancestry counts; `type` is its `kind`.
 TABLE: dict[type[SplatliftError], tuple[int, str]] = {
@@ -58,7 +62,7 @@ TABLE: dict[type[SplatliftError], tuple[int, str]] = {
     errors.KeyReused: (422, "The key belongs to another order"),
     errors.OverLimit: (422, "The job needs more than the server allows"),
     errors.NoSpace: (507, NO_SPACE),
-    errors.Busy: (503, "The server is busy"),
+    errors.Busy: (503, BUSY),
     errors.NotReady: (503, "The server is not ready"),
     errors.TimedOut: (504, "The query took too long"),
     errors.Crashed: (500, "A process of the server died"),
@@ -72,6 +76,7 @@ FRAMEWORK: dict[int, tuple[str, str]] = {
     408: ("too-slow", "The request came too slowly"),
     413: ("too-large", "The body is too large"),
     431: ("headers-too-large", "The request's line and headers are too large"),
+    503: ("busy", BUSY),
 }
 
 # For OpenAPI: every route may answer with a problem.
@@ -99,11 +104,24 @@ def problem_of(error: SplatliftError) -> Problem:
     )
 
 
+def by_status(status: int, detail: str, **told: str) -> Problem:
+    """A problem that no error of ours tells of."""
+    phrase = HTTPStatus(status).phrase
+    slug, title = FRAMEWORK.get(status, (phrase.lower().replace(" ", "-"), phrase))
+    return Problem(type=f"/problems/{slug}", title=title, status=status, detail=detail, **told)
+
+
 def answer(problem: Problem, headers: Mapping[str, str] | None = None) -> JSONResponse:
     """The problem as a response to the request that is worked for."""
-    problem = problem.model_copy(update={"request_id": request_id.current()})
+    problem = problem.model_copy(update={"request_id": current_id()})
     told = {name: _plain(value) for name, value in problem.model_dump(exclude_none=True).items()}
     return JSONResponse(told, problem.status, headers=headers, media_type=MEDIA_TYPE)
+
+
+def answer_to(error: SplatliftError, headers: Mapping[str, str] | None = None) -> JSONResponse:
+    """The error as a response, with the headers that belong to it, and more."""
+    own = error.headers if isinstance(error, errors.ServiceError) else {}
+    return answer(problem_of(error), {**own, **(headers or {})})
 
 
 def install(app: FastAPI) -> None:
@@ -114,7 +132,7 @@ def install(app: FastAPI) -> None:
     app.add_exception_handler(HTTPException, _on_framework)
     app.add_exception_handler(ClientDisconnect, _on_disconnect)
     app.add_exception_handler(OSError, _on_system)
-    app.add_exception_handler(sqlite3.OperationalError, _on_system)
+    app.add_exception_handler(sqlite3.Error, _on_system)
     app.add_exception_handler(Exception, _on_unexpected)
 
 
@@ -123,56 +141,40 @@ async def _on_known(request: Request, error: Exception) -> JSONResponse:
     return answer_to(error)
 
 
-def answer_to(error: SplatliftError) -> JSONResponse:
-    """The error as a response, with the headers that belong to it."""
-    headers: dict[str, str] = {}
-    if isinstance(error, errors.Busy | errors.TooMany):
-        headers["Retry-After"] = str(error.retry_after)
-    if isinstance(error, errors.RangeNotSatisfiable):
-        headers["Content-Range"] = f"bytes */{error.size}"
-    if isinstance(error, errors.Unauthorized):
-        given = ', error="invalid_token"' if error.got != "none" else ""  # RFC 6750, 3.1: no code without a key
-        headers["WWW-Authenticate"] = f'Bearer realm="splatlift"{given}'
-    if isinstance(error, errors.MissingScope):
-        headers["WWW-Authenticate"] = f'Bearer realm="splatlift", error="insufficient_scope", scope="{error.scope}"'
-    return answer(problem_of(error), headers)
-
-
 async def _on_validation(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, RequestValidationError)
-    return answer(problem_of(refusal(request, error)))
+    return answer_to(refusal(request, error))
 
 
 async def _on_framework(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, HTTPException)
-    phrase = HTTPStatus(error.status_code).phrase
-    slug, title = FRAMEWORK.get(error.status_code, (phrase.lower().replace(" ", "-"), phrase))
     method = request.method[:PATH_CHARACTERS]
-    asked = f"{method} {request.url.path[:PATH_CHARACTERS]}"
     headers, told, detail = dict(error.headers or {}), {}, error.detail
     if error.status_code == HTTPStatus.METHOD_NOT_ALLOWED:
         headers["Allow"] = ", ".join(_methods_of(request))
         told = {"argument": "method", "expected": f"one of {headers['Allow']}", "got": method}
         detail = f"expected {told['expected']}, got {method}"
-    problem = Problem(
-        type=f"/problems/{slug}", title=title, status=error.status_code, detail=f"{asked}: {detail}", **told
-    )
-    return answer(problem, headers)
+    asked = f"{method} {request.url.path[:PATH_CHARACTERS]}"
+    return answer(by_status(error.status_code, f"{asked}: {detail}", **told), headers)
 
 
 async def _on_disconnect(request: Request, error: Exception) -> JSONResponse:
     # Nobody reads this; without it the log would tell of an error of ours.
-    detail = "The client left before the end of the body."
-    return answer(Problem(type="/problems/malformed-request", title=FRAMEWORK[400][1], status=400, detail=detail))
+    return answer(by_status(400, "The client left before the end of the body."))
 
 
 async def _on_system(request: Request, error: Exception) -> JSONResponse:
-    code = getattr(error, "errno", None)
-    if code not in (errno.ENOSPC, errno.EDQUOT) and getattr(error, "sqlite_errorcode", None) != sqlite3.SQLITE_FULL:
-        return await _on_unexpected(request, error)
-    log.error("%s %s: the disk is full", request.method, request.url.path)
-    detail = "The server's disk is full; what was sent is not kept."
-    return answer(Problem(type="/problems/no-space", title=NO_SPACE, status=507, detail=detail))
+    """A full disk, and a database that others hold, are the operator's to mend, and no error of the program."""
+    code = getattr(error, "sqlite_errorcode", None)
+    if getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT) or code == sqlite3.SQLITE_FULL:
+        log.error("%s %s: the disk is full", request.method, request.url.path)
+        detail = "The server's disk is full; what was sent is not kept."
+        return answer(Problem(type="/problems/no-space", title=NO_SPACE, status=507, detail=detail))
+    if code is not None and code & 0xFF in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED):
+        log.error("%s %s: another process holds the database", request.method, request.url.path)
+        held = errors.Busy("database", expected="a turn to write", got="one that another process holds for long")
+        return answer_to(held)
+    return await _on_unexpected(request, error)
 
 
 async def _on_unexpected(request: Request, error: Exception) -> JSONResponse:
@@ -192,6 +194,52 @@ def _methods_of(request: Request) -> list[str]:
         if any(route.matches(dict(scope))[0] is Match.FULL for route in routes)
     ]
     return [*taken, "HEAD"] if "GET" in taken else taken
+
+
+def refusal(request: Request, error: RequestValidationError) -> errors.InvalidRequest:
+    """The first thing that is wrong with the form of a request: where, what was expected, what came."""
+    first = error.errors()[0]
+    place, kind, told = [str(part) for part in first["loc"]], first["type"], first.get("ctx", {})
+    if kind == "json_invalid":
+        return _no_json(error.body, int(place[1]), told["error"])
+    if place == ["body"] and isinstance(first.get("input"), bytes):
+        return _unread(request.headers.get("content-type"))
+    got = "nothing" if kind == "missing" else _short(first.get("input"))
+    if kind == "unknown_field":  # told of what holds it, `service.models.Body`
+        place.append(told["field"])
+        got = repr(told["field"])
+    return errors.InvalidRequest(
+        ".".join(place[1:]) or place[0],
+        expected="a JSON object" if place == ["body"] else _expected(first),
+        got=got,
+        hint=f"in the {place[0]} of the request",
+    )
+
+
+def _expected(told: dict[str, Any]) -> str:
+    if told["type"] == "missing":
+        return "a value"
+    words = told["msg"].removeprefix("Input should be ")
+    return told.get("ctx", {}).get("expected") or words[:1].lower() + words[1:]
+
+
+def _no_json(body: str, place: int, why: str) -> errors.InvalidRequest:
+    shown = repr(body[place : place + SHOWN_OF_JSON]) if place < len(body) else "its end"
+    got = f"{shown} at character {place + 1} ({why[:1].lower()}{why[1:]})"
+    return errors.InvalidRequest("body", expected="JSON", got=got, hint="in the body of the request")
+
+
+def _unread(media: str | None) -> errors.InvalidRequest:
+    """A body that is not read, as nothing says that it is JSON: curl says that all it sends is a form."""
+    return errors.InvalidRequest(
+        "Content-Type", expected="application/json", got="nothing" if media is None else _short(media),
+        hint="send the header Content-Type: application/json with the body",
+    )  # fmt: skip
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= SHOWN else f"{text[:SHOWN]}..."
 
 
 def _plain(value: Any) -> Any:

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
-
-from liftcore.query.text import NO_WORDS
-from service.errors import InvalidRequest
 
 MiB = 1 << 20
 GiB = 1 << 30
@@ -114,74 +110,4 @@ class ServiceSettings(BaseSettings):
 
     def max_upload_bytes(self, kind: str) -> int:
         """The size limit of an asset kind."""
-        limits = {
-            "splats": self.max_splats_bytes,
-            "cameras": self.max_cameras_bytes,
-            "features": self.max_features_bytes,
-            "masks": self.max_masks_bytes,
-            "table": self.max_table_bytes,
-        }
-        return limits[kind]
-
-    def encoder_spec(self, text_space: str, asked: str | None) -> str:
-        """The text encoder of a query: the one of the space asked for, else of the lift's.
-
-        The default stands in for a space that has none only where the operator chose it: scores of an encoder of
-        another space look like any others, and mean nothing.
-
-        Raises:
-            InvalidRequest: no encoder was set up under the name asked for, or for the lift's text space.
-        """
-        if asked == "default":
-            return self.encoder
-        if asked is not None:
-            if asked not in self.text_spaces:
-                known = ", ".join(["default", *sorted(self.text_spaces)])
-                raise InvalidRequest(
-                    "encoder", expected="the name of a text space that the operator set up", got=repr(asked),
-                    hint=f"known here: {known}",
-                )  # fmt: skip
-            return self.text_spaces[asked]
-        if text_space in self.text_spaces:
-            return self.text_spaces[text_space]
-        if text_space == self.encoder or (text_space != NO_WORDS and "encoder" in self.model_fields_set):
-            return self.encoder
-        raise self._no_encoder(text_space)
-
-    def _no_encoder(self, text_space: str) -> InvalidRequest:
-        if text_space == NO_WORDS:
-            return InvalidRequest(
-                "lift", expected="features that share a space with a text encoder", got="text space 'none'",
-                hint="ask by example, with like=; or name an encoder with encoder= if you know better",
-            )  # fmt: skip
-        example = json.dumps({text_space or "NAME": "table:FILE"})
-        return InvalidRequest(
-            "lift", expected="features of a text space that this server has an encoder for",
-            got=f"text space {text_space!r}" if text_space else "features that name no text space",
-            hint=f"ask by example, with like=; or the operator sets SPLATLIFT_TEXT_SPACES='{example}' or"
-            f" SPLATLIFT_ENCODER; encoder=default asks {encoder_label(self.encoder)} all the same",
-        )  # fmt: skip
-
-
-def encoder_label(spec: str) -> str:
-    """An encoder as clients may know it: its specification without a file of the server."""
-    return "table" if spec.startswith("table:") or spec.endswith(".safetensors") else spec.partition("@")[0]
-
-
-def encoder_file(spec: str) -> Path | None:
-    """The file that an encoder specification names, None when it names none."""
-    if spec.startswith("table:"):
-        return Path(spec.removeprefix("table:"))
-    if spec.startswith("open_clip:") and "@" in spec:
-        return Path(spec.partition("@")[2])
-    return Path(spec) if spec.endswith(".safetensors") else None
-
-
-def encoder_version(spec: str) -> list[int] | None:
-    """What changes when the file of an encoder does: its time and size; None without a file."""
-    file = encoder_file(spec)
-    try:
-        status = file.stat() if file is not None else None
-    except OSError:
-        return None
-    return None if status is None else [status.st_mtime_ns, status.st_size]
+        return getattr(self, f"max_{kind}_bytes")

@@ -13,18 +13,18 @@ from pathlib import Path
 from typing import Any
 
 from liftcore.errors import SplatliftError
+from service.child import fault_of
 from service.errors import OverLimit
-from service.faults import fault_of
 from service.jobs.leftovers import mark
 from service.jobs.limits import JobLimits
 from service.jobs.pace import StagePace
 from service.jobs.process import JobProcess
+from service.models import ENDED, JobKind, JobState
 from service.store.assets import kernel_of
 from service.store.jobs import JobRecord, labels_of
 from service.store.lifts import FinishedLift
 from service.store.store import Store
 from service.store.tradeoffs import FinishedTradeoff
-from service.wire import ENDED, JobKind, JobState
 
 TICK_SECONDS = 0.2  # how soon a cancel, a stop or a limit is seen
 RENEWALS = 4  # of a lease, in the time that it lasts

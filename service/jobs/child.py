@@ -12,20 +12,18 @@ import contextlib
 import errno
 import json
 import os
-import signal
 import sys
 import tempfile
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from liftcore.errors import SplatliftError
+from service.child import end_with_parent, fault_of, own_stdout
 from service.errors import NoSpace, OverLimit
-from service.faults import fault_of
 from service.jobs.reporter import Reporter
-from service.own_stdout import own_stdout
-from service.wire import JobKind
+from service.models import JobKind
 
 Work = Callable[[dict[str, Any], Reporter], dict[str, Any]]  # an order to what is told of its result
 
@@ -69,18 +67,10 @@ def run(order: dict[str, Any], report: Reporter) -> dict[str, Any]:
         return {"event": "fault", "fault": fault_of(error)}
 
 
-def _end_with_parent(stdin: BinaryIO) -> None:
-    stdin.read()  # returns when the server's end of the pipe closes, however the server ended
-    if os.getpgrp() == os.getpid():  # the server gave us a group of our own: all in it is our doing
-        os.killpg(0, signal.SIGKILL)
-    os._exit(3)
-
-
 def main() -> None:
     """Run one job."""
     out = own_stdout()
-    stdin = os.fdopen(os.dup(0), "rb", buffering=0)
-    threading.Thread(target=_end_with_parent, args=(stdin,), daemon=True).start()
+    end_with_parent()
     report = Reporter(out)
     threading.Thread(target=report.beat, daemon=True).start()
     os.nice(NICENESS)

@@ -11,8 +11,7 @@ import sys
 
 from liftcore.device import choose_device
 from liftcore.errors import SplatliftError
-from service.faults import fault_of
-from service.own_stdout import own_stdout
+from service.child import fault_of, own_stdout
 
 
 def look(asked: str) -> dict[str, object]:

@@ -10,7 +10,7 @@ import threading
 from collections.abc import Mapping
 from typing import Any
 
-from service.faults import error_of
+from service.child import error_of
 
 SECONDS = 60.0  # to load torch on a busy machine and ask the driver
 

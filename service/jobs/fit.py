@@ -14,9 +14,9 @@ from liftcore.scene.kernel import Kernel
 from liftcore.scene.views import cameras_of_views, require_pairs, some_of
 from liftcore.settings import LiftSettings
 from service.errors import InvalidRequest
+from service.models import JobKind
 from service.store.assets import AssetRecord, kernel_of
 from service.store.jobs import JobOrder
-from service.wire import JobKind
 
 FLOAT_BYTES = 2  # at least: of float16, which features are unless told otherwise
 

@@ -18,7 +18,7 @@ from liftcore.progress import one_step
 from liftcore.result import InputFile, LiftMetadata
 from liftcore.settings import LiftSettings
 from liftcore.solve.checkpoint import Checkpoint
-from service.faults import renamed
+from service.child import renamed
 from service.jobs.reporter import Reporter
 
 
@@ -61,7 +61,7 @@ def lift_as_ordered(order: dict[str, Any], report: Reporter) -> dict[str, Any]:
 
 
 def plan_document(plan: Plan, names: Mapping[str, str]) -> dict[str, Any]:
-    """A plan as `service.wire.Plan` has it, with the names that clients know in place of paths."""
+    """A plan as `service.models.Plan` has it, with the names that clients know in place of paths."""
     warnings = [renamed(warning, names) for warning in (*plan.warnings, *plan.told)]
     return finite({"summary": list(plan.summary()), "warnings": warnings, **plan.facts()})
 

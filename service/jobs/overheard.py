@@ -6,7 +6,7 @@ import logging
 import threading
 from typing import IO
 
-from service import request_id
+from service.observe import current_id, working_for
 
 LONGEST = 8192  # bytes of a record; what is longer without an end of line comes in pieces
 
@@ -18,10 +18,10 @@ def log_lines(pipe: IO[bytes], job: str) -> threading.Thread:
 
     The records have the job's id, and that of the request that this thread works for.
     """
-    request = request_id.current()
+    request = current_id()
 
     def listen() -> None:
-        with pipe, request_id.working_for(request):
+        with pipe, working_for(request):
             while line := pipe.readline(LONGEST):
                 text = line.decode("utf-8", "replace").strip()
                 if text:

@@ -15,7 +15,7 @@ class StagePace:
         self._done_at_begin = 0
 
     def progress(self, message: dict[str, Any]) -> dict[str, Any]:
-        """The message as `service.wire.Progress` has it."""
+        """The message as `service.models.Progress` has it."""
         now = time.monotonic()
         stage, done, total = message["stage"], message["done"], message["total"]
         if stage != self._stage:

@@ -31,7 +31,7 @@ class Reporter:
         self.say({"event": "progress", "stage": stage, "done": done, "total": total, "unit": unit})
 
     def plan(self, plan: dict[str, Any]) -> None:
-        """Say what the work is going to be, as `service.wire.Plan` has it."""
+        """Say what the work is going to be, as `service.models.Plan` has it."""
         self.say({"event": "plan", "plan": plan})
 
     def say(self, message: dict[str, Any]) -> None:

@@ -7,12 +7,12 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 
-from service import request_id
+from service.child import fault_of
 from service.errors import Crashed
-from service.faults import fault_of
 from service.jobs.attempt import CHILD, Attempt
 from service.jobs.leftovers import end_leftovers
 from service.jobs.limits import JobLimits
+from service.observe import working_for
 from service.store.jobs import JobRecord
 from service.store.store import Store
 
@@ -88,7 +88,7 @@ class Supervisor:
 
     def _run(self, job: JobRecord) -> None:
         begun = time.monotonic()
-        with request_id.working_for(job.request_id):
+        with working_for(job.request_id):
             log.info("job %s, attempt %d begins", job.id, job.attempt)
             try:
                 Attempt(job, self._store, self._limits, self._command).run(self._stopping)

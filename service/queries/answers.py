@@ -8,10 +8,11 @@ import hashlib
 import itertools
 import json
 import threading
+from collections import OrderedDict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import torch
 
@@ -28,8 +29,7 @@ from liftcore.query.text import RememberingEncoder, TextEncoder, open_encoder
 from liftcore.raster.cpu.warm_up import warm_up
 from liftcore.scene.splats import Kernel
 from service.errors import NoSpace
-from service.queries.frames import Frame
-from service.queries.kept import Kept
+from service.queries.client import Frame
 
 TERMS = ("text", "like", "negatives", "unlike")  # in the order in which a query has them
 WARM_UP_TEXT = "something"
@@ -37,7 +37,57 @@ PRODUCT_BYTES = 128 << 20  # of the cosines that one pass over a lift's features
 COSINE_BYTES = 4  # of a splat and a direction
 ANSWER_BYTES = 6  # of a splat: its score, whether it was seen, whether it was selected
 ENTRY_BYTES = 2 << 10  # of what is kept, beside its tensors and its question
+T = TypeVar("T")
 NUMBER_BYTES = 32  # of a number of a question: a Python float and the place in its tuple
+
+
+def _one(value: object) -> int:
+    return 1
+
+
+class Kept(Generic[T]):
+    """A cache with a size: the values used last, as many as fit; the very last is kept whatever its size.
+
+    Args:
+        limit: how much they may be together.
+        size_of: how much one is; left out, each is one.
+    """
+
+    def __init__(self, limit: int, size_of: Callable[[T], int] = _one) -> None:
+        self.limit = limit
+        self._size_of = size_of
+        self._values: OrderedDict[object, tuple[T, int]] = OrderedDict()  # with how much each is
+        self._size = 0
+
+    @property
+    def size(self) -> int:
+        """How much is kept."""
+        return self._size
+
+    def __contains__(self, key: object) -> bool:
+        return key in self._values
+
+    def get(self, key: object, make: Callable[[], T]) -> T:
+        """The value of a key, made when it is not here."""
+        if key not in self._values:
+            self._make_room(1)  # of values that are one each, the old and the new are never here together
+            self.put(key, make())
+        self._values.move_to_end(key)
+        return self._values[key][0]
+
+    def put(self, key: object, value: T) -> None:
+        """Keep a value."""
+        _, old = self._values.pop(key, (None, 0))
+        self._size -= old
+        size = self._size_of(value)
+        self._make_room(size)
+        self._values[key] = value, size
+        self._size += size
+
+    def _make_room(self, coming: int) -> None:
+        while self._values and self._size + coming > self.limit:
+            _, (_, size) = self._values.popitem(last=False)
+            self._size -= size
 
 
 class Answers:

@@ -14,11 +14,10 @@ import traceback
 from typing import Any
 
 from liftcore.errors import SplatliftError
-from service.faults import fault_of
-from service.own_stdout import own_stdout
+from service.child import fault_of, own_stdout
+from service.encoders import encoder_version
 from service.queries.answers import Answers, use_one_library_thread
-from service.queries.frames import Frame, read_frame, write_frame
-from service.settings import encoder_version
+from service.queries.client import Frame, read_frame, write_frame
 
 
 def reply_to(requests: list[dict[str, Any]], answers: Answers) -> Frame:

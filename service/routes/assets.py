@@ -2,37 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Callable
-from contextlib import ExitStack, asynccontextmanager
-from pathlib import Path as FilePath
-from typing import Annotated
+from collections.abc import Callable
+from functools import partial
+from typing import Annotated, Any, TypeVar
 
 import anyio
 from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.responses import JSONResponse
 
-from service import wire
-from service.content import FILE, StoredFile, file_answer
-from service.errors import DigestMismatch
-from service.parts import Here
-from service.store.assets import AssetRecord, CheckedUpload
-from service.store.files import DataDirectory
-from service.store.store import Store
-from service.uploads.checking import CheckLimits, check
-from service.uploads.decoding import coding_of
-from service.uploads.intake import Intake, require_size
+from service import models
+from service.content import FILE, Cursor, Limit, StoredFile, file_answer, listed
+from service.state import Deps
+from service.store.assets import AssetRecord
+from service.uploads.intake import CheckLimits, Intake, coding_of, require_size
 
+T = TypeVar("T")
 BATCH = 1 << 20  # bytes gathered before a thread writes them
 MAX_DIGITS = 20  # of a Content-Length: h11 takes no more
+SHOWN_CHARACTERS = 256 << 10  # of an asset's counts; of more the names are told apart, in pages
+NAMES = 1000  # a page of them, unless another number is asked for
 
 router = APIRouter(prefix="/assets", tags=["assets"])
 # By the name of the other routes' part: to OpenAPI, two templates that match the same paths are one path twice.
-Kind = Annotated[wire.AssetKind, Path(alias="asset", description="what it is")]
+Kind = Annotated[models.AssetKind, Path(alias="asset", description="what it is")]
 AssetId = Annotated[str, Path(description="sha256: and the digest of the bytes, in hex")]
 Sha256 = Annotated[
     str | None,
     Query(pattern="^[0-9a-fA-F]{64}$", description="of the content after decompression; checked if given"),
 ]
+NamesCursor = Annotated[int, Query(ge=0, le=10**9, description="the `next` of the page before")]
 RAW_BODY = {
     "requestBody": {
         "required": True,
@@ -44,33 +42,34 @@ RAW_BODY = {
 
 @router.put(
     "/{asset}",
-    response_model=wire.Asset,
+    response_model=models.Asset,
     status_code=201,
-    responses={200: {"model": wire.Asset, "description": "It was here already"}},
+    responses={200: {"model": models.Asset, "description": "It was here already"}},
     openapi_extra=RAW_BODY,
 )
-async def upload(kind: Kind, request: Request, here: Here, sha256: Sha256 = None) -> Response:
+async def upload(kind: Kind, request: Request, deps: Deps, sha256: Sha256 = None) -> Response:
     """Upload splats (PLY), cameras (JSON or a zip of a COLMAP model), a feature pack, masks or a text table."""
     coding = coding_of(", ".join(request.headers.getlist("content-encoding")))
-    limit = here.settings.max_upload_bytes(kind)
+    limit = deps.settings.max_upload_bytes(kind)
     require_size(kind, _announced(request), limit)  # before a byte of it is asked for with 100 Continue
-    here.store.files.require_room()
-    await anyio.to_thread.run_sync(here.store.assets.require_quota)
-    async with _workspace(here.store.files, kind) as (draft, scratch):
-        with Intake(draft, kind, limit=limit, coding=coding, permit=_permit(here.store)) as intake:
-            await _receive(request, intake)
-            digest = intake.finish()
-        if sha256 is not None and digest != sha256.lower():
-            raise DigestMismatch("sha256", expected=sha256, got=digest, hint="upload the file again")
-        known = await anyio.to_thread.run_sync(here.store.assets.find, f"sha256:{digest}")
-        if known is not None and known.kind is kind and known.whole:
+    intake = Intake(deps.store, kind, limit, coding)
+
+    async def write(step: Callable[..., T], *given: Any) -> T:
+        return await anyio.to_thread.run_sync(step, *given, limiter=deps.writing)
+
+    try:
+        await write(intake.open)
+        await _receive(request, partial(write, intake.feed))
+        known = await write(intake.finish, sha256)
+        if known is not None:
             return _reply(known, 200)
-        allowed = here.settings
-        limits = CheckLimits(scratch, allowed.check_seconds, allowed.check_memory_bytes, here.ending)
-        report = await anyio.to_thread.run_sync(check, kind, draft, limits, limiter=here.checks)
-        checked = CheckedUpload(draft, kind, digest, report.suffix, report.counts, report.warnings)
-        asset, new = await anyio.to_thread.run_sync(here.store.assets.add, checked)
-    return _reply(asset, 201 if new else 200)
+        allowed = CheckLimits(deps.settings.check_seconds, deps.settings.check_memory_bytes, deps.ending)
+        checked = await anyio.to_thread.run_sync(intake.check, allowed, limiter=deps.checks)
+        asset, new = await write(intake.keep, checked)
+        return _reply(asset, 201 if new else 200)
+    finally:
+        with anyio.CancelScope(shield=True):  # removing gigabytes takes its time
+            await write(intake.close)
 
 
 def _announced(request: Request) -> int:
@@ -79,73 +78,63 @@ def _announced(request: Request) -> int:
     return int(length[:MAX_DIGITS]) if length.isascii() and length.isdigit() else 0
 
 
-@asynccontextmanager
-async def _workspace(files: DataDirectory, kind: wire.AssetKind) -> AsyncIterator[tuple[FilePath, FilePath]]:
-    """A draft and a folder for one upload; both go in a thread, as removing gigabytes takes its time."""
-    stack = ExitStack()
-    try:
-        yield stack.enter_context(files.draft(f".{kind}")), stack.enter_context(files.scratch())
-    finally:
-        with anyio.CancelScope(shield=True):
-            await anyio.to_thread.run_sync(stack.close)
-
-
-def _permit(store: Store) -> Callable[[int, int], None]:
-    """Looks at the disk and the owner's quota while content comes: compressed, its end is not known before."""
-
-    def permit(whole: int, coming: int) -> None:
-        store.files.require_room(coming)
-        store.assets.require_quota(whole)
-
-    return permit
-
-
-async def _receive(request: Request, intake: Intake) -> None:
+async def _receive(request: Request, feed: Callable[[bytes], Any]) -> None:
     batch = bytearray()
     async for chunk in request.stream():
         batch += chunk
         if len(batch) >= BATCH:
-            await anyio.to_thread.run_sync(intake.feed, bytes(batch))
+            await feed(bytes(batch))
             batch.clear()
-    await anyio.to_thread.run_sync(intake.feed, bytes(batch))
+    await feed(bytes(batch))
 
 
-@router.get("", response_model=wire.Assets)
-def list_assets(here: Here) -> wire.Assets:
+@router.get("", response_model=models.Assets)
+def list_assets(deps: Deps, limit: Limit = None, cursor: Cursor = None) -> Response:
     """All assets, newest first. Lists of names and words are told with each asset alone."""
-    return wire.Assets(assets=[shape(asset) for asset in here.store.assets.all()])
+    return listed("assets", deps.store.assets.page, shape, limit=limit, cursor=cursor)
 
 
-@router.get("/{asset}", response_model=wire.Asset)
-def get_asset(asset: AssetId, here: Here) -> wire.Asset:
-    """One asset."""
-    return shape(here.store.assets.get(asset))
+@router.get("/{asset}", response_model=models.Asset)
+def get_asset(asset: AssetId, deps: Deps) -> Response:
+    """One asset. Where its names or words are very many, they are at ``links.names`` alone."""
+    found = shape(deps.store.assets.get(asset, most=SHOWN_CHARACTERS))
+    return Response(found.model_dump_json(), media_type="application/json")
+
+
+@router.get("/{asset}/names", response_model=models.Names)
+async def get_names(asset: AssetId, deps: Deps, limit: Limit = NAMES, cursor: NamesCursor = 0) -> models.Names:
+    """The names of views, or the words, that an asset holds, in pages."""
+    most = limit or NAMES
+    names = await anyio.to_thread.run_sync(deps.store.assets.names, asset, cursor, most + 1, limiter=deps.naming)
+    return models.Names(names=names[:most], next=cursor + most if len(names) > most else None)
 
 
 @router.get("/{asset}/content", response_class=Response, responses=FILE)
-def get_content(asset: AssetId, request: Request, here: Here) -> Response:
+def get_content(asset: AssetId, request: Request, deps: Deps) -> Response:
     """The bytes of an asset, or a range of them."""
-    found = here.store.assets.get(asset)
+    found = deps.store.assets.get(asset, most=0)
     digest = found.id.removeprefix("sha256:")
     return file_answer(request, StoredFile(found.path, found.bytes, digest, found.file_name))
 
 
 @router.delete("/{asset}", status_code=204)
-def delete_asset(asset: AssetId, here: Here) -> None:
+def delete_asset(asset: AssetId, deps: Deps) -> None:
     """Forget an asset that no job and no lift refers to."""
-    here.store.assets.delete(asset)
+    deps.store.assets.delete(asset)
 
 
-def shape(asset: AssetRecord) -> wire.Asset:
-    """An asset as the wire has it."""
-    return wire.Asset(
+def shape(asset: AssetRecord) -> models.Asset:
+    """An asset as clients get it."""
+    own = f"/assets/{asset.id}"
+    return models.Asset(
         id=asset.id,
         kind=asset.kind,
         bytes=asset.bytes,
         counts=asset.counts,
         warnings=asset.warnings,
         created=asset.created,
-        links={"self": f"/assets/{asset.id}", "content": f"/assets/{asset.id}/content"},
+        links={"self": own, "content": f"{own}/content"}
+        | ({} if asset.kind is models.AssetKind.SPLATS else {"names": f"{own}/names"}),
     )
 
 

@@ -11,11 +11,14 @@ from fastapi import APIRouter, Header, Query, Response
 from fastapi.responses import JSONResponse
 
 from liftcore.settings import LiftSettings
-from service import request_id, wire
-from service.faults import error_of
+from service import models
+from service.child import error_of
+from service.content import Cursor, Limit, listed
 from service.jobs.fit import check_fit, check_kernel, check_labels, scratch_bytes
-from service.parts import Here, Parts
+from service.observe import current_id
 from service.problems import problem_of
+from service.requests import described_body, json_body
+from service.state import AppState, Deps
 from service.store.events import Event, EventKind
 from service.store.jobs import JobOrder, JobRecord, fingerprint, labels_of
 
@@ -31,9 +34,9 @@ Key = Annotated[
 LastEvent = Annotated[
     int, Header(alias="Last-Event-ID", ge=0, le=2**53, description="the last event that the client has")
 ]
-RESULT_LINKS: dict[wire.JobKind, Callable[[str], dict[str, str]]] = {
-    wire.JobKind.LIFT: lambda job: {"lift": f"/lifts/{job}", "features": f"/lifts/{job}/features"},
-    wire.JobKind.TRADEOFF: lambda job: {"tradeoff": f"/tradeoffs/{job}", "chart": f"/tradeoffs/{job}/chart"},
+RESULT_LINKS: dict[models.JobKind, Callable[[str], dict[str, str]]] = {
+    models.JobKind.LIFT: lambda job: {"lift": f"/lifts/{job}", "features": f"/lifts/{job}/features"},
+    models.JobKind.TRADEOFF: lambda job: {"tradeoff": f"/tradeoffs/{job}", "chart": f"/tradeoffs/{job}/chart"},
 }
 EVENT = {
     "type": "object",
@@ -55,13 +58,23 @@ EVENTS: dict[int | str, dict[str, Any]] = {
 
 
 REPEATED: dict[int | str, dict[str, Any]] = {
-    200: {"model": wire.Job, "description": "The job that the same key made before"}
+    200: {"model": models.Job, "description": "The job that the same key made before"}
 }
 
 
-@router.post("/lift", response_model=wire.Job, status_code=202, responses=REPEATED)
-def submit(order: wire.LiftRequest, here: Here, key: Key = None) -> Response:
+LIFT_BODY = json_body(models.LiftRequest)
+
+
+@router.post(
+    "/lift", response_model=models.Job, status_code=202, responses=REPEATED,
+    openapi_extra=described_body(models.LiftRequest),
+)  # fmt: skip
+async def submit(deps: Deps, order: models.LiftRequest = LIFT_BODY, key: Key = None) -> Response:
     """Lift features onto splats. The job is on the disk before this answers."""
+    return await anyio.to_thread.run_sync(_submit, order, deps, key, limiter=deps.ordering)
+
+
+def _submit(order: models.LiftRequest, deps: AppState, key: str | None) -> Response:
     settings = LiftSettings.of_json(order.settings)
     wanted = JobOrder(
         splats=order.splats,
@@ -70,105 +83,105 @@ def submit(order: wire.LiftRequest, here: Here, key: Key = None) -> Response:
         settings=settings.model_dump(mode="json"),
         key=key,
         fingerprint=None if key is None else fingerprint(order.model_dump(mode="json")),
-        request_id=request_id.current(),
+        request_id=current_id(),
     )
-    return take(wanted, here)
+    return take(wanted, deps)
 
 
-@router.get("/jobs", response_model=wire.Jobs)
-def list_jobs(here: Here) -> wire.Jobs:
+@router.get("/jobs", response_model=models.Jobs)
+def list_jobs(deps: Deps, limit: Limit = None, cursor: Cursor = None) -> Response:
     """All jobs, newest first."""
-    return wire.Jobs(jobs=[shape(job) for job in here.store.jobs.all()])
+    return listed("jobs", deps.store.jobs.page, shape, limit=limit, cursor=cursor)
 
 
-@router.get("/jobs/{job}", response_model=wire.Job)
-def get_job(job: str, here: Here) -> wire.Job:
+@router.get("/jobs/{job}", response_model=models.Job)
+def get_job(job: str, deps: Deps) -> models.Job:
     """One job: its state, its progress, and what came of it."""
-    return shape(here.store.jobs.get(job))
+    return shape(deps.store.jobs.get(job))
 
 
 @router.get("/jobs/{job}/events", response_class=Response, responses=EVENTS)
-async def follow_job(job: str, here: Here, last_event: LastEvent = 0) -> Response:
+async def follow_job(job: str, deps: Deps, last_event: LastEvent = 0) -> Response:
     """What happens to a job, as it happens: its states, plan, latest progress and log. Ends after the last state."""
-    look = partial(here.store.events.after, job)
-    state = await anyio.to_thread.run_sync(here.store.attempts.state, job)
-    if not await anyio.to_thread.run_sync(look, last_event) and state in wire.ENDED:
+    look = partial(deps.store.events.after, job)
+    state = await anyio.to_thread.run_sync(deps.store.attempts.state, job)
+    if not await anyio.to_thread.run_sync(look, last_event) and state in models.ENDED:
         return Response(status_code=204)
-    return here.streams.answer(look, event_data, last_event)
+    return deps.streams.answer(look, event_data, last_event)
 
 
 @router.post(
     "/jobs/{job}/cancel",
-    response_model=wire.Job,
+    response_model=models.Job,
     status_code=202,
-    responses={200: {"model": wire.Job, "description": "It is canceled, and nothing of it runs any more"}},
+    responses={200: {"model": models.Job, "description": "It is canceled, and nothing of it runs any more"}},
 )
-def cancel_job(job: str, here: Here) -> Response:
+def cancel_job(job: str, deps: Deps) -> Response:
     """End a job. It is ``canceling`` until its processes are gone, then ``canceled``; asking twice does no harm."""
-    here.store.attempts.cancel(job)
-    found = here.store.jobs.get(job)
-    status = 200 if found.state is wire.JobState.CANCELED else 202
+    deps.store.attempts.cancel(job)
+    found = deps.store.jobs.get(job)
+    status = 200 if found.state is models.JobState.CANCELED else 202
     return JSONResponse(shape(found).model_dump(mode="json"), status, headers={"Location": f"/jobs/{job}"})
 
 
 @router.delete("/jobs/{job}", status_code=204)
 def delete_job(
     job: str,
-    here: Here,
+    deps: Deps,
     with_lift: Annotated[bool, Query(description="its lift goes too; without this a job with a lift stays")] = False,
     with_tradeoff: Annotated[bool, Query(description="its trade-off goes too, likewise")] = False,
 ) -> None:
     """Forget a job that has ended."""
-    said = {wire.JobKind.LIFT: with_lift, wire.JobKind.TRADEOFF: with_tradeoff}
-    here.store.jobs.delete(job, given_up=[kind for kind, gone in said.items() if gone])
+    said = {models.JobKind.LIFT: with_lift, models.JobKind.TRADEOFF: with_tradeoff}
+    deps.store.jobs.delete(job, given_up=[kind for kind, gone in said.items() if gone])
 
 
-def take(order: JobOrder, here: Parts) -> Response:
+def take(order: JobOrder, deps: AppState) -> Response:
     """The answer to an order: the job that it makes, or made before."""
-    job, new = here.store.jobs.repeated(order), False
+    job, new = deps.store.jobs.repeated(order), False
     if job is None:
-        require_fit(order, here)
-        here.devices.require(order.settings.get("device", "auto"))
-        job, new = here.store.jobs.submit(order, max_queued=here.settings.max_queued)
-        here.runner.wake()
-    shaped = shape(here.store.jobs.get(job)).model_dump(mode="json")
+        require_fit(order, deps)
+        deps.devices.require(order.settings.get("device", "auto"))
+        job, new = deps.store.jobs.submit(order, max_queued=deps.settings.max_queued)
+        deps.runner.wake()
+    shaped = shape(deps.store.jobs.get(job)).model_dump(mode="json")
     return JSONResponse(shaped, 202 if new else 200, headers={"Location": f"/jobs/{job}"})
 
 
-def require_fit(order: JobOrder, here: Parts) -> None:
+def require_fit(order: JobOrder, deps: AppState) -> None:
     """Refuse an order that cannot be lifted, or that there is no room for."""
-    cameras = here.store.assets.get(order.cameras, wire.AssetKind.CAMERAS)
-    packs = [here.store.assets.get(pack, wire.AssetKind.FEATURES) for pack in order.features]
-    splats = here.store.assets.get(order.splats, wire.AssetKind.SPLATS)
+    cameras = deps.store.assets.get(order.cameras, models.AssetKind.CAMERAS)
+    packs = [deps.store.assets.get(pack, models.AssetKind.FEATURES) for pack in order.features]
+    splats = deps.store.assets.get(order.splats, models.AssetKind.SPLATS)
     check_kernel(splats, order.settings)
     check_fit(cameras, packs)
-    judges = [here.store.assets.get(*named) for named in labels_of(order.parameters)]
+    judges = [deps.store.assets.get(*named) for named in labels_of(order.parameters)]
     if judges:
         check_labels(order, cameras, packs, *judges)
-    here.store.files.require_room(scratch_bytes(order.kind, splats, packs))
+    deps.store.files.require_room(scratch_bytes(order.kind, splats, packs))
 
 
 def event_data(event: Event) -> str:
-    """An event's data as the wire has it."""
+    """An event's data as clients get it."""
     if event.kind is EventKind.PROGRESS:
-        return wire.Progress.model_validate(event.data).model_dump_json()
+        return models.Progress.model_validate(event.data).model_dump_json()
     if event.kind is EventKind.PLAN:
-        return wire.Plan.model_validate(event.data).model_dump_json()
+        return models.Plan.model_validate(event.data).model_dump_json()
     if event.kind is EventKind.LOG:
-        return wire.LogLine.model_validate(event.data).model_dump_json()
+        return models.LogLine.model_validate(event.data).model_dump_json()
     problem = event.data["problem"]
     told = None if problem is None else problem_of(error_of(problem))
-    return wire.JobStep(state=event.data["state"], attempt=event.data["attempt"], problem=told).model_dump_json()
+    return models.JobStep(state=event.data["state"], attempt=event.data["attempt"], problem=told).model_dump_json()
 
 
-def shape(job: JobRecord) -> wire.Job:
-    """A job as the wire has it."""
+def shape(job: JobRecord) -> models.Job:
+    """A job as clients get it."""
     links = {"self": f"/jobs/{job.id}", "events": f"/jobs/{job.id}/events"}
-    if job.state not in wire.ENDED:
+    if job.state not in models.ENDED:
         links["cancel"] = f"/jobs/{job.id}/cancel"
-    if job.state is wire.JobState.SUCCEEDED:
+    if job.state is models.JobState.SUCCEEDED:
         links |= RESULT_LINKS[job.kind](job.id)
-    return wire.Job(
+    return models.Job(
         id=job.id,
         kind=job.kind,
         state=job.state,
@@ -178,8 +191,8 @@ def shape(job: JobRecord) -> wire.Job:
         features=list(job.features),
         settings=job.settings,
         parameters=job.parameters,
-        plan=None if job.plan is None else wire.Plan.model_validate(job.plan),
-        progress=None if job.progress is None else wire.Progress.model_validate(job.progress),
+        plan=None if job.plan is None else models.Plan.model_validate(job.plan),
+        progress=None if job.progress is None else models.Progress.model_validate(job.progress),
         problem=None if job.problem is None else problem_of(error_of(job.problem)),
         created=job.created,
         started=job.started,

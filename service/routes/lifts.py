@@ -4,37 +4,37 @@ from __future__ import annotations
 
 from fastapi import APIRouter, Request, Response
 
-from service import wire
-from service.content import FILE, StoredFile, file_answer
-from service.parts import Here
+from service import models
+from service.content import FILE, Cursor, Limit, StoredFile, file_answer, listed
+from service.state import Deps
 from service.store.lifts import LiftRecord
 
 router = APIRouter(prefix="/lifts", tags=["lifts"])
 
 
-@router.get("", response_model=wire.Lifts)
-def list_lifts(here: Here) -> wire.Lifts:
+@router.get("", response_model=models.Lifts)
+def list_lifts(deps: Deps, limit: Limit = None, cursor: Cursor = None) -> Response:
     """All lifts, newest first."""
-    return wire.Lifts(lifts=[shape(lift) for lift in here.store.lifts.all()])
+    return listed("lifts", deps.store.lifts.page, shape, limit=limit, cursor=cursor)
 
 
-@router.get("/{lift}", response_model=wire.LiftResult)
-def get_lift(lift: str, here: Here) -> wire.LiftResult:
+@router.get("/{lift}", response_model=models.LiftResult)
+def get_lift(lift: str, deps: Deps) -> models.LiftResult:
     """One lift: its settings, certificate and timings."""
-    return shape(here.store.lifts.get(lift))
+    return shape(deps.store.lifts.get(lift))
 
 
 @router.get("/{lift}/features", response_class=Response, responses=FILE)
-def get_features(lift: str, request: Request, here: Here) -> Response:
+def get_features(lift: str, request: Request, deps: Deps) -> Response:
     """The lift file (safetensors), or a range of it."""
-    found = here.store.lifts.get(lift)
+    found = deps.store.lifts.get(lift)
     return file_answer(request, StoredFile(found.path, found.bytes, found.sha256, f"lift-{found.id}.safetensors"))
 
 
-def shape(lift: LiftRecord) -> wire.LiftResult:
-    """A lift as the wire has it; paths of this machine stay here."""
+def shape(lift: LiftRecord) -> models.LiftResult:
+    """A lift as clients get it; paths of this machine stay deps."""
     metadata = lift.metadata
-    return wire.LiftResult(
+    return models.LiftResult(
         id=lift.id,
         bytes=lift.bytes,
         sha256=lift.sha256,

@@ -2,125 +2,135 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from typing import Annotated, Any, Literal
+from urllib.parse import urlencode
 
 from fastapi import APIRouter, Query, Request, Response
 
-from service import wire
-from service.content import TAGGED, draft_answer, tagged, unchanged
+from liftcore import __version__
+from service import models
+from service.content import TAGGED, Draft, tagged, unchanged
+from service.encoders import encoder_file, encoder_label, encoder_spec, encoder_version
 from service.errors import InvalidRequest
-from service.parts import Here, Parts
-from service.routes.question import answer_links, entity_tag, find_lift, query_request, scene_request, shown
-from service.settings import encoder_label
+from service.requests import described_body, json_body
+from service.state import AppState, Deps
+from service.store.assets import kernel_of
 from service.store.lifts import LiftRecord
 
 router = APIRouter(tags=["queries"])
 
-PNG: dict[int | str, dict[str, Any]] = {
-    200: {"content": {"image/png": {"schema": {"type": "string", "format": "binary"}}}}
-}
-NPY: dict[int | str, dict[str, Any]] = {
-    200: {"content": {"application/x-npy": {"schema": {"type": "string", "format": "binary"}}}}
-}
-PLY: dict[int | str, dict[str, Any]] = {
-    200: {"content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}}
-}
+Question = models.Asked | models.AskedInBody
+QUERY_BODY = json_body(models.AskedInBody)
+BODY = described_body(models.AskedInBody)
+REGION = "region:"  # what needs the lift's feature packs begins with it
 MEDIA_TYPES = {"scores": "application/x-npy", "mask": "image/png", "attention": "image/png", "render": "image/png"}
 
+
+def bytes_of(media_type: str) -> dict[int | str, dict[str, Any]]:
+    """What OpenAPI tells of an answer that is a file."""
+    return {200: {"content": {media_type: {"schema": {"type": "string", "format": "binary"}}}}}
+
+
+PNG, NPY, PLY = bytes_of("image/png"), bytes_of("application/x-npy"), bytes_of("application/octet-stream")
+
 LiftParameter = Annotated[
-    str | None, Query(pattern=wire.JOB_ID, description="the lift; may be left out when there is exactly one")
+    str | None, Query(pattern=models.JOB_ID, description="the lift; may be left out when there is exactly one")
 ]
-View = Annotated[str, Query(min_length=1, max_length=wire.VIEW_CHARACTERS, description="the name of a camera")]
+View = Annotated[str, Query(min_length=1, max_length=models.VIEW_CHARACTERS, description="the name of a camera")]
 
 
-@router.get("/query", response_model=wire.QueryAnswer)
-def query(asked: Annotated[wire.AskedWhere, Query()], here: Here) -> wire.QueryAnswer:
+@router.get("/query", response_model=models.QueryAnswer)
+def query(asked: Annotated[models.AskedWhere, Query()], deps: Deps) -> models.QueryAnswer:
     """Where it is: scores in numbers, the best splats, a box, and links to objects, splats and pictures."""
-    return _answer(asked, here)
+    return _answer(asked, deps)
 
 
-@router.post("/query", response_model=wire.QueryAnswer)
-def query_by_body(asked: wire.AskedInBody, here: Here) -> wire.QueryAnswer:
+@router.post("/query", response_model=models.QueryAnswer, openapi_extra=BODY)
+def query_by_body(deps: Deps, asked: models.AskedInBody = QUERY_BODY) -> models.QueryAnswer:
     """The same for a query in a body, where examples may be vectors. POST the same body to the links of those."""
-    return _answer(asked, here)
+    return _answer(asked, deps)
 
 
-@router.get("/query/objects", response_model=wire.ObjectsAnswer)
-def objects(asked: Annotated[wire.Asked, Query()], here: Here) -> wire.ObjectsAnswer:
+@router.get("/query/objects", response_model=models.ObjectsAnswer)
+def objects(asked: Annotated[models.Asked, Query()], deps: Deps) -> models.ObjectsAnswer:
     """The things that were found, splats that touch one another: where each lies, and how large it is."""
-    return _objects(asked, here)
+    return _objects(asked, deps)
 
 
-@router.post("/query/objects", response_model=wire.ObjectsAnswer)
-def objects_by_body(asked: wire.AskedInBody, here: Here) -> wire.ObjectsAnswer:
+@router.post("/query/objects", response_model=models.ObjectsAnswer, openapi_extra=BODY)
+def objects_by_body(deps: Deps, asked: models.AskedInBody = QUERY_BODY) -> models.ObjectsAnswer:
     """The things that were found, for a query in a body."""
-    return _objects(asked, here)
+    return _objects(asked, deps)
 
 
 @router.get("/query/scores", responses=NPY | TAGGED, response_class=Response)
-def scores(asked: Annotated[wire.Asked, Query()], request: Request, here: Here) -> Response:
+def scores(asked: Annotated[models.Asked, Query()], request: Request, deps: Deps) -> Response:
     """The score of every splat: .npy, float32 [P]."""
-    lift = find_lift(asked.lift, here)
-    return _entity(request, here, query_request("scores", asked, lift, here), lift)
+    lift = _find_lift(asked.lift, deps)
+    return _entity(request, deps, query_request("scores", asked, lift, deps), lift)
 
 
 @router.get("/query/mask", responses=PNG | TAGGED, response_class=Response)
-def mask(asked: Annotated[wire.AskedInView, Query()], request: Request, here: Here) -> Response:
+def mask(asked: Annotated[models.AskedInView, Query()], request: Request, deps: Deps) -> Response:
     """Where it is in a view: a PNG, white where it is."""
-    lift = find_lift(asked.lift, here)
-    return _entity(request, here, query_request("mask", asked, lift, here) | {"view": asked.view}, lift)
+    lift = _find_lift(asked.lift, deps)
+    return _entity(request, deps, query_request("mask", asked, lift, deps) | {"view": asked.view}, lift)
 
 
 @router.get("/query/attention", responses=PNG | TAGGED, response_class=Response)
-def attention(asked: Annotated[wire.AskedInView, Query()], request: Request, here: Here) -> Response:
+def attention(asked: Annotated[models.AskedInView, Query()], request: Request, deps: Deps) -> Response:
     """How well each pixel of a view answers to it: a PNG."""
-    lift = find_lift(asked.lift, here)
-    return _entity(request, here, query_request("attention", asked, lift, here) | {"view": asked.view}, lift)
+    lift = _find_lift(asked.lift, deps)
+    return _entity(request, deps, query_request("attention", asked, lift, deps) | {"view": asked.view}, lift)
 
 
 @router.get("/query/splats", responses=PLY | TAGGED, response_class=Response)
-def splats(asked: Annotated[wire.AskedForSplats, Query()], request: Request, here: Here) -> Response:
+def splats(asked: Annotated[models.AskedForSplats, Query()], request: Request, deps: Deps) -> Response:
     """What was found, or the scene in the colours of its scores, as splats: a PLY of the dialect that was lifted."""
-    lift = find_lift(asked.lift, here)
-    wanted = query_request("splats", asked, lift, here) | {"what": asked.what}
-    etag = entity_tag(wanted, lift)
-    return unchanged(request, etag, found=False) or _splat_file(here, wanted, lift, etag)
+    lift = _find_lift(asked.lift, deps)
+    wanted = query_request("splats", asked, lift, deps) | {"what": asked.what}
+    etag = _entity_tag(wanted, lift)
+    return unchanged(request, etag, found=False) or _splat_file(deps, wanted, lift, etag)
 
 
-@router.post("/query/scores", responses=NPY, response_class=Response)
-def scores_by_body(asked: wire.AskedInBody, here: Here) -> Response:
+@router.post("/query/scores", responses=NPY, response_class=Response, openapi_extra=BODY)
+def scores_by_body(deps: Deps, asked: models.AskedInBody = QUERY_BODY) -> Response:
     """The score of every splat, for a query in a body."""
-    return _content(here, query_request("scores", asked, find_lift(asked.lift, here), here))
+    return _content(deps, query_request("scores", asked, _find_lift(asked.lift, deps), deps))
 
 
-@router.post("/query/mask", responses=PNG, response_class=Response)
-def mask_by_body(asked: wire.AskedInBody, here: Here) -> Response:
+@router.post("/query/mask", responses=PNG, response_class=Response, openapi_extra=BODY)
+def mask_by_body(deps: Deps, asked: models.AskedInBody = QUERY_BODY) -> Response:
     """Where it is in a view, for a query in a body with a view."""
-    lift = find_lift(asked.lift, here)
-    return _content(here, query_request("mask", asked, lift, here) | {"view": _view(asked)})
+    lift = _find_lift(asked.lift, deps)
+    return _content(deps, query_request("mask", asked, lift, deps) | {"view": _view(asked)})
 
 
-@router.post("/query/attention", responses=PNG, response_class=Response)
-def attention_by_body(asked: wire.AskedInBody, here: Here) -> Response:
+@router.post("/query/attention", responses=PNG, response_class=Response, openapi_extra=BODY)
+def attention_by_body(deps: Deps, asked: models.AskedInBody = QUERY_BODY) -> Response:
     """How well each pixel of a view answers to it, for a query in a body with a view."""
-    lift = find_lift(asked.lift, here)
-    return _content(here, query_request("attention", asked, lift, here) | {"view": _view(asked)})
+    lift = _find_lift(asked.lift, deps)
+    return _content(deps, query_request("attention", asked, lift, deps) | {"view": _view(asked)})
 
 
-@router.post("/query/splats", responses=PLY, response_class=Response)
+@router.post("/query/splats", responses=PLY, response_class=Response, openapi_extra=BODY)
 def splats_by_body(
-    asked: wire.AskedInBody, here: Here, what: Annotated[wire.SplatsOf, Query(description=wire.SPLATS_OF)] = "object"
+    deps: Deps,
+    asked: models.AskedInBody = QUERY_BODY,
+    what: Annotated[models.SplatsOf, Query(description=models.SPLATS_OF)] = "object",
 ) -> Response:
     """What was found, or the scene in the colours of its scores, as splats, for a query in a body."""
-    lift = find_lift(asked.lift, here)
-    return _splat_file(here, query_request("splats", asked, lift, here) | {"what": what}, lift)
+    lift = _find_lift(asked.lift, deps)
+    return _splat_file(deps, query_request("splats", asked, lift, deps) | {"what": what}, lift)
 
 
 @router.get("/render", responses=PNG | TAGGED, response_class=Response)
 def render(
     view: View,
     request: Request,
-    here: Here,
+    deps: Deps,
     lift: LiftParameter = None,
     what: Annotated[
         Literal["rgb", "depth", "pca", "cluster"],
@@ -132,34 +142,34 @@ def render(
     Depths are grey, near bright. The PNG's texts `depth-near` and `depth-far` tell the depths of its levels 255 and
     1, in scene units, with even steps between; what lies beyond has these levels too. 0 is where no splat is.
     """
-    found = find_lift(lift, here)
-    return _entity(request, here, scene_request("render", found, here) | {"view": view, "what": what}, found)
+    found = _find_lift(lift, deps)
+    return _entity(request, deps, _scene_request("render", found, deps) | {"view": view, "what": what}, found)
 
 
-def _answer(asked: wire.AskedWhere | wire.AskedInBody, here: Parts) -> wire.QueryAnswer:
-    lift = find_lift(asked.lift, here)
-    request = query_request("query", asked, lift, here) | {"view": asked.view, "top": asked.top}
-    found = here.queries.call(request).header
+def _answer(asked: models.AskedWhere | models.AskedInBody, deps: AppState) -> models.QueryAnswer:
+    lift = _find_lift(asked.lift, deps)
+    request = query_request("query", asked, lift, deps) | {"view": asked.view, "top": asked.top}
+    found = deps.queries.call(request).header
     view = asked.view or next(iter(lift.metadata["views"]), None)
-    return wire.QueryAnswer(
+    return models.QueryAnswer(
         text=asked.text,
-        like=[shown(example) for example in asked.like],
+        like=[_shown(example) for example in asked.like],
         lift=lift.id,
         view=view,
         text_space=lift.metadata["text_space"],
         encoder=None if request["encoder"] is None else encoder_label(request["encoder"]),
-        links=answer_links(asked, lift, view, found=found["count"] > 0),
+        links=_answer_links(asked, lift, view, found=found["count"] > 0),
         **found,
     )
 
 
-def _objects(asked: wire.Asked | wire.AskedInBody, here: Parts) -> wire.ObjectsAnswer:
-    lift = find_lift(asked.lift, here)
-    found = here.queries.call(query_request("objects", asked, lift, here)).header
-    return wire.ObjectsAnswer(lift=lift.id, **found)
+def _objects(asked: models.Asked | models.AskedInBody, deps: AppState) -> models.ObjectsAnswer:
+    lift = _find_lift(asked.lift, deps)
+    found = deps.queries.call(query_request("objects", asked, lift, deps)).header
+    return models.ObjectsAnswer(lift=lift.id, **found)
 
 
-def _view(asked: wire.AskedInBody) -> str:
+def _view(asked: models.AskedInBody) -> str:
     if asked.view is None:
         raise InvalidRequest(
             "view", expected="the name of a camera", got="nothing", hint="in the body of the request"
@@ -167,23 +177,110 @@ def _view(asked: wire.AskedInBody) -> str:
     return asked.view
 
 
-def _entity(request: Request, here: Parts, asked: dict[str, Any], lift: LiftRecord) -> Response:
-    etag = entity_tag(asked, lift)
+def _entity(request: Request, deps: AppState, asked: dict[str, Any], lift: LiftRecord) -> Response:
+    etag = _entity_tag(asked, lift)
     same = unchanged(request, etag, found=False)  # the tag is made before anybody looks for the view
     if same is not None:
         return same
-    content = here.queries.call(asked).body
+    content = deps.queries.call(asked).body
     return unchanged(request, etag) or tagged(content, MEDIA_TYPES[asked["operation"]], etag)
 
 
-def _splat_file(here: Parts, asked: dict[str, Any], lift: LiftRecord, etag: str | None = None) -> Response:
-    """The query process writes a draft, as a scene is more than a pipe should carry or this process should hold."""
-    files = here.store.files
-    files.require_room(here.store.assets.get(lift.splats).bytes)
+def _splat_file(deps: AppState, asked: dict[str, Any], lift: LiftRecord, etag: str | None = None) -> Response:
+    """The query process writes a draft, as a scene is more than a pipe should carry."""
+    files = deps.store.files
+    files.require_room(deps.store.assets.get(lift.splats).bytes)
     with files.draft(".ply") as draft:
-        here.queries.call(asked | {"draft": str(draft)})
-        return draft_answer(draft, filename=f"{asked['what']}-{lift.id}.ply", etag=etag)
+        deps.queries.call(asked | {"draft": str(draft)})
+        return Draft(draft, filename=f"{asked['what']}-{lift.id}.ply", etag=etag)
 
 
-def _content(here: Parts, asked: dict[str, Any]) -> Response:
-    return Response(here.queries.call(asked).body, media_type=MEDIA_TYPES[asked["operation"]])
+def _content(deps: AppState, asked: dict[str, Any]) -> Response:
+    return Response(deps.queries.call(asked).body, media_type=MEDIA_TYPES[asked["operation"]])
+
+
+def _find_lift(lift: str | None, deps: AppState) -> LiftRecord:
+    """The lift that is meant; left out, the only one."""
+    return deps.store.lifts.only() if lift is None else deps.store.lifts.get(lift)
+
+
+def _scene_request(operation: str, lift: LiftRecord, deps: AppState) -> dict[str, Any]:
+    """What the query process must know of a lift's files; ``names`` says what the client calls them."""
+    job = deps.store.jobs.get(lift.id)
+    splats, cameras = deps.store.assets.get(job.splats), deps.store.assets.get(job.cameras)
+    return {
+        "operation": operation,
+        "lift": str(lift.path),
+        "splats": str(splats.path),
+        "cameras": str(cameras.path),
+        "kernel": kernel_of(splats, lift.metadata["settings"]),
+        "names": {
+            str(lift.path): f"lift {lift.id}",
+            str(splats.path): f"splats {splats.id}",
+            str(cameras.path): f"cameras {cameras.id}",
+        },
+    }
+
+
+def query_request(operation: str, asked: Question, lift: LiftRecord, deps: AppState) -> dict[str, Any]:
+    """The same with a query; texts bring their encoder, and examples of regions the lift's feature packs."""
+    request = _scene_request(operation, lift, deps)
+    spec = None
+    if asked.text or asked.negatives:
+        spec = encoder_spec(deps.settings, lift.metadata["text_space"], asked.encoder)
+        file = encoder_file(spec)
+        request["names"] |= {} if file is None else {str(file): "the encoder's file"}
+    if any(isinstance(example, str) and example.startswith(REGION) for example in (*asked.like, *asked.unlike)):
+        packs = [deps.store.assets.get(asset) for asset in deps.store.jobs.get(lift.id).features]
+        request["features"] = [str(pack.path) for pack in packs]
+        request["names"] |= {str(pack.path): f"features {pack.id}" for pack in packs}
+    terms = ("text", "negatives", "like", "unlike", "threshold", "instances", "keep")
+    return request | {
+        "encoder": spec,
+        "encoder_version": None if spec is None else encoder_version(spec),
+        "query": {name: getattr(asked, name) for name in terms},
+    }
+
+
+def _entity_tag(asked: dict[str, Any], lift: LiftRecord) -> str:
+    """The tag of an answer, from all that decides it: so 304 costs no query."""
+    decides = {name: value for name, value in asked.items() if name != "names"}
+    decides["lift"] = lift.sha256
+    decides["version"] = __version__
+    return f'"{hashlib.sha256(json.dumps(decides, sort_keys=True).encode()).hexdigest()}"'
+
+
+def _answer_links(asked: Question, lift: LiftRecord, view: str | None, *, found: bool) -> dict[str, str]:
+    """The URLs of other looks at the same query; vectors do not fit in one, and are sent there again.
+
+    Where nothing was ``found`` there are no objects.
+    """
+    links = {"lift": f"/lifts/{lift.id}", "scores": _link("/query/scores", asked, lift=lift.id)}
+    if found:
+        links["objects"] = _link("/query/objects", asked, lift=lift.id)
+        links["object"] = _link("/query/splats?what=object", asked, lift=lift.id)
+    links["coloured"] = _link("/query/splats?what=scores", asked, lift=lift.id)
+    if view is not None:
+        links["mask"] = _link("/query/mask", asked, lift=lift.id, view=view)
+        links["attention"] = _link("/query/attention", asked, lift=lift.id, view=view)
+        links["render"] = f"/render?{urlencode({'lift': lift.id, 'view': view})}"
+    return links
+
+
+def _shown(example: str | list[float]) -> str:
+    """An example as an answer names it."""
+    return example if isinstance(example, str) else f"a vector of {len(example)} channels"
+
+
+def _link(path: str, asked: Question, **more: str) -> str:
+    pairs: list[tuple[str, str]] = []
+    for name in ("text", "like", "negatives", "unlike"):
+        values = getattr(asked, name)
+        if not all(isinstance(value, str) for value in values):
+            return path
+        pairs += [(name, value) for value in values]
+    pairs.append(("threshold", str(asked.threshold)))
+    pairs += [("instances", str(asked.instances))] if asked.instances is not None else []
+    pairs += [("keep", asked.keep)] if asked.keep != "all" else []
+    pairs += [("encoder", asked.encoder)] if asked.encoder is not None else []
+    return f"{path}{'&' if '?' in path else '?'}{urlencode(pairs + list(more.items()))}"

@@ -20,13 +20,13 @@ from safetensors import SafetensorError, safe_open
 from liftcore.cli import build_parser
 from liftcore.errors import InvalidLift, NotFound, SplatliftError
 from service.__main__ import parse
+from service.models import JOB_ID, AssetKind
 from service.settings import ServiceSettings
 from service.store.assets import CheckedUpload
 from service.store.jobs import JobOrder
 from service.store.lifts import FinishedLift
 from service.store.store import DATABASE, Store
-from service.uploads.checking import CheckLimits, check
-from service.wire import JOB_ID, AssetKind
+from service.uploads.intake import CheckLimits, check
 
 LOST = (
     "what the database alone held is not made again: keys, owners (what was added is of admins alone), trade-offs,"
@@ -92,8 +92,8 @@ def _add_asset(store: Store, settings: ServiceSettings, path: Path) -> AssetKind
         raise NotFound("asset", expected="a file named after its sha256", got=f"one whose sha256 is {digest}")
     kind = _kind_of(path)
     with store.files.scratch() as scratch:
-        limits = CheckLimits(scratch, settings.check_seconds, settings.check_memory_bytes, threading.Event())
-        report = check(kind, path, limits)
+        limits = CheckLimits(settings.check_seconds, settings.check_memory_bytes, threading.Event())
+        report = check(kind, path, scratch, limits)
     # The file is its own draft: it stays where it is.
     store.assets.add(CheckedUpload(path, kind, digest, path.suffix, report.counts, report.warnings))
     return kind

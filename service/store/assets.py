@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sqlite3
+import sys
 import threading
 import time
 from collections.abc import Mapping
@@ -14,10 +15,11 @@ from typing import Any
 
 from liftcore.errors import NotFound
 from service.errors import InUse
+from service.models import AssetKind
 from service.store.database import Database
 from service.store.files import DataDirectory, is_whole
 from service.store.owners import SEEN, Owned, require_quota
-from service.wire import AssetKind
+from service.store.pages import Page, after, page_of
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,9 @@ VISIBLE = (
     "SELECT id, kind, bytes, file, counts, warnings, min(created) AS created"
     f" FROM assets JOIN asset_owners ON asset = id WHERE {SEEN}"
 )
-IN_BRIEF = VISIBLE.replace("counts", "json_remove(counts, '$.names', '$.words') AS counts")
+IN_BRIEF = VISIBLE.replace("counts", "brief AS counts")
+SHOWN = VISIBLE.replace("counts", "CASE WHEN counts_bytes <= :most THEN counts ELSE brief END AS counts")
+LONG = ("names", "words")  # of counts: what there may be a hundred thousand of
 
 
 class AssetStore(Owned):
@@ -104,16 +108,19 @@ class AssetStore(Owned):
         """The bytes and the row; both may be there, and then the bytes are replaced by equal ones."""
         row = connection.execute("SELECT file FROM assets WHERE id = ?", (asset,)).fetchone()
         path = self._files.blob(upload.sha256, upload.suffix) if row is None else self._files.root / row["file"]
-        size = upload.draft.stat().st_size
+        size, counts = upload.draft.stat().st_size, json.dumps(upload.counts)
         self._files.publish(upload.draft, path)
         connection.execute(
-            "INSERT OR IGNORE INTO assets (id, kind, bytes, file, counts, warnings) VALUES (?,?,?,?,?,?)",
+            "INSERT OR IGNORE INTO assets (id, kind, bytes, file, counts, brief, counts_bytes, warnings)"
+            " VALUES (?,?,?,?,?,?,?,?)",
             (
                 asset,
                 upload.kind,
                 size,
                 self._files.relative(path),
-                json.dumps(upload.counts),
+                counts,
+                json.dumps({name: value for name, value in upload.counts.items() if name not in LONG}),
+                len(counts),
                 json.dumps(upload.warnings),
             ),
         )
@@ -127,21 +134,32 @@ class AssetStore(Owned):
         with self._database.read() as connection:
             require_quota(connection, self._owner, coming)
 
-    def find(self, asset: str) -> AssetRecord | None:
-        """The asset of that id, None when there is none."""
+    def find(self, asset: str, *, most: int = sys.maxsize) -> AssetRecord | None:
+        """The asset of that id, None when there is none; without names and words if all counts are above ``most``
+        characters."""
         with self._database.read() as connection:
             row = connection.execute(
-                f"{VISIBLE} AND id = :asset GROUP BY id", self._owner.terms(asset=asset)
+                f"{SHOWN} AND id = :asset GROUP BY id", self._owner.terms(asset=asset, most=most)
             ).fetchone()
         return None if row is None else self._record(row)
 
-    def get(self, asset: str, kind: AssetKind | None = None) -> AssetRecord:
-        """The asset of that id.
+    def names(self, asset: str, first: int, limit: int) -> list[str]:
+        """So many of the names, or words, that an asset holds, from the one of that number on."""
+        with self._database.read() as connection:
+            rows = connection.execute(
+                "SELECT value FROM assets, json_each(counts, iif(json_type(counts, '$.words') IS NULL, '$.names',"
+                " '$.words')) WHERE assets.id = ? LIMIT ? OFFSET ?",
+                (self.get(asset, most=0).id, limit, first),
+            ).fetchall()
+        return [row["value"] for row in rows]
+
+    def get(self, asset: str, kind: AssetKind | None = None, *, most: int = sys.maxsize) -> AssetRecord:
+        """The asset of that id, as `find` has it.
 
         Raises:
             NotFound: there is none, or it is of another kind.
         """
-        found = self.find(asset)
+        found = self.find(asset, most=most)
         name = f"{kind or 'asset'}"
         if found is None:
             raise NotFound(name, expected="the id of an asset that is here", got=asset, hint="PUT /assets/... first")
@@ -149,13 +167,20 @@ class AssetStore(Owned):
             raise NotFound(name, expected=f"an asset of kind {kind}", got=f"{asset}, which is of kind {found.kind}")
         return found
 
-    def all(self) -> list[AssetRecord]:
-        """Every asset, newest first, without the names and words that it holds."""
+    def page(self, limit: int, cursor: str | None = None) -> Page[AssetRecord]:
+        """So many assets after a cursor, newest first, without the names and words that they hold."""
+        terms = self._owner.terms(most=limit + 1, **after(cursor))
         with self._database.read() as connection:
             rows = connection.execute(
-                f"{IN_BRIEF} GROUP BY id ORDER BY min(created) DESC, id", self._owner.terms()
+                f"{IN_BRIEF} GROUP BY id HAVING min(created) < :created OR (min(created) = :created AND id > :after)"
+                " ORDER BY min(created) DESC, id LIMIT :most",
+                terms,
             ).fetchall()
-        return [self._record(row) for row in rows]
+        return page_of(rows, limit, self._record)
+
+    def all(self) -> list[AssetRecord]:
+        """Every asset, newest first, without the names and words that it holds."""
+        return self.page(sys.maxsize - 1).records
 
     def delete(self, asset: str) -> None:
         """Take an asset from its owner, or from everybody when it is an admin who asks. Its bytes go with the last.

@@ -13,13 +13,13 @@ from collections.abc import Mapping
 from typing import Any
 
 from liftcore.errors import SplatliftError
+from service.child import fault_of
 from service.errors import Conflict, Crashed
-from service.faults import fault_of
+from service.models import ENDED, JobState
 from service.store.database import Database
 from service.store.events import EventKind, log_line, note
 from service.store.jobs import JobRecord, find, record, row_of
 from service.store.owners import Owned
-from service.wire import ENDED, JobState
 
 MAX_ATTEMPTS = 3
 

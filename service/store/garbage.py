@@ -8,9 +8,9 @@ import threading
 import time
 from pathlib import Path
 
+from service.models import ENDED
 from service.store.files import DataDirectory
 from service.store.store import Store
-from service.wire import ENDED
 
 log = logging.getLogger(__name__)
 

@@ -6,6 +6,7 @@ import hashlib
 import json
 import secrets
 import sqlite3
+import sys
 import time
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
@@ -13,12 +14,13 @@ from typing import Any
 
 from liftcore.errors import NotFound
 from service.errors import Busy, Conflict, KeyReused
+from service.models import ENDED, AssetKind, JobKind, JobState
 from service.store.assets import own
 from service.store.database import Database
 from service.store.events import EventKind, note
 from service.store.files import DataDirectory
 from service.store.owners import QUEUE_RETRY_SECONDS, SEEN, Owned, Owner, require_quota, require_turn
-from service.wire import ENDED, AssetKind, JobKind, JobState
+from service.store.pages import Page, after, page_of
 
 RESULTS = {JobKind.LIFT: "lifts", JobKind.TRADEOFF: "tradeoffs"}  # the tables of what jobs make, by their ids
 
@@ -157,13 +159,20 @@ class JobStore(Owned):
             rows = connection.execute("SELECT state, count(*) FROM jobs GROUP BY state").fetchall()
         return {JobState(state): count for state, count in rows}
 
-    def all(self) -> list[JobRecord]:
-        """Every job, newest first."""
+    def page(self, limit: int, cursor: str | None = None) -> Page[JobRecord]:
+        """So many jobs after a cursor, newest first."""
+        terms = self._owner.terms(most=limit + 1, **after(cursor))
         with self._database.read() as connection:
             rows = connection.execute(
-                f"SELECT * FROM jobs WHERE {SEEN} ORDER BY created DESC, id", self._owner.terms()
+                f"SELECT * FROM jobs WHERE {SEEN} AND created <= :created AND (created < :created OR id > :after)"
+                " ORDER BY created DESC, id LIMIT :most",
+                terms,
             ).fetchall()
-            return [record(connection, row) for row in rows]
+            return page_of(rows, limit, lambda row: record(connection, row))
+
+    def all(self) -> list[JobRecord]:
+        """Every job, newest first."""
+        return self.page(sys.maxsize - 1).records
 
     def delete(self, job: str, *, given_up: Collection[JobKind] = ()) -> None:
         """Forget a job that has ended, its events and its result.

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Literal, Self
 
 from liftcore.errors import NotFound
-from service.keys.scopes import Scope, parse_scopes
+from service.scopes import Scope, parse_scopes
 from service.store.database import Database, unusable
 from service.store.markers import keys_were_made, remember_keys
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sqlite3
+import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,7 @@ from service.store.database import Database
 from service.store.files import DataDirectory
 from service.store.jobs import JobOrder
 from service.store.owners import SEEN, Owned
+from service.store.pages import Page, after, page_of
 
 
 @dataclass(frozen=True)
@@ -168,11 +170,20 @@ class LiftStore(Owned):
             )
         return self._record(rows[0])
 
+    def page(self, limit: int, cursor: str | None = None) -> Page[LiftRecord]:
+        """So many lifts after a cursor, newest first."""
+        terms = self._owner.terms(most=limit + 1, **after(cursor))
+        with self._database.read() as connection:
+            rows = connection.execute(
+                f"{VISIBLE} AND lifts.created <= :created AND (lifts.created < :created OR id > :after)"
+                " ORDER BY lifts.created DESC, id LIMIT :most",
+                terms,
+            ).fetchall()
+        return page_of(rows, limit, self._record)
+
     def all(self) -> list[LiftRecord]:
         """Every lift, newest first."""
-        with self._database.read() as connection:
-            rows = connection.execute(f"{VISIBLE} ORDER BY lifts.created DESC, id", self._owner.terms()).fetchall()
-        return [self._record(row) for row in rows]
+        return self.page(sys.maxsize - 1).records
 
     def collect(self, older_than: float) -> list[Path]:
         """Move files that no lift has to quarantine: what a crash between a file and its row left.

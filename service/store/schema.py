@@ -17,7 +17,7 @@ CREATE TABLE assets (
 
 CREATE TABLE jobs (
     id TEXT PRIMARY KEY,
-    state TEXT NOT NULL,            -- as service.wire.JobState
+    state TEXT NOT NULL,            -- as service.models.JobState
     attempt INTEGER NOT NULL DEFAULT 0,
     released INTEGER NOT NULL DEFAULT 0,  -- attempts that ended with an orderly stop of the server
     splats TEXT NOT NULL REFERENCES assets (id),
@@ -77,7 +77,7 @@ CREATE TABLE keys (
     id TEXT PRIMARY KEY,
     name TEXT NOT NULL,
     digest TEXT NOT NULL UNIQUE,    -- sha256 of the secret in hex; the secret itself is nowhere
-    scopes TEXT NOT NULL,           -- as service.keys.scopes.Scope, with spaces between
+    scopes TEXT NOT NULL,           -- as service.scopes.Scope, with spaces between
     max_bytes INTEGER,              -- what is not set is as the server's settings have it
     max_queued INTEGER,
     max_uploads INTEGER,
@@ -100,7 +100,7 @@ DROP INDEX jobs_by_key;
 CREATE UNIQUE INDEX jobs_by_key ON jobs (owner, idempotency_key);
 """,
     """
-ALTER TABLE jobs ADD COLUMN kind TEXT NOT NULL DEFAULT 'lift';      -- as service.wire.JobKind
+ALTER TABLE jobs ADD COLUMN kind TEXT NOT NULL DEFAULT 'lift';      -- as service.models.JobKind
 ALTER TABLE jobs ADD COLUMN parameters TEXT NOT NULL DEFAULT '{}';  -- JSON: what its kind takes beside settings
 
 CREATE TABLE tradeoffs (            -- small enough to lie here, so that no file can be without its row
@@ -129,5 +129,13 @@ CREATE TABLE generation (           -- one row: how many transactions were count
     number INTEGER NOT NULL
 ) STRICT;
 INSERT INTO generation VALUES (0);
+""",
+    """
+CREATE INDEX jobs_by_age ON jobs (created DESC, id);    -- lists are read in pages
+CREATE INDEX lifts_by_age ON lifts (created DESC, id);
+
+ALTER TABLE assets ADD COLUMN brief TEXT NOT NULL DEFAULT '{}';  -- counts without names and words: these may be 49 MB
+ALTER TABLE assets ADD COLUMN counts_bytes INTEGER NOT NULL DEFAULT 0;
+UPDATE assets SET brief = json_remove(counts, '$.names', '$.words'), counts_bytes = length(counts);
 """,
 )

@@ -16,14 +16,14 @@ from typing import Any, BinaryIO
 from liftcore.errors import InvalidCameras, InvalidInput, SplatliftError
 from liftcore.features.pack import read_features
 from liftcore.io.class_masks import describe_masks
-from liftcore.io.inspect import describe_camera_file, describe_packs, describe_splats, describe_table
+from liftcore.io.inspect import describe_packs, describe_table
+from liftcore.io.inspect_scene import describe_camera_file, describe_splats
 from liftcore.io.json_file import finite
 from liftcore.io.ply import read_splats
 from liftcore.query.text.table import TableEncoder
-from service.faults import fault_of
-from service.own_stdout import own_stdout
-from service.uploads.checking import INVALID
-from service.wire import VIEW_CHARACTERS, AssetKind
+from service.child import end_with_parent, fault_of, own_stdout
+from service.models import VIEW_CHARACTERS, AssetKind
+from service.uploads import INVALID
 
 
 def check_splats(path: Path) -> dict[str, Any]:
@@ -103,6 +103,7 @@ def main() -> None:
     """Check the file that the command line names."""
     kind, path, memory = AssetKind(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3])
     out = own_stdout()
+    end_with_parent()
     # Private memory and not address space: mapped files, however large, cost none.
     resource.setrlimit(resource.RLIMIT_DATA, (memory, memory))
     _say(out, {"event": "ready"})

@@ -1,18 +1,124 @@
-"""A body on its way to a file: decompressed, counted and digested as it comes."""
+"""A body on its way to a checked file: decompressed, counted and digested as it comes, then read in a child process.
+
+No bomb ever lies in memory. What a decoder gives at once is bounded by what it is given: deflate makes at most 1,032
+bytes of one, and a zstd block of four bytes at most 128 KiB. So each coding has a size of piece of which 16 MiB come
+out at most.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
-from collections.abc import Callable
+import json
+import logging
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Self
+from typing import Any, BinaryIO
 
-from service.errors import TooLarge
-from service.uploads.decoding import Coding, Decoding
-from service.wire import AssetKind
+import zstandard
 
+from service.child import error_of
+from service.errors import Busy, Crashed, DigestMismatch, InvalidEncoding, TooLarge, UnsupportedEncoding
+from service.models import AssetKind
+from service.store.assets import AssetRecord, CheckedUpload
+from service.store.store import Store
+from service.uploads import INVALID
+
+GZIP_WINDOW = 31  # zlib's name for "a gzip header and a 32 KiB window"
+ZSTD_WINDOW_BYTES = 8 << 20  # the largest that RFC 9659 lets a Content-Encoding ask for
+MAX_MEMBERS = 1_000_000  # of a concatenated body; bgzip makes one of each 64 KiB
 STEP = 4 << 20  # bytes of content between two looks at what may still be stored
+TICK_SECONDS = 0.5  # how soon the end of the server is seen by who waits for a check
+CHECK_BASE_BYTES, CHECK_FACTOR = 1 << 30, 16  # private memory of a check: a reader holds several copies of a file
+TRACE_CHARACTERS = 4000  # of a check that died, in the log
 HINTS = {AssetKind.FEATURES: "several feature packs may make one lift, so features can be cut"}
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Coding:
+    """A way to compress a body, of one or more members (gzip members, zstd frames) one after the other."""
+
+    name: str
+    piece: int  # bytes that one step takes
+    begin: Callable[[], Callable[[], Any]]  # for a body: what makes a decoder for each of its members
+
+
+GZIP = Coding("gzip", 16 << 10, lambda: partial(zlib.decompressobj, GZIP_WINDOW))
+# The tables of zstd are made once a body, and not once a frame.
+ZSTD = Coding("zstd", 512, lambda: zstandard.ZstdDecompressor(max_window_size=ZSTD_WINDOW_BYTES).decompressobj)
+CODINGS = {"": None, "identity": None, "gzip": GZIP, "x-gzip": GZIP, "zstd": ZSTD}
+
+
+def coding_of(content_encoding: str) -> Coding | None:
+    """The coding that a Content-Encoding names, None for none.
+
+    Raises:
+        UnsupportedEncoding: it names another, or several.
+    """
+    name = content_encoding.strip().lower()
+    if name not in CODINGS:
+        raise UnsupportedEncoding("Content-Encoding", expected="gzip, zstd, or none", got=name[:40])
+    return CODINGS[name]
+
+
+class Decoding:
+    """Undoes a coding."""
+
+    def __init__(self, coding: Coding) -> None:
+        self._coding = coding
+        self._member = coding.begin()
+        self._decoder = self._member()
+        self._members = 1
+
+    def feed(self, chunk: bytes) -> Iterator[bytes]:
+        """What the next bytes of the body stand for, 16 MiB at most at a time.
+
+        Raises:
+            InvalidEncoding: they are not in the coding, ask for too large a window, or are too many members.
+        """
+        for first in range(0, len(chunk), self._coding.piece):
+            rest = chunk[first : first + self._coding.piece]
+            while rest:
+                if self._decoder.eof:
+                    self._next_member()
+                yield self._decompress(rest)
+                rest = self._decoder.unused_data if self._decoder.eof else b""
+
+    def finish(self) -> None:
+        """See that the body has ended.
+
+        Raises:
+            InvalidEncoding: its last member is cut short.
+        """
+        if not self._decoder.eof:
+            raise self._refuse(f"a whole {self._coding.name} stream", "one that ends early")
+
+    def _next_member(self) -> None:
+        self._members += 1
+        if self._members > MAX_MEMBERS:
+            raise self._refuse(f"at most {MAX_MEMBERS} {self._coding.name} streams in a row", "more")
+        self._decoder = self._member()
+
+    def _decompress(self, piece: bytes) -> bytes:
+        try:
+            return self._decoder.decompress(piece)
+        except (zlib.error, zstandard.ZstdError) as error:
+            hint = f"a window of at most {ZSTD_WINDOW_BYTES >> 20} MiB" if "memory" in str(error) else ""
+            raise self._refuse(f"{self._coding.name}, as Content-Encoding says", str(error), hint) from None
+
+    def _refuse(self, expected: str, got: str, hint: str = "") -> InvalidEncoding:
+        return InvalidEncoding("body", expected=expected, got=got, hint=hint)
 
 
 def require_size(kind: AssetKind, count: int, limit: int) -> None:
@@ -27,36 +133,50 @@ def require_size(kind: AssetKind, count: int, limit: int) -> None:
         )
 
 
+@dataclass(frozen=True)
+class CheckLimits:
+    """What the check of one upload may take."""
+
+    seconds: float
+    memory_bytes: int  # whatever its size
+    ending: threading.Event  # set when the server must end, and every check with it
+
+
 class Intake:
-    """Writes a body to a draft, never more than ``limit`` bytes of it before or after decompression.
+    """One upload, as its owner's store takes it. All methods work on files: call them in threads, one at a time.
 
     Args:
-        draft: the file.
-        kind: what it is to be.
-        limit: what the operator allows.
+        store: as the owner sees it.
+        kind: what the body is to be.
+        limit: bytes that may come, and come out after decompression.
         coding: how the body is compressed.
-        permit: called every few MiB of content with what there will be of it and what comes now, in bytes; raises
-            when that may not be stored.
     """
 
-    def __init__(
-        self, draft: Path, kind: AssetKind, *, limit: int, coding: Coding | None, permit: Callable[[int, int], None]
-    ) -> None:
+    def __init__(self, store: Store, kind: AssetKind, limit: int, coding: Coding | None) -> None:
+        self._store = store
         self._kind = kind
-        self._permit = permit
-        self._permitted = 0
-        self._file = draft.open("wb")
         self._limit = limit
-        self._received = 0
-        self._written = 0
-        self._digest = hashlib.sha256()
         self._decoding = None if coding is None else Decoding(coding)
+        self._received = self._written = self._permitted = 0
+        self._digest = hashlib.sha256()
+        self._open = contextlib.ExitStack()
+        self._draft: Path | None = None
+        self._file: BinaryIO | None = None
 
-    def __enter__(self) -> Self:
-        return self
+    def open(self) -> None:
+        """Begin a draft where there may be one.
 
-    def __exit__(self, *exception: object) -> None:
-        self._file.close()
+        Raises:
+            NoSpace, OverQuota: there may not.
+        """
+        self._store.files.require_room()
+        self._store.assets.require_quota()
+        self._draft = self._open.enter_context(self._store.files.draft(f".{self._kind}"))
+        self._file = self._open.enter_context(self._draft.open("wb"))
+
+    def close(self) -> None:
+        """Remove what is left of it."""
+        self._open.close()
 
     def feed(self, chunk: bytes) -> None:
         """Take the next bytes of the body.
@@ -64,29 +184,147 @@ class Intake:
         Raises:
             TooLarge: there are more than may come, or come out.
             InvalidEncoding: they do not decompress.
-            ServiceError: as `permit` does.
+            NoSpace, OverQuota: they may not be stored.
         """
         self._received += len(chunk)
         require_size(self._kind, self._received, self._limit)
         for content in (chunk,) if self._decoding is None else self._decoding.feed(chunk):
             self._write(content)
 
-    def finish(self) -> str:
-        """The sha256 of the content, in hex; call once after the last byte.
-
-        Raises:
-            InvalidEncoding: a compressed body ended early.
-        """
-        if self._decoding is not None:
-            self._decoding.finish()
-        self._file.flush()
-        return self._digest.hexdigest()
-
     def _write(self, content: bytes) -> None:
+        assert self._file is not None
         self._written += len(content)
         require_size(self._kind, self._written, self._limit)
-        if self._written > self._permitted:
-            self._permit(self._written, len(content))
+        if self._written > self._permitted:  # compressed, a body's end is not known before
+            self._store.files.require_room(len(content))
+            self._store.assets.require_quota(self._written)
             self._permitted = self._written + STEP
         self._digest.update(content)
         self._file.write(content)
+
+    def finish(self, promised: str | None) -> AssetRecord | None:
+        """Call once after the last byte.
+
+        Args:
+            promised: the sha256 in hex that the client said, if it did.
+
+        Returns:
+            The asset, when its owner has these very bytes already.
+
+        Raises:
+            InvalidEncoding: a compressed body ended early.
+            DigestMismatch: the bytes are others.
+        """
+        assert self._file is not None
+        if self._decoding is not None:
+            self._decoding.finish()
+        self._file.flush()
+        digest = self._digest.hexdigest()
+        if promised is not None and digest != promised.lower():
+            raise DigestMismatch("sha256", expected=promised, got=digest, hint="upload the file again")
+        known = self._store.assets.find(f"sha256:{digest}")
+        return known if known is not None and known.kind is self._kind and known.whole else None
+
+    def check(self, limits: CheckLimits) -> CheckedUpload:
+        """Read the whole draft in a process of its own.
+
+        Raises:
+            InvalidInput, Crashed, Busy: as `check` has it.
+        """
+        assert self._draft is not None
+        with self._store.files.scratch() as scratch:
+            report = check(self._kind, self._draft, scratch, limits)
+        digest = self._digest.hexdigest()
+        return CheckedUpload(self._draft, self._kind, digest, report.suffix, report.counts, report.warnings)
+
+    def keep(self, upload: CheckedUpload) -> tuple[AssetRecord, bool]:
+        """Make an asset of it; whether its owner did not have it before.
+
+        Raises:
+            OverQuota: it would be more than the owner may store.
+        """
+        return self._store.assets.add(upload)
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a check found in a valid file."""
+
+    suffix: str  # of the stored file, such as .ply
+    counts: dict[str, Any]
+    warnings: list[str]
+
+
+def check(kind: AssetKind, path: Path, scratch: Path, limits: CheckLimits) -> Report:
+    """Read a whole file in a process of its own, which unpacks into ``scratch`` and ends with this process.
+
+    Raises:
+        InvalidInput: the file is malformed, or it takes more time or memory than it may.
+        Crashed: the process did not get as far as opening the file.
+        Busy: the server ended meanwhile.
+    """
+    memory = min(limits.memory_bytes, CHECK_BASE_BYTES + CHECK_FACTOR * _size(path))
+    process = subprocess.Popen(
+        [sys.executable, "-m", "service.uploads.check", kind, str(path), str(memory)],
+        stdin=subprocess.PIPE,  # its lifeline
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+        env=os.environ | {"TMPDIR": str(scratch)},
+    )
+    with process:
+        heard = _listen(process, limits)
+        if heard is None:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.communicate()
+    if heard is not None:
+        return _report(kind, heard[0], process.returncode, heard[1])
+    if limits.ending.is_set():
+        raise Busy("upload", expected="a running server", got="one that stops", hint="send it again")
+    raise INVALID[kind](
+        kind, expected=f"a file that is read within {limits.seconds:g} s", got="one that takes longer"
+    )
+
+
+def _size(path: Path) -> int:
+    return path.stat().st_size if path.exists() else 0
+
+
+def _listen(process: subprocess.Popen[bytes], limits: CheckLimits) -> tuple[bytes, bytes] | None:
+    """What the process says on stdout and stderr until it ends; None when it must be ended."""
+    assert process.stdout is not None and process.stderr is not None
+    said: dict[str, bytes] = {}
+    pipes = {"out": process.stdout, "error": process.stderr}
+    # Not `communicate`, which closes stdin first.
+    readers = [
+        threading.Thread(target=lambda name=name, pipe=pipe: said.update({name: pipe.read()}), daemon=True)
+        for name, pipe in pipes.items()
+    ]
+    for reader in readers:
+        reader.start()
+    deadline = time.monotonic() + limits.seconds
+    while not limits.ending.is_set() and (left := deadline - time.monotonic()) > 0:
+        readers[0].join(min(left, TICK_SECONDS))
+        if not readers[0].is_alive():
+            readers[1].join()
+            process.wait()
+            return said["out"], said["error"]
+    return None
+
+
+def _report(kind: AssetKind, output: bytes, returncode: int, trace: bytes) -> Report:
+    messages = [json.loads(line) for line in output.splitlines()]
+    last: dict[str, Any] = messages[-1] if messages else {"event": "nothing"}
+    if last["event"] == "valid":
+        return Report(suffix=last["suffix"], counts=last["counts"], warnings=last["warnings"])
+    if last["event"] == "invalid":
+        raise error_of(last["fault"])
+    told = trace.decode(errors="replace")[-TRACE_CHARACTERS:]
+    log.error("the check of %s ended with %d: %s", kind, returncode, told)
+    if last["event"] == "ready":
+        # It had started to read: whatever ended it, this file did.
+        raise INVALID[kind](
+            kind, expected="a file that its reader can take", got=f"one that ended it with {returncode}",
+            hint="it may be broken, or need more memory than an upload may take",
+        )  # fmt: skip
+    raise Crashed("check", expected="a process that starts", got=f"one that ended with {returncode}")

@@ -13,8 +13,8 @@ from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
 from service.app import assemble
-from service.parts import Parts
 from service.settings import ServiceSettings
+from service.state import AppState
 from service.store.store import Store
 
 from .following import ended
@@ -49,9 +49,9 @@ def app_of(client: TestClient) -> FastAPI:
     return client.app
 
 
-def parts_of(client: TestClient) -> Parts:
+def parts_of(client: TestClient) -> AppState:
     """What that application was made of."""
-    return app_of(client).state.parts
+    return app_of(client).state.deps
 
 
 @dataclass(frozen=True)

@@ -27,12 +27,12 @@ import httpx
 from service.__main__ import server_of
 from service.app import create_app, job_limits, query_limits
 from service.jobs.supervisor import Supervisor
-from service.keys.scopes import Scope
-from service.queries.warm import WarmWorker
+from service.queries.client import QueryClient
+from service.scopes import Scope
 from service.settings import ServiceSettings
 from service.store.keys import Quota
 from service.store.store import Store
-from service.uploads.checking import Report
+from service.uploads.intake import Report
 from tests.crash.conftest import stand_in, until
 
 CHECKS = (
@@ -53,10 +53,10 @@ def served(data: Path, *, keys: bool, **settings: Any) -> Iterator[tuple[str, st
     secret = store.keys.create("contract", frozenset({Scope.ADMIN}), Quota())[1] if keys else None
     runner = Supervisor(store, job_limits(chosen), command=stand_in("answer"))
     listener = socket.create_server(("127.0.0.1", 0))
-    server = server_of(create_app(chosen, store, runner, WarmWorker(query_limits(chosen))), chosen)
+    server = server_of(create_app(chosen, store, runner, QueryClient(query_limits(chosen))), chosen)
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
     report = Report(".bin", {"names": ["v"], "channels": 1, "classes": 1, "words": ["apple"]}, [])
-    with mock.patch("service.routes.assets.check", lambda *given: report):
+    with mock.patch("service.uploads.intake.check", lambda *given: report):
         thread.start()
         try:
             until(lambda: server.started)

@@ -15,8 +15,9 @@ from starlette.routing import Route
 
 from service.app import create_app
 from service.jobs.supervisor import Supervisor
-from service.keys.scopes import Scope
-from service.queries.warm import WarmWorker
+from service.models import JobKind
+from service.queries.client import QueryClient
+from service.scopes import Scope
 from service.settings import ServiceSettings
 from service.store.jobs import JobOrder
 from service.store.keys import Quota
@@ -24,7 +25,6 @@ from service.store.lifts import FinishedLift
 from service.store.owners import Owner
 from service.store.store import Store
 from service.store.tradeoffs import FinishedTradeoff
-from service.wire import JobKind
 from tests.crash.conftest import order
 from tests.crash.server import NoQueries
 
@@ -78,7 +78,7 @@ def guarded(data: Path, **settings: Any) -> Iterator[Guarded]:
     """Serve it."""
     store = Store.open(data)
     chosen = ServiceSettings.model_validate({"data": data, "disk_floor_bytes": 0, **settings})
-    app = create_app(chosen, store, cast("Supervisor", NoJobs()), cast("WarmWorker", NoQueries()))
+    app = create_app(chosen, store, cast("Supervisor", NoJobs()), cast("QueryClient", NoQueries()))
     made = {name: make_key(store, scopes) for name, scopes in SCOPES.items()}
     ids, secrets = ({name: pair[place] for name, pair in made.items()} for place in (0, 1))
     hers = store.seen_by(Owner(ids["alice"], sees_all=False))

@@ -14,12 +14,12 @@ import zstandard
 from fastapi.testclient import TestClient
 from safetensors.numpy import save
 
+from service.child import error_of
 from service.errors import InvalidEncoding
-from service.faults import error_of
+from service.models import AssetKind
 from service.problems import problem_of
-from service.uploads import check, decoding
-from service.uploads.decoding import GZIP, ZSTD, Coding, Decoding
-from service.wire import AssetKind
+from service.uploads import check, intake
+from service.uploads.intake import GZIP, ZSTD, Coding, Decoding
 
 from .tiny_scene import (
     PROPERTIES,
@@ -304,7 +304,7 @@ def test_what_comes_out_at_once_is_bounded_whatever_goes_in(coding: Coding) -> N
 
 @pytest.mark.parametrize("coding", [GZIP, ZSTD], ids=["gzip", "zstd"])
 def test_streams_in_a_row_are_bounded(coding: Coding, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(decoding, "MAX_MEMBERS", 50)
+    monkeypatch.setattr(intake, "MAX_MEMBERS", 50)
     body = COMPRESS[coding.name](b"")
     assert list(Decoding(coding).feed(body * 50))
     with pytest.raises(InvalidEncoding, match="at most 50"):

@@ -14,10 +14,10 @@ from fastapi.testclient import TestClient
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from service.faults import error_of
+from service.child import error_of
+from service.models import AssetKind
 from service.problems import problem_of
 from service.uploads import check
-from service.wire import AssetKind
 
 from .bombs import camera_documents, features
 from .tiny_scene import TinyScene, colmap_zip, labels, make_scene, masks
@@ -30,7 +30,7 @@ ALL_IN_ONE_PROCESS = """
 import json, resource, sys
 from pathlib import Path
 from service.uploads import check
-from service.wire import AssetKind
+from service.models import AssetKind
 from tests.api.bombs import CORPUS
 kind, folder = AssetKind(sys.argv[1]), Path(sys.argv[2])
 found = {}

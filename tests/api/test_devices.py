@@ -14,7 +14,7 @@ from fastapi.testclient import TestClient
 from liftcore.device import choose_device
 from liftcore.errors import Unavailable
 from liftcore.progress import Progress
-from service.faults import fault_of
+from service.child import fault_of
 from service.jobs import child, devices
 from service.jobs.devices import Devices
 from service.jobs.reporter import Reporter

@@ -13,10 +13,9 @@ from hypothesis import strategies as st
 from starlette.datastructures import Headers
 
 from liftcore.errors import SplatliftError
+from service.auth import CALLER, Caller, Gate, Hosts, host_name, is_loopback
 from service.errors import ForeignOrigin, Misdirected
-from service.keys.gate import CALLER, Caller, Gate
-from service.keys.hosts import Hosts, host_name, is_loopback
-from service.keys.scopes import OPEN, needed
+from service.scopes import OPEN, needed
 from service.settings import ServiceSettings
 from service.store.store import Store
 

@@ -10,9 +10,9 @@ import anyio
 import uvicorn
 
 from service.__main__ import AnnouncingServer
-from service.jobs.streams import EventStreams
 from service.jobs.supervisor import Supervisor
-from service.stopping import Stopping
+from service.state import Stopping
+from service.streams import EventStreams
 
 
 class Idle:

@@ -18,11 +18,11 @@ from service.app import create_app
 from service.errors import Misconfigured
 from service.jobs.limits import JobLimits
 from service.jobs.supervisor import Supervisor
-from service.queries.warm import QueryLimits, WarmWorker
+from service.models import JobState
+from service.queries.client import QueryClient, QueryLimits
 from service.settings import ServiceSettings
 from service.store.schema import MIGRATIONS
 from service.store.store import Store
-from service.wire import JobState
 from tests.crash.conftest import order, stand_in, until
 
 from .conftest import ADDRESS, Uploaded
@@ -40,7 +40,7 @@ def quick(store: Store) -> Quick:
     @contextmanager
     def serve(behaviour: str, **settings: Any) -> Iterator[tuple[TestClient, dict[str, Any]]]:
         chosen = ServiceSettings.model_validate({"data": store.files.root, **settings})
-        worker = WarmWorker(QueryLimits(waiting=1, seconds=1, scenes=1, cache_bytes=0, encoder="minilm"))
+        worker = QueryClient(QueryLimits(waiting=1, seconds=1, scenes=1, cache_bytes=0, encoder="minilm"))
         supervisor = Supervisor(store, JobLimits(), command=stand_in(behaviour))
         known = order(store)
         body = {"splats": known.splats, "cameras": known.cameras, "features": list(known.features)}
@@ -169,7 +169,7 @@ def test_streams_are_bounded(quick: Quick) -> None:
     with quick("answer", max_streams=1) as (client, body):
         job = client.post("/lift", json=body).headers["location"]
         ended(client, job)
-        streams = application(client).state.parts.streams
+        streams = application(client).state.deps.streams
         streams.open = 1  # as if another client followed
         reply = client.get(f"{job}/events")
         assert (assert_problem(reply)["type"], reply.status_code) == ("/problems/busy", 503)
@@ -182,7 +182,7 @@ def test_no_work_is_taken_below_the_disk_floor_and_the_service_lives(
 ) -> None:
     usage = shutil.disk_usage("/")
     with quick("answer", disk_floor_bytes=1000) as (client, body):
-        application(client).state.parts.store.files._floor = 1000
+        application(client).state.deps.store.files._floor = 1000
         monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=999))
         for reply in (
             client.put("/assets/splats", content=scene.splats),
@@ -216,7 +216,7 @@ def test_job_interrupted_by_a_stop_goes_on_where_the_data_directory_is_next(
 
 def test_query_worker_that_died_is_replaced(client: TestClient, lift: dict[str, Any]) -> None:
     assert isinstance(client.app, FastAPI)
-    worker = client.app.state.parts.queries
+    worker = client.app.state.deps.queries
     assert client.get("/query", params={"text": "apple", "lift": lift["id"]}).status_code == 200
     worker._process.kill()
     assert client.get("/query", params={"text": "book", "lift": lift["id"]}).status_code == 200

@@ -15,14 +15,14 @@ import pytest
 
 from service.__main__ import require_keys
 from service.errors import Misconfigured
-from service.jobs.streams import is_last
-from service.keys.__main__ import main
-from service.keys.scopes import OPEN, Scope, needed
+from service.keys import main
+from service.models import JobState
+from service.scopes import OPEN, Scope, needed
 from service.settings import ServiceSettings
 from service.store.events import Event
 from service.store.owners import Owner
 from service.store.store import Store
-from service.wire import JobState
+from service.streams import is_last
 from tests.crash.conftest import order
 
 from .conftest import app_of, parts_of
@@ -274,7 +274,7 @@ def test_revoked_key_loses_its_streams(house: Guarded, monkeypatch: pytest.Monke
         sent.set()
         return is_last(event)
 
-    monkeypatch.setattr("service.jobs.streams.is_last", noted)
+    monkeypatch.setattr("service.streams.is_last", noted)
 
     def follow() -> None:
         replies.append(house.ask("alice", "GET", f"/jobs/{house.queued}/events"))  # its job does not end

@@ -13,12 +13,12 @@ import pytest
 from fastapi.testclient import TestClient
 
 from liftcore.evaluate.tradeoff import RunSpec, Scene, measured
+from service.models import AssetKind, JobKind
 from service.store.assets import CheckedUpload
 from service.store.jobs import fingerprint
 from service.store.owners import Owner
 from service.store.store import Store
 from service.uploads import check
-from service.wire import AssetKind, JobKind
 from tests.crash.conftest import labels as stored_labels
 from tests.crash.conftest import order
 

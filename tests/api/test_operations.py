@@ -24,14 +24,13 @@ from fastapi.testclient import TestClient
 from prometheus_client import REGISTRY
 from prometheus_client.parser import text_string_to_metric_families
 
-from service import request_id
 from service.errors import Busy
 from service.jobs.limits import JobLimits
 from service.jobs.supervisor import Supervisor
-from service.logs import JsonLines, TextLines
+from service.models import AssetKind
+from service.observe import JsonLines, TextLines, current_id, working_for
 from service.store.store import Store
-from service.uploads.checking import CheckLimits, check
-from service.wire import AssetKind
+from service.uploads.intake import CheckLimits, check
 from tests.crash.conftest import order, stand_in, until
 from tests.crash.service_process import ServiceProcess, processes_of
 
@@ -254,7 +253,7 @@ def test_log_of_a_job_names_the_request_that_made_it(tmp_path: Path) -> None:
 
     class Watch(logging.Handler):
         def emit(self, record: logging.LogRecord) -> None:
-            seen[record.getMessage()] = request_id.current()
+            seen[record.getMessage()] = current_id()
 
     watch, logger = Watch(), logging.getLogger("service.jobs")
     store = Store.open(tmp_path)
@@ -285,7 +284,7 @@ def test_json_log_is_one_object_a_line_whatever_is_logged() -> None:
     except ValueError:
         found = record("a\nb \x1b[31m\u2028", path="/\x00", odd=Path("p"))
         found.exc_info = sys.exc_info()
-    with request_id.working_for("r"):
+    with working_for("r"):
         line = JsonLines().format(found)
     assert len(line.splitlines()) == 1 and line.isascii()
     told = json.loads(line)
@@ -317,7 +316,7 @@ def test_stop_refuses_work_ends_streams_puts_jobs_back_and_exits_0(
         until(lambda: processes_of(job))
         with service.client.stream("GET", f"/jobs/{job}/events") as stream:
             lines = stream.iter_lines()
-            assert next(lines).startswith("id: ")
+            assert next(lines) == "event: state"
             os.kill(service.pid, signal.SIGTERM)
             until(lambda: service.client.get("/readyz").status_code == 503)
             reply = service.client.post("/lift", json={})
@@ -337,11 +336,11 @@ def test_stop_ends_a_check_that_would_take_long(tmp_path: Path) -> None:
     fifo = tmp_path / "never.ply"
     os.mkfifo(fifo)  # who opens it waits for a writer, for ever
     ending, ended = threading.Event(), []
-    limits = CheckLimits(tmp_path, 300.0, 1 << 33, ending)
+    limits = CheckLimits(300.0, 1 << 33, ending)
 
     def run() -> None:
         with pytest.raises(Busy):
-            check(AssetKind.SPLATS, fifo, limits)
+            check(AssetKind.SPLATS, fifo, tmp_path, limits)
         ended.append(True)
 
     thread = threading.Thread(target=run)

@@ -15,7 +15,7 @@ from fastapi.testclient import TestClient
 
 from liftcore.errors import SplatliftError
 from service import problems
-from service.faults import error_of, fault_of
+from service.child import error_of, fault_of
 from service.problems import TABLE, problem_of
 
 from .conftest import Uploaded
@@ -28,6 +28,7 @@ ROUTES = {
     "/assets",
     "/assets/{asset}",
     "/assets/{asset}/content",
+    "/assets/{asset}/names",
     "/lift",
     "/jobs",
     "/jobs/{job}",

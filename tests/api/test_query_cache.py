@@ -8,8 +8,7 @@ import torch
 
 from liftcore.query.ask import Answer
 from liftcore.query.terms import Query, Vector
-from service.queries.answers import _key, bytes_of
-from service.queries.kept import Kept
+from service.queries.answers import Kept, _key, bytes_of
 
 
 def answer_to(query: Query) -> Answer:

@@ -13,13 +13,12 @@ from fastapi.testclient import TestClient
 
 from liftcore.query import ask
 from liftcore.query.objects import objects
-from service import wire
+from service import models
 from service.queries import answers
-from service.queries.answers import Answers
-from service.queries.frames import Frame
-from service.queries.kept import Kept
+from service.queries.answers import Answers, Kept
+from service.queries.client import Frame
 from service.queries.worker import reply_to
-from service.routes.question import query_request
+from service.routes.queries import query_request
 from tests.crash.conftest import until
 
 from .conftest import parts_of
@@ -46,7 +45,7 @@ def request_of(client: TestClient, lift: dict[str, Any]) -> Callable[..., dict[s
     record = here.store.lifts.get(lift["id"])
 
     def make(operation: str = "scores", **asked: Any) -> dict[str, Any]:
-        body = wire.AskedInBody.model_validate({"lift": lift["id"], **asked})
+        body = models.AskedInBody.model_validate({"lift": lift["id"], **asked})
         return query_request(operation, body, record, here) | {"view": "left", "top": 3}
 
     return make
@@ -177,7 +176,7 @@ def test_calls_of_a_worker_that_dies_are_answered_by_the_next(client: TestClient
     threads = [threading.Thread(target=run, args=(number,)) for number in range(4)]
     for thread in threads:
         thread.start()
-    until(lambda: worker._taken)
+    until(lambda: worker._places < 16 and not worker._line)
     os.kill(process.pid, signal.SIGKILL)
     for thread in threads:
         thread.join()

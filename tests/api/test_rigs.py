@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from service.wire import AssetKind
+from service.models import AssetKind
 
 from .following import ended
 from .test_labels import put

@@ -20,9 +20,10 @@ import pytest
 from safetensors.numpy import save
 
 from service.__main__ import main, parse
+from service.encoders import encoder_label, encoder_spec
 from service.errors import InvalidRequest
 from service.routes.operations import WEB, page
-from service.settings import ServiceSettings, encoder_label
+from service.settings import ServiceSettings
 
 from .conftest import Uploaded
 from .following import ended
@@ -183,24 +184,24 @@ def test_encoder_that_does_not_exist_is_told_before_the_start(
 
 def test_encoder_is_chosen_by_text_space_and_never_by_the_client(tmp_path: Path) -> None:
     settings = ServiceSettings.model_validate({"data": tmp_path, "text_spaces": {"clip": "open_clip:X@w.pt"}})
-    assert settings.encoder_spec("clip", None) == "open_clip:X@w.pt"
-    assert settings.encoder_spec("minilm", None) == settings.encoder_spec("clip", "default") == "minilm"
-    assert settings.encoder_spec("none", "clip") == "open_clip:X@w.pt"
+    assert encoder_spec(settings, "clip", None) == "open_clip:X@w.pt"
+    assert encoder_spec(settings, "minilm", None) == encoder_spec(settings, "clip", "default") == "minilm"
+    assert encoder_spec(settings, "none", "clip") == "open_clip:X@w.pt"
     for space, asked in (("clip", "table:secret"), ("none", None)):
         with pytest.raises(InvalidRequest, match="expected"):
-            settings.encoder_spec(space, asked)
+            encoder_spec(settings, space, asked)
 
 
 def test_default_encoder_stands_in_for_other_spaces_only_where_the_operator_chose_it(tmp_path: Path) -> None:
     untouched = ServiceSettings.model_validate({"data": tmp_path})
     for space in ("dino", ""):
         with pytest.raises(InvalidRequest, match="SPLATLIFT_TEXT_SPACES"):
-            untouched.encoder_spec(space, None)
-        assert untouched.encoder_spec(space, "default") == "minilm"
+            encoder_spec(untouched, space, None)
+        assert encoder_spec(untouched, space, "default") == "minilm"
     chosen = ServiceSettings.model_validate({"data": tmp_path, "encoder": "minilm"})
-    assert chosen.encoder_spec("dino", None) == chosen.encoder_spec("", None) == "minilm"
+    assert encoder_spec(chosen, "dino", None) == encoder_spec(chosen, "", None) == "minilm"
     with pytest.raises(InvalidRequest, match="none"):
-        chosen.encoder_spec("none", None)
+        encoder_spec(chosen, "none", None)
 
 
 @pytest.mark.parametrize(

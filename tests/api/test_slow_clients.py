@@ -9,26 +9,23 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, cast
 
-import anyio
 import httpx
 import pytest
 import uvicorn
-from starlette.exceptions import HTTPException
 
-from service.app import create_app, job_limits, pace_of
-from service.connection import watched
+from service.__main__ import pace_of
+from service.app import create_app, job_limits
+from service.connection import UNREAD_BYTES, Pace, Patience, Wait, watched
 from service.jobs.supervisor import Supervisor
-from service.limits import BodyLimit, Pace
-from service.queries.warm import WarmWorker
+from service.models import AssetKind
+from service.queries.client import QueryClient
 from service.settings import ServiceSettings
 from service.store.assets import CheckedUpload
 from service.store.store import Store
-from service.wire import AssetKind
 from tests.crash.conftest import until
 from tests.crash.server import NoQueries
 
@@ -55,9 +52,9 @@ def running(data: Path, **settings: Any) -> Iterator[uvicorn.Server]:
     patient = {"min_bytes_per_second": 1000, "slow_grace_seconds": 30, "header_seconds": 30}
     chosen = ServiceSettings.model_validate({"data": data, "disk_floor_bytes": 0, **patient, **settings})
     store = Store.open(chosen.data)
-    app = create_app(chosen, store, Supervisor(store, job_limits(chosen)), cast("WarmWorker", NoQueries()))
+    app = create_app(chosen, store, Supervisor(store, job_limits(chosen)), cast("QueryClient", NoQueries()))
     listener = socket.create_server(("127.0.0.1", 0))
-    connection = watched(pace_of(chosen), chosen.max_connections)
+    connection = watched(pace_of(chosen))
     config = uvicorn.Config(app, http=connection, log_level="critical", timeout_graceful_shutdown=10)
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
@@ -188,32 +185,39 @@ def test_body_in_pieces_is_taken(patient: tuple[str, int]) -> None:
     assert head.startswith(b"HTTP/1.1 422 ")  # read to its end, and found to be no order
 
 
-@pytest.mark.parametrize(("speed", "taken"), [(5000, True), (1100, True), (900, False)])
-def test_body_may_take_longer_than_the_grace_if_it_keeps_the_least_speed(
-    monkeypatch: pytest.MonkeyPatch, speed: int, taken: bool
-) -> None:
-    pace = Pace(bytes_per_second=1000, grace_seconds=1000.0)
-    clock = itertools.count(0, 25)  # seconds between two looks at it, of which none goes by here
-    monkeypatch.setattr("service.limits.time", SimpleNamespace(monotonic=lambda: next(clock)))
-    pieces = iter([True] * 200 + [False])
+def judged(wait: Wait, steps: list[tuple[float, int]], turn: int = 0) -> list[bool]:
+    """What is said of a client that waits, by seconds and bytes since the beginning."""
+    patience = Patience(Pace(bytes_per_second=1000, grace_seconds=10, head_seconds=20))
+    return [patience.is_over(wait, turn, moved, 1000 + seconds) for seconds, moved in steps]
 
-    async def receive() -> dict[str, Any]:
-        await anyio.sleep(0)
-        return {"type": "http.request", "body": bytes(25 * speed), "more_body": next(pieces)}
 
-    async def read_all(scope: Any, receive: Any, send: Any) -> None:
-        while (await receive())["more_body"]:
-            pass
+@pytest.mark.parametrize(("speed", "over"), [(5000, False), (1100, False), (900, True)])
+def test_body_may_take_long_if_it_keeps_the_least_speed(speed: int, over: bool) -> None:
+    assert any(judged(Wait.BODY, [(seconds, seconds * speed) for seconds in range(0, 600, 2)])) is over
 
-    async def send(message: Any) -> None:
-        raise AssertionError(message)
 
-    async def run() -> None:
-        await BodyLimit(read_all, 1 << 30, pace)({"type": "http", "path": "/lift"}, receive, send)
+def test_body_that_is_fast_and_then_stalls_is_too_slow() -> None:
+    assert judged(Wait.BODY, [(0, 0), (10, 10**6), (19, 10**6), (20, 10**6)]) == [False, False, False, True]
 
-    with nullcontext() if taken else pytest.raises(HTTPException, match="less than 1000 bytes"):
-        anyio.run(run)
-    assert (next(pieces, None) is None) == taken
+
+def test_head_has_its_time_whatever_trickles() -> None:
+    assert judged(Wait.HEAD, [(0, 0), (19, 19), (20, 20)]) == [False, False, True]
+
+
+def test_reader_must_take_something_in_its_time() -> None:
+    most = 10 + UNREAD_BYTES / 1000
+    assert judged(Wait.READER, [(0, 0), (most - 1, 1), (2 * most - 2, 1), (2 * most, 1)]) == [
+        False,
+        False,
+        False,
+        True,
+    ]
+
+
+def test_work_of_the_server_is_nobodys_fault() -> None:
+    assert not any(judged(Wait.NOTHING, [(0, 0), (10**6, 0)]))
+    patience = Patience(Pace(head_seconds=1))
+    assert not any(patience.is_over(Wait.HEAD, turn, 0, turn) for turn in range(9))  # each request has its own time
 
 
 @pytest.mark.parametrize("begin", [b"G", b"GET / HTTP/1.1\r\nHost: localhost\r\n"], ids=["line", "headers"])
@@ -276,21 +280,58 @@ def test_more_connections_than_allowed_are_503_until_one_ends(tmp_path: Path) ->
         until(lambda: httpx.get(f"http://127.0.0.1:{address[1]}/healthz").status_code == 200)
 
 
-def test_client_that_does_not_read_is_cut_off(tmp_path: Path) -> None:
-    content = bytes(33_000_000)  # more than the buffers between us hold
+def stored(data: Path, content: bytes) -> str:
+    """The path of content that a server over a data directory will have."""
     digest = hashlib.sha256(content).hexdigest()
-    store = Store.open(tmp_path / "data")
+    store = Store.open(data)
     with store.files.draft(".ply") as draft:
         draft.write_bytes(content)
         store.assets.add(CheckedUpload(draft, AssetKind.SPLATS, digest, ".ply", {}, []))
     store.close()
-    path = f"/assets/sha256:{digest}/content"
+    return f"/assets/sha256:{digest}/content"
+
+
+@pytest.mark.parametrize("size", [33_000_000, 3_000_000], ids=["held up", "sent, and not read to its end"])
+def test_client_that_does_not_read_is_cut_off(tmp_path: Path, size: int) -> None:
+    content = bytes(size)  # more than the buffers between us hold
+    path = stored(tmp_path / "data", content)
     with running(tmp_path / "data", min_bytes_per_second=1 << 20, slow_grace_seconds=0.5) as server:
-        with client_of(server.servers[0].sockets[0].getsockname()) as client:
-            until(lambda: server.server_state.connections)
+        with socket.socket() as client:
+            client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            client.settimeout(PATIENCE_SECONDS)
+            client.connect(server.servers[0].sockets[0].getsockname())
             client.sendall(f"GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
+            until(lambda: server.server_state.connections)
             until(lambda: not server.server_state.connections)
             head, body = answer(client)
         assert head.startswith(b"HTTP/1.1 200 ") and len(body) < len(content)
     with served(tmp_path / "data") as address:
         assert httpx.get(f"http://127.0.0.1:{address[1]}{path}", timeout=PATIENCE_SECONDS).content == content
+
+
+def test_two_lengths_of_a_body_are_refused_and_the_connection_is_closed(patient: tuple[str, int]) -> None:
+    with client_of(patient) as client:
+        both = b"Content-Length: 4\r\nTransfer-Encoding: chunked\r\nContent-Type: application/json\r\n\r\n"
+        client.sendall(b"POST /lift HTTP/1.1\r\nHost: localhost\r\n" + both + b"0\r\n\r\n" + HEALTH)
+        head, body = answer(client)
+    assert head.startswith(b"HTTP/1.1 422 ") and b"connection: close" in head.lower()
+    assert json.loads(body)["argument"] == "Content-Length"  # and nothing comes after it
+
+
+def test_upload_that_announces_too_much_is_refused_before_it_is_sent(tmp_path: Path) -> None:
+    limits = {f"max_{kind}_bytes": 1000 for kind in AssetKind}
+    with served(tmp_path / "data", **limits) as address:
+        for kind, length in itertools.product(AssetKind, (1001, 10**19)):
+            with client_of(address) as client:
+                expects = f"Expect: 100-continue\r\nContent-Length: {length}\r\nConnection: close\r\n\r\n"
+                client.sendall(f"PUT /assets/{kind} HTTP/1.1\r\nHost: localhost\r\n{expects}".encode())
+                said = answer(client)
+            assert_problem(said, 413, "too-large")
+            assert ("hint" in json.loads(said[1])) == (kind is AssetKind.FEATURES)
+
+
+def test_answer_that_began_goes_on_whatever_comes_of_the_body(brisk: tuple[str, int]) -> None:
+    begin = b"GET /healthz HTTP/1.1\r\nHost: localhost\r\nContent-Length: 5000\r\n\r\n"
+    with client_of(brisk) as client:
+        client.sendall(begin)
+        assert client.recv(1 << 16).startswith(b"HTTP/1.1 200 ")

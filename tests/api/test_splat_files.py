@@ -17,7 +17,7 @@ from plyfile import PlyData
 from starlette.requests import ClientDisconnect
 
 from liftcore.errors import SplatliftError
-from service.content import BLOCK_BYTES, Draft, draft_answer
+from service.content import BLOCK_BYTES, Draft
 from service.errors import NoSpace
 from service.queries import answers
 
@@ -130,7 +130,7 @@ def test_a_disk_that_fills_up_meanwhile_is_no_fault_of_ours() -> None:
 def test_a_draft_is_sent_without_its_name_and_closed_however_that_ends(tmp_path: Path, leaves: bool) -> None:
     content = np.random.default_rng(0).bytes(3 * BLOCK_BYTES + 17)
     (tmp_path / "draft").write_bytes(content)
-    reply = draft_answer(tmp_path / "draft", filename="object.ply", etag=None)
+    reply = Draft(tmp_path / "draft", filename="object.ply", etag=None)
     (tmp_path / "draft").unlink()
     sent: list[bytes] = []
 
@@ -144,6 +144,6 @@ def test_a_draft_is_sent_without_its_name_and_closed_however_that_ends(tmp_path:
 
     with pytest.raises(ClientDisconnect) if leaves else contextlib.nullcontext():
         anyio.run(reply, {"type": "http", "asgi": {"spec_version": "2.4"}}, receive, send)
-    assert isinstance(reply, Draft) and reply.file.closed
+    assert reply.file.closed
     assert max(map(len, sent)) == BLOCK_BYTES
     assert leaves or b"".join(sent) == content

@@ -13,7 +13,7 @@ from fastapi.testclient import TestClient
 from liftcore import cli
 from service.__main__ import require_keys
 from service.errors import Misconfigured, StaleDatabase
-from service.keys.scopes import needed
+from service.scopes import needed
 from service.settings import ServiceSettings
 from service.store.__main__ import main
 from service.store.garbage import collect

@@ -13,11 +13,11 @@ import pytest
 from fastapi.testclient import TestClient
 
 from service.jobs import child, comparing
+from service.models import JobKind, JobState
 from service.store.jobs import fingerprint
 from service.store.owners import Owner, stored_bytes
 from service.store.schema import MIGRATIONS
 from service.store.store import Store
-from service.wire import JobKind, JobState
 from tests.crash.conftest import until
 from tests.crash.service_process import processes_of
 

@@ -11,8 +11,8 @@ from fastapi.testclient import TestClient
 
 from service.app import create_app, job_limits
 from service.jobs.supervisor import Supervisor
-from service.keys.scopes import parse_scopes
-from service.queries.warm import WarmWorker
+from service.queries.client import QueryClient
+from service.scopes import parse_scopes
 from service.settings import ServiceSettings
 from service.store.files import DataDirectory
 from service.store.keys import Quota
@@ -28,20 +28,21 @@ BODY = gzip.compress(bytes(64 * MiB), 1)  # a few hundred kilobytes
 def most(monkeypatch: pytest.MonkeyPatch) -> Callable[[], int]:
     """The bytes of the largest draft so far."""
     written: list[int] = []
-    original = Intake.__exit__
+    original = Intake.close
 
-    def leave(intake: Intake, *exception: object) -> None:
+    def close(intake: Intake) -> None:
+        assert intake._file is not None
         written.append(intake._file.tell())
-        original(intake, *exception)
+        original(intake)
 
-    monkeypatch.setattr(Intake, "__exit__", leave)
+    monkeypatch.setattr(Intake, "close", close)
     return lambda: max(written)
 
 
 def put(store: Store, headers: dict[str, str]) -> Any:
     """Upload what decompresses to 64 MiB."""
     settings = ServiceSettings.model_validate({"data": store.files.root})
-    app = create_app(settings, store, Supervisor(store, job_limits(settings)), cast("WarmWorker", NoQueries()))
+    app = create_app(settings, store, Supervisor(store, job_limits(settings)), cast("QueryClient", NoQueries()))
     with TestClient(app, "http://127.0.0.1", raise_server_exceptions=False) as client:
         return client.put("/assets/splats", content=BODY, headers={"Content-Encoding": "gzip", **headers})
 

@@ -20,8 +20,8 @@ from hypothesis import strategies as st
 from liftcore.errors import NotFound
 from liftcore.io.inspect import inspect_file
 from service.content import StoredFile, file_answer
-from service.uploads.decoding import GZIP, ZSTD, Coding, Decoding
-from service.wire import AssetKind
+from service.models import AssetKind
+from service.uploads.intake import GZIP, ZSTD, Coding, Decoding
 
 from .conftest import Uploaded
 from .test_problems import assert_problem

@@ -8,7 +8,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from liftcore.settings import LiftSettings
-from service.wire import COMPARED
+from service.models import COMPARED
 
 from .test_problems import NO_ASSET, assert_problem
 

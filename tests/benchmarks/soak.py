@@ -28,7 +28,7 @@ from liftcore.raster.cpu.warm_up import warm_up
 from liftcore.scene.cameras import Cameras
 from service.store.assets import CheckedUpload
 from service.store.store import Store
-from service.wire import AssetKind
+from service.models import AssetKind
 from tests.crash.server import POINTS
 from tests.crash.service_process import ServiceProcess, kill_processes_of, usage
 from tests.scenes import centred, random_camera, random_regions, random_splats

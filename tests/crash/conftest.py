@@ -13,10 +13,10 @@ import pytest
 
 from service.jobs.limits import JobLimits
 from service.jobs.supervisor import Supervisor
+from service.models import ENDED, AssetKind
 from service.store.assets import CheckedUpload
 from service.store.jobs import JobOrder, JobRecord
 from service.store.store import Store
-from service.wire import ENDED, AssetKind
 
 Supervising = Callable[..., AbstractContextManager[Supervisor]]
 

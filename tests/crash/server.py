@@ -20,7 +20,7 @@ from service.app import create_app, job_limits
 from service.jobs.attempt import CHILD
 from service.jobs.process import JobProcess
 from service.jobs.supervisor import Supervisor
-from service.queries.warm import WarmWorker
+from service.queries.client import QueryClient
 from service.settings import ServiceSettings
 from service.store.attempts import AttemptStore
 from service.store.files import DataDirectory
@@ -93,7 +93,7 @@ def main() -> None:
         arm(given.point)
     command = stand_in(given.behaviour) if given.behaviour else CHILD
     runner = Supervisor(store, job_limits(settings), command=command)
-    app = create_app(settings, store, runner, cast("WarmWorker", NoQueries()))
+    app = create_app(settings, store, runner, cast("QueryClient", NoQueries()))
     listener = socket.create_server(("127.0.0.1", 0))
     server_of(app, settings).run(sockets=[listener])
     store.close()

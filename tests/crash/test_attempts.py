@@ -16,12 +16,12 @@ import pytest
 from service.errors import Conflict
 from service.jobs import leftovers
 from service.jobs.leftovers import mark
+from service.models import JobState
 from service.store.attempts import MAX_ATTEMPTS
 from service.store.events import EventKind
 from service.store.files import DataDirectory
 from service.store.lifts import FinishedLift
 from service.store.store import Store
-from service.wire import JobState
 
 from .conftest import Supervising, alive, ended, order, until
 

@@ -13,7 +13,7 @@ from fastapi.testclient import TestClient
 from service.app import create_app
 from service.jobs.limits import JobLimits
 from service.jobs.supervisor import Supervisor
-from service.queries.warm import WarmWorker
+from service.queries.client import QueryClient
 from service.settings import ServiceSettings
 from service.store.store import Store
 
@@ -41,7 +41,7 @@ def test_full_disk_is_507_and_the_service_lives(small_disk: Path) -> None:
     body = {"splats": known.splats, "cameras": known.cameras, "features": list(known.features)}
     settings = ServiceSettings.model_validate({"data": small_disk / "data"})
     runner = Supervisor(store, JobLimits(), command=stand_in("answer"))
-    app = create_app(settings, store, runner, cast("WarmWorker", NoQueries()))
+    app = create_app(settings, store, runner, cast("QueryClient", NoQueries()))
     with TestClient(app, "http://127.0.0.1", raise_server_exceptions=False) as client:
         upload = client.put("/assets/splats", content=b"x" * 4_000_000)
         assert (upload.status_code, upload.json()["type"]) == (507, "/problems/no-space")

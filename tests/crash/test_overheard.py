@@ -12,7 +12,7 @@ from dataclasses import replace
 import pytest
 
 from service.jobs.overheard import LONGEST
-from service.logs import JsonLines
+from service.observe import JsonLines
 from service.store.store import Store
 
 from .conftest import Supervising, ended, order

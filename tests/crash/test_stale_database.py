@@ -13,14 +13,14 @@ import pytest
 
 from service import __main__ as server
 from service.errors import StaleDatabase
-from service.keys.__main__ import main as keys
-from service.keys.scopes import Scope
+from service.keys import main as keys
+from service.models import AssetKind
+from service.scopes import Scope
 from service.store import markers
 from service.store.files import DataDirectory
 from service.store.garbage import Collector, collect, empty_quarantine
 from service.store.keys import Quota
 from service.store.store import DATABASE, Store
-from service.wire import AssetKind
 
 from .conftest import asset_of, until
 

@@ -16,6 +16,7 @@ from hypothesis.stateful import Bundle, RuleBasedStateMachine, initialize, invar
 
 from liftcore.errors import NotFound
 from service.errors import Busy, Conflict, InUse, KeyReused
+from service.models import ENDED, AssetKind, JobKind, JobState
 from service.store.assets import CheckedUpload
 from service.store.attempts import MAX_ATTEMPTS
 from service.store.events import EventKind
@@ -25,7 +26,6 @@ from service.store.lifts import FinishedLift
 from service.store.owners import Owner, stored_bytes
 from service.store.store import Store
 from service.store.tradeoffs import FinishedTradeoff
-from service.wire import ENDED, AssetKind, JobKind, JobState
 
 LEASE = 60.0
 MAX_QUEUED = 3

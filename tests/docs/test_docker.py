@@ -39,7 +39,19 @@ def environment() -> dict[str, str]:
 
 
 def services() -> dict[str, Any]:
-    return yaml.safe_load(text("docker/compose.yaml"))["services"]
+    """Those that are this service: the proxy is built by others."""
+    found = yaml.safe_load(text("docker/compose.yaml"))["services"]
+    assert found.pop("proxy")["volumes"][0] == "./Caddyfile:/etc/caddy/Caddyfile:ro"
+    return found
+
+
+def test_the_proxy_has_the_limits_of_the_service() -> None:
+    caddy = text("docker/Caddyfile")
+    gib, mib = DEFAULTS.max_features_bytes >> 30, DEFAULTS.max_body_bytes >> 20
+    assert f"max_size {gib}GiB # SPLATLIFT_MAX_FEATURES_BYTES" in caddy
+    assert f"max_size {mib}MiB # SPLATLIFT_MAX_BODY_BYTES" in caddy
+    assert f"read_header {DEFAULTS.header_seconds:g}s" in caddy
+    assert f"splatlift:{DEFAULTS.port}" in caddy and "Host localhost" in caddy
 
 
 def health_check() -> list[str]:

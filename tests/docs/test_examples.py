@@ -23,7 +23,7 @@ from liftcore.cli import main
 from liftcore.features.pack import read_features
 from liftcore.features.sam import mask_of_runs, read_runs
 from liftcore.io.ply import read_splats
-from service import wire
+from service import models
 from service.routes import assets, jobs, lifts, operations, queries, tradeoffs
 from tests.api.tiny_scene import WIDTH, WORDS, codebook, colmap_zip, labels, make_scene
 from tests.run_lengths import sam_records
@@ -32,11 +32,11 @@ from .readme import ASKING, COMMANDS, GUIDE, SCENES, SERVICE, blocks, text
 
 ROUTES: tuple[ModuleType, ...] = (operations, assets, jobs, lifts, tradeoffs, queries)
 SHAPES: dict[str, type[BaseModel]] = {  # a field that no other answer has -> the answer
-    "counts": wire.Asset,
-    "attempt": wire.Job,
-    "statistics": wire.QueryAnswer,
-    "strays": wire.ObjectsAnswer,
-    "detail": wire.Problem,
+    "counts": models.Asset,
+    "attempt": models.Job,
+    "statistics": models.QueryAnswer,
+    "strays": models.ObjectsAnswer,
+    "detail": models.Problem,
 }
 
 

@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from service.keys.scopes import Scope
+from service.scopes import Scope
 from service.store.keys import Quota
 
 from .browser import Browser

@@ -6,19 +6,19 @@ import time
 from collections.abc import AsyncIterator, Callable
 
 import anyio
-from fastapi.responses import StreamingResponse
+from fastapi.sse import EventSourceResponse, format_sse_event
 from starlette.types import Receive, Scope, Send
 
 from liftcore.errors import NotFound
 from service.errors import Busy
+from service.models import ENDED
 from service.store.events import Event, EventKind
-from service.wire import ENDED
 
 LOOK_SECONDS = 0.25  # between looks for new events
 BREATH_SECONDS = 15.0  # of silence, then a comment shows that the line is open
 LOOKERS = 2  # threads that look, however many follow: streams must not starve the other routes
 
-ViewMask = Callable[[int], list[Event]]  # the events after a number
+Look = Callable[[int], list[Event]]  # the events after a number
 Shape = Callable[[Event], str]  # the JSON of an event
 
 
@@ -35,7 +35,7 @@ class EventStreams:
         """Let every stream end soon: the server stops."""
         self._closing = True
 
-    def answer(self, look: ViewMask, shape: Shape, after: int) -> StreamingResponse:
+    def answer(self, look: Look, shape: Shape, after: int) -> EventSourceResponse:
         """The events after a number as they come, until the last state.
 
         Raises:
@@ -47,23 +47,23 @@ class EventStreams:
             )
         return _Stream(self, self._follow(look, shape, after))
 
-    async def _follow(self, look: ViewMask, shape: Shape, after: int) -> AsyncIterator[str]:
+    async def _follow(self, look: Look, shape: Shape, after: int) -> AsyncIterator[bytes]:
         if self._lookers is None:
             self._lookers = anyio.CapacityLimiter(LOOKERS)
         spoke = time.monotonic()
         while not self._closing:
             try:
                 events = await anyio.to_thread.run_sync(look, after, limiter=self._lookers)
-            except NotFound:  # deleted meanwhile
+            except NotFound:  # deleted meanwhile, or the key was revoked
                 return
             for event in events:
                 after, spoke = event.number, time.monotonic()
-                yield f"id: {event.number}\nevent: {event.kind}\ndata: {shape(event)}\n\n"
+                yield format_sse_event(id=str(event.number), event=event.kind, data_str=shape(event))
                 if is_last(event):
                     return
             if time.monotonic() - spoke > BREATH_SECONDS:
                 spoke = time.monotonic()
-                yield ": still here\n\n"
+                yield format_sse_event(comment="still here")
             await anyio.sleep(LOOK_SECONDS)
 
 
@@ -72,12 +72,10 @@ def is_last(event: Event) -> bool:
     return event.kind is EventKind.STATE and event.data["state"] in ENDED
 
 
-class _Stream(StreamingResponse):
+class _Stream(EventSourceResponse):
     """Counts as open while it is being sent, and lets go however that ends."""
 
-    media_type = "text/event-stream"
-
-    def __init__(self, streams: EventStreams, events: AsyncIterator[str]) -> None:
+    def __init__(self, streams: EventStreams, events: AsyncIterator[bytes]) -> None:
         super().__init__(events, headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"})
         self._streams = streams
         streams.open += 1

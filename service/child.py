@@ -1,16 +1,41 @@
-"""How an error crosses from a child process to the HTTP process: as a flat JSON object."""
+"""What the child processes share: how they report, how they tell of errors, and that they end with their server."""
 
 from __future__ import annotations
 
+import os
+import signal
+import threading
 from collections.abc import Mapping
+from typing import BinaryIO
 
 from liftcore.errors import SplatliftError
 
 FIELDS = ("argument", "expected", "got", "hint")
+ORPHANED = 3  # the exit status of a process whose server is gone
+
+
+def own_stdout() -> BinaryIO:
+    """The pipe to whoever started this process, for reports only: what libraries print goes to stderr from now on."""
+    out = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
+    return out
+
+
+def end_with_parent() -> None:
+    """End this process, and its group, when its stdin closes: the server's end does, however the server ended."""
+    stdin = os.fdopen(os.dup(0), "rb", buffering=0)
+
+    def wait() -> None:
+        stdin.read()
+        if os.getpgrp() == os.getpid():  # the server gave us a group of our own: all in it is our doing
+            os.killpg(0, signal.SIGKILL)
+        os._exit(ORPHANED)
+
+    threading.Thread(target=wait, daemon=True).start()
 
 
 def fault_of(error: SplatliftError, names: Mapping[str, str] | None = None) -> dict[str, str]:
-    """The error as JSON: kind, argument, expected, got, hint.
+    """The error as flat JSON: kind, argument, expected, got, hint.
 
     Args:
         error: the error to send.
@@ -29,7 +54,7 @@ def renamed(text: str, names: Mapping[str, str]) -> str:
 
 def error_of(fault: Mapping[str, str]) -> SplatliftError:
     """The error that `fault_of` told of; an unknown kind becomes the base class."""
-    kinds = {cls.kind: cls for cls in _tree(SplatliftError)}
+    kinds = {cls.kind: cls for cls in reversed(_tree(SplatliftError))}  # of two of a kind the base class counts
     cls = kinds.get(fault["kind"], SplatliftError)
     return cls(fault["argument"], expected=fault["expected"], got=fault["got"], hint=fault["hint"])
 

@@ -16,7 +16,7 @@ from typing import Any
 from liftcore.errors import NotFound, SplatliftError
 from service.__main__ import parse
 from service.errors import InvalidRequest
-from service.keys.scopes import parse_scopes
+from service.scopes import parse_scopes
 from service.store.database import Database
 from service.store.keys import KeyRecord, KeyStore, Quota
 from service.store.store import DATABASE

@@ -1,18 +1,125 @@
-"""What goes over the wire: the JSON that the service takes and gives."""
+"""The JSON that the service takes and gives."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
+from copy import deepcopy
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Annotated, Any, Literal, get_args
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    GetJsonSchemaHandler,
+    ValidationError,
+    ValidatorFunctionWrapHandler,
+    WrapValidator,
+    model_validator,
+)
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema, PydanticCustomError
 
 from liftcore.settings import LiftSettings
-from service.fields import Body, NoBoolean, Published, at_most, takes
+
+# How fields tell of what does not fit: one error, in words, whatever pydantic would make of it
+
+NAME_CHARACTERS = 80  # of a name that a client sent, told back
+
+
+def one_of(names: Iterable[str]) -> str:
+    """What is expected where one of these names is."""
+    return f"one of {', '.join(names)}"
+
+
+def takes(expected: str) -> WrapValidator:
+    """Says what a union takes, in one error in place of one for each of its branches."""
+
+    def check(value: Any, branches: ValidatorFunctionWrapHandler) -> Any:
+        try:
+            return branches(value)
+        except ValidationError:
+            raise PydanticCustomError("takes", "{expected}", {"expected": expected}) from None
+
+    return WrapValidator(check)
+
+
+def at_most(characters: int) -> AfterValidator:
+    """Bounds a list of texts by what they have together."""
+
+    def check(texts: list[str]) -> list[str]:
+        if (got := sum(map(len, texts))) > characters:
+            told = {"expected": f"texts of at most {characters} characters together, which are {got}"}
+            raise PydanticCustomError("too_long_together", "{expected}", told)
+        return texts
+
+    return AfterValidator(check)
+
+
+def _no_boolean(value: Any) -> Any:
+    if isinstance(value, bool):
+        raise PydanticCustomError("no_number", "{expected}", {"expected": "a number"})
+    return value
+
+
+NoBoolean = BeforeValidator(_no_boolean)  # of a number: pydantic reads true as 1
+
+
+@dataclass(frozen=True)
+class Published:
+    """Shows a field in the OpenAPI document as a model's own fields, which another module checks in its own words."""
+
+    model: type[BaseModel]
+    without: Sequence[str] = ()
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        shown = deepcopy(handler.resolve_ref_schema(handler(self.model.__pydantic_core_schema__)))
+        for name in self.without:
+            shown["properties"].pop(name)
+        del shown["title"]
+        return shown
+
+
+class Body(BaseModel):
+    """What a body, or a part of one, may hold. A field that is not known is refused with those that are."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _knows(cls, given: Any) -> Any:
+        for name in given if isinstance(given, dict) else ():
+            if name not in cls.model_fields:
+                # Half a surrogate pair, which JSON can name, would break pydantic's own report.
+                shown = name[:NAME_CHARACTERS].encode("utf-8", "backslashreplace").decode()
+                told = {"field": shown, "expected": one_of(cls.model_fields)}
+                raise PydanticCustomError("unknown_field", "{expected}", told)
+        return given
+
+
+def _bounded(given: Any) -> Any:
+    """What is too much to be settings is refused before any of it is looked at."""
+    if isinstance(given, dict):
+        texts = (text for pair in given.items() for text in pair if isinstance(text, str))
+        if len(given) > MAX_SETTINGS or any(len(text) > SETTING_CHARACTERS for text in texts):
+            told = {"expected": f"at most {MAX_SETTINGS} settings of at most {SETTING_CHARACTERS} characters"}
+            raise PydanticCustomError("too_many_settings", "{expected}", told)
+    return given
+
+
+Bounded = BeforeValidator(_bounded)
+
+
+# What goes in and out
 
 ASSET_ID = r"^sha256:[0-9a-f]{64}$"
 JOB_ID = r"^[0-9a-f]{32}$"
 COMPARED = ("preset", "speed")  # what differs between the runs of a trade-off
+MAX_SETTINGS = 100
+SETTING_CHARACTERS = 200  # of a name or a text among them
 VIEW_CHARACTERS = 500  # of a camera's name that can be asked for
 
 AssetId = Annotated[str, Field(pattern=ASSET_ID, description="sha256: and the digest of the bytes, in hex")]
@@ -83,6 +190,14 @@ class Assets(BaseModel):
     """All assets, newest first."""
 
     assets: list[Asset]
+    next: str | None = Field(None, description="with limit: the cursor of the page after this one; null at the end")
+
+
+class Names(BaseModel):
+    """Some of the names of views, or of the words, that an asset holds."""
+
+    names: list[str]
+    next: int | None = Field(description="the cursor of the page after this one; null at the end")
 
 
 class LiftRequest(Body):
@@ -91,7 +206,7 @@ class LiftRequest(Body):
     splats: AssetId
     cameras: AssetId
     features: Annotated[list[AssetId], Field(min_length=1, max_length=10_000)]
-    settings: Annotated[dict[str, Scalar], Published(LiftSettings)] = Field(
+    settings: Annotated[dict[str, Scalar], Bounded, Published(LiftSettings)] = Field(
         default_factory=dict,
         description="preset and knobs of the lift; those left out take the values of the preset and the speed",
         examples=[{"preset": "tikhonov", "speed": "balanced"}],
@@ -111,7 +226,7 @@ class Labels(Body):
 class TradeoffRequest(LiftRequest):
     """What to compare: lifts of these assets, each with another preset or place of the dial."""
 
-    settings: Annotated[dict[str, Scalar], Published(LiftSettings, without=COMPARED)] = Field(
+    settings: Annotated[dict[str, Scalar], Bounded, Published(LiftSettings, without=COMPARED)] = Field(
         default_factory=dict,
         description="of all runs: knobs of the lift beside preset and speed, which are compared",
         examples=[{"robust_steps": 1}],
@@ -167,6 +282,7 @@ class Jobs(BaseModel):
     """All jobs, newest first."""
 
     jobs: list[Job]
+    next: str | None = Field(None, description="with limit: the cursor of the page after this one; null at the end")
 
 
 class JobStep(BaseModel):
@@ -210,6 +326,7 @@ class Lifts(BaseModel):
     """All lifts, newest first."""
 
     lifts: list[LiftResult]
+    next: str | None = Field(None, description="with limit: the cursor of the page after this one; null at the end")
 
 
 class Tradeoff(BaseModel):

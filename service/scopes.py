@@ -50,8 +50,7 @@ def parse_scopes(names: Iterable[str]) -> frozenset[Scope]:
         InvalidRequest: there is none, or one is unknown.
     """
     names = [name.strip() for name in names if name.strip()]
-    known = ", ".join(Scope)
-    if not names or not set(names) <= set(Scope):
-        wrong = next((name for name in names if name not in set(Scope)), "none")
-        raise InvalidRequest("scopes", expected=f"one or more of {known}", got=wrong[:80])
-    return frozenset(Scope(name) for name in names)
+    wrong = next((name for name in names if name not in set(Scope)), None if names else "none")
+    if wrong is not None:
+        raise InvalidRequest("scopes", expected=f"one or more of {', '.join(Scope)}", got=wrong[:80])
+    return frozenset(map(Scope, names))

@@ -1,0 +1,229 @@
+"""Who may ask, and for what: the gate that every request goes through before anything of it is read.
+
+First the Host and the Origin: the threat is a page of another site in the browser of somebody who can reach the
+service. It may send requests itself (then its Origin tells), or have its own name point to this machine (DNS
+rebinding; then the Host tells). Then the key, its scope, and its uploads at a time.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+from urllib.parse import urlsplit
+
+import anyio
+from starlette.datastructures import Headers
+from starlette.types import ASGIApp, Receive, Send
+from starlette.types import Scope as AsgiScope
+
+from liftcore.errors import SplatliftError
+from service.errors import ForeignOrigin, InvalidRequest, Misdirected, MissingScope, TooMany, Unauthorized
+from service.problems import CLOSE, answer_to
+from service.scopes import SAFE, Scope, allows, needed
+from service.settings import ServiceSettings
+from service.store.keys import KeyRecord, KeyStore
+from service.store.owners import Owner
+
+CALLER = "caller"  # of the scope's state
+LOOPBACK = frozenset({"localhost", "127.0.0.1", "::1"})
+BEARER = re.compile(r"bearer +([A-Za-z0-9._~+/-]+=*)", re.ASCII | re.IGNORECASE)  # RFC 6750, 2.1
+LOOKUPS = 4  # threads that look keys up, so that slow routes cannot keep anyone waiting at the gate
+UPLOADS = "/assets/"
+SCHEMES = {
+    "key": {
+        "type": "http",
+        "scheme": "bearer",
+        "description": f"A key that the operator made, with one or more of the scopes {', '.join(Scope)}.",
+    }
+}
+
+
+@dataclass(frozen=True)
+class Caller:
+    """Who asks."""
+
+    owner: Owner
+    max_uploads: int | None = None
+    key: str | None = None  # its id, for the log
+
+
+EVERYBODY = Caller(Owner())  # while there are no keys
+STRANGER = Caller(Owner(key="-", sees_all=False))  # on an open route: the id of no key, so nothing is theirs
+
+
+class Gate:
+    """ASGI middleware: lets a request pass with its `Caller` in the scope's state, or answers why not."""
+
+    def __init__(self, app: ASGIApp, keys: KeyStore, settings: ServiceSettings) -> None:
+        self._app = app
+        self._keys = keys.under(settings.keys)
+        self._settings = settings
+        self._hosts = Hosts(settings.host, settings.allowed_hosts)
+        self._uploads: Counter[str] = Counter()  # by key, those that are on their way
+        self._lookups: anyio.CapacityLimiter | None = None
+
+    async def __call__(self, scope: AsgiScope, receive: Receive, send: Send) -> None:
+        """Let the request pass, or say why not."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        headers = Headers(scope=scope)
+        try:
+            require_one_length(headers)
+            self._hosts.check(scope["method"], headers)
+            caller = await self._caller(needed(scope["method"], scope["path"]), headers)
+            uploads = scope["method"] == "PUT" and scope["path"].startswith(UPLOADS)
+            if uploads:
+                self._require_turn(caller)
+        except SplatliftError as error:
+            await answer_to(error, CLOSE if isinstance(error, InvalidRequest) else None)(scope, receive, send)
+            return
+        scope.setdefault("state", {})[CALLER] = caller
+        self._uploads[caller.owner.key] += uploads
+        try:
+            await self._app(scope, receive, send)
+        finally:
+            self._uploads[caller.owner.key] -= uploads
+            if not self._uploads[caller.owner.key]:
+                del self._uploads[caller.owner.key]
+
+    async def _caller(self, wanted: Scope | None, headers: Headers) -> Caller:
+        if wanted is None:
+            return STRANGER
+        if self._lookups is None:
+            self._lookups = anyio.CapacityLimiter(LOOKUPS)
+        required, key = await anyio.to_thread.run_sync(self._keys.admit, bearer(headers), limiter=self._lookups)
+        if not required:
+            return EVERYBODY
+        if key is None:
+            raise Unauthorized(
+                "Authorization", expected="Bearer and a key of this service",
+                got="one that is not valid" if "authorization" in headers else "none",
+                hint="the operator makes keys with splatlift keys create",
+            )  # fmt: skip
+        if not allows(key.scopes, wanted):
+            raise MissingScope(
+                "Authorization", expected=f"a key with the scope {wanted}",
+                got=f"one with {', '.join(sorted(key.scopes))}", scope=wanted,
+            )  # fmt: skip
+        return self._known(key)
+
+    def _known(self, key: KeyRecord) -> Caller:
+        quota, settings = key.quota, self._settings
+        owner = Owner(
+            key=key.id,
+            sees_all=Scope.ADMIN in key.scopes,
+            max_bytes=settings.key_bytes if quota.max_bytes is None else quota.max_bytes,
+            max_queued=settings.key_queued if quota.max_queued is None else quota.max_queued,
+        )
+        return Caller(owner, settings.key_uploads if quota.max_uploads is None else quota.max_uploads, key.id)
+
+    def _require_turn(self, caller: Caller) -> None:
+        if caller.max_uploads is not None and self._uploads[caller.owner.key] >= caller.max_uploads:
+            raise TooMany(
+                "upload", expected=f"at most {caller.max_uploads} uploads of this key at a time", got="more",
+                hint="wait for the end of one",
+            )  # fmt: skip
+
+
+def bearer(headers: Headers) -> str | None:
+    """The secret that a request brings, None when it brings none, or not as it should."""
+    given = headers.getlist("authorization")
+    match = BEARER.fullmatch(given[0].strip()) if len(given) == 1 else None
+    return None if match is None else match[1]
+
+
+def require_one_length(headers: Headers) -> None:
+    """Refuse a body whose end is told in two ways: a proxy may see another end than we do (RFC 9112, 6.1).
+
+    Raises:
+        InvalidRequest: there are both headers.
+    """
+    if "content-length" in headers and "transfer-encoding" in headers:
+        raise InvalidRequest("Content-Length", expected="either it or Transfer-Encoding", got="both")
+
+
+class Hosts:
+    """The names of this service.
+
+    Args:
+        bound: the address that the service listens on. When that is all of them, every address in digits is this
+            service: rebinding needs a name.
+        allowed: more names, for those who come through a proxy or by a name of this machine.
+    """
+
+    def __init__(self, bound: str, allowed: Iterable[str]) -> None:
+        self._allowed = frozenset(name.lower() for name in allowed)
+        self._names = LOOPBACK | {bound.lower()} | self._allowed
+        self._all_addresses = _is_address(bound) and ipaddress.ip_address(bound).is_unspecified
+
+    def check(self, method: str, headers: Headers) -> None:
+        """See that a request means this service, and that no foreign page sends it.
+
+        Raises:
+            Misdirected: the Host is another.
+            ForeignOrigin: it would change something, and comes from a page of another site.
+        """
+        hosts = headers.getlist("host")
+        name = host_name(hosts[0]) if len(hosts) == 1 else None
+        if name is None or not (name in self._names or (self._all_addresses and _is_address(name))):
+            raise Misdirected(
+                "Host", expected="a name of this service", got=", ".join(hosts)[:200] or "none",
+                hint="the operator may add names with SPLATLIFT_ALLOWED_HOSTS",
+            )  # fmt: skip
+        origins = headers.getlist("origin")
+        if method not in SAFE and any(not self._same_site(origin, hosts[0]) for origin in origins):
+            raise ForeignOrigin("Origin", expected="this service's own page", got=", ".join(origins)[:200])
+
+    def _same_site(self, origin: str, host: str) -> bool:
+        try:
+            authority = urlsplit(origin).netloc.lower()
+        except ValueError:
+            return False
+        return authority != "" and (authority == host.lower() or host_name(authority) in self._allowed)
+
+
+def host_name(host: str) -> str | None:
+    """The name in a Host header, lower case, without port and brackets; None when it is malformed."""
+    name, bracket, rest = host.strip().lower().rpartition("]")
+    if bracket:
+        name = name.removeprefix("[")
+        return name if _is_address(name) and _is_port(rest) else None
+    name, colon, port = rest.partition(":")
+    return name.removesuffix(".") if name and _is_port(colon + port) else None
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine reaches that address."""
+    return host == "localhost" or (_is_address(host) and ipaddress.ip_address(host).is_loopback)
+
+
+def _is_port(text: str) -> bool:
+    digits = text.removeprefix(":")
+    return text in ("", ":") or (text != digits and digits.isascii() and digits.isdigit())
+
+
+def _is_address(name: str) -> bool:
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return True
+
+
+def with_keys(document: dict[str, Any]) -> dict[str, Any]:
+    """An OpenAPI document that says which operations need a key."""
+    paths = {
+        path: {method: _secured(method, path, operation) for method, operation in operations.items()}
+        for path, operations in document["paths"].items()
+    }
+    return {**document, "paths": paths, "components": {**document["components"], "securitySchemes": SCHEMES}}
+
+
+def _secured(method: str, path: str, operation: dict[str, Any]) -> dict[str, Any]:
+    scope = needed(method.upper(), path)
+    return operation if scope is None else {**operation, "security": [{"key": [scope]}]}

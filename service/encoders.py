@@ -1,0 +1,131 @@
+"""Which text encoder answers for a text space, and the files that encoders are read from.
+
+The process that queries opens an encoder at the first question to it, and an error is then told to whoever asked,
+who can do nothing about it: so `require_encoder_files` looks before the service starts.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError, safe_open
+
+from liftcore.errors import InvalidInput
+from liftcore.io.safetensors_file import check_header
+from liftcore.query.text import ENCODER_SPECS, NO_WORDS
+from service.errors import InvalidRequest, Misconfigured
+from service.settings import ServiceSettings
+
+TABLE = "a text table: safetensors with embeddings [n, F] and metadata words, a JSON list of n strings"
+
+
+def encoder_spec(settings: ServiceSettings, text_space: str, asked: str | None) -> str:
+    """The text encoder of a query: the one of the space asked for, else of the lift's.
+
+    The default stands in for a space that has none only where the operator chose it: scores of an encoder of
+    another space look like any others, and mean nothing.
+
+    Raises:
+        InvalidRequest: no encoder was set up under the name asked for, or for the lift's text space.
+    """
+    if asked == "default":
+        return settings.encoder
+    if asked is not None:
+        if asked not in settings.text_spaces:
+            known = ", ".join(["default", *sorted(settings.text_spaces)])
+            raise InvalidRequest(
+                "encoder", expected="the name of a text space that the operator set up", got=repr(asked),
+                hint=f"known here: {known}",
+            )  # fmt: skip
+        return settings.text_spaces[asked]
+    if text_space in settings.text_spaces:
+        return settings.text_spaces[text_space]
+    if text_space == settings.encoder or (text_space != NO_WORDS and "encoder" in settings.model_fields_set):
+        return settings.encoder
+    raise _no_encoder(settings, text_space)
+
+
+def _no_encoder(settings: ServiceSettings, text_space: str) -> InvalidRequest:
+    if text_space == NO_WORDS:
+        return InvalidRequest(
+            "lift", expected="features that share a space with a text encoder", got="text space 'none'",
+            hint="ask by example, with like=; or name an encoder with encoder= if you know better",
+        )  # fmt: skip
+    example = json.dumps({text_space or "NAME": "table:FILE"})
+    return InvalidRequest(
+        "lift", expected="features of a text space that this server has an encoder for",
+        got=f"text space {text_space!r}" if text_space else "features that name no text space",
+        hint=f"ask by example, with like=; or the operator sets SPLATLIFT_TEXT_SPACES='{example}' or"
+        f" SPLATLIFT_ENCODER; encoder=default asks {encoder_label(settings.encoder)} all the same",
+    )  # fmt: skip
+
+
+def encoder_label(spec: str) -> str:
+    """An encoder as clients may know it: its specification without a file of the server."""
+    return "table" if spec.startswith("table:") or spec.endswith(".safetensors") else spec.partition("@")[0]
+
+
+def encoder_file(spec: str) -> Path | None:
+    """The file that an encoder specification names, None when it names none."""
+    if spec.startswith("table:"):
+        return Path(spec.removeprefix("table:"))
+    if spec.startswith("open_clip:") and "@" in spec:
+        return Path(spec.partition("@")[2])
+    return Path(spec) if spec.endswith(".safetensors") else None
+
+
+def encoder_version(spec: str) -> list[int] | None:
+    """What changes when the file of an encoder does: its time and size; None without a file."""
+    file = encoder_file(spec)
+    try:
+        status = file.stat() if file is not None else None
+    except OSError:
+        return None
+    return None if status is None else [status.st_mtime_ns, status.st_size]
+
+
+def require_encoder_files(settings: ServiceSettings) -> None:
+    """See that every file that a text encoder of the settings names is there, and that tables look like ones.
+
+    Raises:
+        Misconfigured: there is no such encoder, a file is missing or does not open, or a table is none. The setting
+            is named.
+    """
+    named = {"encoder": settings.encoder}
+    named |= {f"text_spaces, {space!r}": spec for space, spec in settings.text_spaces.items()}
+    for argument, spec in named.items():
+        path = encoder_file(spec)
+        if path is None and spec != "minilm" and not spec.startswith("open_clip:"):
+            raise Misconfigured(argument, expected=f"one of {', '.join(ENCODER_SPECS)}", got=repr(spec))
+        if path is not None:
+            _require_readable(argument, path)
+            if encoder_label(spec) == "table":
+                _require_table(argument, path)
+
+
+def _require_readable(argument: str, path: Path) -> None:
+    try:
+        with path.open("rb"):
+            return
+    except OSError as error:
+        got = f"{path} ({error.strerror})"
+        raise Misconfigured(argument, expected="a file that opens", got=got, hint="name one that is there") from None
+
+
+def _require_table(argument: str, path: Path) -> None:
+    """Look at the header alone: the values are read, and judged, where the table is opened."""
+    try:
+        check_header(path, str(path), InvalidInput, expected=TABLE)
+        handle: Any
+        with safe_open(str(path), framework="np") as handle:
+            shape = handle.get_slice("embeddings").get_shape()
+            words = json.loads((handle.metadata() or {}).get("words", "null"))
+    except InvalidInput as error:
+        raise Misconfigured(argument, expected=error.expected, got=f"{error.got} at {path}") from None
+    except (SafetensorError, OSError, ValueError, RecursionError) as error:
+        raise Misconfigured(argument, expected=TABLE, got=f"{str(error)[:120]} in {path}") from None
+    if len(shape) != 2 or not isinstance(words, list) or len(words) != shape[0]:
+        count = f"{len(words)} words" if isinstance(words, list) else "no words"
+        raise Misconfigured(argument, expected=TABLE, got=f"{path} with {count} and embeddings {shape}")

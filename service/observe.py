@@ -1,0 +1,425 @@
+"""What the service tells its operator: ids of requests, the log, counters, and what runs here."""
+
+from __future__ import annotations
+
+import json
+import logging
+import logging.handlers
+import platform
+import queue
+import re
+import secrets
+import sys
+import threading
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+from fastapi import FastAPI
+from prometheus_client import (
+    CollectorRegistry,
+    Counter,
+    Histogram,
+    Info,
+    ProcessCollector,
+    disable_created_metrics,
+    generate_latest,
+)
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
+from prometheus_client.metrics_core import Metric
+from prometheus_client.registry import Collector
+from starlette.datastructures import MutableHeaders
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from liftcore import __version__
+from service import models
+from service.models import JobState
+from service.queries.client import QueryClient
+from service.store.schema import MIGRATIONS
+from service.store.store import Store
+from service.streams import EventStreams
+
+# Ids of requests
+
+REQUEST_ID = b"x-request-id"
+SANE = re.compile(rb"[A-Za-z0-9._~+/=:@-]{1,128}")  # no space, quote or control character: safe in any log
+_CURRENT: ContextVar[str | None] = ContextVar("request_id", default=None)
+
+
+def chosen_id(headers: Iterable[tuple[bytes, bytes]]) -> str:
+    """The id for a request with these headers (names in lower case): the client's own when it is a sane one."""
+    sent = [value for name, value in headers if name == REQUEST_ID]
+    if len(sent) == 1 and SANE.fullmatch(sent[0]):
+        return sent[0].decode("ascii")
+    return secrets.token_hex(16)
+
+
+def current_id() -> str | None:
+    """The id of the request that this task or thread works for, None when it works for none."""
+    return _CURRENT.get()
+
+
+@contextmanager
+def working_for(request: str | None) -> Iterator[None]:
+    """What is done in the block, and in threads that it awaits, is done for that request."""
+    token = _CURRENT.set(request)
+    try:
+        yield
+    finally:
+        _CURRENT.reset(token)
+
+
+# The log
+
+SECRET = re.compile(r"(?i)\b(bearer|basic)\s+[^\s\"',;]+")
+WAITING_RECORDS = 10_000  # for a reader of stderr that is slow; more are dropped, and counted
+SAME_A_MINUTE = 60  # records from one line of code that are no access: what fails in a loop must not fill a disk
+
+log = logging.getLogger(__name__)
+access = logging.getLogger("service.access")
+
+
+@contextmanager
+def logging_to_stderr(log_format: str) -> Iterator[None]:
+    """Send the records of this process to stderr, warnings and threads that died among them, while the block runs.
+
+    A thread of its own writes them: where stderr is stalled nobody waits for it.
+    """
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(JsonLines() if log_format == "json" else TextLines())
+    waiting: queue.Queue[logging.LogRecord] = queue.Queue(WAITING_RECORDS)
+    line = _Line(waiting)
+    line.addFilter(Sparing())
+    listener = logging.handlers.QueueListener(waiting, handler)
+    logging.basicConfig(level=logging.INFO, handlers=[line])
+    logging.captureWarnings(True)
+    threading.excepthook = _thread_died
+    listener.start()
+    try:
+        yield
+    finally:
+        listener.stop()
+
+
+class _Line(logging.handlers.QueueHandler):
+    """Notes the request that a record was made for, as the thread that writes it works for none."""
+
+    def prepare(self, record: logging.LogRecord) -> logging.LogRecord:
+        """The record as it is, with its request."""
+        record.request_id = current_id()
+        return record
+
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802
+        """Nothing: the line is full, and complaints would go to where nobody reads."""
+
+
+class Sparing(logging.Filter):
+    """Lets one line of code say SAME_A_MINUTE things a minute; the access log tells of every request.
+
+    Args:
+        clock: seconds that never go back.
+    """
+
+    def __init__(self, clock: Any = time.monotonic) -> None:
+        super().__init__()
+        self._clock = clock
+        self._said: dict[tuple[str, int], tuple[float, int]] = {}  # place -> the minute's begin, records in it
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Whether the record is to be written; the first one after a silence says how long that was."""
+        if record.name == access.name:
+            return True
+        place, now = (record.pathname, record.lineno), self._clock()
+        begun, count = self._said.get(place, (now, 0))
+        if now - begun >= 60:
+            left_out = count - SAME_A_MINUTE
+            if left_out > 0:
+                record.fields = getattr(record, "fields", {}) | {"left_out": left_out}
+            begun, count = now, 0
+        self._said[place] = begun, count + 1
+        return count < SAME_A_MINUTE
+
+
+class JsonLines(logging.Formatter):
+    """A JSON object a record: ``time``, ``level``, ``logger``, ``message``, then what the record brings.
+
+    A record brings ``request_id`` when it is made for a request, ``error`` with an exception's trace, and whatever it
+    was given as ``extra={"fields": {...}}``.
+    """
+
+    def format(self, record: logging.LogRecord) -> str:
+        """One line."""
+        return json.dumps(_told(self, record), ensure_ascii=True, default=str)
+
+
+class TextLines(logging.Formatter):
+    """The same for people: time, level, logger and message, the rest as ``name=value``, then the trace."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """One line, and those of the trace."""
+        told = _told(self, record)
+        trace = told.pop("error", None)
+        time, level, logger, message = (told.pop(name) for name in ("time", "level", "logger", "message"))
+        message = message if message.isprintable() else message.encode("unicode_escape").decode()
+        rest = "".join(f" {name}={json.dumps(value, default=str)}" for name, value in told.items())
+        line = f"{time} {level.upper()} {logger}: {message}{rest}"
+        return line if trace is None else f"{line}\n{trace}"
+
+
+def _told(formatter: logging.Formatter, record: logging.LogRecord) -> dict[str, Any]:
+    moment = datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")
+    told: dict[str, Any] = {
+        "time": moment.replace("+00:00", "Z"),
+        "level": record.levelname.lower(),
+        "logger": record.name,
+        "message": _without_secrets(record.getMessage()),
+    }
+    request = getattr(record, "request_id", None) or current_id()
+    if request is not None:
+        told["request_id"] = request
+    told |= getattr(record, "fields", {})
+    if record.exc_info:
+        told["error"] = _without_secrets(formatter.formatException(record.exc_info))
+    return told
+
+
+def _without_secrets(text: str) -> str:
+    """No record is made of headers; this is for traces that quote them."""
+    return SECRET.sub(r"\1 [hidden]", text)
+
+
+def _thread_died(died: threading.ExceptHookArgs) -> None:
+    name = died.thread.name if died.thread is not None else "a thread"
+    trace = (died.exc_type, died.exc_value or died.exc_type(), died.exc_traceback)
+    log.error("%s died", name, exc_info=trace)
+
+
+# What runs here
+
+API = "1"  # of the routes and their JSON: changes when a client that works today would break
+PACKAGES = ("torch", "numpy", "numba", "fastapi", "uvicorn")
+
+
+def versions(commit: str | None) -> models.Version:
+    """What runs here, found without importing it; the commit is told by whoever built this, in the settings."""
+    found = {name: _installed(name) for name in PACKAGES}
+    return models.Version(
+        version=__version__,
+        api=API,
+        database=len(MIGRATIONS),
+        commit=commit,
+        python=platform.python_version(),
+        packages={name: known for name, known in found.items() if known is not None},
+    )
+
+
+def _installed(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+# Counters
+
+# A label may take few values: a route is its template, a method one that HTTP defines, and the rest are one value.
+METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS", "TRACE", "CONNECT"})
+OTHER = "other"
+REQUEST_BUCKETS = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 120.0, 600.0)  # seconds
+ATTEMPT_BUCKETS = (1.0, 3.0, 10.0, 30.0, 60.0, 180.0, 600.0, 1800.0, 3600.0, 10_800.0, 43_200.0)  # seconds
+
+
+class Metrics:
+    """What is counted for Prometheus, in a registry of its own. Any thread may call any method."""
+
+    def __init__(self, store: Store, queries: QueryClient, streams: EventStreams, build: models.Version) -> None:
+        disable_created_metrics()  # a second series for each one that says when it began: nobody reads those
+        self._registry = registry = CollectorRegistry()
+        self._requests = Counter(
+            "splatlift_http_requests", "Requests by route and status.", ("method", "route", "status"),
+            registry=registry,
+        )  # fmt: skip
+        self._seconds = Histogram(
+            "splatlift_http_request_seconds", "Time from a request's head to the end of its answer.",
+            ("method", "route"), buckets=REQUEST_BUCKETS, registry=registry,
+        )  # fmt: skip
+        self._received = Counter(
+            "splatlift_http_request_body_bytes", "Bytes of request bodies; of PUT /assets/{asset}: uploads.",
+            ("method", "route"), registry=registry,
+        )  # fmt: skip
+        self._attempts = Histogram(
+            "splatlift_attempt_seconds", "Time that attempts at jobs took, by the state that the job came to.",
+            ("outcome",), buckets=ATTEMPT_BUCKETS, registry=registry,
+        )  # fmt: skip
+        self._queries = Histogram(
+            "splatlift_query_seconds", "Time that the query worker took, waiting included, by what came of it.",
+            ("operation", "outcome"), buckets=REQUEST_BUCKETS, registry=registry,
+        )  # fmt: skip
+        told = {"version": build.version, "commit": build.commit or "", "python": build.python, **build.packages}
+        Info("splatlift_build", "What runs here.", registry=registry).info(told)
+        ProcessCollector(registry=registry)
+        registry.register(_Gauges(store, queries, streams))
+
+    def served(self, exchange: Exchange, route: str | None) -> None:
+        """Count a request; its route is the template, None when no route takes the path."""
+        method = exchange.method if exchange.method in METHODS else OTHER
+        route = route or OTHER
+        self._requests.labels(method, route, str(exchange.status)).inc()
+        self._seconds.labels(method, route).observe(exchange.seconds)
+        if exchange.received:
+            self._received.labels(method, route).inc(exchange.received)
+
+    def attempted(self, outcome: str, seconds: float) -> None:
+        """Count an attempt at a job."""
+        self._attempts.labels(outcome).observe(seconds)
+
+    def queried(self, operation: str, outcome: str, seconds: float) -> None:
+        """Count a call of the query worker."""
+        self._queries.labels(operation, outcome).observe(seconds)
+
+    def text(self) -> bytes:
+        """All of it in the text format 0.0.4. Reads the database and the disk."""
+        return generate_latest(self._registry)
+
+
+class _Gauges(Collector):
+    """What is true when somebody asks."""
+
+    def __init__(self, store: Store, queries: QueryClient, streams: EventStreams) -> None:
+        self._store = store
+        self._queries = queries
+        self._streams = streams
+
+    def describe(self) -> Iterable[Metric]:
+        """Nothing: the names are our own, and looking them up would read the database."""
+        return ()
+
+    def collect(self) -> Iterator[Metric]:
+        """Look."""
+        counts = self._store.jobs.count_by_state()
+        jobs = GaugeMetricFamily("splatlift_jobs", "Jobs by state.", labels=("state",))
+        for state in JobState:
+            jobs.add_metric((state.value,), counts.get(state, 0))
+        yield jobs
+        running = counts.get(JobState.RUNNING, 0) + counts.get(JobState.CANCELING, 0)
+        yield GaugeMetricFamily("splatlift_queue_length", "Jobs in line.", value=counts.get(JobState.QUEUED, 0))
+        yield GaugeMetricFamily("splatlift_running_lifts", "Jobs whose process is there.", value=running)
+        yield GaugeMetricFamily("splatlift_open_streams", "Clients that follow events.", value=self._streams.open)
+        files = self._store.files
+        yield GaugeMetricFamily("splatlift_disk_free_bytes", "Free disk below the data.", value=files.free_bytes())
+        yield GaugeMetricFamily("splatlift_disk_floor_bytes", "Free disk to be left.", value=files.floor_bytes)
+        yield GaugeMetricFamily("splatlift_query_worker_up", "1 while it lives.", value=float(self._queries.alive()))
+        yield CounterMetricFamily(
+            "splatlift_query_worker_restarts", "Query workers after the first.", value=self._queries.restarts
+        )
+
+
+# The outermost layer
+
+PATH_CHARACTERS = 200  # of a path in the log
+# For browsers: nothing here is guessed at, framed or allowed to load anything; pages bring a policy of their own.
+SAFE_HEADERS = {
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Referrer-Policy": "no-referrer",
+    "Content-Security-Policy": "default-src 'none'; frame-ancestors 'none'",
+}
+
+
+class RecordedApp(FastAPI):
+    """Records its requests outside of all else, so that answers to unforeseen errors are recorded too.
+
+    ``state.metrics`` must be there before the first request.
+    """
+
+    def build_middleware_stack(self) -> ASGIApp:
+        """The usual layers within the recorder."""
+        return Recorder(super().build_middleware_stack(), self.state.metrics)
+
+
+class Recorder:
+    """ASGI middleware: every answer gets its request's id and `SAFE_HEADERS`; log and counters hear of it."""
+
+    def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
+        self._app = app
+        self._metrics = metrics
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass the request on and watch."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        exchange = Exchange(scope["method"], chosen_id(scope["headers"]), receive, send)
+        with working_for(exchange.id):
+            try:
+                await self._app(scope, exchange.receive, exchange.send)
+            except Exception:
+                # The framework raises again what `service.problems` has answered and logged.
+                if not exchange.complete:
+                    raise
+            finally:
+                self._note(scope, exchange)
+
+    def _note(self, scope: Scope, exchange: Exchange) -> None:
+        route = getattr(scope.get("route"), "path", None)
+        exchange.seconds = time.monotonic() - exchange.begun
+        self._metrics.served(exchange, route)
+        fields = {
+            "method": exchange.method,
+            "route": route,
+            "path": scope["path"][:PATH_CHARACTERS],  # never the query: people put secrets there
+            "status": exchange.status,
+            "seconds": round(exchange.seconds, 6),
+            "received": exchange.received,
+            "sent": exchange.sent,
+            "client": (scope.get("client") or (None,))[0],
+        }
+        caller = scope.get("state", {}).get("caller")  # as `service.auth` leaves it
+        if caller is not None and caller.key is not None:
+            fields |= {"key": caller.key} | ({"admin": True} if caller.owner.sees_all else {})
+        if not exchange.complete:
+            fields["broken_off"] = True
+        access.info("%s %s %d", exchange.method, route or "(no route)", exchange.status, extra={"fields": fields})
+
+
+@dataclass
+class Exchange:
+    """A request and its answer, counted as they pass."""
+
+    method: str
+    id: str
+    _receive: Receive
+    _send: Send
+    status: int = 0  # while there is no answer
+    received: int = 0  # bytes of the body
+    sent: int = 0
+    complete: bool = False
+    seconds: float = 0.0
+
+    def __post_init__(self) -> None:
+        self.begun = time.monotonic()
+
+    async def receive(self) -> Message:
+        """Count what comes."""
+        message = await self._receive()
+        self.received += len(message.get("body", b""))
+        return message
+
+    async def send(self, message: Message) -> None:
+        """Count what goes."""
+        if message["type"] == "http.response.start":
+            self.status = message["status"]
+            message = {**message, "headers": list(message.get("headers", ()))}
+            headers = MutableHeaders(raw=message["headers"])
+            for name, value in SAFE_HEADERS.items():
+                headers.setdefault(name, value)
+            headers.append("X-Request-ID", self.id)
+        await self._send(message)
+        if message["type"] == "http.response.body":
+            self.sent += len(message.get("body", b""))
+            self.complete = not message.get("more_body", False)

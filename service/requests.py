@@ -1,0 +1,106 @@
+"""How requests are read: parameters that are known, and JSON bodies that are parsed beside the event loop."""
+
+from __future__ import annotations
+
+import email.message
+import json
+from collections.abc import Iterator
+from typing import Any, TypeVar
+
+import anyio
+from fastapi import Depends, Request
+from fastapi.dependencies.models import Dependant
+from fastapi.exceptions import RequestValidationError
+from fastapi.routing import APIRoute
+from pydantic import BaseModel, ValidationError
+from pydantic.json_schema import models_json_schema
+from starlette.exceptions import HTTPException
+
+from service.errors import InvalidRequest
+from service.models import NAME_CHARACTERS, one_of
+
+M = TypeVar("M", bound=BaseModel)
+SCHEMAS = "#/components/schemas/"
+
+
+# Async: a sync dependency waits for a thread of the pool, and every route with it.
+async def _known_only(request: Request) -> None:
+    """Refuse query parameters that the route does not know: passed over, they would seem to have been heard."""
+    given = request.query_params
+    if not given:
+        return
+    route: APIRoute = request.scope["route"]
+    known = list(_names(route.dependant))
+    for name in given:
+        if name not in known:
+            raise InvalidRequest(
+                name[:NAME_CHARACTERS], expected=one_of(known) if known else "no parameters",
+                got=repr(name[:NAME_CHARACTERS]), hint="in the query of the request",
+            )  # fmt: skip
+
+
+KnownParameters = Depends(_known_only)
+
+
+def _names(route: Dependant) -> Iterator[str]:
+    """The query parameters that a route declares, one by one or as the fields of a model."""
+    for field in route.query_params:
+        declared = field.field_info.annotation
+        if isinstance(declared, type) and issubclass(declared, BaseModel):
+            yield from declared.model_fields
+        else:
+            yield field.alias
+
+
+def json_body(model: type[BaseModel]) -> Any:
+    """A dependency that gives the body as a model. The framework would parse and validate it on the event loop, where
+    a megabyte of odd JSON keeps everybody waiting; `described_body` says in OpenAPI what the framework would.
+    """
+
+    async def parse(request: Request) -> BaseModel:
+        content = await request.body()
+        media = request.headers.get("content-type")
+        return await anyio.to_thread.run_sync(_parsed, model, content, media, limiter=request.app.state.deps.parsing)
+
+    return Depends(parse)
+
+
+def _parsed(model: type[M], content: bytes, media: str | None) -> M:
+    if not content:
+        raise _refused("missing", "Field required", None)
+    if not _is_json(media):
+        raise _refused("model_type", "Input should be JSON", content)
+    try:
+        return model.model_validate(json.loads(content))
+    except json.JSONDecodeError as error:
+        told = {"type": "json_invalid", "loc": ("body", error.pos), "msg": "", "ctx": {"error": error.msg}}
+        raise RequestValidationError([told], body=error.doc) from None
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        raise RequestValidationError([{**first, "loc": ("body", *first["loc"])}]) from None
+    except (ValueError, RecursionError):  # no UTF-8, numbers of thousands of digits, too deep
+        raise HTTPException(400, "the body is no JSON that can be read") from None
+
+
+def _refused(kind: str, message: str, given: object) -> RequestValidationError:
+    return RequestValidationError([{"type": kind, "loc": ("body",), "msg": message, "input": given}])
+
+
+def _is_json(media: str | None) -> bool:
+    message = email.message.Message()
+    message["content-type"] = media or ""
+    subtype = message.get_content_subtype()
+    return message.get_content_maintype() == "application" and (subtype == "json" or subtype.endswith("+json"))
+
+
+def described_body(model: type[BaseModel]) -> dict[str, Any]:
+    """What OpenAPI tells of a route with a `json_body`."""
+    schema = {"$ref": f"{SCHEMAS}{model.__name__}"}
+    return {"requestBody": {"required": True, "content": {"application/json": {"schema": schema}}}}
+
+
+def with_bodies(document: dict[str, Any], *models: type[BaseModel]) -> dict[str, Any]:
+    """An OpenAPI document with the schemas of these bodies."""
+    _, found = models_json_schema([(model, "validation") for model in models], ref_template=SCHEMAS + "{model}")
+    components = document["components"]
+    return {**document, "components": {**components, "schemas": found["$defs"] | components["schemas"]}}

@@ -1,0 +1,187 @@
+"""What an application carries: the parts that routes call, whether it can work, and how it stops."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sqlite3
+import threading
+import time
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated
+
+import anyio
+from fastapi import Depends, Request
+
+from liftcore.errors import SplatliftError
+from service.auth import CALLER
+from service.errors import Misconfigured, NotReady
+from service.jobs.devices import Devices
+from service.jobs.supervisor import Supervisor
+from service.models import Version
+from service.observe import Metrics
+from service.queries.client import QueryClient
+from service.settings import ServiceSettings
+from service.store.store import DATABASE, Store
+from service.streams import EventStreams
+
+WRITING_THREADS = 8  # for uploads: a disk that is stalled stops them, and no other route
+PARSING_THREADS = 2  # for JSON bodies
+ORDERING_THREADS = 2  # for orders, which are compared with all names in their assets: these take memory
+PATIENCE_SECONDS = 2.0  # for all checks of readiness; a disk that takes longer is no disk to work with
+FRESH_SECONDS = 1.0  # a look counts for so long: however many ask, the disk is written once a second
+HURRY_SECONDS = 0.1  # between two looks at whether somebody is in a hurry
+PROBE_BYTES = 4096
+CHECKS = ("database", "disk", "supervisor", "queries")
+
+log = logging.getLogger(__name__)
+
+
+class Stopping:
+    """The orderly stop: work is refused, streams end, running jobs go back in line, and only then the port closes.
+
+    Begun once, from the event loop; anybody may ask whether it has.
+    """
+
+    def __init__(self, streams: EventStreams, runner: Supervisor, *, notice_seconds: float = 0.0) -> None:
+        self._streams = streams
+        self._runner = runner
+        self._notice = notice_seconds
+        self.begun = False
+
+    async def begin(self, hurried: Callable[[], bool]) -> None:
+        """Stop taking work; returns when no job runs any more and those in front of us had their notice.
+
+        Args:
+            hurried: whether the notice is to end now; asked a few times a second.
+        """
+        begun = time.monotonic()
+        self.begun = True
+        log.info("stopping: no new work, running jobs go back in line")
+        self._streams.close()
+        await anyio.to_thread.run_sync(self._runner.stop)
+        while not hurried() and (left := self._notice - (time.monotonic() - begun)) > 0:
+            await anyio.sleep(min(left, HURRY_SECONDS))
+
+
+class Readiness:
+    """What ``/readyz`` asks. The checks run in a thread of their own: they neither wait behind slow routes nor hold
+    up the event loop."""
+
+    def __init__(self, store: Store, runner: Supervisor, queries: QueryClient, stopping: Stopping) -> None:
+        self._stopping = stopping
+        opened = _identity(store.files.root / DATABASE)
+        self._checks: dict[str, Callable[[], str | None]] = {
+            "database": lambda: _complaint(lambda: _prove_database(store, opened)),
+            "disk": lambda: _complaint(lambda: _prove_disk(store)),
+            "supervisor": lambda: None if runner.alive() else "a thread of the supervisor has died",
+            "queries": lambda: None if queries.revive() else "the query worker has died; a new one starts",
+        }
+        self._turn: anyio.CapacityLimiter | None = None
+        self._looked = -FRESH_SECONDS
+        self._looking_at = CHECKS[0]
+        self._found: dict[str, str] = {}
+
+    async def require(self) -> None:
+        """Return when all is well.
+
+        Raises:
+            NotReady: the service stops, or a check failed; it says which.
+        """
+        if self._stopping.begun:
+            raise NotReady("stopping", expected="a service that goes on", got="one that stops")
+        found = self._found if self._fresh() else await self._look_in_time()
+        if found:
+            told = "; ".join(f"{name}: {why}" for name, why in found.items())
+            raise NotReady(", ".join(found), expected="checks that pass", got=told)
+
+    async def _look_in_time(self) -> dict[str, str]:
+        if self._turn is None:
+            self._turn = anyio.CapacityLimiter(1)
+        with anyio.move_on_after(PATIENCE_SECONDS):
+            # A look that hangs keeps its turn: those after it wait in vain, and no second thread hangs beside it.
+            return await anyio.to_thread.run_sync(self._look, limiter=self._turn, abandon_on_cancel=True)
+        return {self._looking_at: f"no answer within {PATIENCE_SECONDS:g} s"}
+
+    def _look(self) -> dict[str, str]:
+        if not self._fresh():  # the one before us may just have looked
+            found = {}
+            for name, check in self._checks.items():
+                self._looking_at = name
+                found[name] = check()
+            self._found = {name: why for name, why in found.items() if why is not None}
+            self._looked = time.monotonic()
+        return self._found
+
+    def _fresh(self) -> bool:
+        return time.monotonic() - self._looked < FRESH_SECONDS
+
+
+def _prove_database(store: Store, opened: tuple[int, int]) -> None:
+    """See that the database is the file that was opened, can be read by who comes anew, and takes writes."""
+    path = store.files.root / DATABASE
+    if _identity(path) != opened:
+        raise Misconfigured("data", expected="the database that was opened", got="another file in its place")
+    with closing(sqlite3.connect(f"{path.as_uri()}?mode=ro", uri=True)) as connection:
+        connection.execute("SELECT count(*) FROM jobs WHERE state = 'queued'").fetchone()
+    store.database.prove_writable()
+
+
+def _identity(path: Path) -> tuple[int, int]:
+    status = path.stat()
+    return status.st_dev, status.st_ino
+
+
+def _prove_disk(store: Store) -> None:
+    """See that there is room, and that a file can be written as far as the disk."""
+    store.files.require_room()
+    with store.files.draft(".probe") as path, path.open("wb") as probe:
+        probe.write(bytes(PROBE_BYTES))
+        probe.flush()
+        os.fsync(probe.fileno())
+
+
+def _complaint(check: Callable[[], None]) -> str | None:
+    try:
+        check()
+    except (SplatliftError, sqlite3.Error, OSError) as error:
+        return str(error)
+    return None
+
+
+@dataclass(frozen=True)
+class AppState:
+    """What `create_app` was given and made. Routes get the store as their caller sees it."""
+
+    settings: ServiceSettings
+    version: Version
+    store: Store
+    runner: Supervisor
+    devices: Devices
+    queries: QueryClient
+    streams: EventStreams
+    metrics: Metrics
+    readiness: Readiness
+    checks: anyio.CapacityLimiter  # uploads that are validated at the same time
+    ending: threading.Event = field(default_factory=threading.Event)  # set when what still runs must end
+    writing: anyio.CapacityLimiter = field(default_factory=lambda: anyio.CapacityLimiter(WRITING_THREADS))
+    parsing: anyio.CapacityLimiter = field(default_factory=lambda: anyio.CapacityLimiter(PARSING_THREADS))
+    ordering: anyio.CapacityLimiter = field(default_factory=lambda: anyio.CapacityLimiter(ORDERING_THREADS))
+    naming: anyio.CapacityLimiter = field(
+        default_factory=lambda: anyio.CapacityLimiter(1)
+    )  # pages of an asset's names, of which all are read for each
+    scrapes: anyio.CapacityLimiter = field(
+        default_factory=lambda: anyio.CapacityLimiter(1)
+    )  # those who read the metrics
+
+
+# Async: a sync dependency waits for a thread of the pool, and every route with it.
+async def _deps(request: Request) -> AppState:
+    deps: AppState = request.app.state.deps
+    return replace(deps, store=deps.store.seen_by(request.scope["state"][CALLER].owner))
+
+
+Deps = Annotated[AppState, Depends(_deps)]
