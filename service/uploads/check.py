@@ -16,8 +16,7 @@ from typing import Any, BinaryIO
 from liftcore.errors import InvalidCameras, InvalidInput, SplatliftError
 from liftcore.features.pack import read_features
 from liftcore.io.class_masks import describe_masks
-from liftcore.io.inspect import describe_packs, describe_table
-from liftcore.io.inspect_scene import describe_camera_file, describe_splats
+from liftcore.io.inspect import describe_camera_file, describe_packs, describe_splats, describe_table
 from liftcore.io.json_file import finite
 from liftcore.io.ply import read_splats
 from liftcore.query.text.table import TableEncoder
