@@ -17,7 +17,36 @@ torch nor numba.
 """
 
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from liftcore.errors import InvalidCameras as InvalidCameras
+    from liftcore.errors import InvalidFeatures as InvalidFeatures
+    from liftcore.errors import InvalidInput as InvalidInput
+    from liftcore.errors import InvalidLift as InvalidLift
+    from liftcore.errors import InvalidQuery as InvalidQuery
+    from liftcore.errors import InvalidSettings as InvalidSettings
+    from liftcore.errors import InvalidSplats as InvalidSplats
+    from liftcore.errors import NotFound as NotFound
+    from liftcore.errors import SplatliftError as SplatliftError
+    from liftcore.errors import Unavailable as Unavailable
+    from liftcore.features.pack import read_features as read_features
+    from liftcore.features.views import FeatureGrid as FeatureGrid
+    from liftcore.features.views import Regions as Regions
+    from liftcore.io.cameras import read_cameras as read_cameras
+    from liftcore.io.lift_file import load_lift as load_lift
+    from liftcore.io.ply import read_splats as read_splats
+    from liftcore.lifting import lift as lift
+    from liftcore.lifting import plan as plan
+    from liftcore.operators import region_weights as region_weights
+    from liftcore.operators import render as render
+    from liftcore.planning.plan import Plan as Plan
+    from liftcore.result import LiftResult as LiftResult
+    from liftcore.scene.cameras import Camera as Camera
+    from liftcore.scene.cameras import Cameras as Cameras
+    from liftcore.scene.splats import Splats as Splats
+    from liftcore.settings import LiftSettings as LiftSettings
+    from liftcore.solve.weights import RegionWeights as RegionWeights
 
 __version__ = "0.3.0"
 
@@ -51,7 +80,35 @@ _PUBLIC = {
     "Unavailable": "liftcore.errors:Unavailable",
 }
 
-__all__ = list(_PUBLIC)
+__all__ = [
+    "Camera",
+    "Cameras",
+    "FeatureGrid",
+    "InvalidCameras",
+    "InvalidFeatures",
+    "InvalidInput",
+    "InvalidLift",
+    "InvalidQuery",
+    "InvalidSettings",
+    "InvalidSplats",
+    "LiftResult",
+    "LiftSettings",
+    "NotFound",
+    "Plan",
+    "RegionWeights",
+    "Regions",
+    "SplatliftError",
+    "Splats",
+    "Unavailable",
+    "lift",
+    "load_lift",
+    "plan",
+    "read_cameras",
+    "read_features",
+    "read_splats",
+    "region_weights",
+    "render",
+]
 
 
 def __getattr__(name: str) -> Any:

@@ -22,14 +22,13 @@ from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.splats import Splats
 from liftcore.settings import LiftSettings, Preset
 from liftcore.solve.accumulate import Geometry, accumulate, as_read
-from liftcore.solve.aggregation import Aggregation, aggregate
+from liftcore.solve.aggregation import Aggregation, aggregate, kept_columns
 from liftcore.solve.all_rays import AllRays
 from liftcore.solve.certificate import certify
 from liftcore.solve.checkpoint import Checkpoint, identity, resumed
 from liftcore.solve.closed_form import Solution
 from liftcore.solve.feature_room import room_within
 from liftcore.solve.host import Host
-from liftcore.solve.kept_columns import kept_columns
 from liftcore.solve.least_squares import refine
 from liftcore.solve.lift_warnings import lift_warnings
 from liftcore.solve.reference import reference

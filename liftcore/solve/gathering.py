@@ -63,7 +63,7 @@ class Gathering:
             raise Unavailable("features", expected=f"at most {MOST_ROWS} rows of codebooks", got=got, hint=hint)
         self._each_share, self._scale, self._curve = each_share, scale, curve
         self._views = [
-            tuple(part.numpy() for part in (own.splats, own.indptr, own.columns, own.weights)) for own in store
+            (own.splats.numpy(), own.indptr.numpy(), own.columns.numpy(), own.weights.numpy()) for own in store
         ]
         self._bases = np.concatenate([[0], np.cumsum(counts)])[:-1].tolist()
         self._counts = np.zeros(scale.size, np.int64)

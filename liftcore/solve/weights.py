@@ -46,5 +46,10 @@ def merged(
     rows = np.flatnonzero(lengths)
     indptr, offsets = np.concatenate([[0], np.cumsum(lengths[rows])]), np.concatenate([[0], np.cumsum(counts)])
     return RegionWeights(
-        *(torch.from_numpy(part) for part in (rows.astype(np.int32), indptr, region, weight, offsets)), views
+        splats=torch.from_numpy(rows.astype(np.int32)),
+        indptr=torch.from_numpy(indptr),
+        region=torch.from_numpy(region),
+        weight=torch.from_numpy(weight),
+        offsets=torch.from_numpy(offsets),
+        views=views,
     )

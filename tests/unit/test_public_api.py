@@ -47,7 +47,7 @@ def test_import_loads_neither_torch_nor_numba():
 
 @pytest.mark.parametrize("given", ["dict", "numpy", "iterator", "pack"])
 def test_lift_of_values_has_the_bits_of_the_lift_of_files(scene, given):
-    (splats, cameras, pack), *values, views = scene
+    (splats, cameras, pack), cloud, poses, views = scene
     forms = {
         "dict": lambda: views,
         "numpy": lambda: {name: as_numpy(view) for name, view in views.items()},
@@ -55,7 +55,7 @@ def test_lift_of_values_has_the_bits_of_the_lift_of_files(scene, given):
         "pack": lambda: lc.read_features(pack),
     }
     expected = lift_files(splats, cameras, [pack], lc.LiftSettings.of(preset="row-sum"))
-    found = lc.lift(*values, forms[given](), preset="row-sum")
+    found = lc.lift(cloud, poses, forms[given](), preset="row-sum")
     for name in ("features", "evidence", "agreement", "seen"):
         assert torch.equal(getattr(found, name), getattr(expected, name))
     assert found.views == expected.views == ("v0", "v1", "v2")
@@ -96,7 +96,7 @@ def test_plan_chooses_what_the_lift_takes(scene):
 def test_view_of_another_kind_is_refused_by_name(scene):
     _, splats, cameras, _ = scene
     with pytest.raises(lc.InvalidFeatures, match="Regions or FeatureGrid") as told:
-        lc.lift(splats, cameras, {"v0": torch.ones(2, 2, 4)})
+        lc.lift(splats, cameras, {"v0": torch.ones(2, 2, 4)})  # pyright: ignore[reportArgumentType]
     assert "v0" in told.value.argument
 
 
