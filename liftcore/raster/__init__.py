@@ -23,5 +23,4 @@ def open_raster(splats: Splats, device: Device, threads: int | None = None, kept
         return CpuRaster(splats, threads)
     from liftcore.raster.gpu.raster import GpuRaster  # loads triton
 
-    free = device.free_bytes()
-    return GpuRaster(splats, device.place, None if free is None else max(0, free - kept), stays=kept > 0)
+    return GpuRaster(splats, device.place, stays=kept > 0)

@@ -1,22 +1,23 @@
 """The GPU backend: A by Triton kernels, the same to the bit in every run.
 
-Projection and tile lists are tensor operations in float64 (``projection``, ``tile_lists``); the rays are walked by
-one program a tile (``walk``), whose weights a product takes as a matrix (``weighing``, ``rendering``); sums over
-tiles are float64 in a fixed order (``sums``). No kernel adds to memory that another adds to. On tensors of the CPU
-all of it runs in Triton's interpreter: that is how it is tested where there is no card.
+Projection and tile lists are tensor operations in float64 (``project``, ``tiles``); one program a tile composites its
+rays (``composite``), and a product takes the weights as a matrix (``weights``, ``render``). Sums over tiles are
+float64 in a fixed order. No kernel adds to memory that another adds to. On tensors of the CPU all of it runs in Triton's
+interpreter: that is how it is tested where there is no card.
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable
+from collections.abc import Callable, Generator, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from functools import wraps
-from typing import TYPE_CHECKING, Concatenate, ParamSpec, TypeVar
+from typing import Concatenate, ParamSpec, TypeVar
 
 import torch
+from torch import Tensor
 
 from liftcore.device import indexed, out_of_memory
 from liftcore.errors import Unavailable
+from liftcore.features.views import ViewFeatures
 from liftcore.raster.base import (
     CompositingParams,
     RayRows,
@@ -34,42 +35,31 @@ from liftcore.raster.base import (
 from liftcore.raster.cpu.composite import choice_of
 from liftcore.raster.cpu.project import activated, view_of, with_opacities
 from liftcore.raster.cpu.weights_home import on_host
-from liftcore.raster.gpu import rendering, weighing
-from liftcore.raster.gpu.ahead import made_ahead
-from liftcore.raster.gpu.frame import Frame
+from liftcore.raster.gpu import render, weights
 from liftcore.raster.gpu.launching import check_device
-from liftcore.raster.gpu.memory import USUAL_LEVELS, raster_bytes
-from liftcore.raster.gpu.projection import Projection
-from liftcore.raster.gpu.room import SCENE_SHARE, room_within, scene_bytes
-from liftcore.raster.gpu.scene import scene_on, with_opacity
-from liftcore.raster.gpu.slots import DeviceReading
-from liftcore.raster.gpu.tracing import ray_rows
-
-if TYPE_CHECKING:
-    from collections.abc import Generator, Iterable
-
-    from torch import Tensor
-
-    from liftcore.features.views import ViewFeatures
-    from liftcore.raster.gpu.scene import DeviceScene
-    from liftcore.scene.cameras import Camera
-    from liftcore.scene.splats import Splats
+from liftcore.raster.gpu.project import DeviceScene, scene_on, with_opacity
+from liftcore.raster.gpu.render import ray_rows
+from liftcore.raster.gpu.tiles import BLOCK, Frame
+from liftcore.raster.gpu.weights import DeviceReading
+from liftcore.scene.cameras import Camera
+from liftcore.scene.splats import Splats
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
+Item = TypeVar("Item")
+Made = TypeVar("Made")
+
+LEAST_BLOCK = 1 << 14  # items: a product that does not fit in blocks of so few fits into none
 
 
-LEAST_FREE = 1 << 24  # bytes: a product that does not fit into pieces for so few fits into none
+def _within_memory(product: Callable[Concatenate["GpuRaster", Arguments], Result]) -> Callable[..., Result]:
+    """A product that is made again in blocks of half the size when the device's memory runs out.
 
-
-def _within_memory(product: Callable[Concatenate[GpuRaster, Arguments], Result]) -> Callable[..., Result]:
-    """A product that is made again in smaller pieces when the device's memory runs out, and at last says so in words.
-
-    No bit depends on the pieces, so it matters to nobody how often that was.
+    No bit depends on the block, so it matters to nobody how often that was.
     """
 
     @wraps(product)
-    def guarded(self: GpuRaster, *arguments: Arguments.args, **named: Arguments.kwargs) -> Result:
+    def guarded(self: "GpuRaster", *arguments: Arguments.args, **named: Arguments.kwargs) -> Result:
         while True:
             try:
                 return product(self, *arguments, **named)
@@ -77,10 +67,10 @@ def _within_memory(product: Callable[Concatenate[GpuRaster, Arguments], Result])
                 if not out_of_memory(error):
                     raise
                 told = str(error).splitlines()[0] if str(error) else type(error).__name__
-            if not self.take_less():  # out here the error no longer holds what the product held
+            if not self.halve_block():  # out here the error no longer holds what the product held
                 raise Unavailable(
                     "device",
-                    expected="a GPU with free memory for the footprints and lists of a row of tiles",
+                    expected="a GPU with free memory for the scene, and for the projected splats and lists of a view",
                     got=told,
                     hint="free memory on the device, lower the images' resolution, or take the device cpu",
                 )
@@ -94,34 +84,33 @@ class GpuRaster:
     One call at a time: the view at hand is kept for the next product.
 
     Args:
-        splats: the scene.
+        splats: the scene; it lies whole on the device, about 110 bytes a splat.
         device: a CUDA device; the CPU where Triton's interpreter is on.
-        free: bytes that may be taken there; None for no limit. What does not fit is cut, and no bit depends on it.
-        stays: whether region weights stay on the device where they fit, for a solution there.
+        block: items of tile lists that are held at a time. It is halved where memory runs out; no bit depends on it.
+        stays: whether region weights stay on the device, for a solution there.
 
     Raises:
         Unavailable: the device cannot run the kernels.
     """
 
-    def __init__(self, splats: Splats, device: torch.device, free: int | None = None, *, stays: bool = False) -> None:
+    def __init__(self, splats: Splats, device: torch.device, block: int = BLOCK, *, stays: bool = False) -> None:
         check_device(device)
         self.splats = splats
         self.device = indexed(device)
-        self._free, self._stays = free, stays
+        self._block, self._stays = block, stays
         self._host = activated(splats, 1.0)
-        self._size = scene_bytes(splats.count, splats.kernel)
-        self._gain = 1.0  # of the scene
+        self._scale = 1.0  # on the opacity logits of the scene
         self._scene: DeviceScene | None = None
         self._kept: tuple[Camera, CompositingParams, Frame] | None = None
 
-    def take_less(self) -> bool:
-        """Let go of everything and cut the work for half of the memory; False where it cannot be cut any more."""
-        free = raster_bytes(self.splats.count, 1, 1, self.splats.kernel, 1) if self._free is None else self._free
-        if free <= LEAST_FREE:
-            return False
-        self._free, self._scene, self._kept = free // 2, None, None
+    def halve_block(self) -> bool:
+        """Let go of everything and cut the work into blocks of half the size; False where they are the least."""
+        self._scene = self._kept = None
         if self.device.type == "cuda":
             torch.cuda.empty_cache()
+        if self._block <= LEAST_BLOCK:
+            return False
+        self._block //= 2
         return True
 
     def region_weights(
@@ -134,8 +123,8 @@ class GpuRaster:
     def _weighed(
         self, reading: DeviceReading, camera: Camera, params: CompositingParams, weighting: Weighting
     ) -> RegionWeights:
-        choice, frame = choice_of(weighting), self._frame(camera, params, reading.levels)
-        return weighing.region_weights(frame, reading, choice, params.opacity_logit_scale != 1.0, self.splats.count)
+        choice, frame = choice_of(weighting), self._frame(camera, params)
+        return weights.region_weights(frame, reading, choice, params.opacity_logit_scale != 1.0, self.splats.count)
 
     def _brought(self, weights: RegionWeights) -> RegionWeights:
         """Where they are wanted. A host without room for them is no reason for smaller pieces on the device."""
@@ -167,9 +156,9 @@ class GpuRaster:
         check_rows(values, self.splats.count)
         frame = self._frame(camera, every_pixel(params))
         image = torch.empty(camera.height, camera.width, values.shape[1])
-        for begin in range(0, values.shape[1], rendering.WIDEST):
-            block = values[:, begin : begin + rendering.WIDEST].to(torch.float32).contiguous()
-            image[:, :, begin : begin + rendering.WIDEST] = rendering.render(frame, block)
+        for begin in range(0, values.shape[1], render.WIDEST):
+            block = values[:, begin : begin + render.WIDEST].to(torch.float32).contiguous()
+            image[:, :, begin : begin + render.WIDEST] = render.render(frame, block)
         return image
 
     @_within_memory
@@ -178,9 +167,9 @@ class GpuRaster:
         check_image(values, camera)
         frame = self._frame(camera, every_pixel(params))
         result = torch.empty(self.splats.count, values.shape[2])
-        for begin in range(0, values.shape[2], weighing.WIDEST):
-            block = values[:, :, begin : begin + weighing.WIDEST]
-            result[:, begin : begin + weighing.WIDEST] = weighing.adjoint(frame, block, self.splats.count)
+        for begin in range(0, values.shape[2], weights.WIDEST):
+            block = values[:, :, begin : begin + weights.WIDEST]
+            result[:, begin : begin + weights.WIDEST] = weights.adjoint(frame, block, self.splats.count)
         return result
 
     def row_sums(self, camera: Camera, params: CompositingParams) -> Tensor:
@@ -192,7 +181,7 @@ class GpuRaster:
         """``argmax(A onehot(labels))``: labels [P] i32 in -1..K - 1 -> [H, W] i32. See the protocol."""
         check_labels(labels, self.splats.count)
         frame = self._frame(camera, every_pixel(params))
-        return rendering.strongest_labels(frame, labels.to(torch.int32)).cpu()
+        return render.strongest_labels(frame, labels.to(torch.int32)).cpu()
 
     @_within_memory
     def ray_rows(self, camera: Camera, pixels: Tensor, params: CompositingParams) -> RayRows:
@@ -206,28 +195,42 @@ class GpuRaster:
         """Drop the projected view that is kept for the next product."""
         self._kept = None
 
-    def _frame(self, camera: Camera, params: CompositingParams, levels: int = USUAL_LEVELS) -> Frame:
-        """The view projected, with room for labels of so many levels; the last one is kept."""
+    def _frame(self, camera: Camera, params: CompositingParams) -> Frame:
+        """The view projected; the last one is kept."""
         if self._kept is not None and self._kept[0] is camera and self._kept[1] == params:
             return self._kept[2]
         check_params(self.splats.kernel, camera, params)
         self._kept = None  # before, so that one frame's memory is the most ever held
-        view = view_of(camera, params)
-        levels = max(levels, USUAL_LEVELS)  # one level may stand for tuples of several, and has as many sums
-        need = raster_bytes(self.splats.count, view.width, view.height, self.splats.kernel, levels)
-        room = room_within(self._free, self.splats.kernel, need)
         scene = self._scene_with(params.opacity_logit_scale)
-        projection = Projection(scene, view, self.splats.kernel, params.antialiased, self.device, room.splats)
-        frame = Frame(projection, params, room)
+        frame = Frame(scene, view_of(camera, params), self.splats.kernel, params, self._block)
         self._kept = camera, params, frame
         return frame
 
-    def _scene_with(self, gain: float) -> DeviceScene:
-        """The splats with that gain on their opacity: on the device, or on the host where they would fill it."""
-        if gain != self._gain:
-            self._host, self._gain = with_opacities(self._host, self.splats, gain), gain
+    def _scene_with(self, scale: float) -> DeviceScene:
+        """The splats on the device, with that scale on their opacity logits."""
+        if scale != self._scale:
+            self._host, self._scale = with_opacities(self._host, self.splats, scale), scale
             self._scene = None if self._scene is None else with_opacity(self._scene, self._host)
         if self._scene is None:
-            staged = self._free is not None and self._size > SCENE_SHARE * self._free
-            self._scene = scene_on(torch.device("cpu") if staged else self.device, self._host)
+            self._scene = scene_on(self.device, self._host)
         return self._scene
+
+
+def made_ahead(items: Iterable[Item], make: Callable[[Item], Made]) -> Generator[tuple[Item, Made]]:
+    """Every item and what is made of it, in their order; a thread takes and makes the next one meanwhile.
+
+    Raises:
+        Exception: what the items or ``make`` raise, in their turn.
+    """
+    source = iter(items)
+
+    def following() -> tuple[Item, Made] | None:
+        for item in source:
+            return item, make(item)
+        return None
+
+    with ThreadPoolExecutor(1, "view-ahead") as pool:
+        waiting = pool.submit(following)
+        while (found := waiting.result()) is not None:
+            waiting = pool.submit(following)
+            yield found
