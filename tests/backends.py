@@ -24,11 +24,11 @@ if TYPE_CHECKING:
     from liftcore.scene.splats import Splats
 
 
-def gpu_raster(splats: Splats, free: int | None = None) -> GpuRaster:
+def gpu_raster(splats: Splats, block: int = 1 << 24) -> GpuRaster:
     """The GPU backend, on a card where there is one and in Triton's interpreter elsewhere."""
     from liftcore.raster.gpu.raster import GpuRaster
 
-    return GpuRaster(splats, torch.device("cuda:0" if torch.cuda.is_available() else "cpu"), free)
+    return GpuRaster(splats, torch.device("cuda:0" if torch.cuda.is_available() else "cpu"), block)
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from triton.compiler import ASTSource, make_backend
 from liftcore.device import Device
 from liftcore.raster.base import CompositingParams, Selection, Weighting
 from liftcore.raster.cpu.warm_up import warm_up
-from liftcore.raster.gpu import launching, raster, rendering, selecting, sums, tracing, weighing
+from liftcore.raster.gpu import launching, raster, render, weights
 from liftcore.scene.splats import Kernel
 from tests.scenes import random_camera, random_grid, random_regions, random_splats
 
@@ -115,7 +115,7 @@ def launches_of(work: Callable[[], None]) -> dict[Launch, None]:
             if isinstance(argument, torch.Tensor) and argument.dtype == torch.float32:
                 argument.fill_(1.0)
 
-    modules: list[Any] = [rendering, selecting, sums, tracing, weighing]
+    modules: list[Any] = [render, weights]
     for module in modules:
         module.launch = note
     work()
@@ -139,8 +139,8 @@ def _every_product() -> None:
     splats, camera = random_splats(3), random_camera(3)
     gpu = raster.GpuRaster(splats, torch.device("cpu"))
     gpu.region_weights(camera, random_regions(3), CompositingParams(), Weighting(2, Selection.CENTRE))
-    gpu.render(camera, torch.zeros(splats.count, rendering.WIDEST), CompositingParams())
-    gpu.adjoint(camera, torch.zeros(camera.height, camera.width, weighing.WIDEST), CompositingParams())
+    gpu.render(camera, torch.zeros(splats.count, render.WIDEST), CompositingParams())
+    gpu.adjoint(camera, torch.zeros(camera.height, camera.width, weights.WIDEST), CompositingParams())
     gpu.strongest_labels(camera, torch.zeros(splats.count, dtype=torch.int32), CompositingParams())
     gpu.row_sums(random_camera(3, 1, 1), CompositingParams())
 

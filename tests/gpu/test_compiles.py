@@ -45,7 +45,7 @@ def lifts(reports) -> list[dict]:
 
 def test_every_kernel_compiles_for_an_h100(compiled):
     names = {report["kernel"] for report in compiled}
-    assert names == {"_weigh", "_gather", "_render", "_strongest", "_rank", "_trace", "_add_runs"}
+    assert names == {"_weigh", "_gather", "_render", "_strongest", "rank_tile", "_trace", "_add_runs"}
     assert {report["constants"]["KIND"] for report in compiled if report["kernel"] == "_weigh"} == {0, 1, 2}
     assert all(report["machine_code"] > 0 and report["hints"] > 4 for report in compiled)
 
@@ -66,8 +66,8 @@ def test_no_kernel_adds_by_atomics(compiled):
 
 
 def test_a_lifts_kernels_keep_their_values_in_registers(compiled):
-    assert {report["stack"] for report in compiled if report["kernel"] in ("_add_runs", "_trace", "_rank")} == {0}
-    assert 64 in {report["constants"]["COUNT"] for report in compiled if report["kernel"] == "_rank"}
+    assert {report["stack"] for report in compiled if report["kernel"] in ("_add_runs", "_trace", "rank_tile")} == {0}
+    assert 64 in {report["constants"]["COUNT"] for report in compiled if report["kernel"] == "rank_tile"}
     assert max(report["stack"] for report in compiled if report["kernel"] == "_weigh") <= STACK
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import weakref
 from dataclasses import replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
@@ -17,9 +16,8 @@ from liftcore.errors import InvalidInput, InvalidSettings, Unavailable
 from liftcore.features.views import Regions
 from liftcore.raster.base import CompositingParams, RegionWeights, Selection, Weighting
 from liftcore.raster.cpu.raster import CpuRaster
-from liftcore.raster.gpu import selecting
-from liftcore.raster.gpu.frame import Frame
-from liftcore.raster.gpu.sums import Pieces, sums_by_unit
+from liftcore.raster.gpu.tiles import Frame
+from liftcore.raster.gpu.weights import sums_by_unit, sums_over_units
 from liftcore.raster.reference import ReferenceRaster
 from liftcore.scene.splats import Kernel
 from tests.backends import gpu_raster, needs_triton
@@ -28,7 +26,6 @@ from tests.scenes import random_camera, random_grid, random_regions, random_spla
 
 if TYPE_CHECKING:
     from liftcore.raster.gpu.raster import GpuRaster
-    from liftcore.raster.gpu.tile_lists import Lists
     from liftcore.scene.cameras import Camera
 
 pytestmark = [needs_triton, pytest.mark.usefixtures("every_kernel")]
@@ -110,116 +107,52 @@ def every_product(raster: GpuRaster, camera: Camera) -> list[torch.Tensor]:
 
 
 @pytest.mark.parametrize("kernel", [Kernel.GAUSSIAN_3D, Kernel.GAUSSIAN_2D])
-def test_no_bit_depends_on_the_memory_that_is_free(monkeypatch, kernel):
-    """Blocks of the scene, strips of tile rows, runs of tiles and parts of sums, all as small as they go."""
+def test_no_bit_depends_on_the_size_of_blocks(monkeypatch, kernel):
+    """Blocks of splats, bands of tile rows, runs of tiles and parts of sums, all as small as they go."""
     splats, camera = random_splats(8, 16, kernel=kernel), random_camera(8, 17, 36)
     products = every_product if kernel is Kernel.GAUSSIAN_3D else top_two
-    monkeypatch.setattr("liftcore.raster.gpu.frame.UNIT", 1)
-    monkeypatch.setattr("liftcore.raster.gpu.sums.PART", 3)
+    monkeypatch.setattr("liftcore.raster.gpu.tiles.UNIT", 1)
+    monkeypatch.setattr("liftcore.raster.gpu.weights.RUN", 3)
     whole = products(gpu_raster(splats), camera)
-    for least in ("SPLATS", "ITEMS", "TILES", "TABLE", "ENTRY_BYTES", "KEPT"):
-        monkeypatch.setattr(f"liftcore.raster.gpu.room.LEAST_{least}", 7 if least == "SPLATS" else 1)
-    tight = gpu_raster(splats, free=1)
+    tight = gpu_raster(splats, block=1)
     for first, second in zip(whole, products(tight, camera), strict=True):
         assert first.numel() and torch.equal(first, second)
     frame = tight._frame(camera, WALK)
-    assert frame.bands == [(0, 1), (1, 2), (2, 3)] and frame.room.splats == 7
-    every = [frame.lists_of(band) for band in frame.bands]
-    assert [len(frame.tile_runs(lists)) for lists in every] == [2, 2, 2]
-    assert tight._scene_with(WALK.opacity_logit_scale).means.device.type == "cpu"  # it comes in blocks
-    assert all(lists.ids.numel() < splats.count for lists in every)  # a strip's own splats alone
+    assert frame.bands == [(0, 1), (1, 2), (2, 3)]
+    assert [len(frame.tile_runs(frame.lists_of(band))) for band in frame.bands] == [2, 2, 2]
 
 
 def test_sums_do_not_know_in_which_pieces_their_terms_came():
     """Terms of both signs and thirty orders of magnitude: another order of adding them is another sum."""
     rng = torch.Generator().manual_seed(0)
-    keys = torch.randint(0, 5, (400,), generator=rng, dtype=torch.int32)
-    units = torch.sort(torch.randint(0, 9, (400,), generator=rng, dtype=torch.int32)).values
+    keys = torch.randint(0, 5, (400,), generator=rng, dtype=torch.int32).to(DEVICE)
+    units = torch.sort(torch.randint(0, 9, (400,), generator=rng, dtype=torch.int32)).values.to(DEVICE)
     values = (torch.randn(400, 2, generator=rng) * 10 ** (30 * torch.rand(400, 2, generator=rng) - 15)).to(DEVICE)
 
-    def summed(cuts: list[int], room: int | None) -> list[torch.Tensor]:
-        pieces = Pieces(DEVICE, room)
-        for begin, end in pairwise([0, *cuts, 400]):
-            own = slice(begin, end)
-            pieces.add(sums_by_unit(keys[own].to(DEVICE), units[own].to(DEVICE), values[own]))
-        found = list(pieces.joined(5))
-        assert len(found) == (1 if room is None else 5)
-        return [torch.cat(column) for column in zip(*found, strict=True)]
+    def summed(cuts: list[int]) -> torch.Tensor:
+        pieces = [slice(begin, end) for begin, end in pairwise([0, *cuts, 400])]
+        return sums_over_units([sums_by_unit(keys[own], units[own], values[own]) for own in pieces]).values
 
-    whole, begins = summed([], None), (units.diff().nonzero()[:, 0] + 1).tolist()
-    for other in (summed(begins, None), summed(begins[::3], 1), summed(begins, 1)):
-        assert all(torch.equal(first, second) for first, second in zip(whole, other, strict=True))
-    split = summed([begins[0] + 7], None)  # inside a unit
-    assert not torch.equal(whole[1], split[1])
+    whole, begins = summed([]), (units.diff().nonzero()[:, 0] + 1).tolist()
+    assert torch.equal(whole, summed(begins)) and torch.equal(whole, summed(begins[::3]))
+    assert not torch.equal(whole, summed([begins[0] + 7]))  # inside a unit
 
 
-def test_memory_that_runs_out_is_made_do_with(monkeypatch):
-    """A card with less room than it said: the same answer from smaller pieces."""
+def test_memory_that_runs_out_halves_the_block(monkeypatch):
+    """A card with less room than asked for: the same answer from smaller blocks."""
     splats, camera = random_splats(8, 24), random_camera(8, 20, 36)
     whole = gpu_raster(splats).row_sums(camera, WALK)
     tries = []
 
     def crowded(*arguments: Any) -> Frame:
-        tries.append(arguments[2].footprints)
+        tries.append(arguments[-1])
         if len(tries) < 3:
             raise (torch.OutOfMemoryError("CUDA out of memory.") if len(tries) == 1 else FULL)
         return Frame(*arguments)
 
     monkeypatch.setattr("liftcore.raster.gpu.raster.Frame", crowded)
-    monkeypatch.setattr("liftcore.raster.gpu.raster.LEAST_FREE", 1)
-    assert torch.equal(gpu_raster(splats, free=1 << 40).row_sums(camera, WALK), whole)
-    assert tries == [None, None, None]  # half of so much is still ample
-    tries.clear()
-    assert torch.equal(gpu_raster(splats, free=1 << 10).row_sums(camera, WALK), whole)
-    assert tries[0] > tries[1] > tries[2] > 0
-
-
-def test_the_lists_of_a_band_are_let_go_before_those_of_the_next_are_made(monkeypatch):
-    splats, camera = random_splats(8, 16), random_camera(8, 17, 36)
-    made, known = Frame._made, []
-
-    def watched(self: Frame, band: tuple[int, int]) -> Lists:
-        assert all(own() is None for own in known)
-        lists = made(self, band)
-        known.extend(weakref.ref(part) for part in (lists.items, lists.ids, *lists.splats))
-        return lists
-
-    monkeypatch.setattr("liftcore.raster.gpu.room.LEAST_ITEMS", 1)
-    monkeypatch.setattr(Frame, "_made", watched)
-    every_product(gpu_raster(splats, free=1), camera)
-    assert len(known) > 4 * 3
-
-
-def test_ranks_in_parts_of_a_run_are_those_of_the_run(monkeypatch):
-    splats, camera = random_splats(8, 16), random_camera(8, 17, 36)
-    launched, ranks = [], selecting.launch
-
-    def counting(kernel: Any, programs: int, *rest: Any, **named: Any) -> None:
-        launched.append(programs)
-        ranks(kernel, programs, *rest, **named)
-
-    monkeypatch.setattr(selecting, "launch", counting)
-    whole = top_two(gpu_raster(splats), camera)
-    monkeypatch.setattr(selecting, "A_PIXEL", 0)
-    cut = top_two(gpu_raster(splats), camera)
-    assert launched == [6] + [1] * 6
-    assert all(torch.equal(first, second) for first, second in zip(whole, cut, strict=True))
-
-
-def test_no_memory_is_not_memory_without_limit(monkeypatch):
-    monkeypatch.setattr("liftcore.raster.gpu.raster.LEAST_FREE", 1)
-    splats, camera = random_splats(8, 24), random_camera(8, 20, 36)
-    whole, tight = gpu_raster(splats), gpu_raster(splats, free=0)
-    assert torch.equal(tight.row_sums(camera, WALK), whole.row_sums(camera, WALK))
-    assert tight._frame(camera, WALK).room.footprints == 0
-    assert not tight.take_less() and whole.take_less()
-
-
-def test_a_view_has_room_for_the_levels_that_it_has(monkeypatch):
-    asked = []
-    monkeypatch.setattr("liftcore.raster.gpu.raster.raster_bytes", lambda *given: asked.append(given[-1]) or 1)
-    gpu_raster(random_splats(3, 5)).region_weights(random_camera(3), random_regions(3, levels=9), WALK, Weighting())
-    assert asked == [9]
+    assert torch.equal(gpu_raster(splats, block=1 << 20).row_sums(camera, WALK), whole)
+    assert tries == [1 << 20, 1 << 19, 1 << 18]
 
 
 def test_depth_ties_keep_the_order_of_the_file():
@@ -308,7 +241,7 @@ def test_memory_that_runs_out_for_good_is_told_in_words(monkeypatch, error):
 
     raster = gpu_raster(random_splats(0, 4))
     monkeypatch.setattr("liftcore.raster.gpu.raster.Frame", full)
-    with pytest.raises(Unavailable, match="footprints and lists of a row of tiles") as caught:
+    with pytest.raises(Unavailable, match="projected splats and lists of a view") as caught:
         raster.row_sums(random_camera(0), CompositingParams())
     assert caught.value.got == str(error) and caught.value.hint
     monkeypatch.setattr("liftcore.raster.gpu.raster.Frame", lambda *_: broken())

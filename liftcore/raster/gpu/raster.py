@@ -2,7 +2,7 @@
 
 Projection and tile lists are tensor operations in float64 (``project``, ``tiles``); one program a tile composites its
 rays (``composite``), and a product takes the weights as a matrix (``weights``, ``render``). Sums over tiles are
-float64 in a fixed order. No kernel adds to memory that another adds to. On tensors of the CPU all of it runs in Triton's
+float64 in a fixed order. No kernel adds to memory that another adds to. On tensors of the CPU it runs in Triton's
 interpreter: that is how it is tested where there is no card.
 """
 
