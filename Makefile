@@ -31,13 +31,13 @@ check: $(READY) lint  ## before a commit: lint, types and the fast tests, in 90 
 kernels: $(READY)
 	$(BIN)/python -m tests.kernels
 
-soak: $(READY)  ## the long proofs of docs/reliability.md: prints their figures, takes an hour or so
+soak: $(READY)  ## the long proofs of docs/service.md: prints their figures, takes an hour or so
 	$(BIN)/python -m tests.benchmarks.soak
 
 contract: $(READY)  ## every operation against the OpenAPI document, without keys and with them; some minutes
 	$(BIN)/python -m tests.api.contract
 
-load: $(READY)  ## what clients wait for under load (docs/reliability.md): prints figures, takes some minutes
+load: $(READY)  ## what clients wait for under load (docs/service.md): prints figures, takes some minutes
 	$(BIN)/python -m tests.benchmarks.load
 
 # Another torch than the lock's build brings the triton that it was made with: that one stays.

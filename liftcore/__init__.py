@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from liftcore.settings import LiftSettings as LiftSettings
     from liftcore.solve.weights import RegionWeights as RegionWeights
 
-__version__ = "0.3.0"
+__version__ = "0.4.0"
 
 _PUBLIC = {
     "read_splats": "liftcore.io.ply:read_splats",

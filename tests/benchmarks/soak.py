@@ -1,4 +1,4 @@
-"""``make soak``: the long proofs of docs/reliability.md, and their figures as one JSON object on stdout.
+"""``make soak``: the long proofs of docs/service.md, and their figures as one JSON object on stdout.
 
     python -m tests.benchmarks.soak [--kills N] [--seconds S] [--jobs N]
 

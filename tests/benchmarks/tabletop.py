@@ -173,7 +173,7 @@ class Tabletop:
 def _no_truth(folder: Path, got: str) -> InvalidInput:
     return InvalidInput(
         str(folder), expected=f"truth in the layout of tabletop ({', '.join(TRUTH_FILES)})", got=got,
-        hint="docs/accuracy.md says under Experiments what they hold, and which experiments need none",
+        hint="docs/results.md says under The paper's experiments which of them need none",
     )  # fmt: skip
 
 

@@ -6,15 +6,12 @@ import re
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-DOCUMENTS = ("README.md", "ARCHITECTURE.md")
-SCENES, LIFTING, ASKING, COMMANDS, SERVICE, ACCURACY, LIMITS = (
-    f"docs/{page}.md" for page in ("scenes", "lifting", "asking", "commands", "service", "accuracy", "limits")
+DOCUMENTS = ("README.md", "ARCHITECTURE.md", "CONTRIBUTING.md", "CHANGELOG.md")
+GUIDE, SETTINGS, PYTHON, SERVICE, METHOD, RESULTS = (
+    f"docs/{page}.md" for page in ("guide", "settings", "python", "service", "method", "results")
 )
-GUIDE = ("README.md", SCENES, LIFTING, ASKING, COMMANDS, SERVICE, ACCURACY, LIMITS)  # what users read
-# A page that `make gpu` writes is of one machine's card, and no part of the guide.
-MADE_BY_A_CARD = "docs/benchmarks_gpu.md"
-_FOUND = sorted(str(page.relative_to(ROOT)) for page in ROOT.glob("docs/*.md"))
-PAGES = (*DOCUMENTS, *(page for page in _FOUND if page != MADE_BY_A_CARD))
+FOR_USERS = ("README.md", GUIDE, SETTINGS, PYTHON, SERVICE, RESULTS)
+PAGES = (*DOCUMENTS, *sorted(str(page.relative_to(ROOT)) for page in ROOT.glob("docs/*.md")))
 
 
 def text(name: str) -> str:

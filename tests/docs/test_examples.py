@@ -6,6 +6,7 @@ import io
 import json
 import re
 import shlex
+import shutil
 import sys
 import zipfile
 from pathlib import Path
@@ -19,6 +20,7 @@ from fastapi.routing import APIRoute
 from PIL import Image
 from pydantic import BaseModel
 
+import liftcore as lc
 from liftcore.cli import main
 from liftcore.features.pack import read_features
 from liftcore.features.sam import mask_of_runs, read_runs
@@ -28,7 +30,7 @@ from service.routes import assets, jobs, lifts, operations, queries, tradeoffs
 from tests.api.tiny_scene import WIDTH, WORDS, codebook, colmap_zip, labels, make_scene
 from tests.run_lengths import sam_records
 
-from .readme import ASKING, COMMANDS, GUIDE, SCENES, SERVICE, blocks, text
+from .readme import FOR_USERS, GUIDE, PYTHON, SERVICE, SETTINGS, blocks, text
 
 ROUTES: tuple[ModuleType, ...] = (operations, assets, jobs, lifts, tradeoffs, queries)
 SHAPES: dict[str, type[BaseModel]] = {  # a field that no other answer has -> the answer
@@ -55,15 +57,13 @@ def scene_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_python_example_finds_the_apple(scene_folder: Path) -> None:
-    names = run_example(COMMANDS, "from liftcore.io.lift_files import lift_files")
-    made, scene, mask, more = (names[name] for name in ("made", "scene", "mask", "more"))
-    columns = mask.nonzero()[:, 1]
-    assert len(columns) > 0
-    assert int(columns.max()) < WIDTH // 2  # the apple is the cluster on the left
-    assert more.count > 0 and float(scene.splats.means[more.selected, 0].max()) < 0  # and so is the example
-    assert names["features"].shape == made.features.shape
-    assert any((scene_folder / "walked").iterdir())
+@pytest.mark.parametrize("page", ["README.md", PYTHON])
+def test_python_example_of_files_finds_the_apple(page: str, scene_folder: Path) -> None:
+    names = run_example(page, 'read_splats("scene.ply")')
+    result, means = lc.load_lift("scene.lift.safetensors"), names["splats"].means
+    assert torch.equal(result.features, names["result"].features)
+    found = result.query(codebook()[WORDS.index("apple")]).splats
+    assert found.any() and float(means[found, 0].max()) < 0  # the apple is the cluster on the left
 
 
 def test_sams_masks_make_a_lift_that_knows_the_words(scene_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -73,9 +73,9 @@ def test_sams_masks_make_a_lift_that_knows_the_words(scene_folder: Path, monkeyp
     for name, module in stand_ins().items():
         monkeypatch.setitem(sys.modules, name, module)
     (scene_folder / "words.safetensors").unlink()
-    run_example(SCENES, "from segment_anything import")
-    run_example(SCENES, "open_clip.get_tokenizer")
-    commands = commands_between(SCENES, "## From SAM's masks", "\n## ", scene_folder)
+    run_example(GUIDE, "from segment_anything import")
+    run_example(GUIDE, "open_clip.get_tokenizer")
+    commands = commands_between(GUIDE, "### From SAM's masks", "\n### ", scene_folder)
     assert [command[0] for command in commands] == ["pack", "lift"]
     question = ["query", "scene.lift.safetensors", "apple", "--table", "words.safetensors", "--view", "middle"]
     assert [main(command) for command in [*commands, [*question, "--mask", "apple.png"]]] == [0, 0, 0]
@@ -89,7 +89,7 @@ def test_langsplats_files_become_a_pack(scene_folder: Path) -> None:
     for view, clusters in labels().items():
         np.save(scene_folder / "language_features" / f"{view}_s.npy", clusters)
         np.save(scene_folder / "language_features" / f"{view}_f.npy", codebook().astype(np.float16))
-    (command,) = commands_between(SCENES, "## From LangSplat's folders", "\n## ", scene_folder)
+    (command,) = commands_between(GUIDE, "### From LangSplat's folders", "\n### ", scene_folder)
     assert main(command) == 0
     packs = read_features(scene_folder / "features.safetensors")
     assert packs.views == tuple(sorted(labels())) and packs.text_space == command[-1]
@@ -104,11 +104,11 @@ def test_pack_of_ones_own_program_makes_a_lift_that_python_reads(
         np.save(scene_folder / "labels" / f"{view}.npy", clusters[0])
         np.save(scene_folder / "vectors" / f"{view}.npy", codebook())
     (scene_folder / "features.safetensors").unlink()
-    run_example(SCENES, 'Path("labels")')
+    run_example(GUIDE, 'Path("labels")')
     sources = [str(scene_folder / name) for name in ("scene.ply", "cameras.json", "features.safetensors")]
     assert main(["lift", *sources, "-o", "scene.lift.safetensors"]) == 0
     capsys.readouterr()
-    names = run_example(SCENES, 'load_file("scene.lift.safetensors")')
+    names = run_example(GUIDE, 'load_file("scene.lift.safetensors")')
     assert len(capsys.readouterr().out.splitlines()) >= 3
     places, features, sure = names["places"], names["lift"]["features"], names["sure"]
     assert np.array_equal(places, read_splats(scene_folder / "scene.ply").means.numpy())
@@ -179,8 +179,10 @@ def stand_ins() -> dict[str, ModuleType]:
 
 
 def test_command_line_example_writes_its_files(scene_folder: Path) -> None:
-    lines = [line for page in (COMMANDS, ASKING) for block in blocks(page, "sh") for line in block.splitlines()]
-    commands = [line.split()[1:] for line in lines if line.startswith("splatlift ")]
+    main(["lift", "scene.ply", "cameras.json", "features.safetensors", "-o", "scene.lift.safetensors"])
+    section = text(GUIDE).partition("## Asking")[2].partition("###")[0]
+    commands = [line.split()[1:] for line in section.splitlines() if line.startswith("splatlift ")]
+    assert [command[0] for command in commands] == ["query"] * 3
     assert [main(command) for command in commands] == [0] * len(commands)
     assert (scene_folder / "apple.png").is_file()
     apple, scores = (read_splats(scene_folder / name) for name in ("apple.ply", "scores.ply"))
@@ -189,7 +191,7 @@ def test_command_line_example_writes_its_files(scene_folder: Path) -> None:
 
 
 def test_no_example_saves_an_error_as_what_was_asked_for() -> None:
-    shell = [block for page in GUIDE for block in blocks(page, "sh")]
+    shell = [block for page in FOR_USERS for block in blocks(page, "sh")]
     saving = [line for block in shell for line in block.splitlines() if " -o " in line]
     curls = [line for line in saving if line.startswith("curl ")]
     assert curls and all(re.match(r"curl -[a-zA-Z]*f", line) for line in curls)
@@ -200,12 +202,20 @@ def test_the_way_from_own_maps_to_a_mask_leads_there(scene_folder: Path) -> None
     for view, clusters in labels().items():
         grid = codebook()[clusters[0]].transpose(2, 0, 1)  # [F, h, w], as PyTorch has it
         np.save(scene_folder / "maps" / f"{view}.png.npy", grid.astype(np.float16))
-    commands = commands_between("README.md", "## Your own scene", "The same over HTTP", scene_folder)
-    assert [command[0] for command in commands] == ["inspect", "inspect", "pack", "plan", "lift", "query"]
+    commands = commands_between("README.md", "## From the command line", "## Over HTTP", scene_folder)
+    assert [command[0] for command in commands] == ["inspect", "pack", "plan", "lift", "query"]
     assert [main(command) for command in commands] == [0] * len(commands)
     with Image.open(scene_folder / "apple.png") as mask:
         columns = np.asarray(mask).nonzero()[1]
     assert len(columns) > 0 and columns.max() < WIDTH // 2
+
+
+def test_another_encoders_vectors_take_the_same_weights(scene_folder: Path) -> None:
+    for name in ("clip", "siglip"):
+        shutil.copy(scene_folder / "features.safetensors", scene_folder / f"{name}.safetensors")
+    commands = commands_between(SETTINGS, "## Another encoder", "\n## ", scene_folder)
+    assert [main(command) for command in commands] == [0, 0]
+    assert any((scene_folder / "weights").iterdir())
 
 
 def test_json_examples_show_fields_that_the_service_sends() -> None:
@@ -225,5 +235,5 @@ def test_every_route_is_told_and_no_other() -> None:
     for module in ROUTES:
         for route in module.router.routes:
             assert isinstance(route, APIRoute)
-            real |= {f"{method} {route.path}" for method in route.methods or ()}
+            real |= {f"{method} {route.path}" for method in route.methods or () if route.include_in_schema}
     assert named == real

@@ -20,7 +20,7 @@ from liftcore.cli import main
 from liftcore.io.cameras import read_cameras
 from tests.api.tiny_scene import WIDTH, cameras_document, colmap_zip, make_scene
 
-from .readme import SCENES, blocks, text
+from .readme import GUIDE, blocks, text
 
 SCALE = 0.2
 
@@ -34,7 +34,7 @@ def similarity() -> np.ndarray:
 
 
 def commands() -> list[list[str]]:
-    section = text(SCENES).partition("## Scenes of nerfstudio and gsplat")[2].partition("\n## ")[0]
+    section = text(GUIDE).partition("## Scenes of nerfstudio and gsplat")[2].partition("\n## ")[0]
     lines = section.partition("```sh\n")[2].partition("```")[0].splitlines()
     return [shlex.split(line) for line in lines]
 
@@ -93,8 +93,8 @@ def test_transform_of_gsplat_is_written_and_read(folder: Path, monkeypatch: pyte
     vars(module)["Parser"] = lambda path, factor, normalize: SimpleNamespace(transform=similarity())
     monkeypatch.setitem(sys.modules, "datasets", ModuleType("datasets"))
     monkeypatch.setitem(sys.modules, "datasets.colmap", module)
-    (example,) = (block for block in blocks(SCENES, "python") if "datasets.colmap" in block)
-    exec(compile(example, SCENES, "exec"), {})
+    (example,) = (block for block in blocks(GUIDE, "python") if "datasets.colmap" in block)
+    exec(compile(example, GUIDE, "exec"), {})
     after = read_cameras(folder / "data/garden")
     for old, new in zip(before.values(), after.values(), strict=True):
         assert np.allclose(new.centre, (similarity() @ [*old.centre, 1])[:3])
