@@ -15,9 +15,7 @@ def add_arguments(parser: Parser, shared: Parser) -> None:
     backup.add_argument("directory", type=Path, metavar="DIR", help="the backup, which is not there yet")
     restore = actions.add_parser("restore", parents=[shared], help="make a data directory of a backup")
     restore.add_argument("directory", type=Path, metavar="DIR", help="the backup")
-    verify = actions.add_parser(
-        "verify", parents=[shared], help="compare every file with its digest"
-    )
+    verify = actions.add_parser("verify", parents=[shared], help="compare every file with its digest")
     for action in (rebuild, backup, restore, verify):
         action.add_argument("--data", type=Path, metavar="DIR", help="the service's directory")
 
