@@ -32,10 +32,9 @@ from service.errors import Misconfigured
 from service.observe import logging_to_stderr
 from service.settings import ServiceSettings
 from service.state import Stopping
-from service.store.database import require_database
+from service.store.database import DATABASE, keys_were_made, require_database
 from service.store.keys import any_key
-from service.store.markers import keys_were_made
-from service.store.store import DATABASE, Store
+from service.store.store import Store
 
 FILES_A_CONNECTION = 2  # itself, and what it is sent
 FILES_BESIDE = 128  # of the database, checks, jobs and the query worker

@@ -12,8 +12,8 @@ from fastapi import FastAPI
 from liftcore import __version__
 from service import problems
 from service.auth import Gate
-from service.jobs.devices import Devices
-from service.jobs.limits import JobLimits
+from service.jobs.device import Devices
+from service.jobs.process import JobLimits
 from service.jobs.supervisor import Supervisor
 from service.middleware import AnswerHead, BodyLimit, RefuseWork
 from service.observe import Metrics, RecordedApp, versions
@@ -22,7 +22,8 @@ from service.requests import KnownParameters
 from service.routes import assets, jobs, lifts, operations, queries, tradeoffs
 from service.settings import ServiceSettings
 from service.state import AppState, Readiness, Stopping
-from service.store.garbage import Collector
+from service.store.collect import Collector
+from service.store.owners import NOBODY
 from service.store.store import Store
 from service.streams import EventStreams
 
@@ -44,7 +45,8 @@ def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, work
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         app.state.deps = deps = AppState(
-            settings=settings, version=build, store=store, runner=runner, devices=Devices(), queries=worker,
+            settings=settings, version=build, whole=store, store=store.seen_by(NOBODY), runner=runner,
+            devices=Devices(), queries=worker,
             streams=streams, metrics=metrics, readiness=readiness,
             checks=anyio.CapacityLimiter(settings.parallel_checks),
         )  # fmt: skip

@@ -26,7 +26,7 @@ from service.problems import CLOSE, answer_to
 from service.scopes import SAFE, Scope, allows, needed
 from service.settings import ServiceSettings
 from service.store.keys import KeyRecord, KeyStore
-from service.store.owners import Owner
+from service.store.owners import NOBODY, SERVICE, Owner
 
 CALLER = "caller"  # of the scope's state
 LOOPBACK = frozenset({"localhost", "127.0.0.1", "::1"})
@@ -51,8 +51,8 @@ class Caller:
     key: str | None = None  # its id, for the log
 
 
-EVERYBODY = Caller(Owner())  # while there are no keys
-STRANGER = Caller(Owner(key="-", sees_all=False))  # on an open route: the id of no key, so nothing is theirs
+EVERYBODY = Caller(SERVICE)  # while there are no keys
+STRANGER = Caller(NOBODY)  # on an open route
 
 
 class Gate:

@@ -17,9 +17,8 @@ from liftcore.errors import NotFound, SplatliftError
 from service.__main__ import parse
 from service.errors import InvalidRequest
 from service.scopes import parse_scopes
-from service.store.database import Database
+from service.store.database import DATABASE, Database
 from service.store.keys import KeyRecord, KeyStore, Quota
-from service.store.store import DATABASE
 
 MAX_NAME = 100
 

@@ -19,13 +19,14 @@ from fastapi import Depends, Request
 from liftcore.errors import SplatliftError
 from service.auth import CALLER
 from service.errors import Misconfigured, NotReady
-from service.jobs.devices import Devices
+from service.jobs.device import Devices
 from service.jobs.supervisor import Supervisor
 from service.models import Version
 from service.observe import Metrics
 from service.queries.client import QueryClient
 from service.settings import ServiceSettings
-from service.store.store import DATABASE, Store
+from service.store.database import DATABASE
+from service.store.store import Store, StoreView
 from service.streams import EventStreams
 
 WRITING_THREADS = 8  # for uploads: a disk that is stalled stops them, and no other route
@@ -158,7 +159,8 @@ class AppState:
 
     settings: ServiceSettings
     version: Version
-    store: Store
+    whole: Store  # for the service itself: routes have their caller's view of it
+    store: StoreView
     runner: Supervisor
     devices: Devices
     queries: QueryClient
@@ -181,7 +183,7 @@ class AppState:
 # Async: a sync dependency waits for a thread of the pool, and every route with it.
 async def _deps(request: Request) -> AppState:
     deps: AppState = request.app.state.deps
-    return replace(deps, store=deps.store.seen_by(request.scope["state"][CALLER].owner))
+    return replace(deps, store=deps.whole.seen_by(request.scope["state"][CALLER].owner))
 
 
 Deps = Annotated[AppState, Depends(_deps)]

@@ -12,7 +12,7 @@ from starlette.types import Receive, Scope, Send
 from liftcore.errors import NotFound
 from service.errors import Busy
 from service.models import ENDED
-from service.store.events import Event, EventKind
+from service.store.jobs import Event, EventKind
 
 LOOK_SECONDS = 0.25  # between looks for new events
 BREATH_SECONDS = 15.0  # of silence, then a comment shows that the line is open

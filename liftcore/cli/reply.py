@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from liftcore.errors import InvalidInput
-from liftcore.io.json_file import finite
 from liftcore.progress import Progress, silent
 
 SHOWN_ITEMS = 6  # of a list, for people
@@ -19,6 +18,8 @@ SHOWN_FOLDERS = 8
 def reply(document: Mapping[str, Any], *, as_json: bool, lines: Iterable[str] | None = None) -> None:
     """Print one JSON object, or else ``lines``, or else the document's entries, a line each."""
     if as_json:
+        from liftcore.io.json_file import finite  # loads numpy
+
         print(json.dumps(finite(document), allow_nan=False))
         return
     for line in lines if lines is not None else _entries(document):

@@ -19,7 +19,7 @@ from liftcore.result import InputFile, LiftMetadata
 from liftcore.settings import LiftSettings
 from liftcore.solve.checkpoint import Checkpoint
 from service.child import renamed
-from service.jobs.reporter import Reporter
+from service.jobs.child import Reporter
 
 
 def lift_as_ordered(order: dict[str, Any], report: Reporter) -> dict[str, Any]:

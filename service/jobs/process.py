@@ -1,22 +1,42 @@
-"""A child process of one job, as the thread that runs the job holds it."""
+"""A child process of one job, as the thread that runs the job holds it; and those that outlived their server."""
 
 from __future__ import annotations
 
 import contextlib
 import json
+import logging
 import os
 import select
 import signal
 import subprocess
+import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import IO, Any, Self
 
-from service.jobs.overheard import log_lines
+from service.observe import current_id, working_for
 
 PIECE = 1 << 16
 GONE_SECONDS = 3.0  # the kernel takes a moment to end a group
+LONGEST = 8192  # bytes of a record of the log; what is longer without an end of line comes in pieces
+MARK = "SPLATLIFT_JOB_PROCESS"  # a job's processes carry its id under this name
+MOST_LOOKS = 10
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class JobLimits:
+    """What jobs may take, and how their processes are watched."""
+
+    parallel: int = 1  # jobs at the same time
+    threads: int | None = None  # of a job; None shares the cores out
+    seconds: float = 86_400.0  # wall time of an attempt
+    memory_bytes: int | None = None  # private memory of a job's processes; None sets no limit
+    lease_seconds: float = 30.0  # silence after which an attempt is lost, unless it computes
+    checkpoint_seconds: float = 2.0  # work that a killed lift may lose, beside the views in work
 
 
 class JobProcess:
@@ -33,11 +53,13 @@ class JobProcess:
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             start_new_session=True,
-            env=os.environ | dict(environment),
+            env=os.environ | dict(environment) | mark(job),
         )
         assert self._process.stdout is not None and self._process.stderr is not None
-        self._overheard = log_lines(self._process.stderr, job)
+        self._printed = log_lines(self._process.stderr, job)
         self._pipe = self._process.stdout.fileno()
+        self._poll = select.poll()  # not select(), which takes no file of a number above 1023
+        self._poll.register(self._pipe, select.POLLIN)
         self._open = True
         self._rest = b""
         self._status: int | None = None
@@ -59,7 +81,7 @@ class JobProcess:
         if not self._open:
             time.sleep(seconds)
             return []
-        if not select.select([self._pipe], [], [], seconds)[0]:
+        if not self._poll.poll(seconds * 1000):
             return []
         with contextlib.suppress(BlockingIOError):
             while piece := os.read(self._pipe, PIECE):
@@ -90,7 +112,7 @@ class JobProcess:
             os.killpg(self.pid, signal.SIGKILL)
             self._status = self._process.wait()
             self._await_group()
-            self._overheard.join(GONE_SECONDS)
+            self._printed.join(GONE_SECONDS)
             for pipe in (self._process.stdin, self._process.stdout):
                 assert pipe is not None
                 pipe.close()
@@ -102,6 +124,68 @@ class JobProcess:
             while time.monotonic() < deadline:
                 os.killpg(self.pid, 0)
                 time.sleep(0.005)
+
+
+def log_lines(pipe: IO[bytes], job: str) -> threading.Thread:
+    """Log each line that comes through a pipe as a warning, until its other ends are closed; the thread that does.
+
+    The records have the job's id, and that of the request that this thread works for.
+    """
+    request = current_id()
+
+    def listen() -> None:
+        with pipe, working_for(request):
+            while line := pipe.readline(LONGEST):
+                text = line.decode("utf-8", "replace").strip()
+                if text:
+                    log.warning("%s", text, extra={"fields": {"job": job}})
+
+    thread = threading.Thread(target=listen, name=f"printed-{job}", daemon=True)
+    thread.start()
+    return thread
+
+
+def mark(job: str) -> dict[str, str]:
+    """The environment variable by which a job's processes are known; what a process starts inherits it."""
+    return {MARK: job}
+
+
+def end_orphans(jobs: Iterable[str]) -> int:
+    """End all processes of these jobs, and wait until they are gone; how many there were. Linux only, else 0."""
+    marks = {f"{MARK}={job}".encode() for job in jobs}
+    if not marks or not Path("/proc/self/environ").exists():
+        return 0
+    ended = 0
+    for _ in range(MOST_LOOKS):
+        handles = [handle for pid in _processes() if (handle := _killed(pid, marks)) is not None]
+        for handle in handles:
+            poll = select.poll()
+            poll.register(handle, select.POLLIN)
+            poll.poll(GONE_SECONDS * 1000)  # readable once the process has ended
+            os.close(handle)
+        ended += len(handles)
+        if not handles:
+            break  # and not before: one that we killed may have started another after we looked
+    return ended
+
+
+def _processes() -> list[int]:
+    return [int(entry.name) for entry in Path("/proc").iterdir() if entry.name.isdecimal()]
+
+
+def _killed(pid: int, marks: set[bytes]) -> int | None:
+    """A handle on the process when it carried a mark and was killed; with it we signal what we looked at."""
+    with contextlib.suppress(OSError):
+        handle = os.pidfd_open(pid)
+        try:
+            if marks & set(Path(f"/proc/{pid}/environ").read_bytes().split(b"\0")):
+                signal.pidfd_send_signal(handle, signal.SIGKILL)
+                kept, handle = handle, -1
+                return kept
+        finally:
+            if handle >= 0:
+                os.close(handle)
+    return None
 
 
 def _private_bytes(pid: int) -> int:

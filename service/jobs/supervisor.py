@@ -7,43 +7,55 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 
+from liftcore.errors import SplatliftError
 from service.child import fault_of
-from service.errors import Crashed
-from service.jobs.attempt import CHILD, Attempt
-from service.jobs.leftovers import end_leftovers
-from service.jobs.limits import JobLimits
+from service.errors import Crashed, NoSpace
+from service.jobs.attempt import CHILD, TROUBLE, Attempt, Clock, insist
+from service.jobs.process import JobLimits, end_orphans
 from service.observe import working_for
 from service.store.jobs import JobRecord
 from service.store.store import Store
 
 IDLE_SECONDS = 5.0  # a forgotten wake-up costs at most this
-INSIST_SECONDS = 1.0  # between tries to note the end of a job
+TROUBLED_SECONDS = (1.0, 30.0)  # first and longest pause after an attempt that the server could not keep up
+ROOM_SECONDS = 60.0  # how long an attempt waits for room on the disk before it tries without
 
 log = logging.getLogger(__name__)
 
 
 class Supervisor:
-    """Threads that own the running jobs, one each. Only they change a job after it was submitted or canceled."""
+    """Threads that own the running jobs, one each. Only they change a job after it was submitted or canceled.
 
-    def __init__(self, store: Store, limits: JobLimits, *, command: Sequence[str] = CHILD) -> None:
+    Args:
+        store: that holds the jobs.
+        limits: what they may take.
+        command: of their processes.
+        clock: by which leases are measured.
+    """
+
+    def __init__(
+        self, store: Store, limits: JobLimits, *, command: Sequence[str] = CHILD, clock: Clock = time.monotonic
+    ) -> None:
         self._store = store
         self._limits = limits
         self._command = command
+        self._clock = clock
         self._bell = threading.Condition()
         self._rung = 0
         self._stopping = threading.Event()
         self._told: Callable[[str, float], None] | None = None
+        self._beginning = threading.Lock()
+        self._left_behind = True  # jobs of the server before us may seem to run
         self._threads = [
             threading.Thread(target=self._loop, name=f"supervisor-{number}", daemon=True)
             for number in range(limits.parallel)
         ]
 
     def start(self) -> None:
-        """End and put back what a dead server left running, then begin to take jobs."""
-        found = end_leftovers(self._store.attempts.unfinished())
+        """End what a dead server left running, then begin to take jobs."""
+        found = end_orphans(self._store.attempts.unfinished())
         if found:
             log.warning("ended %d processes that outlived their server", found)
-        self._store.attempts.lose_all("the server died")
         for thread in self._threads:
             thread.start()
 
@@ -70,43 +82,65 @@ class Supervisor:
                 thread.join()
 
     def _loop(self) -> None:
+        troubled = 0  # attempts in a row that the server could not keep up
         while not self._stopping.is_set():
             rung = self._rung
             try:
-                job = self._store.attempts.claim(self._limits.lease_seconds)
+                job = self._next()
                 if job is not None:
-                    self._run(job)
+                    troubled = 0 if self._run(job) else troubled + 1
+                    self._pause(troubled)
                     continue
             except Exception:  # the thread must outlive a full disk or a locked database
                 log.exception("the supervisor stumbled")
             self._rest(rung)
+
+    def _next(self) -> JobRecord | None:
+        """Claim a job; before the first one, those of the server before us go back in line."""
+        with self._beginning:
+            if self._left_behind:
+                self._store.attempts.release_all("the server died")
+                self._left_behind = False
+        return self._store.attempts.claim()
 
     def _rest(self, rung: int) -> None:
         """Wait for a ring of the bell after that one, for a stop, or for IDLE_SECONDS."""
         with self._bell:
             self._bell.wait_for(lambda: self._rung != rung or self._stopping.is_set(), IDLE_SECONDS)
 
-    def _run(self, job: JobRecord) -> None:
-        begun = time.monotonic()
+    def _pause(self, troubled: int) -> None:
+        """Wait while the server has trouble: longer each time, then for a disk above its floor, though not for ever:
+        what fills it may be what the next job goes on from.
+        """
+        first, longest = TROUBLED_SECONDS
+        if troubled:
+            self._stopping.wait(min(longest, first * 2 ** min(troubled - 1, 10)))
+        until = time.monotonic() + ROOM_SECONDS
+        while time.monotonic() < until and not self._stopping.is_set():
+            try:
+                self._store.files.require_room()
+                return
+            except (NoSpace, OSError):
+                self._stopping.wait(first)
+
+    def _run(self, job: JobRecord) -> bool:
+        """Run a job; whether its attempt came to an end of its own."""
+        begun, attempts, kept_up = time.monotonic(), self._store.attempts, True
         with working_for(job.request_id):
             log.info("job %s, attempt %d begins", job.id, job.attempt)
             try:
-                Attempt(job, self._store, self._limits, self._command).run(self._stopping)
-            except Exception:
+                Attempt(job, self._store, self._limits, self._command, self._clock).run(self._stopping)
+            except TROUBLE as error:
+                log.exception("job %s could not be kept up", job.id)
+                kept_up, why = False, f"the server could not keep it up: {error}"
+                insist(lambda: attempts.release(job.id, job.attempt, why), self._stopping)
+            except Exception as error:
                 log.exception("job %s could not be run", job.id)
-                error = Crashed("job", expected="a process that runs", got="an error of the server")
-                self._insist(lambda: self._store.attempts.fail(job.id, job.attempt, fault_of(error)))
-            outcome, seconds = self._store.attempts.state(job.id) or "deleted", time.monotonic() - begun
+                unforeseen = Crashed("job", expected="a process that runs", got="an error of the server")
+                fault = fault_of(error if isinstance(error, SplatliftError) else unforeseen)
+                insist(lambda: attempts.fail(job.id, job.attempt, fault), self._stopping)
+            outcome, seconds = attempts.state(job.id) or "deleted", time.monotonic() - begun
             log.info("job %s, attempt %d: %s after %.3f s", job.id, job.attempt, outcome, seconds)
         if self._told is not None:
             self._told(outcome, seconds)
-
-    def _insist(self, note: Callable[[], None]) -> None:
-        """Note the end of a job, however long the disk is full: else it would seem to run for ever."""
-        while not self._stopping.is_set():
-            try:
-                note()
-                return
-            except Exception:
-                log.exception("the end of a job could not be noted yet")
-                self._stopping.wait(INSIST_SECONDS)
+        return kept_up

@@ -19,8 +19,7 @@ from service.observe import current_id
 from service.problems import problem_of
 from service.requests import described_body, json_body
 from service.state import AppState, Deps
-from service.store.events import Event, EventKind
-from service.store.jobs import JobOrder, JobRecord, fingerprint, labels_of
+from service.store.jobs import Event, EventKind, JobOrder, JobRecord, fingerprint, labels_of
 
 router = APIRouter(tags=["jobs"])
 
@@ -103,8 +102,8 @@ def get_job(job: str, deps: Deps) -> models.Job:
 @router.get("/jobs/{job}/events", response_class=Response, responses=EVENTS)
 async def follow_job(job: str, deps: Deps, last_event: LastEvent = 0) -> Response:
     """What happens to a job, as it happens: its states, plan, latest progress and log. Ends after the last state."""
-    look = partial(deps.store.events.after, job)
-    state = await anyio.to_thread.run_sync(deps.store.attempts.state, job)
+    look = partial(deps.store.jobs.events, job)
+    state = await anyio.to_thread.run_sync(deps.store.jobs.state, job)
     if not await anyio.to_thread.run_sync(look, last_event) and state in models.ENDED:
         return Response(status_code=204)
     return deps.streams.answer(look, event_data, last_event)
@@ -118,7 +117,7 @@ async def follow_job(job: str, deps: Deps, last_event: LastEvent = 0) -> Respons
 )
 def cancel_job(job: str, deps: Deps) -> Response:
     """End a job. It is ``canceling`` until its processes are gone, then ``canceled``; asking twice does no harm."""
-    deps.store.attempts.cancel(job)
+    deps.store.jobs.cancel(job)
     found = deps.store.jobs.get(job)
     status = 200 if found.state is models.JobState.CANCELED else 202
     return JSONResponse(shape(found).model_dump(mode="json"), status, headers={"Location": f"/jobs/{job}"})

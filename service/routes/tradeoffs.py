@@ -18,7 +18,7 @@ from service.routes.jobs import REPEATED, Key, take
 from service.routes.queries import PNG
 from service.state import AppState, Deps
 from service.store.jobs import JobOrder, fingerprint
-from service.store.tradeoffs import TradeoffRecord
+from service.store.lifts import TradeoffRecord
 
 MARKDOWN_TYPE = "text/markdown; charset=utf-8"
 MARKDOWN: dict[int | str, dict[str, Any]] = {200: {"content": {MARKDOWN_TYPE: {"schema": {"type": "string"}}}}}

@@ -1,32 +1,23 @@
-"""``python -m service.store rebuild``: rows for files whose database is gone or older than they are."""
+"""``python -m service.store``: rebuild, back up, restore and verify a data directory."""
 
 from __future__ import annotations
 
 import argparse
-import hashlib
 import json
-import re
 import sqlite3
 import sys
-import threading
-import zipfile
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from safetensors import SafetensorError, safe_open
-
 from liftcore.cli import build_parser
-from liftcore.errors import InvalidLift, NotFound, SplatliftError
+from liftcore.errors import NotFound, SplatliftError
 from service.__main__ import parse
-from service.models import JOB_ID, AssetKind
 from service.settings import ServiceSettings
-from service.store.assets import CheckedUpload
-from service.store.jobs import JobOrder
-from service.store.lifts import FinishedLift
-from service.store.store import DATABASE, Store
-from service.uploads.intake import CheckLimits, check
+from service.store.backup import back_up, restore, verify
+from service.store.database import DATABASE
+from service.store.rebuild import rebuild
+from service.store.store import Store
 
 LOST = (
     "what the database alone held is not made again: keys, owners (what was added is of admins alone), trade-offs,"
@@ -35,124 +26,50 @@ LOST = (
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Do what the command line says; the exit status."""
+    """Do what the command line says; the exit status: 1 where `verify` finds damage, 2 after an error."""
     given = build_parser().parse_args(["store", *(sys.argv[1:] if arguments is None else arguments)])
     try:
         settings = parse([] if given.data is None else ["--data", str(given.data)])
-        if not settings.data.is_dir():
-            raise NotFound("data", expected="the data directory of a service", got=str(settings.data),
-                           hint="name it with --data")  # fmt: skip
-        store = Store.open(settings.data, rebuilding=True)
-        try:
-            _tell(rebuild(store, settings), given)
-        finally:
-            store.close()
+        if given.action == "restore":
+            return _told(given, {"files": restore(given.directory, settings.data)}, f"restored to {settings.data}")
+        _require_directory(settings.data)
+        if given.action == "backup":
+            found = {"files": back_up(settings.data, given.directory)}
+            return _told(given, found, f"{DATABASE} and {found['files']} files are in {given.directory}")
+        if given.action == "verify":
+            damage = verify(settings.data)
+            _told(given, {"damage": damage}, "\n".join(damage) or "every file is as it was stored")
+            return 1 if damage else 0
+        return _rebuild(given, settings)
     except SplatliftError as error:
         print(f"splatlift: {error}", file=sys.stderr)
-        return 2
     except (OSError, sqlite3.Error) as error:
         print(f"splatlift: data: expected a directory to read and write, got {error}", file=sys.stderr)
-        return 2
-    return 0
+    return 2
 
 
-def rebuild(store: Store, settings: ServiceSettings) -> dict[str, Any]:
-    """Give rows to the files that have none, and let the database be the newest one of its directory.
-
-    Returns:
-        ``assets`` by kind and ``lifts``: how many were added; ``left``: files that could not be, and why.
-    """
-    left: list[dict[str, str]] = []
-    assets: Counter[str] = Counter()
-    known = {asset.path for asset in store.assets.all()}
-    for path in sorted(store.files.root.glob("blobs/*/*")):
-        if path not in known:
-            try:
-                assets[_add_asset(store, settings, path)] += 1
-            except SplatliftError as error:
-                left.append({"file": store.files.relative(path), "why": str(error)})
-    lifts = 0
-    known = {lift.path for lift in store.lifts.all()}
-    for path in sorted(store.files.root.glob("lifts/*")):
-        if path not in known:
-            try:
-                _add_lift(store, path)
-                lifts += 1
-            except SplatliftError as error:
-                left.append({"file": store.files.relative(path), "why": str(error)})
-    store.database.catch_up()
-    return {"assets": dict(assets), "lifts": lifts, "left": left}
+def _require_directory(data: Path) -> None:
+    if not data.is_dir():
+        raise NotFound("data", expected="the data directory of a service", got=str(data), hint="name it with --data")
 
 
-def _add_asset(store: Store, settings: ServiceSettings, path: Path) -> AssetKind:
-    """A blob is whole when its name is its digest; what it holds is read by the check of uploads."""
-    with path.open("rb") as handle:
-        digest = hashlib.file_digest(handle, "sha256").hexdigest()
-    if path != store.files.blob(digest, path.suffix):
-        raise NotFound("asset", expected="a file named after its sha256", got=f"one whose sha256 is {digest}")
-    kind = _kind_of(path)
-    with store.files.scratch() as scratch:
-        limits = CheckLimits(settings.check_seconds, settings.check_memory_bytes, threading.Event())
-        report = check(kind, path, scratch, limits)
-    # The file is its own draft: it stays where it is.
-    store.assets.add(CheckedUpload(path, kind, digest, path.suffix, report.counts, report.warnings))
-    return kind
-
-
-def _kind_of(path: Path) -> AssetKind:
-    if path.suffix == ".ply":
-        return AssetKind.SPLATS
-    if path.suffix == ".json" or zipfile.is_zipfile(path):
-        return AssetKind.CAMERAS
-    names = _header(path)[0]
-    if names == {"embeddings"}:
-        return AssetKind.TABLE
-    return AssetKind.MASKS if any(name.endswith("/mask") for name in names) else AssetKind.FEATURES
-
-
-def _add_lift(store: Store, path: Path) -> None:
-    """A lift remembers the settings and the digests of what it was made of: that is its job's order."""
-    if not re.match(JOB_ID, path.stem) or path != store.files.lift(path.stem):
-        raise InvalidLift("lift", expected="a file named after its job", got=path.name)
-    _, metadata, shape = _header(path)
+def _rebuild(given: argparse.Namespace, settings: ServiceSettings) -> int:
+    store = Store.open(settings.data, rebuilding=True)
     try:
-        told = json.loads(metadata["splatlift"])
-        splats, cameras, *features = [
-            f"sha256:{file['sha256']}" for file in (told["splats"], told["cameras"], *told["features"])
-        ]
-        order = JobOrder(splats, cameras, tuple(features), told["settings"])
-        count, channels = shape
-    except (KeyError, TypeError, ValueError) as error:
-        raise InvalidLift("lift", expected="the metadata of a lift", got=f"none that tell of it: {error!r}") from None
-    for asset, kind in order.assets():
-        store.assets.get(asset, kind)  # a lift without what it was made of can be shown to nobody
-    with path.open("rb") as handle:
-        digest = hashlib.file_digest(handle, "sha256").hexdigest()
-    store.lifts.adopt(path.stem, order, FinishedLift(path, digest, count, channels, told))
-
-
-def _header(path: Path) -> tuple[set[str], dict[str, str], list[int]]:
-    """Names of tensors, metadata and the shape of ``features``, of a safetensors file."""
-    try:
-        handle: Any
-        with safe_open(str(path), framework="np") as handle:
-            names = set(handle.keys())
-            shape = handle.get_slice("features").get_shape() if "features" in names else []
-            return names, handle.metadata() or {}, shape
-    except (SafetensorError, OSError) as error:
-        raise InvalidLift("file", expected="a whole safetensors file", got=str(error)[:120]) from None
-
-
-def _tell(found: dict[str, Any], given: argparse.Namespace) -> None:
-    if given.json:
-        print(json.dumps({**found, "lost": LOST}))
-        return
+        found = rebuild(store, settings)
+    finally:
+        store.close()
     added = [f"{count} of kind {kind}" for kind, count in sorted(found["assets"].items())]
     kinds = f" ({', '.join(added)})" if added else ""
-    print(f"added to {DATABASE}: {sum(found['assets'].values())} assets{kinds}, {found['lifts']} lifts")
+    lines = [f"added to {DATABASE}: {sum(found['assets'].values())} assets{kinds}, {found['lifts']} lifts"]
     for left in found["left"]:
-        print(f"left out, and to be moved to quarantine by the server: {left['file']}: {left['why']}")
-    print(LOST)
+        lines.append(f"left out, and to be moved to quarantine by the server: {left['file']}: {left['why']}")
+    return _told(given, {**found, "lost": LOST}, "\n".join([*lines, LOST]))
+
+
+def _told(given: argparse.Namespace, found: dict[str, Any], text: str) -> int:
+    print(json.dumps(found) if given.json else text)
+    return 0
 
 
 if __name__ == "__main__":

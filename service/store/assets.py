@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import sqlite3
 import sys
-import threading
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -18,7 +17,7 @@ from service.errors import InUse
 from service.models import AssetKind
 from service.store.database import Database
 from service.store.files import DataDirectory, is_whole
-from service.store.owners import SEEN, Owned, require_quota
+from service.store.owners import SEEN, Owner, require_quota
 from service.store.pages import Page, after, page_of
 
 
@@ -72,14 +71,13 @@ SHOWN = VISIBLE.replace("counts", "CASE WHEN counts_bytes <= :most THEN counts E
 LONG = ("names", "words")  # of counts: what there may be a hundred thousand of
 
 
-class AssetStore(Owned):
-    """Assets in the database, their bytes in blobs/."""
+class AssetStore:
+    """Assets in the database, their bytes in blobs/, as an owner sees them."""
 
-    def __init__(self, database: Database, files: DataDirectory) -> None:
+    def __init__(self, database: Database, files: DataDirectory, owner: Owner) -> None:
         self._database = database
         self._files = files
-        # Held while a blob appears or goes, so that no delete removes the bytes of a new upload.
-        self._blobs = threading.Lock()
+        self._owner = owner
 
     def add(self, upload: CheckedUpload) -> tuple[AssetRecord, bool]:
         """Keep a checked upload.
@@ -92,7 +90,7 @@ class AssetStore(Owned):
             OverQuota: it would be more than the owner may store.
         """
         asset = f"sha256:{upload.sha256}"
-        with self._blobs, self._database.write(counted=True) as connection:
+        with self._files.blobs_changing, self._database.write(counted=True) as connection:
             owned = connection.execute(
                 "SELECT 1 FROM asset_owners WHERE asset = ? AND owner = ?", (asset, self._owner.key)
             ).fetchone()
@@ -189,7 +187,7 @@ class AssetStore(Owned):
             NotFound: there is none.
             InUse: a job or a lift of theirs refers to it.
         """
-        with self._blobs:
+        with self._files.blobs_changing:
             found = self.get(asset)
             terms = self._owner.terms(asset=asset)
             with self._database.write(counted=True) as connection:
@@ -213,22 +211,6 @@ class AssetStore(Owned):
             # After the commit: a crash here leaves bytes that nobody knows of, never an asset without bytes.
             if last:
                 found.path.unlink(missing_ok=True)
-
-    def collect(self, older_than: float) -> list[Path]:
-        """Move bytes that no asset has to quarantine: what a crash between a blob and its row left.
-
-        Args:
-            older_than: seconds since 1970; younger files stay.
-
-        Returns:
-            What was moved.
-        """
-        with self._blobs:  # so no upload is between its blob and its row
-            with self._database.read() as connection:
-                known = {row["file"] for row in connection.execute("SELECT file FROM assets")}
-            found = (self._files.root / "blobs").glob("*/*")
-            lost = [path for path in found if self._files.relative(path) not in known]
-            return self._files.quarantine(path for path in lost if path.stat().st_mtime < older_than)
 
     def _record(self, row: sqlite3.Row) -> AssetRecord:
         return AssetRecord(

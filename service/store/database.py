@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import logging
+import os
 import queue
 import sqlite3
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 
+from liftcore.io.files import whole_file
 from service.errors import Misconfigured, StaleDatabase
-from service.store.markers import expected_generation, remember_generation
+from service.store.files import sync_directory
 from service.store.schema import MIGRATIONS
 
+DATABASE = "service.sqlite"  # in the data directory, beside two files that know an empty or older one from it:
+GENERATION = "generation"  # the number that the newest counted transaction had
+KEYS_REQUIRED = "keys.required"  # there when a key was ever made
+BUSY_SECONDS = 10.0  # that a write waits for others, of this process and of others
 MOST_IDLE = 4  # connections kept for the next readers; those of a rush are closed after it
 
 log = logging.getLogger(__name__)
@@ -49,7 +55,7 @@ class Database:
             raise
 
     def _connect(self) -> sqlite3.Connection:
-        connection = sqlite3.connect(self._path, isolation_level=None, check_same_thread=False, timeout=30)
+        connection = sqlite3.connect(self._path, isolation_level=None, check_same_thread=False, timeout=BUSY_SECONDS)
         connection.row_factory = sqlite3.Row
         connection.execute("PRAGMA journal_mode = WAL")
         connection.execute("PRAGMA synchronous = FULL")
@@ -66,18 +72,26 @@ class Database:
                     "data", expected=f"a database of schema version {len(MIGRATIONS)} or less", got=f"{version}",
                     hint="use the release that wrote it, or another data directory",
                 )  # fmt: skip
-            if version < len(MIGRATIONS) and not allowed:
+            if version == len(MIGRATIONS):
+                self._require_generation(least)
+                return  # nothing to write, which a full disk would refuse
+            if not allowed:
                 raise Misconfigured(
                     "data", expected=f"a database of schema version {len(MIGRATIONS)}", got=f"{version}",
                     hint="an older server runs over it: start it again with this release first",
                 )  # fmt: skip
+            if version > 0:
+                copy_database(self._path, self._path.with_name(f"{self._path.name}.schema-{version}"))
             for step in MIGRATIONS[version:]:
                 for statement in _statements(step):
                     connection.execute(statement)
             connection.execute(f"PRAGMA user_version = {len(MIGRATIONS)}")
-            generation = connection.execute("SELECT number FROM generation").fetchone()[0]
-            if least is not None and generation < least:
-                raise StaleDatabase(self._path.parent, f"an older one (generation {generation}, not {least})")
+            self._require_generation(least)
+
+    def _require_generation(self, least: int | None) -> None:
+        generation = self._writer.execute("SELECT number FROM generation").fetchone()[0]
+        if least is not None and generation < least:
+            raise StaleDatabase(self._path.parent, f"an older one (generation {generation}, not {least})")
 
     @contextmanager
     def write(self, *, counted: bool = False) -> Iterator[sqlite3.Connection]:
@@ -86,7 +100,9 @@ class Database:
         Args:
             counted: a start must not go on without what it writes, so the data directory remembers its generation.
         """
-        with self._write_lock:
+        if not self._write_lock.acquire(timeout=BUSY_SECONDS):
+            raise _busy()
+        try:
             self._writer.execute("BEGIN IMMEDIATE")
             try:
                 generation = self._next_generation() if counted and not self._rebuilding else None
@@ -98,6 +114,8 @@ class Database:
                 raise
             if generation is not None:
                 self._remember(generation)
+        finally:
+            self._write_lock.release()
 
     def _next_generation(self) -> int:
         return self._writer.execute("UPDATE generation SET number = number + 1 RETURNING number").fetchone()[0]
@@ -149,6 +167,73 @@ class Database:
             self._idle.get_nowait().close()
 
 
+def expected_generation(data: Path) -> int | None:
+    """The least generation that the database of a data directory has; None when a new one does no harm.
+
+    Raises:
+        Misconfigured: the marker is there and holds no number.
+    """
+    marked = _marked(data)
+    if marked is None and (any(data.glob("blobs/*/*")) or any(data.glob("lifts/*"))):
+        return 0  # files of a release without the marker
+    return marked
+
+
+def remember_generation(data: Path, number: int) -> None:
+    """Keep the number of a transaction that is on the disk; a larger one, of another process, stays."""
+    if (_marked(data) or 0) < number:
+        _write(data / GENERATION, f"{number}\n")
+
+
+def keys_were_made(data: Path) -> bool:
+    """Whether there ever was a key."""
+    return (data / KEYS_REQUIRED).exists()
+
+
+def remember_keys(data: Path) -> None:
+    """Keep that there is a key."""
+    if not keys_were_made(data):
+        _write(data / KEYS_REQUIRED, "A key was made for this data directory: without one nobody is let in.\n")
+
+
+def _marked(data: Path) -> int | None:
+    path = data / GENERATION
+    try:
+        return int(path.read_text("ascii"))
+    except FileNotFoundError:
+        return None
+    except ValueError:
+        raise Misconfigured(
+            "data", expected="a whole number in the file 'generation'", got=f"something else at {path}",
+            hint="remove it, if the database is the newest one",
+        ) from None  # fmt: skip
+
+
+def _write(path: Path, text: str) -> None:
+    with whole_file(path) as handle:
+        handle.write(text.encode())
+    sync_directory(path.parent)
+
+
+def copy_database(source: Path, target: Path) -> None:
+    """Copy a database as it was last committed, whole or not at all, beside those who read and write it."""
+    draft = target.with_name(f".{target.name}.part")
+    draft.unlink(missing_ok=True)
+    try:
+        with (
+            closing(sqlite3.connect(f"{source.absolute().as_uri()}?mode=ro", uri=True)) as read,
+            closing(sqlite3.connect(draft)) as written,
+        ):
+            read.backup(written)
+            written.execute("PRAGMA journal_mode = DELETE")  # so that it is one file
+        with draft.open("rb") as handle:
+            os.fsync(handle.fileno())
+        draft.replace(target)
+        sync_directory(target.parent)
+    finally:
+        draft.unlink(missing_ok=True)
+
+
 def require_database(path: Path) -> None:
     """See that there is a database, or nothing that one belongs to; it is not opened.
 
@@ -157,6 +242,13 @@ def require_database(path: Path) -> None:
     """
     if not path.exists() and expected_generation(path.parent) is not None:
         raise StaleDatabase(path.parent, "none")
+
+
+def _busy() -> sqlite3.OperationalError:
+    """What SQLite says when another process holds its lock, said of our own."""
+    error = sqlite3.OperationalError("database is locked")
+    error.sqlite_errorcode, error.sqlite_errorname = sqlite3.SQLITE_BUSY, "SQLITE_BUSY"
+    return error
 
 
 def unusable(path: Path, error: sqlite3.Error) -> Misconfigured:

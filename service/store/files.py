@@ -6,6 +6,7 @@ import fcntl
 import os
 import secrets
 import shutil
+import threading
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -35,9 +36,12 @@ class DataDirectory:
     def __init__(self, root: Path, *, floor_bytes: int = 0) -> None:
         self.root = root.absolute()
         self._floor = floor_bytes
+        # Held while a blob appears or goes, so that no delete removes the bytes of a new upload.
+        self.blobs_changing = threading.Lock()
         self._live: set[str] = set()  # names below tmp/ that are in use; adding and removing one is atomic
+        keep_private(self.root)
         for name in (*ROOMS, "tmp"):
-            (self.root / name).mkdir(parents=True, exist_ok=True)
+            (self.root / name).mkdir(exist_ok=True)
         self._lock = (self.root / "lock").open("w")
         if not _locked(self._lock):
             self._lock.close()
@@ -174,6 +178,15 @@ class DataDirectory:
     def close(self) -> None:
         """Let another server have the directory."""
         self._lock.close()
+
+
+def keep_private(root: Path) -> None:
+    """Make a data directory, if need be, and keep it from other users: what is made in it from now on, too."""
+    os.umask(0o077)  # of this process and of its children, which work in nothing else
+    root.mkdir(parents=True, exist_ok=True)
+    root.chmod(0o700)
+    for path in root.glob("*.sqlite*"):  # of a release that left them open
+        path.chmod(0o600)
 
 
 def is_whole(path: Path, size: int) -> bool:

@@ -1,4 +1,4 @@
-"""Jobs: what was acknowledged, and what became of it."""
+"""Jobs: what was acknowledged, what became of it, and what happened on the way."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
+from enum import StrEnum
 from typing import Any
 
 from liftcore.errors import NotFound
@@ -17,11 +18,12 @@ from service.errors import Busy, Conflict, KeyReused
 from service.models import ENDED, AssetKind, JobKind, JobState
 from service.store.assets import own
 from service.store.database import Database
-from service.store.events import EventKind, note
 from service.store.files import DataDirectory
-from service.store.owners import QUEUE_RETRY_SECONDS, SEEN, Owned, Owner, require_quota, require_turn
+from service.store.owners import QUEUE_RETRY_SECONDS, SEEN, Owner, require_quota, require_turn
 from service.store.pages import Page, after, page_of
 
+LOG_LINES = 200  # a job; older ones go
+LINE_CHARACTERS = 500
 RESULTS = {JobKind.LIFT: "lifts", JobKind.TRADEOFF: "tradeoffs"}  # the tables of what jobs make, by their ids
 
 
@@ -67,6 +69,24 @@ class JobRecord:
     plan: dict[str, Any] | None = None
 
 
+class EventKind(StrEnum):
+    """What an event tells of."""
+
+    STATE = "state"
+    PLAN = "plan"
+    PROGRESS = "progress"
+    LOG = "log"
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something that happened to a job."""
+
+    number: int  # ascending in a job
+    kind: EventKind
+    data: dict[str, Any]
+
+
 def labels_of(parameters: Mapping[str, Any]) -> list[tuple[str, AssetKind]]:
     """The assets that a job's parameters name, with their kinds: what a trade-off is judged by."""
     named = parameters.get("labels")
@@ -78,12 +98,13 @@ def fingerprint(order: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(order, sort_keys=True).encode()).hexdigest()
 
 
-class JobStore(Owned):
-    """The line of jobs and their history. Attempts at them are in `service.store.attempts`."""
+class JobStore:
+    """The line of jobs and their history, as an owner sees them. Attempts at them are in `service.store.attempts`."""
 
-    def __init__(self, database: Database, files: DataDirectory) -> None:
+    def __init__(self, database: Database, files: DataDirectory, owner: Owner) -> None:
         self._database = database
         self._files = files
+        self._owner = owner
 
     def submit(self, order: JobOrder, *, max_queued: int = 1_000_000) -> tuple[str, bool]:
         """Put a job in line; it is on the disk when this returns.
@@ -173,6 +194,52 @@ class JobStore(Owned):
     def all(self) -> list[JobRecord]:
         """Every job, newest first."""
         return self.page(sys.maxsize - 1).records
+
+    def state(self, job: str) -> JobState | None:
+        """Where a job is; None when there is none."""
+        with self._database.read() as connection:
+            row = find(connection, job, self._owner)
+        return None if row is None else JobState(row["state"])
+
+    def cancel(self, job: str) -> bool:
+        """Ask for the end of a job. One in line is canceled at once; a running one when its processes are gone.
+
+        Returns:
+            Whether something changed; a job that is canceled, or is being, may be canceled again.
+
+        Raises:
+            NotFound: there is none.
+            Conflict: it has succeeded or failed.
+        """
+        with self._database.write() as connection:
+            row = row_of(connection, job, self._owner)
+            state = JobState(row["state"])
+            if state in (JobState.CANCELING, JobState.CANCELED):
+                return False
+            if state in ENDED:
+                raise Conflict("job", expected="a job that has not ended", got=f"one that has {state}")
+            move(connection, row, JobState.CANCELED if state is JobState.QUEUED else JobState.CANCELING)
+            return True
+
+    def events(self, job: str, number: int) -> list[Event]:
+        """The events of a job beyond a number, in order.
+
+        Raises:
+            NotFound: there is no such job, or the key that follows it was revoked.
+        """
+        with self._database.read() as connection:
+            seen = connection.execute(
+                f"SELECT 1 FROM jobs WHERE id = :job AND {SEEN}"
+                " AND NOT EXISTS (SELECT 1 FROM keys WHERE id = :owner AND revoked IS NOT NULL)",
+                self._owner.terms(job=job),
+            )
+            if seen.fetchone() is None:
+                raise NotFound("job", expected="the id of a job", got=job)
+            rows = connection.execute(
+                "SELECT number, kind, data FROM job_events WHERE job = ? AND number > ? ORDER BY number",
+                (job, number),
+            ).fetchall()
+        return [Event(row["number"], EventKind(row["kind"]), json.loads(row["data"])) for row in rows]
 
     def delete(self, job: str, *, given_up: Collection[JobKind] = ()) -> None:
         """Forget a job that has ended, its events and its result.
@@ -278,3 +345,51 @@ def _take_assets(connection: sqlite3.Connection, order: JobOrder, owner: Owner) 
         if seen.fetchone() is None:
             raise NotFound(kind, expected=f"the id of an asset of kind {kind}", got=asset)
         own(connection, asset, owner.key)
+
+
+def note(connection: sqlite3.Connection, job: str, kind: EventKind, data: Mapping[str, Any]) -> None:
+    """Add an event within a write transaction. Of plan and progress the latest is kept, of the log the last lines."""
+    connection.execute(
+        "INSERT INTO job_events (job, number, kind, data, created)"
+        " SELECT ?, coalesce(max(number), 0) + 1, ?, ?, ? FROM job_events WHERE job = ?",
+        (job, kind, json.dumps(data), time.time(), job),
+    )
+    kept = {EventKind.PLAN: 1, EventKind.PROGRESS: 1, EventKind.LOG: LOG_LINES}.get(kind)
+    if kept is not None:
+        connection.execute(
+            "DELETE FROM job_events WHERE job = :job AND kind = :kind AND number NOT IN"
+            " (SELECT number FROM job_events WHERE job = :job AND kind = :kind ORDER BY number DESC LIMIT :kept)",
+            {"job": job, "kind": kind, "kept": kept},
+        )
+
+
+def log_line(text: str) -> dict[str, Any]:
+    """A line of the log as the data of an event."""
+    return {"line": text[:LINE_CHARACTERS], "time": round(time.time(), 3)}
+
+
+def told(connection: sqlite3.Connection, row: sqlite3.Row) -> None:
+    """Note the state of a row that was just changed."""
+    problem = None if row["problem"] is None else json.loads(row["problem"])
+    data = {"state": row["state"], "attempt": row["attempt"], "problem": problem}
+    note(connection, row["id"], EventKind.STATE, data)
+
+
+def move(
+    connection: sqlite3.Connection, row: sqlite3.Row, state: JobState, problem: Mapping[str, str] | None = None
+) -> None:
+    """Within a write transaction: bring a job to a state, and note it."""
+    changed = connection.execute(
+        "UPDATE jobs SET state = :state, problem = :problem, leased_until = NULL,"
+        " ended = CASE WHEN :ended THEN :now ELSE NULL END,"
+        " progress = CASE WHEN :state = 'queued' THEN NULL ELSE progress END"
+        " WHERE id = :job RETURNING *",
+        {
+            "state": state,
+            "problem": None if problem is None else json.dumps(problem),
+            "ended": state in ENDED,
+            "now": time.time(),
+            "job": row["id"],
+        },
+    ).fetchone()
+    told(connection, changed)

@@ -14,8 +14,7 @@ from typing import Literal, Self
 
 from liftcore.errors import NotFound
 from service.scopes import Scope, parse_scopes
-from service.store.database import Database, unusable
-from service.store.markers import keys_were_made, remember_keys
+from service.store.database import Database, keys_were_made, remember_keys, unusable
 
 PREFIX = "splatlift_"  # by which people, and scanners for leaked secrets, know what it is
 SECRET_BYTES = 32

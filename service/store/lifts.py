@@ -1,7 +1,9 @@
-"""Lifts: the results of jobs."""
+"""What jobs make: lifts, which are files, and trade-offs, which are small and lie in the database whole."""
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import json
 import sqlite3
 import sys
@@ -13,11 +15,11 @@ from typing import Any
 from liftcore.errors import NotFound
 from service.errors import InvalidRequest
 from service.store.assets import own
-from service.store.attempts import succeed, told
+from service.store.attempts import succeed
 from service.store.database import Database
 from service.store.files import DataDirectory
-from service.store.jobs import JobOrder
-from service.store.owners import SEEN, Owned
+from service.store.jobs import JobOrder, told
+from service.store.owners import SEEN, Owner
 from service.store.pages import Page, after, page_of
 
 
@@ -49,20 +51,47 @@ class LiftRecord:
     features: tuple[str, ...]
 
 
-# A lift belongs to whom its job does. One statement, so that no lift is without its job.
-VISIBLE = (
-    "SELECT lifts.*, splats, cameras, (SELECT json_group_array(asset) FROM"
-    " (SELECT asset FROM job_features WHERE job = jobs.id ORDER BY place)) AS features"
-    f" FROM lifts JOIN jobs USING (id) WHERE {SEEN}"
+@dataclass(frozen=True)
+class FinishedTradeoff:
+    """What a job's process found."""
+
+    document: dict[str, Any]  # as liftcore.evaluate.tradeoff.compare gives it
+    page: str  # Markdown
+    chart: bytes  # PNG
+
+
+@dataclass(frozen=True)
+class TradeoffRecord:
+    """A trade-off as the store knows it."""
+
+    id: str  # the id of its job
+    document: dict[str, Any]
+    page: str
+    chart: bytes
+    sha256: str  # of the chart
+    created: float
+    splats: str  # ids of the assets that were lifted
+    cameras: str
+    features: tuple[str, ...]
+    labels: dict[str, Any] | None  # of the order
+
+
+# A result belongs to whom its job does. One statement, so that none is without its job.
+FEATURES = "(SELECT json_group_array(asset) FROM (SELECT asset FROM job_features WHERE job = jobs.id ORDER BY place))"
+VISIBLE = f"SELECT lifts.*, splats, cameras, {FEATURES} AS features FROM lifts JOIN jobs USING (id) WHERE {SEEN}"
+VISIBLE_TRADEOFFS = (
+    "SELECT tradeoffs.*, splats, cameras, json_extract(parameters, '$.labels') AS labels,"
+    f" {FEATURES} AS features FROM tradeoffs JOIN jobs USING (id) WHERE {SEEN}"
 )
 
 
-class LiftStore(Owned):
-    """Lifts in the database, their bytes in lifts/."""
+class LiftStore:
+    """Lifts in the database, their bytes in lifts/, as an owner sees them."""
 
-    def __init__(self, database: Database, files: DataDirectory) -> None:
+    def __init__(self, database: Database, files: DataDirectory, owner: Owner) -> None:
         self._database = database
         self._files = files
+        self._owner = owner
 
     def finish(self, job: str, attempt: int, made: FinishedLift) -> bool:
         """End an attempt with its lift: the file, the lift and the job's last state become true together.
@@ -70,13 +99,19 @@ class LiftStore(Owned):
         Returns:
             False when the attempt may not (`succeed`); then nothing changes.
         """
-        path = self._files.lift(job)
-        size = made.draft.stat().st_size
-        with self._database.write(counted=True) as connection:
-            if not succeed(connection, job, attempt):
-                return False
-            self._files.publish(made.draft, path)
-            self._insert(connection, job, made, size, time.time())
+        path, size, published = self._files.lift(job), made.draft.stat().st_size, False
+        try:
+            with self._database.write(counted=True) as connection:
+                if not succeed(connection, job, attempt):
+                    return False
+                self._files.publish(made.draft, path)
+                published = True
+                self._insert(connection, job, made, size, time.time())
+        except BaseException:
+            if published:  # but not recorded: whoever tries again finds the draft where it was
+                with contextlib.suppress(OSError):
+                    path.replace(made.draft)
+            raise
         return True
 
     def adopt(self, job: str, order: JobOrder, made: FinishedLift) -> None:
@@ -185,21 +220,6 @@ class LiftStore(Owned):
         """Every lift, newest first."""
         return self.page(sys.maxsize - 1).records
 
-    def collect(self, older_than: float) -> list[Path]:
-        """Move files that no lift has to quarantine: what a crash between a file and its row left.
-
-        Args:
-            older_than: seconds since 1970; younger files stay.
-
-        Returns:
-            What was moved.
-        """
-        with self._database.write() as connection:  # so no lift is between its file and its row
-            known = {row["file"] for row in connection.execute("SELECT file FROM lifts")}
-            found = (self._files.root / "lifts").iterdir()
-            lost = [path for path in found if self._files.relative(path) not in known]
-            return self._files.quarantine(path for path in lost if path.stat().st_mtime < older_than)
-
     def _record(self, row: sqlite3.Row) -> LiftRecord:
         return LiftRecord(
             id=row["id"],
@@ -213,4 +233,57 @@ class LiftStore(Owned):
             splats=row["splats"],
             cameras=row["cameras"],
             features=tuple(json.loads(row["features"])),
+        )
+
+
+class TradeoffStore:
+    """Trade-offs in the database, as an owner sees them."""
+
+    def __init__(self, database: Database, owner: Owner) -> None:
+        self._database = database
+        self._owner = owner
+
+    def finish(self, job: str, attempt: int, made: FinishedTradeoff) -> bool:
+        """End an attempt with its trade-off: it and the job's last state become true together.
+
+        Returns:
+            False when the attempt may not (`succeed`); then nothing changes.
+        """
+        document = json.dumps(made.document)
+        size = len(document) + len(made.page.encode()) + len(made.chart)
+        digest = hashlib.sha256(made.chart).hexdigest()
+        with self._database.write(counted=True) as connection:
+            if not succeed(connection, job, attempt):
+                return False
+            connection.execute(
+                "INSERT INTO tradeoffs (id, bytes, document, page, chart, sha256, created) VALUES (?,?,?,?,?,?,?)",
+                (job, size, document, made.page, made.chart, digest, time.time()),
+            )
+        return True
+
+    def get(self, tradeoff: str) -> TradeoffRecord:
+        """The trade-off of that id.
+
+        Raises:
+            NotFound: there is none.
+        """
+        terms = self._owner.terms(tradeoff=tradeoff)
+        with self._database.read() as connection:
+            row = connection.execute(f"{VISIBLE_TRADEOFFS} AND id = :tradeoff", terms).fetchone()
+        if row is None:
+            raise NotFound(
+                "tradeoff", expected="the id of a trade-off", got=tradeoff,
+                hint="POST /tradeoff makes one; it has its job's id",
+            )  # fmt: skip
+        return TradeoffRecord(
+            id=row["id"],
+            document=json.loads(row["document"]),
+            page=row["page"],
+            chart=row["chart"],
+            sha256=row["sha256"],
+            created=row["created"],
+            splats=row["splats"],
+            cameras=row["cameras"],
+            features=tuple(json.loads(row["features"])),
+            labels=None if row["labels"] is None else json.loads(row["labels"]),
         )

@@ -1,11 +1,10 @@
-"""Whose things are whose: what a part of the store shows depends on who looks."""
+"""Whose things are whose, and what one owner may fill."""
 
 from __future__ import annotations
 
-import copy
 import sqlite3
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any
 
 from service.errors import OverQuota, TooMany
 
@@ -16,14 +15,10 @@ QUEUE_RETRY_SECONDS = 30  # a lift takes seconds to minutes, and one must end be
 
 @dataclass(frozen=True)
 class Owner:
-    """Who looks at the store, and what they may fill of it.
+    """Who looks at the store, and what they may fill of it. What another owner made is absent: it is not found."""
 
-    The default is the service itself, and everybody while there are no keys: it sees all, and what it makes belongs
-    to admins once there are keys.
-    """
-
-    key: str = ""  # the id of a key: what is made belongs to it
-    sees_all: bool = True
+    key: str  # the id of a key: what is made belongs to it
+    sees_all: bool
     max_bytes: int | None = None  # of assets and results together; None = no limit
     max_queued: int | None = None  # jobs in line
 
@@ -32,19 +27,9 @@ class Owner:
         return {"sees_all": self.sees_all, "owner": self.key, **more}
 
 
-class Owned:
-    """A part of the store as an owner sees it; as it was opened, it shows everything.
-
-    What another owner made is absent, in every answer: it is not looked up and refused, it is not found.
-    """
-
-    _owner = Owner()
-
-    def seen_by(self, owner: Owner) -> Self:
-        """The same part, as that owner sees it."""
-        seen = copy.copy(self)
-        seen._owner = owner
-        return seen
+# The service itself, and everybody while there are no keys; what it makes belongs to admins once there are keys.
+SERVICE = Owner("", sees_all=True)
+NOBODY = Owner("-", sees_all=False)  # the id of no key, so nothing is theirs
 
 
 def stored_bytes(connection: sqlite3.Connection, owner: Owner) -> int:
@@ -52,18 +37,12 @@ def stored_bytes(connection: sqlite3.Connection, owner: Owner) -> int:
     assets = "SELECT total(bytes) FROM assets JOIN asset_owners ON asset = id WHERE owner = :owner"
     lifts = "SELECT total(lifts.bytes) FROM lifts JOIN jobs USING (id) WHERE owner = :owner"
     tradeoffs = "SELECT total(tradeoffs.bytes) FROM tradeoffs JOIN jobs USING (id) WHERE owner = :owner"
-    return int(
-        connection.execute(f"SELECT ({assets}) + ({lifts}) + ({tradeoffs})", {"owner": owner.key}).fetchone()[0]
-    )
+    total = f"SELECT ({assets}) + ({lifts}) + ({tradeoffs})"
+    return int(connection.execute(total, {"owner": owner.key}).fetchone()[0])
 
 
 def require_quota(connection: sqlite3.Connection, owner: Owner, coming: int) -> None:
-    """See that an owner may store more.
-
-    Args:
-        connection: to read with, or of the transaction that will store it.
-        owner: who stores it.
-        coming: bytes.
+    """See that an owner may store so many bytes more, within the transaction that will store them or before it.
 
     Raises:
         OverQuota: it would be more than the owner may store.

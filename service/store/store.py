@@ -3,39 +3,52 @@
 from __future__ import annotations
 
 import sqlite3
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
 from service.errors import StaleDatabase
 from service.store.assets import AssetStore
 from service.store.attempts import AttemptStore
-from service.store.database import Database, unusable
-from service.store.events import EventStore
+from service.store.database import (
+    DATABASE,
+    GENERATION,
+    Database,
+    expected_generation,
+    remember_generation,
+    remember_keys,
+    unusable,
+)
 from service.store.files import DataDirectory
 from service.store.jobs import JobStore
 from service.store.keys import KeyStore, any_key
-from service.store.lifts import LiftStore
-from service.store.markers import GENERATION, expected_generation, remember_generation, remember_keys
-from service.store.owners import Owner
-from service.store.tradeoffs import TradeoffStore
+from service.store.lifts import LiftStore, TradeoffStore
+from service.store.owners import SERVICE, Owner
 
-DATABASE = "service.sqlite"  # in the data directory
+
+@dataclass(frozen=True)
+class StoreView:
+    """The store as one owner sees it: what others made is absent, and what is made belongs to them."""
+
+    files: DataDirectory
+    assets: AssetStore
+    jobs: JobStore
+    lifts: LiftStore
+    tradeoffs: TradeoffStore
+    keys: KeyStore
 
 
 @dataclass(frozen=True)
 class Store:
-    """Assets, jobs, their results and keys, with the files and the database that hold them."""
+    """The files and the database of a data directory, the keys to it, and what the supervisor notes of jobs.
+
+    Assets, jobs and their results are seen through a view, which says for whom: `seen_by`, or `everything`.
+    """
 
     files: DataDirectory
     database: Database
-    assets: AssetStore
-    jobs: JobStore
-    attempts: AttemptStore
-    events: EventStore
-    lifts: LiftStore
-    tradeoffs: TradeoffStore
     keys: KeyStore
+    attempts: AttemptStore
 
     @classmethod
     def open(cls, root: Path, *, floor_bytes: int = 0, new: bool = False, rebuilding: bool = False) -> Self:
@@ -45,7 +58,7 @@ class Store:
             root: the directory.
             floor_bytes: free disk that new work must leave.
             new: where the database is gone or older than the files, move these to quarantine and begin an empty one.
-            rebuilding: let it be so: `service.store.rebuild` mends it.
+            rebuilding: let it be so: `splatlift store rebuild` mends it.
 
         Raises:
             StaleDatabase: it is so, and neither was asked for.
@@ -60,29 +73,24 @@ class Store:
         except BaseException:
             files.close()
             raise
-        return cls(
+        return cls(files, database, KeyStore(database, files.root), AttemptStore(database))
+
+    def seen_by(self, owner: Owner) -> StoreView:
+        """The store as that owner sees it."""
+        database, files = self.database, self.files
+        return StoreView(
             files=files,
-            database=database,
-            assets=AssetStore(database, files),
-            jobs=JobStore(database, files),
-            attempts=AttemptStore(database),
-            events=EventStore(database),
-            lifts=LiftStore(database, files),
-            tradeoffs=TradeoffStore(database),
-            keys=KeyStore(database, files.root),
+            assets=AssetStore(database, files, owner),
+            jobs=JobStore(database, files, owner),
+            lifts=LiftStore(database, files, owner),
+            tradeoffs=TradeoffStore(database, owner),
+            keys=self.keys,
         )
 
-    def seen_by(self, owner: Owner) -> Self:
-        """The same store as an owner sees it: what others made is absent."""
-        return replace(
-            self,
-            assets=self.assets.seen_by(owner),
-            jobs=self.jobs.seen_by(owner),
-            attempts=self.attempts.seen_by(owner),
-            events=self.events.seen_by(owner),
-            lifts=self.lifts.seen_by(owner),
-            tradeoffs=self.tradeoffs.seen_by(owner),
-        )
+    @property
+    def everything(self) -> StoreView:
+        """The store as the service itself sees it. What is made through it belongs to admins."""
+        return self.seen_by(SERVICE)
 
     def close(self) -> None:
         """Close the database and let the directory go."""

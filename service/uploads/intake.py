@@ -30,7 +30,7 @@ from service.child import error_of
 from service.errors import Busy, Crashed, DigestMismatch, InvalidEncoding, TooLarge, UnsupportedEncoding
 from service.models import AssetKind
 from service.store.assets import AssetRecord, CheckedUpload
-from service.store.store import Store
+from service.store.store import StoreView
 from service.uploads import INVALID
 
 GZIP_WINDOW = 31  # zlib's name for "a gzip header and a 32 KiB window"
@@ -152,7 +152,7 @@ class Intake:
         coding: how the body is compressed.
     """
 
-    def __init__(self, store: Store, kind: AssetKind, limit: int, coding: Coding | None) -> None:
+    def __init__(self, store: StoreView, kind: AssetKind, limit: int, coding: Coding | None) -> None:
         self._store = store
         self._kind = kind
         self._limit = limit

@@ -21,10 +21,9 @@ from service.scopes import Scope
 from service.settings import ServiceSettings
 from service.store.jobs import JobOrder
 from service.store.keys import Quota
-from service.store.lifts import FinishedLift
+from service.store.lifts import FinishedLift, FinishedTradeoff
 from service.store.owners import Owner
 from service.store.store import Store
-from service.store.tradeoffs import FinishedTradeoff
 from tests.crash.conftest import order
 from tests.crash.server import NoQueries
 
@@ -103,19 +102,21 @@ def make_key(store: Store, scopes: str, **quota: int) -> tuple[str, str]:
 
 def finish(store: Store, content: bytes) -> None:
     """Claim the oldest job in line and end it with a lift."""
-    claimed = store.attempts.claim(60)
+    claimed = store.attempts.claim()
     assert claimed is not None
     with store.files.draft(".safetensors") as draft:
         draft.write_bytes(content)
-        assert store.lifts.finish(claimed.id, claimed.attempt, FinishedLift(draft, "0" * 64, 1, 1, METADATA))
+        assert store.everything.lifts.finish(
+            claimed.id, claimed.attempt, FinishedLift(draft, "0" * 64, 1, 1, METADATA)
+        )
 
 
 def finish_tradeoff(store: Store, chart: bytes) -> None:
     """Claim the oldest job in line and end it with a trade-off."""
-    claimed = store.attempts.claim(60)
+    claimed = store.attempts.claim()
     assert claimed is not None
     found = {"runs": [], "skipped": [], "choice": {}, "views": {}, "budget_s": 60, "seconds": 1}
-    assert store.tradeoffs.finish(claimed.id, claimed.attempt, FinishedTradeoff(found, "a table", chart))
+    assert store.everything.tradeoffs.finish(claimed.id, claimed.attempt, FinishedTradeoff(found, "a table", chart))
 
 
 def every_route(app: FastAPI) -> list[tuple[str, str]]:

@@ -15,9 +15,9 @@ from liftcore.device import choose_device
 from liftcore.errors import Unavailable
 from liftcore.progress import Progress
 from service.child import fault_of
-from service.jobs import child, devices
-from service.jobs.devices import Devices
-from service.jobs.reporter import Reporter
+from service.jobs import child, device
+from service.jobs.child import Reporter
+from service.jobs.device import Devices
 
 from .conftest import Uploaded
 from .test_problems import assert_problem
@@ -28,7 +28,7 @@ LACK = Unavailable("device", expected="a card", got="none", hint="take device=cp
 def test_card_that_is_missing_refuses_the_order_at_once(
     client: TestClient, uploaded: Uploaded, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(devices, "_look", lambda asked: {"event": "fault", "fault": fault_of(LACK)})
+    monkeypatch.setattr(device, "ask", lambda asked: {"event": "fault", "fault": fault_of(LACK)})
     jobs = len(client.get("/jobs").json()["jobs"])
     problem = assert_problem(client.post("/lift", json=uploaded.order(device="cuda")))
     assert (problem["status"], problem["type"]) == (422, "/problems/unavailable")
@@ -44,7 +44,7 @@ def test_device_is_looked_for_once_and_what_cannot_be_found_out_is_let_through(
     looks: list[str] = []
     found = Devices()
     for told, refused in ((None, False), ({"event": "fault", "fault": fault_of(LACK)}, True)):
-        monkeypatch.setattr(devices, "_look", lambda asked, told=told: looks.append(asked) or told)
+        monkeypatch.setattr(device, "ask", lambda asked, told=told: looks.append(asked) or told)
         for _ in range(2):
             if refused:
                 with pytest.raises(Unavailable):

@@ -65,7 +65,7 @@ def test_counters_know_the_route_of_a_head(client: TestClient) -> None:
 def test_head_of_events_ends_at_once_and_leaves_no_stream(client: TestClient, uploaded: Uploaded) -> None:
     parts = parts_of(client)
     order = JobOrder(splats=uploaded.splats, cameras=uploaded.cameras, features=(uploaded.features,), settings={})
-    job, _ = parts.store.jobs.submit(order, max_queued=10)  # nobody is woken for it, so it stays in line
+    job, _ = parts.whole.everything.jobs.submit(order, max_queued=10)  # nobody is woken for it, so it stays in line
     try:
         for _ in range(3):
             head = client.head(f"/jobs/{job}/events")

@@ -16,7 +16,7 @@ from fastapi.testclient import TestClient
 
 from service.app import create_app
 from service.errors import Misconfigured
-from service.jobs.limits import JobLimits
+from service.jobs.process import JobLimits
 from service.jobs.supervisor import Supervisor
 from service.models import JobState
 from service.queries.client import QueryClient, QueryLimits
@@ -182,7 +182,7 @@ def test_no_work_is_taken_below_the_disk_floor_and_the_service_lives(
 ) -> None:
     usage = shutil.disk_usage("/")
     with quick("answer", disk_floor_bytes=1000) as (client, body):
-        application(client).state.deps.store.files._floor = 1000
+        application(client).state.deps.whole.files._floor = 1000
         monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=999))
         for reply in (
             client.put("/assets/splats", content=scene.splats),
@@ -238,11 +238,11 @@ def test_database_of_a_later_release_is_refused(tmp_path: Path) -> None:
 
 def test_store_remembers_after_reopening(tmp_path: Path) -> None:
     store = Store.open(tmp_path)
-    job = store.jobs.submit(order(store))[0]
+    job = store.everything.jobs.submit(order(store))[0]
     (tmp_path / "tmp" / "left-over").write_bytes(b"half a file")
     store.close()
     store = Store.open(tmp_path)
-    assert store.jobs.get(job).state is JobState.QUEUED and len(store.assets.all()) == 3
+    assert store.everything.jobs.get(job).state is JobState.QUEUED and len(store.everything.assets.all()) == 3
     assert list((tmp_path / "tmp").iterdir()) == []
     store.close()
 
@@ -266,10 +266,14 @@ def test_database_of_the_first_schema_is_taken_over(tmp_path: Path) -> None:
     old.commit()
     old.close()
     store = Store.open(tmp_path / "data")
-    assert store.jobs.get("a").features == ("f",) and store.jobs.get("a").plan is None
-    store.attempts.lose_all("the server died")
-    assert [store.jobs.get(job).state for job in "abc"] == [JobState.QUEUED, JobState.QUEUED, JobState.FAILED]
-    (last,) = store.events.after("c", 0)
+    assert store.everything.jobs.get("a").features == ("f",) and store.everything.jobs.get("a").plan is None
+    store.attempts.release_all("the server died")
+    assert [store.everything.jobs.get(job).state for job in "abc"] == [
+        JobState.QUEUED,
+        JobState.QUEUED,
+        JobState.FAILED,
+    ]
+    (last,) = store.everything.jobs.events("c", 0)
     assert last.data == {"state": "failed", "attempt": 1, "problem": json.loads(problem)}
     with store.database.read() as connection:
         assert connection.execute("PRAGMA user_version").fetchone()[0] == len(MIGRATIONS)

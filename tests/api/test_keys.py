@@ -19,7 +19,7 @@ from service.keys import main
 from service.models import JobState
 from service.scopes import OPEN, Scope, needed
 from service.settings import ServiceSettings
-from service.store.events import Event
+from service.store.jobs import Event
 from service.store.owners import Owner
 from service.store.store import Store
 from service.streams import is_last
@@ -77,7 +77,7 @@ def test_every_route_wants_its_scope(house: Guarded) -> None:
         assert reply.status_code == 403, path
         assert f'error="insufficient_scope", scope="{wanted}"' in reply.headers["www-authenticate"]
         assert assert_problem(reply)["expected"] == f"a key with the scope {wanted}"
-    assert house.store.jobs.get(house.queued).state is JobState.QUEUED
+    assert house.store.everything.jobs.get(house.queued).state is JobState.QUEUED
 
 
 @pytest.mark.parametrize(
@@ -131,7 +131,7 @@ def test_what_is_anothers_is_absent_on_every_route(house: Guarded) -> None:
     assert "at least one lift" in house.ask("bob", "GET", "/query", params=ASKING).json()["detail"]
     assert house.ask("alice", "GET", f"/lifts/{house.done}/features").content == b"a lift"
     assert house.ask("alice", "GET", f"/tradeoffs/{house.compared}/chart").content == b"a chart"
-    assert house.store.jobs.get(house.queued).state is JobState.QUEUED
+    assert house.store.everything.jobs.get(house.queued).state is JobState.QUEUED
 
 
 def test_admins_see_and_touch_everything(house: Guarded) -> None:
@@ -212,7 +212,7 @@ def test_owner_asks_and_sees_pictures(
 ) -> None:
     shutil.copytree(data, tmp_path / "data", ignore=shutil.ignore_patterns("lock"))  # while nothing is written there
     with start() as client:
-        store = parts_of(client).store
+        store = parts_of(client).whole
         (owner, secret), (_, other) = make_key(store, "read"), make_key(store, "read write")
         with store.database.write() as connection:
             connection.execute("UPDATE jobs SET owner = ?", (owner,))

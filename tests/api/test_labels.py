@@ -46,7 +46,7 @@ def judged(client: TestClient, uploaded: Uploaded, scene: TinyScene) -> Iterator
 
 def put(client: TestClient, kind: AssetKind, content: bytes) -> str:
     """Store what the check takes, without a process; the id."""
-    store = parts_of(client).store
+    store = parts_of(client).whole
     with store.files.draft(".part") as draft, store.files.scratch() as folder:
         draft.write_bytes(content)
         copy = folder / "copy"
@@ -54,7 +54,7 @@ def put(client: TestClient, kind: AssetKind, content: bytes) -> str:
         said = check.run(kind, copy)
         digest = hashlib.sha256(content).hexdigest()
         upload = CheckedUpload(draft, kind, digest, said["suffix"], said["counts"], said["warnings"])
-        return store.assets.add(upload)[0].id
+        return store.everything.assets.add(upload)[0].id
 
 
 def test_masks_and_tables_tell_what_orders_are_held_to(client: TestClient, judged: dict[str, Any]) -> None:
@@ -190,7 +190,7 @@ def test_order_with_other_labels_is_another_order_and_one_without_is_what_it_was
 
 
 def test_labels_of_another_owner_are_not_found_and_an_admins_job_keeps_them(store: Store) -> None:
-    anna, admin = (store.seen_by(owner) for owner in (Owner("a", sees_all=False), Owner("admin")))
+    anna, admin = (store.seen_by(owner) for owner in (Owner("a", sees_all=False), Owner("admin", sees_all=True)))
     given = stored_labels(anna)
     known = order(anna)
     for kind in ("masks", "table"):

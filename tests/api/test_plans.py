@@ -17,8 +17,8 @@ from liftcore.lifting import plan as plan_of
 from liftcore.planning.plan import Plan
 from liftcore.settings import LiftSettings
 from service.jobs import child
+from service.jobs.child import Reporter
 from service.jobs.lifting import plan_document
-from service.jobs.reporter import Reporter
 from tests.crash.conftest import until
 
 from .test_jobs import Quick, events, quick

@@ -42,7 +42,7 @@ QUESTIONS: list[dict[str, Any]] = [
 def request_of(client: TestClient, lift: dict[str, Any]) -> Callable[..., dict[str, Any]]:
     """A request as the query process gets it."""
     here = parts_of(client)
-    record = here.store.lifts.get(lift["id"])
+    record = here.whole.everything.lifts.get(lift["id"])
 
     def make(operation: str = "scores", **asked: Any) -> dict[str, Any]:
         body = models.AskedInBody.model_validate({"lift": lift["id"], **asked})

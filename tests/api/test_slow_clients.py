@@ -286,7 +286,7 @@ def stored(data: Path, content: bytes) -> str:
     store = Store.open(data)
     with store.files.draft(".ply") as draft:
         draft.write_bytes(content)
-        store.assets.add(CheckedUpload(draft, AssetKind.SPLATS, digest, ".ply", {}, []))
+        store.everything.assets.add(CheckedUpload(draft, AssetKind.SPLATS, digest, ".ply", {}, []))
     store.close()
     return f"/assets/sha256:{digest}/content"
 

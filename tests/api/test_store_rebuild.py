@@ -16,8 +16,9 @@ from service.errors import Misconfigured, StaleDatabase
 from service.scopes import needed
 from service.settings import ServiceSettings
 from service.store.__main__ import main
-from service.store.garbage import collect
-from service.store.store import DATABASE, Store
+from service.store.collect import collect
+from service.store.database import DATABASE
+from service.store.store import Store
 from tests.unit.command_line import programs_become
 
 from .conftest import Uploaded, app_of, serving
@@ -90,7 +91,7 @@ def test_rebuild_brings_an_older_database_up_to_its_files(filled: tuple[Path, di
         Store.open(data)
     assert main(["rebuild", "--data", str(data)]) == 0
     store = Store.open(data)
-    assert store.jobs.get(lift).state == "succeeded" and store.attempts.claim(60) is None
+    assert store.everything.jobs.get(lift).state == "succeeded" and store.attempts.claim() is None
     with store.database.read() as connection:
         assert connection.execute("SELECT owner FROM jobs").fetchone()["owner"] == "somebody"
     store.close()
@@ -108,7 +109,7 @@ def test_rebuild_that_was_cut_off_does_not_let_the_server_start(
     def cut_off(*given: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("service.store.__main__._add_lift", cut_off)
+    monkeypatch.setattr("service.store.rebuild._add_lift", cut_off)
     with pytest.raises(KeyboardInterrupt):
         main(["rebuild", "--data", str(data)])
     monkeypatch.undo()

@@ -15,7 +15,7 @@ from fastapi.testclient import TestClient
 from service.jobs import child, comparing
 from service.models import JobKind, JobState
 from service.store.jobs import fingerprint
-from service.store.owners import Owner, stored_bytes
+from service.store.owners import SERVICE, stored_bytes
 from service.store.schema import MIGRATIONS
 from service.store.store import Store
 from tests.crash.conftest import until
@@ -72,10 +72,10 @@ def test_what_was_found_is_looked_at_in_three_ways_and_is_no_lift(quick: Quick, 
         for path in (f"/lifts/{job}", f"/lifts/{job}/features", f"/tradeoffs/{lift}", f"/tradeoffs/{lift}/chart"):
             assert assert_problem(client.get(path))["type"] == "/problems/not-found"
         with store.database.read() as connection:
-            stored = stored_bytes(connection, Owner())
+            stored = stored_bytes(connection, SERVICE)
         assert client.delete(f"/jobs/{job}", params={"with_tradeoff": True}).status_code == 204
         with store.database.read() as connection:
-            assert 0 < stored - stored_bytes(connection, Owner()) < 1000
+            assert 0 < stored - stored_bytes(connection, SERVICE) < 1000
 
 
 def test_tradeoff_goes_with_its_job_when_that_is_said(quick: Quick) -> None:
@@ -130,7 +130,7 @@ def test_asset_of_another_kind_is_not_found(quick: Quick) -> None:
 def test_room_for_the_exact_features_is_asked_for_beforehand(
     client: TestClient, uploaded: Uploaded, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    usage, floor = shutil.disk_usage("/"), parts_of(client).store.files.floor_bytes
+    usage, floor = shutil.disk_usage("/"), parts_of(client).whole.files.floor_bytes
     monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=floor + 60 * 9 * 2 - 1))
     reply = client.post("/tradeoff", json=uploaded.order() | {"budget_s": 10})
     assert (assert_problem(reply)["type"], reply.status_code) == ("/problems/no-space", 507)
@@ -146,7 +146,7 @@ def test_real_tradeoff_of_a_tiny_scene(client: TestClient, uploaded: Uploaded) -
     assert found["choice"]["name"] in {run["name"] for run in found["runs"]}
     assert found["views"]["held_out"] == 1 and found["views"]["lifted"] in (1, 2)
     assert all(run["settings"]["certificate_rays"] == 0 for run in found["runs"])
-    data = str(parts_of(client).store.files.root)
+    data = str(parts_of(client).whole.files.root)
     assert data not in json.dumps(found)  # no path of this machine
     assert client.get(job["links"]["chart"]).content.startswith(b"\x89PNG")
     assert "**Take " in client.get(found["links"]["table"]).text
@@ -198,9 +198,12 @@ def test_directory_of_the_release_before_keeps_its_jobs_lifts_and_keys(tmp_path:
     old.commit()
     old.close()
     store = Store.open(tmp_path / "data")
-    assert {job.id: job.state for job in store.jobs.all()} == {"a": JobState.SUCCEEDED, "b": JobState.QUEUED}
-    assert {job.kind for job in store.jobs.all()} == {JobKind.LIFT}
-    assert store.lifts.get("a").bytes == 7
-    claimed = store.attempts.claim(60)
+    assert {job.id: job.state for job in store.everything.jobs.all()} == {
+        "a": JobState.SUCCEEDED,
+        "b": JobState.QUEUED,
+    }
+    assert {job.kind for job in store.everything.jobs.all()} == {JobKind.LIFT}
+    assert store.everything.lifts.get("a").bytes == 7
+    claimed = store.attempts.claim()
     assert claimed is not None and (claimed.id, claimed.kind, claimed.parameters) == ("b", JobKind.LIFT, {})
     store.close()

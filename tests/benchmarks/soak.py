@@ -26,9 +26,9 @@ from liftcore.io.inria import write_inria_cameras
 from liftcore.io.ply import write_splats
 from liftcore.raster.cpu.warm_up import warm_up
 from liftcore.scene.cameras import Cameras
+from service.models import AssetKind
 from service.store.assets import CheckedUpload
 from service.store.store import Store
-from service.models import AssetKind
 from tests.crash.server import POINTS
 from tests.crash.service_process import ServiceProcess, kill_processes_of, usage
 from tests.scenes import centred, random_camera, random_regions, random_splats
@@ -65,7 +65,9 @@ def stored(data: Path, files: dict[str, bytes]) -> dict[str, Any]:
         with store.files.draft(".part") as draft:
             draft.write_bytes(content)
             digest, suffix = hashlib.sha256(content).hexdigest(), SUFFIXES[kind]
-            ids[kind] = store.assets.add(CheckedUpload(draft, AssetKind(kind), digest, suffix, names, []))[0].id
+            ids[kind] = store.everything.assets.add(CheckedUpload(draft, AssetKind(kind), digest, suffix, names, []))[
+                0
+            ].id
     store.close()
     return {**ids, "features": [ids["features"]]}
 

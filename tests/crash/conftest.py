@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -11,12 +12,13 @@ from typing import Any
 
 import pytest
 
-from service.jobs.limits import JobLimits
+from service.jobs.attempt import Clock
+from service.jobs.process import JobLimits
 from service.jobs.supervisor import Supervisor
 from service.models import ENDED, AssetKind
 from service.store.assets import CheckedUpload
 from service.store.jobs import JobOrder, JobRecord
-from service.store.store import Store
+from service.store.store import Store, StoreView
 
 Supervising = Callable[..., AbstractContextManager[Supervisor]]
 
@@ -26,25 +28,26 @@ def stand_in(behaviour: str) -> list[str]:
     return [sys.executable, "-S", "-E", str(Path(__file__).with_name("stand_in.py")), behaviour]
 
 
-def order(store: Store, **settings: Any) -> JobOrder:
+def order(store: Store | StoreView, **settings: Any) -> JobOrder:
     """An order over assets whose content nobody looks at."""
     ids = [asset_of(store, kind, {"names": ["v", "w"], "channels": 1}) for kind in [*AssetKind][:3]]
     return JobOrder(ids[0], ids[1], (ids[2],), settings)
 
 
-def labels(store: Store) -> dict[str, Any]:
+def labels(store: Store | StoreView) -> dict[str, Any]:
     """What a trade-off of that order may be judged by: masks of one of its two views."""
     masks = asset_of(store, AssetKind.MASKS, {"names": ["v"], "classes": 1})
     table = asset_of(store, AssetKind.TABLE, {"words": ["apple"], "channels": 1})
     return {"masks": masks, "table": table, "classes": ["apple"]}
 
 
-def asset_of(store: Store, kind: AssetKind, counts: dict[str, Any]) -> str:
+def asset_of(store: Store | StoreView, kind: AssetKind, counts: dict[str, Any]) -> str:
     """An asset whose content nobody looks at; its id."""
     with store.files.draft(".bin") as draft:
         draft.write_bytes(kind.encode())
-        checked = CheckedUpload(draft, kind, kind.encode().hex().ljust(64, "0"), ".bin", counts, [])
-        return store.assets.add(checked)[0].id
+        checked = CheckedUpload(draft, kind, hashlib.sha256(kind.encode()).hexdigest(), ".bin", counts, [])
+        seen = store.everything if isinstance(store, Store) else store
+        return seen.assets.add(checked)[0].id
 
 
 def until(condition: Callable[[], Any], seconds: float = 60.0) -> None:
@@ -57,16 +60,21 @@ def until(condition: Callable[[], Any], seconds: float = 60.0) -> None:
 
 def ended(store: Store, job: str) -> JobRecord:
     """The job, once it has ended."""
-    until(lambda: store.jobs.get(job).state in ENDED)
-    return store.jobs.get(job)
+    until(lambda: store.everything.jobs.get(job).state in ENDED)
+    return store.everything.jobs.get(job)
+
+
+def state_of(pid: int) -> str:
+    """The state of a process as Linux has it: R, S, T (stopped), Z (dead and not yet reaped); X when it is gone."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except (FileNotFoundError, ProcessLookupError):
+        return "X"
 
 
 def alive(pid: int) -> bool:
-    """Whether a process runs; one that is dead and not yet reaped does not."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in ("Z", "X")
-    except (FileNotFoundError, ProcessLookupError):
-        return False
+    """Whether a process runs."""
+    return state_of(pid) not in ("Z", "X")
 
 
 @pytest.fixture
@@ -81,8 +89,8 @@ def supervising(store: Store) -> Supervising:
     """Run a supervisor whose children behave as told."""
 
     @contextmanager
-    def run(behaviour: str, **limits: Any) -> Iterator[Supervisor]:
-        supervisor = Supervisor(store, JobLimits(**limits), command=stand_in(behaviour))
+    def run(behaviour: str, *, clock: Clock = time.monotonic, **limits: Any) -> Iterator[Supervisor]:
+        supervisor = Supervisor(store, JobLimits(**limits), command=stand_in(behaviour), clock=clock)
         supervisor.start()
         try:
             yield supervisor

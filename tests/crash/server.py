@@ -25,9 +25,8 @@ from service.settings import ServiceSettings
 from service.store.attempts import AttemptStore
 from service.store.files import DataDirectory
 from service.store.jobs import JobStore
-from service.store.lifts import LiftStore
+from service.store.lifts import LiftStore, TradeoffStore
 from service.store.store import Store
-from service.store.tradeoffs import TradeoffStore
 
 from .conftest import stand_in
 

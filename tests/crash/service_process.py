@@ -16,7 +16,7 @@ from typing import Any, Self
 import httpx
 from safetensors.numpy import load
 
-from service.jobs.leftovers import MARK
+from service.jobs.process import MARK
 
 ROOT = Path(__file__).parents[2]
 PATIENCE_SECONDS = 300.0

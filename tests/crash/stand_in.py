@@ -125,17 +125,45 @@ def slowly(order: dict[str, Any]) -> None:
     answer(order)
 
 
-def toil(order: dict[str, Any]) -> None:
-    """Compute for some leases without a word."""
-    ends = time.process_time() + 6
-    while time.process_time() < ends:
-        pass
+def obey(order: dict[str, Any]) -> None:
+    """Wait for a word, then answer."""
+    work = Path(order["work"])
+    (work / "waiting").mkdir(parents=True)
+    while not (work / "go on").exists():
+        time.sleep(0.02)
     answer(order)
+    (work / "waiting").rmdir()
+
+
+def lack_room(order: dict[str, Any]) -> None:
+    """Find the disk full."""
+    say(
+        event="fault",
+        fault={"kind": "no-space", "argument": "lift", "expected": "", "got": "a full disk", "hint": ""},
+    )
+
+
+def lack_room_once(order: dict[str, Any]) -> None:
+    lack_room(order) if first_time(order) else answer(order)
 
 
 BEHAVIOURS: dict[str, Callable[[dict[str, Any]], None]] = {
     function.__name__: function
-    for function in (answer, hang, die, die_once, stop_once, eat, feed, meet, print_much, slowly, toil)
+    for function in (
+        answer,
+        die,
+        die_once,
+        eat,
+        feed,
+        hang,
+        lack_room,
+        lack_room_once,
+        meet,
+        obey,
+        print_much,
+        slowly,
+        stop_once,
+    )
 }
 
 

@@ -11,9 +11,9 @@ import pytest
 
 from service import __main__ as server
 from service.errors import Misconfigured
-from service.store.database import Database
+from service.store.database import DATABASE, Database
 from service.store.keys import any_key
-from service.store.store import DATABASE, Store
+from service.store.store import Store
 
 
 @pytest.mark.parametrize("bytes_of_row", [100_000, 1])

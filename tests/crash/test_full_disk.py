@@ -11,7 +11,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from service.app import create_app
-from service.jobs.limits import JobLimits
+from service.jobs.process import JobLimits
 from service.jobs.supervisor import Supervisor
 from service.queries.client import QueryClient
 from service.settings import ServiceSettings

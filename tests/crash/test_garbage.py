@@ -6,7 +6,7 @@ import os
 import time
 from pathlib import Path
 
-from service.store.garbage import Collector, collect
+from service.store.collect import Collector, collect
 from service.store.store import Store
 
 from .conftest import Supervising, ended, order, until
@@ -29,11 +29,11 @@ def files(store: Store) -> set[str]:
 
 
 def test_what_a_crash_left_goes_and_what_is_needed_stays(store: Store, supervising: Supervising) -> None:
-    done, queued = (store.jobs.submit(order(store))[0] for _ in range(2))
-    store.attempts.cancel(queued)
+    done, queued = (store.everything.jobs.submit(order(store))[0] for _ in range(2))
+    store.everything.jobs.cancel(queued)
     with supervising("answer"):
         ended(store, done)
-    waiting = store.jobs.submit(order(store))[0]
+    waiting = store.everything.jobs.submit(order(store))[0]
     needed = files(store) | {f"work/{waiting}/000000.safetensors"}
     old(store.files.work(waiting) / "000000.safetensors")
     os.utime(store.files.work(waiting), (1.0, 1.0))
@@ -47,7 +47,10 @@ def test_what_a_crash_left_goes_and_what_is_needed_stays(store: Store, supervisi
         left.append(old(store.files.work(job)))
     assert set(collect(store, time.time() - HOUR)) == set(left)
     assert files(store) == needed
-    assert store.assets.get(store.jobs.get(done).splats).path.exists() and store.files.lift(done).exists()
+    assert (
+        store.everything.assets.get(store.everything.jobs.get(done).splats).path.exists()
+        and store.files.lift(done).exists()
+    )
 
 
 def test_nothing_young_and_nothing_in_use_goes(store: Store) -> None:

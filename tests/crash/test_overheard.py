@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import pytest
 
-from service.jobs.overheard import LONGEST
+from service.jobs.process import LONGEST
 from service.observe import JsonLines
 from service.store.store import Store
 
@@ -29,7 +29,7 @@ class Slow(logging.StreamHandler[io.StringIO]):
 @pytest.fixture
 def logged() -> Iterator[io.StringIO]:
     """The server's log of what jobs print."""
-    written, logger = io.StringIO(), logging.getLogger("service.jobs.overheard")
+    written, logger = io.StringIO(), logging.getLogger("service.jobs.process")
     handler = Slow(written)
     handler.setFormatter(JsonLines())
     logger.addHandler(handler)
@@ -40,7 +40,7 @@ def logged() -> Iterator[io.StringIO]:
 def test_every_line_that_a_job_prints_is_a_record_with_its_job_and_request(
     store: Store, supervising: Supervising, logged: io.StringIO, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    job = store.jobs.submit(replace(order(store), request_id="the-order"))[0]
+    job = store.everything.jobs.submit(replace(order(store), request_id="the-order"))[0]
     with supervising("print_much"):
         ended(store, job)
     records = [json.loads(line) for line in logged.getvalue().splitlines()]

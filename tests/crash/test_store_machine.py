@@ -19,18 +19,20 @@ from service.errors import Busy, Conflict, InUse, KeyReused
 from service.models import ENDED, AssetKind, JobKind, JobState
 from service.store.assets import CheckedUpload
 from service.store.attempts import MAX_ATTEMPTS
-from service.store.events import EventKind
-from service.store.garbage import collect
-from service.store.jobs import JobOrder
-from service.store.lifts import FinishedLift
-from service.store.owners import Owner, stored_bytes
+from service.store.collect import collect
+from service.store.jobs import EventKind, JobOrder
+from service.store.lifts import FinishedLift, FinishedTradeoff
+from service.store.owners import SERVICE, Owner, stored_bytes
 from service.store.store import Store
-from service.store.tradeoffs import FinishedTradeoff
 
-LEASE = 60.0
 MAX_QUEUED = 3
 ROOMS = ("blobs", "lifts", "work", "tmp")
-OWNERS = {"": Owner(), "a": Owner("a", sees_all=False), "b": Owner("b", sees_all=False), "admin": Owner("admin")}
+OWNERS = {
+    "": SERVICE,
+    "a": Owner("a", sees_all=False),
+    "b": Owner("b", sees_all=False),
+    "admin": Owner("admin", sees_all=True),
+}
 
 
 @dataclass
@@ -146,7 +148,7 @@ class StoreMachine(RuleBasedStateMachine):
             if key is not None and (model.order.key, model.owner) == (key, who)
         ]
         seen = self.store.seen_by(OWNERS[who]).jobs
-        kinds = [self.store.assets.get(asset).kind if self.sees(who, asset) else None for asset in chosen]
+        kinds = [self.store.everything.assets.get(asset).kind if self.sees(who, asset) else None for asset in chosen]
         if known and self.jobs[known[0]].order.fingerprint != print_:
             expected: type[Exception] | None = KeyReused
         elif not known and sum(model.state == "queued" for model in self.jobs.values()) >= MAX_QUEUED:
@@ -168,7 +170,7 @@ class StoreMachine(RuleBasedStateMachine):
 
     @rule(target=attempts)
     def claim(self) -> tuple[str, int]:
-        claimed = self.store.attempts.claim(LEASE)
+        claimed = self.store.attempts.claim()
         line = [job for job, model in self.jobs.items() if model.state == "queued"]
         if claimed is None:
             assert not line
@@ -189,11 +191,11 @@ class StoreMachine(RuleBasedStateMachine):
     def finish(self, attempt: tuple[str, int], content: bytes) -> None:
         model = self.owner(attempt)
         if attempt[0] in self.jobs and self.jobs[attempt[0]].order.kind is JobKind.TRADEOFF:
-            done = self.store.tradeoffs.finish(*attempt, FinishedTradeoff({}, "", content))
+            done = self.store.everything.tradeoffs.finish(*attempt, FinishedTradeoff({}, "", content))
         else:
             with self.store.files.draft(".safetensors") as draft:
                 draft.write_bytes(content)
-                done = self.store.lifts.finish(*attempt, FinishedLift(draft, "0" * 64, 1, 1, {}))
+                done = self.store.everything.lifts.finish(*attempt, FinishedLift(draft, "0" * 64, 1, 1, {}))
         assert done == (model is not None and model.state == "running")
         if done and model is not None:
             model.result = content
@@ -210,7 +212,7 @@ class StoreMachine(RuleBasedStateMachine):
     @rule(attempt=attempts)
     def release(self, attempt: tuple[str, int]) -> None:
         model = self.owner(attempt)
-        self.store.attempts.release(*attempt)
+        self.store.attempts.release(*attempt, "the server stops")
         if model is not None:
             model.released += 1
             model.move("canceled" if model.state == "canceling" else "queued")
@@ -229,9 +231,7 @@ class StoreMachine(RuleBasedStateMachine):
             model.move("failed" if model.attempt - model.released >= MAX_ATTEMPTS else "queued")
 
     @rule(attempt=attempts)
-    def renew_and_advance(self, attempt: tuple[str, int]) -> None:
-        owned = self.owner(attempt) is not None
-        assert (self.store.attempts.renew(*attempt, LEASE) is not None) == owned
+    def advance(self, attempt: tuple[str, int]) -> None:
         self.store.attempts.advance(*attempt, {"done": 1})
 
     def drawn(self, data: Any) -> str:
@@ -243,7 +243,7 @@ class StoreMachine(RuleBasedStateMachine):
     def cancel(self, data: Any, who: str) -> None:
         job = self.drawn(data)
         model = self.jobs[job]
-        seen = self.store.seen_by(OWNERS[who]).attempts
+        seen = self.store.seen_by(OWNERS[who]).jobs
         if not OWNERS[who].sees_all and model.owner != who:
             with pytest.raises(NotFound):
                 seen.cancel(job)
@@ -286,23 +286,24 @@ class StoreMachine(RuleBasedStateMachine):
             path.parent.mkdir(exist_ok=True)
             path.write_bytes(b"half")
         self.store = Store.open(root)
-        self.store.attempts.lose_all("the server died")
+        self.store.attempts.release_all("the server died")
         for model in self.jobs.values():
             if model.state in ("running", "canceling"):
-                self.lost(model)
+                model.released += 1
+                model.move("canceled" if model.state == "canceling" else "queued")
         assert set(collect(self.store, time.time() + 1)) == set(litter[:2])
 
     @invariant()
     def agrees(self) -> None:
-        assert {asset.id: asset.path.read_bytes() for asset in self.store.assets.all()} == self.assets
-        found = {job.id: (job.state, job.attempt) for job in self.store.jobs.all()}
+        assert {asset.id: asset.path.read_bytes() for asset in self.store.everything.assets.all()} == self.assets
+        found = {job.id: (job.state, job.attempt) for job in self.store.everything.jobs.all()}
         assert found == {job: (JobState(model.state), model.attempt) for job, model in self.jobs.items()}
-        lifts = {lift.id: lift.path.read_bytes() for lift in self.store.lifts.all()}
+        lifts = {lift.id: lift.path.read_bytes() for lift in self.store.everything.lifts.all()}
         assert lifts == self.results(JobKind.LIFT)
         for job, chart in self.results(JobKind.TRADEOFF).items():
-            assert self.store.tradeoffs.get(job).chart == chart
+            assert self.store.everything.tradeoffs.get(job).chart == chart
         for job, model in self.jobs.items():
-            events = self.store.events.after(job, 0)
+            events = self.store.everything.jobs.events(job, 0)
             assert [event.data["state"] for event in events if event.kind is EventKind.STATE] == model.story
             assert model.story.count("succeeded") <= 1
         for who in OWNERS:
@@ -322,7 +323,7 @@ class StoreMachine(RuleBasedStateMachine):
         lifts, tradeoffs = (self.results(kind) for kind in JobKind)
         assert {lift.id for lift in seen.lifts.all()} == jobs & lifts.keys()
         for job in self.jobs:
-            assert (seen.attempts.state(job) is not None) == (job in jobs)
+            assert (seen.jobs.state(job) is not None) == (job in jobs)
             assert (seen.lifts.find(job) is not None) == (job in jobs & lifts.keys())
             if job not in jobs & tradeoffs.keys():
                 with pytest.raises(NotFound):

@@ -6,6 +6,7 @@ import logging
 import shutil
 import threading
 import time
+from collections.abc import Container, Iterable
 from pathlib import Path
 
 from service.models import ENDED
@@ -28,13 +29,25 @@ def collect(store: Store, older_than: float) -> list[Path]:
     Returns:
         What was moved or removed.
     """
-    moved = store.assets.collect(older_than) + store.lifts.collect(older_than)
+    files, moved = store.files, []
+    with files.blobs_changing, store.database.read() as connection:  # so no upload is between its blob and its row
+        known = {row["file"] for row in connection.execute("SELECT file FROM assets")}
+        moved += _lost(files, (files.root / "blobs").glob("*/*"), known, older_than)
+    with store.database.write() as connection:  # so no lift is between its file and its row
+        known = {row["file"] for row in connection.execute("SELECT file FROM lifts")}
+        moved += _lost(files, (files.root / "lifts").iterdir(), known, older_than)
     ended, unknown = _unused_work(store)
-    moved += store.files.quarantine(path for path in unknown if _changed(path) < older_than)
-    removed = [path for path in ended + store.files.left_over() if _changed(path) < older_than]
+    moved += files.quarantine(path for path in unknown if _changed(path) < older_than)
+    removed = [path for path in ended + files.left_over() if _changed(path) < older_than]
     for path in removed:
         shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
     return moved + removed
+
+
+def _lost(files: DataDirectory, found: Iterable[Path], known: Container[str], older_than: float) -> list[Path]:
+    """Move files that have no row to quarantine."""
+    lost = [path for path in found if files.relative(path) not in known and _changed(path) < older_than]
+    return files.quarantine(lost)
 
 
 def empty_quarantine(files: DataDirectory, since_before: float) -> list[Path]:

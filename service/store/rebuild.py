@@ -1,0 +1,110 @@
+"""Rows for files whose database is gone or older than they are, made of what the files tell of themselves."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import threading
+import zipfile
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError, safe_open
+
+from liftcore.errors import InvalidLift, NotFound, SplatliftError
+from service.models import JOB_ID, AssetKind
+from service.settings import ServiceSettings
+from service.store.assets import CheckedUpload
+from service.store.jobs import JobOrder
+from service.store.lifts import FinishedLift
+from service.store.store import Store
+from service.uploads.intake import CheckLimits, check
+
+
+def rebuild(store: Store, settings: ServiceSettings) -> dict[str, Any]:
+    """Give rows to the files that have none, and let the database be the newest one of its directory.
+
+    Returns:
+        ``assets`` by kind and ``lifts``: how many were added; ``left``: files that could not be, and why.
+    """
+    left: list[dict[str, str]] = []
+    assets: Counter[str] = Counter()
+    known = {asset.path for asset in store.everything.assets.all()}
+    for path in sorted(store.files.root.glob("blobs/*/*")):
+        if path not in known:
+            try:
+                assets[_add_asset(store, settings, path)] += 1
+            except SplatliftError as error:
+                left.append({"file": store.files.relative(path), "why": str(error)})
+    lifts = 0
+    known = {lift.path for lift in store.everything.lifts.all()}
+    for path in sorted(store.files.root.glob("lifts/*")):
+        if path not in known:
+            try:
+                _add_lift(store, path)
+                lifts += 1
+            except SplatliftError as error:
+                left.append({"file": store.files.relative(path), "why": str(error)})
+    store.database.catch_up()
+    return {"assets": dict(assets), "lifts": lifts, "left": left}
+
+
+def _add_asset(store: Store, settings: ServiceSettings, path: Path) -> AssetKind:
+    """A blob is whole when its name is its digest; what it holds is read by the check of uploads."""
+    with path.open("rb") as handle:
+        digest = hashlib.file_digest(handle, "sha256").hexdigest()
+    if path != store.files.blob(digest, path.suffix):
+        raise NotFound("asset", expected="a file named after its sha256", got=f"one whose sha256 is {digest}")
+    kind = _kind_of(path)
+    with store.files.scratch() as scratch:
+        limits = CheckLimits(settings.check_seconds, settings.check_memory_bytes, threading.Event())
+        report = check(kind, path, scratch, limits)
+    # The file is its own draft: it stays where it is.
+    store.everything.assets.add(CheckedUpload(path, kind, digest, path.suffix, report.counts, report.warnings))
+    return kind
+
+
+def _kind_of(path: Path) -> AssetKind:
+    if path.suffix == ".ply":
+        return AssetKind.SPLATS
+    if path.suffix == ".json" or zipfile.is_zipfile(path):
+        return AssetKind.CAMERAS
+    names = _header(path)[0]
+    if names == {"embeddings"}:
+        return AssetKind.TABLE
+    return AssetKind.MASKS if any(name.endswith("/mask") for name in names) else AssetKind.FEATURES
+
+
+def _add_lift(store: Store, path: Path) -> None:
+    """A lift remembers the settings and the digests of what it was made of: that is its job's order."""
+    if not re.match(JOB_ID, path.stem) or path != store.files.lift(path.stem):
+        raise InvalidLift("lift", expected="a file named after its job", got=path.name)
+    _, metadata, shape = _header(path)
+    try:
+        told = json.loads(metadata["splatlift"])
+        splats, cameras, *features = [
+            f"sha256:{file['sha256']}" for file in (told["splats"], told["cameras"], *told["features"])
+        ]
+        order = JobOrder(splats, cameras, tuple(features), told["settings"])
+        count, channels = shape
+    except (KeyError, TypeError, ValueError) as error:
+        raise InvalidLift("lift", expected="the metadata of a lift", got=f"none that tell of it: {error!r}") from None
+    for asset, kind in order.assets():
+        store.everything.assets.get(asset, kind)  # a lift without what it was made of can be shown to nobody
+    with path.open("rb") as handle:
+        digest = hashlib.file_digest(handle, "sha256").hexdigest()
+    store.everything.lifts.adopt(path.stem, order, FinishedLift(path, digest, count, channels, told))
+
+
+def _header(path: Path) -> tuple[set[str], dict[str, str], list[int]]:
+    """Names of tensors, metadata and the shape of ``features``, of a safetensors file."""
+    try:
+        handle: Any
+        with safe_open(str(path), framework="np") as handle:
+            names = set(handle.keys())
+            shape = handle.get_slice("features").get_shape() if "features" in names else []
+            return names, handle.metadata() or {}, shape
+    except (SafetensorError, OSError) as error:
+        raise InvalidLift("file", expected="a whole safetensors file", got=str(error)[:120]) from None

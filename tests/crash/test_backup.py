@@ -1,0 +1,158 @@
+"""A backup has what the database knows, whole; what is damaged is told; and nobody else reads a data directory."""
+
+from __future__ import annotations
+
+import json
+import os
+import sqlite3
+import stat
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from service.errors import Misconfigured
+from service.models import AssetKind, JobState
+from service.scopes import Scope
+from service.store import backup
+from service.store.__main__ import main as store_command
+from service.store.backup import back_up, restore, verify
+from service.store.database import DATABASE, KEYS_REQUIRED
+from service.store.keys import Quota
+from service.store.schema import MIGRATIONS
+from service.store.store import Store
+
+from .conftest import Supervising, asset_of, ended, order
+
+
+@pytest.fixture
+def filled(store: Store, supervising: Supervising) -> Store:
+    """A store that a server holds, with a lift and a key."""
+    job = store.everything.jobs.submit(order(store))[0]
+    with supervising("answer"):
+        assert ended(store, job).state is JobState.SUCCEEDED
+    store.keys.create("a", frozenset({Scope.READ}), Quota())
+    return store
+
+
+def files(data: Path) -> dict[str, bytes]:
+    found = (path for room in ("blobs", "lifts") for path in (data / room).rglob("*") if path.is_file())
+    return {str(path.relative_to(data)): path.read_bytes() for path in found}
+
+
+@pytest.mark.parametrize("links", [True, False])
+def test_backup_beside_a_server_is_restored_as_it_was(
+    filled: Store, tmp_path: Path, links: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*given: object) -> None:
+        raise OSError(18, "Invalid cross-device link")
+
+    if not links:
+        monkeypatch.setattr(os, "link", refuse)
+    assert back_up(filled.files.root, tmp_path / "backup") == 4
+    assert verify(tmp_path / "backup") == []
+    before, jobs = files(filled.files.root), filled.everything.jobs.all()
+    asset_of(filled, AssetKind.MASKS, {})  # after it, and none of it
+    assert restore(tmp_path / "backup", tmp_path / "again") == 4
+    again = Store.open(tmp_path / "again")  # which is refused where the database is older than the files
+    assert files(again.files.root) == before == files(tmp_path / "backup")
+    assert again.everything.jobs.all() == jobs and again.keys.required()
+    assert (tmp_path / "again" / KEYS_REQUIRED).exists()
+    again.close()
+
+
+def test_asset_that_is_deleted_during_a_backup_is_no_loss(
+    filled: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asset, copy = asset_of(filled, AssetKind.MASKS, {}), backup.copy_database
+
+    def copy_then_delete(source: Path, target: Path) -> None:
+        copy(source, target)
+        if filled.everything.assets.find(asset) is not None:
+            filled.everything.assets.delete(asset)
+
+    monkeypatch.setattr(backup, "copy_database", copy_then_delete)
+    assert back_up(filled.files.root, tmp_path / "backup") == 4
+    assert verify(tmp_path / "backup") == [] and files(tmp_path / "backup") == files(filled.files.root)
+
+
+def flip(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    content[0] ^= 1
+    path.write_bytes(content)
+
+
+def cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-1])
+
+
+@pytest.mark.parametrize(
+    ("damage", "told"), [(flip, "other bytes"), (cut, "in place of"), (Path.unlink, "No such file")]
+)
+def test_damaged_file_is_told_and_not_restored(
+    damage: Callable[[Path], None], told: str, filled: Store, tmp_path: Path
+) -> None:
+    back_up(filled.files.root, tmp_path / "backup")
+    (lift,) = (tmp_path / "backup" / "lifts").iterdir()
+    content = lift.read_bytes()
+    lift.unlink()  # it is the server's file too
+    lift.write_bytes(content)
+    damage(lift)
+    (line,) = [line for line in verify(tmp_path / "backup") if line.startswith("lifts/")]
+    assert told in line
+    with pytest.raises(Misconfigured, match="files as they were stored"):
+        restore(tmp_path / "backup", tmp_path / "again")
+    assert not (tmp_path / "again").exists() and not (tmp_path / ".again.part").exists()
+
+
+def test_backup_replaces_nothing_and_leaves_no_half_of_one(filled: Store, tmp_path: Path) -> None:
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "letter").write_text("to keep")
+    with pytest.raises(Misconfigured, match="not there yet"):
+        back_up(filled.files.root, tmp_path / "full")
+    next((filled.files.root / "lifts").iterdir()).unlink()
+    with pytest.raises(Misconfigured, match="1 lost"):
+        back_up(filled.files.root, tmp_path / "half")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["data", "full"]
+
+
+def test_copy_of_the_database_is_made_before_a_migration(tmp_path: Path) -> None:
+    old = sqlite3.connect(tmp_path / DATABASE)
+    old.executescript(f"BEGIN; {MIGRATIONS[0]} PRAGMA user_version = 1; COMMIT;")
+    old.execute("INSERT INTO assets VALUES ('s', 'splats', 1, 'blobs/x', '{}', '[]', 0)")
+    old.commit()
+    old.close()
+    Store.open(tmp_path).close()
+    kept = sqlite3.connect(tmp_path / f"{DATABASE}.schema-1")
+    assert kept.execute("PRAGMA user_version").fetchone()[0] == 1
+    assert kept.execute("SELECT id, created FROM assets").fetchall() == [("s", 0)]
+    kept.close()
+
+
+def test_data_directory_is_its_owners_alone(tmp_path: Path) -> None:
+    (tmp_path / "data").mkdir(mode=0o755)
+    before = os.umask(0o022)
+    store = Store.open(tmp_path / "data")
+    asset_of(store, AssetKind.SPLATS, {})
+    modes = {path: stat.S_IMODE(path.stat().st_mode) for path in [store.files.root, *store.files.root.rglob("*")]}
+    store.close()
+    os.umask(before)
+    wrong = {str(path): oct(mode) for path, mode in modes.items() if mode != (0o700 if path.is_dir() else 0o600)}
+    assert wrong == {}
+
+
+def test_commands_back_up_verify_and_restore(
+    filled: Store, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data, copy, again = (str(tmp_path / name) for name in ("data", "backup", "again"))
+    assert store_command(["backup", copy, "--data", data]) == 0
+    assert store_command(["verify", "--data", data]) == 0
+    assert store_command(["restore", copy, "--data", again]) == 0
+    assert store_command(["restore", copy, "--data", again]) == 2  # it replaces nothing
+    said = capsys.readouterr()
+    assert "4 files" in said.out and "every file is as it was stored" in said.out and "move it away" in said.err
+    (lift,) = (tmp_path / "again" / "lifts").iterdir()
+    flip(lift)
+    assert store_command(["verify", "--data", again, "--json"]) == 1
+    (damage,) = json.loads(capsys.readouterr().out)["damage"]
+    assert damage.startswith("lifts/")
