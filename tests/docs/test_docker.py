@@ -94,6 +94,12 @@ def test_versions_come_from_the_lock_and_torch_is_first() -> None:
     assert names <= locked
 
 
+def test_one_version_is_told_everywhere() -> None:
+    assert f'\nversion = "{__version__}"\n' in text("pyproject.toml")
+    assert f"\n## {__version__}" in text("CHANGELOG.md").partition("# Changes")[2][:20]
+    assert set(re.findall(r"splatlift:([\d.]+)", text("docker/Dockerfile"))) == {__version__}
+
+
 def test_no_image_is_named_without_its_version() -> None:
     arguments = dict(re.findall(r"(\w+)=(\S*)", " ".join(given("ARG"))))
     stages = {words.split()[-1] for words in given("FROM")}
