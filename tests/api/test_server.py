@@ -253,6 +253,6 @@ def test_empty_variable_is_one_that_is_not_set(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_page_comes_in_one_piece_with_its_style_and_script() -> None:
-    whole = page()
+    whole = bytes(page().body).decode()
     for name in ("page.css", "page.js"):
         assert (WEB / name).read_text() in whole and name not in whole
