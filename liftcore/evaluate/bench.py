@@ -20,7 +20,6 @@ from liftcore.features.views import Regions, ViewFeatures
 from liftcore.progress import silent
 from liftcore.raster import open_raster
 from liftcore.raster.base import CompositingParams, Raster, ViewRequest, Weighting
-from liftcore.raster.cpu.weights_home import on_host
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Splats
 from liftcore.settings import LiftSettings, Preset
@@ -151,7 +150,7 @@ def walk_regions(
 
     for number, walked in enumerate(raster.iterate_views(looks())):
         weights = columns[number].weighted(walked.weights)
-        home = on_host(weights)
+        home = weights.on_host()
         denominators[home.splats.numpy()] += row_totals(home)
         store.append(weights)
     return denominators, columns

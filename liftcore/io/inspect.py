@@ -16,7 +16,7 @@ from liftcore.io.cameras import TRANSFORMS, camera_source, has_nerfstudio_beside
 from liftcore.io.class_masks import describe_masks
 from liftcore.io.files import SUFFIXES
 from liftcore.io.ply import read_splats
-from liftcore.io.ply_dialect import nearest_dialect
+from liftcore.io.ply_header import nearest_dialect
 from liftcore.io.transforms import FRAME_FILE, frame_warning
 from liftcore.query.text.table import plain
 from liftcore.raster.base import ALPHA_FLOOR

@@ -3,46 +3,42 @@
 Headers are read under limits, and what they say must fit the file's size, before anything trusts their numbers.
 """
 
-import io
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
-from plyfile import PlyData, PlyListProperty, PlyParseError
 from torch import Tensor
 
 from liftcore.errors import InvalidSplats
-from liftcore.io.files import CONVERT, LFS_POINTER, foreign_format, whole_file
-from liftcore.io.ply_dialect import NORMALS, Slot, model_slots, recognise_kernel, usual_layout
+from liftcore.io.files import LFS_POINTER, whole_file
+from liftcore.io.ply_header import (
+    NORMALS,
+    PlyHeader,
+    Slot,
+    header_bytes,
+    model_slots,
+    parse_header,
+    read_header,
+    recognise_kernel,
+    usual_layout,
+)
 from liftcore.scene.kernel import Kernel, kernel_named
 from liftcore.scene.splats import Splats
 
 BLOCK_ROWS = 16_384  # rows converted at a time: a few MB, so that memory stays near the file's size
-MAX_HEADER_BYTES = 256 * 1024
-MAX_HEADER_LINES = 4096
 COLOUR = ("sh", "sb_params")  # fields that a lift has no use for, and most of a file
 FILTER = "filter_3D"  # of Mip-Splatting, the column of its smoothing filter
 LOBE_COLOURS = 3  # r g b, the first channels of a spherical beta lobe
 DARK_LOBE = -10.0  # r g b of a lobe that adds nothing: its softplus of sharpness 10 ln 2 is 1e-31, and of zero 0.1
 PICKLED = (".pt", ".pth", ".ckpt", ".pkl")
-SPLAT_PROPERTIES = ("opacity", "scale_0", "rot_0", "f_dc_0", "sh0_0", "packed_position")  # one at least
 SPELLING = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint"}
 SPELLING |= {"f4": "float", "f8": "double"}
 EXPORT_PLY = (
     "export the splats as PLY from the program that trained them (nerfstudio: ns-export gaussian-splat; gsplat's "
     "simple_trainer: --save-ply)"
 )
-EXPORT = "export the splats again as binary little-endian PLY"
-REWRITE = (
-    "rewrite it with Python: from plyfile import PlyData; p = PlyData.read('IN.ply'); p.text = False; "
-    "p.byte_order = '<'; p.write('OUT.ply')"
-)
-_END = re.compile(rb"(?:^|\n)end_header(\r?\n)")
-_ELEMENT = re.compile(r"\s*element\s+(\S+)\s+([0-9]{1,18})\s*")
 
 
 def read_splats(path: Path | str, kernel: Kernel | str = "auto", *, colour: bool = True) -> Splats:
@@ -102,7 +98,7 @@ def write_splats(splats: Splats, path: Path) -> None:
     if source is not None and source.dtype == dtype:
         lines = source.lines_for(splats.count)
     with whole_file(path) as handle:
-        handle.write(_bytes_of(lines))
+        handle.write(header_bytes(lines))
         for start in range(0, splats.count, BLOCK_ROWS):
             rows = np.zeros(min(BLOCK_ROWS, splats.count - start), dtype)
             for name, column in columns.items():
@@ -124,7 +120,7 @@ def some_rows(path: Path, kept: np.ndarray) -> Iterator[bytes]:
         InvalidSplats: the file is malformed, or has another number of splats.
     """
     header = _header_of(path, len(kept))
-    yield _bytes_of(header.lines_for(int(np.count_nonzero(kept))))
+    yield header_bytes(header.lines_for(int(np.count_nonzero(kept))))
     for first, rows in _blocks(path, header):
         yield rows[kept[first : first + len(rows)]].tobytes()
 
@@ -152,7 +148,7 @@ def recoloured(path: Path, colours: np.ndarray) -> Iterator[bytes]:
         raise InvalidSplats(str(path), expected="colours (f_dc_0, ...) to show scores in", got="a file without any")
     fixed = {name: 0.0 for name, (row, _) in harmonics.items() if row > 0}
     fixed |= {name: DARK_LOBE for name, (_, channel) in lobes.items() if channel < LOBE_COLOURS}
-    yield _bytes_of(header.lines)
+    yield header_bytes(header.lines)
     for first, rows in _blocks(path, header):
         for name, value in fixed.items():
             rows[name] = value
@@ -160,146 +156,6 @@ def recoloured(path: Path, colours: np.ndarray) -> Iterator[bytes]:
             if row == 0:
                 rows[name] = colours[first : first + len(rows), channel]
         yield rows.tobytes()
-
-
-@dataclass(frozen=True)
-class PlyHeader:
-    """A header that fits its file: a vertex element of scalar columns before any other, little-endian."""
-
-    lines: tuple[str, ...]  # verbatim, with end_header, without the line feeds and what describes other elements
-    count: int  # rows
-    dtype: np.dtype  # of a row, a field a column
-    data_offset: int  # bytes before the first row
-    after: int | None = 0  # bytes behind the last row, of other elements; None when their lists make it unknown
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The columns, in the order of the file."""
-        return self.dtype.names or ()
-
-    def lines_for(self, count: int) -> list[str]:
-        """The lines of a file with ``count`` rows of these columns; all but that number stays as it is."""
-        end = "\r" if self.lines[0].endswith("\r") else ""
-        changed = f"element vertex {count}{end}"
-        is_same = count == self.count
-        return [changed if line.split()[:1] == ["element"] and not is_same else line for line in self.lines]
-
-
-def read_header(path: Path) -> PlyHeader:
-    """Read and check the header of a splat PLY, at most 256 KiB of the file.
-
-    Raises:
-        InvalidSplats: the file cannot be opened, is not a binary little-endian PLY that begins with a vertex element
-            of scalar properties, or has another size than the header says.
-    """
-    try:
-        with path.open("rb") as handle:
-            head = handle.read(MAX_HEADER_BYTES)
-            size = handle.seek(0, 2)
-    except OSError as error:
-        got = f"one that does not open ({error.strerror})"
-        raise InvalidSplats(str(path), expected="a splat file", got=got) from None
-    header = parse_header(head, str(path))
-    found, stride = size - header.data_offset, header.dtype.itemsize
-    least = header.count * stride + (header.after or 0)
-    if found < least or (header.after is not None and found > least):
-        hint = "the file has bytes that its header does not describe: export it again"
-        if found < least:
-            hint = "the file is truncated: copy or export it again"
-        others = f" and {header.after} bytes of other elements" if header.after else ""
-        expected = f"{header.count} rows of {stride} bytes{others} = {least} bytes after the header"
-        raise InvalidSplats(str(path), expected=expected, got=f"{found} bytes", hint=hint)
-    return header
-
-
-def parse_header(head: bytes, source: str) -> PlyHeader:
-    """Parse the first bytes of a PLY; ``source`` names the file in errors.
-
-    Raises:
-        InvalidSplats: the bytes are not the header of a splat PLY.
-    """
-
-    def refuse(expected: str, got: str, hint: str = EXPORT) -> InvalidSplats:
-        return InvalidSplats(f"{source} header", expected=expected, got=got, hint=hint)
-
-    lines, offset = _header_lines(head, source)
-    counts: list[int] = []
-    empty: list[str] = []  # the same header of no rows, which plyfile reads without any data
-    for line in lines:
-        words, element = line.split(), _ELEMENT.fullmatch(line)
-        if words[:1] == ["element"] and element is None:
-            expected = "the name of an element and a count of zero or more"
-            raise refuse(expected, repr(" ".join(words)[:60]))
-        counts += [int(element[2])] if element else []
-        empty.append(f"element {element[1]} 0" if element else line.removesuffix("\r"))
-    try:
-        ply = PlyData.read(io.BytesIO(_bytes_of(empty)))
-    except (PlyParseError, ValueError) as error:
-        raise refuse("a header of PLY 1.0", f"one that does not parse ({str(error)[:120]})") from None
-    if ply.text or ply.byte_order != "<":
-        kind = "ascii" if ply.text else "binary_big_endian"
-        raise refuse("'format binary_little_endian 1.0'", f"'format {kind} 1.0'", REWRITE)
-    first = next(iter(ply.elements), None)
-    if first is None or not first.properties:
-        raise refuse("an element 'vertex' with properties", "a header without one")
-    if first.name == "chunk":
-        raise refuse("plain splats", "SuperSplat's compressed PLY", CONVERT)
-    if first.name != "vertex":
-        raise refuse("'vertex' as the first element", repr(first.name[:60]))
-    listed = next((column.name for column in first.properties if isinstance(column, PlyListProperty)), None)
-    if listed is not None:
-        raise refuse("scalar properties ('property float x')", f"a list {listed[:60]!r}")
-    after: int | None = 0
-    for element, count in zip(ply.elements[1:], counts[1:], strict=True):
-        if count and any(isinstance(column, PlyListProperty) for column in element.properties):
-            after = None
-        elif after is not None:
-            after += count * sum(np.dtype(column.val_dtype).itemsize for column in element.properties)
-    own = [i for i, line in enumerate(lines) if line.split()[:1] == ["element"]][1:2] or [len(lines) - 1]
-    dtype = np.dtype([(column.name, "<" + column.val_dtype) for column in first.properties])
-    return PlyHeader((*lines[: own[0]], lines[-1]), counts[0], dtype, offset, after)
-
-
-def _header_lines(head: bytes, source: str) -> tuple[tuple[str, ...], int]:
-    """The lines of a header without their line feeds, and its length in bytes."""
-    if head[:4] not in (b"ply\n", b"ply\r"):
-        foreign = foreign_format(head, Path(source).suffix)
-        begins = f"a file that begins with {head[:8]!r}" if head else "an empty file"
-        got, hint = foreign or (begins, f"{EXPORT}; if it is a .splat or a .ksplat, {CONVERT}")
-        raise InvalidSplats(source, expected="a PLY file (first line 'ply')", got=got, hint=hint)
-    end = _END.search(head)
-    if end is None:
-        limit = f"'end_header' within the first {MAX_HEADER_BYTES} bytes"
-        raise InvalidSplats(source, expected=limit, got=f"none in {len(head)} bytes", hint=EXPORT)
-    text = head[: end.end() - 1]
-    if not text.isascii():
-        hint = "take the comments with other characters out of it"
-        raise InvalidSplats(source, expected="an ASCII header", got="other characters in it", hint=hint)
-    lines = tuple(text.decode("ascii").split("\n"))
-    if len(lines) > MAX_HEADER_LINES:
-        limit, hint = f"at most {MAX_HEADER_LINES} header lines", "leave out properties that are no splat's"
-        raise InvalidSplats(source, expected=limit, got=str(len(lines)), hint=hint)
-    _refuse_clouds(lines, source)
-    return lines, end.end()
-
-
-def _refuse_clouds(lines: tuple[str, ...], source: str) -> None:
-    """Point clouds and meshes: what is wrong with them is not how they are written."""
-    words = [line.split() for line in lines]
-    names = {line[-1] for line in words if line[:1] == ["property"]}
-    if not names.issuperset("xyz") or names.intersection(SPLAT_PROPERTIES):
-        return
-    is_mesh = any(line[:2] == ["element", "face"] for line in words)
-    hint = "give the trained splats; the 3DGS trainers keep them in point_cloud/iteration_N/point_cloud.ply"
-    if any(name.startswith("scalar_") for name in names):
-        hint = "CloudCompare renames properties (scalar_opacity): give the file that it was opened from"
-    expected = "splats (properties such as 'opacity', 'scale_0', 'rot_0')"
-    got = f"a {'mesh' if is_mesh else 'point cloud'} without any of them"
-    raise InvalidSplats(source, expected=expected, got=got, hint=hint)
-
-
-def _bytes_of(lines: Sequence[str]) -> bytes:
-    return "".join(f"{line}\n" for line in lines).encode("ascii")
 
 
 def _begins(path: Path, first: bytes) -> bool:
@@ -407,5 +263,5 @@ def _source_header(splats: Splats) -> PlyHeader | None:
     """The header that the splats were read with, if it still describes their columns."""
     if not splats.header:
         return None
-    header = parse_header(_bytes_of(splats.header), "header")
+    header = parse_header(header_bytes(splats.header), "header")
     return header if header.names == splats.layout else None

@@ -21,7 +21,7 @@ MOST_SPLATS = 1 << 20  # that are grouped: a million take seven seconds of two c
 NEIGHBOURS = 16  # that each splat looks at, the nearest by their centres
 REACH = 2.0  # standard deviations to which a splat touches
 _TAIL = 1e-3  # of an object's evidence that its box leaves out at each end of each axis
-_PIECE = 1 << 14  # splats whose neighbours are looked at at once
+_PIECE = 1 << 12  # splats whose neighbours are looked at at once: what is made of them stays in the cache
 _TOLD_APART = 1e-12  # of the farthest coordinate
 
 
@@ -108,35 +108,37 @@ def touching(splats: "Splats", rows: np.ndarray) -> np.ndarray:
     count = len(rows)
     if count < 2:
         return np.zeros(count, np.int32)
-    means, covariances = as_numpy(splats.means)[rows].astype(np.float64), _covariances(splats, rows)
+    means = as_numpy(splats.means)[rows].astype(np.float64)
+    shapes = np.concatenate([means, _covariances(splats, rows)], axis=1)
     # Points at one place make a leaf that no search can divide: told apart by less than float32 can, they are.
     extent = float(np.abs(means).max()) or 1.0
     places = means + _TOLD_APART * extent * np.random.default_rng(0).random(means.shape)
     tree = KDTree(places)
+    order = tree.indices  # leaf by leaf: splats that are looked at one after the other have the same neighbours
 
     def look(first: int) -> tuple[np.ndarray, np.ndarray]:
-        piece = slice(first, first + _PIECE)
-        near = np.asarray(tree.query(places[piece], min(NEIGHBOURS + 1, count))[1])  # itself among them
-        touch = _touch(means, covariances, np.arange(first, first + len(near)), near)
-        return near[touch], touch.sum(axis=1)
+        own = order[first : first + _PIECE]
+        near = np.asarray(tree.query(places[own], min(NEIGHBOURS + 1, count))[1])  # itself among them
+        touch = _touch(shapes[own], shapes[near])
+        return np.repeat(own, touch.sum(axis=1)), near[touch]
 
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
         looks = list(pool.map(look, range(0, count, _PIECE)))
-    columns, sizes = (np.concatenate(parts) for parts in zip(*looks, strict=True))
-    indptr = np.concatenate([[0], np.cumsum(sizes)])
-    graph = csr_array((np.ones(len(columns), np.int8), columns, indptr), shape=(count, count))
+    pairs = tuple(np.concatenate(parts) for parts in zip(*looks, strict=True))
+    graph = csr_array((np.ones(len(pairs[0]), np.int8), pairs), shape=(count, count))
     return connected_components(graph, directed=True, connection="weak")[1]
 
 
-def _touch(means: np.ndarray, covariances: np.ndarray, own: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """[m, k] bool, which of the rows ``near`` [m, k] the rows ``own`` [m] touch; means [n, 3], covariances [n, 6]."""
-    x, y, z = (means[near, axis] - means[own, axis, None] for axis in range(3))
+def _touch(own: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """[m, k] bool, which of its neighbours ``near`` [m, k, 9] each splat of ``own`` [m, 9] touches; centre, Sigma."""
+    own = own[:, None]
+    x, y, z = (near[..., axis] - own[..., axis] for axis in range(3))
     squares = (x * x, y * y, z * z, x * y, x * z, y * z)
     # s |d| of both sides, so that nothing is divided by a distance of zero.
-    mine, theirs = np.zeros(near.shape), np.zeros(near.shape)
-    for place, square in enumerate(squares):
-        mine += covariances[own, place, None] * square
-        theirs += covariances[near, place] * square
+    mine, theirs = np.zeros(x.shape), np.zeros(x.shape)
+    for place, square in enumerate(squares, start=3):
+        mine += own[..., place] * square
+        theirs += near[..., place] * square
     reach = REACH * (np.sqrt(np.maximum(mine, 0.0)) + np.sqrt(np.maximum(theirs, 0.0)))
     return squares[0] + squares[1] + squares[2] <= reach
 

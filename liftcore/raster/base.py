@@ -5,7 +5,7 @@ Nothing here loads torch: settings share these values with processes that never 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from enum import StrEnum
 from typing import TYPE_CHECKING, Protocol
 
@@ -83,6 +83,19 @@ class RegionWeights:
     weights: Tensor  # [nnz] f32, sums over rays of the selected w^p times the reading S
     evidence_splats: Tensor  # [m] i32 ascending, the splats that any ray met, labelled or not
     evidence: Tensor  # [m] f32, sum of plain weights w (opacity_logit_scale 1, power 1), each ray once
+
+    def on_host(self) -> RegionWeights:
+        """The same on the host: all of it at once into pinned memory, as other copies wait for each part."""
+        if not self.columns.is_cuda:
+            return self
+        import torch
+
+        parts = {field.name: getattr(self, field.name) for field in fields(self)}
+        made = {name: torch.empty(part.shape, dtype=part.dtype, pin_memory=True) for name, part in parts.items()}
+        for name, part in parts.items():
+            made[name].copy_(part, non_blocking=True)
+        torch.cuda.current_stream(self.columns.device).synchronize()
+        return RegionWeights(**made)
 
 
 @dataclass(frozen=True)

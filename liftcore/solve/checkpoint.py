@@ -31,7 +31,6 @@ from liftcore import __version__
 from liftcore.features.views import Regions
 from liftcore.io.safetensors_file import tensor_bytes, write_tensors
 from liftcore.raster.base import RayRows, RegionWeights, ViewWeights
-from liftcore.raster.cpu.weights_home import on_host
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Iterable, Iterator, Mapping
@@ -165,7 +164,7 @@ class _Journal:
 
     def keep(self, asked: str, walked: ViewWeights) -> None:
         """Note the answer to the next question."""
-        walked = replace(walked, weights=on_host(walked.weights))
+        walked = replace(walked, weights=walked.weights.on_host())
         tensors = {
             f"{part}/{name}": getattr(getattr(walked, part), name)
             for part, kind in _PARTS.items()

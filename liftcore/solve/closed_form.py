@@ -24,11 +24,10 @@ from liftcore.progress import Progress, silent
 from liftcore.raster.base import RegionWeights
 from liftcore.solve.columns import Columns, rows_of
 from liftcore.solve.curve import places_along_curve
-from liftcore.solve.gathering import WIDE, Chunk, EachShare, Gathering, channel_slices, strips_of
+from liftcore.solve.gathering import LONG, WIDE, Chunk, EachShare, Gathering, channel_slices, strips_of
 from liftcore.solve.host import ALL_CORES, Host
 from liftcore.solve.view_weights import WeightStore
 
-LONG = 256  # entries of a splat that float32 adds up one by one
 NORM_VALUES = 1 << 16  # of a codebook that are widened at a time
 FLOAT16_MAX = 65_504.0
 FLOAT16_STEP = 2.0**-25  # the largest rounding error of its small values

@@ -18,6 +18,7 @@ from liftcore.errors import Unavailable
 from liftcore.jit import kernel
 from liftcore.raster.base import RegionWeights
 
+LONG = 256  # entries of a splat that float32 adds up one by one
 WIDE = 64  # channels of a strip: what a splat's sum holds in the first cache
 CHUNK_ENTRIES = 1 << 23  # gathered at a time, unless a splat alone has more
 CHUNK_BYTES = 1 << 29  # of X at a time: where it is a mapped file, more might not stay in memory

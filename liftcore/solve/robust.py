@@ -39,7 +39,7 @@ from torch import Tensor
 from liftcore.jit import kernel, vectorised
 from liftcore.one_thread import one_thread
 from liftcore.progress import Progress
-from liftcore.solve.gathering import WIDE, EachShare, Gathering, channel_slices, strips_of
+from liftcore.solve.gathering import LONG, WIDE, EachShare, Gathering, channel_slices, strips_of
 from liftcore.solve.host import ALL_CORES, Host
 from liftcore.solve.totals import row_totals
 from liftcore.solve.view_weights import WeightStore
@@ -198,11 +198,26 @@ def judge_rows(order, indptr, rows, shares, runs, strip, products, squares, firs
 
 @vectorised
 def run_sum(rows, shares, begin, end, strip, own):
-    """``own[c] = sum_k shares[k] strip[rows[k], c]`` of the entries ``begin..end``."""
+    """``own[c] = sum_k shares[k] strip[rows[k], c]`` [WIDE] f32 of the entries ``begin..end``, by parts of LONG."""
+    if end - begin <= LONG:
+        part_sum(rows, shares, begin, end, strip, own)
+        return
+    total = np.zeros(WIDE)
+    for first in range(begin, end, LONG):
+        part_sum(rows, shares, first, min(first + LONG, end), strip, own)
+        for c in range(WIDE):
+            total[c] += own[c]
+    for c in range(WIDE):
+        own[c] = total[c]
+
+
+@vectorised
+def part_sum(rows, shares, begin, end, strip, own):
+    """``run_sum`` in float32, one by one."""
     own[:] = 0
     for k in range(begin, end):
         line, share = strip[rows[k]], shares[k]
-        for c in range(own.shape[0]):
+        for c in range(WIDE):
             own[c] += share * line[c]
 
 

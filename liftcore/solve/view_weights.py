@@ -15,7 +15,6 @@ import torch
 from liftcore.device import indexed
 from liftcore.errors import Unavailable
 from liftcore.raster.base import RegionWeights
-from liftcore.raster.cpu.weights_home import on_host
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -72,7 +71,7 @@ class WeightStore:
 
     def _at_home(self, weights: RegionWeights, number: int) -> RegionWeights:
         """In memory, or in files."""
-        weights, size = on_host(weights), _size(weights)
+        weights, size = weights.on_host(), _size(weights)
         self.bytes += size
         if self.bytes <= self._limit:
             return weights

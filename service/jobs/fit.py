@@ -6,8 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from liftcore.errors import InvalidFeatures, InvalidSettings, InvalidSplats
-from liftcore.io.ply import read_header
-from liftcore.io.ply_dialect import model_slots
+from liftcore.io.ply_header import model_slots, read_header
 from liftcore.query.text.table import nearest_words, plain
 from liftcore.raster.base import check_antialiased
 from liftcore.scene.kernel import Kernel

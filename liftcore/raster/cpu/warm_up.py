@@ -7,7 +7,7 @@ import torch
 
 from liftcore.device import CPU, Device
 from liftcore.features.views import FeatureGrid, Regions
-from liftcore.io.ply_dialect import scale_count
+from liftcore.io.ply_header import scale_count
 from liftcore.raster import open_raster
 from liftcore.raster.base import CompositingParams, Weighting
 from liftcore.scene.cameras import Camera

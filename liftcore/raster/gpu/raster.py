@@ -34,7 +34,6 @@ from liftcore.raster.base import (
 )
 from liftcore.raster.cpu.composite import choice_of
 from liftcore.raster.cpu.project import activated, view_of, with_opacities
-from liftcore.raster.cpu.weights_home import on_host
 from liftcore.raster.gpu import render, weights
 from liftcore.raster.gpu.launching import check_device
 from liftcore.raster.gpu.project import DeviceScene, scene_on, with_opacity
@@ -128,7 +127,7 @@ class GpuRaster:
 
     def _brought(self, weights: RegionWeights) -> RegionWeights:
         """Where they are wanted. A host without room for them is no reason for smaller pieces on the device."""
-        return weights if self._stays else on_host(weights)
+        return weights if self._stays else weights.on_host()
 
     def iterate_views(self, requests: Iterable[ViewRequest]) -> Generator[ViewWeights]:
         """``region_weights`` and ``ray_rows`` of views, one at a time; the next one is read while the card walks."""

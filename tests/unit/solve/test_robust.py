@@ -15,7 +15,7 @@ from liftcore.progress import silent
 from liftcore.raster.base import RegionWeights
 from liftcore.settings import LiftSettings
 from liftcore.solve import gathering, host
-from liftcore.solve.closed_form import LONG
+from liftcore.solve.gathering import LONG
 from liftcore.solve.host import ALL_CORES, Host
 from liftcore.solve.robust import NO_CONSENSUS, robust_weights
 from liftcore.solve.view_weights import WeightStore
