@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-import torch
+import numpy as np
 
 from liftcore.query.ask import Answer
 from liftcore.query.terms import Query, Vector
@@ -13,8 +13,8 @@ from service.queries.answers import Kept, _key, bytes_of
 
 def answer_to(query: Query) -> Answer:
     """An answer of a scene without splats."""
-    none = torch.empty(0)
-    return Answer(query, none, none.bool(), 0.5, "fixed", "as asked", none.bool(), {})
+    none = np.empty(0, bool)
+    return Answer(query, np.empty(0, np.float32), none, 0.5, "fixed", "as asked", none, {})
 
 
 def test_question_counts_with_its_answer() -> None:

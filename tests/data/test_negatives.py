@@ -40,7 +40,7 @@ class Asked:
         """Of the splats found with those of the thing."""
         like, *against = (OneSplat(self.best[other]) for other in (thing, *unlike))
         found = ask(self.scene, Query((like,), tuple(against))).selected
-        wanted = (self.truth == thing) & self.scene.seen.numpy()
+        wanted = (self.truth == thing) & self.scene.seen
         return float((found & wanted).sum() / (found | wanted).sum())
 
 

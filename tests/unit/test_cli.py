@@ -186,11 +186,11 @@ def test_plan_is_printed_alone_and_before_a_lift_and_kept_with_it(
     assert (status, err) == (0, "")
     plan = json.loads(out)
     assert plan["views"] == {"lifted": ["front"], "left_out": []}
-    assert (plan["splats"], plan["channels"], plan["rank"], plan["dtype"]) == (2, 3, 2, "float16")
+    assert (plan["splats"], plan["channels"], plan["dtype"]) == (2, 3, "float16")
     assert plan["memory_bytes"] == sum(plan["memory"].values())
     status, out, _ = run(capsys, *arguments, "--explain", "--speed", "draft", "--set", "stride=1")
     assert status == 0
-    assert out.startswith("plan: 2 splats (3dgs), 100.0% in some view's field\n")
+    assert out.startswith("plan: 2 splats (3dgs), 100.0% in some view's field; 1 of 1 views\n")
     made = load_lift(scene / "lift.safetensors").metadata
     assert (made.settings.speed, made.settings.stride, made.settings.view_cosine) == ("draft", 1, 0.98)
     assert made.certificate["plan"]["memory_bytes"] == plan["memory_bytes"]

@@ -50,8 +50,8 @@ def test_a_lift_has_no_threads_of_torch(tmp_path, monkeypatch):
 
     watch(accumulate, "as_walked")
     watch(robust, "directions_of")
-    watch(robust, "judge_share")
+    watch(robust, "strips_of")
     splats, cameras, features = write_scene(tmp_path, 3)[:3]
     lift_files(splats, cameras, [features], LiftSettings.of(robust_steps=1))
-    assert seen == {"as_walked": 1, "directions_of": 1, "judge_share": 1}
+    assert seen == {"as_walked": 1, "directions_of": 1, "strips_of": 1}
     assert torch.get_num_threads() == 3
