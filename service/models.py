@@ -119,7 +119,7 @@ ASSET_ID = r"^sha256:[0-9a-f]{64}$"
 JOB_ID = r"^[0-9a-f]{32}$"
 COMPARED = ("preset", "speed")  # what differs between the runs of a trade-off
 MAX_SETTINGS = 100
-SETTING_CHARACTERS = 200  # of a name or a text among them
+SETTING_CHARACTERS = 1000  # of a name or a text among them
 VIEW_CHARACTERS = 500  # of a camera's name that can be asked for
 
 AssetId = Annotated[str, Field(pattern=ASSET_ID, description="sha256: and the digest of the bytes, in hex")]

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from plyfile import PlyData, PlyListProperty, PlyParseError
 
 from liftcore.errors import InvalidSplats
 from liftcore.io.files import CONVERT, foreign_format
@@ -222,6 +221,8 @@ def parse_header(head: bytes, source: str) -> PlyHeader:
     Raises:
         InvalidSplats: the bytes are not the header of a splat PLY.
     """
+
+    from plyfile import PlyData, PlyListProperty, PlyParseError  # here: processes that read no PLY start sooner
 
     def refuse(expected: str, got: str, hint: str = EXPORT) -> InvalidSplats:
         return InvalidSplats(f"{source} header", expected=expected, got=got, hint=hint)
