@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +24,7 @@ from service.store.pages import CURSOR, Page
 
 BLOCK_BYTES = 256 << 10  # of a draft that is read and sent at a time
 STREAMED = 200  # records of a long list that are in memory at a time
+FAR_BEGINNING = re.compile(r"(=\s*)0*[1-9]\d{19,}(?=\s*-)", re.ASCII)  # int() takes no number of thousands of digits
 BINARY = "application/octet-stream"
 BYTES = {BINARY: {"schema": {"type": "string", "format": "binary"}}}
 
@@ -95,7 +97,7 @@ class _FileAnswer(FileResponse):
     @classmethod
     def _parse_range_header(cls, http_range: str, file_size: int) -> list[tuple[int, int]]:
         try:
-            ranges = super()._parse_range_header(http_range, file_size)
+            ranges = super()._parse_range_header(FAR_BEGINNING.sub(r"\g<1>" + "9" * 19, http_range), file_size)
         except responses.MalformedRangeHeader:
             return []
         except responses.RangeNotSatisfiable:

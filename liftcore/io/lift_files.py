@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from liftcore.device import choose_device
 from liftcore.errors import InvalidFeatures
 from liftcore.features.pack import Views, read_features
 from liftcore.io.cameras import read_cameras
@@ -40,7 +41,9 @@ def lift_files(
 
     Raises:
         InvalidInput: a file is malformed, or the packs do not fit the cameras.
+        Unavailable: there is no such device as asked for.
     """
+    choose_device(settings.device)  # told before gigabytes are read
     paths = Path(splats), Path(cameras), _checked(features)
     timings = Timings(progress)
     with timings.step("read"):

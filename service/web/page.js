@@ -175,9 +175,19 @@ const settings = job => {
 let lifts = [];
 const named = new Map(); // names of a cameras asset's views; an asset never changes
 
+async function namesOf(asset) { // in pages: an asset's counts leave very many names out
+  const names = [];
+  for (let next = 0; next !== null;) {
+    const page = await json(`/assets/${asset}/names?cursor=${next}`);
+    names.push(...page.names);
+    next = page.next;
+  }
+  return names;
+}
+
 async function viewsOf(lift) {
   try {
-    if (!named.has(lift.cameras)) named.set(lift.cameras, (await json(`/assets/${lift.cameras}`)).counts.names);
+    if (!named.has(lift.cameras)) named.set(lift.cameras, await namesOf(lift.cameras));
     return named.get(lift.cameras);
   } catch {
     return lift.views;

@@ -6,6 +6,7 @@ import os
 import signal
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -41,8 +42,9 @@ QUESTIONS: list[dict[str, Any]] = [
 @pytest.fixture
 def request_of(client: TestClient, lift: dict[str, Any]) -> Callable[..., dict[str, Any]]:
     """A request as the query process gets it."""
-    here = parts_of(client)
-    record = here.whole.everything.lifts.get(lift["id"])
+    parts = parts_of(client)
+    here = replace(parts, store=parts.whole.everything)  # as for a caller who sees the lift
+    record = here.store.lifts.get(lift["id"])
 
     def make(operation: str = "scores", **asked: Any) -> dict[str, Any]:
         body = models.AskedInBody.model_validate({"lift": lift["id"], **asked})
