@@ -254,7 +254,7 @@ def _tiles(seen: Visibility) -> float:
 
 def _parts_a_tile(features: Views, view: str, settings: LiftSettings) -> int:
     if not features.is_regions(view):
-        return 4 if settings.grid_reading == "bilinear" else 1
+        return 4  # nearest reads fewer, but fine cells are smaller than a tile
     shape = features.specs(view)["labels"].shape
     return shape[0] if len(shape) == 3 and not isinstance(settings.levels, int) else 1
 

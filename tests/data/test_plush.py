@@ -75,8 +75,8 @@ def rendered_cosine(
 
 
 def test_lifted_cnn_features_render_like_those_of_unseen_photos(plush, cameras, raster):
-    # This encoder's last block is linear: cells side by side have a cosine of 0.06, and 0.10 is what survives the
-    # views, every fourth of them. What must hold is that the right cells are met, not their mirror images.
+    # Cells side by side have a cosine of 0.89, those of other things about 0.4: the right cells must be met, not
+    # their mirror images.
     settings = LiftSettings.of(preset="row-sum", certificate_rays=0, view_stride=4)
     paths = [plush / name for name in ("point_cloud.ply", "cameras.json", "grids.safetensors")]
     features = lift_files(paths[0], paths[1], paths[2:], settings).features
@@ -87,5 +87,5 @@ def test_lifted_cnn_features_render_like_those_of_unseen_photos(plush, cameras, 
         walk, camera = settings.render_params, cameras[name]
         cosine = rendered_cosine(raster, camera, features, observed.grid, walk)
         mirrored = rendered_cosine(raster, camera, features, observed.grid.flip(1), walk)
-        assert cosine > 0.08
-        assert cosine > 5 * mirrored
+        assert cosine > 0.7
+        assert cosine > 1.5 * mirrored
