@@ -96,6 +96,10 @@ def test_maps_of_any_size_equal_the_dense_definition(tmp_path, name):
     assert_sound(lifted(tmp_path, {"v0": observation}, preset="row-sum"), observation)
 
 
+def without_plan(result: LiftResult) -> dict[str, object]:
+    return {key: value for key, value in result.metadata.certificate.items() if key != "plan"}
+
+
 @pytest.mark.parametrize("size", [(1, 1), (5, 7), (12, 16), (50, 70)])
 def test_the_nearest_reading_of_a_grid_takes_the_cell_under_the_pixel(tmp_path, size):
     vectors = np.random.default_rng(1).uniform(size=(*size, 6))
@@ -105,7 +109,7 @@ def test_the_nearest_reading_of_a_grid_takes_the_cell_under_the_pixel(tmp_path, 
     assert_sound(got, cells)
     as_regions = lifted(tmp_path, {"v0": cells}, preset="row-sum")
     assert torch.equal(got.features, as_regions.features)
-    assert got.metadata.certificate == as_regions.metadata.certificate
+    assert without_plan(got) == without_plan(as_regions)  # the plan's memory is an upper bound of each reading
 
 
 def test_a_view_that_sees_nothing_changes_nothing(tmp_path):
