@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from liftcore.features.views import Regions as Regions
     from liftcore.io.cameras import read_cameras as read_cameras
     from liftcore.io.lift_file import load_lift as load_lift
-    from liftcore.io.ply import read_splats as read_splats
+    from liftcore.io.splats import read_splats as read_splats
     from liftcore.lifting import lift as lift
     from liftcore.lifting import plan as plan
     from liftcore.operators import region_weights as region_weights
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 __version__ = "0.4.0"
 
 _PUBLIC = {
-    "read_splats": "liftcore.io.ply:read_splats",
+    "read_splats": "liftcore.io.splats:read_splats",
     "read_cameras": "liftcore.io.cameras:read_cameras",
     "read_features": "liftcore.features.pack:read_features",
     "Splats": "liftcore.scene.splats:Splats",

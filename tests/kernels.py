@@ -10,7 +10,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from liftcore.io.lift_files import lift_files
+from liftcore.io.scene_files import lift_files
 from liftcore.raster.cpu.warm_up import warm_up
 from liftcore.scene.splats import Kernel
 from liftcore.settings import LiftSettings

@@ -14,9 +14,8 @@ import torch
 from PIL import Image
 from safetensors.torch import save_file
 
-from liftcore.io.input_files import input_file
 from liftcore.io.inria import write_inria_cameras
-from liftcore.io.lift_file import save_lift
+from liftcore.io.lift_file import input_file, save_lift
 from liftcore.io.ply import write_splats
 from liftcore.result import LiftMetadata, LiftResult
 from liftcore.scene.cameras import Camera, Cameras

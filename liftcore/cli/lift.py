@@ -39,7 +39,7 @@ def run(options: argparse.Namespace) -> int:
     settings = settings_of(options)
     from liftcore.io.cameras import camera_source
     from liftcore.io.lift_file import save_lift
-    from liftcore.io.lift_files import lift_files
+    from liftcore.io.scene_files import lift_files
 
     views = camera_source(options.cameras).files
     out = free_output(options.output, [options.splats, *views, *options.features])
@@ -143,7 +143,7 @@ def _contradiction(name: str, one: str, other: str) -> InvalidSettings:
 
 def plan_of(options: argparse.Namespace, settings: LiftSettings) -> Plan:
     """The plan of the lift that the options describe."""
-    from liftcore.io.lift_files import open_files
+    from liftcore.io.scene_files import open_files
     from liftcore.lifting import plan
 
     return plan(

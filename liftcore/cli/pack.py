@@ -12,7 +12,7 @@ from liftcore.cli.reply import folders_of, free_output, progress_bars, reply, sh
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from liftcore.io.npy import ViewFolder
+    from liftcore.features.folders import ViewFolder
 
 
 LARGEST_GREY = 65_535  # of a picture of 16 bits
@@ -102,14 +102,14 @@ def _lines(document: dict[str, Any]) -> Iterator[str]:
 
 def _views(options: argparse.Namespace) -> ViewFolder:
     if options.format == "langsplat":
-        from liftcore.io.langsplat import langsplat_views
+        from liftcore.features.folders import langsplat_views
 
         return langsplat_views(options.folder)
     if options.format == "masks":
         from liftcore.features.masks import mask_views
 
         return mask_views(options.folder, options.unlabelled)
-    from liftcore.io.npy import array_views
+    from liftcore.features.folders import array_views
 
     return array_views(options.folder, options.layout)
 

@@ -253,7 +253,7 @@ def _real(folder: Path, channels: int, levels: int, count: int) -> Workload:
     """A scene folder with point_cloud.ply, cameras and regions.safetensors or features.safetensors."""
     from liftcore.features.pack import pair, read_features
     from liftcore.io.cameras import read_cameras
-    from liftcore.io.ply import read_splats
+    from liftcore.io.splats import read_splats
 
     packs = [folder / name for name in ("regions.safetensors", "features.safetensors") if (folder / name).is_file()]
     if not packs:

@@ -30,7 +30,7 @@ from liftcore.evaluate.hardware import hardware, peak_memory
 from liftcore.features.pack import Views, pair, read_features
 from liftcore.io.cameras import read_cameras
 from liftcore.io.class_masks import read_masks
-from liftcore.io.lift_files import open_files
+from liftcore.io.scene_files import open_files
 from liftcore.lifting import lift
 from liftcore.progress import Progress
 from liftcore.query.render import in_photo

@@ -45,7 +45,6 @@ class _Source(Protocol):
     @property
     def specs(self) -> Mapping[str, TensorSpec]: ...  # by part: labels and codebook, or grid
     def read(self) -> ViewFeatures: ...
-    def part(self, part: str) -> Any: ...  # a tensor, or what can be sliced like one
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,19 +107,6 @@ class Views(Mapping[str, ViewFeatures]):
         height, width = specs["labels"].shape[-2:] if "labels" in specs else specs["grid"].shape[:2]
         return width, height
 
-    def sample_rows(self, view: str, count: int) -> Tensor:
-        """Some rows [n, F] of the view's codebook, ``count`` at most; nothing else of it is read or checked.
-
-        The first rows of a codebook, or evenly spaced cells of a grid as it is stored.
-        """
-        source = self._find(view)
-        if "grid" not in source.specs:
-            return source.part("codebook")[:count]
-        height, width = source.specs["grid"].shape[:2]
-        lines = _spread(height, round(count**0.5))
-        cells, grid = _spread(width, count // len(lines)), source.part("grid")
-        return torch.cat([grid[line][cells] for line in lines])
-
     def seen_by(self, names: Mapping[str, str], cameras: Mapping[str, Camera]) -> "Views":
         """The views that ``names`` gives the name of a camera, under it and as it sees them, and no others."""
         sources = {name: self._find(view) for view, name in names.items()}
@@ -130,9 +116,6 @@ class Views(Mapping[str, ViewFeatures]):
         if view not in self._sources:
             raise InvalidFeatures("view", expected="a view of the features", got=repr(view))
         return self._sources[view]
-
-
-FeaturePacks = Views
 
 
 def as_views(
@@ -281,12 +264,6 @@ def _spooled(pairs: Iterable[tuple[str, ViewFeatures]], scratch: Path | None) ->
         return replace(read_features(*files.values()), paths=())  # mapped: the files may lose their names
 
 
-def _spread(length: int, count: int) -> list[int]:
-    """At most ``count`` places of so many, evenly spaced and off the ends; one at least."""
-    steps = max(1, min(count, length))
-    return [(2 * k + 1) * length // (2 * steps) for k in range(steps)]
-
-
 @dataclass(frozen=True)
 class _Given:
     """A view of a mapping of values."""
@@ -306,9 +283,6 @@ class _Given:
         raise InvalidFeatures(
             f"view {self.name!r}", expected="Regions or FeatureGrid", got=type(found).__name__, hint=hint
         )
-
-    def part(self, part: str) -> Tensor:
-        return dict(_parts(self.read()))[part]
 
 
 @dataclass(frozen=True)
@@ -334,9 +308,6 @@ class _Stored:
     def specs(self) -> dict[str, TensorSpec]:
         keys = {part: f"{self.name}/{part}" for part in PARTS}
         return {part: self.pack.specs[key] for part, key in keys.items() if key in self.pack.specs}
-
-    def part(self, part: str) -> Any:
-        return self.pack.handle.get_slice(f"{self.name}/{part}")
 
     def read(self) -> ViewFeatures:
         tensor = self.pack.handle.get_tensor

@@ -1,44 +1,16 @@
-"""Files that are written whole or not at all, and what a file is that should have been another."""
+"""Files that are written whole or not at all, and pointers of Git LFS that lie where a file should."""
 
 import os
 import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, NamedTuple
+from typing import IO
 
 from liftcore.errors import InvalidCameras
 
 LFS_POINTER = b"version https://git-lfs.github.com/spec/"
-CONVERT = "convert it with PlayCanvas's splat-transform: npx @playcanvas/splat-transform IN OUT.ply"
-SUFFIXES = {
-    ".splat": "splats in antimatter15's .splat format",
-    ".ksplat": "splats in GaussianSplats3D's .ksplat format",
-    ".spz": "splats in Niantic's .spz format",
-    ".sog": "splats in PlayCanvas's .sog format",
-}
-
-
-class Foreign(NamedTuple):
-    """Another kind of file than a PLY."""
-
-    what: str
-    hint: str
-
-
-_SPZ = Foreign(SUFFIXES[".spz"], CONVERT)
-_WEB_PAGE = Foreign("a web page", "the download went wrong: fetch the file itself")
-_BY_FIRST_BYTES = {
-    LFS_POINTER: Foreign(
-        "a Git LFS pointer, which stands for the file", "run 'git lfs pull' in the repository where it lies"
-    ),
-    b"NGSP": _SPZ,
-    b"\x1f\x8b": Foreign("a gzip file", "unzip it, or upload it with the header 'Content-Encoding: gzip'"),
-    b"PK\x03\x04": Foreign("a zip", "unzip it and give the PLY in it"),
-    b"\x93NUMPY": Foreign("a NumPy array", "export the splats as PLY from the program that trained them"),
-    b"<!doctype": _WEB_PAGE,
-    b"<html": _WEB_PAGE,
-}
+LFS_HINT = "run 'git lfs pull' in the repository where it lies"
 
 
 def refuse_pointer(source: str, head: bytes) -> None:
@@ -48,18 +20,8 @@ def refuse_pointer(source: str, head: bytes) -> None:
         InvalidCameras: the first bytes are one's.
     """
     if head.startswith(LFS_POINTER):
-        pointer = _BY_FIRST_BYTES[LFS_POINTER]
-        raise InvalidCameras(source, expected="a camera file", got=pointer.what, hint=pointer.hint)
-
-
-def foreign_format(head: bytes, suffix: str) -> Foreign | None:
-    """What a file that is no PLY is, by its first bytes or its name's suffix; None when neither tells."""
-    named = SUFFIXES.get(suffix.lower())
-    start = head.lstrip(b"\xef\xbb\xbf \t\r\n").lower() if head[:1] != b"\x1f" else head
-    found = next((foreign for first, foreign in _BY_FIRST_BYTES.items() if start.startswith(first.lower())), None)
-    if named and (found is None or found.what in ("a gzip file", "a zip")):  # .spz and .sog are such files inside
-        return Foreign(named, CONVERT)
-    return found
+        got = "a Git LFS pointer, which stands for the file"
+        raise InvalidCameras(source, expected="a camera file", got=got, hint=LFS_HINT)
 
 
 @contextmanager

@@ -14,9 +14,8 @@ from liftcore.features.pack import read_features
 from liftcore.features.views import NO_LABEL, Regions
 from liftcore.io.cameras import TRANSFORMS, camera_source, has_nerfstudio_beside, other_models, read_cameras
 from liftcore.io.class_masks import describe_masks
-from liftcore.io.files import SUFFIXES
-from liftcore.io.ply import read_splats
-from liftcore.io.ply_header import nearest_dialect
+from liftcore.io.ply import nearest_dialect
+from liftcore.io.splats import is_splats, read_splats
 from liftcore.io.transforms import FRAME_FILE, frame_warning
 from liftcore.query.text.table import plain
 from liftcore.raster.base import ALPHA_FLOOR
@@ -27,7 +26,7 @@ from liftcore.solve.lift_warnings import UNSEEN
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from liftcore.features.pack import FeaturePacks
+    from liftcore.features.pack import Views
     from liftcore.features.views import ViewFeatures
     from liftcore.result import LiftMetadata, LiftResult
 
@@ -60,7 +59,7 @@ def inspect_file(path: Path) -> dict[str, Any]:
     """
     if not path.exists():
         raise InvalidInput(str(path), expected="a file or a folder", got="nothing of that name")
-    if _is_splats(path):
+    if is_splats(path):
         return {"kind": "splats", "bytes": path.stat().st_size, **describe_splats(read_splats(path))}
     if path.is_dir() or not _looks_like_safetensors(path):
         found = describe_camera_file(path)  # first: which of its files are there is told better by who reads them
@@ -77,16 +76,6 @@ def inspect_file(path: Path) -> dict[str, Any]:
     if any(key.endswith("/mask") for key in keys):
         return {"kind": "masks", "bytes": size, **describe_masks(path)}
     return {"kind": "features", "bytes": size, **describe_packs(read_features(path))}
-
-
-def _is_splats(path: Path) -> bool:
-    """Whether the file begins like splats, or is named like them or like a checkpoint, if only to be refused."""
-    if path.suffix.lower() in (".ply", ".pt", ".pth", ".ckpt", *SUFFIXES):
-        return True
-    if not path.is_file():
-        return False
-    with path.open("rb") as handle:
-        return handle.read(4) in (b"ply\n", b"ply\r", b"NGSP")
 
 
 def describe_splats(splats: Splats) -> dict[str, Any]:
@@ -217,7 +206,7 @@ def _keys(path: Path) -> tuple[set[str], dict[str, str]]:
         raise InvalidInput(str(path), expected="a safetensors file", got=got) from None
 
 
-def describe_packs(packs: FeaturePacks) -> dict[str, Any]:
+def describe_packs(packs: Views) -> dict[str, Any]:
     """Read every view: counts, ranges and warnings of feature packs."""
     found = [_describe_view(packs[view], packs.is_regions(view)) for view in packs.views]
     regions = [view for view in found if view["regions"]]
@@ -262,7 +251,7 @@ def _describe_view(observation: ViewFeatures, regions: bool) -> dict[str, Any]:
     return {**view, "sides": (width, height), "size": f"{width}x{height} cells", "unused": 0}
 
 
-def _pack_warnings(packs: FeaturePacks, found: list[dict[str, Any]], low: float, high: float) -> list[str]:
+def _pack_warnings(packs: Views, found: list[dict[str, Any]], low: float, high: float) -> list[str]:
     rows = sum(view["rows"] for view in found)
     zero = sum(view["zero"] for view in found)
     unused = sum(view["unused"] for view in found)

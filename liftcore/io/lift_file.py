@@ -3,10 +3,13 @@
 A ``.safetensors`` file holds ``features`` [P, F], ``evidence`` [P], ``agreement`` [P] and ``seen`` [P]; after
 Post-Lifting Aggregation also ``cluster`` [P] i32, -1 for splats in none, and ``cluster_features`` [K, F]. Its
 metadata hold settings, inputs with digests, the encoder, the certificate, timings and the version, as JSON.
+Readers of the arrays need neither torch nor pydantic, which are loaded where values are made.
 """
 
 from __future__ import annotations
 
+import hashlib
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,8 +18,10 @@ import numpy as np
 from liftcore.errors import InvalidLift
 from liftcore.io.safetensors_file import map_tensors
 
-if TYPE_CHECKING:  # loads pydantic, which a reader of the arrays does without
-    from liftcore.result import LiftMetadata, LiftResult
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from liftcore.result import InputFile, LiftMetadata, LiftResult
 
 TENSORS = ("features", "evidence", "agreement", "seen")
 CLUSTER_TENSORS = ("cluster", "cluster_features")  # in lifts with aggregation only
@@ -107,3 +112,40 @@ def _check_shapes(arrays: dict[str, np.ndarray], path: Path | str) -> None:
     if not fits or int(cluster.min()) < -1 or int(cluster.max()) >= len(means):
         got = f"{list(cluster.shape)} {cluster.dtype} and {list(means.shape)} {means.dtype}"
         raise InvalidLift(str(path), expected="a cluster of -1 or a row of cluster_features for each splat", got=got)
+
+
+def input_files(splats: Path, cameras: Path, features: Sequence[Path]) -> list[InputFile]:
+    """The inputs of a lift with their digests: splats, cameras and feature packs."""
+    return [input_file(splats), camera_input(cameras), *(input_file(pack) for pack in features)]
+
+
+def input_file(path: Path) -> InputFile:
+    """Where a file is, and its digest."""
+    from liftcore.result import InputFile
+
+    resolved = path.resolve()
+    return InputFile(path=str(resolved), sha256=sha256_of(resolved))
+
+
+def camera_input(path: Path) -> InputFile:
+    """Where cameras are, and the digest of their file or, of several, of the names and digests of all that are read.
+
+    Photos, features and lifts that lie in the same folder do not count: they may come and go.
+    """
+    from liftcore.io.cameras import camera_source
+    from liftcore.result import InputFile
+
+    given = Path(os.path.abspath(path))  # links stay: other files count beside them than where they lead
+    files = camera_source(given).files
+    if files == [given]:
+        return InputFile(path=str(given), sha256=sha256_of(given))
+    folder, total = given if given.is_dir() else given.parent, hashlib.sha256()
+    for part in files:
+        total.update(f"{os.path.relpath(part, folder)} {sha256_of(part)}\n".encode())
+    return InputFile(path=str(given), sha256=total.hexdigest())
+
+
+def sha256_of(path: Path) -> str:
+    """The digest of a file, in hexadecimal digits."""
+    with path.open("rb") as handle:
+        return hashlib.file_digest(handle, "sha256").hexdigest()

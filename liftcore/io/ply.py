@@ -1,47 +1,68 @@
 """Splat scenes in PLY files of every dialect: read, written back to the byte, and copied with one thing changed.
 
 Headers are read under limits, and what they say must fit the file's size, before anything trusts their numbers.
+
+One table of columns serves reading and writing, for every dialect: Inria, gsplat (no normals), SAGA and LaGa
+(``mask``), 2DGS (two scales) and DBS (``sh0_*``, ``shN_*``, ``sb_params_*``, ``beta``). Colour coefficients and lobes
+are stored channel-major: all of red, then green, then blue.
+
+Torch is imported where splats are made, so that processes without it can look at headers.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from liftcore.errors import InvalidSplats
-from liftcore.io.files import LFS_POINTER, whole_file
-from liftcore.io.ply_header import (
-    NORMALS,
-    PlyHeader,
-    Slot,
-    header_bytes,
-    model_slots,
-    parse_header,
-    read_header,
-    recognise_kernel,
-    usual_layout,
-)
-from liftcore.scene.kernel import Kernel, kernel_named
-from liftcore.scene.splats import Splats
+from liftcore.io.files import whole_file
+from liftcore.scene.kernel import Kernel, kernel_named, scale_count
 
+if TYPE_CHECKING:
+    from liftcore.scene.splats import Splats
+
+MAX_HEADER_BYTES = 256 * 1024
+MAX_HEADER_LINES = 4096
 BLOCK_ROWS = 16_384  # rows converted at a time: a few MB, so that memory stays near the file's size
+MAX_SH_DEGREE = 4
+LOBE_CHANNELS = 6  # of a spherical beta lobe: r g b theta phi beta
+LOBE_COLOURS = 3  # r g b, the first of them
+DARK_LOBE = -10.0  # r g b of a lobe that adds nothing: its softplus of sharpness 10 ln 2 is 1e-31, and of zero 0.1
 COLOUR = ("sh", "sb_params")  # fields that a lift has no use for, and most of a file
 FILTER = "filter_3D"  # of Mip-Splatting, the column of its smoothing filter
-LOBE_COLOURS = 3  # r g b, the first channels of a spherical beta lobe
-DARK_LOBE = -10.0  # r g b of a lobe that adds nothing: its softplus of sharpness 10 ln 2 is 1e-31, and of zero 0.1
-PICKLED = (".pt", ".pth", ".ckpt", ".pkl")
+NORMALS = ("nx", "ny", "nz")
+SPLAT_PROPERTIES = ("opacity", "scale_0", "rot_0", "f_dc_0", "sh0_0", "packed_position")  # one at least
+SCAFFOLD = ("f_anchor_feat_0", "f_offset_0")  # of Scaffold-GS, whose networks turn anchors into splats
 SPELLING = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint"}
 SPELLING |= {"f4": "float", "f8": "double"}
-EXPORT_PLY = (
-    "export the splats as PLY from the program that trained them (nerfstudio: ns-export gaussian-splat; gsplat's "
-    "simple_trainer: --save-ply)"
+CONVERT = "convert it with PlayCanvas's splat-transform: npx @playcanvas/splat-transform IN OUT.ply"
+EXPORT = "export the splats again as binary little-endian PLY"
+REWRITE = (
+    "rewrite it with Python: from plyfile import PlyData; p = PlyData.read('IN.ply'); p.text = False; "
+    "p.byte_order = '<'; p.write('OUT.ply')"
 )
+_END = re.compile(rb"(?:^|\n)end_header(\r?\n)")
+_ELEMENT = re.compile(r"\s*element\s+(\S+)\s+([0-9]{1,18})\s*")
+_GSPLAT = {"x", "y", "z", "f_dc_0", "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_3"}
+_SIGNATURES = {
+    "Inria 3DGS": {*_GSPLAT, "nx"},
+    "gsplat": _GSPLAT,
+    "2DGS": {*_GSPLAT, "nx"} - {"scale_2"},
+    "DBS": {*_GSPLAT, "sh0_0", "beta"} - {"f_dc_0"},
+    "a point cloud, which has no splats": {"x", "y", "z", "red", "green", "blue", "nx"},
+}
 
 
-def read_splats(path: Path | str, kernel: Kernel | str = "auto", *, colour: bool = True) -> Splats:
+# ---- splats
+
+
+def read_ply(path: Path, kernel: Kernel | str = "auto", *, colour: bool = True) -> Splats:
     """Read trained splats from a binary little-endian PLY of any dialect.
 
     With the kernel ``auto`` it is recognised from the properties. Columns that the model does not know are kept as
@@ -52,10 +73,10 @@ def read_splats(path: Path | str, kernel: Kernel | str = "auto", *, colour: bool
     Raises:
         InvalidSplats: the file is malformed, lacks a property of the kernel, or holds NaN or no splats.
     """
-    path = Path(path)
-    if path.suffix.lower() in PICKLED and not _begins(path, LFS_POINTER):
-        got = "a Python pickle, which may run code when it is opened"
-        raise InvalidSplats(str(path), expected="a PLY file", got=got, hint=EXPORT_PLY)
+    import torch
+
+    from liftcore.scene.splats import Splats
+
     header = read_header(path)
     kernel = recognise_kernel(header.names) if kernel == "auto" else kernel_named(kernel)
     slots = model_slots(header.names, kernel, str(path))
@@ -73,12 +94,11 @@ def read_splats(path: Path | str, kernel: Kernel | str = "auto", *, colour: bool
         others = [name for name in others if name == FILTER]
     fields, extras = _read_columns(path, header, slots, others)
     layout, lines = (header.names, header.lines) if colour else ((), ())
-    with _splats_from(path):
-        if FILTER in extras:
-            lines, layout = (), tuple(name for name in layout if name != FILTER)
-            fields |= _filtered(fields["log_scales"], fields["opacity_logits"], extras.pop(FILTER))
-        tensors = {name: torch.from_numpy(values) for name, values in extras.items()}
-        return Splats(**fields, kernel=kernel, extras=tensors, layout=layout, header=lines)
+    if FILTER in extras:
+        lines, layout = (), tuple(name for name in layout if name != FILTER)
+        fields |= _filtered(fields["log_scales"], fields["opacity_logits"], extras.pop(FILTER))
+    tensors = {name: torch.from_numpy(values) for name, values in extras.items()}
+    return Splats(**fields, kernel=kernel, extras=tensors, layout=layout, header=lines)
 
 
 def write_splats(splats: Splats, path: Path) -> None:
@@ -87,9 +107,20 @@ def write_splats(splats: Splats, path: Path) -> None:
     Raises:
         InvalidSplats: the layout names a column that the splats do not have.
     """
+    blocks = ply_blocks(splats)
+    with whole_file(path) as handle:
+        for block in blocks:
+            handle.write(block)
+
+
+def ply_blocks(splats: Splats) -> Iterator[bytes]:
+    """The bytes of the file that `write_splats` writes, in blocks."""
     layout = splats.layout or _default_layout(splats)
     columns = _columns_of(splats, layout)
-    source = _source_header(splats)
+    source = None
+    if splats.header:  # still describes the columns unless somebody changed the layout
+        header = parse_header(header_bytes(splats.header), "header")
+        source = header if header.names == splats.layout else None
     codes = {name: source.dtype[name].str[1:] if source else "f4" for name in layout}
     codes |= {name: columns[name].dtype.str[1:] for name in layout if name in splats.extras}
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {splats.count}"]
@@ -97,17 +128,16 @@ def write_splats(splats: Splats, path: Path) -> None:
     dtype = np.dtype([(name, "<" + code) for name, code in codes.items()])
     if source is not None and source.dtype == dtype:
         lines = source.lines_for(splats.count)
-    with whole_file(path) as handle:
-        handle.write(header_bytes(lines))
-        for start in range(0, splats.count, BLOCK_ROWS):
-            rows = np.zeros(min(BLOCK_ROWS, splats.count - start), dtype)
-            for name, column in columns.items():
-                rows[name] = column[start : start + len(rows)]
-            handle.write(rows.tobytes())
+    yield header_bytes(lines)
+    for start in range(0, splats.count, BLOCK_ROWS):
+        rows = np.zeros(min(BLOCK_ROWS, splats.count - start), dtype)
+        for name, column in columns.items():
+            rows[name] = column[start : start + len(rows)]
+        yield rows.tobytes()
 
 
 def some_rows(path: Path, kept: np.ndarray) -> Iterator[bytes]:
-    """A splat file with some of its rows, of its own bytes, a block of rows at a time.
+    """A PLY with some of its rows, of its own bytes, a block of rows at a time.
 
     Args:
         path: the file.
@@ -126,7 +156,7 @@ def some_rows(path: Path, kept: np.ndarray) -> Iterator[bytes]:
 
 
 def recoloured(path: Path, colours: np.ndarray) -> Iterator[bytes]:
-    """A splat file whose splats have one colour each, the same from everywhere; all else is of its own bytes.
+    """A PLY whose splats have one colour each, the same from everywhere; all else is of its own bytes.
 
     Higher harmonics become zero. The lobes of DBS become dark and not zero: a lobe of zeros shines.
 
@@ -156,14 +186,6 @@ def recoloured(path: Path, colours: np.ndarray) -> Iterator[bytes]:
             if row == 0:
                 rows[name] = colours[first : first + len(rows), channel]
         yield rows.tobytes()
-
-
-def _begins(path: Path, first: bytes) -> bool:
-    try:
-        with path.open("rb") as handle:
-            return handle.read(len(first)) == first
-    except OSError:
-        return False
 
 
 def _header_of(path: Path, count: int) -> PlyHeader:
@@ -223,16 +245,6 @@ def _filtered(log_scales: np.ndarray, opacity_logits: np.ndarray, deviations: np
     return {"log_scales": widened.astype(np.float32), "opacity_logits": logits.astype(np.float32)}
 
 
-@contextmanager
-def _splats_from(path: Path) -> Iterator[None]:
-    """Name the file in what the splats themselves find wrong."""
-    try:
-        yield
-    except InvalidSplats as error:
-        argument = f"{path} {error.argument}"
-        raise InvalidSplats(argument, expected=error.expected, got=error.got, hint=error.hint) from None
-
-
 def _default_layout(splats: Splats) -> tuple[str, ...]:
     sh_rows = 0 if splats.sh is None else splats.sh.shape[1]
     lobes = 0 if splats.sb_params is None else splats.sb_params.shape[1]
@@ -246,7 +258,7 @@ def _columns_of(splats: Splats, layout: Sequence[str]) -> dict[str, np.ndarray]:
     columns: dict[str, np.ndarray] = {}
     for name in layout:
         if name in slots:
-            values: Tensor | None = getattr(splats, slots[name].field)
+            values = getattr(splats, slots[name].field)
             index = slots[name].index
             if values is None or any(i >= n for i, n in zip(index, values.shape[1:], strict=True)):
                 expected, hint = "columns of the splats", "clear the layout"
@@ -259,9 +271,238 @@ def _columns_of(splats: Splats, layout: Sequence[str]) -> dict[str, np.ndarray]:
     return columns
 
 
-def _source_header(splats: Splats) -> PlyHeader | None:
-    """The header that the splats were read with, if it still describes their columns."""
-    if not splats.header:
-        return None
-    header = parse_header(header_bytes(splats.header), "header")
-    return header if header.names == splats.layout else None
+# ---- columns: which of them is which number of the model
+
+
+@dataclass(frozen=True)
+class Slot:
+    """Where a column lives: a field of ``Splats`` and the index behind the splat's."""
+
+    field: str
+    index: tuple[int, ...]
+
+
+def recognise_kernel(names: Collection[str]) -> Kernel:
+    """The kernel that the columns speak of."""
+    if "beta" in names or "sb_params_0" in names or "sh0_0" in names:
+        return Kernel.BETA
+    if "scale_1" in names and "scale_2" not in names:
+        return Kernel.GAUSSIAN_2D
+    return Kernel.GAUSSIAN_3D
+
+
+def nearest_dialect(names: Collection[str]) -> str:
+    """The dialect that shares most of these columns."""
+    found = set(names)
+    return max(_SIGNATURES, key=lambda dialect: len(_SIGNATURES[dialect] & found) / len(_SIGNATURES[dialect]))
+
+
+def usual_layout(kernel: Kernel, sh_rows: int, lobes: int) -> tuple[str, ...]:
+    """The column order of the kernel's own trainer, for ``sh_rows`` coefficients a channel and S lobes."""
+    first, *others = _columns(kernel, sh_rows, lobes, beta_names=kernel is Kernel.BETA)
+    return (first, *others[:2], *NORMALS, *others[2:])
+
+
+def model_slots(names: Sequence[str], kernel: Kernel, source: str) -> dict[str, Slot]:
+    """The columns that the model knows; the others are extras.
+
+    Raises:
+        InvalidSplats: a column of the kernel is missing, there is an odd number of them, or the model is another.
+    """
+    for name in SCAFFOLD:
+        if name in names:
+            got = f"anchors of Scaffold-GS, which its networks turn into splats (property {name!r})"
+            raise InvalidSplats(source, expected="splats", got=got, hint="export the splats themselves")
+    for name in _columns(kernel, 0, 0, beta_names=False):
+        if name not in names:
+            some = ", ".join([*names[:8], "..."] if len(names) > 8 else names)
+            expected, got = (
+                f"the property {name!r} of a {kernel} splat",
+                f"{len(names)} properties without it ({some})",
+            )
+            raise InvalidSplats(source, expected=expected, got=got, hint=_nearest(names))
+    beta_names = "sh0_0" in names
+    first, rest = ("sh0", "shN") if beta_names else ("f_dc", "f_rest")
+    base, higher = _numbered(names, first, source), _numbered(names, rest, source)
+    complete = [3 * ((degree + 1) ** 2 - 1) for degree in range(MAX_SH_DEGREE + 1)]
+    if (base, higher) != (0, 0) and (base != 3 or higher not in complete):
+        counts = ", ".join(map(str, complete))
+        expected = f"3 properties {first}_* and {counts} properties {rest}_* (degree 0..{MAX_SH_DEGREE})"
+        raise InvalidSplats(source, expected=expected, got=f"{base} and {higher}", hint=_nearest(names))
+    lobes = _numbered(names, "sb_params", source) if kernel is Kernel.BETA else 0
+    if lobes % LOBE_CHANNELS:
+        raise InvalidSplats(source, expected=f"a multiple of {LOBE_CHANNELS} properties sb_params_*", got=str(lobes))
+    return _columns(kernel, (base + higher) // 3, lobes // LOBE_CHANNELS, beta_names=beta_names)
+
+
+def _columns(kernel: Kernel, sh_rows: int, lobes: int, *, beta_names: bool) -> dict[str, Slot]:
+    """The columns of a model, in the usual order, without normals."""
+    first, rest = ("sh0", "shN") if beta_names else ("f_dc", "f_rest")
+    higher = max(0, sh_rows - 1)
+    slots = {axis: Slot("means", (i,)) for i, axis in enumerate("xyz")}
+    slots |= {f"{first}_{c}": Slot("sh", (0, c)) for c in range(3 if sh_rows else 0)}
+    slots |= {f"{rest}_{i}": Slot("sh", (1 + i % higher, i // higher)) for i in range(3 * higher)}
+    slots |= {f"sb_params_{i}": Slot("sb_params", (i % lobes, i // lobes)) for i in range(LOBE_CHANNELS * lobes)}
+    slots["opacity"] = Slot("opacity_logits", ())
+    if kernel is Kernel.BETA:
+        slots["beta"] = Slot("beta", ())
+    slots |= {f"scale_{i}": Slot("log_scales", (i,)) for i in range(scale_count(kernel))}
+    return slots | {f"rot_{i}": Slot("quats", (i,)) for i in range(4)}
+
+
+def _numbered(names: Sequence[str], stem: str, source: str) -> int:
+    """How many columns ``stem_0, stem_1, ...`` there are; they must have no gap."""
+    pattern = re.compile(re.escape(stem) + r"_(0|[1-9][0-9]{0,5})")
+    indices = sorted(int(match[1]) for match in map(pattern.fullmatch, names) if match)
+    for wanted, found in enumerate(indices):
+        if found != wanted:
+            expected, got = f"the property '{stem}_{wanted}'", f"'{stem}_{found}' without it"
+            raise InvalidSplats(source, expected=expected, got=got, hint=_nearest(names))
+    return len(indices)
+
+
+def _nearest(names: Collection[str]) -> str:
+    return f"the nearest dialect is {nearest_dialect(names)}"
+
+
+# ---- headers
+
+
+@dataclass(frozen=True)
+class PlyHeader:
+    """A header that fits its file: a vertex element of scalar columns before any other, little-endian."""
+
+    lines: tuple[str, ...]  # verbatim, with end_header, without the line feeds and what describes other elements
+    count: int  # rows
+    dtype: np.dtype  # of a row, a field a column
+    data_offset: int  # bytes before the first row
+    after: int | None = 0  # bytes behind the last row, of other elements; None when their lists make it unknown
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The columns, in the order of the file."""
+        return self.dtype.names or ()
+
+    def lines_for(self, count: int) -> list[str]:
+        """The lines of a file with ``count`` rows of these columns; all but that number stays as it is."""
+        end = "\r" if self.lines[0].endswith("\r") else ""
+        changed = f"element vertex {count}{end}"
+        is_same = count == self.count
+        return [changed if line.split()[:1] == ["element"] and not is_same else line for line in self.lines]
+
+
+def read_header(path: Path) -> PlyHeader:
+    """Read and check the header of a splat PLY, at most 256 KiB of the file.
+
+    Raises:
+        InvalidSplats: the file cannot be opened, is not a binary little-endian PLY that begins with a vertex element
+            of scalar properties, or has another size than the header says.
+    """
+    try:
+        with path.open("rb") as handle:
+            head = handle.read(MAX_HEADER_BYTES)
+            size = handle.seek(0, 2)
+    except OSError as error:
+        got = f"one that does not open ({error.strerror})"
+        raise InvalidSplats(str(path), expected="a splat file", got=got) from None
+    header = parse_header(head, str(path))
+    found, stride = size - header.data_offset, header.dtype.itemsize
+    least = header.count * stride + (header.after or 0)
+    if found < least or (header.after is not None and found > least):
+        hint = "the file has bytes that its header does not describe: export it again"
+        if found < least:
+            hint = "the file is truncated: copy or export it again"
+        others = f" and {header.after} bytes of other elements" if header.after else ""
+        expected = f"{header.count} rows of {stride} bytes{others} = {least} bytes after the header"
+        raise InvalidSplats(str(path), expected=expected, got=f"{found} bytes", hint=hint)
+    return header
+
+
+def parse_header(head: bytes, source: str) -> PlyHeader:
+    """Parse the first bytes of a PLY; ``source`` names the file in errors.
+
+    Raises:
+        InvalidSplats: the bytes are not the header of a splat PLY.
+    """
+
+    from plyfile import PlyData, PlyListProperty, PlyParseError  # here: processes that read no PLY start sooner
+
+    def refuse(expected: str, got: str, hint: str = EXPORT) -> InvalidSplats:
+        return InvalidSplats(f"{source} header", expected=expected, got=got, hint=hint)
+
+    lines, offset = _header_lines(head, source)
+    counts: list[int] = []
+    empty: list[str] = []  # the same header of no rows, which plyfile reads without any data
+    for line in lines:
+        words, element = line.split(), _ELEMENT.fullmatch(line)
+        if words[:1] == ["element"] and element is None:
+            expected = "the name of an element and a count of zero or more"
+            raise refuse(expected, repr(" ".join(words)[:60]))
+        counts += [int(element[2])] if element else []
+        empty.append(f"element {element[1]} 0" if element else line.removesuffix("\r"))
+    try:
+        ply = PlyData.read(io.BytesIO(header_bytes(empty)))
+    except (PlyParseError, ValueError) as error:
+        raise refuse("a header of PLY 1.0", f"one that does not parse ({str(error)[:120]})") from None
+    if ply.text or ply.byte_order != "<":
+        kind = "ascii" if ply.text else "binary_big_endian"
+        raise refuse("'format binary_little_endian 1.0'", f"'format {kind} 1.0'", REWRITE)
+    first = next(iter(ply.elements), None)
+    if first is None or not first.properties:
+        raise refuse("an element 'vertex' with properties", "a header without one")
+    if first.name == "chunk":
+        raise refuse("plain splats", "SuperSplat's compressed PLY", CONVERT)
+    if first.name != "vertex":
+        raise refuse("'vertex' as the first element", repr(first.name[:60]))
+    listed = next((column.name for column in first.properties if isinstance(column, PlyListProperty)), None)
+    if listed is not None:
+        raise refuse("scalar properties ('property float x')", f"a list {listed[:60]!r}")
+    after: int | None = 0
+    for element, count in zip(ply.elements[1:], counts[1:], strict=True):
+        if count and any(isinstance(column, PlyListProperty) for column in element.properties):
+            after = None
+        elif after is not None:
+            after += count * sum(np.dtype(column.val_dtype).itemsize for column in element.properties)
+    own = [i for i, line in enumerate(lines) if line.split()[:1] == ["element"]][1:2] or [len(lines) - 1]
+    dtype = np.dtype([(column.name, "<" + column.val_dtype) for column in first.properties])
+    return PlyHeader((*lines[: own[0]], lines[-1]), counts[0], dtype, offset, after)
+
+
+def header_bytes(lines: Sequence[str]) -> bytes:
+    """The lines of a header as they stand in a file."""
+    return "".join(f"{line}\n" for line in lines).encode("ascii")
+
+
+def _header_lines(head: bytes, source: str) -> tuple[tuple[str, ...], int]:
+    """The lines of a header without their line feeds, and its length in bytes."""
+    if head[:4] not in (b"ply\n", b"ply\r"):
+        raise InvalidSplats(source, expected="a PLY file (first line 'ply')", got=repr(head[:8]), hint=EXPORT)
+    end = _END.search(head)
+    if end is None:
+        limit = f"'end_header' within the first {MAX_HEADER_BYTES} bytes"
+        raise InvalidSplats(source, expected=limit, got=f"none in {len(head)} bytes", hint=EXPORT)
+    text = head[: end.end() - 1]
+    if not text.isascii():
+        hint = "take the comments with other characters out of it"
+        raise InvalidSplats(source, expected="an ASCII header", got="other characters in it", hint=hint)
+    lines = tuple(text.decode("ascii").split("\n"))
+    if len(lines) > MAX_HEADER_LINES:
+        limit, hint = f"at most {MAX_HEADER_LINES} header lines", "leave out properties that are no splat's"
+        raise InvalidSplats(source, expected=limit, got=str(len(lines)), hint=hint)
+    _refuse_clouds(lines, source)
+    return lines, end.end()
+
+
+def _refuse_clouds(lines: tuple[str, ...], source: str) -> None:
+    """Point clouds and meshes: what is wrong with them is not how they are written."""
+    words = [line.split() for line in lines]
+    names = {line[-1] for line in words if line[:1] == ["property"]}
+    if not names.issuperset("xyz") or names.intersection(SPLAT_PROPERTIES):
+        return
+    is_mesh = any(line[:2] == ["element", "face"] for line in words)
+    hint = "give the trained splats; the 3DGS trainers keep them in point_cloud/iteration_N/point_cloud.ply"
+    if any(name.startswith("scalar_") for name in names):
+        hint = "CloudCompare renames properties (scalar_opacity): give the file that it was opened from"
+    expected = "splats (properties such as 'opacity', 'scale_0', 'rot_0')"
+    got = f"a {'mesh' if is_mesh else 'point cloud'} without any of them"
+    raise InvalidSplats(source, expected=expected, got=got, hint=hint)

@@ -25,7 +25,7 @@ def object_ply(scene: QueryScene, answer: Answer) -> Iterable[bytes]:
         InvalidQuery: none was selected: most viewers open no file without splats; or more than objects are made of.
         InvalidLift: the splats moved or changed since the lift.
     """
-    from liftcore.io.ply import some_rows
+    from liftcore.io.splats import some_rows
 
     if answer.count == 0:
         raise InvalidQuery(
@@ -48,7 +48,7 @@ def coloured_ply(scene: QueryScene, answer: Answer) -> Iterable[bytes]:
         InvalidLift: the splats moved or changed since the lift.
         InvalidSplats: their file holds no colours; told when the first block is asked for.
     """
-    from liftcore.io.ply import recoloured
+    from liftcore.io.splats import recoloured
 
     colours = heat_colours(answer.scores, answer.seen)
     colours[~answer.seen] = NOT_SEEN_COLOUR

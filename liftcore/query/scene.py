@@ -16,7 +16,7 @@ from liftcore.query.scores import mean_direction, norms_of
 if TYPE_CHECKING:  # these load torch or pydantic, which scores do without
     from torch import Tensor
 
-    from liftcore.features.pack import FeaturePacks
+    from liftcore.features.pack import Views
     from liftcore.raster.base import CompositingParams, Raster
     from liftcore.result import InputFile, LiftMetadata, LiftResult
     from liftcore.scene.cameras import Camera, Cameras
@@ -47,7 +47,7 @@ class QueryScene:
         result: LiftResult,
         splats: Splats | None = None,
         cameras: Cameras | None = None,
-        packs: FeaturePacks | None = None,
+        packs: Views | None = None,
     ) -> None:
         names = ("features", "evidence", "seen", "cluster", "cluster_features")
         self._hold({name: as_numpy(getattr(result, name)) for name in names})
@@ -153,7 +153,7 @@ class QueryScene:
         Raises:
             InvalidLift: their file moved, or is another than the one that was lifted.
         """
-        from liftcore.io.ply import read_splats
+        from liftcore.io.splats import read_splats
 
         return read_splats(self.splat_file, self.metadata.settings.kernel)
 
@@ -175,7 +175,7 @@ class QueryScene:
         return read_cameras(self._unchanged("cameras", self.metadata.cameras), choosing=False)
 
     @cached_property
-    def packs(self) -> FeaturePacks:
+    def packs(self) -> Views:
         """The feature packs that were lifted; queries by region read a row of them.
 
         Raises:
@@ -236,7 +236,7 @@ class QueryScene:
                 hint=f"move the {role} back to {path}, or lift again from where they are now",
             )  # fmt: skip
         # The lift's own digest: one definition for files and folders, where it was taken and where it is checked.
-        from liftcore.io.input_files import camera_input, input_file
+        from liftcore.io.lift_file import camera_input, input_file
         from liftcore.io.transforms import FRAME_FILE
 
         found = (camera_input if role == "cameras" else input_file)(path)

@@ -25,3 +25,8 @@ def kernel_named(name: Kernel | str) -> Kernel:
         return Kernel(name)
     except ValueError:
         raise InvalidSplats("kernel", expected=" or ".join(Kernel), got=repr(name)[:60]) from None
+
+
+def scale_count(kernel: Kernel) -> int:
+    """Two for the flat splats of 2DGS, three for the others."""
+    return 2 if kernel is Kernel.GAUSSIAN_2D else 3

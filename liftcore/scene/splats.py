@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from liftcore.errors import InvalidSplats
-from liftcore.scene.kernel import Kernel, kernel_named
+from liftcore.scene.kernel import Kernel, kernel_named, scale_count
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -73,7 +73,7 @@ class Splats:
         shapes = {
             "means": (means, (count, 3)),
             "quats": (quats, (count, 4)),
-            "log_scales": (log_scales, (count, 2 if kernel is Kernel.GAUSSIAN_2D else 3)),
+            "log_scales": (log_scales, (count, scale_count(kernel))),
             "opacity_logits": (opacity_logits, (count,)),
             "beta": (beta, (count,)),
             "sh": (sh, (count, ..., 3)),

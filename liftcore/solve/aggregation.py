@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from torch import Tensor
 
-    from liftcore.features.pack import FeaturePacks
+    from liftcore.features.pack import Views
     from liftcore.features.views import ViewFeatures
     from liftcore.progress import Progress
     from liftcore.raster.base import Raster
@@ -69,7 +69,7 @@ class KeptRegions:
 def aggregate(
     features: Tensor,
     evidence: np.ndarray,
-    views: tuple[Raster, Cameras, FeaturePacks, Sequence[str]],
+    views: tuple[Raster, Cameras, Views, Sequence[str]],
     settings: LiftSettings,
     progress: Progress,
     threads: int | None = None,
@@ -117,7 +117,7 @@ def clustering_facts(clustering: Clustering, merged: Tensor) -> dict[str, Any]:
 def filter_regions(
     clustering: Clustering,
     channels: int,
-    views: tuple[Raster, Cameras, FeaturePacks, Sequence[str]],
+    views: tuple[Raster, Cameras, Views, Sequence[str]],
     settings: LiftSettings,
     progress: Progress,
 ) -> KeptRegions:

@@ -9,7 +9,7 @@ from liftcore.scene.cameras import photo_size
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from liftcore.features.pack import FeaturePacks
+    from liftcore.features.pack import Views
     from liftcore.scene.cameras import Camera
 
 FEW_CELLS = 4  # on a side; of fewer a shape says little
@@ -18,7 +18,7 @@ CELL = 1  # cells of a map, and pixels of its image, that rounding to whole ones
 TURNED = 1.2  # times nearer to the image's shape when rows and columns are swapped
 
 
-def shape_warnings(packs: FeaturePacks, views: Sequence[Camera]) -> list[str]:
+def shape_warnings(packs: Views, views: Sequence[Camera]) -> list[str]:
     """Warnings where maps are far from the shape of their images or nearer to it when turned, or else stretched.
 
     Maps of any shape are stretched over their image, as some encoders squeeze images into squares; what they cannot
@@ -43,7 +43,7 @@ def shape_warnings(packs: FeaturePacks, views: Sequence[Camera]) -> list[str]:
     ]
 
 
-def _shapes(packs: FeaturePacks, camera: Camera) -> str:
+def _shapes(packs: Views, camera: Camera) -> str:
     (width, height), (W, H) = packs.map_size(camera.name), photo_size(camera)
     return f" ({camera.name}: {width}x{height} for {W}x{H})"
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from liftcore.errors import InvalidFeatures, InvalidSettings, InvalidSplats
-from liftcore.io.ply_header import model_slots, read_header
+from liftcore.io.splats import require_kernel
 from liftcore.query.text.table import nearest_words, plain
 from liftcore.raster.base import check_antialiased
 from liftcore.scene.kernel import Kernel
@@ -51,7 +51,7 @@ def check_kernel(splats: AssetRecord, settings: Mapping[str, Any]) -> None:
     if kernel == own:
         return
     try:
-        model_slots(read_header(splats.path).names, Kernel(kernel), splats.id)
+        require_kernel(splats.path, Kernel(kernel), splats.id)
     except InvalidSplats as error:
         got, hint = f"{kernel} for {splats.id}, which has {error.got}", f"leave it out: the file speaks of {own}"
         raise InvalidSettings("kernel", expected=f"a kernel with {error.expected}", got=got, hint=hint) from None

@@ -8,10 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from liftcore.io.input_files import sha256_of
 from liftcore.io.json_file import finite
-from liftcore.io.lift_file import save_lift
-from liftcore.io.lift_files import lift_files
+from liftcore.io.lift_file import save_lift, sha256_of
+from liftcore.io.scene_files import lift_files
 from liftcore.lifting import log_warnings
 from liftcore.planning.plan import Plan
 from liftcore.progress import one_step

@@ -18,7 +18,7 @@ from liftcore.features.pack import read_features
 from liftcore.io.class_masks import describe_masks
 from liftcore.io.inspect import describe_camera_file, describe_packs, describe_splats, describe_table
 from liftcore.io.json_file import finite
-from liftcore.io.ply import read_splats
+from liftcore.io.splats import read_splats
 from liftcore.query.text.table import TableEncoder
 from service.child import end_with_parent, fault_of, own_stdout
 from service.models import VIEW_CHARACTERS, AssetKind

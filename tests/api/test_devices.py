@@ -76,7 +76,7 @@ def test_job_that_meets_no_card_fails_in_words(tmp_path: Path, monkeypatch: pyte
     def missing(asked: str) -> None:
         raise LACK
 
-    monkeypatch.setattr("liftcore.io.lift_files.choose_device", missing)
+    monkeypatch.setattr("liftcore.io.scene_files.choose_device", missing)
     order = {
         "kind": "lift", "splats": "s", "cameras": "c", "features": ["f"], "settings": {"device": "cuda"},
         "threads": 1, "work": str(tmp_path), "checkpoint_seconds": 1, "output": str(tmp_path / "o"), "names": {},

@@ -12,7 +12,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from liftcore.errors import Unavailable
-from liftcore.io.lift_files import open_files
+from liftcore.io.scene_files import open_files
 from liftcore.lifting import plan as plan_of
 from liftcore.planning.plan import Plan
 from liftcore.settings import LiftSettings

@@ -9,7 +9,7 @@ from typing import Any
 
 from liftcore.evaluate.hardware import hardware, machine_line
 from liftcore.io.lift_file import save_lift
-from liftcore.io.lift_files import lift_files as lift_paths
+from liftcore.io.scene_files import lift_files as lift_paths
 from liftcore.query.scene import QueryScene
 from liftcore.raster.base import Raster
 from liftcore.result import LiftResult

@@ -25,7 +25,7 @@ from torch import Tensor
 from liftcore.errors import InvalidQuery
 from liftcore.evaluate.accuracy import mask_iou
 from liftcore.features.views import Regions
-from liftcore.io.ply import read_splats
+from liftcore.io.splats import read_splats
 from liftcore.query.ask import ask
 from liftcore.query.directions import MINIMUM_ROW_SUM
 from liftcore.query.objects import objects

@@ -25,11 +25,12 @@ from torch.nn.functional import cosine_similarity, normalize
 from liftcore.errors import SplatliftError
 from liftcore.evaluate.accuracy import mask_iou, splat_accuracy, view_cosines
 from liftcore.evaluate.synthetic import room_cameras, room_splats
-from liftcore.features.pack import FeaturePacks, pair, read_features, write_pack
+from liftcore.features.pack import Views, pair, read_features, write_pack
 from liftcore.features.views import NO_LABEL, Regions, ViewFeatures
 from liftcore.io.cameras import read_cameras
 from liftcore.io.inria import write_inria_cameras
-from liftcore.io.ply import read_splats, write_splats
+from liftcore.io.ply import write_splats
+from liftcore.io.splats import read_splats
 from liftcore.query.directions import MINIMUM_ROW_SUM
 from liftcore.query.threshold import find_threshold
 from liftcore.raster.base import CompositingParams
@@ -59,7 +60,7 @@ class Subject:
         """Those of the packs that the scene has."""
         return [name for name in names if (self.folder / f"{name}.safetensors").is_file()]
 
-    def open(self, name: str, cameras: Cameras) -> FeaturePacks:
+    def open(self, name: str, cameras: Cameras) -> Views:
         """A pack, its views paired with the cameras."""
         return pair(read_features(self.folder / f"{name}.safetensors"), cameras)[0]
 

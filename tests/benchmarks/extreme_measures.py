@@ -19,8 +19,8 @@ from liftcore.features.pack import read_features, write_pack
 from liftcore.features.views import Regions, ViewFeatures
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.inspect import describe_cameras, describe_packs, describe_splats
-from liftcore.io.lift_files import lift_files
 from liftcore.io.ply import write_splats
+from liftcore.io.scene_files import lift_files
 from liftcore.progress import silent
 from liftcore.raster.base import NEAR_PLANE, CompositingParams, RegionWeights, Weighting
 from liftcore.raster.cpu.raster import CpuRaster

@@ -30,7 +30,7 @@ from liftcore.evaluate.hardware import hardware, machine_line
 from liftcore.evaluate.synthetic import room_cameras, room_regions, room_splats
 from liftcore.features.views import Regions
 from liftcore.io.lift_file import TENSORS, save_lift
-from liftcore.io.lift_files import lift_files as lift_paths
+from liftcore.io.scene_files import lift_files as lift_paths
 from liftcore.progress import silent
 from liftcore.raster import open_raster
 from liftcore.raster.base import CompositingParams, Weighting

@@ -25,9 +25,8 @@ from liftcore import __version__
 from liftcore.errors import InvalidInput
 from liftcore.evaluate.hardware import hardware
 from liftcore.evaluate.synthetic import room_cameras, room_splats
-from liftcore.io.input_files import input_file
 from liftcore.io.inria import write_inria_cameras
-from liftcore.io.lift_file import save_lift
+from liftcore.io.lift_file import input_file, save_lift
 from liftcore.io.ply import write_splats
 from liftcore.query.ask import Answer, ask
 from liftcore.query.render import mask_png, view_mask

@@ -20,7 +20,7 @@ import torch
 
 from liftcore.errors import InvalidFeatures
 from liftcore.evaluate.synthetic import PART_LEVELS, room_cameras, room_parts, room_regions, room_splats
-from liftcore.features.pack import FeaturePacks, read_features, write_pack
+from liftcore.features.pack import Views, read_features, write_pack
 from liftcore.features.views import NO_LABEL, FeatureGrid, Regions, ViewFeatures
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.ply import write_splats
@@ -150,7 +150,7 @@ def write_bench_room(folder: Path, size: Room, different: int = 12) -> tuple[Pat
 class Enlarged(Mapping[str, ViewFeatures]):
     """The feature grids of packs with so many (rows, columns) of cells, bilinearly, each made when asked for."""
 
-    packs: FeaturePacks
+    packs: Views
     cells: tuple[int, int]
 
     def __getitem__(self, view: str) -> FeatureGrid:

@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 
 from liftcore.evaluate.tradeoff import cosine_figures
-from liftcore.io.lift_files import lift_files
+from liftcore.io.scene_files import lift_files
 from liftcore.result import LiftResult
 from liftcore.settings import LiftSettings, Speed
 from tests.benchmarks.base import command_line, scene_files, tell

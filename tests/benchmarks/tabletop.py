@@ -23,7 +23,7 @@ from liftcore.evaluate.accuracy import class_ious, class_scores, rendered_scores
 from liftcore.features.pack import read_features
 from liftcore.features.views import NO_LABEL, Regions
 from liftcore.io.cameras import read_cameras
-from liftcore.io.ply import read_splats
+from liftcore.io.splats import read_splats
 from liftcore.raster.base import CompositingParams, Raster, Weighting
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.cameras import Cameras

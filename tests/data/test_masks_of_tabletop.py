@@ -13,7 +13,7 @@ from PIL import Image
 from liftcore.features.masks import mask_views
 from liftcore.features.pack import read_features, write_pack
 from liftcore.features.views import Regions
-from liftcore.io.lift_files import lift_files
+from liftcore.io.scene_files import lift_files
 from liftcore.settings import LiftSettings
 from tests.run_lengths import sam_records
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from liftcore.io.lift_files import lift_files
+from liftcore.io.scene_files import lift_files
 from liftcore.query.ask import ask
 from liftcore.query.scene import QueryScene
 from liftcore.query.scores import relevancy

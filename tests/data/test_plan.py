@@ -9,7 +9,7 @@ import torch
 
 from liftcore.features.pack import read_features, write_pack
 from liftcore.features.views import FeatureGrid
-from liftcore.io.lift_files import lift_files
+from liftcore.io.scene_files import lift_files
 from liftcore.planning.plan import ENTRY_BYTES
 from liftcore.settings import LiftSettings
 

@@ -12,8 +12,8 @@ import torch
 from liftcore.features.pack import read_features
 from liftcore.features.views import FeatureGrid
 from liftcore.io.cameras import read_cameras
-from liftcore.io.lift_files import lift_files
-from liftcore.io.ply import read_splats
+from liftcore.io.scene_files import lift_files
+from liftcore.io.splats import read_splats
 from liftcore.raster.base import CompositingParams
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.settings import LiftSettings

@@ -22,9 +22,9 @@ from pydantic import BaseModel
 
 import liftcore as lc
 from liftcore.cli import main
+from liftcore.features.masks import mask_of_runs, read_runs
 from liftcore.features.pack import read_features
-from liftcore.features.sam import mask_of_runs, read_runs
-from liftcore.io.ply import read_splats
+from liftcore.io.splats import read_splats
 from service import models
 from service.routes import assets, jobs, lifts, operations, queries, tradeoffs
 from tests.api.tiny_scene import WIDTH, WORDS, codebook, colmap_zip, labels, make_scene

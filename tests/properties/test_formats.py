@@ -18,8 +18,8 @@ from liftcore.features.pack import read_features, write_pack
 from liftcore.features.views import FeatureGrid, Regions
 from liftcore.io.cameras import read_cameras
 from liftcore.io.npy import open_npy
-from liftcore.io.ply import read_splats, write_splats
-from liftcore.io.ply_header import parse_header, usual_layout
+from liftcore.io.ply import parse_header, usual_layout, write_splats
+from liftcore.io.splats import read_splats
 from liftcore.scene.splats import Kernel
 
 LINES = [

@@ -12,8 +12,8 @@ from liftcore.features.pack import write_pack
 from liftcore.features.views import FeatureGrid, Regions, ViewFeatures
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.lift_file import load_lift, save_lift
-from liftcore.io.lift_files import lift_files
 from liftcore.io.ply import write_splats
+from liftcore.io.scene_files import lift_files
 from liftcore.raster.base import CompositingParams
 from liftcore.raster.reference import reading_matrix
 from liftcore.result import LiftResult

@@ -21,7 +21,7 @@ from liftcore.errors import InvalidFeatures, InvalidSettings, SplatliftError
 from liftcore.features.pack import write_pack
 from liftcore.features.views import FeatureGrid
 from liftcore.io.lift_file import load_lift
-from liftcore.io.lift_files import lift_files
+from liftcore.io.scene_files import lift_files
 from liftcore.query.threshold import METHODS
 from liftcore.settings import LiftSettings, Preset
 

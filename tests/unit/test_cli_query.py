@@ -11,7 +11,7 @@ import torch
 
 from liftcore import cli
 from liftcore.io.lift_file import load_lift, save_lift
-from liftcore.io.ply import read_splats
+from liftcore.io.splats import read_splats
 
 from .command_line import assert_one_line, lift_arguments, run, write_toy_scene
 

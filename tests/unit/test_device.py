@@ -11,7 +11,7 @@ import torch
 
 from liftcore.device import CPU, Device, choose_device, driver_version, processor, within_memory
 from liftcore.errors import InvalidSettings, Unavailable
-from liftcore.io.lift_files import lift_files
+from liftcore.io.scene_files import lift_files
 from liftcore.planning.plan import check_card
 from liftcore.settings import LiftSettings
 from service.jobs import device as device_process

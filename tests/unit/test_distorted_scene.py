@@ -15,7 +15,7 @@ from liftcore.errors import InvalidCameras, InvalidQuery
 from liftcore.io.cameras import read_cameras
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.lift_file import save_lift
-from liftcore.io.lift_files import lift_files
+from liftcore.io.scene_files import lift_files
 from liftcore.query.ask import ask
 from liftcore.query.render import render_png, view_mask
 from liftcore.query.scene import QueryScene

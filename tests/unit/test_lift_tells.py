@@ -11,7 +11,7 @@ import pytest
 
 from liftcore import lifting as pipeline
 from liftcore.cli import reply
-from liftcore.io.lift_files import lift_files
+from liftcore.io.scene_files import lift_files
 from liftcore.settings import LiftSettings
 
 from .command_line import lift_arguments, run, write_toy_scene

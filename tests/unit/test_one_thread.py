@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 import torch
 
-from liftcore.io.lift_files import lift_files
+from liftcore.io.scene_files import lift_files
 from liftcore.one_thread import one_thread
 from liftcore.settings import LiftSettings
 from liftcore.solve import accumulate, robust

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import liftcore as lc
-from liftcore.io.lift_files import lift_files
+from liftcore.io.scene_files import lift_files
 from tests.unit.solve.test_lift_equals_dense import observed, write_scene
 
 PUBLIC = """

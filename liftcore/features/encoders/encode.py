@@ -13,9 +13,9 @@ from torch import Tensor
 
 from liftcore.errors import InvalidInput
 from liftcore.features.encoders import ImageEncoder, Pixels
+from liftcore.features.folders import files_below, grids_of
 from liftcore.features.pack import write_pack
 from liftcore.features.views import check_finite
-from liftcore.io.npy import files_below, grids_of
 from liftcore.progress import Progress, silent
 from liftcore.scene.views import IMAGE_SUFFIXES, without_image_suffix
 

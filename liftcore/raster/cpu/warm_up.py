@@ -7,11 +7,11 @@ import torch
 
 from liftcore.device import CPU, Device
 from liftcore.features.views import FeatureGrid, Regions
-from liftcore.io.ply_header import scale_count
 from liftcore.raster import open_raster
 from liftcore.raster.base import CompositingParams, Weighting
 from liftcore.scene.cameras import Camera
-from liftcore.scene.splats import Kernel, Splats
+from liftcore.scene.kernel import Kernel, scale_count
+from liftcore.scene.splats import Splats
 
 PLAIN, ALL = CompositingParams(), Weighting()
 

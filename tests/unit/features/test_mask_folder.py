@@ -205,7 +205,7 @@ def test_json_that_holds_no_such_masks_is_refused(content: str, message: str, tm
 
 
 def test_json_beyond_the_limit_is_refused_unread(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("liftcore.features.sam.MAX_BYTES", 10)
+    monkeypatch.setattr("liftcore.features.masks.MAX_JSON_BYTES", 10)
     save_text(tmp_path / "a.json", sam_records(MASKS))
     np.save(tmp_path / "a.npy", VECTORS)
     with pytest.raises(InvalidFeatures, match=r"at most 10 bytes, got \d+ bytes; .*coco_rle"):

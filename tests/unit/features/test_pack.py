@@ -191,7 +191,6 @@ def test_paired_views_are_named_like_their_cameras_and_tell_their_own_names(tmp_
     assert (paired.views, without) == (("b", "camA/a"), ["c"])
     assert (paired.is_regions("camA/a"), paired.map_size("b"), list(paired.specs("b"))) == (True, (2, 1), ["grid"])
     assert torch.equal(paired["b"].codebook, torch.ones(2, 3))
-    assert torch.equal(paired.sample_rows("camA/a", 2), CODEBOOK[:2])
     with pytest.raises(InvalidFeatures, match=r"view 'a' labels: .*the label 9"):
         paired["camA/a"]
 

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from liftcore.errors import InvalidFeatures
-from liftcore.features.sam import mask_of_runs, read_runs
+from liftcore.features.masks import mask_of_runs, read_runs
 from tests.run_lengths import compressed, lengths_of
 
 

@@ -14,8 +14,8 @@ from liftcore.features.pack import read_features, write_pack
 from liftcore.features.views import Regions
 from liftcore.io.cameras import read_cameras
 from liftcore.io.inria import write_inria_cameras
-from liftcore.io.lift_files import lift_files, open_files
 from liftcore.io.ply import write_splats
+from liftcore.io.scene_files import lift_files, open_files
 from liftcore.planning.pilot import PILOT_VIEWS, Pilot, fly_pilot
 from liftcore.planning.plan import FEW_VIEWS
 from liftcore.planning.visibility import visibility

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from liftcore.io.lift_files import lift_files
+from liftcore.io.scene_files import lift_files
 from liftcore.planning.coverage import (
     ORDER_SPLATS,
     SIDES,

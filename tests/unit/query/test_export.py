@@ -9,8 +9,8 @@ import pytest
 from PIL import Image
 
 from liftcore.errors import InvalidLift, InvalidQuery
-from liftcore.io.lift_files import lift_files
-from liftcore.io.ply import read_splats
+from liftcore.io.scene_files import lift_files
+from liftcore.io.splats import read_splats
 from liftcore.query.ask import Answer, ask
 from liftcore.query.colours import NOT_SEEN_COLOUR, SH_C0, colour_map
 from liftcore.query.export import coloured_ply, object_ply

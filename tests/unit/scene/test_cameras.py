@@ -19,7 +19,7 @@ from liftcore.io import cameras, json_file
 from liftcore.io.cameras import other_models, read_cameras
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.inspect import describe_camera_file
-from liftcore.io.ply import read_splats
+from liftcore.io.splats import read_splats
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.distortion import Brown, Fisheye, Lens
 

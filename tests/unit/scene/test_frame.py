@@ -18,9 +18,9 @@ from scipy.spatial.transform import Rotation
 from liftcore.errors import InvalidCameras, Unavailable
 from liftcore.io import cameras
 from liftcore.io.cameras import read_cameras
-from liftcore.io.input_files import camera_input
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.inspect import inspect_file
+from liftcore.io.lift_file import camera_input
 from liftcore.io.transforms import FRAME_FILE
 from liftcore.scene.cameras import Camera, Cameras
 

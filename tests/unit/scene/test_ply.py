@@ -12,7 +12,8 @@ import torch
 from ply_files import DIALECTS, INRIA, ply_bytes, ply_rows, with_ply
 
 from liftcore.errors import InvalidSplats
-from liftcore.io.ply import read_splats, write_splats
+from liftcore.io.ply import write_splats
+from liftcore.io.splats import read_splats
 from liftcore.scene.splats import Kernel, Splats
 from tests.scenes import random_splats
 

@@ -13,7 +13,8 @@ from ply_files import DIALECTS, INRIA, ply_bytes, with_ply
 from plyfile import PlyData
 
 from liftcore.errors import InvalidSplats
-from liftcore.io.ply import BLOCK_ROWS, read_splats, recoloured, some_rows
+from liftcore.io.ply import BLOCK_ROWS
+from liftcore.io.splats import read_splats, recoloured, some_rows
 from liftcore.query.colours import constant_terms
 from liftcore.query.splat_colours import seen_colours
 from tests.scenes import look_at

@@ -16,8 +16,9 @@ from liftcore.features.views import FeatureGrid, Regions
 from liftcore.io.cameras import read_cameras
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.lift_file import CLUSTER_TENSORS, load_lift, save_lift
-from liftcore.io.lift_files import lift_files
-from liftcore.io.ply import read_splats, write_splats
+from liftcore.io.ply import write_splats
+from liftcore.io.scene_files import lift_files
+from liftcore.io.splats import read_splats
 from liftcore.lifting import LEAST_KEPT
 from liftcore.progress import silent
 from liftcore.raster.cpu.raster import CpuRaster

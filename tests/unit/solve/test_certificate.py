@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from liftcore.io.cameras import read_cameras
-from liftcore.io.lift_files import lift_files
+from liftcore.io.scene_files import lift_files
 from liftcore.raster.base import CompositingParams
 from liftcore.raster.reference import dense_view, reading_matrix
 from liftcore.settings import LiftSettings

@@ -16,7 +16,7 @@ from liftcore.features.pack import write_pack
 from liftcore.features.views import NO_LABEL, FeatureGrid, Regions
 from liftcore.io.cameras import read_cameras
 from liftcore.io.lift_file import TENSORS
-from liftcore.io.lift_files import lift_files
+from liftcore.io.scene_files import lift_files
 from liftcore.raster.base import CompositingParams, ViewRequest, Weighting
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.result import LiftResult

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from liftcore.features.views import Regions, ViewFeatures
-from liftcore.io.lift_files import lift_files
+from liftcore.io.scene_files import lift_files
 from liftcore.progress import silent
 from liftcore.settings import LiftSettings
 from liftcore.solve.channels import BLOCK, blocks, codebook_axes, random_axes

@@ -13,8 +13,8 @@ from liftcore.features.views import Regions
 from liftcore.io.cameras import read_cameras
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.lift_file import load_lift, save_lift
-from liftcore.io.lift_files import lift_files, open_files
 from liftcore.io.ply import write_splats
+from liftcore.io.scene_files import lift_files, open_files
 from liftcore.progress import silent
 from liftcore.raster.base import CompositingParams, Selection, Weighting
 from liftcore.raster.cpu.raster import CpuRaster

@@ -13,8 +13,9 @@ from liftcore.features.pack import write_pack
 from liftcore.io.cameras import read_cameras
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.lift_file import save_lift
-from liftcore.io.lift_files import lift_files
-from liftcore.io.ply import read_splats, write_splats
+from liftcore.io.ply import write_splats
+from liftcore.io.scene_files import lift_files
+from liftcore.io.splats import read_splats
 from liftcore.query.scene import QueryScene
 from liftcore.raster.base import CompositingParams
 from liftcore.raster.reference import dense_view, reading_matrix

@@ -10,7 +10,7 @@ from liftcore.errors import InvalidFeatures, InvalidSettings
 from liftcore.features.pack import write_pack
 from liftcore.features.views import Regions
 from liftcore.io.cameras import read_cameras
-from liftcore.io.lift_files import lift_files
+from liftcore.io.scene_files import lift_files
 from liftcore.raster.reference import dense_view, reading_matrix, strided_rays
 from liftcore.settings import LiftSettings, Preset
 from liftcore.solve.accumulate import strided_walk

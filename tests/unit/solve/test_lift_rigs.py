@@ -10,7 +10,7 @@ import torch
 from liftcore.features.pack import read_features, write_pack
 from liftcore.features.views import Regions
 from liftcore.io.lift_file import save_lift
-from liftcore.io.lift_files import lift_files
+from liftcore.io.scene_files import lift_files
 from liftcore.query.directions import directions
 from liftcore.query.scene import QueryScene
 from liftcore.query.terms import Query, Region

@@ -12,7 +12,7 @@ from liftcore.features.pack import pair, read_features, write_pack
 from liftcore.features.views import FeatureGrid, Regions, ViewFeatures
 from liftcore.io.cameras import read_cameras
 from liftcore.io.inspect import inspect_file
-from liftcore.io.lift_files import lift_files, open_files
+from liftcore.io.scene_files import lift_files, open_files
 from liftcore.lifting import plan
 from liftcore.scene.cameras import Camera
 from liftcore.settings import LiftSettings

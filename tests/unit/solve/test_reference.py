@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from liftcore.io.lift_files import lift_files
+from liftcore.io.scene_files import lift_files
 from liftcore.progress import silent
 from liftcore.raster.base import CompositingParams
 from liftcore.scene.splats import Splats

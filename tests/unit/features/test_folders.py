@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from liftcore.errors import InvalidFeatures
+from liftcore.features.folders import array_views, langsplat_views
 from liftcore.features.pack import read_features, write_pack
 from liftcore.features.views import Regions
-from liftcore.io.langsplat import langsplat_views
-from liftcore.io.npy import array_views, open_npy
+from liftcore.io.npy import open_npy
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -10,8 +10,8 @@ from liftcore.device import choose_device
 from liftcore.errors import InvalidFeatures
 from liftcore.features.pack import Views, read_features
 from liftcore.io.cameras import read_cameras
-from liftcore.io.input_files import input_files
-from liftcore.io.ply import read_splats
+from liftcore.io.lift_file import input_files
+from liftcore.io.splats import read_splats
 from liftcore.lifting import lift
 from liftcore.planning.plan import Plan
 from liftcore.progress import Progress, Timings

@@ -1,0 +1,163 @@
+"""Folders of NumPy files, a view a file: dense maps, LangSplat's regions, and what masks are read from.
+
+``camA/000.npy`` is of the view ``camA/000``, as rigs have them, and ``IMG.jpg.npy`` of the view ``IMG``, as the
+camera of ``IMG.jpg`` is. Hidden sub-folders are left out.
+
+LangSplat's ``IMG_s.npy`` [L, H, W] holds mask ids, -1 for none, counted on over the levels, so that an id is a row of
+``IMG_f.npy`` [M, F]. Occam's LGS, OpenGaussian, LaGa and VALA write the same files.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Literal, TypeVar
+
+import numpy as np
+
+from liftcore.errors import InvalidFeatures
+from liftcore.features.views import NO_LABEL, FeatureGrid, Regions, ViewFeatures
+from liftcore.io.npy import open_npy, read_floats
+from liftcore.scene.views import without_image_suffix
+
+PICKLED = (".pt", ".pth", ".pkl")
+LABELS, CODEBOOK = "_s.npy", "_f.npy"  # of LangSplat
+
+Layout = Literal["hwc", "chw"]
+V_co = TypeVar("V_co", bound=ViewFeatures, covariant=True)
+
+
+class ViewFolder(Mapping[str, V_co]):
+    """Views of a folder by name; each is read and checked anew when it is asked for.
+
+    Args:
+        files: view name -> the file that names the view.
+        read: view name -> what it observes.
+        inputs: all files that are read.
+    """
+
+    def __init__(self, files: Mapping[str, Path], read: Callable[[str], V_co], inputs: Iterable[Path] = ()) -> None:
+        self.files = files
+        self.inputs = [*files.values(), *inputs]
+        self._read = read
+
+    def __getitem__(self, view: str) -> V_co:
+        return self._read(view)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.files)
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+
+def array_views(folder: Path, layout: Layout = "hwc") -> ViewFolder[FeatureGrid]:
+    """The grids of a folder of ``.npy`` files [h, w, F], or [F, h, w] with the layout ``chw``.
+
+    Raises:
+        InvalidFeatures: the folder has no such files, or two of one view.
+    """
+    return grids_of(files_by_view(npy_files(folder, ".npy"), folder, ".npy"), layout)
+
+
+def grids_of(files: Mapping[str, Path], layout: Layout = "hwc") -> ViewFolder[FeatureGrid]:
+    """The grids of ``.npy`` files by view."""
+
+    def read(view: str) -> FeatureGrid:
+        grid = read_floats(files[view], "F, h, w" if layout == "chw" else "h, w, F")
+        return FeatureGrid(grid.transpose(1, 2, 0) if layout == "chw" else grid, where=f"view {view!r}")
+
+    return ViewFolder(files, read)
+
+
+def langsplat_views(folder: Path) -> ViewFolder[Regions]:
+    """The regions of a folder of ``IMG_s.npy`` and ``IMG_f.npy`` files, and of its sub-folders.
+
+    Raises:
+        InvalidFeatures: the folder has no such files, or a map lacks its embeddings. Reading a view: a file is
+            malformed, an id has no embedding, or an embedding is not finite.
+    """
+    files = npy_files(folder, LABELS)
+    labels = {path.relative_to(folder).as_posix().removesuffix(LABELS): path for path in files}
+    codebooks = {view: path.with_name(path.name.removesuffix(LABELS) + CODEBOOK) for view, path in labels.items()}
+    for view, path in codebooks.items():
+        if not path.is_file():
+            got = f"{labels[view].name} alone"
+            raise InvalidFeatures(str(folder), expected=f"embeddings in {path.name}", got=got)
+
+    def read(view: str) -> Regions:
+        codebook = read_floats(codebooks[view], "M, F")
+        ids = mask_ids(open_npy(labels[view]), len(codebook), labels[view])
+        return Regions(ids, codebook, where=f"view {view!r}")
+
+    return ViewFolder(labels, read, codebooks.values())
+
+
+def mask_ids(stored: np.ndarray, rows: int, path: Path) -> np.ndarray:
+    """[L, H, W] i32 of ids, -1 for none, stored as integers or as floats.
+
+    Args:
+        stored: [L, H, W], or [H, W] for one level. rows: vectors that there are. path: named in errors.
+
+    Raises:
+        InvalidFeatures: other axes, an id without a vector, or one that is no whole number.
+    """
+    if stored.ndim not in (2, 3):
+        raise InvalidFeatures(str(path), expected="mask ids [L, H, W]", got=str(list(stored.shape)))
+    low, high = float(stored.min()), float(stored.max())
+    # NaN fails every comparison, so it is refused here too.
+    if not (low >= NO_LABEL and high < rows):
+        got = f"ids from {low:g} to {high:g}"
+        hint = "ids are counted on over the levels; those of each level alone must be shifted first"
+        raise InvalidFeatures(str(path), expected=f"ids in -1..{rows - 1}", got=got, hint=hint)
+    labels = stored.astype(np.int32)
+    if stored.dtype.kind == "f" and not np.array_equal(labels, stored):
+        raise InvalidFeatures(str(path), expected="whole numbers as mask ids", got="fractions")
+    return labels if labels.ndim == 3 else labels[None]
+
+
+def files_below(folder: Path) -> list[Path]:
+    """The files of a folder and its sub-folders, sorted; hidden sub-folders are left out."""
+    inner = {path: path.relative_to(folder).parts[:-1] for path in sorted(folder.rglob("*")) if path.is_file()}
+    return [path for path, parts in inner.items() if not any(part.startswith(".") for part in parts)]
+
+
+def npy_files(folder: Path, suffix: str) -> list[Path]:
+    """The files in the folder and its sub-folders whose names end so, sorted.
+
+    Raises:
+        InvalidFeatures: there is none; pickles are named as the reason where there are some.
+    """
+    if not folder.is_dir():
+        raise InvalidFeatures(str(folder), expected=f"a folder of *{suffix} files", got="no such folder")
+    files = files_below(folder)
+    found = [path for path in files if path.name.endswith(suffix)]
+    pickles = [path.name for path in files if path.suffix.lower() in PICKLED]
+    if not found and pickles:
+        raise InvalidFeatures(
+            str(folder),
+            expected=f"*{suffix} files",
+            got=f"{len(pickles)} pickles ({pickles[0]}), which may run code when they are opened",
+            hint="save them as .npy with the program that wrote them: numpy.save(name, tensor.cpu().numpy())",
+        )
+    if not found:
+        raise InvalidFeatures(str(folder), expected=f"*{suffix} files", got=f"{len(files)} other files")
+    return found
+
+
+def files_by_view(
+    paths: Iterable[Path], folder: Path, *suffixes: str, what: str = "file", hint: str = ""
+) -> dict[str, Path]:
+    """View name -> file, the first of the suffixes that a file has cut off its name, and that of an image before it.
+
+    Raises:
+        InvalidFeatures: two files are of one view; ``what`` names them.
+    """
+    found: dict[str, Path] = {}
+    for path in paths:
+        inner = path.relative_to(folder).as_posix()
+        suffix = next((suffix for suffix in suffixes if inner.endswith(suffix)), path.suffix)
+        view = without_image_suffix(inner.removesuffix(suffix))
+        if view in found:
+            got = f"{found[view].name} and {path.name}, both of the view {view!r}"
+            raise InvalidFeatures(str(folder), expected=f"one {what} a view", got=got, hint=hint)
+        found[view] = path
+    return found
