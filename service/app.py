@@ -45,7 +45,7 @@ def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, work
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         app.state.deps = deps = AppState(
-            settings=settings, version=build, whole=store, store=store.seen_by(NOBODY), runner=runner,
+            settings=settings, version=build, store=store, owner=NOBODY, runner=runner,
             devices=Devices(), queries=worker,
             streams=streams, metrics=metrics, readiness=readiness,
             checks=anyio.CapacityLimiter(settings.parallel_checks),

@@ -19,8 +19,8 @@ from starlette.types import Receive, Scope, Send
 from liftcore.errors import NotFound
 from service.errors import RangeNotSatisfiable
 from service.problems import PROBLEM
+from service.store.database import CURSOR, Page
 from service.store.files import is_whole
-from service.store.pages import CURSOR, Page
 
 BLOCK_BYTES = 256 << 10  # of a draft that is read and sent at a time
 STREAMED = 200  # records of a long list that are in memory at a time

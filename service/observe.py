@@ -301,7 +301,7 @@ class _Gauges(Collector):
 
     def collect(self) -> Iterator[Metric]:
         """Look."""
-        counts = self._store.everything.jobs.count_by_state()
+        counts = self._store.jobs.count_by_state()
         jobs = GaugeMetricFamily("splatlift_jobs", "Jobs by state.", labels=("state",))
         for state in JobState:
             jobs.add_metric((state.value,), counts.get(state, 0))

@@ -8,9 +8,7 @@ import sqlite3
 import threading
 import time
 from collections.abc import Callable
-from contextlib import closing
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Annotated
 
 import anyio
@@ -18,15 +16,15 @@ from fastapi import Depends, Request
 
 from liftcore.errors import SplatliftError
 from service.auth import CALLER
-from service.errors import Misconfigured, NotReady
+from service.errors import NotReady
 from service.jobs.device import Devices
 from service.jobs.supervisor import Supervisor
 from service.models import Version
 from service.observe import Metrics
 from service.queries.client import QueryClient
 from service.settings import ServiceSettings
-from service.store.database import DATABASE
-from service.store.store import Store, StoreView
+from service.store.owners import Owner
+from service.store.store import Store
 from service.streams import EventStreams
 
 WRITING_THREADS = 8  # for uploads: a disk that is stalled stops them, and no other route
@@ -74,9 +72,8 @@ class Readiness:
 
     def __init__(self, store: Store, runner: Supervisor, queries: QueryClient, stopping: Stopping) -> None:
         self._stopping = stopping
-        opened = _identity(store.files.root / DATABASE)
         self._checks: dict[str, Callable[[], str | None]] = {
-            "database": lambda: _complaint(lambda: _prove_database(store, opened)),
+            "database": lambda: _complaint(store.database.prove_usable),
             "disk": lambda: _complaint(lambda: _prove_disk(store)),
             "supervisor": lambda: None if runner.alive() else "a thread of the supervisor has died",
             "queries": lambda: None if queries.revive() else "the query worker has died; a new one starts",
@@ -121,21 +118,6 @@ class Readiness:
         return time.monotonic() - self._looked < FRESH_SECONDS
 
 
-def _prove_database(store: Store, opened: tuple[int, int]) -> None:
-    """See that the database is the file that was opened, can be read by who comes anew, and takes writes."""
-    path = store.files.root / DATABASE
-    if _identity(path) != opened:
-        raise Misconfigured("data", expected="the database that was opened", got="another file in its place")
-    with closing(sqlite3.connect(f"{path.as_uri()}?mode=ro", uri=True)) as connection:
-        connection.execute("SELECT count(*) FROM jobs WHERE state = 'queued'").fetchone()
-    store.database.prove_writable()
-
-
-def _identity(path: Path) -> tuple[int, int]:
-    status = path.stat()
-    return status.st_dev, status.st_ino
-
-
 def _prove_disk(store: Store) -> None:
     """See that there is room, and that a file can be written as far as the disk."""
     store.files.require_room()
@@ -155,12 +137,12 @@ def _complaint(check: Callable[[], None]) -> str | None:
 
 @dataclass(frozen=True)
 class AppState:
-    """What `create_app` was given and made. Routes get the store as their caller sees it."""
+    """What `create_app` was given and made, and for whom a route uses it."""
 
     settings: ServiceSettings
     version: Version
-    whole: Store  # for the service itself: routes have their caller's view of it
-    store: StoreView
+    store: Store
+    owner: Owner  # for whom a route works
     runner: Supervisor
     devices: Devices
     queries: QueryClient
@@ -183,7 +165,7 @@ class AppState:
 # Async: a sync dependency waits for a thread of the pool, and every route with it.
 async def _deps(request: Request) -> AppState:
     deps: AppState = request.app.state.deps
-    return replace(deps, store=deps.whole.seen_by(request.scope["state"][CALLER].owner))
+    return replace(deps, owner=request.scope["state"][CALLER].owner)
 
 
 Deps = Annotated[AppState, Depends(_deps)]

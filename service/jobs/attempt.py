@@ -21,6 +21,7 @@ from service.models import ENDED, JobKind, JobState
 from service.store.assets import kernel_of
 from service.store.jobs import LOG_LINES, EventKind, JobRecord, labels_of
 from service.store.lifts import FinishedLift, FinishedTradeoff
+from service.store.owners import SERVICE
 from service.store.store import Store
 
 TICK_SECONDS = 0.2  # how soon a cancel, a stop or a limit is seen
@@ -81,9 +82,9 @@ class Notes:
     def __init__(self, job: JobRecord, store: Store) -> None:
         self._job = job
         self._write = {
-            EventKind.LOG: store.attempts.log,
-            EventKind.PLAN: store.attempts.plan,
-            EventKind.PROGRESS: store.attempts.advance,
+            EventKind.LOG: store.jobs.log,
+            EventKind.PLAN: store.jobs.plan,
+            EventKind.PROGRESS: store.jobs.advance,
         }
         self._waiting: deque[tuple[EventKind, Any]] = deque(maxlen=LOG_LINES)
         self._again = 0.0
@@ -156,7 +157,7 @@ class Attempt:
                 why = self._follow(process, stopping)
                 status = process.end()
             insist(lambda: self._settle(draft, why or _told(status), stopping.is_set()), stopping)
-        if self._store.attempts.state(self._job.id) in ENDED:
+        if self._store.jobs.state(SERVICE, self._job.id) in ENDED:
             files.forget_work(self._job.id)
 
     def _follow(self, process: JobProcess, stopping: threading.Event) -> str | SplatliftError | None:
@@ -204,14 +205,14 @@ class Attempt:
 
     def _is_wanted(self) -> bool:
         try:
-            return self._store.attempts.state(self._job.id) is JobState.RUNNING
+            return self._store.jobs.state(SERVICE, self._job.id) is JobState.RUNNING
         except TROUBLE:  # nobody can have canceled it in a database that cannot be read
             return True
 
     def _settle(self, draft: Path, why: str | SplatliftError, stopping: bool) -> None:
         """No process of this attempt is left; what becomes true now stays true."""
         self._notes.flush()
-        job, attempts, answer = self._job, self._store.attempts, self._answer or {"event": "none"}
+        job, attempts, answer = self._job, self._store.jobs, self._answer or {"event": "none"}
         if answer["event"] == "done" and draft.exists():
             if not self._keep(draft, answer):
                 attempts.lose(job.id, job.attempt, "it is canceled")
@@ -229,7 +230,7 @@ class Attempt:
 
     def _keep(self, draft: Path, answer: dict[str, Any]) -> bool:
         """Make the result true, and the job succeeded with it; False when the attempt may not."""
-        job, kept = self._job, self._store.everything
+        job, kept = self._job, self._store
         if job.kind is JobKind.TRADEOFF:
             found = FinishedTradeoff(answer["document"], answer["page"], draft.read_bytes())
             return kept.tradeoffs.finish(job.id, job.attempt, found)
@@ -247,9 +248,9 @@ class Attempt:
         return f", {blocks} blocks of walked views are kept" if blocks else ""
 
     def _order(self, draft: Path) -> dict[str, Any]:
-        job, files, kept = self._job, self._store.files, self._store.everything.assets
-        assets = [kept.get(name) for name in (job.splats, job.cameras, *job.features)]
-        labels = [kept.get(*named) for named in labels_of(job.parameters)]
+        job, files, kept = self._job, self._store.files, self._store.assets
+        assets = [kept.get(SERVICE, name) for name in (job.splats, job.cameras, *job.features)]
+        labels = [kept.get(SERVICE, *named) for named in labels_of(job.parameters)]
         return {
             "kind": job.kind,
             "parameters": job.parameters,

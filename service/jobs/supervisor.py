@@ -14,6 +14,7 @@ from service.jobs.attempt import CHILD, TROUBLE, Attempt, Clock, insist
 from service.jobs.process import JobLimits, end_orphans
 from service.observe import working_for
 from service.store.jobs import JobRecord
+from service.store.owners import SERVICE
 from service.store.store import Store
 
 IDLE_SECONDS = 5.0  # a forgotten wake-up costs at most this
@@ -53,7 +54,7 @@ class Supervisor:
 
     def start(self) -> None:
         """End what a dead server left running, then begin to take jobs."""
-        found = end_orphans(self._store.attempts.unfinished())
+        found = end_orphans(self._store.jobs.unfinished())
         if found:
             log.warning("ended %d processes that outlived their server", found)
         for thread in self._threads:
@@ -99,9 +100,9 @@ class Supervisor:
         """Claim a job; before the first one, those of the server before us go back in line."""
         with self._beginning:
             if self._left_behind:
-                self._store.attempts.release_all("the server died")
+                self._store.jobs.release_all("the server died")
                 self._left_behind = False
-        return self._store.attempts.claim()
+        return self._store.jobs.claim()
 
     def _rest(self, rung: int) -> None:
         """Wait for a ring of the bell after that one, for a stop, or for IDLE_SECONDS."""
@@ -125,7 +126,7 @@ class Supervisor:
 
     def _run(self, job: JobRecord) -> bool:
         """Run a job; whether its attempt came to an end of its own."""
-        begun, attempts, kept_up = time.monotonic(), self._store.attempts, True
+        begun, attempts, kept_up = time.monotonic(), self._store.jobs, True
         with working_for(job.request_id):
             log.info("job %s, attempt %d begins", job.id, job.attempt)
             try:
@@ -139,7 +140,7 @@ class Supervisor:
                 unforeseen = Crashed("job", expected="a process that runs", got="an error of the server")
                 fault = fault_of(error if isinstance(error, SplatliftError) else unforeseen)
                 insist(lambda: attempts.fail(job.id, job.attempt, fault), self._stopping)
-            outcome, seconds = attempts.state(job.id) or "deleted", time.monotonic() - begun
+            outcome, seconds = attempts.state(SERVICE, job.id) or "deleted", time.monotonic() - begun
             log.info("job %s, attempt %d: %s after %.3f s", job.id, job.attempt, outcome, seconds)
         if self._told is not None:
             self._told(outcome, seconds)

@@ -52,7 +52,7 @@ async def upload(kind: Kind, request: Request, deps: Deps, sha256: Sha256 = None
     coding = coding_of(", ".join(request.headers.getlist("content-encoding")))
     limit = deps.settings.max_upload_bytes(kind)
     require_size(kind, _announced(request), limit)  # before a byte of it is asked for with 100 Continue
-    intake = Intake(deps.store, kind, limit, coding)
+    intake = Intake(deps.store, deps.owner, kind, limit, coding)
 
     async def write(step: Callable[..., T], *given: Any) -> T:
         return await anyio.to_thread.run_sync(step, *given, limiter=deps.writing)
@@ -91,13 +91,13 @@ async def _receive(request: Request, feed: Callable[[bytes], Any]) -> None:
 @router.get("", response_model=models.Assets)
 def list_assets(deps: Deps, limit: Limit = None, cursor: Cursor = None) -> Response:
     """All assets, newest first. Lists of names and words are told with each asset alone."""
-    return listed("assets", deps.store.assets.page, shape, limit=limit, cursor=cursor)
+    return listed("assets", partial(deps.store.assets.page, deps.owner), shape, limit=limit, cursor=cursor)
 
 
 @router.get("/{asset}", response_model=models.Asset)
 def get_asset(asset: AssetId, deps: Deps) -> Response:
     """One asset. Where its names or words are very many, they are at ``links.names`` alone."""
-    found = shape(deps.store.assets.get(asset, most=SHOWN_CHARACTERS))
+    found = shape(deps.store.assets.get(deps.owner, asset, most=SHOWN_CHARACTERS))
     return Response(found.model_dump_json(), media_type="application/json")
 
 
@@ -105,14 +105,16 @@ def get_asset(asset: AssetId, deps: Deps) -> Response:
 async def get_names(asset: AssetId, deps: Deps, limit: Limit = NAMES, cursor: NamesCursor = 0) -> models.Names:
     """The names of views, or the words, that an asset holds, in pages."""
     most = limit or NAMES
-    names = await anyio.to_thread.run_sync(deps.store.assets.names, asset, cursor, most + 1, limiter=deps.naming)
+    names = await anyio.to_thread.run_sync(
+        deps.store.assets.names, deps.owner, asset, cursor, most + 1, limiter=deps.naming
+    )
     return models.Names(names=names[:most], next=cursor + most if len(names) > most else None)
 
 
 @router.get("/{asset}/content", response_class=Response, responses=FILE)
 def get_content(asset: AssetId, request: Request, deps: Deps) -> Response:
     """The bytes of an asset, or a range of them."""
-    found = deps.store.assets.get(asset, most=0)
+    found = deps.store.assets.get(deps.owner, asset, most=0)
     digest = found.id.removeprefix("sha256:")
     return file_answer(request, StoredFile(found.path, found.bytes, digest, found.file_name))
 
@@ -120,7 +122,7 @@ def get_content(asset: AssetId, request: Request, deps: Deps) -> Response:
 @router.delete("/{asset}", status_code=204)
 def delete_asset(asset: AssetId, deps: Deps) -> None:
     """Forget an asset that no job and no lift refers to."""
-    deps.store.assets.delete(asset)
+    deps.store.assets.delete(deps.owner, asset)
 
 
 def shape(asset: AssetRecord) -> models.Asset:

@@ -90,20 +90,20 @@ def _submit(order: models.LiftRequest, deps: AppState, key: str | None) -> Respo
 @router.get("/jobs", response_model=models.Jobs)
 def list_jobs(deps: Deps, limit: Limit = None, cursor: Cursor = None) -> Response:
     """All jobs, newest first."""
-    return listed("jobs", deps.store.jobs.page, shape, limit=limit, cursor=cursor)
+    return listed("jobs", partial(deps.store.jobs.page, deps.owner), shape, limit=limit, cursor=cursor)
 
 
 @router.get("/jobs/{job}", response_model=models.Job)
 def get_job(job: str, deps: Deps) -> models.Job:
     """One job: its state, its progress, and what came of it."""
-    return shape(deps.store.jobs.get(job))
+    return shape(deps.store.jobs.get(deps.owner, job))
 
 
 @router.get("/jobs/{job}/events", response_class=Response, responses=EVENTS)
 async def follow_job(job: str, deps: Deps, last_event: LastEvent = 0) -> Response:
     """What happens to a job, as it happens: its states, plan, latest progress and log. Ends after the last state."""
-    look = partial(deps.store.jobs.events, job)
-    state = await anyio.to_thread.run_sync(deps.store.jobs.state, job)
+    look = partial(deps.store.jobs.events, deps.owner, job)
+    state = await anyio.to_thread.run_sync(deps.store.jobs.state, deps.owner, job)
     if not await anyio.to_thread.run_sync(look, last_event) and state in models.ENDED:
         return Response(status_code=204)
     return deps.streams.answer(look, event_data, last_event)
@@ -117,8 +117,8 @@ async def follow_job(job: str, deps: Deps, last_event: LastEvent = 0) -> Respons
 )
 def cancel_job(job: str, deps: Deps) -> Response:
     """End a job. It is ``canceling`` until its processes are gone, then ``canceled``; asking twice does no harm."""
-    deps.store.jobs.cancel(job)
-    found = deps.store.jobs.get(job)
+    deps.store.jobs.cancel(deps.owner, job)
+    found = deps.store.jobs.get(deps.owner, job)
     status = 200 if found.state is models.JobState.CANCELED else 202
     return JSONResponse(shape(found).model_dump(mode="json"), status, headers={"Location": f"/jobs/{job}"})
 
@@ -132,29 +132,29 @@ def delete_job(
 ) -> None:
     """Forget a job that has ended."""
     said = {models.JobKind.LIFT: with_lift, models.JobKind.TRADEOFF: with_tradeoff}
-    deps.store.jobs.delete(job, given_up=[kind for kind, gone in said.items() if gone])
+    deps.store.jobs.delete(deps.owner, job, given_up=[kind for kind, gone in said.items() if gone])
 
 
 def take(order: JobOrder, deps: AppState) -> Response:
     """The answer to an order: the job that it makes, or made before."""
-    job, new = deps.store.jobs.repeated(order), False
+    job, new = deps.store.jobs.repeated(deps.owner, order), False
     if job is None:
         require_fit(order, deps)
         deps.devices.require(order.settings.get("device", "auto"))
-        job, new = deps.store.jobs.submit(order, max_queued=deps.settings.max_queued)
+        job, new = deps.store.jobs.submit(deps.owner, order, max_queued=deps.settings.max_queued)
         deps.runner.wake()
-    shaped = shape(deps.store.jobs.get(job)).model_dump(mode="json")
+    shaped = shape(deps.store.jobs.get(deps.owner, job)).model_dump(mode="json")
     return JSONResponse(shaped, 202 if new else 200, headers={"Location": f"/jobs/{job}"})
 
 
 def require_fit(order: JobOrder, deps: AppState) -> None:
     """Refuse an order that cannot be lifted, or that there is no room for."""
-    cameras = deps.store.assets.get(order.cameras, models.AssetKind.CAMERAS)
-    packs = [deps.store.assets.get(pack, models.AssetKind.FEATURES) for pack in order.features]
-    splats = deps.store.assets.get(order.splats, models.AssetKind.SPLATS)
+    cameras = deps.store.assets.get(deps.owner, order.cameras, models.AssetKind.CAMERAS)
+    packs = [deps.store.assets.get(deps.owner, pack, models.AssetKind.FEATURES) for pack in order.features]
+    splats = deps.store.assets.get(deps.owner, order.splats, models.AssetKind.SPLATS)
     check_kernel(splats, order.settings)
     check_fit(cameras, packs)
-    judges = [deps.store.assets.get(*named) for named in labels_of(order.parameters)]
+    judges = [deps.store.assets.get(deps.owner, *named) for named in labels_of(order.parameters)]
     if judges:
         check_labels(order, cameras, packs, *judges)
     deps.store.files.require_room(scratch_bytes(order.kind, splats, packs))

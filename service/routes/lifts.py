@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from fastapi import APIRouter, Request, Response
 
 from service import models
@@ -15,19 +17,19 @@ router = APIRouter(prefix="/lifts", tags=["lifts"])
 @router.get("", response_model=models.Lifts)
 def list_lifts(deps: Deps, limit: Limit = None, cursor: Cursor = None) -> Response:
     """All lifts, newest first."""
-    return listed("lifts", deps.store.lifts.page, shape, limit=limit, cursor=cursor)
+    return listed("lifts", partial(deps.store.lifts.page, deps.owner), shape, limit=limit, cursor=cursor)
 
 
 @router.get("/{lift}", response_model=models.LiftResult)
 def get_lift(lift: str, deps: Deps) -> models.LiftResult:
     """One lift: its settings, certificate and timings."""
-    return shape(deps.store.lifts.get(lift))
+    return shape(deps.store.lifts.get(deps.owner, lift))
 
 
 @router.get("/{lift}/features", response_class=Response, responses=FILE)
 def get_features(lift: str, request: Request, deps: Deps) -> Response:
     """The lift file (safetensors), or a range of it."""
-    found = deps.store.lifts.get(lift)
+    found = deps.store.lifts.get(deps.owner, lift)
     return file_answer(request, StoredFile(found.path, found.bytes, found.sha256, f"lift-{found.id}.safetensors"))
 
 

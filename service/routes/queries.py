@@ -189,7 +189,7 @@ def _entity(request: Request, deps: AppState, asked: dict[str, Any], lift: LiftR
 def _splat_file(deps: AppState, asked: dict[str, Any], lift: LiftRecord, etag: str | None = None) -> Response:
     """The query process writes a draft, as a scene is more than a pipe should carry."""
     files = deps.store.files
-    files.require_room(deps.store.assets.get(lift.splats).bytes)
+    files.require_room(deps.store.assets.get(deps.owner, lift.splats).bytes)
     with files.draft(".ply") as draft:
         deps.queries.call(asked | {"draft": str(draft)})
         return Draft(draft, filename=f"{asked['what']}-{lift.id}.ply", etag=etag)
@@ -201,13 +201,13 @@ def _content(deps: AppState, asked: dict[str, Any]) -> Response:
 
 def _find_lift(lift: str | None, deps: AppState) -> LiftRecord:
     """The lift that is meant; left out, the only one."""
-    return deps.store.lifts.only() if lift is None else deps.store.lifts.get(lift)
+    return deps.store.lifts.only(deps.owner) if lift is None else deps.store.lifts.get(deps.owner, lift)
 
 
 def _scene_request(operation: str, lift: LiftRecord, deps: AppState) -> dict[str, Any]:
     """What the query process must know of a lift's files; ``names`` says what the client calls them."""
-    job = deps.store.jobs.get(lift.id)
-    splats, cameras = deps.store.assets.get(job.splats), deps.store.assets.get(job.cameras)
+    job = deps.store.jobs.get(deps.owner, lift.id)
+    splats, cameras = deps.store.assets.get(deps.owner, job.splats), deps.store.assets.get(deps.owner, job.cameras)
     return {
         "operation": operation,
         "lift": str(lift.path),
@@ -231,7 +231,9 @@ def query_request(operation: str, asked: Question, lift: LiftRecord, deps: AppSt
         file = encoder_file(spec)
         request["names"] |= {} if file is None else {str(file): "the encoder's file"}
     if any(isinstance(example, str) and example.startswith(REGION) for example in (*asked.like, *asked.unlike)):
-        packs = [deps.store.assets.get(asset) for asset in deps.store.jobs.get(lift.id).features]
+        packs = [
+            deps.store.assets.get(deps.owner, asset) for asset in deps.store.jobs.get(deps.owner, lift.id).features
+        ]
         request["features"] = [str(pack.path) for pack in packs]
         request["names"] |= {str(pack.path): f"features {pack.id}" for pack in packs}
     terms = ("text", "negatives", "like", "unlike", "threshold", "instances", "keep")

@@ -64,13 +64,13 @@ def _submit(order: models.TradeoffRequest, deps: AppState, key: str | None) -> R
 @router.get("/tradeoffs/{tradeoff}", response_model=models.Tradeoff)
 def get_tradeoff(tradeoff: str, deps: Deps) -> models.Tradeoff:
     """What was found: the runs, and which to take."""
-    return shape(deps.store.tradeoffs.get(tradeoff))
+    return shape(deps.store.tradeoffs.get(deps.owner, tradeoff))
 
 
 @router.get("/tradeoffs/{tradeoff}/chart", response_class=Response, responses=PNG | TAGGED)
 def get_chart(tradeoff: str, request: Request, deps: Deps) -> Response:
     """Accuracy over time, and how near the dial stays to the exact lift, as a picture."""
-    found = deps.store.tradeoffs.get(tradeoff)
+    found = deps.store.tradeoffs.get(deps.owner, tradeoff)
     etag = f'"{found.sha256}"'
     return unchanged(request, etag) or tagged(found.chart, "image/png", etag)
 
@@ -78,7 +78,7 @@ def get_chart(tradeoff: str, request: Request, deps: Deps) -> Response:
 @router.get("/tradeoffs/{tradeoff}/table", response_class=Response, responses=MARKDOWN)
 def get_table(tradeoff: str, deps: Deps) -> Response:
     """The runs as a table, with what it says and how it was made."""
-    return Response(deps.store.tradeoffs.get(tradeoff).page, headers={"Content-Type": MARKDOWN_TYPE})
+    return Response(deps.store.tradeoffs.get(deps.owner, tradeoff).page, headers={"Content-Type": MARKDOWN_TYPE})
 
 
 def shape(tradeoff: TradeoffRecord) -> models.Tradeoff:

@@ -15,10 +15,9 @@ from typing import Any
 from liftcore.errors import NotFound
 from service.errors import InUse
 from service.models import AssetKind
-from service.store.database import Database
+from service.store.database import Database, Page, after, insert, page_of, record_of
 from service.store.files import DataDirectory, is_whole
 from service.store.owners import SEEN, Owner, require_quota
-from service.store.pages import Page, after, page_of
 
 
 @dataclass(frozen=True)
@@ -72,14 +71,13 @@ LONG = ("names", "words")  # of counts: what there may be a hundred thousand of
 
 
 class AssetStore:
-    """Assets in the database, their bytes in blobs/, as an owner sees them."""
+    """Assets in the database, their bytes in blobs/. What an owner does not see is absent."""
 
-    def __init__(self, database: Database, files: DataDirectory, owner: Owner) -> None:
+    def __init__(self, database: Database, files: DataDirectory) -> None:
         self._database = database
         self._files = files
-        self._owner = owner
 
-    def add(self, upload: CheckedUpload) -> tuple[AssetRecord, bool]:
+    def add(self, owner: Owner, upload: CheckedUpload) -> tuple[AssetRecord, bool]:
         """Keep a checked upload.
 
         Returns:
@@ -92,15 +90,15 @@ class AssetStore:
         asset = f"sha256:{upload.sha256}"
         with self._files.blobs_changing, self._database.write(counted=True) as connection:
             owned = connection.execute(
-                "SELECT 1 FROM asset_owners WHERE asset = ? AND owner = ?", (asset, self._owner.key)
+                "SELECT 1 FROM asset_owners WHERE asset = ? AND owner = ?", (asset, owner.key)
             ).fetchone()
             if owned is None:
-                require_quota(connection, self._owner, upload.draft.stat().st_size)
+                require_quota(connection, owner, upload.draft.stat().st_size)
                 self._publish(connection, asset, upload)
-                own(connection, asset, self._owner.key)
-            elif not self.get(asset).whole:
+                own(connection, asset, owner.key)
+            elif not self.get(owner, asset).whole:
                 self._publish(connection, asset, upload)
-        return self.get(asset), owned is None
+        return self.get(owner, asset), owned is None
 
     def _publish(self, connection: sqlite3.Connection, asset: str, upload: CheckedUpload) -> None:
         """The bytes and the row; both may be there, and then the bytes are replaced by equal ones."""
@@ -108,56 +106,53 @@ class AssetStore:
         path = self._files.blob(upload.sha256, upload.suffix) if row is None else self._files.root / row["file"]
         size, counts = upload.draft.stat().st_size, json.dumps(upload.counts)
         self._files.publish(upload.draft, path)
-        connection.execute(
-            "INSERT OR IGNORE INTO assets (id, kind, bytes, file, counts, brief, counts_bytes, warnings)"
-            " VALUES (?,?,?,?,?,?,?,?)",
-            (
-                asset,
-                upload.kind,
-                size,
-                self._files.relative(path),
-                counts,
-                json.dumps({name: value for name, value in upload.counts.items() if name not in LONG}),
-                len(counts),
-                json.dumps(upload.warnings),
-            ),
-        )
+        row = {
+            "id": asset,
+            "kind": upload.kind,
+            "bytes": size,
+            "file": self._files.relative(path),
+            "counts": counts,
+            "brief": json.dumps({name: value for name, value in upload.counts.items() if name not in LONG}),
+            "counts_bytes": len(counts),
+            "warnings": json.dumps(upload.warnings),
+        }
+        insert(connection, "assets", row, known="IGNORE")
 
-    def require_quota(self, coming: int = 1) -> None:
+    def require_quota(self, owner: Owner, coming: int = 1) -> None:
         """See that the owner may store more, before bytes are on their way.
 
         Raises:
             OverQuota: it may not.
         """
         with self._database.read() as connection:
-            require_quota(connection, self._owner, coming)
+            require_quota(connection, owner, coming)
 
-    def find(self, asset: str, *, most: int = sys.maxsize) -> AssetRecord | None:
+    def find(self, owner: Owner, asset: str, *, most: int = sys.maxsize) -> AssetRecord | None:
         """The asset of that id, None when there is none; without names and words if all counts are above ``most``
         characters."""
         with self._database.read() as connection:
             row = connection.execute(
-                f"{SHOWN} AND id = :asset GROUP BY id", self._owner.terms(asset=asset, most=most)
+                f"{SHOWN} AND id = :asset GROUP BY id", owner.terms(asset=asset, most=most)
             ).fetchone()
         return None if row is None else self._record(row)
 
-    def names(self, asset: str, first: int, limit: int) -> list[str]:
+    def names(self, owner: Owner, asset: str, first: int, limit: int) -> list[str]:
         """So many of the names, or words, that an asset holds, from the one of that number on."""
         with self._database.read() as connection:
             rows = connection.execute(
                 "SELECT value FROM assets, json_each(counts, iif(json_type(counts, '$.words') IS NULL, '$.names',"
                 " '$.words')) WHERE assets.id = ? LIMIT ? OFFSET ?",
-                (self.get(asset, most=0).id, limit, first),
+                (self.get(owner, asset, most=0).id, limit, first),
             ).fetchall()
         return [row["value"] for row in rows]
 
-    def get(self, asset: str, kind: AssetKind | None = None, *, most: int = sys.maxsize) -> AssetRecord:
+    def get(self, owner: Owner, asset: str, kind: AssetKind | None = None, *, most: int = sys.maxsize) -> AssetRecord:
         """The asset of that id, as `find` has it.
 
         Raises:
             NotFound: there is none, or it is of another kind.
         """
-        found = self.find(asset, most=most)
+        found = self.find(owner, asset, most=most)
         name = f"{kind or 'asset'}"
         if found is None:
             raise NotFound(name, expected="the id of an asset that is here", got=asset, hint="PUT /assets/... first")
@@ -165,9 +160,9 @@ class AssetStore:
             raise NotFound(name, expected=f"an asset of kind {kind}", got=f"{asset}, which is of kind {found.kind}")
         return found
 
-    def page(self, limit: int, cursor: str | None = None) -> Page[AssetRecord]:
+    def page(self, owner: Owner, limit: int, cursor: str | None = None) -> Page[AssetRecord]:
         """So many assets after a cursor, newest first, without the names and words that they hold."""
-        terms = self._owner.terms(most=limit + 1, **after(cursor))
+        terms = owner.terms(most=limit + 1, **after(cursor))
         with self._database.read() as connection:
             rows = connection.execute(
                 f"{IN_BRIEF} GROUP BY id HAVING min(created) < :created OR (min(created) = :created AND id > :after)"
@@ -176,11 +171,11 @@ class AssetStore:
             ).fetchall()
         return page_of(rows, limit, self._record)
 
-    def all(self) -> list[AssetRecord]:
+    def all(self, owner: Owner) -> list[AssetRecord]:
         """Every asset, newest first, without the names and words that it holds."""
-        return self.page(sys.maxsize - 1).records
+        return self.page(owner, sys.maxsize - 1).records
 
-    def delete(self, asset: str) -> None:
+    def delete(self, owner: Owner, asset: str) -> None:
         """Take an asset from its owner, or from everybody when it is an admin who asks. Its bytes go with the last.
 
         Raises:
@@ -188,9 +183,9 @@ class AssetStore:
             InUse: a job or a lift of theirs refers to it.
         """
         with self._files.blobs_changing:
-            found = self.get(asset)
-            terms = self._owner.terms(asset=asset)
-            with self._database.write(counted=True) as connection:
+            found, terms = self.get(owner, asset, most=0), owner.terms(asset=asset)
+
+            def forget(connection: sqlite3.Connection) -> list[Path]:
                 users = connection.execute(
                     f"SELECT id FROM jobs WHERE {SEEN} AND (splats = :asset OR cameras = :asset OR EXISTS"
                     " (SELECT 1 FROM job_features WHERE job = id AND asset = :asset) OR EXISTS"
@@ -208,19 +203,18 @@ class AssetStore:
                     " AND NOT EXISTS (SELECT 1 FROM asset_owners WHERE asset = :asset) RETURNING id",
                     terms,
                 ).fetchall()
-            # After the commit: a crash here leaves bytes that nobody knows of, never an asset without bytes.
-            if last:
-                found.path.unlink(missing_ok=True)
+                return [found.path] if last else []
+
+            self._database.write_freeing(forget)
 
     def _record(self, row: sqlite3.Row) -> AssetRecord:
-        return AssetRecord(
-            id=row["id"],
+        return record_of(
+            AssetRecord,
+            row,
             kind=AssetKind(row["kind"]),
-            bytes=row["bytes"],
             path=self._files.root / row["file"],
             counted=row["counts"],
             warnings=json.loads(row["warnings"]),
-            created=row["created"],
         )
 
 
@@ -232,6 +226,4 @@ def kernel_of(splats: AssetRecord, settings: Mapping[str, Any]) -> str:
 
 def own(connection: sqlite3.Connection, asset: str, owner: str) -> None:
     """Within a write transaction: let an owner have an asset that is here."""
-    connection.execute(
-        "INSERT OR IGNORE INTO asset_owners (asset, owner, created) VALUES (?, ?, ?)", (asset, owner, time.time())
-    )
+    insert(connection, "asset_owners", {"asset": asset, "owner": owner, "created": time.time()}, known="IGNORE")

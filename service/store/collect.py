@@ -11,6 +11,7 @@ from pathlib import Path
 
 from service.models import ENDED
 from service.store.files import DataDirectory
+from service.store.owners import SERVICE
 from service.store.store import Store
 
 log = logging.getLogger(__name__)
@@ -68,7 +69,7 @@ def empty_quarantine(files: DataDirectory, since_before: float) -> list[Path]:
 
 def _unused_work(store: Store) -> tuple[list[Path], list[Path]]:
     """Folders of jobs that have ended, which never run again, and of jobs that the database does not know."""
-    states = {folder: store.attempts.state(folder.name) for folder in (store.files.root / "work").iterdir()}
+    states = {folder: store.jobs.state(SERVICE, folder.name) for folder in (store.files.root / "work").iterdir()}
     ended = [folder for folder, state in states.items() if state in ENDED]
     return ended, [folder for folder, state in states.items() if state is None]
 

@@ -1,27 +1,35 @@
-"""The database: one connection that writes, and a few that read."""
+"""The database: one connection that writes, a few that read; and the files that know a lost one from a new one."""
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import queue
+import re
 import sqlite3
 import threading
-from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any, Generic, TypeVar, cast
 
 from liftcore.io.files import whole_file
-from service.errors import Misconfigured, StaleDatabase
-from service.store.files import sync_directory
+from service.errors import InvalidRequest, Misconfigured, StaleDatabase
+from service.store.files import remove, sync_directory
 from service.store.schema import MIGRATIONS
 
 DATABASE = "service.sqlite"  # in the data directory, beside two files that know an empty or older one from it:
 GENERATION = "generation"  # the number that the newest counted transaction had
 KEYS_REQUIRED = "keys.required"  # there when a key was ever made
+RESERVE = "reserve"  # room for the transaction of a deletion on a full disk
+RESERVE_BYTES = 1 << 20
 BUSY_SECONDS = 10.0  # that a write waits for others, of this process and of others
 MOST_IDLE = 4  # connections kept for the next readers; those of a rush are closed after it
+CURSOR = r"^[0-9.e+-]{1,30}~[0-9a-z:]{1,80}$"  # when the last one of a page was made, and its id
 
+R = TypeVar("R")
 log = logging.getLogger(__name__)
 
 
@@ -47,15 +55,20 @@ class Database:
             require_database(path)
         self._write_lock = threading.Lock()
         self._idle: queue.LifoQueue[sqlite3.Connection] = queue.LifoQueue()
-        self._writer = self._connect()
+        self._writer = self._connect("rwc")
+        self._identity = _identity(path)
         try:
             self._migrate(migrate, least)
         except BaseException:
             self._writer.close()
             raise
 
-    def _connect(self) -> sqlite3.Connection:
-        connection = sqlite3.connect(self._path, isolation_level=None, check_same_thread=False, timeout=BUSY_SECONDS)
+    def _connect(self, mode: str = "rw") -> sqlite3.Connection:
+        """A connection; only the first one may make the file: a later one would hide that it is gone."""
+        connection = sqlite3.connect(
+            f"{self._path.absolute().as_uri()}?mode={mode}", uri=True,
+            isolation_level=None, check_same_thread=False, timeout=BUSY_SECONDS,
+        )  # fmt: skip
         connection.row_factory = sqlite3.Row
         connection.execute("PRAGMA journal_mode = WAL")
         connection.execute("PRAGMA synchronous = FULL")
@@ -99,9 +112,12 @@ class Database:
 
         Args:
             counted: a start must not go on without what it writes, so the data directory remembers its generation.
+
+        Raises:
+            sqlite3.OperationalError: busy, full, or the file is no longer the one that was opened.
         """
         if not self._write_lock.acquire(timeout=BUSY_SECONDS):
-            raise _busy()
+            raise _error("database is locked", "SQLITE_BUSY")
         try:
             self._writer.execute("BEGIN IMMEDIATE")
             try:
@@ -112,10 +128,53 @@ class Database:
                 if self._writer.in_transaction:  # on a full disk SQLite has rolled back by itself
                     self._writer.execute("ROLLBACK")
                 raise
+            self.require_same_file()  # what is committed to a file that is gone is not kept
             if generation is not None:
                 self._remember(generation)
         finally:
             self._write_lock.release()
+
+    def write_freeing(self, work: Callable[[sqlite3.Connection], Iterable[Path]]) -> None:
+        """A counted write transaction that makes room: on a full disk the reserve is given up for it.
+
+        Args:
+            work: deletes rows, and returns the files and folders that go after the commit. A crash between leaves
+                files that the collection of garbage finds, and never a row without its file.
+        """
+        try:
+            with self.write(counted=True) as connection:
+                freed = list(work(connection))
+        except sqlite3.OperationalError as error:
+            if error.sqlite_errorcode & 0xFF not in (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR):
+                raise
+            (self._path.parent / RESERVE).unlink(missing_ok=True)
+            with self.write(counted=True) as connection:
+                freed = list(work(connection))
+        for path in freed:
+            remove(path)
+        self.keep_reserve()
+
+    def keep_reserve(self) -> None:
+        """See that there is a reserve, if the disk has room for it."""
+        path = self._path.parent / RESERVE
+        if path.exists():
+            return
+        try:
+            with whole_file(path) as handle:
+                handle.write(os.urandom(RESERVE_BYTES))  # which no file system stores in less
+        except OSError as error:
+            log.warning("there is no room for %s, from which deletions on a full disk live: %s", path, error)
+
+    def require_same_file(self) -> None:
+        """See that the database is the file that was opened: what is written to another one would be lost.
+
+        Raises:
+            sqlite3.OperationalError: it is gone, or another.
+        """
+        with suppress(FileNotFoundError):
+            if _identity(self._path) == self._identity:
+                return
+        raise _error("another file, or none, is in the place of the database", "SQLITE_READONLY_DBMOVED")
 
     def _next_generation(self) -> int:
         return self._writer.execute("UPDATE generation SET number = number + 1 RETURNING number").fetchone()[0]
@@ -149,12 +208,15 @@ class Database:
             expected = expected_generation(self._path.parent)
             connection.execute("UPDATE generation SET number = max(number, ?)", (expected or 0,))
 
-    def prove_writable(self) -> None:
-        """Write what is there already, as far as the disk.
+    def prove_usable(self) -> None:
+        """See that the file is the one that was opened, can be read by who comes anew, and takes a write.
 
         Raises:
-            sqlite3.Error, OSError: it cannot be written.
+            sqlite3.Error, OSError: it is not so.
         """
+        self.require_same_file()
+        with closing(open_to_read(self._path)) as connection:
+            connection.execute("SELECT count(*) FROM jobs WHERE state = 'queued'").fetchone()
         with self.write() as connection:
             version = connection.execute("PRAGMA user_version").fetchone()[0]
             connection.execute(f"PRAGMA user_version = {version}")
@@ -221,7 +283,7 @@ def copy_database(source: Path, target: Path) -> None:
     draft.unlink(missing_ok=True)
     try:
         with (
-            closing(sqlite3.connect(f"{source.absolute().as_uri()}?mode=ro", uri=True)) as read,
+            closing(open_to_read(source)) as read,
             closing(sqlite3.connect(draft)) as written,
         ):
             read.backup(written)
@@ -244,11 +306,21 @@ def require_database(path: Path) -> None:
         raise StaleDatabase(path.parent, "none")
 
 
-def _busy() -> sqlite3.OperationalError:
-    """What SQLite says when another process holds its lock, said of our own."""
-    error = sqlite3.OperationalError("database is locked")
-    error.sqlite_errorcode, error.sqlite_errorname = sqlite3.SQLITE_BUSY, "SQLITE_BUSY"
+def _error(message: str, name: str) -> sqlite3.OperationalError:
+    """What SQLite would say, said of what it does not see."""
+    error = sqlite3.OperationalError(message)
+    error.sqlite_errorcode, error.sqlite_errorname = getattr(sqlite3, name), name
     return error
+
+
+def _identity(path: Path) -> tuple[int, int]:
+    status = path.stat()
+    return status.st_dev, status.st_ino
+
+
+def open_to_read(path: Path) -> sqlite3.Connection:
+    """A connection to a database that somebody else may hold; nothing is made or changed."""
+    return sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)
 
 
 def unusable(path: Path, error: sqlite3.Error) -> Misconfigured:
@@ -258,6 +330,60 @@ def unusable(path: Path, error: sqlite3.Error) -> Misconfigured:
     else:
         hint = "name another data directory, or put a backup in its place"
     return Misconfigured("data", expected="a database of this service", got=f"{path}: {error}", hint=hint)
+
+
+def insert(connection: sqlite3.Connection, table: str, values: Mapping[str, Any], *, known: str = "ABORT") -> None:
+    """Add a row within a write transaction.
+
+    Args:
+        connection: of the transaction.
+        table: that gets it.
+        values: by column.
+        known: what to do with a row that is there already: ``ABORT`` or ``IGNORE``.
+    """
+    columns, places = ", ".join(values), ", ".join("?" * len(values))
+    connection.execute(f"INSERT OR {known} INTO {table} ({columns}) VALUES ({places})", list(values.values()))
+
+
+def record_of(kind: type[R], row: sqlite3.Row, /, **made: Any) -> R:
+    """A row as a dataclass: its fields are columns of their names, or what was made of them."""
+    names = [field.name for field in fields(cast("Any", kind))]
+    return kind(**{name: made[name] if name in made else row[name] for name in names})
+
+
+def parsed(text: str | None) -> Any:
+    """The JSON of a column that may be empty."""
+    return None if text is None else json.loads(text)
+
+
+@dataclass(frozen=True)
+class Page(Generic[R]):
+    """Some records of a list, newest first, and where the next page begins; None when there is none."""
+
+    records: list[R]
+    cursor: str | None
+
+
+def after(cursor: str | None) -> dict[str, Any]:
+    """Terms ``:created`` and ``:after`` of a query for what is older than that, or for the newest.
+
+    Raises:
+        InvalidRequest: it is no cursor.
+    """
+    if cursor is None:
+        return {"created": float("inf"), "after": ""}
+    created, _, ident = cursor.partition("~")
+    with suppress(ValueError):
+        if re.match(CURSOR, cursor):
+            return {"created": float(created), "after": ident}
+    raise InvalidRequest("cursor", expected="the next of a page", got=repr(cursor[:80]))
+
+
+def page_of(rows: Sequence[sqlite3.Row], limit: int, record: Callable[[sqlite3.Row], R]) -> Page[R]:
+    """A page of the first ``limit`` rows, where one more was asked for."""
+    last = rows[limit - 1] if len(rows) > limit else None
+    cursor = None if last is None else f"{last['created']!r}~{last['id']}"
+    return Page([record(row) for row in rows[:limit]], cursor)
 
 
 def _statements(script: str) -> Iterator[str]:

@@ -113,7 +113,7 @@ class DataDirectory:
 
     def forget_work(self, job: str) -> None:
         """Remove that folder."""
-        shutil.rmtree(self.work(job), ignore_errors=True)
+        remove(self.work(job))
 
     def blob(self, digest: str, suffix: str) -> Path:
         """Where an asset of that digest lies."""
@@ -187,6 +187,14 @@ def keep_private(root: Path) -> None:
     root.chmod(0o700)
     for path in root.glob("*.sqlite*"):  # of a release that left them open
         path.chmod(0o600)
+
+
+def remove(path: Path) -> None:
+    """Remove a file, or a folder with all that is in it; what cannot go now is garbage for the collector."""
+    try:
+        path.unlink()
+    except OSError:
+        shutil.rmtree(path, ignore_errors=True)
 
 
 def is_whole(path: Path, size: int) -> bool:

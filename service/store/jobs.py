@@ -1,4 +1,8 @@
-"""Jobs: what was acknowledged, what became of it, and what happened on the way."""
+"""Jobs: what was acknowledged, what became of it, and what happened on the way.
+
+An attempt at a job is a claim with a number. Every note of it names its number, and changes nothing once the job has
+moved on: an attempt that was given up, however alive its process still is, can end nothing and publish nothing.
+"""
 
 from __future__ import annotations
 
@@ -11,19 +15,23 @@ import time
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
+from pathlib import Path
 from typing import Any
 
 from liftcore.errors import NotFound
-from service.errors import Busy, Conflict, KeyReused
+from service.child import fault_of
+from service.errors import Busy, Conflict, Crashed, KeyReused
 from service.models import ENDED, AssetKind, JobKind, JobState
 from service.store.assets import own
-from service.store.database import Database
+from service.store.database import Database, Page, after, insert, page_of, parsed, record_of
 from service.store.files import DataDirectory
 from service.store.owners import QUEUE_RETRY_SECONDS, SEEN, Owner, require_quota, require_turn
-from service.store.pages import Page, after, page_of
 
 LOG_LINES = 200  # a job; older ones go
 LINE_CHARACTERS = 500
+MAX_ATTEMPTS = 3  # that give no answer, and that the job itself is to blame for
+# An attempt may act while this holds; ids and numbers are bound by name.
+OWNS = "id = :job AND attempt = :attempt AND state IN ('running', 'canceling')"
 RESULTS = {JobKind.LIFT: "lifts", JobKind.TRADEOFF: "tradeoffs"}  # the tables of what jobs make, by their ids
 
 
@@ -99,14 +107,13 @@ def fingerprint(order: dict[str, Any]) -> str:
 
 
 class JobStore:
-    """The line of jobs and their history, as an owner sees them. Attempts at them are in `service.store.attempts`."""
+    """The line of jobs and their history. What an owner does not see is absent; attempts serve all owners alike."""
 
-    def __init__(self, database: Database, files: DataDirectory, owner: Owner) -> None:
+    def __init__(self, database: Database, files: DataDirectory) -> None:
         self._database = database
         self._files = files
-        self._owner = owner
 
-    def submit(self, order: JobOrder, *, max_queued: int = 1_000_000) -> tuple[str, bool]:
+    def submit(self, owner: Owner, order: JobOrder, *, max_queued: int = 1_000_000) -> tuple[str, bool]:
         """Put a job in line; it is on the disk when this returns.
 
         Returns:
@@ -120,30 +127,28 @@ class JobStore:
         """
         job = secrets.token_hex(16)
         with self._database.write(counted=True) as connection:
-            known = _of_key(connection, order, self._owner)
+            known = _of_key(connection, order, owner)
             if known is not None:
                 return known, False
             _require_place(connection, order.kind, max_queued)
-            require_turn(connection, order.kind, self._owner)
-            _take_assets(connection, order, self._owner)
-            require_quota(connection, self._owner, 1)
-            connection.execute(
-                "INSERT INTO jobs (id, owner, kind, state, splats, cameras, settings, parameters, created,"
-                " idempotency_key, fingerprint, request_id) VALUES (?, ?, ?, 'queued', ?, ?, ?, ?, ?, ?, ?, ?)",
-                (
-                    job,
-                    self._owner.key,
-                    order.kind,
-                    order.splats,
-                    order.cameras,
-                    json.dumps(order.settings),
-                    json.dumps(order.parameters),
-                    time.time(),
-                    order.key,
-                    order.fingerprint,
-                    order.request_id,
-                ),
-            )
+            require_turn(connection, order.kind, owner)
+            _take_assets(connection, order, owner)
+            require_quota(connection, owner, 1)
+            row = {
+                "id": job,
+                "owner": owner.key,
+                "kind": order.kind,
+                "state": JobState.QUEUED,
+                "splats": order.splats,
+                "cameras": order.cameras,
+                "settings": json.dumps(order.settings),
+                "parameters": json.dumps(order.parameters),
+                "created": time.time(),
+                "idempotency_key": order.key,
+                "fingerprint": order.fingerprint,
+                "request_id": order.request_id,
+            }
+            insert(connection, "jobs", row)
             connection.executemany(
                 "INSERT INTO job_features (job, place, asset) VALUES (?, ?, ?)",
                 [(job, place, asset) for place, asset in enumerate(order.features)],
@@ -155,24 +160,23 @@ class JobStore:
             note(connection, job, EventKind.STATE, {"state": JobState.QUEUED, "attempt": 0, "problem": None})
         return job, True
 
-    def repeated(self, order: JobOrder) -> str | None:
+    def repeated(self, owner: Owner, order: JobOrder) -> str | None:
         """The job that an earlier order of this owner with this Idempotency-Key made, None when there is none.
 
         Raises:
             KeyReused: the key came with another order before.
         """
         with self._database.read() as connection:
-            return _of_key(connection, order, self._owner)
+            return _of_key(connection, order, owner)
 
-    def get(self, job: str) -> JobRecord:
+    def get(self, owner: Owner, job: str) -> JobRecord:
         """The job of that id.
 
         Raises:
             NotFound: there is none.
         """
         with self._database.read() as connection:
-            row = row_of(connection, job, self._owner)
-            return record(connection, row)
+            return record(connection, row_of(connection, job, owner))
 
     def count_by_state(self) -> dict[JobState, int]:
         """How many jobs there are in each state that has any."""
@@ -180,9 +184,9 @@ class JobStore:
             rows = connection.execute("SELECT state, count(*) FROM jobs GROUP BY state").fetchall()
         return {JobState(state): count for state, count in rows}
 
-    def page(self, limit: int, cursor: str | None = None) -> Page[JobRecord]:
+    def page(self, owner: Owner, limit: int, cursor: str | None = None) -> Page[JobRecord]:
         """So many jobs after a cursor, newest first."""
-        terms = self._owner.terms(most=limit + 1, **after(cursor))
+        terms = owner.terms(most=limit + 1, **after(cursor))
         with self._database.read() as connection:
             rows = connection.execute(
                 f"SELECT * FROM jobs WHERE {SEEN} AND created <= :created AND (created < :created OR id > :after)"
@@ -191,17 +195,17 @@ class JobStore:
             ).fetchall()
             return page_of(rows, limit, lambda row: record(connection, row))
 
-    def all(self) -> list[JobRecord]:
+    def all(self, owner: Owner) -> list[JobRecord]:
         """Every job, newest first."""
-        return self.page(sys.maxsize - 1).records
+        return self.page(owner, sys.maxsize - 1).records
 
-    def state(self, job: str) -> JobState | None:
+    def state(self, owner: Owner, job: str) -> JobState | None:
         """Where a job is; None when there is none."""
         with self._database.read() as connection:
-            row = find(connection, job, self._owner)
+            row = find(connection, job, owner)
         return None if row is None else JobState(row["state"])
 
-    def cancel(self, job: str) -> bool:
+    def cancel(self, owner: Owner, job: str) -> bool:
         """Ask for the end of a job. One in line is canceled at once; a running one when its processes are gone.
 
         Returns:
@@ -212,7 +216,7 @@ class JobStore:
             Conflict: it has succeeded or failed.
         """
         with self._database.write() as connection:
-            row = row_of(connection, job, self._owner)
+            row = row_of(connection, job, owner)
             state = JobState(row["state"])
             if state in (JobState.CANCELING, JobState.CANCELED):
                 return False
@@ -221,7 +225,7 @@ class JobStore:
             move(connection, row, JobState.CANCELED if state is JobState.QUEUED else JobState.CANCELING)
             return True
 
-    def events(self, job: str, number: int) -> list[Event]:
+    def events(self, owner: Owner, job: str, number: int) -> list[Event]:
         """The events of a job beyond a number, in order.
 
         Raises:
@@ -231,7 +235,7 @@ class JobStore:
             seen = connection.execute(
                 f"SELECT 1 FROM jobs WHERE id = :job AND {SEEN}"
                 " AND NOT EXISTS (SELECT 1 FROM keys WHERE id = :owner AND revoked IS NOT NULL)",
-                self._owner.terms(job=job),
+                owner.terms(job=job),
             )
             if seen.fetchone() is None:
                 raise NotFound("job", expected="the id of a job", got=job)
@@ -241,7 +245,7 @@ class JobStore:
             ).fetchall()
         return [Event(row["number"], EventKind(row["kind"]), json.loads(row["data"])) for row in rows]
 
-    def delete(self, job: str, *, given_up: Collection[JobKind] = ()) -> None:
+    def delete(self, owner: Owner, job: str, *, given_up: Collection[JobKind] = ()) -> None:
         """Forget a job that has ended, its events and its result.
 
         Args:
@@ -252,8 +256,9 @@ class JobStore:
             NotFound: there is none.
             Conflict: it has not ended, or it has a result that was not given up.
         """
-        with self._database.write(counted=True) as connection:
-            row = row_of(connection, job, self._owner)
+
+        def forget(connection: sqlite3.Connection) -> list[Path]:
+            row = row_of(connection, job, owner)
             if row["state"] not in ENDED:
                 raise Conflict(
                     "job", expected="a job that has ended", got=f"one that is {row['state']}",
@@ -267,9 +272,94 @@ class JobStore:
                     hint=f"say with_{kind}=true if that is meant",
                 )  # fmt: skip
             connection.execute("DELETE FROM jobs WHERE id = ?", (job,))
-        # After the commit: a crash here leaves files that the collection of garbage finds.
-        self._files.lift(job).unlink(missing_ok=True)
-        self._files.forget_work(job)
+            return [self._files.lift(job), self._files.work(job)]
+
+        self._database.write_freeing(forget)
+
+    def claim(self) -> JobRecord | None:
+        """Take the oldest queued job and make it running, as a new attempt."""
+        with self._database.write() as connection:
+            row = connection.execute(
+                "UPDATE jobs SET state = 'running', attempt = attempt + 1, started = ?, progress = NULL"
+                " WHERE id = (SELECT id FROM jobs WHERE state = 'queued' ORDER BY created, id LIMIT 1)"
+                " RETURNING *",
+                (time.time(),),
+            ).fetchone()
+            if row is None:
+                return None
+            told(connection, row)
+            return record(connection, row)
+
+    def advance(self, job: str, attempt: int, progress: Mapping[str, Any]) -> None:
+        """Note how far an attempt is."""
+        self._note_latest(job, attempt, EventKind.PROGRESS, progress)
+
+    def plan(self, job: str, attempt: int, plan: Mapping[str, Any]) -> None:
+        """Note what an attempt is about to do. It stays with the job until the next attempt has planned."""
+        self._note_latest(job, attempt, EventKind.PLAN, plan)
+
+    def _note_latest(self, job: str, attempt: int, kind: EventKind, data: Mapping[str, Any]) -> None:
+        """Keep what there is one of: in the job's column of that name, and as an event."""
+        with self._database.write() as connection:
+            changed = connection.execute(
+                f"UPDATE jobs SET {kind} = :data WHERE {OWNS}",
+                {"data": json.dumps(data), "job": job, "attempt": attempt},
+            )
+            if changed.rowcount == 1:
+                note(connection, job, kind, data)
+
+    def log(self, job: str, attempt: int, text: str) -> None:
+        """Add a line to the job's log."""
+        with self._database.write() as connection:
+            if _owned(connection, job, attempt) is not None:
+                note(connection, job, EventKind.LOG, log_line(text))
+
+    def fail(self, job: str, attempt: int, error: Mapping[str, str]) -> None:
+        """End an attempt, and its job, with a problem; a job that was to be canceled is canceled."""
+        with self._database.write() as connection:
+            row = _owned(connection, job, attempt)
+            if row is not None and row["state"] == JobState.CANCELING:
+                move(connection, row, JobState.CANCELED)
+            elif row is not None:
+                move(connection, row, JobState.FAILED, error)
+
+    def lose(self, job: str, attempt: int, why: str, error: Mapping[str, str] | None = None) -> None:
+        """End an attempt that gave no answer: the job goes back in line, or fails after its last attempt.
+
+        Args:
+            job: its id.
+            attempt: its number.
+            why: for the job's log.
+            error: what the job fails with in the end, instead of having crashed.
+        """
+        with self._database.write() as connection:
+            row = _owned(connection, job, attempt)
+            if row is None:
+                return
+            note(connection, job, EventKind.LOG, log_line(f"attempt {attempt} is lost: {why}"))
+            if row["state"] == JobState.RUNNING and attempt - row["released"] >= MAX_ATTEMPTS:
+                move(connection, row, JobState.FAILED, error or _gave_up(why))
+            else:
+                move(connection, row, _without_answer(row))
+
+    def release(self, job: str, attempt: int, why: str) -> None:
+        """Put the job of an attempt that the server ended or could not keep up back in line: it counts as none."""
+        with self._database.write() as connection:
+            row = _owned(connection, job, attempt)
+            if row is not None:
+                _release(connection, row, why)
+
+    def unfinished(self) -> list[str]:
+        """At start-up: the jobs that a dead server left in the middle of an attempt."""
+        with self._database.read() as connection:
+            rows = connection.execute("SELECT id FROM jobs WHERE state IN ('running', 'canceling')").fetchall()
+        return [row["id"] for row in rows]
+
+    def release_all(self, why: str) -> None:
+        """At start-up: put all of these back in line. A server's death is no job's fault."""
+        with self._database.write() as connection:
+            for row in connection.execute("SELECT * FROM jobs WHERE state IN ('running', 'canceling')").fetchall():
+                _release(connection, row, why)
 
 
 def find(connection: sqlite3.Connection, job: str, owner: Owner) -> sqlite3.Row | None:
@@ -292,23 +382,13 @@ def row_of(connection: sqlite3.Connection, job: str, owner: Owner) -> sqlite3.Ro
 def record(connection: sqlite3.Connection, row: sqlite3.Row) -> JobRecord:
     """A row of the table as a record."""
     features = connection.execute("SELECT asset FROM job_features WHERE job = ? ORDER BY place", (row["id"],))
-    return JobRecord(
-        id=row["id"],
+    return record_of(
+        JobRecord,
+        row,
         state=JobState(row["state"]),
-        attempt=row["attempt"],
-        splats=row["splats"],
-        cameras=row["cameras"],
-        features=tuple(found["asset"] for found in features),
-        settings=json.loads(row["settings"]),
-        progress=None if row["progress"] is None else json.loads(row["progress"]),
-        problem=None if row["problem"] is None else json.loads(row["problem"]),
-        created=row["created"],
-        started=row["started"],
-        ended=row["ended"],
-        request_id=row["request_id"],
         kind=JobKind(row["kind"]),
-        parameters=json.loads(row["parameters"]),
-        plan=None if row["plan"] is None else json.loads(row["plan"]),
+        features=tuple(found["asset"] for found in features),
+        **{name: parsed(row[name]) for name in ("settings", "parameters", "progress", "plan", "problem")},
     )
 
 
@@ -370,8 +450,7 @@ def log_line(text: str) -> dict[str, Any]:
 
 def told(connection: sqlite3.Connection, row: sqlite3.Row) -> None:
     """Note the state of a row that was just changed."""
-    problem = None if row["problem"] is None else json.loads(row["problem"])
-    data = {"state": row["state"], "attempt": row["attempt"], "problem": problem}
+    data = {"state": row["state"], "attempt": row["attempt"], "problem": parsed(row["problem"])}
     note(connection, row["id"], EventKind.STATE, data)
 
 
@@ -393,3 +472,38 @@ def move(
         },
     ).fetchone()
     told(connection, changed)
+
+
+def succeed(connection: sqlite3.Connection, job: str, attempt: int) -> bool:
+    """Within the transaction that keeps its result: end an attempt well.
+
+    Returns:
+        False when it is no longer the job's running one, or is to be canceled; then nothing changes.
+    """
+    row = _owned(connection, job, attempt)
+    if row is None or row["state"] == JobState.CANCELING:
+        return False
+    move(connection, row, JobState.SUCCEEDED)
+    return True
+
+
+def _owned(connection: sqlite3.Connection, job: str, attempt: int) -> sqlite3.Row | None:
+    return connection.execute(f"SELECT * FROM jobs WHERE {OWNS}", {"job": job, "attempt": attempt}).fetchone()
+
+
+def _without_answer(row: sqlite3.Row) -> JobState:
+    return JobState.CANCELED if row["state"] == JobState.CANCELING else JobState.QUEUED
+
+
+def _release(connection: sqlite3.Connection, row: sqlite3.Row, why: str) -> None:
+    note(connection, row["id"], EventKind.LOG, log_line(f"attempt {row['attempt']} does not count: {why}"))
+    connection.execute("UPDATE jobs SET released = released + 1 WHERE id = ?", (row["id"],))
+    move(connection, row, _without_answer(row))
+
+
+def _gave_up(why: str) -> dict[str, str]:
+    crashed = Crashed(
+        "job", expected="an answer from the job's process", got=f"none in {MAX_ATTEMPTS} attempts; the last: {why}",
+        hint="signal 9 is mostly a lack of memory; the server's log has what the process printed",
+    )  # fmt: skip
+    return fault_of(crashed)

@@ -15,12 +15,10 @@ from typing import Any
 from liftcore.errors import NotFound
 from service.errors import InvalidRequest
 from service.store.assets import own
-from service.store.attempts import succeed
-from service.store.database import Database
+from service.store.database import Database, Page, after, insert, page_of, parsed, record_of
 from service.store.files import DataDirectory
-from service.store.jobs import JobOrder, told
+from service.store.jobs import JobOrder, succeed, told
 from service.store.owners import SEEN, Owner
-from service.store.pages import Page, after, page_of
 
 
 @dataclass(frozen=True)
@@ -86,12 +84,11 @@ VISIBLE_TRADEOFFS = (
 
 
 class LiftStore:
-    """Lifts in the database, their bytes in lifts/, as an owner sees them."""
+    """Lifts in the database, their bytes in lifts/. What an owner does not see is absent."""
 
-    def __init__(self, database: Database, files: DataDirectory, owner: Owner) -> None:
+    def __init__(self, database: Database, files: DataDirectory) -> None:
         self._database = database
         self._files = files
-        self._owner = owner
 
     def finish(self, job: str, attempt: int, made: FinishedLift) -> bool:
         """End an attempt with its lift: the file, the lift and the job's last state become true together.
@@ -114,10 +111,11 @@ class LiftStore:
             raise
         return True
 
-    def adopt(self, job: str, order: JobOrder, made: FinishedLift) -> None:
+    def adopt(self, owner: Owner, job: str, order: JobOrder, made: FinishedLift) -> None:
         """Keep a lift whose file lies where it belongs and whose row, and perhaps its job, was lost.
 
         Args:
+            owner: of the job, if it was lost.
             job: its id.
             order: what it was made of; the assets are here.
             made: of the file itself, not of a draft.
@@ -131,7 +129,7 @@ class LiftStore:
                 " leased_until = NULL RETURNING *",
                 {
                     "id": job,
-                    "owner": self._owner.key,
+                    "owner": owner.key,
                     "splats": order.splats,
                     "cameras": order.cameras,
                     "settings": json.dumps(order.settings),
@@ -148,44 +146,38 @@ class LiftStore:
     def _insert(
         self, connection: sqlite3.Connection, job: str, made: FinishedLift, size: int, created: float
     ) -> None:
-        connection.execute(
-            "INSERT INTO lifts (id, bytes, sha256, file, count, channels, metadata, created)"
-            " VALUES (?,?,?,?,?,?,?,?)",
-            (
-                job,
-                size,
-                made.sha256,
-                self._files.relative(self._files.lift(job)),
-                made.count,
-                made.channels,
-                json.dumps(made.metadata),
-                created,
-            ),
-        )
+        row = {
+            "id": job,
+            "bytes": size,
+            "sha256": made.sha256,
+            "file": self._files.relative(self._files.lift(job)),
+            "count": made.count,
+            "channels": made.channels,
+            "metadata": json.dumps(made.metadata),
+            "created": created,
+        }
+        insert(connection, "lifts", row)
 
-    def find(self, lift: str) -> LiftRecord | None:
+    def find(self, owner: Owner, lift: str) -> LiftRecord | None:
         """The lift of that id, None when there is none."""
         with self._database.read() as connection:
-            row = connection.execute(f"{VISIBLE} AND id = :lift", self._owner.terms(lift=lift)).fetchone()
+            row = connection.execute(f"{VISIBLE} AND id = :lift", owner.terms(lift=lift)).fetchone()
         return None if row is None else self._record(row)
 
-    def get(self, lift: str) -> LiftRecord:
+    def get(self, owner: Owner, lift: str) -> LiftRecord:
         """The lift of that id.
 
         Raises:
             NotFound: there is none.
         """
-        found = self.find(lift)
+        found = self.find(owner, lift)
         if found is None:
             raise NotFound(
-                "lift",
-                expected="the id of a lift",
-                got=lift,
-                hint="GET /lifts lists them; a lift has its job's id",
+                "lift", expected="the id of a lift", got=lift, hint="GET /lifts lists them; a lift has its job's id"
             )
         return found
 
-    def only(self) -> LiftRecord:
+    def only(self, owner: Owner) -> LiftRecord:
         """The one lift that is here.
 
         Raises:
@@ -193,21 +185,18 @@ class LiftStore:
             InvalidRequest: there are several, so one must be named.
         """
         with self._database.read() as connection:
-            rows = connection.execute(f"{VISIBLE} LIMIT 2", self._owner.terms()).fetchall()
+            rows = connection.execute(f"{VISIBLE} LIMIT 2", owner.terms()).fetchall()
         if not rows:
             raise NotFound("lift", expected="at least one lift", got="none", hint="POST /lift first")
         if len(rows) > 1:
             raise InvalidRequest(
-                "lift",
-                expected="the id of a lift, as there are several",
-                got="nothing",
-                hint="GET /lifts lists them",
+                "lift", expected="the id of a lift, as there are several", got="nothing", hint="GET /lifts lists them"
             )
         return self._record(rows[0])
 
-    def page(self, limit: int, cursor: str | None = None) -> Page[LiftRecord]:
+    def page(self, owner: Owner, limit: int, cursor: str | None = None) -> Page[LiftRecord]:
         """So many lifts after a cursor, newest first."""
-        terms = self._owner.terms(most=limit + 1, **after(cursor))
+        terms = owner.terms(most=limit + 1, **after(cursor))
         with self._database.read() as connection:
             rows = connection.execute(
                 f"{VISIBLE} AND lifts.created <= :created AND (lifts.created < :created OR id > :after)"
@@ -216,32 +205,25 @@ class LiftStore:
             ).fetchall()
         return page_of(rows, limit, self._record)
 
-    def all(self) -> list[LiftRecord]:
+    def all(self, owner: Owner) -> list[LiftRecord]:
         """Every lift, newest first."""
-        return self.page(sys.maxsize - 1).records
+        return self.page(owner, sys.maxsize - 1).records
 
     def _record(self, row: sqlite3.Row) -> LiftRecord:
-        return LiftRecord(
-            id=row["id"],
-            bytes=row["bytes"],
-            sha256=row["sha256"],
+        return record_of(
+            LiftRecord,
+            row,
             path=self._files.root / row["file"],
-            count=row["count"],
-            channels=row["channels"],
             metadata=json.loads(row["metadata"]),
-            created=row["created"],
-            splats=row["splats"],
-            cameras=row["cameras"],
             features=tuple(json.loads(row["features"])),
         )
 
 
 class TradeoffStore:
-    """Trade-offs in the database, as an owner sees them."""
+    """Trade-offs in the database. What an owner does not see is absent."""
 
-    def __init__(self, database: Database, owner: Owner) -> None:
+    def __init__(self, database: Database) -> None:
         self._database = database
-        self._owner = owner
 
     def finish(self, job: str, attempt: int, made: FinishedTradeoff) -> bool:
         """End an attempt with its trade-off: it and the job's last state become true together.
@@ -250,24 +232,28 @@ class TradeoffStore:
             False when the attempt may not (`succeed`); then nothing changes.
         """
         document = json.dumps(made.document)
-        size = len(document) + len(made.page.encode()) + len(made.chart)
-        digest = hashlib.sha256(made.chart).hexdigest()
+        row = {
+            "id": job,
+            "bytes": len(document) + len(made.page.encode()) + len(made.chart),
+            "document": document,
+            "page": made.page,
+            "chart": made.chart,
+            "sha256": hashlib.sha256(made.chart).hexdigest(),
+            "created": time.time(),
+        }
         with self._database.write(counted=True) as connection:
             if not succeed(connection, job, attempt):
                 return False
-            connection.execute(
-                "INSERT INTO tradeoffs (id, bytes, document, page, chart, sha256, created) VALUES (?,?,?,?,?,?,?)",
-                (job, size, document, made.page, made.chart, digest, time.time()),
-            )
+            insert(connection, "tradeoffs", row)
         return True
 
-    def get(self, tradeoff: str) -> TradeoffRecord:
+    def get(self, owner: Owner, tradeoff: str) -> TradeoffRecord:
         """The trade-off of that id.
 
         Raises:
             NotFound: there is none.
         """
-        terms = self._owner.terms(tradeoff=tradeoff)
+        terms = owner.terms(tradeoff=tradeoff)
         with self._database.read() as connection:
             row = connection.execute(f"{VISIBLE_TRADEOFFS} AND id = :tradeoff", terms).fetchone()
         if row is None:
@@ -275,15 +261,10 @@ class TradeoffStore:
                 "tradeoff", expected="the id of a trade-off", got=tradeoff,
                 hint="POST /tradeoff makes one; it has its job's id",
             )  # fmt: skip
-        return TradeoffRecord(
-            id=row["id"],
+        return record_of(
+            TradeoffRecord,
+            row,
             document=json.loads(row["document"]),
-            page=row["page"],
-            chart=row["chart"],
-            sha256=row["sha256"],
-            created=row["created"],
-            splats=row["splats"],
-            cameras=row["cameras"],
             features=tuple(json.loads(row["features"])),
-            labels=None if row["labels"] is None else json.loads(row["labels"]),
+            labels=parsed(row["labels"]),
         )

@@ -19,6 +19,7 @@ from service.settings import ServiceSettings
 from service.store.assets import CheckedUpload
 from service.store.jobs import JobOrder
 from service.store.lifts import FinishedLift
+from service.store.owners import SERVICE
 from service.store.store import Store
 from service.uploads.intake import CheckLimits, check
 
@@ -31,7 +32,7 @@ def rebuild(store: Store, settings: ServiceSettings) -> dict[str, Any]:
     """
     left: list[dict[str, str]] = []
     assets: Counter[str] = Counter()
-    known = {asset.path for asset in store.everything.assets.all()}
+    known = {asset.path for asset in store.assets.all(SERVICE)}
     for path in sorted(store.files.root.glob("blobs/*/*")):
         if path not in known:
             try:
@@ -39,7 +40,7 @@ def rebuild(store: Store, settings: ServiceSettings) -> dict[str, Any]:
             except SplatliftError as error:
                 left.append({"file": store.files.relative(path), "why": str(error)})
     lifts = 0
-    known = {lift.path for lift in store.everything.lifts.all()}
+    known = {lift.path for lift in store.lifts.all(SERVICE)}
     for path in sorted(store.files.root.glob("lifts/*")):
         if path not in known:
             try:
@@ -62,7 +63,7 @@ def _add_asset(store: Store, settings: ServiceSettings, path: Path) -> AssetKind
         limits = CheckLimits(settings.check_seconds, settings.check_memory_bytes, threading.Event())
         report = check(kind, path, scratch, limits)
     # The file is its own draft: it stays where it is.
-    store.everything.assets.add(CheckedUpload(path, kind, digest, path.suffix, report.counts, report.warnings))
+    store.assets.add(SERVICE, CheckedUpload(path, kind, digest, path.suffix, report.counts, report.warnings))
     return kind
 
 
@@ -92,10 +93,10 @@ def _add_lift(store: Store, path: Path) -> None:
     except (KeyError, TypeError, ValueError) as error:
         raise InvalidLift("lift", expected="the metadata of a lift", got=f"none that tell of it: {error!r}") from None
     for asset, kind in order.assets():
-        store.everything.assets.get(asset, kind)  # a lift without what it was made of can be shown to nobody
+        store.assets.get(SERVICE, asset, kind)  # a lift without what it was made of can be shown to nobody
     with path.open("rb") as handle:
         digest = hashlib.file_digest(handle, "sha256").hexdigest()
-    store.everything.lifts.adopt(path.stem, order, FinishedLift(path, digest, count, channels, told))
+    store.lifts.adopt(SERVICE, path.stem, order, FinishedLift(path, digest, count, channels, told))
 
 
 def _header(path: Path) -> tuple[set[str], dict[str, str], list[int]]:

@@ -9,7 +9,6 @@ from typing import Self
 
 from service.errors import StaleDatabase
 from service.store.assets import AssetStore
-from service.store.attempts import AttemptStore
 from service.store.database import (
     DATABASE,
     GENERATION,
@@ -23,32 +22,19 @@ from service.store.files import DataDirectory
 from service.store.jobs import JobStore
 from service.store.keys import KeyStore, any_key
 from service.store.lifts import LiftStore, TradeoffStore
-from service.store.owners import SERVICE, Owner
-
-
-@dataclass(frozen=True)
-class StoreView:
-    """The store as one owner sees it: what others made is absent, and what is made belongs to them."""
-
-    files: DataDirectory
-    assets: AssetStore
-    jobs: JobStore
-    lifts: LiftStore
-    tradeoffs: TradeoffStore
-    keys: KeyStore
 
 
 @dataclass(frozen=True)
 class Store:
-    """The files and the database of a data directory, the keys to it, and what the supervisor notes of jobs.
-
-    Assets, jobs and their results are seen through a view, which says for whom: `seen_by`, or `everything`.
-    """
+    """The files and the database of a data directory. Who asks for assets, jobs or results says for which owner."""
 
     files: DataDirectory
     database: Database
     keys: KeyStore
-    attempts: AttemptStore
+    assets: AssetStore
+    jobs: JobStore
+    lifts: LiftStore
+    tradeoffs: TradeoffStore
 
     @classmethod
     def open(cls, root: Path, *, floor_bytes: int = 0, new: bool = False, rebuilding: bool = False) -> Self:
@@ -73,24 +59,16 @@ class Store:
         except BaseException:
             files.close()
             raise
-        return cls(files, database, KeyStore(database, files.root), AttemptStore(database))
-
-    def seen_by(self, owner: Owner) -> StoreView:
-        """The store as that owner sees it."""
-        database, files = self.database, self.files
-        return StoreView(
+        database.keep_reserve()
+        return cls(
             files=files,
-            assets=AssetStore(database, files, owner),
-            jobs=JobStore(database, files, owner),
-            lifts=LiftStore(database, files, owner),
-            tradeoffs=TradeoffStore(database, owner),
-            keys=self.keys,
+            database=database,
+            keys=KeyStore(database, files.root),
+            assets=AssetStore(database, files),
+            jobs=JobStore(database, files),
+            lifts=LiftStore(database, files),
+            tradeoffs=TradeoffStore(database),
         )
-
-    @property
-    def everything(self) -> StoreView:
-        """The store as the service itself sees it. What is made through it belongs to admins."""
-        return self.seen_by(SERVICE)
 
     def close(self) -> None:
         """Close the database and let the directory go."""

@@ -30,7 +30,8 @@ from service.child import error_of
 from service.errors import Busy, Crashed, DigestMismatch, InvalidEncoding, TooLarge, UnsupportedEncoding
 from service.models import AssetKind
 from service.store.assets import AssetRecord, CheckedUpload
-from service.store.store import StoreView
+from service.store.owners import Owner
+from service.store.store import Store
 from service.uploads import INVALID
 
 GZIP_WINDOW = 31  # zlib's name for "a gzip header and a 32 KiB window"
@@ -143,17 +144,19 @@ class CheckLimits:
 
 
 class Intake:
-    """One upload, as its owner's store takes it. All methods work on files: call them in threads, one at a time.
+    """One upload. All methods work on files: call them in threads, one at a time.
 
     Args:
-        store: as the owner sees it.
+        store: that takes it.
+        owner: for whom.
         kind: what the body is to be.
         limit: bytes that may come, and come out after decompression.
         coding: how the body is compressed.
     """
 
-    def __init__(self, store: StoreView, kind: AssetKind, limit: int, coding: Coding | None) -> None:
+    def __init__(self, store: Store, owner: Owner, kind: AssetKind, limit: int, coding: Coding | None) -> None:
         self._store = store
+        self._owner = owner
         self._kind = kind
         self._limit = limit
         self._decoding = None if coding is None else Decoding(coding)
@@ -170,7 +173,7 @@ class Intake:
             NoSpace, OverQuota: there may not.
         """
         self._store.files.require_room()
-        self._store.assets.require_quota()
+        self._store.assets.require_quota(self._owner)
         self._draft = self._open.enter_context(self._store.files.draft(f".{self._kind}"))
         self._file = self._open.enter_context(self._draft.open("wb"))
 
@@ -197,7 +200,7 @@ class Intake:
         require_size(self._kind, self._written, self._limit)
         if self._written > self._permitted:  # compressed, a body's end is not known before
             self._store.files.require_room(len(content))
-            self._store.assets.require_quota(self._written)
+            self._store.assets.require_quota(self._owner, self._written)
             self._permitted = self._written + STEP
         self._digest.update(content)
         self._file.write(content)
@@ -222,7 +225,7 @@ class Intake:
         digest = self._digest.hexdigest()
         if promised is not None and digest != promised.lower():
             raise DigestMismatch("sha256", expected=promised, got=digest, hint="upload the file again")
-        known = self._store.assets.find(f"sha256:{digest}")
+        known = self._store.assets.find(self._owner, f"sha256:{digest}")
         return known if known is not None and known.kind is self._kind and known.whole else None
 
     def check(self, limits: CheckLimits) -> CheckedUpload:
@@ -243,7 +246,7 @@ class Intake:
         Raises:
             OverQuota: it would be more than the owner may store.
         """
-        return self._store.assets.add(upload)
+        return self._store.assets.add(self._owner, upload)
 
 
 @dataclass(frozen=True)

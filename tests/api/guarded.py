@@ -80,13 +80,13 @@ def guarded(data: Path, **settings: Any) -> Iterator[Guarded]:
     app = create_app(chosen, store, cast("Supervisor", NoJobs()), cast("QueryClient", NoQueries()))
     made = {name: make_key(store, scopes) for name, scopes in SCOPES.items()}
     ids, secrets = ({name: pair[place] for name, pair in made.items()} for place in (0, 1))
-    hers = store.seen_by(Owner(ids["alice"], sees_all=False))
-    wanted = order(hers)
-    done = hers.jobs.submit(wanted)[0]
+    alice = Owner(ids["alice"], sees_all=False)
+    wanted = order(store, alice)
+    done = store.jobs.submit(alice, wanted)[0]
     finish(store, b"a lift")
-    compared = hers.jobs.submit(replace(wanted, kind=JobKind.TRADEOFF, parameters={"budget_s": 60}))[0]
+    compared = store.jobs.submit(alice, replace(wanted, kind=JobKind.TRADEOFF, parameters={"budget_s": 60}))[0]
     finish_tradeoff(store, b"a chart")
-    queued = hers.jobs.submit(wanted)[0]
+    queued = store.jobs.submit(alice, wanted)[0]
     try:
         with TestClient(app, ADDRESS, raise_server_exceptions=False) as client:
             yield Guarded(client, store, secrets, ids, wanted, done, compared, queued)
@@ -102,21 +102,19 @@ def make_key(store: Store, scopes: str, **quota: int) -> tuple[str, str]:
 
 def finish(store: Store, content: bytes) -> None:
     """Claim the oldest job in line and end it with a lift."""
-    claimed = store.attempts.claim()
+    claimed = store.jobs.claim()
     assert claimed is not None
     with store.files.draft(".safetensors") as draft:
         draft.write_bytes(content)
-        assert store.everything.lifts.finish(
-            claimed.id, claimed.attempt, FinishedLift(draft, "0" * 64, 1, 1, METADATA)
-        )
+        assert store.lifts.finish(claimed.id, claimed.attempt, FinishedLift(draft, "0" * 64, 1, 1, METADATA))
 
 
 def finish_tradeoff(store: Store, chart: bytes) -> None:
     """Claim the oldest job in line and end it with a trade-off."""
-    claimed = store.attempts.claim()
+    claimed = store.jobs.claim()
     assert claimed is not None
     found = {"runs": [], "skipped": [], "choice": {}, "views": {}, "budget_s": 60, "seconds": 1}
-    assert store.everything.tradeoffs.finish(claimed.id, claimed.attempt, FinishedTradeoff(found, "a table", chart))
+    assert store.tradeoffs.finish(claimed.id, claimed.attempt, FinishedTradeoff(found, "a table", chart))
 
 
 def every_route(app: FastAPI) -> list[tuple[str, str]]:

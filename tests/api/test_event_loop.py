@@ -20,6 +20,7 @@ from service.observe import SAME_A_MINUTE, Sparing
 from service.routes.assets import SHOWN_CHARACTERS
 from service.store.database import Database
 from service.store.files import DataDirectory
+from service.store.owners import SERVICE
 from service.store.store import DATABASE, Store
 from tests.crash.conftest import order, until
 
@@ -138,7 +139,7 @@ def test_list_in_pages_is_the_list_whole(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr("service.content.STREAMED", 2)
     with guarded(tmp_path / "data") as house:
         for _ in range(3):
-            house.store.everything.jobs.submit(house.order)
+            house.store.jobs.submit(SERVICE, house.order)
         whole = house.ask("boss", "GET", f"/{path}")
         assert list(whole.json()) == [path]
         found, cursor = [], {}
@@ -239,4 +240,4 @@ def test_log_of_one_thing_again_and_again_is_thinned_out() -> None:
 
 def test_lists_of_a_directory_of_the_release_before_are_paged(store: Store) -> None:
     order(store)
-    assert [len(store.everything.assets.page(2).records), store.everything.assets.page(3).cursor] == [2, None]
+    assert [len(store.assets.page(SERVICE, 2).records), store.assets.page(SERVICE, 3).cursor] == [2, None]

@@ -10,6 +10,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from service.store.jobs import JobOrder
+from service.store.owners import SERVICE
 from tests.crash.conftest import until
 
 from .conftest import Uploaded, parts_of
@@ -65,7 +66,7 @@ def test_counters_know_the_route_of_a_head(client: TestClient) -> None:
 def test_head_of_events_ends_at_once_and_leaves_no_stream(client: TestClient, uploaded: Uploaded) -> None:
     parts = parts_of(client)
     order = JobOrder(splats=uploaded.splats, cameras=uploaded.cameras, features=(uploaded.features,), settings={})
-    job, _ = parts.whole.everything.jobs.submit(order, max_queued=10)  # nobody is woken for it, so it stays in line
+    job, _ = parts.store.jobs.submit(SERVICE, order, max_queued=10)  # nobody is woken for it, so it stays in line
     try:
         for _ in range(3):
             head = client.head(f"/jobs/{job}/events")

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from service.jobs import attempt as pace
 from service.store.jobs import LINE_CHARACTERS, LOG_LINES, EventKind, log_line, note
+from service.store.owners import SERVICE
 from tests.crash.conftest import order
 
 from .guarded import finish
@@ -21,34 +22,34 @@ NEWEST_FIRST = (2, 0, 1)
 
 
 def test_lists_begin_with_the_newest(store: Store) -> None:
-    jobs = [store.everything.jobs.submit(order(store))[0] for _ in TIMES]
+    jobs = [store.jobs.submit(SERVICE, order(store))[0] for _ in TIMES]
     for job in jobs:
         finish(store, job.encode())
-    assets = [asset.id for asset in store.everything.assets.all()]
+    assets = [asset.id for asset in store.assets.all(SERVICE)]
     with store.database.write() as connection:
         for created, job, asset in zip(TIMES, jobs, assets, strict=True):
             connection.execute("UPDATE jobs SET created = ? WHERE id = ?", (created, job))
             connection.execute("UPDATE lifts SET created = ? WHERE id = ?", (created, job))
             connection.execute("UPDATE asset_owners SET created = ? WHERE asset = ?", (created, asset))
-    assert [job.id for job in store.everything.jobs.all()] == [jobs[place] for place in NEWEST_FIRST]
-    assert [lift.id for lift in store.everything.lifts.all()] == [jobs[place] for place in NEWEST_FIRST]
-    assert [asset.id for asset in store.everything.assets.all()] == [assets[place] for place in NEWEST_FIRST]
+    assert [job.id for job in store.jobs.all(SERVICE)] == [jobs[place] for place in NEWEST_FIRST]
+    assert [lift.id for lift in store.lifts.all(SERVICE)] == [jobs[place] for place in NEWEST_FIRST]
+    assert [asset.id for asset in store.assets.all(SERVICE)] == [assets[place] for place in NEWEST_FIRST]
 
 
 def test_job_keeps_its_states_the_last_of_its_log_and_its_latest_progress(store: Store) -> None:
-    job, _ = store.everything.jobs.submit(order(store))
+    job, _ = store.jobs.submit(SERVICE, order(store))
     with store.database.write() as connection:
         for number in range(LOG_LINES + 5):
             note(connection, job, EventKind.LOG, log_line(f"{number:03} {'x' * LINE_CHARACTERS}"))
             note(connection, job, EventKind.PROGRESS, {"done": number})
-    events = store.everything.jobs.events(job, 0)
+    events = store.jobs.events(SERVICE, job, 0)
     assert [event.data["state"] for event in events if event.kind is EventKind.STATE] == ["queued"]
     lines = [event.data["line"] for event in events if event.kind is EventKind.LOG]
     assert [int(line[:3]) for line in lines] == list(range(5, LOG_LINES + 5))
     assert {len(line) for line in lines} == {LINE_CHARACTERS}
     assert [event.data for event in events if event.kind is EventKind.PROGRESS] == [{"done": LOG_LINES + 4}]
     numbers = [event.number for event in events]
-    assert numbers == sorted(set(numbers)) and store.everything.jobs.events(job, numbers[-2]) == events[-1:]
+    assert numbers == sorted(set(numbers)) and store.jobs.events(SERVICE, job, numbers[-2]) == events[-1:]
 
 
 def test_what_a_stage_will_still_take_follows_from_its_own_pace(monkeypatch: pytest.MonkeyPatch) -> None:

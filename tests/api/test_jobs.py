@@ -21,6 +21,7 @@ from service.jobs.supervisor import Supervisor
 from service.models import JobState
 from service.queries.client import QueryClient, QueryLimits
 from service.settings import ServiceSettings
+from service.store.owners import SERVICE
 from service.store.schema import MIGRATIONS
 from service.store.store import Store
 from tests.crash.conftest import order, stand_in, until
@@ -182,7 +183,7 @@ def test_no_work_is_taken_below_the_disk_floor_and_the_service_lives(
 ) -> None:
     usage = shutil.disk_usage("/")
     with quick("answer", disk_floor_bytes=1000) as (client, body):
-        application(client).state.deps.whole.files._floor = 1000
+        application(client).state.deps.store.files._floor = 1000
         monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=999))
         for reply in (
             client.put("/assets/splats", content=scene.splats),
@@ -238,11 +239,11 @@ def test_database_of_a_later_release_is_refused(tmp_path: Path) -> None:
 
 def test_store_remembers_after_reopening(tmp_path: Path) -> None:
     store = Store.open(tmp_path)
-    job = store.everything.jobs.submit(order(store))[0]
+    job = store.jobs.submit(SERVICE, order(store))[0]
     (tmp_path / "tmp" / "left-over").write_bytes(b"half a file")
     store.close()
     store = Store.open(tmp_path)
-    assert store.everything.jobs.get(job).state is JobState.QUEUED and len(store.everything.assets.all()) == 3
+    assert store.jobs.get(SERVICE, job).state is JobState.QUEUED and len(store.assets.all(SERVICE)) == 3
     assert list((tmp_path / "tmp").iterdir()) == []
     store.close()
 
@@ -266,14 +267,14 @@ def test_database_of_the_first_schema_is_taken_over(tmp_path: Path) -> None:
     old.commit()
     old.close()
     store = Store.open(tmp_path / "data")
-    assert store.everything.jobs.get("a").features == ("f",) and store.everything.jobs.get("a").plan is None
-    store.attempts.release_all("the server died")
-    assert [store.everything.jobs.get(job).state for job in "abc"] == [
+    assert store.jobs.get(SERVICE, "a").features == ("f",) and store.jobs.get(SERVICE, "a").plan is None
+    store.jobs.release_all("the server died")
+    assert [store.jobs.get(SERVICE, job).state for job in "abc"] == [
         JobState.QUEUED,
         JobState.QUEUED,
         JobState.FAILED,
     ]
-    (last,) = store.everything.jobs.events("c", 0)
+    (last,) = store.jobs.events(SERVICE, "c", 0)
     assert last.data == {"state": "failed", "attempt": 1, "problem": json.loads(problem)}
     with store.database.read() as connection:
         assert connection.execute("PRAGMA user_version").fetchone()[0] == len(MIGRATIONS)

@@ -20,7 +20,7 @@ from service.models import JobState
 from service.scopes import OPEN, Scope, needed
 from service.settings import ServiceSettings
 from service.store.jobs import Event
-from service.store.owners import Owner
+from service.store.owners import SERVICE, Owner
 from service.store.store import Store
 from service.streams import is_last
 from tests.crash.conftest import order
@@ -77,7 +77,7 @@ def test_every_route_wants_its_scope(house: Guarded) -> None:
         assert reply.status_code == 403, path
         assert f'error="insufficient_scope", scope="{wanted}"' in reply.headers["www-authenticate"]
         assert assert_problem(reply)["expected"] == f"a key with the scope {wanted}"
-    assert house.store.everything.jobs.get(house.queued).state is JobState.QUEUED
+    assert house.store.jobs.get(SERVICE, house.queued).state is JobState.QUEUED
 
 
 @pytest.mark.parametrize(
@@ -131,7 +131,7 @@ def test_what_is_anothers_is_absent_on_every_route(house: Guarded) -> None:
     assert "at least one lift" in house.ask("bob", "GET", "/query", params=ASKING).json()["detail"]
     assert house.ask("alice", "GET", f"/lifts/{house.done}/features").content == b"a lift"
     assert house.ask("alice", "GET", f"/tradeoffs/{house.compared}/chart").content == b"a chart"
-    assert house.store.everything.jobs.get(house.queued).state is JobState.QUEUED
+    assert house.store.jobs.get(SERVICE, house.queued).state is JobState.QUEUED
 
 
 def test_admins_see_and_touch_everything(house: Guarded) -> None:
@@ -179,19 +179,19 @@ def test_same_bytes_are_of_each_who_uploaded_them(tmp_path: Path, house: Guarded
 
 
 def test_asset_in_use_names_ones_own_jobs_only(house: Guarded) -> None:
-    his = house.store.seen_by(_owner(house, "bob"))
-    order(his)
+    bob = _owner(house, "bob")
+    order(house.store, bob)
     assert house.ask("bob", "DELETE", f"/assets/{house.order.splats}").status_code == 204  # her jobs are no matter
     refused = house.ask("alice", "DELETE", f"/assets/{house.order.splats}")
     assert refused.status_code == 409 and house.done in refused.json()["hint"]
-    order(his)
+    order(house.store, bob)
     job = house.ask("bob", "POST", "/lift", json=house.body()).json()["id"]
     hint = house.ask("bob", "DELETE", f"/assets/{house.order.splats}").json()["hint"]
     assert job in hint and house.done not in hint and house.queued not in hint
 
 
 def test_idempotency_key_is_one_of_its_owner(house: Guarded) -> None:
-    order(house.store.seen_by(_owner(house, "bob")))
+    order(house.store, _owner(house, "bob"))
     headers = {"Idempotency-Key": "monday"}
     replies = [
         house.ask(name, "POST", "/lift", json=house.body(), headers=headers)
@@ -212,7 +212,7 @@ def test_owner_asks_and_sees_pictures(
 ) -> None:
     shutil.copytree(data, tmp_path / "data", ignore=shutil.ignore_patterns("lock"))  # while nothing is written there
     with start() as client:
-        store = parts_of(client).whole
+        store = parts_of(client).store
         (owner, secret), (_, other) = make_key(store, "read"), make_key(store, "read write")
         with store.database.write() as connection:
             connection.execute("UPDATE jobs SET owner = ?", (owner,))

@@ -16,7 +16,7 @@ from liftcore.evaluate.tradeoff import RunSpec, Scene, measured
 from service.models import AssetKind, JobKind
 from service.store.assets import CheckedUpload
 from service.store.jobs import fingerprint
-from service.store.owners import Owner
+from service.store.owners import SERVICE, Owner
 from service.store.store import Store
 from service.uploads import check
 from tests.crash.conftest import labels as stored_labels
@@ -46,7 +46,7 @@ def judged(client: TestClient, uploaded: Uploaded, scene: TinyScene) -> Iterator
 
 def put(client: TestClient, kind: AssetKind, content: bytes) -> str:
     """Store what the check takes, without a process; the id."""
-    store = parts_of(client).whole
+    store = parts_of(client).store
     with store.files.draft(".part") as draft, store.files.scratch() as folder:
         draft.write_bytes(content)
         copy = folder / "copy"
@@ -54,7 +54,7 @@ def put(client: TestClient, kind: AssetKind, content: bytes) -> str:
         said = check.run(kind, copy)
         digest = hashlib.sha256(content).hexdigest()
         upload = CheckedUpload(draft, kind, digest, said["suffix"], said["counts"], said["warnings"])
-        return store.everything.assets.add(upload)[0].id
+        return store.assets.add(SERVICE, upload)[0].id
 
 
 def test_masks_and_tables_tell_what_orders_are_held_to(client: TestClient, judged: dict[str, Any]) -> None:
@@ -190,11 +190,11 @@ def test_order_with_other_labels_is_another_order_and_one_without_is_what_it_was
 
 
 def test_labels_of_another_owner_are_not_found_and_an_admins_job_keeps_them(store: Store) -> None:
-    anna, admin = (store.seen_by(owner) for owner in (Owner("a", sees_all=False), Owner("admin", sees_all=True)))
-    given = stored_labels(anna)
-    known = order(anna)
+    anna, admin = Owner("a", sees_all=False), Owner("admin", sees_all=True)
+    given = stored_labels(store, anna)
+    known = order(store, anna)
     for kind in ("masks", "table"):
-        assert store.seen_by(Owner("b", sees_all=False)).assets.find(given[kind]) is None
-    job = admin.jobs.submit(replace(known, kind=JobKind.TRADEOFF, parameters={"labels": given}))[0]
-    anna.assets.delete(given["masks"])
-    assert admin.assets.find(given["masks"]) is not None, job
+        assert store.assets.find(Owner("b", sees_all=False), given[kind]) is None
+    job = store.jobs.submit(admin, replace(known, kind=JobKind.TRADEOFF, parameters={"labels": given}))[0]
+    store.assets.delete(anna, given["masks"])
+    assert store.assets.find(admin, given["masks"]) is not None, job

@@ -29,6 +29,7 @@ from service.jobs.process import JobLimits
 from service.jobs.supervisor import Supervisor
 from service.models import AssetKind
 from service.observe import JsonLines, TextLines, current_id, working_for
+from service.store.owners import SERVICE
 from service.store.store import Store
 from service.uploads.intake import CheckLimits, check
 from tests.crash.conftest import order, stand_in, until
@@ -257,7 +258,7 @@ def test_log_of_a_job_names_the_request_that_made_it(tmp_path: Path) -> None:
 
     watch, logger = Watch(), logging.getLogger("service.jobs")
     store = Store.open(tmp_path)
-    job = store.everything.jobs.submit(replace(order(store), request_id="the-order"))[0]
+    job = store.jobs.submit(SERVICE, replace(order(store), request_id="the-order"))[0]
     runner = Supervisor(store, JobLimits(), command=stand_in("answer"))
     logger.addHandler(watch)
     logger.setLevel(logging.INFO)
@@ -302,7 +303,7 @@ def test_text_log_is_one_line_that_no_client_can_break() -> None:
 def hanging_server(data: Path, jobs: int) -> Iterator[tuple[ServiceProcess, list[str]]]:
     """A server process whose lifts never end, with jobs in line."""
     store = Store.open(data)
-    ids = [store.everything.jobs.submit(order(store))[0] for _ in range(jobs)]
+    ids = [store.jobs.submit(SERVICE, order(store))[0] for _ in range(jobs)]
     store.close()
     with ServiceProcess(data, "--behaviour", "hang") as service:
         yield service, ids
@@ -327,7 +328,7 @@ def test_stop_refuses_work_ends_streams_puts_jobs_back_and_exits_0(
         assert service.wait() == 0
         assert not processes_of(job)
     store = Store.open(tmp_path)
-    found = store.everything.jobs.get(job)
+    found = store.jobs.get(SERVICE, job)
     store.close()
     assert (found.state, found.attempt) == ("queued", 1)
 

@@ -20,6 +20,7 @@ from service.queries.answers import Answers, Kept
 from service.queries.client import Frame
 from service.queries.worker import reply_to
 from service.routes.queries import query_request
+from service.store.owners import SERVICE
 from tests.crash.conftest import until
 
 from .conftest import parts_of
@@ -43,8 +44,8 @@ QUESTIONS: list[dict[str, Any]] = [
 def request_of(client: TestClient, lift: dict[str, Any]) -> Callable[..., dict[str, Any]]:
     """A request as the query process gets it."""
     parts = parts_of(client)
-    here = replace(parts, store=parts.whole.everything)  # as for a caller who sees the lift
-    record = here.store.lifts.get(lift["id"])
+    here = replace(parts, owner=SERVICE)  # as for a caller who sees the lift
+    record = here.store.lifts.get(SERVICE, lift["id"])
 
     def make(operation: str = "scores", **asked: Any) -> dict[str, Any]:
         body = models.AskedInBody.model_validate({"lift": lift["id"], **asked})

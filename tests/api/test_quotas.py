@@ -40,10 +40,10 @@ def test_stored_bytes_have_a_quota(tmp_path: Path) -> None:
 
 def test_upload_that_would_be_too_much_is_not_kept(tmp_path: Path) -> None:
     with guarded(tmp_path / "data") as house:
-        his = house.store.seen_by(Owner(house.ids["bob"], sees_all=False, max_bytes=8))
+        bob = Owner(house.ids["bob"], sees_all=False, max_bytes=8)
         with pytest.raises(Exception, match="at most 8 bytes"):
-            order(his)  # 6 bytes of splats, then 7 of cameras
-        assert [asset.bytes for asset in his.assets.all()] == [6]
+            order(house.store, bob)  # 6 bytes of splats, then 7 of cameras
+        assert [asset.bytes for asset in house.store.assets.all(bob)] == [6]
 
 
 def test_jobs_in_line_have_a_quota_a_key(tmp_path: Path) -> None:
@@ -52,7 +52,7 @@ def test_jobs_in_line_have_a_quota_a_key(tmp_path: Path) -> None:
         reply = house.ask("alice", "POST", "/lift", json=house.body())
         assert (assert_problem(reply)["type"], reply.status_code) == ("/problems/too-many", 429)
         assert int(reply.headers["retry-after"]) > 0
-        order(house.store.seen_by(Owner(house.ids["bob"], sees_all=False)))
+        order(house.store, Owner(house.ids["bob"], sees_all=False))
         assert house.ask("bob", "POST", "/lift", json=house.body()).status_code == 202
         finish(house.store, b"")
         assert house.ask("alice", "POST", "/lift", json=house.body()).status_code == 202

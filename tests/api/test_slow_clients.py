@@ -25,6 +25,7 @@ from service.models import AssetKind
 from service.queries.client import QueryClient
 from service.settings import ServiceSettings
 from service.store.assets import CheckedUpload
+from service.store.owners import SERVICE
 from service.store.store import Store
 from tests.crash.conftest import until
 from tests.crash.server import NoQueries
@@ -286,7 +287,7 @@ def stored(data: Path, content: bytes) -> str:
     store = Store.open(data)
     with store.files.draft(".ply") as draft:
         draft.write_bytes(content)
-        store.everything.assets.add(CheckedUpload(draft, AssetKind.SPLATS, digest, ".ply", {}, []))
+        store.assets.add(SERVICE, CheckedUpload(draft, AssetKind.SPLATS, digest, ".ply", {}, []))
     store.close()
     return f"/assets/sha256:{digest}/content"
 

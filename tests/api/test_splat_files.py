@@ -30,7 +30,7 @@ LAMP = {"like": f"middle:26,{HEIGHT // 2}", "threshold": 0.5}
 
 
 def drafts(client: TestClient) -> list[Path]:
-    return list((parts_of(client).whole.files.root / "tmp").iterdir())
+    return list((parts_of(client).store.files.root / "tmp").iterdir())
 
 
 def rows_of(content: bytes) -> np.ndarray:
@@ -110,7 +110,7 @@ def test_nothing_found_is_a_problem_that_says_what_to_try(client: TestClient, li
 
 def test_too_little_disk_is_said_before_anything_is_made(start: Callable[..., Any], data: Path) -> None:
     with start("copy") as client:
-        target = parts_of(client).whole.files.root
+        target = parts_of(client).store.files.root
     shutil.rmtree(target)
     shutil.copytree(data, target, ignore=shutil.ignore_patterns("lock", "*-shm", "tmp"))
     with start("copy", disk_floor_bytes=1 << 60) as client:

@@ -18,6 +18,7 @@ from service.settings import ServiceSettings
 from service.store.__main__ import main
 from service.store.collect import collect
 from service.store.database import DATABASE
+from service.store.owners import SERVICE
 from service.store.store import Store
 from tests.unit.command_line import programs_become
 
@@ -91,7 +92,7 @@ def test_rebuild_brings_an_older_database_up_to_its_files(filled: tuple[Path, di
         Store.open(data)
     assert main(["rebuild", "--data", str(data)]) == 0
     store = Store.open(data)
-    assert store.everything.jobs.get(lift).state == "succeeded" and store.attempts.claim() is None
+    assert store.jobs.get(SERVICE, lift).state == "succeeded" and store.jobs.claim() is None
     with store.database.read() as connection:
         assert connection.execute("SELECT owner FROM jobs").fetchone()["owner"] == "somebody"
     store.close()

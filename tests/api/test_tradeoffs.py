@@ -130,7 +130,7 @@ def test_asset_of_another_kind_is_not_found(quick: Quick) -> None:
 def test_room_for_the_exact_features_is_asked_for_beforehand(
     client: TestClient, uploaded: Uploaded, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    usage, floor = shutil.disk_usage("/"), parts_of(client).whole.files.floor_bytes
+    usage, floor = shutil.disk_usage("/"), parts_of(client).store.files.floor_bytes
     monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=floor + 60 * 9 * 2 - 1))
     reply = client.post("/tradeoff", json=uploaded.order() | {"budget_s": 10})
     assert (assert_problem(reply)["type"], reply.status_code) == ("/problems/no-space", 507)
@@ -146,7 +146,7 @@ def test_real_tradeoff_of_a_tiny_scene(client: TestClient, uploaded: Uploaded) -
     assert found["choice"]["name"] in {run["name"] for run in found["runs"]}
     assert found["views"]["held_out"] == 1 and found["views"]["lifted"] in (1, 2)
     assert all(run["settings"]["certificate_rays"] == 0 for run in found["runs"])
-    data = str(parts_of(client).whole.files.root)
+    data = str(parts_of(client).store.files.root)
     assert data not in json.dumps(found)  # no path of this machine
     assert client.get(job["links"]["chart"]).content.startswith(b"\x89PNG")
     assert "**Take " in client.get(found["links"]["table"]).text
@@ -198,12 +198,12 @@ def test_directory_of_the_release_before_keeps_its_jobs_lifts_and_keys(tmp_path:
     old.commit()
     old.close()
     store = Store.open(tmp_path / "data")
-    assert {job.id: job.state for job in store.everything.jobs.all()} == {
+    assert {job.id: job.state for job in store.jobs.all(SERVICE)} == {
         "a": JobState.SUCCEEDED,
         "b": JobState.QUEUED,
     }
-    assert {job.kind for job in store.everything.jobs.all()} == {JobKind.LIFT}
-    assert store.everything.lifts.get("a").bytes == 7
-    claimed = store.attempts.claim()
+    assert {job.kind for job in store.jobs.all(SERVICE)} == {JobKind.LIFT}
+    assert store.lifts.get(SERVICE, "a").bytes == 7
+    claimed = store.jobs.claim()
     assert claimed is not None and (claimed.id, claimed.kind, claimed.parameters) == ("b", JobKind.LIFT, {})
     store.close()

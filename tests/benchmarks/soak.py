@@ -28,6 +28,7 @@ from liftcore.raster.cpu.warm_up import warm_up
 from liftcore.scene.cameras import Cameras
 from service.models import AssetKind
 from service.store.assets import CheckedUpload
+from service.store.owners import SERVICE
 from service.store.store import Store
 from tests.crash.server import POINTS
 from tests.crash.service_process import ServiceProcess, kill_processes_of, usage
@@ -65,7 +66,7 @@ def stored(data: Path, files: dict[str, bytes]) -> dict[str, Any]:
         with store.files.draft(".part") as draft:
             draft.write_bytes(content)
             digest, suffix = hashlib.sha256(content).hexdigest(), SUFFIXES[kind]
-            ids[kind] = store.everything.assets.add(CheckedUpload(draft, AssetKind(kind), digest, suffix, names, []))[
+            ids[kind] = store.assets.add(SERVICE, CheckedUpload(draft, AssetKind(kind), digest, suffix, names, []))[
                 0
             ].id
     store.close()

@@ -18,7 +18,8 @@ from service.jobs.supervisor import Supervisor
 from service.models import ENDED, AssetKind
 from service.store.assets import CheckedUpload
 from service.store.jobs import JobOrder, JobRecord
-from service.store.store import Store, StoreView
+from service.store.owners import SERVICE, Owner
+from service.store.store import Store
 
 Supervising = Callable[..., AbstractContextManager[Supervisor]]
 
@@ -28,26 +29,25 @@ def stand_in(behaviour: str) -> list[str]:
     return [sys.executable, "-S", "-E", str(Path(__file__).with_name("stand_in.py")), behaviour]
 
 
-def order(store: Store | StoreView, **settings: Any) -> JobOrder:
+def order(store: Store, owner: Owner = SERVICE, **settings: Any) -> JobOrder:
     """An order over assets whose content nobody looks at."""
-    ids = [asset_of(store, kind, {"names": ["v", "w"], "channels": 1}) for kind in [*AssetKind][:3]]
+    ids = [asset_of(store, kind, {"names": ["v", "w"], "channels": 1}, owner) for kind in [*AssetKind][:3]]
     return JobOrder(ids[0], ids[1], (ids[2],), settings)
 
 
-def labels(store: Store | StoreView) -> dict[str, Any]:
+def labels(store: Store, owner: Owner = SERVICE) -> dict[str, Any]:
     """What a trade-off of that order may be judged by: masks of one of its two views."""
-    masks = asset_of(store, AssetKind.MASKS, {"names": ["v"], "classes": 1})
-    table = asset_of(store, AssetKind.TABLE, {"words": ["apple"], "channels": 1})
+    masks = asset_of(store, AssetKind.MASKS, {"names": ["v"], "classes": 1}, owner)
+    table = asset_of(store, AssetKind.TABLE, {"words": ["apple"], "channels": 1}, owner)
     return {"masks": masks, "table": table, "classes": ["apple"]}
 
 
-def asset_of(store: Store | StoreView, kind: AssetKind, counts: dict[str, Any]) -> str:
+def asset_of(store: Store, kind: AssetKind, counts: dict[str, Any], owner: Owner = SERVICE) -> str:
     """An asset whose content nobody looks at; its id."""
     with store.files.draft(".bin") as draft:
         draft.write_bytes(kind.encode())
         checked = CheckedUpload(draft, kind, hashlib.sha256(kind.encode()).hexdigest(), ".bin", counts, [])
-        seen = store.everything if isinstance(store, Store) else store
-        return seen.assets.add(checked)[0].id
+        return store.assets.add(owner, checked)[0].id
 
 
 def until(condition: Callable[[], Any], seconds: float = 60.0) -> None:
@@ -60,8 +60,8 @@ def until(condition: Callable[[], Any], seconds: float = 60.0) -> None:
 
 def ended(store: Store, job: str) -> JobRecord:
     """The job, once it has ended."""
-    until(lambda: store.everything.jobs.get(job).state in ENDED)
-    return store.everything.jobs.get(job)
+    until(lambda: store.jobs.get(SERVICE, job).state in ENDED)
+    return store.jobs.get(SERVICE, job)
 
 
 def state_of(pid: int) -> str:

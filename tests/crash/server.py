@@ -22,7 +22,6 @@ from service.jobs.process import JobProcess
 from service.jobs.supervisor import Supervisor
 from service.queries.client import QueryClient
 from service.settings import ServiceSettings
-from service.store.attempts import AttemptStore
 from service.store.files import DataDirectory
 from service.store.jobs import JobStore
 from service.store.lifts import LiftStore, TradeoffStore
@@ -34,9 +33,9 @@ from .conftest import stand_in
 POINTS: dict[str, tuple[type, str, str]] = {
     "before the job is in line": (JobStore, "submit", "before"),
     "after the job is in line, before the 202": (JobStore, "submit", "after"),
-    "after the claim": (AttemptStore, "claim", "after"),
+    "after the claim": (JobStore, "claim", "after"),
     "after the child has begun": (JobProcess, "__init__", "after"),
-    "after some progress": (AttemptStore, "advance", "after"),
+    "after some progress": (JobStore, "advance", "after"),
     "before the lift is published": (DataDirectory, "publish", "before"),
     "after the lift is published, before it has a row": (DataDirectory, "publish", "after"),
     "after the lift has its row": (LiftStore, "finish", "after"),

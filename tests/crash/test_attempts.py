@@ -17,24 +17,24 @@ from service.jobs import process as processes
 from service.jobs.attempt import Lease
 from service.jobs.process import mark
 from service.models import JobState
-from service.store.attempts import MAX_ATTEMPTS
-from service.store.jobs import EventKind
+from service.store.jobs import MAX_ATTEMPTS, EventKind
 from service.store.lifts import FinishedLift
+from service.store.owners import SERVICE
 from service.store.store import Store
 
 from .conftest import Supervising, alive, ended, order, state_of, until
 
 
 def submit(store: Store, **settings: Any) -> str:
-    return store.everything.jobs.submit(order(store, **settings))[0]
+    return store.jobs.submit(SERVICE, order(store, **settings))[0]
 
 
 def states(store: Store, job: str) -> list[str]:
-    return [event.data["state"] for event in store.everything.jobs.events(job, 0) if event.kind is EventKind.STATE]
+    return [event.data["state"] for event in store.jobs.events(SERVICE, job, 0) if event.kind is EventKind.STATE]
 
 
 def log_of(store: Store, job: str) -> str:
-    lines = [event.data["line"] for event in store.everything.jobs.events(job, 0) if event.kind is EventKind.LOG]
+    lines = [event.data["line"] for event in store.jobs.events(SERVICE, job, 0) if event.kind is EventKind.LOG]
     return "\n".join(lines)
 
 
@@ -69,17 +69,17 @@ def test_plan_of_the_latest_attempt_stands(store: Store, supervising: Supervisin
         found = ended(store, job)
     assert (found.state, found.attempt) == (JobState.SUCCEEDED, 2)
     assert found.plan == {"summary": ["one splat"], "warnings": [], "splats": 1}
-    [event] = [event for event in store.everything.jobs.events(job, 0) if event.kind is EventKind.PLAN]
+    [event] = [event for event in store.jobs.events(SERVICE, job, 0) if event.kind is EventKind.PLAN]
     assert event.data == found.plan
 
 
 def test_plan_outlives_the_attempt_that_made_it(store: Store) -> None:
     job = submit(store)
-    assert store.attempts.claim() is not None
-    store.attempts.plan(job, 1, {"summary": []})
-    store.attempts.lose(job, 1, "it died")
-    assert store.attempts.claim() is not None
-    assert store.everything.jobs.get(job).plan == {"summary": []}  # until this one has planned
+    assert store.jobs.claim() is not None
+    store.jobs.plan(job, 1, {"summary": []})
+    store.jobs.lose(job, 1, "it died")
+    assert store.jobs.claim() is not None
+    assert store.jobs.get(SERVICE, job).plan == {"summary": []}  # until this one has planned
 
 
 class StoppedTime:
@@ -160,22 +160,22 @@ def test_server_that_slept_gives_its_children_a_lease(watch: Watch, lease: Lease
 def test_draft_of_a_stale_attempt_never_becomes_the_lift(store: Store) -> None:
     job = submit(store)
     for attempt in (1, 2):
-        claimed = store.attempts.claim()
+        claimed = store.jobs.claim()
         assert claimed is not None and claimed.attempt == attempt
         if attempt == 1:
-            store.attempts.lose(job, 1, "it was silent")
+            store.jobs.lose(job, 1, "it was silent")
     with store.files.draft(".safetensors") as draft:
         draft.write_bytes(b"stale")
-        assert not store.everything.lifts.finish(job, 1, FinishedLift(draft, "0" * 64, 1, 1, {}))
+        assert not store.lifts.finish(job, 1, FinishedLift(draft, "0" * 64, 1, 1, {}))
         assert draft.read_bytes() == b"stale" and not store.files.lift(job).exists()
-    store.attempts.fail(job, 1, {"kind": "crashed"})
-    store.attempts.advance(job, 1, {"stage": "old"})
-    store.attempts.plan(job, 1, {"summary": ["old"]})
-    store.attempts.log(job, 1, "old")
-    found = store.everything.jobs.get(job)
+    store.jobs.fail(job, 1, {"kind": "crashed"})
+    store.jobs.advance(job, 1, {"stage": "old"})
+    store.jobs.plan(job, 1, {"summary": ["old"]})
+    store.jobs.log(job, 1, "old")
+    found = store.jobs.get(SERVICE, job)
     assert (found.state, found.attempt, found.progress, found.plan) == (JobState.RUNNING, 2, None, None)
     assert "old" not in log_of(store, job)
-    assert EventKind.PLAN not in {event.kind for event in store.everything.jobs.events(job, 0)}
+    assert EventKind.PLAN not in {event.kind for event in store.jobs.events(SERVICE, job, 0)}
 
 
 def test_canceled_job_has_no_live_process(store: Store, supervising: Supervising) -> None:
@@ -185,17 +185,17 @@ def test_canceled_job_has_no_live_process(store: Store, supervising: Supervising
         until(lambda: grandchild.exists() and grandchild.read_text())
         processes = [*pids(store, job), int(grandchild.read_text())]
         assert all(alive(pid) for pid in processes)
-        assert store.everything.jobs.cancel(job)
-        until(lambda: store.everything.jobs.get(job).state is JobState.CANCELED)
+        assert store.jobs.cancel(SERVICE, job)
+        until(lambda: store.jobs.get(SERVICE, job).state is JobState.CANCELED)
         assert not any(alive(pid) for pid in processes)
-        assert not store.everything.jobs.cancel(job)  # again does no harm
+        assert not store.jobs.cancel(SERVICE, job)  # again does no harm
     assert states(store, job) == ["queued", "running", "canceling", "canceled"]
 
 
 def test_queued_job_is_canceled_at_once_and_never_runs(store: Store, supervising: Supervising) -> None:
     job, other = submit(store), submit(store)
-    assert store.everything.jobs.cancel(job)
-    assert store.everything.jobs.get(job).state is JobState.CANCELED
+    assert store.jobs.cancel(SERVICE, job)
+    assert store.jobs.get(SERVICE, job).state is JobState.CANCELED
     with supervising("answer"):
         assert ended(store, other).state is JobState.SUCCEEDED
     assert states(store, job) == ["queued", "canceled"]
@@ -206,19 +206,19 @@ def test_job_that_succeeded_cannot_be_canceled(store: Store, supervising: Superv
     with supervising("answer"):
         ended(store, job)
     with pytest.raises(Conflict, match="succeeded"):
-        store.everything.jobs.cancel(job)
-    assert store.everything.jobs.get(job).state is JobState.SUCCEEDED
+        store.jobs.cancel(SERVICE, job)
+    assert store.jobs.get(SERVICE, job).state is JobState.SUCCEEDED
 
 
 def test_lift_that_is_done_when_its_job_is_canceling_is_dropped(store: Store) -> None:
     job = submit(store)
-    assert store.attempts.claim() is not None
-    store.everything.jobs.cancel(job)
+    assert store.jobs.claim() is not None
+    store.jobs.cancel(SERVICE, job)
     with store.files.draft(".safetensors") as draft:
         draft.write_bytes(b"too late")
-        assert not store.everything.lifts.finish(job, 1, FinishedLift(draft, "0" * 64, 1, 1, {}))
-    store.attempts.lose(job, 1, "it is canceled")
-    assert store.everything.jobs.get(job).state is JobState.CANCELED and store.everything.lifts.find(job) is None
+        assert not store.lifts.finish(job, 1, FinishedLift(draft, "0" * 64, 1, 1, {}))
+    store.jobs.lose(job, 1, "it is canceled")
+    assert store.jobs.get(SERVICE, job).state is JobState.CANCELED and store.lifts.find(SERVICE, job) is None
 
 
 @pytest.mark.parametrize(
@@ -249,8 +249,8 @@ def test_orderly_stop_leaves_no_process_and_does_not_use_up_attempts(store: Stor
     job = submit(store)
     for _ in range(MAX_ATTEMPTS + 1):
         with supervising("hang"):
-            until(lambda: store.everything.jobs.get(job).state is JobState.RUNNING and pids(store, job))
-        assert store.everything.jobs.get(job).state is JobState.QUEUED
+            until(lambda: store.jobs.get(SERVICE, job).state is JobState.RUNNING and pids(store, job))
+        assert store.jobs.get(SERVICE, job).state is JobState.QUEUED
     assert not any(alive(pid) for pid in pids(store, job))
 
 
@@ -258,7 +258,7 @@ def test_what_a_dead_server_left_running_is_ended_before_its_job_runs_again(
     store: Store, supervising: Supervising
 ) -> None:
     job = submit(store)
-    assert store.attempts.claim() is not None
+    assert store.jobs.claim() is not None
     command = [sys.executable, "-S", "-c", "import time; time.sleep(600)"]
     left = subprocess.Popen(command, env=os.environ | mark(job), start_new_session=True)
     bystander = subprocess.Popen(command, env=os.environ | mark("0" * 32), start_new_session=True)
@@ -313,43 +313,43 @@ def test_process_that_a_leftover_started_while_it_was_looked_for_is_ended_too(
 def test_deaths_of_the_server_do_not_count_against_a_job(store: Store) -> None:
     job = submit(store)
     for attempt in range(1, 2 * MAX_ATTEMPTS):
-        claimed = store.attempts.claim()
+        claimed = store.jobs.claim()
         assert claimed is not None and (claimed.id, claimed.attempt) == (job, attempt)
-        store.attempts.release_all("the server died")
-    assert store.everything.jobs.get(job).state is JobState.QUEUED
+        store.jobs.release_all("the server died")
+    assert store.jobs.get(SERVICE, job).state is JobState.QUEUED
     for attempt in range(2 * MAX_ATTEMPTS, 3 * MAX_ATTEMPTS):  # and those of its own do, still
-        assert store.attempts.claim() is not None
-        store.attempts.lose(job, attempt, "its process ended with signal 9")
-    found = store.everything.jobs.get(job)
+        assert store.jobs.claim() is not None
+        store.jobs.lose(job, attempt, "its process ended with signal 9")
+    found = store.jobs.get(SERVICE, job)
     assert found.state is JobState.FAILED and found.problem is not None and "3 attempts" in found.problem["got"]
 
 
 def test_job_that_was_canceling_when_the_server_died_is_canceled(store: Store) -> None:
     job = submit(store)
-    assert store.attempts.claim() is not None
-    store.everything.jobs.cancel(job)
-    store.attempts.release_all("the server died")
-    assert store.everything.jobs.get(job).state is JobState.CANCELED
+    assert store.jobs.claim() is not None
+    store.jobs.cancel(SERVICE, job)
+    store.jobs.release_all("the server died")
+    assert store.jobs.get(SERVICE, job).state is JobState.CANCELED
 
 
 def test_jobs_are_claimed_in_order(store: Store) -> None:
     jobs = [submit(store) for _ in range(3)]
-    claimed = [store.attempts.claim() for _ in jobs]
+    claimed = [store.jobs.claim() for _ in jobs]
     assert [job.id for job in claimed if job is not None] == jobs
-    assert [job.id for job in store.everything.jobs.all()] == jobs[::-1]
+    assert [job.id for job in store.jobs.all(SERVICE)] == jobs[::-1]
 
 
 def test_log_and_progress_stay_bounded_and_numbers_grow(store: Store) -> None:
     job = submit(store)
-    assert store.attempts.claim() is not None
+    assert store.jobs.claim() is not None
     for number in range(230):
-        store.attempts.log(job, 1, f"line {number} " + "x" * 1000)
-        store.attempts.advance(job, 1, {"done": number})
-    events = store.everything.jobs.events(job, 0)
+        store.jobs.log(job, 1, f"line {number} " + "x" * 1000)
+        store.jobs.advance(job, 1, {"done": number})
+    events = store.jobs.events(SERVICE, job, 0)
     assert len(events) == 2 + 200 + 1
     assert [event.number for event in events] == sorted({event.number for event in events})
     assert log_of(store, job).endswith("x") and "line 229" in log_of(store, job) and len(log_of(store, job)) < 110_000
     last = events[-1].number
-    assert store.everything.jobs.events(job, last) == []
-    store.attempts.log(job, 1, "one more")
-    assert [event.number for event in store.everything.jobs.events(job, last)] == [last + 1]
+    assert store.jobs.events(SERVICE, job, last) == []
+    store.jobs.log(job, 1, "one more")
+    assert [event.number for event in store.jobs.events(SERVICE, job, last)] == [last + 1]

@@ -19,6 +19,7 @@ from service.store.__main__ import main as store_command
 from service.store.backup import back_up, restore, verify
 from service.store.database import DATABASE, KEYS_REQUIRED
 from service.store.keys import Quota
+from service.store.owners import SERVICE
 from service.store.schema import MIGRATIONS
 from service.store.store import Store
 
@@ -28,7 +29,7 @@ from .conftest import Supervising, asset_of, ended, order
 @pytest.fixture
 def filled(store: Store, supervising: Supervising) -> Store:
     """A store that a server holds, with a lift and a key."""
-    job = store.everything.jobs.submit(order(store))[0]
+    job = store.jobs.submit(SERVICE, order(store))[0]
     with supervising("answer"):
         assert ended(store, job).state is JobState.SUCCEEDED
     store.keys.create("a", frozenset({Scope.READ}), Quota())
@@ -51,12 +52,12 @@ def test_backup_beside_a_server_is_restored_as_it_was(
         monkeypatch.setattr(os, "link", refuse)
     assert back_up(filled.files.root, tmp_path / "backup") == 4
     assert verify(tmp_path / "backup") == []
-    before, jobs = files(filled.files.root), filled.everything.jobs.all()
+    before, jobs = files(filled.files.root), filled.jobs.all(SERVICE)
     asset_of(filled, AssetKind.MASKS, {})  # after it, and none of it
     assert restore(tmp_path / "backup", tmp_path / "again") == 4
     again = Store.open(tmp_path / "again")  # which is refused where the database is older than the files
     assert files(again.files.root) == before == files(tmp_path / "backup")
-    assert again.everything.jobs.all() == jobs and again.keys.required()
+    assert again.jobs.all(SERVICE) == jobs and again.keys.required()
     assert (tmp_path / "again" / KEYS_REQUIRED).exists()
     again.close()
 
@@ -68,8 +69,8 @@ def test_asset_that_is_deleted_during_a_backup_is_no_loss(
 
     def copy_then_delete(source: Path, target: Path) -> None:
         copy(source, target)
-        if filled.everything.assets.find(asset) is not None:
-            filled.everything.assets.delete(asset)
+        if filled.assets.find(SERVICE, asset) is not None:
+            filled.assets.delete(SERVICE, asset)
 
     monkeypatch.setattr(backup, "copy_database", copy_then_delete)
     assert back_up(filled.files.root, tmp_path / "backup") == 4

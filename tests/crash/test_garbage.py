@@ -7,6 +7,7 @@ import time
 from pathlib import Path
 
 from service.store.collect import Collector, collect
+from service.store.owners import SERVICE
 from service.store.store import Store
 
 from .conftest import Supervising, ended, order, until
@@ -29,11 +30,11 @@ def files(store: Store) -> set[str]:
 
 
 def test_what_a_crash_left_goes_and_what_is_needed_stays(store: Store, supervising: Supervising) -> None:
-    done, queued = (store.everything.jobs.submit(order(store))[0] for _ in range(2))
-    store.everything.jobs.cancel(queued)
+    done, queued = (store.jobs.submit(SERVICE, order(store))[0] for _ in range(2))
+    store.jobs.cancel(SERVICE, queued)
     with supervising("answer"):
         ended(store, done)
-    waiting = store.everything.jobs.submit(order(store))[0]
+    waiting = store.jobs.submit(SERVICE, order(store))[0]
     needed = files(store) | {f"work/{waiting}/000000.safetensors"}
     old(store.files.work(waiting) / "000000.safetensors")
     os.utime(store.files.work(waiting), (1.0, 1.0))
@@ -48,7 +49,7 @@ def test_what_a_crash_left_goes_and_what_is_needed_stays(store: Store, supervisi
     assert set(collect(store, time.time() - HOUR)) == set(left)
     assert files(store) == needed
     assert (
-        store.everything.assets.get(store.everything.jobs.get(done).splats).path.exists()
+        store.assets.get(SERVICE, store.jobs.get(SERVICE, done).splats).path.exists()
         and store.files.lift(done).exists()
     )
 

@@ -13,6 +13,7 @@ import pytest
 
 from service.jobs.process import LONGEST
 from service.observe import JsonLines
+from service.store.owners import SERVICE
 from service.store.store import Store
 
 from .conftest import Supervising, ended, order
@@ -40,7 +41,7 @@ def logged() -> Iterator[io.StringIO]:
 def test_every_line_that_a_job_prints_is_a_record_with_its_job_and_request(
     store: Store, supervising: Supervising, logged: io.StringIO, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    job = store.everything.jobs.submit(replace(order(store), request_id="the-order"))[0]
+    job = store.jobs.submit(SERVICE, replace(order(store), request_id="the-order"))[0]
     with supervising("print_much"):
         ended(store, job)
     records = [json.loads(line) for line in logged.getvalue().splitlines()]

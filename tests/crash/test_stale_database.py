@@ -21,6 +21,7 @@ from service.store.collect import Collector, collect, empty_quarantine
 from service.store.database import DATABASE
 from service.store.files import DataDirectory
 from service.store.keys import Quota
+from service.store.owners import SERVICE
 from service.store.store import Store
 
 from .conftest import asset_of, until
@@ -137,7 +138,7 @@ def test_crash_between_a_commit_and_the_marker_does_not_either(data: Path, monke
     monkeypatch.undo()
     store.close()
     store = Store.open(data)
-    assert len(store.everything.assets.all()) == 2
+    assert len(store.assets.all(SERVICE)) == 2
     asset_of(store, AssetKind.FEATURES, {})
     store.close()
     assert (data / markers.GENERATION).read_text() == "3\n"
@@ -150,7 +151,7 @@ def test_marker_on_a_full_disk_fails_no_upload(data: Path, monkeypatch: pytest.M
     store = Store.open(data)
     monkeypatch.setattr("service.store.database.remember_generation", full)
     asset = asset_of(store, AssetKind.CAMERAS, {})
-    assert store.everything.assets.get(asset).whole
+    assert store.assets.get(SERVICE, asset).whole
     store.close()
 
 
@@ -164,13 +165,13 @@ def test_new_moves_the_files_to_quarantine_and_begins_an_empty_database(data: Pa
     gone(data)
     (blob,) = blobs(data)
     store = Store.open(data, new=True)
-    assert store.everything.assets.all() == [] and blobs(data / "blobs") == []
+    assert store.assets.all(SERVICE) == [] and blobs(data / "blobs") == []
     (kept,) = blobs(data / "quarantine")
     assert kept.relative_to(data / "quarantine").parts[1:] == blob.relative_to(data).parts
     asset = asset_of(store, AssetKind.SPLATS, {})
     store.close()
     store = Store.open(data, new=True)  # a service that is started so each time begins anew but once
-    assert [found.id for found in store.everything.assets.all()] == [asset]
+    assert [found.id for found in store.assets.all(SERVICE)] == [asset]
     store.close()
 
 
@@ -222,8 +223,8 @@ def test_quarantine_replaces_nothing(data: Path) -> None:
 
 def test_what_a_user_deletes_frees_its_room_at_once(data: Path) -> None:
     store = Store.open(data)
-    (asset,) = store.everything.assets.all()
-    store.everything.assets.delete(asset.id)
+    (asset,) = store.assets.all(SERVICE)
+    store.assets.delete(SERVICE, asset.id)
     assert blobs(data) == [] and collect(store, time.time() + 1) == []
     store.close()
 

@@ -18,9 +18,8 @@ from liftcore.errors import NotFound
 from service.errors import Busy, Conflict, InUse, KeyReused
 from service.models import ENDED, AssetKind, JobKind, JobState
 from service.store.assets import CheckedUpload
-from service.store.attempts import MAX_ATTEMPTS
 from service.store.collect import collect
-from service.store.jobs import EventKind, JobOrder
+from service.store.jobs import MAX_ATTEMPTS, EventKind, JobOrder
 from service.store.lifts import FinishedLift, FinishedTradeoff
 from service.store.owners import SERVICE, Owner, stored_bytes
 from service.store.store import Store
@@ -86,7 +85,7 @@ class StoreMachine(RuleBasedStateMachine):
         with self.store.files.draft(".bin") as draft:
             draft.write_bytes(content)
             upload = CheckedUpload(draft, kind, digest, ".bin", {}, [])
-            asset, new = self.store.seen_by(OWNERS[who]).assets.add(upload)
+            asset, new = self.store.assets.add(OWNERS[who], upload)
         assert new == (who not in self.owned.get(asset.id, set()))
         self.assets[asset.id] = content
         self.owned.setdefault(asset.id, set()).add(who)
@@ -109,16 +108,16 @@ class StoreMachine(RuleBasedStateMachine):
             for job, model in self.jobs.items()
             if asset in (named for named, _ in model.order.assets()) and (OWNERS[who].sees_all or model.owner == who)
         ]
-        seen = self.store.seen_by(OWNERS[who]).assets
+        seen, owner = self.store.assets, OWNERS[who]
         if not self.sees(who, asset):
             with pytest.raises(NotFound):
-                seen.delete(asset)
+                seen.delete(owner, asset)
         elif used:
             with pytest.raises(InUse) as refused:
-                seen.delete(asset)
+                seen.delete(owner, asset)
             assert set(refused.value.hint.partition(": ")[2].split(", ")) <= set(used)
         else:
-            seen.delete(asset)
+            seen.delete(owner, asset)
             self.owned[asset] -= set(OWNERS) if OWNERS[who].sees_all else {who}
             if not self.owned[asset]:
                 del self.assets[asset], self.owned[asset]
@@ -147,8 +146,8 @@ class StoreMachine(RuleBasedStateMachine):
             for job, model in self.jobs.items()
             if key is not None and (model.order.key, model.owner) == (key, who)
         ]
-        seen = self.store.seen_by(OWNERS[who]).jobs
-        kinds = [self.store.everything.assets.get(asset).kind if self.sees(who, asset) else None for asset in chosen]
+        seen, owner = self.store.jobs, OWNERS[who]
+        kinds = [self.store.assets.get(SERVICE, asset).kind if self.sees(who, asset) else None for asset in chosen]
         if known and self.jobs[known[0]].order.fingerprint != print_:
             expected: type[Exception] | None = KeyReused
         elif not known and sum(model.state == "queued" for model in self.jobs.values()) >= MAX_QUEUED:
@@ -159,9 +158,9 @@ class StoreMachine(RuleBasedStateMachine):
             expected = None
         if expected is not None:
             with pytest.raises(expected):
-                seen.submit(order, max_queued=MAX_QUEUED)
+                seen.submit(owner, order, max_queued=MAX_QUEUED)
             return
-        job, new = seen.submit(order, max_queued=MAX_QUEUED)
+        job, new = seen.submit(owner, order, max_queued=MAX_QUEUED)
         assert new == (not known) and (new or job == known[0])
         if new:
             self.jobs[job] = Model(order, who)
@@ -170,7 +169,7 @@ class StoreMachine(RuleBasedStateMachine):
 
     @rule(target=attempts)
     def claim(self) -> tuple[str, int]:
-        claimed = self.store.attempts.claim()
+        claimed = self.store.jobs.claim()
         line = [job for job, model in self.jobs.items() if model.state == "queued"]
         if claimed is None:
             assert not line
@@ -191,11 +190,11 @@ class StoreMachine(RuleBasedStateMachine):
     def finish(self, attempt: tuple[str, int], content: bytes) -> None:
         model = self.owner(attempt)
         if attempt[0] in self.jobs and self.jobs[attempt[0]].order.kind is JobKind.TRADEOFF:
-            done = self.store.everything.tradeoffs.finish(*attempt, FinishedTradeoff({}, "", content))
+            done = self.store.tradeoffs.finish(*attempt, FinishedTradeoff({}, "", content))
         else:
             with self.store.files.draft(".safetensors") as draft:
                 draft.write_bytes(content)
-                done = self.store.everything.lifts.finish(*attempt, FinishedLift(draft, "0" * 64, 1, 1, {}))
+                done = self.store.lifts.finish(*attempt, FinishedLift(draft, "0" * 64, 1, 1, {}))
         assert done == (model is not None and model.state == "running")
         if done and model is not None:
             model.result = content
@@ -205,14 +204,14 @@ class StoreMachine(RuleBasedStateMachine):
     def fail(self, attempt: tuple[str, int]) -> None:
         model = self.owner(attempt)
         fault = {"kind": "crashed", "argument": "", "expected": "", "got": "", "hint": ""}
-        self.store.attempts.fail(*attempt, fault)
+        self.store.jobs.fail(*attempt, fault)
         if model is not None:
             model.move("canceled" if model.state == "canceling" else "failed")
 
     @rule(attempt=attempts)
     def release(self, attempt: tuple[str, int]) -> None:
         model = self.owner(attempt)
-        self.store.attempts.release(*attempt, "the server stops")
+        self.store.jobs.release(*attempt, "the server stops")
         if model is not None:
             model.released += 1
             model.move("canceled" if model.state == "canceling" else "queued")
@@ -220,7 +219,7 @@ class StoreMachine(RuleBasedStateMachine):
     @rule(attempt=attempts)
     def lose(self, attempt: tuple[str, int]) -> None:
         model = self.owner(attempt)
-        self.store.attempts.lose(*attempt, "why")
+        self.store.jobs.lose(*attempt, "why")
         if model is not None:
             self.lost(model)
 
@@ -232,7 +231,7 @@ class StoreMachine(RuleBasedStateMachine):
 
     @rule(attempt=attempts)
     def advance(self, attempt: tuple[str, int]) -> None:
-        self.store.attempts.advance(*attempt, {"done": 1})
+        self.store.jobs.advance(*attempt, {"done": 1})
 
     def drawn(self, data: Any) -> str:
         """A job by its place in line: ids are random, so a choice among them would differ when a story is retold."""
@@ -243,16 +242,16 @@ class StoreMachine(RuleBasedStateMachine):
     def cancel(self, data: Any, who: str) -> None:
         job = self.drawn(data)
         model = self.jobs[job]
-        seen = self.store.seen_by(OWNERS[who]).jobs
+        seen, owner = self.store.jobs, OWNERS[who]
         if not OWNERS[who].sees_all and model.owner != who:
             with pytest.raises(NotFound):
-                seen.cancel(job)
+                seen.cancel(owner, job)
             return
         if model.state in ("succeeded", "failed"):
             with pytest.raises(Conflict):
-                seen.cancel(job)
+                seen.cancel(owner, job)
             return
-        assert seen.cancel(job) == (model.state in ("queued", "running"))
+        assert seen.cancel(owner, job) == (model.state in ("queued", "running"))
         if model.state in ("queued", "running"):
             model.move("canceled" if model.state == "queued" else "canceling")
 
@@ -261,16 +260,16 @@ class StoreMachine(RuleBasedStateMachine):
     def delete_job(self, data: Any, given_up: set[JobKind], who: str) -> None:
         job = self.drawn(data)
         model = self.jobs[job]
-        seen = self.store.seen_by(OWNERS[who]).jobs
+        seen, owner = self.store.jobs, OWNERS[who]
         if not OWNERS[who].sees_all and model.owner != who:
             with pytest.raises(NotFound):
-                seen.delete(job, given_up=given_up)
+                seen.delete(owner, job, given_up=given_up)
         elif model.state in ENDED and (model.result is None or model.order.kind in given_up):
-            seen.delete(job, given_up=given_up)
+            seen.delete(owner, job, given_up=given_up)
             del self.jobs[job]
         else:
             with pytest.raises(Conflict):
-                seen.delete(job, given_up=given_up)
+                seen.delete(owner, job, given_up=given_up)
 
     @rule()
     def collect(self) -> None:
@@ -286,7 +285,7 @@ class StoreMachine(RuleBasedStateMachine):
             path.parent.mkdir(exist_ok=True)
             path.write_bytes(b"half")
         self.store = Store.open(root)
-        self.store.attempts.release_all("the server died")
+        self.store.jobs.release_all("the server died")
         for model in self.jobs.values():
             if model.state in ("running", "canceling"):
                 model.released += 1
@@ -295,15 +294,15 @@ class StoreMachine(RuleBasedStateMachine):
 
     @invariant()
     def agrees(self) -> None:
-        assert {asset.id: asset.path.read_bytes() for asset in self.store.everything.assets.all()} == self.assets
-        found = {job.id: (job.state, job.attempt) for job in self.store.everything.jobs.all()}
+        assert {asset.id: asset.path.read_bytes() for asset in self.store.assets.all(SERVICE)} == self.assets
+        found = {job.id: (job.state, job.attempt) for job in self.store.jobs.all(SERVICE)}
         assert found == {job: (JobState(model.state), model.attempt) for job, model in self.jobs.items()}
-        lifts = {lift.id: lift.path.read_bytes() for lift in self.store.everything.lifts.all()}
+        lifts = {lift.id: lift.path.read_bytes() for lift in self.store.lifts.all(SERVICE)}
         assert lifts == self.results(JobKind.LIFT)
         for job, chart in self.results(JobKind.TRADEOFF).items():
-            assert self.store.everything.tradeoffs.get(job).chart == chart
+            assert self.store.tradeoffs.get(SERVICE, job).chart == chart
         for job, model in self.jobs.items():
-            events = self.store.everything.jobs.events(job, 0)
+            events = self.store.jobs.events(SERVICE, job, 0)
             assert [event.data["state"] for event in events if event.kind is EventKind.STATE] == model.story
             assert model.story.count("succeeded") <= 1
         for who in OWNERS:
@@ -316,18 +315,20 @@ class StoreMachine(RuleBasedStateMachine):
         return {job: content for job, content in made.items() if content is not None}
 
     def sees_its_own(self, who: str) -> None:
-        seen, all_ = self.store.seen_by(OWNERS[who]), OWNERS[who].sees_all
-        jobs = {job for job, model in self.jobs.items() if all_ or model.owner == who}
-        assert {asset.id for asset in seen.assets.all()} == {asset for asset in self.assets if self.sees(who, asset)}
-        assert {job.id for job in seen.jobs.all()} == jobs
+        seen, owner = self.store, OWNERS[who]
+        jobs = {job for job, model in self.jobs.items() if owner.sees_all or model.owner == who}
+        assert {asset.id for asset in seen.assets.all(owner)} == {
+            asset for asset in self.assets if self.sees(who, asset)
+        }
+        assert {job.id for job in seen.jobs.all(owner)} == jobs
         lifts, tradeoffs = (self.results(kind) for kind in JobKind)
-        assert {lift.id for lift in seen.lifts.all()} == jobs & lifts.keys()
+        assert {lift.id for lift in seen.lifts.all(owner)} == jobs & lifts.keys()
         for job in self.jobs:
-            assert (seen.jobs.state(job) is not None) == (job in jobs)
-            assert (seen.lifts.find(job) is not None) == (job in jobs & lifts.keys())
+            assert (seen.jobs.state(owner, job) is not None) == (job in jobs)
+            assert (seen.lifts.find(owner, job) is not None) == (job in jobs & lifts.keys())
             if job not in jobs & tradeoffs.keys():
                 with pytest.raises(NotFound):
-                    seen.tradeoffs.get(job)
+                    seen.tradeoffs.get(owner, job)
         stored = sum(len(content) for asset, content in self.assets.items() if who in self.owned[asset])
         stored += sum(len(content) for job, content in lifts.items() if self.jobs[job].owner == who)
         stored += sum(len(b"{}" + content) for job, content in tradeoffs.items() if self.jobs[job].owner == who)

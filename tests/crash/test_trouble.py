@@ -16,10 +16,11 @@ from service.jobs import attempt as attempts
 from service.jobs import supervisor as supervisors
 from service.models import JobState
 from service.store import database
-from service.store.attempts import MAX_ATTEMPTS
 from service.store.database import DATABASE
 from service.store.files import DataDirectory
+from service.store.jobs import MAX_ATTEMPTS
 from service.store.lifts import FinishedLift
+from service.store.owners import SERVICE
 from service.store.store import Store
 
 from .conftest import Supervising, ended, order, until
@@ -75,7 +76,7 @@ def no_files_left(store: Store) -> Iterator[None]:
 def test_trouble_while_a_job_runs_ends_nothing(
     trouble: Trouble, store: Store, supervising: Supervising, caplog: pytest.LogCaptureFixture
 ) -> None:
-    job = store.everything.jobs.submit(order(store))[0]
+    job = store.jobs.submit(SERVICE, order(store))[0]
     work = store.files.work(job)
     with supervising("obey"):
         until((work / "waiting").exists)
@@ -85,11 +86,11 @@ def test_trouble_while_a_job_runs_ends_nothing(
         found = ended(store, job)
     assert (found.state, found.attempt) == (JobState.SUCCEEDED, 1)
     assert found.plan == {"summary": ["one splat"], "warnings": [], "splats": 1} and found.progress is not None
-    assert store.everything.lifts.get(job).path.stat().st_size == store.everything.lifts.get(job).bytes
+    assert store.lifts.get(SERVICE, job).path.stat().st_size == store.lifts.get(SERVICE, job).bytes
 
 
 def test_running_job_outlives_a_server_without_file_descriptors(store: Store, supervising: Supervising) -> None:
-    job = store.everything.jobs.submit(order(store))[0]
+    job = store.jobs.submit(SERVICE, order(store))[0]
     work = store.files.work(job)
     with supervising("obey"):
         until((work / "waiting").exists)
@@ -117,17 +118,17 @@ def test_attempt_that_the_server_cannot_begin_is_none(
         raise OSError(code, "trouble")
 
     monkeypatch.setattr(DataDirectory, "scratch", troubled)
-    job = store.everything.jobs.submit(order(store))[0]
+    job = store.jobs.submit(SERVICE, order(store))[0]
     with supervising("answer"):
         found = ended(store, job)
     assert (found.state, found.attempt) == (JobState.SUCCEEDED, MAX_ATTEMPTS + 2)
 
 
 def test_jobs_of_a_dead_server_go_back_in_line_once_that_can_be_noted(store: Store, supervising: Supervising) -> None:
-    job = store.everything.jobs.submit(order(store))[0]
-    assert store.attempts.claim() is not None
+    job = store.jobs.submit(SERVICE, order(store))[0]
+    assert store.jobs.claim() is not None
     with lock_held(store), supervising("answer"):
-        assert store.everything.jobs.get(job).state is JobState.RUNNING
+        assert store.jobs.get(SERVICE, job).state is JobState.RUNNING
     with supervising("answer"):
         assert ended(store, job).state is JobState.SUCCEEDED
 
@@ -139,7 +140,7 @@ def test_jobs_of_a_dead_server_go_back_in_line_once_that_can_be_noted(store: Sto
 def test_job_that_finds_the_disk_full_is_tried_again_before_it_fails(
     behaviour: str, state: JobState, attempt: int, store: Store, supervising: Supervising
 ) -> None:
-    job = store.everything.jobs.submit(order(store))[0]
+    job = store.jobs.submit(SERVICE, order(store))[0]
     with supervising(behaviour):
         found = ended(store, job)
     assert (found.state, found.attempt) == (state, attempt)
@@ -147,16 +148,16 @@ def test_job_that_finds_the_disk_full_is_tried_again_before_it_fails(
 
 
 def test_lift_that_could_not_be_recorded_is_no_file_and_its_draft_is_kept(store: Store) -> None:
-    job = store.everything.jobs.submit(order(store))[0]
-    assert store.attempts.claim() is not None
+    job = store.jobs.submit(SERVICE, order(store))[0]
+    assert store.jobs.claim() is not None
     with store.files.draft(".safetensors") as draft:
         draft.write_bytes(b"made")
         made = FinishedLift(draft, "0" * 64, 1, 1, {})
         with store.database.write() as connection:
             connection.execute("ALTER TABLE lifts RENAME TO elsewhere")
         with pytest.raises(sqlite3.OperationalError):
-            store.everything.lifts.finish(job, 1, made)
+            store.lifts.finish(job, 1, made)
         assert draft.read_bytes() == b"made" and not store.files.lift(job).exists()
         with store.database.write() as connection:
             connection.execute("ALTER TABLE elsewhere RENAME TO lifts")
-        assert store.everything.lifts.finish(job, 1, made)
+        assert store.lifts.finish(job, 1, made)
