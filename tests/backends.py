@@ -39,6 +39,9 @@ class Backend:
     open: Callable[[Splats], Raster]
     examples: int  # of a property; interpreted kernels take a second where compiled ones take a millisecond
     seeds: int  # scenes of a pooled count
+    splats: int = 60  # of a random scene, at most: more than a chunk of a tile's list
+    size: tuple[int, int] = (50, 40)  # of a random image, at most: more than a tile each way
+    rays: int = 2_000  # whose rows of A are asked for, at most
 
     def holds(self, *strategies: SearchStrategy[Any]) -> Callable[[Callable[..., None]], None]:
         """Run a check on examples of the strategies at once."""
@@ -52,7 +55,7 @@ class Backend:
 
 
 CPU = Backend("cpu", lambda splats: CpuRaster(splats, threads=2), examples=20, seeds=30)
-GPU = Backend("gpu", gpu_raster, *((20, 30) if torch.cuda.is_available() else (4, 1)))
+GPU = Backend("gpu", gpu_raster, *((20, 30) if torch.cuda.is_available() else (6, 1, 24, (20, 18), 12)))
 # Where the lock has triton, to be without it is a failure.
 locked = (sys.platform, platform.machine()) == ("linux", "x86_64")
 needs_triton = pytest.mark.skipif(

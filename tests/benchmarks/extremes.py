@@ -45,7 +45,7 @@ from tests.benchmarks.extreme_measures import (
     GAUSSIAN,
     HEIGHT,
     KERNELS,
-    SEEDS,
+    SCENES,
     WIDTH,
     Extreme,
     Found,
@@ -939,9 +939,7 @@ def main() -> None:
         warm_up(kernel)
     tables = {title: rows_of(table) for title, table in TABLES.items()} | {
         "Sums over many rays": sums(),
-        f"Wide random scenes, {len(SEEDS)} a kernel": (
-            {"kernel": kernel} | vars(survey(kernel)) for kernel in KERNELS
-        ),
+        f"Wide random scenes, {SCENES} a kernel": ({"kernel": kernel} | vars(survey(kernel)) for kernel in KERNELS),
     }
     for title, rows in tables.items():
         print("" if options.json else f"\n## {title}\n")

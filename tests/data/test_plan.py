@@ -21,9 +21,9 @@ FINE = (120, 160)  # cells: four pixels of tabletop each
 
 @pytest.fixture(scope="module")
 def fine_maps(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Dense maps of eight views: as many cells as an encoder of small strides makes, of few channels."""
+    """Dense maps of four views: as many cells as an encoder of small strides makes, of few channels."""
     packs = read_features(shared_data / "tabletop" / "grids.safetensors")
-    maps = {view: FeatureGrid(torch.rand(*FINE, 4)) for view in packs.views[:8]}
+    maps = {view: FeatureGrid(torch.rand(*FINE, 4)) for view in packs.views[:4]}
     path = tmp_path_factory.mktemp("fine") / "fine.safetensors"
     write_pack(path, maps, {})
     return path
@@ -37,25 +37,26 @@ def told(scene: Path, pack: Path, own: dict[str, Any]) -> tuple[float, float]:
     return plan["memory"]["weights"], ENTRY_BYTES * certificate["weights_entries"]
 
 
+# The most that a plan may be above what is found: the more levels a view has, the fewer of its regions a splat meets.
 @pytest.mark.parametrize(
-    ("name", "own"),
+    ("name", "own", "most"),
     [
-        ("features", {"view_stride": 4}),
-        ("features", {"view_stride": 4, "robust_steps": 1}),
-        ("features", {"view_stride": 4, "levels": 0}),
-        ("grids", {}),
-        ("grids", {"grid_reading": "nearest"}),
-        ("grids", {"stride": 3}),
+        ("features", {"view_stride": 6}, 9),
+        ("features", {"view_stride": 6, "robust_steps": 1}, 7),
+        ("features", {"view_stride": 6, "levels": 0}, 7),
+        ("grids", {"view_stride": 6}, 4),
+        ("grids", {"view_stride": 6, "grid_reading": "nearest"}, 9),
+        ("grids", {"view_stride": 6, "stride": 3}, 5),
     ],
 )
-def test_plan_has_room_for_the_region_weights_there_will_be(shared_data, name, own):
+def test_plan_has_room_for_the_region_weights_there_will_be(shared_data, name, own, most):
     """An upper bound: a splat meets a region or four cells in each tile and level that it touches."""
     scene = shared_data / "tabletop"
     planned, found = told(scene, scene / f"{name}.safetensors", own)
-    assert 0.9 * found < planned < 12 * found
+    assert found < planned < most * found
 
 
-@pytest.mark.parametrize("reading", ["bilinear", "nearest"])
-def test_fine_maps_are_planned_with_their_many_weights(shared_data, fine_maps, reading):
+@pytest.mark.parametrize(("reading", "most"), [("bilinear", 1.4), ("nearest", 2.5)])
+def test_fine_maps_are_planned_with_their_many_weights(shared_data, fine_maps, reading, most):
     planned, found = told(shared_data / "tabletop", fine_maps, {"grid_reading": reading})
-    assert 0.9 * found < planned < 12 * found
+    assert found < planned < most * found

@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     from liftcore.scene.cameras import Camera, Cameras
 
 SAMPLE = 8  # views
-HELD_OUT = ("20240212_003927",)
+CHANNELS = 5  # every fifth of 320
+HELD_OUT = ("20240212_003919", "20240212_003927", "20240212_003936")
 
 
 @pytest.fixture(scope="module")
@@ -63,29 +64,33 @@ def test_rays_are_as_full_as_the_training_measured(plush, cameras, raster):
     assert float(sums.max()) <= 1 + 1e-5
 
 
-def rendered_cosine(
-    raster: CpuRaster, camera: Camera, features: Tensor, grid: Tensor, walk: CompositingParams
-) -> float:
-    """Mean cosine of the rendered features, read at the centres of the grid's cells, with the grid."""
-    image = raster.render(camera, features, walk)
-    rows, columns = grid.shape[:2]
-    y = ((torch.arange(rows) + 0.5) * camera.height / rows).long()
-    x = ((torch.arange(columns) + 0.5) * camera.width / columns).long()
-    return float(torch.cosine_similarity(image[y][:, x], grid.float(), dim=2).mean())
-
-
 def test_lifted_cnn_features_render_like_those_of_unseen_photos(plush, cameras, raster):
     # Cells side by side have a cosine of 0.89, those of other things about 0.4: the right cells must be met, not
     # their mirror images.
-    settings = LiftSettings.of(preset="row-sum", certificate_rays=0, view_stride=4)
+    settings = LiftSettings.of(preset="row-sum", certificate_rays=0, view_stride=12, stride=3)
     paths = [plush / name for name in ("point_cloud.ply", "cameras.json", "grids.safetensors")]
     features = lift_files(paths[0], paths[1], paths[2:], settings).features
-    held_out = read_features(plush / "grids_test.safetensors")
+    held_out, found = read_features(plush / "grids_test.safetensors"), []
     for name in HELD_OUT:
         observed = held_out[name]
         assert isinstance(observed, FeatureGrid)
-        walk, camera = settings.render_params, cameras[name]
-        cosine = rendered_cosine(raster, camera, features, observed.grid, walk)
-        mirrored = rendered_cosine(raster, camera, features, observed.grid.flip(1), walk)
-        assert cosine > 0.7
-        assert cosine > 1.5 * mirrored
+        grid = observed.grid[..., ::CHANNELS]
+        image = raster.render(quarter(cameras[name]), features[:, ::CHANNELS].float(), settings.render_params)
+        cosines = [cosine_with(image, cells) for cells in (grid, grid.flip(1), grid.flip(0))]
+        assert cosines[0] > max(cosines[1:]) + 0.2
+        found.append(cosines[0])
+    assert np.mean(found) > 0.77  # .795
+
+
+def quarter(camera: Camera) -> Camera:
+    """The camera with a quarter of its rows and columns: a cell of the encoder is 8 x 8 of these pixels."""
+    sizes = {"width": camera.width // 4, "height": camera.height // 4}
+    return camera.replace(**sizes, **{name: getattr(camera, name) / 4 for name in ("fx", "fy", "cx", "cy")})
+
+
+def cosine_with(image: Tensor, grid: Tensor) -> float:
+    """Mean cosine of an image [H, W, F], read at the centres of the grid's cells, with the grid [h, w, F]."""
+    rows, columns = grid.shape[:2]
+    y = ((torch.arange(rows) + 0.5) * image.shape[0] / rows).long()
+    x = ((torch.arange(columns) + 0.5) * image.shape[1] / columns).long()
+    return float(torch.cosine_similarity(image[y][:, x], grid.float(), dim=2).mean())

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 ROUNDING = 0.0005 + 1e-9  # of three printed digits
-SHORT = ("features", "features_hard", "grids")  # python -m tests.benchmarks.tabletop measures all
+SHORT = ("features_hard", "grids")  # python -m tests.benchmarks.tabletop measures all
 BARS = [case for case in CASES if case.pack in SHORT and case.accuracy is not None and case.power == 1]
 
 

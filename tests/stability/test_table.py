@@ -37,7 +37,7 @@ def test_a_row_says_what_was_measured() -> None:
 
 @pytest.mark.parametrize("kernel", list(Kernel))
 def test_wide_scenes_equal_the_reference_and_rarely_flip(kernel: Kernel) -> None:
-    got = survey(kernel)
+    got = survey(kernel, 100)
     assert got.finite
     assert got.error < WEIGHTS
     assert got.flips <= max(1, RAYS_FLIPPED * got.rays)
@@ -51,9 +51,9 @@ def test_sums_over_a_million_rays_are_those_of_float64() -> None:
 @pytest.mark.parametrize(("equal", "bound"), [(True, EQUAL), (False, DIGITS)])
 def test_many_regions_or_views_have_their_mean(equal: bool, bound: float) -> None:
     assert sums_of_entries(1_000_000, equal) < bound < added_one_by_one(1_000_000)
-    assert sums_of_views(10_000, equal) < bound
+    assert sums_of_views(1_000, equal) < bound
 
 
-@pytest.mark.parametrize(("rows", "channels"), [(100_000, 8), (8, 10_000)])
+@pytest.mark.parametrize(("rows", "channels"), [(20_000, 8), (8, 10_000)])
 def test_a_robust_step_over_many_keeps_its_weights(rows: int, channels: int) -> None:
     assert robust_sums(rows, channels) < DIGITS
