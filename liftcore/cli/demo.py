@@ -3,9 +3,23 @@
 from __future__ import annotations
 
 import argparse
+import json
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from liftcore.cli.options import Parser
+from liftcore.errors import Unavailable
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+LISTENING = "listening on "  # what the service says first
+STOP_SECONDS = 20
+LAST_WORDS = 3_000  # characters of its log, when it fails
 
 
 def add_arguments(parser: Parser) -> None:
@@ -20,7 +34,67 @@ def add_arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the demo; it prints its own answers."""
-    from liftcore.demo.run import run_demo
+    """Make or find the scene, run the service as a user would, and say what it found."""
+    from liftcore.demo.run import show
+    from liftcore.demo.scene_folder import find_scene
+    from liftcore.demo.write_scene import write_still_life
 
-    return run_demo(options.scene, options.out, options.json, options.ask)
+    def say(line: str) -> None:
+        if not options.json:
+            print(line, flush=True)
+
+    begin, out, data = time.perf_counter(), options.out, options.out / "service"
+    out.mkdir(parents=True, exist_ok=True)
+    if options.scene is None:
+        say("Making a still life: a table, a mug, a bowl of fruit, a book, a lamp and a plant.")
+        subject = write_still_life(out / "scene", options.ask)
+    else:
+        subject = find_scene(options.scene, options.ask, out / "scene")
+    with serving(data, subject.encoder, out / "service.log") as url:
+        say(f"The service listens on {url}.")
+        report = show(subject, url, out, say)
+    report |= {"seconds": round(time.perf_counter() - begin, 1), "out": str(out.resolve())}
+    report["lift_file"] = str((data / "lifts" / f"{report['lift']}.safetensors").resolve())
+    say(f"Pictures are in {report['out']}. All of it took {report['seconds']:.0f} s.")
+    say(f"The lift is {report['lift_file']}")
+    if options.json:
+        print(json.dumps(report))
+    return 0
+
+
+@contextmanager
+def serving(data: Path, encoder: str, log: Path) -> Iterator[str]:
+    """``splatlift serve`` on a free port while the block runs; its address.
+
+    Args:
+        data: the service's directory. encoder: its text encoder. log: where what it says goes.
+
+    Raises:
+        Unavailable: the service does not start; the message holds the end of its log.
+    """
+    options = ["--port", "0", "--data", str(data), "--encoder", encoder]
+    command = [sys.executable, "-m", "liftcore.cli", "serve", *options]
+    with (
+        log.open("wb") as told,
+        subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=told, text=True) as server,
+    ):
+        try:
+            said = server.stdout.readline() if server.stdout else ""
+            if said.startswith(LISTENING):
+                yield said.removeprefix(LISTENING).strip()
+        except BaseException:
+            print(f"--- the service's last words ---\n{_last_words(log)}", file=sys.stderr)
+            raise
+        finally:
+            server.terminate()
+            try:
+                server.wait(STOP_SECONDS)
+            except subprocess.TimeoutExpired:
+                server.kill()
+    if not said.startswith(LISTENING):
+        got = f"an early end; its last words: {_last_words(log)}"
+        raise Unavailable("service", expected="a service that starts", got=got)
+
+
+def _last_words(log: Path) -> str:
+    return log.read_text(errors="replace")[-LAST_WORDS:].strip() or "not a word"

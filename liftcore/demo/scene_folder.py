@@ -38,6 +38,19 @@ class Truth:
         rows = [self.names.index(name) for name in self.meant[phrase]]
         return np.isin(self.masks[view], rows)
 
+    def name_of(self, splats: Sequence[int]) -> str | None:
+        """The object that most of these splats belong to; None where they are of none."""
+        objects = self.splat_objects[np.array(splats)]
+        known = objects[objects >= 0]
+        return self.names[int(np.bincount(known).argmax())] if len(known) else None
+
+    def mean_iou(self, phrase: str, masks: Mapping[str, np.ndarray]) -> float | None:
+        """Mean intersection over union of masks [H, W] bool, over the views that show what the phrase means."""
+        pairs = [(mask, self.mask_of(phrase, view)) for view, mask in masks.items()]
+        shown = [(mask, meant) for mask, meant in pairs if meant is not None and meant.any()]
+        values = [(mask & meant).sum() / (mask | meant).sum() for mask, meant in shown]
+        return float(np.mean(values)) if values else None
+
 
 @dataclass(frozen=True)
 class DemoScene:

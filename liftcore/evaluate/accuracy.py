@@ -1,4 +1,4 @@
-"""How good lifted features are: classes of splats, masks of held-out views, rendered features beside given ones."""
+"""How good lifted features are: beside an exact lift's, in masks of held-out views, rendered beside given ones."""
 
 import numpy as np
 import torch
@@ -11,21 +11,33 @@ from liftcore.scene.cameras import Camera
 from liftcore.solve.readout import read_pixels, sample_pixels
 
 PIXELS = 1_000  # of a view, whose rendered features are compared with the given ones
+LOW_QUANTILE = 0.05
+ROWS = 1 << 16  # of features, compared at a time
 
 
-def class_scores(features: Tensor, classes: Tensor) -> Tensor:
-    """Cosine of every splat with every class vector: features [P, F], classes [K, F] unit -> [P, K] f32."""
-    parts = []
-    for block in features.split(65_536):
-        rows = block.to(torch.float32)
-        norms = torch.linalg.vector_norm(rows, dim=1, keepdim=True).clamp_min(1e-12)
-        parts.append(rows / norms @ classes.to(torch.float32).T)
-    return torch.cat(parts)
+def cosine_figures(features: Tensor, exact: Tensor, evidence: Tensor) -> dict[str, float | None]:
+    """How near the features [P, F] are to the exact ones, over the splats that the exact run saw.
 
-
-def splat_accuracy(scores: Tensor, truth: Tensor, counted: Tensor) -> float:
-    """Share of the counted splats [P] bool whose best class equals the truth [P]."""
-    return float((scores.argmax(dim=1) == truth.long())[counted].float().mean())
+    The mean weighted by evidence, the plain mean, and the quantile below which LOW_QUANTILE of the splats lie. A
+    splat that this run did not see counts zero. None where the exact run saw nothing.
+    """
+    nothing: dict[str, float | None] = {"cosine": None, "cosine_plain": None, "cosine_q05": None}
+    if not exact.shape[0]:
+        return nothing
+    parts, seen = [], []
+    for first in range(0, exact.shape[0], ROWS):
+        one, other = features[first : first + ROWS].float(), exact[first : first + ROWS].float()
+        parts.append(torch.nn.functional.cosine_similarity(one, other, dim=1).double())
+        seen.append((other != 0).any(dim=1))
+    chosen = torch.cat(seen)
+    cosines, weights = torch.cat(parts)[chosen], evidence[chosen].double()
+    if not float(weights.sum()) > 0:
+        return nothing
+    return {
+        "cosine": float((cosines * weights).sum() / weights.sum()),
+        "cosine_plain": float(cosines.mean()),
+        "cosine_q05": float(np.quantile(cosines.numpy(), LOW_QUANTILE)),
+    }
 
 
 def rendered_scores(
@@ -47,13 +59,6 @@ def class_ious(labels: Tensor, truth: Tensor, count: int) -> Tensor:
         if union:
             ious[k] = int((mine & real).sum()) / union
     return ious
-
-
-def mask_iou(mask: Tensor | np.ndarray, truth: Tensor | np.ndarray) -> float:
-    """Intersection over union of two masks [H, W] bool; one where both are empty."""
-    mask, truth = torch.as_tensor(mask), torch.as_tensor(truth)
-    union = int((mask | truth).sum())
-    return int((mask & truth).sum()) / union if union else 1.0
 
 
 def view_cosines(

@@ -1,20 +1,18 @@
-"""`splatlift bench`: how long a view takes, stage by stage, and how much memory the whole lift needs."""
+"""`splatlift bench`: how long a view takes to lift, and how much memory that needs."""
 
-import os
 import statistics
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from torch.nn.functional import normalize
 
 from liftcore.device import Device, choose_device
 from liftcore.errors import InvalidInput
-from liftcore.evaluate.hardware import hardware, peak_memory, watched
+from liftcore.evaluate.hardware import hardware, peak_memory
 from liftcore.evaluate.synthetic import room_cameras, room_regions, room_splats
 from liftcore.features.views import Regions, ViewFeatures
 from liftcore.progress import silent
@@ -31,11 +29,7 @@ from liftcore.solve.view_weights import WeightStore
 from liftcore.warm_up import warm_up_lift
 
 PASSES = 3  # over all views, of which the median counts
-CHANNELS = FEW, USUAL, MANY = 64, 512, 1024
-# Aims of seconds a view, USUAL channels on two cores, by workload, splats and image.
-VIEW_SECONDS = {("plush", 179_788, 990, 742): 0.15, ("synthetic room", 1_000_000, 986, 728): 0.30}
-CHANNELS_RATIO = 1.1  # a view with MANY channels over one with FEW
-BEYOND_BYTES = 1 << 30  # the most memory beside inputs and X
+PACKS = ("regions.safetensors", "features.safetensors")  # of a scene folder, the first that is there
 
 
 @dataclass(frozen=True)
@@ -47,52 +41,36 @@ class Workload:
     views: Sequence[tuple[Camera, ViewFeatures]]
 
 
-def run_bench(options: dict[str, Any]) -> dict[str, Any]:
-    """Time the lift of a real scene (``scene``: a folder) or of a synthetic room.
+def run_bench(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Time the lift of a real scene or of a synthetic room, by all presets or by one.
 
     Args:
-        options: scene (folder or None), splats, size ("WxH"), channels, levels, views, threads, device ("auto", "cpu"
-            or "cuda"); preset (one alone, else all); stages (bool): every step apart, on one thread, as
-            ``liftcore.evaluate.stages`` has it; aims (bool).
+        options: as `workload` takes them; ``threads``, ``preset``, and ``device`` ("auto", "cpu" or "cuda"). What is
+            not named or None has its default.
 
     Returns:
         Plain numbers, ready for JSON: hardware, versions, seconds a view by stage (medians), peak memory.
+
+    Raises:
+        InvalidInput: a size or a folder that makes no workload. InvalidSettings: an unknown preset or device.
     """
-    asked = LiftSettings.of(device=options.get("device") or "auto").device
-    if options.get("stages") and asked == "cuda":
-        raise InvalidInput("device", expected="cpu beside stages, which are the processor's", got=asked)
-    if options.get("aims") and options.get("channels"):
-        raise InvalidInput(
-            "channels", expected="none beside aims, which have their own", got=str(options["channels"])
-        )
-    device = choose_device("cpu" if options.get("stages") else asked)
-    work = _workload(options | ({"channels": 1} if options.get("aims") else {}))
+    device = choose_device(LiftSettings.of(device=options.get("device") or "auto").device)
+    presets = [LiftSettings.of(preset=options["preset"]).preset] if options.get("preset") else list(Preset)
+    work = workload(options)
     start = time.perf_counter()
     warm_up_lift(work.splats.kernel, device, LiftSettings.of(preset=Preset.ROW_SUM))
     compile_seconds = time.perf_counter() - start
-    channels: int | list[int] = work.views[0][1].codebook.shape[1]
-    if options.get("stages"):
-        from liftcore.evaluate.stages import time_stages
-
-        chosen = _presets(options, (Preset.ROW_SUM, Preset.TIKHONOV))
-        presets = {str(preset): time_stages(work, preset) for preset in chosen}
-    elif options.get("aims"):
-        chosen = _presets(options, (Preset.ROW_SUM,))
-        presets = {str(preset): measure_aims(work, preset, device, options.get("threads")) for preset in chosen}
-        channels = list(CHANNELS)
-    else:
-        chosen = _presets(options, tuple(Preset))
-        presets = {str(preset): time_lift(work, preset, device, options.get("threads")) for preset in chosen}
+    camera, observed = work.views[0]
     return {
         "workload": work.name,
         "splats": work.splats.count,
         "views": len(work.views),
-        "width": work.views[0][0].width,
-        "height": work.views[0][0].height,
-        "channels": channels,
+        "width": camera.width,
+        "height": camera.height,
+        "channels": observed.codebook.shape[1],
         "levels": options.get("levels") or 4,
         "compile_or_load_s": compile_seconds,
-        "presets": presets,
+        "presets": {str(preset): time_lift(work, preset, device, options.get("threads")) for preset in presets},
         "peak_memory_bytes": peak_memory(),
         "hardware": hardware() | ({} if device.kind == "cpu" else {"device": device.facts()}),
     }
@@ -156,127 +134,46 @@ def walk_regions(
     return denominators, columns
 
 
-def measure_aims(work: Workload, preset: Preset, device: Device, threads: int | None = None) -> dict[str, Any]:
-    """The figures that the project set itself as aims, beside what this machine does.
+def workload(options: Mapping[str, Any]) -> Workload:
+    """What to lift.
 
-    One walk of all views a pass, and of its W the solution with few, usual and many channels: what a channel costs is
-    then no matter of how busy the machine was between two runs.
+    Args:
+        options: ``scene``, a folder with point_cloud.ply, cameras and region maps; without it a synthetic room of
+            ``splats`` and of images of ``size`` ("WxH"). ``channels``, ``levels`` of labels, and at most ``views``.
 
-    Returns:
-        ``aims``, and the figures behind them: seconds a view of geometry, and of the solution by channels; bytes, the
-        peak without pages of files where the system tells it.
+    Raises:
+        InvalidInput: the size is none, or the folder lacks something.
     """
-    settings, count = LiftSettings.of(preset=preset), work.splats.count
-    looking, raster = (settings.lift_params, settings.weighting), open_raster(work.splats, device, threads)
-    geometry, solution = [], {channels: [] for channels in CHANNELS}
-    peaks: dict[int, int] = {}
-    host = Host(threads, means=work.splats.means)
-    for _ in range(PASSES):
-        with WeightStore() as store:
-            start = time.perf_counter()
-            with watched() as walking:
-                denominators, columns = walk_regions(raster, work.views, looking, count, store)
-            geometry.append((time.perf_counter() - start) / len(work.views))
-            for channels, seconds in solution.items():
-                books = _with_channels(columns, channels)
-                start = time.perf_counter()
-                with watched() as solving:
-                    closed_form(store, books, denominators, torch.float16, silent, device, host)
-                seconds.append((time.perf_counter() - start) / len(work.views))
-                if channels not in peaks:  # a process that has solved for more keeps some of what that took
-                    peaks[channels] = max(walking.bytes or peak_memory(), solving.bytes or peak_memory())
-    walked = statistics.median(geometry)
-    view = {channels: walked + statistics.median(seconds) for channels, seconds in solution.items()}
-    held = {
-        "inputs_bytes": inputs_bytes(work, USUAL),
-        "features_bytes": 2 * count * USUAL,
-        "peak_bytes": peaks[USUAL],
-    }
-    beyond = peaks[USUAL] - held["inputs_bytes"] - held["features_bytes"]
-    targets = (
-        (f"seconds a view, {USUAL} channels", view[USUAL], _view_seconds(work)),
-        (f"a view with {MANY} channels over one with {FEW}", view[MANY] / view[FEW], CHANNELS_RATIO),
-        ("MiB beyond inputs and X", beyond / 2**20, BEYOND_BYTES / 2**20),
-    )
-    return {
-        "aims": [
-            {"name": name, "found": found, "aim": aim} | ({} if aim is None else {"met": found <= aim})
-            for name, found, aim in targets
-        ],
-        "geometry_s_per_view": walked,
-        "solve_s_per_view": {str(channels): statistics.median(seconds) for channels, seconds in solution.items()},
-        "load": os.getloadavg()[0],
-        **held,
-    }
-
-
-def _view_seconds(work: Workload) -> float | None:
-    camera = work.views[0][0]
-    return VIEW_SECONDS.get((work.name, work.splats.count, camera.width, camera.height))
-
-
-def inputs_bytes(work: Workload, channels: int) -> int:
-    """Bytes of splats as a lift reads them (no colour), and of label maps and float16 codebooks of F channels."""
-    splats = work.splats
-    geometry = (splats.means, splats.quats, splats.log_scales, splats.opacity_logits)
-    maps = [observed for _, observed in work.views if isinstance(observed, Regions)]
-    labels = sum(observed.labels.nbytes + 2 * observed.codebook.shape[0] * channels for observed in maps)
-    return sum(part.nbytes for part in geometry) + labels
-
-
-def _with_channels(columns: Sequence[Columns], channels: int) -> list[Columns]:
-    """The same columns over unit codebooks of so many channels: what they say is of no account here."""
-    books = []
-    for number, part in enumerate(columns):
-        drawn = torch.randn(part.codebook.shape[0], channels, generator=torch.Generator().manual_seed(number))
-        books.append(replace(part, codebook=normalize(drawn, dim=1).half()))
-    return books
-
-
-def _presets(options: dict[str, Any], every: Sequence[Preset]) -> Sequence[Preset]:
-    return [LiftSettings.of(preset=options["preset"]).preset] if options.get("preset") else every
-
-
-def _workload(options: dict[str, Any]) -> Workload:
     channels, levels = options.get("channels") or 512, options.get("levels") or 4
-    count = options.get("views") or 8
-    if options.get("scene"):
-        return _real(Path(options["scene"]), channels, levels, count)
-    width, height = _size(options.get("size") or "986x728")
-    cameras = room_cameras(count, width, height)
-    splats = room_splats(options.get("splats") or 1_000_000)
+    count, folder = options.get("views") or 8, options.get("scene")
+    if folder:
+        return _real(Path(folder), channels, levels, count)
+    size = options.get("size") or "986x728"
+    width, times, height = size.lower().partition("x")
+    if not (times and width.isdigit() and height.isdigit()):
+        raise InvalidInput("size", expected="WIDTHxHEIGHT in pixels", got=repr(size))
+    cameras = room_cameras(count, int(width), int(height))
     views = [(camera, room_regions(camera, k, levels, channels)) for k, camera in enumerate(cameras)]
-    return Workload("synthetic room", splats, views)
+    return Workload("synthetic room", room_splats(options.get("splats") or 1_000_000), views)
 
 
 def _real(folder: Path, channels: int, levels: int, count: int) -> Workload:
-    """A scene folder with point_cloud.ply, cameras and regions.safetensors or features.safetensors."""
     from liftcore.features.pack import pair, read_features
     from liftcore.io.cameras import read_cameras
     from liftcore.io.splats import read_splats
 
-    packs = [folder / name for name in ("regions.safetensors", "features.safetensors") if (folder / name).is_file()]
-    if not packs:
+    pack = next((folder / name for name in PACKS if (folder / name).is_file()), None)
+    if pack is None:
         raise InvalidInput("scene", expected="a folder with regions.safetensors", got=str(folder))
     inria = folder / "cameras.json"
     cameras = read_cameras(inria if inria.is_file() else folder)
-    features = pair(read_features(*packs[:1]), cameras)[0]
-    views = []
+    features, views = pair(read_features(pack), cameras)[0], []
     for number, name in enumerate(features.views[:count]):
         observed = features[name]
         if not isinstance(observed, Regions):
-            raise InvalidInput("scene", expected="a pack of region maps", got=f"grids in {packs[0].name}")
-        repeats = -(-levels // observed.labels.shape[0])
-        labels = observed.labels.repeat(repeats, 1, 1)[:levels]
+            raise InvalidInput("scene", expected="a pack of region maps", got=f"grids in {pack.name}")
+        labels = observed.labels.repeat(-(-levels // observed.labels.shape[0]), 1, 1)[:levels]
         generator = torch.Generator().manual_seed(number)
         codebook = torch.randn(observed.codebook.shape[0], channels, generator=generator)
-        codebook = torch.nn.functional.normalize(codebook, dim=1).half()
-        views.append((cameras[name], Regions(labels, codebook)))
+        views.append((cameras[name], Regions(labels, torch.nn.functional.normalize(codebook, dim=1).half())))
     return Workload(folder.name, read_splats(folder / "point_cloud.ply"), views)
-
-
-def _size(text: str) -> tuple[int, int]:
-    parts = text.lower().split("x")
-    if len(parts) != 2 or not all(part.isdigit() for part in parts):
-        raise InvalidInput("size", expected="WIDTHxHEIGHT in pixels", got=repr(text))
-    return int(parts[0]), int(parts[1])

@@ -1,12 +1,9 @@
-"""The machine that a figure was taken on, and what of its memory this process took."""
+"""The machine that a figure was taken on; the most memory that this process took."""
 
 import os
 import platform
 import resource
-import threading
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -51,50 +48,3 @@ def peak_memory() -> int:
         if lines:
             return int(lines[0].split()[1]) * 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-
-
-PAUSE = 0.003  # seconds between two looks at memory
-
-
-@dataclass
-class Most:
-    """The most bytes of all looks; None where nothing tells them, as Linux alone does."""
-
-    bytes: int | None = None
-
-    def take(self, found: int | None) -> None:
-        """Another look."""
-        if found is not None:
-            self.bytes = max(self.bytes or 0, found)
-
-
-def anonymous_bytes(process: int | str = "self") -> int | None:
-    """What a process holds now that is no file's; None where it has ended, or nothing tells.
-
-    Mapped files count as resident, though the system takes their pages back.
-    """
-    try:
-        lines = Path(f"/proc/{process}/status").read_text(encoding="ascii").splitlines()
-    except OSError:
-        return None
-    return next((int(line.split()[1]) * 1024 for line in lines if line.startswith("RssAnon:")), None)
-
-
-@contextmanager
-def watched() -> Iterator[Most]:
-    """The most that this process holds while the block runs."""
-    most, ended = Most(), threading.Event()
-
-    def look() -> None:
-        while not ended.wait(PAUSE):
-            most.take(anonymous_bytes())
-
-    watch = threading.Thread(target=look, daemon=True)
-    most.take(anonymous_bytes())
-    watch.start()
-    try:
-        yield most
-    finally:
-        most.take(anonymous_bytes())
-        ended.set()
-        watch.join()

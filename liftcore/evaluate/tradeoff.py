@@ -25,7 +25,7 @@ from torch import Tensor
 
 from liftcore.device import choose_device
 from liftcore.errors import InvalidInput, SplatliftError, Unavailable
-from liftcore.evaluate.accuracy import class_ious, rendered_scores, view_cosines
+from liftcore.evaluate.accuracy import class_ious, cosine_figures, rendered_scores, view_cosines
 from liftcore.evaluate.hardware import hardware, peak_memory
 from liftcore.features.pack import Views, pair, read_features
 from liftcore.io.cameras import read_cameras
@@ -44,6 +44,19 @@ from liftcore.settings import LiftSettings
 from liftcore.warm_up import warm_up_lift
 
 HOLD_OUT = 8  # every n-th view is held out of the lifts
+EXACT_OVER_DRAFT = 5.0  # how much longer an exact view takes, at most, as far as the budget is planned
+EXACT_SHARE = 1 / 3  # of the budget, that the exact run may take
+PRESET_OVER_EXACT = 1.5  # top-k walks tiles twice, the robust step goes over W again
+LEAST_VIEWS = 4
+LONGEST = 86_400  # seconds that one run may take: longer, it hangs
+APART = ("read", "digest", "compile")  # stages that the seconds of a lift leave out
+BAD_INPUT = 2
+WITHIN = 0.01  # of the best accuracy
+NAMES = {  # what runs are judged by, the first that all of them have
+    "mask_iou": "held-out mask IoU",
+    "held_out_cosine": "held-out view cosine",
+    "cosine": "cosine against exact",
+}
 
 
 @dataclass(frozen=True)
@@ -75,7 +88,11 @@ CANDIDATES = (
 
 @dataclass(frozen=True)
 class Scene:
-    """The files, and what to judge by."""
+    """The files, and what to judge by.
+
+    Raises:
+        InvalidInput: labels without the words of their classes.
+    """
 
     splats: Path
     cameras: Path
@@ -83,6 +100,18 @@ class Scene:
     labels: Path | None = None  # masks of views, VIEW/mask [h, w] int: numbers of classes, -1 none
     table: Path | None = None  # text embeddings
     classes: tuple[str, ...] = ()  # the words of the classes, in the order of their numbers
+
+    def __post_init__(self) -> None:
+        if self.labels is not None and (self.table is None or not self.classes):
+            raise InvalidInput("labels", expected="a table and the classes' words beside them", got="no words")
+
+    def truth(self, cameras: Cameras) -> tuple[dict[str, Tensor], Tensor]:
+        """Camera -> its class numbers [h, w] i64, and the unit vectors [K, F] of the classes' words."""
+        if self.labels is None or self.table is None:
+            return {}, torch.empty(0, 0)
+        masks = read_masks(self.labels, len(self.classes))
+        by_camera = {camera: masks[view] for view, camera in cameras_of_views(masks, cameras).items()}
+        return by_camera, torch.as_tensor(TableEncoder.open(self.table).encode(self.classes))
 
 
 @dataclass(frozen=True)
@@ -97,13 +126,6 @@ class RunSpec:
     threads: int | None
     reference: Path  # a folder: the exact run writes its features there, the others read them
     exact: bool
-
-
-EXACT_OVER_DRAFT = 5.0  # how much longer an exact view takes, at most, as far as the budget is planned
-EXACT_SHARE = 1 / 3  # of the budget, that the exact run may take
-PRESET_OVER_EXACT = 1.5  # top-k walks tiles twice, the robust step goes over W again
-LEAST_VIEWS = 4
-LONGEST = 86_400  # seconds that one run may take: longer, it hangs
 
 
 def compare(
@@ -122,20 +144,29 @@ def compare(
         InvalidInput: the scene lacks what is needed; or whatever a lift refuses.
         Unavailable: a run did not end within a day.
     """
-    start = time.monotonic()
+    start, runs, skipped = time.monotonic(), [], []
     with tempfile.TemporaryDirectory(prefix="splatlift-tradeoff-") as folder:
         spec = _plan_runs(scene, settings, threads, Path(folder))
         lifted = len(spec.lifted)
         spec = _fitting(spec, budget)
-        runs, skipped = [], []
         for number, candidate in enumerate(CANDIDATES):
-            if candidate is EXACT or time.monotonic() - start + _expected(candidate, runs) <= budget:
-                runs.append(_entry(candidate, settings, _run(spec, candidate)))
-                _check_seen(runs[0])
+            if candidate is EXACT or time.monotonic() - start + _expected(candidate, runs[0]) <= budget:
+                named = {
+                    "name": candidate.name,
+                    "kind": candidate.kind,
+                    "options": {**settings, **candidate.settings},
+                }
+                runs.append(named | _run(spec, candidate))
+                if runs[0]["cosine"] is None:  # no run could be set beside the exact one
+                    got = "an exact run that gave no splat a feature"
+                    hint = "splats and cameras must share their frame, and features must not be zero"
+                    raise InvalidInput("features", expected="views that lift", got=got, hint=hint)
             else:
                 skipped.append(candidate.name)
             progress("tradeoff", number + 1, len(CANDIDATES), "runs")
-    _ratios(runs)
+    for run in runs:
+        for name in ("wall", "cpu", "wall_with_reading", "cpu_with_reading"):
+            run[f"{name}_ratio"] = runs[0][f"{name}_s"] / run[f"{name}_s"]
     return {
         "runs": runs,
         "skipped": skipped,
@@ -152,26 +183,22 @@ def compare(
 def _plan_runs(scene: Scene, settings: Mapping[str, Any], threads: int | None, folder: Path) -> RunSpec:
     """The views of each kind. Every HOLD_OUT-th view is held out, and what has masks is."""
     cameras = read_cameras(scene.cameras)
-    stride = LiftSettings.of(**settings).view_stride
     packs = pair(read_features(*scene.features), cameras)[0]
-    names = packs.views[::stride]
-    labelled: list[str] = []
+    names = packs.views[:: LiftSettings.of(**settings).view_stride]
+    masks, classes = scene.truth(cameras)
     if scene.labels is not None:
-        if scene.table is None or not scene.classes:
-            raise InvalidInput("labels", expected="a table and the classes' words beside them", got="no words")
-        channels = class_vectors(scene).shape[1]
-        if channels != packs.channels:
-            raise InvalidInput("table", expected=f"{packs.channels} channels, as the features", got=f"{channels}")
-        labelled = sorted(labelled_masks(scene, cameras))
-        if not labelled:
+        if classes.shape[1] != packs.channels:
+            expected = f"{packs.channels} channels, as the features"
+            raise InvalidInput("table", expected=expected, got=f"{classes.shape[1]}")
+        if not masks:
             raise InvalidInput("labels", expected="VIEW/mask of some camera", got="none")
-    free = [name for name in names if name not in set(labelled)]
+    free = [name for name in names if name not in masks]
     held_out = free[HOLD_OUT // 2 :: HOLD_OUT] if len(free) >= HOLD_OUT else free[1:2]
     lifted = [name for name in free if name not in set(held_out)]
     if not lifted:
         raise InvalidInput("features", expected="views besides those with labels", got=f"{len(names)} views")
     own = {**settings, "view_stride": 1}  # the views are named
-    return RunSpec(scene, own, tuple(lifted), tuple(held_out), tuple(labelled), threads, folder, False)
+    return RunSpec(scene, own, tuple(lifted), tuple(held_out), tuple(sorted(masks)), threads, folder, False)
 
 
 def _fitting(spec: RunSpec, budget: float) -> RunSpec:
@@ -183,32 +210,18 @@ def _fitting(spec: RunSpec, budget: float) -> RunSpec:
     return replace(spec, lifted=spec.lifted[:: max(1, step)])
 
 
-def _expected(candidate: Candidate, runs: Sequence[Mapping[str, Any]]) -> float:
+def _expected(candidate: Candidate, exact: Mapping[str, Any]) -> float:
     """Seconds that a run may take with all around it, guessed from the exact run's, which comes first."""
     slower = candidate.kind == "preset" and "speed" not in candidate.settings
-    return runs[0]["process_s"] * (PRESET_OVER_EXACT if slower else 1.0)
-
-
-def _check_seen(exact: Mapping[str, Any]) -> None:
-    """Raise InvalidInput where no run could be set beside the exact one."""
-    if exact["cosine"] is None:
-        got = "an exact run that gave no splat a feature"
-        hint = "splats and cameras must share their frame, and features must not be zero"
-        raise InvalidInput("features", expected="views that lift", got=got, hint=hint)
+    return exact["process_s"] * (PRESET_OVER_EXACT if slower else 1.0)
 
 
 def _run(spec: RunSpec, candidate: Candidate) -> dict[str, Any]:
     """The figures of one candidate, from its own process."""
     own = replace(spec, settings={**spec.settings, **candidate.settings}, exact=candidate is EXACT)
-    start = time.monotonic()
+    command, start = [sys.executable, "-m", "liftcore.evaluate.tradeoff"], time.monotonic()
     try:
-        done = subprocess.run(
-            [sys.executable, "-m", "liftcore.evaluate.tradeoff"],
-            input=pickle.dumps(own),
-            capture_output=True,
-            check=False,
-            timeout=LONGEST,
-        )
+        done = subprocess.run(command, input=pickle.dumps(own), capture_output=True, check=False, timeout=LONGEST)
     except subprocess.TimeoutExpired:
         hint = "lift fewer views (--set view_stride=n)"
         raise Unavailable(candidate.name, expected=f"an end within {LONGEST} s", got="none yet", hint=hint) from None
@@ -217,27 +230,9 @@ def _run(spec: RunSpec, candidate: Candidate) -> dict[str, Any]:
         fault = Unavailable if answer["kind"] == Unavailable.kind else InvalidInput
         raise fault(candidate.name, expected="a scene that lifts", got=answer["error"])
     if done.returncode != 0:
-        raise RuntimeError(
-            f"{candidate.name} ended with {done.returncode}: {done.stderr.decode(errors='replace').strip()[-300:]}"
-        )
+        told = done.stderr.decode(errors="replace").strip()[-300:]
+        raise RuntimeError(f"{candidate.name} ended with {done.returncode}: {told}")
     return {**answer, "process_s": time.monotonic() - start}
-
-
-def _entry(candidate: Candidate, settings: Mapping[str, Any], figures: Mapping[str, Any]) -> dict[str, Any]:
-    options = {**settings, **candidate.settings}
-    return {"name": candidate.name, "kind": candidate.kind, "options": options, **figures}
-
-
-def _ratios(runs: Sequence[dict[str, Any]]) -> None:
-    """How much faster than the exact run each is, in wall and in processor time, with reading and without."""
-    exact = next(run for run in runs if run["name"] == EXACT.name)
-    for run in runs:
-        for name in ("wall", "cpu", "wall_with_reading", "cpu_with_reading"):
-            run[f"{name}_ratio"] = exact[f"{name}_s"] / run[f"{name}_s"]
-
-
-APART = ("read", "digest", "compile")  # stages that the seconds of a lift leave out
-BAD_INPUT = 2
 
 
 def measured(spec: RunSpec) -> dict[str, Any]:
@@ -264,102 +259,38 @@ def measured(spec: RunSpec) -> dict[str, Any]:
         "seen_share": float(made.seen.float().mean()),
         "timings": {name: value for name, value in made.metadata.timings.items() if name not in APART},
     }
-    return figures | judge(spec, splats, cameras, features, _reference(spec, made), made)
+    return figures | _judge(spec, splats, cameras, features, made)
 
 
-def _reference(spec: RunSpec, made: LiftResult) -> tuple[torch.Tensor, torch.Tensor]:
-    """Features [P, F] and evidence [P] of the exact run."""
-    from safetensors import safe_open
-    from safetensors.torch import save_file
+def _judge(spec: RunSpec, splats: Splats, cameras: Cameras, features: Views, made: LiftResult) -> dict[str, Any]:
+    """The figures of accuracy; None where there is nothing to compare with."""
+    figures: dict[str, Any] = cosine_figures(made.features, *_reference(spec, made))
+    raster, params = CpuRaster(splats, spec.threads), made.metadata.settings.render_params
+    rows = [view_cosines(raster, cameras[view], features[view], made.features, params) for view in spec.held_out]
+    figures |= {"held_out_cosine": float(np.concatenate(rows).mean()) if rows else None, "mask_iou": None}
+    if not spec.labelled:
+        return figures
+    masks, classes = spec.scene.truth(cameras)
+    found, truth = [], []
+    for view in spec.labelled:
+        scores = in_photo(cameras[view], lambda of: rendered_scores(raster, of, made.features, classes, params))
+        found.append(_resized(scores.argmax(dim=2), masks[view]))
+        truth.append(masks[view].flatten())
+    mean = float(class_ious(torch.cat(found), torch.cat(truth), len(classes)).nanmean())
+    return figures | {"mask_iou": None if math.isnan(mean) else mean}  # masks that name no class
+
+
+def _reference(spec: RunSpec, made: LiftResult) -> tuple[Tensor, Tensor]:
+    """Features [P, F] and evidence [P] of the exact run; empty before it."""
+    from safetensors.torch import load_file, save_file
 
     path = spec.reference / "exact.safetensors"
     if spec.exact:
         save_file({"features": made.features, "evidence": made.evidence}, path)
-        return made.features, made.evidence
     if not path.is_file():
         return made.features[:0], made.evidence[:0]
-    with safe_open(str(path), framework="pt") as kept:
-        return kept.get_tensor("features"), kept.get_tensor("evidence")
-
-
-LOW_QUANTILE = 0.05
-ROWS = 1 << 16  # compared at a time
-
-
-def judge(
-    spec: RunSpec,
-    splats: Splats,
-    cameras: Cameras,
-    features: Views,
-    reference: tuple[Tensor, Tensor],
-    made: LiftResult,
-) -> dict[str, Any]:
-    """The figures of accuracy; None where there is nothing to compare with.
-
-    Args:
-        reference: features [P, F] and evidence [P] of the exact run, empty before it.
-    """
-    figures = cosine_figures(made.features, *reference)
-    raster, walk = CpuRaster(splats, spec.threads), made.metadata.settings.render_params
-    rows = [view_cosines(raster, cameras[view], features[view], made.features, walk) for view in spec.held_out]
-    cosines = np.concatenate(rows) if rows else np.zeros(0)
-    figures["held_out_cosine"] = float(cosines.mean()) if cosines.size else None
-    figures["mask_iou"] = None
-    if spec.scene.labels is not None and spec.labelled:
-        classes = class_vectors(spec.scene)
-        masks = labelled_masks(spec.scene, cameras)
-        found = []
-        for view in spec.labelled:
-            scores = in_photo(
-                cameras[view],
-                lambda camera: rendered_scores(raster, camera, made.features, classes, walk),
-            )
-            found.append(_resized(scores.argmax(dim=2), masks[view]))
-        truth = [masks[view].flatten() for view in spec.labelled]
-        ious = class_ious(torch.cat(found), torch.cat(truth), len(classes))
-        mean = float(ious.nanmean())
-        figures["mask_iou"] = None if math.isnan(mean) else mean  # masks that name no class
-    return figures
-
-
-def cosine_figures(features: Tensor, exact: Tensor, evidence: Tensor) -> dict[str, float | None]:
-    """How near the features [P, F] are to the exact ones, over the splats that the exact run saw.
-
-    The mean weighted by evidence, the plain mean, and the quantile below which LOW_QUANTILE of the splats lie. A
-    splat that this run did not see counts zero. None where the exact run saw nothing.
-    """
-    nothing: dict[str, float | None] = {"cosine": None, "cosine_plain": None, "cosine_q05": None}
-    if not exact.shape[0]:
-        return nothing
-    parts, seen = [], []
-    for first in range(0, exact.shape[0], ROWS):
-        one, other = features[first : first + ROWS].float(), exact[first : first + ROWS].float()
-        parts.append(torch.nn.functional.cosine_similarity(one, other, dim=1).double())
-        seen.append((other != 0).any(dim=1))
-    chosen = torch.cat(seen)
-    cosines, weights = torch.cat(parts)[chosen], evidence[chosen].double()
-    if not float(weights.sum()) > 0:
-        return nothing
-    return {
-        "cosine": float((cosines * weights).sum() / weights.sum()),
-        "cosine_plain": float(cosines.mean()),
-        "cosine_q05": float(np.quantile(cosines.numpy(), LOW_QUANTILE)),
-    }
-
-
-def class_vectors(scene: Scene) -> Tensor:
-    """The unit vectors [K, F] of the classes' words."""
-    if scene.table is None:
-        raise ValueError("labels come with a table of their words")
-    return torch.as_tensor(TableEncoder.open(scene.table).encode(scene.classes))
-
-
-def labelled_masks(scene: Scene, cameras: Cameras) -> dict[str, Tensor]:
-    """Camera -> its [h, w] i64 of class numbers, as `liftcore.io.class_masks.read_masks` has it."""
-    if scene.labels is None:
-        raise ValueError("there are no labels")
-    masks = read_masks(scene.labels, len(scene.classes))
-    return {camera: masks[view] for view, camera in cameras_of_views(masks, cameras).items()}
+    kept = load_file(path)
+    return kept["features"], kept["evidence"]
 
 
 def _resized(labels: Tensor, mask: Tensor) -> Tensor:
@@ -367,22 +298,6 @@ def _resized(labels: Tensor, mask: Tensor) -> Tensor:
     rows = ((2 * torch.arange(mask.shape[0]) + 1) * labels.shape[0]) // (2 * mask.shape[0])
     columns = ((2 * torch.arange(mask.shape[1]) + 1) * labels.shape[1]) // (2 * mask.shape[1])
     return labels[rows][:, columns].flatten()
-
-
-WITHIN = 0.01  # of the best accuracy
-NAMES = {
-    "mask_iou": "held-out mask IoU",
-    "held_out_cosine": "held-out view cosine",
-    "cosine": "cosine against exact",
-}
-
-
-def accuracy_of(runs: Sequence[Mapping[str, Any]]) -> str:
-    """The figure that the runs are judged by: masks when there are some, else held-out views, else the exact run."""
-    for name in ("mask_iou", "held_out_cosine"):
-        if runs and all(run[name] is not None for run in runs):
-            return name
-    return "cosine"
 
 
 def pareto(runs: Sequence[Mapping[str, Any]], accuracy: str) -> list[str]:
@@ -396,31 +311,32 @@ def pareto(runs: Sequence[Mapping[str, Any]], accuracy: str) -> list[str]:
 
 
 def choose(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """The fastest run whose accuracy is within WITHIN of the best one's, and why, in a sentence."""
-    accuracy = accuracy_of(runs)
-    front = pareto(runs, accuracy)
-    by_name = {run["name"]: run for run in runs}
+    """The fastest run whose accuracy is within WITHIN of the best one's, and why, in a sentence.
+
+    The accuracy is that of masks when there are some, else of held-out views, else the cosine to the exact run.
+    """
+    accuracy = next((name for name in NAMES if all(run[name] is not None for run in runs)), "cosine")
+    front, by_name = pareto(runs, accuracy), {run["name"]: run for run in runs}
     best = by_name[front[-1]]
     floor = _value(best, accuracy) - WITHIN * abs(_value(best, accuracy))
     taken = by_name[next(name for name in front if _value(by_name[name], accuracy) >= floor)]
-    why = _why(taken, best, accuracy)
-    return {"name": taken["name"], "options": taken["options"], "accuracy": accuracy, "front": front, "why": why}
-
-
-def _why(taken: Mapping[str, Any], best: Mapping[str, Any], accuracy: str) -> str:
     figure, value, seconds = NAMES[accuracy], f"{_value(taken, accuracy):.4f}", f"{taken['cpu_s']:.2f} s"
     if taken is best:
-        return (
+        why = (
             f"{taken['name']} has the best {figure} ({value}), and none within {WITHIN:.0%} of it takes less than "
             f"its {seconds} of processor time"
         )
-    return (
-        f"{taken['name']} is the fastest whose {figure} ({value}) is within {WITHIN:.0%} of the best "
-        f"({best['name']}, {_value(best, accuracy):.4f}): {seconds} of processor time against {best['cpu_s']:.2f} s"
-    )
+    else:
+        why = (
+            f"{taken['name']} is the fastest whose {figure} ({value}) is within {WITHIN:.0%} of the best "
+            f"({best['name']}, {_value(best, accuracy):.4f}): {seconds} of processor time against "
+            f"{best['cpu_s']:.2f} s"
+        )
+    return {"name": taken["name"], "options": taken["options"], "accuracy": accuracy, "front": front, "why": why}
 
 
 def _value(run: Mapping[str, Any], accuracy: str) -> float:
+    """What is no number is the worst."""
     value = run[accuracy]
     return -1.0 if value is None or math.isnan(value) else float(value)
 

@@ -7,6 +7,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import torch
+from torch import Tensor
+
 from liftcore.evaluate.hardware import hardware, machine_line
 from liftcore.io.lift_file import save_lift
 from liftcore.io.scene_files import lift_files as lift_paths
@@ -44,6 +48,28 @@ def opened(made: LiftResult, raster: Raster | None = None) -> QueryScene:
             scene.raster = raster
         _ = scene.cameras
     return scene
+
+
+def class_scores(features: Tensor, classes: Tensor) -> Tensor:
+    """Cosine of every splat with every class vector: features [P, F], classes [K, F] unit -> [P, K] f32."""
+    parts = []
+    for block in features.split(65_536):
+        rows = block.to(torch.float32)
+        norms = torch.linalg.vector_norm(rows, dim=1, keepdim=True).clamp_min(1e-12)
+        parts.append(rows / norms @ classes.to(torch.float32).T)
+    return torch.cat(parts)
+
+
+def splat_accuracy(scores: Tensor, truth: Tensor, counted: Tensor) -> float:
+    """Share of the counted splats [P] bool whose best class equals the truth [P]."""
+    return float((scores.argmax(dim=1) == truth.long())[counted].float().mean())
+
+
+def mask_iou(mask: Tensor | np.ndarray, truth: Tensor | np.ndarray) -> float:
+    """Intersection over union of two masks [H, W] bool; one where both are empty."""
+    mask, truth = torch.as_tensor(mask), torch.as_tensor(truth)
+    union = int((mask | truth).sum())
+    return int((mask & truth).sum()) / union if union else 1.0
 
 
 def command_line(module: str, doc: str | None, *arguments: Sequence[Any]) -> argparse.ArgumentParser:

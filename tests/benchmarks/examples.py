@@ -23,7 +23,6 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from liftcore.errors import InvalidQuery
-from liftcore.evaluate.accuracy import mask_iou
 from liftcore.features.views import Regions
 from liftcore.io.splats import read_splats
 from liftcore.query.ask import ask
@@ -34,7 +33,7 @@ from liftcore.query.scene import QueryScene
 from liftcore.query.terms import Pixel, Query
 from liftcore.query.threshold import METHODS, find_threshold
 from liftcore.raster.cpu.raster import CpuRaster
-from tests.benchmarks.base import PACKS, PRESETS, command_line, lift_files, opened, scene_files, tell
+from tests.benchmarks.base import PACKS, PRESETS, command_line, lift_files, mask_iou, opened, scene_files, tell
 from tests.benchmarks.tabletop import Tabletop
 from tests.benchmarks.thresholds import best_iou
 

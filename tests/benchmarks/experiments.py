@@ -23,7 +23,7 @@ from torch import Tensor
 from torch.nn.functional import cosine_similarity, normalize
 
 from liftcore.errors import SplatliftError
-from liftcore.evaluate.accuracy import mask_iou, splat_accuracy, view_cosines
+from liftcore.evaluate.accuracy import view_cosines
 from liftcore.evaluate.synthetic import room_cameras, room_splats
 from liftcore.features.pack import Views, pair, read_features, write_pack
 from liftcore.features.views import NO_LABEL, Regions, ViewFeatures
@@ -43,7 +43,7 @@ from liftcore.solve.all_rays import AllRays
 from liftcore.solve.channels import Channels
 from liftcore.solve.least_squares import solve_block
 from liftcore.solve.readout import sample_pixels
-from tests.benchmarks.base import PRESETS, command_line, lift_files, scene_files, tell
+from tests.benchmarks.base import PRESETS, command_line, lift_files, mask_iou, scene_files, splat_accuracy, tell
 from tests.benchmarks.tabletop import Tabletop
 
 Rows = Iterator[dict[str, Any]]

@@ -9,7 +9,7 @@ compiling. ``splatlift tradeoff`` measures more, with views held out. FOLDER as 
 import time
 from pathlib import Path
 
-from liftcore.evaluate.tradeoff import cosine_figures
+from liftcore.evaluate.accuracy import cosine_figures
 from liftcore.io.scene_files import lift_files
 from liftcore.result import LiftResult
 from liftcore.settings import LiftSettings, Speed

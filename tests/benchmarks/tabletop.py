@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from liftcore.errors import InvalidInput
-from liftcore.evaluate.accuracy import class_ious, class_scores, rendered_scores, splat_accuracy
+from liftcore.evaluate.accuracy import class_ious, rendered_scores
 from liftcore.features.pack import read_features
 from liftcore.features.views import NO_LABEL, Regions
 from liftcore.io.cameras import read_cameras
@@ -28,7 +28,15 @@ from liftcore.raster.base import CompositingParams, Raster, Weighting
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.cameras import Cameras
 from liftcore.settings import LiftSettings
-from tests.benchmarks.base import cameras_of, command_line, lift_files, scene_files, tell
+from tests.benchmarks.base import (
+    cameras_of,
+    class_scores,
+    command_line,
+    lift_files,
+    scene_files,
+    splat_accuracy,
+    tell,
+)
 
 EVIDENCE_PACK = "features"  # its views say which splats count
 EVIDENCE_OVER = 0.5

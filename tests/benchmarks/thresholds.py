@@ -23,7 +23,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from liftcore.evaluate.accuracy import mask_iou
 from liftcore.query.ask import ask
 from liftcore.query.directions import MINIMUM_ROW_SUM
 from liftcore.query.objects import objects
@@ -32,7 +31,7 @@ from liftcore.query.scene import QueryScene
 from liftcore.query.terms import Query
 from liftcore.query.text import TextEncoder, open_encoder
 from liftcore.query.threshold import METHODS, find_threshold
-from tests.benchmarks.base import PACKS, PRESETS, command_line, lift_files, opened, scene_files, tell
+from tests.benchmarks.base import PACKS, PRESETS, command_line, lift_files, mask_iou, opened, scene_files, tell
 from tests.benchmarks.tabletop import Tabletop
 
 COLUMNS = (*METHODS, "rendered", "best", "absent", "absent rendered")

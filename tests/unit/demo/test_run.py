@@ -1,22 +1,26 @@
 """The demo end to end: a small still life through the real service, in a process of its own."""
 
-from __future__ import annotations
-
+import argparse
 import json
 from pathlib import Path
 
 import pytest
 from PIL import Image
 
-from liftcore.demo.run import run_demo
+from liftcore.cli import demo
+from liftcore.demo import write_scene
 from liftcore.demo.still_life import still_life
+from liftcore.errors import Unavailable
 from liftcore.io.lift_file import load_lift
 
+pytestmark = pytest.mark.slow
 
-def test_the_demo_finds_what_it_asks_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+
+def test_the_demo_finds_what_it_asks_for(tmp_path: Path, capsys, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = still_life(seed=7, views=12, density=0.15)
+    monkeypatch.setattr(write_scene, "still_life", lambda _: scene)
     phrases = ["something to drink coffee from", "reading light"]
-    assert run_demo(None, tmp_path, True, phrases, scene) == 0
+    assert demo.run(argparse.Namespace(scene=None, out=tmp_path, json=True, ask=phrases)) == 0
     report = json.loads(capsys.readouterr().out)
     assert report["splats"] == scene.splats.count < 10_000 and report["views"] == 12 - len(scene.held_out)
     for found, thing in zip(report["phrases"], ("mug", "lamp"), strict=True):
@@ -32,3 +36,11 @@ def test_the_demo_finds_what_it_asks_for(tmp_path: Path, capsys: pytest.CaptureF
     for name in names:
         with Image.open(tmp_path / name) as picture:
             assert picture.size == (480, 360) and picture.getextrema() != ((0, 0),) * 3
+
+
+def test_service_that_does_not_start_says_why(tmp_path: Path) -> None:
+    with (
+        pytest.raises(Unavailable, match=r"an early end; its last words: .*no-such-table"),
+        demo.serving(tmp_path / "data", "table:no-such-table.safetensors", tmp_path / "log"),
+    ):
+        raise AssertionError

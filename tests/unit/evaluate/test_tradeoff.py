@@ -16,7 +16,8 @@ from liftcore import cli
 from liftcore.errors import InvalidInput
 from liftcore.evaluate import tradeoff as comparison
 from liftcore.evaluate import tradeoff_report as report
-from liftcore.evaluate.tradeoff import CANDIDATES, RunSpec, Scene, choose, cosine_figures, measured, pareto
+from liftcore.evaluate.accuracy import cosine_figures
+from liftcore.evaluate.tradeoff import CANDIDATES, RunSpec, Scene, choose, measured, pareto
 from liftcore.evaluate.tradeoff_report import table_of
 from liftcore.progress import silent
 from tests.unit.solve.test_lift_equals_dense import write_scene

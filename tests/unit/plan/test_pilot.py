@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from liftcore.evaluate.tradeoff import cosine_figures
+from liftcore.evaluate.accuracy import cosine_figures
 from liftcore.features.pack import read_features, write_pack
 from liftcore.features.views import Regions
 from liftcore.io.cameras import read_cameras

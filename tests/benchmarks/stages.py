@@ -1,8 +1,10 @@
-"""``splatlift bench --stages``: wall and processor seconds of every step of a view, on one thread.
+"""Wall and processor seconds of every step of a view, on one thread, of the workloads of ``splatlift bench``.
+
+    python -m tests.benchmarks.stages [--scene DIR] [--splats N] [--size WxH] [--channels F] [--views N]
 
 A raster that times its own steps: nothing else about it differs, so the kernels are those of every lift. On one
 thread a step's processor time is its own, and near its wall time on an idle machine; how far two cores share the work
-is what ``splatlift bench`` without ``--stages`` shows.
+is what ``splatlift bench`` shows.
 """
 
 import os
@@ -16,7 +18,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from liftcore.evaluate.bench import Workload
+from liftcore.device import choose_device
+from liftcore.evaluate.bench import Workload, workload
 from liftcore.progress import silent
 from liftcore.raster.base import CompositingParams, RegionWeights
 from liftcore.raster.cpu.composite import Frame
@@ -30,6 +33,8 @@ from liftcore.solve.columns import by_tuples
 from liftcore.solve.host import Host
 from liftcore.solve.totals import row_totals
 from liftcore.solve.view_weights import WeightStore
+from liftcore.warm_up import warm_up_lift
+from tests.benchmarks.base import command_line, tell
 
 STAGES = ("projection", "order", "lists", "walk", "merge", "rest", "solution")
 
@@ -130,3 +135,23 @@ def _figures(name: str, clocks: list[Clock]) -> dict[str, float]:
         "cpu_s": statistics.median(cpu),
         "cpu_s_min": min(cpu),
     }
+
+
+def main() -> None:
+    """Time a workload."""
+    sizes = [(f"--{name}", {"type": int}) for name in ("splats", "channels", "levels", "views")]
+    names = [(f"--{name}", {}) for name in ("scene", "size", "preset")]
+    options = vars(command_line("tests.benchmarks.stages", __doc__, *sizes, *names).parse_args())
+    work, presets = workload(options), [options["preset"]] if options["preset"] else ["row-sum", "tikhonov"]
+    warm_up_lift(work.splats.kernel, choose_device("cpu"), LiftSettings.of(preset="row-sum"))
+    rows = []
+    for preset in presets:
+        found = time_stages(work, LiftSettings.of(preset=preset).preset)
+        rows += [{"preset": preset, "step": name, **figures} for name, figures in found["stages"].items()]
+    sizes = f"{work.splats.count} splats, {len(work.views)} views"
+    note = f"{work.name}, {sizes}; seconds a view; load {os.getloadavg()[0]:.1f}"
+    tell(rows, as_json=options["json"], note=note)
+
+
+if __name__ == "__main__":
+    main()
