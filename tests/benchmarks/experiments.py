@@ -18,17 +18,13 @@ from typing import Any
 import numpy as np
 import torch
 from scipy.sparse import csr_array, vstack
-from scipy.sparse.linalg import LinearOperator, eigsh
 from torch import Tensor
 from torch.nn.functional import cosine_similarity, normalize
 
 from liftcore.errors import SplatliftError
-from liftcore.evaluate.accuracy import view_cosines
-from liftcore.evaluate.synthetic import room_cameras, room_splats
 from liftcore.features.pack import Views, pair, read_features, write_pack
 from liftcore.features.views import NO_LABEL, Regions, ViewFeatures
 from liftcore.io.cameras import read_cameras
-from liftcore.io.inria import write_inria_cameras
 from liftcore.io.ply import write_splats
 from liftcore.io.splats import read_splats
 from liftcore.query.directions import MINIMUM_ROW_SUM
@@ -38,7 +34,7 @@ from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.result import LiftResult
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.splats import Kernel, Splats
-from liftcore.settings import TIKHONOV_GAIN, LiftSettings, Preset
+from liftcore.settings import TIKHONOV_GAIN
 from liftcore.solve.all_rays import AllRays
 from liftcore.solve.channels import Channels
 from liftcore.solve.least_squares import solve_block
@@ -68,19 +64,15 @@ class Subject:
         self,
         pack: str,
         splats: Splats | None = None,
-        cameras: Cameras | None = None,
         views: Mapping[str, ViewFeatures] | None = None,
         **settings: Any,
     ) -> LiftResult:
-        """A lift of a pack; onto other splats, from other cameras or of other views where they are given."""
+        """A lift of a pack; onto other splats or of other views where they are given."""
         with tempfile.TemporaryDirectory(prefix="splatlift-experiment-") as place:
             files, own = list(scene_files(self.folder, pack)), Path(place)
             if splats is not None:
                 files[0] = own / "splats.ply"
                 write_splats(splats, files[0])
-            if cameras is not None:
-                files[1] = own / "cameras.json"
-                write_inria_cameras(cameras, files[1])
             if views is not None:
                 files[2] = own / "features.safetensors"
                 write_pack(files[2], views, {"normalised": "true"})
@@ -97,57 +89,30 @@ def judged(truth: Tabletop, made: LiftResult, raster: CpuRaster | None = None) -
 
 
 def ablation(subject: Subject) -> Rows:
-    """Table 1c: guidance (T), robust step (R) and aggregation (P) on and off, with and without automatic threshold.
+    """Table 1c: guidance (T), robust step (R) and aggregation (P) on and off.
 
-    mIoU by argmax knows all classes; phrase IoU asks for each class of a view alone and cuts its map.
+    mIoU by argmax knows all classes; phrase IoU asks for each class of a view alone and cuts its map by an automatic
+    threshold.
     """
     truth = Tabletop(subject.folder)
-    parts = [(guided, robust, aggregated) for guided, robust, aggregated in product((False, True), repeat=3)]
+    parts = product((False, True), repeat=3)
     for pack, (guided, robust, aggregated) in product(subject.packs("features", "features_hard"), parts):
         preset = "tikhonov" if guided else "row-sum"
         made = subject.lift(pack, preset=preset, robust_steps=int(robust), aggregation=aggregated)
-        automatic, by_hand = phrase_ious(truth, made.features, made.metadata.settings)
         marks = {name: "on" if on else "-" for name, on in (("T", guided), ("R", robust), ("P", aggregated))}
-        phrases = {"phrase_iou_with_A": automatic, "phrase_iou_without_A": by_hand}
-        yield {"pack": pack, **marks, **judged(truth, made), **phrases}
+        yield {"pack": pack, **marks, **judged(truth, made), "phrase_iou": phrase_iou(truth, made)}
 
 
-BY_HAND = 0.65  # of the way from a map's mean to its maximum, as the released code cuts by hand
-
-
-def phrase_ious(truth: Tabletop, features: Tensor, settings: LiftSettings) -> tuple[float, float]:
-    """Mean IoU over the classes of each held-out view, each asked for alone: threshold automatic, and by hand."""
-    ious: list[list[float]] = []
-    maps = truth.maps(features, settings, truth.raster)
+def phrase_iou(truth: Tabletop, made: LiftResult) -> float:
+    """Mean IoU over the classes of each held-out view, each asked for alone."""
+    ious, settings = [], made.metadata.settings
+    maps = truth.maps(made.features, settings, truth.raster)
     for (view, mask), scores in zip(truth.held_out.items(), maps, strict=True):
         met = truth.raster.row_sums(truth.cameras[view], settings.render_params) >= MINIMUM_ROW_SUM
         for k in mask[mask >= 0].unique().tolist():
-            attention, known = scores[:, :, k], scores[:, :, k][met]
-            by_hand = float(known.mean()) + BY_HAND * float(known.max() - known.mean())
-            cuts = find_threshold(known, "auto").value, by_hand
-            ious.append([mask_iou(met & (attention >= cut), mask == k) for cut in cuts])
-    automatic, by_hand = torch.tensor(ious).mean(dim=0).tolist()
-    return automatic, by_hand
-
-
-def fidelity(subject: Subject) -> Rows:
-    """Table 1b: the cosine of rendered features with the given ones, on sampled pixels of lifted and held-out views.
-
-    Vectors of one encoder lie in a narrow cone: compare rows, and read no quality into a figure by itself.
-    """
-    splats, cameras, _ = scene_files(subject.folder)
-    raster, known = CpuRaster(read_splats(splats)), read_cameras(cameras)
-    for pack in subject.packs("features_clean", "features", "features_hard", "grids", "regions"):
-        for preset in map(str, Preset):
-            made = subject.lift(pack, preset=preset)
-            row: dict[str, Any] = {"pack": pack, "preset": preset}
-            for name, key in ((pack, ""), (f"{pack}_test", "held_out_")):
-                if subject.packs(name):
-                    packs, walk = subject.open(name, known), made.metadata.settings.render_params
-                    views = packs.views[:: subject.every]
-                    cosines = [view_cosines(raster, known[view], packs[view], made.features, walk) for view in views]
-                    row |= {f"{key}views": len(views), f"{key}cosine": float(np.concatenate(cosines).mean())}
-            yield row
+            cut = find_threshold(scores[:, :, k][met], "auto").value
+            ious.append(mask_iou(met & (scores[:, :, k] >= cut), mask == k))
+    return float(np.mean(ious))
 
 
 def kernels(subject: Subject) -> Rows:
@@ -200,24 +165,6 @@ def mask_noise(subject: Subject) -> Rows:
             }  # fmt: skip
 
 
-def pose_noise(subject: Subject) -> Rows:
-    """Table on noisy poses: N of 100 feature views turned by a degree and moved by a hundredth of the scene.
-
-    Splats and held-out cameras stay right. Means over three seeds.
-    """
-    truth = Tabletop(subject.folder)
-    for pack, preset, share in product(subject.packs("features"), PRESETS, (0, 20, 50, 100)):
-        names, found = subject.open(pack, truth.cameras).views[:: subject.every], []
-        for seed in range(3 if share else 1):
-            order = np.random.default_rng((seed, 1)).permutation(len(names))
-            wrong = [names[k] for k in order[: round(len(names) * share / 100)]]
-            moved = noisy_poses(truth.cameras, wrong, seed)
-            found.append(judged(truth, subject.lift(pack, cameras=moved, preset=preset)))
-        means = {key: float(np.mean([one[key] for one in found])) for key in ("accuracy", "miou")}
-        spread = float(np.std([one["miou"] for one in found]))
-        yield {"pack": pack, "method": preset, "noisy_of_100": share, **means, "miou_std": spread}
-
-
 def row_sums(subject: Subject) -> Rows:
     """Property 2: how close the rows of A come to one, over all pixels, without and with the opacity scale."""
     splats, cameras, _ = scene_files(subject.folder)
@@ -234,43 +181,32 @@ def row_sums(subject: Subject) -> Rows:
 
 RAYS = 150_000  # of the scene
 NEIGHBOURS = 1_200  # splats whose dense spectrum is taken
-GAINS = (0.5, 0.8, 1.0, 1.2, 1.5, 2.0, 4.0, 8.0)
 
 
 def conditioning(subject: Subject) -> Rows:
-    """What lambda does to G = A^T A, on rays of the scene and on a room small enough for its whole spectrum.
+    """What lambda does to G = A^T A, on rays of the scene.
 
     own_share: how much of what the closed form gives a splat is the splat's own, ``(C^T A)_jj / (C^T A 1)_j`` with
     C = A^p; dominant: the share of splats where it is over a half. cond: of the unit-diagonal form of C^T C over
-    splats that lie together, by interlacing a lower bound of the whole; lost: eigenvalues below 1e-6 of the largest;
-    hidden: splats that the scale makes invisible. coupling: the largest eigenvalue of the unit-diagonal form over all
-    splats, 1 where splats share no ray. noise: a splat's deviation under white noise in B. beta: the paper's.
+    splats that lie together, by interlacing a lower bound of the whole. noise: a splat's deviation under white noise
+    in B. beta: the paper's.
     """
     splats, cameras, _ = scene_files(subject.folder)
-    scenes = (
-        (subject.folder.resolve().name, read_splats(splats), list(read_cameras(cameras).values())[:: subject.every]),
-        ("room", room_splats(600), room_cameras(16, 96, 72)),
-    )
-    packs = subject.packs("features", "regions", "features_clean")
-    for name, own, views in scenes:
-        raster = CpuRaster(own)
-        evidence = np.asarray(rays_of(raster, views, 1.0).sum(axis=0)).ravel()
-        chosen = neighbourhood(own.means, evidence)
-        for gain in GAINS:
-            beta = None
-            if packs and name != "room":
-                sampled = {"lift_gain": gain, "stride": 2, "certificate_rays": 5_000}
-                beta = subject.lift(packs[0], preset="row-sum", **sampled).metadata.certificate["beta"]["median"]
-            A = rays_of(raster, views, gain)
-            yield {"scene": name, "gain": gain, **conditions(A, evidence, chosen), "beta_median": beta}
+    raster, views = CpuRaster(read_splats(splats)), list(read_cameras(cameras).values())[:: subject.every]
+    evidence = np.asarray(rays_of(raster, views, 1.0).sum(axis=0)).ravel()
+    chosen, packs = neighbourhood(raster.splats.means, evidence), subject.packs("features", "regions")
+    for gain in (0.5, 0.8, 1.0, 1.2, 1.5, 2.0, 4.0, 8.0):
+        sampled = {"preset": "row-sum", "lift_gain": gain, "stride": 2, "certificate_rays": 5_000}
+        beta = subject.lift(packs[0], **sampled).metadata.certificate["beta"]["median"] if packs else None
+        yield {"gain": gain, **conditions(rays_of(raster, views, gain), evidence, chosen), "beta_median": beta}
 
 
 def conditions(A: csr_array, evidence: np.ndarray, chosen: np.ndarray) -> dict[str, float]:
     """The figures of `conditioning` for A [R, P], evidence [P] and the splats ``chosen`` whose spectrum is taken."""
-    met, count, found = evidence > 0, len(evidence), {}
+    met, found = evidence > 0, {}
     for power, key in ((1, "w"), (2, "w2")):
         C = A if power == 1 else A.multiply(A).tocsr()
-        own, total = np.asarray(A.multiply(C).sum(axis=0)).ravel(), C.T @ (A @ np.ones(count))
+        own, total = np.asarray(A.multiply(C).sum(axis=0)).ravel(), C.T @ (A @ np.ones(len(evidence)))
         shares = np.divide(own, total, out=np.zeros_like(own), where=total > 0)
         sums, squares = np.asarray(C.sum(axis=0)).ravel(), np.asarray(C.multiply(C).sum(axis=0)).ravel()
         some = chosen[sums[chosen] > 0]
@@ -282,17 +218,7 @@ def conditions(A: csr_array, evidence: np.ndarray, chosen: np.ndarray) -> dict[s
         found[f"cond_{key}"] = float(values[-1] / max(values[0], 1e-16 * values[-1]))
         found[f"noise_{key}"] = float(np.median(np.sqrt(squares[some]) / sums[some]))
         if power == 1:
-            found |= {"dominant": float((shares[met] > 0.5).mean()), "hidden": int((~visible).sum())}
-            found["lost_w"] = float((values < 1e-6 * values[-1]).mean())
-            half = np.divide(1.0, np.sqrt(squares), out=np.zeros_like(squares), where=squares > 0)
-            make: Any = LinearOperator  # scipy's stubs know neither its arguments nor those of eigsh
-            operator = make(
-                (count,) * 2, matvec=lambda x, half=half: half * (A.T @ (A @ (half * x.ravel()))), dtype=float
-            )
-            lanczos: Any = eigsh
-            start = np.where(squares > 0, 1.0, 0.0)
-            largest = lanczos(operator, k=1, which="LA", v0=start, tol=1e-3, return_eigenvectors=False)
-            found["coupling"] = float(largest[0])
+            found["dominant"] = float((shares[met] > 0.5).mean())
     return found
 
 
@@ -399,34 +325,6 @@ def follow(rays: AllRays, first: Tensor, truth: Truth, damping: float, steps: in
 # --- ways to be wrong, by an explicit seed ---
 
 
-def noisy_poses(cameras: Cameras, wrong: Sequence[str], seed: int) -> Cameras:
-    """The cameras, those named in ``wrong`` with the paper's noise.
-
-    Deviations are a degree of roll, pitch and yaw each, and a hundredth of the scene's scale (the farthest camera
-    from the mean of all) of each coordinate.
-    """
-    centres = np.stack([camera.centre for camera in cameras.values()])
-    scale = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
-    random, moved = np.random.default_rng(seed), []
-    for camera in cameras.values():
-        if camera.name in set(wrong):
-            roll, pitch, yaw = np.deg2rad(random.normal(0, 1.0, 3))
-            centre = camera.centre + random.normal(0, 0.01 * scale, 3)
-            pose = np.eye(4)
-            pose[:3, :3] = _about(2, roll) @ _about(0, pitch) @ _about(1, yaw) @ camera.viewmat[:3, :3]
-            pose[:3, 3] = -pose[:3, :3] @ centre
-            camera = camera.replace(viewmat=pose)  # noqa: PLW2901
-        moved.append(camera)
-    return Cameras(tuple(moved))
-
-
-def _about(axis: int, angle: float) -> np.ndarray:
-    """[3, 3] f64, a turn about one axis."""
-    matrix, (i, j) = np.eye(3), [k for k in range(3) if k != axis]
-    matrix[[i, i, j, j], [i, j, i, j]] = np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)
-    return matrix
-
-
 def noisy_masks(maps: Mapping[str, Regions], rate: float, seed: int) -> dict[str, Regions]:
     """Region maps in which each region of each level goes wrong with probability ``rate``.
 
@@ -511,7 +409,7 @@ def to_betas(splats: Splats) -> Splats:
 EXPERIMENTS: dict[str, Callable[[Subject], Rows]] = {
     made.__name__: made
     for made in (
-        ablation, conditioning, fidelity, kernels, lambda_sweep, mask_noise, overfitting, pose_noise, row_sums,
+        ablation, conditioning, kernels, lambda_sweep, mask_noise, overfitting, row_sums,
     )
 }  # fmt: skip
 

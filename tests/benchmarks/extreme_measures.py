@@ -21,20 +21,14 @@ from liftcore.io.inria import write_inria_cameras
 from liftcore.io.inspect import describe_cameras, describe_packs, describe_splats
 from liftcore.io.ply import write_splats
 from liftcore.io.scene_files import lift_files
-from liftcore.progress import silent
-from liftcore.raster.base import NEAR_PLANE, CompositingParams, RegionWeights, Weighting
+from liftcore.raster.base import NEAR_PLANE, CompositingParams, Weighting
 from liftcore.raster.cpu.raster import CpuRaster
-from liftcore.raster.reference import DenseView, alphas, dense_view, projected_gaussian, reading_matrix
+from liftcore.raster.reference import DenseView, dense_view, projected_gaussian, reading_matrix
 from liftcore.result import LiftResult
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.splats import Kernel, Splats
 from liftcore.settings import LiftSettings
-from liftcore.solve.closed_form import solve_closed_form
-from liftcore.solve.columns import Columns
-from liftcore.solve.host import Host
 from liftcore.solve.lift_warnings import FAINT, order_warnings
-from liftcore.solve.robust import robust_weights
-from liftcore.solve.view_weights import WeightStore
 from tests.scenes import IDENTITY, of_kernel, splats_at
 
 KERNELS = (Kernel.GAUSSIAN_3D, Kernel.GAUSSIAN_2D, Kernel.BETA)
@@ -65,7 +59,6 @@ class Extreme:
     """One row of the table, and one test a kernel."""
 
     name: str
-    exact: str  # what exact arithmetic says
     measure: Callable[[Kernel], Found]
     kernels: tuple[Kernel, ...] = KERNELS
     bound: float = WEIGHTS  # of the error; the test holds it
@@ -152,7 +145,6 @@ class View:
 
 def walked(
     name: str,
-    exact: str,
     scene: Callable[[Kernel], View],
     claim: Callable[[np.ndarray], bool] = always,
     like: Callable[[Kernel], np.ndarray] | None = None,
@@ -161,13 +153,12 @@ def walked(
     """An extreme whose weights are held to the oracle.
 
     Args:
-        name: of the row. exact: what exact arithmetic says.
-        scene: the view, for a kernel.
-        claim: ``exact`` as a function of A [H * W, P], of the oracle's and of the float32 walk's.
-        like: what A equals by ``exact``, from another scene or camera, for a kernel; NaN where it says nothing.
+        name: of the row. scene: the view, for a kernel.
+        claim: what exact arithmetic says of A [H * W, P], of the oracle's and of the float32 raster's.
+        like: what A equals, from another scene or camera, for a kernel; NaN where that says nothing.
         more: kernels, bound and told of the Extreme.
     """
-    return Extreme(name, exact, partial(_measure_view, scene, claim, like), **more)
+    return Extreme(name, partial(_measure_view, scene, claim, like), **more)
 
 
 def told_of(splats: Splats, camera: Camera) -> tuple[str, ...]:
@@ -216,23 +207,19 @@ class Task:
     settings: Mapping[str, Any] = field(default_factory=lambda: {"dtype": "float32"})
 
 
-def lifted(
-    name: str, exact: str, task: Callable[[], Task], claim: Callable[[Any], bool] = always, **more: Any
-) -> Extreme:
+def lifted(name: str, task: Task, claim: Callable[[Any], bool] = always, **more: Any) -> Extreme:
     """An extreme whose features are held to the dense definition, relative to the longest value that came in.
 
     Args:
-        name: of the row. exact: what exact arithmetic says.
-        task: what is lifted.
-        claim: ``exact`` as a function of the Lift.
+        name: of the row. task: what is lifted. claim: what exact arithmetic says of the lift.
         more: kernels, bound and told of the Extreme.
     """
-    return Extreme(name, exact, partial(_measure_lift, task, claim), **more)
+    return Extreme(name, partial(_measure_lift, task, claim), **more)
 
 
-def refused(name: str, exact: str, work: Callable[[], object], told: str, **more: Any) -> Extreme:
+def refused(name: str, work: Callable[[], object], told: str, **more: Any) -> Extreme:
     """An extreme that no answer could be right for: the input is refused, with ``told`` in the error."""
-    return Extreme(name, exact, partial(_refusal, work), told=told, **more)
+    return Extreme(name, partial(_refusal, work), told=told, **more)
 
 
 def cloud(kernel: Kernel | None = None) -> Splats:
@@ -278,8 +265,7 @@ def dense_features(task: Task, splats: Splats, settings: LiftSettings) -> tuple[
     return np.divide(X, totals[:, None], out=np.zeros_like(X), where=totals[:, None] > 0), totals
 
 
-def _measure_lift(task_of: Callable[[], Task], claim: Callable[[LiftResult], bool], kernel: Kernel) -> Found:
-    task = task_of()
+def _measure_lift(task: Task, claim: Callable[[LiftResult], bool], kernel: Kernel) -> Found:
     splats = task.splats or cloud(kernel)
     made, warnings = run(task, splats)
     X, totals = dense_features(task, splats, made.metadata.settings)
@@ -304,122 +290,6 @@ def _refusal(work: Callable[[], object], _: Kernel) -> Found:
     except SplatliftError as error:
         return Found("refused", None, (re.sub(rf"\S*{FOLDER}[^/]*/", "", str(error)),))
     return Found("accepted", None, (), holds=False)
-
-
-ROWS = 1_000  # of the codebook, which the entries read in turn
-
-
-def sums_of_rays(side: int) -> dict[str, float]:
-    """Relative errors of one faint splat's sums over an image of ``side`` squared, which it covers.
-
-    Returns:
-        by name: region weights, squared region weights, evidence, ``A^T 1``.
-    """
-    splats = splats_at([(0.0, 0.0, 2.0)], log_scales=[0.3, 0.1, 0.0], logits=-2.0)
-    camera = Camera.pinhole("v0", side, side, 0.7 * side, 0.7 * side, side / 2, side / 2, np.eye(4))
-    exact, squares = _exact_sums(splats, camera)
-    raster, region = CpuRaster(splats), Regions(torch.zeros(1, 1, 1, dtype=torch.int32), torch.ones(1, 1))
-    plain = raster.region_weights(camera, region, CompositingParams(), Weighting(1))
-    squared = raster.region_weights(camera, region, CompositingParams(), Weighting(2))
-    adjoint = raster.adjoint(camera, torch.ones(side, side, 1), CompositingParams())
-    found = {
-        "A^T S": float(plain.weights[0]) / exact,
-        "A^T S, squared weights": float(squared.weights[0]) / squares,
-        "evidence": float(plain.evidence[0]) / exact,
-        "A^T Y": float(adjoint[0, 0]) / exact,
-    }
-    return {name: abs(ratio - 1) for name, ratio in found.items()}
-
-
-def sums_of_entries(count: int, equal: bool) -> float:
-    """Relative error of x of a splat that reads ``count`` codebook rows of one view, by weights equal or random."""
-    return _solved([_entries(count, equal)], equal)
-
-
-def sums_of_views(count: int, equal: bool) -> float:
-    """The same of a splat that reads one row in each of ``count`` views."""
-    whole = _entries(count, equal)
-    one = torch.tensor([0, 1])
-    views = [_row(whole.columns[k : k + 1], whole.weights[k : k + 1], one) for k in range(count)]
-    return _solved(views, equal)
-
-
-def robust_sums(rows: int, channels: int) -> float:
-    """Error of a splat's weights after one robust step, over the largest; it reads so many rows in each of two views.
-
-    A row is one direction times -1 .. 2, and noise.
-    """
-    rng = np.random.default_rng(2)
-    direction = rng.normal(0, 1, channels)
-    amounts, noise = rng.uniform(-1, 2, (2, rows, 1)), rng.normal(0, 1, (2, rows, channels))
-    books = (amounts * direction + noise).astype(np.float32)
-    weights = rng.uniform(0, 1, (2, rows)).astype(np.float32)
-    every, starts = torch.arange(rows, dtype=torch.int32), torch.tensor([0, rows])
-    total = weights.sum(dtype=np.float64)
-    with WeightStore() as store:
-        for view in weights:
-            store.append(_row(every, torch.from_numpy(view), starts))
-        judged = robust_weights(store, [*map(torch.from_numpy, books)], np.array([total]), 1, silent, Host(1))
-        got = np.stack([view.weights.numpy() for view in judged])
-    exact = _robust_step(weights.astype(np.float64), books.astype(np.float64))
-    return float(np.abs(got - exact).max() / exact.max())
-
-
-def added_one_by_one(count: int) -> float:
-    """Relative error of ``count`` equal terms in a single float32 sum, which nothing here is: to compare with."""
-    terms = np.full(count, 0.3, np.float32)
-    return abs(float(np.cumsum(terms, dtype=np.float32)[-1]) / (count * float(terms[0])) - 1)
-
-
-def _exact_sums(splats: Splats, camera: Camera) -> tuple[float, float]:
-    """The sums of the one splat's alphas and of their squares, in float64, row by row of the image."""
-    x = np.arange(camera.width) + 0.5
-    total = squares = 0.0
-    for y in x:
-        alpha = alphas(splats, 0, camera, CompositingParams(), np.stack([x, np.full_like(x, y)], axis=1))[0]
-        total += float(alpha.sum())
-        squares += float((alpha * alpha).sum())
-    return total, squares
-
-
-def _entries(count: int, equal: bool) -> RegionWeights:
-    rng = np.random.default_rng(0)
-    values = np.full(count, 0.3) if equal else rng.uniform(0, 1, count)
-    columns = torch.from_numpy((np.arange(count) % ROWS).astype(np.int32))
-    return _row(columns, torch.from_numpy(values.astype(np.float32)), torch.tensor([0, count]))
-
-
-def _row(columns: torch.Tensor, weights: torch.Tensor, starts: torch.Tensor) -> RegionWeights:
-    first = torch.zeros(1, dtype=torch.int32)
-    return RegionWeights(first, starts, columns, weights, first, torch.ones(1))
-
-
-def _robust_step(W: np.ndarray, E: np.ndarray) -> np.ndarray:
-    """W' [2, M] of one splat by the equation of ``liftcore.solve.robust``, from W [2, M] and E [2, M, F], in f64."""
-    units = E / np.linalg.norm(E, axis=2, keepdims=True)
-    away = units - np.einsum("vm,vmf->f", W, units) / W.sum()
-    e = away / np.linalg.norm(away, axis=2, keepdims=True)
-    others = np.einsum("vm,vmf->vf", W, e)[::-1]
-    r = others / np.linalg.norm(others, axis=1, keepdims=True)
-    cosines = np.maximum(np.einsum("vmf,vf->vm", e, r), 0)
-    own = W.sum(axis=1, keepdims=True) / W.sum()
-    new = W * ((1 - own) * cosines + own * (W * cosines).sum() / W.sum())
-    return new * W.sum() / new.sum()
-
-
-def _solved(views: list[RegionWeights], equal: bool) -> float:
-    rng = np.random.default_rng(1)
-    book = torch.tensor(np.full((ROWS, 1), 0.7) if equal else rng.uniform(-1, 2, (ROWS, 1)), dtype=torch.float32)
-    total = value = 0.0
-    with WeightStore() as store:
-        for view in views:
-            store.append(view)
-            weights = view.weights.double()
-            total += float(weights.sum())
-            value += float(weights @ book[view.columns.long(), 0].double())
-        columns = [Columns(book)] * len(store)
-        solved = solve_closed_form(store, columns, np.array([total]), torch.float32, silent, Host(1))
-    return abs(float(solved.features[0, 0]) * total / value - 1)
 
 
 SCENES = 300

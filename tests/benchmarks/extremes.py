@@ -46,22 +46,18 @@ from tests.benchmarks.extreme_measures import (
     HEIGHT,
     KERNELS,
     SCENES,
+    WEIGHTS,
     WIDTH,
     Extreme,
     Found,
     Task,
     View,
-    added_one_by_one,
     always,
     cloud,
     exact_weights,
     lifted,
     refused,
-    robust_sums,
     run,
-    sums_of_entries,
-    sums_of_rays,
-    sums_of_views,
     survey,
     told_of,
     walked,
@@ -78,6 +74,22 @@ ON_NEAR_PLANE = float(np.nextafter(np.float32(0.01), np.float32(1)))  # the firs
 def _row(kernel: Kernel, walk: CompositingParams | None = None, **more: Any) -> View:
     """Five splats in a row before the camera; ``more`` as ``splats_at`` takes it."""
     return View(splats_at(ROW, **more, kernel=kernel), camera_at_origin(), walk or CompositingParams())
+
+
+def in_a_row(
+    name: str,
+    claim: Callable[[np.ndarray], bool] = always,
+    *,
+    walk: CompositingParams | None = None,
+    kernels: tuple[Kernel, ...] = KERNELS,
+    like: Callable[[Kernel], np.ndarray] | None = None,
+    bound: float = WEIGHTS,
+    told: str = "",
+    **splats: Any,
+) -> Extreme:
+    """``walked`` of five splats in a row."""
+    more: dict[str, Any] = {"kernels": kernels, "bound": bound, "told": told}
+    return walked(name, lambda kernel: _row(kernel, walk, **splats), claim, like, **more)
 
 
 def _stack(kernel: Kernel, count: int, logits: ArrayLike, walk: CompositingParams | None = None) -> View:
@@ -141,105 +153,74 @@ def _crowd(count: int, logit: float, stop: float, kernel: Kernel) -> Found:
 
 
 OPACITIES: tuple[Extreme, ...] = (
-    walked(
-        "opacity logits of +-1e4",
-        "opaque to the cap of 0.99, or absent",
-        lambda kernel: _row(kernel, logits=[OPAQUE, -OPAQUE, 0.5, OPAQUE, -OPAQUE]),
-        _opaque_or_absent,
-    ),
-    walked(
+    in_a_row("opacity logits of +-1e4", _opaque_or_absent, logits=[OPAQUE, -OPAQUE, 0.5, OPAQUE, -OPAQUE]),
+    in_a_row(
         "opacity logits of +-infinity, as converters of quantised splats write them",
-        "opaque to the cap of 0.99, or absent",
-        lambda kernel: _row(kernel, logits=[math.inf, -math.inf, 0.5, math.inf, -math.inf]),
         _opaque_or_absent,
+        logits=[math.inf, -math.inf, 0.5, math.inf, -math.inf],
     ),
-    walked(
+    in_a_row(
         "every splat transparent (logits of -20)",
-        "alphas of 2e-9: below the floor of 1/255, so no weight",
-        lambda kernel: _row(kernel, logits=-20.0),
         lambda A: A.max() == 0,
+        logits=-20.0,
         kernels=FLOORED,
         told="never seen",
     ),
-    walked(
+    in_a_row(
         "the same, DBS, which has no floor",
-        "weights of 2e-9",
-        lambda kernel: _row(kernel, logits=-20.0),
         lambda A: 1e-9 < A.max() < 3e-9,
+        logits=-20.0,
         kernels=(Kernel.BETA,),
         bound=1e-12,
     ),
     walked(
         "every splat opaque (logits of 1e4)",
-        "a ray ends at its first splat: (1 - 0.99)^2 is the stop itself",
         lambda kernel: _stack(kernel, 6, OPAQUE),
         lambda A: (A > 0.5).sum(axis=1).max() == 1 and A[CENTRE, 1:].max() <= 0.0099 + 1e-6,
     ),
     walked(
         "forty opaque splats without a stop",
-        "weights down to 1e-78, below what float32 holds",
         lambda kernel: _stack(kernel, 40, OPAQUE, CompositingParams(transmittance_stop=0.0)),
         lambda A: A.sum(axis=1).max() <= 1 + 1e-6,
     ),
-    walked(
+    in_a_row(
         "the gain lambda at 0.01",
-        "every opacity near a half",
-        lambda kernel: _row(
-            kernel, logits=[5.0, -5.0, 1.0, 0.0, -1.0], walk=CompositingParams(opacity_logit_scale=0.01)
-        ),
         lambda A: 0.3 < A[:, 1].max() < 0.6,
+        logits=[5.0, -5.0, 1.0, 0.0, -1.0],
+        walk=CompositingParams(opacity_logit_scale=0.01),
     ),
-    walked(
+    in_a_row(
         "the gain lambda at 16",
-        "every opacity near nought or one",
-        lambda kernel: _row(
-            kernel, logits=[5.0, -5.0, 1.0, 0.0, -1.0], walk=CompositingParams(opacity_logit_scale=16.0)
-        ),
         lambda A: A[:, [1, 4]].max() == 0,
+        logits=[5.0, -5.0, 1.0, 0.0, -1.0],
+        walk=CompositingParams(opacity_logit_scale=16.0),
         kernels=FLOORED,
     ),
     walked(
         "a cap of 0.9999999",
-        "a tenth of a millionth of the light passes each opaque splat",
         lambda kernel: _stack(kernel, 3, OPAQUE, CompositingParams(alpha_cap=0.9999999, transmittance_stop=0.0)),
         lambda A: A[CENTRE, 0] > 0.999999,
     ),
 )
 
 SHAPES: tuple[Extreme, ...] = (
-    walked(
+    in_a_row(
         "a log scale of minus infinity on one axis",
-        "as flat as with a scale of 1e-12",
-        lambda kernel: _row(kernel, log_scales=[-1.0, -math.inf, -2.0]),
+        log_scales=[-1.0, -math.inf, -2.0],
         like=lambda kernel: exact_weights(_row(kernel, log_scales=[-1.0, math.log(1e-12), -2.0])),
     ),
-    walked(
-        "scales of 1e-12",
-        "points: footprints of the low-pass alone",
-        lambda kernel: _row(kernel, log_scales=math.log(1e-12)),
-        lambda A: A.max() > 1e-3,
-        told="smaller than 1e-07 scene units",
+    in_a_row(
+        "scales of 1e-12", lambda A: A.max() > 1e-3, log_scales=math.log(1e-12), told="smaller than 1e-07 scene units"
     ),
-    walked(
-        "scales of 1e6",
-        "every ray meets every splat at its middle",
-        lambda kernel: _row(kernel, log_scales=math.log(1e6)),
-        lambda A: A.max() > 0.7,
-        told="larger than the scene",
-    ),
-    walked(
+    in_a_row("scales of 1e6", lambda A: A.max() > 0.7, log_scales=math.log(1e6), told="larger than the scene"),
+    in_a_row(
         "needles and sheets: axes 1e6 apart",
-        "as narrow as the low-pass, as long as they are",
-        lambda kernel: _row(
-            kernel,
-            log_scales=[[0, -13.8, -13.8], [-13.8, 0, -13.8], [-13.8, -13.8, 0], [0, 0, -13.8], [-13.8, 0, 0]],
-            quats=TURNED,
-        ),
         lambda A: A.max() > 0.1,
+        log_scales=[[0, -13.8, -13.8], [-13.8, 0, -13.8], [-13.8, -13.8, 0], [0, 0, -13.8], [-13.8, 0, 0]],
+        quats=TURNED,
     ),
     walked(
         "discs seen edge-on, to 1e-9 of a radian",
-        "a line as wide as the low-pass",
         lambda kernel: View(
             splats_at(
                 [(0.0, 0.0, 2.0 + 0.1 * k) for k in range(4)],
@@ -252,33 +233,30 @@ SHAPES: tuple[Extreme, ...] = (
         lambda A: A.max() > 0.1,
         kernels=(Kernel.GAUSSIAN_2D,),
     ),
-    walked(
+    in_a_row(
         "quaternions of zero",
-        "no rotation is defined; taken as none",
-        lambda kernel: _row(kernel, log_scales=[0.0, -2.0, -3.0], quats=(0.0, 0.0, 0.0, 0.0)),
+        log_scales=[0.0, -2.0, -3.0],
+        quats=(0.0, 0.0, 0.0, 0.0),
         like=lambda kernel: exact_weights(_row(kernel, log_scales=[0.0, -2.0, -3.0])),
         told="zero quaternion",
     ),
-    walked(
+    in_a_row(
         "quaternions of length 1e-18 and 1e18",
-        "their direction alone counts",
-        lambda kernel: _row(
-            kernel, log_scales=[0.0, -2.0, -3.0], quats=[np.multiply(TURNED, 10.0**k) for k in (-18, 18, 0, 9, -9)]
-        ),
+        log_scales=[0.0, -2.0, -3.0],
+        quats=[np.multiply(TURNED, 10.0**k) for k in (-18, 18, 0, 9, -9)],
         like=lambda kernel: exact_weights(_row(kernel, log_scales=[0.0, -2.0, -3.0], quats=TURNED)),
     ),
-    walked(
+    in_a_row(
         "dust under the mip filter's compensation",
-        "opacity fades with the area: 1e-12 squared is none",
-        lambda kernel: _row(kernel, log_scales=math.log(1e-12), walk=CompositingParams(antialiased=True)),
         lambda A: A.max() == 0,
+        log_scales=math.log(1e-12),
+        walk=CompositingParams(antialiased=True),
         kernels=GAUSSIAN,
         told="smaller than 1e-07 scene units",
     ),
     *(
         walked(
             f"DBS: b of {b:+g}",
-            f"beta = 4 exp(b) = {4 * math.exp(b):.2g}: {shape}",
             lambda kernel, b=b: View(splats_at([(0.0, 0.0, 2.0)], -0.5, betas=b, kernel=kernel), camera_at_origin()),
             claim,
             kernels=(Kernel.BETA,),
@@ -293,27 +271,19 @@ SHAPES: tuple[Extreme, ...] = (
 PLACES: tuple[Extreme, ...] = (
     walked(
         "world coordinates of 1e7, the camera beside them",
-        "as at the origin, from the float32 centres that the file gives",
         lambda kernel: _far_away(kernel, 1e7),
         like=lambda kernel: exact_weights(_far_away(kernel, 0.0)),
         told="where float32 is coarse",
     ),
     Extreme(
         "a camera 1e7 from splats a tenth apart",
-        "the nearest first",
         _unordered,
         bound=0.75,  # the order is lost, as the lift tells
         told="float32 depths cannot order",
     ),
-    walked(
-        "depth ties",
-        "no order is defined; that of the file is taken",
-        lambda kernel: _stack(kernel, 6, 1.0),
-        _in_file_order,
-    ),
+    walked("depth ties", lambda kernel: _stack(kernel, 6, 1.0), _in_file_order),
     walked(
         "splats on the near plane, a rounding before it, at the camera and behind",
-        "the first is drawn, the others are not",
         lambda kernel: View(
             splats_at(
                 [(0.0, 0.0, z) for z in (ON_NEAR_PLANE, math.nextafter(0.01, 0), 0.0, -0.01, -5.0)],
@@ -326,7 +296,6 @@ PLACES: tuple[Extreme, ...] = (
     ),
     walked(
         "a camera inside splats",
-        "splats larger than their distance, projected by the clamped Jacobian",
         lambda kernel: View(
             splats_at([(0.0, 0.0, 0.05), (0.02, 0.01, 0.3), (0.0, 0.0, 3.0)], [0.5, 0.0, -0.5], kernel=kernel),
             camera_at_origin(),
@@ -335,25 +304,17 @@ PLACES: tuple[Extreme, ...] = (
     ),
     walked(
         "two hundred identical splats",
-        "weights fall geometrically, in the order of the file",
         lambda kernel: _stack(kernel, 200, -3.0),
         lambda A: bool((np.diff(A[CENTRE, :150]) < 0).all()),
     ),
     walked(
         "one splat (P = 1)",
-        "its alpha on every ray",
         lambda kernel: View(splats_at([(0.0, 0.0, 2.0)], kernel=kernel), camera_at_origin()),
         lambda A: abs(A.max() - ALPHA) < 1e-5,
     ),
-    Extreme(
-        "a million splats on one ray",
-        "a geometric series until the transmittance falls to 1e-4",
-        lambda kernel: _crowd(1_000_000, -5.0, 1e-4, kernel),
-        kernels=FLOORED,
-    ),
+    Extreme("a million splats on one ray", lambda kernel: _crowd(1_000_000, -5.0, 1e-4, kernel), kernels=FLOORED),
     Extreme(
         "a million DBS splats of alpha 1e-6 on one ray",
-        "two thirds of the light: 1 - 1/e",
         lambda kernel: _crowd(1_000_000, math.log(1e-6), 1e-4, kernel),
         kernels=(Kernel.BETA,),
         bound=1e-4,
@@ -407,7 +368,6 @@ VIEWS: tuple[Extreme, ...] = (
     *(
         walked(
             f"an image of {width} x {height}",
-            "weights at the centres of its pixels",
             lambda kernel, size=(width, height): View(splats_at(ROW, -1.0, kernel=kernel), camera_at_origin(*size)),
             lambda A: A.max() > 0.1,
         )
@@ -415,7 +375,6 @@ VIEWS: tuple[Extreme, ...] = (
     ),
     walked(
         f"an image of {MAX_SIDE} x 3, the widest allowed",
-        "weights at the centres of its pixels",
         lambda kernel: View(
             splats_at([(0.3 * k - 0.6, 0.0, 2.0) for k in range(5)], kernel=kernel), _narrow(MAX_SIDE, 3)
         ),
@@ -423,19 +382,16 @@ VIEWS: tuple[Extreme, ...] = (
     ),
     walked(
         f"a focal length of {MAX_FOCAL:g} px",
-        "the image is one point of the splat on the axis",
         lambda kernel: View(splats_at([(0.0, 0.0, 2.0)], kernel=kernel), camera_at_origin(focal=MAX_FOCAL)),
         lambda A: np.ptp(A[:, 0]) < 1e-5 and A.min() > 0.7,
     ),
     walked(
         f"a focal length of {MIN_FOCAL:g} px",
-        "the whole scene falls into one pixel",
         lambda kernel: View(splats_at(ROW, -1.0, kernel=kernel), camera_at_origin(focal=MIN_FOCAL)),
         lambda A: A[6 * 16 + 8].sum() > 0.9,
     ),
     walked(
         "a principal point 1e6 px outside the image",
-        "rays far aside: they meet what lies there",
         lambda kernel: View(
             splats_at([*ROW, (-2e6 / 16 + 1.0, 0.0, 2.0)], 0.5, kernel=kernel),
             Camera.pinhole("v0", 16, 12, 16.0, 16.0, 1e6, 6.5, np.eye(4)),
@@ -443,40 +399,21 @@ VIEWS: tuple[Extreme, ...] = (
         lambda A: A[:, 5].max() > 0.1,
         told="principal point far off the centre",
     ),
-    walked(
-        "a camera rolled by a right angle",
-        "the image, rolled",
-        lambda kernel: _rolled(kernel, math.pi / 2),
-        like=_image_rolled,
-    ),
+    walked("a camera rolled by a right angle", lambda kernel: _rolled(kernel, math.pi / 2), like=_image_rolled),
     walked(
         "a camera rolled by 1e-9 of a radian",
-        "the image within 1e-8 px",
         lambda kernel: _rolled(kernel, 1e-9),
         like=lambda kernel: exact_weights(_rolled(kernel, 0.0)),
     ),
-    walked(
-        "a camera upside down, looking back",
-        "the order is turned round: the last of the row is met first",
-        _turned_back,
-        like=_last_alone,
-    ),
+    walked("a camera upside down, looking back", _turned_back, like=_last_alone),
     walked(
         "a view that sees nothing: all behind, or far aside",
-        "no weight",
         lambda kernel: View(splats_at([(0.0, 0.0, -2.0), (1e6, 0.0, 1.0)], kernel=kernel), camera_at_origin()),
         lambda A: A.max() == 0,
     ),
-    walked(
-        "a splat on one ray only",
-        "that ray's weight",
-        _one_ray,
-        lambda A: (A > 0).sum() == 1,
-        kernels=FLOORED,
-    ),
+    walked("a splat on one ray only", _one_ray, lambda A: (A > 0).sum() == 1, kernels=FLOORED),
     walked(
         "splats beside the camera plane, at depth 0.0101",
-        "projected to 1e6 px by the clamped Jacobian",
         lambda kernel: View(
             splats_at(
                 [(s * x, 0.3 * x, 0.0101) for x in (0.01, 1.0, 100.0) for s in (-1, 1)], [-1, -3, 0], kernel=kernel
@@ -503,17 +440,13 @@ def _behind(distortion: Distortion, focal: float = FOCAL) -> Camera:
     )
 
 
-def photographed(
-    name: str, exact: str, camera: Callable[[], Camera], claim: Callable[[Camera], bool] = always
-) -> Extreme:
+def photographed(name: str, camera: Callable[[], Camera], claim: Callable[[Camera], bool] = always) -> Extreme:
     """An extreme whose error is how far, in pixels, a pixel lies from where its ray meets the photo again.
 
     Args:
-        name: of the row. exact: what exact arithmetic says.
-        camera: of the distorted photo.
-        claim: ``exact`` as a function of that camera.
+        name: of the row. camera: of the distorted photo. claim: what exact arithmetic says of that camera.
     """
-    return Extreme(name, exact, partial(_round_trip, camera, claim), kernels=GAUSSIAN, bound=PIXELS, told=TOLD)
+    return Extreme(name, partial(_round_trip, camera, claim), kernels=GAUSSIAN, bound=PIXELS, told=TOLD)
 
 
 def _round_trip(camera_of: Callable[[], Camera], claim: Callable[[Camera], bool], _: Kernel) -> Found:
@@ -564,69 +497,53 @@ def _where_they_were(kernel: Kernel) -> np.ndarray:
 LENSES: tuple[Extreme, ...] = (
     photographed(
         "a distortion of 1e-12",
-        "the pinhole's image within 1e-10 px",
         lambda: _behind(Brown(k1=1e-12)),
         lambda camera: (camera.width, camera.height) == (PHOTO_WIDTH, PHOTO_HEIGHT),
     ),
     photographed(
         "a barrel lens that turns back a millionth beyond the photo's corner",
-        "one ray a pixel, and rays ever farther apart",
         lambda: _behind(Brown(k1=-4 / 27 / (CORNER * (1 + 1e-6)) ** 2)),
     ),
     photographed(
         "a barrel lens that turns back before the photo's corners",
-        "corners without rays; lifted is what has some",
         lambda: _behind(Brown(k1=-4 / 27 / (CORNER * 0.9) ** 2)),
         lambda camera: camera.lens is not None and 0.8 < camera.lens.share < 1,
     ),
-    photographed(
-        "a pincushion of k1 = 1000", "a photo of what lies near the axis", lambda: _behind(Brown(k1=1000.0))
-    ),
+    photographed("a pincushion of k1 = 1000", lambda: _behind(Brown(k1=1000.0))),
     photographed(
         "a lens of 1e9 px",
-        "rays on the axis, where there is no distortion",
         lambda: _behind(Brown(k1=-0.3), 1e9),
         lambda camera: (camera.width, camera.height) == (PHOTO_WIDTH, PHOTO_HEIGHT),
     ),
     photographed(
         "a fisheye whose corners lie 110 degrees off its axis",
-        "no pinhole sees them; lifted is what lies within 60",
         lambda: _behind(Fisheye(), CORNER * FOCAL / math.radians(110)),
         lambda camera: camera.width / 2 / camera.fx <= math.tan(math.radians(60)) + 1 / camera.fx,
     ),
     *(
         walked(
             f"a frame {scale:g} times as large",
-            "the weights of the scene before it was moved",
             partial(_moved, scale),
             like=_where_they_were,
             told="further than" if scale * 2 > 1e5 else "",
         )
         for scale in (0.01, 1e6)
     ),
-    walked(
-        "a frame told in float32",
-        "the nearest rotation: the weights within its digits",
-        partial(_moved, 0.37, digits=np.float32),
-        like=_where_they_were,
-    ),
+    walked("a frame told in float32", partial(_moved, 0.37, digits=np.float32), like=_where_they_were),
     refused(
         "a barrel that turns back near the axis (k1 = -9)",
-        "hardly a pixel with a ray of its own",
         lambda: _behind(Brown(k1=-9.0)),
         "of the photo",
         kernels=GAUSSIAN,
     ),
     refused(
         "a thin prism",
-        "a distortion, which is not to be ignored",
         lambda: calibration(MODELS_BY_NAME["THIN_PRISM_FISHEYE"], [0.0] * 12, "camera 1"),
         "undistort the photos first",
         kernels=GAUSSIAN,
     ),
     refused(
         "a frame that mirrors",
-        "no rotation leads there",
         lambda: Similarity.of(np.diag([1.0, 1.0, -1.0, 1.0]), "transform"),
         "a proper rotation",
         kernels=GAUSSIAN,
@@ -680,19 +597,13 @@ def _task(observation: ViewFeatures, **settings: object) -> Task:
 
 LENGTHS: tuple[Extreme, ...] = (
     *(
-        lifted(
-            f"F = {channels}",
-            "a weighted mean of the rows",
-            lambda channels=channels: _task(checkerboard(channels=channels)),
-            bound=SUM,
-        )
-        for channels in (1, 8_192)
+        lifted(f"F = {channels}", _task(checkerboard(channels=channels)), bound=SUM)
+        for channels in (1, 2, 31, 33, 8_192)
     ),
     *(
         lifted(
             f"values to {scale:g}, given in {str(given).removeprefix('torch.')}, to be stored in float16",
-            "a mean is no longer than its inputs",
-            lambda scale=scale, given=given: Task({"v0": checkerboard(5, 40, scale, given)}, settings=FLOAT16),
+            Task({"v0": checkerboard(5, 40, scale, given)}, settings=FLOAT16),
             lambda made, stored=stored: made.features.dtype == stored,
             bound=STEP if stored == torch.float16 else SUM,
             told="float16 does not hold" if stored == torch.float32 else "",
@@ -709,101 +620,83 @@ LENGTHS: tuple[Extreme, ...] = (
     ),
     lifted(
         "values of 1e-40, below the normal numbers of float32",
-        "a weighted mean",
-        lambda: _task(checkerboard(scale=1e-40)),
+        _task(checkerboard(scale=1e-40)),
         bound=1e-3,
         kernels=GAUSSIAN,
     ),
-    lifted(
-        "a zero row in the codebook",
-        "it pulls means towards zero; it has no direction",
-        lambda: _task(_zero_row()),
-        bound=SUM,
-        told="codebook rows are zero",
-    ),
+    lifted("a zero row in the codebook", _task(_zero_row()), bound=SUM, told="codebook rows are zero"),
     lifted(
         "a codebook of zeros",
-        "zero, with no agreement",
-        lambda: _task(Regions(checkerboard(3).labels, torch.zeros(3, 7))),
+        _task(Regions(checkerboard(3).labels, torch.zeros(3, 7))),
         lambda made: float(made.agreement.max()) == 0,
         bound=0.0,
         told="codebook rows are zero",
     ),
     lifted(
         "vectors that cancel: +1e4 and -9990 in turn",
-        "means far shorter than the inputs, to their digits",
-        lambda: _task(_cancelling()),
+        _task(_cancelling()),
         lambda made: float(made.agreement.min()) < 0.2,
         bound=SUM,
     ),
 )
 
 MAPS: tuple[Extreme, ...] = (
-    lifted("a mask of one pixel", "what its ray meets has its feature", lambda: _task(_one_pixel()), bound=SUM),
+    lifted("a mask of one pixel", _task(_one_pixel()), bound=SUM),
     lifted(
         "one label on the whole image",
-        "every splat that is seen has the same feature",
-        lambda: _task(_labelled(np.zeros((HEIGHT, WIDTH)), 1)),
+        _task(_labelled(np.zeros((HEIGHT, WIDTH)), 1)),
         lambda made: bool((made.features[made.seen] - made.features[made.seen][0]).abs().max() < 1e-6),
         bound=SUM,
     ),
     lifted(
         "labels of 1 x 1 pixel",
-        "the same",
-        lambda: _task(_labelled(np.zeros((1, 1)), 1)),
+        _task(_labelled(np.zeros((1, 1)), 1)),
         lambda made: float(made.agreement[made.seen].min()) > 1 - 1e-6,
         bound=SUM,
     ),
     lifted(
         "a region a pixel",
-        "the dense map",
-        lambda: _task(_labelled(np.arange(HEIGHT * WIDTH).reshape(HEIGHT, WIDTH), HEIGHT * WIDTH)),
+        _task(_labelled(np.arange(HEIGHT * WIDTH).reshape(HEIGHT, WIDTH), HEIGHT * WIDTH)),
         bound=SUM,
     ),
     lifted(
         "labels of 32,766 and 32,767, the last of int16",
-        "as with small numbers",
-        lambda: _task(_labelled(LARGEST_I16 - np.indices((HEIGHT, WIDTH)).sum(axis=0) % 2, LARGEST_I16 + 1)),
+        _task(_labelled(LARGEST_I16 - np.indices((HEIGHT, WIDTH)).sum(axis=0) % 2, LARGEST_I16 + 1)),
         bound=SUM,
         kernels=GAUSSIAN,
         told="are read by no label",
     ),
     lifted(
         "a label of 32,768, the first beyond int16",
-        "as with small numbers",
-        lambda: _task(_one_pixel(LARGEST_I16 + 1, LARGEST_I16 + 2)),
+        _task(_one_pixel(LARGEST_I16 + 1, LARGEST_I16 + 2)),
         bound=SUM,
         kernels=GAUSSIAN,
         told="are read by no label",
     ),
     lifted(
         "a view without any label",
-        "no feature; the evidence is as it was",
-        lambda: _task(_labelled(np.full((3, 4), -1), 2)),
+        _task(_labelled(np.full((3, 4), -1), 2)),
         lambda made: not bool(made.seen.any()) and bool((made.evidence > 0).any()),
         bound=0.0,
         told="no labelled ray reached any splat",
     ),
     lifted(
         "a view that sees nothing beside one that does",
-        "as without it",
-        lambda: Task({AWAY: checkerboard(), "v0": checkerboard()}),
+        Task({AWAY: checkerboard(), "v0": checkerboard()}),
         lambda made: bool(made.seen.any()),
         bound=SUM,
         told="1 of 2 views meet no splat: away",
     ),
     lifted(
         "views that all see nothing",
-        "no feature",
-        lambda: Task({AWAY: checkerboard()}),
+        Task({AWAY: checkerboard()}),
         lambda made: not bool(made.seen.any()),
         bound=0.0,
         told="share their frame",
     ),
     lifted(
         "a splat that one ray alone meets",
-        "the feature of that ray",
-        lambda: Task(
+        Task(
             {"v0": _labelled(np.arange(HEIGHT * WIDTH).reshape(HEIGHT, WIDTH), HEIGHT * WIDTH)},
             splats_at([(0.125, 0.125, 0.0)], -12.0, logits=-4.0),
         ),
@@ -813,30 +706,28 @@ MAPS: tuple[Extreme, ...] = (
     ),
     lifted(
         "a grid of 1 x 1 cell",
-        "its vector everywhere",
-        lambda: _task(FeatureGrid(torch.ones(1, 1, 6))),
+        _task(FeatureGrid(torch.ones(1, 1, 6))),
         lambda made: bool((made.features[made.seen] - 1).abs().max() < 1e-6),
         bound=SUM,
     ),
     lifted(
+        "labels larger than the image",
+        _task(_labelled(np.arange(100 * 130).reshape(100, 130) % 4, 4)),
+        bound=SUM,
+    ),
+    lifted("a grid of one row", _task(FeatureGrid(torch.rand(1, 9, 6, generator=torch.manual_seed(0)))), bound=SUM),
+    lifted(
         "a grid finer than the pixels",
-        "the cells nearest to pixel centres",
-        lambda: _task(FeatureGrid(torch.rand(50, 70, 6, generator=torch.manual_seed(0)))),
+        _task(FeatureGrid(torch.rand(50, 70, 6, generator=torch.manual_seed(0)))),
         bound=SUM,
     ),
     *(
-        lifted(
-            f"squared weights and a gain of {gain:g}",
-            "the mean under polarised opacities",
-            lambda gain=gain: _task(checkerboard(), power=2, lift_gain=gain),
-            bound=SUM,
-        )
+        lifted(f"squared weights and a gain of {gain:g}", _task(checkerboard(), power=2, lift_gain=gain), bound=SUM)
         for gain in (0.01, 8.0, 16.0)
     ),
     lifted(
         "weights of 1e-20, squared (DBS)",
-        "a mean over weights of 1e-40",
-        lambda: Task(
+        Task(
             {"v0": checkerboard()},
             splats_at([(0.0, 0.0, 0.0)], 0.0, logits=-46.0, kernel=Kernel.BETA),
             {"dtype": "float32", "power": 2},
@@ -852,7 +743,6 @@ REFUSALS: tuple[Extreme, ...] = (
     *(
         refused(
             name,
-            "no splat",
             lambda more=more: splats_at(**{"means": [(0.0, 0.0, 2.0)], **more}),
             "finite values",
             kernels=GAUSSIAN,
@@ -863,29 +753,21 @@ REFUSALS: tuple[Extreme, ...] = (
             ("a place of inf", {"means": [(0.0, math.inf, 2.0)]}),
         )
     ),
-    refused("no splats (P = 0)", "no X", lambda: splats_at(np.zeros((0, 3))), "empty scene", kernels=GAUSSIAN),
-    refused("no views", "no rays", lambda: Cameras(()), "at least one view", kernels=GAUSSIAN),
+    refused("no splats (P = 0)", lambda: splats_at(np.zeros((0, 3))), "empty scene", kernels=GAUSSIAN),
+    refused("no views", lambda: Cameras(()), "at least one view", kernels=GAUSSIAN),
     refused(
         "values of 1e30",
-        "squares that float32 does not hold",
         lambda: run(_task(checkerboard(scale=1e30)), cloud()),
         "finite values within",
         kernels=GAUSSIAN,
     ),
     refused(
         "a label beyond the codebook",
-        "no row to read",
         lambda: run(_task(_labelled(np.full((2, 2), 4), 4)), cloud()),
         "rows of its codebook",
         kernels=GAUSSIAN,
     ),
-    refused(
-        "a gain of nought",
-        "every opacity a half",
-        lambda: LiftSettings.of(lift_gain=0),
-        "greater than 0",
-        kernels=GAUSSIAN,
-    ),
+    refused("a gain of nought", lambda: LiftSettings.of(lift_gain=0), "greater than 0", kernels=GAUSSIAN),
 )
 
 
@@ -911,25 +793,11 @@ def rows_of(extremes: Iterable[Extreme]) -> Iterator[dict[str, Any]]:
         yield {
             "extreme": extreme.name,
             "kernels": "all" if extreme.kernels == KERNELS else ", ".join(extreme.kernels),
-            "exact arithmetic says": extreme.exact,
             "float32 gives": found[0].gives,
             "error": max(errors) if errors else None,
             "rays that flip": f"{flips} of {rays}" if flips else None,
             "told": "; ".join(dict.fromkeys(told for part in found for told in part.told)) or None,
         }
-
-
-def sums() -> Iterator[dict[str, Any]]:
-    """Relative errors of one splat's sums over 10^3 .. 10^7 rays, entries or views; equal terms are the worst."""
-    for side in (32, 100, 316, 1_000, 3_162):
-        terms = 10 ** round(math.log10(side**2))
-        row = {"terms": terms, **sums_of_rays(side), "equal terms one by one": added_one_by_one(terms)}
-        for equal, kind in ((False, "random"), (True, "equal")):
-            row[f"X, entries, {kind}"] = sums_of_entries(terms, equal)
-            row[f"X, views, {kind}"] = sums_of_views(terms, equal) if terms <= 10_000 else None
-        row["a robust step, entries"] = robust_sums(terms, 8) if terms <= 100_000 else None
-        row["a robust step, channels"] = robust_sums(8, terms) if terms <= 10_000 else None
-        yield row
 
 
 def main() -> None:
@@ -938,8 +806,7 @@ def main() -> None:
     for kernel in Kernel:
         warm_up(kernel)
     tables = {title: rows_of(table) for title, table in TABLES.items()} | {
-        "Sums over many rays": sums(),
-        f"Wide random scenes, {SCENES} a kernel": ({"kernel": kernel} | vars(survey(kernel)) for kernel in KERNELS),
+        f"Wide random scenes, {SCENES} a kernel": ({"kernel": kernel} | vars(survey(kernel)) for kernel in KERNELS)
     }
     for title, rows in tables.items():
         print("" if options.json else f"\n## {title}\n")

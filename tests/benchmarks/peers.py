@@ -1,45 +1,40 @@
 """Other ways to lift the same features onto the same splats, on the CPU, beside ours.
 
-    python -m tests.benchmarks.peers [--sizes small base large splats pixels views channels] [--rounds N] [--json]
+    python -m tests.benchmarks.peers [--sizes large channels] [--rounds N] [--json]
 
 All lift ``X = (A^T B) / (A^T n)`` of a synthetic room with label maps of 4 levels over random unit codebooks: B sums
 the codebook rows that a ray's levels read, n counts them. Each starts from splats, cameras, label maps and codebooks;
-the others make an image of all channels a view first. Seconds are the median of the rounds, taken in turns; a peer
-whose lift takes longer than LONG is not asked for more. Cosine: of a splat's feature with ours, the mean by evidence.
-``peak MiB`` is what the lift adds in a process of its own, and ``first s`` what its first lift took there.
+the others make an image of all channels a view first, and have our projection and tile lists, so that what differs
+is the accumulation alone. Seconds are the median of the rounds, taken in turns; a peer whose lift takes longer than
+LONG is not asked for more. Cosine: of a splat's feature with ours, the mean by evidence.
 
-- ours: region weights ``A^T S`` in one walk a view, then the closed form for all channels.
-- dense numba: for each weight of a pixel, ``w b`` of all channels onto the splat's own, compiled. Its projection,
-  lists and bounds are ours: what differs is the accumulation alone.
+- ours: region weights ``A^T S`` once a view, then the closed form for all channels.
+- dense numba: for each weight of a pixel, ``w b`` of all channels onto the splat's own, compiled.
 - torch autograd: ``d/dx sum(render(x) B) = A^T B`` with a tiled renderer of torch operations.
 """
 
-import json
 import math
 import os
 import statistics
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
 from numba import njit
 from torch import Tensor
-from torch.nn.functional import cosine_similarity, embedding, embedding_bag, normalize, pad, threshold
+from torch.nn.functional import cosine_similarity, embedding, embedding_bag, pad, threshold
 
 from liftcore.evaluate.bench import walk_regions
-from liftcore.evaluate.hardware import peak_memory
 from liftcore.evaluate.synthetic import room_cameras, room_regions, room_splats
 from liftcore.features.views import Regions
 from liftcore.progress import silent
-from liftcore.raster.base import ALPHA_FLOOR, FIELD_MARGIN, LOW_PASS, NEAR_PLANE, CompositingParams, Weighting
-from liftcore.raster.base import TILE as OUR_TILE
+from liftcore.raster.base import ALPHA_FLOOR, TILE, CompositingParams, Weighting
+from liftcore.raster.cpu.composite import Frame
 from liftcore.raster.cpu.project import CUTOFF, KY, MX, MY, OPACITY, ROOT_X, SLOPE
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.cameras import Camera
@@ -65,15 +60,9 @@ class Size:
 
 
 TINY = Size(500, 64, 48, 1, 4)  # to load kernels and start threads
-BASE = Size(20_000, 200, 150, 4, 64)
 SIZES = {
-    "small": [Size(5_000, 100, 75, 2, 8)],
-    "base": [BASE],
     "large": [Size(200_000, 640, 480, 2, 512)],
-    "splats": [replace(BASE, splats=1_000 * n) for n in (5, 20, 80, 320)],
-    "pixels": [replace(BASE, width=4 * n, height=3 * n) for n in (25, 50, 100, 200)],
-    "views": [replace(BASE, views=n) for n in (1, 4, 12, 32)],
-    "channels": [replace(BASE, channels=n) for n in (4, 16, 64, 256, 1024)],
+    "channels": [Size(20_000, 200, 150, 4, n) for n in (4, 16, 64, 256, 1024)],
 }
 
 
@@ -155,11 +144,11 @@ def dense_numba(work: Work) -> Answer:
 @njit(nogil=True, cache=True)
 def _add_shares(thread, threads, edges, frame, target, sums):
     """``A^T [B n]`` of every ``threads``-th share of the tiles; target [H, W, F + 1], sums [P, F + 1] f32, grows."""
-    light = np.empty((OUR_TILE, OUR_TILE), np.float32)
+    light = np.empty((TILE, TILE), np.float32)
     for share in range(thread, edges.shape[0] - 1, threads):
         for tile in range(edges[share], edges[share + 1]):
-            x0, y0 = tile % frame.columns * OUR_TILE, tile // frame.columns * OUR_TILE
-            width, height = min(OUR_TILE, frame.width - x0), min(OUR_TILE, frame.height - y0)
+            x0, y0 = tile % frame.columns * TILE, tile // frame.columns * TILE
+            width, height = min(TILE, frame.width - x0), min(TILE, frame.height - y0)
             light[:] = 0
             light[:height, :width] = 1
             for step in range(frame.starts[tile], frame.starts[tile + 1]):
@@ -208,7 +197,6 @@ def _add_scaled(row, weight, pixel):
 
 # --- torch autograd ---
 
-TILE = 8  # pixels; 16 takes a quarter longer
 SLAB = 128  # splats along the depth of a tile at a time
 WEIGHTS = 1 << 20  # of a batch of slabs: 4 MiB an intermediate
 CHANNELS = 128  # a chunk
@@ -227,165 +215,77 @@ def torch_threads(count: int) -> Iterator[None]:
 
 def torch_autograd(work: Work) -> Answer:
     """View by view, slab by slab, chunk by chunk of channels; each thread has tiles and sums of its own."""
+    raster = CpuRaster(work.splats, THREADS)
     own = torch.zeros(THREADS, work.splats.count, work.channels + 1)
     one_each = {"initializer": torch.set_num_threads, "initargs": (1,)}
     with torch_threads(1), ThreadPoolExecutor(THREADS, **one_each) as pool:
         for camera, regions in work.views:
-            footprints = _project(work.splats, camera)
-            lists, target = _lists(footprints, camera), by_tile(dense_target(camera, regions))
-            view = _View(camera, work.walk, footprints, lists, target)
+            (frame,) = raster._bands(camera, work.walk)
+            target = by_tile(dense_target(camera, regions))
             tiles = torch.arange(len(target))
-            parts = [pool.submit(_add_view, view, tiles[k::THREADS], sums) for k, sums in enumerate(own)]
+            parts = [pool.submit(_add_view, frame, target, tiles[k::THREADS], sums) for k, sums in enumerate(own)]
             for part in parts:
                 part.result()
     return answer_of(own.sum(dim=0))
 
 
-class _Footprints(NamedTuple):
-    """The splats that a view may see, near to far; n of them."""
+def _add_view(frame: Frame, target: Tensor, own: Tensor, sums: Tensor) -> None:
+    """``A^T [B n]`` of the tiles ``own`` [n], a slab of splats on a batch of tiles at a time, onto sums [P, F + 1].
 
-    splats: Tensor  # [n] i64
-    mean: Tensor  # [n, 2] f32, px
-    conic: Tensor  # [n, 3] f32: xx, xy, yy of the inverse covariance
-    opacity: Tensor  # [n] f32
-    extent: Tensor  # [n, 2] f32, px from the mean to where alpha falls below its floor
-
-
-class _View(NamedTuple):
-    """A view to lift from."""
-
-    camera: Camera
-    walk: CompositingParams
-    footprints: _Footprints
-    lists: tuple[Tensor, Tensor]  # starts [tiles + 1] and items of every tile's list of footprints, near to far
-    target: Tensor  # [tiles, TILE * TILE, F + 1] f32
-
-
-class _Slab(NamedTuple):
-    """Weights of some splats on some tiles."""
-
-    tiles: Tensor  # [t] i64
-    splats: Tensor  # [t, k] i64
-    weights: Tensor  # [t, TILE * TILE, k] f32
-
-
-def _project(splats: Splats, camera: Camera) -> _Footprints:
-    """EWA projection of all splats at once (float64: it costs little here), those out of sight left out."""
-    pose = torch.tensor(camera.viewmat[:3])
-    point = splats.means.double() @ pose[:, :3].T + pose[:, 3]
-    opacity = torch.sigmoid(splats.opacity_logits.double())
-    kept = torch.nonzero((point[:, 2] >= NEAR_PLANE) & (opacity >= ALPHA_FLOOR))[:, 0]
-    kept = kept[torch.argsort(point[kept, 2].float(), stable=True)]
-    (x, y, z), opacity = point[kept].T, opacity[kept]
-    bounds = [
-        (-c / f - FIELD_MARGIN * 0.5 * size / f, (size - c) / f + FIELD_MARGIN * 0.5 * size / f)
-        for f, c, size in ((camera.fx, camera.cx, camera.width), (camera.fy, camera.cy, camera.height))
-    ]
-    u, v = (x / z).clamp(*bounds[0]), (y / z).clamp(*bounds[1])
-    axes = pose[:, :3] @ _rotations(splats.quats[kept].double()) * splats.log_scales[kept].double().exp()[:, None]
-    across = (axes[:, 0] - u[:, None] * axes[:, 2]) * (camera.fx / z)[:, None]
-    down = (axes[:, 1] - v[:, None] * axes[:, 2]) * (camera.fy / z)[:, None]
-    xx, xy, yy = (across**2).sum(1) + LOW_PASS, (across * down).sum(1), (down**2).sum(1) + LOW_PASS
-    conic = torch.stack([yy, -xy, xx], dim=1) / (xx * yy - xy**2)[:, None]
-    mean = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], dim=1)
-    extent = (2 * torch.log(opacity / ALPHA_FLOOR)).sqrt()[:, None] * torch.stack([xx, yy], dim=1).sqrt()
-    limits = torch.tensor([camera.width, camera.height])
-    seen = ((mean + extent >= 0.5) & (mean - extent <= limits - 0.5)).all(dim=1)
-    return _Footprints(kept[seen], *(part[seen].float() for part in (mean, conic, opacity, extent)))
-
-
-def _rotations(quats: Tensor) -> Tensor:
-    """[n, 3, 3] of quaternions w x y z of any length."""
-    w, x, y, z = normalize(quats, dim=1).T
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
-
-
-def _lists(footprints: _Footprints, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Starts [tiles + 1] and items of every tile's list of footprints, near to far."""
-    columns, rows = -(-camera.width // TILE), -(-camera.height // TILE)
-    most = torch.tensor([columns - 1, rows - 1])
-    low = ((footprints.mean - footprints.extent - 0.5).ceil() // TILE).long().clamp(min=0)
-    high = torch.minimum(((footprints.mean + footprints.extent - 0.5).floor() // TILE).long(), most)
-    span = (high - low + 1).clamp(min=0)
-    counts = span.prod(dim=1)
-    items = torch.repeat_interleave(torch.arange(len(counts)), counts)
-    within = torch.arange(len(items)) - (counts.cumsum(0) - counts)[items]
-    across = span[items, 0]
-    tiles = (low[items, 1] + within // across) * columns + low[items, 0] + within % across
-    tiles, order = torch.sort(tiles.int(), stable=True)
-    lengths = torch.bincount(tiles, minlength=rows * columns)
-    return pad(lengths.cumsum(0), (1, 0)), items[order]
-
-
-def _add_view(view: _View, tiles: Tensor, sums: Tensor) -> None:
-    """``A^T [B n]`` of some tiles of a view onto ``sums`` [P, F + 1]."""
-    for slab in _slabs(view, tiles):
-        _add_gradient(slab, view.target, sums)
-
-
-def _slabs(view: _View, own: Tensor) -> Iterator[_Slab]:
-    """The weights of a view's tiles ``own``, a slab of splats on a batch of tiles at a time, near to far on each."""
-    camera, walk, footprints, (starts, items), _ = view
-    lengths, columns = starts.diff(), -(-camera.width // TILE)
-    light = by_tile(torch.ones(camera.height, camera.width, 1))[:, :, 0]
+    Args:
+        target: [tiles, TILE^2, F + 1] f32.
+    """
+    starts, items = torch.from_numpy(frame.starts), torch.from_numpy(frame.items)
+    ids, lengths = torch.from_numpy(frame.ids), starts.diff()
+    light = by_tile(torch.ones(frame.height, frame.width, 1))[:, :, 0]
     depth = 0
     while True:
-        left = own[(lengths[own] > depth) & (light[own].amax(dim=1) > walk.transmittance_stop)]
+        left = own[(lengths[own] > depth) & (light[own].amax(dim=1) > frame.transmittance_stop)]
         if len(left) == 0:
             return
         left = left[torch.argsort(lengths[left], descending=True)]  # so that few slabs of a batch are padded
         for tiles in left.split(max(1, WEIGHTS // (SLAB * TILE * TILE))):
             offsets = torch.arange(depth, min(depth + SLAB, int(lengths[tiles[0]])))
-            members = items[(starts[tiles, None] + offsets).clamp(max=len(items) - 1)]
-            corners = torch.stack([tiles % columns, tiles // columns]) * TILE
-            alphas = _alphas(footprints, members, offsets < lengths[tiles, None], corners)
-            weights, light[tiles] = _composite(alphas.clamp_(max=walk.alpha_cap), light[tiles], walk)
-            yield _Slab(tiles, footprints.splats[members], weights)
+            members = items[(starts[tiles, None] + offsets).clamp(max=len(items) - 1)].long()
+            alphas = _alphas(frame, members, offsets < lengths[tiles, None], tiles)
+            weights, light[tiles] = _composite(alphas.clamp_(max=frame.alpha_cap), light[tiles], frame)
+            _add_gradient(weights, ids[members], target[tiles], sums)
         depth += SLAB
 
 
-def _alphas(footprints: _Footprints, members: Tensor, there: Tensor, corners: Tensor) -> Tensor:
-    """[t, TILE * TILE, k] f32, the alphas of footprints ``members`` [t, k] on tiles from ``corners`` [2, t] px on.
-
-    The quadratic form is a part by column, a part by row, and one product of both. ``there`` [t, k]: no padding.
-    """
-    dx, dy = (
-        (corners[axis, :, None] + torch.arange(TILE) + 0.5)[:, :, None] - footprints.mean[:, axis][members][:, None]
-        for axis in (0, 1)
+def _alphas(frame: Frame, members: Tensor, there: Tensor, tiles: Tensor) -> Tensor:
+    """[t, TILE^2, k] f32, the alphas of projected splats ``members`` [t, k] on tiles [t]; there: no padding."""
+    own = torch.from_numpy(frame.projected)[members]  # [t, k, COLUMNS] f64
+    x, y = (
+        (corner[:, None] * TILE + torch.arange(TILE) + 0.5)[:, :, None] - own[:, None, :, centre]
+        for corner, centre in ((tiles % frame.columns, MX), (tiles // frame.columns, MY))
     )
-    xx, xy, yy = footprints.conic[members].permute(2, 0, 1)[:, :, None]
-    level = torch.where(there, footprints.opacity[members].log(), -torch.inf)[:, None]
-    by_column, by_row = -0.5 * xx * dx * dx, level - 0.5 * yy * dy * dy
-    exponents = by_column[:, None] + by_row[:, :, None]
-    exponents.addcmul_((-xy * dx)[:, None], dy[:, :, None])
-    return threshold(exponents.exp_(), ALPHA_FLOOR, 0.0, inplace=True).flatten(1, 2)
+    root = own[:, None, :, ROOT_X]
+    across = (root * x).float()[:, None] - (root * own[:, None, :, SLOPE] * y).float()[:, :, None]
+    exponents = across.square_().add_((own[:, None, :, KY] * y * y).float()[:, :, None])
+    opacity = torch.where(there, own[:, :, OPACITY], 0.0).float()
+    return threshold(exponents.neg_().exp2_() * opacity[:, None, None], ALPHA_FLOOR, 0.0).flatten(1, 2)
 
 
-def _composite(alphas: Tensor, light: Tensor, walk: CompositingParams) -> tuple[Tensor, Tensor]:
-    """Weights [t, TILE * TILE, k] f32, made in place of the alphas, and the light [t, TILE * TILE] behind them."""
+def _composite(alphas: Tensor, light: Tensor, frame: Frame) -> tuple[Tensor, Tensor]:
+    """Weights [t, TILE^2, k] f32, made in place of the alphas, and the light [t, TILE^2] behind them."""
     after = 1 - alphas
     after[:, :, 0] *= light
     torch.cumprod(after, dim=2, out=after)
     alphas[:, :, 1:] *= after[:, :, :-1]
     alphas[:, :, 0] *= light
-    if after[:, :, -1].amin() <= walk.transmittance_stop:
-        alphas *= after > walk.transmittance_stop
+    if after[:, :, -1].amin() <= frame.transmittance_stop:
+        alphas *= after > frame.transmittance_stop
     return alphas, after[:, :, -1]
 
 
-def _add_gradient(slab: _Slab, target: Tensor, sums: Tensor) -> None:
-    """The gradient of ``sum(render(x) B)`` for the splats of the slab onto ``sums`` [P, F + 1]."""
-    distinct, places = torch.unique(slab.splats, return_inverse=True)
+def _add_gradient(weights: Tensor, splats: Tensor, pixels: Tensor, sums: Tensor) -> None:
+    """The gradient of ``sum(render(x) B)`` for splats [t, k] of weights [t, TILE^2, k] onto ``sums`` [P, F + 1]."""
+    distinct, places = torch.unique(splats, return_inverse=True)
     first = 0
-    pixels = target[slab.tiles]
     for part in pixels.tensor_split(-(-pixels.shape[2] // CHANNELS), dim=2):
         x = torch.zeros(len(distinct), part.shape[2], requires_grad=True)  # any x: the render is linear in it
-        rendered = torch.bmm(slab.weights, embedding(places, x))
+        rendered = torch.bmm(weights, embedding(places, x))
         (gradient,) = torch.autograd.grad(rendered, x, grad_outputs=part)
         sums[distinct, first : first + part.shape[2]] += gradient
         first += part.shape[2]
@@ -428,37 +328,18 @@ def side_by_side(size: Size, rounds: int) -> Iterator[dict[str, Any]]:
         }  # fmt: skip
 
 
-def alone(name: str, size: Size) -> dict[str, float]:
-    """What a peer's lift adds to a process of its own, MiB, and the seconds of its first lift there."""
-    command = [sys.executable, "-m", "tests.benchmarks.peers", "--alone", name, json.dumps(vars(size))]
-    return json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
-
-
-def _measured(name: str, size: Size) -> dict[str, float]:
-    start = time.perf_counter()
-    PEERS[name](room(TINY))
-    first, work, before = time.perf_counter() - start, room(size), peak_memory()
-    PEERS[name](work)
-    return {"first s": first, "peak MiB": (peak_memory() - before) / 2**20}
-
-
 def main() -> None:
     """Print the table."""
     parser = command_line(
         "tests.benchmarks.peers",
         __doc__,
-        ("--sizes", {"nargs": "+", "choices": list(SIZES), "default": ["small", "base"], "help": "what grows"}),
+        ("--sizes", {"nargs": "+", "choices": list(SIZES), "default": ["large"], "help": "what grows"}),
         ("--rounds", {"type": int, "default": 3}),
-        ("--alone", {"nargs": 2, "metavar": ("PEER", "SIZE"), "help": "one lift in this process, as JSON"}),
     )
     options = parser.parse_args()
-    if options.alone:
-        print(json.dumps(_measured(options.alone[0], Size(**json.loads(options.alone[1])))))
-        return
     for lift in PEERS.values():
         lift(room(TINY))
-    sizes = dict.fromkeys(size for name in options.sizes for size in SIZES[name])
-    rows = [row | alone(row["peer"], size) for size in sizes for row in side_by_side(size, options.rounds)]
+    rows = [row for name in options.sizes for size in SIZES[name] for row in side_by_side(size, options.rounds)]
     tell(rows, as_json=options.json)
 
 

@@ -1,13 +1,12 @@
-"""Scenes to measure on: a synthetic room of many views, with known mistakes, and feature grids of more cells.
+"""A scene to measure on: a synthetic room of many views, with known mistakes.
 
     python -m tests.benchmarks.scenes room FOLDER --splats 500000 --views 160 [--alike C] [--clean]
-    python -m tests.benchmarks.scenes enlarge PACK --rows H --columns W -o FILE
 
 Every view of the room has regions on four levels, from walls and balls to their parts, seen with occlusion. A part
 has a random unit vector; what a view says of it has noise of norm NOISE. Of all regions a tenth say another part's
-vector, and of
-three tenths the vector is mixed with another's, unless ``--clean`` leaves the noise alone. With ``--alike C`` the
-vectors of parts have the cosine C to one another in the mean, as those of an encoder lie in a narrow cone.
+vector, and of three tenths the vector is mixed with another's, unless ``--clean`` leaves the noise alone. With
+``--alike C`` the vectors of parts have the cosine C to one another in the mean, as those of an encoder lie in a
+narrow cone.
 """
 
 import argparse
@@ -18,10 +17,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from liftcore.errors import InvalidFeatures
 from liftcore.evaluate.synthetic import PART_LEVELS, room_cameras, room_parts, room_regions, room_splats
-from liftcore.features.pack import Views, read_features, write_pack
-from liftcore.features.views import NO_LABEL, FeatureGrid, Regions, ViewFeatures
+from liftcore.features.pack import write_pack
+from liftcore.features.views import NO_LABEL, Regions, ViewFeatures
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.ply import write_splats
 from liftcore.raster.base import CompositingParams
@@ -146,50 +144,18 @@ def write_bench_room(folder: Path, size: Room, different: int = 12) -> tuple[Pat
     return paths
 
 
-@dataclass(frozen=True)
-class Enlarged(Mapping[str, ViewFeatures]):
-    """The feature grids of packs with so many (rows, columns) of cells, bilinearly, each made when asked for."""
-
-    packs: Views
-    cells: tuple[int, int]
-
-    def __getitem__(self, view: str) -> FeatureGrid:
-        observation = self.packs[view]
-        if not isinstance(observation, FeatureGrid):
-            raise InvalidFeatures("features", expected="grids in all views", got=f"regions in {view}")
-        first = observation.grid.float().permute(2, 0, 1)[None]
-        larger = torch.nn.functional.interpolate(first, size=self.cells, mode="bilinear", align_corners=False)
-        return FeatureGrid(larger[0].permute(1, 2, 0).to(observation.grid.dtype).contiguous())
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.packs.views)
-
-    def __len__(self) -> int:
-        return len(self.packs.views)
-
-
 def main() -> None:
-    """Write the scene or the pack."""
+    """Write the scene."""
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.scenes", description=__doc__)
-    kinds = parser.add_subparsers(dest="kind", required=True)
-    room, grids = kinds.add_parser("room"), kinds.add_parser("enlarge")
+    room = parser.add_subparsers(dest="kind", required=True).add_parser("room")
     room.add_argument("folder", type=Path)
     for name, default in (("splats", 500_000), ("views", 160), ("width", 986), ("height", 728), ("channels", 512)):
         room.add_argument(f"--{name}", type=int, default=default)
     room.add_argument("--clean", action="store_true")
     room.add_argument("--alike", type=float, default=0.0, metavar="C")
-    grids.add_argument("pack", type=Path)
-    grids.add_argument("--rows", type=int, required=True)
-    grids.add_argument("--columns", type=int, required=True)
-    grids.add_argument("-o", "--output", type=Path, required=True)
     given = parser.parse_args()
-    if given.kind == "room":
-        size = given.width, given.height
-        write_room(given.folder, Room(given.splats, given.views, size, given.channels, given.clean, given.alike))
-        return
-    packs = read_features(given.pack)
-    metadata = {"encoder": packs.encoder, "text_space": packs.text_space, "normalised": "false"}
-    write_pack(given.output, Enlarged(packs, (given.rows, given.columns)), metadata)
+    size = given.width, given.height
+    write_room(given.folder, Room(given.splats, given.views, size, given.channels, given.clean, given.alike))
 
 
 if __name__ == "__main__":

@@ -160,11 +160,7 @@ class Tabletop:
         """
         scores = class_scores(features, self.classes)
         miou = self.miou(self.maps(features, settings, raster or self.raster))
-        return Figures(
-            splat_accuracy(scores, self.objects, self.counted),
-            miou,
-            seconds,
-        )
+        return Figures(splat_accuracy(scores, self.objects, self.counted), miou, seconds)
 
     def miou(self, maps: Iterable[Tensor]) -> float:
         """Mean IoU over classes of each pixel's best class, of score maps [H, W, K] of the held-out views."""
