@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import KW_ONLY, dataclass, replace
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,6 +14,11 @@ from liftcore.errors import InvalidCameras, NotFound
 from liftcore.nearest import nearest
 from liftcore.scene.distortion import MAX_SIDE, Distortion, Lens, Rectangle, shared_lens
 from liftcore.scene.views import cameras_of_views
+
+if TYPE_CHECKING:  # torch is taken, and not loaded for it
+    from torch import Tensor
+
+    Matrix = np.ndarray | Tensor | Sequence[Sequence[float]]
 
 ROUNDING = 1e-6  # of the last row of a pose
 MIN_FOCAL, MAX_FOCAL = 1e-3, 1e9  # pixels; float64 squares of what they project stay finite
@@ -30,46 +35,41 @@ SAME_NAMES = (
 )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False)
 class Camera:
     """One pinhole view, in gsplat's conventions: OpenCV axes (x right, y down, z forward), pixel centres at +0.5.
 
     A point p of the world lies at ``viewmat @ (p, 1)`` in the camera, and a point x of the camera at the pixel
-    ``K @ x / x_z``. Matrices may be of numpy or torch, on the CPU or a card; they are kept as float64 on the CPU.
+    ``K @ x / x_z``.
+
+    Args:
+        viewmat: [4, 4] world to camera, rigid, of numpy, torch on any device, or nested lists.
+        K: [3, 3] pixels, (fx 0 cx; 0 fy cy; 0 0 1), likewise.
+        width: pixels. height: pixels.
+        lens: of a distorted photo, which this pinhole stands for; None: the photo is as it says.
+        name: the image's name without its extension; pairs the view with its features.
 
     Raises:
         InvalidCameras: a size, an intrinsic or the pose is out of range; the error names which.
     """
 
-    viewmat: np.ndarray  # [4, 4] f64, world to camera, rigid
-    K: np.ndarray  # [3, 3] f64, pixels, (fx 0 cx; 0 fy cy; 0 0 1)
-    width: int  # pixels
-    height: int  # pixels
-    _: KW_ONLY
-    lens: Lens | None = None  # of a distorted photo, which this pinhole stands for; None: the photo is as it says
-    name: str = ""  # the image's name without its extension; pairs the view with its features
+    viewmat: np.ndarray  # [4, 4] f64, read-only, on the CPU
+    K: np.ndarray  # [3, 3] f64, read-only, on the CPU
+    width: int
+    height: int
+    lens: Lens | None
+    name: str
 
-    def __post_init__(self) -> None:
-        pose, intrinsics = _matrix(self.viewmat), _matrix(self.K)
-        object.__setattr__(self, "viewmat", pose)
-        object.__setattr__(self, "K", intrinsics)
-        if not (0 < self.width <= MAX_SIDE and 0 < self.height <= MAX_SIDE):
-            self._refuse("size", f"width and height in 1..{MAX_SIDE}", f"{self.width}x{self.height}")
+    def __init__(
+        self, viewmat: Matrix, K: Matrix, width: int, height: int, *, lens: Lens | None = None, name: str = ""
+    ) -> None:
+        fields = {"viewmat": _matrix(viewmat), "K": _matrix(K), "width": width, "height": height}
+        for field, value in {**fields, "lens": lens, "name": name}.items():
+            object.__setattr__(self, field, value)
+        if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
+            self._refuse("size", f"width and height in 1..{MAX_SIDE}", f"{width}x{height}")
         self._check_intrinsics()
-        if pose.shape != (4, 4) or not np.isfinite(pose).all():
-            self._refuse("pose", "a finite 4x4 matrix", f"shape {list(pose.shape)}")
-        if np.abs(pose[3] - (0.0, 0.0, 0.0, 1.0)).max() > ROUNDING:
-            self._refuse("pose", "0 0 0 1 as the last row", " ".join(f"{value:g}" for value in pose[3]))
-        rotation = pose[:3, :3]
-        # Large entries are refused before the product, which they could overflow.
-        error = float(np.abs(rotation).max())
-        if error <= 2:
-            error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-        if error > 1e-3 or np.linalg.det(rotation) < 0:
-            self._refuse("pose", "a proper rotation", _what_it_is(rotation, error))
-        reach = float(np.abs(pose[:3, 3]).max())
-        if reach > MAX_REACH:
-            self._refuse("pose", f"a translation within {MAX_REACH:g}", f"{reach:.2g}")
+        self._check_pose(self.viewmat)
 
     @classmethod
     def pinhole(
@@ -81,7 +81,7 @@ class Camera:
         fy: float,
         cx: float,
         cy: float,
-        viewmat: np.ndarray,
+        viewmat: Matrix,
         lens: Lens | None = None,
     ) -> Camera:
         """A camera of its intrinsics in pixels, the principal point from the left and top edge of the image."""
@@ -108,6 +108,22 @@ class Camera:
             self._refuse("intrinsics", f"focal lengths in {MIN_FOCAL:g}..{MAX_FOCAL:g} pixels", str(intrinsics))
         if max(abs(self.cx), abs(self.cy)) > MAX_OFF_CENTRE:
             self._refuse("intrinsics", f"a principal point within {MAX_OFF_CENTRE:g} pixels", str(intrinsics))
+
+    def _check_pose(self, pose: np.ndarray) -> None:
+        if pose.shape != (4, 4) or not np.isfinite(pose).all():
+            self._refuse("pose", "a finite 4x4 matrix", f"shape {list(pose.shape)}")
+        if np.abs(pose[3] - (0.0, 0.0, 0.0, 1.0)).max() > ROUNDING:
+            self._refuse("pose", "0 0 0 1 as the last row", " ".join(f"{value:g}" for value in pose[3]))
+        rotation = pose[:3, :3]
+        # Large entries are refused before the product, which they could overflow.
+        error = float(np.abs(rotation).max())
+        if error <= 2:
+            error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+        if error > 1e-3 or np.linalg.det(rotation) < 0:
+            self._refuse("pose", "a proper rotation", _what_it_is(rotation, error))
+        reach = float(np.abs(pose[:3, 3]).max())
+        if reach > MAX_REACH:
+            self._refuse("pose", f"a translation within {MAX_REACH:g}", f"{reach:.2g}")
 
     def _refuse(self, part: str, expected: str, got: str) -> None:
         raise InvalidCameras(f"camera {self.name!r} {part}", expected=expected, got=got)

@@ -6,10 +6,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file
 
 from liftcore.errors import InvalidFeatures
 from liftcore.features.pack import Views, as_views, pair, read_features, write_pack
 from liftcore.features.views import FeatureGrid, Regions, ViewFeatures
+from liftcore.io.safetensors_file import write_tensors
 from liftcore.scene.cameras import Camera, Cameras
 
 MAP = np.arange(24, dtype=np.float32).reshape(3, 2, 4)  # [F, h, w]
@@ -67,6 +69,13 @@ def test_transposed_arrays_read_back_as_they_are(tmp_path) -> None:
     write_pack(tmp_path / "p", {"v": FeatureGrid.unchecked(torch.from_numpy(MAP.transpose(1, 2, 0)))}, {})
     found = read_features(tmp_path / "p")["v"]
     assert isinstance(found, FeatureGrid) and np.array_equal(found.grid.numpy(), MAP.transpose(1, 2, 0))
+
+
+def test_tensors_of_any_order_are_stored_in_row_order(tmp_path) -> None:
+    turned = torch.from_numpy(MAP).permute(1, 2, 0)
+    write_tensors(tmp_path / "t", {"turned": turned, "every other": turned[:, ::2]}, {})
+    found = load_file(tmp_path / "t")
+    assert torch.equal(found["turned"], turned) and torch.equal(found["every other"], turned[:, ::2])
 
 
 def sources(tmp_path) -> dict[str, Views]:
