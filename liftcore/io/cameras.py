@@ -5,11 +5,9 @@ tells the frame of the splats. A zip is read as the folder that was zipped, unde
 """
 
 import errno
-import lzma
 import os
 import tempfile
 import zipfile
-import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -18,7 +16,7 @@ from typing import TypeVar
 
 from liftcore.errors import InvalidCameras, Unavailable
 from liftcore.io.colmap import MODEL_FILES, has_model, is_whole, model_files, read_colmap
-from liftcore.io.files import refuse_pointer
+from liftcore.io.files import BROKEN_ZIP, refuse_pointer
 from liftcore.io.inria import parse_inria
 from liftcore.io.json_file import read_json
 from liftcore.io.transforms import FRAME_FILE, OF_NERFSTUDIO, parse_transforms, read_frame
@@ -35,17 +33,6 @@ MAX_UNZIPPED_BYTES = 512 * 1024 * 1024
 MAX_ZIP_MEMBERS = 100_000
 MOST_MODELS = 8  # of a zip that are looked at
 ONE_RUN = "zip those of one run alone"
-# What zipfile and its decompressors raise of a broken or foreign file.
-BROKEN = (
-    zipfile.BadZipFile,
-    zlib.error,
-    lzma.LZMAError,
-    EOFError,
-    NotImplementedError,
-    OSError,
-    RuntimeError,
-    ValueError,
-)
 Files = Mapping[str, zipfile.ZipInfo]  # by their names in the zip
 P = TypeVar("P", bound=PurePath)
 
@@ -336,7 +323,7 @@ def _unzip(path: Path, pick: Callable[[Files], Files], folder: Path) -> None:
                 raise InvalidCameras(str(path), expected=f"at most {MAX_ZIP_MEMBERS} files", got=str(count))
             for name, member in pick(_files(archive)).items():
                 budget -= _unzip_one(archive, member, folder / name, budget)
-    except BROKEN as error:
+    except BROKEN_ZIP as error:
         if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
             expected, hint = f"room in {tempfile.gettempdir()} for what is in the zip", "make room, or set TMPDIR"
             raise Unavailable(str(path), expected=expected, got="a full disk", hint=hint) from None

@@ -1,7 +1,10 @@
 """Files that are written whole or not at all, and pointers of Git LFS that lie where a file should."""
 
+import lzma
 import os
 import secrets
+import zipfile
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,6 +13,11 @@ from typing import IO
 from liftcore.errors import InvalidCameras
 
 LFS_POINTER = b"version https://git-lfs.github.com/spec/"
+# What zipfile and its decompressors raise of a broken or foreign file.
+BROKEN_ZIP = (
+    *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError),
+    *(NotImplementedError, OSError, RuntimeError, ValueError),
+)
 LFS_HINT = "run 'git lfs pull' in the repository where it lies"
 
 

@@ -15,7 +15,7 @@ from liftcore.features.views import NO_LABEL, Regions
 from liftcore.io.cameras import TRANSFORMS, camera_source, has_nerfstudio_beside, other_models, read_cameras
 from liftcore.io.class_masks import describe_masks
 from liftcore.io.ply import nearest_dialect
-from liftcore.io.splats import is_splats, read_splats
+from liftcore.io.splats import SplatFormat, format_of, is_splats, read_splats
 from liftcore.io.transforms import FRAME_FILE, frame_warning
 from liftcore.query.text.table import plain
 from liftcore.raster.base import ALPHA_FLOOR
@@ -60,7 +60,8 @@ def inspect_file(path: Path) -> dict[str, Any]:
     if not path.exists():
         raise InvalidInput(str(path), expected="a file or a folder", got="nothing of that name")
     if is_splats(path):
-        return {"kind": "splats", "bytes": path.stat().st_size, **describe_splats(read_splats(path))}
+        found = describe_splat_file(path)  # first: what is no file is told better by who reads it
+        return {"kind": "splats", "bytes": path.stat().st_size, **found}
     if path.is_dir() or not _looks_like_safetensors(path):
         found = describe_camera_file(path)  # first: which of its files are there is told better by who reads them
         size = sum(file.stat().st_size for file in camera_source(path).files)
@@ -76,6 +77,16 @@ def inspect_file(path: Path) -> dict[str, Any]:
     if any(key.endswith("/mask") for key in keys):
         return {"kind": "masks", "bytes": size, **describe_masks(path)}
     return {"kind": "features", "bytes": size, **describe_packs(read_features(path))}
+
+
+def describe_splat_file(path: Path) -> dict[str, Any]:
+    """`describe_splats` of a file; the dialect of what is no PLY is its format.
+
+    Raises:
+        InvalidSplats: the file is malformed.
+    """
+    found, splats = format_of(path), read_splats(path)
+    return describe_splats(splats) | ({} if found is SplatFormat.PLY else {"dialect": found.value})
 
 
 def describe_splats(splats: Splats) -> dict[str, Any]:

@@ -41,7 +41,6 @@ SPLAT_PROPERTIES = ("opacity", "scale_0", "rot_0", "f_dc_0", "sh0_0", "packed_po
 SCAFFOLD = ("f_anchor_feat_0", "f_offset_0")  # of Scaffold-GS, whose networks turn anchors into splats
 SPELLING = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint"}
 SPELLING |= {"f4": "float", "f8": "double"}
-CONVERT = "convert it with PlayCanvas's splat-transform: npx @playcanvas/splat-transform IN OUT.ply"
 EXPORT = "export the splats again as binary little-endian PLY"
 REWRITE = (
     "rewrite it with Python: from plyfile import PlyData; p = PlyData.read('IN.ply'); p.text = False; "
@@ -398,13 +397,7 @@ def read_header(path: Path) -> PlyHeader:
         InvalidSplats: the file cannot be opened, is not a binary little-endian PLY that begins with a vertex element
             of scalar properties, or has another size than the header says.
     """
-    try:
-        with path.open("rb") as handle:
-            head = handle.read(MAX_HEADER_BYTES)
-            size = handle.seek(0, 2)
-    except OSError as error:
-        got = f"one that does not open ({error.strerror})"
-        raise InvalidSplats(str(path), expected="a splat file", got=got) from None
+    head, size = read_head(path)
     header = parse_header(head, str(path))
     found, stride = size - header.data_offset, header.dtype.itemsize
     least = header.count * stride + (header.after or 0)
@@ -418,17 +411,55 @@ def read_header(path: Path) -> PlyHeader:
     return header
 
 
+def read_head(path: Path) -> tuple[bytes, int]:
+    """As many bytes of a file as a header may take, and the file's size.
+
+    Raises:
+        InvalidSplats: it does not open.
+    """
+    try:
+        with path.open("rb") as handle:
+            return handle.read(MAX_HEADER_BYTES), handle.seek(0, 2)
+    except OSError as error:
+        got = f"one that does not open ({error.strerror})"
+        raise InvalidSplats(str(path), expected="a splat file", got=got) from None
+
+
 def parse_header(head: bytes, source: str) -> PlyHeader:
-    """Parse the first bytes of a PLY; ``source`` names the file in errors.
+    """Parse the first bytes of a PLY of plain splats; ``source`` names the file in errors.
 
     Raises:
         InvalidSplats: the bytes are not the header of a splat PLY.
     """
+    lines, elements, offset = parse_elements(head, source)
+    first, *others = elements
+    if first.name != "vertex":
+        raise _refused(source, "'vertex' as the first element", repr(first.name[:60]))
+    if first.list_column is not None:
+        raise _refused(source, "scalar properties ('property float x')", f"a list {first.list_column[:60]!r}")
+    has_lists = any(element.count and element.list_column is not None for element in others)
+    after = None if has_lists else sum(element.count * element.dtype.itemsize for element in others)
+    own = [i for i, line in enumerate(lines) if line.split()[:1] == ["element"]][1:2] or [len(lines) - 1]
+    return PlyHeader((*lines[: own[0]], lines[-1]), first.count, first.dtype, offset, after)
 
+
+@dataclass(frozen=True)
+class Element:
+    """What a header says of an element."""
+
+    name: str
+    count: int  # rows
+    dtype: np.dtype  # of a row, little-endian, a field a column; without its lists
+    list_column: str | None  # the first of its columns that is a list
+
+
+def parse_elements(head: bytes, source: str) -> tuple[tuple[str, ...], list[Element], int]:
+    """The lines of a binary little-endian header, its elements, at least one, and its length in bytes.
+
+    Raises:
+        InvalidSplats: the bytes are not such a header.
+    """
     from plyfile import PlyData, PlyListProperty, PlyParseError  # here: processes that read no PLY start sooner
-
-    def refuse(expected: str, got: str, hint: str = EXPORT) -> InvalidSplats:
-        return InvalidSplats(f"{source} header", expected=expected, got=got, hint=hint)
 
     lines, offset = _header_lines(head, source)
     counts: list[int] = []
@@ -437,35 +468,28 @@ def parse_header(head: bytes, source: str) -> PlyHeader:
         words, element = line.split(), _ELEMENT.fullmatch(line)
         if words[:1] == ["element"] and element is None:
             expected = "the name of an element and a count of zero or more"
-            raise refuse(expected, repr(" ".join(words)[:60]))
+            raise _refused(source, expected, repr(" ".join(words)[:60]))
         counts += [int(element[2])] if element else []
         empty.append(f"element {element[1]} 0" if element else line.removesuffix("\r"))
     try:
         ply = PlyData.read(io.BytesIO(header_bytes(empty)))
     except (PlyParseError, ValueError) as error:
-        raise refuse("a header of PLY 1.0", f"one that does not parse ({str(error)[:120]})") from None
+        raise _refused(source, "a header of PLY 1.0", f"one that does not parse ({str(error)[:120]})") from None
     if ply.text or ply.byte_order != "<":
         kind = "ascii" if ply.text else "binary_big_endian"
-        raise refuse("'format binary_little_endian 1.0'", f"'format {kind} 1.0'", REWRITE)
-    first = next(iter(ply.elements), None)
-    if first is None or not first.properties:
-        raise refuse("an element 'vertex' with properties", "a header without one")
-    if first.name == "chunk":
-        raise refuse("plain splats", "SuperSplat's compressed PLY", CONVERT)
-    if first.name != "vertex":
-        raise refuse("'vertex' as the first element", repr(first.name[:60]))
-    listed = next((column.name for column in first.properties if isinstance(column, PlyListProperty)), None)
-    if listed is not None:
-        raise refuse("scalar properties ('property float x')", f"a list {listed[:60]!r}")
-    after: int | None = 0
-    for element, count in zip(ply.elements[1:], counts[1:], strict=True):
-        if count and any(isinstance(column, PlyListProperty) for column in element.properties):
-            after = None
-        elif after is not None:
-            after += count * sum(np.dtype(column.val_dtype).itemsize for column in element.properties)
-    own = [i for i, line in enumerate(lines) if line.split()[:1] == ["element"]][1:2] or [len(lines) - 1]
-    dtype = np.dtype([(column.name, "<" + column.val_dtype) for column in first.properties])
-    return PlyHeader((*lines[: own[0]], lines[-1]), counts[0], dtype, offset, after)
+        raise _refused(source, "'format binary_little_endian 1.0'", f"'format {kind} 1.0'", REWRITE)
+    elements = []
+    for element, count in zip(ply.elements, counts, strict=True):
+        lists = [column.name for column in element.properties if isinstance(column, PlyListProperty)]
+        scalars = [(column.name, "<" + column.val_dtype) for column in element.properties if column.name not in lists]
+        elements.append(Element(element.name, count, np.dtype(scalars), lists[0] if lists else None))
+    if not elements or not (elements[0].dtype.names or elements[0].list_column):
+        raise _refused(source, "an element 'vertex' with properties", "a header without one")
+    return lines, elements, offset
+
+
+def _refused(source: str, expected: str, got: str, hint: str = EXPORT) -> InvalidSplats:
+    return InvalidSplats(f"{source} header", expected=expected, got=got, hint=hint)
 
 
 def header_bytes(lines: Sequence[str]) -> bytes:

@@ -1,50 +1,72 @@
 """Splat files: which format one is of, told by its content, and reading and copying it.
 
-| format | begins with |
-|---|---|
-| PLY of every dialect (`liftcore.io.ply`) | ``ply`` |
-
-What is none of these is refused with what it is and what to do.
+All have a row a splat, and ours are the file's rows in their order. What is of none of these formats is refused with
+what it is and what to do.
 """
 
 from __future__ import annotations
 
+import zipfile
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
+from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from liftcore.errors import InvalidSplats
 from liftcore.io import ply
-from liftcore.io.files import LFS_HINT, LFS_POINTER
-from liftcore.io.ply import CONVERT
-from liftcore.scene.kernel import Kernel
+from liftcore.io.checkpoint import EXPORT_PLY, read_checkpoint
+from liftcore.io.compressed_ply import read_compressed_ply
+from liftcore.io.files import BROKEN_ZIP, LFS_HINT, LFS_POINTER
+from liftcore.io.quantised import Fields
+from liftcore.io.sog import META, read_sog
+from liftcore.io.splat import looks_like_splat, read_splat
+from liftcore.io.spz import begins_like_spz, read_spz
+from liftcore.scene.kernel import Kernel, kernel_named
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    import numpy as np
-
     from liftcore.scene.splats import Splats
 
-HEAD_BYTES = 64
-EXPORT_PLY = (
-    "export the splats as PLY from the program that trained them (nerfstudio: ns-export gaussian-splat; gsplat's "
-    "simple_trainer: --save-ply)"
-)
-PICKLED = (".pt", ".pth", ".ckpt", ".pkl")
-OTHER_FORMATS = {
-    ".splat": "splats in antimatter15's .splat format",
-    ".ksplat": "splats in GaussianSplats3D's .ksplat format",
-    ".spz": "splats in Niantic's .spz format",
-    ".sog": "splats in PlayCanvas's .sog format",
+
+class SplatFormat(StrEnum):
+    """A format that is read, as people call it."""
+
+    PLY = "PLY"  # of every dialect
+    COMPRESSED_PLY = "compressed PLY"
+    SPLAT = ".splat"
+    SPZ = ".spz"
+    SOG = ".sog"
+    CHECKPOINT = "checkpoint"  # of gsplat or nerfstudio: a pickle, if only of tensors
+
+
+SUFFIX = {
+    SplatFormat.PLY: ".ply",
+    SplatFormat.COMPRESSED_PLY: ".ply",
+    SplatFormat.SPLAT: ".splat",
+    SplatFormat.SPZ: ".spz",
+    SplatFormat.SOG: ".sog",
+    SplatFormat.CHECKPOINT: ".pt",
 }
-SUFFIXES = (".ply", *PICKLED, *OTHER_FORMATS)
+PICKLED = (".pt", ".pth", ".ckpt", ".pkl")
+SUFFIXES = frozenset([*SUFFIX.values(), *PICKLED, ".ksplat"])
+EXPECTED = "splats as PLY, compressed PLY, .splat, .spz, .sog or a checkpoint"
+CONVERT = "convert it with PlayCanvas's splat-transform: npx @playcanvas/splat-transform IN OUT.ply"
+_READERS: dict[SplatFormat, Callable[..., Fields]] = {
+    SplatFormat.COMPRESSED_PLY: read_compressed_ply,
+    SplatFormat.SPLAT: read_splat,
+    SplatFormat.SPZ: read_spz,
+    SplatFormat.SOG: read_sog,
+    SplatFormat.CHECKPOINT: read_checkpoint,
+}
 _WEB_PAGE = ("a web page", "the download went wrong: fetch the file itself")
-_BY_FIRST_BYTES = {
+_OTHERS = {  # by their first bytes
     LFS_POINTER: ("a Git LFS pointer, which stands for the file", LFS_HINT),
-    b"NGSP": (OTHER_FORMATS[".spz"], CONVERT),
     b"\x1f\x8b": ("a gzip file", "unzip it, or upload it with the header 'Content-Encoding: gzip'"),
-    b"PK\x03\x04": ("a zip", "unzip it and give the PLY in it"),
+    b"PK\x03\x04": ("a zip", "unzip it and give the splats in it"),
+    b"\x80": ("a Python pickle, which may run code when it is opened", EXPORT_PLY),
     b"\x93NUMPY": ("a NumPy array", "export the splats as PLY from the program that trained them"),
     b"<!doctype": _WEB_PAGE,
     b"<html": _WEB_PAGE,
@@ -52,19 +74,54 @@ _BY_FIRST_BYTES = {
 
 
 def read_splats(path: Path | str, kernel: Kernel | str = "auto", *, colour: bool = True) -> Splats:
-    """Read trained splats from a file of any format of the table above.
+    """Read trained splats from a file of any `SplatFormat`, recognised by content.
 
-    With the kernel ``auto`` the file tells it. Without ``colour`` neither colours nor what else a lift has no use for
-    are read or allocated, and what comes cannot be written back. Of a PLY `liftcore.io.ply.read_ply` has the rest.
+    With the kernel ``auto`` the columns of a PLY tell it, and what else there is are 3D Gaussians. Without ``colour``
+    neither colours nor what else a lift has no use for are read or allocated, and what comes cannot be written back.
+    More of PLYs is in `liftcore.io.ply.read_ply`. Checkpoints are opened for tensors alone: no code of theirs runs.
 
     Raises:
         InvalidSplats: the file is malformed or of no such format, lacks a property of the kernel, or holds NaN or no
             splats.
     """
     path = Path(path)
-    _require_ply(path)
+    found = format_of(path)
     with _naming(path):
-        return ply.read_ply(path, kernel, colour=colour)
+        if found is SplatFormat.PLY:
+            return ply.read_ply(path, kernel, colour=colour)
+        chosen = Kernel.GAUSSIAN_3D if kernel == "auto" else kernel_named(kernel)
+        require_kernel(path, chosen, str(path))
+        from liftcore.scene.splats import Splats
+
+        fields: dict[str, Any] = _READERS[found](path, colour=colour)
+        if chosen is Kernel.GAUSSIAN_2D:
+            fields["log_scales"] = np.ascontiguousarray(fields["log_scales"][:, :2])
+        return Splats(**fields, kernel=chosen)
+
+
+def format_of(path: Path) -> SplatFormat:
+    """The format of a file, by its content.
+
+    Raises:
+        InvalidSplats: it is of none; the error says what it is, if that can be told.
+    """
+    head, size = ply.read_head(path)
+    suffix = path.suffix.lower()
+    if head[:4] in (b"ply\n", b"ply\r"):
+        compressed = b"\nelement chunk " in head.partition(b"end_header")[0]
+        return SplatFormat.COMPRESSED_PLY if compressed else SplatFormat.PLY
+    if begins_like_spz(head):
+        return SplatFormat.SPZ
+    if head[:4] == b"PK\x03\x04" and (inner := _in_zip(path)):
+        return inner
+    known = _known_as(head)
+    if suffix == ".splat" or (known is None and suffix != ".ksplat" and looks_like_splat(head, size)):
+        return SplatFormat.SPLAT
+    if suffix == ".ksplat":
+        known = ("splats in GaussianSplats3D's .ksplat format", CONVERT)
+    begins = f"a file that begins with {head[:8]!r}" if head else "an empty file"
+    got, hint = known or (begins, f"{ply.EXPORT}; or {CONVERT}")
+    raise InvalidSplats(str(path), expected=EXPECTED, got=got, hint=hint)
 
 
 def require_kernel(path: Path, kernel: Kernel, source: str) -> None:
@@ -73,57 +130,86 @@ def require_kernel(path: Path, kernel: Kernel, source: str) -> None:
     Raises:
         InvalidSplats: it does; ``source`` is named.
     """
-    ply.model_slots(ply.read_header(path).names, kernel, source)
+    found = format_of(path)
+    if found is SplatFormat.PLY:
+        ply.model_slots(ply.read_header(path).names, kernel, source)
+    elif kernel is Kernel.BETA:
+        raise InvalidSplats(source, expected="the property 'beta' of a dbs splat", got=f"{found}, which has none")
 
 
 def some_rows(path: Path, kept: np.ndarray) -> Iterator[bytes]:
-    """The file with some of its rows alone (`liftcore.io.ply.some_rows`); ``kept`` is [P] bool."""
-    return ply.some_rows(path, kept)
+    """Some rows of a file, in its order, as the bytes of a PLY in blocks.
+
+    A PLY gives its own bytes (`liftcore.io.ply.some_rows`); what is of another format becomes a PLY of 3DGS.
+
+    Args:
+        path: the file. kept: [P] bool, the rows to keep.
+
+    Raises:
+        InvalidSplats: the file is malformed, or has another number of splats.
+    """
+    if format_of(path) is SplatFormat.PLY:
+        return ply.some_rows(path, kept)
+    splats = _of_count(path, len(kept))
+    import torch
+
+    rows = torch.from_numpy(np.flatnonzero(kept))
+    fields = ("means", "quats", "log_scales", "opacity_logits", "sh")
+    values = {name: getattr(splats, name) for name in fields if getattr(splats, name) is not None}
+    return ply.ply_blocks(replace(splats, **{name: value[rows] for name, value in values.items()}))
 
 
 def recoloured(path: Path, colours: np.ndarray) -> Iterator[bytes]:
-    """The file with a colour of each splat's own (`liftcore.io.ply.recoloured`); ``colours`` are [P, 3] f32."""
-    return ply.recoloured(path, colours)
+    """A file with one colour a splat, the same from everywhere, as the bytes of a PLY in blocks.
+
+    All else of a PLY is of its own bytes (`liftcore.io.ply.recoloured`); another format becomes a PLY of 3DGS.
+
+    Args:
+        path: the file. colours: [P, 3] f32, the constant terms of the spherical harmonics.
+
+    Raises:
+        InvalidSplats: the file is malformed, has another number of splats, or is a PLY that holds no colours.
+    """
+    if format_of(path) is SplatFormat.PLY:
+        return ply.recoloured(path, colours)
+    return ply.ply_blocks(replace(_of_count(path, len(colours), colour=False), sh=colours[:, None]))
 
 
 def is_splats(path: Path) -> bool:
-    """Whether the file begins like splats, or is named like them or like a checkpoint, if only to be refused."""
+    """Whether a file begins like splats, or is named like them, if only to be refused."""
     if path.suffix.lower() in SUFFIXES:
         return True
-    return path.is_file() and (_head(path).startswith((b"ply\n", b"ply\r", b"NGSP")))
-
-
-def _head(path: Path) -> bytes:
-    """The first bytes.
-
-    Raises:
-        InvalidSplats: the file does not open.
-    """
     try:
-        with path.open("rb") as handle:
-            return handle.read(HEAD_BYTES)
-    except OSError as error:
-        got = f"one that does not open ({error.strerror})"
-        raise InvalidSplats(str(path), expected="a splat file", got=got) from None
+        return path.is_file() and bool(format_of(path))
+    except InvalidSplats:
+        return False
 
 
-def _require_ply(path: Path) -> None:
-    suffix = path.suffix.lower()
-    if suffix in PICKLED and not (path.is_file() and _head(path).startswith(LFS_POINTER)):
-        got = "a Python pickle, which may run code when it is opened"
-        raise InvalidSplats(str(path), expected="a PLY file", got=got, hint=EXPORT_PLY)
-    head = _head(path)
-    if head[:4] in (b"ply\n", b"ply\r"):
-        return
-    start = head.lstrip(b"\xef\xbb\xbf \t\r\n").lower() if head[:1] != b"\x1f" else head
-    begins = f"a file that begins with {head[:8]!r}" if head else "an empty file"
-    got, hint = next(
-        (told for first, told in _BY_FIRST_BYTES.items() if start.startswith(first.lower())),
-        (begins, f"{ply.EXPORT}; if it is a .splat or a .ksplat, {CONVERT}"),
+def _in_zip(path: Path) -> SplatFormat | None:
+    """What splats a zip holds, by the names of its members."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = archive.namelist()
+    except BROKEN_ZIP:
+        return None
+    if META in names:
+        return SplatFormat.SOG
+    return SplatFormat.CHECKPOINT if any(name.endswith("/data.pkl") for name in names) else None
+
+
+def _known_as(head: bytes) -> tuple[str, str] | None:
+    """What a file of no splats is, and what to do."""
+    start = head[:64].lstrip(b"\xef\xbb\xbf \t\r\n").lower()
+    return next(
+        (told for first, told in _OTHERS.items() if start.startswith(first.lower()) or head.startswith(first)), None
     )
-    if suffix in OTHER_FORMATS and got in (begins, "a gzip file", "a zip"):  # .spz and .sog are such files inside
-        got, hint = OTHER_FORMATS[suffix], CONVERT
-    raise InvalidSplats(str(path), expected="a PLY file (first line 'ply')", got=got, hint=hint)
+
+
+def _of_count(path: Path, count: int, *, colour: bool = True) -> Splats:
+    splats = read_splats(path, colour=colour)
+    if splats.count != count:
+        raise InvalidSplats(str(path), expected=f"{count} splats, as many as were lifted", got=str(splats.count))
+    return splats
 
 
 @contextmanager

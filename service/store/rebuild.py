@@ -14,6 +14,7 @@ from typing import Any
 from safetensors import SafetensorError, safe_open
 
 from liftcore.errors import InvalidLift, NotFound, SplatliftError
+from liftcore.io.splats import SUFFIX
 from service.models import JOB_ID, AssetKind
 from service.settings import ServiceSettings
 from service.store.assets import CheckedUpload
@@ -68,7 +69,7 @@ def _add_asset(store: Store, settings: ServiceSettings, path: Path) -> AssetKind
 
 
 def _kind_of(path: Path) -> AssetKind:
-    if path.suffix == ".ply":
+    if path.suffix in SUFFIX.values():
         return AssetKind.SPLATS
     if path.suffix == ".json" or zipfile.is_zipfile(path):
         return AssetKind.CAMERAS

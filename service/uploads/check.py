@@ -13,12 +13,13 @@ import zipfile
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from liftcore.errors import InvalidCameras, InvalidInput, SplatliftError
+from liftcore.errors import InvalidCameras, InvalidInput, InvalidSplats, SplatliftError
 from liftcore.features.pack import read_features
+from liftcore.io.checkpoint import EXPORT_PLY
 from liftcore.io.class_masks import describe_masks
-from liftcore.io.inspect import describe_camera_file, describe_packs, describe_splats, describe_table
+from liftcore.io.inspect import describe_camera_file, describe_packs, describe_splat_file, describe_table
 from liftcore.io.json_file import finite
-from liftcore.io.splats import read_splats
+from liftcore.io.splats import SUFFIX, SplatFormat, format_of
 from liftcore.query.text.table import TableEncoder
 from service.child import end_with_parent, fault_of, own_stdout
 from service.models import VIEW_CHARACTERS, AssetKind
@@ -26,8 +27,12 @@ from service.uploads import INVALID
 
 
 def check_splats(path: Path) -> dict[str, Any]:
-    """Read and describe every splat."""
-    return {"suffix": ".ply", "found": describe_splats(read_splats(path))}
+    """Read and describe every splat; checkpoints are pickles, and are not opened here."""
+    found = format_of(path)
+    if found is SplatFormat.CHECKPOINT:
+        got = "a checkpoint of a trainer, which is a Python pickle"
+        raise InvalidSplats("splats", expected="a format that holds no code", got=got, hint=EXPORT_PLY)
+    return {"suffix": SUFFIX[found], "found": describe_splat_file(path)}
 
 
 def check_cameras(path: Path) -> dict[str, Any]:

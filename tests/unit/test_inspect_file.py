@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from safetensors.torch import save_file
 
-from liftcore.errors import InvalidInput, InvalidSplats, SplatliftError
+from liftcore.errors import InvalidInput, SplatliftError
 from liftcore.features.pack import write_pack
 from liftcore.features.views import FeatureGrid, Regions
 from liftcore.io.inria import write_inria_cameras
@@ -23,8 +24,7 @@ from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.splats import Splats
 from liftcore.settings import LiftSettings
 
-if TYPE_CHECKING:
-    from pathlib import Path
+SPLATS = Path(__file__).parents[1] / "data" / "splats"
 
 
 def inspected(path: Path) -> dict[str, Any]:
@@ -74,22 +74,12 @@ def test_moving_splats_are_said_to_stand_still(tmp_path: Path) -> None:
     assert any("motion_0" in warning for warning in inspected(tmp_path / "moving.ply")["warnings"])
 
 
-@pytest.mark.parametrize(
-    ("name", "content", "message"),
-    [
-        ("scene.splat", b"\0" * 64, "splat-transform"),
-        ("scene.ksplat", b"\0" * 64, "splat-transform"),
-        ("scene.sog", b"PK\x03\x04", r"\.sog format.*splat-transform"),
-        ("scene.spz", b"\x1f\x8b\x08", r"\.spz format.*splat-transform"),
-        ("unnamed", b"NGSP\x04\0\0\0", r"\.spz format.*splat-transform"),
-        ("step.ckpt", b"version https://git-lfs.github.com/spec/v1\n", "git lfs pull"),
-        ("step.ckpt", b"PK\x03\x04", "a Python pickle"),
-    ],
-)
-def test_splats_in_another_format_are_named(name: str, content: bytes, message: str, tmp_path: Path) -> None:
-    (tmp_path / name).write_bytes(content)
-    with pytest.raises(InvalidSplats, match=message):
-        inspect_file(tmp_path / name)
+@pytest.mark.parametrize("name", ["degree3.splat", "degree3.v4.spz", "degree3.sog", "degree3.compressed.ply"])
+def test_formats_of_editors_are_described_by_their_names(name: str) -> None:
+    found = inspected(SPLATS / name)
+    dialect = {".ply": "compressed PLY"}.get(Path(name).suffix, Path(name).suffix)
+    assert (found["kind"], found["splats"], found["dialect"]) == ("splats", 40, dialect)
+    assert found["sh_degree"] == (0 if name == "degree3.splat" else 3)
 
 
 def test_discs_with_a_third_scale_are_noticed(tmp_path: Path) -> None:

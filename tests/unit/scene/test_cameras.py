@@ -14,12 +14,11 @@ import pytest
 from camera_documents import assert_same
 from colmap_files import IMAGES, binary_files, text_files, write_files
 
-from liftcore.errors import InvalidCameras, InvalidSplats
+from liftcore.errors import InvalidCameras
 from liftcore.io import cameras, json_file
 from liftcore.io.cameras import other_models, read_cameras
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.inspect import describe_camera_file
-from liftcore.io.splats import read_splats
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.distortion import Brown, Fisheye, Lens
 
@@ -256,11 +255,6 @@ def test_what_is_no_camera_file_is_refused(tmp_path: Path) -> None:
         read_cameras(tmp_path / "nowhere")
     with pytest.raises(InvalidCameras, match="a folder without any of them"):
         read_cameras(tmp_path)
-
-
-def test_pickled_splats_are_refused_unopened(tmp_path: Path) -> None:
-    with pytest.raises(InvalidSplats, match="may run code"):
-        read_splats(tmp_path / "ckpt.pt")
 
 
 def test_real_cameras_agree_in_both_formats(shared_data: Path) -> None:

@@ -1,0 +1,80 @@
+"""Checkpoints of trainers: gsplat's ``.pt`` and nerfstudio's ``.ckpt``, of which the splats are plain tensors.
+
+They are pickles. Torch's reader for weights alone opens them, which builds tensors and runs no code of the file; what
+it refuses is refused. They are for files of one's own all the same: nobody sends them over HTTP.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from liftcore.errors import InvalidSplats
+from liftcore.io.quantised import Fields
+
+# Our fields by what the two trainers call them.
+GSPLAT = {"means": "means", "quats": "quats", "log_scales": "scales", "opacity_logits": "opacities"}
+GSPLAT_COLOUR = ("sh0", "shN")
+NERFSTUDIO_COLOUR = ("features_dc", "features_rest")
+NERFSTUDIO = ("_model.gauss_params.", "_model.")  # before the names, in newer and older versions
+EXPORT_PLY = (
+    "export the splats as PLY from the program that trained them (nerfstudio: ns-export gaussian-splat; gsplat's "
+    "simple_trainer: --save-ply)"
+)
+
+
+def read_checkpoint(path: Path, *, colour: bool = True) -> Fields:
+    """The fields of a checkpoint's splats, in the frame that they were trained in.
+
+    Raises:
+        InvalidSplats: the file holds more than tensors and plain values, or no splats of either trainer.
+    """
+    import torch
+
+    try:
+        stored = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+    except Exception as error:  # unpickling fails in many kinds
+        got = f"one that holds more than tensors, or is damaged ({str(error).splitlines()[0][:100]})"
+        raise InvalidSplats(str(path), expected="a checkpoint of tensors", got=got, hint=EXPORT_PLY) from None
+    tensors, names = _splats(stored, path)
+    fields = {field: _array(tensors, name, path) for field, name in GSPLAT.items()}
+    fields["opacity_logits"] = fields["opacity_logits"].reshape(len(fields["opacity_logits"]), -1)[:, 0]
+    if colour and names[0] in tensors:
+        first, rest = (_array(tensors, name, path) for name in names)
+        try:
+            fields["sh"] = np.concatenate([first.reshape(len(first), 1, 3), rest.reshape(len(rest), -1, 3)], axis=1)
+        except ValueError:
+            got = f"{list(first.shape)} and {list(rest.shape)}"
+            argument = f"{path} {' and '.join(names)}"
+            raise InvalidSplats(argument, expected="shapes [P, 1, 3] and [P, K, 3]", got=got) from None
+    return fields
+
+
+def _splats(stored: Any, path: Path) -> tuple[dict[str, Any], tuple[str, str]]:
+    """The tensors of the splats by gsplat's names, and the names of their colours."""
+    inner = stored if isinstance(stored, dict) else {}
+    if isinstance(inner.get("splats"), dict):
+        return inner["splats"], GSPLAT_COLOUR
+    pipeline = inner.get("pipeline")
+    pipeline = pipeline if isinstance(pipeline, dict) else {}
+    for before in NERFSTUDIO:
+        if f"{before}means" in pipeline:
+            own = {key.removeprefix(before): value for key, value in pipeline.items() if str(key).startswith(before)}
+            return own, NERFSTUDIO_COLOUR
+    some = ", ".join(map(repr, list(inner)[:4])) if inner else type(stored).__name__
+    expected = "the splats of gsplat ('splats') or of nerfstudio ('pipeline')"
+    raise InvalidSplats(str(path), expected=expected, got=f"a checkpoint of {some}"[:160], hint=EXPORT_PLY)
+
+
+def _array(tensors: dict[str, Any], name: str, path: Path) -> np.ndarray:
+    import torch
+
+    found = tensors.get(name)
+    if not isinstance(found, torch.Tensor) or not found.is_floating_point() or not found.ndim or not len(found):
+        got = (
+            f"{str(found.dtype).removeprefix('torch.')} {list(found.shape)}"
+            if isinstance(found, torch.Tensor)
+            else "none"
+        )
+        raise InvalidSplats(f"{path} {name}", expected="floats, a row a splat", got=got, hint=EXPORT_PLY)
+    return found.detach().to(torch.float32).numpy()

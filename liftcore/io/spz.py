@@ -1,0 +1,197 @@
+"""Niantic's ``.spz`` of versions 1 to 4: quantised splats, compressed by gzip or, from version 4 on, by zstd.
+
+One section an attribute: means (three f16 in version 1, then 24-bit fixed point), opacities u8, colours u8, log
+scales u8 (v / 16 - 10), quaternions (x y z u8; from version 3 the smallest three parts in 10 bits each, sign and
+magnitude, behind two bits for the largest of x y z w) and higher harmonics u8, coefficient by coefficient. To version
+3 all is one gzip stream with a header of 16 bytes. Version 4 has a plain header of 32, then extensions, then the
+sizes of the sections' zstd streams, then these.
+
+The frame is right, up, back (RUB) unless an extension declares another. PLYs and cameras are in right, down, front
+(RDF): axes are turned, and quaternions and harmonics with them. The format is of nianticlabs/spz.
+"""
+
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+
+from liftcore.errors import InvalidSplats
+from liftcore.io.quantised import MOST_GROWTH, Fields, decoded, field_shapes, logits, smallest_three
+
+MAGIC = b"NGSP"
+VERSIONS = (1, 2, 3, 4)
+HEADER = "<4sIIBBBB"  # magic, version, count, SH degree, fractional bits, flags; then the number of streams, or zero
+HEADER_BYTES = struct.calcsize(HEADER)
+STREAMS_HEADER_BYTES = 32  # of version 4, which also has the place of the sizes
+MAX_EXTENSION_BYTES = 1 << 16  # that version 3 may have behind the sections
+MAX_DEGREE = 4
+MAX_FRACTIONAL_BITS = 24
+COLOUR_SCALE = 0.15  # of the constant term
+FRAME_EXTENSION = 0xADBE0003
+RUB, RDF = 4, 6  # frames as spz numbers them: 1 + (x is right) + 2 (y is up) + 4 (z is front), up to 8
+HINT = "export it again, or as PLY"
+# Which axes' signs change a harmonic of degree 1 to 4; the last as the library has it that writes these files.
+SH_AXES = (
+    *("y", "z", "x"),
+    *("xy", "yz", "", "xz", ""),
+    *("y", "xyz", "y", "z", "x", "z", "x"),
+    *("xy", "yz", "xy", "yz", "", "xz", "", "xz", "y"),
+)
+
+
+def begins_like_spz(head: bytes) -> bool:
+    """Whether these first bytes are of the format, of any version."""
+    if head[:2] != b"\x1f\x8b":
+        return head[:4] == MAGIC
+    try:
+        return zlib.decompressobj(31).decompress(head, 4) == MAGIC
+    except zlib.error:
+        return False
+
+
+def read_spz(path: Path, *, colour: bool = True) -> Fields:
+    """The fields of an ``.spz`` file, in the frame of PLYs and cameras.
+
+    Raises:
+        InvalidSplats: the file is malformed, of a later version, or has more splats than its size can be of.
+    """
+    content = path.read_bytes()
+    is_plain, unpacking = content[:4] == MAGIC, zlib.decompressobj(31)
+    start = content[:STREAMS_HEADER_BYTES] if is_plain else _inflated(unpacking, content, HEADER_BYTES, path)
+    version, count, degree, bits, streams = _header(start, path)
+    if is_plain != (version >= 4):
+        raise _broken(path, "gzip for versions 1 to 3 and a plain header for 4", f"the other for {version}")
+    sizes = _section_bytes(version, count, degree)
+    if sum(sizes) > MOST_GROWTH * len(content):
+        got = f"{count} in {len(content)} bytes"
+        raise InvalidSplats(str(path), expected="as many splats as the file's size can be of", got=got, hint=HINT)
+    if is_plain:
+        (table,) = struct.unpack_from("<I", start, HEADER_BYTES)
+        frame, sections = _declared_frame(content, table, path), _streams(content, table, streams, sizes, path)
+    else:
+        body = np.frombuffer(_inflated(unpacking, unpacking.unconsumed_tail, sum(sizes), path), np.uint8)
+        _inflated(unpacking, unpacking.unconsumed_tail, 0, path)
+        frame, sections = RUB, np.split(body, np.cumsum(sizes)[:-1])
+    return _decoded(sections, version, degree if colour else 0, 2.0**-bits, frame, colour=colour)
+
+
+def _header(start: bytes, path: Path) -> tuple[int, int, int, int, int]:
+    """Version, number of splats, degree of the harmonics, fractional bits of means, number of streams."""
+    if len(start) < HEADER_BYTES or (start[4:8] == b"\4\0\0\0" and len(start) < STREAMS_HEADER_BYTES):
+        raise _broken(path, "a whole header", f"{len(start)} bytes")
+    magic, version, count, degree, bits, _, streams = struct.unpack_from(HEADER, start)
+    if magic != MAGIC or version not in VERSIONS:
+        got = f"version {version}" if magic == MAGIC else repr(magic)
+        raise InvalidSplats(str(path), expected="an .spz of version 1 to 4", got=got, hint=HINT)
+    if degree > MAX_DEGREE or (version > 1 and not 1 <= bits <= MAX_FRACTIONAL_BITS):
+        expected = f"harmonics of degree 0..{MAX_DEGREE} and 1..{MAX_FRACTIONAL_BITS} fractional bits"
+        raise _broken(path, expected, f"{degree} and {bits}")
+    if count == 0:
+        raise InvalidSplats(str(path), expected="at least one splat", got="an empty scene")
+    return version, count, degree, bits, streams
+
+
+def _section_bytes(version: int, count: int, degree: int) -> list[int]:
+    """Bytes of means, opacities, colours, log scales, quaternions and harmonics."""
+    higher = (degree + 1) ** 2 - 1
+    return [count * size for size in (6 if version == 1 else 9, 1, 3, 3, 4 if version >= 3 else 3, 3 * higher)]
+
+
+def _inflated(unpacking: "zlib._Decompress", content: bytes, size: int, path: Path) -> bytes:
+    """The next ``size`` bytes of a gzip stream; with 0 what is left is looked at, where its checksum may be."""
+    try:
+        found = unpacking.decompress(content, size or MAX_EXTENSION_BYTES)
+    except zlib.error as error:
+        raise _broken(path, "a whole gzip stream", str(error)[:120]) from None
+    if len(found) < size:
+        raise _broken(path, f"{size} bytes in the gzip stream", f"{len(found)}")
+    return found
+
+
+def _streams(content: bytes, table: int, streams: int, sizes: list[int], path: Path) -> list[np.ndarray]:
+    """The sections of version 4, each u8; those of no bytes have no stream."""
+    import zstandard
+
+    filled = [size for size in sizes if size]
+    at = table + 16 * streams
+    if streams != len(filled) or table < STREAMS_HEADER_BYTES or at > len(content):
+        raise _broken(path, f"{len(filled)} streams whose sizes lie in the file", f"{streams} at {table}")
+    sections = []
+    for place, size in enumerate(filled):
+        packed, told = struct.unpack_from("<QQ", content, table + 16 * place)
+        if told != size or at + packed > len(content):
+            raise _broken(path, f"a stream of {size} bytes", f"{told} in {packed} of {len(content) - at} left")
+        stream = content[at : at + packed]
+        try:
+            if zstandard.frame_content_size(stream) not in (-1, size):  # else what it says would be allocated
+                raise _broken(path, f"a stream of {size} bytes", "one of another size")
+            found = zstandard.ZstdDecompressor().decompress(stream, max_output_size=size)
+            if len(found) != size:
+                raise _broken(path, f"a stream of {size} bytes", f"{len(found)}")
+        except zstandard.ZstdError as error:
+            raise _broken(path, "a whole zstd stream", str(error)[:120]) from None
+        sections.append(np.frombuffer(found, np.uint8))
+        at += packed
+    return sections + [np.empty(0, np.uint8)] * (len(sizes) - len(filled))
+
+
+def _declared_frame(content: bytes, table: int, path: Path) -> int:
+    """The frame that an extension of version 4 declares; RUB if none does."""
+    at = STREAMS_HEADER_BYTES
+    while at + 8 <= min(table, len(content)):
+        kind, size = struct.unpack_from("<II", content, at)
+        if kind == FRAME_EXTENSION and size == 4 and at + 12 <= len(content):
+            (frame,) = struct.unpack_from("<I", content, at + 8)
+            if frame > 8:
+                raise InvalidSplats(str(path), expected="a frame with y up or down", got=f"frame {frame}", hint=HINT)
+            return frame or RUB
+        at += 8 + size
+    return RUB
+
+
+def _decoded(
+    sections: list[np.ndarray], version: int, degree: int, step: float, frame: int, *, colour: bool
+) -> Fields:
+    means, opacities, colours, scales, quats, harmonics = sections
+    count, higher = len(opacities), (degree + 1) ** 2 - 1
+    x, y, z = (1.0 if (frame - 1) >> axis & 1 == (RDF - 1) >> axis & 1 else -1.0 for axis in range(3))
+    signs = {"x": x, "y": y, "z": z}
+    sh_signs = np.array([np.prod([signs.get(axis, 1.0) for axis in axes]) for axes in SH_AXES[:higher]])
+    stored = harmonics.reshape(count, -1, 3)
+
+    def decode(rows: slice) -> Fields:
+        if version == 1:
+            places = means.view("<f2").reshape(count, 3)[rows].astype(np.float64)
+        else:
+            low, middle, high = (means.reshape(count, 3, 3)[rows, :, i].astype(np.int32) for i in range(3))
+            places = (low | middle << 8 | high << 16).astype(np.float64)
+            places = np.where(places >= 1 << 23, places - (1 << 24), places) * step
+        fields = {
+            "means": places * (x, y, z),
+            "log_scales": scales.reshape(count, 3)[rows] / 16.0 - 10,
+            "quats": _quats(quats.reshape(count, -1)[rows]) * (1, y * z, x * z, x * y),
+            "opacity_logits": logits(opacities[rows] / 255.0),
+        }
+        if colour:
+            fields["sh"] = np.empty((len(places), 1 + higher, 3))
+            fields["sh"][:, 0] = (colours.reshape(count, 3)[rows] / 255.0 - 0.5) / COLOUR_SCALE
+            fields["sh"][:, 1:] = (stored[rows] / 128.0 - 1) * sh_signs[:, None] if higher else 0
+        return fields
+
+    return decoded(count, field_shapes(1 + higher if colour else 0), decode)
+
+
+def _quats(stored: np.ndarray) -> np.ndarray:
+    """[n, 4] w x y z, of x y z [n, 3] u8 or of the smallest three of x y z w [n, 4] u8."""
+    if stored.shape[1] == 3:
+        parts = stored / 127.5 - 1
+        return np.column_stack([np.sqrt(np.maximum(0.0, 1 - (parts**2).sum(axis=1))), parts])
+    packed = np.ascontiguousarray(stored).view("<u4")[:, 0]
+    parts = np.stack([packed >> 20, packed >> 10, packed], axis=1) & 1023
+    values = (parts & 511) / 511 * np.sqrt(0.5) * np.where(parts & 512, -1, 1)
+    return np.roll(smallest_three(values, (packed >> 30).astype(np.int64)), 1, axis=1)
+
+
+def _broken(path: Path, expected: str, got: str) -> InvalidSplats:
+    return InvalidSplats(str(path), expected=expected, got=got, hint=f"the file is truncated or damaged: {HINT}")

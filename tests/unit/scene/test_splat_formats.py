@@ -1,0 +1,251 @@
+"""Splat files that editors and trainers write: read as their own tools read them, bounded, and exported row by row.
+
+``tests/data/splats`` holds seeded scenes of 300 splats (degree 1, two chunks) and 40 (degree 3) that splat-transform
+2.7.1 wrote, the ``.splat`` and the ``.spz`` of versions 1 and 2 apart, which it only reads. Each lies beside the PLY
+that splat-transform makes of it.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import zstandard
+
+from liftcore.errors import InvalidSplats
+from liftcore.io.ply import write_splats
+from liftcore.io.quantised import LEAST_ALPHA
+from liftcore.io.splats import SplatFormat, format_of, read_splats, recoloured, require_kernel, some_rows
+from liftcore.io.spz import FRAME_EXTENSION, RDF
+from liftcore.scene.kernel import Kernel
+from liftcore.scene.splats import Splats
+from tests.scenes import random_splats
+
+FILES = Path(__file__).parents[2] / "data" / "splats"
+FORMATS = {
+    "degree1.compressed.ply": SplatFormat.COMPRESSED_PLY,
+    "degree1.sog": SplatFormat.SOG,
+    "degree3.compressed.ply": SplatFormat.COMPRESSED_PLY,
+    "degree3.sog": SplatFormat.SOG,
+    "degree3.splat": SplatFormat.SPLAT,
+    **{f"degree3.v{version}.spz": SplatFormat.SPZ for version in (1, 2, 3, 4)},
+}
+HIGHEST = float(np.log((1 - LEAST_ALPHA) / LEAST_ALPHA))
+
+
+def assert_alike(found: Splats, expected: Splats) -> None:
+    assert torch.allclose(found.means, expected.means, atol=1e-6)
+    assert torch.allclose(found.log_scales, expected.log_scales, atol=1e-6)
+    turned = (torch.nn.functional.normalize(found.quats) * torch.nn.functional.normalize(expected.quats)).sum(dim=1)
+    assert torch.allclose(turned.abs(), torch.ones(found.count), atol=2e-4)  # .splat's zero is read as 127.5 or 128
+    clamped = expected.opacity_logits.clamp(-HIGHEST, HIGHEST)  # infinite in some of splat-transform's
+    assert torch.allclose(found.opacity_logits, clamped, atol=1e-4)
+    assert found.sh is not None and expected.sh is not None and found.sh.shape == expected.sh.shape
+    assert torch.allclose(found.sh, expected.sh, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_every_format_is_read_as_its_own_tool_reads_it(name: str, tmp_path: Path) -> None:
+    expected = read_splats(FILES / f"{name}.decoded.ply")
+    unnamed = tmp_path / "upload"
+    unnamed.write_bytes((FILES / name).read_bytes())
+    for path in (FILES / name, unnamed):
+        assert format_of(path) is FORMATS[name]
+        assert_alike(read_splats(path), expected)
+    bare, whole = read_splats(unnamed, colour=False), read_splats(unnamed)
+    assert bare.sh is None and torch.equal(bare.means, whole.means) and torch.equal(bare.quats, whole.quats)
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_exports_of_every_format_are_plys_of_the_same_rows(name: str, tmp_path: Path) -> None:
+    whole = read_splats(FILES / name)
+    kept = np.arange(whole.count) % 3 == 1
+    (tmp_path / "some.ply").write_bytes(b"".join(some_rows(FILES / name, kept)))
+    some = read_splats(tmp_path / "some.ply")
+    for field in ("means", "quats", "log_scales", "opacity_logits", "sh"):
+        assert torch.equal(getattr(some, field), getattr(whole, field)[torch.from_numpy(kept)])
+    colours = np.random.default_rng(0).normal(size=(whole.count, 3)).astype(np.float32)
+    (tmp_path / "coloured.ply").write_bytes(b"".join(recoloured(FILES / name, colours)))
+    coloured = read_splats(tmp_path / "coloured.ply")
+    assert coloured.sh is not None and torch.equal(coloured.sh[:, 0], torch.from_numpy(colours))
+    assert torch.equal(coloured.means, whole.means)
+    with pytest.raises(InvalidSplats, match=f"as many as were lifted, got {whole.count}"):
+        list(some_rows(FILES / name, kept[:-1]))
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_damage_of_any_kind_is_splats_or_an_error_of_ours(name: str, tmp_path: Path) -> None:
+    content, path, random = (FILES / name).read_bytes(), tmp_path / "damaged", np.random.default_rng(1)
+    damaged = [content[:cut] for cut in random.integers(0, len(content), 25)]
+    for _ in range(60):
+        changed = bytearray(content)
+        for place in random.integers(0, min(len(content), 2000), 3):
+            changed[place] = random.integers(256)
+        damaged.append(bytes(changed))
+    for one in damaged:
+        path.write_bytes(one)
+        try:
+            assert read_splats(path).count > 0
+        except InvalidSplats as error:
+            assert "\n" not in str(error) and len(str(error)) < 700
+
+
+def spz_header(version: int, count: int, streams: int = 0) -> bytes:
+    return struct.pack("<4sIIBBBB", b"NGSP", version, count, 0, 12, 0, streams)
+
+
+def bomb(kind: str, path: Path) -> None:
+    """A small file that says it is a large one."""
+    if kind == "spz 4":
+        sizes = [9, 1, 3, 3, 4]
+        stream = zstandard.ZstdCompressor().compress(bytes(10_000_000))
+        table = b"".join(struct.pack("<QQ", len(stream), 100 * size) for size in sizes)
+        path.write_bytes(spz_header(4, 100, 5) + struct.pack("<I12x", 32) + table + stream * 5)
+    elif kind == "spz 4 of many":
+        path.write_bytes(spz_header(4, 1 << 30, 5) + struct.pack("<I12x", 32))
+    elif kind == "spz 3":
+        import gzip
+
+        path.write_bytes(gzip.compress(spz_header(3, 1 << 30) + bytes(1000)))
+    elif kind == "sog":
+        with zipfile.ZipFile(path, "w") as archive:
+            archive.writestr("meta.json", json.dumps({"version": 2, "count": 1 << 40}))
+    elif kind == "sog of zeros":
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+            part = {"files": ["zeros.webp", "zeros.webp"], "mins": [0] * 3, "maxs": [1] * 3}
+            archive.writestr("meta.json", json.dumps({"version": 2, "count": 4, "means": part}))
+            archive.writestr("zeros.webp", bytes(10_000_000))
+    else:
+        head = (FILES / "degree3.compressed.ply").read_bytes()
+        path.write_bytes(head.replace(b"element vertex 40", b"element vertex 99999999999"))
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        ("spz 4", "a stream of 900 bytes"),
+        ("spz 4 of many", "as many splats as the file's size can be of, got 1073741824 in"),
+        ("spz 3", "as many splats as the file's size can be of, got 1073741824 in"),
+        ("sog", "a count of splats that the file's size can be of, got 1099511627776"),
+        ("sog of zeros", "bytes of 'zeros.webp', got more"),
+        ("compressed PLY", "bytes, as its header says"),
+    ],
+)
+def test_small_files_that_say_they_are_large_are_refused(kind: str, message: str, tmp_path: Path) -> None:
+    bomb(kind, tmp_path / "bomb")
+    with pytest.raises(InvalidSplats, match=message):
+        read_splats(tmp_path / "bomb")
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("a.splat", bytes(33), "rows of 32 bytes, got 33 bytes"),
+        ("a.splat", b"", "rows of 32 bytes, got 0 bytes"),
+        ("a.ksplat", bytes(64), r"GaussianSplats3D's \.ksplat format; .*splat-transform"),
+        ("a", b"NGSP\x09\0\0\0" + bytes(40), r"an \.spz of version 1 to 4, got version 9"),
+        ("a.spz", b"\x1f\x8b\x08", "a gzip file"),
+        ("a.sog", b"PK\x03\x04", "a zip"),
+        ("a.ckpt", b"version https://git-lfs.github.com/spec/v1\n", "git lfs pull"),
+        ("a.pt", b"\x80\x02}q\0.", "a Python pickle, which may run code"),
+    ],
+)
+def test_what_is_none_of_the_formats_is_named(name: str, content: bytes, message: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(InvalidSplats, match=message):
+        read_splats(tmp_path / name)
+
+
+def test_the_frame_that_an_spz_declares_is_its_own(tmp_path: Path) -> None:
+    content = (FILES / "degree3.v4.spz").read_bytes()
+    extensions = struct.pack("<III", FRAME_EXTENSION, 4, RDF) + struct.pack("<II3x", 0x12340001, 3)
+    place = struct.pack("<I", 32 + len(extensions))
+    (tmp_path / "declared.spz").write_bytes(content[:16] + place + content[20:32] + extensions + content[32:])
+    turned, plain = read_splats(tmp_path / "declared.spz"), read_splats(FILES / "degree3.v4.spz")
+    assert torch.equal(turned.means, plain.means * torch.tensor([1.0, -1.0, -1.0]))
+    assert torch.allclose(turned.quats, plain.quats * torch.tensor([1.0, 1.0, -1.0, -1.0]))
+    assert turned.sh is not None and plain.sh is not None
+    assert torch.allclose(turned.sh[:, 1:4], plain.sh[:, 1:4] * torch.tensor([-1.0, -1.0, 1.0])[:, None])
+
+
+def trained() -> Splats:
+    return read_splats(FILES / "degree3.sog.decoded.ply")
+
+
+def gsplat_checkpoint(splats: Splats) -> dict[str, Any]:
+    assert splats.sh is not None
+    own = {"means": splats.means, "quats": splats.quats, "scales": splats.log_scales}
+    own |= {"opacities": splats.opacity_logits, "sh0": splats.sh[:, :1], "shN": splats.sh[:, 1:]}
+    return {"step": 6999, "splats": {name: torch.nn.Parameter(value) for name, value in own.items()}}
+
+
+def nerfstudio_checkpoint(splats: Splats, before: str) -> dict[str, Any]:
+    assert splats.sh is not None
+    own = {"means": splats.means, "quats": splats.quats, "scales": splats.log_scales}
+    own |= {"opacities": splats.opacity_logits[:, None], "features_dc": splats.sh[:, 0]}
+    own |= {"features_rest": splats.sh[:, 1:], "other": torch.zeros(1)}
+    return {"step": 1, "pipeline": {f"{before}{name}": value for name, value in own.items()}, "optimizers": {}}
+
+
+@pytest.mark.parametrize("kind", ["gsplat", "_model.gauss_params.", "_model."])
+def test_checkpoints_of_trainers_are_read_as_tensors(kind: str, tmp_path: Path) -> None:
+    splats, path = trained(), tmp_path / "step-000029999.ckpt"
+    torch.save(gsplat_checkpoint(splats) if kind == "gsplat" else nerfstudio_checkpoint(splats, kind), path)
+    assert format_of(path) is SplatFormat.CHECKPOINT
+    found = read_splats(path)
+    for field in ("means", "quats", "log_scales", "opacity_logits", "sh"):
+        assert torch.equal(getattr(found, field), getattr(splats, field))
+    write_splats(found, tmp_path / "again.ply")
+    assert torch.equal(read_splats(tmp_path / "again.ply").means, splats.means)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({"splats": {"means": Path("code")}}, "holds more than tensors, or is damaged .*ns-export"),
+        ({"model": {"weight": torch.zeros(2)}}, "the splats of gsplat .* got a checkpoint of 'model'"),
+        ([torch.zeros(2)], "got a checkpoint of list"),
+        ({"splats": {"means": torch.zeros(2, 3)}}, "quats: expected floats, a row a splat, got none"),
+        ({"splats": {"means": torch.zeros(2, 3, dtype=torch.int32)}}, r"means: expected floats.*int32 \[2, 3\]"),
+    ],
+)
+def test_checkpoints_of_other_things_are_refused_and_run_nothing(content: Any, message: str, tmp_path: Path) -> None:
+    torch.save(content, tmp_path / "c.pt")
+    with pytest.raises(InvalidSplats, match=message):
+        read_splats(tmp_path / "c.pt")
+
+
+def test_kernels_of_formats_without_columns_are_3dgs_or_2dgs() -> None:
+    path = FILES / "degree3.splat"
+    assert read_splats(path).kernel is Kernel.GAUSSIAN_3D
+    flat = read_splats(path, "2dgs")
+    assert flat.kernel is Kernel.GAUSSIAN_2D and flat.log_scales.shape == (40, 2)
+    with pytest.raises(InvalidSplats, match=r"the property 'beta' of a dbs splat, got \.splat, which has none"):
+        read_splats(path, "dbs")
+    with pytest.raises(InvalidSplats, match=r"asset: expected the property 'beta'"):
+        require_kernel(path, Kernel.BETA, "asset")
+
+
+def test_large_files_are_decoded_in_blocks_to_the_same_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = [read_splats(FILES / name) for name in FORMATS]
+    monkeypatch.setattr("liftcore.io.quantised.BLOCK_ROWS", 7)
+    for name, splats in zip(FORMATS, whole, strict=True):
+        again = read_splats(FILES / name)
+        assert again.sh is not None and splats.sh is not None
+        assert torch.equal(again.means, splats.means) and torch.equal(again.sh, splats.sh)
+        assert torch.equal(again.quats, splats.quats)
+
+
+def test_random_bytes_are_no_splats(tmp_path: Path) -> None:
+    for seed in range(20):
+        (tmp_path / "noise").write_bytes(np.random.default_rng(seed).bytes(32 * 200))
+        with pytest.raises(InvalidSplats, match=r"begins with|gzip|pickle"):
+            read_splats(tmp_path / "noise")
+    write_splats(random_splats(1, 20), tmp_path / "noise")  # a PLY of any name stays one
+    assert format_of(tmp_path / "noise") is SplatFormat.PLY
