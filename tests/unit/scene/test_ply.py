@@ -1,24 +1,66 @@
-"""Splat files: every dialect is read, written back to the byte, or refused in one line."""
+"""PLYs of every dialect are read, written back and copied to the byte, or refused in one line."""
 
 from __future__ import annotations
 
+import io
 import tracemalloc
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from ply_files import DIALECTS, INRIA, ply_bytes, ply_rows, with_ply
+from plyfile import PlyData
 
 from liftcore.errors import InvalidSplats
-from liftcore.io.ply import write_splats
-from liftcore.io.splats import read_splats
+from liftcore.io.ply import BLOCK_ROWS, write_splats
+from liftcore.io.splats import read_splats, recoloured, some_rows
+from liftcore.query.colours import constant_terms
+from liftcore.query.splat_colours import seen_colours
 from liftcore.scene.splats import Kernel, Splats
-from tests.scenes import random_splats
+from tests.scenes import look_at, random_splats
 
-if TYPE_CHECKING:
-    from pathlib import Path
+ROTATION = [f"rot_{i}" for i in range(4)]
+SCALES = [f"scale_{i}" for i in range(3)]
+INRIA = [*"xyz", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", *SCALES, *ROTATION]
+LOBES = [f"sb_params_{i}" for i in range(12)]
+DIALECTS = {
+    "inria degree 0": INRIA,
+    "inria degree 3": [*INRIA[:9], *(f"f_rest_{i}" for i in range(45)), *INRIA[9:]],
+    "gsplat": [*"xyz", *INRIA[6:]],
+    "saga": [*"xyz", "mask", *INRIA[3:]],
+    "2dgs": [name for name in INRIA if name != "scale_2"],
+    "dbs": [*INRIA[:6], "sh0_0", "sh0_1", "sh0_2", *LOBES, "opacity", "beta", *SCALES, *ROTATION],
+    "no colour": [*"xyz", "opacity", *SCALES, *ROTATION],
+}
+
+
+def ply_bytes(names: list[str], count: int = 5, types: dict[str, str] | None = None, head: str = "") -> bytes:
+    """Seeded numbers; ``types`` gives columns other types than float, ``head`` more header lines."""
+    types = types or {}
+    codes = {"float": "f4", "double": "f8", "uchar": "u1", "ushort": "u2", "int": "i4"}
+    dtype = np.dtype([(name, "<" + codes[types.get(name, "float")]) for name in names])
+    rows = np.zeros(count, dtype)
+    generator = np.random.default_rng(0)
+    for name in names:
+        rows[name] = generator.normal(size=count) if types.get(name, "float")[-1] in "te" else np.arange(count)
+    lines = [f"property {types.get(name, 'float')} {name}" for name in names]
+    header = "\n".join(["ply", "format binary_little_endian 1.0", f"{head}element vertex {count}", *lines])
+    return header.encode() + b"\nend_header\n" + rows.tobytes()
+
+
+def ply_rows(names: list[str], count: int = 5) -> np.ndarray:
+    """The rows of ``ply_bytes`` of float columns, to be changed."""
+    content = ply_bytes(names, count)
+    dtype = np.dtype([(name, "<f4") for name in names])
+    return np.frombuffer(content[-count * dtype.itemsize :], dtype).copy()
+
+
+def with_ply(tmp_path: Path, content: bytes) -> Path:
+    path = tmp_path / "splats.ply"
+    path.write_bytes(content)
+    return path
+
 
 KERNELS = {"2dgs": Kernel.GAUSSIAN_2D, "dbs": Kernel.BETA}
 
@@ -80,15 +122,6 @@ def test_beta_lobes_are_stored_channel_major(tmp_path: Path) -> None:
         assert np.array_equal(splats.sb_params[:, lobe, channel].numpy(), expected)
 
 
-def test_double_columns_are_cast(tmp_path: Path) -> None:
-    types = dict.fromkeys(INRIA, "double")
-    splats = read_splats(with_ply(tmp_path, ply_bytes(INRIA, types=types)))
-    assert splats.means.dtype == torch.float32
-    write_splats(splats, tmp_path / "again.ply")
-    again = read_splats(tmp_path / "again.ply")
-    assert torch.equal(again.means, splats.means)
-
-
 def test_double_beyond_float32_is_refused(tmp_path: Path) -> None:
     types = {"x": "double"}
     content = bytearray(ply_bytes(INRIA, types=types))
@@ -108,26 +141,6 @@ def test_forced_kernel_overrules_the_properties(tmp_path: Path) -> None:
     assert flat.log_scales.shape == (5, 2)
     with pytest.raises(InvalidSplats, match=r"'scale_2' of a 3dgs splat.*nearest dialect is 2DGS"):
         read_splats(with_ply(tmp_path, ply_bytes(DIALECTS["2dgs"])), Kernel.GAUSSIAN_3D)
-
-
-def test_subset_keeps_its_header_with_the_new_count(tmp_path: Path) -> None:
-    splats = read_splats(with_ply(tmp_path, ply_bytes(INRIA, head="comment kept\n")))
-    extras = {name: column[:2] for name, column in splats.extras.items()}
-    assert splats.sh is not None
-    few = replace(
-        splats,
-        means=splats.means[:2],
-        quats=splats.quats[:2],
-        log_scales=splats.log_scales[:2],
-        opacity_logits=splats.opacity_logits[:2],
-        sh=splats.sh[:2],
-        extras=extras,
-    )
-    write_splats(few, tmp_path / "few.ply")
-    again = read_splats(tmp_path / "few.ply")
-    assert again.count == 2
-    assert "comment kept" in again.header
-    assert torch.equal(again.means, splats.means[:2])
 
 
 def test_splats_made_in_code_are_written_in_the_usual_layout(tmp_path: Path) -> None:
@@ -330,3 +343,80 @@ def test_filter_of_mip_splatting_must_be_a_width(tmp_path: Path) -> None:
         InvalidSplats, match=r"filter_3D: expected finite values of zero or more, got -0\.001 in splat 2"
     ):
         read_splats(with_ply(tmp_path, ply_bytes(names)[: -rows.nbytes] + rows.tobytes()))
+
+
+DOUBLES = [*DIALECTS["inria degree 3"], "mask", "time"]
+TYPES = {"f_dc_1": "double", "mask": "uchar", "time": "double"}
+
+
+def rows_of(content: bytes) -> np.ndarray:
+    return PlyData.read(io.BytesIO(content))["vertex"].data
+
+
+@pytest.mark.parametrize("dialect", DIALECTS)
+def test_some_rows_of_every_dialect_are_kept_to_the_byte(dialect: str, tmp_path: Path) -> None:
+    path = with_ply(tmp_path, ply_bytes(DIALECTS[dialect], count=7, head="comment of somebody\n"))
+    kept = np.array([True, False, True, True, False, False, True])
+    copy = b"".join(some_rows(path, kept))
+    whole = rows_of(path.read_bytes())
+    assert rows_of(copy).dtype == whole.dtype
+    assert rows_of(copy).tobytes() == whole[kept].tobytes()
+    assert copy.startswith(b"ply\nformat binary_little_endian 1.0\ncomment of somebody\nelement vertex 4\n")
+    assert b"".join(some_rows(path, np.ones(7, bool))) == path.read_bytes()
+
+
+def test_rows_are_kept_over_blocks_and_in_their_own_types(tmp_path: Path) -> None:
+    path = with_ply(tmp_path, ply_bytes(DOUBLES, count=2 * BLOCK_ROWS + 5, types=TYPES))
+    kept = np.random.default_rng(1).random(2 * BLOCK_ROWS + 5) < 0.3
+    copy = rows_of(b"".join(some_rows(path, kept)))
+    assert copy.tobytes() == rows_of(path.read_bytes())[kept].tobytes()
+
+
+def test_elements_behind_the_vertices_are_no_rows_of_a_copy(tmp_path: Path) -> None:
+    plain = ply_bytes(INRIA)
+    others = b"element version 200\nproperty uchar number\n"  # as many bytes as two splats and more
+    path = with_ply(tmp_path, plain.replace(b"end_header", others + b"end_header") + bytes(200))
+    assert b"".join(some_rows(path, np.ones(5, bool))) == plain
+    copy = b"".join(recoloured(path, np.zeros((5, 3), np.float32)))
+    assert len(copy) == len(plain) and len(rows_of(copy)) == 5
+
+
+@pytest.mark.parametrize("dialect", [name for name in DIALECTS if name != "no colour"])
+def test_colours_of_every_dialect_are_the_same_from_everywhere(dialect: str, tmp_path: Path) -> None:
+    names = DIALECTS[dialect]
+    path = with_ply(tmp_path, ply_bytes(names))
+    wanted = np.random.default_rng(2).integers(0, 256, (5, 3)).astype(np.uint8)
+    (tmp_path / "coloured.ply").write_bytes(b"".join(recoloured(path, constant_terms(wanted))))
+    splats = read_splats(tmp_path / "coloured.ply")
+    for centre in ([3.0, 1.0, -4.0], [-0.2, 0.1, 9.0], [0.0, -5.0, 0.3]):
+        shown = seen_colours(splats, look_at("v", np.array(centre), 8, 8, 8.0))
+        torch.testing.assert_close(shown, torch.from_numpy(wanted / 255).float(), atol=1e-6, rtol=0)
+    before, after = rows_of(path.read_bytes()), rows_of((tmp_path / "coloured.ply").read_bytes())
+    coloured = ("f_dc", "f_rest", "sh0", "sb_params")
+    for name in names:
+        assert name.startswith(coloured) or before[name].tobytes() == after[name].tobytes(), name
+    directions = [name for name in names if name in {f"sb_params_{i}" for i in range(6, 12)}]
+    assert all(before[name].tobytes() == after[name].tobytes() for name in directions)
+
+
+def test_a_file_without_colours_or_with_another_count_is_refused(tmp_path: Path) -> None:
+    path = with_ply(tmp_path, ply_bytes(DIALECTS["no colour"]))
+    with pytest.raises(InvalidSplats, match="expected colours"):
+        list(recoloured(path, np.zeros((5, 3), np.float32)))
+    for copy in (some_rows(path, np.ones(4, bool)), recoloured(path, np.zeros((6, 3), np.float32))):
+        with pytest.raises(InvalidSplats, match="as many as were lifted, got 5"):
+            list(copy)
+
+
+def test_a_copy_takes_the_memory_of_a_few_blocks(tmp_path: Path) -> None:
+    names = DIALECTS["inria degree 3"]
+    count = 10 * BLOCK_ROWS
+    path = with_ply(tmp_path, ply_bytes(names, count=count))
+    block = BLOCK_ROWS * 4 * len(names)
+    for make in (lambda: some_rows(path, np.ones(count, bool)), lambda: recoloured(path, np.zeros((count, 3)))):
+        tracemalloc.start()
+        total = sum(map(len, make()))
+        peak = tracemalloc.get_traced_memory()[1] - (24 * count)  # the colours, or less for the rows to keep
+        tracemalloc.stop()
+        assert total == path.stat().st_size
+        assert peak < 4 * block

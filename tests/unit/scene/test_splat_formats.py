@@ -190,7 +190,12 @@ def nerfstudio_checkpoint(splats: Splats, before: str) -> dict[str, Any]:
     own = {"means": splats.means, "quats": splats.quats, "scales": splats.log_scales}
     own |= {"opacities": splats.opacity_logits[:, None], "features_dc": splats.sh[:, 0]}
     own |= {"features_rest": splats.sh[:, 1:], "other": torch.zeros(1)}
-    return {"step": 1, "pipeline": {f"{before}{name}": value for name, value in own.items()}, "optimizers": {}}
+    rates = {
+        "_last_lr": [np.float64(1e-4), np.float32(1e-3)],
+        "last_epoch": np.int64(7),
+    }  # as its schedulers have them
+    pipeline = {f"{before}{name}": value for name, value in own.items()}
+    return {"step": 1, "pipeline": pipeline, "schedulers": {"means": rates}}
 
 
 @pytest.mark.parametrize("kind", ["gsplat", "_model.gauss_params.", "_model."])

@@ -1,18 +1,28 @@
-"""nerfstudio's transforms.json: what its keys mean, and what is refused."""
+"""nerfstudio's files: what a transforms.json means, and the frame in which a run trained."""
 
 from __future__ import annotations
 
+import errno
+import json
 import math
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from camera_documents import assert_same, transforms_of, with_json
-from colmap_files import binary_files, write_files
+from camera_files import CAMERAS, FLIP, assert_same, binary_files, transforms_of, with_json, write_files
+from scipy.spatial.transform import Rotation
 
-from liftcore.errors import InvalidCameras
+from liftcore.errors import InvalidCameras, Unavailable
+from liftcore.io import cameras
 from liftcore.io.cameras import read_cameras
+from liftcore.io.inria import write_inria_cameras
+from liftcore.io.inspect import inspect_file
+from liftcore.io.lift_file import camera_input
+from liftcore.io.transforms import FRAME_FILE
+from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.distortion import Brown, Fisheye, Lens
 
 
@@ -126,3 +136,317 @@ def test_bad_transforms_are_refused(changes: dict[str, Any], message: str, tmp_p
     document = {key: value for key, value in {**SIZED, **changes}.items() if value is not None}
     with pytest.raises(InvalidCameras, match=message):
         read_cameras(with_json(tmp_path, document))
+
+
+APPLIED = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])  # of nerfstudio's converter
+SCALE, APPLIED_SCALE = 0.37, 4.0
+
+
+def oriented() -> np.ndarray:
+    """[4, 4], how a run turns and centres the poses of its transforms.json."""
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_euler("xyz", [20, -35, 70], degrees=True).as_matrix()
+    pose[:3, 3] = (0.4, -1.3, 2.2)
+    return pose
+
+
+def trained(poses: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Camera-to-world poses of a transforms.json as nerfstudio trains on them: moved, then scaled."""
+    moved = {name: oriented() @ pose for name, pose in poses.items()}
+    return {name: np.vstack([np.hstack([p[:3, :3], SCALE * p[:3, 3:]]), p[3:]]) for name, p in moved.items()}
+
+
+@pytest.fixture
+def model(tmp_path: Path) -> Path:
+    return write_files(tmp_path / "model", binary_files())
+
+
+@pytest.fixture
+def run(tmp_path: Path, model: Path) -> Path:
+    """A folder with the transforms.json of the model's poses, and the file of a run."""
+    document, poses = transforms_of(read_cameras(model)), {}
+    for record in document["frames"]:
+        poses[record["file_path"]] = APPLIED @ np.array(record["transform_matrix"])
+        record["transform_matrix"] = poses[record["file_path"]].tolist()
+    folder = tmp_path / "run"
+    folder.mkdir()
+    (folder / "transforms.json").write_text(json.dumps({**document, "applied_transform": APPLIED[:3].tolist()}))
+    (folder / FRAME_FILE).write_text(json.dumps({"transform": (oriented() @ APPLIED)[:3].tolist(), "scale": SCALE}))
+    (folder.parent / "trained.json").write_text(json.dumps({k: v.tolist() for k, v in trained(poses).items()}))
+    return folder
+
+
+@pytest.fixture
+def expected(run: Path, model: Path) -> Cameras:
+    """The model's cameras with the poses that nerfstudio trains on."""
+    poses = json.loads((run.parent / "trained.json").read_text())
+    views = []
+    for camera, pose in zip(read_cameras(model).values(), poses.values(), strict=True):
+        sizes = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+        views.append(Camera.pinhole(camera.name, *sizes, viewmat=np.linalg.inv(np.array(pose) @ FLIP)))
+    return Cameras(tuple(views))
+
+
+def test_poses_of_a_transforms_json_are_moved_as_nerfstudio_moves_them(run: Path, expected: Cameras) -> None:
+    for path in (run, run / "transforms.json"):
+        cameras = read_cameras(path)
+        assert cameras.frame == FRAME_FILE
+        assert_same(cameras, expected)
+    (run / FRAME_FILE).unlink()
+    assert read_cameras(run).frame is None
+    with pytest.raises(AssertionError):
+        assert_same(read_cameras(run), expected)
+
+
+def test_scale_that_was_applied_before_is_not_applied_twice(run: Path, expected: Cameras) -> None:
+    document = json.loads((run / "transforms.json").read_text())
+    (run / "transforms.json").write_text(json.dumps({**document, "applied_scale": APPLIED_SCALE}))
+    told = json.loads((run / FRAME_FILE).read_text())
+    (run / FRAME_FILE).write_text(json.dumps({**told, "scale": SCALE * APPLIED_SCALE}))  # what nerfstudio then writes
+    assert_same(read_cameras(run), expected)
+
+
+@pytest.mark.parametrize("place", [".", "sparse/0", "colmap/sparse/0"])
+def test_models_are_moved_to_the_same_frame(
+    place: str, run: Path, model: Path, expected: Cameras, tmp_path: Path
+) -> None:
+    scene = tmp_path / "scene"
+    shutil.copytree(model, scene / place)
+    shutil.copy(run / FRAME_FILE, scene)
+    for path in (scene, scene / place, scene / place / "images.bin"):
+        assert_same(read_cameras(path), expected)
+    assert_same(read_cameras(Path(shutil.make_archive(str(scene), "zip", scene))), expected)
+
+
+def test_transforms_json_comes_before_a_model_where_the_frame_is_told(
+    run: Path, model: Path, expected: Cameras
+) -> None:
+    document = json.loads((run / "transforms.json").read_text())
+    del document["applied_transform"]  # of a capture whose poses are no COLMAP model's
+    (run / "transforms.json").write_text(json.dumps(document))
+    (run / FRAME_FILE).write_text(json.dumps({"transform": oriented()[:3].tolist(), "scale": SCALE}))
+    shutil.copytree(model, run / "colmap/sparse/0")
+    for path in (run, Path(shutil.make_archive(str(run), "zip", run))):
+        assert_same(read_cameras(path), expected)
+
+
+@pytest.mark.parametrize("flat", [False, True])
+def test_zip_of_the_two_files_is_read(flat: bool, run: Path, expected: Cameras, tmp_path: Path) -> None:
+    scene = tmp_path / "scene"
+    inner = scene if flat else scene / "outputs/splatfacto/2026-01-01"
+    inner.mkdir(parents=True)
+    shutil.copy(run / "transforms.json", scene)
+    shutil.copy(run / FRAME_FILE, inner)
+    path = Path(shutil.make_archive(str(scene), "zip", scene))
+    assert_same(read_cameras(path), expected)
+    assert inspect_file(path)["warnings"] == []
+
+
+def test_transform_of_gsplat_holds_its_scale(run: Path, expected: Cameras, model: Path, tmp_path: Path) -> None:
+    """Its ``Parser.transform`` written in nerfstudio's layout, as README has it."""
+    transform = oriented() @ APPLIED
+    transform[:3] *= SCALE
+    scene = tmp_path / "scene"
+    shutil.copytree(model, scene / "sparse/0")
+    (scene / FRAME_FILE).write_text(json.dumps({"transform": transform[:3].tolist(), "scale": 1.0}))
+    assert_same(read_cameras(scene), expected)
+
+
+def test_lenses_stay_as_they_are(run: Path, tmp_path: Path) -> None:
+    scene = tmp_path / "scene"
+    write_files(scene / "sparse/0", binary_files({**CAMERAS, 1: (2, "SIMPLE_RADIAL", (500.0, 320.0, 240.0, 0.1))}))
+    before = read_cameras(scene)
+    shutil.copy(run / FRAME_FILE, scene)
+    after = read_cameras(scene)
+    assert [view.lens for view in after.values()] == [view.lens for view in before.values()]
+    assert len(after.distorted) == 2
+
+
+@pytest.mark.parametrize(
+    ("told", "message"),
+    [
+        ([1], "an object with 'transform', got list"),
+        ({"scale": 1}, "an object with 'transform'"),
+        ({"transform": np.eye(4)[:3].tolist()}, "an object with 'scale'"),
+        ({"transform": np.eye(3).tolist(), "scale": 1}, "a 3x4 or 4x4 matrix"),
+        ({"transform": np.diag([1.0, 1, -1, 1]).tolist(), "scale": 1}, "a proper rotation .* a determinant of -1"),
+        ({"transform": np.zeros((3, 4)).tolist(), "scale": 1}, "a determinant of 0"),
+        (
+            {"transform": np.diag([1.0, 1, 2, 1]).tolist(), "scale": 1},
+            "a rotation, a shift and a scale, got a matrix off",
+        ),
+        ({"transform": np.eye(4).tolist(), "scale": 0}, r"scale: expected a scale in 1e-09\.\.1e\+09, got 0"),
+        ({"transform": np.eye(4).tolist(), "scale": 1e300}, "scale: expected a scale in"),
+        ({"transform": np.diag([1e12, 1e12, 1e12, 1]).tolist(), "scale": 1}, "numbers within 1e"),
+        ({"transform": [[float("nan")] * 4] * 3, "scale": 1}, "a finite number"),
+    ],
+)
+def test_frame_that_is_none_is_refused(told: Any, message: str, run: Path) -> None:
+    (run / FRAME_FILE).write_text(json.dumps(told))
+    with pytest.raises(InvalidCameras, match=rf"dataparser_transforms\.json.*{message}"):
+        read_cameras(run)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("applied_transform", np.zeros((3, 4)).tolist(), "applied_transform: expected a proper rotation"),
+        ("applied_transform", "up", "applied_transform: expected a 3x4 or 4x4 matrix"),
+        ("applied_scale", 0, "applied_scale: expected a scale in"),
+    ],
+)
+def test_what_was_applied_before_is_checked(key: str, value: Any, message: str, run: Path) -> None:
+    document = json.loads((run / "transforms.json").read_text())
+    (run / "transforms.json").write_text(json.dumps({**document, key: value}))
+    with pytest.raises(InvalidCameras, match=rf"transforms\.json {message}"):
+        read_cameras(run)
+
+
+def test_inria_cameras_are_in_the_frame_of_their_splats(run: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "inria"
+    folder.mkdir()
+    camera = Camera.pinhole("a", 9, 9, 5, 5, 4.5, 4.5, np.eye(4))
+    write_inria_cameras(Cameras((camera,)), folder / "cameras.json")
+    shutil.copy(run / FRAME_FILE, folder)
+    for path in (folder, folder / "cameras.json"):
+        with pytest.raises(InvalidCameras, match=r"cameras that are still to be moved, got Inria's.*; take .* away"):
+            read_cameras(path)
+
+
+@pytest.mark.parametrize("name", [FRAME_FILE, "transforms.json"])
+def test_zip_of_several_runs_is_refused(name: str, run: Path) -> None:
+    (run / "other").mkdir()
+    shutil.copy(run / name, run / "other")
+    path = Path(shutil.make_archive(str(run), "zip", run))
+    with pytest.raises(InvalidCameras, match=rf"expected one {name}, got {name} and other/{name}; zip those of one"):
+        read_cameras(path)
+
+
+def test_the_frame_is_told_and_counts(run: Path, model: Path, tmp_path: Path) -> None:
+    found = inspect_file(run)
+    assert (found["frame"], found["warnings"]) == (FRAME_FILE, [])
+    assert found["bytes"] == sum(path.stat().st_size for path in run.iterdir())
+    shutil.copytree(model, run / "sparse/0")
+    (run / FRAME_FILE).unlink()
+    found = inspect_file(run)
+    assert found["frame"] is None
+    assert any("the COLMAP model was read, and beside it lies nerfstudio's" in text for text in found["warnings"])
+    assert any(
+        f"Put its run's {FRAME_FILE} beside" in text for text in inspect_file(run / "transforms.json")["warnings"]
+    )
+    (run / "transforms.json").write_text("{")
+    assert inspect_file(run)["warnings"] == []
+
+
+@pytest.mark.parametrize("given", [lambda run: run, lambda run: run / "transforms.json"], ids=["folder", "file"])
+def test_another_frame_is_another_input(given: Callable[[Path], Path], run: Path) -> None:
+    before = camera_input(given(run))
+    told = json.loads((run / FRAME_FILE).read_text())
+    (run / FRAME_FILE).write_text(json.dumps({**told, "scale": 2 * SCALE}))
+    assert camera_input(given(run)).sha256 != before.sha256
+    (run / FRAME_FILE).unlink()
+    assert camera_input(given(run)).sha256 not in (before.sha256, "")
+    (run / "photo.jpg").write_bytes(b"not read")
+    (run / FRAME_FILE).write_text(json.dumps(told))
+    assert camera_input(given(run)) == before
+
+
+def test_link_counts_where_it_lies_in_the_lift_and_after(run: Path, expected: Cameras, tmp_path: Path) -> None:
+    scene = tmp_path / "linked"
+    scene.mkdir()
+    (scene / "transforms.json").symlink_to(run / "transforms.json")
+    told = json.loads((run / FRAME_FILE).read_text())
+    (run / FRAME_FILE).unlink()
+    (scene / FRAME_FILE).write_text(json.dumps(told))
+    remembered = camera_input(scene / "transforms.json")
+    assert_same(read_cameras(Path(remembered.path)), expected)
+    (scene / FRAME_FILE).write_text(json.dumps({**told, "scale": 2 * SCALE}))
+    assert camera_input(Path(remembered.path)).sha256 != remembered.sha256
+
+
+@pytest.mark.parametrize("kind", ["link", "folder"])
+def test_frame_that_is_no_file_is_told(kind: str, run: Path, model: Path) -> None:
+    (run / FRAME_FILE).unlink()
+    if kind == "link":
+        (run / FRAME_FILE).symlink_to("outputs/nowhere")
+    else:
+        (run / FRAME_FILE).mkdir()
+    shutil.copytree(model, run / "sparse/0")
+    said = "a link that leads to none" if kind == "link" else "none"
+    for path in (run, run / "transforms.json", run / "sparse/0"):
+        with pytest.raises(InvalidCameras, match=rf"{FRAME_FILE}: expected a file, got {said}; copy the file itself"):
+            read_cameras(path)
+
+
+def test_frame_beside_a_zip_counts_where_the_zip_has_none(run: Path, expected: Cameras, tmp_path: Path) -> None:
+    told = json.loads((run / FRAME_FILE).read_text())
+    path = Path(shutil.make_archive(str(tmp_path / "scene"), "zip", run))
+    (tmp_path / FRAME_FILE).write_text(json.dumps({**told, "scale": 5 * SCALE}))
+    assert_same(read_cameras(path), expected)
+    (run / FRAME_FILE).unlink()
+    path = Path(shutil.make_archive(str(tmp_path / "scene"), "zip", run))
+    (tmp_path / FRAME_FILE).write_text(json.dumps(told))
+    before = camera_input(path)
+    assert_same(read_cameras(path), expected)
+    (tmp_path / FRAME_FILE).unlink()
+    assert camera_input(path).sha256 != before.sha256
+
+
+def test_frame_of_another_model_of_a_zip_is_refused(
+    run: Path, model: Path, expected: Cameras, tmp_path: Path
+) -> None:
+    scenes = tmp_path / "scenes"
+    for name in ("a", "b"):
+        shutil.copytree(model, scenes / name / "sparse/0")
+    shutil.copy(run / FRAME_FILE, scenes / "b")
+    with pytest.raises(InvalidCameras, match=r"got one of b and the model a/sparse/0; zip those of one run alone"):
+        read_cameras(Path(shutil.make_archive(str(scenes), "zip", scenes)))
+    shutil.copy(run / FRAME_FILE, scenes / "a")
+    assert_same(read_cameras(Path(shutil.make_archive(str(scenes), "zip", scenes))), expected)
+
+
+def test_hidden_files_of_a_zip_do_not_count(run: Path, expected: Cameras) -> None:
+    (run / ".ipynb_checkpoints").mkdir()
+    shutil.copy(run / "transforms.json", run / ".ipynb_checkpoints")
+    assert_same(read_cameras(Path(shutil.make_archive(str(run), "zip", run))), expected)
+
+
+def test_transforms_of_another_name_are_zipped_with_their_frame(run: Path, expected: Cameras) -> None:
+    (run / "transforms.json").rename(run / "transforms_train.json")
+    assert_same(read_cameras(run / "transforms_train.json"), expected)
+    assert_same(read_cameras(Path(shutil.make_archive(str(run), "zip", run))), expected)
+
+
+def test_transforms_of_another_frame_are_told_beside_a_model(run: Path, model: Path) -> None:
+    (run / FRAME_FILE).unlink()
+    shutil.copytree(model, run / "colmap/sparse/0")
+    zipped = Path(shutil.make_archive(str(run), "zip", run))
+    for path in (run, run / "colmap/sparse/0", run / "colmap/sparse/0/cameras.bin", zipped):
+        assert any("beside it lies nerfstudio's" in text for text in inspect_file(path)["warnings"])
+    shutil.rmtree(run / "colmap")
+    document = json.loads((run / "transforms.json").read_text())
+    del document["applied_transform"]  # as others than nerfstudio's converter write it
+    for other in (json.dumps(document), json.dumps(list(document)), "{"):
+        shutil.copytree(model, run / "colmap/sparse/0", dirs_exist_ok=True)
+        (run / "transforms.json").write_text(other)
+        assert not any("nerfstudio" in text for text in inspect_file(run / "colmap/sparse/0")["warnings"])
+
+
+def test_frame_that_lies_elsewhere_in_a_zip_is_of_its_only_model(
+    run: Path, model: Path, expected: Cameras, tmp_path: Path
+) -> None:
+    scene = tmp_path / "scene"
+    shutil.copytree(model, scene / "sparse/0")
+    (scene / "outputs").mkdir()
+    shutil.copy(run / FRAME_FILE, scene / "outputs")
+    assert_same(read_cameras(Path(shutil.make_archive(str(scene), "zip", scene))), expected)
+
+
+def test_full_disk_is_no_broken_zip(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: Any) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    path = Path(shutil.make_archive(str(run), "zip", run))
+    monkeypatch.setattr(cameras, "_unzip_one", full)
+    with pytest.raises(Unavailable, match=r"expected room in .* for what is in the zip, got a full disk; make room"):
+        read_cameras(path)

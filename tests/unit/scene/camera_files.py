@@ -1,9 +1,15 @@
-"""COLMAP sparse models for tests, written from the format's description."""
+"""COLMAP models and JSON documents of cameras for tests, and what makes cameras the same."""
 
 from __future__ import annotations
 
+import json
 import struct
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from liftcore.scene.cameras import Cameras
 
 # Cameras by id (model id, model name, parameters); images (camera, quaternion, translation, name).
 CAMERAS = {1: (1, "PINHOLE", (500.0, 510.0, 320.5, 239.5)), 7: (0, "SIMPLE_PINHOLE", (400.0, 320.0, 240.0))}
@@ -45,3 +51,30 @@ def write_files(folder: Path, files: dict[str, bytes]) -> Path:
     for name, content in files.items():
         (folder / name).write_bytes(content)
     return folder
+
+
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def transforms_of(cameras: Cameras) -> dict[str, Any]:
+    frames = []
+    for camera in cameras.values():
+        pose = np.linalg.inv(camera.viewmat) @ FLIP
+        size = {"w": camera.width, "h": camera.height}
+        lens = {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
+        frames.append({"file_path": f"images/{camera.name}.png", "transform_matrix": pose.tolist(), **size, **lens})
+    return {"frames": frames}
+
+
+def with_json(tmp_path: Path, document: Any) -> Path:
+    path = tmp_path / "document.json"
+    path.write_text(json.dumps(document))
+    return path
+
+
+def assert_same(one: Cameras, other: Cameras) -> None:
+    assert list(one) == list(other)
+    for a, b in zip(one.values(), other.values(), strict=True):
+        assert (a.width, a.height) == (b.width, b.height)
+        assert np.allclose([a.fx, a.fy, a.cx, a.cy], [b.fx, b.fy, b.cx, b.cy], atol=1e-9)
+        assert np.allclose(a.viewmat, b.viewmat, atol=1e-12)
