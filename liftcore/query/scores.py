@@ -31,9 +31,14 @@ _BLOCK, _BLOCK_FLOATS = 16_384, 1 << 25  # rows widened at once for means and co
 
 
 @vectorised
-def _widen(halves, words):
-    for c in range(halves.shape[0]):
-        words[c] = (np.int32(halves[c]) << np.int32(13)) & SIGN_AND_MAGNITUDE
+def _widen(bits, half, words):
+    """The bits of a row as those of float32: of float16 shifted into place, of float32 as they are."""
+    if half:
+        for c in range(bits.shape[0]):
+            words[c] = (np.int32(bits[c]) << np.int32(13)) & SIGN_AND_MAGNITUDE
+    else:
+        for c in range(bits.shape[0]):
+            words[c] = bits[c]
 
 
 @vectorised
@@ -45,59 +50,34 @@ def _dot(row, direction):
 
 
 @vectorised
-def _square(row, scale):
-    total = np.float32(0.0)
-    for c in range(row.shape[0]):
-        value = row[c] * scale
-        total += value * value
-    return total
-
-
-@vectorised
-def _cosine(product, norm):
-    if norm == 0:
-        return np.float32(LOWEST_COSINE)
-    return min(max(product / norm, np.float32(-1.0)), np.float32(1.0))
-
-
-@vectorised
-def _compare_halves(first, last, halves, norms, directions, cosines):
-    words = np.empty(halves.shape[1], np.int32)
+def _compare(first, last, bits, half, norms, directions, cosines):
+    words = np.empty(bits.shape[1], np.int32)
     row = words.view(np.float32)
     for j in range(first, last):
-        _widen(halves[j], words)
+        _widen(bits[j], half, words)
         for n in range(directions.shape[0]):
-            cosines[j, n] = _cosine(_dot(row, directions[n]), norms[j])
+            if norms[j] == 0:
+                cosines[j, n] = LOWEST_COSINE
+            else:
+                cosines[j, n] = min(max(_dot(row, directions[n]) / norms[j], np.float32(-1.0)), np.float32(1.0))
 
 
 @vectorised
-def _compare_floats(first, last, floats, norms, directions, cosines):
-    for j in range(first, last):
-        for n in range(directions.shape[0]):
-            cosines[j, n] = _cosine(_dot(floats[j], directions[n]), norms[j])
-
-
-@vectorised
-def _norm_halves(first, last, halves, norms):
-    words = np.empty(halves.shape[1], np.int32)
+def _measure(first, last, bits, half, scale, norms):
+    words = np.empty(bits.shape[1], np.int32)
     row = words.view(np.float32)
     for j in range(first, last):
-        _widen(halves[j], words)
-        norms[j] = np.sqrt(_square(row, np.float32(HALF_SCALE)))
-
-
-@vectorised
-def _norm_floats(first, last, floats, norms):
-    for j in range(first, last):
-        norms[j] = np.sqrt(_square(floats[j], np.float32(1.0)))
+        _widen(bits[j], half, words)
+        for c in range(row.shape[0]):
+            row[c] *= scale
+        norms[j] = np.sqrt(_dot(row, row))
 
 
 def norms_of(features: np.ndarray) -> np.ndarray:
     """Euclidean norms of the rows of features [P, F] f16 or f32, as [P] f32."""
     norms = np.empty(len(features), np.float32)
-    rows, half = _rows(features)
-    work = _norm_halves if half else _norm_floats
-    _over_rows(len(norms), lambda first, last: work(first, last, rows, norms))
+    bits, half, scale = _bits(features)
+    _over_rows(len(norms), lambda first, last: _measure(first, last, bits, half, scale, norms))
     return norms
 
 
@@ -125,11 +105,10 @@ def cosines(features: np.ndarray, norms: np.ndarray, texts: np.ndarray) -> np.nd
 
 def _cosines(features: np.ndarray, norms: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """The same to unit rows [n, F] f32."""
-    rows, half = _rows(features)
-    work, scale = (_compare_halves, HALF_SCALE) if half else (_compare_floats, 1.0)
-    columns = np.ascontiguousarray(directions * np.float32(scale))
-    found = np.empty((len(rows), len(columns)), np.float32)
-    _over_rows(len(rows), lambda first, last: work(first, last, rows, norms, columns, found))
+    bits, half, scale = _bits(features)
+    columns = np.ascontiguousarray(directions * scale)
+    found = np.empty((len(bits), len(columns)), np.float32)
+    _over_rows(len(bits), lambda first, last: _compare(first, last, bits, half, norms, columns, found))
     return found
 
 
@@ -227,10 +206,11 @@ def relevancy(similarities: np.ndarray, positives: int) -> np.ndarray:
     return 1 / (1 + np.exp(RELEVANCY_SHARPNESS * (against - nearest)))
 
 
-def _rows(features: np.ndarray) -> tuple[np.ndarray, bool]:
-    """Rows as the kernels take them: the bits [P, F] i16 of float16, or [P, F] f32; and whether they are bits."""
+def _bits(features: np.ndarray) -> tuple[np.ndarray, bool, np.float32]:
+    """Rows as the kernels take them: their bits [P, F] i16 or i32, whether they are float16, and what they count."""
     half = features.dtype == np.float16
-    return np.ascontiguousarray(features.view(np.int16) if half else features.astype(np.float32, copy=False)), half
+    rows = features.view(np.int16) if half else features.astype(np.float32, copy=False).view(np.int32)
+    return np.ascontiguousarray(rows), half, np.float32(HALF_SCALE if half else 1.0)
 
 
 def _over_rows(count: int, work: Callable[[int, int], None]) -> None:
