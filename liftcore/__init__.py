@@ -41,6 +41,11 @@ if TYPE_CHECKING:
     from liftcore.operators import region_weights as region_weights
     from liftcore.operators import render as render
     from liftcore.planning.plan import Plan as Plan
+    from liftcore.query.ask import VectorAnswer as VectorAnswer
+    from liftcore.query.objects import FoundObject as FoundObject
+    from liftcore.query.objects import Objects as Objects
+    from liftcore.query.segment import NamedSplats as NamedSplats
+    from liftcore.query.segment import Segmentation as Segmentation
     from liftcore.result import LiftResult as LiftResult
     from liftcore.scene.cameras import Camera as Camera
     from liftcore.scene.cameras import Cameras as Cameras
@@ -50,40 +55,46 @@ if TYPE_CHECKING:
 
 __version__ = "0.4.0"
 
-_PUBLIC = {
-    "read_splats": "liftcore.io.splats:read_splats",
-    "read_cameras": "liftcore.io.cameras:read_cameras",
-    "read_features": "liftcore.features.pack:read_features",
-    "Splats": "liftcore.scene.splats:Splats",
-    "Camera": "liftcore.scene.cameras:Camera",
-    "Cameras": "liftcore.scene.cameras:Cameras",
-    "Regions": "liftcore.features.views:Regions",
-    "FeatureGrid": "liftcore.features.views:FeatureGrid",
-    "LiftSettings": "liftcore.settings:LiftSettings",
-    "lift": "liftcore.lifting:lift",
-    "plan": "liftcore.lifting:plan",
-    "Plan": "liftcore.planning.plan:Plan",
-    "LiftResult": "liftcore.result:LiftResult",
-    "load_lift": "liftcore.io.lift_file:load_lift",
-    "region_weights": "liftcore.operators:region_weights",
-    "RegionWeights": "liftcore.solve.weights:RegionWeights",
-    "render": "liftcore.operators:render",
-    "SplatliftError": "liftcore.errors:SplatliftError",
-    "InvalidInput": "liftcore.errors:InvalidInput",
-    "InvalidSplats": "liftcore.errors:InvalidSplats",
-    "InvalidCameras": "liftcore.errors:InvalidCameras",
-    "InvalidFeatures": "liftcore.errors:InvalidFeatures",
-    "InvalidLift": "liftcore.errors:InvalidLift",
-    "InvalidSettings": "liftcore.errors:InvalidSettings",
-    "InvalidQuery": "liftcore.errors:InvalidQuery",
-    "NotFound": "liftcore.errors:NotFound",
-    "Unavailable": "liftcore.errors:Unavailable",
+_PUBLIC = {  # name -> the module that defines it
+    "read_splats": "liftcore.io.splats",
+    "read_cameras": "liftcore.io.cameras",
+    "read_features": "liftcore.features.pack",
+    "Splats": "liftcore.scene.splats",
+    "Camera": "liftcore.scene.cameras",
+    "Cameras": "liftcore.scene.cameras",
+    "Regions": "liftcore.features.views",
+    "FeatureGrid": "liftcore.features.views",
+    "LiftSettings": "liftcore.settings",
+    "lift": "liftcore.lifting",
+    "plan": "liftcore.lifting",
+    "Plan": "liftcore.planning.plan",
+    "LiftResult": "liftcore.result",
+    "load_lift": "liftcore.io.lift_file",
+    "VectorAnswer": "liftcore.query.ask",
+    "Segmentation": "liftcore.query.segment",
+    "NamedSplats": "liftcore.query.segment",
+    "Objects": "liftcore.query.objects",
+    "FoundObject": "liftcore.query.objects",
+    "region_weights": "liftcore.operators",
+    "RegionWeights": "liftcore.solve.weights",
+    "render": "liftcore.operators",
+    "SplatliftError": "liftcore.errors",
+    "InvalidInput": "liftcore.errors",
+    "InvalidSplats": "liftcore.errors",
+    "InvalidCameras": "liftcore.errors",
+    "InvalidFeatures": "liftcore.errors",
+    "InvalidLift": "liftcore.errors",
+    "InvalidSettings": "liftcore.errors",
+    "InvalidQuery": "liftcore.errors",
+    "NotFound": "liftcore.errors",
+    "Unavailable": "liftcore.errors",
 }
 
 __all__ = [
     "Camera",
     "Cameras",
     "FeatureGrid",
+    "FoundObject",
     "InvalidCameras",
     "InvalidFeatures",
     "InvalidInput",
@@ -93,13 +104,17 @@ __all__ = [
     "InvalidSplats",
     "LiftResult",
     "LiftSettings",
+    "NamedSplats",
     "NotFound",
+    "Objects",
     "Plan",
     "RegionWeights",
     "Regions",
+    "Segmentation",
     "SplatliftError",
     "Splats",
     "Unavailable",
+    "VectorAnswer",
     "lift",
     "load_lift",
     "plan",
@@ -114,8 +129,7 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     if name not in _PUBLIC:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    module, _, attribute = _PUBLIC[name].partition(":")
-    found = getattr(import_module(module), attribute)
+    found = getattr(import_module(_PUBLIC[name]), name)
     globals()[name] = found
     return found
 

@@ -11,9 +11,12 @@ from pydantic import BaseModel, ConfigDict
 from liftcore.settings import LiftSettings
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from torch import Tensor
 
     from liftcore.query.ask import VectorAnswer
+    from liftcore.query.segment import Segmentation
     from liftcore.scene.splats import Splats
 
 FORMAT = "splatlift-lift/1"
@@ -103,6 +106,21 @@ class LiftResult:
         return query_vectors(
             self, positives, negatives, splats=splats, threshold=threshold, instances=instances, keep=keep
         )
+
+    def segment(self, words: Sequence[str], vectors: Any, splats: Splats) -> Segmentation:
+        """Name every splat by the word that it is most like, or by none (`liftcore.query.segment`).
+
+        Args:
+            words: n different ones. vectors: [n, F], torch or numpy, their text vectors, of any length above zero.
+            splats: that were lifted.
+
+        Raises:
+            InvalidQuery: no words, one word twice, or vectors that are no directions of the lift's space.
+        """
+        from liftcore.query.scene import QueryScene
+        from liftcore.query.segment import segment
+
+        return segment(QueryScene(self, splats), words, vectors)
 
     def save(self, path: Path | str) -> None:
         """Write a lift file (`liftcore.io.lift_file`), whole or not at all."""

@@ -22,6 +22,7 @@ COMMANDS = {
     "lift": "lift features onto splats",
     "plan": "what a lift would do and need",
     "query": "find words and examples in a lift",
+    "segment": "name every splat of a lift by the best of many words",
     "pack": "make a feature pack of the field's formats",
     "encode": "make a feature pack of images",
     "inspect": "what is in a file, and what is wrong",

@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from liftcore.cli.options import THRESHOLDS, Parser, add_negative, encoder_spec
+from liftcore.cli.options import THRESHOLDS, Parser, add_encoder, add_negative, encoder_spec
 from liftcore.cli.reply import progress_bars, reply
 from liftcore.errors import InvalidInput
 
@@ -36,9 +36,7 @@ def add_arguments(parser: Parser) -> None:
         "lifts", nargs="+", metavar="LIFT", help="SCENE=LIFT, SCENE.lift.safetensors, or a folder of those"
     )
     parser.add_argument("--data", type=Path, required=True, metavar="DIR", help="the dataset, or its labels")
-    words = parser.add_mutually_exclusive_group()
-    words.add_argument("--table", type=Path, metavar="FILE", help="precomputed text embeddings")
-    words.add_argument("--encoder", metavar="NAME", help="else the one that the lift's text space names")
+    add_encoder(parser)
     parser.add_argument("--protocol", nargs="+", choices=("P1", "P2", "P3", "own"), help="else all")
     parser.add_argument("--threshold", default="auto", metavar="T", help=f"of P2, P3 and own: {THRESHOLDS}")
     add_negative(parser)

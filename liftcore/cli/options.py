@@ -68,6 +68,45 @@ def add_negative(parser: argparse.ArgumentParser, order: str = "") -> None:
     parser.add_argument("--negative", nargs="+", action="extend", default=[], metavar="WORD", help=competitors)
 
 
+def add_encoder(parser: argparse.ArgumentParser) -> None:
+    """Where the vectors of words come from."""
+    words = parser.add_mutually_exclusive_group()
+    words.add_argument("--table", type=Path, metavar="FILE", help="precomputed text embeddings")
+    specs = "minilm, open_clip:MODEL/TAG, open_clip:MODEL@FILE or table:FILE"
+    words.add_argument("--encoder", metavar="NAME", help=f"{specs}; else the one that the lift's text space names")
+
+
+def add_view(parser: argparse.ArgumentParser) -> None:
+    """The camera of pictures."""
+    parser.add_argument("--view", metavar="NAME", help="the camera to see it from")
+    own = "a camera that the lift need not know, in the splats' frame: a file of any format; of several, --view's"
+    parser.add_argument("--camera", type=Path, metavar="FILE", help=own)
+
+
+def view_of(options: argparse.Namespace, *pictures: str) -> Any:
+    """What ``--view`` and ``--camera`` name: a camera of the lift by its name, another camera, or None.
+
+    Args:
+        pictures: options that need it.
+
+    Raises:
+        InvalidQuery: a picture without a view, or a file of several cameras without one.
+        InvalidCameras, NotFound: the file holds none, or none of that name.
+    """
+    named = " and ".join(f"--{name}" for name in pictures)
+    if options.camera is None:
+        if options.view is None and any(getattr(options, name) for name in pictures):
+            raise InvalidQuery(named, expected="a view to see them from", got="no --view and no --camera")
+        return options.view
+    from liftcore.io.cameras import read_cameras
+
+    cameras = read_cameras(options.camera)
+    if options.view is None and len(cameras) > 1:
+        got = f"{len(cameras)} of them in {options.camera}"
+        raise InvalidQuery("--camera", expected="one camera", got=got, hint="--view NAME says which one")
+    return cameras[options.view] if options.view is not None else next(iter(cameras.values()))
+
+
 def count(text: str) -> int:
     """A whole number of one or more."""
     value = int(text) if text.isascii() and text.isdigit() else 0

@@ -7,13 +7,13 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from liftcore.cli.options import THRESHOLDS, Parser, add_negative, count, encoder_spec
-from liftcore.cli.reply import free_output, reply, writing
+from liftcore.cli.options import THRESHOLDS, Parser, add_encoder, add_negative, add_view, count, encoder_spec, view_of
+from liftcore.cli.reply import free_outputs, reply, writing
 from liftcore.errors import InvalidQuery
 from liftcore.io.files import whole_file
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Iterable, Mapping
 
     from liftcore.query.ask import Answer
     from liftcore.query.render import ViewMask
@@ -33,11 +33,7 @@ def add_arguments(parser: Parser) -> None:
     like = "VIEW:x,y (a pixel), region:VIEW:LEVEL:ID, splat:J or a vector FILE.npy; may be given several times"
     parser.add_argument("--like", action="append", default=[], metavar="EXAMPLE", help=f"more of this: {like}")
     parser.add_argument("--unlike", action="append", default=[], metavar="EXAMPLE", help="less of that, likewise")
-    words = parser.add_mutually_exclusive_group()
-    words.add_argument("--table", type=Path, metavar="FILE", help="precomputed text embeddings")
-    words.add_argument(
-        "--encoder", metavar="NAME", help="minilm, open_clip:MODEL/TAG, open_clip:MODEL@FILE or table:FILE"
-    )
+    add_encoder(parser)
     add_negative(parser, ", so TEXT goes before it")
     parser.add_argument("--threshold", default="auto", metavar="T", help=THRESHOLDS)
     parser.add_argument("--instances", type=count, metavar="N", help="how many there are, if you know")
@@ -45,7 +41,7 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument("--keep", choices=("all", "largest"), default="all", help=keep)
     parser.add_argument("--top", type=count, default=0, metavar="N", help="name the best N splats")
     parser.add_argument("--objects", action="store_true", help="name the things found, with their places and boxes")
-    parser.add_argument("--view", metavar="NAME", help="the camera to see the answer from")
+    add_view(parser)
     parser.add_argument("--mask", type=Path, metavar="PNG", help="write the mask of the view")
     parser.add_argument("--attention", type=Path, metavar="PNG", help="write the attention map of the view")
     parser.add_argument("--scores", type=Path, metavar="NPY", help="write the scores [P], float32")
@@ -55,25 +51,23 @@ def add_arguments(parser: Parser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Ask, look where a view is named, write what was asked for, and say what was found."""
-    if (options.mask or options.attention) and not options.view:
-        raise InvalidQuery("--mask and --attention", expected="a view to see them from", got="no --view")
-    outputs = [path.absolute() for kind in OUTPUTS if (path := getattr(options, kind)) is not None]
-    if len(set(outputs)) < len(outputs):
-        raise InvalidQuery(f"--{', --'.join(OUTPUTS)}", expected="a file each", got="the same file twice")
-    for path in outputs:
-        free_output(path, [options.lift, *([options.table] if options.table else [])])
+    view = view_of(options, "mask", "attention")
+    files = {kind: path for kind in OUTPUTS if (path := getattr(options, kind)) is not None}
+    free_outputs(files, [path for path in (options.lift, options.table, options.camera) if path])
     from liftcore.query.ask import ask, top
     from liftcore.query.objects import objects
     from liftcore.query.scene import QueryScene
 
     query = _query(options)
     scene = QueryScene.open(options.lift)
-    for path in outputs:
-        made_from = (scene.metadata.splats, scene.metadata.cameras, *scene.metadata.features)
-        free_output(path, [Path(file.path) for file in made_from])
+    free_outputs(files, made_from(scene))
     encoder = _encoder(options, scene) if query.texts else None
     answer = ask(scene, query, encoder)
-    seen = _view_mask(scene, answer, options.view) if options.view else None
+    seen = None
+    if view is not None:
+        from liftcore.query.render import view_mask  # with torch, which numbers do without
+
+        seen = view_mask(scene, answer, view)
     document = _document(answer, seen, encoder)
     if options.top:
         best = top(answer, scene, options.top)
@@ -81,7 +75,7 @@ def run(options: argparse.Namespace) -> int:
     if options.objects:
         found = objects(scene, answer)
         document |= {"objects": [asdict(thing) for thing in found.found], "strays": found.strays}
-    document["files"] = _write(options, scene, answer, seen)
+    document["files"] = write_files(files, _contents(scene, answer, seen))
     reply(document, as_json=options.json, lines=_lines(document))
     return 0
 
@@ -97,15 +91,16 @@ def _query(options: argparse.Namespace) -> Query:
             hint="--negative takes all words up to the next option",
         )
     return Query(
-        positives=(*([options.text] if options.text is not None else []), *_examples(options.like, "--like")),
-        negatives=(*options.negative, *_examples(options.unlike, "--unlike")),
+        positives=(*([options.text] if options.text is not None else []), *examples_of(options.like, "--like")),
+        negatives=(*options.negative, *examples_of(options.unlike, "--unlike")),
         threshold=_threshold(options.threshold),
         instances=options.instances,
         keep=options.keep,
     )
 
 
-def _examples(notations: list[str], argument: str) -> list[Example]:
+def examples_of(notations: list[str], argument: str) -> list[Example]:
+    """Examples of their notations; what ends in .npy is a file of a vector."""
     from liftcore.query.terms import parse_example, read_vector
 
     return [
@@ -122,12 +117,6 @@ def _encoder(options: argparse.Namespace, scene: QueryScene) -> TextEncoder:
             options, "" if options.table else scene.metadata.text_space, hint="or ask by example, with --like"
         )
     )
-
-
-def _view_mask(scene: QueryScene, answer: Answer, view: str) -> ViewMask:
-    from liftcore.query.render import view_mask  # with torch, which numbers do without
-
-    return view_mask(scene, answer, view)
 
 
 def _threshold(text: str) -> str | float:
@@ -158,23 +147,31 @@ def _document(answer: Answer, seen: ViewMask | None, encoder: TextEncoder | None
     return document
 
 
-def _write(options: argparse.Namespace, scene: QueryScene, answer: Answer, seen: ViewMask | None) -> dict[str, str]:
-    """Write what was asked for, the object first: when nothing was found, nothing is written."""
-    from liftcore.query.export import coloured_ply, object_ply, scores_npy
+def _contents(scene: QueryScene, answer: Answer, seen: ViewMask | None) -> dict[str, Callable[[], Iterable[bytes]]]:
+    from liftcore.query.export import coloured_ply, npy, object_ply
 
-    blocks: dict[str, Callable[[], Iterable[bytes]]] = {
+    contents: dict[str, Callable[[], Iterable[bytes]]] = {
         "object": lambda: object_ply(scene, answer),
         "coloured": lambda: coloured_ply(scene, answer),
-        "scores": lambda: [scores_npy(answer)],
+        "scores": lambda: [npy(answer.scores)],
     }
     if seen is not None:
         from liftcore.query.render import attention_png, mask_png
 
-        blocks |= {"mask": lambda: [mask_png(seen)], "attention": lambda: [attention_png(seen)]}
-    files = {kind: path for kind in OUTPUTS if (path := getattr(options, kind)) is not None}
+        contents |= {"mask": lambda: [mask_png(seen)], "attention": lambda: [attention_png(seen)]}
+    return contents
+
+
+def made_from(scene: QueryScene) -> list[Path]:
+    """The files that a lift remembers."""
+    return [Path(file.path) for file in (scene.metadata.splats, scene.metadata.cameras, *scene.metadata.features)]
+
+
+def write_files(files: Mapping[str, Path], contents: Mapping[str, Callable[[], Iterable[bytes]]]) -> dict[str, str]:
+    """Write each file, in their order: what cannot be made leaves no file, and none after it."""
     for kind, path in files.items():
         with writing(path):
-            content = blocks[kind]()  # before there is a draft, or a folder for it: nothing found is no file
+            content = contents[kind]()  # before there is a draft, or a folder for it: nothing found is no file
             with whole_file(path) as handle:
                 handle.writelines(content)
     return {kind: str(path) for kind, path in files.items()}
@@ -189,17 +186,18 @@ def _lines(document: dict[str, Any]) -> Iterable[str]:
         view = document["view"]
         yield f"  view {view['name']}: {view['mask_share']:.2%} of the image ({view['explanation']})"
     for best in document.get("top", []):
-        yield f"  splat {best['splat']}: score {best['score']:.4g} at {_place(best['position'])}"
+        yield f"  splat {best['splat']}: score {best['score']:.4g} at {place_of(best['position'])}"
     for number, thing in enumerate(document.get("objects", []), 1):
         low, high = thing["box"]
         yield (
             f"  object {number}: {thing['splats']} splats, {thing['share']:.1%} of the evidence, score "
-            f"{thing['score']:.4g}, at {_place(thing['centre'])}, from {_place(low)} to {_place(high)}"
+            f"{thing['score']:.4g}, at {place_of(thing['centre'])}, from {place_of(low)} to {place_of(high)}"
         )
     if document.get("strays"):
         yield f"  {document['strays']} splats are strays: single or in specks, and of no object"
     yield from (f"  {kind}: {path}" for kind, path in document["files"].items())
 
 
-def _place(point: tuple[float, ...]) -> str:
+def place_of(point: tuple[float, ...]) -> str:
+    """A point for people."""
     return f"({', '.join(f'{value:.4g}' for value in point)})"

@@ -45,6 +45,19 @@ def free_output(path: Path, inputs: Sequence[Path]) -> Path:
     return path
 
 
+def free_outputs(files: Mapping[str, Path], inputs: Sequence[Path]) -> None:
+    """Several outputs, by the options that name them.
+
+    Raises:
+        InvalidInput: one of them is no `free_output`, or two are one file.
+    """
+    if len({path.absolute() for path in files.values()}) < len(files):
+        named = " and ".join(f"--{name.replace('_', '-')}" for name in files)
+        raise InvalidInput(named, expected="a file each", got="the same file twice")
+    for path in files.values():
+        free_output(path, inputs)
+
+
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
     """Say which output failed, and why, when the disk is full or the folder is not for us to write.

@@ -55,8 +55,8 @@ def coloured_ply(scene: QueryScene, answer: Answer) -> Iterable[bytes]:
     return recoloured(scene.splat_file, constant_terms(colours))
 
 
-def scores_npy(answer: Answer) -> bytes:
-    """The score of every splat, [P] f32, as an ``.npy`` file."""
+def npy(values: np.ndarray) -> bytes:
+    """Values of splats, such as an answer's scores [P] f32, as an ``.npy`` file."""
     content = io.BytesIO()
-    np.save(content, answer.scores)
+    np.save(content, values)
     return content.getvalue()

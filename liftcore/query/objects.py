@@ -75,14 +75,14 @@ def objects(scene: QueryScene, answer: "Answer") -> Objects:
     means, found = as_numpy(scene.splats.means), []
     for number in range(large):
         inside = numbers[rows] == number
-        low, high = _box(means[rows[inside]], weights[inside])
+        box = trimmed_box(means[rows[inside]], weights[inside])
         found.append(
             FoundObject(
                 splats=int(inside.sum()),
                 share=float(weights[inside].sum() / weights.sum()),
                 score=float(np.average(answer.scores[rows[inside]], weights=weights[inside])),
-                centre=_point((low + high) / 2),
-                box=(_point(low), _point(high)),
+                centre=_point(np.mean(box, axis=0)),
+                box=box,
             )
         )
     return Objects(tuple(found), numbers, int((numbers[rows] < 0).sum()))
@@ -152,15 +152,19 @@ def _covariances(splats: "Splats", rows: np.ndarray) -> np.ndarray:
     return np.stack([product.sum(axis=0) for product in products], axis=1)
 
 
-def _box(means: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """[3], [3] f64, between what a thousandth of the weight lies below and above, axis by axis."""
+def trimmed_box(means: np.ndarray, weights: np.ndarray) -> "tuple[Point, Point]":
+    """The corners between which all but a thousandth of the weight at each end lies, axis by axis.
+
+    Args:
+        means: [n, 3] f32, at least one. weights: [n], at least zero.
+    """
     corners = np.empty((2, 3))
     for axis in range(3):
         order = np.argsort(means[:, axis])
         sums = np.cumsum(weights[order])
         ends = np.searchsorted(sums, [_TAIL * sums[-1], (1 - _TAIL) * sums[-1]])
         corners[:, axis] = means[order[np.minimum(ends, len(order) - 1)], axis]
-    return corners[0], corners[1]
+    return _point(corners[0]), _point(corners[1])
 
 
 def _point(row: np.ndarray) -> "Point":

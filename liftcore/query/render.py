@@ -34,7 +34,7 @@ _OUTLINE = np.array([255, 209, 64], dtype=np.uint8)  # sRGB of the line around w
 class ViewMask:
     """An answer seen from one camera."""
 
-    view: str
+    view: str  # the name of its camera
     attention: np.ndarray  # [H, W] f32, A s: the scores rendered with the lift's rendering scale of opacity
     row_sums: np.ndarray  # [H, W] f32, A 1
     mask: np.ndarray  # [H, W] bool, where at least half of a ray that meets the scene is of what was found
@@ -54,7 +54,7 @@ class ShownDepth:
 
 
 def view_mask(
-    scene: QueryScene, answer: Answer, view: str, group: Callable[[QueryScene, Answer], Objects] = objects
+    scene: QueryScene, answer: Answer, view: str | Camera, group: Callable[[QueryScene, Answer], Objects] = objects
 ) -> ViewMask:
     """See an answer from a camera: attention, and a mask of the objects that were found.
 
@@ -64,7 +64,7 @@ def view_mask(
 
     Args:
         scene: the opened lift. answer: of that lift.
-        view: the name of a camera, lifted or not.
+        view: the name of a camera, lifted or not; or any camera in the frame of the splats.
         group: makes the objects of an answer; who has them already gives them so.
 
     Raises:
@@ -72,7 +72,7 @@ def view_mask(
         InvalidQuery: the view's image is larger than pictures may be; or the largest of more splats than are grouped.
         InvalidLift: the splats or the cameras moved or changed since the lift.
     """
-    scene.cameras[view]  # a name that is not there is told before anything is grouped
+    camera = scene.camera(view)  # a name that is not there is told before anything is grouped
     if answer.count > MOST_GROUPED and answer.query.keep == "all":
         members, shown = answer.selected, f"all {answer.count} selected splats, too many to tell strays apart"
     else:
@@ -82,10 +82,11 @@ def view_mask(
     # A splat without a feature adds nothing to a ray; its score of -1 would count against its neighbours.
     scores = np.where(answer.seen, answer.scores, np.float32(0.0))
     values = torch.from_numpy(np.stack([scores, members.astype(np.float32), np.ones_like(scores)], axis=1))
-    image = scene.image(view, lambda camera: scene.raster.render(camera, values, scene.compositing)).numpy()
+    image = scene.image(camera, lambda of: scene.raster.render(of, values, scene.compositing)).numpy()
     attention, weights, row_sums = (np.ascontiguousarray(image[..., column]) for column in range(3))
     mask = (row_sums >= MINIMUM_ROW_SUM) & (weights >= LEAST_SHARE * row_sums)
-    return ViewMask(view, attention, row_sums, mask, f"at least half of the ray is of {shown}")
+    name = view if isinstance(view, str) else camera.name
+    return ViewMask(name, attention, row_sums, mask, f"at least half of the ray is of {shown}")
 
 
 def mask_png(seen: ViewMask) -> bytes:
@@ -98,7 +99,7 @@ def attention_png(seen: ViewMask) -> bytes:
     return _png(heat_colours(seen.attention, seen.row_sums > 0))
 
 
-def render_png(scene: QueryScene, view: str, what: str = "rgb") -> bytes:
+def render_png(scene: QueryScene, view: str | Camera, what: str = "rgb") -> bytes:
     """The scene as a camera sees it, RGB [H, W, 3] on black: its colours, features (``pca``) or clusters.
 
     Its ``depth`` is one 8-bit channel [H, W], near bright, whose PNG tells its range as text (`ShownDepth`).
@@ -112,7 +113,7 @@ def render_png(scene: QueryScene, view: str, what: str = "rgb") -> bytes:
     return _png(render(scene, view, what))
 
 
-def render(scene: QueryScene, view: str, what: str = "rgb") -> np.ndarray:
+def render(scene: QueryScene, view: str | Camera, what: str = "rgb") -> np.ndarray:
     """The colours of a view, [H, W, 3] u8 sRGB on black, with the opacities as trained.
 
     ``rgb`` takes the splats' own colours, ``pca`` the first three principal components of their features, and
@@ -126,14 +127,14 @@ def render(scene: QueryScene, view: str, what: str = "rgb") -> np.ndarray:
     """
     if what == "cluster":
         return _render_clusters(scene, view)
-    colours = scene.principal if what == "pca" else seen_colours(scene.splats, scene.cameras[view])
+    colours = scene.principal if what == "pca" else seen_colours(scene.splats, scene.camera(view))
     levels = scene.image(view, lambda camera: scene.raster.render(camera, colours, _as_trained(scene))).numpy()
     np.clip(levels, 0.0, 1.0, out=levels)  # in place: an image of floats is large
     levels *= 255
     return np.round(levels, out=levels).astype(np.uint8)
 
 
-def _render_clusters(scene: QueryScene, view: str) -> np.ndarray:
+def _render_clusters(scene: QueryScene, view: str | Camera) -> np.ndarray:
     if scene.cluster is None or scene.cluster_features is None:
         hint = "lift again with the setting aggregation=true"
         raise InvalidQuery("what", expected="a lift with clusters", got="a lift without aggregation", hint=hint)
@@ -145,7 +146,7 @@ def _render_clusters(scene: QueryScene, view: str) -> np.ndarray:
     return picture
 
 
-def expected_depth(scene: QueryScene, view: str) -> tuple[np.ndarray, np.ndarray]:
+def expected_depth(scene: QueryScene, view: str | Camera) -> tuple[np.ndarray, np.ndarray]:
     """The expected depth of the rays of a view, ``sum_j w_j z_j / sum_j w_j``.
 
     z_j is the depth of a splat's centre along the camera's axis, not along the ray. Opacities are as trained.
@@ -156,7 +157,7 @@ def expected_depth(scene: QueryScene, view: str) -> tuple[np.ndarray, np.ndarray
     Raises:
         NotFound, InvalidQuery, InvalidLift: as `render` does.
     """
-    pose = torch.from_numpy(scene.cameras[view].viewmat[2].copy())
+    pose = torch.from_numpy(scene.camera(view).viewmat[2].copy())
     depths = (scene.splats.means.double() @ pose[:3] + pose[3]).to(torch.float32)
     values = torch.stack([depths, torch.ones_like(depths)], dim=1)
     image = scene.image(view, lambda camera: scene.raster.render(camera, values, _as_trained(scene)))
@@ -164,7 +165,7 @@ def expected_depth(scene: QueryScene, view: str) -> tuple[np.ndarray, np.ndarray
     return torch.where(covered, image[..., 0] / image[..., 1], 0.0).numpy(), covered.numpy()
 
 
-def shown_depth(scene: QueryScene, view: str) -> ShownDepth:
+def shown_depth(scene: QueryScene, view: str | Camera) -> ShownDepth:
     """The expected depths of a view, near bright, from the 1st to the 99th percentile of the covered pixels.
 
     Raises:

@@ -203,8 +203,20 @@ class QueryScene:
         """How scores are rendered: with the lift's rendering scale of the opacity logits."""
         return self.metadata.settings.render_params
 
-    def image(self, view: str, draw: Callable[[Camera], Tensor]) -> Tensor:
+    def camera(self, view: str | Camera) -> Camera:
+        """The camera of that name; a camera itself needs none of the lift's.
+
+        Raises:
+            NotFound: no camera has this name.
+            InvalidLift: the cameras moved or changed since the lift.
+        """
+        return self.cameras[view] if isinstance(view, str) else view
+
+    def image(self, view: str | Camera, draw: Callable[[Camera], Tensor]) -> Tensor:
         """A picture [H, W, ..] of a view in its photo's pixels, from what draws one of a pinhole (`in_photo`).
+
+        Args:
+            view: the name of a camera of the scene, or any camera in the frame of the splats.
 
         Raises:
             NotFound: no camera has this name.
@@ -214,12 +226,12 @@ class QueryScene:
         from liftcore.query.render import in_photo
         from liftcore.scene.cameras import drawn_by, photo_size
 
-        camera = self.cameras[view]
+        camera = self.camera(view)
         for width, height in (photo_size(camera), photo_size(drawn_by(camera))):
             if width * height > MOST_PIXELS:
                 raise InvalidQuery(
                     "view", expected=f"an image of at most {MOST_PIXELS} pixels to draw",
-                    got=f"{width}x{height} in {view!r}" + (", for its distorted photo" if camera.lens else ""),
+                    got=f"{width}x{height} in {camera.name!r}" + (", for its distorted photo" if camera.lens else ""),
                     hint="give the scene a camera of that pose with width, height, fx, fy, cx and cy divided alike",
                 )  # fmt: skip
         return in_photo(camera, draw)

@@ -19,7 +19,7 @@ import torch
 from liftcore.errors import SplatliftError
 from liftcore.io.json_file import finite
 from liftcore.query.ask import Answer, Point, Question, answers, question, top
-from liftcore.query.export import coloured_ply, object_ply, scores_npy
+from liftcore.query.export import coloured_ply, npy, object_ply
 from liftcore.query.objects import Objects, objects
 from liftcore.query.render import ViewMask, attention_png, mask_png, render_png, view_mask
 from liftcore.query.scene import QueryScene
@@ -223,7 +223,7 @@ class Answers:
         return Frame(_found(self._answer(request)) | describe_objects(self._grouped(request)))
 
     def _scores(self, request: dict[str, Any]) -> Frame:
-        return Frame({}, scores_npy(self._answer(request)))
+        return Frame({}, npy(self._answer(request).scores))
 
     def _mask(self, request: dict[str, Any]) -> Frame:
         return Frame({}, mask_png(self._look(request)))

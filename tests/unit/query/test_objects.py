@@ -89,12 +89,12 @@ def test_without_evidence_splats_count_alike(scene: QueryScene) -> None:
 def test_tails_of_a_thousandth_are_not_in_the_box() -> None:
     means = np.zeros((2001, 3))
     means[:, 0] = np.arange(2001)
-    low, high = module._box(means, np.ones(2001))
+    low, high = module.trimmed_box(means, np.ones(2001))
     assert (low[0], high[0]) == (2, 1998)  # two of 2001 below, two above
     weights = np.ones(2001)
     weights[-1] = 100.0
-    assert module._box(means, weights)[1][0] == 2000
-    assert (module._box(means[:1], np.ones(1))[0] == 0).all()
+    assert module.trimmed_box(means, weights)[1][0] == 2000
+    assert module.trimmed_box(means[:1], np.ones(1))[0] == (0, 0, 0)
 
 
 def test_more_splats_than_are_grouped_are_refused(scene: QueryScene, monkeypatch) -> None:

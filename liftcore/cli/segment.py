@@ -1,0 +1,125 @@
+"""``splatlift segment``: to every splat the best of many words, or none; and the best words for an example."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from liftcore.cli.options import Parser, add_encoder, add_view, count, encoder_spec, view_of
+from liftcore.cli.query import examples_of, made_from, place_of, write_files
+from liftcore.cli.reply import free_outputs, progress_bars, reply
+from liftcore.errors import InvalidQuery
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+    from liftcore.query.scene import QueryScene
+    from liftcore.query.segment import Segmentation
+    from liftcore.query.text import TextEncoder
+    from liftcore.scene.cameras import Camera
+
+OUTPUTS = ("labels", "picture", "coloured", "splat_labels")  # options that name a file to write
+
+
+def add_arguments(parser: Parser) -> None:
+    """The options of the command."""
+    parser.add_argument("lift", type=Path, help="a lift (.safetensors)")
+    parser.add_argument("--words", type=Path, metavar="FILE", help="the words, one a line; else all of the table's")
+    add_encoder(parser)
+    what = "what is this? VIEW:x,y (a pixel), region:VIEW:LEVEL:ID, splat:J or a vector FILE.npy"
+    parser.add_argument("--what", action="append", default=[], metavar="EXAMPLE", help=f"{what}; repeatable")
+    parser.add_argument("--top", type=count, default=5, metavar="N", help="words for each --what; 5")
+    add_view(parser)
+    parser.add_argument("--labels", type=Path, metavar="PNG", help="write the words of the view's pixels, as numbers")
+    parser.add_argument("--picture", type=Path, metavar="PNG", help="write the view in their colours, with a legend")
+    parser.add_argument("--coloured", type=Path, metavar="PLY", help="write all splats in the colours of their words")
+    parser.add_argument("--splat-labels", type=Path, metavar="NPY", help="write the numbers [P] of the splats' words")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Name the splats, write what was asked for, and say which words are there; or name the examples alone."""
+    view = view_of(options, "labels", "picture")
+    files = {kind: path for kind in OUTPUTS if (path := getattr(options, kind)) is not None}
+    given = [path for path in (options.lift, options.table, options.words, options.camera) if path]
+    free_outputs(files, given)
+    from liftcore.query.scene import QueryScene
+    from liftcore.query.segment import best_words, segment
+    from liftcore.query.text import open_encoder
+
+    scene = QueryScene.open(options.lift)
+    free_outputs(files, made_from(scene))
+    encoder = open_encoder(encoder_spec(options, "" if options.table else scene.metadata.text_space))
+    words = _words(options.words, encoder)
+    vectors = encoder.encode(words)
+    document: dict[str, Any] = {"encoder": encoder.name, "words": len(words)}
+    if options.what:
+        named = zip(options.what, examples_of(options.what, "--what"), strict=True)
+        document["what"] = {
+            said: [asdict(word) for word in best_words(scene, example, words, vectors, options.top)]
+            for said, example in named
+        }
+    if files or not options.what:
+        with progress_bars() as progress:
+            found = segment(scene, words, vectors, progress)
+        document |= {
+            "splats": len(found.labels),
+            "none": int((found.labels < 0).sum()),
+            "found": [
+                {"value": value, **asdict(named), "colour": found.colours[value].tolist()}
+                for value, named in enumerate(found.found, 1)
+            ],
+        }
+        document["files"] = write_files(files, _contents(scene, found, view))
+    reply(document, as_json=options.json, lines=_lines(document))
+    return 0
+
+
+def _words(path: Path | None, encoder: TextEncoder) -> list[str]:
+    """Those of the file, one a line, or all that a table has."""
+    from liftcore.query.text.table import TableEncoder
+
+    if path is None:
+        if not isinstance(encoder, TableEncoder):
+            raise InvalidQuery("words", expected="--words FILE beside an encoder, or a --table", got="neither")
+        return list(dict.fromkeys(encoder.words))
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InvalidQuery("--words", expected="a file of words, one a line", got=str(error)[:120]) from None
+    return list(dict.fromkeys(line.strip() for line in lines if line.strip()))
+
+
+def _contents(scene: QueryScene, found: Segmentation, view: str | Camera) -> dict[str, Callable[[], Iterable[bytes]]]:
+    from liftcore.query.export import npy
+    from liftcore.query.segment import map_png, named_ply, picture_png, word_map
+
+    def picture() -> bytes:
+        from liftcore.query.render import render
+
+        return picture_png(render(scene, view), word_map(scene, found, view), found)
+
+    return {
+        "coloured": lambda: named_ply(scene, found),
+        "splat_labels": lambda: [npy(found.values)],
+        "labels": lambda: [map_png(word_map(scene, found, view), found)],
+        "picture": lambda: [picture()],
+    }
+
+
+def _lines(document: dict[str, Any]) -> Iterable[str]:
+    for example, words in document.get("what", {}).items():
+        best = ", ".join(f"{word['word']} {word['score']:.3f}" for word in words)
+        yield f"{example}: {best}"
+    if "found" not in document:
+        return
+    bare = f"{document['none']} of {document['splats']} splats have none"
+    yield f"{len(document['found'])} of {document['words']} words are there; {bare}"
+    for named in document["found"]:
+        low, high = named["box"]
+        yield (
+            f"  {named['value']} {named['word']}: {named['splats']} splats, {named['share']:.1%} of the evidence, "
+            f"score {named['score']:.3f}, margin {named['margin']:.3f}, from {place_of(low)} to {place_of(high)}"
+        )
+    yield from (f"  {kind.replace('_', ' ')}: {path}" for kind, path in document["files"].items())

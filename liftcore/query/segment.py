@@ -1,0 +1,249 @@
+"""Many words at once: to every splat the word that it is most like, or none; and the best words for an example.
+
+A word alone is asked as a query is: its automatic threshold says which splats answer it. A splat is named by the
+nearest of the words that it answers, and by none where it answers none. Asked for what is not there, a threshold
+finds what is most like it; beside other words such a word wins hardly a splat that it answers, as these are more like
+their own. So a word is there if it is the nearest of all words for at least a quarter of its answer, by evidence, and
+words that are not there name nothing.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from liftcore.errors import InvalidQuery
+from liftcore.progress import Progress, silent
+from liftcore.query.colours import cluster_colours, constant_terms
+from liftcore.query.directions import MINIMUM_ROW_SUM, directions
+from liftcore.query.objects import trimmed_box
+from liftcore.query.scene import QueryScene, as_numpy
+from liftcore.query.scores import cosines, norms_of
+from liftcore.query.terms import Example, Query
+from liftcore.query.threshold import find_threshold
+
+if TYPE_CHECKING:
+    from liftcore.query.ask import Point
+    from liftcore.scene.cameras import Camera
+
+NO_WORD = -1
+LEAST_OWN = 0.25  # of a word's answer, by evidence, that no other word is nearer to
+MOST_WORDS = 4_096
+AT_ONCE = 16  # words whose cosines are held at a time: [P, AT_ONCE] f32
+SHOWN = 20  # words of a drawn legend
+
+
+@dataclass(frozen=True)
+class NamedSplats:
+    """A word that is there."""
+
+    word: str
+    row: int  # among the words that were asked
+    splats: int  # how many it names
+    share: float  # of the evidence of all seen splats
+    score: float  # the mean cosine of its splats, by evidence
+    margin: float  # the mean of theirs
+    threshold: float  # of its cosines
+    box: tuple[Point, Point]  # least and greatest corner of its splats' centres, but for a thousandth at each end
+
+
+@dataclass(frozen=True)
+class Segmentation:
+    """What every splat is, of some words."""
+
+    words: tuple[str, ...]  # as asked
+    labels: np.ndarray  # [P] i32, rows of words; -1 where none of them is
+    margin: np.ndarray  # [P] f32, the cosine to its word less that to the nearest other; 0 where it has none
+    found: tuple[NamedSplats, ...]  # those that are there, with the most evidence first
+
+    @property
+    def values(self) -> np.ndarray:
+        """[P] i32, the place of each splat's word in ``found``, from 1; 0 for none."""
+        places = np.zeros(len(self.words) + 1, np.int32)  # the last is of -1
+        places[[named.row for named in self.found]] = np.arange(1, len(self.found) + 1)
+        return places[self.labels]
+
+    @property
+    def colours(self) -> np.ndarray:
+        """[len(found) + 1, 3] u8 sRGB, by ``values``: grey, then a colour a word."""
+        return np.roll(cluster_colours(len(self.found)), 1, axis=0)
+
+
+def segment(scene: QueryScene, words: Sequence[str], vectors: Any, progress: Progress = silent) -> Segmentation:
+    """Name every splat by the word that it is most like, or by none.
+
+    Args:
+        scene: an opened lift.
+        words: n different ones. vectors: [n, F], torch or numpy, their text vectors, of any length above zero.
+        progress: told about a stage "words".
+
+    Raises:
+        InvalidQuery: no words, one word twice, too many, or vectors that are no directions of the lift's space.
+        InvalidLift: the splats moved or changed since the lift.
+    """
+    words, rows = tuple(words), np.atleast_2d(np.asarray(as_numpy(vectors), np.float32))
+    if not 1 <= len(words) <= MOST_WORDS or len(rows) != len(words):
+        got = f"{len(words)} words and {len(rows)} vectors"
+        raise InvalidQuery("words", expected=f"1 to {MOST_WORDS} words, a vector each", got=got)
+    if len(set(words)) < len(words):
+        twice = next(word for place, word in enumerate(words) if word in words[:place])
+        raise InvalidQuery("words", expected="every word once", got=f"{twice!r} twice")
+    means = as_numpy(scene.splats.means)
+    weights = np.where(scene.seen, scene.evidence, 0.0).astype(np.float64)
+    weights = weights if weights.any() else scene.seen.astype(np.float64)
+    thresholds, answered = np.empty(len(words)), np.empty(len(words))
+    nearest = _Nearest(len(weights))
+    for row, scores in _scores(scene, rows, range(len(words))):
+        found = find_threshold(scores[scene.seen], "auto", scene.weights)
+        thresholds[row] = found.value if found.clear else np.inf
+        answered[row] = weights[scores >= thresholds[row]].sum()
+        nearest.take(row, scores)
+        progress("words", row + 1, len(words), "words")
+    own = nearest.score >= thresholds[nearest.row]
+    shares = np.bincount(nearest.row[own], weights[own], len(words)) / np.maximum(answered, 1e-30)
+    named = _Nearest(len(weights))
+    for row, scores in _scores(scene, rows, np.flatnonzero(shares >= LEAST_OWN).tolist()):
+        named.take(row, np.where(scene.seen & (scores >= thresholds[row]), scores, -np.inf))
+    labels = np.where(named.score > -np.inf, named.row, NO_WORD).astype(np.int32)
+    other = np.where(named.row == nearest.row, nearest.second, nearest.score)
+    margin = np.where((labels != NO_WORD) & (other > -np.inf), named.score - other, 0.0).astype(np.float32)
+    found = [
+        NamedSplats(
+            word=words[row],
+            row=row,
+            splats=len(mine),
+            share=float(weights[mine].sum() / weights.sum()),
+            score=float(np.average(named.score[mine], weights=weights[mine])),
+            margin=float(np.average(margin[mine], weights=weights[mine])),
+            threshold=float(thresholds[row]),
+            box=trimmed_box(means[mine], weights[mine]),
+        )
+        for row in np.unique(labels[labels != NO_WORD]).tolist()
+        if weights[mine := np.flatnonzero(labels == row)].any()
+    ]
+    return Segmentation(words, labels, margin, tuple(sorted(found, key=lambda one: -one.share)))
+
+
+class _Nearest:
+    """The nearest word of every splat so far, and how near it and the next one are."""
+
+    def __init__(self, count: int) -> None:
+        self.row = np.zeros(count, np.int32)
+        self.score = np.full(count, -np.inf, np.float32)
+        self.second = np.full(count, -np.inf, np.float32)
+
+    def take(self, row: int, scores: np.ndarray) -> None:
+        nearer = scores > self.score  # of equal ones the first stays
+        self.second = np.where(nearer, self.score, np.maximum(self.second, scores))
+        self.score = np.where(nearer, scores, self.score)
+        self.row[nearer] = row
+
+
+def _scores(scene: QueryScene, vectors: np.ndarray, rows: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
+    """Each of the rows with the cosines [P] f32 of its vector; some rows in one pass over the features."""
+    for first in range(0, len(rows), AT_ONCE):
+        some = rows[first : first + AT_ONCE]
+        yield from zip(some, np.ascontiguousarray(cosines(scene.features, scene.norms, vectors[some]).T), strict=True)
+
+
+@dataclass(frozen=True)
+class BestWord:
+    """How like a word an example is."""
+
+    word: str
+    score: float  # their cosine
+
+
+def best_words(
+    scene: QueryScene, example: Example, words: Sequence[str], vectors: Any, count: int = 5
+) -> tuple[BestWord, ...]:
+    """What is this? The words that a pixel, a region, a splat or a vector is most like, the nearest first.
+
+    Args:
+        scene: an opened lift. example: as in a query. words: n. vectors: [n, F], their text vectors.
+
+    Raises:
+        InvalidQuery, NotFound, InvalidLift: as `liftcore.query.directions.directions`.
+    """
+    rows = np.atleast_2d(np.asarray(as_numpy(vectors), np.float32))
+    feature = directions(scene, Query((example,)), None)
+    scores = cosines(rows, norms_of(rows), feature)[:, 0]
+    nearest = map(int, np.argsort(-scores, kind="stable")[:count])
+    return tuple(BestWord(words[row], float(scores[row])) for row in nearest)
+
+
+def named_ply(scene: QueryScene, segmentation: Segmentation) -> Iterable[bytes]:
+    """All splats in the colours of their words, grey where they have none, as a file in blocks.
+
+    Raises:
+        InvalidLift: the splats moved or changed since the lift.
+        InvalidSplats: their file holds no colours; told when the first block is asked for.
+    """
+    from liftcore.io.ply import recoloured
+
+    return recoloured(scene.splat_file, constant_terms(segmentation.colours[segmentation.values]))
+
+
+def word_map(scene: QueryScene, segmentation: Segmentation, view: str | Camera) -> np.ndarray:
+    """[H, W] i32, the value of the word (`Segmentation.values`) that has the most weight on each ray.
+
+    Raises:
+        NotFound, InvalidQuery, InvalidLift: as `liftcore.query.render.view_mask`.
+    """
+    import torch
+
+    values, params = torch.from_numpy(segmentation.values), scene.compositing
+    found = scene.image(view, lambda camera: scene.raster.strongest_labels(camera, values, params)).numpy()
+    sums = scene.image(view, lambda camera: scene.raster.row_sums(camera, params)).numpy()
+    return np.where(sums >= MINIMUM_ROW_SUM, np.maximum(found, 0), 0)
+
+
+def map_png(values: np.ndarray, segmentation: Segmentation) -> bytes:
+    """Values [H, W] as a picture with a palette, 0 black; its text ``legend`` is JSON from values to words.
+
+    More than 255 words make a grey picture of 16 bits.
+    """
+    from PIL import Image
+    from PIL.PngImagePlugin import PngInfo
+
+    text, content = PngInfo(), io.BytesIO()
+    text.add_text("legend", json.dumps({place: named.word for place, named in enumerate(segmentation.found, 1)}))
+    if len(segmentation.found) > 255:
+        picture = Image.fromarray(values.astype(np.uint16))
+    else:
+        picture = Image.fromarray(values.astype(np.uint8))
+        colours = segmentation.colours.copy()
+        colours[0] = 0
+        picture.putpalette(colours.tobytes())
+    picture.save(content, format="PNG", pnginfo=text)
+    return content.getvalue()
+
+
+def picture_png(image: np.ndarray, values: np.ndarray, segmentation: Segmentation) -> bytes:
+    """A view [H, W, 3] u8 tinted with the colours of its words, and a drawn legend beside it, as a PNG."""
+    from PIL import Image, ImageDraw, ImageFont
+
+    colours = segmentation.colours
+    tinted = np.where(values[..., None] > 0, (0.4 * image + 0.6 * colours[values]).astype(np.uint8), image // 2)
+    pixels = np.bincount(values.ravel(), minlength=len(colours))
+    shown = [place for place in np.argsort(-pixels, kind="stable").tolist() if place and pixels[place]][:SHOWN]
+    size = max(12, image.shape[0] // 30)
+    font = ImageFont.load_default(size)
+    words = [segmentation.found[place - 1].word for place in shown] or ["no word is here"]
+    width = int(max(font.getlength(word) for word in words)) + 3 * size
+    canvas = Image.new("RGB", (image.shape[1] + width, max(image.shape[0], (2 * len(words) + 1) * size)), "white")
+    canvas.paste(Image.fromarray(tinted), (0, 0))
+    draw = ImageDraw.Draw(canvas)
+    for line, word in enumerate(words):
+        x, y = image.shape[1] + size // 2, size // 2 + line * 2 * size
+        if shown:
+            draw.rectangle((x, y, x + size, y + size), fill=tuple(colours[shown[line]].tolist()))
+        draw.text((x + 1.5 * size, y), word, fill="black", font=font)
+    content = io.BytesIO()
+    canvas.save(content, format="PNG")
+    return content.getvalue()

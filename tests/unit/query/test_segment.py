@@ -1,0 +1,170 @@
+"""Many words at once: every splat's word or none, its pictures, and the best words for an example."""
+
+import io
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from liftcore import cli
+from liftcore.errors import InvalidQuery
+from liftcore.io.cameras import read_cameras
+from liftcore.io.inria import write_inria_cameras
+from liftcore.io.splats import read_splats
+from liftcore.query.colours import NO_CLUSTER_COLOUR
+from liftcore.query.render import render
+from liftcore.query.scene import QueryScene
+from liftcore.query.segment import best_words, map_png, named_ply, picture_png, segment, word_map
+from liftcore.query.splat_colours import seen_colours
+from liftcore.query.terms import OneSplat, Pixel, Vector
+from liftcore.scene.cameras import Cameras
+from tests.api.tiny_scene import CHANNELS, HEIGHT, SPLATS_A_CLUSTER, WIDTH, text_table
+
+EYE = np.eye(CHANNELS, dtype=np.float32)
+COUNT = 3 * SPLATS_A_CLUSTER
+CLUSTER = np.arange(COUNT) // SPLATS_A_CLUSTER
+FIRST = slice(0, SPLATS_A_CLUSTER)
+
+
+@pytest.fixture
+def clear(scene: QueryScene) -> QueryScene:
+    """Each cluster is an axis with noise on all others."""
+    rows = EYE[CLUSTER] + np.random.default_rng(0).normal(0, 0.05, (COUNT, CHANNELS)).astype(np.float32)
+    ones = torch.ones(COUNT)
+    lift = replace(scene.lift, features=torch.from_numpy(rows), evidence=ones, seen=ones > 0)
+    lifted = QueryScene(lift, scene.splats, scene.cameras)
+    lifted.splat_file = scene.splat_file
+    return lifted
+
+
+def test_every_splat_gets_the_word_that_it_is_most_like(clear: QueryScene) -> None:
+    found = segment(clear, ["lamp", "apple", "book"], EYE[[2, 0, 1]])
+    assert np.array_equal(found.labels, np.array([1, 2, 0])[CLUSTER])
+    assert (found.margin > 0.5).all()
+    means = clear.splats.means.numpy()
+    for named in found.found:
+        mine = means[found.labels == named.row]
+        assert named.splats == SPLATS_A_CLUSTER and named.share == pytest.approx(1 / 3, abs=1e-6)
+        assert np.array(named.box) == pytest.approx(np.stack([mine.min(axis=0), mine.max(axis=0)]), abs=0.3)
+        assert named.score > 0.9 and 0 < named.threshold < 1
+    assert [found.found[value - 1].word for value in found.values[::SPLATS_A_CLUSTER]] == ["apple", "book", "lamp"]
+
+
+def test_words_that_are_not_there_name_nothing(clear: QueryScene) -> None:
+    between = (EYE[0] + EYE[5]) / np.sqrt(2)  # what the first cluster is most like, but for its own word
+    found = segment(clear, ["apple", "pear", "book", "lamp", "void"], np.stack([EYE[0], between, *EYE[[1, 2, 7]]]))
+    assert {named.word for named in found.found} == {"apple", "book", "lamp"}
+    assert np.array_equal(found.labels, np.array([0, 2, 3])[CLUSTER])
+
+
+def test_splats_of_no_word_are_named_none(clear: QueryScene) -> None:
+    found = segment(clear, ["apple", "book"], EYE[:2])
+    assert (found.labels[2 * SPLATS_A_CLUSTER :] == -1).all() and not found.margin[2 * SPLATS_A_CLUSTER :].any()
+    assert (found.labels[: 2 * SPLATS_A_CLUSTER] >= 0).all() and (found.values[2 * SPLATS_A_CLUSTER :] == 0).all()
+
+
+def test_unseen_splats_and_equal_scores_have_no_word(clear: QueryScene) -> None:
+    seen = torch.ones(COUNT, dtype=torch.bool)
+    seen[3] = False
+    hidden = QueryScene(replace(clear.lift, seen=seen), clear.splats)
+    assert segment(hidden, ["apple", "book", "lamp"], EYE[:3]).labels[3] == -1
+    flat = QueryScene(replace(clear.lift, features=torch.ones(COUNT, CHANNELS)), clear.splats)
+    assert segment(flat, ["apple", "book"], EYE[:2]).found == ()
+
+
+def test_order_and_number_of_words_change_no_label(clear: QueryScene) -> None:
+    words, vectors = [f"w{k}" for k in range(40)], np.random.default_rng(1).normal(size=(40, CHANNELS))
+    words[:3], vectors[:3] = ["apple", "book", "lamp"], EYE[:3]
+    mixed = np.random.default_rng(2).permutation(40)
+    one = segment(clear, words, vectors)
+    other = segment(clear, [words[k] for k in mixed], vectors[mixed])
+    assert [one.words[row] for row in one.labels] == [other.words[row] for row in other.labels] == [
+        words[cluster] for cluster in CLUSTER]  # fmt: skip
+    assert np.array_equal(one.margin, other.margin)
+
+
+@pytest.mark.parametrize(
+    ("words", "vectors"),
+    [([], EYE[:0]), (["a", "a"], EYE[:2]), (["a"], EYE[:2]), (["a"], EYE[:1, :5]), (["a"], 0 * EYE[:1])],
+)
+def test_words_without_directions_of_their_own_are_refused(clear: QueryScene, words: list, vectors) -> None:
+    with pytest.raises(InvalidQuery):
+        segment(clear, words, vectors)
+
+
+def test_a_lift_in_memory_is_segmented_by_one_call(clear: QueryScene) -> None:
+    found = clear.lift.segment(["apple", "book", "lamp"], torch.eye(CHANNELS)[:3], clear.splats)
+    assert np.array_equal(found.labels, CLUSTER)
+
+
+def test_pictures_show_the_words_of_the_pixels(clear: QueryScene) -> None:
+    found = segment(clear, ["apple", "book"], EYE[:2])
+    values = word_map(clear, found, "middle")
+    with Image.open(io.BytesIO(map_png(values, found))) as picture:
+        assert picture.mode == "P" and np.array_equal(np.asarray(picture), values)
+        legend = json.loads(picture.info["legend"])
+        shown = np.asarray(picture.convert("RGB"))
+    assert set(legend.values()) == {"apple", "book"}
+    left = {word: np.flatnonzero((values == int(value)).any(axis=0)).mean() for value, word in legend.items()}
+    assert left["apple"] < left["book"] < WIDTH / 2 + 3
+    assert not shown[values == 0].any() and (shown[values == 1] == found.colours[1]).all()
+    with Image.open(io.BytesIO(picture_png(render(clear, "middle"), values, found))) as picture:
+        assert picture.width > WIDTH and picture.height >= HEIGHT
+
+
+def test_coloured_splats_have_the_colours_of_their_words(clear: QueryScene, tmp_path: Path) -> None:
+    found = segment(clear, ["apple", "book"], EYE[:2])
+    (tmp_path / "named.ply").write_bytes(b"".join(named_ply(clear, found)))
+    seen = seen_colours(read_splats(tmp_path / "named.ply"), clear.cameras["middle"]).numpy()
+    np.testing.assert_allclose(255 * seen, found.colours[found.values], atol=1e-2)
+    assert tuple(found.colours[0]) == NO_CLUSTER_COLOUR
+
+
+def test_best_words_of_an_example_come_first(clear: QueryScene) -> None:
+    words = ["apple", "book", "lamp"]
+    for example in (OneSplat(SPLATS_A_CLUSTER), Pixel("middle", 16, HEIGHT // 2), Vector(tuple(2 * EYE[1]))):
+        best = best_words(clear, example, words, EYE[:3], 2)
+        assert best[0].word == "book" and best[0].score > 0.7 and len(best) == 2
+
+
+def test_command_names_splats_and_examples(tiny_lift: Path, tmp_path: Path, capsys) -> None:
+    (tmp_path / "table.safetensors").write_bytes(text_table())
+    (tmp_path / "words.txt").write_text("apple\nlamp\n\napple\n")
+    files = {kind: tmp_path / f"{kind}.out" for kind in ("labels", "picture", "coloured", "splat_labels")}
+    written = [part for kind, path in files.items() for part in (f"--{kind.replace('_', '-')}", str(path))]
+    command = ["segment", str(tiny_lift), "--table", str(tmp_path / "table.safetensors")]
+    assert cli.main([*command, "--view", "middle", *written, "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert {named["word"] for named in document["found"]} == {"apple", "book", "lamp"}
+    assert document["files"] == {kind: str(path) for kind, path in files.items()}
+    values = np.load(files["splat_labels"])
+    for named in document["found"]:
+        assert (values == named["value"]).sum() == named["splats"]
+    assert cli.main([*command, "--words", str(tmp_path / "words.txt"), "--what", "splat:0", "--top", "1"]) == 0
+    assert capsys.readouterr().out.startswith("splat:0: apple ")
+    assert cli.main([*command, "--words", str(tmp_path / "words.txt")]) == 0
+    assert "2 of 2 words are there" in capsys.readouterr().out
+    for wrong in (["--labels", "l.png"], ["--words", str(tmp_path / "none.txt")], ["--what", "nothing"]):
+        assert cli.main([*command, *wrong]) == 2
+        assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_a_camera_of_ones_own_is_seen_from(tiny_lift: Path, tmp_path: Path, capsys) -> None:
+    known = read_cameras(tiny_lift.parent / "c.json")
+    own, two = tmp_path / "own.json", tmp_path / "two.json"
+    write_inria_cameras(Cameras((known["middle"].replace(name="mine"),)), own)
+    write_inria_cameras(Cameras((known["middle"].replace(name="mine"), known["left"])), two)
+    command = ["query", str(tiny_lift), "--like", "splat:0", "--mask"]
+    assert cli.main([*command, str(tmp_path / "lift.png"), "--view", "middle"]) == 0
+    assert cli.main([*command, str(tmp_path / "own.png"), "--camera", str(own)]) == 0
+    assert "view mine" in capsys.readouterr().out
+    assert cli.main([*command, str(tmp_path / "of_two.png"), "--camera", str(two), "--view", "mine"]) == 0
+    for name in ("own.png", "of_two.png"):
+        assert (tmp_path / name).read_bytes() == (tmp_path / "lift.png").read_bytes()
+    capsys.readouterr()
+    assert cli.main([*command, str(tmp_path / "m.png"), "--camera", str(two)]) == 2
+    assert "--camera: expected one camera, got 2 of them" in capsys.readouterr().err
