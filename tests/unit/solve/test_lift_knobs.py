@@ -15,7 +15,7 @@ from liftcore.raster.reference import dense_view, reading_matrix, strided_rays
 from liftcore.settings import LiftSettings, Preset
 from liftcore.solve.accumulate import strided_walk
 from tests.scenes import observed, random_camera, random_splats
-from tests.unit.features.test_levels import dense_sums
+from tests.unit.features.test_observations import dense_sums
 from tests.unit.solve.test_lift_equals_dense import write_scene
 
 ROW_SUM = {"preset": "row-sum", "dtype": "float32"}
