@@ -26,6 +26,7 @@ from liftcore.errors import InvalidQuery
 BINS = 300  # a multiple of the sweep's 100 steps
 SMOOTHING = BINS / 64  # bins, standard deviation of the Gaussian that removes a histogram's ripples
 LEAST_SHARE = 3e-4  # of the scores: less than this above a threshold is stray (SAM drops masks this small)
+MOST_SHARE = 0.8  # a question that four fifths of a scene answer is rare; .5 to .9 are alike (docs/method.md)
 MOST_INSTANCES = 100  # more hills than a histogram can show
 DEPTH = 0.6  # a valley must fall to this share of its peak, else it is a ripple; tuned on one scene's masks
 # The sweep of Occam's LGS: thresholds in steps, the slope of the share found after a median filter, and how long a
@@ -161,6 +162,10 @@ def steady(histogram: Histogram, least: float = -math.inf) -> Found:
     with p the smoothed density. Inside a hill and in its tails the log-odds fall steeply, whatever the hill's size,
     and between two hills they lie flat. Nothing is tuned: the smoothing takes away ripples (half of it or twice it
     changes little), and the least share keeps stray scores from being an object.
+
+    The log-odds see a share and its rest alike, so where features are clean the widest gap may be the one that parts
+    a single unlike thing from all the rest. Cuts that leave at most MOST_SHARE come first; the others are looked at
+    where no hill lies above any of these, as when what is asked for fills the scene.
     """
     density = histogram.smoothed()
     density = density / density.sum()
@@ -171,13 +176,18 @@ def steady(histogram: Histogram, least: float = -math.inf) -> Found:
     counted = high if high.any() else counted
     slope = np.full(len(density), np.inf)
     slope[counted] = density[counted] / (above[counted] * (1 - above[counted]))
-    # Empty stretches tie at zero: the middle of the widest keeps clear of both its sides.
-    run = max(_runs(slope <= slope.min() * (1 + 1e-9)), key=len)
-    place = int(run[0] + run[-1]) // 2
-    value = histogram.edge(place + 0.5)
-    found = f"{floor} share found changes least, in log-odds, around {value:.4g}"
-    if density[place] < density[place:].max():
-        return value, f"{found}.", True
+    for among in (counted & (above <= MOST_SHARE), counted):
+        if not among.any():
+            continue
+        # Empty stretches tie at zero: the middle of the widest keeps clear of both its sides.
+        run = max(_runs(among & (slope <= slope[among].min() * (1 + 1e-9))), key=len)
+        if run[0] > 0 and slope[run[0] - 1] < slope[run[0]]:
+            continue  # it lies on the flank of a hill that reaches below MOST_SHARE
+        place = int(run[0] + run[-1]) // 2
+        value = histogram.edge(place + 0.5)
+        found = f"{floor} share found changes least, in log-odds, around {value:.4g}"
+        if density[place] < density[place:].max():
+            return value, f"{found}.", True
     # Over one hill the log-odds are steadiest near its middle, which means nothing.
     lack = "but no hill of the histogram lies above it: take it with care, or name a threshold"
     return value, f"{found}, {lack}.", False

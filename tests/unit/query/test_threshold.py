@@ -58,6 +58,16 @@ def test_auto_finds_a_hill_whatever_its_size(count: int) -> None:
     assert 0.28 < find_threshold(scores, "auto").value < 0.38
 
 
+def test_a_gap_below_nearly_everything_is_no_answer() -> None:
+    scores = hills((0.0, 0.003, 5000), (0.3, 0.02, 80_000), (0.42, 0.015, 8000))
+    assert 0.34 < find_threshold(scores, "auto").value < 0.41
+
+
+def test_a_thing_that_fills_most_of_a_scene_is_found() -> None:
+    scores = hills((0.0, 0.01, 1000), (0.3, 0.01, 9000))
+    assert 0.02 < find_threshold(scores, "auto").value < 0.28
+
+
 def test_auto_looks_no_lower_than_it_is_told_to() -> None:
     scores = hills((-0.3, 0.05, 50_000), (0.3, 0.05, 20_000), (0.7, 0.05, 5000))
     anywhere, above = find_threshold(scores), find_threshold(scores, least=0.4)
