@@ -26,7 +26,6 @@ SHARED_SOURCES = (
     "raster/cpu/composite.py",
     "raster/cpu/project.py",
     "raster/cpu/simd.py",
-    "solve/gathering.py",
 )
 
 

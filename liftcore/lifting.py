@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -21,21 +22,14 @@ from liftcore.result import LiftMetadata, LiftResult
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.splats import Splats
 from liftcore.settings import LiftSettings, Preset
-from liftcore.solve.accumulate import Geometry, accumulate, as_read
-from liftcore.solve.aggregation import Aggregation, aggregate, kept_columns
-from liftcore.solve.all_rays import AllRays
-from liftcore.solve.certificate import certify
-from liftcore.solve.checkpoint import Checkpoint, identity, resumed
-from liftcore.solve.closed_form import Solution
-from liftcore.solve.feature_room import room_within
-from liftcore.solve.host import Host
-from liftcore.solve.least_squares import refine
-from liftcore.solve.lift_warnings import lift_warnings
-from liftcore.solve.reference import reference
-from liftcore.solve.robust import robust_weights
-from liftcore.solve.solver import closed_form
-from liftcore.solve.view_weights import WeightStore
-from liftcore.solve.views import Given, LiftViews
+from liftcore.solve.aggregate import Aggregation, aggregate
+from liftcore.solve.checkpoint import Checkpoint
+from liftcore.solve.closed_form import Solution, solve, solve_rows
+from liftcore.solve.diagnostics import certify, lift_warnings
+from liftcore.solve.geometry import Geometry, Given, LiftViews, as_read, weigh_views
+from liftcore.solve.least_squares import AllRays, reference, refine
+from liftcore.solve.reweight import agreement_factors, reweighted
+from liftcore.solve.weights import RegionWeights
 from liftcore.warm_up import warm_up_lift
 
 LEAST_KEPT = 0.5  # of a splat's weight, in regions that the aggregation kept, for it to be solved for again
@@ -70,7 +64,8 @@ def lift(
         settings: fields of `LiftSettings` that differ from the preset's.
 
     Returns:
-        Features [P, F] f16 (or f32) with evidence, agreement and diagnostics, on the device that the splats are on.
+        Features [P, F] f16 (or f32) with evidence, agreement and diagnostics, on the device that did the work, or on
+        the CPU where that has no room for them.
 
     Raises:
         InvalidFeatures: views are malformed, or none has a camera.
@@ -83,34 +78,37 @@ def lift(
     if settings:
         own = chosen.model_dump(exclude_unset=True) if isinstance(preset, LiftSettings) else {"preset": preset}
         chosen = LiftSettings.of(**own | settings)
-    work = _Lift(splats, chosen, threads, Timings(progress), choose_device(chosen.device))
     check_antialiased(splats.kernel, chosen.antialiased)
+    work = _Lift(splats, chosen, threads, Timings(progress), choose_device(chosen.device))
     found = LiftViews.of(views, cameras, chosen)
     plan = work.planned(found, on_plan or log_warnings)
     kept = Checkpoint(checkpoint) if isinstance(checkpoint, Path) else checkpoint
-    with within_memory(work.device), WeightStore(card=(work.device.place, plan.kept_on_card)) as store:
-        geometry = work.weigh(found, plan, store, kept)
-        weights, solution = work.solve(store, geometry, plan)
-        X, notes = work.refine(found, geometry, solution.features)
-        clusters = work.aggregate(found, geometry, weights, X, plan, notes)
-        certificate = work.diagnose(found, geometry, store, X, plan, notes)
-    return LiftResult(
+    with within_memory(work.device):
+        geometry = work.weigh(found, plan, kept)
+        W = work.reweight(geometry, plan)
+        solution = work.solve(W, geometry, plan)
+        sums = geometry.weights.row_sums().cpu().numpy()
+        X, notes = work.refine(found, geometry, solution.features, sums > 0)
+        clusters = work.aggregate(found, geometry, W, X, sums, notes)
+        diagnostics = work.diagnose(found, geometry, X, sums, plan, notes)
+    made = LiftResult(
         features=X,
-        evidence=torch.from_numpy(geometry.evidence).to(torch.float32),
+        evidence=geometry.evidence(),
         agreement=solution.agreement,
-        seen=torch.from_numpy(geometry.denominators > 0),
+        seen=torch.from_numpy(sums > 0),
         metadata=LiftMetadata(
             version=__version__,
             settings=chosen,
             encoder=found.features.encoder,
             text_space=found.features.text_space,
             views=tuple(found.names),
-            certificate=certificate,
+            certificate=diagnostics,
             timings=work.timings.seconds,
         ),
         cluster=clusters.clusters if clusters else None,
         cluster_features=clusters.cluster_features if clusters else None,
     )
+    return made.to(work.device.place)
 
 
 def plan(
@@ -172,67 +170,97 @@ class _Lift:
             self.compile()
         return plan
 
-    def weigh(self, views: LiftViews, plan: Plan, store: WeightStore, checkpoint: Checkpoint | None) -> Geometry:
-        """W of every view into the store, with the sums of its rows."""
+    def weigh(self, views: LiftViews, plan: Plan, checkpoint: Checkpoint | None) -> Geometry:
+        """W of all views, and sampled rows of A."""
         self.raster = open_raster(self.splats, self.device, self.threads, plan.kept_on_card)
-        key = identity(self.splats, self.device.facts()) if checkpoint else ""
-        with self.timings.stage("geometry"), resumed(self.raster, checkpoint, key) as raster:
-            return accumulate(raster, self.splats.count, views, self.settings, store, self.progress)
+        with self.timings.stage("geometry"):
+            return weigh_views(
+                self.raster,
+                self.splats.count,
+                views,
+                self.settings,
+                self.progress,
+                by_rows=bool(self.settings.robust_steps or self.settings.aggregation_resolve),
+                checkpoint=checkpoint.of(self.splats, self.device.facts()) if checkpoint else None,
+                device_bytes=plan.kept_on_card,
+                threads=self.threads,
+            )
 
-    def solve(self, store: WeightStore, geometry: Geometry, plan: Plan) -> tuple[WeightStore, Solution]:
-        """The weights, which reweighting may have changed, and the closed form of them."""
-        settings, sums, weights = self.settings, geometry.denominators, store
-        host = self._host(plan)
-        if settings.robust_steps or settings.aggregation_resolve:  # which read the weights on the host
-            store.bring_home()
+    def reweight(self, geometry: Geometry, plan: Plan) -> RegionWeights:
+        """W as it is solved: each step gives factors of W's entries, which keep the sums of its rows."""
+        W, settings = geometry.weights, self.settings
         with self.timings.stage("robust"):
-            weights = robust_weights(store, geometry.codebooks, sums, settings.robust_steps, self.progress, host)
-        with self.timings.stage("solve"):
-            dtype = getattr(torch, settings.dtype)
-            return weights, closed_form(weights, geometry.columns, sums, dtype, self.progress, self.device, host)
+            if settings.robust_steps:
+                W = W.cpu()
+                factors = agreement_factors(
+                    W, geometry.codebook, settings.robust_steps, self.progress, means=self.splats.means,
+                    threads=self.threads,
+                )  # fmt: skip
+                W = reweighted(W, factors)
+        return W
 
-    def refine(self, views: LiftViews, geometry: Geometry, X: Tensor) -> tuple[Tensor, dict[str, Any]]:
+    def solve(self, W: RegionWeights, geometry: Geometry, plan: Plan) -> Solution:
+        """The closed form."""
+        with self.timings.stage("solve"):
+            return solve(
+                W,
+                geometry.codebook,
+                getattr(torch, self.settings.dtype),
+                self.progress,
+                means=self.splats.means,
+                threads=self.threads,
+                device=self.device,
+                memory=plan.features_room,
+            )
+
+    def refine(
+        self, views: LiftViews, geometry: Geometry, X: Tensor, seen: np.ndarray
+    ) -> tuple[Tensor, dict[str, Any]]:
         """X after the conjugate gradient steps that the settings ask for, and what is known of the optimum."""
         settings, progress, notes = self.settings, self.progress, dict[str, Any]()
         if not settings.cg_steps and not settings.reference_channels:
             return X, notes
-        seen, numbers = geometry.denominators > 0, range(len(views.names))
         with self.timings.stage("rays"):
             rays = AllRays(
                 self._raster(),
                 self.splats.count,
-                [views.camera(number) for number in numbers],
+                [views.camera(number) for number in range(len(views))],
                 lambda number: as_read(views[number][1], settings, views.names[number]),
                 settings.lift_params,
                 progress,
             )
         if settings.cg_steps:
             with self.timings.stage("refine"):
-                refinement = refine(rays, X, seen, geometry.codebooks, settings, progress)
+                refinement = refine(rays, X, seen, geometry.books, settings, progress)
             X, notes["refinement"] = refinement.features, refinement.stats
         if settings.reference_channels:
             with self.timings.stage("reference"):
-                books = geometry.codebooks
-                notes["reference"] = reference(rays, X, seen, geometry.samples, books, settings, progress)
+                notes["reference"] = reference(rays, X, seen, geometry.samples, geometry.books, settings, progress)
         return X, notes
 
     def aggregate(
-        self, views: LiftViews, geometry: Geometry, weights: WeightStore, X: Tensor, plan: Plan, notes: dict[str, Any]
+        self,
+        views: LiftViews,
+        geometry: Geometry,
+        W: RegionWeights,
+        X: Tensor,
+        sums: np.ndarray,
+        notes: dict[str, Any],
     ) -> Aggregation | None:
         """Aggregate X in place, if the settings ask for it."""
         settings = self.settings
         if not settings.aggregation:
             return None
         with self.timings.stage("aggregate"):
-            lifted: Any = (self._raster(), views.cameras, views.features, views.names)
-            found = aggregate(X, geometry.evidence, lifted, settings, self.progress, self.threads)
+            evidence = geometry.evidence().numpy()
+            found = aggregate(X, evidence, self._raster(), views, settings, self.progress, self.threads)
         notes["aggregation"] = found.facts
         if settings.aggregation_resolve:
-            notes["aggregation"]["resolved"] = self._resolve(weights, geometry, found, X, self._host(plan, X.nbytes))
+            notes["aggregation"]["resolved"] = self._resolve(W.cpu(), geometry, found, X, sums)
         return found
 
     def _resolve(
-        self, weights: WeightStore, geometry: Geometry, aggregation: Aggregation, X: Tensor, host: Host
+        self, W: RegionWeights, geometry: Geometry, aggregation: Aggregation, X: Tensor, sums: np.ndarray
     ) -> float:
         """Solve again, from the kept regions alone, for splats that took no cluster's feature; their share of all.
 
@@ -241,37 +269,37 @@ class _Lift:
         if all(rows is None for rows in aggregation.kept):
             return 0.0
         with self.timings.stage("resolve"):
-            fewer, sums = kept_columns(weights, aggregation.kept, X.shape[0])
-            again = closed_form(fewer, geometry.columns, sums, X.dtype, self.progress, self.device, host).features
-            most = (sums > 0) & (sums >= LEAST_KEPT * geometry.denominators)
-            chosen = aggregation.own & torch.from_numpy(most)
-            X[chosen] = again[chosen].to(X.dtype)
+            counted = [
+                torch.ones(book.shape[0]) if rows is None else torch.from_numpy(rows).float()
+                for book, rows in zip(geometry.books, aggregation.kept, strict=True)
+            ]
+            fewer = reweighted(W, torch.cat(counted).index_select(0, W.region))
+            most = fewer.row_sums().numpy()
+            chosen = aggregation.own & torch.from_numpy((most > 0) & (most >= LEAST_KEPT * sums))
+            rows = torch.nonzero(chosen)[:, 0]
+            solve_rows(
+                X, rows, fewer, geometry.codebook, self.progress, means=self.splats.means, threads=self.threads
+            )
             return float(chosen.float().mean())
 
     def diagnose(
-        self, views: LiftViews, geometry: Geometry, store: WeightStore, X: Tensor, plan: Plan, notes: dict[str, Any]
+        self, views: LiftViews, geometry: Geometry, X: Tensor, sums: np.ndarray, plan: Plan, notes: dict[str, Any]
     ) -> dict[str, Any]:
         """What the lift measured of itself."""
-        blind = [name for name, own in zip(views.names, store, strict=True) if not own.evidence_splats.numel()]
         facts: dict[str, Any] = {
             "device": self.device.facts(),
-            "weights_entries": sum(len(part.columns) for part in store),
+            "weights_entries": geometry.weights.region.shape[0],
             "views_without_camera": views.unpaired,
             "plan": plan.facts(),
-            "views_without_splats": blind,
+            "views_without_splats": list(geometry.blind),
         }
-        lifted, sums = [views.camera(number) for number in range(len(views.names))], geometry.denominators
+        lifted = [views.camera(number) for number in range(len(views))]
         told = lift_warnings(self.splats, lifted, sums, self.settings.dtype, X.dtype, facts)
         facts["warnings"] = [*told, *plan.told]
         with self.timings.step("certify"):
-            return certify(geometry, X, self.settings, self.threads) | notes | facts
+            return certify(geometry, X, sums, self.settings, self.threads) | notes | facts
 
     def _raster(self) -> Raster:
         if self.raster is None:
             raise RuntimeError("there is no raster before the views are weighed")
         return self.raster
-
-    def _host(self, plan: Plan, taken: int = 0) -> Host:
-        """What the closed form has of this machine, beside so many bytes of features that there are already."""
-        limit = plan.features_room
-        return Host(self.threads, room_within(None if limit is None else limit - taken), self.splats.means)

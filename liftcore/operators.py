@@ -17,10 +17,8 @@ from liftcore.raster.base import CompositingParams, check_antialiased
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.splats import Splats
 from liftcore.settings import LiftSettings, Preset
-from liftcore.solve.accumulate import accumulate
-from liftcore.solve.view_weights import WeightStore
-from liftcore.solve.views import Given, LiftViews
-from liftcore.solve.weights import RegionWeights, merged
+from liftcore.solve.geometry import Given, LiftViews, weigh_views
+from liftcore.solve.weights import RegionWeights
 
 DEFAULT = CompositingParams()
 
@@ -81,7 +79,8 @@ def region_weights(
             settings' coverage. A label on several levels is a region each time.
 
     Returns:
-        W on the CPU, in memory. Rows of ``W E`` over the sums of rows of W are the features that `lift` finds.
+        W on the CPU, a row a splat: in memory, or in mapped files where it is large. Rows of ``W E`` over the sums of
+        rows of W are the features that `lift` finds.
 
     Raises:
         InvalidFeatures, InvalidSettings, Unavailable: as `lift` has it.
@@ -89,9 +88,6 @@ def region_weights(
     chosen = preset if isinstance(preset, LiftSettings) else LiftSettings.of(preset=preset, **settings)
     check_antialiased(splats.kernel, chosen.antialiased)
     found = LiftViews.of(views, cameras, chosen)
-    own = chosen.model_copy(update={"robust_steps": 1, "certificate_rays": 0})  # by regions, not tuples of them
+    own = chosen.model_copy(update={"certificate_rays": 0})
     raster = open_raster(splats, choose_device(chosen.device), threads)
-    with WeightStore() as store:
-        geometry = accumulate(raster, splats.count, found, own, store, progress)
-        counts = [book.shape[0] for book in geometry.codebooks]
-        return merged(store, counts, tuple(found.names), splats.count, threads)
+    return weigh_views(raster, splats.count, found, own, progress, by_rows=True, threads=threads).weights.cpu()

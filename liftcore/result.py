@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +13,7 @@ from liftcore.settings import LiftSettings
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    import torch
     from torch import Tensor
 
     from liftcore.query.ask import VectorAnswer
@@ -79,6 +80,26 @@ class LiftResult:
         """What the lift measured of itself (residual, bound, row sums, warnings, plan), as plain numbers."""
         return self.metadata.certificate
 
+    def to(self, place: torch.device) -> LiftResult:
+        """The same with its tensors there; where they are, if there is no room for them."""
+        from liftcore.device import out_of_memory
+
+        tensors = {name: part for name, part in vars(self).items() if name != "metadata" and part is not None}
+        if all(part.device == place for part in tensors.values()):
+            return self
+        try:
+            return replace(self, **{name: part.to(place) for name, part in tensors.items()})
+        except RuntimeError as error:
+            if not out_of_memory(error):
+                raise
+            return self
+
+    def cpu(self) -> LiftResult:
+        """The same with its tensors on the CPU."""
+        import torch
+
+        return self.to(torch.device("cpu"))
+
     def query(
         self,
         positives: Any,
@@ -104,7 +125,7 @@ class LiftResult:
         from liftcore.query.ask import query_vectors
 
         return query_vectors(
-            self, positives, negatives, splats=splats, threshold=threshold, instances=instances, keep=keep
+            self.cpu(), positives, negatives, splats=splats, threshold=threshold, instances=instances, keep=keep
         )
 
     def segment(self, words: Sequence[str], vectors: Any, splats: Splats) -> Segmentation:
@@ -120,7 +141,7 @@ class LiftResult:
         from liftcore.query.scene import QueryScene
         from liftcore.query.segment import segment
 
-        return segment(QueryScene(self, splats), words, vectors)
+        return segment(QueryScene(self.cpu(), splats), words, vectors)
 
     def save(self, path: Path | str) -> None:
         """Write a lift file (`liftcore.io.lift_file`), whole or not at all."""

@@ -8,7 +8,7 @@ from torch import Tensor
 from liftcore.features.views import ViewFeatures
 from liftcore.raster.base import CompositingParams, Raster
 from liftcore.scene.cameras import Camera
-from liftcore.solve.readout import read_pixels, sample_pixels
+from liftcore.solve.geometry import read_pixels, sample_pixels
 
 PIXELS = 1_000  # of a view, whose rendered features are compared with the given ones
 LOW_QUANTILE = 0.05

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from liftcore.device import Device, choose_device
@@ -15,17 +14,14 @@ from liftcore.errors import InvalidInput
 from liftcore.evaluate.hardware import hardware, peak_memory
 from liftcore.evaluate.synthetic import room_cameras, room_regions, room_splats
 from liftcore.features.views import Regions, ViewFeatures
-from liftcore.progress import silent
 from liftcore.raster import open_raster
 from liftcore.raster.base import CompositingParams, Raster, ViewRequest, Weighting
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Splats
 from liftcore.settings import LiftSettings, Preset
-from liftcore.solve.columns import Columns, by_tuples
-from liftcore.solve.host import Host
-from liftcore.solve.solver import closed_form
-from liftcore.solve.totals import row_totals
-from liftcore.solve.view_weights import WeightStore
+from liftcore.solve.closed_form import solve
+from liftcore.solve.codebook import Codebook, ViewCodebook, as_regions
+from liftcore.solve.weights import RegionWeights, stacked
 from liftcore.warm_up import warm_up_lift
 
 PASSES = 3  # over all views, of which the median counts
@@ -83,19 +79,16 @@ def time_lift(work: Workload, preset: Preset, device: Device, threads: int | Non
     """
     settings, count = LiftSettings.of(preset=preset), work.splats.count
     looking, raster = (settings.lift_params, settings.weighting), open_raster(work.splats, device, threads)
-    with WeightStore() as store:  # for the caches alone
-        walk_regions(raster, work.views[:1], looking, count, store)
+    weigh_regions(raster, work.views[:1], looking, count, threads)  # for the caches alone
     geometry, solution, entries = [], [], 0
     for _ in range(PASSES):
-        with WeightStore() as store:
-            start = time.perf_counter()
-            denominators, columns = walk_regions(raster, work.views, looking, count, store)
-            middle = time.perf_counter()
-            host = Host(threads, means=work.splats.means)
-            closed_form(store, columns, denominators, torch.float16, silent, device, host)
-            geometry.append((middle - start) / len(work.views))
-            solution.append((time.perf_counter() - middle) / len(work.views))
-            entries = sum(len(part.columns) for part in store)
+        start = time.perf_counter()
+        W, codebook = weigh_regions(raster, work.views, looking, count, threads)
+        middle = time.perf_counter()
+        solve(W, codebook, torch.float16, means=work.splats.means, threads=threads, device=device)
+        geometry.append((middle - start) / len(work.views))
+        solution.append((time.perf_counter() - middle) / len(work.views))
+        entries = W.region.shape[0]
     return {
         "geometry_s_per_view": statistics.median(geometry),
         "geometry_s_per_view_min": min(geometry),
@@ -105,33 +98,30 @@ def time_lift(work: Workload, preset: Preset, device: Device, threads: int | Non
     }
 
 
-def walk_regions(
+def weigh_regions(
     raster: Raster,
     views: Sequence[tuple[Camera, ViewFeatures]],
     looking: tuple[CompositingParams, Weighting],
     count: int,
-    store: WeightStore,
-) -> tuple[np.ndarray, list[Columns]]:
-    """W of every view into the store; the denominators [P] f64 and the columns of W, as the closed form takes them.
+    threads: int | None = None,
+) -> tuple[RegionWeights, Codebook]:
+    """W of all views and what its regions stand for, as the closed form takes them.
 
     Args:
         count: P.
     """
-    denominators, columns = np.zeros(count), []
+    codebooks: list[ViewCodebook] = []
     nowhere = torch.empty(0, 2, dtype=torch.int32)
 
-    def looks() -> Iterator[ViewRequest]:
+    def requests() -> Iterator[ViewRequest]:
         for camera, observation in views:
-            walked, own = by_tuples(observation)
-            columns.append(own)
-            yield ViewRequest(camera, walked, *looking, nowhere)
+            regions, own = as_regions(observation, by_rows=False)
+            codebooks.append(own)
+            yield ViewRequest(camera, regions, *looking, nowhere)
 
-    for number, walked in enumerate(raster.iterate_views(looks())):
-        weights = columns[number].weighted(walked.weights)
-        home = weights.on_host()
-        denominators[home.splats.numpy()] += row_totals(home)
-        store.append(weights)
-    return denominators, columns
+    found = enumerate(raster.iterate_views(requests()))
+    parts = [codebooks[number].counted(view.weights) for number, view in found]
+    return stacked(parts, count, threads), Codebook(tuple(codebooks))
 
 
 def workload(options: Mapping[str, Any]) -> Workload:

@@ -21,7 +21,7 @@ from liftcore.query.text.table import plain
 from liftcore.raster.base import ALPHA_FLOOR
 from liftcore.scene.cameras import Cameras, distortion_warning, photo_size
 from liftcore.scene.splats import Kernel, Splats
-from liftcore.solve.lift_warnings import UNSEEN
+from liftcore.solve.diagnostics import UNSEEN
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -28,16 +28,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from torch.nn.functional import embedding_bag
 
 from liftcore.one_thread import one_thread
 from liftcore.planning.visibility import spread
 from liftcore.progress import silent
 from liftcore.raster.cpu.raster import CpuRaster
-from liftcore.solve.accumulate import accumulate
-from liftcore.solve.channels import random_axes
-from liftcore.solve.totals import sums_in_order
-from liftcore.solve.view_weights import WeightStore
+from liftcore.solve.closed_form import bag_sums
+from liftcore.solve.geometry import LiftViews, weigh_views
+from liftcore.solve.least_squares import random_axes
+from liftcore.solve.weights import RegionWeights, segment_sums
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -45,10 +44,8 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from liftcore.planning.visibility import Visibility
-    from liftcore.raster.base import RegionWeights
     from liftcore.scene.splats import Splats
     from liftcore.settings import LiftSettings
-    from liftcore.solve.views import LiftViews
 
 PILOT_SIDE = 160  # pixels of an image's longer side, about
 PILOT_CHANNELS = 64
@@ -96,12 +93,13 @@ def fly_pilot(
     own = settings.model_copy(update=coarse)
     channels = views.features.channels
     axes = random_axes(channels, min(PILOT_CHANNELS, channels), settings.seed)
-    said = _Said(spread(splats.count, seen.areas.shape[1]), splats.count, axes.shape[1])
-    with WeightStore() as store, one_thread():
-        geometry = accumulate(CpuRaster(splats, threads), splats.count, chosen, own, store, silent)
-        for weights, columns in zip(store, geometry.columns, strict=True):
-            said.add(weights, columns.means(columns.codebook.float() @ axes))
-    evidence = _evidence(geometry.evidence[said.rows], seen.areas, seen.areas[flown])
+    raster = CpuRaster(splats, threads)
+    rows = spread(splats.count, seen.areas.shape[1])
+    with one_thread():
+        geometry = weigh_views(raster, splats.count, chosen, own, silent, by_rows=False, threads=threads)
+        read = [view.means(view.rows.float() @ axes) for view in geometry.codebook.views]
+        said = _Said(geometry.weights, torch.cat(read), torch.from_numpy(rows))
+    evidence = _evidence(geometry.evidence().numpy()[rows], seen.areas, seen.areas[flown])
     if not evidence.any():  # no ray met a splat, so nothing is known of any view
         return Pilot(seen.areas, np.ones(len(evidence)), np.ones(len(evidence)))
     variance, together = said.disagreement(evidence)
@@ -111,31 +109,20 @@ def fly_pilot(
 
 
 class _Said:
-    """What the pilot's views say of the sampled splats, in sums over the views added."""
+    """What the pilot's views say of the sampled splats, in sums over the views."""
 
-    def __init__(self, rows: np.ndarray, splats: int, channels: int) -> None:
-        self.rows = rows  # [n] i64, of all splats
-        self._places = np.full(splats, -1)
-        self._places[self.rows] = np.arange(len(self.rows))
-        self._weights, self._squared_weights, self._squares = np.zeros((3, len(self.rows)))
-        self._vectors = np.zeros((len(self.rows), channels))
-
-    def add(self, weights: RegionWeights, codebook: Tensor) -> None:
-        """Add a view: its W, and what its columns read [T, C] f32."""
-        places = torch.from_numpy(self._places[weights.splats.numpy()])
-        lengths = weights.indptr.diff()
-        sampled, entries = places >= 0, torch.repeat_interleave(places >= 0, lengths)
-        starts = torch.cat([lengths.new_zeros(1), lengths[sampled].cumsum(0)])
-        columns, values = weights.columns[entries].long(), weights.weights[entries]
-        sums = embedding_bag(
-            columns, codebook, starts, mode="sum", per_sample_weights=values, include_last_offset=True
+    def __init__(self, W: RegionWeights, read: Tensor, rows: Tensor) -> None:
+        """Args: read: [M, C] f32, what all regions read. rows: [n] i64, the splats."""
+        starts, entries = W.take(rows)
+        region, weight = W.region[entries], W.weight[entries]
+        runs, row = W.runs(starts, region)
+        said, total = bag_sums(region, read, runs, weight).double(), segment_sums(weight, runs)
+        of_rows = torch.searchsorted(row, torch.arange(len(rows) + 1))
+        squares = torch.where(total > 0, said.square().sum(dim=1) / total, 0.0)
+        self._weights, self._squared_weights, self._squares = (
+            segment_sums(part, of_rows).numpy() for part in (total, total.square(), squares)
         )
-        totals = sums_in_order(values.double(), starts)
-        own, total, vectors = places[sampled].numpy(), totals.numpy(), sums.double().numpy()
-        self._weights[own] += total
-        self._squared_weights[own] += total**2
-        self._squares[own] += _ratio((vectors**2).sum(axis=1), total)
-        self._vectors[own] += vectors
+        self._vectors = bag_sums(torch.arange(len(row)), said.float(), of_rows).double().numpy()
 
     def disagreement(self, evidence: np.ndarray) -> tuple[float, float]:
         """v, infinite where the views have nothing in common, and b, over the splats that a labelled ray met."""

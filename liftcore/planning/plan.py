@@ -23,11 +23,11 @@ from liftcore.raster.base import TILE
 from liftcore.scene.cameras import Camera, distortion_warning
 from liftcore.scene.splats import Splats
 from liftcore.settings import LiftSettings
-from liftcore.solve.feature_room import check_disk, lack_of_disk
-from liftcore.solve.gathering import CHUNK_ENTRIES, STRIP_BYTES
-from liftcore.solve.map_shapes import shape_warnings
-from liftcore.solve.view_weights import MEMORY_LIMIT
-from liftcore.solve.views import LiftViews
+from liftcore.solve.codebook import TABLE_BYTES
+from liftcore.solve.diagnostics import shape_warnings
+from liftcore.solve.geometry import LiftViews
+from liftcore.solve.memory import check_disk, lack_of_disk
+from liftcore.solve.weights import MEMORY_LIMIT
 
 FEW_VIEWS = 32  # and below, view_cosine takes all: a pilot would cost what it saves
 SHOWN_VIEWS = 6  # names in a line for people
@@ -234,9 +234,8 @@ def memory_parts(
         "splats": inputs,
         "scene": splats.count * SCENE_BYTES,
         "view": 2 * view,  # two are in work, or one and what is made of it
-        "weights": min(weights, MEMORY_LIMIT),
-        "gathered": 2 * ENTRY_BYTES * min(weights // ENTRY_BYTES, CHUNK_ENTRIES),
-        "codebooks": size * sum(books) + min(4 * sum(books), STRIP_BYTES),
+        "weights": 2 * min(weights, MEMORY_LIMIT),  # a view at a time, and of all views
+        "codebooks": size * sum(books) + min(8 * sum(books), 2 * TABLE_BYTES),
         "features": splats.count * channels * size,
     }
     if settings.cg_steps or settings.reference_channels:
@@ -306,7 +305,7 @@ def check_memory(parts: Mapping[str, int], free: int | None) -> list[str]:
         raise Unavailable("memory", expected=f"at most the {there} that are free", got=got, hint=hint)
     told = []
     if room is not None and parts["features"] > room:
-        check_disk(parts["features"])
+        check_disk(parts["features"], "features")
         size = f"{parts['features'] / GIB:.1f} GiB"
         told.append(f"the features, {size}, do not fit into the {there} that are free: they go through a mapped file")
     if rest > SPARE * free:

@@ -10,7 +10,7 @@ from liftcore.query.colours import SH_C0
 from liftcore.query.scores import rows_at_a_time
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Splats
-from liftcore.solve.principal_axes import principal_axes
+from liftcore.solve.aggregate import principal_axes
 
 # Real spherical harmonics, in the field's order and signs (Condon-Shortley phase left in).
 SH_C1 = math.sqrt(3 / (4 * math.pi))

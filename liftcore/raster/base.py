@@ -5,7 +5,7 @@ Nothing here loads torch: settings share these values with processes that never 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import TYPE_CHECKING, Protocol
 
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
     from liftcore.features.views import ViewFeatures
     from liftcore.scene.cameras import Camera
+    from liftcore.solve.weights import RegionWeights
 
 # The constants of the field, named once. They move results at the 1e-3 level: state them with every number.
 LOW_PASS = 0.3  # px^2, added to both axes of every projected covariance (3DGS; gsplat's eps2d)
@@ -68,34 +69,6 @@ class Weighting:
     count: int = 1  # k of top-k, at most MOST_OF_A_RAY
     mass: float = 0.75  # of front-mass: a weight counts while 1 - T before it is below this
     floor: float = 0.0  # a smaller weight counts none, in every selection
-
-
-@dataclass(frozen=True)
-class RegionWeights:
-    """``W = A'^T S`` of one view, sparse by rows of the splats that it saw, and ``A^T 1``.
-
-    ``A'`` holds the weights that the weighting selects, to its power; for all of them at power 1 it is A.
-    """
-
-    splats: Tensor  # [n] i32 ascending, the splats with a row
-    indptr: Tensor  # [n + 1] i64, CSR row pointers
-    columns: Tensor  # [nnz] i32 ascending in a row, rows of the codebook
-    weights: Tensor  # [nnz] f32, sums over rays of the selected w^p times the reading S
-    evidence_splats: Tensor  # [m] i32 ascending, the splats that any ray met, labelled or not
-    evidence: Tensor  # [m] f32, sum of plain weights w (opacity_logit_scale 1, power 1), each ray once
-
-    def on_host(self) -> RegionWeights:
-        """The same on the host: all of it at once into pinned memory, as other copies wait for each part."""
-        if not self.columns.is_cuda:
-            return self
-        import torch
-
-        parts = {field.name: getattr(self, field.name) for field in fields(self)}
-        made = {name: torch.empty(part.shape, dtype=part.dtype, pin_memory=True) for name, part in parts.items()}
-        for name, part in parts.items():
-            made[name].copy_(part, non_blocking=True)
-        torch.cuda.current_stream(self.columns.device).synchronize()
-        return RegionWeights(**made)
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,6 @@ from liftcore.raster.base import (
     NEAR_PLANE,
     CompositingParams,
     RayRows,
-    RegionWeights,
     Selection,
     ViewRequest,
     ViewWeights,
@@ -32,6 +31,7 @@ from liftcore.raster.base import (
     check_antialiased,
 )
 from liftcore.scene.kernel import Kernel
+from liftcore.solve.weights import RegionWeights, one_view
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Iterable
@@ -307,13 +307,14 @@ class ReferenceRaster:
         rows, columns = np.nonzero(W)
         splats, counts = np.unique(rows, return_counts=True)
         met = np.flatnonzero(plain)
-        return RegionWeights(
+        return one_view(
             torch.from_numpy(splats.astype(np.int32)),
             torch.from_numpy(np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)),
             torch.from_numpy(columns.astype(np.int32)),
             torch.from_numpy(W[rows, columns].astype(np.float32)),
             torch.from_numpy(met.astype(np.int32)),
             torch.from_numpy(plain[met].astype(np.float32)),
+            regions=observation.codebook.shape[0],
         )
 
     def iterate_views(self, requests: Iterable[ViewRequest]) -> Generator[ViewWeights]:

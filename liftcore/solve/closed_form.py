@@ -1,38 +1,31 @@
 """The closed form: ``x_j = sum_v W_v[j] E_v / sum W[j]`` (paper Eq. 6, App. Tikhonov for squared weights).
 
-X is never held in float32 as a whole. Splats go in chunks (`gathering`) and channels in strips, so that a chunk's
-entries and the rows of a strip that it reads stay in the cache. Weights are divided by their sum before they meet the
-codebook: a mean cannot overflow where its inputs do not, and faint splats keep their digits.
+torch's ``embedding_bag`` makes the sums, on the CPU and on a device: one thread adds up a bag in a fixed order, so
+the bits repeat for any number of threads. A product with a sparse tensor would take cuSPARSE's default algorithm, and
+``index_add_`` atomic sums: neither has a fixed order.
 
-Sums are float32 over a few hundred terms at most. Longer ones, of a splat behind a million regions or of thousands of
-views, are sums of such parts in float64: added one by one, ten million equal terms would be wrong in their first
-digit.
+Weights are divided by their sum before they meet the codebook: a mean cannot overflow where its inputs do not, and
+faint splats keep their digits. float32 adds LONG terms one by one; longer bags, of a splat behind a million regions,
+are sums of the sums of such parts: added one by one, ten million equal terms would be wrong in their first digit.
 """
 
-import math
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 
-import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import embedding_bag
 
-from liftcore.jit import vectorised
+from liftcore.device import CPU, Device, out_of_memory
 from liftcore.one_thread import one_thread
 from liftcore.progress import Progress, silent
-from liftcore.raster.base import RegionWeights
-from liftcore.solve.columns import Columns, rows_of
-from liftcore.solve.curve import places_along_curve
-from liftcore.solve.gathering import LONG, WIDE, Chunk, EachShare, Gathering, channel_slices, strips_of
-from liftcore.solve.host import ALL_CORES, Host
-from liftcore.solve.view_weights import WeightStore
+from liftcore.solve.codebook import Codebook
+from liftcore.solve.memory import zeros
+from liftcore.solve.weights import BLOCK_ENTRIES, BLOCK_ROWS, RegionWeights, from_zero, row_blocks, run_each
 
-NORM_VALUES = 1 << 16  # of a codebook that are widened at a time
-FLOAT16_MAX = 65_504.0
-FLOAT16_STEP = 2.0**-25  # the largest rounding error of its small values
-FLOAT16_ERROR = 1e-4  # of the longest vector, which float16 must hold
-UNIT_TOLERANCE = 5e-3  # float16 unit vectors are off by less
+LONG = 256  # terms of a sum that float32 adds up one by one
+DEVICE_ROWS, DEVICE_ENTRIES = 1 << 16, 1 << 24  # of a block on a device; halved where its memory runs out
+LEAST_ROWS = 256  # of a block that is halved no more
 
 
 @dataclass(frozen=True)
@@ -44,140 +37,146 @@ class Solution:
 
 
 @one_thread()
-def solve_closed_form(
-    store: Sequence[RegionWeights] | WeightStore,
-    columns: Sequence[Columns],
-    denominators: np.ndarray,
+def solve(
+    W: RegionWeights,
+    codebook: Codebook,
     dtype: torch.dtype,
-    progress: Progress,
-    host: Host = ALL_CORES,
+    progress: Progress = silent,
+    *,
+    means: Tensor | None = None,
+    threads: int | None = None,
+    device: Device = CPU,
+    memory: int | None = None,
 ) -> Solution:
-    """Solve for X, slice by slice of channels and chunk by chunk of splats.
+    """``X = D^-1 W E`` and the agreement of each splat's inputs.
 
     Args:
-        store: W of every view.
-        columns: of every view, what the columns of its W stand for.
-        denominators: [P] f64, row sums of W over all views.
+        W: of all views, with a row for every splat, wherever it lies.
         dtype: how X is stored; float16 becomes float32 when the codebooks are too large or too small for it.
-        host: what there is to solve with, and where X is to lie.
+        means: [P, 3] of the splats: neighbours, which read the same rows, are solved together. None: in their order.
+        threads: of the CPU. None takes the cores that this process may use. The number changes no bit.
+        device: where the sums are made; X comes back to the CPU.
+        memory: bytes that X may take before it lies in a mapped file; None for no limit.
     """
-    books = [part.codebook for part in columns]
-    channels, count = books[0].shape[1], denominators.shape[0]
-    norms = [row_norms(book).numpy() for book in books]
-    unit = all(bool((np.abs(norm - 1) < UNIT_TOLERANCE).all()) for norm in norms)
-    if dtype == torch.float16 and not fits_float16(books, max(float(norm.max()) for norm in norms)):
+    if dtype == torch.float16 and not codebook.fits_float16():
         dtype = torch.float32
-    features = host.room(count, channels, dtype)  # every share of splats fills its rows
-    squares, counts = np.zeros(count), [part.count for part in columns]
-    scale = np.divide(1.0, denominators, out=np.zeros(count), where=denominators > 0)
-    slices = channel_slices(sum(counts) * (1 if unit else 2), channels)
-    with host.workers() as (_, each_share):
-        row_bytes = channels * dtype.itemsize
-        gathering = Gathering(each_share, store, counts, scale, host.places(channels), row_bytes)
-        for number, (begin, end) in enumerate(slices):
-            rows = (part.means(part.codebook[:, begin:end]) for part in columns)
-            strips, others = strips_of(rows, sum(counts), end - begin), None
-            if not unit:
-                pairs = zip(columns, norms, strict=True)
-                rows = (part.means(_unit_rows(part.codebook[:, begin:end], norm)) for part, norm in pairs)
-                others = strips_of(rows, sum(counts), end - begin)
-            for chunk in gathering:
-                solve_chunk(each_share, chunk, strips, features[chunk.first : chunk.last, begin:end], squares, others)
-            del strips, others  # before others are made
-            progress("solve", number + 1, len(slices), "slices")
-    agreement = np.sqrt(squares).clip(0.0, 1.0).astype(np.float32)
-    return Solution(features, torch.from_numpy(agreement))
+    shape = W.splats.shape[0], codebook.channels
+    size = shape[0] * shape[1] * dtype.itemsize
+    X = zeros(shape, dtype, name="features", in_file=memory is not None and size > memory)
+    seen = torch.nonzero(W.indptr.diff())[:, 0]
+    squares = solve_rows(X, seen, W, codebook, progress, means=means, threads=threads, device=device)
+    return Solution(X, squares.sqrt().clamp(0.0, 1.0).float())
 
 
-def solve_chunk(
-    each_share: EachShare,
-    chunk: Chunk,
-    strips: np.ndarray,
-    target: Tensor,
-    squares: np.ndarray,
-    units: np.ndarray | None = None,
-) -> None:
-    """X of a chunk over the channels of the strips, and the squared norms of the means of unit vectors.
+def solve_rows(
+    X: Tensor,
+    rows: Tensor,
+    W: RegionWeights,
+    codebook: Codebook,
+    progress: Progress = silent,
+    *,
+    means: Tensor | None = None,
+    threads: int | None = None,
+    device: Device = CPU,
+) -> Tensor:
+    """Solve for some splats alone, by their numbers [n] i64, into their rows of X [P, F].
+
+    Returns:
+        [P] f64, squared lengths of the means of unit vectors; zero for the other splats.
+    """
+    sums = W.row_sums()
+    scale = torch.where(sums > 0, 1.0 / sums, 0.0)
+    squares = torch.zeros(X.shape[0], dtype=torch.float64)
+    if means is not None:
+        rows = rows[torch.argsort(morton_codes(means.cpu()[rows.cpu()])).to(rows.device)]
+    most = (BLOCK_ROWS, BLOCK_ENTRIES) if device.kind == "cpu" else (DEVICE_ROWS, DEVICE_ENTRIES)
+    blocks = row_blocks(W.indptr.diff()[rows].cpu().numpy(), *most)
+    slices = list(codebook.slices())
+    for number, channels in enumerate(slices):
+        tables = [codebook.values(channels, device.place)]
+        if not codebook.unit:
+            tables.append(codebook.unit_values(channels, device.place))
+
+        def solve_block(first: int, last: int, tables: list[Tensor] = tables, channels: slice = channels) -> None:
+            own = rows[first:last]
+            starts, entries = W.take(own)
+            scales = scale[own].repeat_interleave(starts.diff(), output_size=entries.shape[0])
+            shares = (W.weight.index_select(0, entries) * scales).float().to(device.place)
+            region, starts = W.region.index_select(0, entries).to(device.place), starts.to(device.place)
+            del entries, scales
+            own = own.cpu()
+            sums = bag_sums(region, tables[0], starts, shares)
+            X[:, channels].index_copy_(0, own, sums.to(X.dtype).cpu())
+            if len(tables) > 1:
+                sums = bag_sums(region, tables[1], starts, shares)
+            squares[own] += torch.linalg.vector_norm(sums, dim=1).double().square().cpu()
+
+        if device.kind == "cpu":
+            run_each(solve_block, blocks, threads)
+        else:
+            for block in blocks:
+                _halved_to_fit(solve_block, *block)
+        progress("solve", number + 1, len(slices), "slices")
+    return squares
+
+
+def bag_sums(index: Tensor, table: Tensor, starts: Tensor, shares: Tensor | None = None) -> Tensor:
+    """``sum_k shares[k] table[index[k]]`` over bags, k in ``starts[b]..starts[b + 1]``: [B, C] f32.
 
     Args:
-        strips: [S, M, WIDE] f32. target: [n, C] f16 or f32, written. squares: [P] f64, those of the chunk grow.
-        units: the strips of unit vectors, where ``strips`` are none.
+        index: [n] i32 or i64. table: [M, C] f32. starts: [B + 1] i64. shares: [n] f32; None for ones.
     """
-    count = chunk.last - chunk.first
-    sums, own = np.empty((count, WIDE), np.float32), squares[chunk.first : chunk.last]
-    made = torch.from_numpy(sums)
-    for strip in range(strips.shape[0]):
-        part = target[:, strip * WIDE : (strip + 1) * WIDE]
-
-        def add(values: np.ndarray, lengths: np.ndarray) -> None:
-            each_share(partial(sum_rows, *chunk[2:6], values, sums, lengths), 0, count)
-
-        def keep(first: int, last: int, part: Tensor = part) -> None:
-            part[first:last].copy_(made[first:last, : part.shape[1]])
-
-        if units is not None:
-            add(units[strip], own)
-        add(strips[strip], own if units is None else np.zeros(count))
-        each_share(keep, 0, count)
+    lengths = starts.diff()
+    if lengths.numel() == 0 or int(lengths.max()) <= LONG:
+        return _bags(index, table, starts, shares)
+    counts = (lengths + LONG - 1) // LONG  # of parts
+    bags = from_zero(counts)
+    total = int(bags[-1])
+    number = torch.arange(total, device=starts.device)
+    part_starts = torch.repeat_interleave(starts[:-1] - LONG * bags[:-1], counts, output_size=total) + LONG * number
+    parts = _bags(index, table, torch.cat([part_starts, starts[-1:]]), shares)
+    return bag_sums(number, parts, bags)
 
 
-@vectorised
-def sum_rows(order, indptr, rows, shares, strip, sums, squares, begin_row, end_row):
-    """``sums[b] = sum_k shares[k] strip[rows[k]]`` of the rows ``order[begin_row:end_row]``, and their norms.
+def _bags(index: Tensor, table: Tensor, starts: Tensor, shares: Tensor | None) -> Tensor:
+    return embedding_bag(
+        index, table, starts.to(index.dtype), mode="sum", per_sample_weights=shares, include_last_offset=True
+    )
+
+
+def _halved_to_fit(work: Callable[[int, int], None], first: int, last: int) -> None:
+    """Do a block of work, in halves where the device has less room than that.
+
+    Raises:
+        RuntimeError: LEAST_ROWS do not fit either (`device.out_of_memory`).
+    """
+    try:
+        work(first, last)
+    except RuntimeError as error:
+        if not out_of_memory(error) or last - first <= LEAST_ROWS:
+            raise
+    else:
+        return
+    torch.cuda.empty_cache()  # out here the error no longer holds what the block held
+    middle = (first + last) // 2
+    _halved_to_fit(work, first, middle)
+    _halved_to_fit(work, middle, last)
+
+
+def morton_codes(points: Tensor) -> Tensor:
+    """[n] i64: places along a curve that fills space, near to one another on it is near in space (Morton, 1966).
 
     Args:
-        order: [n] i64, row numbers. indptr: [n + 1] i64. rows: [nnz] i32. shares: [nnz] f32.
-        strip: [M, WIDE] f32. sums: [n, WIDE] f32, written. squares: [n] f64.
+        points: [n, 3] f32, finite, any frame and unit; of 2^21 cells an axis between the least and the greatest.
     """
-    part, total = np.empty(WIDE, np.float32), np.empty(WIDE)
-    for place in range(begin_row, end_row):
-        own = order[place]
-        first, last = indptr[own], indptr[own + 1]
-        total[:] = 0
-        for begin in range(first, last, LONG):
-            part[:] = 0
-            for k in range(begin, min(begin + LONG, last)):
-                line, share = strip[rows[k]], shares[k]
-                for c in range(WIDE):
-                    part[c] += share * line[c]
-            for c in range(WIDE):
-                total[c] += part[c]
-        square = 0.0
-        for c in range(WIDE):
-            sums[own, c] = total[c]
-            square += total[c] * total[c]
-        squares[own] += square
-
-
-def row_norms(book: Tensor) -> Tensor:
-    """[M] f64: lengths of a codebook's rows [M, F], f16 or f32.
-
-    Some rows at a time: all in float64 were four times what a codebook of float16 takes.
-    """
-    norms = torch.empty(book.shape[0], dtype=torch.float64)
-    step = max(1, NORM_VALUES // max(book.shape[1], 1))
-    for first in range(0, book.shape[0], step):
-        wide = book[first : first + step].float()  # two quick conversions instead of a slow one
-        torch.linalg.vector_norm(wide, dim=1, dtype=torch.float64, out=norms[first : first + step])
-    return norms
-
-
-def fits_float16(books: Sequence[Tensor], longest: float) -> bool:
-    """Whether float16 holds every value of the codebooks, and the longest of their rows to FLOAT16_ERROR."""
-    if any(max(abs(float(end)) for end in torch.aminmax(book)) > FLOAT16_MAX for book in books):
-        return False
-    return longest == 0 or FLOAT16_STEP * math.sqrt(books[0].shape[1]) <= FLOAT16_ERROR * longest
-
-
-def _unit_rows(part: Tensor, norms: np.ndarray) -> Tensor:
-    """Some channels of a codebook as f32, every row divided by its norm, if it has one."""
-    rows = part.to(torch.float32, copy=True).numpy()
-    return torch.from_numpy(np.divide(rows, norms[:, None], out=rows, where=norms[:, None] > 0, casting="same_kind"))
-
-
-def warm_up_solution() -> None:
-    """Compile the kernels of the solution, or load them from the disk cache."""
-    one = torch.zeros(1, dtype=torch.int32)
-    weights = RegionWeights(one, torch.tensor([0, 1]), one, torch.ones(1), one, torch.ones(1))
-    solve_closed_form([weights], rows_of([torch.ones(1, 1)]), np.ones(1), torch.float16, silent, Host(1))
-    places_along_curve(torch.zeros(1, 3))  # which more channels than one ask for
+    codes = torch.zeros(points.shape[0], dtype=torch.int64)
+    for axis, values in enumerate(points.double().T if codes.numel() else ()):
+        low, high = values.aminmax()
+        cells = ((values - low) * ((2**21 - 1) / (high - low) if high > low else 0.0)).long()
+        for shift, mask in (  # 21 bits in a row to the same with two zeros before each
+            (32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F),
+            (4, 0x10C30C30C30C30C3), (2, 0x1249249249249249),
+        ):  # fmt: skip
+            cells = (cells | cells << shift) & mask
+        codes |= cells << axis
+    return codes

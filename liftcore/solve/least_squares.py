@@ -1,35 +1,323 @@
-"""Damped least squares, from the closed form X0 towards the smallest ``|A X - B|^2``.
+"""Least squares over all rays: steps from the closed form X0 towards the smallest ``|A X - B|^2``, and the optimum.
 
-With a row of A for each row of B, D = A^T 1 and the damping mu, the answer is the smallest of::
+A ray has a row of B for each labelled level (one for a grid), so its row of A counts as often: with N the number of
+rows of each ray, the matrix is ``sum_v A_v^T N_v A_v``. It is never formed: each step of conjugate gradients renders
+and transposes all views, a view and a block of channels at a time.
+
+**Damping.** With a row of A for each row of B, D = A^T 1 and the damping mu, `refine` looks for the smallest of::
 
     |A X - B|^2 + mu |D^(1/2) (X - X0)|^2,   (A^T A + mu D)(X - X0) = A^T (B - A X0)
 
 mu has no unit: where the rows of A sum to one, ``A^T A <= D``, so mu = 1 keeps at least as much of X0 as the data
 can take from it. mu = 0 is plain least squares, a large mu the closed form. Splats that the lift did not see stay
-zero. The matrix is never formed: each step of conjugate gradients renders and transposes all views.
+zero.
+
+**How far the lift is from the optimum** (`reference`): ``L(x') / L(x^)`` over all rays, beside ``1 + beta``.
+
+x^ is found by conjugate gradients in r random projections ``G = E R`` of the channels. Least squares is linear in B,
+so x^ R is the solution for B R; and with R Gaussian / sqrt(r), squared lengths and so L keep their mean (the ratio's
+relative error is about sqrt(2 / r), less where residuals point many ways).
+
+The theorem, and which beta it is about. Where the rows of A sum to one, Jensen gives ``L(x') <= J(x')`` with
+``J(x) = sum_ij A_ij |x_j - B_i|^2``, and x' minimises J, so ``L(x') <= J(x^)``. Now with
+
+    mu_i = | sum_j A_ij (x^_j - B_i) |,  beta_i = sum_j A_ij |x^_j - B_i|^2 / mu_i^2 - 1
+
+mu_i^2 is the row's part of L(x^), hence ``L(x') <= J(x^) = sum_i (1 + beta_i) mu_i^2 <= (1 + max_i beta_i) L(x^)``.
+The paper writes ``mu_i = sum_j A_ij |x^_j - B_i|``, lengths before the sum; that mu_i^2 is at least the row's part of
+L, not at most, its last step does not follow, and two rays suffice for a counterexample (tests/unit/solve). So the
+bound is built from the first reading, and the second is given beside it as ``beta_of_lengths``. The whole chain holds
+for any x in the place of x^, converged or not, and in the projected channels as in any.
 """
 
-from __future__ import annotations
-
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+import torch
+from torch import Tensor
 
-from liftcore.solve.channels import Channels, blocks, codebook_axes
-from liftcore.solve.conjugate_gradients import CgOutcome, Stopping, Watch, column_dots, conjugate_gradients
+from liftcore.features.views import NO_LABEL, Regions, ViewFeatures
+from liftcore.jit import kernel
+from liftcore.one_thread import one_thread
+from liftcore.progress import Progress, silent
+from liftcore.raster.base import CompositingParams, Raster, Weighting
+from liftcore.scene.cameras import Camera
+from liftcore.settings import LiftSettings
+from liftcore.solve.diagnostics import ViewMeasures, measure_samples, quantiles
+from liftcore.solve.geometry import Readout, SampledRays, read_pixels
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from torch import Tensor
-
-    from liftcore.progress import Progress
-    from liftcore.settings import LiftSettings
-    from liftcore.solve.all_rays import AllRays
-
+BLOCK = 32  # channels solved at a time: what a raster does in one pass, and memory for a few [P, 32] f32
+ROWS = 1 << 14  # rows widened at a time
+EXTRA_AXES = 8  # directions that the iteration carries beyond those asked for
+ROUNDS = 12  # of the subspace iteration
+FLOAT16_MAX = 65_504.0
 TOLERANCE = 1e-4  # of the gradient, relative to the closed form's; float32 products give little more
-_FAINTEST = 1e-30  # a diagonal entry below this says nothing of its splat, and its inverse would overflow
+FAINTEST = 1e-30  # a diagonal entry below this says nothing of its splat, and its inverse would overflow
+STEPS = 100  # of conjugate gradients towards the optimum, unless the gradient has vanished before
+
+Product = Callable[[np.ndarray], np.ndarray]  # [P, C] f32 -> [P, C] f32
+Watch = Callable[[int, np.ndarray, np.ndarray], None]  # step, solution, rest: after every step
+
+
+@dataclass(frozen=True)
+class Channels:
+    """A block of channels: ``rows [n, F] -> rows axes [n, C]``, with axes orthonormal or a slice of the identity."""
+
+    begin: int  # of the slice, or of the columns of axes
+    end: int
+    axes: Tensor | None  # [F, K] f32; None takes the channels as they are
+
+    def project(self, rows: Tensor) -> np.ndarray:
+        """[n, F] f16 or f32 -> [n, C] f32."""
+        result = torch.empty(rows.shape[0], self.end - self.begin)
+        axes = None if self.axes is None else self.axes[:, self.begin : self.end].contiguous()
+        with one_thread():
+            for first in range(0, rows.shape[0], ROWS):
+                part = rows[first : first + ROWS]
+                block = part[:, self.begin : self.end].float() if axes is None else part.float() @ axes
+                result[first : first + ROWS] = block
+        return result.numpy()
+
+    def add(self, features: Tensor, step: np.ndarray) -> Tensor:
+        """Add ``step`` [P, C] f32, put back into all channels, to the features [P, F]; gives them.
+
+        They are changed in place, unless float16 cannot hold the result: then a float32 copy is.
+        """
+        if features.dtype == torch.float16 and float(np.abs(step).max(initial=0)) > FLOAT16_MAX / 4:
+            features = features.float()
+        axes = None if self.axes is None else self.axes[:, self.begin : self.end].T.contiguous()
+        with one_thread():
+            for first in range(0, features.shape[0], ROWS):
+                part = torch.from_numpy(step[first : first + ROWS])
+                target = features[first : first + ROWS]
+                if axes is None:
+                    target = target[:, self.begin : self.end]
+                target += (part if axes is None else part @ axes).to(features.dtype)
+        return features
+
+
+def blocks(channels: int, axes: Tensor | None = None) -> list[Channels]:
+    """All channels, or all columns of ``axes`` [F, K], in blocks of one pass of the raster."""
+    total = channels if axes is None else axes.shape[1]
+    return [Channels(begin, min(begin + BLOCK, total), axes) for begin in range(0, total, BLOCK)]
+
+
+def codebook_axes(codebooks: Sequence[Tensor], count: int) -> Tensor:
+    """The ``count`` directions [F, count] f32 that hold most of the squares of all codebook rows.
+
+    A block power iteration from a fixed start. The rows are not centred, so their mean is held too; every solution
+    is a combination of them, and with ``count`` at their rank nothing is left out.
+    """
+    channels = codebooks[0].shape[1]
+    generator = torch.Generator().manual_seed(0)
+    width = min(channels, count + EXTRA_AXES)
+    axes = torch.randn(channels, width, generator=generator, dtype=torch.float64)
+    longest = max(max((float(book.abs().max()) for book in codebooks if book.numel()), default=0.0), 1e-300)
+    with one_thread():
+        for _ in range(ROUNDS):
+            axes = torch.linalg.qr(_gram_times(codebooks, axes, longest)).Q
+        image = _gram_times(codebooks, axes, longest)
+        values, vectors = torch.linalg.eigh(axes.T @ image)
+        order = torch.argsort(values, descending=True, stable=True)[:count]
+        return (axes @ vectors[:, order]).float()
+
+
+def random_axes(channels: int, count: int, seed: int) -> Tensor:
+    """Gaussian projections [F, count] f32 that keep squared lengths in the mean (Johnson-Lindenstrauss)."""
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randn(channels, count, generator=generator) / count**0.5
+
+
+def _gram_times(codebooks: Sequence[Tensor], axes: Tensor, scale: float) -> Tensor:
+    """``sum_v E_v^T E_v axes / scale^2``."""
+    total = torch.zeros_like(axes)
+    for book in codebooks:
+        for first in range(0, book.shape[0], ROWS):
+            rows = book[first : first + ROWS].double() / scale
+            total += rows.T @ (rows @ axes)
+    return total
+
+
+class AllRays:
+    """The operator. Weights are plain (power 1), whatever power the closed form takes: the aim is ``|A X - B|^2``.
+
+    Args:
+        raster: A of a view. count: P.
+        views: the cameras, in the order of the sums.
+        observed: view number -> what it observes, as the lift read it.
+        params: of the lift; every ray counts, whatever its stride.
+    """
+
+    def __init__(
+        self,
+        raster: Raster,
+        count: int,
+        views: Sequence[Camera],
+        observed: Callable[[int], ViewFeatures],
+        params: CompositingParams,
+        progress: Progress = silent,
+    ) -> None:
+        self.count = count
+        self.views = views
+        self._raster, self._observed = raster, observed
+        self._params = replace(params, stride=1, offset=(0, 0))
+        self._counts: list[np.ndarray] = []  # [H, W] of every view: rows of B of each ray
+        self.row_sums = np.zeros(count)  # D = sum_v A_v^T N_v 1, [P] f64
+        self.diagonal = np.zeros(count)  # of sum_v A_v^T N_v A_v, [P] f64
+        self.rows = 0  # of B
+        for number, camera in enumerate(views):
+            self._count_rows(number, camera)
+            progress("rays", number + 1, len(views), "views")
+
+    def _count_rows(self, number: int, camera: Camera) -> None:
+        """Count the rows of a view, and add up what they say of each splat."""
+        observation = self._observed(number)
+        rays = _readout(observation, camera).rays
+        counts = np.bincount(rays, minlength=camera.width * camera.height).reshape(camera.height, camera.width)
+        self._counts.append(counts.astype(np.uint8 if counts.max(initial=0) <= 255 else np.int32))
+        self.rows += rays.size
+        labelled = _labelled(observation)
+        for power, sums in ((1, self.row_sums), (2, self.diagonal)):
+            weights = self._raster.region_weights(camera, labelled, self._params, Weighting(power))
+            sums[weights.splats.numpy()] += weights.weight.numpy()
+
+    def normal(self, X: np.ndarray) -> np.ndarray:
+        """``sum_v A_v^T N_v A_v X``: [P, C] f32 -> [P, C] f32."""
+        total = np.zeros_like(X)
+        values = torch.from_numpy(X)
+        for camera, counts in zip(self.views, self._counts, strict=True):
+            image = self._raster.render(camera, values, self._params).numpy()
+            image *= counts[:, :, None]
+            total += self._raster.adjoint(camera, torch.from_numpy(image), self._params).numpy()
+        return total
+
+    def gradient(self, X: np.ndarray, project: Callable[[Tensor], np.ndarray]) -> tuple[np.ndarray, float]:
+        """``A^T (B - A X)`` [P, C] f32 over all rows, and ``|A X - B|^2``.
+
+        Args:
+            X: [P, C] f32. project: rows of a codebook [M, F] -> [M, C] f32, the channels that X has.
+        """
+        total, squares = np.zeros_like(X), 0.0
+        for number, camera in enumerate(self.views):
+            observation = self._observed(number)
+            readout = _readout(observation, camera)
+            rendered = self._raster.render(camera, torch.from_numpy(X), self._params).numpy()
+            rest = np.zeros_like(rendered)
+            squares += subtract_rows(
+                readout.rays,
+                readout.columns,
+                readout.shares,
+                project(observation.codebook),
+                rendered.reshape(-1, X.shape[1]),
+                rest.reshape(-1, X.shape[1]),
+            )
+            total += self._raster.adjoint(camera, torch.from_numpy(rest), self._params).numpy()
+        return total, squares
+
+
+@kernel
+def subtract_rows(rays, columns, shares, codebook, rendered, rest):
+    """Add ``B_i - (A X)_i`` of every row i to its ray in ``rest`` [rays, C] f32; gives the sum of their squares.
+
+    Args:
+        rays: [rows] i64. columns: [rows, taps] i64. shares: [rows, taps] f64. codebook: [M, C] f32.
+        rendered: [rays, C] f32.
+    """
+    squares = 0.0
+    for row in range(rays.shape[0]):
+        ray = rays[row]
+        for channel in range(codebook.shape[1]):
+            value = 0.0
+            for tap in range(columns.shape[1]):
+                value += shares[row, tap] * codebook[columns[row, tap], channel]
+            value -= rendered[ray, channel]
+            rest[ray, channel] += value
+            squares += value * value
+    return squares
+
+
+def _readout(observation: ViewFeatures, camera: Camera) -> Readout:
+    """S of all pixels of a view."""
+    y, x = np.mgrid[: camera.height, : camera.width].astype(np.int32)
+    return read_pixels(observation, camera, torch.from_numpy(np.stack([x.ravel(), y.ravel()], axis=1)))
+
+
+def _labelled(observation: ViewFeatures) -> Regions:
+    """The observation with one region for all that is labelled: its region weights are sums over the rows of B."""
+    if isinstance(observation, Regions):
+        return Regions(observation.labels.clamp(NO_LABEL, 0), torch.ones(1, 1))
+    return Regions(torch.zeros(1, 1, 1, dtype=torch.int32), torch.ones(1, 1))
+
+
+@dataclass(frozen=True)
+class Stopping:
+    """When to stop."""
+
+    steps: int
+    tolerance: float = 0.0  # of the gradient's preconditioned length, relative to the first
+
+
+@dataclass(frozen=True)
+class CgOutcome:
+    """Where it ended, and why."""
+
+    solution: np.ndarray  # [P, C] f32
+    rest: np.ndarray  # [P, C] f32, R - K X as the recurrence has it
+    steps: int
+    gradients: np.ndarray  # [steps + 1] f64: sqrt(sum_c r^T M^-1 r), relative to the first
+    converged: np.ndarray  # [C] bool: the tolerance was reached
+    broken: np.ndarray  # [C] bool: no curvature was left before that
+
+
+def conjugate_gradients(
+    product: Product, right: np.ndarray, inverse: np.ndarray, stopping: Stopping, watch: Watch | None = None
+) -> CgOutcome:
+    """Solve from zero.
+
+    Args:
+        product: K.
+        right: [P, C] f32. inverse: [P] f32, the preconditioner ``M^-1``; rows where it is zero stay zero.
+        watch: called after every step; an exception from it stops the work.
+    """
+    solution, rest = np.zeros_like(right), right.copy()
+    slope = column_dots(rest, rest * inverse[:, None])  # r^T M^-1 r
+    first = slope.copy()
+    direction = rest * inverse[:, None]
+    converged, broken = slope <= 0, ~np.isfinite(slope)
+    gradients = [1.0]
+    step = 0
+    while step < stopping.steps and not (converged | broken).all():
+        active = np.flatnonzero(~(converged | broken))
+        part = np.ascontiguousarray(direction[:, active])
+        image = product(part)
+        curvature = column_dots(part, image)
+        sound = np.isfinite(curvature) & (curvature > 0)
+        broken[active[~sound]] = True
+        length = np.divide(slope[active], curvature, out=np.zeros(active.size), where=sound)
+        solution[:, active] += part * length.astype(np.float32)
+        rest[:, active] -= image * length.astype(np.float32)
+        scaled = rest[:, active] * inverse[:, None]
+        old, slope[active] = slope[active], column_dots(rest[:, active], scaled)
+        turn = np.divide(slope[active], old, out=np.zeros(active.size), where=old > 0)
+        direction[:, active] = part * turn.astype(np.float32) + scaled
+        step += 1
+        broken |= ~np.isfinite(slope)
+        converged |= slope <= stopping.tolerance**2 * first
+        gradients.append(float(np.sqrt(slope.sum() / first.sum())))
+        if watch is not None:
+            watch(step, solution, rest)
+    return CgOutcome(solution, rest, step, np.array(gradients), converged & ~broken, broken)
+
+
+def column_dots(left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """[C] f64: the inner products of the columns of two [P, C] f32, in a fixed order."""
+    total = np.zeros(left.shape[1])
+    for begin in range(0, left.shape[0], ROWS):
+        block = slice(begin, begin + ROWS)
+        total += np.multiply(left[block], right[block], dtype=np.float64).sum(axis=0)
+    return total
 
 
 @dataclass(frozen=True)
@@ -46,26 +334,10 @@ class BlockOutcome:
 
     step: np.ndarray  # [P, C] f32, X - X0
     losses: list[float]  # |A X - B|^2 in these channels: of X0 and after every step
-    cg: CgOutcome
-
-
-@dataclass(frozen=True)
-class BlockFacts:
-    """What is kept of a solved block, whose vectors are as large as its part of X."""
-
-    channels: int
-    losses: list[float]
     steps: int
     gradient: float  # after the last step, relative to the first
     converged: bool  # in all channels
     broken: bool  # in any
-
-    @classmethod
-    def of(cls, block: BlockOutcome) -> BlockFacts:
-        """The facts of a block."""
-        cg, channels = block.cg, block.step.shape[1]
-        last = float(cg.gradients[-1])
-        return cls(channels, block.losses, cg.steps, last, bool(cg.converged.all()), bool(cg.broken.any()))
 
 
 def refine(
@@ -93,12 +365,12 @@ def refine(
         def watch(step: int, *_: object, done: int = done) -> None:
             progress("refine", done + step, total, "steps")
 
-        block = solve_block(rays, part, features, seen, (settings.damping, settings.cg_steps), watch)
+        block = solve_block(rays, part, features, seen, settings.damping, settings.cg_steps, watch)
         features = part.add(features, block.step)
-        solved.append(BlockFacts.of(block))
+        solved.append(replace(block, step=np.empty(0)))  # which is as large as its part of X
         del block  # before the next one is solved beside it
         progress("refine", done + settings.cg_steps, total, "steps")
-    return _summary(features, solved, settings, rays.rows)
+    return _summary(features, solved, parts[-1].end, settings, rays.rows)
 
 
 def solve_block(
@@ -106,14 +378,14 @@ def solve_block(
     part: Channels,
     features: Tensor,
     seen: np.ndarray,
-    effort: tuple[float, int],
+    damping: float,
+    steps: int,
     watch: Watch | None = None,
 ) -> BlockOutcome:
-    """``X - X0`` in one block of channels, with ``effort = (damping, steps)``."""
-    damping, steps = effort
+    """``X - X0`` in one block of channels."""
     weight = np.where(seen, damping * rays.row_sums, 0.0)
     diagonal = np.where(seen, rays.diagonal, 0.0) + weight
-    inverse = np.divide(1.0, diagonal, out=np.zeros_like(diagonal), where=diagonal > _FAINTEST).astype(np.float32)
+    inverse = np.divide(1.0, diagonal, out=np.zeros_like(diagonal), where=diagonal > FAINTEST).astype(np.float32)
     weight = weight.astype(np.float32)[:, None]
     gradient, loss = rays.gradient(part.project(features), part.project)
     losses = [loss]
@@ -128,10 +400,19 @@ def solve_block(
     outcome = conjugate_gradients(
         lambda X: rays.normal(X) + weight * X, gradient, inverse, Stopping(steps, TOLERANCE), note
     )
-    return BlockOutcome(outcome.solution, losses, outcome)
+    return BlockOutcome(
+        outcome.solution,
+        losses,
+        outcome.steps,
+        float(outcome.gradients[-1]),
+        bool(outcome.converged.all()),
+        bool(outcome.broken.any()),
+    )
 
 
-def _summary(features: Tensor, solved: Sequence[BlockFacts], settings: LiftSettings, rows: int) -> Refinement:
+def _summary(
+    features: Tensor, solved: Sequence[BlockOutcome], channels: int, settings: LiftSettings, rows: int
+) -> Refinement:
     longest = max(len(block.losses) for block in solved)
     losses = [
         sum(block.losses[min(step, len(block.losses) - 1)] for block in solved) / max(rows, 1)
@@ -149,7 +430,7 @@ def _summary(features: Tensor, solved: Sequence[BlockFacts], settings: LiftSetti
         "result": result,
         "steps": max(block.steps for block in solved),
         "damping": settings.damping,
-        "channels": sum(block.channels for block in solved),
+        "channels": channels,
         "gradient": gradient,
         "residuals": losses,
     }
@@ -158,3 +439,91 @@ def _summary(features: Tensor, solved: Sequence[BlockFacts], settings: LiftSetti
         f"residual in {stats['channels']} channels: {why}."
     )
     return Refinement(features, stats)
+
+
+def reference(
+    rays: AllRays,
+    features: Tensor,
+    seen: np.ndarray,
+    samples: Sequence[SampledRays],
+    codebooks: Sequence[Tensor],
+    settings: LiftSettings,
+    progress: Progress,
+) -> dict[str, Any]:
+    """``L(x')``, ``L(x^)`` and their ratio over all rays; beta and the bounds at x^ on the sampled rays.
+
+    Args:
+        features: [P, F], x'. seen: [P] bool. samples, codebooks: of every view.
+
+    Returns:
+        Plain numbers, ready for JSON; None where nothing was sampled or a row is met exactly.
+    """
+    axes = random_axes(features.shape[1], settings.reference_channels, settings.seed)
+    parts = blocks(features.shape[1], axes)
+    optimum = np.empty((features.shape[0], axes.shape[1]), np.float32)
+    lifted = best = gradient = 0.0
+    steps, converged = 0, True
+    for number, part in enumerate(parts):
+        block = solve_block(rays, part, features, seen, 0.0, STEPS, _teller(progress, number, len(parts)))
+        solution = part.project(features) + block.step
+        optimum[:, part.begin : part.end] = solution
+        lifted += block.losses[0]
+        best += rays.gradient(solution, part.project)[1]  # measured, not by recurrence
+        gradient = max(gradient, block.gradient)
+        steps, converged = max(steps, block.steps), converged and block.converged
+        progress("reference", (number + 1) * STEPS, len(parts) * STEPS, "steps")
+    whole = Channels(0, axes.shape[1], axes)
+    books = [torch.from_numpy(whole.project(book)) for book in codebooks]
+    measured = _measured(measure_samples(samples, torch.from_numpy(optimum), books))
+    found = {
+        "channels": axes.shape[1],
+        "steps": steps,
+        "converged": converged,
+        "gradient": gradient,
+        "residual": lifted / max(rays.rows, 1),
+        "optimum": best / max(rays.rows, 1),
+        "ratio": lifted / best if best > 0 else None,
+        **measured,
+    }
+    return found | {"message": _message(found)}
+
+
+def row_betas(measures: ViewMeasures) -> np.ndarray:
+    """beta_i [rows] f64 of the theorem: ``sum_j A_ij |x_j - B_i|^2 / mu_i^2 - 1``; infinite where only mu is zero."""
+    ratio = np.ones_like(measures.surrogates)
+    np.divide(measures.surrogates, measures.residuals, out=ratio, where=measures.residuals > 0)
+    ratio[(measures.residuals == 0) & (measures.surrogates > 0)] = np.inf
+    return np.maximum(ratio - 1.0, 0.0)
+
+
+def _measured(measures: ViewMeasures) -> dict[str, Any]:
+    beta = quantiles(row_betas(measures))
+    residual = measures.residuals.sum()
+    return {
+        "beta": beta,
+        "bound": None if beta["max"] is None else 1.0 + beta["max"],
+        "surrogate_bound": float(measures.surrogates.sum() / residual) if residual > 0 else None,
+        "beta_of_lengths": quantiles(measures.betas),
+    }
+
+
+def _message(found: dict[str, Any]) -> str:
+    """What was found, in a sentence for the user."""
+    if found["ratio"] is None:
+        return "The optimum meets every row exactly: there is no ratio to speak of."
+    end = (
+        "converged"
+        if found["converged"]
+        else f"not converged, so it is at least that; gradient {found['gradient']:.2g}"
+    )
+    said = f"L(x') is {found['ratio']:.3f} times L(x^) after {found['steps']} steps ({end})"
+    if found["bound"] is None:
+        return f"{said}; no bound, for no row was sampled or one is met exactly."
+    return (
+        f"{said}; on the sampled rays J(x^) / L(x^) is {found['surrogate_bound']:.3f} and 1 + beta is "
+        f"{found['bound']:.3g}. Both bound the ratio for plain weights (power 1) over all rays."
+    )
+
+
+def _teller(progress: Progress, number: int, parts: int) -> Watch:
+    return lambda step, *_: progress("reference", number * STEPS + step, parts * STEPS, "steps")

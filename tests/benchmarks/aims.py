@@ -9,7 +9,7 @@ import os
 import statistics
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,16 +19,13 @@ import torch
 from torch.nn.functional import normalize
 
 from liftcore.device import Device, choose_device
-from liftcore.evaluate.bench import PASSES, Workload, walk_regions, workload
+from liftcore.evaluate.bench import PASSES, Workload, weigh_regions, workload
 from liftcore.evaluate.hardware import peak_memory
 from liftcore.features.views import Regions
-from liftcore.progress import silent
 from liftcore.raster import open_raster
 from liftcore.settings import LiftSettings, Preset
-from liftcore.solve.columns import Columns
-from liftcore.solve.host import Host
-from liftcore.solve.solver import closed_form
-from liftcore.solve.view_weights import WeightStore
+from liftcore.solve.closed_form import solve
+from liftcore.solve.codebook import Codebook
 from liftcore.warm_up import warm_up_lift
 from tests.benchmarks.base import command_line, tell
 
@@ -100,21 +97,19 @@ def measure_aims(work: Workload, preset: Preset, device: Device, threads: int | 
     looking, raster = (settings.lift_params, settings.weighting), open_raster(work.splats, device, threads)
     geometry, solution = [], {channels: [] for channels in CHANNELS}
     peaks: dict[int, int] = {}
-    host = Host(threads, means=work.splats.means)
     for _ in range(PASSES):
-        with WeightStore() as store:
+        start = time.perf_counter()
+        with watched() as walking:
+            W, codebook = weigh_regions(raster, work.views, looking, count, threads)
+        geometry.append((time.perf_counter() - start) / len(work.views))
+        for channels, seconds in solution.items():
+            books = _with_channels(codebook, channels)
             start = time.perf_counter()
-            with watched() as walking:
-                denominators, columns = walk_regions(raster, work.views, looking, count, store)
-            geometry.append((time.perf_counter() - start) / len(work.views))
-            for channels, seconds in solution.items():
-                books = _with_channels(columns, channels)
-                start = time.perf_counter()
-                with watched() as solving:
-                    closed_form(store, books, denominators, torch.float16, silent, device, host)
-                seconds.append((time.perf_counter() - start) / len(work.views))
-                if channels not in peaks:  # a process that has solved for more keeps some of what that took
-                    peaks[channels] = max(walking.bytes or peak_memory(), solving.bytes or peak_memory())
+            with watched() as solving:
+                solve(W, books, torch.float16, means=work.splats.means, threads=threads, device=device)
+            seconds.append((time.perf_counter() - start) / len(work.views))
+            if channels not in peaks:  # a process that has solved for more keeps some of what that took
+                peaks[channels] = max(walking.bytes or peak_memory(), solving.bytes or peak_memory())
     walked = statistics.median(geometry)
     view = {channels: walked + statistics.median(seconds) for channels, seconds in solution.items()}
     held = {
@@ -154,13 +149,13 @@ def inputs_bytes(work: Workload, channels: int) -> int:
     return sum(part.nbytes for part in geometry) + labels
 
 
-def _with_channels(columns: Sequence[Columns], channels: int) -> list[Columns]:
-    """The same columns over unit codebooks of so many channels: what they say is of no account here."""
+def _with_channels(codebook: Codebook, channels: int) -> Codebook:
+    """The same regions over unit codebooks of so many channels: what they say is of no account here."""
     books = []
-    for number, part in enumerate(columns):
-        drawn = torch.randn(part.codebook.shape[0], channels, generator=torch.Generator().manual_seed(number))
-        books.append(replace(part, codebook=normalize(drawn, dim=1).half()))
-    return books
+    for number, part in enumerate(codebook.views):
+        drawn = torch.randn(part.rows.shape[0], channels, generator=torch.Generator().manual_seed(number))
+        books.append(replace(part, rows=normalize(drawn, dim=1).half()))
+    return Codebook(tuple(books))
 
 
 def main() -> None:

@@ -35,10 +35,8 @@ from liftcore.result import LiftResult
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.splats import Kernel, Splats
 from liftcore.settings import TIKHONOV_GAIN
-from liftcore.solve.all_rays import AllRays
-from liftcore.solve.channels import Channels
-from liftcore.solve.least_squares import solve_block
-from liftcore.solve.readout import sample_pixels
+from liftcore.solve.geometry import sample_pixels
+from liftcore.solve.least_squares import AllRays, Channels, solve_block
 from tests.benchmarks.base import PRESETS, command_line, lift_files, mask_iou, scene_files, splat_accuracy, tell
 from tests.benchmarks.tabletop import Tabletop
 
@@ -316,7 +314,7 @@ def follow(rays: AllRays, first: Tensor, truth: Truth, damping: float, steps: in
         found.append(truth.judge(first + torch.from_numpy(solution)))
 
     part = Channels(0, first.shape[1], None)
-    block = solve_block(rays, part, first, rays.row_sums > 0, (damping, steps), watch)
+    block = solve_block(rays, part, first, rays.row_sums > 0, damping, steps, watch)
     path: dict[str, Any] = {"residual": [loss / max(rays.rows, 1) for loss in block.losses]}
     path |= {key: [point[key] for point in found] for key in ("accuracy", "cosine")}
     return path, first + torch.from_numpy(block.step)

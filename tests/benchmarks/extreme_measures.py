@@ -28,7 +28,7 @@ from liftcore.result import LiftResult
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.splats import Kernel, Splats
 from liftcore.settings import LiftSettings
-from liftcore.solve.lift_warnings import FAINT, order_warnings
+from liftcore.solve.diagnostics import FAINT, order_warnings
 from tests.scenes import IDENTITY, of_kernel, splats_at
 
 KERNELS = (Kernel.GAUSSIAN_3D, Kernel.GAUSSIAN_2D, Kernel.BETA)
@@ -97,7 +97,7 @@ def weights_of(
     got = CpuRaster(splats, threads=2).region_weights(camera, every_ray, walk, Weighting(power))
     A = np.zeros((rays, splats.count))
     rows = np.repeat(got.splats.numpy(), np.diff(got.indptr.numpy()))
-    A[got.columns.numpy(), rows] = got.weights.numpy()
+    A[got.region.numpy(), rows] = got.weight.numpy()
     evidence = np.zeros(splats.count)
     evidence[got.evidence_splats.numpy()] = got.evidence.numpy()
     return A, evidence

@@ -25,22 +25,19 @@ from torch.nn.functional import cosine_similarity
 
 from liftcore.device import Device, choose_device
 from liftcore.errors import SplatliftError
-from liftcore.evaluate.bench import run_bench, walk_regions
+from liftcore.evaluate.bench import run_bench, weigh_regions
 from liftcore.evaluate.hardware import hardware, machine_line
 from liftcore.evaluate.synthetic import room_cameras, room_regions, room_splats
 from liftcore.features.views import Regions
 from liftcore.io.lift_file import TENSORS, save_lift
 from liftcore.io.scene_files import lift_files as lift_paths
-from liftcore.progress import silent
 from liftcore.raster import open_raster
 from liftcore.raster.base import CompositingParams, Weighting
 from liftcore.result import LiftResult
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Splats
 from liftcore.settings import LiftSettings
-from liftcore.solve.host import Host
-from liftcore.solve.solver import closed_form
-from liftcore.solve.view_weights import WeightStore
+from liftcore.solve.closed_form import solve
 from tests.benchmarks.base import lift_files, scene_files, table_of
 from tests.benchmarks.scenes import Room, write_bench_room
 from tests.benchmarks.tabletop import CASES, Tabletop
@@ -141,12 +138,10 @@ def beside_gsplat(size: Room, device: Device) -> dict[str, Any]:
 
 def lift_ours(splats: Splats, views: Views, device: Device) -> tuple[Tensor, Tensor]:
     """X [P, F] f32 and the totals [P] f64 of plain weights, by region weights and the closed form."""
-    with WeightStore() as store:
-        looking = CompositingParams(), Weighting()
-        totals, columns = walk_regions(open_raster(splats, device), views, looking, splats.count, store)
-        host = Host(means=splats.means)
-        X = closed_form(store, columns, totals, torch.float32, silent, device, host).features
-    return X.cpu(), torch.from_numpy(totals)
+    looking = CompositingParams(), Weighting()
+    W, codebook = weigh_regions(open_raster(splats, device), views, looking, splats.count)
+    X = solve(W, codebook, torch.float32, means=splats.means, device=device).features
+    return X, W.row_sums().cpu()
 
 
 def lift_theirs(rasterization: Any, splats: Splats, views: Views, place: torch.device) -> tuple[Tensor, Tensor]:

@@ -29,19 +29,16 @@ from numba import njit
 from torch import Tensor
 from torch.nn.functional import cosine_similarity, embedding, embedding_bag, pad, threshold
 
-from liftcore.evaluate.bench import walk_regions
+from liftcore.evaluate.bench import weigh_regions
 from liftcore.evaluate.synthetic import room_cameras, room_regions, room_splats
 from liftcore.features.views import Regions
-from liftcore.progress import silent
 from liftcore.raster.base import ALPHA_FLOOR, TILE, CompositingParams, Weighting
 from liftcore.raster.cpu.composite import Frame
 from liftcore.raster.cpu.project import CUTOFF, KY, MX, MY, OPACITY, ROOT_X, SLOPE
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Splats
-from liftcore.solve.closed_form import solve_closed_form
-from liftcore.solve.host import Host
-from liftcore.solve.view_weights import WeightStore
+from liftcore.solve.closed_form import solve
 from tests.benchmarks.base import command_line, tell
 
 LONG = 60.0  # seconds
@@ -113,11 +110,9 @@ def answer_of(sums: Tensor) -> Answer:
 def ours(work: Work) -> Answer:
     """As ``splatlift lift --preset row-sum --set dtype=float32`` has it."""
     raster, looking = CpuRaster(work.splats, THREADS), (work.walk, Weighting())
-    with WeightStore() as store:
-        totals, columns = walk_regions(raster, work.views, looking, work.splats.count, store)
-        host = Host(THREADS, means=work.splats.means)
-        solution = solve_closed_form(store, columns, totals, torch.float32, silent, host)
-    return solution.features, torch.from_numpy(totals)
+    W, codebook = weigh_regions(raster, work.views, looking, work.splats.count, THREADS)
+    solution = solve(W, codebook, torch.float32, means=work.splats.means, threads=THREADS)
+    return solution.features, W.row_sums()
 
 
 # --- dense numba ---

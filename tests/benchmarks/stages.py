@@ -20,19 +20,16 @@ import torch
 
 from liftcore.device import choose_device
 from liftcore.evaluate.bench import Workload, workload
-from liftcore.progress import silent
-from liftcore.raster.base import CompositingParams, RegionWeights
+from liftcore.raster.base import CompositingParams
 from liftcore.raster.cpu.composite import Frame
 from liftcore.raster.cpu.project import View
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.raster.cpu.tiles import Bands
 from liftcore.scene.splats import Splats
 from liftcore.settings import LiftSettings, Preset
-from liftcore.solve.closed_form import solve_closed_form
-from liftcore.solve.columns import by_tuples
-from liftcore.solve.host import Host
-from liftcore.solve.totals import row_totals
-from liftcore.solve.view_weights import WeightStore
+from liftcore.solve.closed_form import solve
+from liftcore.solve.codebook import Codebook, as_regions
+from liftcore.solve.weights import RegionWeights, stacked
 from liftcore.warm_up import warm_up_lift
 from tests.benchmarks.base import command_line, tell
 
@@ -97,27 +94,24 @@ class TimedRaster(CpuRaster):
 def time_stages(work: Workload, preset: Preset) -> dict[str, Any]:
     """Seconds a view of each of STAGES on one thread: medians and minima over the views; the solution once for all.
 
-    ``rest`` is what a view takes beside the named steps: its tuples of labels, its reading, row totals, keeping W.
+    ``rest`` is what a view takes beside the named steps: its tuples of labels and its reading.
     """
     settings = LiftSettings.of(preset=preset)
     raster, walk, weighting = TimedRaster(work.splats), settings.lift_params, settings.weighting
-    denominators, views, columns = np.zeros(work.splats.count), [], []
-    with WeightStore() as store:
-        raster.region_weights(*work.views[0], walk, weighting)  # warm caches, not counted
-        for camera, observation in work.views:
-            raster.forget()
-            raster.clock = Clock()
-            with raster.clock.stage("rest"):
-                tuples, own = by_tuples(observation)
-                weights = own.weighted(raster.region_weights(camera, tuples, walk, weighting))
-                denominators[weights.splats.numpy()] += row_totals(weights)
-                store.append(weights)
-            columns.append(own)
-            views.append(raster.clock)
-        clock = Clock()
-        with clock.stage("solution"):
-            host = Host(1, means=work.splats.means)
-            solve_closed_form(store, columns, denominators, torch.float16, silent, host)
+    parts, views, codebooks = [], [], []
+    raster.region_weights(*work.views[0], walk, weighting)  # warm caches, not counted
+    for camera, observation in work.views:
+        raster.forget()
+        raster.clock = Clock()
+        with raster.clock.stage("rest"):
+            regions, own = as_regions(observation, by_rows=False)
+            parts.append(own.counted(raster.region_weights(camera, regions, walk, weighting)))
+        codebooks.append(own)
+        views.append(raster.clock)
+    clock = Clock()
+    with clock.stage("solution"):
+        W = stacked(parts, work.splats.count, threads=1)
+        solve(W, Codebook(tuple(codebooks)), torch.float16, means=work.splats.means, threads=1)
     share = 1 / len(views)
     solution = Clock({"solution": clock.wall["solution"] * share}, {"solution": clock.cpu["solution"] * share})
     return {

@@ -14,12 +14,13 @@ import torch
 
 from liftcore.errors import InvalidInput, InvalidSettings, Unavailable
 from liftcore.features.views import Regions
-from liftcore.raster.base import CompositingParams, RegionWeights, Selection, Weighting
+from liftcore.raster.base import CompositingParams, Selection, Weighting
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.raster.gpu.tiles import Frame
 from liftcore.raster.gpu.weights import sums_by_unit, sums_over_units
 from liftcore.raster.reference import ReferenceRaster
 from liftcore.scene.splats import Kernel
+from liftcore.solve.weights import RegionWeights
 from tests.backends import gpu_raster, needs_triton
 from tests.properties.test_raster_conformance import INSIDE, dense
 from tests.scenes import random_camera, random_grid, random_regions, random_splats
@@ -43,7 +44,7 @@ FULL = RuntimeError("Triton Error [CUDA]: out of memory")  # the driver's word f
 
 
 def as_parts(weights: RegionWeights) -> list[torch.Tensor]:
-    return [getattr(weights, name) for name in RegionWeights.__dataclass_fields__]
+    return list(weights.tensors().values())
 
 
 @pytest.mark.parametrize("kernel", Kernel)
@@ -192,7 +193,7 @@ def test_an_image_of_one_pixel_and_labels_of_none():
     )
     nothing = Regions(torch.full((2, 1, 1), -1, dtype=torch.int32), torch.ones(3, 1))
     weights = raster.region_weights(camera, nothing, CompositingParams(), Weighting())
-    assert weights.weights.numel() == 0
+    assert weights.weight.numel() == 0
     assert weights.evidence.numel() > 0
 
 
@@ -204,8 +205,8 @@ def test_more_levels_than_one_key_holds_are_told_apart():
         raster.region_weights(camera, regions, CompositingParams(), Weighting())
         for raster in (gpu_raster(splats), CpuRaster(splats, threads=1))
     )
-    assert torch.equal(ours.columns, theirs.columns)
-    assert torch.allclose(ours.weights, theirs.weights, rtol=1e-4)
+    assert torch.equal(ours.region, theirs.region)
+    assert torch.allclose(ours.weight, theirs.weight, rtol=1e-4)
 
 
 def test_strongest_labels_are_those_of_the_oracle_with_more_labels_than_a_block():

@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 
 from liftcore.errors import InvalidInput
 from liftcore.features.views import Regions
-from liftcore.raster.base import CompositingParams, RegionWeights, Selection, Weighting
+from liftcore.raster.base import CompositingParams, Selection, Weighting
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.raster.reference import ReferenceRaster, counted_weights, dense_view, strided_rays
+from liftcore.solve.weights import RegionWeights
 from tests.scenes import random_camera, random_grid, random_regions, random_splats, scenes
 
 INSIDE = 1e-5  # absolute, on weights away from cut-offs, ties and borders
@@ -52,7 +53,7 @@ def matrix(weights: RegionWeights, splats: int, rows: int) -> np.ndarray:
     """W^T as a dense [M, P] matrix."""
     W = np.zeros((rows, splats))
     lengths = np.diff(weights.indptr.numpy())
-    W[weights.columns.numpy(), np.repeat(weights.splats.numpy(), lengths)] = weights.weights.numpy()
+    W[weights.region.numpy(), np.repeat(weights.splats.numpy(), lengths)] = weights.weight.numpy()
     return W
 
 
@@ -183,8 +184,8 @@ def test_the_number_of_threads_changes_no_bit(weighting, walk):
     for observation in (random_regions(7, 4, 30, (75, 100)), random_grid(7, (10, 13))):
         runs = [CpuRaster(splats, threads=n).region_weights(camera, observation, walk, weighting) for n in (1, 2, 5)]
         for other in runs[1:]:
-            for name in RegionWeights.__dataclass_fields__:
-                assert torch.equal(getattr(runs[0], name), getattr(other, name)), name
+            for name, own in runs[0].tensors().items():
+                assert torch.equal(own, getattr(other, name)), name
 
 
 def test_images_and_traced_rays_are_whole_whatever_the_stride():

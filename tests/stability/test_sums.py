@@ -1,21 +1,21 @@
 """Sums of very many terms: of rays, of regions, of views, in the closed form and in a robust step."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from liftcore.features.views import Regions
-from liftcore.progress import silent
-from liftcore.raster.base import CompositingParams, RegionWeights, Weighting
+from liftcore.raster.base import CompositingParams, Weighting
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.raster.reference import alphas
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Splats
-from liftcore.solve.closed_form import solve_closed_form
-from liftcore.solve.columns import Columns
-from liftcore.solve.host import Host
-from liftcore.solve.robust import robust_weights
-from liftcore.solve.view_weights import WeightStore
+from liftcore.solve.closed_form import solve
+from liftcore.solve.codebook import Codebook, ViewCodebook
+from liftcore.solve.reweight import agreement_factors
+from liftcore.solve.weights import RegionWeights, one_view, stacked
 from tests.scenes import splats_at
 
 DIGITS, EQUAL = 1e-6, 5e-6  # relative; one rounding to float32 is 6e-8, and of equal terms all go one way
@@ -36,8 +36,8 @@ def sums_of_rays(side: int) -> dict[str, float]:
     squared = raster.region_weights(camera, region, CompositingParams(), Weighting(2))
     adjoint = raster.adjoint(camera, torch.ones(side, side, 1), CompositingParams())
     found = {
-        "A^T S": float(plain.weights[0]) / exact,
-        "A^T S, squared weights": float(squared.weights[0]) / squares,
+        "A^T S": float(plain.weight[0]) / exact,
+        "A^T S, squared weights": float(squared.weight[0]) / squares,
         "evidence": float(plain.evidence[0]) / exact,
         "A^T Y": float(adjoint[0, 0]) / exact,
     }
@@ -53,7 +53,7 @@ def sums_of_views(count: int, equal: bool) -> float:
     """The same of a splat that reads one row in each of ``count`` views."""
     whole = _entries(count, equal)
     one = torch.tensor([0, 1])
-    views = [_row(whole.columns[k : k + 1], whole.weights[k : k + 1], one) for k in range(count)]
+    views = [_row(whole.region[k : k + 1], whole.weight[k : k + 1], one) for k in range(count)]
     return _solved(views, equal)
 
 
@@ -68,12 +68,9 @@ def robust_sums(rows: int, channels: int) -> float:
     books = (amounts * direction + noise).astype(np.float32)
     weights = rng.uniform(0, 1, (2, rows)).astype(np.float32)
     every, starts = torch.arange(rows, dtype=torch.int32), torch.tensor([0, rows])
-    total = weights.sum(dtype=np.float64)
-    with WeightStore() as store:
-        for view in weights:
-            store.append(_row(every, torch.from_numpy(view), starts))
-        judged = robust_weights(store, [*map(torch.from_numpy, books)], np.array([total]), 1, silent, Host(1))
-        got = np.stack([view.weights.numpy() for view in judged])
+    W = stacked([_row(every, torch.from_numpy(view), starts) for view in weights], 1)
+    codebook = Codebook([ViewCodebook(torch.from_numpy(book)) for book in books])
+    got = (W.weight * agreement_factors(W, codebook, 1)).numpy().reshape(2, rows)
     exact = _robust_step(weights.astype(np.float64), books.astype(np.float64))
     return float(np.abs(got - exact).max() / exact.max())
 
@@ -104,11 +101,11 @@ def _entries(count: int, equal: bool) -> RegionWeights:
 
 def _row(columns: torch.Tensor, weights: torch.Tensor, starts: torch.Tensor) -> RegionWeights:
     first = torch.zeros(1, dtype=torch.int32)
-    return RegionWeights(first, starts, columns, weights, first, torch.ones(1))
+    return one_view(first, starts, columns, weights, first, torch.ones(1), regions=int(columns.max()) + 1)
 
 
 def _robust_step(W: np.ndarray, E: np.ndarray) -> np.ndarray:
-    """W' [2, M] of one splat by the equation of ``liftcore.solve.robust``, from W [2, M] and E [2, M, F], in f64."""
+    """W' [2, M] of one splat by the equation of `liftcore.solve.reweight`, from W [2, M] and E [2, M, F], in f64."""
     units = E / np.linalg.norm(E, axis=2, keepdims=True)
     away = units - np.einsum("vm,vmf->f", W, units) / W.sum()
     e = away / np.linalg.norm(away, axis=2, keepdims=True)
@@ -123,15 +120,10 @@ def _robust_step(W: np.ndarray, E: np.ndarray) -> np.ndarray:
 def _solved(views: list[RegionWeights], equal: bool) -> float:
     rng = np.random.default_rng(1)
     book = torch.tensor(np.full((ROWS, 1), 0.7) if equal else rng.uniform(-1, 2, (ROWS, 1)), dtype=torch.float32)
-    total = value = 0.0
-    with WeightStore() as store:
-        for view in views:
-            store.append(view)
-            weights = view.weights.double()
-            total += float(weights.sum())
-            value += float(weights @ book[view.columns.long(), 0].double())
-        columns = [Columns(book)] * len(store)
-        solved = solve_closed_form(store, columns, np.array([total]), torch.float32, silent, Host(1))
+    views = [replace(view, offsets=torch.tensor([0, ROWS])) for view in views]
+    total = sum(float(view.weight.double().sum()) for view in views)
+    value = sum(float(view.weight.double() @ book[view.region.long(), 0].double()) for view in views)
+    solved = solve(stacked(views, 1), Codebook([ViewCodebook(book)] * len(views)), torch.float32)
     return abs(float(solved.features[0, 0]) * total / value - 1)
 
 

@@ -10,7 +10,7 @@ import torch
 from liftcore.io.scene_files import lift_files
 from liftcore.one_thread import one_thread
 from liftcore.settings import LiftSettings
-from liftcore.solve import accumulate, robust
+from liftcore.solve import closed_form, geometry, reweight
 from tests.unit.solve.test_lift_equals_dense import write_scene
 
 
@@ -48,10 +48,11 @@ def test_a_lift_has_no_threads_of_torch(tmp_path, monkeypatch):
 
         monkeypatch.setattr(module, name, watched)
 
-    watch(accumulate, "as_walked")
-    watch(robust, "directions_of")
-    watch(robust, "strips_of")
+    watch(geometry, "as_regions")
+    watch(geometry, "stacked")
+    watch(reweight, "row_blocks")
+    watch(closed_form, "bag_sums")
     splats, cameras, features = write_scene(tmp_path, 3)[:3]
     lift_files(splats, cameras, [features], LiftSettings.of(robust_steps=1))
-    assert seen == {"as_walked": 1, "directions_of": 1, "strips_of": 1}
+    assert seen == dict.fromkeys(("as_regions", "stacked", "row_blocks", "bag_sums"), 1)
     assert torch.get_num_threads() == 3

@@ -24,7 +24,6 @@ from liftcore.raster.base import (
     CompositingParams,
     Raster,
     RayRows,
-    RegionWeights,
     ViewRequest,
     ViewWeights,
     Weighting,
@@ -49,6 +48,7 @@ from liftcore.raster.cpu.composite import (
 from liftcore.raster.cpu.project import COLUMNS, Targets, activated, project, view_of, with_opacities
 from liftcore.raster.cpu.tiles import Bands, depth_order
 from liftcore.raster.cpu.weights import entries_of, merged, reading_of, weigh_tiles
+from liftcore.solve.weights import RegionWeights, one_view
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterable, Sequence
@@ -235,9 +235,8 @@ class CpuRaster:
 
     def _merge(self, frame: Frame, entries: list, codebook_rows: int) -> RegionWeights:
         """Entries of all tile shares -> one row a splat."""
-        return RegionWeights(
-            *map(torch.from_numpy, merged(entries, frame.ids, codebook_rows, self.threads, self._map))
-        )
+        found = merged(entries, frame.ids, codebook_rows, self.threads, self._map)
+        return one_view(*map(torch.from_numpy, found), regions=codebook_rows)
 
     def _activated(self, scale: float) -> Scene:
         if scale != self._scale:

@@ -27,7 +27,7 @@ import torch
 
 from liftcore.features.views import Regions, ViewFeatures
 from liftcore.jit import inlined, kernel
-from liftcore.raster.base import TILE, CompositingParams, RegionWeights
+from liftcore.raster.base import TILE, CompositingParams
 from liftcore.raster.cpu.composite import (
     CENTRAL,
     CHECK_EVERY,
@@ -66,6 +66,7 @@ from liftcore.raster.cpu.simd import (
     times,
     without_lowest,
 )
+from liftcore.solve.weights import RegionWeights
 
 Run = Callable[[Callable, list], list]
 
@@ -78,7 +79,6 @@ SEVERAL = -2  # a segment whose pixels read several slots, or parts of one
 _ROW_BITS = np.uint64((1 << SIDES) - 1)  # of a row of cells, in a set of slots
 _WORD = 64  # columns of a set that a word holds
 _NEAR, _FAR = 12, 24  # entries ahead whose places in memory are asked for, and whose cursors, by which they are known
-
 
 # ----------------------------------------------------------------------------------------------------------- Reading
 
@@ -650,13 +650,13 @@ def entries_of(found: RegionWeights, ids: np.ndarray, codebook_rows: int, levels
     used = np.flatnonzero(ids >= 0)
     records = used[np.searchsorted(ids[used], found.splats.numpy())]
     met = used[np.searchsorted(ids[used], found.evidence_splats.numpy())]
-    entries, evidence = found.columns.numpy(), found.evidence.numpy()
+    entries, evidence = found.region.numpy(), found.evidence.numpy()
     slot_rows = np.full((codebook_rows, levels), -1, np.int32)
     slot_rows[:, 0] = np.arange(codebook_rows)
     return (
         np.concatenate([np.repeat(records, np.diff(found.indptr.numpy())), met]).astype(np.int32),
         np.concatenate([entries, np.full(len(met), NO_SLOT, np.int32)]),
-        np.concatenate([found.weights.numpy(), np.zeros(len(met), np.float32)]),
+        np.concatenate([found.weight.numpy(), np.zeros(len(met), np.float32)]),
         np.concatenate([np.zeros(len(entries), np.float32), evidence]),
         slot_rows,
     )

@@ -21,7 +21,6 @@ from liftcore.features.views import ViewFeatures
 from liftcore.raster.base import (
     CompositingParams,
     RayRows,
-    RegionWeights,
     ViewRequest,
     ViewWeights,
     Weighting,
@@ -42,6 +41,7 @@ from liftcore.raster.gpu.tiles import BLOCK, Frame
 from liftcore.raster.gpu.weights import DeviceReading
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Splats
+from liftcore.solve.weights import RegionWeights
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
@@ -127,7 +127,7 @@ class GpuRaster:
 
     def _brought(self, weights: RegionWeights) -> RegionWeights:
         """Where they are wanted. A host without room for them is no reason for smaller pieces on the device."""
-        return weights if self._stays else weights.on_host()
+        return weights if self._stays else weights.cpu()
 
     def iterate_views(self, requests: Iterable[ViewRequest]) -> Generator[ViewWeights]:
         """``region_weights`` and ``ray_rows`` of views, one at a time; the next one is read while the card walks."""

@@ -18,7 +18,7 @@ import triton.language as tl
 from torch import Tensor
 
 from liftcore.features.views import ViewFeatures
-from liftcore.raster.base import TILE, CompositingParams, RegionWeights
+from liftcore.raster.base import TILE, CompositingParams
 from liftcore.raster.cpu.composite import FRONT, LARGEST, Choice
 from liftcore.raster.cpu.weights import Reading, reading_of
 from liftcore.raster.gpu.composite import (
@@ -36,6 +36,7 @@ from liftcore.raster.gpu.composite import (
 from liftcore.raster.gpu.launching import WARPS, jit, lang, launch
 from liftcore.raster.gpu.tiles import Frame, Lists, expanded
 from liftcore.scene.cameras import Camera
+from liftcore.solve.weights import RegionWeights, one_view
 
 PIXELS = TILE * TILE
 NONE = -1
@@ -341,9 +342,9 @@ def region_weights(
     own, counts = torch.unique_consecutive(found.keys // rows, return_counts=True)
     indptr = torch.zeros(own.shape[0] + 1, dtype=torch.int64, device=frame.device)
     torch.cumsum(counts, 0, out=indptr[1:])
-    return RegionWeights(
+    return one_view(
         own.to(torch.int32), indptr, (found.keys % rows).to(torch.int32), found.values[:, 0].to(torch.float32),
-        met.keys.to(torch.int32), met.values[:, 0].to(torch.float32),
+        met.keys.to(torch.int32), met.values[:, 0].to(torch.float32), regions=rows,
     )  # fmt: skip
 
 

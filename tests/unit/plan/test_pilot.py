@@ -21,7 +21,7 @@ from liftcore.planning.plan import FEW_VIEWS
 from liftcore.planning.visibility import visibility
 from liftcore.scene.cameras import Cameras
 from liftcore.settings import LiftSettings
-from liftcore.solve.views import LiftViews
+from liftcore.solve.geometry import LiftViews
 from tests.benchmarks.scenes import Room, write_room
 from tests.scenes import centred, random_splats
 from tests.unit.plan.test_views import ring

@@ -13,7 +13,7 @@ from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.raster.reference import reading_matrix
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Splats
-from liftcore.solve.all_rays import AllRays
+from liftcore.solve.least_squares import AllRays
 from tests.scenes import random_camera, random_grid, random_regions, random_splats
 
 

@@ -25,9 +25,15 @@ from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.raster.reference import ReferenceRaster, dense_view
 from liftcore.scene.cameras import Cameras
 from liftcore.settings import LiftSettings
-from liftcore.solve.aggregation import KeptRegions, evidence_means, filter_regions, kept_means, spread
-from liftcore.solve.clustering import Clustering
-from liftcore.solve.totals import row_totals
+from liftcore.solve.aggregate import (
+    Clustering,
+    KeptRegions,
+    evidence_means,
+    filter_regions,
+    kept_means,
+    spread,
+)
+from liftcore.solve.geometry import LiftViews
 from tests.scenes import centred, random_camera, random_grid, random_regions, random_splats
 
 SETTINGS = LiftSettings.of(aggregation=True, aggregation_iou=0.3, certificate_rays=10)
@@ -47,8 +53,8 @@ def test_kept_regions_are_those_of_the_paper_pixel_by_pixel(tmp_path_factory, se
     path = tmp_path_factory.mktemp("pack") / "features.safetensors"
     write_pack(path, maps, {"encoder": "random"})
     labels = np.random.default_rng(seed).integers(-1, K, P)
-    lifted = (ReferenceRaster(splats), Cameras(views), read_features(path), ("v0", "v1"))
-    kept = filter_regions(clustering_of(labels), 6, lifted, SETTINGS, silent)
+    lifted = LiftViews.of(read_features(path), Cameras(views), SETTINGS)
+    kept = filter_regions(clustering_of(labels), 6, ReferenceRaster(splats), lifted, SETTINGS, silent)
 
     onehot = np.array([[float(label == k) for k in range(-1, K)] for label in labels])
     A = dense_view(splats, views[0], SETTINGS.render_params).A
@@ -168,7 +174,7 @@ def weights_of(splats, cameras, maps, settings) -> np.ndarray:
     total = np.zeros(raster.splats.count)
     for name in maps.keys() & views.keys():
         weights = raster.region_weights(views[name], maps[name], settings.lift_params, settings.weighting)
-        total[weights.splats.numpy()] += row_totals(weights)
+        total[weights.splats.numpy()] += weights.row_sums().numpy()
     return total
 
 
@@ -194,10 +200,11 @@ def test_what_takes_no_cluster_is_solved_again_as_if_the_other_regions_had_never
     plain = lift_files(splats, cameras, [features], LiftSettings.of(aggregation=True, **knobs))
     whole = weights_of(splats, cameras, maps | {"v0": wrong}, plain.metadata.settings)
 
-    lifted = (CpuRaster(read_splats(splats)), read_cameras(cameras), read_features(features), result.metadata.views)
+    settings, raster = LiftSettings.of(aggregation=True, **knobs), CpuRaster(read_splats(splats))
+    lifted = LiftViews.of(read_features(features), read_cameras(cameras), settings)
     assert result.cluster is not None and result.cluster_features is not None
     clustering = clustering_of(result.cluster.numpy(), result.cluster_features.shape[0])
-    kept = filter_regions(clustering, 6, lifted, LiftSettings.of(aggregation=True, **knobs), silent).masks
+    kept = filter_regions(clustering, 6, raster, lifted, settings, silent).masks
     for name, observation in (maps | {"v0": wrong}).items():
         if name in kept and isinstance(observation, Regions):
             dropped = torch.from_numpy(~kept[name])

@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from liftcore.settings import LiftSettings
-from liftcore.solve.clustering import NO_CLUSTER, cluster_splats, draw
-from liftcore.solve.principal_axes import principal_axes
+from liftcore.solve.aggregate import NO_CLUSTER, cluster_splats, draw, principal_axes
 
 SETTINGS = LiftSettings.of(aggregation=True, aggregation_cluster_size=20, aggregation_neighbours=5)
 
@@ -102,7 +101,7 @@ def test_splats_without_evidence_are_never_drawn_and_faint_ones_less_often():
 
 
 def test_wide_features_have_the_same_axes_as_by_all_eigenvectors(monkeypatch):
-    monkeypatch.setattr("liftcore.solve.principal_axes.EXACT_CHANNELS", 8)
+    monkeypatch.setattr("liftcore.solve.aggregate.EXACT_CHANNELS", 8)
     rng = np.random.default_rng(0)
     F = 60
     rows = (rng.normal(size=(300, 5)) * [9, 7, 5, 4, 3]) @ rng.normal(size=(5, F)) + 0.1 * rng.normal(size=(300, F))

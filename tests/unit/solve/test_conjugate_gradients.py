@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from liftcore.solve.conjugate_gradients import Stopping, column_dots, conjugate_gradients
+from liftcore.solve.least_squares import Stopping, column_dots, conjugate_gradients
 
 
 def system(kind: str, seed: int = 0, size: int = 12, channels: int = 5) -> tuple[np.ndarray, np.ndarray]:

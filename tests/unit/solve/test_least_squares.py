@@ -12,8 +12,7 @@ from liftcore.features.views import Regions, ViewFeatures
 from liftcore.io.scene_files import lift_files
 from liftcore.progress import silent
 from liftcore.settings import LiftSettings
-from liftcore.solve.channels import BLOCK, blocks, codebook_axes, random_axes
-from liftcore.solve.least_squares import Refinement, refine
+from liftcore.solve.least_squares import BLOCK, Refinement, blocks, codebook_axes, random_axes, refine
 from tests.unit.solve.dense_rays import SmallScene
 from tests.unit.solve.test_lift_equals_dense import write_scene
 

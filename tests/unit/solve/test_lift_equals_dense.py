@@ -14,16 +14,11 @@ from liftcore.io.cameras import read_cameras
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.lift_file import load_lift, save_lift
 from liftcore.io.ply import write_splats
-from liftcore.io.scene_files import lift_files, open_files
-from liftcore.progress import silent
+from liftcore.io.scene_files import lift_files
 from liftcore.raster.base import CompositingParams, Selection, Weighting
-from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.raster.reference import counted_weights, dense_view, reading_matrix
 from liftcore.scene.cameras import Cameras
 from liftcore.settings import LiftSettings
-from liftcore.solve.accumulate import accumulate
-from liftcore.solve.view_weights import WeightStore
-from liftcore.solve.views import LiftViews
 from tests.scenes import centred, observed, random_camera, random_splats
 
 PRESETS = {  # lambda, and what counts as a weight
@@ -95,16 +90,6 @@ def test_agreement_is_the_norm_of_the_mean_of_unit_inputs(tmp_path, preset):
     assert float(got.agreement.max()) <= 1.0
 
 
-def test_a_lift_has_views_by_tuples_of_labels_and_views_by_rows(tmp_path):
-    paths, settings = write_scene(tmp_path, 5), LiftSettings.of()
-    splats, cameras, packs = open_files(paths[0], paths[1], [paths[2]], settings)
-    for robust, expected in ((0, [False, True, False]), (1, [False] * 3)):
-        with WeightStore() as store:
-            raster, own = CpuRaster(splats, threads=1), LiftSettings.of(robust_steps=robust)
-            geometry = accumulate(raster, splats.count, LiftViews.of(packs, cameras, own), own, store, silent)
-        assert [columns.tuples is not None for columns in geometry.columns] == expected
-
-
 def test_agreement_does_not_depend_on_the_length_of_inputs(tmp_path):
     splats, cameras, features = write_scene(tmp_path, 6)
     plain = lift_files(splats, cameras, [features], LiftSettings.of(preset="row-sum"))
@@ -129,6 +114,7 @@ def test_the_number_of_threads_changes_no_bit_of_a_lift(tmp_path):
 def test_weights_in_files_give_the_same_lift_as_weights_in_memory(tmp_path, monkeypatch):
     paths = write_scene(tmp_path, 8)
     memory = lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of())
-    monkeypatch.setattr("liftcore.solve.view_weights.MEMORY_LIMIT", 0)
+    monkeypatch.setattr("liftcore.solve.geometry.MEMORY_LIMIT", 0)
+    monkeypatch.setattr("liftcore.solve.weights.MEMORY_LIMIT", 0)
     files = lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of())
     assert torch.equal(memory.features, files.features)

@@ -13,7 +13,7 @@ from liftcore.io.cameras import read_cameras
 from liftcore.io.scene_files import lift_files
 from liftcore.raster.reference import dense_view, reading_matrix, strided_rays
 from liftcore.settings import LiftSettings, Preset
-from liftcore.solve.accumulate import strided_walk
+from liftcore.solve.geometry import strided
 from tests.scenes import observed, random_camera, random_splats
 from tests.unit.features.test_observations import dense_sums
 from tests.unit.solve.test_lift_equals_dense import write_scene
@@ -34,7 +34,7 @@ def test_a_strided_lift_is_that_of_its_rays_and_its_evidence_speaks_for_all_of_t
     numerator, denominator, evidence, cut = np.zeros((50, 6)), np.zeros(50), np.zeros(50), np.zeros(50, bool)
     for k, camera in enumerate(read_cameras(paths[1]).values()):
         observation = observed(2, k, grids)
-        walk = strided_walk(settings.lift_params, settings, camera, k)
+        walk = strided(settings.lift_params, settings, camera, k)
         view, walked = dense_view(splats, camera, walk), strided_rays(camera, walk)
         S, ray = reading_matrix(observation, camera.width, camera.height)
         weights = view.A[ray[walked[ray]]]
@@ -46,20 +46,20 @@ def test_a_strided_lift_is_that_of_its_rays_and_its_evidence_speaks_for_all_of_t
     assert np.abs(got.features.numpy() - X)[~cut].max() < 1e-3
     assert np.abs(got.evidence.numpy() - evidence)[~cut].max() < 1e-3
     assert got.metadata.certificate["rays"] == sum(
-        int(strided_rays(camera, strided_walk(settings.lift_params, settings, camera, k)).sum())
+        int(strided_rays(camera, strided(settings.lift_params, settings, camera, k)).sum())
         for k, camera in enumerate(read_cameras(paths[1]).values())
     )
 
 
 def test_first_pixels_differ_between_views_and_repeat_with_the_seed():
     camera, settings = random_camera(0), LiftSettings.of(stride=4)
-    offsets = [strided_walk(settings.lift_params, settings, camera, k).offset for k in range(40)]
+    offsets = [strided(settings.lift_params, settings, camera, k).offset for k in range(40)]
     assert len(set(offsets)) > 8
-    assert offsets == [strided_walk(settings.lift_params, settings, camera, k).offset for k in range(40)]
+    assert offsets == [strided(settings.lift_params, settings, camera, k).offset for k in range(40)]
     other = LiftSettings.of(stride=4, seed=1)
-    assert offsets != [strided_walk(other.lift_params, other, camera, k).offset for k in range(40)]
+    assert offsets != [strided(other.lift_params, other, camera, k).offset for k in range(40)]
     slim = camera.replace(width=2)
-    assert all(strided_walk(settings.lift_params, settings, slim, k).offset[0] < 2 for k in range(20))
+    assert all(strided(settings.lift_params, settings, slim, k).offset[0] < 2 for k in range(20))
 
 
 def test_every_nth_view_is_lifted_from_the_first_on(tmp_path):

@@ -16,7 +16,7 @@ from liftcore.io.scene_files import lift_files, open_files
 from liftcore.lifting import plan
 from liftcore.scene.cameras import Camera
 from liftcore.settings import LiftSettings
-from liftcore.solve.map_shapes import shape_warnings
+from liftcore.solve.diagnostics import shape_warnings
 from tests.benchmarks.base import cameras_of
 
 from .test_lift_equals_dense import write_scene

@@ -13,10 +13,9 @@ from liftcore.progress import silent
 from liftcore.raster.base import CompositingParams
 from liftcore.scene.splats import Splats
 from liftcore.settings import LARGEST_ALPHA, LiftSettings
-from liftcore.solve.accumulate import SampledRays
-from liftcore.solve.certificate import ViewMeasures, measure_rows
-from liftcore.solve.readout import read_pixels, sample_pixels
-from liftcore.solve.reference import reference, row_betas
+from liftcore.solve.diagnostics import ViewMeasures, measure_rows
+from liftcore.solve.geometry import SampledRays, read_pixels, sample_pixels
+from liftcore.solve.least_squares import reference, row_betas
 from tests.scenes import look_at, random_splats
 from tests.unit.solve.dense_rays import SmallScene
 from tests.unit.solve.test_lift_equals_dense import write_scene

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from liftcore.solve.aggregation import contingency, match_regions
+from liftcore.solve.aggregate import contingency, match_regions
 
 example = settings(max_examples=60, deadline=None)
 

@@ -11,7 +11,7 @@ from liftcore.raster.base import CompositingParams
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Splats
-from liftcore.solve.all_rays import AllRays
+from liftcore.solve.least_squares import AllRays
 from tests.benchmarks.experiments import Truth, closed_form, follow, scored
 from tests.scenes import random_camera, random_splats
 

@@ -1,4 +1,4 @@
-"""The certificate: what a lift measured of itself, on a stated sample of rays.
+"""What a lift measured of itself, on a stated sample of rays, and what it cannot answer for, in sentences.
 
 All sums are over the sampled rays and the A that the lift used: its opacity gain, but power 1 and every weight of
 the ray, whatever the preset selects. So the residual says how the answer renders, not how well it fits the weights
@@ -10,29 +10,28 @@ that were kept. With a stride, rays are sampled among those that the lift saw; B
 ``L <= J`` (Jensen) where rows sum to one; a ray that meets nothing has ``L = ||B||^2`` and ``J = 0``.
 Here ``a_ij = A_ij / sum_j A_ij``. A ray has a row i for each labelled level. The paper defines beta at the optimum
 x^; here it is measured at the answer x', which is what a user has, and so ``1 + beta`` here is a sign and no proof.
-``solve/reference.py`` finds x^, and says which beta the theorem is about.
+`least_squares.reference` finds x^, and says which beta the theorem is about.
 """
-
-from __future__ import annotations
 
 import math
 import os
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import torch
+from torch import Tensor
 
+from liftcore.features.pack import Views
 from liftcore.jit import vectorised
 from liftcore.one_thread import one_thread
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from torch import Tensor
-
-    from liftcore.settings import LiftSettings
-    from liftcore.solve.accumulate import Geometry, SampledRays
+from liftcore.raster.base import LOW_PASS, MAX_LOG_SCALE
+from liftcore.scene.cameras import Camera, photo_size
+from liftcore.scene.splats import Splats
+from liftcore.settings import LiftSettings
+from liftcore.solve.geometry import Geometry, SampledRays
 
 _CHUNK_VALUES = 1 << 21  # float32 values gathered at a time: 8 MB, as larger ones are fresh pages every time
 _READS_A_RAY = 8  # levels or taps of a ray; few scenes have more
@@ -52,19 +51,20 @@ class ViewMeasures:
 def certify(
     geometry: Geometry,
     features: Tensor,
+    sums: np.ndarray,
     settings: LiftSettings,
     threads: int | None = None,
 ) -> dict[str, Any]:
     """Measure the lift on its sampled rays.
 
     Args:
-        features: [P, F], as they are stored.
+        features: [P, F], as they are stored. sums: [P] f64, of rows of W.
         threads: None takes the cores that this process may use. The number changes no bit.
 
     Returns:
         Plain numbers, ready for JSON; None where nothing was sampled.
     """
-    measures = measure_samples(geometry.samples, features, geometry.codebooks, threads)
+    measures = measure_samples(geometry.samples, features, geometry.books, threads)
     row_sums, residuals = measures.row_sums, measures.residuals
     beta = quantiles(measures.betas)
     return {
@@ -78,8 +78,8 @@ def certify(
         "surrogate": _mean(measures.surrogates),
         "beta": beta,
         "bound": None if beta["max"] is None else 1.0 + beta["max"],
-        "seen_share": float((geometry.denominators > 0).mean()),
-        "evidence_over_half_share": float((geometry.evidence > 0.5).mean()),
+        "seen_share": float((sums > 0).mean()),
+        "evidence_over_half_share": float((geometry.evidence() > 0.5).float().mean()),
     }
 
 
@@ -170,3 +170,135 @@ def quantiles(values: np.ndarray) -> dict[str, float | None]:
         return {"median": None, "p99": None, "max": None}
     found = {"median": np.median(values), "p99": np.quantile(values, 0.99), "max": values.max()}
     return {name: float(value) if np.isfinite(value) else None for name, value in found.items()}
+
+
+MOSTLY = 0.5  # of the splats; below it, what was not seen is most of the answer
+FAINT = 1e-30  # of a sum of weights: its terms come near the smallest numbers of float32
+UNSEEN = "splats were reached by no labelled ray; their features are zero"
+NAMES = 3  # that a sentence shows
+SAMPLE = 10_000  # splats whose depths are looked at, evenly over the file
+
+
+def lift_warnings(
+    splats: Splats,
+    views: Sequence[Camera],
+    sums: np.ndarray,
+    asked: str,
+    stored: torch.dtype,
+    facts: Mapping[str, Any],
+) -> list[str]:
+    """Warnings of a lift.
+
+    Args:
+        views: the cameras that were lifted. sums: [P] f64, of the weights of labelled rays, to their power.
+        asked, stored: the type that features were to have, and have.
+        facts: of the certificate: ``views_without_camera`` and ``views_without_splats``, names.
+    """
+    warnings = []
+    skipped, empty = facts["views_without_camera"], facts["views_without_splats"]
+    if skipped:
+        told = f"{len(skipped)} views have features but no camera and were skipped: {_some(skipped)}"
+        warnings.append(told + _folders_of(views))
+    if empty:
+        warnings.append(f"{len(empty)} of {len(views)} views meet no splat: {_some(empty)}")
+    unseen, faint = int((sums == 0).sum()), int(((sums > 0) & (sums < FAINT)).sum())
+    if unseen == len(sums):
+        warnings.append("no labelled ray reached any splat: check that splats and cameras share their frame")
+    elif unseen > MOSTLY * len(sums):
+        warnings.append(f"{unseen} of {len(sums)} {UNSEEN}")
+    if faint:
+        warnings.append(f"{faint} of {len(sums)} splats weigh less than {FAINT:g}, where float32 loses digits")
+    if asked not in str(stored):
+        name = str(stored).removeprefix("torch.")
+        warnings.append(f"features are stored as {name}: {asked} does not hold vectors of their length")
+    return warnings + order_warnings(splats, views)
+
+
+def order_warnings(splats: Splats, views: Sequence[Camera]) -> list[str]:
+    """A warning where most splats lie so far from a camera that float32 depths are coarser than their footprints.
+
+    Depths are sorted as float32, whose step at z is about ``z 2^-23``; splats within a step of each other are walked
+    in the order of the file. A footprint is as large as its splat or its low-pass, whichever is larger.
+    """
+    step = -(-splats.count // SAMPLE)
+    size = np.exp(splats.log_scales[::step].amax(dim=1).double().numpy().clip(max=MAX_LOG_SCALE))
+    means = splats.means[::step].double().numpy()
+    coarse = []
+    for camera in views:
+        z = means @ camera.viewmat[2, :3] + camera.viewmat[2, 3]
+        ahead = z > 0
+        blur = math.sqrt(LOW_PASS) * z / max(camera.fx, camera.fy)
+        steps = np.spacing(z.astype(np.float32))
+        if ahead.any() and (steps > np.maximum(size, blur))[ahead].mean() > MOSTLY:
+            coarse.append(camera.name)
+    if not coarse:
+        return []
+    return [
+        f"{len(coarse)} of {len(views)} views are so far from the splats that float32 depths cannot order most of "
+        f"them: {_some(coarse)}"
+    ]
+
+
+def _folders_of(views: Sequence[Camera]) -> str:
+    """What to do where cameras are named with their folders, as those of a rig are."""
+    example = next((camera.name for camera in views if "/" in camera.name), None)
+    return f"; cameras are named with their folders here, such as {example}: name views like them" if example else ""
+
+
+def _some(names: Sequence[str]) -> str:
+    return ", ".join(names[:NAMES])
+
+
+FEW_CELLS = 4  # on a side; of fewer a shape says little
+FAR = 2.0  # times wider or narrower than the image: square maps of photos are nearer
+CELL = 1  # cells of a map, and pixels of its image, that rounding to whole ones may add or take on a side
+TURNED = 1.2  # times nearer to the image's shape when rows and columns are swapped
+
+
+def shape_warnings(packs: Views, views: Sequence[Camera]) -> list[str]:
+    """Warnings where maps are far from the shape of their images or nearer to it when turned, or else stretched.
+
+    Maps of any shape are stretched over their image, as some encoders squeeze images into squares; what they cannot
+    be told from is a crop, so no lift is refused.
+    """
+    odd, stretched = [], []
+    for camera in views:
+        size = packs.map_size(camera.name)
+        if _odd(size, photo_size(camera)):
+            odd.append(camera)
+        elif _stretched(size, photo_size(camera)):
+            stretched.append(camera)
+    advice = {
+        "of another shape than their images{}: see that they are [rows, columns], channels last": odd,
+        "of another aspect than their images{}, over which they are stretched: maps must cover the whole image, and "
+        "those of a centre crop do not": stretched,
+    }
+    return [
+        f"{len(found)} of {len(views)} views have maps {text.format(_shapes(packs, found[0]))}"
+        for text, found in advice.items()
+        if found
+    ]
+
+
+def _shapes(packs: Views, camera: Camera) -> str:
+    (width, height), (W, H) = packs.map_size(camera.name), photo_size(camera)
+    return f" ({camera.name}: {width}x{height} for {W}x{H})"
+
+
+def _odd(size: tuple[int, int], photo: tuple[int, int]) -> bool:
+    (width, height), (W, H) = size, photo
+    if min(width, height) < FEW_CELLS:
+        return False
+    off, turned = (_factor(ratio * H / W) for ratio in (width / height, height / width))
+    return off > FAR or off > TURNED * turned
+
+
+def _stretched(size: tuple[int, int], photo: tuple[int, int]) -> bool:
+    """Whether no scale makes both sides of the image those of the map, to a cell, nor to a pixel of the image."""
+    (width, height), (W, H) = size, photo
+    wide = (width - CELL) * (H - CELL) > (height + CELL) * (W + CELL)
+    return wide or (height - CELL) * (W - CELL) > (width + CELL) * (H + CELL)
+
+
+def _factor(ratio: float) -> float:
+    return max(ratio, 1.0 / ratio)

@@ -11,14 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from liftcore.io.scene_files import lift_files
-from liftcore.progress import silent
-from liftcore.raster.base import RegionWeights
 from liftcore.settings import LiftSettings
-from liftcore.solve import gathering, host
-from liftcore.solve.gathering import LONG
-from liftcore.solve.host import ALL_CORES, Host
-from liftcore.solve.robust import NO_CONSENSUS, robust_weights
-from liftcore.solve.view_weights import WeightStore
+from liftcore.solve.closed_form import LONG
+from liftcore.solve.reweight import NO_CONSENSUS, agreement_factors, reweighted
+from liftcore.solve.weights import RegionWeights, stacked
+from tests.unit.solve.sparse_views import codebook_of, dense, of_dense
 from tests.unit.solve.test_lift_equals_dense import write_scene
 
 
@@ -33,34 +30,15 @@ class Scene:
     def denominators(self) -> np.ndarray:
         return np.sum([view.sum(axis=1, dtype=np.float64) for view in self.weights], axis=0)
 
-    def store(self, memory_limit: int | None = None) -> WeightStore:
-        store = WeightStore(memory_limit)
-        for view in self.weights:
-            store.append(sparse(view))
-        return store
+    def stacked(self) -> RegionWeights:
+        return stacked([of_dense(view) for view in self.weights], len(self.weights[0]))
 
-    def after(self, steps: int, machine: Host = ALL_CORES, memory_limit: int | None = None) -> list[np.ndarray]:
+    def after(self, steps: int, **how) -> list[np.ndarray]:
         """The weights of every view after so many steps, dense."""
-        with self.store(memory_limit) as store:
-            result = robust_weights(store, self.books, self.denominators, steps, silent, machine)
-            return [dense(view, like) for view, like in zip(result, self.weights, strict=True)]
-
-
-def sparse(view: np.ndarray) -> RegionWeights:
-    splats = np.nonzero(view.any(axis=1))[0].astype(np.int32)
-    rows, columns = np.nonzero(view)
-    starts = np.concatenate([[0], np.cumsum((view[splats] != 0).sum(axis=1))]).astype(np.int64)
-    parts = splats, starts, columns.astype(np.int32), view[rows, columns].astype(np.float32)
-    nothing = torch.zeros(0)
-    tensors = [torch.from_numpy(part) for part in parts]
-    return RegionWeights(*tensors, evidence_splats=nothing.int(), evidence=nothing)
-
-
-def dense(weights: RegionWeights, like: np.ndarray) -> np.ndarray:
-    rows = np.repeat(weights.splats.numpy(), np.diff(weights.indptr.numpy()))
-    result = np.zeros_like(like)
-    result[rows, weights.columns.numpy()] = weights.weights.numpy()
-    return result
+        W = self.stacked()
+        found = reweighted(W, agreement_factors(W, codebook_of(self.books), steps, **how))
+        whole = dense(found, len(self.weights[0])).astype(np.float32)
+        return np.split(whole, W.offsets.numpy()[1:-1], axis=1)
 
 
 def over(values: np.ndarray, lengths: np.ndarray) -> np.ndarray:
@@ -130,22 +108,23 @@ def random_scene(seed: int, count: int = 9_000, views: int = 4, rows: int = 7, c
     return Scene([view.astype(np.float32) for view in kept], books)
 
 
-def test_neither_threads_nor_files_nor_order_nor_chunks_change_a_bit_and_the_first_weights_stay(monkeypatch):
+def test_neither_threads_nor_files_nor_order_change_a_bit_and_the_first_weights_stay(monkeypatch):
     scene = random_scene(0)
-    expected = scene.after(3, Host(1))
+    expected, means = scene.after(3, threads=1), torch.rand(9_000, 3, generator=torch.manual_seed(0))
 
-    def assert_same(*how) -> None:
-        assert all(np.array_equal(a, b) for a, b in zip(expected, scene.after(3, *how), strict=True))
+    def assert_same(**how) -> None:
+        assert all(np.array_equal(a, b) for a, b in zip(expected, scene.after(3, **how), strict=True))
 
-    assert_same(Host(5))
-    assert_same(Host(2), 0)
-    monkeypatch.setattr(host, "FEW_CHANNELS", 0)
-    monkeypatch.setattr(gathering, "CHUNK_ENTRIES", 5_000)
-    assert_same(Host(2, means=torch.rand(9_000, 3, generator=torch.Generator().manual_seed(0))))
-    with scene.store() as store:
-        assert robust_weights(store, scene.books, scene.denominators, 0, silent) is store
-        robust_weights(store, scene.books, scene.denominators, 2, silent)
-        assert all(np.array_equal(dense(a, b), b) for a, b in zip(store, scene.weights, strict=True))
+    assert_same(threads=5)
+    assert_same(threads=2, means=means)
+    monkeypatch.setattr("liftcore.solve.reweight.MEMORY_LIMIT", 0)
+    monkeypatch.setattr("liftcore.solve.weights.MEMORY_LIMIT", 0)
+    assert_same(threads=2)
+    W = scene.stacked()
+    before = W.weight.clone()
+    assert (agreement_factors(W, codebook_of(scene.books), 0) == 1).all()
+    agreement_factors(W, codebook_of(scene.books), 2)
+    assert torch.equal(W.weight, before)
 
 
 @pytest.mark.parametrize("steps", [1, 2, 3])
@@ -165,7 +144,7 @@ def test_steps_that_change_much_equal_their_definition_to_the_last_digits(seed, 
 def test_slices_of_channels_are_judged_together(monkeypatch):
     scene = random_scene(3, count=500)
     whole = scene.after(2)
-    monkeypatch.setattr(gathering, "STRIP_BYTES", 1)
+    monkeypatch.setattr("liftcore.solve.codebook.TABLE_BYTES", 1)
     for sliced, expected in zip(scene.after(2), whole, strict=True):
         np.testing.assert_allclose(sliced, expected, rtol=1e-4, atol=1e-6)
 

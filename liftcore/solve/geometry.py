@@ -1,0 +1,223 @@
+"""The geometry phase: each view meets the raster once, which finds its W, and no feature channel is touched."""
+
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import closing
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from liftcore.features.levels import at_levels
+from liftcore.features.pack import Views, as_views, pair
+from liftcore.features.views import FeatureGrid, Regions, ViewFeatures
+from liftcore.one_thread import one_thread
+from liftcore.progress import Progress
+from liftcore.raster.base import CompositingParams, Raster, RayRows, ViewRequest
+from liftcore.scene.cameras import Camera, Cameras
+from liftcore.settings import LiftSettings
+from liftcore.solve.checkpoint import Checkpoint
+from liftcore.solve.codebook import Codebook, ViewCodebook, as_regions
+from liftcore.solve.weights import MEMORY_LIMIT, RegionWeights, stacked
+
+Given = Mapping[str, ViewFeatures] | Iterable[tuple[str, ViewFeatures]]
+
+
+@dataclass
+class LiftViews:
+    """The views of a lift, features and cameras paired by name; each view is read when it is asked for."""
+
+    cameras: Cameras
+    features: Views  # paired with the cameras
+    names: list[str]  # that are lifted, in the order of the sums
+    unpaired: list[str]  # views with features and no camera, which are skipped
+
+    @classmethod
+    def of(cls, views: Given, cameras: Cameras | Mapping[str, Camera], settings: LiftSettings) -> "LiftViews":
+        """Views paired with cameras by name, every ``view_stride``-th of them.
+
+        Raises:
+            InvalidFeatures: no view has a camera, or views are malformed.
+            InvalidCameras: there is no camera.
+        """
+        known = cameras if isinstance(cameras, Cameras) else Cameras(cameras)
+        features, unpaired = pair(as_views(views), known)
+        return cls(known, features, list(features.views[:: settings.view_stride]), unpaired)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __getitem__(self, number: int) -> tuple[Camera, ViewFeatures]:
+        """The camera of the view of that number, and what it observes."""
+        return self.cameras[self.names[number]], self.features[self.names[number]]
+
+    def __iter__(self) -> Iterator[tuple[Camera, ViewFeatures]]:
+        """The views, one in memory at a time."""
+        return (self[number] for number in range(len(self)))
+
+    def camera(self, number: int) -> Camera:
+        """Of the view of that number."""
+        return self.cameras[self.names[number]]
+
+
+@dataclass(frozen=True)
+class Readout:
+    """Rows of S for n rays; a ray has a row for each labelled level, or one for a grid."""
+
+    rays: np.ndarray  # [rows] i64, which of the rays
+    columns: np.ndarray  # [rows, taps] i64, codebook rows
+    shares: np.ndarray  # [rows, taps] f64, sum to one
+
+    def rows(self, chosen: np.ndarray) -> "Readout":
+        """Only the chosen rows, by their numbers [n] i64; rays keep theirs."""
+        return Readout(self.rays[chosen], self.columns[chosen], self.shares[chosen])
+
+    def observed(self, codebook: Tensor) -> Tensor:
+        """B [rows, F] f32 of the rays."""
+        taken = codebook[torch.from_numpy(self.columns)].to(torch.float32)
+        return (taken * torch.from_numpy(self.shares).to(torch.float32)[:, :, None]).sum(dim=1)
+
+
+@dataclass(frozen=True)
+class SampledRays:
+    """Some rays of one view: their rows of A and what they read of the codebook."""
+
+    rows: RayRows
+    readout: Readout
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """What all views together say about the splats."""
+
+    weights: RegionWeights  # of all views, with a row for every splat
+    codebook: Codebook  # what its regions stand for
+    samples: tuple[SampledRays, ...]  # for the diagnostics, one a view
+    blind: tuple[str, ...]  # views that meet no splat
+
+    @property
+    def books(self) -> list[Tensor]:
+        """E [M, F] of every view, as its observation was read."""
+        return [view.rows for view in self.codebook.views]
+
+    def evidence(self) -> Tensor:
+        """[P] f32 on the CPU: sums of plain weights over all views, each ray once."""
+        found = torch.zeros(self.weights.splats.shape[0])
+        found[self.weights.evidence_splats.cpu().long()] = self.weights.evidence.cpu()
+        return found
+
+
+@one_thread()
+def weigh_views(
+    raster: Raster,
+    splats: int,
+    views: LiftViews,
+    settings: LiftSettings,
+    progress: Progress,
+    *,
+    by_rows: bool,
+    checkpoint: Checkpoint | None = None,
+    device_bytes: int = 0,
+    threads: int | None = None,
+) -> Geometry:
+    """W of all views, and sampled rows of A.
+
+    Args:
+        splats: P. views: in the order of the sums.
+        by_rows: whether a region is a row of a codebook in any case, or may be a tuple of labels (`as_regions`).
+        checkpoint: what the raster found of views before, and is to keep.
+        device_bytes: of W that may stay on the device that found it.
+    """
+    parts: list[RegionWeights] = []
+    samples, blind = [], []
+    readouts, codebooks = deque[Readout](), list[ViewCodebook]()
+
+    def requests() -> Iterator[ViewRequest]:
+        rays = -(-settings.certificate_rays // len(views))
+        for number, (camera, given) in enumerate(views):
+            observation = as_read(given, settings, camera.name)
+            params = strided(settings.lift_params, settings, camera, number)
+            pixels = sample_pixels(camera, rays, (settings.seed, number), params)
+            readouts.append(read_pixels(observation, camera, pixels))
+            regions, own = as_regions(observation, by_rows)
+            codebooks.append(own)
+            yield ViewRequest(camera, regions, params, settings.weighting, pixels)
+
+    found = raster.iterate_views(requests()) if checkpoint is None else checkpoint.answers(raster, requests())
+    on_device = in_memory = 0
+    with closing(found):
+        for view in found:
+            part = codebooks[len(parts)].counted(view.weights)
+            name = views.names[len(parts)]
+            part = replace(part, views=(name,), evidence=part.evidence * float(settings.stride**2))
+            if part.region.is_cuda and on_device + part.nbytes <= device_bytes:
+                on_device += part.nbytes
+            else:
+                part = part.cpu()
+                in_memory += part.nbytes
+                part = part if in_memory <= MEMORY_LIMIT else part.in_files()
+            if not part.evidence.numel():
+                blind.append(name)
+            parts.append(part)
+            samples.append(SampledRays(view.rows, readouts.popleft()))
+            del view, part  # before the next one is made beside it
+            progress("geometry", len(samples), len(views), "views")
+    return Geometry(stacked(parts, splats, threads), Codebook(tuple(codebooks)), tuple(samples), tuple(blind))
+
+
+def strided(params: CompositingParams, settings: LiftSettings, camera: Camera, number: int) -> CompositingParams:
+    """The parameters with the stride, its first pixel drawn for view ``number``: none is left out in all views."""
+    rng = np.random.default_rng((settings.seed, number, settings.stride))
+    left, top = (int(rng.integers(min(settings.stride, side))) for side in (camera.width, camera.height))
+    return replace(params, stride=settings.stride, offset=(left, top))
+
+
+def as_read(observation: ViewFeatures, settings: LiftSettings, view: str) -> ViewFeatures:
+    """The observation as the settings read it: its levels, and with ``nearest`` a grid as regions of one cell each.
+
+    Raises:
+        InvalidFeatures: the view lacks the level that the settings ask for.
+    """
+    observation = at_levels(observation, settings.levels, view)
+    if not isinstance(observation, FeatureGrid) or settings.grid_reading == "bilinear":
+        return observation
+    rows, columns = observation.grid.shape[:2]
+    cells = torch.arange(rows * columns, dtype=torch.int32).reshape(1, rows, columns)
+    return Regions.unchecked(cells, observation.codebook)
+
+
+def sample_pixels(camera: Camera, count: int, seed: tuple[int, int], walk: CompositingParams) -> Tensor:
+    """[n, 2] i32: up to ``count`` different pixels (x, y) that the walk sees, in image order, by an explicit seed."""
+    left, top = walk.offset
+    columns, rows = np.arange(left, camera.width, walk.stride), np.arange(top, camera.height, walk.stride)
+    total = columns.size * rows.size
+    chosen = np.random.default_rng(seed).choice(total, size=min(count, total), replace=False)
+    chosen.sort()
+    places = np.stack([columns[chosen % columns.size], rows[chosen // columns.size]], axis=1)
+    return torch.from_numpy(places.astype(np.int32))
+
+
+def read_pixels(observation: ViewFeatures, camera: Camera, pixels: Tensor) -> Readout:
+    """The rows of S of the given pixels [n, 2] (x, y)."""
+    x, y = pixels.numpy().astype(np.int64).T
+    if isinstance(observation, Regions):
+        _, rows, columns = observation.labels.shape
+        label_y = (2 * y + 1) * rows // (2 * camera.height)
+        label_x = (2 * x + 1) * columns // (2 * camera.width)
+        labels = observation.labels.numpy()[:, label_y, label_x]
+        level, ray = np.nonzero(labels >= 0)
+        return Readout(ray, labels[level, ray][:, None].astype(np.int64), np.ones((ray.shape[0], 1)))
+    rows, columns = observation.grid.shape[:2]
+    u = ((x + 0.5) * columns / camera.width - 0.5).clip(0, columns - 1)
+    v = ((y + 0.5) * rows / camera.height - 0.5).clip(0, rows - 1)
+    left, top = np.floor(u).astype(np.int64), np.floor(v).astype(np.int64)
+    right, bottom = np.minimum(left + 1, columns - 1), np.minimum(top + 1, rows - 1)
+    share_x, share_y = u - left, v - top
+    cells = np.stack(
+        [top * columns + left, top * columns + right, bottom * columns + left, bottom * columns + right], axis=1
+    )
+    shares = np.stack(
+        [(1 - share_y) * (1 - share_x), (1 - share_y) * share_x, share_y * (1 - share_x), share_y * share_x], axis=1
+    )
+    return Readout(np.arange(x.shape[0]), cells, shares)

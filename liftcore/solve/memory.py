@@ -1,0 +1,86 @@
+"""Large arrays: in memory, or in mapped files that have no name, which the system writes and drops as it needs."""
+
+import mmap
+import os
+import shutil
+import tempfile
+from contextlib import suppress
+from math import prod
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from liftcore.errors import Unavailable
+
+MOUNTS = Path("/proc/self/mounts")
+IN_MEMORY = ("tmpfs", "ramfs")
+
+
+def zeros(shape: tuple[int, ...], dtype: torch.dtype, *, name: str, in_file: bool = False) -> Tensor:
+    """Zeros on the CPU, of which no page is taken before it is written.
+
+    Args:
+        name: what errors call it. in_file: mapped from a file in the temporary folder that is gone with the tensor.
+
+    Raises:
+        Unavailable: the disk has no room. It is taken now, for a page without one would end the process later.
+    """
+    size = prod(shape) * dtype.itemsize
+    if not size:
+        return torch.zeros(shape, dtype=dtype)
+    if not in_file:
+        # Not numpy's, which asks for large pages: to clear those took longer than to solve. Nor torch's, which writes
+        # the zeros by one thread, where all threads write soon, or nobody does.
+        pages = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+        return torch.frombuffer(pages, dtype=torch.uint8).view(dtype).view(shape)
+    check_disk(size, name)
+    handle, path = tempfile.mkstemp(prefix="splatlift-")
+    try:
+        os.posix_fallocate(handle, 0, size)
+        return torch.from_file(path, shared=True, size=prod(shape), dtype=dtype).view(shape)
+    except OSError as error:
+        raise _no_disk(size, name, error.strerror or str(error)) from None
+    finally:
+        os.close(handle)
+        Path(path).unlink()
+
+
+def check_disk(size: int, name: str) -> None:
+    """See early that the disk has room for ``size`` bytes.
+
+    Raises:
+        Unavailable: it has not.
+    """
+    got = lack_of_disk(size)
+    if got:
+        raise _no_disk(size, name, got)
+
+
+def lack_of_disk(size: int) -> str:
+    """What the temporary folder has in place of room for ``size`` bytes on a disk; empty where there is room."""
+    folder = Path(tempfile.gettempdir())
+    if file_system(folder) in IN_MEMORY:
+        return "a temporary folder that lies in memory itself"
+    free = shutil.disk_usage(folder).free
+    return "" if free >= size else f"{free / 2**30:.1f} GiB of disk"
+
+
+def file_system(folder: Path, mounts: Path = MOUNTS) -> str:
+    """The kind of file system that a folder lies on, as Linux names it; empty where nothing says."""
+    kinds: dict[Path, str] = {}
+    with suppress(OSError):
+        for line in mounts.read_text(encoding="utf-8", errors="replace").splitlines():
+            _, place, kind, *_ = line.split(" ")
+            kinds[Path(place)] = kind  # the last one mounted there is the one seen
+    own = folder.resolve()
+    return next((kinds[place] for place in (own, *own.parents) if place in kinds), "")
+
+
+def _no_disk(size: int, name: str, got: str) -> Unavailable:
+    return Unavailable(
+        name,
+        expected=f"{size / 2**30:.1f} GiB of memory for them, or of disk in {tempfile.gettempdir()}",
+        got=got,
+        hint="set TMPDIR to a folder with more room, or try fewer views, fewer splats or fewer channels",
+    )

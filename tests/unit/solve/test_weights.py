@@ -1,0 +1,95 @@
+"""The one sparse type: views stacked by splat, what lies in files, and what is taken of it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from liftcore.errors import InvalidInput, Unavailable
+from liftcore.solve import weights
+from liftcore.solve.weights import RegionWeights, stacked
+from tests.unit.solve.sparse_views import dense, of_dense, random_view
+
+SPLATS = 300
+
+
+def views() -> list[RegionWeights]:
+    return [random_view(k, 4 + k, SPLATS) for k in range(5)]
+
+
+def assert_same(one: RegionWeights, other: RegionWeights) -> None:
+    assert one.views == other.views
+    for name, own in one.tensors().items():
+        assert torch.equal(own, getattr(other, name)), name
+
+
+def test_stacked_views_are_their_matrices_side_by_side():
+    own = views()
+    W = stacked(own, SPLATS)
+    assert np.array_equal(dense(W, SPLATS), np.hstack([dense(view, SPLATS) for view in own]))
+    assert W.indptr.shape == (SPLATS + 1,) and W.splats.tolist() == list(range(SPLATS))
+    assert W.offsets.tolist() == [0, 4, 9, 15, 22, 30]
+    rows = np.split(W.region.numpy(), W.indptr.numpy()[1:-1])
+    assert all((np.diff(row) > 0).all() for row in rows)
+    evidence = np.bincount(np.concatenate([view.splats.numpy() for view in own]), minlength=SPLATS)
+    assert np.array_equal(np.flatnonzero(evidence), W.evidence_splats.numpy())
+    assert np.array_equal(evidence[evidence > 0], W.evidence.numpy())
+    np.testing.assert_allclose(W.row_sums().numpy(), dense(W, SPLATS).sum(axis=1), rtol=1e-12)
+
+
+def test_neither_threads_nor_files_nor_groups_of_views_change_a_bit(monkeypatch):
+    own = views()
+    whole = stacked(own, SPLATS, threads=1)
+    assert_same(whole, stacked(own, SPLATS, threads=5))
+    assert_same(whole, stacked([stacked(own[:2], SPLATS), *own[2:]], SPLATS))
+    assert_same(whole, stacked([view.in_files() for view in own], SPLATS))
+    monkeypatch.setattr(weights, "MEMORY_LIMIT", 0)
+    assert_same(whole, stacked(own, SPLATS))
+
+
+def test_no_view_and_views_without_splats_are_rows_without_entries():
+    nothing = of_dense(np.zeros((SPLATS, 3)))
+    for own in ([], [nothing, nothing]):
+        W = stacked(own, SPLATS)
+        assert W.region.numel() == 0 and not W.row_sums().any()
+        assert W.indptr.tolist() == [0] * (SPLATS + 1)
+
+
+def test_a_saved_file_is_mapped_as_it_was(tmp_path):
+    W = stacked([weights.replace(view, views=(f"v{k}",)) for k, view in enumerate(views())], SPLATS)
+    W.save(tmp_path / "w.safetensors")
+    assert_same(W, RegionWeights.load(tmp_path / "w.safetensors"))
+    assert W.views == ("v0", "v1", "v2", "v3", "v4")
+    (tmp_path / "w.safetensors").write_bytes(b"words")
+    for path in (tmp_path / "w.safetensors", tmp_path / "none.safetensors"):
+        with pytest.raises(InvalidInput, match="weights"):
+            RegionWeights.load(path)
+
+
+def test_taken_rows_and_their_runs_are_those_of_the_matrix():
+    W = stacked(views(), SPLATS)
+    rows = torch.tensor([7, 3, 299, 0, 3])
+    starts, entries = W.take(rows)
+    region = W.region[entries]
+    runs, row = W.runs(starts, region)
+    view = np.searchsorted(W.offsets.numpy(), region.numpy(), side="right") - 1
+    matrix = dense(W, SPLATS)
+    for place, splat in enumerate(rows.tolist()):
+        own = slice(int(starts[place]), int(starts[place + 1]))
+        assert np.array_equal(region[own].numpy(), np.flatnonzero(matrix[splat]))
+        expected = [np.flatnonzero(view[own] == v)[0] + own.start for v in np.unique(view[own])]
+        assert runs[:-1][row == place].tolist() == expected
+    assert runs[-1] == entries.shape[0]
+
+
+def test_more_regions_than_four_bytes_number_are_refused():
+    many = weights.replace(random_view(0, 3, 5), offsets=torch.tensor([0, 2**30]))
+    with pytest.raises(Unavailable, match="regions"):
+        stacked([many] * 3, 5)
+
+
+def test_a_full_disk_is_told_in_words(monkeypatch):
+    monkeypatch.setattr("liftcore.solve.memory.lack_of_disk", lambda size: "0.0 GiB of disk")
+    with pytest.raises(Unavailable, match="GiB of memory for them, or of disk"):
+        views()[0].in_files()
