@@ -10,7 +10,7 @@ OUT ?= demo-output
 TORCH_PIP ?=
 CUDA_TORCH_PIP ?=
 
-.PHONY: demo test check kernels soak contract load gpu lint format serve bench setup clean
+.PHONY: demo test check kernels soak contract load gpu lint format serve web bench setup clean
 
 demo: $(READY)  ## the whole job through the real service; SCENE=DIR takes a scene of your own, ASK=TEXT a question
 	$(BIN)/splatlift demo --out "$(OUT)" $(if $(SCENE),--scene "$(SCENE)") $(if $(ASK),--ask "$(ASK)")
@@ -65,6 +65,11 @@ format: $(READY)
 
 serve: $(READY)
 	$(BIN)/splatlift serve
+
+# Needs Node.js with npm; what it builds is committed, so that nobody else does.
+web:  ## the page, from service/web/src into service/web/built
+	cd service/web && npm ci --silent && node build.mjs
+	cp service/web/node_modules/axe-core/axe.min.js tests/browser/axe.min.js
 
 bench: $(READY)
 	$(BIN)/splatlift bench $(if $(SCENE),--scene "$(SCENE)")

@@ -19,7 +19,7 @@ from service.middleware import AnswerHead, BodyLimit, RefuseWork
 from service.observe import Metrics, RecordedApp, versions
 from service.queries.client import QueryClient, QueryLimits
 from service.requests import KnownParameters
-from service.routes import assets, jobs, lifts, operations, queries, tradeoffs
+from service.routes import assets, jobs, lifts, operations, queries, scene, tradeoffs
 from service.settings import ServiceSettings
 from service.state import AppState, Readiness, Stopping
 from service.store.collect import Collector
@@ -77,7 +77,7 @@ def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, work
     app.add_middleware(Gate, keys=store.keys, settings=settings)  # outside of it: no body of a stranger is read
     problems.install(app)
     app.include_router(operations.router)  # probes and links to the page may carry what they like
-    for module in (assets, jobs, lifts, tradeoffs, queries):
+    for module in (assets, jobs, lifts, scene, tradeoffs, queries):
         app.include_router(module.router, dependencies=[KnownParameters])
     return app
 

@@ -329,6 +329,27 @@ class Lifts(BaseModel):
     next: str | None = Field(None, description="with limit: the cursor of the page after this one; null at the end")
 
 
+class View(BaseModel):
+    """A camera of a lift's scene, in gsplat's conventions: OpenCV axes, pixel centres at +0.5."""
+
+    name: str
+    lifted: bool = Field(description="whether its features were lifted")
+    width: int = Field(description="pixels")
+    height: int
+    fx: float = Field(description="pixels, like fy, cx and cy")
+    fy: float
+    cx: float
+    cy: float
+    viewmat: list[list[float]] = Field(description="[4, 4], world to camera")
+
+
+class Views(BaseModel):
+    """Some of the cameras of a lift's scene, in their file's order."""
+
+    views: list[View]
+    next: int | None = Field(description="the cursor of the page after this one; null at the end")
+
+
 class Tradeoff(BaseModel):
     """Speed against accuracy on a scene, as ``splatlift tradeoff --json`` has it. It has the id of its job."""
 
@@ -463,6 +484,7 @@ class QueryAnswer(BaseModel):
     statistics: dict[str, Any] = Field(description="of the scores over the seen splats")
     threshold: Threshold
     count: int = Field(description="splats at or above the threshold")
+    present: bool = Field(description="whether what was found stands apart from the rest of the scene")
     top: list[TopSplat]
     box: Box | None = Field(description="around all splats at or above the threshold, strays too: see objects")
     links: dict[str, str]
@@ -474,6 +496,7 @@ class ObjectsAnswer(BaseModel):
     lift: JobId
     threshold: Threshold
     count: int = Field(description="splats at or above the threshold")
+    present: bool = Field(description="whether they stand apart from the rest of the scene")
     objects: list[FoundObject] = Field(description="those with the most evidence first")
     strays: int = Field(description="splats at or above the threshold in none of them")
 

@@ -21,7 +21,7 @@ class Scope(StrEnum):
 # who have none yet, and browsers send none with a link.
 OPEN = frozenset(
     {
-        "/", "/healthz", "/readyz", "/version",
+        "/", "/web/page.js", "/web/page.css", "/web/LICENSES.txt", "/healthz", "/readyz", "/version",
         "/openapi.json", "/docs", "/docs/swagger-ui-bundle.js", "/docs/swagger-ui.css",
     }
 )  # fmt: skip

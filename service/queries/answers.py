@@ -19,7 +19,7 @@ import torch
 from liftcore.errors import SplatliftError
 from liftcore.io.json_file import finite
 from liftcore.query.ask import Answer, Point, Question, answers, question, top
-from liftcore.query.export import coloured_ply, npy, object_ply
+from liftcore.query.export import coloured_ply, layer_colours, npy, object_ply, viewer_splats
 from liftcore.query.objects import Objects, objects
 from liftcore.query.render import ViewMask, attention_png, mask_png, render_png, view_mask
 from liftcore.query.scene import QueryScene
@@ -27,6 +27,7 @@ from liftcore.query.scores import warm_up as warm_up_scores
 from liftcore.query.terms import Example, Query, Vector, parse_example
 from liftcore.query.text import RememberingEncoder, TextEncoder, open_encoder
 from liftcore.raster.cpu.warm_up import warm_up
+from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Kernel
 from service.errors import NoSpace
 from service.queries.client import Frame
@@ -112,6 +113,9 @@ class Answers:
             "attention": self._attention,
             "render": self._render,
             "splats": self._splats,
+            "scene": self._viewer_splats,
+            "layer": self._layer,
+            "views": self._views,
         }
 
     @property
@@ -239,6 +243,19 @@ class Answers:
         write_draft(make(self._scene(request), self._answer(request)), Path(request["draft"]))
         return Frame({})
 
+    def _viewer_splats(self, request: dict[str, Any]) -> Frame:
+        write_draft(viewer_splats(self._scene(request)), Path(request["draft"]))
+        return Frame({})
+
+    def _layer(self, request: dict[str, Any]) -> Frame:
+        return Frame({}, npy(layer_colours(self._scene(request), request["what"])))
+
+    def _views(self, request: dict[str, Any]) -> Frame:
+        cameras, first, count = self._scene(request).cameras, request["first"], request["count"]
+        names = list(itertools.islice(cameras, first, first + count))
+        more = first + count < len(cameras)
+        return Frame({"views": [describe_view(cameras[name], name) for name in names], "more": more})
+
 
 def write_draft(blocks: Iterable[bytes], draft: Path) -> None:
     """Write what is too much for a pipe where the HTTP process finds it, and removes it.
@@ -326,10 +343,18 @@ def describe_objects(found: Objects) -> dict[str, Any]:
     return {"objects": things, "strays": found.strays}
 
 
+def describe_view(camera: Camera, name: str) -> dict[str, Any]:
+    """A camera, as JSON takes it; of a distorted photo the pinhole that stands for it."""
+    K = {"fx": camera.fx, "fy": camera.fy, "cx": camera.K[0, 2].item(), "cy": camera.K[1, 2].item()}
+    size = {"width": camera.width, "height": camera.height}
+    return {"name": name, **size, **K, "viewmat": camera.viewmat.tolist()}
+
+
 def _box(corners: tuple[Point, Point]) -> dict[str, Point]:
     return {"low": corners[0], "high": corners[1]}
 
 
 def _found(answer: Answer) -> dict[str, Any]:
     cut = {"method": answer.threshold_method, "explanation": answer.explanation}
-    return {"threshold": {"value": finite(answer.threshold), **cut}, "count": answer.count}
+    present = answer.clear and answer.count > 0
+    return {"threshold": {"value": finite(answer.threshold), **cut}, "count": answer.count, "present": present}

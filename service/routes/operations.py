@@ -20,7 +20,7 @@ from service.auth import with_keys
 from service.requests import with_bodies
 from service.state import CHECKS, Deps
 
-WEB = Path(__file__).parents[1] / "web"
+WEB = Path(__file__).parents[1] / "web" / "built"  # by `make web`
 SWAGGER = Path(str(files("fastapi_offline"))) / "static"  # shipped, as a robot's network may lead nowhere
 NO_PICTURE = "data:,"  # the page asks another host for one unless it is told
 METRICS_TYPE = "text/plain; version=0.0.4; charset=utf-8"
@@ -30,6 +30,24 @@ METRICS: dict[int | str, dict[str, Any]] = {
         "content": {METRICS_TYPE: {"schema": {"type": "string"}}},
     }
 }
+
+# What the page may do: ask this service, and sort and unpack splats, which is done by WebAssembly in workers.
+PAGE_POLICY = {
+    "default-src": "'none'",
+    "script-src": "'self' 'wasm-unsafe-eval'",
+    "style-src": "'self'",
+    "img-src": "'self' blob: data:",
+    "connect-src": "'self'",
+    "worker-src": "blob:",
+    "base-uri": "'none'",
+    "form-action": "'none'",
+    "frame-ancestors": "'none'",
+}
+PAGE_HEADERS = {
+    "Content-Security-Policy": "; ".join(f"{name} {value}" for name, value in PAGE_POLICY.items()),
+    "Cache-Control": "no-cache",
+}
+KEPT = {"Cache-Control": "public, max-age=31536000, immutable"}  # the page asks for them by their digest
 
 router = APIRouter(tags=["operations"])
 
@@ -64,10 +82,26 @@ async def metrics(deps: Deps) -> Response:
 
 @router.get("/", response_class=HTMLResponse, include_in_schema=False)
 def page() -> HTMLResponse:
-    """The page, in one piece: it needs no other route, so no key, before it can ask for one."""
-    names = ("index.html", "page.css", "page.js")
-    whole, style, script = ((WEB / name).read_text(encoding="utf-8") for name in names)
-    return _guarded(whole.replace("/* page.css */\n", style).replace("/* page.js */\n", script))
+    """The page. It and its files need no key, before it can ask for one."""
+    return HTMLResponse((WEB / "page.html").read_text(encoding="utf-8"), headers=PAGE_HEADERS)
+
+
+@router.get("/web/page.js", include_in_schema=False)
+def page_script() -> Response:
+    """What draws the page."""
+    return Response((WEB / "page.js").read_bytes(), media_type="text/javascript", headers=KEPT)
+
+
+@router.get("/web/page.css", include_in_schema=False)
+def page_style() -> Response:
+    """How it looks."""
+    return Response((WEB / "page.css").read_bytes(), media_type="text/css", headers=KEPT)
+
+
+@router.get("/web/LICENSES.txt", include_in_schema=False)
+def page_licences() -> Response:
+    """The licences of the libraries in it."""
+    return Response((WEB / "LICENSES.txt").read_bytes(), media_type="text/plain; charset=utf-8")
 
 
 @router.get("/openapi.json", include_in_schema=False)

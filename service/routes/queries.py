@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from pathlib import Path
 from typing import Annotated, Any, Literal
 from urllib.parse import urlencode
 
@@ -26,6 +27,7 @@ QUERY_BODY = json_body(models.AskedInBody)
 BODY = described_body(models.AskedInBody)
 REGION = "region:"  # what needs the lift's feature packs begins with it
 MEDIA_TYPES = {"scores": "application/x-npy", "mask": "image/png", "attention": "image/png", "render": "image/png"}
+MEDIA_TYPES["layer"] = MEDIA_TYPES["scores"]  # both are arrays
 
 
 def bytes_of(media_type: str) -> dict[int | str, dict[str, Any]]:
@@ -69,21 +71,21 @@ def objects_by_body(deps: Deps, asked: models.AskedInBody = QUERY_BODY) -> model
 def scores(asked: Annotated[models.Asked, Query()], request: Request, deps: Deps) -> Response:
     """The score of every splat: .npy, float32 [P]."""
     lift = _find_lift(asked.lift, deps)
-    return _entity(request, deps, query_request("scores", asked, lift, deps), lift)
+    return entity(request, deps, query_request("scores", asked, lift, deps), lift)
 
 
 @router.get("/query/mask", responses=PNG | TAGGED, response_class=Response)
 def mask(asked: Annotated[models.AskedInView, Query()], request: Request, deps: Deps) -> Response:
     """Where it is in a view: a PNG, white where it is."""
     lift = _find_lift(asked.lift, deps)
-    return _entity(request, deps, query_request("mask", asked, lift, deps) | {"view": asked.view}, lift)
+    return entity(request, deps, query_request("mask", asked, lift, deps) | {"view": asked.view}, lift)
 
 
 @router.get("/query/attention", responses=PNG | TAGGED, response_class=Response)
 def attention(asked: Annotated[models.AskedInView, Query()], request: Request, deps: Deps) -> Response:
     """How well each pixel of a view answers to it: a PNG."""
     lift = _find_lift(asked.lift, deps)
-    return _entity(request, deps, query_request("attention", asked, lift, deps) | {"view": asked.view}, lift)
+    return entity(request, deps, query_request("attention", asked, lift, deps) | {"view": asked.view}, lift)
 
 
 @router.get("/query/splats", responses=PLY | TAGGED, response_class=Response)
@@ -91,7 +93,7 @@ def splats(asked: Annotated[models.AskedForSplats, Query()], request: Request, d
     """What was found, or the scene in the colours of its scores, as splats: a PLY of the dialect that was lifted."""
     lift = _find_lift(asked.lift, deps)
     wanted = query_request("splats", asked, lift, deps) | {"what": asked.what}
-    etag = _entity_tag(wanted, lift)
+    etag = entity_tag(wanted, lift)
     return unchanged(request, etag, found=False) or _splat_file(deps, wanted, lift, etag)
 
 
@@ -143,7 +145,7 @@ def render(
     1, in scene units, with even steps between; what lies beyond has these levels too. 0 is where no splat is.
     """
     found = _find_lift(lift, deps)
-    return _entity(request, deps, _scene_request("render", found, deps) | {"view": view, "what": what}, found)
+    return entity(request, deps, scene_request("render", found, deps) | {"view": view, "what": what}, found)
 
 
 def _answer(asked: models.AskedWhere | models.AskedInBody, deps: AppState) -> models.QueryAnswer:
@@ -177,8 +179,8 @@ def _view(asked: models.AskedInBody) -> str:
     return asked.view
 
 
-def _entity(request: Request, deps: AppState, asked: dict[str, Any], lift: LiftRecord) -> Response:
-    etag = _entity_tag(asked, lift)
+def entity(request: Request, deps: AppState, asked: dict[str, Any], lift: LiftRecord) -> Response:
+    etag = entity_tag(asked, lift)
     same = unchanged(request, etag, found=False)  # the tag is made before anybody looks for the view
     if same is not None:
         return same
@@ -187,12 +189,17 @@ def _entity(request: Request, deps: AppState, asked: dict[str, Any], lift: LiftR
 
 
 def _splat_file(deps: AppState, asked: dict[str, Any], lift: LiftRecord, etag: str | None = None) -> Response:
-    """The query process writes a draft, as a scene is more than a pipe should carry."""
+    size = deps.store.assets.get(deps.owner, lift.splats).bytes
+    return drafted(deps, asked, size, f"{asked['what']}-{lift.id}.ply", etag)
+
+
+def drafted(deps: AppState, asked: dict[str, Any], size: int, name: str, etag: str | None) -> Response:
+    """A file of at most ``size`` bytes: the query process writes a draft, as it is more than a pipe should carry."""
     files = deps.store.files
-    files.require_room(deps.store.assets.get(deps.owner, lift.splats).bytes)
-    with files.draft(".ply") as draft:
+    files.require_room(size)
+    with files.draft(Path(name).suffix) as draft:
         deps.queries.call(asked | {"draft": str(draft)})
-        return Draft(draft, filename=f"{asked['what']}-{lift.id}.ply", etag=etag)
+        return Draft(draft, filename=name, etag=etag)
 
 
 def _content(deps: AppState, asked: dict[str, Any]) -> Response:
@@ -204,7 +211,7 @@ def _find_lift(lift: str | None, deps: AppState) -> LiftRecord:
     return deps.store.lifts.only(deps.owner) if lift is None else deps.store.lifts.get(deps.owner, lift)
 
 
-def _scene_request(operation: str, lift: LiftRecord, deps: AppState) -> dict[str, Any]:
+def scene_request(operation: str, lift: LiftRecord, deps: AppState) -> dict[str, Any]:
     """What the query process must know of a lift's files; ``names`` says what the client calls them."""
     job = deps.store.jobs.get(deps.owner, lift.id)
     splats, cameras = deps.store.assets.get(deps.owner, job.splats), deps.store.assets.get(deps.owner, job.cameras)
@@ -224,7 +231,7 @@ def _scene_request(operation: str, lift: LiftRecord, deps: AppState) -> dict[str
 
 def query_request(operation: str, asked: Question, lift: LiftRecord, deps: AppState) -> dict[str, Any]:
     """The same with a query; texts bring their encoder, and examples of regions the lift's feature packs."""
-    request = _scene_request(operation, lift, deps)
+    request = scene_request(operation, lift, deps)
     spec = None
     if asked.text or asked.negatives:
         spec = encoder_spec(deps.settings, lift.metadata["text_space"], asked.encoder)
@@ -244,7 +251,7 @@ def query_request(operation: str, asked: Question, lift: LiftRecord, deps: AppSt
     }
 
 
-def _entity_tag(asked: dict[str, Any], lift: LiftRecord) -> str:
+def entity_tag(asked: dict[str, Any], lift: LiftRecord) -> str:
     """The tag of an answer, from all that decides it: so 304 costs no query."""
     decides = {name: value for name, value in asked.items() if name != "names"}
     decides["lift"] = lift.sha256

@@ -33,7 +33,8 @@ PATIENCE_SECONDS = 60.0  # for what takes a quarter of a second
 NOBODY = "e" * 32
 NO_ASSET = "sha256:" + "f" * 64
 DOCS = {"/openapi.json", "/docs", "/docs/swagger-ui-bundle.js", "/docs/swagger-ui.css"}
-OPEN_ROUTES = {"/", "/healthz", "/readyz", "/version", *DOCS}
+PAGE = {"/", "/web/page.js", "/web/page.css", "/web/LICENSES.txt"}
+OPEN_ROUTES = {*PAGE, "/healthz", "/readyz", "/version", *DOCS}
 # Routes that name nothing of anybody: they show one's own things, or make new ones.
 NAMELESS = {("GET", "/metrics"), ("GET", "/assets"), ("PUT", "/assets/{asset}"), ("GET", "/jobs"), ("GET", "/lifts")}
 ASKING = {"text": "apple", "view": "v"}

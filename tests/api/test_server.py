@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import signal
@@ -22,7 +23,7 @@ from safetensors.numpy import save
 from service.__main__ import main, parse
 from service.encoders import encoder_label, encoder_spec
 from service.errors import InvalidRequest
-from service.routes.operations import WEB, page
+from service.routes.operations import WEB
 from service.settings import ServiceSettings
 
 from .conftest import Uploaded
@@ -252,7 +253,31 @@ def test_empty_variable_is_one_that_is_not_set(monkeypatch: pytest.MonkeyPatch) 
     assert (parse([]).commit, parse([]).port, parse([]).allowed_hosts) == (None, 8787, ())
 
 
-def test_page_comes_in_one_piece_with_its_style_and_script() -> None:
-    whole = bytes(page().body).decode()
-    for name in ("page.css", "page.js"):
-        assert (WEB / name).read_text() in whole and name not in whole
+def test_built_page_is_of_these_sources() -> None:
+    web = WEB.parent
+    sources = [
+        *(path.relative_to(web).as_posix() for path in (web / "src").iterdir()),
+        "build.mjs",
+        "package-lock.json",
+    ]
+    digest = hashlib.sha256()
+    for name in sorted(sources):
+        digest.update(f"{name}\0{(web / name).read_text(encoding='utf-8')}\0".encode())
+    told = f"sources sha256:{digest.hexdigest()}"
+    for name in ("page.js", "page.css"):
+        assert told in (WEB / name).read_text(encoding="utf-8").split("\n", 1)[0], "run `make web`"
+    assert (WEB / "page.html").read_text(encoding="utf-8").count(f"?{digest.hexdigest()[:16]}") == 2
+
+
+def test_page_names_its_libraries_and_no_registry() -> None:
+    lock = (WEB.parent / "package-lock.json").read_text(encoding="utf-8")
+    assert "resolved" not in lock and "://" not in lock
+    exact = json.loads((WEB.parent / "package.json").read_text(encoding="utf-8"))
+    assert all(
+        version[0].isdigit() for kind in ("dependencies", "devDependencies") for version in exact[kind].values()
+    )
+    licences = (WEB / "LICENSES.txt").read_text(encoding="utf-8")
+    assert (
+        all(name in licences for name in exact["dependencies"])
+        and licences.count("Permission is hereby granted") == 3
+    )

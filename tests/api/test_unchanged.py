@@ -27,7 +27,14 @@ def test_any_picture_is_one_that_exists(client: TestClient, lift: dict[str, Any]
 def test_document_says_what_is_answered_beside_200(client: TestClient, uploaded: Uploaded) -> None:
     paths = client.get("/openapi.json").json()["paths"]
     files = ("/assets/{asset}/content", "/lifts/{lift}/features")
-    for path in (*files, *PICTURES, "/query/scores", "/tradeoffs/{tradeoff}/chart"):
+    for path in (
+        *files,
+        *PICTURES,
+        "/query/scores",
+        "/lifts/{lift}/splats",
+        "/lifts/{lift}/colours",
+        "/tradeoffs/{tradeoff}/chart",
+    ):
         told = paths[path]["get"]["responses"]
         assert "304" in told and "content" not in told["304"], path
         assert ("206" in told, "416" in told) == (path in files, path in files), path

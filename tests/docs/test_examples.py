@@ -26,13 +26,14 @@ from liftcore.features.masks import mask_of_runs, read_runs
 from liftcore.features.pack import read_features
 from liftcore.io.splats import read_splats
 from service import models
-from service.routes import assets, jobs, lifts, operations, queries, tradeoffs
+from service.routes import assets, jobs, lifts, operations, queries, scene, tradeoffs
+from service.scopes import OPEN
 from tests.api.tiny_scene import WIDTH, WORDS, codebook, colmap_zip, labels, make_scene
 from tests.run_lengths import sam_records
 
 from .readme import FOR_USERS, GUIDE, PYTHON, SERVICE, SETTINGS, blocks, text
 
-ROUTES: tuple[ModuleType, ...] = (operations, assets, jobs, lifts, tradeoffs, queries)
+ROUTES: tuple[ModuleType, ...] = (operations, assets, jobs, lifts, scene, tradeoffs, queries)
 SHAPES: dict[str, type[BaseModel]] = {  # a field that no other answer has -> the answer
     "counts": models.Asset,
     "attempt": models.Job,
@@ -236,5 +237,5 @@ def test_every_route_is_told_and_no_other() -> None:
         for route in module.router.routes:
             assert isinstance(route, APIRoute)
             real |= {f"{method} {route.path}" for method in route.methods or ()}
-    in_a_sentence = {"GET /openapi.json", "GET /docs", "GET /docs/swagger-ui-bundle.js", "GET /docs/swagger-ui.css"}
+    in_a_sentence = {f"GET {path}" for path in OPEN if path.startswith(("/openapi", "/docs", "/web"))}
     assert named == real - in_a_sentence

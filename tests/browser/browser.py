@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import json
 import os
@@ -14,13 +15,15 @@ from pathlib import Path
 from typing import Any, Self
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
-PATIENCE_SECONDS = 60.0  # for what takes a second; the machine may be busy
+PATIENCE_SECONDS = 15.0  # for what takes a second; the machine may be busy
 OPTIONS = (
     "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync",
     "--disable-background-networking", "--disable-component-update", "--disable-dev-shm-usage",
-    "--window-size=1200,900", "--remote-debugging-pipe",
+    "--enable-unsafe-swiftshader", "--force-prefers-reduced-motion", "--hide-scrollbars",
+    "--window-size=900,700", "--remote-debugging-pipe",
 )  # fmt: skip
 SHIFT = 8  # DevTools' bit of the key
+KEYS = {"Enter": 13, "Escape": 27, "Tab": 9, "ArrowLeft": 37, "ArrowUp": 38, "ArrowRight": 39, "ArrowDown": 40}
 
 
 def chromium() -> str | None:
@@ -29,21 +32,26 @@ def chromium() -> str | None:
 
 
 class Browser:
-    """One window. What its scripts say of errors that nobody caught is kept in ``faults``."""
+    """One window.
+
+    ``faults`` keeps what its scripts say of errors: uncaught ones, those of the console, and what the policy of the
+    page's contents refused; ``asked`` the addresses of all its requests.
+    """
 
     def __init__(self, process: subprocess.Popen[bytes], told: int, heard: int) -> None:
         self._process, self._told, self._heard = process, told, heard
         self._buffer, self._last, self._session = b"", 0, ""
         self.faults: list[str] = []
+        self.asked: list[str] = []
 
     @classmethod
     @contextlib.contextmanager
-    def started(cls, program: str, profile: Path) -> Iterator[Self]:
-        """A browser with an empty profile; gone at the end."""
+    def started(cls, program: str, profile: Path, *more: str) -> Iterator[Self]:
+        """A browser with an empty profile and ``more`` options; gone at the end."""
         (theirs_in, told), (heard, theirs_out) = os.pipe(), os.pipe()
         # Chromium looks for its pipes at 3 and 4, where this process has other things.
         moved = f'exec "$@" 3<&{theirs_in} 4>&{theirs_out}'
-        command = ["bash", "-c", moved, "bash", program, *OPTIONS, f"--user-data-dir={profile}", "about:blank"]
+        command = ["bash", "-c", moved, "bash", program, *OPTIONS, *more, f"--user-data-dir={profile}", "about:blank"]
         quiet = subprocess.DEVNULL
         process = subprocess.Popen(command, stdout=quiet, stderr=quiet, pass_fds=(theirs_in, theirs_out))
         os.close(theirs_in)
@@ -64,6 +72,8 @@ class Browser:
         self._session = attached["sessionId"]
         self._call("Page.enable")
         self._call("Runtime.enable")
+        self._call("Network.enable")
+        self._call("Log.enable")
 
     def open(self, address: str) -> None:
         """Go to an address, and wait until the document is there."""
@@ -89,13 +99,42 @@ class Browser:
 
     def press(self, selector: str, x: float = 0.5, y: float = 0.5, *, shift: bool = False) -> None:
         """Click an element, x and y as shares of its box."""
-        self.value(f"document.querySelector({json.dumps(selector)}).scrollIntoView()")
+        self.value(f"document.querySelector({json.dumps(selector)}).scrollIntoView({{block: 'nearest'}})")
         box = self.value(f"document.querySelector({json.dumps(selector)}).getBoundingClientRect().toJSON()")
         place = {"x": box["left"] + x * box["width"], "y": box["top"] + y * box["height"]}
         for kind in ("mousePressed", "mouseReleased"):
             self._call(
                 "Input.dispatchMouseEvent", type=kind, button="left", clickCount=1, modifiers=SHIFT * shift, **place
             )
+
+    def key(self, name: str, *, shift: bool = False) -> None:
+        """Press a key and let it go."""
+        told = {
+            "key": name,
+            "modifiers": SHIFT * shift,
+            "windowsVirtualKeyCode": KEYS.get(name, ord(name[0].upper())),
+        }
+        text = {"text": "\r" if name == "Enter" else name} if name == "Enter" or len(name) == 1 else {}
+        self._call("Input.dispatchKeyEvent", type="keyDown" if text else "rawKeyDown", **told, **text)
+        self._call("Input.dispatchKeyEvent", type="keyUp", **told)
+
+    def window(self, width: int, height: int, scheme: str = "dark") -> None:
+        """The window's size in CSS pixels, and whether its user likes it ``dark`` or ``light``."""
+        size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 500}
+        self._call("Emulation.setDeviceMetricsOverride", **size)
+        self._call("Emulation.setEmulatedMedia", features=[
+            {"name": "prefers-color-scheme", "value": scheme}, {"name": "prefers-reduced-motion", "value": "reduce"},
+        ])  # fmt: skip
+
+    def give(self, selector: str, files: list[Path]) -> None:
+        """Choose files in an input for them."""
+        node = self._call("DOM.getDocument")["root"]["nodeId"]
+        found = self._call("DOM.querySelector", nodeId=node, selector=selector)["nodeId"]
+        self._call("DOM.setFileInputFiles", nodeId=found, files=[str(file) for file in files])
+
+    def screenshot(self) -> bytes:
+        """The window as a PNG."""
+        return base64.b64decode(self._call("Page.captureScreenshot", format="png")["data"])
 
     def write(self, selector: str, text: str) -> None:
         """Put text into a field, in place of what is there."""
@@ -110,12 +149,23 @@ class Browser:
         os.write(self._told, json.dumps(message).encode() + b"\0")
         while True:
             answer = self._next()
-            if answer.get("method") == "Runtime.exceptionThrown":
-                self.faults.append(str(answer["params"]["exceptionDetails"]))
+            self._note(answer.get("method"), answer.get("params", {}))
             if answer.get("id") == self._last:
                 if "error" in answer:
                     raise AssertionError(f"{method}: {answer['error']}")
                 return answer["result"]
+
+    def _note(self, method: str | None, told: dict[str, Any]) -> None:
+        if method == "Runtime.exceptionThrown":
+            self.faults.append(str(told["exceptionDetails"]))
+        elif method == "Runtime.consoleAPICalled" and told["type"] == "error":
+            self.faults.append(str(told["args"]))
+        elif (
+            method == "Log.entryAdded" and told["entry"]["level"] == "error" and told["entry"]["source"] != "network"
+        ):
+            self.faults.append(told["entry"]["text"])
+        elif method == "Network.requestWillBeSent":
+            self.asked.append(told["request"]["url"])
 
     def _next(self) -> dict[str, Any]:
         while b"\0" not in self._buffer:

@@ -1,0 +1,289 @@
+// The panel of bringing: files by drag and drop, the settings of a lift from the schema, jobs as they run, and what
+// is here already.
+import { ago, at, count, el, plural, size, tell } from "./dom.js";
+import { events, json, picture, post, remove, upload, words } from "./service.js";
+
+const PAGE = 20; // of each list
+const LOOK = 15_000; // ms between looks for jobs of others, while the panel is open
+const ENDED = ["succeeded", "failed", "canceled"];
+const KINDS = { splats: "Splats", cameras: "Cameras", features: "Features" };
+const WANTED = { splats: ".ply, .splat, .spz or .sog", cameras: "cameras.json, transforms.json, or a .zip of a COLMAP model", features: ".safetensors packs" };
+const PRESETS = {
+  tikhonov: ["Sharp", "The paper's best: strong weights count more."],
+  "row-sum": ["Plain", "Every splat takes the mean of what its rays see."],
+  "top-k": ["Front splats", "The largest weights of each ray alone."],
+};
+const SPEEDS = { exact: "every pixel", balanced: "every 4th pixel", fast: "fewer views too", draft: "a first look" };
+const STAGES = { read: "Reading files", digest: "Reading files", compile: "Compiling kernels", plan: "Planning", geometry: "Looking through the views",
+  solve: "Solving", robust: "Comparing views", certify: "Checking the result", save: "Saving" };
+
+const kindOf = name => (/\.(ply|splat|spz|sog)$/i.test(name) ? "splats" : /\.(json|zip)$/i.test(name) ? "cameras" : /\.safetensors$/i.test(name) ? "features" : null);
+
+export class Bring {
+  // opened: with a lift that is to be shown; gone: after lifts were deleted.
+  constructor({ opened, gone }) {
+    Object.assign(this, { opened, gone, files: [], followed: new Map(), jobs: [] });
+    const stop = event => { if ([...event.dataTransfer.types].includes("Files")) event.preventDefault(); };
+    addEventListener("dragover", event => { stop(event); document.body.classList.add("dragging"); });
+    addEventListener("dragleave", event => { if (!event.relatedTarget) document.body.classList.remove("dragging"); });
+    addEventListener("drop", event => {
+      stop(event);
+      document.body.classList.remove("dragging");
+      if (event.dataTransfer.files.length) { this.open?.(); this.add([...event.dataTransfer.files]); }
+    });
+    at("choose").addEventListener("click", () => at("files").click());
+    at("files").addEventListener("change", () => { this.add([...at("files").files]); at("files").value = ""; });
+    at("order").addEventListener("submit", event => { event.preventDefault(); this.order("/lift"); });
+    at("compare").addEventListener("click", () => this.order("/tradeoff"));
+    at("preset").replaceChildren(...Object.entries(PRESETS).map(([name, [title, why]], place) => choice("preset", name, title, why, place === 0)));
+    at("speed").replaceChildren(...Object.entries(SPEEDS).map(([name, why], place) => choice("speed", name, name, why, place === 0)));
+    at("more-settings").addEventListener("toggle", () => { if (at("more-settings").open) this.schema(); });
+    setInterval(() => { if (!document.hidden && !at("panel-bring").hidden) this.refresh(); }, LOOK);
+    this.show();
+  }
+
+  add(files) {
+    for (const file of files) {
+      const kind = kindOf(file.name);
+      const one = { name: file.name, bytes: file.size, kind, sent: 0, asset: null, problem: null };
+      if (!kind) one.problem = { title: "Not sent", detail: /\.bin$/i.test(file.name) ? "zip the folder of the COLMAP model, and drop the zip" : `it is none of ${Object.values(WANTED).join("; ")}` };
+      if (kind && kind !== "features") this.files = this.files.filter(known => known.kind !== kind || !known.asset);
+      this.files.push(one);
+      if (kind) this.send(one, file);
+    }
+    this.show();
+  }
+
+  async send(one, file) {
+    const sending = upload(one.kind, file, sent => { one.sent = sent; this.show(); });
+    one.end = sending.end;
+    try {
+      one.asset = await sending.done;
+    } catch (problem) {
+      one.problem = problem;
+    }
+    this.show();
+    if (one.asset) this.refreshAssets();
+  }
+
+  // An asset that is here already, taken for the next lift.
+  take(asset) {
+    if (this.files.some(one => one.asset?.id === asset.id)) return;
+    if (asset.kind !== "features") this.files = this.files.filter(one => one.kind !== asset.kind);
+    this.files.push({ name: `${KINDS[asset.kind]} from before`, bytes: asset.bytes, kind: asset.kind, sent: asset.bytes, asset, problem: null });
+    this.show();
+    at("drop").scrollIntoView({ block: "nearest" });
+  }
+
+  show() {
+    at("sent").replaceChildren(...this.files.map(one => this.line(one)));
+    const has = kind => this.files.some(one => one.kind === kind && one.asset);
+    const missing = Object.keys(KINDS).filter(kind => !has(kind));
+    const busy = this.files.some(one => !one.asset && !one.problem);
+    at("needs").replaceChildren(...Object.keys(KINDS).map(kind => el("li", { className: has(kind) ? "done" : "" },
+      el("b", {}, KINDS[kind]), ` ${has(kind) ? "ready" : WANTED[kind]}`)));
+    at("lift-it").disabled = at("compare").disabled = Boolean(missing.length) || busy;
+    at("settings").hidden = missing.length === 3 && !this.files.length;
+  }
+
+  line(one) {
+    const done = one.asset || one.problem;
+    const share = one.bytes ? one.sent / one.bytes : 1;
+    const state = one.problem ? words(one.problem) : one.asset ? said(one.asset)
+      : share >= 1 ? "checking it\u2026" : `${size(one.sent)} of ${size(one.bytes)}`;
+    return el("li", { className: one.problem ? "file bad" : one.asset ? "file done" : "file" },
+      el("span", { className: "name" }, one.name), el("span", { className: "kind" }, one.kind || ""),
+      done ? null : el("progress", share >= 1 ? { "aria-label": `checking ${one.name}` } : { max: 1, value: share, "aria-label": `upload of ${one.name}` }),
+      el("span", { className: "state" }, state),
+      ...(one.asset?.warnings || []).map(warning => el("span", { className: "state warning" }, `Note: ${warning}`)),
+      el("button", { type: "button", className: "away", "aria-label": `Take ${one.name} away`,
+        on: { click: () => { if (!done) one.end?.(); this.files = this.files.filter(known => known !== one); this.show(); } } }, "\u00d7"));
+  }
+
+  // The knobs behind the presets, from the service's own schema.
+  async schema() {
+    if (this.fields) return;
+    this.fields = {};
+    try {
+      const { components: { schemas } } = await json("/openapi.json");
+      const { properties } = schemas.LiftRequest.properties.settings;
+      at("knobs").replaceChildren(...Object.entries(properties).filter(([name]) => !["speed"].includes(name)).map(([name, told]) => {
+        const input = this.fields[name] = field(resolved(told, schemas));
+        input.id = `knob-${name}`;
+        return el("div", { className: "knob" }, el("label", { htmlFor: input.id }, name), input, el("small", {}, told.description || ""));
+      }));
+    } catch (problem) {
+      this.fields = null;
+      tell(words(problem), true);
+    }
+  }
+
+  settings() {
+    const chosen = { preset: at("order").elements.preset.value, speed: at("order").elements.speed.value };
+    for (const [name, input] of Object.entries(this.fields || {})) {
+      if (input.value === "") continue;
+      const value = input.value;
+      chosen[name] = value === "true" ? true : value === "false" ? false : value !== "" && !Number.isNaN(Number(value)) ? Number(value) : value;
+    }
+    return chosen;
+  }
+
+  async order(path) {
+    const ids = kind => this.files.filter(one => one.kind === kind && one.asset).map(one => one.asset.id);
+    const settings = this.settings();
+    const body = { splats: ids("splats").at(-1), cameras: ids("cameras").at(-1), features: ids("features"), settings };
+    if (path === "/tradeoff") {
+      delete settings.preset;
+      delete settings.speed;
+      body.budget_s = Number(at("budget").value);
+    }
+    try {
+      const job = await post(path, body);
+      at("order-problem").hidden = true;
+      this.jobs = [job, ...this.jobs.filter(known => known.id !== job.id)];
+      this.showJobs();
+      this.follow(job, true);
+      at("jobs").scrollIntoView({ block: "nearest" });
+    } catch (problem) {
+      at("order-problem").textContent = words(problem);
+      at("order-problem").hidden = false;
+    }
+  }
+
+  // Live progress, until the job has ended. What was ordered here is opened when it is done.
+  async follow(job, ordered = false) {
+    if (this.followed.has(job.id) || ENDED.includes(job.state)) return;
+    const end = new AbortController();
+    this.followed.set(job.id, end);
+    try {
+      for await (const { event, data } of events(`/jobs/${job.id}/events`, end.signal)) {
+        if (event === "progress") job.progress = data;
+        if (event === "plan") job.plan = data;
+        if (event === "state") Object.assign(job, data);
+        this.showJobs();
+      }
+      Object.assign(job, await json(`/jobs/${job.id}`));
+      this.showJobs();
+      if (ordered && job.state === "succeeded" && job.kind === "lift") this.opened(job.id);
+      else if (job.state === "succeeded") this.gone();
+    } catch (problem) {
+      if (!end.signal.aborted && problem.status !== 401) tell(words(problem), true);
+    } finally {
+      this.followed.delete(job.id);
+    }
+  }
+
+  async refresh() {
+    try {
+      const { jobs } = await json(`/jobs?limit=${PAGE}`);
+      const known = new Map(this.jobs.filter(job => this.followed.has(job.id)).map(job => [job.id, job]));
+      this.jobs = jobs.map(job => known.get(job.id) || job);
+      this.showJobs();
+      for (const job of this.jobs) this.follow(job);
+      await this.refreshAssets();
+    } catch (problem) {
+      if (problem.status !== 401) tell(words(problem), true);
+    }
+  }
+
+  async refreshAssets() {
+    const { assets, next } = await json(`/assets?limit=${PAGE}`);
+    at("assets-count").textContent = assets.length ? `(${assets.length}${next ? "+" : ""})` : "(none)";
+    at("assets").replaceChildren(...assets.map(asset => el("li", {},
+      el("span", { className: "name" }, KINDS[asset.kind] || asset.kind), el("span", { className: "state" }, `${said(asset)} \u00b7 ${size(asset.bytes)} \u00b7 ${ago(asset.created)}`),
+      el("span", { className: "actions" },
+        KINDS[asset.kind] ? el("button", { type: "button", on: { click: () => this.take(asset) } }, "Lift it again") : null,
+        twice("Delete", () => remove(`/assets/${asset.id}`).then(() => this.refreshAssets()))))));
+  }
+
+  showJobs() {
+    at("jobs-none").hidden = Boolean(this.jobs.length);
+    at("jobs").replaceChildren(...this.jobs.map(job => this.job(job)));
+  }
+
+  job(job) {
+    const kind = job.kind === "tradeoff" ? `Comparison within ${job.parameters.budget_s} s` : `Lift, ${job.settings.preset || "tikhonov"}`;
+    const parts = [el("span", { className: "name" }, kind), el("span", { className: `kind ${job.state}` }, job.state)];
+    const step = job.progress;
+    if (job.state === "running" && step) {
+      const name = STAGES[step.stage] || step.stage;
+      parts.push(el("progress", { max: step.total || 1, value: step.done, "aria-label": name }),
+        el("span", { className: "state" }, `${name}${step.total > 1 ? `: ${count(step.done)} of ${count(step.total)} ${step.unit}` : ""}${step.eta_s ? `, ${Math.ceil(step.eta_s)} s left` : ""}`));
+    }
+    if (job.plan && !ENDED.includes(job.state)) parts.push(el("ul", { className: "plan" }, ...[...job.plan.summary, ...job.plan.warnings.map(warning => `Note: ${warning}`)].map(line => el("li", {}, line))));
+    if (job.problem) parts.push(el("span", { className: "state bad" }, words(job.problem)));
+    if (ENDED.includes(job.state) && job.ended) parts.push(el("span", { className: "state" }, `${job.started ? `took ${(job.ended - job.started).toFixed(1)} s, ` : ""}${ago(job.ended)}`));
+    const actions = el("span", { className: "actions" });
+    if (job.state === "succeeded" && job.kind === "lift") actions.append(el("button", { type: "button", on: { click: () => this.opened(job.id) } }, "Open"));
+    if (job.state === "succeeded" && job.kind === "tradeoff") actions.append(el("button", { type: "button", on: { click: event => this.chart(job, event.target.closest("li")) } }, "Show chart"));
+    if (["queued", "running"].includes(job.state)) actions.append(el("button", { type: "button", on: { click: () => this.cancel(job) } }, "Cancel"));
+    if (ENDED.includes(job.state)) {
+      const going = job.state !== "succeeded" ? "" : job.kind === "lift" ? "?with_lift=true" : "?with_tradeoff=true";
+      actions.append(twice("Delete", () => remove(`/jobs/${job.id}${going}`).then(() => { this.jobs = this.jobs.filter(known => known !== job); this.showJobs(); this.gone(); })));
+    }
+    return el("li", { className: "job", data: { state: job.state } }, ...parts, actions);
+  }
+
+  async cancel(job) {
+    try {
+      Object.assign(job, await post(`/jobs/${job.id}/cancel`));
+      this.showJobs();
+    } catch (problem) {
+      tell(words(problem), true);
+    }
+  }
+
+  async chart(job, line) {
+    try {
+      const [image, { choice }] = await Promise.all([picture(`/tradeoffs/${job.id}/chart`), json(`/tradeoffs/${job.id}`)]);
+      image.alt = "Seconds against accuracy of each run";
+      line.append(el("figure", { className: "chart" }, image, el("figcaption", {}, choice.why || "")));
+    } catch (problem) {
+      tell(words(problem), true);
+    }
+  }
+}
+
+// A button that asks once more before it does what cannot be undone.
+function twice(label, action) {
+  const button = el("button", { type: "button", className: "danger" }, label);
+  button.addEventListener("click", async () => {
+    if (!button.dataset.sure) {
+      button.dataset.sure = "yes";
+      button.textContent = "Really?";
+      setTimeout(() => { delete button.dataset.sure; button.textContent = label; }, 4000);
+      return;
+    }
+    try {
+      await action();
+    } catch (problem) {
+      tell(words(problem), true);
+    }
+  });
+  return button;
+}
+
+function choice(group, value, title, why, checked) {
+  return el("label", { className: "choice" }, el("input", { type: "radio", name: group, value, checked }), el("span", {}, el("b", {}, title), el("small", {}, why)));
+}
+
+const resolved = (told, schemas) => (told.$ref ? { ...schemas[told.$ref.split("/").at(-1)], ...told } : told);
+
+function field(told) {
+  const values = told.enum || (told.type === "boolean" ? ["true", "false"] : null);
+  const usual = told.default === undefined ? "" : String(told.default);
+  if (values) return el("select", {}, new Option(`as the preset has it${usual ? ` (${usual})` : ""}`, ""), ...values.map(value => new Option(String(value), String(value))));
+  const number = told.type === "integer" || told.type === "number";
+  return el("input", { type: number ? "number" : "text", placeholder: usual, ...(number ? { step: told.type === "integer" ? "1" : "any" } : {}),
+    ...(told.minimum === undefined ? {} : { min: told.minimum }), ...(told.maximum === undefined ? {} : { max: told.maximum }) });
+}
+
+// What the check found in a file.
+function said({ kind, counts }) {
+  const told = { splats: ["splats", "kernel"], cameras: ["views"], features: ["views", "channels", "text_space"] }[kind] || Object.keys(counts);
+  const parts = told.filter(name => ["number", "string"].includes(typeof counts[name])).map(name => {
+    if (typeof counts[name] === "string") return name === "text_space" ? `words of ${counts[name]}` : counts[name];
+    return plural(counts[name], name.replace(/s$/, "").replaceAll("_", " "));
+  });
+  return parts.join(", ");
+}

@@ -1,0 +1,204 @@
+// The panel of looking: layers of colours in 3D and in the pictures of views, the list of views, and the pictures
+// themselves, which need no WebGL.
+import { at, el, fill, tell } from "./dom.js";
+import { bytes, json, npy, picture, words } from "./service.js";
+
+const PAGE = 1000; // views that are asked for at a time
+const LAYERS = {
+  rgb: "The splats' own colours.",
+  pca: "Three principal components of the features as red, green and blue: what looks alike here is alike to a question.",
+  cluster: "A colour for each cluster that aggregation found; grey is in none.",
+  evidence: "How much the views say of each splat, by its logarithm: bright is much.",
+  agreement: "How well the views agree on each splat: bright is well.",
+  depth: "The depth of the splats: near is bright.",
+};
+const IN_VIEWS = ["rgb", "pca", "cluster", "depth"]; // that the service draws of a view
+
+export class Look {
+  // changed: when colours or the link must follow; fly: with a view; pick: with an example's notation.
+  constructor({ changed, fly, pick, fallback }) {
+    Object.assign(this, { changed, fly, pick, views: [], view: null, colours: new Map(), layer: null, turn: 0, mode: fallback ? "view" : "scene" });
+    this.fallback = fallback;
+    for (const input of document.querySelectorAll("input[name=layer]")) input.addEventListener("change", () => this.choose(input.value));
+    for (const input of document.querySelectorAll("input[name=mode]")) input.addEventListener("change", () => this.switch(input.value));
+    at("cover").addEventListener("input", () => { this.blend(); this.changed(); });
+    at("veil").addEventListener("input", () => this.blend());
+    at("view").addEventListener("change", () => this.go(at("view").value));
+    at("view-before").addEventListener("click", () => this.step(-1));
+    at("view-after").addEventListener("click", () => this.step(1));
+    at("picture").addEventListener("click", event => this.clicked(event));
+  }
+
+  get what() {
+    return document.querySelector("input[name=layer]:checked").value;
+  }
+
+  // The views of a lift; the first page is awaited, the others come after it.
+  async of(lift, wanted) {
+    this.lift = lift;
+    this.colours.clear();
+    this.layer = null;
+    this.views = [];
+    this.showLayer("rgb");
+    const clusters = lift.certificate?.clusters ?? lift.settings?.aggregation;
+    at("layer-cluster").hidden = !clusters;
+    let { views, next } = await json(`/lifts/${lift.id}/views?limit=${PAGE}`);
+    this.views = views;
+    this.choices(wanted);
+    if (next !== null) this.rest(lift, next);
+  }
+
+  async rest(lift, next) {
+    try {
+      while (next !== null) {
+        const page = await json(`/lifts/${lift.id}/views?limit=${PAGE}&cursor=${next}`);
+        if (lift !== this.lift) return;
+        this.views.push(...page.views);
+        next = page.next;
+      }
+      this.choices(this.view?.name);
+    } catch (problem) {
+      tell(words(problem), true);
+    }
+  }
+
+  choices(wanted) {
+    fill(at("view"), this.views.map(({ name, lifted }) => [name, lifted ? name : `${name} (not lifted)`]), wanted);
+    this.view = this.views.find(view => view.name === at("view").value) || this.views[0] || null;
+  }
+
+  step(by) {
+    if (!this.views.length) return;
+    const place = this.views.indexOf(this.view);
+    this.go(this.views[(place + by + this.views.length) % this.views.length].name);
+  }
+
+  go(name) {
+    const view = this.views.find(known => known.name === name);
+    if (!view) return;
+    this.view = view;
+    at("view").value = name;
+    this.fly(view);
+    this.draw();
+    this.changed();
+  }
+
+  switch(mode) {
+    this.mode = this.fallback ? "view" : mode;
+    at("stage").dataset.mode = this.mode;
+    document.querySelector(`input[name=mode][value=${this.mode}]`).checked = true;
+    this.draw();
+    this.changed();
+  }
+
+  showLayer(what) {
+    document.querySelector(`input[name=layer][value=${what}]`).checked = true;
+    at("layer-words").textContent = LAYERS[what];
+    at("cover-label").hidden = what === "rgb";
+  }
+
+  async choose(what) {
+    this.showLayer(what);
+    this.draw();
+    if (what === "rgb" || what === "depth" || this.fallback) {
+      this.layer = null;
+      return this.changed();
+    }
+    try {
+      const { lift } = this;
+      if (!this.colours.has(what)) this.colours.set(what, npy(await bytes(`/lifts/${lift.id}/colours?what=${what}`)));
+      if (lift !== this.lift || what !== this.what) return;
+      this.layer = this.colours.get(what);
+      this.changed();
+    } catch (problem) {
+      tell(words(problem), true);
+      this.choose("rgb");
+    }
+  }
+
+  painted() {
+    return this.layer ? { colours: this.layer, cover: Number(at("cover").value) / 100 } : null;
+  }
+
+  // The view's picture, its layer over it, and a veil over what a question did not find.
+  async draw() {
+    const mine = ++this.turn;
+    if (!this.lift || !this.view || this.mode === "scene") return;
+    const shown = async (id, path) => {
+      const image = at(id);
+      const old = image.src;
+      const made = path && await picture(path);
+      if (mine !== this.turn) return made && URL.revokeObjectURL(made.src);
+      if (old.startsWith("blob:")) URL.revokeObjectURL(old);
+      if (made) image.src = made.src; else image.removeAttribute("src");
+      image.hidden = !made;
+    };
+    const place = new URLSearchParams({ lift: this.lift.id, view: this.view.name });
+    const over = IN_VIEWS.includes(this.what) && this.what !== "rgb" ? `/render?${place}&what=${this.what}` : null;
+    at("picture-box").classList.add("busy");
+    try {
+      await Promise.all([shown("render", `/render?${place}&what=rgb`), shown("over", over), this.mask(mine)]);
+      this.marks();
+    } catch (problem) {
+      if (mine === this.turn) tell(words(problem), true);
+    }
+    if (mine === this.turn) at("picture-box").classList.remove("busy");
+    this.blend();
+  }
+
+  async mask(mine) {
+    const canvas = at("mask");
+    const asked = this.asked?.(this.view.name);
+    if (!asked) { canvas.hidden = true; return; }
+    const image = await picture(asked.mask);
+    URL.revokeObjectURL(image.src);
+    if (mine !== this.turn) return;
+    canvas.width = image.naturalWidth;
+    canvas.height = image.naturalHeight;
+    const context = canvas.getContext("2d", { willReadFrequently: true });
+    context.drawImage(image, 0, 0);
+    const pixels = context.getImageData(0, 0, canvas.width, canvas.height);
+    const { data } = pixels;
+    const [r, g, b] = asked.rgb;
+    const found = place => data[4 * place] > 127;
+    const out = new Uint8ClampedArray(data.length);
+    for (let place = 0; place < data.length / 4; place += 1) {
+      const x = place % canvas.width;
+      if (!found(place)) { out.set([8, 10, 14, 190], 4 * place); continue; }
+      const edge = !x || x === canvas.width - 1 || !found(place - 1) || !found(place + 1) || place < canvas.width
+        || place >= data.length / 4 - canvas.width || !found(place - canvas.width) || !found(place + canvas.width);
+      out.set(edge ? [r, g, b, 255] : [r, g, b, 0], 4 * place);
+    }
+    context.putImageData(new ImageData(out, canvas.width, canvas.height), 0, 0);
+    canvas.hidden = false;
+    canvas.dataset.view = this.view.name;
+  }
+
+  blend() {
+    at("over").style.opacity = Number(at("cover").value) / 100;
+    at("mask").style.opacity = Number(at("veil").value) / 100;
+  }
+
+  // Where examples of this view were clicked.
+  marks() {
+    for (const old of at("picture").querySelectorAll(".mark")) old.remove();
+    for (const { term, unlike } of this.examples?.() || []) {
+      const place = /^(.*):(\d+),(\d+)$/.exec(term);
+      if (!place || place[1] !== this.view.name) continue;
+      at("picture").append(el("span", {
+        className: unlike ? "mark unlike" : "mark",
+        style: { left: `${100 * (Number(place[2]) + 0.5) / this.view.width}%`, top: `${100 * (Number(place[3]) + 0.5) / this.view.height}%` },
+      }));
+    }
+  }
+
+  clicked(event) {
+    const image = at("render");
+    const box = image.getBoundingClientRect();
+    if (!image.naturalWidth || !box.width || !event.detail) return;
+    const x = Math.floor((event.clientX - box.left) / box.width * image.naturalWidth);
+    const y = Math.floor((event.clientY - box.top) / box.height * image.naturalHeight);
+    if (x < 0 || y < 0 || x >= image.naturalWidth || y >= image.naturalHeight) return;
+    this.pick(`${this.view.name}:${x},${y}`, event.shiftKey);
+  }
+}

@@ -1,0 +1,341 @@
+// The page: a lift on the stage, what is asked of it, and a link that opens the same again.
+import { Ask, label } from "./ask.js";
+import { Bring } from "./bring.js";
+import { ago, at, count, el, fill, size, tell } from "./dom.js";
+import { Look } from "./look.js";
+import { COLOURS, paint, rgb } from "./paint.js";
+import { bytes, json, keyOf, onRefused, useKey, words } from "./service.js";
+import { Take } from "./take.js";
+import { MOST, Viewer, webgl } from "./viewer.js";
+
+const PAGE = 100; // lifts to choose from
+const TURN = Math.PI / 24; // of an arrow key
+const TWICE = 260; // ms within which a second click makes a double one
+const SHIFTED = 5; // pixels that the pointer may move in a click
+
+const started = new URLSearchParams(location.search);
+const dark = matchMedia("(prefers-color-scheme: dark)");
+let lift = null;
+let viewer = null;
+let turn = 0; // of opening lifts: what an older one loads is late and is dropped
+let busy = false;
+
+const ask = new Ask({ changed, fly: box => viewer?.toBox(box) });
+const look = new Look({ changed: () => { repaint(); link(); }, fly: view => viewer?.to(view), pick: (term, less) => ask.example(term, less), fallback: !webgl() });
+const take = new Take({ ask, look, shot });
+const bring = new Bring({ opened: id => open(id, true), gone: () => refreshLifts() });
+bring.open = () => tab("bring");
+
+look.asked = view => {
+  const question = ask.painted().length ? ask.now : null;
+  if (!question?.answer || !ask.painted().some(({ scores }) => scores === question.scores)) return null;
+  return { mask: `/query/mask?${ask.parameters(question, { view })}`, rgb: rgb(question.colour) };
+};
+look.examples = () => ask.questions.flatMap(({ like, unlike }) => [...like.map(term => ({ term })), ...unlike.map(term => ({ term, unlike: true }))]);
+
+let drawn = "";
+
+// After what is asked, or how it is shown, has changed.
+function changed() {
+  repaint();
+  link();
+  take.show();
+  const question = ask.now?.answer ? `${ask.parameters(ask.now)}` : "";
+  clearTimeout(changed.soon);
+  if (question !== drawn) changed.soon = setTimeout(() => { drawn = question; look.draw(); }, 150); // the slider moves often
+}
+
+function repaint() {
+  if (!viewer?.mesh) return;
+  const begun = performance.now();
+  const questions = ask.painted();
+  viewer.hidden.value = at("hide").checked && questions.length ? 1 : 0;
+  paint(viewer.paints, viewer.rows, viewer.bytes, questions, { heat: ask.heated(), layer: look.painted() });
+  viewer.outline(at("show-boxes").checked ? ask.boxes() : []);
+  labels();
+  viewer.painted();
+  document.body.dataset.painted = (performance.now() - begun).toFixed(1);
+}
+
+// Names at the boxes; the chosen one is larger.
+function labels() {
+  const boxes = at("show-boxes").checked ? ask.boxes() : [];
+  at("labels").replaceChildren(...boxes.slice(0, 40).map(box => el("button", {
+    type: "button", className: box.strong ? "label strong" : "label", tabIndex: -1, style: { "--mine": box.colour },
+    data: { at: JSON.stringify([(box.low[0] + box.high[0]) / 2, (box.low[1] + box.high[1]) / 2, (box.low[2] + box.high[2]) / 2]), box: JSON.stringify([box.low, box.high]) },
+    on: { click: () => ask.choose(box.question, box.thing) },
+  }, box.of > 1 ? `${box.name} ${box.thing + 1}` : box.name)));
+}
+
+// After each frame: labels lie at the top of their boxes as these are seen.
+function placed(place) {
+  for (const shown of at("labels").children) {
+    const [low, high] = JSON.parse(shown.dataset.box);
+    const corners = [0, 1, 2, 3, 4, 5, 6, 7].map(which => place([0, 1, 2].map(axis => (which >> axis & 1 ? high : low)[axis])));
+    const x = (Math.min(...corners.map(corner => corner.x)) + Math.max(...corners.map(corner => corner.x))) / 2;
+    const y = Math.min(...corners.map(corner => corner.y));
+    shown.hidden = corners.some(corner => !corner.before);
+    shown.style.transform = `translate(-50%, -100%) translate(${x.toFixed(1)}px, ${Math.max(18, y - 4).toFixed(1)}px)`;
+  }
+}
+
+// The address bar holds the link that opens the same question, camera and layer.
+function link() {
+  if (!lift || busy) return;
+  const parameters = new URLSearchParams({ lift: lift.id });
+  if (look.view) parameters.set("view", look.view.name);
+  ask.link(parameters);
+  if (look.what !== "rgb") parameters.set("what", look.what);
+  if (look.mode !== "scene" && !look.fallback) parameters.set("show", look.mode);
+  if (at("hide").checked) parameters.set("hide", "1");
+  if (viewer?.mesh) parameters.set("camera", viewer.place3d.map(value => Number(value.toPrecision(5))).join(","));
+  history.replaceState(null, "", `?${parameters}`);
+}
+
+function tab(name) {
+  for (const button of document.querySelectorAll("[role=tab]")) {
+    const chosen = button.id === `tab-${name}`;
+    button.setAttribute("aria-selected", String(chosen));
+    button.tabIndex = chosen ? 0 : -1;
+    at(`panel-${button.id.slice(4)}`).hidden = !chosen;
+  }
+  if (name === "bring") bring.refresh();
+  if (name === "take") take.show();
+}
+
+function loading(text, share = null) {
+  at("loading").hidden = text === null;
+  if (text === null) return;
+  at("loading-text").textContent = text;
+  const bar = at("loading-bar");
+  if (share === null) bar.removeAttribute("value"); else bar.value = share;
+}
+
+function trouble(text) {
+  at("trouble").hidden = !text;
+  at("trouble-text").textContent = text || "";
+}
+
+async function refreshLifts() {
+  const { lifts, next } = await json(`/lifts?limit=${PAGE}`);
+  at("lift-label").hidden = !lifts.length;
+  fill(at("lift"), [...lifts, ...(lift && next && !lifts.some(known => known.id === lift.id) ? [lift] : [])].map(known => [known.id,
+    `${count(known.count)} splats, ${known.text_space === "none" ? "no words" : known.text_space || "own words"}, ${ago(known.created)}`]), lift?.id);
+  if (lift && !next && !lifts.some(known => known.id === lift.id)) { // it was deleted
+    lift = null;
+    viewer?.clear();
+    ask.of(null);
+    if (lifts.length) open(lifts[0].id);
+  }
+  at("empty").hidden = Boolean(lifts.length);
+  document.body.classList.toggle("no-lifts", !lifts.length);
+  return lifts;
+}
+
+async function open(id, fresh = false) {
+  const mine = ++turn;
+  busy = true;
+  const parameters = !fresh && [null, id].includes(started.get("lift")) ? started : new URLSearchParams();
+  trouble(null);
+  try {
+    loading("Opening the lift");
+    const found = await json(`/lifts/${id}`);
+    if (mine !== turn) return;
+    lift = found;
+    at("empty").hidden = true;
+    document.body.classList.remove("no-lifts");
+    ask.of(lift);
+    at("mask").hidden = true;
+    if (fresh) { await refreshLifts(); tab("ask"); }
+    at("lift").value = id;
+    viewer?.clear();
+    const [content] = await Promise.all([
+      look.fallback ? null : bytes(`/lifts/${id}/splats`, { progress: (got, total) => mine === turn && loading(`Loading ${size(got)}${total ? ` of ${size(total)}` : ""}`, total ? got / total : null) }),
+      look.of(lift, parameters.get("view")),
+    ]);
+    if (mine !== turn) return;
+    if (content) await show(content, parameters);
+    about();
+    if (parameters.has("what")) await look.choose(parameters.get("what"));
+    look.switch(parameters.get("show") || (look.fallback ? "view" : "scene"));
+    at("hide").checked = parameters.has("hide");
+    loading(null);
+    busy = false;
+    await ask.restore(parameters);
+    link();
+  } catch (problem) {
+    if (mine !== turn) return;
+    busy = false;
+    loading(null);
+    trouble(words(problem));
+  }
+}
+
+async function show(content, parameters) {
+  viewer ||= made();
+  if (!viewer) return;
+  loading("Unpacking the splats");
+  await viewer.load(content);
+  viewer.settle(look.views);
+  if (look.view) viewer.to(look.view, true);
+  const camera = (parameters.get("camera") || "").split(",").map(Number);
+  if (camera.length === 6 && camera.every(Number.isFinite)) {
+    viewer.camera.position.set(...camera.slice(0, 3));
+    viewer.controls.target.set(...camera.slice(3));
+    viewer.draw();
+  }
+  at("stage").classList.add("ready");
+}
+
+// The 3D view, or, where it does not start after all, the pictures of views.
+function made() {
+  try {
+    const canvas = at("scene");
+    const built = new Viewer(canvas, placed);
+    built.moved = link;
+    built.background(ground());
+    pointing(canvas, built);
+    return built;
+  } catch (problem) {
+    fallBack();
+    console.warn(problem);
+    return null;
+  }
+}
+
+const ground = () => getComputedStyle(document.documentElement).getPropertyValue("--ground").trim();
+
+function fallBack() {
+  look.fallback = true;
+  document.body.classList.add("flat");
+  look.switch("view");
+}
+
+// What is said of the scene below it.
+async function about() {
+  const said = [`${count(lift.count)} splats`, `${lift.channels} channels`, `${lift.views.length} views lifted`];
+  if (viewer?.rows) said[0] = `${count(viewer.count)} of ${count(lift.count)} splats shown (every ${Math.ceil(lift.count / MOST)}.)`;
+  at("about").textContent = said.join(" \u00b7 ");
+  try {
+    const { counts } = await json(`/assets/${lift.splats}`);
+    const kernel = lift.settings.kernel && lift.settings.kernel !== "auto" ? lift.settings.kernel : counts.kernel;
+    const note = { "2dgs": "discs drawn as thin Gaussians", dbs: "beta kernels drawn as Gaussians of the nearest size" }[kernel];
+    if (note && !look.fallback) at("about").textContent = [...said, note].join(" \u00b7 ");
+  } catch { /* said without it */ }
+}
+
+function pointing(canvas, built) {
+  let down = null;
+  let waiting = 0;
+  let last = -TWICE;
+  const at3d = event => {
+    const box = canvas.getBoundingClientRect();
+    return built.pick(event.clientX - box.left, event.clientY - box.top);
+  };
+  canvas.addEventListener("pointerdown", event => { down = event.isPrimary ? [event.clientX, event.clientY] : null; });
+  canvas.addEventListener("pointerup", event => {
+    if (!down || event.button !== 0 || Math.hypot(event.clientX - down[0], event.clientY - down[1]) > SHIFTED) return;
+    clearTimeout(waiting);
+    if (event.timeStamp - last < TWICE) {
+      last = -TWICE;
+      const hit = at3d(event);
+      if (hit) built.toPoint(hit.point);
+      return;
+    }
+    last = event.timeStamp;
+    const less = event.shiftKey;
+    waiting = setTimeout(() => pointed(at3d(event), less), TWICE);
+  });
+  canvas.addEventListener("keydown", event => keyed(event, built));
+}
+
+function pointed(hit, less) {
+  if (!hit) return tell("There is no splat there.");
+  return ask.example(`splat:${hit.splat}`, less);
+}
+
+function keyed(event, built) {
+  if (event.ctrlKey || event.metaKey || event.altKey) return;
+  const turns = { ArrowLeft: [-TURN, 0], ArrowRight: [TURN, 0], ArrowUp: [0, -TURN], ArrowDown: [0, TURN] };
+  if (turns[event.key]) built.turn(...turns[event.key]);
+  else if (event.key === "+" || event.key === "=") built.zoom(0.85);
+  else if (event.key === "-") built.zoom(1 / 0.85);
+  else if (event.key === "Enter") pointed(built.pick(at("scene").clientWidth / 2, at("scene").clientHeight / 2), event.shiftKey);
+  else return;
+  event.preventDefault();
+}
+
+async function shot() {
+  if (look.mode !== "view" && viewer) return viewer.picture();
+  const canvas = document.createElement("canvas");
+  const image = at("render");
+  canvas.width = image.naturalWidth;
+  canvas.height = image.naturalHeight;
+  const context = canvas.getContext("2d");
+  for (const part of [image, at("over"), at("mask")]) {
+    if (part.hidden) continue;
+    context.globalAlpha = part === image ? 1 : Number(part.style.opacity || 1);
+    context.drawImage(part, 0, 0, canvas.width, canvas.height);
+  }
+  return new Promise(done => canvas.toBlob(done, "image/png"));
+}
+
+// Keys that work wherever no text is typed.
+addEventListener("keydown", event => {
+  if (event.target.matches("input:not([type=radio]):not([type=checkbox]):not([type=range]), select, textarea") || event.ctrlKey || event.metaKey || event.altKey) {
+    if (event.key === "Escape") event.target.blur();
+    return;
+  }
+  const action = {
+    "/": () => at("words").focus(), "[": () => look.step(-1), "]": () => look.step(1), n: () => ask.step(1), p: () => ask.step(-1),
+    h: () => at("hide").click(), b: () => at("show-boxes").click(), m: () => at("heat").click(), r: () => look.view && viewer?.to(look.view),
+    "?": () => at("help").showModal(), Escape: () => ask.reset(true),
+  }[event.key];
+  if (!action || at("help").open || at("door").open) return;
+  event.preventDefault();
+  action();
+});
+
+for (const button of document.querySelectorAll("[role=tab]")) {
+  button.addEventListener("click", () => tab(button.id.slice(4)));
+  button.addEventListener("keydown", event => {
+    const tabs = [...document.querySelectorAll("[role=tab]")];
+    const by = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
+    if (!by) return;
+    const next = tabs[(tabs.indexOf(button) + by + tabs.length) % tabs.length];
+    tab(next.id.slice(4));
+    next.focus();
+  });
+}
+at("lift").addEventListener("change", () => open(at("lift").value, true));
+for (const id of ["hide", "show-boxes"]) at(id).addEventListener("change", () => { repaint(); link(); });
+at("again").addEventListener("click", () => location.reload());
+at("reset-view").addEventListener("click", () => look.view && viewer?.to(look.view));
+at("show-help").addEventListener("click", () => at("help").showModal());
+at("show-key").addEventListener("click", () => at("door").showModal());
+at("empty-bring").addEventListener("click", () => { tab("bring"); at("files").click(); });
+at("key-form").addEventListener("submit", event => { event.preventDefault(); useKey(at("key").value.trim()); });
+at("forget").addEventListener("click", () => useKey(""));
+for (const button of document.querySelectorAll("[data-close]")) button.addEventListener("click", () => button.closest("dialog").close());
+onRefused(() => { at("door-wrong").hidden = !keyOf(); if (!at("door").open) at("door").showModal(); });
+at("forget").hidden = !keyOf();
+dark.addEventListener("change", () => { viewer?.background(ground()); repaint(); ask.bars(); });
+
+// For tests, and for the curious in the console.
+Object.assign(globalThis, { splatlift: { ask, look, bring, take, get viewer() { return viewer; }, get lift() { return lift; }, label, COLOURS } });
+
+async function begin() {
+  if (look.fallback) fallBack();
+  look.showLayer("rgb");
+  tab("ask");
+  try {
+    const lifts = await refreshLifts();
+    const wanted = started.get("lift") || lifts[0]?.id;
+    if (wanted) return await open(wanted);
+    tab("bring");
+  } catch (problem) {
+    if (problem.status !== 401) trouble(words(problem));
+  }
+}
+
+begin();

@@ -1,0 +1,343 @@
+// The scene in 3D: three.js and Spark draw the splats; colours are painted by row, without loading anything anew.
+import * as THREE from "three";
+import { OrbitControls } from "three/addons/controls/OrbitControls.js";
+import { dyno, readRgbaArray, RgbaArray, SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
+import { still } from "./dom.js";
+
+const ROW = 32; // bytes of a splat in a .splat file
+export const MOST = 2_000_000; // splats that are drawn; of larger scenes every n-th is
+const FLIGHT = 700; // ms
+const LOADING = 60_000; // ms that the unpacking of a scene may take before that is told
+const OPAQUE = 40; // of 255: fainter splats are not what somebody points at
+
+// A painted row is r g b and a byte: from 128 on it was found, and 127 parts of the colour cover its own.
+function painter(rgba, hidden) {
+  return dyno.dynoBlock({ gsplat: dyno.Gsplat }, { gsplat: dyno.Gsplat }, ({ gsplat }) => {
+    const { index } = dyno.splitGsplat(gsplat).outputs;
+    const mixed = new dyno.Dyno({
+      inTypes: { gsplat: dyno.Gsplat, told: "vec4", hidden: "float" },
+      outTypes: { gsplat: dyno.Gsplat },
+      inputs: { gsplat, told: readRgbaArray(rgba.dyno, index), hidden },
+      globals: () => [dyno.defineGsplat],
+      statements: ({ inputs: { gsplat: own, told, hidden: hide }, outputs: { gsplat: out } }) => [
+        `${out} = ${own};`,
+        "{",
+        `  float found = step(127.5, ${told}.a * 255.0);`,
+        `  float cover = clamp((${told}.a * 255.0 - 128.0 * found) / 127.0, 0.0, 1.0);`,
+        `  ${out}.rgba.rgb = mix(${own}.rgba.rgb, ${told}.rgb, cover);`,
+        `  ${out}.rgba.a *= 1.0 - ${hide} * (1.0 - found);`,
+        "}",
+      ],
+    });
+    return { gsplat: mixed.outputs.gsplat };
+  });
+}
+
+export function webgl() {
+  try {
+    return Boolean(document.createElement("canvas").getContext("webgl2"));
+  } catch {
+    return false;
+  }
+}
+
+export class Viewer {
+  // canvas: to draw on. seen: called after each frame with a function from a point of the world to its place in CSS pixels.
+  constructor(canvas, seen) {
+    this.canvas = canvas;
+    this.seen = seen;
+    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: false, preserveDrawingBuffer: true, powerPreference: "high-performance" });
+    this.renderer.setPixelRatio(Math.min(devicePixelRatio, 1.5));
+    this.scene = new THREE.Scene();
+    this.camera = new THREE.PerspectiveCamera(50, 1, 0.01, 1000);
+    this.controls = new OrbitControls(this.camera, canvas);
+    this.controls.enableDamping = !still();
+    this.controls.dampingFactor = 0.12;
+    this.controls.zoomToCursor = true;
+    this.controls.addEventListener("change", () => this.draw());
+    this.controls.addEventListener("start", () => { this.flight = null; });
+    this.moved = () => {};
+    this.controls.addEventListener("end", () => this.moved());
+    this.hidden = dyno.dynoFloat(0);
+    this.boxes = new THREE.Group();
+    this.scene.add(this.boxes);
+    this.spark = new SparkRenderer({
+      renderer: this.renderer, preBlurAmount: 0.3, blurAmount: 0, sortRadial: false, maxStdDev: 3, minAlpha: 1 / 255,
+      onDirty: () => this.draw(),
+    });
+    this.scene.add(this.spark);
+    this.frames = 0;
+    new ResizeObserver(() => this.resize()).observe(canvas.parentElement);
+    this.resize();
+  }
+
+  resize() {
+    const { clientWidth: width, clientHeight: height } = this.canvas.parentElement;
+    if (!width || !height) return;
+    this.renderer.setSize(width, height, false);
+    this.camera.aspect = width / height;
+    this.frame();
+    this.draw();
+  }
+
+  background(colour) {
+    this.renderer.setClearColor(new THREE.Color(colour), 1);
+    this.draw();
+  }
+
+  draw() {
+    if (this.asked) return;
+    this.asked = requestAnimationFrame(now => {
+      this.asked = 0;
+      this.fly(now);
+      this.controls.update();
+      this.renderer.render(this.scene, this.camera);
+      this.frames += 1;
+      this.seen(point => this.place(point));
+      if (this.flight) this.draw();
+    });
+  }
+
+  // Whether all that was asked for is on the screen.
+  get settled() {
+    const { activeSplats, sorting, sortDirty, dirty } = this.spark;
+    return Boolean(this.mesh) && !this.asked && !this.flight && activeSplats > 0 && !sorting && !sortDirty && !dirty;
+  }
+
+  place(point) {
+    const there = new THREE.Vector3(...point).project(this.camera);
+    const { clientWidth: width, clientHeight: height } = this.canvas;
+    return { x: (there.x + 1) / 2 * width, y: (1 - there.y) / 2 * height, before: there.z < 1 };
+  }
+
+  // Show the rows of a .splat file.
+  async load(content) {
+    this.clear();
+    this.total = content.length / ROW;
+    const step = Math.ceil(this.total / MOST);
+    this.rows = null;
+    if (step > 1) {
+      this.rows = Uint32Array.from({ length: Math.floor(this.total / step) }, (_, place) => place * step);
+      const thinned = new Uint8Array(this.rows.length * ROW);
+      this.rows.forEach((row, place) => thinned.set(content.subarray(row * ROW, (row + 1) * ROW), place * ROW));
+      content = thinned;
+    }
+    this.count = content.length / ROW;
+    if (content.byteOffset % 4) content = content.slice();
+    this.bytes = content;
+    this.floats = new Float32Array(content.buffer, content.byteOffset, content.length / 4);
+    const mesh = new SplatMesh({ fileBytes: content.slice(), fileName: "scene.splat", lod: false });
+    let timer;
+    await Promise.race([mesh.initialized, new Promise((_, reject) => {
+      timer = setTimeout(() => reject(new Error("unpacking it takes too long")), LOADING);
+    })]).finally(() => clearTimeout(timer));
+    this.rgba = new RgbaArray({ capacity: this.count });
+    this.paints = this.rgba.ensureCapacity(this.count);
+    this.rgba.count = this.count;
+    mesh.objectModifiers = [painter(this.rgba, this.hidden)];
+    mesh.updateGenerator();
+    this.mesh = mesh;
+    this.scene.add(mesh);
+    this.measure();
+    this.painted();
+  }
+
+  clear() {
+    if (this.mesh) {
+      this.scene.remove(this.mesh);
+      this.mesh.dispose();
+      this.rgba.dispose();
+      this.mesh = null;
+    }
+    this.outline([]);
+  }
+
+  // The middle of the scene and its reach, by the middle half of a sample on each axis: floaters count for nothing.
+  measure() {
+    const every = Math.max(1, Math.floor(this.count / 5000));
+    const axes = [[], [], []];
+    for (let row = 0; row < this.count; row += every) for (let axis = 0; axis < 3; axis += 1) axes[axis].push(this.floats[row * 8 + axis]);
+    const ends = axes.map(values => values.sort((a, b) => a - b)).map(v => [v[Math.floor(v.length / 4)], v[Math.floor(v.length / 2)], v[Math.floor(3 * v.length / 4)]]);
+    this.middle = new THREE.Vector3(...ends.map(end => end[1]));
+    this.reach = Math.max(...ends.map(end => end[2] - end[0]), 1e-6);
+    this.camera.near = this.reach / 500;
+    this.camera.far = this.reach * 500;
+    this.camera.updateProjectionMatrix();
+  }
+
+  // The row of the file that is drawn at a place.
+  row(place) {
+    return this.rows ? this.rows[place] : place;
+  }
+
+  // After the paints were written.
+  painted() {
+    if (!this.mesh) return;
+    this.rgba.needsUpdate = true;
+    this.mesh.updateVersion();
+    this.draw();
+  }
+
+  hide(share) {
+    if (this.hidden.value === share) return;
+    this.hidden.value = share;
+    this.painted();
+  }
+
+  // Which way is up, and what all the views look at. Cameras are seldom rolled: up is the mean of their own, but for
+  // what of it lies along their horizontal axes. The focus is the point nearest to their lines of sight.
+  settle(views) {
+    const poses = views.map(poseOf);
+    const mean = poses.reduce((sum, pose) => sum.add(pose.up), new THREE.Vector3());
+    this.up = mean.applyMatrix3(outer(poses.map(pose => pose.right), 1, 0.002 * poses.length).invert()).normalize();
+    if (this.up.lengthSq() < 0.5) this.up.set(0, 0, 1);
+    this.camera.up.copy(this.up);
+    const across = outer(poses.map(pose => pose.forward), -1, poses.length); // sum of I - d d^T
+    const side = poses.reduce((sum, { position, forward }) => sum.add(position).addScaledVector(forward, -position.dot(forward)), new THREE.Vector3());
+    const found = Math.abs(across.determinant()) > 1e-6 * poses.length ** 3 ? side.applyMatrix3(across.invert()) : null;
+    const inFront = found && poses.filter(pose => found.clone().sub(pose.position).dot(pose.forward) > 0).length > poses.length / 2;
+    this.focus = inFront ? found : this.middle.clone();
+  }
+
+  // Angles of view: a photo is shown whole, whatever the window's shape.
+  frame() {
+    const { halfWidth, halfHeight } = this.lens || { halfWidth: 0.5, halfHeight: 0.5 };
+    this.camera.fov = 2 * Math.atan(Math.max(halfHeight, halfWidth / this.camera.aspect)) * 180 / Math.PI;
+    this.camera.updateProjectionMatrix();
+  }
+
+  to(view, quick) {
+    const pose = poseOf(view);
+    const depth = this.focus.clone().sub(pose.position).dot(pose.forward);
+    const target = pose.position.clone().addScaledVector(pose.forward, depth > 0 ? depth : this.reach);
+    this.lens = { halfWidth: view.width / 2 / view.fx, halfHeight: view.height / 2 / view.fy };
+    this.frame();
+    this.go(pose.position, target, quick);
+  }
+
+  // Keep the direction, and look at a box or a point.
+  toBox({ low, high }) {
+    const box = new THREE.Box3(new THREE.Vector3(...low), new THREE.Vector3(...high));
+    const sphere = box.getBoundingSphere(new THREE.Sphere());
+    const back = this.camera.position.clone().sub(this.controls.target).normalize();
+    const angle = this.camera.fov * Math.PI / 360;
+    const far = 1.9 * Math.max(sphere.radius, this.reach / 100) / Math.sin(Math.min(angle, Math.atan(Math.tan(angle) * this.camera.aspect)));
+    this.go(sphere.center.clone().addScaledVector(back, far), sphere.center);
+  }
+
+  toPoint(point) {
+    const back = this.camera.position.clone().sub(this.controls.target);
+    const near = 0.6 * this.camera.position.distanceTo(point);
+    this.go(point.clone().addScaledVector(back.normalize(), near), point);
+  }
+
+  go(position, target, quick = still()) {
+    if (quick) {
+      this.flight = null;
+      this.camera.position.copy(position);
+      this.controls.target.copy(target);
+      this.moved();
+    } else {
+      const from = { position: this.camera.position.clone(), target: this.controls.target.clone() };
+      this.flight = { from, position: position.clone(), target: target.clone(), begun: 0 };
+    }
+    this.draw();
+  }
+
+  fly(now) {
+    const flight = this.flight;
+    if (!flight) return;
+    flight.begun ||= now;
+    const share = Math.min(1, (now - flight.begun) / FLIGHT);
+    const eased = share * share * (3 - 2 * share);
+    this.controls.target.lerpVectors(flight.from.target, flight.target, eased);
+    this.camera.position.lerpVectors(flight.from.position, flight.position, eased);
+    if (share === 1) {
+      this.flight = null;
+      this.moved();
+    }
+  }
+
+  // By keyboard: turn by angles in radians, zoom by a factor.
+  turn(around, over) {
+    const offset = this.camera.position.clone().sub(this.controls.target);
+    const turned = new THREE.Quaternion().setFromUnitVectors(this.camera.up, new THREE.Vector3(0, 1, 0));
+    const place = new THREE.Spherical().setFromVector3(offset.applyQuaternion(turned));
+    place.theta += around;
+    place.phi += over;
+    place.makeSafe();
+    offset.setFromSpherical(place).applyQuaternion(turned.invert());
+    this.camera.position.copy(this.controls.target).add(offset);
+    this.moved();
+    this.draw();
+  }
+
+  zoom(factor) {
+    this.camera.position.sub(this.controls.target).multiplyScalar(factor).add(this.controls.target);
+    this.moved();
+    this.draw();
+  }
+
+  get place3d() {
+    return [...this.camera.position.toArray(), ...this.controls.target.toArray()];
+  }
+
+  // What lies under a place of the canvas: the splat nearest to where the ray ends, and that point. null: nothing.
+  pick(x, y) {
+    if (!this.mesh) return null;
+    const { clientWidth: width, clientHeight: height } = this.canvas;
+    const ray = new THREE.Raycaster();
+    ray.setFromCamera(new THREE.Vector2(2 * x / width - 1, 1 - 2 * y / height), this.camera);
+    const hit = ray.intersectObject(this.mesh)[0];
+    if (!hit) return null;
+    const { x: px, y: py, z: pz } = hit.point;
+    let best = -1;
+    let least = Infinity;
+    for (let place = 0; place < this.count; place += 1) {
+      const dx = this.floats[8 * place] - px;
+      const dy = this.floats[8 * place + 1] - py;
+      const dz = this.floats[8 * place + 2] - pz;
+      const far = dx * dx + dy * dy + dz * dz;
+      if (far < least && this.bytes[ROW * place + 27] >= OPAQUE) {
+        least = far;
+        best = place;
+      }
+    }
+    return best < 0 ? null : { splat: this.row(best), point: hit.point };
+  }
+
+  // Boxes of things: [{low, high, colour, strong}].
+  outline(boxes) {
+    for (const line of this.boxes.children) line.geometry.dispose();
+    this.boxes.clear();
+    for (const { low, high, colour, strong } of boxes) {
+      const box = new THREE.Box3(new THREE.Vector3(...low), new THREE.Vector3(...high));
+      const line = new THREE.Box3Helper(box, new THREE.Color(colour));
+      Object.assign(line.material, { depthTest: false, transparent: true, opacity: strong ? 1 : 0.45 });
+      line.renderOrder = 10;
+      this.boxes.add(line);
+    }
+    this.draw();
+  }
+
+  picture() {
+    this.renderer.render(this.scene, this.camera);
+    return new Promise(done => this.canvas.toBlob(done, "image/png"));
+  }
+}
+
+// OpenCV's axes: x right, y down, z forward.
+function poseOf({ viewmat: m }) {
+  const position = new THREE.Vector3(...[0, 1, 2].map(axis => -(m[0][axis] * m[0][3] + m[1][axis] * m[1][3] + m[2][axis] * m[2][3])));
+  return { position, right: new THREE.Vector3(m[0][0], m[0][1], m[0][2]), forward: new THREE.Vector3(m[2][0], m[2][1], m[2][2]), up: new THREE.Vector3(-m[1][0], -m[1][1], -m[1][2]) };
+}
+
+// sign * sum of v v^T + ridge * I, of vectors of the world.
+function outer(vectors, sign, ridge) {
+  const { elements } = new THREE.Matrix3().multiplyScalar(ridge);
+  for (const vector of vectors) {
+    const v = vector.toArray();
+    for (let place = 0; place < 9; place += 1) elements[place] += sign * v[Math.floor(place / 3)] * v[place % 3];
+  }
+  return new THREE.Matrix3().fromArray(elements);
+}

@@ -1,0 +1,86 @@
+"""What a viewer draws of a lift: its splats, colours by row, and its cameras."""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import numpy as np
+import pytest
+from fastapi.testclient import TestClient
+
+from liftcore.io.splat import ROW
+from liftcore.query.scene import QueryScene
+
+from .test_problems import assert_problem
+from .tiny_scene import FOCAL, HEIGHT, SPLATS_A_CLUSTER, VIEWS, WIDTH, splat_rows
+
+
+def test_splats_come_in_the_rows_of_the_lift(client: TestClient, lift: dict[str, Any]) -> None:
+    reply = client.get(f"/lifts/{lift['id']}/splats")
+    rows, lifted = np.frombuffer(reply.content, ROW), splat_rows()
+    assert reply.status_code == 200 and len(rows) == lift["count"] == len(lifted)
+    assert int(reply.headers["content-length"]) == 32 * len(lifted)
+    np.testing.assert_array_equal(rows["means"], lifted[:, :3])
+    np.testing.assert_allclose(rows["scales"], np.exp(lifted[:, 7:10]), rtol=1e-6)
+    np.testing.assert_allclose(
+        rows["colours"][:, :3] / 255, np.clip(0.5 + 0.282095 * lifted[:, 3:6], 0, 1), atol=3e-3
+    )
+    np.testing.assert_allclose(rows["colours"][:, 3] / 255, 1 / (1 + np.exp(-lifted[:, 6])), atol=3e-3)
+    assert (rows["quats"] == (255, 128, 128, 128)).all()
+    again = client.get(f"/lifts/{lift['id']}/splats", headers={"If-None-Match": reply.headers["etag"]})
+    assert (again.status_code, again.content) == (304, b"")
+
+
+@pytest.mark.parametrize("what", ["pca", "evidence", "agreement"])
+def test_each_splat_has_a_colour_in_each_layer(client: TestClient, lift: dict[str, Any], what: str) -> None:
+    reply = client.get(f"/lifts/{lift['id']}/colours", params={"what": what})
+    colours = np.load(io.BytesIO(reply.content), allow_pickle=False)
+    assert (colours.shape, colours.dtype) == ((lift["count"], 3), np.uint8)
+    if what == "pca":  # three words, so three colours that lie apart
+        means = colours.reshape(3, SPLATS_A_CLUSTER, 3).mean(axis=1)
+        assert min(np.abs(means[one] - means[other]).max() for one, other in ((0, 1), (0, 2), (1, 2))) > 60
+    assert client.get(f"/lifts/{lift['id']}/colours", params={"what": "pca"}).headers["etag"] is not None
+
+
+def test_clusters_are_asked_of_a_lift_that_has_them(client: TestClient, lift: dict[str, Any]) -> None:
+    problem = assert_problem(client.get(f"/lifts/{lift['id']}/colours", params={"what": "cluster"}))
+    assert (problem["status"], problem["argument"]) == (422, "what") and "aggregation" in problem["hint"]
+
+
+def test_views_have_their_poses_in_pages(client: TestClient, lift: dict[str, Any]) -> None:
+    whole = client.get(f"/lifts/{lift['id']}/views").json()
+    assert whole["next"] is None and [view["name"] for view in whole["views"]] == list(VIEWS)
+    first = client.get(f"/lifts/{lift['id']}/views", params={"limit": 2}).json()
+    rest = client.get(f"/lifts/{lift['id']}/views", params={"limit": 2, "cursor": first["next"]}).json()
+    assert first["views"] + rest["views"] == whole["views"] and rest["next"] is None
+    for view in whole["views"]:
+        assert view["lifted"] == (view["name"] in lift["views"])
+        assert (view["width"], view["height"], view["fx"]) == (WIDTH, HEIGHT, FOCAL)
+        pose = np.array(view["viewmat"])
+        np.testing.assert_allclose(-pose[:3, :3].T @ pose[:3, 3], (VIEWS[view["name"]], 0, 0), atol=1e-6)
+
+
+def test_an_answer_says_whether_the_thing_stands_apart(client: TestClient, lift: dict[str, Any]) -> None:
+    for route in ("/query", "/query/objects"):
+        assert client.get(route, params={"lift": lift["id"], "text": "lamp"}).json()["present"] is True
+    nothing = client.get("/query", params={"lift": lift["id"], "text": "lamp", "threshold": 2}).json()
+    assert (nothing["present"], nothing["count"]) == (False, 0)
+
+
+def test_other_kernels_are_shown_as_near_gaussians() -> None:
+    from liftcore.query.export import viewer_splats
+    from liftcore.scene.splats import Splats
+
+    means, quats, logits = np.zeros((2, 3), "f4"), np.zeros((2, 4), "f4"), np.array([np.inf, -np.inf], "f4")
+    discs = Splats(means, quats, np.log(np.full((2, 2), 0.5, "f4")), logits, "2dgs")
+    betas = Splats(means, quats, np.zeros((2, 3), "f4"), logits, "dbs", beta=np.zeros(2, "f4"))
+    shown = []
+    for splats in (discs, betas):
+        scene = QueryScene.__new__(QueryScene)
+        scene.__dict__["splats"] = splats
+        shown.append(np.frombuffer(b"".join(viewer_splats(scene)), ROW))
+    np.testing.assert_allclose(shown[0]["scales"], [[0.5, 0.5, 0.005]] * 2, rtol=1e-5)
+    np.testing.assert_allclose(shown[1]["scales"], np.sqrt(1 / 12), rtol=1e-5)  # (1 - r^2)^4 in the image
+    assert shown[0]["colours"].tolist() == [[153, 153, 153, 255], [153, 153, 153, 0]]  # no colours: grey
+    assert (shown[0]["quats"][:, 0] == 255).all()  # of no length: no turn

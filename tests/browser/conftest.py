@@ -1,0 +1,98 @@
+"""A real server with a lift of the tiny scene, and a browser."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from service.__main__ import server_of
+from service.app import assemble
+from service.settings import ServiceSettings
+from service.store.store import Store
+from tests.api.following import ended
+from tests.api.tiny_scene import make_scene
+from tests.crash.conftest import until
+
+from .browser import Browser, chromium
+
+NO_BROWSER = "no Chromium on this machine (apt-get install chromium)"
+
+
+@dataclass(frozen=True)
+class Served:
+    """Where the service is, and its one lift."""
+
+    address: str
+    lift: str
+    store: Store
+
+
+@contextlib.contextmanager
+def serving(data: Path, **settings: Any) -> Iterator[tuple[str, Store]]:
+    """A server on a free port: its address and its store."""
+    chosen = ServiceSettings.model_validate({"data": data, "disk_floor_bytes": 0, **settings})
+    store = Store.open(chosen.data)
+    listener = socket.create_server(("127.0.0.1", 0))
+    server = server_of(assemble(chosen, store), chosen)
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+    thread.start()
+    try:
+        until(lambda: server.started)
+        yield f"http://127.0.0.1:{listener.getsockname()[1]}", store
+    finally:
+        server.should_exit = True
+        thread.join()
+        store.close()
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    if chromium() is None:
+        pytest.skip(NO_BROWSER)
+    folder, scene = tmp_path_factory.mktemp("page"), make_scene()
+    (folder / "table.safetensors").write_bytes(scene.table)
+    with serving(folder / "data", encoder=f"table:{folder}/table.safetensors") as (address, store):
+        with httpx.Client(base_url=address, timeout=60) as client:
+            put = {kind: getattr(scene, kind) for kind in ("splats", "cameras", "features")}
+            ids = {kind: client.put(f"/assets/{kind}", content=body).json()["id"] for kind, body in put.items()}
+            order = ids | {"features": [ids["features"]], "settings": {"preset": "row-sum"}}
+            job = ended(client, client.post("/lift", json=order).headers["location"])
+        assert job["state"] == "succeeded", job
+        yield Served(address, job["id"], store)
+
+
+@contextlib.contextmanager
+def browsing(profile: Path, *options: str) -> Iterator[Browser]:
+    """A browser of which nothing is heard but what was asked of it, and which asks this machine alone."""
+    program = chromium()
+    if program is None:
+        pytest.skip(NO_BROWSER)
+    with Browser.started(program, profile, *options) as browser:
+        yield browser
+        assert browser.faults == []
+        assert all(address.startswith(("http://127.0.0.1:", "blob:", "data:")) for address in browser.asked)
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    with browsing(tmp_path_factory.mktemp("profile")) as browser:
+        yield browser
+
+
+@pytest.fixture
+def keep(request: pytest.FixtureRequest) -> Callable[[Browser, str], None]:
+    """Keeps a picture of the window: in .pytest_cache/d/page, for who wants to see what the tests saw."""
+    folder = request.config.cache.mkdir("page")
+
+    def shot(browser: Browser, name: str) -> None:
+        (folder / f"{name}.png").write_bytes(browser.screenshot())
+
+    return shot

@@ -1,0 +1,62 @@
+"""What tests read of the page: whether it is at rest, and where the picture has which colour."""
+
+from __future__ import annotations
+
+import json
+
+from .browser import Browser
+
+READY = (
+    "globalThis.splatlift?.lift && document.querySelector('#loading').hidden && "
+    "(splatlift.viewer ? splatlift.viewer.settled : document.querySelector('#render').naturalWidth > 0)"
+)
+FOUND = (
+    "!document.querySelector('#stage').classList.contains('asking') && splatlift.ask.questions.length && "
+    "splatlift.ask.questions.every(asked => asked.answer && (asked.things.length || !asked.count)) && "
+    "(!splatlift.viewer || splatlift.viewer.settled)"
+)
+TROUBLE = "!document.querySelector('#toast').hidden && document.querySelector('#toast').classList.contains('bad')"
+AMBER, SKY = "255,176,0", "56,182,255"  # colours of the first and the second question
+# Columns of the picture, in hundredths of its width, of pixels whose hue is near to a colour's.
+COLUMNS = """((wanted, near) => {
+  const from = splatlift.viewer.canvas;
+  const flat = Object.assign(document.createElement('canvas'), { width: from.width, height: from.height });
+  const context = flat.getContext('2d');
+  context.drawImage(from, 0, 0);
+  const { data } = context.getImageData(0, 0, flat.width, flat.height);
+  const hue = ([r, g, b]) => Math.atan2(Math.sqrt(3) * (g - b), 2 * r - g - b);
+  const found = [];
+  for (let i = 0; i < data.length; i += 4) {
+    const pixel = [data[i], data[i + 1], data[i + 2]];
+    const most = Math.max(...pixel);
+    const strong = most > 60 && most - Math.min(...pixel) > 40;
+    if (wanted ? strong && Math.abs(hue(pixel) - hue(wanted)) < near : most > 45) {
+      found.push(Math.floor(100 * ((i / 4) % flat.width) / flat.width));
+    }
+  }
+  return found;
+})"""
+
+
+def text_of(browser: Browser, selector: str) -> str:
+    return browser.value(f"document.querySelector({json.dumps(selector)}).textContent")
+
+
+def columns(browser: Browser, colour: str | None = None, near: float = 0.35) -> list[int]:
+    """Where the 3D picture shows a colour; without one, where it shows anything."""
+    browser.until("splatlift.viewer.settled")
+    return browser.value(f"{COLUMNS}({f'[{colour}]' if colour else 'null'}, {near})")
+
+
+def splat_at(browser: Browser, row: int) -> tuple[float, float]:
+    """Where a splat is seen in the 3D picture, as shares of its width and height."""
+    place = f"splatlift.viewer.place([...splatlift.viewer.floats.slice(8 * {row}, 8 * {row} + 3)])"
+    box = "splatlift.viewer.canvas.getBoundingClientRect()"
+    x, y = browser.value(f"(({{x, y}}, box) => [x / box.width, y / box.height])({place}, {box})")
+    return x, y
+
+
+def ask(browser: Browser, words: str) -> None:
+    browser.write("#words", words)
+    browser.press("#query button.main")
+    browser.until(FOUND)

@@ -1,0 +1,258 @@
+"""The page, as somebody uses it: words, clicks, keys, links, files. What is seen is counted in pixels."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from service.scopes import Scope
+from service.store.keys import Quota
+
+from .browser import Browser
+from .conftest import Served, browsing
+from .looking import AMBER, FOUND, READY, SKY, TROUBLE, ask, columns, splat_at, text_of
+
+AXE = (Path(__file__).parent / "axe.min.js").read_text(encoding="utf-8")
+EXAMPLES = "splatlift.ask.questions.flatMap(asked => [...asked.like, ...asked.unlike.map(term => `not ${term}`)])"
+WORDS = "splatlift.ask.questions.flatMap(asked => asked.text)"
+APPLE, LAMP = 5, 45  # splats of these
+CLEAR = """(() => {
+  const canvas = document.querySelector('#mask');
+  const pixels = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data;
+  const clear = [];
+  for (let i = 0; i < pixels.length; i += 4) {
+    if (pixels[i + 3] === 0 || pixels[i] > 128) clear.push(i / 4 % canvas.width);
+  }
+  return clear;
+})()"""
+Keep = Callable[[Browser, str], None]
+
+
+@pytest.fixture
+def page(browser: Browser, served: Served) -> Browser:
+    browser.window(1200, 700)
+    browser.open(served.address)
+    browser.until(READY)
+    return browser
+
+
+def test_first_view_is_shown_in_3d_with_its_lists(page: Browser, served: Served) -> None:
+    shown = columns(page)
+    assert shown and min(shown) < 40 and max(shown) > 60  # three clusters side by side
+    assert page.value("[...document.querySelector('#view').options].map(option => option.value)") == [
+        "left", "middle", "right"
+    ]  # fmt: skip
+    assert page.value("document.querySelector('#lift').value") == served.lift
+    assert "60 splats" in text_of(page, "#about")
+
+
+def test_word_lights_its_thing(page: Browser, keep: Keep) -> None:
+    before = columns(page)
+    ask(page, "lamp")
+    keep(page, "lamp")
+    lit = columns(page, AMBER)
+    assert lit and min(lit) > 50  # the lamp is the right one of three
+    assert "splats of 60" in text_of(page, "#answer") and "by itself" in text_of(page, "#why")
+    assert page.value("document.querySelectorAll('#things li').length") == 1
+    assert text_of(page, "#labels .label") == "lamp"
+    page.press("#hide")
+    assert min(columns(page)) > 50  # the rest is hidden
+    page.press("#hide")
+    page.press("#clear")
+    after = columns(page)
+    assert sorted(after) == sorted(before)  # to the pixel
+
+
+def test_slider_repaints_without_a_request(page: Browser) -> None:
+    ask(page, "lamp")
+    lit, asked = len(columns(page, AMBER)), len(page.asked)
+    page.value("document.querySelector('#cut').value = 9")  # the most there is
+    page.value("document.querySelector('#cut').dispatchEvent(new Event('input'))")
+    assert len(page.asked) == asked and "You set this cut" in text_of(page, "#why")
+    assert len(columns(page, AMBER)) < lit
+    page.until(FOUND)  # the things follow
+    page.press("#auto")
+    page.until(FOUND)
+    assert len(columns(page, AMBER)) == lit
+
+
+def test_several_words_have_a_colour_each(page: Browser) -> None:
+    ask(page, "lamp, apple")
+    assert min(columns(page, AMBER)) > 50 > max(columns(page, SKY))
+    page.press(".chip .away")
+    assert page.value(WORDS) == ["apple"]
+    page.key("Escape")
+    assert page.value(WORDS) == []
+
+
+def test_click_asks_for_more_and_shift_for_less(page: Browser) -> None:
+    page.press("#scene", *splat_at(page, APPLE))
+    page.until(f"{EXAMPLES}.length === 1")
+    page.until(FOUND)
+    assert page.value(EXAMPLES)[0].startswith("splat:") and int(page.value(EXAMPLES)[0][6:]) < 20  # the apple
+    assert max(columns(page, AMBER)) < 50
+    page.press("#scene", *splat_at(page, LAMP), shift=True)
+    page.until(f"{EXAMPLES}.length === 2")
+    page.until(FOUND)
+    assert page.value(EXAMPLES)[1].startswith("not splat:")
+    page.press("#examples button")
+    page.until(f"{EXAMPLES}.length === 0")
+    page.press("#scene", *splat_at(page, APPLE))
+    page.until(FOUND)
+    ask(page, "lamp")
+    assert page.value(EXAMPLES) == [] and page.value(WORDS) == ["lamp"]  # words after a click ask the words
+
+
+def test_double_click_goes_there_and_asks_nothing(page: Browser) -> None:
+    before = page.value("splatlift.viewer.place3d")
+    there = splat_at(page, APPLE)
+    page.press("#scene", *there)
+    page.press("#scene", *there)
+    page.until(f"splatlift.viewer.place3d.some((value, axis) => Math.abs(value - {before}[axis]) > .1)")
+    assert page.value(EXAMPLES) == []
+
+
+def test_what_is_not_there_is_said_plainly(page: Browser) -> None:
+    ask(page, "lamp")
+    page.value(
+        "(() => { splatlift.ask.now.answer.present = false; splatlift.ask.show(); splatlift.ask.changed(); })()"
+    )
+    assert text_of(page, "#answer") == "\u201clamp\u201d is not here." and not columns(page, AMBER)
+    page.press("#nearest")
+    page.until(FOUND)
+    assert columns(page, AMBER) and "comes closest" in text_of(page, "#why")
+
+
+def test_example_that_nothing_understands_is_told_and_taken_back(page: Browser) -> None:
+    page.value("void splatlift.ask.example('nowhere:1,1')")
+    page.until(TROUBLE)
+    assert "nowhere" in text_of(page, "#toast") and page.value(EXAMPLES) == []
+
+
+def test_words_of_users_never_become_markup(page: Browser) -> None:
+    page.write("#words", "<img src=x onerror=alert(1)>")
+    page.press("#query button.main")
+    page.until(TROUBLE)
+    assert "<img src=x" in text_of(page, "#toast")
+    assert page.value("document.querySelectorAll('#toast *, #chips img, #found img').length") == 0
+
+
+def test_page_works_by_keyboard_alone(page: Browser) -> None:
+    page.key("/")
+    assert page.value("document.activeElement.id") == "words"
+    page.write("#words", "lamp")
+    page.key("Enter")
+    page.until(FOUND)
+    page.value("document.querySelector('#scene').focus()")
+    before = page.value("splatlift.viewer.place3d")
+    for key in ("ArrowLeft", "ArrowUp", "+"):
+        page.key(key)
+        after = page.value("splatlift.viewer.place3d")
+        assert after != before, key
+        before = after
+    page.key("h")
+    assert page.value("document.querySelector('#hide').checked") is True
+    page.key("]")
+    assert page.value("document.querySelector('#view').value") == "middle"
+    page.key("Enter")  # the book lies in the middle
+    page.until(f"{EXAMPLES}.length === 1")
+    assert 20 <= int(page.value(EXAMPLES)[0][6:]) < 40
+    page.key("?")
+    assert page.value("document.querySelector('#help').open") is True
+
+
+def test_link_opens_question_layer_and_camera_again(page: Browser, served: Served) -> None:
+    ask(page, "apple, lamp")
+    page.value("document.querySelector('#scene').focus()")
+    page.key("ArrowRight")
+    page.press("#tab-look")
+    page.press("#panel-look input[value=pca]")
+    page.until("location.search.includes('what=pca')")
+    link, place = page.value("location.href"), page.value("splatlift.viewer.place3d")
+    page.open("about:blank#")
+    page.open(link)
+    page.until(READY)
+    page.until(FOUND)
+    assert page.value(WORDS) == ["apple", "lamp"] and page.value("splatlift.look.what") == "pca"
+    assert page.value("splatlift.viewer.place3d") == pytest.approx(place, rel=1e-3, abs=1e-3)
+    page.open(f"{served.address}/?lift={served.lift}&view=right&text=apple&threshold=0.5")  # a link of before
+    page.until(READY)
+    page.until(FOUND)
+    assert page.value("[splatlift.look.view.name, splatlift.ask.now.cut]") == ["right", 0.5]
+
+
+def test_photo_view_shows_the_mask_and_takes_examples(page: Browser, keep: Keep) -> None:
+    page.press("#tools input[value=view] + span")
+    page.until("document.querySelector('#render').naturalWidth === 32")
+    ask(page, "lamp")
+    page.until("!document.querySelector('#mask').hidden")
+    assert min(page.value(CLEAR)) > 16
+    keep(page, "photo-view")
+    page.press("#render", 7.5 / 32, 12.5 / 24)
+    page.until(f"{EXAMPLES}.length === 1")
+    assert page.value(EXAMPLES) == ["left:7,12"]
+    page.until("document.querySelectorAll('#picture .mark').length === 1")
+
+
+def test_page_without_webgl_shows_the_views(served: Served, tmp_path: Path) -> None:
+    with browsing(tmp_path, "--disable-3d-apis") as browser:
+        browser.open(served.address)
+        browser.until("globalThis.splatlift?.lift && document.querySelector('#render').naturalWidth === 32")
+        assert browser.value("document.querySelector('#stage').dataset.mode") == "view"
+        ask(browser, "lamp")
+        browser.until("!document.querySelector('#mask').hidden")
+        assert min(browser.value(CLEAR)) > 16
+
+
+@pytest.mark.parametrize("scheme", ["dark", "light"])
+def test_accessibility_check_finds_nothing_serious(page: Browser, scheme: str, keep: Keep) -> None:
+    page.window(1280, 800, scheme)
+    ask(page, "lamp")
+    page.value(f"(() => {{ {AXE}; }})()")
+    for tab in ("ask", "look", "bring", "take"):
+        page.press(f"#tab-{tab}")
+        found = page.value("axe.run(document).then(all => all.violations)")
+        told = {rule["id"]: [node["html"] for node in rule["nodes"]] for rule in found if rule["impact"] != "minor"}
+        assert told == {}, tab
+        keep(page, f"{scheme}-{tab}")
+
+
+@pytest.mark.parametrize(("width", "height"), [(1280, 800), (768, 1024), (390, 844), (450, 400)])
+def test_nothing_is_wider_than_the_window(page: Browser, width: int, height: int, keep: Keep) -> None:
+    page.window(width, height)
+    ask(page, "lamp")
+    for tab in ("bring", "take", "look", "ask"):
+        page.press(f"#tab-{tab}")
+        assert page.value("document.documentElement.scrollWidth") <= width, tab
+    keep(page, f"{width}")
+
+
+def test_lines_to_take_away_ask_the_same(page: Browser) -> None:
+    ask(page, "apple")
+    page.press("#tab-take")
+    assert "text=apple" in text_of(page, "#curl") and '"apple"' in text_of(page, "#python")
+    addresses = ["object", "boxes", "mask", "scores", "coloured"]
+    asked = f"{json.dumps(addresses)}.map(what => fetch(splatlift.take.address(what)).then(reply => reply.status))"
+    assert page.value(f"Promise.all({asked})") == [200] * 5
+
+
+def test_page_asks_for_a_key_where_one_is_needed(page: Browser, served: Served) -> None:
+    """The last one: from here on the service is closed."""
+    key, secret = served.store.keys.create("page", frozenset({Scope.READ}), Quota())
+    try:
+        page.open(served.address)
+        page.until("document.querySelector('#door').open")
+        page.write("#key", "wrong")
+        page.value("document.body.dataset.old = true")
+        page.press("#use-key")
+        page.until("!document.body.dataset.old && document.querySelector('#door').open")
+        assert page.value("document.querySelector('#door-wrong').hidden") is False
+        page.write("#key", secret)
+        page.press("#use-key")
+        page.until("globalThis.splatlift && !document.querySelector('#empty').hidden")  # another's are not shown
+        assert page.value("document.querySelector('#door').open") is False
+    finally:
+        served.store.keys.revoke(key.id)
