@@ -25,7 +25,7 @@ LAST_WORDS = 3_000  # characters of its log, when it fails
 def add_arguments(parser: Parser) -> None:
     """The options of the command."""
     cameras = "cameras.json, transforms.json, cameras.zip or sparse/0"
-    holds = f"its .ply; {cameras}; a feature pack; text_table.safetensors if any"
+    holds = f"its .ply, .sog, .spz or .splat; {cameras}; a feature pack; text_table.safetensors if any"
     parser.add_argument("--scene", type=Path, metavar="DIR", help=f"a scene of your own ({holds}); else a still life")
     parser.add_argument(
         "--ask", action="append", default=[], metavar="TEXT", help="what to look for; may be given several times"

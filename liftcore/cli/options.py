@@ -44,7 +44,7 @@ def shared_options() -> Parser:
 
 def add_sources(parser: argparse.ArgumentParser) -> None:
     """Splats, cameras and feature packs."""
-    parser.add_argument("splats", type=Path, help="trained splats (.ply)")
+    parser.add_argument("splats", type=Path, help="trained splats (.ply, .splat, .spz, .sog, or a checkpoint)")
     parser.add_argument("cameras", type=Path, help="COLMAP folder or .zip, transforms.json or cameras.json")
     parser.add_argument("features", type=Path, nargs="+", help="feature packs (.safetensors)")
 

@@ -16,6 +16,7 @@ from liftcore.query.text import NO_WORDS
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+_SPLATS = (".ply", ".sog", ".spz", ".splat")  # the first kind that is there
 _CAMERA_FILES = ("cameras.json", "transforms.json", "cameras.zip")
 _TABLE = "text_table.safetensors"
 _BUILT_IN = "minilm"  # the text encoder that needs no files
@@ -71,7 +72,7 @@ def find_scene(folder: Path, phrases: Sequence[str], scratch: Path) -> DemoScene
     """A scene folder as it is: the files are found by name, a COLMAP model is zipped for the upload.
 
     Args:
-        folder: holds a ``.ply``, cameras (``cameras.json``, ``transforms.json``, ``sparse/0``) and a pack.
+        folder: holds splats (``.ply``, ``.sog``, ``.spz`` or ``.splat``), cameras (``cameras.json``, ``transforms.json``, ``sparse/0``) and a pack.
         phrases: what to ask; empty = three objects of ``truth.json`` if the features have words, else nothing.
         scratch: where to put the zipped model.
 
@@ -93,7 +94,7 @@ def find_scene(folder: Path, phrases: Sequence[str], scratch: Path) -> DemoScene
     asked = tuple(phrases) or (_phrases_of(truth) if text_space != NO_WORDS else ())
     return DemoScene(
         name=folder.name,
-        splats=_first(folder, "*.ply", "splats"),
+        splats=_splats(folder),
         cameras=cameras,
         features=features,
         encoder=f"table:{table}" if table.is_file() else _BUILT_IN,
@@ -104,11 +105,13 @@ def find_scene(folder: Path, phrases: Sequence[str], scratch: Path) -> DemoScene
     )
 
 
-def _first(folder: Path, pattern: str, what: str) -> Path:
-    found = sorted(folder.glob(pattern)) or sorted(folder.glob(f"point_cloud/*/{pattern}"))
-    if not found:
-        raise InvalidInput(f"{what} of {folder.name}", expected=f"a {pattern[1:]} file", got="none")
-    return found[-1]
+def _splats(folder: Path) -> Path:
+    """The splats of a folder, or of the last iteration that a 3DGS trainer kept in it."""
+    for suffix in _SPLATS:
+        found = sorted(folder.glob(f"*{suffix}")) or sorted(folder.glob(f"point_cloud/*/*{suffix}"))
+        if found:
+            return found[-1]
+    raise InvalidInput(f"splats of {folder.name}", expected=f"a file of {', '.join(_SPLATS)}", got="none")
 
 
 def _cameras(folder: Path, scratch: Path) -> Path:

@@ -1,6 +1,5 @@
 """What a camera's pinhole observes of a distorted photo: its maps, carried from the photo's pixels to its own."""
 
-from collections.abc import Iterable
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -14,7 +13,6 @@ from liftcore.scene.distortion import Lens
 
 BAND_VALUES = 1 << 22  # of a grid, carried at a time in float32
 BAND_PIXELS = 1 << 15  # whose rays are bent at a time: what that takes stays in the cache
-PLACE_BYTES = 4
 KEPT_PINHOLES = 2  # whose labels' places are kept: mostly one lens took all photos, and labels are of one size
 
 
@@ -38,12 +36,6 @@ def grid_sides(height: int, width: int, camera: Camera) -> tuple[int, int]:
         return height, width
     rows, columns = height * camera.height / camera.lens.height, width * camera.width / camera.lens.width
     return max(1, round(rows)), max(1, round(columns))
-
-
-def kept_bytes(cameras: Iterable[Camera]) -> int:
-    """What is kept of labels' places for the largest of some cameras' pinholes."""
-    pixels = [camera.width * camera.height for camera in cameras if camera.lens is not None]
-    return KEPT_PINHOLES * PLACE_BYTES * max(pixels, default=0)
 
 
 def _labels(labels: Tensor, camera: Camera) -> Tensor:

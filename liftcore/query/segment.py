@@ -184,7 +184,7 @@ def named_ply(scene: QueryScene, segmentation: Segmentation) -> Iterable[bytes]:
         InvalidLift: the splats moved or changed since the lift.
         InvalidSplats: their file holds no colours; told when the first block is asked for.
     """
-    from liftcore.io.ply import recoloured
+    from liftcore.io.splats import recoloured
 
     return recoloured(scene.splat_file, constant_terms(segmentation.colours[segmentation.values]))
 

@@ -345,20 +345,6 @@ def test_resnet_values_are_what_the_pool_gives_for_equal_cells() -> None:
     assert grid.shape == (1, 2, 3, F)
 
 
-def test_positions_follow_the_grid_when_the_size_changes() -> None:
-    tower = small_vit()
-    ramp = torch.arange(4.0).repeat(4)  # the column of a cell
-    with torch.no_grad():
-        tower.positional_embedding.zero_()
-        tower.positional_embedding[1:, 0] = ramp
-        from liftcore.features.encoders.clip import _positions
-
-        wide = _positions(tower, 4, 8)[1:, 0].reshape(4, 8)
-        assert torch.equal(_positions(tower, 4, 4), tower.positional_embedding)
-    # Twice as many columns, half a cell apart: bicubic keeps a ramp a ramp, inside.
-    torch.testing.assert_close(wide[:, 2:6], (torch.arange(2, 6) / 2 - 0.25).expand(4, 4), atol=0.06, rtol=0)
-
-
 ENCODERS = {
     "maskclip ViT": lambda: small_encoder("maskclip", small_vit()),
     "clip ViT": lambda: small_encoder("clip", small_vit()),

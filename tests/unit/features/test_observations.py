@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from liftcore.errors import InvalidFeatures
-from liftcore.features import lens, levels
+from liftcore.features import levels
 from liftcore.features.lens import as_pinhole_sees
 from liftcore.features.levels import at_levels, composite
 from liftcore.features.pack import pair, read_features, write_pack
@@ -166,16 +166,6 @@ def test_a_cell_reads_the_grid_where_its_ray_lies(distortion: Distortion, dtype:
             assert np.abs(seen.grid[r, c].double().numpy() - wanted).max() < tolerance
 
 
-def test_large_grids_are_carried_in_bands_to_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
-    view, grid = camera(BARREL), FeatureGrid(torch.rand(11, 15, 4, generator=torch.Generator().manual_seed(0)))
-    whole = as_pinhole_sees(grid, view)
-    monkeypatch.setattr("liftcore.features.lens.BAND_VALUES", 1)
-    parts = as_pinhole_sees(grid, view)
-    assert isinstance(whole, FeatureGrid)
-    assert isinstance(parts, FeatureGrid)
-    assert torch.equal(whole.grid, parts.grid)
-
-
 def test_what_has_no_lens_is_seen_as_it_is() -> None:
     view = Camera.pinhole("v", 60, 44, 48.0, 47.0, 29.0, 23.0, np.eye(4))
     observation = Regions(torch.zeros(1, 4, 5, dtype=torch.int32), torch.ones(1, 2))
@@ -200,20 +190,3 @@ def test_packs_tell_before_a_map_is_read_what_size_it_will_have(tmp_path: Path) 
     assert packs["bent"].codebook.shape == (1, 3)
     assert [packs.map_size(name) for name in maps] == [(30, 22), (15, 11), (30, 22)]  # of the photos, as they lie
     assert tuple(packs.specs("plain")["labels"].shape) == (1, 22, 30)
-
-
-def test_bands_make_no_difference_to_labels(monkeypatch: pytest.MonkeyPatch) -> None:
-    view = camera(BARREL)
-    labels = Regions(torch.arange(44 * 60, dtype=torch.int32).reshape(1, 44, 60), torch.ones(44 * 60, 1))
-    whole = as_pinhole_sees(labels, view)
-    monkeypatch.setattr(lens, "BAND_PIXELS", 7 * view.width)
-    lens._label_places.cache_clear()
-    parts = as_pinhole_sees(labels, view)
-    assert isinstance(whole, Regions) and isinstance(parts, Regions)
-    assert torch.equal(parts.labels, whole.labels)
-
-
-def test_places_of_labels_are_kept_for_the_largest_pinhole_behind_a_lens() -> None:
-    view, plain = camera(BARREL), Camera.pinhole("p", 500, 400, 48.0, 47.0, 29.0, 23.0, np.eye(4))
-    assert lens.kept_bytes([plain]) == 0
-    assert lens.kept_bytes([plain, view]) == 2 * 4 * view.width * view.height

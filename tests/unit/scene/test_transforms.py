@@ -242,16 +242,6 @@ def test_zip_of_the_two_files_is_read(flat: bool, run: Path, expected: Cameras, 
     assert inspect_file(path)["warnings"] == []
 
 
-def test_transform_of_gsplat_holds_its_scale(run: Path, expected: Cameras, model: Path, tmp_path: Path) -> None:
-    """Its ``Parser.transform`` written in nerfstudio's layout, as README has it."""
-    transform = oriented() @ APPLIED
-    transform[:3] *= SCALE
-    scene = tmp_path / "scene"
-    shutil.copytree(model, scene / "sparse/0")
-    (scene / FRAME_FILE).write_text(json.dumps({"transform": transform[:3].tolist(), "scale": 1.0}))
-    assert_same(read_cameras(scene), expected)
-
-
 def test_lenses_stay_as_they_are(run: Path, tmp_path: Path) -> None:
     scene = tmp_path / "scene"
     write_files(scene / "sparse/0", binary_files({**CAMERAS, 1: (2, "SIMPLE_RADIAL", (500.0, 320.0, 240.0, 0.1))}))
