@@ -72,7 +72,8 @@ def find_scene(folder: Path, phrases: Sequence[str], scratch: Path) -> DemoScene
     """A scene folder as it is: the files are found by name, a COLMAP model is zipped for the upload.
 
     Args:
-        folder: holds splats (``.ply``, ``.sog``, ``.spz`` or ``.splat``), cameras (``cameras.json``, ``transforms.json``, ``sparse/0``) and a pack.
+        folder: holds splats (``.ply``, ``.sog``, ``.spz`` or ``.splat``), cameras (``cameras.json``,
+            ``transforms.json``, ``sparse/0``) and a pack.
         phrases: what to ask; empty = three objects of ``truth.json`` if the features have words, else nothing.
         scratch: where to put the zipped model.
 

@@ -8,8 +8,8 @@ import errno
 import os
 import tempfile
 import zipfile
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path, PurePath, PurePosixPath
 from typing import TypeVar
@@ -33,7 +33,6 @@ MAX_UNZIPPED_BYTES = 512 * 1024 * 1024
 MAX_ZIP_MEMBERS = 100_000
 MOST_MODELS = 8  # of a zip that are looked at
 ONE_RUN = "zip those of one run alone"
-Files = Mapping[str, zipfile.ZipInfo]  # by their names in the zip
 P = TypeVar("P", bound=PurePath)
 
 
@@ -136,7 +135,10 @@ def other_models(path: Path) -> list[str]:
     if path.is_dir():
         read = camera_source(path).model
         return [] if read is None else [str(model) for model in _models_below(path) if path / model != read]
-    return _models_in_zip(path)[1:] if zipfile.is_zipfile(path) else []
+    if not zipfile.is_zipfile(path):
+        return []
+    with zipfile.ZipFile(path) as archive:
+        return [str(model) for model in _whole_models(_files(archive))[1:]]
 
 
 def has_nerfstudio_beside(path: Path) -> bool:
@@ -229,19 +231,18 @@ def _models_below(folder: Path) -> list[PurePosixPath]:
         here = Path(parent).relative_to(folder)
         names += [(here / name).as_posix() for name in files if name in MODEL_FILES]
         inner[:] = [name for name in sorted(inner) if not name.startswith(".") and len(here.parts) < DEPTH]
-    return [root for root, _ in _whole_models(names)]
+    return _whole_models(names)
 
 
-def _whole_models(names: Iterable[str]) -> Iterator[tuple[PurePosixPath, str]]:
-    """The folders with both files of a model among such names, and of which kind, the preferred first."""
-    known = set(names)
-    found: dict[PurePosixPath, str] = {}
-    for kind in ("txt", "bin"):  # of two kinds in a folder the binary one
-        for name in known:
-            path = PurePosixPath(name)
-            if path.name == f"cameras.{kind}" and str(path.with_name(f"images.{kind}")) in known:
-                found[path.parent] = kind
-    yield from sorted(found.items(), key=lambda item: _preference(item[0]))
+def _whole_models(names: Iterable[str]) -> list[PurePosixPath]:
+    """The folders with both files of a model among such names, the preferred first."""
+    known = {PurePosixPath(name) for name in names}
+    found = {
+        path.parent
+        for path in known
+        if path.stem == "cameras" and path.with_stem("images") in known and path.name in MODEL_FILES
+    }
+    return sorted(found, key=_preference)
 
 
 def _preference(model: PurePosixPath) -> tuple[bool, int, str, int]:
@@ -268,9 +269,9 @@ def _scene_of(model: P) -> P:
 def _from_zip(path: Path, beside: Path | None, *, choosing: bool) -> Cameras:
     """The cameras of the preferred model in a zip; with a frame's file in it or ``beside`` it, a transforms first."""
     with tempfile.TemporaryDirectory(prefix="splatlift-") as folder:
-        _unzip(path, lambda files: _camera_members(files, path, framed=beside is not None), Path(folder))
-        source = camera_source(Path(folder))
-        source = replace(source, frame=source.frame or beside)
+        root = Path(folder)
+        names = _unzip(path, root)
+        source = _source_in_zip(names, root, path, beside)
         try:
             cameras = source.read()
         except InvalidCameras as error:
@@ -278,51 +279,60 @@ def _from_zip(path: Path, beside: Path | None, *, choosing: bool) -> Cameras:
                 text.replace(folder, str(path)) for text in (error.argument, error.got, error.hint)
             )
             raise InvalidCameras(argument, expected=error.expected, got=got, hint=hint) from None
-    if choosing and source.model is not None and cameras.distorted:
-        read, *others = _models_in_zip(path)[:MOST_MODELS]
-        straight = [name for place, name in enumerate(others, start=1) if _is_undistorted_in_zip(path, place)]
-        _refuse_both(str(path), read, straight, "zip the one alone")
+        if choosing and source.model is not None and cameras.distorted:
+            read, *others = _whole_models(names)[:MOST_MODELS]
+            straight = [str(model) for model in others if _is_undistorted(root / model)]
+            _refuse_both(str(path), str(read), straight, "zip the one alone")
     return cameras
 
 
-def _models_in_zip(path: Path) -> list[str]:
-    """The folders of all whole models in a zip, the one that is read first."""
-    with zipfile.ZipFile(path) as archive:
-        return [str(root) for root, _ in _whole_models(_files(archive))]
+def _source_in_zip(names: list[str], root: Path, path: Path, beside: Path | None) -> CameraSource:
+    """What is read of a zip whose camera files lie unzipped in ``root``, wherever they are there."""
+    models, frames = _whole_models(names), _named(names, lambda name: name == FRAME_FILE)
+    documents = _named(names, lambda name: name == TRANSFORMS) or _named(names, _is_transforms)
+    if documents and (frames or beside):
+        frame = root / _only(frames, FRAME_FILE, path) if frames else beside
+        return CameraSource(file=root / _only(documents, TRANSFORMS, path), frame=frame)
+    if not models:
+        got, hint = _what_else(names)
+        expected = "a COLMAP model (cameras and images, .bin or .txt) in the zip"
+        raise InvalidCameras(str(path), expected=expected, got=got, hint=hint)
+    above = [name for name in frames if models[0].is_relative_to(PurePosixPath(name).parent)]
+    if frames and not above and len({_scene_of(model) for model in models}) > 1:
+        got = f"one of {PurePosixPath(frames[0]).parent} and the model {models[0]}"
+        raise InvalidCameras(str(path), expected=f"the {FRAME_FILE} of the model", got=got, hint=ONE_RUN)
+    frames = above[-1:] or frames
+    return CameraSource(model=root / models[0], frame=root / _only(frames, FRAME_FILE, path) if frames else beside)
 
 
-def _is_undistorted_in_zip(path: Path, place: int) -> bool:
-    """Whether the zip's model of this place among all reads, and is of pinholes alone."""
-    with tempfile.TemporaryDirectory(prefix="splatlift-") as folder:
-        try:
-            _unzip(path, lambda files: _model_members(files, path, place), Path(folder))
-        except InvalidCameras:
-            return False
-        return _is_undistorted(Path(folder))
-
-
-def _files(archive: zipfile.ZipFile) -> Files:
-    """The files by their names, with slashes: Windows' own programs write backslashes, others ``./`` before all.
+def _files(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
+    """The files by their names in a folder of the zip's own, with slashes: some programs write backslashes or ``./``.
 
     What is hidden, or below a hidden folder, is left out, as it is of folders.
     """
-    members = {PurePosixPath(m.filename.replace("\\", "/")): m for m in archive.infolist() if not m.is_dir()}
-    return {
-        str(name): member
-        for name, member in members.items()
-        if not any(part.startswith(".") and part != ".." for part in name.parts)
-    }
+    files = {}
+    for member in archive.infolist():
+        parts = PurePosixPath(member.filename.replace("\\", "/")).parts
+        inner = [part for part in parts if part not in ("/", "..")]
+        if inner and not member.is_dir() and not any(part.startswith(".") for part in inner):
+            files["/".join(inner)] = member
+    return files
 
 
-def _unzip(path: Path, pick: Callable[[Files], Files], folder: Path) -> None:
-    """Unzip what is picked of all files, under the names that are picked."""
+def _unzip(path: Path, folder: Path) -> list[str]:
+    """Unzip what cameras may be read from, each file at its place; the names of all files in the zip."""
     try:
         with zipfile.ZipFile(path) as archive:
             count, budget = len(archive.infolist()), MAX_UNZIPPED_BYTES
             if count > MAX_ZIP_MEMBERS:
                 raise InvalidCameras(str(path), expected=f"at most {MAX_ZIP_MEMBERS} files", got=str(count))
-            for name, member in pick(_files(archive)).items():
-                budget -= _unzip_one(archive, member, folder / name, budget)
+            files = _files(archive)
+            for name, member in files.items():
+                last = PurePosixPath(name).name
+                if last in (*MODEL_FILES, FRAME_FILE) or _is_transforms(last):
+                    (folder / name).parent.mkdir(parents=True, exist_ok=True)
+                    budget -= _unzip_one(archive, member, folder / name, budget)
+            return list(files)
     except BROKEN_ZIP as error:
         if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
             expected, hint = f"room in {tempfile.gettempdir()} for what is in the zip", "make room, or set TMPDIR"
@@ -343,37 +353,10 @@ def _unzip_one(archive: zipfile.ZipFile, member: zipfile.ZipInfo, target: Path, 
     return written
 
 
-def _camera_members(files: Files, path: Path, *, framed: bool) -> Files:
-    """What the cameras are read from, with the frame of the splats if the zip tells it, wherever it lies."""
-    frames = _named(files, lambda name: name == FRAME_FILE)
-    if not (frames or framed):
-        return _model_members(files, path, 0)
-    documents = _named(files, lambda name: name == TRANSFORMS) or _named(files, _is_transforms)
-    if documents:
-        chosen = {TRANSFORMS: files[_only(documents, TRANSFORMS, path)]}
-    else:
-        chosen = dict(_model_members(files, path, 0))
-        model = next(_whole_models(files))[0]
-        above = [name for name in frames if model.is_relative_to(PurePosixPath(name).parent)]
-        if frames and not above and len({_scene_of(root) for root, _ in _whole_models(files)}) > 1:
-            got = f"one of {PurePosixPath(frames[0]).parent} and the model {model}"
-            raise InvalidCameras(str(path), expected=f"the {FRAME_FILE} of the model", got=got, hint=ONE_RUN)
-        frames = sorted(above, key=lambda name: -name.count("/"))[:1] or frames
-    return {**chosen, **({FRAME_FILE: files[_only(frames, FRAME_FILE, path)]} if frames else {})}
-
-
-def _model_members(files: Files, path: Path, place: int) -> Files:
-    """The cameras and images of the model of this place among all."""
-    for root, kind in islice(_whole_models(files), place, None):
-        return {f"{part}.{kind}": files[str(root / f"{part}.{kind}")] for part in ("cameras", "images")}
-    got, hint = _what_else(files)
-    expected = "a COLMAP model (cameras and images, .bin or .txt) in the zip"
-    raise InvalidCameras(str(path), expected=expected, got=got, hint=hint)
-
-
-def _named(files: Files, fits: Callable[[str], bool]) -> list[str]:
-    found = [place for place in files if fits(PurePosixPath(place).name)]
-    return sorted(found, key=lambda place: (place.count("/"), place))
+def _named(names: Iterable[str], fits: Callable[[str], bool]) -> list[str]:
+    """Those whose last part fits, the outermost first."""
+    found = [name for name in names if fits(PurePosixPath(name).name)]
+    return sorted(found, key=lambda name: (name.count("/"), name))
 
 
 def _is_transforms(name: str) -> bool:
