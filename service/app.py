@@ -37,10 +37,7 @@ def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, work
     readiness = Readiness(store, runner, worker, stopping)
     runner.tell(metrics.attempted)
     worker.tell(metrics.queried)
-    collector = Collector(
-        store, every_seconds=settings.garbage_seconds, grace_seconds=settings.garbage_grace_seconds,
-        quarantine_seconds=settings.quarantine_seconds,
-    )  # fmt: skip
+    collector = Collector(store, settings)
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:

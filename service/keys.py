@@ -1,18 +1,21 @@
-"""``python -m service.keys``: make, list and revoke keys, beside a server that runs or without one."""
+"""``python -m service.keys``: make, list, rotate and revoke keys, beside a server that runs or without one."""
 
 from __future__ import annotations
 
 import argparse
 import fcntl
 import json
+import re
 import sqlite3
 import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from liftcore.cli import build_parser
 from liftcore.errors import NotFound, SplatliftError
 from service.__main__ import parse
 from service.errors import InvalidRequest
@@ -21,15 +24,16 @@ from service.store.database import DATABASE, Database
 from service.store.keys import KeyRecord, KeyStore, Quota
 
 MAX_NAME = 100
+UNITS = {"s": 1, "m": 60, "h": 3600, "d": 86_400}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Do what the command line says; the exit status."""
-    given = _parser().parse_args(arguments)
+    given = build_parser().parse_args(["keys", *(sys.argv[1:] if arguments is None else arguments)])
     try:
         data = parse([] if given.data is None else ["--data", str(given.data)]).data
         with opened(data, make=given.action == "create") as keys:
-            {"create": _create, "list": _list, "revoke": _revoke}[given.action](keys, given)
+            {"create": _create, "list": _list, "rotate": _rotate, "revoke": _revoke}[given.action](keys, given)
     except SplatliftError as error:
         print(f"splatlift: {error}", file=sys.stderr)
         return 2
@@ -37,23 +41,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"splatlift: data: expected a directory to write to, got {error}", file=sys.stderr)
         return 2
     return 0
-
-
-def _parser() -> argparse.ArgumentParser:
-    """What ``splatlift keys`` hands over."""
-    shared = argparse.ArgumentParser(add_help=False)
-    shared.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
-    shared.add_argument("--data", help="the service's directory")
-    parser = argparse.ArgumentParser(prog="splatlift keys")
-    actions = parser.add_subparsers(dest="action", required=True)
-    create = actions.add_parser("create", parents=[shared])
-    create.add_argument("--name", required=True)
-    create.add_argument("--scopes", required=True, help="read,write,metrics,admin")
-    for limit in ("--max-bytes", "--max-queued", "--max-uploads"):
-        create.add_argument(limit, type=int)
-    actions.add_parser("list", parents=[shared])
-    actions.add_parser("revoke", parents=[shared]).add_argument("id")
-    return parser
 
 
 @contextmanager
@@ -92,12 +79,45 @@ def _create(keys: KeyStore, given: argparse.Namespace) -> None:
     if not name or len(name) > MAX_NAME or not name.isprintable():
         raise InvalidRequest("name", expected=f"1 to {MAX_NAME} printable characters", got=repr(given.name)[:120])
     quota = Quota(given.max_bytes, given.max_queued, given.max_uploads)
-    key, secret = keys.create(name, parse_scopes(given.scopes.split(",")), quota)
+    expires = None if given.expires is None else _moment(given.expires)
+    key, secret = keys.create(name, parse_scopes(given.scopes.split(",")), quota, expires=expires)
+    _show(key, secret, given)
+
+
+def _rotate(keys: KeyStore, given: argparse.Namespace) -> None:
+    grace = 0.0 if given.grace is None else _seconds("grace", given.grace)
+    _show(*keys.rotate(given.key, grace=grace), given)
+
+
+def _show(key: KeyRecord, secret: str, given: argparse.Namespace) -> None:
     if given.json:
         print(json.dumps({**_document(key), "key": secret}))
         return
     print(secret)
-    print(f"key {key.id} of {name}: {', '.join(sorted(key.scopes))}. It is shown this once.", file=sys.stderr)
+    until = "" if key.expires is None else f", until {_when(key.expires)}"
+    print(
+        f"key {key.id} of {key.name}: {', '.join(sorted(key.scopes))}{until}. It is shown this once.", file=sys.stderr
+    )
+
+
+def _seconds(argument: str, text: str) -> float:
+    """A time such as 30d."""
+    match = re.fullmatch(r"(\d{1,6})([smhd])", text.strip(), re.ASCII)
+    if match is None:
+        raise InvalidRequest(argument, expected="a time such as 30d, 12h, 90m or 45s", got=repr(text)[:80])
+    return int(match[1]) * UNITS[match[2]]
+
+
+def _moment(text: str) -> float:
+    """A time from now, or a date, in seconds since 1970."""
+    try:
+        date = datetime.fromisoformat(text.strip())
+    except ValueError:
+        return time.time() + _seconds("expires", text)
+    moment = (date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp()
+    if moment <= time.time():
+        raise InvalidRequest("expires", expected="a moment that is to come", got=text)
+    return moment
 
 
 def _list(keys: KeyStore, given: argparse.Namespace) -> None:
@@ -116,7 +136,7 @@ def _list(keys: KeyStore, given: argparse.Namespace) -> None:
 
 
 def _revoke(keys: KeyStore, given: argparse.Namespace) -> None:
-    key = keys.revoke(given.id)
+    key = keys.revoke(given.key)
     if given.json:
         print(json.dumps(_document(key)))
     else:
@@ -132,12 +152,17 @@ def _document(key: KeyRecord) -> dict[str, Any]:
         "max_queued": key.quota.max_queued,
         "max_uploads": key.quota.max_uploads,
         "created": key.created,
+        "expires": key.expires,
         "revoked": key.revoked,
     }
 
 
 def _state(key: KeyRecord) -> str:
-    return "valid" if key.revoked is None else f"revoked {_when(key.revoked)}"
+    if key.revoked is not None:
+        return f"revoked {_when(key.revoked)}"
+    if key.expires is None:
+        return "valid"
+    return f"{'expired' if key.expires <= time.time() else 'valid until'} {_when(key.expires)}"
 
 
 def _limits(key: KeyRecord) -> str:

@@ -28,6 +28,11 @@ PATH_CHARACTERS = 200  # of what a client asked for, told back
 SHOWN = 120  # characters of a value that came
 SHOWN_OF_JSON = 20  # from where it is none
 CLOSE = {"Connection": "close"}  # what is still to come of the body would be taken for the next request
+# Of the database's file, or of the disk below it: nobody's request is at fault, and nothing was kept of it.
+UNUSABLE = (
+    sqlite3.SQLITE_READONLY, sqlite3.SQLITE_IOERR, sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_CANTOPEN,
+    sqlite3.SQLITE_NOTADB,
+)  # fmt: skip
 NO_SPACE = "There is no room left"
 BUSY = "The server is busy"
 
@@ -174,6 +179,10 @@ async def _on_system(request: Request, error: Exception) -> JSONResponse:
         log.error("%s %s: another process holds the database", request.method, request.url.path)
         held = errors.Busy("database", expected="a turn to write", got="one that another process holds for long")
         return answer_to(held)
+    if code is not None and code & 0xFF in UNUSABLE:
+        log.error("%s %s: the database cannot be used", request.method, request.url.path, exc_info=error)
+        got = "one that is damaged, gone, or on a disk that fails"
+        return answer_to(errors.NotReady("database", expected="the database that was opened", got=got))
     return await _on_unexpected(request, error)
 
 

@@ -68,6 +68,13 @@ class ServiceSettings(BaseSettings):
         604_800, ge=0, description="how long it is then kept in quarantine/ before it is removed"
     )
 
+    keep_jobs_seconds: float | None = Field(
+        None, ge=0, description="how long a job without a result is kept after its end; not set = until it is deleted"
+    )
+    keep_jobs: int | None = Field(
+        None, ge=0, description="how many of these, the latest, are kept for each key; not set = all"
+    )
+
     lift_threads: int | None = Field(
         None, ge=1, description="threads of a job; not set = the cores shared out among the parallel jobs"
     )

@@ -1,27 +1,47 @@
-"""The supervisor: takes queued jobs in order and runs each in a child process, some at the same time."""
+"""The supervisor: takes queued jobs and runs each in a child process, some at the same time.
+
+An attempt at a job is a child process, the conversation with it, and what comes of it.
+"""
 
 from __future__ import annotations
 
+import json
 import logging
+import sqlite3
+import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
 
 from liftcore.errors import SplatliftError
 from service.child import fault_of
-from service.errors import Crashed, NoSpace
-from service.jobs.attempt import CHILD, TROUBLE, Attempt, Clock, insist
-from service.jobs.process import JobLimits, end_orphans
+from service.errors import Crashed, NoSpace, OverLimit
+from service.jobs.process import JobLimits, JobProcess, end_orphans
+from service.models import ENDED, JobKind, JobState
 from service.observe import working_for
-from service.store.jobs import JobRecord
+from service.store.assets import kernel_of
+from service.store.jobs import LOG_LINES, EventKind, JobRecord, labels_of
+from service.store.lifts import FinishedLift, FinishedTradeoff
 from service.store.owners import SERVICE
 from service.store.store import Store
 
 IDLE_SECONDS = 5.0  # a forgotten wake-up costs at most this
 TROUBLED_SECONDS = (1.0, 30.0)  # first and longest pause after an attempt that the server could not keep up
 ROOM_SECONDS = 60.0  # how long an attempt waits for room on the disk before it tries without
+TICK_SECONDS = 0.2  # how soon a cancel, a stop or a limit is seen
+AGAIN_SECONDS = 1.0  # between tries to note what could not be noted
+LOOKS = 4  # a child that is silent for this part of its lease is looked at
+BUSY_SECONDS = 0.1  # of a processor: a silent child that takes so much meanwhile is alive
+CHILD = (sys.executable, "-m", "service.jobs.child")
+DRAFTS = {JobKind.LIFT: ".safetensors", JobKind.TRADEOFF: ".png"}  # what a child writes
+TROUBLE = (OSError, sqlite3.OperationalError)  # of the server, not of the job: a full disk, a locked database
 
 log = logging.getLogger(__name__)
+
+Clock = Callable[[], float]  # seconds
 
 
 class Supervisor:
@@ -145,3 +165,284 @@ class Supervisor:
         if self._told is not None:
             self._told(outcome, seconds)
         return kept_up
+
+
+class Lease:
+    """Whether a child is still to be waited for: it speaks or computes now and then.
+
+    Args:
+        seconds: how long it may do neither.
+        clock: what these seconds are measured by.
+    """
+
+    def __init__(self, seconds: float, clock: Clock = time.monotonic) -> None:
+        self._seconds = seconds
+        self._clock = clock
+        self._looked = clock()
+        self.renew()
+
+    def renew(self) -> None:
+        """The child gave a sign of life."""
+        self._alive = self._clock()
+        self._spent: float | None = None  # processor seconds when it was found silent
+
+    def over(self, processor_seconds: Callable[[], float]) -> bool:
+        """Whether the child is given up; called several times in a lease.
+
+        Args:
+            processor_seconds: what the child has taken. One call into a library (HDBSCAN on many splats) may keep
+                all its threads from speaking.
+        """
+        now = self._clock()
+        if now - self._looked > self._seconds / 2:
+            self.renew()  # it was the server that slept: the child has a lease from now on
+        self._looked = now
+        if now - self._alive > self._seconds / LOOKS:
+            spent = processor_seconds()
+            if self._spent is None or spent < self._spent:  # less when one that it had started has ended
+                self._spent = spent
+            elif spent - self._spent > BUSY_SECONDS:
+                self.renew()
+        return now - self._alive > self._seconds
+
+
+class Notes:
+    """What an attempt tells of itself. What cannot be noted now is noted later, and stops nobody."""
+
+    def __init__(self, job: JobRecord, store: Store) -> None:
+        self._job = job
+        self._write = {
+            EventKind.LOG: store.jobs.log,
+            EventKind.PLAN: store.jobs.plan,
+            EventKind.PROGRESS: store.jobs.advance,
+        }
+        self._waiting: deque[tuple[EventKind, Any]] = deque(maxlen=LOG_LINES)
+        self._again = 0.0
+
+    def add(self, kind: EventKind, data: Any) -> None:
+        """Note a line of the log, the plan or how far the work is; of the last two the latest counts."""
+        if kind is not EventKind.LOG:
+            for earlier in [note for note in self._waiting if note[0] is kind]:
+                self._waiting.remove(earlier)
+        self._waiting.append((kind, data))
+        self.write()
+
+    def write(self) -> None:
+        """Write what waits, unless that failed a moment ago."""
+        if not self._waiting or time.monotonic() < self._again:
+            return
+        try:
+            self.flush()
+        except TROUBLE as error:
+            log.warning("what job %s tells cannot be noted yet: %s", self._job.id, error)
+            self._again = time.monotonic() + AGAIN_SECONDS
+
+    def flush(self) -> None:
+        """Write what waits.
+
+        Raises:
+            TROUBLE: it cannot be written now, and waits on.
+        """
+        while self._waiting:
+            kind, data = self._waiting[0]
+            self._write[kind](self._job.id, self._job.attempt, data)
+            self._waiting.popleft()
+
+
+class Attempt:
+    """Runs in a thread of the supervisor, which is the only one that changes its job.
+
+    Args:
+        job: as it was claimed.
+        store: that holds it.
+        limits: what it may take.
+        command: of the child, before the path of its order.
+        clock: by which the child's lease is measured.
+    """
+
+    def __init__(self, job: JobRecord, store: Store, limits: JobLimits, command: Sequence[str], clock: Clock) -> None:
+        self._job = job
+        self._store = store
+        self._limits = limits
+        self._command = command
+        self._lease = Lease(limits.lease_seconds, clock)
+        self._begun = time.monotonic()
+        self._notes = Notes(job, store)
+        self._pace = StagePace()
+        self._answer: dict[str, Any] | None = None  # the child's last word
+
+    def run(self, stopping: threading.Event) -> None:
+        """From the start of the child to the end of its process group, and the state that follows from it.
+
+        Raises:
+            TROUBLE: the server could not keep it up; no process of it is left, and its state is as it was.
+        """
+        files = self._store.files
+        with files.draft(DRAFTS[self._job.kind]) as draft, files.scratch() as scratch:
+            order = scratch / "order.json"
+            order.write_text(json.dumps(self._order(draft)), encoding="utf-8")
+            self._log(f"attempt {self._job.attempt} begins{self._asked()}{self._kept()}")
+            command, environment = [*self._command, str(order)], {"TMPDIR": str(scratch)}
+            with JobProcess(command, environment, self._job.id) as process:
+                why = self._follow(process, stopping)
+                status = process.end()
+            insist(lambda: self._settle(draft, why or _told(status), stopping.is_set()), stopping)
+        if self._store.jobs.state(SERVICE, self._job.id) in ENDED:
+            files.forget_work(self._job.id)
+
+    def _follow(self, process: JobProcess, stopping: threading.Event) -> str | SplatliftError | None:
+        """Listen until the child has ended or must end; why it must, None when it ended by itself."""
+        while True:
+            ended = process.ended()  # before listening, so that its last words are heard
+            for message in process.listen(0 if ended else TICK_SECONDS):
+                self._take(message)
+            if ended:
+                return None
+            self._notes.write()
+            why = self._why_end(process)
+            if why is not None or stopping.is_set():
+                return why or "the server stops"
+
+    def _take(self, message: dict[str, Any]) -> None:
+        self._lease.renew()
+        if message["event"] == "progress":
+            if self._pace.begins(message):
+                parts = f": {message['total']} {message['unit']}" if message["total"] > 1 else ""
+                self._log(f"{message['stage']}{parts}")
+            self._notes.add(EventKind.PROGRESS, self._pace.progress(message))
+        elif message["event"] == "plan":
+            self._notes.add(EventKind.PLAN, message["plan"])
+        elif message["event"] != "beat":
+            self._answer = message
+
+    def _why_end(self, process: JobProcess) -> str | SplatliftError | None:
+        limits, kind = self._limits, self._job.kind
+        silent = self._lease.over(process.processor_seconds)
+        if not self._is_wanted():
+            return "it is canceled"
+        if silent:
+            return f"its process was silent for {limits.lease_seconds:g} s"
+        if time.monotonic() - self._begun > limits.seconds:
+            return OverLimit(
+                kind, expected=f"a {kind} that takes at most {limits.seconds:g} s", got="one that takes more"
+            )
+        if limits.memory_bytes is not None and process.private_bytes() > limits.memory_bytes:
+            return OverLimit(
+                kind, expected=f"a {kind} that takes at most {limits.memory_bytes} bytes of memory",
+                got="one that takes more", hint="fewer views, channels or splats take less",
+            )  # fmt: skip
+        return None
+
+    def _is_wanted(self) -> bool:
+        try:
+            return self._store.jobs.state(SERVICE, self._job.id) is JobState.RUNNING
+        except TROUBLE:  # nobody can have canceled it in a database that cannot be read
+            return True
+
+    def _settle(self, draft: Path, why: str | SplatliftError, stopping: bool) -> None:
+        """No process of this attempt is left; what becomes true now stays true."""
+        self._notes.flush()
+        job, attempts, answer = self._job, self._store.jobs, self._answer or {"event": "none"}
+        if answer["event"] == "done" and draft.exists():
+            if not self._keep(draft, answer):
+                attempts.lose(job.id, job.attempt, "it is canceled")
+        elif answer["event"] == "fault" and answer["fault"]["kind"] == NoSpace.kind:
+            attempts.lose(job.id, job.attempt, answer["fault"]["got"], answer["fault"])
+        elif answer["event"] == "fault":
+            attempts.fail(job.id, job.attempt, answer["fault"])
+        elif isinstance(why, SplatliftError):
+            attempts.fail(job.id, job.attempt, fault_of(why))
+        elif stopping:
+            attempts.release(job.id, job.attempt, "the server stops")
+        else:
+            log.warning("job %s, attempt %d: %s", job.id, job.attempt, why)
+            attempts.lose(job.id, job.attempt, why)
+
+    def _keep(self, draft: Path, answer: dict[str, Any]) -> bool:
+        """Make the result true, and the job succeeded with it; False when the attempt may not."""
+        job, kept = self._job, self._store
+        if job.kind is JobKind.TRADEOFF:
+            found = FinishedTradeoff(answer["document"], answer["page"], draft.read_bytes())
+            return kept.tradeoffs.finish(job.id, job.attempt, found)
+        made = FinishedLift(draft, answer["sha256"], answer["count"], answer["channels"], answer["metadata"])
+        return kept.lifts.finish(job.id, job.attempt, made)
+
+    def _log(self, text: str) -> None:
+        self._notes.add(EventKind.LOG, text)
+
+    def _asked(self) -> str:
+        return f", asked for by request {self._job.request_id}" if self._job.request_id else ""
+
+    def _kept(self) -> str:
+        blocks = len(list(self._store.files.work(self._job.id).glob("*.safetensors")))
+        return f", {blocks} blocks of walked views are kept" if blocks else ""
+
+    def _order(self, draft: Path) -> dict[str, Any]:
+        job, files, kept = self._job, self._store.files, self._store.assets
+        assets = [kept.get(SERVICE, name) for name in (job.splats, job.cameras, *job.features)]
+        labels = [kept.get(SERVICE, *named) for named in labels_of(job.parameters)]
+        return {
+            "kind": job.kind,
+            "parameters": job.parameters,
+            "splats": str(assets[0].path),
+            "kernel": kernel_of(assets[0], job.settings),  # to compile for
+            "cameras": str(assets[1].path),
+            "features": [str(asset.path) for asset in assets[2:]],
+            "labels": {str(asset.kind): str(asset.path) for asset in labels},
+            "settings": job.settings,
+            "threads": self._limits.threads,
+            "work": str(files.work(job.id)),
+            "checkpoint_seconds": self._limits.checkpoint_seconds,
+            "output": str(draft),
+            "file_names": {str(asset.path): asset.file_name for asset in assets},
+            "names": {str(asset.path): f"{asset.kind} {asset.id}" for asset in (*assets, *labels)},
+        }
+
+
+class StagePace:
+    """Adds to the progress that a child reports how long its stage will still take, from its pace so far."""
+
+    def __init__(self) -> None:
+        self._stage = ""
+        self._begin = 0.0
+        self._done_at_begin = 0
+
+    def begins(self, message: dict[str, Any]) -> bool:
+        """Whether a message is the first of another stage."""
+        return message["stage"] != self._stage
+
+    def progress(self, message: dict[str, Any]) -> dict[str, Any]:
+        """The message as `service.models.Progress` has it."""
+        now = time.monotonic()
+        done, total = message["done"], message["total"]
+        if self.begins(message):
+            self._stage, self._begin, self._done_at_begin = message["stage"], now, done
+        advanced = done - self._done_at_begin
+        eta = (now - self._begin) / advanced * (total - done) if advanced > 0 else None
+        return {
+            "stage": self._stage,
+            "done": done,
+            "total": total,
+            "unit": message["unit"],
+            "eta_s": None if eta is None else round(eta, 2),
+        }
+
+
+def insist(note: Callable[[], None], stopping: threading.Event) -> None:
+    """Note the end of an attempt, however long the disk is full: else its job would seem to run for ever.
+
+    A stop ends that; the next start then finds the job running, and puts it back in line.
+    """
+    while True:
+        try:
+            note()
+            return
+        except TROUBLE as error:
+            log.warning("the end of a job cannot be noted yet: %s", error)
+            if stopping.is_set():
+                raise
+            stopping.wait(AGAIN_SECONDS)
+
+
+def _told(status: int) -> str:
+    return f"its process ended with signal {-status}" if status < 0 else f"its process ended with status {status}"

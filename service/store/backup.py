@@ -16,7 +16,7 @@ from pathlib import Path
 
 from liftcore.errors import NotFound
 from service.errors import Misconfigured
-from service.store.database import DATABASE, KEYS_REQUIRED, copy_database, remember_generation
+from service.store.database import DATABASE, KEYS_REQUIRED, copy_database, open_to_read, remember_generation
 from service.store.files import keep_private, sync_directory
 
 TRIES = 10  # of a database whose files all are here; each DELETE meanwhile may cost one
@@ -114,7 +114,7 @@ def _generation(data: Path) -> int:
 
 
 def _opened(data: Path) -> sqlite3.Connection:
-    return sqlite3.connect(f"{(data / DATABASE).absolute().as_uri()}?mode=ro", uri=True)
+    return open_to_read(data / DATABASE)
 
 
 def _digest_of(content: bytes) -> str:

@@ -1,15 +1,18 @@
-"""Garbage: files that nothing in the database reaches and no running work needs."""
+"""Garbage: files that nothing in the database reaches and no running work needs, and jobs that ended long ago."""
 
 from __future__ import annotations
 
 import logging
+import math
 import shutil
+import sys
 import threading
 import time
 from collections.abc import Container, Iterable
 from pathlib import Path
 
 from service.models import ENDED
+from service.settings import ServiceSettings
 from service.store.files import DataDirectory
 from service.store.owners import SERVICE
 from service.store.store import Store
@@ -84,13 +87,9 @@ def _changed(path: Path) -> float:
 class Collector:
     """A thread that collects at start-up and now and then."""
 
-    def __init__(
-        self, store: Store, *, every_seconds: float, grace_seconds: float, quarantine_seconds: float
-    ) -> None:
+    def __init__(self, store: Store, settings: ServiceSettings) -> None:
         self._store = store
-        self._every = every_seconds
-        self._grace = grace_seconds
-        self._quarantine = quarantine_seconds
+        self._settings = settings
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._loop, name="collector", daemon=True)
 
@@ -106,11 +105,20 @@ class Collector:
     def _loop(self) -> None:
         while True:
             try:
-                for path in collect(self._store, time.time() - self._grace):
-                    log.info("moved %s away, which nothing refers to", path)
-                for path in empty_quarantine(self._store.files, time.time() - self._quarantine):
-                    log.info("removed %s, whose time in quarantine is over", path)
+                self._collect()
             except Exception:  # a full disk today must not stop the collection of tomorrow
                 log.exception("the collection of garbage stumbled")
-            if self._stopping.wait(self._every):
+            if self._stopping.wait(self._settings.garbage_seconds):
                 return
+
+    def _collect(self) -> None:
+        store, settings, now = self._store, self._settings, time.time()
+        for path in empty_quarantine(store.files, now - settings.quarantine_seconds):
+            log.info("removed %s, whose time in quarantine is over", path)
+        before = -math.inf if settings.keep_jobs_seconds is None else now - settings.keep_jobs_seconds
+        most = sys.maxsize if settings.keep_jobs is None else settings.keep_jobs
+        if forgotten := store.jobs.forget_ended(before, most):
+            log.info("forgot %d jobs that ended long ago, without a result", forgotten)
+        store.database.keep_reserve()
+        for path in collect(store, now - settings.garbage_grace_seconds):
+            log.info("moved %s away, which nothing refers to", path)

@@ -26,6 +26,7 @@ KEYS_REQUIRED = "keys.required"  # there when a key was ever made
 RESERVE = "reserve"  # room for the transaction of a deletion on a full disk
 RESERVE_BYTES = 1 << 20
 BUSY_SECONDS = 10.0  # that a write waits for others, of this process and of others
+MAGIC = b"SQLite format 3\0"
 MOST_IDLE = 4  # connections kept for the next readers; those of a rush are closed after it
 CURSOR = r"^[0-9.e+-]{1,30}~[0-9a-z:]{1,80}$"  # when the last one of a page was made, and its id
 
@@ -119,6 +120,7 @@ class Database:
         if not self._write_lock.acquire(timeout=BUSY_SECONDS):
             raise _error("database is locked", "SQLITE_BUSY")
         try:
+            self.require_same_file()
             self._writer.execute("BEGIN IMMEDIATE")
             try:
                 generation = self._next_generation() if counted and not self._rebuilding else None
@@ -166,14 +168,17 @@ class Database:
             log.warning("there is no room for %s, from which deletions on a full disk live: %s", path, error)
 
     def require_same_file(self) -> None:
-        """See that the database is the file that was opened: what is written to another one would be lost.
+        """See that the database is the file that was opened, and still one: else what is written would be lost.
 
         Raises:
-            sqlite3.OperationalError: it is gone, or another.
+            sqlite3.OperationalError: it is gone, another, or overwritten.
         """
         with suppress(FileNotFoundError):
             if _identity(self._path) == self._identity:
-                return
+                with self._path.open("rb") as handle:
+                    if handle.read(len(MAGIC)) == MAGIC:
+                        return
+                raise _error("file is not a database", "SQLITE_NOTADB")
         raise _error("another file, or none, is in the place of the database", "SQLITE_READONLY_DBMOVED")
 
     def _next_generation(self) -> int:
@@ -195,6 +200,9 @@ class Database:
             connection = self._connect()
         try:
             yield connection
+        except sqlite3.Error:
+            self.require_same_file()  # what another file has to say is no news
+            raise
         finally:
             if self._idle.qsize() < MOST_IDLE:
                 self._idle.put(connection)

@@ -20,15 +20,16 @@ from typing import Any
 
 from liftcore.errors import NotFound
 from service.child import fault_of
-from service.errors import Busy, Conflict, Crashed, KeyReused
+from service.errors import Busy, Conflict, Crashed, KeyReused, Unauthorized
 from service.models import ENDED, AssetKind, JobKind, JobState
 from service.store.assets import own
 from service.store.database import Database, Page, after, insert, page_of, parsed, record_of
 from service.store.files import DataDirectory
-from service.store.owners import QUEUE_RETRY_SECONDS, SEEN, Owner, require_quota, require_turn
+from service.store.owners import ENDED_KEYS, QUEUE_RETRY_SECONDS, SEEN, Owner, require_quota, require_turn
 
 LOG_LINES = 200  # a job; older ones go
 LINE_CHARACTERS = 500
+FORGOTTEN_AT_ONCE = 500  # jobs a transaction: others write, too
 MAX_ATTEMPTS = 3  # that give no answer, and that the job itself is to blame for
 # An attempt may act while this holds; ids and numbers are bound by name.
 OWNS = "id = :job AND attempt = :attempt AND state IN ('running', 'canceling')"
@@ -112,6 +113,7 @@ class JobStore:
     def __init__(self, database: Database, files: DataDirectory) -> None:
         self._database = database
         self._files = files
+        self._claims: list[str] = []  # owners of claimed jobs, each once, the latest last
 
     def submit(self, owner: Owner, order: JobOrder, *, max_queued: int = 1_000_000) -> tuple[str, bool]:
         """Put a job in line; it is on the disk when this returns.
@@ -229,13 +231,12 @@ class JobStore:
         """The events of a job beyond a number, in order.
 
         Raises:
-            NotFound: there is no such job, or the key that follows it was revoked.
+            NotFound: there is no such job, or the key that follows it is no longer valid.
         """
         with self._database.read() as connection:
             seen = connection.execute(
-                f"SELECT 1 FROM jobs WHERE id = :job AND {SEEN}"
-                " AND NOT EXISTS (SELECT 1 FROM keys WHERE id = :owner AND revoked IS NOT NULL)",
-                owner.terms(job=job),
+                f"SELECT 1 FROM jobs WHERE id = :job AND {SEEN} AND :owner NOT IN ({ENDED_KEYS})",
+                owner.terms(job=job, now=time.time()),
             )
             if seen.fetchone() is None:
                 raise NotFound("job", expected="the id of a job", got=job)
@@ -276,19 +277,64 @@ class JobStore:
 
         self._database.write_freeing(forget)
 
+    def forget_ended(self, before: float, most: int) -> int:
+        """Forget jobs that have ended without a result, or whose result was deleted; lifts and trade-offs stay.
+
+        Args:
+            before: seconds since 1970; those that ended earlier go.
+            most: how many stay of each owner, the latest.
+
+        Returns:
+            How many went.
+        """
+        forgotten = 0
+        while True:
+            gone: list[str] = []
+
+            def forget(connection: sqlite3.Connection, gone: list[str] = gone) -> list[Path]:
+                rows = connection.execute(
+                    "DELETE FROM jobs WHERE id IN (SELECT id FROM (SELECT id, coalesce(ended, created) AS since,"
+                    " row_number() OVER (PARTITION BY owner ORDER BY coalesce(ended, created) DESC, id) AS place"
+                    " FROM jobs WHERE state IN ('succeeded', 'failed', 'canceled')"
+                    " AND id NOT IN (SELECT id FROM lifts UNION ALL SELECT id FROM tradeoffs))"
+                    " WHERE since < :before OR place > :most LIMIT :at_once) RETURNING id",
+                    {"before": before, "most": most, "at_once": FORGOTTEN_AT_ONCE},
+                ).fetchall()
+                gone[:] = [row["id"] for row in rows]
+                return [self._files.work(job) for job in gone]
+
+            self._database.write_freeing(forget)
+            forgotten += len(gone)
+            if len(gone) < FORGOTTEN_AT_ONCE:
+                return forgotten
+
     def claim(self) -> JobRecord | None:
-        """Take the oldest queued job and make it running, as a new attempt."""
+        """Take a queued job and make it running, as a new attempt.
+
+        Owners take turns: it is the oldest job of the one that has the fewest running, and of these of the one whose
+        last turn is longest ago.
+        """
         with self._database.write() as connection:
-            row = connection.execute(
-                "UPDATE jobs SET state = 'running', attempt = attempt + 1, started = ?, progress = NULL"
-                " WHERE id = (SELECT id FROM jobs WHERE state = 'queued' ORDER BY created, id LIMIT 1)"
-                " RETURNING *",
-                (time.time(),),
-            ).fetchone()
-            if row is None:
+            stop_waiting(connection)
+            owners = connection.execute(
+                "SELECT owner, (SELECT count(*) FROM jobs WHERE owner = waiting.owner"
+                " AND state IN ('running', 'canceling')) AS running"
+                " FROM jobs AS waiting WHERE state = 'queued' GROUP BY owner ORDER BY min(created)"
+            ).fetchall()
+            if not owners:
                 return None
+            turns = {owner: turn for turn, owner in enumerate(self._claims)}
+            owner = min(owners, key=lambda row: (row["running"], turns.get(row["owner"], -1)))["owner"]
+            row = connection.execute(
+                "UPDATE jobs SET state = 'running', attempt = attempt + 1, started = ?, progress = NULL WHERE id ="
+                " (SELECT id FROM jobs WHERE state = 'queued' AND owner = ? ORDER BY created, id LIMIT 1)"
+                " RETURNING *",
+                (time.time(), owner),
+            ).fetchone()
             told(connection, row)
-            return record(connection, row)
+            claimed = record(connection, row)
+        self._claims = [*(other for other in self._claims if other != owner), owner]
+        return claimed
 
     def advance(self, job: str, attempt: int, progress: Mapping[str, Any]) -> None:
         """Note how far an attempt is."""
@@ -485,6 +531,15 @@ def succeed(connection: sqlite3.Connection, job: str, attempt: int) -> bool:
         return False
     move(connection, row, JobState.SUCCEEDED)
     return True
+
+
+def stop_waiting(connection: sqlite3.Connection) -> None:
+    """Within a write transaction: cancel the queued jobs of keys that are no longer valid."""
+    now = time.time()
+    rows = connection.execute(f"SELECT * FROM jobs WHERE state = 'queued' AND owner IN ({ENDED_KEYS})", {"now": now})
+    for row in rows.fetchall():
+        ended = Unauthorized("key", expected="a key that is valid when its job begins", got="one that no longer is")
+        move(connection, row, JobState.CANCELED, fault_of(ended))
 
 
 def _owned(connection: sqlite3.Connection, job: str, attempt: int) -> sqlite3.Row | None:

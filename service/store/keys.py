@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import hashlib
-import hmac
 import secrets
 import sqlite3
 import time
@@ -13,8 +12,11 @@ from pathlib import Path
 from typing import Literal, Self
 
 from liftcore.errors import NotFound
+from service.errors import InvalidRequest
 from service.scopes import Scope, parse_scopes
-from service.store.database import Database, keys_were_made, remember_keys, unusable
+from service.store.database import Database, insert, keys_were_made, open_to_read, remember_keys, unusable
+from service.store.jobs import stop_waiting
+from service.store.owners import ENDED_KEYS
 
 PREFIX = "splatlift_"  # by which people, and scanners for leaked secrets, know what it is
 SECRET_BYTES = 32
@@ -40,7 +42,8 @@ class KeyRecord:
     scopes: frozenset[Scope]
     quota: Quota
     created: float  # seconds since 1970
-    revoked: float | None
+    revoked: float | None = None
+    expires: float | None = None
 
 
 class KeyStore:
@@ -63,34 +66,65 @@ class KeyStore:
         ruled._rule = rule
         return ruled
 
-    def create(self, name: str, scopes: frozenset[Scope], quota: Quota) -> tuple[KeyRecord, str]:
-        """Make a key.
+    def create(
+        self, name: str, scopes: frozenset[Scope], quota: Quota, *, expires: float | None = None
+    ) -> tuple[KeyRecord, str]:
+        """Make a key, which is valid until it is revoked or expires (seconds since 1970).
 
         Returns:
             The key, and its secret, which nobody can ask for again.
         """
-        secret = PREFIX + secrets.token_urlsafe(SECRET_BYTES)
-        key = KeyRecord(secrets.token_hex(6), name, scopes, quota, time.time(), None)
+        secret = _new_secret()
+        key = KeyRecord(secrets.token_hex(6), name, scopes, quota, time.time(), expires=expires)
+        row = {
+            "id": key.id,
+            "name": name,
+            "digest": digest_of(secret),
+            "scopes": " ".join(sorted(scopes)),
+            "max_bytes": quota.max_bytes,
+            "max_queued": quota.max_queued,
+            "max_uploads": quota.max_uploads,
+            "created": key.created,
+            "expires": expires,
+        }
         remember_keys(self._data)  # first: a key whose database is lost must not leave the door open
         with self._database.write(counted=True) as connection:
-            connection.execute(
-                "INSERT INTO keys (id, name, digest, scopes, max_bytes, max_queued, max_uploads, created)"
-                " VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
-                (
-                    key.id,
-                    name,
-                    digest_of(secret),
-                    " ".join(sorted(scopes)),
-                    quota.max_bytes,
-                    quota.max_queued,
-                    quota.max_uploads,
-                    key.created,
-                ),
-            )
+            insert(connection, "keys", row)
         return key, secret
 
+    def rotate(self, named: str, *, grace: float = 0.0) -> tuple[KeyRecord, str]:
+        """Give a key a new secret; what it made stays its own.
+
+        Args:
+            named: its id, or its name where no other valid key has it.
+            grace: seconds for which the secret before counts, too. The one before that ends now.
+
+        Returns:
+            The key, and its new secret.
+
+        Raises:
+            NotFound: no valid key is called so.
+            InvalidRequest: several are.
+        """
+        secret, now = _new_secret(), time.time()
+        with self._database.write(counted=True) as connection:
+            found = connection.execute(
+                f"SELECT id FROM keys WHERE (id = :named OR name = :named) AND id NOT IN ({ENDED_KEYS})",
+                {"named": named, "now": now},
+            ).fetchall()
+            if not found:
+                raise NotFound("key", expected="the id or name of a valid key", got=named, hint="see keys list")
+            if len(found) > 1:
+                ids = ", ".join(row["id"] for row in found)
+                raise InvalidRequest("key", expected="a name that one key has", got=named, hint=f"name one of {ids}")
+            row = connection.execute(
+                "UPDATE keys SET old_digest = digest, old_until = ?, digest = ? WHERE id = ? RETURNING *",
+                (now + grace, digest_of(secret), found[0]["id"]),
+            ).fetchone()
+        return _record(row), secret
+
     def revoke(self, key: str) -> KeyRecord:
-        """End a key for good; again does no harm. What it made stays, for admins.
+        """End a key for good; again does no harm. What it made stays, for admins; its jobs in line are canceled.
 
         Raises:
             NotFound: there is none of that id.
@@ -99,8 +133,9 @@ class KeyStore:
             row = connection.execute(
                 "UPDATE keys SET revoked = coalesce(revoked, ?) WHERE id = ? RETURNING *", (time.time(), key)
             ).fetchone()
-        if row is None:
-            raise NotFound("key", expected="the id of a key", got=key, hint="keys list shows them")
+            if row is None:
+                raise NotFound("key", expected="the id of a key", got=key, hint="keys list shows them")
+            stop_waiting(connection)
         return _record(row)
 
     def all(self) -> list[KeyRecord]:
@@ -119,9 +154,12 @@ class KeyStore:
         with self._database.read() as connection:
             if secret is None:
                 return self._required(connection), None
-            digest = digest_of(secret)
-            row = connection.execute("SELECT * FROM keys WHERE digest = ? AND revoked IS NULL", (digest,)).fetchone()
-            if row is None or not hmac.compare_digest(row["digest"], digest):
+            row = connection.execute(
+                "SELECT * FROM keys WHERE (digest = :digest OR (old_digest = :digest AND old_until > :now))"
+                f" AND id NOT IN ({ENDED_KEYS})",
+                {"digest": digest_of(secret), "now": time.time()},
+            ).fetchone()
+            if row is None:
                 return self._required(connection), None
             return self._rule != "none", _record(row)
 
@@ -131,8 +169,14 @@ class KeyStore:
         return _any(connection) or keys_were_made(self._data)
 
 
+def _new_secret() -> str:
+    return PREFIX + secrets.token_urlsafe(SECRET_BYTES)
+
+
 def digest_of(secret: str) -> str:
-    """What is kept of a secret. It has 256 random bits, so a plain digest gives nothing to guess."""
+    """What is kept and compared of a secret. It has 256 random bits: neither the digest nor the time that it takes to
+    compare two gives anything to guess.
+    """
     return hashlib.sha256(secret.encode()).hexdigest()
 
 
@@ -144,7 +188,7 @@ def any_key(database: Path) -> bool:
     """
     if not database.exists():
         return False
-    connection = sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True)
+    connection = open_to_read(database)
     try:
         known = connection.execute("SELECT 1 FROM sqlite_master WHERE name = 'keys'").fetchone()
         return known is not None and _any(connection)
@@ -166,4 +210,5 @@ def _record(row: sqlite3.Row) -> KeyRecord:
         quota=Quota(row["max_bytes"], row["max_queued"], row["max_uploads"]),
         created=row["created"],
         revoked=row["revoked"],
+        expires=row["expires"],
     )

@@ -10,6 +10,8 @@ from service.errors import OverQuota, TooMany
 
 # For WHERE clauses over a table with a column `owner`; its names are bound by `Owner.terms`.
 SEEN = "(:sees_all OR owner = :owner)"
+# Keys that nobody comes in with any more; `:now` in seconds since 1970. A NULL is no end.
+ENDED_KEYS = "SELECT id FROM keys WHERE revoked IS NOT NULL OR expires <= :now"
 QUEUE_RETRY_SECONDS = 30  # a lift takes seconds to minutes, and one must end before the line is shorter
 
 

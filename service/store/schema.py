@@ -138,4 +138,9 @@ ALTER TABLE assets ADD COLUMN brief TEXT NOT NULL DEFAULT '{}';  -- counts witho
 ALTER TABLE assets ADD COLUMN counts_bytes INTEGER NOT NULL DEFAULT 0;
 UPDATE assets SET brief = json_remove(counts, '$.names', '$.words'), counts_bytes = length(counts);
 """,
+    """
+ALTER TABLE keys ADD COLUMN expires REAL;
+ALTER TABLE keys ADD COLUMN old_digest TEXT;        -- of the secret before a rotation, which counts
+ALTER TABLE keys ADD COLUMN old_until REAL;         -- until then
+""",
 )

@@ -21,7 +21,7 @@ from liftcore.io.inspect import describe_camera_file, describe_packs, describe_s
 from liftcore.io.json_file import finite
 from liftcore.io.splats import SUFFIX, SplatFormat, format_of
 from liftcore.query.text.table import TableEncoder
-from service.child import end_with_parent, fault_of, own_stdout
+from service.child import die_with_parent, end_with_parent, fault_of, own_stdout
 from service.models import VIEW_CHARACTERS, AssetKind
 from service.uploads import INVALID
 
@@ -107,7 +107,8 @@ def main() -> None:
     """Check the file that the command line names."""
     kind, path, memory = AssetKind(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3])
     out = own_stdout()
-    end_with_parent()
+    die_with_parent()
+    end_with_parent()  # it may have died before
     # Private memory and not address space: mapped files, however large, cost none.
     resource.setrlimit(resource.RLIMIT_DATA, (memory, memory))
     _say(out, {"event": "ready"})

@@ -26,7 +26,7 @@ from service.store.schema import MIGRATIONS
 from service.store.store import Store
 from tests.crash.conftest import order, stand_in, until
 
-from .conftest import ADDRESS, Uploaded
+from .conftest import ADDRESS
 from .following import ended
 from .test_problems import assert_problem
 from .tiny_scene import TinyScene
@@ -193,26 +193,6 @@ def test_no_work_is_taken_below_the_disk_floor_and_the_service_lives(
         assert client.get("/jobs").json() == {"jobs": []} and len(client.get("/assets").json()["assets"]) == 3
         monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=1000))
         assert ended(client, client.post("/lift", json=body).headers["location"])["state"] == "succeeded"
-
-
-def upload(client: TestClient, scene: TinyScene) -> Uploaded:
-    contents = {"splats": scene.splats, "cameras": scene.cameras, "features": scene.features}
-    return Uploaded(*(client.put(f"/assets/{kind}", content=body).json()["id"] for kind, body in contents.items()))
-
-
-def test_job_interrupted_by_a_stop_goes_on_where_the_data_directory_is_next(
-    start: Callable[..., Any], scene: TinyScene, tmp_path: Path
-) -> None:
-    with start() as client:
-        uploaded = upload(client, scene)
-        location = client.post("/lift", json=uploaded.order()).headers["location"]
-        until(lambda: client.get(location).json()["state"] != "queued")
-    (tmp_path / "data").rename(tmp_path / "moved")
-    with start("moved") as client:
-        job = ended(client, location)
-        assert job["state"] == "succeeded" and job["attempt"] in (1, 2)
-        assert client.get("/query", params={"text": "apple"}).status_code == 200
-        assert client.get("/query/mask", params={"text": "apple", "view": "left"}).status_code == 200
 
 
 def test_query_worker_that_died_is_replaced(client: TestClient, lift: dict[str, Any]) -> None:

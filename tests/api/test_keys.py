@@ -7,7 +7,9 @@ import logging
 import re
 import shutil
 import threading
+import time
 from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,7 @@ from service.models import JobState
 from service.scopes import OPEN, Scope, needed
 from service.settings import ServiceSettings
 from service.store.jobs import Event
+from service.store.keys import Quota
 from service.store.owners import SERVICE, Owner
 from service.store.store import Store
 from service.streams import is_last
@@ -261,6 +264,57 @@ def test_open_until_the_first_key_and_never_again(tmp_path: Path, capsys: pytest
         assert "security" not in document["paths"]["/healthz"]["get"]
 
 
+def test_key_expires(house: Guarded) -> None:
+    key, secret = house.store.keys.create("guest", frozenset({Scope.READ}), Quota(), expires=time.time() + 3600)
+    assert house.client.get("/jobs", headers=bearer(secret)).status_code == 200
+    with house.store.database.write() as connection:
+        connection.execute("UPDATE keys SET expires = ? WHERE id = ?", (time.time(), key.id))
+    gone = house.client.get("/jobs", headers=bearer(secret))
+    assert gone.status_code == 401 and 'error="invalid_token"' in gone.headers["www-authenticate"]
+    assert [found.expires is None for found in house.store.keys.all()].count(False) == 1
+
+
+@pytest.mark.parametrize("grace", ["1h", None])
+def test_rotated_key_has_a_new_secret_and_keeps_what_is_its_own(
+    grace: str | None, house: Guarded, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    old, where = house.secrets["alice"], ["--data", str(tmp_path / "data")]
+    assert main(["rotate", house.ids["alice"], *([] if grace is None else ["--grace", grace]), *where]) == 0
+    new = capsys.readouterr().out.strip()
+    assert house.client.get(f"/jobs/{house.done}", headers=bearer(new)).status_code == 200
+    assert house.client.get("/jobs", headers=bearer(old)).status_code == (401 if grace is None else 200)
+    with house.store.database.write() as connection:
+        connection.execute("UPDATE keys SET old_until = ?", (time.time(),))
+    assert house.client.get("/jobs", headers=bearer(old)).status_code == 401
+    house.store.keys.revoke(house.ids["alice"])
+    assert house.client.get("/jobs", headers=bearer(new)).status_code == 401
+
+
+def test_key_is_rotated_by_its_name_where_one_has_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    where = ["--data", str(tmp_path)]
+    for name in ("anna", "bob", "bob"):
+        assert main(["create", "--name", name, "--scopes", "read", *where]) == 0
+    assert main(["rotate", "anna", *where]) == 0
+    capsys.readouterr()
+    for name, told in (("bob", "name one of"), ("nobody", "valid key")):
+        assert main(["rotate", name, *where]) == 2
+        assert told in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("text", "seconds"), [("30d", 30 * 86_400), ("12h", 43_200), ("2999-12-31", None)])
+def test_keys_say_until_when_they_are_valid(
+    text: str, seconds: int | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    begun = time.time()
+    arguments = ["create", "--name", "x", "--scopes", "read", "--expires", text, "--data", str(tmp_path)]
+    assert main([*arguments, "--json"]) == 0
+    expires = json.loads(capsys.readouterr().out)["expires"]
+    wanted = datetime(2999, 12, 31, tzinfo=UTC).timestamp() if seconds is None else begun + seconds
+    assert wanted <= expires <= wanted + (time.time() - begun if seconds else 0)
+    assert main(["list", "--data", str(tmp_path)]) == 0
+    assert "valid until" in capsys.readouterr().out
+
+
 def test_key_that_is_revoked_again_was_revoked_the_first_time(house: Guarded) -> None:
     assert house.store.keys.revoke(house.ids["bob"]).revoked is not None
     with house.store.database.write() as connection:
@@ -343,6 +397,10 @@ def test_keys_speak_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
         ["create", "--name", "x", "--scopes", ","],
         ["create", "--name", " ", "--scopes", "read"],
         ["create", "--name", "a\nb", "--scopes", "read"],
+        ["create", "--name", "x", "--scopes", "read", "--expires", "soon"],
+        ["create", "--name", "x", "--scopes", "read", "--expires", "1999-12-31"],
+        ["rotate", "nobody"],
+        ["rotate", "nobody", "--grace", "long"],
         ["revoke", "nobody"],
     ],
 )

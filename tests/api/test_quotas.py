@@ -54,5 +54,6 @@ def test_jobs_in_line_have_a_quota_a_key(tmp_path: Path) -> None:
         assert int(reply.headers["retry-after"]) > 0
         order(house.store, Owner(house.ids["bob"], sees_all=False))
         assert house.ask("bob", "POST", "/lift", json=house.body()).status_code == 202
-        finish(house.store, b"")
+        for _ in "ba":  # keys take turns, and hers was the last
+            finish(house.store, b"")
         assert house.ask("alice", "POST", "/lift", json=house.body()).status_code == 202

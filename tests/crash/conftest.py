@@ -7,15 +7,16 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from service.jobs.attempt import Clock
 from service.jobs.process import JobLimits
-from service.jobs.supervisor import Supervisor
+from service.jobs.supervisor import Clock, Supervisor
 from service.models import ENDED, AssetKind
+from service.settings import ServiceSettings
 from service.store.assets import CheckedUpload
 from service.store.jobs import JobOrder, JobRecord
 from service.store.owners import SERVICE, Owner
@@ -50,8 +51,13 @@ def asset_of(store: Store, kind: AssetKind, counts: dict[str, Any], owner: Owner
         return store.assets.add(owner, checked)[0].id
 
 
-def until(condition: Callable[[], Any], seconds: float = 60.0) -> None:
-    """Wait for something that is about to happen."""
+def often(**chosen: float) -> ServiceSettings:
+    """Settings of a collector that looks all the time and spares nothing."""
+    return ServiceSettings.model_validate({"garbage_seconds": 0.02, "garbage_grace_seconds": 0.0, **chosen})
+
+
+def until(condition: Callable[[], Any], seconds: float = 600.0) -> None:
+    """Wait for something that is about to happen: at once, but for a machine that has other things to do."""
     deadline = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < deadline, "it did not happen"
@@ -84,17 +90,18 @@ def store(tmp_path: Path) -> Iterator[Store]:
     opened.close()
 
 
+@contextmanager
+def supervised(store: Store, behaviour: str, *, clock: Clock = time.monotonic, **limits: Any) -> Iterator[Supervisor]:
+    """Run a supervisor whose children behave as told."""
+    supervisor = Supervisor(store, JobLimits(**limits), command=stand_in(behaviour), clock=clock)
+    supervisor.start()
+    try:
+        yield supervisor
+    finally:
+        supervisor.stop()
+
+
 @pytest.fixture
 def supervising(store: Store) -> Supervising:
-    """Run a supervisor whose children behave as told."""
-
-    @contextmanager
-    def run(behaviour: str, *, clock: Clock = time.monotonic, **limits: Any) -> Iterator[Supervisor]:
-        supervisor = Supervisor(store, JobLimits(**limits), command=stand_in(behaviour), clock=clock)
-        supervisor.start()
-        try:
-            yield supervisor
-        finally:
-            supervisor.stop()
-
-    return run
+    """The same over the test's own store."""
+    return partial(supervised, store)

@@ -17,9 +17,8 @@ from typing import Any, cast
 
 from service.__main__ import server_of
 from service.app import create_app, job_limits
-from service.jobs.attempt import CHILD
 from service.jobs.process import JobProcess
-from service.jobs.supervisor import Supervisor
+from service.jobs.supervisor import CHILD, Supervisor
 from service.queries.client import QueryClient
 from service.settings import ServiceSettings
 from service.store.files import DataDirectory

@@ -2,27 +2,32 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from service.errors import Conflict
 from service.jobs import process as processes
-from service.jobs.attempt import Lease
 from service.jobs.process import mark
-from service.models import JobState
+from service.jobs.supervisor import Lease
+from service.models import AssetKind, JobState
+from service.scopes import Scope
 from service.store.jobs import MAX_ATTEMPTS, EventKind
+from service.store.keys import Quota
 from service.store.lifts import FinishedLift
-from service.store.owners import SERVICE
+from service.store.owners import SERVICE, Owner
 from service.store.store import Store
+from service.uploads import intake
 
-from .conftest import Supervising, alive, ended, order, state_of, until
+from .conftest import Supervising, alive, ended, order, state_of, supervised, until
 
 
 def submit(store: Store, **settings: Any) -> str:
@@ -61,16 +66,6 @@ def test_job_whose_child_died_succeeds_in_its_next_attempt(store: Store, supervi
     assert (found.state, found.attempt) == (JobState.SUCCEEDED, 2)
     assert states(store, job) == ["queued", "running", "queued", "running", "succeeded"]
     until(lambda: not store.files.work(job).exists())  # what it went on from is removed
-
-
-def test_plan_of_the_latest_attempt_stands(store: Store, supervising: Supervising) -> None:
-    job = submit(store)
-    with supervising("die_once"):
-        found = ended(store, job)
-    assert (found.state, found.attempt) == (JobState.SUCCEEDED, 2)
-    assert found.plan == {"summary": ["one splat"], "warnings": [], "splats": 1}
-    [event] = [event for event in store.jobs.events(SERVICE, job, 0) if event.kind is EventKind.PLAN]
-    assert event.data == found.plan
 
 
 def test_plan_outlives_the_attempt_that_made_it(store: Store) -> None:
@@ -192,35 +187,6 @@ def test_canceled_job_has_no_live_process(store: Store, supervising: Supervising
     assert states(store, job) == ["queued", "running", "canceling", "canceled"]
 
 
-def test_queued_job_is_canceled_at_once_and_never_runs(store: Store, supervising: Supervising) -> None:
-    job, other = submit(store), submit(store)
-    assert store.jobs.cancel(SERVICE, job)
-    assert store.jobs.get(SERVICE, job).state is JobState.CANCELED
-    with supervising("answer"):
-        assert ended(store, other).state is JobState.SUCCEEDED
-    assert states(store, job) == ["queued", "canceled"]
-
-
-def test_job_that_succeeded_cannot_be_canceled(store: Store, supervising: Supervising) -> None:
-    job = submit(store)
-    with supervising("answer"):
-        ended(store, job)
-    with pytest.raises(Conflict, match="succeeded"):
-        store.jobs.cancel(SERVICE, job)
-    assert store.jobs.get(SERVICE, job).state is JobState.SUCCEEDED
-
-
-def test_lift_that_is_done_when_its_job_is_canceling_is_dropped(store: Store) -> None:
-    job = submit(store)
-    assert store.jobs.claim() is not None
-    store.jobs.cancel(SERVICE, job)
-    with store.files.draft(".safetensors") as draft:
-        draft.write_bytes(b"too late")
-        assert not store.lifts.finish(job, 1, FinishedLift(draft, "0" * 64, 1, 1, {}))
-    store.jobs.lose(job, 1, "it is canceled")
-    assert store.jobs.get(SERVICE, job).state is JobState.CANCELED and store.lifts.find(SERVICE, job) is None
-
-
 @pytest.mark.parametrize(
     ("behaviour", "limit", "word"),
     [
@@ -252,6 +218,21 @@ def test_orderly_stop_leaves_no_process_and_does_not_use_up_attempts(store: Stor
             until(lambda: store.jobs.get(SERVICE, job).state is JobState.RUNNING and pids(store, job))
         assert store.jobs.get(SERVICE, job).state is JobState.QUEUED
     assert not any(alive(pid) for pid in pids(store, job))
+
+
+def test_job_interrupted_by_a_stop_goes_on_where_the_data_directory_is_next(tmp_path: Path) -> None:
+    store = Store.open(tmp_path / "data")
+    job = submit(store)
+    with supervised(store, "hang"):
+        until(lambda: pids(store, job))
+    store.close()
+    store = Store.open((tmp_path / "data").rename(tmp_path / "moved"))
+    with supervised(store, "answer"):
+        found = ended(store, job)
+    assert (found.state, found.attempt) == (JobState.SUCCEEDED, 2)
+    assert store.lifts.get(SERVICE, job).path.is_relative_to(tmp_path / "moved")
+    assert store.lifts.get(SERVICE, job).path.exists()
+    store.close()
 
 
 def test_what_a_dead_server_left_running_is_ended_before_its_job_runs_again(
@@ -292,6 +273,50 @@ def test_what_a_job_process_started_ends_when_its_server_does() -> None:
     until(lambda: not alive(grandchild))
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="asks the kernel of Linux for it")
+def test_check_that_cannot_listen_ends_when_its_server_is_killed(tmp_path: Path) -> None:
+    deaf = "import service.uploads.check as c; c.run = lambda *given: sum(range(10**15)); c.main()"  # in one C call
+    code = f"""if True:
+        import subprocess, sys
+        command = [sys.executable, "-c", {deaf!r}, "splats", "none", str(1 << 30)]
+        check = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True)
+        print(check.pid, check.stdout.readline(), flush=True)
+        check.wait()
+    """
+    server = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    assert server.stdout is not None
+    check, ready = server.stdout.readline().split(maxsplit=1)
+    try:
+        assert "ready" in ready and alive(int(check))
+        server.kill()
+        server.wait()
+        until(lambda: not alive(int(check)))
+    finally:
+        server.stdout.close()
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(int(check), signal.SIGKILL)
+
+
+@pytest.mark.parametrize(("size", "most"), [(1 << 20, 1040 << 20), (1 << 40, 8 << 30)])
+def test_check_may_take_memory_by_the_size_of_its_upload(
+    size: int, most: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[str] = []
+
+    def noted(command: list[str], **how: Any) -> None:
+        asked.extend(command)
+        raise OSError("noted")
+
+    with (tmp_path / "upload").open("wb") as handle:
+        handle.truncate(size)
+    monkeypatch.setattr(intake.subprocess, "Popen", noted)
+    with pytest.raises(OSError, match="noted"):
+        intake.check(
+            AssetKind.SPLATS, tmp_path / "upload", tmp_path, intake.CheckLimits(1.0, 8 << 30, threading.Event())
+        )
+    assert int(asked[-1]) == most
+
+
 def environment(pid: int) -> bytes:
     """Of a process, as the system tells it: nothing for a moment after its start."""
     return Path(f"/proc/{pid}/environ").read_bytes()
@@ -324,32 +349,46 @@ def test_deaths_of_the_server_do_not_count_against_a_job(store: Store) -> None:
     assert found.state is JobState.FAILED and found.problem is not None and "3 attempts" in found.problem["got"]
 
 
-def test_job_that_was_canceling_when_the_server_died_is_canceled(store: Store) -> None:
-    job = submit(store)
-    assert store.jobs.claim() is not None
-    store.jobs.cancel(SERVICE, job)
-    store.jobs.release_all("the server died")
-    assert store.jobs.get(SERVICE, job).state is JobState.CANCELED
+def claim(store: Store) -> str | None:
+    claimed = store.jobs.claim()
+    return None if claimed is None else claimed.id
 
 
-def test_jobs_are_claimed_in_order(store: Store) -> None:
+def test_jobs_of_an_owner_are_claimed_in_order(store: Store) -> None:
     jobs = [submit(store) for _ in range(3)]
-    claimed = [store.jobs.claim() for _ in jobs]
-    assert [job.id for job in claimed if job is not None] == jobs
+    assert [claim(store) for _ in range(4)] == [*jobs, None]
     assert [job.id for job in store.jobs.all(SERVICE)] == jobs[::-1]
 
 
-def test_log_and_progress_stay_bounded_and_numbers_grow(store: Store) -> None:
-    job = submit(store)
-    assert store.jobs.claim() is not None
-    for number in range(230):
-        store.jobs.log(job, 1, f"line {number} " + "x" * 1000)
-        store.jobs.advance(job, 1, {"done": number})
-    events = store.jobs.events(SERVICE, job, 0)
-    assert len(events) == 2 + 200 + 1
-    assert [event.number for event in events] == sorted({event.number for event in events})
-    assert log_of(store, job).endswith("x") and "line 229" in log_of(store, job) and len(log_of(store, job)) < 110_000
-    last = events[-1].number
-    assert store.jobs.events(SERVICE, job, last) == []
-    store.jobs.log(job, 1, "one more")
-    assert [event.number for event in store.jobs.events(SERVICE, job, last)] == [last + 1]
+def test_owners_take_turns_whoever_came_first_with_how_many(store: Store) -> None:
+    owners = [Owner(name, sees_all=False) for name in "abc"]
+    jobs = {}
+    for owner, count in zip(owners, (4, 2, 1), strict=True):
+        jobs |= {store.jobs.submit(owner, order(store, owner))[0]: f"{owner.key}{n}" for n in range(count)}
+    claimed = []
+    while (job := claim(store)) is not None:
+        claimed.append(jobs[job])
+        store.jobs.lose(job, 1, "to be claimed again") if claimed == ["a0"] else store.jobs.fail(job, 1, {})
+        if claimed == ["a0", "b0"]:  # who deletes what has ended does not come first for it
+            for ended_job in store.jobs.all(owners[1]):
+                if ended_job.state is JobState.FAILED:
+                    store.jobs.delete(owners[1], ended_job.id)
+    assert claimed == ["a0", "b0", "c0", "a0", "b1", "a1", "a2", "a3"]
+
+
+@pytest.mark.parametrize("expired", [True, False])
+def test_queued_jobs_of_a_key_that_ended_are_canceled_with_a_reason(expired: bool, store: Store) -> None:
+    key, _ = store.keys.create("a", frozenset({Scope.WRITE}), Quota())
+    owner, other = Owner(key.id, sees_all=False), submit(store)
+    running, waiting = (store.jobs.submit(owner, order(store, owner))[0] for _ in range(2))
+    assert [claim(store), claim(store)] == [other, running]
+    if expired:
+        with store.database.write() as connection:
+            connection.execute("UPDATE keys SET expires = ?", (time.time() - 1,))
+    else:
+        store.keys.revoke(key.id)
+        assert store.jobs.get(SERVICE, waiting).state is JobState.CANCELED  # at once, by whichever process
+    assert claim(store) is None
+    found = store.jobs.get(SERVICE, waiting)
+    assert found.state is JobState.CANCELED and found.problem is not None and found.problem["argument"] == "key"
+    assert store.jobs.get(SERVICE, running).state is JobState.RUNNING  # what has begun goes on

@@ -24,7 +24,7 @@ from service.store.keys import Quota
 from service.store.owners import SERVICE
 from service.store.store import Store
 
-from .conftest import asset_of, until
+from .conftest import asset_of, often, until
 
 DAY = 86_400.0
 
@@ -91,7 +91,9 @@ def of_an_older_release(data: Path) -> None:
     database = sqlite3.connect(data / DATABASE)
     database.executescript(
         "DROP TABLE generation; DROP INDEX jobs_by_age; DROP INDEX lifts_by_age;"
-        "ALTER TABLE assets DROP COLUMN brief; ALTER TABLE assets DROP COLUMN counts_bytes; PRAGMA user_version = 7;"
+        "ALTER TABLE assets DROP COLUMN brief; ALTER TABLE assets DROP COLUMN counts_bytes;"
+        "ALTER TABLE keys DROP COLUMN expires; ALTER TABLE keys DROP COLUMN old_digest;"
+        "ALTER TABLE keys DROP COLUMN old_until; PRAGMA user_version = 7;"
     )
     database.close()
 
@@ -197,7 +199,7 @@ def test_collector_moves_to_quarantine_and_removes_from_there_after_its_time(dat
         path.write_bytes(path.name.encode())
         os.utime(path, (1.0, 1.0))
     os.utime(store.files.work("1" * 32), (1.0, 1.0))
-    collector = Collector(store, every_seconds=0.02, grace_seconds=0.0, quarantine_seconds=DAY)
+    collector = Collector(store, often(quarantine_seconds=DAY))
     collector.start()
     until(lambda: not any(path.exists() for path in lost))
     collector.stop()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import tempfile
 import time
+from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -67,6 +68,7 @@ class StoreMachine(RuleBasedStateMachine):
         self.assets: dict[str, bytes] = {}
         self.owned: dict[str, set[str]] = {}  # asset -> who has it
         self.jobs: dict[str, Model] = {}
+        self.turns: Counter[str] = Counter()  # of owners, since the start
 
     def teardown(self) -> None:
         self.store.close()
@@ -174,8 +176,12 @@ class StoreMachine(RuleBasedStateMachine):
         if claimed is None:
             assert not line
             return "0" * 32, 1
-        assert claimed.id == line[0]  # the oldest; dicts keep their order
         model = self.jobs[claimed.id]
+        assert claimed.id == next(job for job in line if self.jobs[job].owner == model.owner)  # its owner's oldest
+        running = Counter(job.owner for job in self.jobs.values() if job.state in ("running", "canceling"))
+        waiting = [(running[self.jobs[job].owner], self.turns[self.jobs[job].owner]) for job in line]
+        assert (running[model.owner], self.turns[model.owner]) == min(waiting)
+        self.turns[model.owner] = max(self.turns.values(), default=0) + 1
         model.attempt += 1
         model.move("running")
         return claimed.id, claimed.attempt
@@ -286,6 +292,7 @@ class StoreMachine(RuleBasedStateMachine):
             path.write_bytes(b"half")
         self.store = Store.open(root)
         self.store.jobs.release_all("the server died")
+        self.turns.clear()
         for model in self.jobs.values():
             if model.state in ("running", "canceling"):
                 model.released += 1

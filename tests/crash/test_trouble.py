@@ -12,7 +12,6 @@ from typing import Any
 
 import pytest
 
-from service.jobs import attempt as attempts
 from service.jobs import supervisor as supervisors
 from service.models import JobState
 from service.store import database
@@ -31,7 +30,7 @@ Trouble = Callable[[Store], AbstractContextManager[None]]
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     """The same waits, shorter."""
-    monkeypatch.setattr(attempts, "AGAIN_SECONDS", 0.05)
+    monkeypatch.setattr(supervisors, "AGAIN_SECONDS", 0.05)
     monkeypatch.setattr(supervisors, "TROUBLED_SECONDS", (0.05, 0.2))
     monkeypatch.setattr(database, "BUSY_SECONDS", 0.2)
 

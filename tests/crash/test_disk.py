@@ -1,0 +1,213 @@
+"""A disk that is full or only read, and a database that is locked, malformed or gone: said, and nothing half done."""
+
+from __future__ import annotations
+
+import fcntl
+import sqlite3
+import subprocess
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, cast
+
+import pytest
+from fastapi.testclient import TestClient
+
+from service import __main__ as server
+from service.app import create_app
+from service.errors import Misconfigured
+from service.jobs.process import JobLimits
+from service.jobs.supervisor import Supervisor
+from service.queries.client import QueryClient
+from service.settings import ServiceSettings
+from service.store import database as databases
+from service.store.database import DATABASE, RESERVE, Database
+from service.store.keys import any_key
+from service.store.store import Store
+
+from .conftest import ended, order, stand_in
+from .server import NoQueries
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of three megabytes."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=3m", "none", str(folder)], capture_output=True, check=False
+    )
+    if mounted.returncode != 0:
+        pytest.skip("mounting a small file system takes rights that this user lacks")
+    yield folder
+    subprocess.run(["umount", "--lazy", str(folder)], check=True)
+
+
+def fill(disk: Path) -> Path:
+    """The file that takes all the room there is."""
+    with (disk / "filler").open("wb", buffering=0) as handle, pytest.raises(OSError, match="space"):
+        while True:
+            handle.write(b"x" * 4096)
+    return disk / "filler"
+
+
+@contextmanager
+def serving(data: Path) -> Iterator[tuple[Store, TestClient, dict[str, Any]]]:
+    """The service with stand-ins for lifts, and the body of an order that it takes."""
+    store = Store.open(data)
+    try:
+        yield from _serving(store)
+    finally:
+        store.close()
+
+
+def _serving(store: Store) -> Iterator[tuple[Store, TestClient, dict[str, Any]]]:
+    known = order(store)
+    body = {"splats": known.splats, "cameras": known.cameras, "features": list(known.features)}
+    settings = ServiceSettings.model_validate({"data": store.files.root, "disk_floor_bytes": 0})
+    runner = Supervisor(store, JobLimits(), command=stand_in("answer"))
+    app = create_app(settings, store, runner, cast("QueryClient", NoQueries()))
+    with TestClient(app, "http://127.0.0.1", raise_server_exceptions=False) as client:
+        yield store, client, body
+
+
+def test_full_disk_is_507_and_the_service_lives(small_disk: Path) -> None:
+    with serving(small_disk / "data") as (store, client, body):
+        upload = client.put("/assets/splats", content=b"x" * 4_000_000)
+        assert (upload.status_code, upload.json()["type"]) == (507, "/problems/no-space")
+        assert not any((small_disk / "data" / "tmp").iterdir())
+        filler = fill(small_disk)
+        replies = [client.post("/lift", json=body).status_code for _ in range(20)]
+        assert replies[-1] == 507 and set(replies) <= {202, 507}
+        assert client.get("/healthz").status_code == 200
+        assert "disk" in client.get("/readyz").json()["argument"]
+        filler.unlink()
+        acknowledged = [job["id"] for job in client.get("/jobs").json()["jobs"]]
+        assert len(acknowledged) == replies.count(202)
+        reply = client.post("/lift", json=body)
+        assert reply.status_code == 202
+        assert ended(store, reply.json()["id"]).state == "succeeded"
+        assert {ended(store, job).state for job in acknowledged} <= {"succeeded", "failed"}
+
+
+def test_delete_works_on_a_full_disk_and_makes_room(small_disk: Path) -> None:
+    with serving(small_disk / "data") as (store, client, body):
+        job = client.post("/lift", json=body).json()["id"]
+        assert ended(store, job).state == "succeeded"
+        (small_disk / "data" / RESERVE).unlink()
+        store.database.keep_reserve()
+        fill(small_disk)
+        while client.post("/lift", json=body).status_code == 202:  # what room there is in the database's own files
+            pass
+        for other in client.get("/jobs").json()["jobs"]:
+            gone = f"/jobs/{other['id']}"
+            if other["state"] not in ("succeeded", "failed", "canceled"):
+                assert client.post(f"{gone}/cancel").status_code in (200, 202, 507)
+        assert client.delete(f"/jobs/{job}?with_lift=true").status_code == 204
+        assert client.get(f"/jobs/{job}").status_code == 404 and not store.files.lift(job).exists()
+
+
+@pytest.mark.parametrize("existing", [True, False])
+@pytest.mark.parametrize("full", [True, False])
+def test_start_on_a_full_or_read_only_disk_is_one_line(
+    full: bool, existing: bool, small_disk: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if existing:
+        Store.open(small_disk / "data").close()
+    if full:
+        fill(small_disk)
+    else:
+        subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)
+    monkeypatch.setattr(server, "server_of", lambda *given: pytest.fail("the server started"))
+    assert server.main(["--data", str(small_disk / "data"), "--port", "0"]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("splatlift: data: expected") and said.count("\n") == 1
+
+
+def malformed(path: Path) -> None:
+    path.write_bytes(b"this is a letter to nobody. " * 1000)
+
+
+def replaced(path: Path) -> None:
+    path.rename(path.with_name("elsewhere"))
+    Database(path, rebuilding=True).close()
+
+
+@pytest.mark.parametrize("broken", [malformed, Path.unlink])
+def test_broken_database_is_told_by_readyz_and_takes_no_order(broken: Callable[[Path], None], tmp_path: Path) -> None:
+    with serving(tmp_path / "data") as (_, client, body):
+        assert client.get("/healthz").status_code == 200
+        broken(tmp_path / "data" / DATABASE)
+        for _ in range(3):
+            reply = client.post("/lift", json=body)
+            assert (reply.status_code, reply.json()["type"]) == (503, "/problems/not-ready"), reply.text
+            assert reply.json()["argument"] == "database" and int(reply.headers["retry-after"]) > 0
+        ready = client.get("/readyz")
+        assert ready.status_code == 503 and "database" in ready.json()["argument"]
+        assert client.get("/healthz").status_code == 200
+        left = sqlite3.connect(tmp_path / "data" / DATABASE)
+        if broken is replaced:
+            assert left.execute("SELECT count(*) FROM jobs").fetchone()[0] == 0  # nothing goes to a stranger
+        left.close()
+
+
+def test_lock_that_another_holds_for_long_is_503_with_retry_after(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(databases, "BUSY_SECONDS", 0.2)
+    with serving(tmp_path / "data") as (store, client, body):
+        other = sqlite3.connect(tmp_path / "data" / DATABASE, isolation_level=None)
+        other.execute("BEGIN IMMEDIATE")
+        for reply in (client.post("/lift", json=body), client.delete(f"/assets/{body['splats']}")):
+            assert (reply.status_code, reply.json()["type"]) == (503, "/problems/busy"), reply.text
+            assert int(reply.headers["retry-after"]) > 0
+        assert client.get("/jobs").status_code == 200  # who reads waits for nobody
+        other.execute("ROLLBACK")
+        other.close()
+        assert ended(store, client.post("/lift", json=body).json()["id"]).state == "succeeded"
+
+
+def test_write_that_cannot_be_committed_is_no_part_of_the_next(tmp_path: Path) -> None:
+    database = Database(tmp_path / "strict.sqlite")
+    with database.write() as connection:
+        connection.execute("CREATE TABLE parents (id INTEGER PRIMARY KEY)")
+        connection.execute("CREATE TABLE children (of INTEGER REFERENCES parents (id) DEFERRABLE INITIALLY DEFERRED)")
+    with pytest.raises(sqlite3.IntegrityError), database.write() as connection:
+        connection.execute("INSERT INTO children VALUES (7)")  # found out by COMMIT
+    with database.write() as connection:
+        connection.execute("INSERT INTO parents VALUES (1)")
+    with database.read() as connection:
+        assert connection.execute("SELECT count(*) FROM children").fetchone()[0] == 0
+    database.close()
+
+
+def test_file_that_is_no_database_is_a_misconfiguration(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    malformed(tmp_path / DATABASE)
+    for look in (lambda: any_key(tmp_path / DATABASE), lambda: Store.open(tmp_path)):
+        with pytest.raises(Misconfigured, match="expected a database of this service"):
+            look()
+    for host in ("127.0.0.1", "0.0.0.0"):
+        assert server.main(["--data", str(tmp_path), "--host", host, "--port", "0"]) == 2
+        said = capsys.readouterr().err
+        assert said.startswith("splatlift: data: expected a database") and said.count("\n") <= 2
+
+
+def test_a_look_at_the_lock_does_not_keep_a_server_from_starting(tmp_path: Path) -> None:
+    Store.open(tmp_path).close()
+    with (tmp_path / "lock").open("a") as looking:
+        fcntl.flock(looking, fcntl.LOCK_SH)
+        timer = threading.Timer(0.1, fcntl.flock, (looking, fcntl.LOCK_UN))
+        timer.start()
+        Store.open(tmp_path).close()
+        timer.join()
+
+
+def test_too_few_files_for_the_connections_are_told_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(server.resource, "getrlimit", lambda which: (256, 256))
+    assert server.main(["--data", str(tmp_path / "data"), "--port", "0"]) == 2
+    said = capsys.readouterr().err
+    assert "max_connections: expected at most 64" in said and "ulimit -n" in said and said.count("\n") == 1
+    assert not (tmp_path / "data").exists()
