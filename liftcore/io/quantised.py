@@ -24,10 +24,11 @@ def decoded(count: int, shapes: Mapping[str, tuple[int, ...]], decode: Callable[
         decode: rows -> those fields of these rows.
     """
     fields = {name: np.empty((count, *shape), np.float32) for name, shape in shapes.items()}
-    for first in range(0, count, BLOCK_ROWS):
-        rows = slice(first, min(first + BLOCK_ROWS, count))
-        for name, values in decode(rows).items():
-            fields[name][rows] = values
+    with np.errstate(over="ignore", invalid="ignore"):  # what is beyond float32 is infinite, and refused as such
+        for first in range(0, count, BLOCK_ROWS):
+            rows = slice(first, min(first + BLOCK_ROWS, count))
+            for name, values in decode(rows).items():
+                fields[name][rows] = values
     return fields
 
 

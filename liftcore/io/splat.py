@@ -42,7 +42,7 @@ def read_splat(path: Path, *, colour: bool = True) -> Fields:
 
     def decode(rows: slice) -> Fields:
         read = table[rows]
-        with np.errstate(divide="ignore", invalid="ignore"):  # a scale of zero is flat; a negative one is refused
+        with np.errstate(divide="ignore"):  # a scale of zero is flat; a negative one is refused as no number
             scales = np.log(read["scales"].astype(np.float64))
         rgba = read["colours"] / 255.0
         fields = {"means": read["means"], "log_scales": scales, "quats": read["quats"] / 128.0 - 1}
