@@ -19,6 +19,7 @@ COMMANDS = {
     "serve": "run the HTTP service",
     "keys": "who may use the HTTP service",
     "store": "mend the HTTP service's data directory",
+    "check": "do splats, cameras, photos and features belong together",
     "lift": "lift features onto splats",
     "plan": "what a lift would do and need",
     "query": "find words and examples in a lift",

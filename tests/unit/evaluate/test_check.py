@@ -1,0 +1,130 @@
+"""``splatlift check``: inputs that contradict each other are told, and healthy ones are not."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from safetensors.torch import load_file, save_file
+
+from liftcore import cli
+from liftcore.demo.still_life import StillLife, still_life
+from liftcore.evaluate.check import check_scene
+from liftcore.features.pack import as_views, read_features, write_pack
+from liftcore.features.views import FeatureGrid, Regions
+from liftcore.io.inria import write_inria_cameras
+from liftcore.io.ply import write_splats
+from liftcore.query.splat_colours import seen_colours
+from liftcore.raster.base import CompositingParams
+from liftcore.raster.cpu.raster import CpuRaster
+from liftcore.scene.cameras import Cameras
+
+
+@pytest.fixture(scope="module")
+def scene() -> StillLife:
+    return still_life(seed=7, views=4, density=0.1)
+
+
+@pytest.fixture(scope="module")
+def photos(scene: StillLife, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    folder, raster = tmp_path_factory.mktemp("photos"), CpuRaster(scene.splats)
+    for name, camera in scene.cameras.items():
+        image = raster.render(camera, seen_colours(scene.splats, camera), CompositingParams()).clamp(0, 1).numpy()
+        Image.fromarray((255 * image).astype(np.uint8)).save(folder / f"{name}.png")
+    return {path.stem: path for path in sorted(folder.iterdir())}
+
+
+@pytest.fixture(scope="module")
+def grids(photos: dict[str, Path]) -> dict[str, FeatureGrid]:
+    """Maps that show the photos: their colours, small, in channels of waves."""
+    made = {}
+    for name, path in photos.items():
+        with Image.open(path) as image:
+            small = np.asarray(image.resize((24, 18)), np.float32) / 255
+        waves = np.random.default_rng(0).normal(size=(3, 32)).astype(np.float32)
+        made[name] = FeatureGrid(torch.from_numpy(np.cos(2 * small @ waves)))
+    return made
+
+
+def test_what_belongs_together_is_healthy(scene: StillLife, photos, grids) -> None:
+    found = check_scene(scene.splats, scene.cameras, photos, as_views(grids))
+    assert found.wrong == () and found.notes == ()
+    assert {view.view for view in found.views} == set(scene.cameras) and found.in_view > 0.9
+    assert all(view.psnr and view.others and view.psnr > 30 > view.others for view in found.views)
+    assert found.features["neighbours"] > found.features["[F, h, w]"] and found.worst is not None
+
+
+def test_cameras_of_another_scale_are_told_by_the_photos(scene: StillLife, photos) -> None:
+    moved = []
+    for camera in scene.cameras.values():
+        pose = camera.viewmat.copy()
+        pose[:3, 3] *= 0.3
+        moved.append(camera.replace(viewmat=pose))
+    (told,) = check_scene(scene.splats, Cameras(tuple(moved)), photos).wrong
+    assert told.startswith("photos: renders are hardly more like their own photos")
+
+
+def test_cameras_that_see_nothing_are_told_without_photos(scene: StillLife) -> None:
+    away = replace(scene.splats, means=scene.splats.means + 1000)
+    found = check_scene(away, scene.cameras)
+    assert len(found.wrong) == 2 and all(told.startswith("cameras: ") for told in found.wrong)
+    assert "none were given" in found.notes[0]
+
+
+def test_grids_whose_bytes_lie_in_another_order_are_told(scene: StillLife, grids) -> None:
+    turned = {
+        name: FeatureGrid(grid.grid.permute(2, 0, 1).contiguous().reshape(grid.grid.shape))
+        for name, grid in grids.items()
+    }
+    (told,) = check_scene(scene.splats, scene.cameras, features=as_views(turned)).wrong
+    assert "read as [F, h, w]" in told and "contiguous" in told
+    noise = {name: FeatureGrid(torch.randn(grid.grid.shape)) for name, grid in grids.items()}
+    (told,) = check_scene(scene.splats, scene.cameras, features=as_views(noise)).wrong
+    assert "as any two cells do" in told
+
+
+def test_masks_of_other_photos_are_told(scene: StillLife, photos) -> None:
+    masks, mirrored = {}, {}
+    for name, path in photos.items():
+        with Image.open(path) as image:
+            grey = np.asarray(image.convert("L").resize((120, 90)), np.int32)
+        labels = torch.from_numpy(grey // 32)[None]
+        masks[name] = Regions(labels, torch.eye(8))
+        mirrored[name] = Regions(labels.flip(2), torch.eye(8))
+    assert check_scene(scene.splats, scene.cameras, photos, as_views(masks)).wrong == ()
+    (told,) = check_scene(scene.splats, scene.cameras, photos, as_views(mirrored)).wrong
+    assert "masks must be of these photos" in told
+
+
+def test_photos_without_cameras_are_named(scene: StillLife, photos) -> None:
+    some = {name: photos[name] for name in list(photos)[:2]} | {"stranger": next(iter(photos.values()))}
+    found = check_scene(scene.splats, scene.cameras, some)
+    assert found.wrong == () and len(found.views) == 2
+    assert "2 cameras have none" in found.notes[0] and "1 have no camera: 'stranger'" in found.notes[1]
+    (told,) = check_scene(scene.splats, scene.cameras, {"stranger": photos["view_00"]}).wrong
+    assert "none is named as a camera" in told
+
+
+def test_command_says_what_is_wrong_and_exits_2(scene: StillLife, photos, grids, tmp_path: Path, capsys) -> None:
+    write_splats(scene.splats, tmp_path / "s.ply")
+    write_inria_cameras(scene.cameras, tmp_path / "c.json")
+    write_pack(tmp_path / "f.safetensors", grids, {})
+    folder = next(iter(photos.values())).parent
+    command = ["check", *(str(tmp_path / name) for name in ("s.ply", "c.json")), str(folder)]
+    pack, worst = str(tmp_path / "f.safetensors"), tmp_path / "worst.png"
+    assert cli.main([*command, pack, "--worst", str(worst), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["healthy"] and document["wrong"] == [] and document["worst"] == str(worst)
+    camera = next(iter(scene.cameras.values()))
+    with Image.open(worst) as picture:
+        assert picture.size == (2 * camera.width, camera.height)
+    broken = {
+        name: values.permute(2, 0, 1).contiguous().reshape(values.shape) for name, values in load_file(pack).items()
+    }
+    save_file(broken, tmp_path / "b.safetensors", metadata={"encoder": "x"})
+    assert read_features(tmp_path / "b.safetensors").views
+    assert cli.main([*command, str(tmp_path / "b.safetensors")]) == 2
+    assert "wrong: features: " in capsys.readouterr().out
