@@ -11,19 +11,18 @@ from fastapi import FastAPI
 
 from liftcore import __version__
 from service import problems
-from service.auth import Gate
+from service.auth import STRANGER, Gate
 from service.jobs.device import Devices
 from service.jobs.process import JobLimits
 from service.jobs.supervisor import Supervisor
-from service.middleware import AnswerHead, BodyLimit, RefuseWork
-from service.observe import Metrics, RecordedApp, versions
+from service.middleware import AnswerHead, RecordedApp
+from service.observe import Metrics, versions
 from service.queries.client import QueryClient, QueryLimits
 from service.requests import KnownParameters
-from service.routes import assets, jobs, lifts, operations, queries, scene, tradeoffs
+from service.routes import assets, jobs, operations, queries, results, scene
 from service.settings import ServiceSettings
 from service.state import AppState, Readiness, Stopping
 from service.store.collect import Collector
-from service.store.owners import NOBODY
 from service.store.store import Store
 from service.streams import EventStreams
 
@@ -31,7 +30,8 @@ from service.streams import EventStreams
 def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, worker: QueryClient) -> FastAPI:
     """The application. It starts and stops the runner and the worker; the store is its caller's to close."""
 
-    streams, build = EventStreams(settings.max_streams), versions(settings.commit)
+    threads = anyio.CapacityLimiter
+    streams, build = EventStreams(settings.max_streams, settings.key_streams), versions(settings.commit)
     stopping = Stopping(streams, runner, notice_seconds=settings.notice_seconds)
     metrics = Metrics(store, worker, streams, build)
     readiness = Readiness(store, runner, worker, stopping)
@@ -42,10 +42,15 @@ def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, work
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         app.state.deps = deps = AppState(
-            settings=settings, version=build, store=store, owner=NOBODY, runner=runner,
-            devices=Devices(), queries=worker,
+            settings=settings, version=build, store=store, caller=STRANGER,
+            runner=runner, devices=Devices(), queries=worker,
             streams=streams, metrics=metrics, readiness=readiness,
-            checks=anyio.CapacityLimiter(settings.parallel_checks),
+            checks=threads(settings.parallel_checks),  # uploads that are validated at the same time
+            writing=threads(8),  # uploads: a stalled disk stops them, and no other route
+            parsing=threads(2),  # JSON bodies
+            ordering=threads(2),  # orders, which are compared with all names in their assets: these take memory
+            naming=threads(1),  # pages of names, of which all are read for each
+            scrapes=threads(1),  # the metrics
         )  # fmt: skip
         await anyio.to_thread.run_sync(worker.start)
         await anyio.to_thread.run_sync(runner.start)
@@ -69,12 +74,10 @@ def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, work
     )
     app.state.stopping, app.state.metrics = stopping, metrics
     app.add_middleware(AnswerHead)
-    app.add_middleware(BodyLimit, limit=settings.max_body_bytes)
-    app.add_middleware(RefuseWork, stopping=stopping)
-    app.add_middleware(Gate, keys=store.keys, settings=settings)  # outside of it: no body of a stranger is read
+    app.add_middleware(Gate, keys=store.keys, settings=settings, stopping=lambda: stopping.begun)
     problems.install(app)
     app.include_router(operations.router)  # probes and links to the page may carry what they like
-    for module in (assets, jobs, lifts, scene, tradeoffs, queries):
+    for module in (assets, jobs, results, scene, queries):
         app.include_router(module.router, dependencies=[KnownParameters])
     return app
 
@@ -92,6 +95,7 @@ def query_limits(settings: ServiceSettings) -> QueryLimits:
         scenes=settings.query_scenes,
         cache_bytes=settings.query_cache_bytes,
         encoder=settings.encoder,
+        of_a_key=settings.key_queries,
     )
 
 

@@ -2,7 +2,7 @@
 
 First the Host and the Origin: the threat is a page of another site in the browser of somebody who can reach the
 service. It may send requests itself (then its Origin tells), or have its own name point to this machine (DNS
-rebinding; then the Host tells). Then the key, its scope, and its uploads at a time.
+rebinding; then the Host tells). Then the key, its scope, whether the server stops, and the key's uploads at a time.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import ipaddress
 import re
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 from urllib.parse import urlsplit
@@ -20,9 +20,16 @@ from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Send
 from starlette.types import Scope as AsgiScope
 
-from liftcore.errors import SplatliftError
-from service.errors import ForeignOrigin, InvalidRequest, Misdirected, MissingScope, TooMany, Unauthorized
-from service.problems import CLOSE, answer_to
+from service.errors import (
+    Busy,
+    ForeignOrigin,
+    InvalidRequest,
+    Misdirected,
+    MissingScope,
+    Unauthorized,
+    require_share,
+)
+from service.problems import CLOSE
 from service.scopes import SAFE, Scope, allows, needed
 from service.settings import ServiceSettings
 from service.store.keys import KeyRecord, KeyStore
@@ -33,6 +40,7 @@ LOOPBACK = frozenset({"localhost", "127.0.0.1", "::1"})
 BEARER = re.compile(r"bearer +([A-Za-z0-9._~+/-]+=*)", re.ASCII | re.IGNORECASE)  # RFC 6750, 2.1
 LOOKUPS = 4  # threads that look keys up, so that slow routes cannot keep anyone waiting at the gate
 UPLOADS = "/assets/"
+WORKLESS = frozenset({"GET", "HEAD", "OPTIONS"})  # methods that start nothing: a stop refuses the others
 SCHEMES = {
     "key": {
         "type": "http",
@@ -56,59 +64,68 @@ STRANGER = Caller(NOBODY)  # on an open route
 
 
 class Gate:
-    """ASGI middleware: lets a request pass with its `Caller` in the scope's state, or answers why not."""
+    """ASGI middleware: lets a request pass with its `Caller` in the scope's state, or raises why not."""
 
-    def __init__(self, app: ASGIApp, keys: KeyStore, settings: ServiceSettings) -> None:
+    def __init__(self, app: ASGIApp, keys: KeyStore, settings: ServiceSettings, stopping: Callable[[], bool]) -> None:
         self._app = app
         self._keys = keys.under(settings.keys)
         self._settings = settings
         self._hosts = Hosts(settings.host, settings.allowed_hosts)
+        self._stopping = stopping
         self._uploads: Counter[str] = Counter()  # by key, those that are on their way
-        self._lookups: anyio.CapacityLimiter | None = None
+        self._lookups = anyio.CapacityLimiter(LOOKUPS)
 
     async def __call__(self, scope: AsgiScope, receive: Receive, send: Send) -> None:
-        """Let the request pass, or say why not."""
+        """Let the request pass.
+
+        Raises:
+            ServiceError: it may not.
+        """
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        headers = Headers(scope=scope)
-        try:
-            require_one_length(headers)
-            self._hosts.check(scope["method"], headers)
-            caller = await self._caller(needed(scope["method"], scope["path"]), headers)
-            uploads = scope["method"] == "PUT" and scope["path"].startswith(UPLOADS)
-            if uploads:
-                self._require_turn(caller)
-        except SplatliftError as error:
-            await answer_to(error, CLOSE if isinstance(error, InvalidRequest) else None)(scope, receive, send)
-            return
+        method, headers = scope["method"], Headers(scope=scope)
+        require_one_length(headers)
+        self._hosts.check(method, headers)
+        caller = await self._caller(needed(method, scope["path"]), headers)
+        if self._stopping() and method not in WORKLESS:
+            busy = Busy("server", expected="a running server", got="one that stops", hint="ask the next one")
+            busy.headers |= CLOSE
+            raise busy
         scope.setdefault("state", {})[CALLER] = caller
-        self._uploads[caller.owner.key] += uploads
+        if method != "PUT" or not scope["path"].startswith(UPLOADS):
+            await self._app(scope, receive, send)
+            return
+        own, most = caller.owner.key, caller.max_uploads
+        require_share("upload", self._uploads[own], most)
+        self._uploads[own] += 1
         try:
             await self._app(scope, receive, send)
         finally:
-            self._uploads[caller.owner.key] -= uploads
-            if not self._uploads[caller.owner.key]:
-                del self._uploads[caller.owner.key]
+            self._uploads[own] -= 1
+            if not self._uploads[own]:
+                del self._uploads[own]
 
     async def _caller(self, wanted: Scope | None, headers: Headers) -> Caller:
         if wanted is None:
             return STRANGER
-        if self._lookups is None:
-            self._lookups = anyio.CapacityLimiter(LOOKUPS)
         required, key = await anyio.to_thread.run_sync(self._keys.admit, bearer(headers), limiter=self._lookups)
         if not required:
             return EVERYBODY
         if key is None:
+            sent = "authorization" in headers
+            code = ', error="invalid_token"' if sent else ""  # only where a key was sent (RFC 6750, 3.1)
             raise Unauthorized(
                 "Authorization", expected="Bearer and a key of this service",
-                got="one that is not valid" if "authorization" in headers else "none",
+                got="one that is not valid" if sent else "none",
                 hint="the operator makes keys with splatlift keys create",
+                headers={"WWW-Authenticate": f'Bearer realm="splatlift"{code}'},
             )  # fmt: skip
         if not allows(key.scopes, wanted):
+            told = f'Bearer realm="splatlift", error="insufficient_scope", scope="{wanted}"'
             raise MissingScope(
                 "Authorization", expected=f"a key with the scope {wanted}",
-                got=f"one with {', '.join(sorted(key.scopes))}", scope=wanted,
+                got=f"one with {', '.join(sorted(key.scopes))}", headers={"WWW-Authenticate": told},
             )  # fmt: skip
         return self._known(key)
 
@@ -121,13 +138,6 @@ class Gate:
             max_queued=settings.key_queued if quota.max_queued is None else quota.max_queued,
         )
         return Caller(owner, settings.key_uploads if quota.max_uploads is None else quota.max_uploads, key.id)
-
-    def _require_turn(self, caller: Caller) -> None:
-        if caller.max_uploads is not None and self._uploads[caller.owner.key] >= caller.max_uploads:
-            raise TooMany(
-                "upload", expected=f"at most {caller.max_uploads} uploads of this key at a time", got="more",
-                hint="wait for the end of one",
-            )  # fmt: skip
 
 
 def bearer(headers: Headers) -> str | None:
@@ -144,7 +154,7 @@ def require_one_length(headers: Headers) -> None:
         InvalidRequest: there are both headers.
     """
     if "content-length" in headers and "transfer-encoding" in headers:
-        raise InvalidRequest("Content-Length", expected="either it or Transfer-Encoding", got="both")
+        raise InvalidRequest("Content-Length", expected="either it or Transfer-Encoding", got="both", headers=CLOSE)
 
 
 class Hosts:

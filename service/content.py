@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
-from collections.abc import Callable, Iterator
+import sys
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, BinaryIO
@@ -23,7 +25,7 @@ from service.store.database import CURSOR, Page
 from service.store.files import is_whole
 
 BLOCK_BYTES = 256 << 10  # of a draft that is read and sent at a time
-STREAMED = 200  # records of a long list that are in memory at a time
+STREAMED = 50  # records of a list that are in memory at a time: of a job of 10,000 packs there are 700 KB
 FAR_BEGINNING = re.compile(r"(=\s*)0*[1-9]\d{19,}(?=\s*-)", re.ASCII)  # int() takes no number of thousands of digits
 BINARY = "application/octet-stream"
 BYTES = {BINARY: {"schema": {"type": "string", "format": "binary"}}}
@@ -58,9 +60,9 @@ def unchanged(request: Request, etag: str, *, found: bool = True) -> Response | 
     return Response(status_code=304, headers={"ETag": etag}) if same else None
 
 
-def tagged(content: bytes, media_type: str, etag: str) -> Response:
-    """Content that a client may keep and must ask about."""
-    return Response(content, media_type=media_type, headers={"ETag": etag, "Cache-Control": "private, no-cache"})
+def kept(etag: str) -> dict[str, str]:
+    """Headers of what a client may keep and must ask about."""
+    return {"ETag": etag, "Cache-Control": "private, no-cache"}
 
 
 @dataclass(frozen=True)
@@ -87,8 +89,9 @@ def file_answer(request: Request, file: StoredFile) -> Response:
             "content", expected=f"a file of {file.bytes} bytes in the data directory", got=there,
             hint="it was deleted a moment ago, or something else wrote there: upload it again, or lift again",
         )  # fmt: skip
-    headers = {"ETag": etag, "Cache-Control": "private, no-cache"}
-    return unchanged(request, etag) or _FileAnswer(file.path, headers=headers, filename=file.name, media_type=BINARY)
+    return unchanged(request, etag) or _FileAnswer(
+        file.path, headers=kept(etag), filename=file.name, media_type=BINARY
+    )
 
 
 class _FileAnswer(FileResponse):
@@ -101,8 +104,8 @@ class _FileAnswer(FileResponse):
         except responses.MalformedRangeHeader:
             return []
         except responses.RangeNotSatisfiable:
-            expected = f"a range within {file_size} bytes"
-            raise RangeNotSatisfiable("Range", expected=expected, got=http_range[:80], size=file_size) from None
+            expected, told = f"a range within {file_size} bytes", {"Content-Range": f"bytes */{file_size}"}
+            raise RangeNotSatisfiable("Range", expected=expected, got=http_range[:80], headers=told) from None
         return ranges if len(ranges) == 1 else []
 
 
@@ -112,14 +115,14 @@ class Draft(StreamingResponse):
     It is held open, so its entry may go as soon as this is made; its room goes with the answer, however that ends.
     """
 
-    def __init__(self, draft: Path, *, filename: str, etag: str | None) -> None:
+    def __init__(self, draft: Path, *, filename: str, headers: Mapping[str, str]) -> None:
         self.file: BinaryIO = draft.open("rb")
-        headers = {
+        told = {
             "Content-Length": str(os.fstat(self.file.fileno()).st_size),
             "Content-Disposition": f'attachment; filename="{filename}"',
             "Cache-Control": "private, no-cache",
-        } | ({"ETag": etag} if etag else {})
-        super().__init__(iter(lambda: self.file.read(BLOCK_BYTES), b""), 200, headers, BINARY)
+        }
+        super().__init__(iter(lambda: self.file.read(BLOCK_BYTES), b""), 200, told | dict(headers), BINARY)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         try:
@@ -137,8 +140,8 @@ def listed(
     limit: int | None,
     cursor: str | None,
 ) -> Response:
-    """A list, newest first: one page of it with ``next``, the cursor of the page after it or null; or, without a
-    limit, all that follows, streamed, so that no list is ever in memory whole.
+    """A list, newest first: so many with ``next``, the cursor of those after them or null; without a limit all that
+    follow. It is streamed, so that no list is ever in memory whole.
 
     Args:
         name: of the list in the JSON object.
@@ -146,25 +149,19 @@ def listed(
         shape: a record as clients get it.
         limit, cursor: as the client gave them.
     """
-    first = page(limit or STREAMED, cursor)
-    if limit is not None:
-        following = "null" if first.cursor is None else f'"{first.cursor}"'
-        body = f'{{"{name}":[{_joined(first, shape)}],"next":{following}}}'
-        return Response(body, media_type="application/json")
+    first = page(min(limit or STREAMED, STREAMED), cursor)  # before the answer begins: the cursor may be none
 
     def pieces() -> Iterator[str]:
-        yield f'{{"{name}":[{_joined(first, shape)}'
-        following = first.cursor
-        while following is not None:
-            found = page(STREAMED, following)
-            following = found.cursor
-            yield f",{_joined(found, shape)}" if found.records else ""
-        yield "]}"
+        found, left = first, sys.maxsize if limit is None else limit
+        yield f'{{"{name}":['
+        while True:
+            yield ",".join(shape(record).model_dump_json() for record in found.records)
+            left -= len(found.records)
+            if found.cursor is None or left == 0:
+                break
+            found = page(min(left, STREAMED), found.cursor)
+            yield "," if found.records else ""
+        yield "]" if limit is None else f'],"next":{json.dumps(found.cursor)}'
+        yield "}"
 
-    if first.cursor is None:
-        return Response("".join(pieces()), media_type="application/json")
     return StreamingResponse(pieces(), media_type="application/json")
-
-
-def _joined(page: Page[Any], shape: Callable[[Any], BaseModel]) -> str:
-    return ",".join(shape(record).model_dump_json() for record in page.records)

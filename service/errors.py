@@ -2,48 +2,34 @@
 
 SplatliftError
 └── ServiceError
-    ├── Unauthorized         no key, or one that is not valid                  401 + WWW-Authenticate
-    ├── MissingScope         a key that may not do that                        403 + WWW-Authenticate
-    ├── ForeignOrigin        a web page of another site asks                   403
-    ├── Misdirected          a Host that is not this service                   421
-    ├── OverQuota            more bytes than the key may store                 403
-    ├── InvalidRequest       a parameter or a body that no route understands   422
-    ├── DigestMismatch       the body is not what ?sha256= promised            422
-    ├── InvalidEncoding      a compressed body that does not decompress        422
-    ├── UnsupportedEncoding  a Content-Encoding that is neither gzip nor zstd  415
-    ├── TooLarge             more bytes than the operator allows               413
-    ├── RangeNotSatisfiable  a Range beyond the end of the content             416 + Content-Range
-    ├── InUse                an asset that a job or a lift needs               409
-    ├── Conflict             a job whose state does not allow that             409
-    ├── KeyReused            an Idempotency-Key that came with another order   422
-    ├── OverLimit            a job beyond the operator's time or memory        422
-    ├── NoSpace              less free disk than the operator wants to keep    507
-    ├── RetryLater
-    │   ├── TooMany          more jobs in line or uploads than the key may     429 + Retry-After
-    │   └── Busy             as much work as the service accepts               503 + Retry-After
-    │       └── NotReady     a check of /readyz that failed                    503 + Retry-After
-    ├── TimedOut             a query that took longer than the operator allows 504
-    ├── Crashed              a process of ours died without an answer          500
-    └── Misconfigured        the operator's settings or data directory         (start-up only)
-        └── StaleDatabase    files whose database is gone, or an older one     (start-up only)
+    ├── Unauthorized, MissingScope, ForeignOrigin, Misdirected      who may ask
+    ├── InvalidRequest, DigestMismatch, InvalidEncoding, UnsupportedEncoding, TooLarge, RangeNotSatisfiable, KeyReused
+    ├── InUse, Conflict                                             what the state of things does not allow
+    ├── OverQuota, OverLimit, NoSpace                               what there is no room for
+    ├── RetryLater: TooMany, Busy (NotReady)                        what may go well in a while
+    ├── TimedOut, ClientLeft, Crashed                               what ended without an answer
+    └── Misconfigured (StaleDatabase)                               at the start only
 
 Statuses and titles are in `service.problems`, which no child process loads.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from liftcore.errors import SplatliftError
 
 
 class ServiceError(SplatliftError):
-    """An error of the service around the core."""
+    """An error of the service around the core; ``headers`` are what an answer tells beside the problem."""
 
     kind = "service"
 
-    @property
-    def headers(self) -> dict[str, str]:
-        """What an answer with this error tells beside its problem."""
-        return {}
+    def __init__(
+        self, argument: str, *, expected: str, got: str, hint: str = "", headers: Mapping[str, str] | None = None
+    ) -> None:
+        super().__init__(argument, expected=expected, got=got, hint=hint)
+        self.headers = dict(headers or {})
 
 
 class Unauthorized(ServiceError):
@@ -51,26 +37,11 @@ class Unauthorized(ServiceError):
 
     kind = "unauthorized"
 
-    @property
-    def headers(self) -> dict[str, str]:
-        """The scheme, with a code only where a key was sent (RFC 6750, 3.1)."""
-        code = ', error="invalid_token"' if self.got != "none" else ""
-        return {"WWW-Authenticate": f'Bearer realm="splatlift"{code}'}
-
 
 class MissingScope(ServiceError):
     """A key that was not made for this."""
 
     kind = "missing-scope"
-
-    def __init__(self, argument: str, *, expected: str, got: str, hint: str = "", scope: str = "") -> None:
-        super().__init__(argument, expected=expected, got=got, hint=hint)
-        self.scope = scope  # the one that it lacks
-
-    @property
-    def headers(self) -> dict[str, str]:
-        """The scope that is missing."""
-        return {"WWW-Authenticate": f'Bearer realm="splatlift", error="insufficient_scope", scope="{self.scope}"'}
 
 
 class ForeignOrigin(ServiceError):
@@ -126,15 +97,6 @@ class RangeNotSatisfiable(ServiceError):
 
     kind = "range-not-satisfiable"
 
-    def __init__(self, argument: str, *, expected: str, got: str, hint: str = "", size: int = 0) -> None:
-        super().__init__(argument, expected=expected, got=got, hint=hint)
-        self.size = size  # bytes of the content
-
-    @property
-    def headers(self) -> dict[str, str]:
-        """The size that there is."""
-        return {"Content-Range": f"bytes */{self.size}"}
-
 
 class InUse(ServiceError):
     """An asset that a job or a lift still needs."""
@@ -170,17 +132,12 @@ class RetryLater(ServiceError):
     """What may go well in a while."""
 
     def __init__(self, argument: str, *, expected: str, got: str, hint: str = "", retry_after: int = 2) -> None:
-        super().__init__(argument, expected=expected, got=got, hint=hint)
-        self.retry_after = retry_after  # seconds
-
-    @property
-    def headers(self) -> dict[str, str]:
-        """When to ask again."""
-        return {"Retry-After": str(self.retry_after)}
+        headers = {"Retry-After": str(retry_after)}  # seconds
+        super().__init__(argument, expected=expected, got=got, hint=hint, headers=headers)
 
 
 class TooMany(RetryLater):
-    """More jobs in line, or uploads at a time, than a key may have."""
+    """More jobs in line, or uploads, queries or streams at a time, than a key may have."""
 
     kind = "too-many"
 
@@ -201,6 +158,12 @@ class TimedOut(ServiceError):
     """A query that took longer than the operator allows."""
 
     kind = "timed-out"
+
+
+class ClientLeft(ServiceError):
+    """A client that did not wait for its turn: nobody reads the answer."""
+
+    kind = "client-left"
 
 
 class Crashed(ServiceError):
@@ -225,3 +188,15 @@ class StaleDatabase(Misconfigured):
             f" splatlift store rebuild --data {data}; or begin anew with splatlift serve --new, which moves the files"
             " to quarantine",
         )  # fmt: skip
+
+
+def require_share(what: str, count: int, most: int | None) -> None:
+    """See that a key may have another one of these at the same time; None = as many as it likes.
+
+    Raises:
+        TooMany: it has as many as it may.
+    """
+    if most is not None and count >= most:
+        raise TooMany(
+            what, expected=f"at most {most} of this key at a time", got="more", hint="wait for the end of one"
+        )

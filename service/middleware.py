@@ -1,51 +1,106 @@
-"""ASGI layers between the gate and the routes: bodies have an end, HEAD is GET's head, a stop takes no work."""
+"""ASGI layers around the routes: every exchange is recorded, HEAD is GET's head. The gate is in `service.auth`."""
 
 from __future__ import annotations
 
+import time
+from typing import Any
+
 import anyio
-from starlette.exceptions import HTTPException
+from fastapi import FastAPI
+from starlette.datastructures import MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.auth import UPLOADS
-from service.errors import Busy
-from service.problems import CLOSE, answer_to
-from service.state import Stopping
+from service.auth import CALLER
+from service.observe import Metrics, access, chosen_id, working_for
 
-WORKLESS = frozenset({"GET", "HEAD", "OPTIONS"})  # methods that start nothing
+PATH_CHARACTERS = 200  # of a path in the log
+# For browsers: nothing here is guessed at, framed or allowed to load anything; pages bring a policy of their own.
+SAFE_HEADERS = {
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Referrer-Policy": "no-referrer",
+    "Content-Security-Policy": "default-src 'none'; frame-ancestors 'none'",
+}
 
 
-class BodyLimit:
-    """No route reads more than ``limit`` bytes, but for uploads, which count their own.
+class RecordedApp(FastAPI):
+    """Records its requests outside of all else, so that answers to unforeseen errors are recorded too.
 
-    Once an answer has begun nobody waits for the body, and the one who listens for the end of the connection hears no
-    more of this.
+    ``state.metrics`` must be there before the first request.
     """
 
-    def __init__(self, app: ASGIApp, limit: int) -> None:
+    def build_middleware_stack(self) -> ASGIApp:
+        """The usual layers within the recorder."""
+        return Recorder(super().build_middleware_stack(), self.state.metrics)
+
+
+class Recorder:
+    """Every answer gets its request's id and `SAFE_HEADERS`; log and counters hear of it."""
+
+    def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
         self._app = app
-        self._limit = limit
+        self._metrics = metrics
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass the request on with a receive channel that counts."""
-        if scope["type"] != "http" or scope["path"].startswith(UPLOADS):
+        """Pass the request on and watch."""
+        if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        received, begun = 0, False
+        begun, made = time.monotonic(), chosen_id(scope["headers"])
+        status, received, sent, complete = 0, 0, 0, False
 
         async def counted() -> Message:
             nonlocal received
             message = await receive()
             received += len(message.get("body", b""))
-            if received > self._limit and not begun:
-                raise HTTPException(413, f"the body has more than {self._limit} bytes", CLOSE)
             return message
 
-        async def told(message: Message) -> None:
-            nonlocal begun
-            begun = True
+        async def marked(message: Message) -> None:
+            nonlocal status, sent, complete
+            if message["type"] == "http.response.start":
+                status = message["status"]
+                message = {**message, "headers": list(message.get("headers", ()))}
+                headers = MutableHeaders(raw=message["headers"])
+                for name, value in SAFE_HEADERS.items():
+                    headers.setdefault(name, value)
+                headers.append("X-Request-ID", made)
             await send(message)
+            if message["type"] == "http.response.body":
+                sent += len(message.get("body", b""))
+                complete = not message.get("more_body", False)
 
-        await self._app(scope, counted, told)
+        with working_for(made):
+            try:
+                await self._app(scope, counted, marked)
+            except Exception:
+                if (
+                    not complete
+                ):  # else `service.problems` has answered and logged it, and the framework raises it again
+                    raise
+            finally:
+                seconds, route = time.monotonic() - begun, getattr(scope.get("route"), "path", None)
+                self._metrics.served(scope["method"], route, status, seconds=seconds, received=received)
+                fields = {
+                    "method": scope["method"],
+                    "route": route,
+                    "path": scope["path"][:PATH_CHARACTERS],  # never the query: people put secrets there
+                    "status": status,
+                    "seconds": round(seconds, 6),
+                    "received": received,
+                    "sent": sent,
+                    "client": (scope.get("client") or (None,))[0],
+                    **_who(scope),
+                    **({} if complete else {"broken_off": True}),
+                }
+                access.info("%s %s %d", scope["method"], route or "(no route)", status, extra={"fields": fields})
+
+
+def _who(scope: Scope) -> dict[str, Any]:
+    """The key that asked, and whether as an admin."""
+    caller = scope.get("state", {}).get(CALLER)
+    if caller is None or caller.key is None:
+        return {}
+    return {"key": caller.key} | ({"admin": True} if caller.owner.sees_all else {})
 
 
 class AnswerHead:
@@ -76,19 +131,3 @@ class AnswerHead:
             finally:
                 if "route" in asked:
                     scope["route"] = asked["route"]  # which the recorder reads
-
-
-class RefuseWork:
-    """While the service stops, what would give it work is answered 503 and may go elsewhere."""
-
-    def __init__(self, app: ASGIApp, stopping: Stopping) -> None:
-        self._app = app
-        self._stopping = stopping
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass the request on, or refuse it."""
-        if scope["type"] == "http" and self._stopping.begun and scope["method"] not in WORKLESS:
-            error = Busy("server", expected="a running server", got="one that stops", hint="ask the next one")
-            await answer_to(error, CLOSE)(scope, receive, send)
-            return
-        await self._app(scope, receive, send)

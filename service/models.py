@@ -315,7 +315,8 @@ class LiftResult(BaseModel):
     settings: dict[str, Any]
     encoder: str = Field(description="the 2D encoder that made the features, as their packs tell it")
     text_space: str = Field(description="the text space that the features share")
-    views: list[str] = Field(description="the views that were lifted")
+    views: list[str] = Field(description="the views that were lifted; very many are at links.views alone")
+    view_count: int = Field(description="how many these are")
     certificate: dict[str, Any]
     timings: dict[str, float] = Field(description="seconds a stage")
     created: float

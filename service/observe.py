@@ -15,12 +15,10 @@ import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
-from fastapi import FastAPI
 from prometheus_client import (
     CollectorRegistry,
     Counter,
@@ -33,8 +31,6 @@ from prometheus_client import (
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 from prometheus_client.metrics_core import Metric
 from prometheus_client.registry import Collector
-from starlette.datastructures import MutableHeaders
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from liftcore import __version__
 from service import models
@@ -265,14 +261,13 @@ class Metrics:
         ProcessCollector(registry=registry)
         registry.register(_Gauges(store, queries, streams))
 
-    def served(self, exchange: Exchange, route: str | None) -> None:
+    def served(self, method: str, route: str | None, status: int, *, seconds: float, received: int) -> None:
         """Count a request; its route is the template, None when no route takes the path."""
-        method = exchange.method if exchange.method in METHODS else OTHER
-        route = route or OTHER
-        self._requests.labels(method, route, str(exchange.status)).inc()
-        self._seconds.labels(method, route).observe(exchange.seconds)
-        if exchange.received:
-            self._received.labels(method, route).inc(exchange.received)
+        method, route = method if method in METHODS else OTHER, route or OTHER
+        self._requests.labels(method, route, str(status)).inc()
+        self._seconds.labels(method, route).observe(seconds)
+        if received:
+            self._received.labels(method, route).inc(received)
 
     def attempted(self, outcome: str, seconds: float) -> None:
         """Count an attempt at a job."""
@@ -317,109 +312,3 @@ class _Gauges(Collector):
         yield CounterMetricFamily(
             "splatlift_query_worker_restarts", "Query workers after the first.", value=self._queries.restarts
         )
-
-
-# The outermost layer
-
-PATH_CHARACTERS = 200  # of a path in the log
-# For browsers: nothing here is guessed at, framed or allowed to load anything; pages bring a policy of their own.
-SAFE_HEADERS = {
-    "X-Content-Type-Options": "nosniff",
-    "X-Frame-Options": "DENY",
-    "Referrer-Policy": "no-referrer",
-    "Content-Security-Policy": "default-src 'none'; frame-ancestors 'none'",
-}
-
-
-class RecordedApp(FastAPI):
-    """Records its requests outside of all else, so that answers to unforeseen errors are recorded too.
-
-    ``state.metrics`` must be there before the first request.
-    """
-
-    def build_middleware_stack(self) -> ASGIApp:
-        """The usual layers within the recorder."""
-        return Recorder(super().build_middleware_stack(), self.state.metrics)
-
-
-class Recorder:
-    """ASGI middleware: every answer gets its request's id and `SAFE_HEADERS`; log and counters hear of it."""
-
-    def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
-        self._app = app
-        self._metrics = metrics
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass the request on and watch."""
-        if scope["type"] != "http":
-            await self._app(scope, receive, send)
-            return
-        exchange = Exchange(scope["method"], chosen_id(scope["headers"]), receive, send)
-        with working_for(exchange.id):
-            try:
-                await self._app(scope, exchange.receive, exchange.send)
-            except Exception:
-                # The framework raises again what `service.problems` has answered and logged.
-                if not exchange.complete:
-                    raise
-            finally:
-                self._note(scope, exchange)
-
-    def _note(self, scope: Scope, exchange: Exchange) -> None:
-        route = getattr(scope.get("route"), "path", None)
-        exchange.seconds = time.monotonic() - exchange.begun
-        self._metrics.served(exchange, route)
-        fields = {
-            "method": exchange.method,
-            "route": route,
-            "path": scope["path"][:PATH_CHARACTERS],  # never the query: people put secrets there
-            "status": exchange.status,
-            "seconds": round(exchange.seconds, 6),
-            "received": exchange.received,
-            "sent": exchange.sent,
-            "client": (scope.get("client") or (None,))[0],
-        }
-        caller = scope.get("state", {}).get("caller")  # as `service.auth` leaves it
-        if caller is not None and caller.key is not None:
-            fields |= {"key": caller.key} | ({"admin": True} if caller.owner.sees_all else {})
-        if not exchange.complete:
-            fields["broken_off"] = True
-        access.info("%s %s %d", exchange.method, route or "(no route)", exchange.status, extra={"fields": fields})
-
-
-@dataclass
-class Exchange:
-    """A request and its answer, counted as they pass."""
-
-    method: str
-    id: str
-    _receive: Receive
-    _send: Send
-    status: int = 0  # while there is no answer
-    received: int = 0  # bytes of the body
-    sent: int = 0
-    complete: bool = False
-    seconds: float = 0.0
-
-    def __post_init__(self) -> None:
-        self.begun = time.monotonic()
-
-    async def receive(self) -> Message:
-        """Count what comes."""
-        message = await self._receive()
-        self.received += len(message.get("body", b""))
-        return message
-
-    async def send(self, message: Message) -> None:
-        """Count what goes."""
-        if message["type"] == "http.response.start":
-            self.status = message["status"]
-            message = {**message, "headers": list(message.get("headers", ()))}
-            headers = MutableHeaders(raw=message["headers"])
-            for name, value in SAFE_HEADERS.items():
-                headers.setdefault(name, value)
-            headers.append("X-Request-ID", self.id)
-        await self._send(message)
-        if message["type"] == "http.response.body":
-            self.sent += len(message.get("body", b""))
-            self.complete = not message.get("more_body", False)

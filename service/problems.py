@@ -70,6 +70,7 @@ TABLE: dict[type[SplatliftError], tuple[int, str]] = {
     errors.Busy: (503, BUSY),
     errors.NotReady: (503, "The server is not ready"),
     errors.TimedOut: (504, "The query took too long"),
+    errors.ClientLeft: (400, "The client left"),
     errors.Crashed: (500, "A process of the server died"),
 }
 
@@ -97,15 +98,9 @@ log = logging.getLogger(__name__)
 def problem_of(error: SplatliftError) -> Problem:
     """The error as a problem."""
     status, title = next(TABLE[cls] for cls in type(error).__mro__ if cls in TABLE)
+    told = {name: getattr(error, name) for name in ("argument", "expected", "got")}
     return Problem(
-        type=f"/problems/{error.kind}",
-        title=title,
-        status=status,
-        detail=str(error),
-        argument=error.argument,
-        expected=error.expected,
-        got=error.got,
-        hint=error.hint or None,
+        type=f"/problems/{error.kind}", title=title, status=status, detail=str(error), hint=error.hint or None, **told
     )
 
 
@@ -123,36 +118,52 @@ def answer(problem: Problem, headers: Mapping[str, str] | None = None) -> JSONRe
     return JSONResponse(told, problem.status, headers=headers, media_type=MEDIA_TYPE)
 
 
-def answer_to(error: SplatliftError, headers: Mapping[str, str] | None = None) -> JSONResponse:
-    """The error as a response, with the headers that belong to it, and more."""
-    own = error.headers if isinstance(error, errors.ServiceError) else {}
-    return answer(problem_of(error), {**own, **(headers or {})})
+def answer_to(error: SplatliftError) -> JSONResponse:
+    """The error as a response, with the headers that belong to it."""
+    return answer(problem_of(error), error.headers if isinstance(error, errors.ServiceError) else None)
 
 
 def install(app: FastAPI) -> None:
-    """Make every error of the application a problem. The handlers are async: a sync one would wait for a thread of
-    the pool, and a bad request behind every slow route."""
-    app.add_exception_handler(SplatliftError, _on_known)
-    app.add_exception_handler(RequestValidationError, _on_validation)
-    app.add_exception_handler(HTTPException, _on_framework)
-    app.add_exception_handler(ClientDisconnect, _on_disconnect)
-    app.add_exception_handler(OSError, _on_system)
-    app.add_exception_handler(sqlite3.Error, _on_system)
-    app.add_exception_handler(Exception, _on_unexpected)
+    """Make every error of the application a problem."""
+    for kind in (SplatliftError, RequestValidationError, HTTPException, ClientDisconnect, OSError, sqlite3.Error):
+        app.add_exception_handler(kind, _tell)
+    app.add_exception_handler(Exception, _tell)  # of the layers, too: the gate raises what it refuses
 
 
-async def _on_known(request: Request, error: Exception) -> JSONResponse:
-    assert isinstance(error, SplatliftError)
-    return answer_to(error)
+# Async: a sync handler would wait for a thread of the pool, and a bad request behind every slow route.
+async def _tell(request: Request, error: Exception) -> JSONResponse:
+    match error:
+        case SplatliftError():
+            return answer_to(error)
+        case RequestValidationError():
+            return answer_to(refusal(request, error))
+        case HTTPException():
+            return _of_framework(request, error)
+        case ClientDisconnect():  # nobody reads this; without it the log would tell of an error of ours
+            return answer(by_status(400, "The client left before the end of the body."))
+    return _of_system(f"{request.method} {request.url.path}", error)
 
 
-async def _on_validation(request: Request, error: Exception) -> JSONResponse:
-    assert isinstance(error, RequestValidationError)
-    return answer_to(refusal(request, error))
+def _of_system(what: str, error: Exception) -> JSONResponse:
+    """What is the operator's to mend, or ours. Details go to the log: they may name what is not the client's."""
+    code = getattr(error, "sqlite_errorcode", None)
+    if getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT) or code == sqlite3.SQLITE_FULL:
+        log.error("%s: the disk is full", what)
+        detail = "The server's disk is full; what was sent is not kept."
+        return answer(Problem(type="/problems/no-space", title=NO_SPACE, status=507, detail=detail))
+    if code is not None and code & 0xFF in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED):
+        log.error("%s: another process holds the database", what)
+        return answer_to(errors.Busy("database", expected="a turn at it", got="one that another process holds"))
+    if code is not None and code & 0xFF in UNUSABLE:
+        log.error("%s: the database cannot be used", what, exc_info=error)
+        got = "one that is damaged, gone, or on a disk that fails"
+        return answer_to(errors.NotReady("database", expected="the database that was opened", got=got))
+    log.error("%s failed", what, exc_info=error)
+    detail = "Something went wrong on our side; the server's log has the details."
+    return answer(Problem(type="/problems/internal", title="An error of the server", status=500, detail=detail))
 
 
-async def _on_framework(request: Request, error: Exception) -> JSONResponse:
-    assert isinstance(error, HTTPException)
+def _of_framework(request: Request, error: HTTPException) -> JSONResponse:
     method = request.method[:PATH_CHARACTERS]
     headers, told, detail = dict(error.headers or {}), {}, error.detail
     if error.status_code == HTTPStatus.METHOD_NOT_ALLOWED:
@@ -161,36 +172,6 @@ async def _on_framework(request: Request, error: Exception) -> JSONResponse:
         detail = f"expected {told['expected']}, got {method}"
     asked = f"{method} {request.url.path[:PATH_CHARACTERS]}"
     return answer(by_status(error.status_code, f"{asked}: {detail}", **told), headers)
-
-
-async def _on_disconnect(request: Request, error: Exception) -> JSONResponse:
-    # Nobody reads this; without it the log would tell of an error of ours.
-    return answer(by_status(400, "The client left before the end of the body."))
-
-
-async def _on_system(request: Request, error: Exception) -> JSONResponse:
-    """A full disk, and a database that others hold, are the operator's to mend, and no error of the program."""
-    code = getattr(error, "sqlite_errorcode", None)
-    if getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT) or code == sqlite3.SQLITE_FULL:
-        log.error("%s %s: the disk is full", request.method, request.url.path)
-        detail = "The server's disk is full; what was sent is not kept."
-        return answer(Problem(type="/problems/no-space", title=NO_SPACE, status=507, detail=detail))
-    if code is not None and code & 0xFF in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED):
-        log.error("%s %s: another process holds the database", request.method, request.url.path)
-        held = errors.Busy("database", expected="a turn to write", got="one that another process holds for long")
-        return answer_to(held)
-    if code is not None and code & 0xFF in UNUSABLE:
-        log.error("%s %s: the database cannot be used", request.method, request.url.path, exc_info=error)
-        got = "one that is damaged, gone, or on a disk that fails"
-        return answer_to(errors.NotReady("database", expected="the database that was opened", got=got))
-    return await _on_unexpected(request, error)
-
-
-async def _on_unexpected(request: Request, error: Exception) -> JSONResponse:
-    # The details go to the log: they may name files or values that are not the client's.
-    log.error("%s %s failed", request.method, request.url.path, exc_info=error)
-    detail = "Something went wrong on our side; the server's log has the details."
-    return answer(Problem(type="/problems/internal", title="An error of the server", status=500, detail=detail))
 
 
 def _methods_of(request: Request) -> list[str]:

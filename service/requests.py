@@ -1,11 +1,11 @@
-"""How requests are read: parameters that are known, and JSON bodies that are parsed beside the event loop."""
+"""How requests are read: parameters that are known, JSON bodies of a bounded size, parsed beside the event loop."""
 
 from __future__ import annotations
 
 import email.message
 import json
 from collections.abc import Iterator
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import anyio
 from fastapi import Depends, Request
@@ -18,6 +18,7 @@ from starlette.exceptions import HTTPException
 
 from service.errors import InvalidRequest
 from service.models import NAME_CHARACTERS, one_of
+from service.problems import CLOSE
 
 M = TypeVar("M", bound=BaseModel)
 SCHEMAS = "#/components/schemas/"
@@ -52,13 +53,26 @@ def _names(route: Dependant) -> Iterator[str]:
             yield field.alias
 
 
+async def _body(request: Request) -> bytes:
+    """The body of a request that has one to read, within its limit."""
+    body, limit = bytearray(), request.app.state.deps.settings.max_body_bytes
+    if request.method == "POST":
+        async for chunk in request.stream():
+            body += chunk
+            if len(body) > limit:
+                raise HTTPException(413, f"the body has more than {limit} bytes", CLOSE)
+    return bytes(body)
+
+
+BodyBytes = Annotated[bytes, Depends(_body)]
+
+
 def json_body(model: type[BaseModel]) -> Any:
     """A dependency that gives the body as a model. The framework would parse and validate it on the event loop, where
     a megabyte of odd JSON keeps everybody waiting; `described_body` says in OpenAPI what the framework would.
     """
 
-    async def parse(request: Request) -> BaseModel:
-        content = await request.body()
+    async def parse(request: Request, content: BodyBytes) -> BaseModel:
         media = request.headers.get("content-type")
         return await anyio.to_thread.run_sync(_parsed, model, content, media, limiter=request.app.state.deps.parsing)
 

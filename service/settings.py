@@ -31,6 +31,8 @@ class ServiceSettings(BaseSettings):
     key_bytes: int = Field(100 * GiB, ge=0, description="bytes of assets and results that a key may store")
     key_queued: int = Field(20, ge=0, description="jobs of a key that may wait in line; more are answered 429")
     key_uploads: int = Field(4, ge=0, description="uploads of a key at the same time; more are answered 429")
+    key_queries: int = Field(8, ge=1, description="queries of a key that may wait or run; more are answered 429")
+    key_streams: int = Field(8, ge=1, description="streams of events of a key at the same time; more get 429")
 
     log_format: Literal["json", "text"] = Field("json", description="of the log on stderr: json or text")
     commit: str | None = Field(None, description="the git commit that this was built from, for /version")

@@ -15,7 +15,7 @@ import anyio
 from fastapi import Depends, Request
 
 from liftcore.errors import SplatliftError
-from service.auth import CALLER
+from service.auth import CALLER, Caller
 from service.errors import NotReady
 from service.jobs.device import Devices
 from service.jobs.supervisor import Supervisor
@@ -27,9 +27,6 @@ from service.store.owners import Owner
 from service.store.store import Store
 from service.streams import EventStreams
 
-WRITING_THREADS = 8  # for uploads: a disk that is stalled stops them, and no other route
-PARSING_THREADS = 2  # for JSON bodies
-ORDERING_THREADS = 2  # for orders, which are compared with all names in their assets: these take memory
 PATIENCE_SECONDS = 2.0  # for all checks of readiness; a disk that takes longer is no disk to work with
 FRESH_SECONDS = 1.0  # a look counts for so long: however many ask, the disk is written once a second
 HURRY_SECONDS = 0.1  # between two looks at whether somebody is in a hurry
@@ -78,7 +75,7 @@ class Readiness:
             "supervisor": lambda: None if runner.alive() else "a thread of the supervisor has died",
             "queries": lambda: None if queries.revive() else "the query worker has died; a new one starts",
         }
-        self._turn: anyio.CapacityLimiter | None = None
+        self._turn = anyio.CapacityLimiter(1)
         self._looked = -FRESH_SECONDS
         self._looking_at = CHECKS[0]
         self._found: dict[str, str] = {}
@@ -97,8 +94,6 @@ class Readiness:
             raise NotReady(", ".join(found), expected="checks that pass", got=told)
 
     async def _look_in_time(self) -> dict[str, str]:
-        if self._turn is None:
-            self._turn = anyio.CapacityLimiter(1)
         with anyio.move_on_after(PATIENCE_SECONDS):
             # A look that hangs keeps its turn: those after it wait in vain, and no second thread hangs beside it.
             return await anyio.to_thread.run_sync(self._look, limiter=self._turn, abandon_on_cancel=True)
@@ -142,30 +137,31 @@ class AppState:
     settings: ServiceSettings
     version: Version
     store: Store
-    owner: Owner  # for whom a route works
+    caller: Caller
     runner: Supervisor
     devices: Devices
     queries: QueryClient
     streams: EventStreams
     metrics: Metrics
     readiness: Readiness
-    checks: anyio.CapacityLimiter  # uploads that are validated at the same time
+    checks: anyio.CapacityLimiter  # threads of their own, so that who waits for them keeps nobody else waiting
+    writing: anyio.CapacityLimiter
+    parsing: anyio.CapacityLimiter
+    ordering: anyio.CapacityLimiter
+    naming: anyio.CapacityLimiter
+    scrapes: anyio.CapacityLimiter
     ending: threading.Event = field(default_factory=threading.Event)  # set when what still runs must end
-    writing: anyio.CapacityLimiter = field(default_factory=lambda: anyio.CapacityLimiter(WRITING_THREADS))
-    parsing: anyio.CapacityLimiter = field(default_factory=lambda: anyio.CapacityLimiter(PARSING_THREADS))
-    ordering: anyio.CapacityLimiter = field(default_factory=lambda: anyio.CapacityLimiter(ORDERING_THREADS))
-    naming: anyio.CapacityLimiter = field(
-        default_factory=lambda: anyio.CapacityLimiter(1)
-    )  # pages of an asset's names, of which all are read for each
-    scrapes: anyio.CapacityLimiter = field(
-        default_factory=lambda: anyio.CapacityLimiter(1)
-    )  # those who read the metrics
+
+    @property
+    def owner(self) -> Owner:
+        """For whom a route works."""
+        return self.caller.owner
 
 
 # Async: a sync dependency waits for a thread of the pool, and every route with it.
 async def _deps(request: Request) -> AppState:
     deps: AppState = request.app.state.deps
-    return replace(deps, owner=request.scope["state"][CALLER].owner)
+    return replace(deps, caller=request.scope["state"][CALLER])
 
 
 Deps = Annotated[AppState, Depends(_deps)]

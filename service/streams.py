@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import AsyncIterator, Callable
 
 import anyio
@@ -10,7 +11,7 @@ from fastapi.sse import EventSourceResponse, format_sse_event
 from starlette.types import Receive, Scope, Send
 
 from liftcore.errors import NotFound
-from service.errors import Busy
+from service.errors import Busy, require_share
 from service.models import ENDED
 from service.store.jobs import Event, EventKind
 
@@ -23,33 +24,44 @@ Shape = Callable[[Event], str]  # the JSON of an event
 
 
 class EventStreams:
-    """All open streams. Used from the event loop only."""
+    """All open streams, of which a key has a share. Used from the event loop only.
 
-    def __init__(self, limit: int) -> None:
+    Args:
+        limit: how many there may be.
+        of_a_key: how many of these one key may have; never all of them.
+    """
+
+    def __init__(self, limit: int, of_a_key: int) -> None:
         self._limit = limit
+        self._share = max(1, min(of_a_key, limit - 1))
         self._closing = False
-        self._lookers: anyio.CapacityLimiter | None = None
-        self.open = 0
+        self._lookers = anyio.CapacityLimiter(LOOKERS)
+        self._open: Counter[str | None] = Counter()
+
+    @property
+    def open(self) -> int:
+        """How many there are."""
+        return self._open.total()
 
     def close(self) -> None:
         """Let every stream end soon: the server stops."""
         self._closing = True
 
-    def answer(self, look: Look, shape: Shape, after: int) -> EventSourceResponse:
+    def answer(self, look: Look, shape: Shape, after: int, key: str | None) -> EventSourceResponse:
         """The events after a number as they come, until the last state.
 
         Raises:
             Busy: as many streams are open as may be.
+            TooMany: the key has its share of them.
         """
         if self.open >= self._limit:
             raise Busy(
                 "events", expected=f"at most {self._limit} open streams", got="more", hint="GET the job instead"
             )
-        return _Stream(self, self._follow(look, shape, after))
+        require_share("events", self._open[key], None if key is None else self._share)
+        return _Stream(self._open, key, self._follow(look, shape, after))
 
     async def _follow(self, look: Look, shape: Shape, after: int) -> AsyncIterator[bytes]:
-        if self._lookers is None:
-            self._lookers = anyio.CapacityLimiter(LOOKERS)
         spoke = time.monotonic()
         while not self._closing:
             try:
@@ -75,13 +87,15 @@ def is_last(event: Event) -> bool:
 class _Stream(EventSourceResponse):
     """Counts as open while it is being sent, and lets go however that ends."""
 
-    def __init__(self, streams: EventStreams, events: AsyncIterator[bytes]) -> None:
+    def __init__(self, count: Counter[str | None], key: str | None, events: AsyncIterator[bytes]) -> None:
         super().__init__(events, headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"})
-        self._streams = streams
-        streams.open += 1
+        self._count, self._key = count, key
+        count[key] += 1
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         try:
             await super().__call__(scope, receive, send)
         finally:
-            self._streams.open -= 1
+            self._count[self._key] -= 1
+            if not self._count[self._key]:
+                del self._count[self._key]

@@ -1,4 +1,9 @@
-"""What the query process computes: answers, scores, masks, maps, renders and splats, over open scenes."""
+"""The query process: answers, scores, masks, maps, renders and splats over open scenes, as its server asks for them.
+
+Run as ``python -m service.queries.answers SCENES CACHE_BYTES ENCODER``. A line on stdin is a JSON list of requests:
+the first of them is answered by a message on stdout, the others wait behind it. It ends when stdin does. The compiled
+kernels and the encoder named are loaded beside the first requests, which wait for no more than they need.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +12,9 @@ import errno
 import hashlib
 import itertools
 import json
+import sys
 import threading
+import traceback
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict
@@ -29,8 +36,10 @@ from liftcore.query.text import RememberingEncoder, TextEncoder, open_encoder
 from liftcore.raster.cpu.warm_up import warm_up
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Kernel
+from service.child import fault_of, own_stdout
+from service.encoders import encoder_version
 from service.errors import NoSpace
-from service.queries.client import Frame
+from service.queries.client import Frame, write_frame
 
 TERMS = ("text", "like", "negatives", "unlike")  # in the order in which a query has them
 WARM_UP_TEXT = "something"
@@ -358,3 +367,35 @@ def _found(answer: Answer) -> dict[str, Any]:
     cut = {"method": answer.threshold_method, "explanation": answer.explanation}
     present = answer.clear and answer.count > 0
     return {"threshold": {"value": finite(answer.threshold), **cut}, "count": answer.count, "present": present}
+
+
+def reply_to(requests: list[dict[str, Any]], answers: Answers) -> Frame:
+    """The answer to the first request, or the error as a header; the others are those that come next."""
+    try:
+        return answers.reply(requests[0], requests[1:])
+    except SplatliftError as error:
+        return Frame({"fault": fault_of(error, requests[0]["names"])})
+    except Exception:
+        traceback.print_exc()
+        return Frame({"crash": True})
+
+
+def _warm_up(answers: Answers, encoder: str) -> None:
+    try:
+        answers.warm_up(encoder, encoder_version(encoder))
+    except Exception:  # whoever asks will meet it again, and is told
+        traceback.print_exc()
+
+
+def main() -> None:
+    """Answer until stdin ends."""
+    out = own_stdout()
+    use_one_library_thread()
+    answers = Answers(scenes=int(sys.argv[1]), cache_bytes=int(sys.argv[2]))
+    threading.Thread(target=_warm_up, args=(answers, sys.argv[3]), daemon=True).start()
+    for line in sys.stdin.buffer:
+        write_frame(out, reply_to(json.loads(line), answers))
+
+
+if __name__ == "__main__":
+    main()

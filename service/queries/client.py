@@ -1,8 +1,9 @@
-"""The HTTP process's side of the query worker: a short line of calls, asked together, that outlive the worker."""
+"""The HTTP process's side of the query worker: turns at one process that keys share fairly, and that outlive it."""
 
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import logging
 import os
@@ -10,16 +11,17 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import IO, Any
 
 from liftcore.errors import SplatliftError
 from service.child import error_of
-from service.errors import Busy, Crashed, TimedOut
+from service.errors import Busy, ClientLeft, Crashed, TimedOut, require_share
 
 # Without these each array of a query is mapped anew and its pages are faulted in one by one: a fifth of its time.
 MEMORY = {"MALLOC_MMAP_THRESHOLD_": str(64 << 20), "MALLOC_TRIM_THRESHOLD_": str(256 << 20)}
+AHEAD_BYTES = 1 << 20  # of requests that are sent along with the one before them
 
 log = logging.getLogger(__name__)
 
@@ -34,7 +36,7 @@ class Frame:
 
 
 def write_frame(out: IO[bytes], frame: Frame) -> None:
-    """Send one message."""
+    """Send one message, as the worker does; it gets requests as a line of JSON, a list."""
     line = json.dumps({"bytes": len(frame.body), "header": frame.header}, allow_nan=False)
     out.write(line.encode() + b"\n")
     out.write(frame.body)
@@ -60,52 +62,59 @@ class QueryLimits:
     scenes: int  # lifts kept open
     cache_bytes: int  # of answers and views kept
     encoder: str  # specification of the text encoder that is loaded before it is asked for
+    of_a_key: int | None = None  # calls of one key that wait or run; never so many that it has all places
+
+
+@dataclass(eq=False)
+class Asker:
+    """Who asks, and whether they still wait for the answer."""
+
+    key: str = ""  # the id of a key; empty while there are none: then all share one line
+    left: bool = False
 
 
 @dataclass(eq=False)
 class _Call:
-    """A request in the line, and what became of it."""
+    """A request in the line."""
 
-    request: dict[str, Any]
+    line: bytes  # the request as JSON
+    asker: Asker
     deadline: float  # of time.monotonic
-    reply: Frame | SplatliftError | None = None
 
 
 class QueryClient:
     """A process that answers queries, and the line in front of it; any thread may call any method.
 
-    A thread of its own speaks with the process: calls that wait while others are answered are asked together, so that
-    questions to one lift share a pass over its features.
+    Callers take turns at the process, each key in its turn and within a key the oldest first. What waits is sent
+    along with each call, so that questions to one lift share a pass over its features. Who leaves the line before its
+    turn is not answered.
     """
 
     def __init__(self, limits: QueryLimits) -> None:
         self._limits = limits
         self._bell = threading.Condition()  # guards all below but the process; rings when any of it changes
         self._line: list[_Call] = []
-        self._places = limits.waiting
-        self._wanted = True  # a process that nobody calls
+        self._busy_with: object | None = None  # the call that speaks with the process, or whoever revives it
+        self._turns: dict[str, int] = {}  # key -> the number of its last turn
         self._stopped = False
-        self._process: subprocess.Popen[bytes] | None = None  # of the speaker, but for a look and a kill
-        self._speaker = threading.Thread(target=self._speak, name="queries", daemon=True)
+        self._process: subprocess.Popen[bytes] | None = None  # of whose turn it is, but for a look and a kill
         self._told: Callable[[str, str, float], None] | None = None
         self._spawned = 0
 
     def start(self) -> None:
         """Start the process, so that the first query finds it warm."""
-        self._speaker.start()
-        with self._bell:
-            self._bell.wait_for(lambda: not self._wanted)
+        self.revive()
 
     def stop(self) -> None:
-        """End the process, and with it a query that still runs."""
+        """End the process, and with it a query that still runs; those that wait are told to ask elsewhere."""
         with self._bell:
             self._stopped = True
             self._bell.notify_all()
-        process = self._process
-        if process is not None:
-            process.kill()
-        if self._speaker.ident is not None:
-            self._speaker.join()
+            process = self._process
+            if process is not None:
+                process.kill()
+            self._bell.wait_for(lambda: self._busy_with is None and not self._line)
+        self._bury()
 
     def tell(self, told: Callable[[str, str, float], None]) -> None:
         """Call this after each call, with its operation, what came of it and the seconds that it took."""
@@ -116,6 +125,11 @@ class QueryClient:
         """Processes after the first."""
         return max(0, self._spawned - 1)
 
+    @property
+    def waiting(self) -> int:
+        """Calls that wait for their turn."""
+        return len(self._line)
+
     def alive(self) -> bool:
         """Whether the process lives."""
         process = self._process
@@ -123,25 +137,53 @@ class QueryClient:
 
     def revive(self) -> bool:
         """Whether the process lives; when it does not, a new one starts."""
-        if not self.alive():
-            with self._bell:
-                self._wanted = True
-                self._bell.notify_all()
-            return False
-        return True
+        if self.alive():
+            return True
+        with self._bell:
+            if self._busy_with is not None or self._stopped:
+                return False  # whoever speaks with it will see
+            self._busy_with = self
+        try:
+            self._spawn()
+        except OSError:  # a machine without room for a process; whoever asks next tries again
+            log.exception("the query worker could not be started")
+        finally:
+            self._end_turn()
+        return False
 
-    def call(self, request: dict[str, Any]) -> Frame:
+    def leave(self, asker: Asker) -> None:
+        """Say that nobody waits for the answers of this one any more. Never waits."""
+        asker.left = True
+        with self._bell:
+            self._bell.notify_all()
+
+    def call(self, request: dict[str, Any], asker: Asker | None = None) -> Frame:
         """Ask the worker.
+
+        Args:
+            request: what is asked, as JSON takes it.
+            asker: for whom.
 
         Raises:
             SplatliftError: the worker's own error, as if raised here.
             Busy: too many calls are waiting, this one had no turn in its time, or the server stops.
+            TooMany: too many of them are of this key.
             TimedOut: the answer took too long.
+            ClientLeft: nobody waits for it.
             Crashed: the worker died twice over this call, or failed with an error that is ours.
         """
         begun, outcome = time.monotonic(), "crashed"
+        call = _Call(json.dumps(request, allow_nan=False).encode(), asker or Asker(), begun + self._limits.seconds)
         try:
-            reply = self._reply_to(request)
+            ahead = self._wait_for_turn(call)
+            try:
+                reply = self._ask(call, ahead)
+            finally:
+                self._end_turn()
+            if "fault" in reply.header:
+                raise error_of(reply.header["fault"])
+            if "crash" in reply.header:
+                raise Crashed("query", expected="an answer", got="an error of the server")
             outcome = "answered"
         except SplatliftError as error:
             outcome = error.kind
@@ -151,112 +193,91 @@ class QueryClient:
                 self._told(request["operation"], outcome, time.monotonic() - begun)
         return reply
 
-    def _reply_to(self, request: dict[str, Any]) -> Frame:
-        call = _Call(request, time.monotonic() + self._limits.seconds)
+    def _wait_for_turn(self, call: _Call) -> list[bytes]:
+        """Wait until nobody is to be asked before this call; what waits behind it."""
         with self._bell:
-            if self._stopped:
-                raise _stops()
-            if self._places == 0:
-                raise self._busy()
-            self._places -= 1
+            self._require_place(call.asker.key)
             self._line.append(call)
-            self._bell.notify_all()
             try:
-                if not self._bell.wait_for(lambda: call.reply is not None, self._limits.seconds):
-                    if call in self._line:
-                        self._line.remove(call)
-                        raise self._busy()
-                    self._bell.wait_for(lambda: call.reply is not None)  # it is asked, and its deadline is kept
+                self._bell.wait_for(lambda: self._stopped or call.asker.left or self._next() is call, _left(call))
+                came = not self._stopped and self._next() is call
             finally:
-                self._places += 1
-        reply = call.reply
-        if isinstance(reply, SplatliftError):
-            raise reply
-        assert reply is not None
-        if "fault" in reply.header:
-            raise error_of(reply.header["fault"])
-        if "crash" in reply.header:
-            raise Crashed("query", expected="an answer", got="an error of the server")
-        return reply
+                self._line.remove(call)
+                self._bell.notify_all()
+            if self._stopped:
+                raise Busy("query", expected="a running server", got="one that stops", hint="ask the next one")
+            if call.asker.left:
+                raise ClientLeft("query", expected="a client that waits for its turn", got="one that left")
+            if not came:
+                raise self._busy()
+            self._busy_with = call
+            self._turns[call.asker.key] = 1 + max(self._turns.values(), default=0)
+            return [other.line for other in self._line if not other.asker.left]
+
+    def _end_turn(self) -> None:
+        with self._bell:
+            self._busy_with = None
+            self._bell.notify_all()
+
+    def _next(self) -> _Call | None:
+        """Whose turn it is: the oldest call of the key that had its last turn before all others."""
+        if self._busy_with is not None:
+            return None
+        waiting = (call for call in self._line if not call.asker.left)
+        return min(waiting, key=lambda call: self._turns.get(call.asker.key, 0), default=None)
+
+    def _require_place(self, key: str) -> None:
+        speaking = self._busy_with if isinstance(self._busy_with, _Call) else None
+        taken = [*self._line, *([] if speaking is None else [speaking])]
+        if self._stopped or len(taken) >= self._limits.waiting:
+            raise self._busy()
+        most = self._limits.of_a_key
+        if key and most is not None:  # with one place in all there are no shares
+            most = max(1, min(most, self._limits.waiting - 1))
+            require_share("query", sum(call.asker.key == key for call in taken), most)
 
     def _busy(self) -> Busy:
         line = f"at most {self._limits.waiting} waiting queries"
         return Busy("query", expected=line, got="more", hint="try again soon")
 
-    def _speak(self) -> None:
-        """What the thread does until the stop: all that wait, then those that came meanwhile, and so on."""
-        while True:
-            with self._bell:
-                self._bell.wait_for(lambda: self._line or self._wanted or self._stopped)
-                calls, self._line = self._line, []
-                if self._stopped:
-                    break
-            try:
-                if not self.alive():
-                    self._spawn()
-                self._answer(calls)
-            except Exception:  # the thread must outlive a machine without room for a process
-                log.exception("the query worker could not be asked")
-            finally:
-                got = "a query process that died twice over it"
-                self._settle(calls, Crashed("query", expected="an answer", got=got))
-                with self._bell:
-                    self._wanted = False
-                    self._bell.notify_all()
-        self._settle(calls, _stops())
-        self._bury()
-
-    def _answer(self, calls: list[_Call]) -> None:
-        """Answer all of them together. When the process dies over that, those without an answer go one by one."""
-        self._exchange(calls)
-        for call in calls:
-            if call.reply is None and not self._stopped:
-                # It may have died while idle, so the first silence is no call's fault.
-                log.error("the query worker died; a new one starts")
+    def _ask(self, call: _Call, ahead: list[bytes]) -> Frame:
+        """Ask the process; when it dies over that, a new one."""
+        for _ in range(2):  # it may have died while idle, so the first silence is no call's fault
+            if not self.alive():
                 self._spawn()
-                self._exchange([call])
+            reply = self._exchange(call, ahead)
+            if reply is not None:
+                return reply
+            if self._stopped:
+                raise Busy("query", expected="a running server", got="one that stops", hint="ask the next one")
+            log.error("the query worker died; a new one starts")
+            self._spawn()
+            ahead = []
+        raise Crashed("query", expected="an answer", got="a query process that died twice over it")
 
-    def _exchange(self, calls: Sequence[_Call]) -> None:
-        """Ask the process; a call without a reply is one over which it died, or one behind a call that took too long.
+    def _exchange(self, call: _Call, ahead: list[bytes]) -> Frame | None:
+        """What the process says, None when it dies.
 
-        Calls come in the order of their deadlines, so whoever waits for one has time left for those behind it.
+        Raises:
+            TimedOut: it takes too long; a new one starts.
         """
-        late = [call for call in calls if call.deadline <= time.monotonic()]
-        self._settle(late, self._late())
-        calls = [call for call in calls if call.reply is None]
         process = self._process
-        if not calls or process is None:
-            return
-        assert process.stdin is not None and process.stdout is not None
-        unsent: Frame | None = Frame({"requests": [call.request for call in calls]})
-        for call in calls:
-            reply = None
-            with _ended_at(call.deadline, process) as expired, contextlib.suppress(BrokenPipeError):
-                if unsent is not None:
-                    write_frame(process.stdin, unsent)  # a process that is stopped does not read it
-                    unsent = None
-                reply = read_frame(process.stdout)
-            if expired.is_set():
-                self._bury()
-                self._settle([call], self._late())
-                return
-            if reply is None:
-                return
-            self._settle([call], reply)
-
-    def _late(self) -> TimedOut:
-        return TimedOut("query", expected=f"an answer within {self._limits.seconds:g} s", got="none yet")
-
-    def _settle(self, calls: Sequence[_Call], reply: Frame | SplatliftError) -> None:
-        """Give this reply to those that have none."""
-        with self._bell:
-            for call in calls:
-                call.reply = call.reply or reply
-            self._bell.notify_all()
+        assert process is not None and process.stdin is not None and process.stdout is not None
+        room = itertools.accumulate(map(len, ahead))
+        sent = [call.line, *(line for line, size in zip(ahead, room, strict=True) if size <= AHEAD_BYTES)]
+        reply = None
+        with _ended_at(call.deadline, process) as expired, contextlib.suppress(BrokenPipeError):
+            process.stdin.write(b"[" + b", ".join(sent) + b"]\n")  # a process that is stopped does not read it
+            process.stdin.flush()
+            reply = read_frame(process.stdout)
+        if not expired.is_set():
+            return reply
+        self._spawn()
+        raise TimedOut("query", expected=f"an answer within {self._limits.seconds:g} s", got="none yet")
 
     def _spawn(self) -> None:
         self._bury()
-        command = [sys.executable, "-m", "service.queries.worker"]
+        command = [sys.executable, "-m", "service.queries.answers"]
         command += [str(self._limits.scenes), str(self._limits.cache_bytes), self._limits.encoder]
         self._spawned += 1
         self._process = subprocess.Popen(
@@ -281,8 +302,8 @@ class QueryClient:
                 pipe.close()
 
 
-def _stops() -> Busy:
-    return Busy("query", expected="a running server", got="one that stops", hint="ask the next one")
+def _left(call: _Call) -> float:
+    return max(0.0, call.deadline - time.monotonic())
 
 
 @contextlib.contextmanager

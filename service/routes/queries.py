@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 import json
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 from urllib.parse import urlencode
 
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import APIRouter, Depends, Query, Request, Response
 
 from liftcore import __version__
 from service import models
-from service.content import TAGGED, Draft, tagged, unchanged
+from service.content import TAGGED, Draft, kept, unchanged
 from service.encoders import encoder_file, encoder_label, encoder_spec, encoder_version
 from service.errors import InvalidRequest
-from service.requests import described_body, json_body
+from service.queries.client import Asker, Frame
+from service.requests import BodyBytes, described_body, json_body
 from service.state import AppState, Deps
 from service.store.assets import kernel_of
 from service.store.lifts import LiftRecord
@@ -25,6 +28,7 @@ router = APIRouter(tags=["queries"])
 Question = models.Asked | models.AskedInBody
 QUERY_BODY = json_body(models.AskedInBody)
 BODY = described_body(models.AskedInBody)
+ROW_BYTES = 32  # of a splat in the .splat format
 REGION = "region:"  # what needs the lift's feature packs begins with it
 MEDIA_TYPES = {"scores": "application/x-npy", "mask": "image/png", "attention": "image/png", "render": "image/png"}
 MEDIA_TYPES["layer"] = MEDIA_TYPES["scores"]  # both are arrays
@@ -43,89 +47,101 @@ LiftParameter = Annotated[
 View = Annotated[str, Query(min_length=1, max_length=models.VIEW_CHARACTERS, description="the name of a camera")]
 
 
+# The body is read before this listens, as both listen to the client.
+async def _asking(request: Request, deps: Deps, body: BodyBytes) -> AsyncIterator[Callable[[dict[str, Any]], Frame]]:
+    """Ask the query process for this caller, who may leave: a query that waits then is not answered."""
+    asker = Asker(deps.caller.key or "")
+
+    async def listen() -> None:
+        while (await request.receive())["type"] != "http.disconnect":
+            pass
+        deps.queries.leave(asker)
+
+    listening = asyncio.create_task(listen())
+    try:
+        yield lambda wanted: deps.queries.call(wanted, asker)
+    finally:
+        listening.cancel()
+
+
+Ask = Annotated[Callable[[dict[str, Any]], Frame], Depends(_asking, scope="function")]
+
+
 @router.get("/query", response_model=models.QueryAnswer)
-def query(asked: Annotated[models.AskedWhere, Query()], deps: Deps) -> models.QueryAnswer:
+def query(asked: Annotated[models.AskedWhere, Query()], deps: Deps, ask: Ask) -> models.QueryAnswer:
     """Where it is: scores in numbers, the best splats, a box, and links to objects, splats and pictures."""
-    return _answer(asked, deps)
+    return _answer(asked, deps, ask)
 
 
 @router.post("/query", response_model=models.QueryAnswer, openapi_extra=BODY)
-def query_by_body(deps: Deps, asked: models.AskedInBody = QUERY_BODY) -> models.QueryAnswer:
+def query_by_body(deps: Deps, ask: Ask, asked: models.AskedInBody = QUERY_BODY) -> models.QueryAnswer:
     """The same for a query in a body, where examples may be vectors. POST the same body to the links of those."""
-    return _answer(asked, deps)
+    return _answer(asked, deps, ask)
 
 
 @router.get("/query/objects", response_model=models.ObjectsAnswer)
-def objects(asked: Annotated[models.Asked, Query()], deps: Deps) -> models.ObjectsAnswer:
+def objects(asked: Annotated[models.Asked, Query()], deps: Deps, ask: Ask) -> models.ObjectsAnswer:
     """The things that were found, splats that touch one another: where each lies, and how large it is."""
-    return _objects(asked, deps)
+    return _objects(asked, deps, ask)
 
 
 @router.post("/query/objects", response_model=models.ObjectsAnswer, openapi_extra=BODY)
-def objects_by_body(deps: Deps, asked: models.AskedInBody = QUERY_BODY) -> models.ObjectsAnswer:
+def objects_by_body(deps: Deps, ask: Ask, asked: models.AskedInBody = QUERY_BODY) -> models.ObjectsAnswer:
     """The things that were found, for a query in a body."""
-    return _objects(asked, deps)
+    return _objects(asked, deps, ask)
 
 
 @router.get("/query/scores", responses=NPY | TAGGED, response_class=Response)
-def scores(asked: Annotated[models.Asked, Query()], request: Request, deps: Deps) -> Response:
+def scores(asked: Annotated[models.Asked, Query()], request: Request, deps: Deps, ask: Ask) -> Response:
     """The score of every splat: .npy, float32 [P]."""
-    lift = _find_lift(asked.lift, deps)
-    return entity(request, deps, query_request("scores", asked, lift, deps), lift)
+    return _entity("scores", asked, request, deps, ask)
 
 
 @router.get("/query/mask", responses=PNG | TAGGED, response_class=Response)
-def mask(asked: Annotated[models.AskedInView, Query()], request: Request, deps: Deps) -> Response:
+def mask(asked: Annotated[models.AskedInView, Query()], request: Request, deps: Deps, ask: Ask) -> Response:
     """Where it is in a view: a PNG, white where it is."""
-    lift = _find_lift(asked.lift, deps)
-    return entity(request, deps, query_request("mask", asked, lift, deps) | {"view": asked.view}, lift)
+    return _entity("mask", asked, request, deps, ask, view=asked.view)
 
 
 @router.get("/query/attention", responses=PNG | TAGGED, response_class=Response)
-def attention(asked: Annotated[models.AskedInView, Query()], request: Request, deps: Deps) -> Response:
+def attention(asked: Annotated[models.AskedInView, Query()], request: Request, deps: Deps, ask: Ask) -> Response:
     """How well each pixel of a view answers to it: a PNG."""
-    lift = _find_lift(asked.lift, deps)
-    return entity(request, deps, query_request("attention", asked, lift, deps) | {"view": asked.view}, lift)
+    return _entity("attention", asked, request, deps, ask, view=asked.view)
 
 
 @router.get("/query/splats", responses=PLY | TAGGED, response_class=Response)
-def splats(asked: Annotated[models.AskedForSplats, Query()], request: Request, deps: Deps) -> Response:
+def splats(asked: Annotated[models.AskedForSplats, Query()], request: Request, deps: Deps, ask: Ask) -> Response:
     """What was found, or the scene in the colours of its scores, as splats: a PLY of the dialect that was lifted."""
-    lift = _find_lift(asked.lift, deps)
-    wanted = query_request("splats", asked, lift, deps) | {"what": asked.what}
-    etag = entity_tag(wanted, lift)
-    return unchanged(request, etag, found=False) or _splat_file(deps, wanted, lift, etag)
+    return _entity("splats", asked, request, deps, ask, what=asked.what)
 
 
 @router.post("/query/scores", responses=NPY, response_class=Response, openapi_extra=BODY)
-def scores_by_body(deps: Deps, asked: models.AskedInBody = QUERY_BODY) -> Response:
+def scores_by_body(deps: Deps, ask: Ask, asked: models.AskedInBody = QUERY_BODY) -> Response:
     """The score of every splat, for a query in a body."""
-    return _content(deps, query_request("scores", asked, _find_lift(asked.lift, deps), deps))
+    return _content("scores", asked, deps, ask)
 
 
 @router.post("/query/mask", responses=PNG, response_class=Response, openapi_extra=BODY)
-def mask_by_body(deps: Deps, asked: models.AskedInBody = QUERY_BODY) -> Response:
+def mask_by_body(deps: Deps, ask: Ask, asked: models.AskedInBody = QUERY_BODY) -> Response:
     """Where it is in a view, for a query in a body with a view."""
-    lift = _find_lift(asked.lift, deps)
-    return _content(deps, query_request("mask", asked, lift, deps) | {"view": _view(asked)})
+    return _content("mask", asked, deps, ask, view=_view(asked))
 
 
 @router.post("/query/attention", responses=PNG, response_class=Response, openapi_extra=BODY)
-def attention_by_body(deps: Deps, asked: models.AskedInBody = QUERY_BODY) -> Response:
+def attention_by_body(deps: Deps, ask: Ask, asked: models.AskedInBody = QUERY_BODY) -> Response:
     """How well each pixel of a view answers to it, for a query in a body with a view."""
-    lift = _find_lift(asked.lift, deps)
-    return _content(deps, query_request("attention", asked, lift, deps) | {"view": _view(asked)})
+    return _content("attention", asked, deps, ask, view=_view(asked))
 
 
 @router.post("/query/splats", responses=PLY, response_class=Response, openapi_extra=BODY)
 def splats_by_body(
     deps: Deps,
+    ask: Ask,
     asked: models.AskedInBody = QUERY_BODY,
     what: Annotated[models.SplatsOf, Query(description=models.SPLATS_OF)] = "object",
 ) -> Response:
     """What was found, or the scene in the colours of its scores, as splats, for a query in a body."""
-    lift = _find_lift(asked.lift, deps)
-    return _splat_file(deps, query_request("splats", asked, lift, deps) | {"what": what}, lift)
+    return _content("splats", asked, deps, ask, what=what)
 
 
 @router.get("/render", responses=PNG | TAGGED, response_class=Response)
@@ -133,6 +149,7 @@ def render(
     view: View,
     request: Request,
     deps: Deps,
+    ask: Ask,
     lift: LiftParameter = None,
     what: Annotated[
         Literal["rgb", "depth", "pca", "cluster"],
@@ -145,14 +162,15 @@ def render(
     1, in scene units, with even steps between; what lies beyond has these levels too. 0 is where no splat is.
     """
     found = _find_lift(lift, deps)
-    return entity(request, deps, scene_request("render", found, deps) | {"view": view, "what": what}, found)
+    wanted = scene_request("render", found, deps) | {"view": view, "what": what}
+    return tagged_answer(request, deps, wanted, found, ask)
 
 
-def _answer(asked: models.AskedWhere | models.AskedInBody, deps: AppState) -> models.QueryAnswer:
+def _answer(asked: models.AskedWhere | models.AskedInBody, deps: AppState, ask: Ask) -> models.QueryAnswer:
     lift = _find_lift(asked.lift, deps)
     request = query_request("query", asked, lift, deps) | {"view": asked.view, "top": asked.top}
-    found = deps.queries.call(request).header
-    view = asked.view or next(iter(lift.metadata["views"]), None)
+    found = ask(request).header
+    view = asked.view or lift.first_view
     return models.QueryAnswer(
         text=asked.text,
         like=[_shown(example) for example in asked.like],
@@ -165,10 +183,9 @@ def _answer(asked: models.AskedWhere | models.AskedInBody, deps: AppState) -> mo
     )
 
 
-def _objects(asked: models.Asked | models.AskedInBody, deps: AppState) -> models.ObjectsAnswer:
+def _objects(asked: Question, deps: AppState, ask: Ask) -> models.ObjectsAnswer:
     lift = _find_lift(asked.lift, deps)
-    found = deps.queries.call(query_request("objects", asked, lift, deps)).header
-    return models.ObjectsAnswer(lift=lift.id, **found)
+    return models.ObjectsAnswer(lift=lift.id, **ask(query_request("objects", asked, lift, deps)).header)
 
 
 def _view(asked: models.AskedInBody) -> str:
@@ -179,31 +196,45 @@ def _view(asked: models.AskedInBody) -> str:
     return asked.view
 
 
-def entity(request: Request, deps: AppState, asked: dict[str, Any], lift: LiftRecord) -> Response:
-    etag = entity_tag(asked, lift)
-    same = unchanged(request, etag, found=False)  # the tag is made before anybody looks for the view
+def _entity(operation: str, asked: Question, request: Request, deps: AppState, ask: Ask, **more: str) -> Response:
+    """What a GET names, with its tag."""
+    lift = _find_lift(asked.lift, deps)
+    return tagged_answer(request, deps, query_request(operation, asked, lift, deps) | more, lift, ask)
+
+
+def _content(operation: str, asked: Question, deps: AppState, ask: Ask, **more: str) -> Response:
+    """What a POST asks for, which has no address and so no tag."""
+    lift = _find_lift(asked.lift, deps)
+    return _made(deps, query_request(operation, asked, lift, deps) | more, lift, ask, {})
+
+
+def tagged_answer(request: Request, deps: AppState, wanted: dict[str, Any], lift: LiftRecord, ask: Ask) -> Response:
+    """304 when the client has it already, and nothing is asked; else it. The tag is made of all that decides it."""
+    decides = {name: value for name, value in wanted.items() if name != "names"}
+    decides |= {"lift": lift.sha256, "version": __version__}
+    etag = f'"{hashlib.sha256(json.dumps(decides, sort_keys=True).encode()).hexdigest()}"'
+    same = unchanged(request, etag, found=False)  # nobody has looked whether the view is there
     if same is not None:
         return same
-    content = deps.queries.call(asked).body
-    return unchanged(request, etag) or tagged(content, MEDIA_TYPES[asked["operation"]], etag)
+    made = _made(deps, wanted, lift, ask, kept(etag))
+    return (None if isinstance(made, Draft) else unchanged(request, etag)) or made
 
 
-def _splat_file(deps: AppState, asked: dict[str, Any], lift: LiftRecord, etag: str | None = None) -> Response:
-    size = deps.store.assets.get(deps.owner, lift.splats).bytes
-    return drafted(deps, asked, size, f"{asked['what']}-{lift.id}.ply", etag)
-
-
-def drafted(deps: AppState, asked: dict[str, Any], size: int, name: str, etag: str | None) -> Response:
-    """A file of at most ``size`` bytes: the query process writes a draft, as it is more than a pipe should carry."""
+def _made(deps: AppState, wanted: dict[str, Any], lift: LiftRecord, ask: Ask, headers: dict[str, str]) -> Response:
+    """The answer itself. Splats are too much for a pipe, so the query process writes them to a draft."""
+    match wanted["operation"]:
+        case "splats":
+            name = f"{wanted['what']}-{lift.id}.ply"
+            size = deps.store.assets.get(deps.owner, lift.splats, most=0).bytes
+        case "scene":
+            name, size = f"scene-{lift.id}.splat", ROW_BYTES * lift.count
+        case operation:
+            return Response(ask(wanted).body, media_type=MEDIA_TYPES[operation], headers=headers)
     files = deps.store.files
     files.require_room(size)
     with files.draft(Path(name).suffix) as draft:
-        deps.queries.call(asked | {"draft": str(draft)})
-        return Draft(draft, filename=name, etag=etag)
-
-
-def _content(deps: AppState, asked: dict[str, Any]) -> Response:
-    return Response(deps.queries.call(asked).body, media_type=MEDIA_TYPES[asked["operation"]])
+        ask(wanted | {"draft": str(draft)})
+        return Draft(draft, filename=name, headers=headers)
 
 
 def _find_lift(lift: str | None, deps: AppState) -> LiftRecord:
@@ -214,7 +245,7 @@ def _find_lift(lift: str | None, deps: AppState) -> LiftRecord:
 def scene_request(operation: str, lift: LiftRecord, deps: AppState) -> dict[str, Any]:
     """What the query process must know of a lift's files; ``names`` says what the client calls them."""
     job = deps.store.jobs.get(deps.owner, lift.id)
-    splats, cameras = deps.store.assets.get(deps.owner, job.splats), deps.store.assets.get(deps.owner, job.cameras)
+    splats, cameras = (deps.store.assets.get(deps.owner, asset, most=0) for asset in (job.splats, job.cameras))
     return {
         "operation": operation,
         "lift": str(lift.path),
@@ -238,9 +269,7 @@ def query_request(operation: str, asked: Question, lift: LiftRecord, deps: AppSt
         file = encoder_file(spec)
         request["names"] |= {} if file is None else {str(file): "the encoder's file"}
     if any(isinstance(example, str) and example.startswith(REGION) for example in (*asked.like, *asked.unlike)):
-        packs = [
-            deps.store.assets.get(deps.owner, asset) for asset in deps.store.jobs.get(deps.owner, lift.id).features
-        ]
+        packs = [deps.store.assets.get(deps.owner, asset, most=0) for asset in lift.features]
         request["features"] = [str(pack.path) for pack in packs]
         request["names"] |= {str(pack.path): f"features {pack.id}" for pack in packs}
     terms = ("text", "negatives", "like", "unlike", "threshold", "instances", "keep")
@@ -249,14 +278,6 @@ def query_request(operation: str, asked: Question, lift: LiftRecord, deps: AppSt
         "encoder_version": None if spec is None else encoder_version(spec),
         "query": {name: getattr(asked, name) for name in terms},
     }
-
-
-def entity_tag(asked: dict[str, Any], lift: LiftRecord) -> str:
-    """The tag of an answer, from all that decides it: so 304 costs no query."""
-    decides = {name: value for name, value in asked.items() if name != "names"}
-    decides["lift"] = lift.sha256
-    decides["version"] = __version__
-    return f'"{hashlib.sha256(json.dumps(decides, sort_keys=True).encode()).hexdigest()}"'
 
 
 def _answer_links(asked: Question, lift: LiftRecord, view: str | None, *, found: bool) -> dict[str, str]:

@@ -60,13 +60,15 @@ class CheckedUpload:
     warnings: list[str]
 
 
-# What several owners have is one file and one row; each has it since its own upload.
-VISIBLE = (
-    "SELECT id, kind, bytes, file, counts, warnings, min(created) AS created"
-    f" FROM assets JOIN asset_owners ON asset = id WHERE {SEEN}"
+# What several owners have is one file and one row; each has it since its own upload. Only small columns are grouped:
+# SQLite copies whatever else a grouped statement names, and counts may be 49 MB.
+IN_BRIEF = (
+    "SELECT id, kind, bytes, file, brief AS counts, warnings, created FROM (SELECT asset, min(created) AS created"
+    f" FROM asset_owners WHERE {SEEN} GROUP BY asset) JOIN assets ON asset = id"
 )
-IN_BRIEF = VISIBLE.replace("counts", "brief AS counts")
-SHOWN = VISIBLE.replace("counts", "CASE WHEN counts_bytes <= :most THEN counts ELSE brief END AS counts")
+SHOWN = IN_BRIEF.replace("brief", "CASE WHEN counts_bytes <= :most THEN counts ELSE brief END").replace(
+    "GROUP", "AND asset = :asset GROUP"
+)
 LONG = ("names", "words")  # of counts: what there may be a hundred thousand of
 
 
@@ -131,9 +133,7 @@ class AssetStore:
         """The asset of that id, None when there is none; without names and words if all counts are above ``most``
         characters."""
         with self._database.read() as connection:
-            row = connection.execute(
-                f"{SHOWN} AND id = :asset GROUP BY id", owner.terms(asset=asset, most=most)
-            ).fetchone()
+            row = connection.execute(SHOWN, owner.terms(asset=asset, most=most)).fetchone()
         return None if row is None else self._record(row)
 
     def names(self, owner: Owner, asset: str, first: int, limit: int) -> list[str]:
@@ -165,8 +165,8 @@ class AssetStore:
         terms = owner.terms(most=limit + 1, **after(cursor))
         with self._database.read() as connection:
             rows = connection.execute(
-                f"{IN_BRIEF} GROUP BY id HAVING min(created) < :created OR (min(created) = :created AND id > :after)"
-                " ORDER BY min(created) DESC, id LIMIT :most",
+                f"{IN_BRIEF} WHERE created < :created OR (created = :created AND id > :after)"
+                " ORDER BY created DESC, id LIMIT :most",
                 terms,
             ).fetchall()
         return page_of(rows, limit, self._record)

@@ -42,7 +42,9 @@ class LiftRecord:
     path: Path
     count: int
     channels: int
-    metadata: dict[str, Any]
+    metadata: dict[str, Any]  # without the names of views where these are very many
+    view_count: int
+    first_view: str | None
     created: float
     splats: str  # ids of the assets that it was made of
     cameras: str
@@ -76,7 +78,13 @@ class TradeoffRecord:
 
 # A result belongs to whom its job does. One statement, so that none is without its job.
 FEATURES = "(SELECT json_group_array(asset) FROM (SELECT asset FROM job_features WHERE job = jobs.id ORDER BY place))"
-VISIBLE = f"SELECT lifts.*, splats, cameras, {FEATURES} AS features FROM lifts JOIN jobs USING (id) WHERE {SEEN}"
+NAMES_OF_VIEWS = ("views_without_camera", "views_without_splats")  # in a certificate
+SHOWN_BYTES = 64 << 10  # of metadata; of more the names of views, which may be 49 MB, are told apart, in pages
+VISIBLE = (
+    "SELECT lifts.id, bytes, sha256, file, count, channels, view_count, first_view, lifts.created, splats, cameras,"
+    f" CASE WHEN metadata_bytes <= {SHOWN_BYTES} THEN metadata ELSE brief END AS metadata, {FEATURES} AS features"
+    f" FROM lifts JOIN jobs USING (id) WHERE {SEEN}"
+)
 VISIBLE_TRADEOFFS = (
     "SELECT tradeoffs.*, splats, cameras, json_extract(parameters, '$.labels') AS labels,"
     f" {FEATURES} AS features FROM tradeoffs JOIN jobs USING (id) WHERE {SEEN}"
@@ -146,6 +154,9 @@ class LiftStore:
     def _insert(
         self, connection: sqlite3.Connection, job: str, made: FinishedLift, size: int, created: float
     ) -> None:
+        metadata, views = json.dumps(made.metadata), made.metadata["views"]
+        brief = {name: value for name, value in made.metadata.items() if name != "views"}
+        certificate = {name: value for name, value in brief["certificate"].items() if name not in NAMES_OF_VIEWS}
         row = {
             "id": job,
             "bytes": size,
@@ -153,7 +164,11 @@ class LiftStore:
             "file": self._files.relative(self._files.lift(job)),
             "count": made.count,
             "channels": made.channels,
-            "metadata": json.dumps(made.metadata),
+            "metadata": metadata,
+            "metadata_bytes": len(metadata),
+            "brief": json.dumps(brief | {"certificate": certificate}),
+            "view_count": len(views),
+            "first_view": next(iter(views), None),
             "created": created,
         }
         insert(connection, "lifts", row)
@@ -176,6 +191,16 @@ class LiftStore:
                 "lift", expected="the id of a lift", got=lift, hint="GET /lifts lists them; a lift has its job's id"
             )
         return found
+
+    def lifted(self, owner: Owner, lift: str, names: list[str]) -> set[str]:
+        """Which of these views were lifted."""
+        with self._database.read() as connection:
+            rows = connection.execute(
+                "SELECT value FROM lifts, json_each(metadata, '$.views') WHERE lifts.id = ?"
+                " AND value IN (SELECT value FROM json_each(?))",
+                (self.get(owner, lift).id, json.dumps(names)),
+            ).fetchall()
+        return {row["value"] for row in rows}
 
     def only(self, owner: Owner) -> LiftRecord:
         """The one lift that is here.

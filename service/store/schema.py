@@ -143,4 +143,13 @@ ALTER TABLE keys ADD COLUMN expires REAL;
 ALTER TABLE keys ADD COLUMN old_digest TEXT;        -- of the secret before a rotation, which counts
 ALTER TABLE keys ADD COLUMN old_until REAL;         -- until then
 """,
+    """
+ALTER TABLE lifts ADD COLUMN brief TEXT NOT NULL DEFAULT '{}';   -- metadata without names of views: likewise
+ALTER TABLE lifts ADD COLUMN metadata_bytes INTEGER NOT NULL DEFAULT 0;
+ALTER TABLE lifts ADD COLUMN view_count INTEGER NOT NULL DEFAULT 0;
+ALTER TABLE lifts ADD COLUMN first_view TEXT;
+UPDATE lifts SET metadata_bytes = length(metadata), view_count = json_array_length(metadata, '$.views'),
+    first_view = json_extract(metadata, '$.views[0]'), brief = json_remove(metadata, '$.views',
+    '$.certificate.views_without_camera', '$.certificate.views_without_splats');
+""",
 )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -31,8 +31,7 @@ from .conftest import ADDRESS
 
 SCOPES = {"alice": "read write", "bob": "read write", "boss": "admin"}
 METADATA = {
-    "settings": {}, "certificate": {}, "timings": {},
-    "version": "0", "encoder": "e", "text_space": "t", "views": ["v"],
+    "settings": {}, "timings": {}, "version": "0", "encoder": "e", "text_space": "t",
 }  # fmt: skip
 
 
@@ -73,8 +72,8 @@ def bearer(secret: str) -> dict[str, str]:
 
 
 @contextmanager
-def guarded(data: Path, **settings: Any) -> Iterator[Guarded]:
-    """Serve it."""
+def guarded(data: Path, views: Sequence[str] = ("v",), **settings: Any) -> Iterator[Guarded]:
+    """Serve it; her lift is of these views."""
     store = Store.open(data)
     chosen = ServiceSettings.model_validate({"data": data, "disk_floor_bytes": 0, **settings})
     app = create_app(chosen, store, cast("Supervisor", NoJobs()), cast("QueryClient", NoQueries()))
@@ -83,7 +82,7 @@ def guarded(data: Path, **settings: Any) -> Iterator[Guarded]:
     alice = Owner(ids["alice"], sees_all=False)
     wanted = order(store, alice)
     done = store.jobs.submit(alice, wanted)[0]
-    finish(store, b"a lift")
+    finish(store, b"a lift", views)
     compared = store.jobs.submit(alice, replace(wanted, kind=JobKind.TRADEOFF, parameters={"budget_s": 60}))[0]
     finish_tradeoff(store, b"a chart")
     queued = store.jobs.submit(alice, wanted)[0]
@@ -100,13 +99,15 @@ def make_key(store: Store, scopes: str, **quota: int) -> tuple[str, str]:
     return key.id, secret
 
 
-def finish(store: Store, content: bytes) -> None:
+def finish(store: Store, content: bytes, views: Sequence[str] = ("v",)) -> None:
     """Claim the oldest job in line and end it with a lift."""
+    certificate = {"warnings": ["x"], "views_without_splats": list(views)}
+    metadata = {**METADATA, "certificate": certificate, "views": list(views)}
     claimed = store.jobs.claim()
     assert claimed is not None
     with store.files.draft(".safetensors") as draft:
         draft.write_bytes(content)
-        assert store.lifts.finish(claimed.id, claimed.attempt, FinishedLift(draft, "0" * 64, 1, 1, METADATA))
+        assert store.lifts.finish(claimed.id, claimed.attempt, FinishedLift(draft, "0" * 64, 1, 1, metadata))
 
 
 def finish_tradeoff(store: Store, chart: bytes) -> None:

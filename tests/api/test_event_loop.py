@@ -17,12 +17,14 @@ from fastapi.testclient import TestClient
 from service.errors import NoSpace
 from service.models import MAX_SETTINGS, AssetKind
 from service.observe import SAME_A_MINUTE, Sparing
+from service.queries.client import Frame
 from service.routes.assets import SHOWN_CHARACTERS
 from service.store.database import Database
 from service.store.files import DataDirectory
 from service.store.owners import SERVICE
 from service.store.store import DATABASE, Store
 from tests.crash.conftest import order, until
+from tests.crash.server import NoQueries
 
 from .conftest import Uploaded, app_of, parts_of
 from .guarded import address, every_route, guarded
@@ -165,6 +167,27 @@ def test_very_many_names_are_told_apart_in_pages(client: TestClient) -> None:
     rest = client.get(told.json()["links"]["names"], params={"cursor": first["next"]}).json()
     assert sorted(first["names"] + rest["names"]) == names and rest["next"] is None
     assert client.delete(f"/assets/{asset}").status_code == 204
+
+
+def test_lift_of_very_many_views_tells_their_names_apart_in_pages(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lifted = [f"{'a' * 100}{number:04}" for number in range(3000)]
+    with guarded(tmp_path / "data", views=lifted) as house:
+        path = f"/lifts/{house.done}"
+        told = house.ask("alice", "GET", path)
+        assert (told.json()["views"], told.json()["view_count"]) == ([], 3000) and len(told.content) < 4000
+        assert told.json()["certificate"] == {"warnings": ["x"]}  # and no names of views in it
+        assert house.ask("alice", "GET", "/lifts").json()["lifts"] == [told.json()]
+        numbers = {"width": 1, "height": 1, "fx": 1, "fy": 1, "cx": 1, "cy": 1, "viewmat": [[1.0]]}
+        page = Frame({"views": [{"name": name, **numbers} for name in (lifted[7], "another")], "more": True})
+        monkeypatch.setattr(NoQueries, "call", lambda *given: page, raising=False)
+        views = house.ask("alice", "GET", told.json()["links"]["views"], params={"limit": 2}).json()
+        assert [(view["name"], view["lifted"]) for view in views["views"]] == [(lifted[7], True), ("another", False)]
+        assert views["next"] == 2
+    with guarded(tmp_path / "few") as house:
+        told = house.ask("alice", "GET", f"/lifts/{house.done}").json()
+        assert (told["views"], told["view_count"]) == (["v"], 1)
 
 
 # Readiness: a database and a disk that are not what they were

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import anyio
 import pytest
@@ -14,10 +16,11 @@ from starlette.datastructures import Headers
 
 from liftcore.errors import SplatliftError
 from service.auth import CALLER, Caller, Gate, Hosts, host_name, is_loopback
-from service.errors import ForeignOrigin, Misdirected
+from service.errors import Busy, ForeignOrigin, Misdirected, TooMany
 from service.scopes import OPEN, needed
 from service.settings import ServiceSettings
 from service.store.store import Store
+from service.streams import EventStreams
 
 from .guarded import Guarded, bearer, guarded, make_key
 from .test_problems import assert_problem
@@ -131,33 +134,23 @@ def test_loopback_is_known(host: str, loopback: bool) -> None:
 def test_uploads_at_a_time_have_a_quota_a_key(tmp_path: Path) -> None:
     store = Store.open(tmp_path)
     keys = {name: make_key(store, "write", max_uploads=2)[1] for name in ("alice", "bob")}
-    told: list[int] = []
-    most = 0
 
-    async def nothing() -> Any:
-        raise AssertionError("nobody reads here")
+    async def nothing(message: Any = None) -> Any:
+        raise AssertionError("nobody reads or answers here")
 
     async def upload(gate: Gate, name: str, path: str = "/assets/splats") -> None:
-        async def send(message: Any) -> None:
-            if message["type"] == "http.response.start":
-                told.append(message["status"])
-
-        pairs = {"host": "localhost", **{key.lower(): value for key, value in bearer(keys[name]).items()}}
-        headers = [(key.encode(), value.encode()) for key, value in pairs.items()]
-        scope = {"type": "http", "method": "PUT", "path": path, "headers": headers}
-        await gate(scope, nothing, send)
+        headers = [(b"host", b"localhost"), (b"authorization", bearer(keys[name])["Authorization"].encode())]
+        await gate({"type": "http", "method": "PUT", "path": path, "headers": headers}, nothing, nothing)
 
     async def run() -> None:
-        nonlocal most
-        release = anyio.Event()
-        inside: list[str] = []
+        release, inside = anyio.Event(), list[str]()
 
         async def slow(scope: Any, receive: Any, send: Any) -> None:
             inside.append(scope["state"][CALLER].owner.key)
             await release.wait()
             raise OSError("it broke off")
 
-        gate = Gate(slow, store.keys, ServiceSettings.model_validate({"data": tmp_path}))
+        gate = Gate(slow, store.keys, ServiceSettings.model_validate({"data": tmp_path}), lambda: False)
 
         async def broken(name: str, path: str = "/assets/splats") -> None:
             with pytest.raises(OSError, match="broke"):
@@ -170,20 +163,56 @@ def test_uploads_at_a_time_have_a_quota_a_key(tmp_path: Path) -> None:
             with anyio.fail_after(60):
                 while len(inside) < 4:
                     await anyio.sleep(0.01)
-            await upload(gate, "alice")
-            assert told == [429]
+            with pytest.raises(TooMany):
+                await upload(gate, "alice")
             release.set()
-        async with anyio.create_task_group() as group:  # what broke off counts no more
-            group.start_soon(broken, "alice")
-            group.start_soon(broken, "alice")
-        assert told == [429]
-        most = len(inside)
+        await broken("alice")  # what broke off counts no more
+        assert len(inside) == 5
 
     try:
         anyio.run(run)
-        assert most == 6
     finally:
         store.close()
+
+
+def test_streams_at_a_time_have_a_share_a_key() -> None:
+    streams = EventStreams(4, 2)
+
+    def follow(key: str | None) -> None:
+        streams.answer(lambda number: [], lambda event: "", 0, key)
+
+    for key in ("alice", "alice", "bob"):
+        follow(key)
+    with pytest.raises(TooMany):
+        follow("alice")
+    follow(None)  # while there are no keys there are no shares
+    with pytest.raises(Busy):
+        follow("bob")
+    few = EventStreams(2, 8)  # a share is never all of them
+    few.answer(lambda number: [], lambda event: "", 0, "alice")
+    with pytest.raises(TooMany):
+        few.answer(lambda number: [], lambda event: "", 0, "alice")
+
+
+def test_access_log_names_the_client_its_key_and_every_use_of_admin(
+    house: Guarded, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO", "service.access")
+    for name in (None, "alice", "boss"):
+        house.ask(name, "GET", "/jobs")
+    told = [vars(record)["fields"] for record in caplog.records if record.name == "service.access"]
+    assert [fields["client"] for fields in told] == ["testclient"] * 3
+    assert [fields.get("key") for fields in told] == [None, house.ids["alice"], house.ids["boss"]]
+    assert ["admin" in fields for fields in told] == [False, False, True]
+
+
+def test_database_that_is_held_at_the_gate_is_503_with_retry_after(house: Guarded, monkeypatch: Any) -> None:
+    held = sqlite3.OperationalError("database is locked")
+    held.sqlite_errorcode = sqlite3.SQLITE_BUSY
+    monkeypatch.setattr(house.store.database, "read", mock.Mock(side_effect=held))
+    reply = house.ask("alice", "GET", "/jobs")
+    assert (assert_problem(reply)["type"], reply.status_code) == ("/problems/busy", 503)
+    assert int(reply.headers["retry-after"]) > 0
 
 
 def test_key_has_its_own_quota_and_else_that_of_every_key(tmp_path: Path) -> None:
@@ -197,7 +226,7 @@ def test_key_has_its_own_quota_and_else_that_of_every_key(tmp_path: Path) -> Non
         raise AssertionError("nobody reads or answers here")
 
     shared = {"key_bytes": 70, "key_queued": 80, "key_uploads": 90}
-    gate = Gate(seen, store.keys, ServiceSettings.model_validate({"data": tmp_path, **shared}))
+    gate = Gate(seen, store.keys, ServiceSettings.model_validate({"data": tmp_path, **shared}), lambda: False)
 
     async def run() -> None:
         for own in ({}, {"max_bytes": 1}, {"max_queued": 2}, {"max_uploads": 3}, {"max_bytes": 0, "max_queued": 0}):

@@ -26,7 +26,7 @@ async def nothing(*_: Any) -> None:
 
 
 def test_second_sigint_ends_the_notice() -> None:
-    stopping = Stopping(EventStreams(1), cast("Supervisor", Idle()), notice_seconds=600)
+    stopping = Stopping(EventStreams(1, 1), cast("Supervisor", Idle()), notice_seconds=600)
     server = AnnouncingServer(uvicorn.Config(nothing, lifespan="off"), stopping, print)
     server.handle_exit(signal.SIGINT, None)
     again = threading.Timer(0.3, server.handle_exit, (signal.SIGINT, None))
@@ -47,6 +47,6 @@ def test_notice_is_kept_while_nobody_hurries() -> None:
         asked.append(1)
         return False
 
-    stopping = Stopping(EventStreams(1), cast("Supervisor", Idle()), notice_seconds=0.5)
+    stopping = Stopping(EventStreams(1, 1), cast("Supervisor", Idle()), notice_seconds=0.5)
     anyio.run(stopping.begin, hurried)
     assert stopping.begun and len(asked) > 1

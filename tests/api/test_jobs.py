@@ -171,10 +171,10 @@ def test_streams_are_bounded(quick: Quick) -> None:
         job = client.post("/lift", json=body).headers["location"]
         ended(client, job)
         streams = application(client).state.deps.streams
-        streams.open = 1  # as if another client followed
+        streams._open["another"] = 1  # as if another client followed
         reply = client.get(f"{job}/events")
         assert (assert_problem(reply)["type"], reply.status_code) == ("/problems/busy", 503)
-        streams.open = 0
+        del streams._open["another"]
         assert client.get(f"{job}/events").status_code == 200 and streams.open == 0
 
 

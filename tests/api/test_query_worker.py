@@ -15,12 +15,11 @@ from fastapi.testclient import TestClient
 from liftcore.query import ask
 from liftcore.query.objects import objects
 from service import models
+from service.auth import EVERYBODY
 from service.queries import answers
-from service.queries.answers import Answers, Kept
+from service.queries.answers import Answers, Kept, reply_to
 from service.queries.client import Frame
-from service.queries.worker import reply_to
 from service.routes.queries import query_request
-from service.store.owners import SERVICE
 from tests.crash.conftest import until
 
 from .conftest import parts_of
@@ -44,8 +43,8 @@ QUESTIONS: list[dict[str, Any]] = [
 def request_of(client: TestClient, lift: dict[str, Any]) -> Callable[..., dict[str, Any]]:
     """A request as the query process gets it."""
     parts = parts_of(client)
-    here = replace(parts, owner=SERVICE)  # as for a caller who sees the lift
-    record = here.store.lifts.get(SERVICE, lift["id"])
+    here = replace(parts, caller=EVERYBODY)  # as for a caller who sees the lift
+    record = here.store.lifts.get(here.owner, lift["id"])
 
     def make(operation: str = "scores", **asked: Any) -> dict[str, Any]:
         body = models.AskedInBody.model_validate({"lift": lift["id"], **asked})
@@ -179,7 +178,7 @@ def test_calls_of_a_worker_that_dies_are_answered_by_the_next(client: TestClient
     threads = [threading.Thread(target=run, args=(number,)) for number in range(4)]
     for thread in threads:
         thread.start()
-    until(lambda: worker._places == 12 and len(worker._line) < 4)
+    until(lambda: worker.waiting == 3)
     os.kill(process.pid, signal.SIGKILL)
     for thread in threads:
         thread.join()

@@ -48,12 +48,13 @@ def served(data: Path, **settings: Any) -> Iterator[tuple[str, int]]:
 
 
 @contextmanager
-def running(data: Path, **settings: Any) -> Iterator[uvicorn.Server]:
-    """That server, to look into it."""
+def running(data: Path, queries: QueryClient | None = None, **settings: Any) -> Iterator[uvicorn.Server]:
+    """That server, to look into it; without a query process, unless one is given."""
     patient = {"min_bytes_per_second": 1000, "slow_grace_seconds": 30, "header_seconds": 30}
     chosen = ServiceSettings.model_validate({"data": data, "disk_floor_bytes": 0, **patient, **settings})
     store = Store.open(chosen.data)
-    app = create_app(chosen, store, Supervisor(store, job_limits(chosen)), cast("QueryClient", NoQueries()))
+    worker = queries or cast("QueryClient", NoQueries())
+    app = create_app(chosen, store, Supervisor(store, job_limits(chosen)), worker)
     listener = socket.create_server(("127.0.0.1", 0))
     connection = watched(pace_of(chosen))
     config = uvicorn.Config(app, http=connection, log_level="critical", timeout_graceful_shutdown=10)

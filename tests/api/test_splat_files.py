@@ -130,7 +130,7 @@ def test_a_disk_that_fills_up_meanwhile_is_no_fault_of_ours() -> None:
 def test_a_draft_is_sent_without_its_name_and_closed_however_that_ends(tmp_path: Path, leaves: bool) -> None:
     content = np.random.default_rng(0).bytes(3 * BLOCK_BYTES + 17)
     (tmp_path / "draft").write_bytes(content)
-    reply = Draft(tmp_path / "draft", filename="object.ply", etag=None)
+    reply = Draft(tmp_path / "draft", filename="object.ply", headers={})
     (tmp_path / "draft").unlink()
     sent: list[bytes] = []
 

@@ -1,0 +1,76 @@
+"""/lifts and /tradeoffs: what jobs made. A result has the id of its job."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+from fastapi import APIRouter, Request, Response
+
+from service import models
+from service.content import FILE, TAGGED, Cursor, Limit, StoredFile, file_answer, kept, listed, unchanged
+from service.routes.queries import PNG
+from service.state import Deps
+from service.store.lifts import LiftRecord, TradeoffRecord
+
+MARKDOWN_TYPE = "text/markdown; charset=utf-8"
+MARKDOWN: dict[int | str, dict[str, Any]] = {200: {"content": {MARKDOWN_TYPE: {"schema": {"type": "string"}}}}}
+
+router = APIRouter()
+
+
+@router.get("/lifts", response_model=models.Lifts, tags=["lifts"])
+def list_lifts(deps: Deps, limit: Limit = None, cursor: Cursor = None) -> Response:
+    """All lifts, newest first."""
+    return listed("lifts", partial(deps.store.lifts.page, deps.owner), shape_lift, limit=limit, cursor=cursor)
+
+
+@router.get("/lifts/{lift}", response_model=models.LiftResult, tags=["lifts"])
+def get_lift(lift: str, deps: Deps) -> models.LiftResult:
+    """One lift: its settings, certificate and timings."""
+    return shape_lift(deps.store.lifts.get(deps.owner, lift))
+
+
+@router.get("/lifts/{lift}/features", response_class=Response, responses=FILE, tags=["lifts"])
+def get_features(lift: str, request: Request, deps: Deps) -> Response:
+    """The lift file (safetensors), or a range of it."""
+    found = deps.store.lifts.get(deps.owner, lift)
+    return file_answer(request, StoredFile(found.path, found.bytes, found.sha256, f"lift-{found.id}.safetensors"))
+
+
+@router.get("/tradeoffs/{tradeoff}", response_model=models.Tradeoff, tags=["trade-offs"])
+def get_tradeoff(tradeoff: str, deps: Deps) -> models.Tradeoff:
+    """What was found: the runs, and which to take."""
+    return shape_tradeoff(deps.store.tradeoffs.get(deps.owner, tradeoff))
+
+
+@router.get("/tradeoffs/{tradeoff}/chart", response_class=Response, responses=PNG | TAGGED, tags=["trade-offs"])
+def get_chart(tradeoff: str, request: Request, deps: Deps) -> Response:
+    """Accuracy over time, and how near the dial stays to the exact lift, as a picture."""
+    found = deps.store.tradeoffs.get(deps.owner, tradeoff)
+    etag = f'"{found.sha256}"'
+    return unchanged(request, etag) or Response(found.chart, media_type="image/png", headers=kept(etag))
+
+
+@router.get("/tradeoffs/{tradeoff}/table", response_class=Response, responses=MARKDOWN, tags=["trade-offs"])
+def get_table(tradeoff: str, deps: Deps) -> Response:
+    """The runs as a table, with what it says and how it was made."""
+    return Response(deps.store.tradeoffs.get(deps.owner, tradeoff).page, headers={"Content-Type": MARKDOWN_TYPE})
+
+
+def shape_lift(lift: LiftRecord) -> models.LiftResult:
+    """A lift as clients get it; paths of this machine stay here."""
+    own = f"/lifts/{lift.id}"
+    links = {"self": own, "job": f"/jobs/{lift.id}", "features": f"{own}/features"}
+    links |= {"views": f"{own}/views", "query": f"/query?lift={lift.id}&text="}
+    told = {"views": [], **lift.metadata, **vars(lift), "links": links}
+    return models.LiftResult(**{name: told[name] for name in models.LiftResult.model_fields})
+
+
+def shape_tradeoff(tradeoff: TradeoffRecord) -> models.Tradeoff:
+    """A trade-off as clients get it."""
+    own = f"/tradeoffs/{tradeoff.id}"
+    links = {"self": own, "job": f"/jobs/{tradeoff.id}", "chart": f"{own}/chart", "table": f"{own}/table"}
+    ours = ("id", "splats", "cameras", "features", "labels", "created")
+    told = {name: getattr(tradeoff, name) for name in ours}
+    return models.Tradeoff.model_validate({**tradeoff.document, **told, "links": links})
