@@ -31,6 +31,7 @@ from liftcore.raster.base import (
     check_antialiased,
 )
 from liftcore.scene.kernel import Kernel
+from liftcore.scene.quaternions import rotation_matrices
 from liftcore.solve.weights import RegionWeights, one_view
 
 if TYPE_CHECKING:
@@ -48,26 +49,13 @@ _SUPPORT_BAND = 1e-5  # of sigma = 1
 _STEEPEST = 16.0  # d alpha / d log(sigma) from which the rounding of sigma to float32 shows in the fifth digit
 
 
-def rotation(quat: np.ndarray) -> np.ndarray:
-    """[3, 3] f64 of a quaternion w x y z of any length; zero counts as identity."""
-    length = np.linalg.norm(quat)
-    w, x, y, z = quat / length if length > 0 else np.array([1.0, 0.0, 0.0, 0.0])
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
 def camera_axes(splats: Splats, j: int, camera: Camera) -> np.ndarray:
     """[3, K] f64, the scaled axes of splat j in the camera's frame: three, or two for 2DGS.
 
     A scale of zero is the limit of small ones: a disc that has become a line keeps its plane.
     """
     scales = np.exp(splats.log_scales[j].double().numpy().clip(min=-MAX_LOG_SCALE))
-    return camera.viewmat[:3, :3] @ rotation(splats.quats[j].double().numpy())[:, : len(scales)] * scales
+    return camera.viewmat[:3, :3] @ rotation_matrices(splats.quats[j].numpy())[:, : len(scales)] * scales
 
 
 def camera_mean(splats: Splats, j: int, camera: Camera) -> np.ndarray:

@@ -16,9 +16,13 @@ def rotation_matrices(quats: np.ndarray) -> np.ndarray:
     largest = np.abs(quats).max(axis=-1, keepdims=True)  # first by this: squares of the largest would overflow
     quats = np.where(largest > 0, quats / np.where(largest > 0, largest, 1.0), [1.0, 0.0, 0.0, 0.0])
     w, x, y, z = np.moveaxis(quats / np.linalg.norm(quats, axis=-1, keepdims=True), -1, 0)
-    rows = (
+    return np.stack([np.stack(row, axis=-1) for row in rotation_rows(w, x, y, z)], axis=-2)
+
+
+def rotation_rows(w: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[tuple[np.ndarray, ...], ...]:
+    """The three rows of the rotations of unit quaternions, each number by the shape of w."""
+    return (
         (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
         (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
         (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
     )
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)

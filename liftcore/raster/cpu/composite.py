@@ -4,7 +4,7 @@ A tile has 32 row segments of eight pixels. Every product takes the segments tha
 it ``blend`` there and uses the weights at once, while they are in a register.
 
 What a kernel adds to this stands in the first part: a class for the view's constants, one for a splat as a tile sees
-it, and five functions. numba compiles each for the class of its first argument, so a product is compiled once for
+it, and four functions. numba compiles each for the class of its first argument, so a product is compiled once for
 each kernel that is used and pays nothing for the others.
 """
 
@@ -17,7 +17,7 @@ import numpy as np
 from numba.extending import overload
 
 from liftcore.jit import inlined, kernel
-from liftcore.raster.base import ALPHA_FLOOR, LARGEST_EXPONENT, TILE, Selection, Weighting, check_weighting
+from liftcore.raster.base import ALPHA_FLOOR, TILE, Selection, Weighting, check_weighting
 from liftcore.raster.cpu.project import (
     BETA,
     CENTRE_X,
@@ -183,10 +183,6 @@ def shape_of(splat, state, segment) -> Any:
     """The splat on a segment of ``segments_of``, as ``simd`` blends it."""
 
 
-def alpha_at(kernel, own, x, y) -> Any:
-    """Alpha of the projected splat ``own`` at one point of the image, before cap and floor, f64."""
-
-
 def circle_of(kernel, own) -> Any:
     """Centre x, y and radius, px, of a circle that the splat reaches beside its outline; a radius below 0 is none."""
 
@@ -268,37 +264,6 @@ def _disc_shape(splat, state, segment):
     )  # fmt: skip
 
 
-@inlined
-def _ellipse_at(own, x, y):
-    """The quadratic form of a projected splat at a point."""
-    dy = y - own[MY]
-    across = own[ROOT_X] * (x - own[MX] - own[SLOPE] * dy)
-    return across * across + own[KY] * dy * dy
-
-
-def _gaussian_alpha(kernel, own, x, y):
-    return own[OPACITY] * math.pow(2.0, -_ellipse_at(own, x, y))
-
-
-def _beta_alpha(kernel, own, x, y):
-    sigma = _ellipse_at(own, x, y)
-    if sigma >= 1.0:
-        return 0.0
-    exponent = -own[BETA] * math.log1p(-sigma) / math.log(2.0)
-    return own[OPACITY] * math.pow(2.0, -exponent) if exponent < LARGEST_EXPONENT else 0.0
-
-
-def _disc_alpha(kernel, own, x, y):
-    dx, dy = x - own[CENTRE_X], y - own[CENTRE_Y]
-    exponent = kernel.curvature * (dx * dx + dy * dy)
-    d = own[D_ZERO] + own[D_X] * dx + own[D_Y] * dy
-    if d > 0.0:
-        s = own[S_X] * dx + own[S_Y] * dy
-        t = own[T_X] * dx + own[T_Y] * dy
-        exponent = min(exponent, (s * s + t * t) / (d * d))
-    return own[OPACITY] * math.pow(2.0, -exponent)
-
-
 def _no_circle(kernel, own):
     return 0.0, 0.0, -1.0
 
@@ -311,37 +276,21 @@ _BY_CLASS: dict[Callable, dict[type, Callable]] = {
     tile_splat: {Gaussians: _tile_gaussian, Betas: _tile_beta, Discs: _tile_disc},
     segments_of: {TileGaussian: _ellipse_segments, TileBeta: _ellipse_segments, TileDisc: _disc_segments},
     shape_of: {TileGaussian: _gaussian_shape, TileBeta: _beta_shape, TileDisc: _disc_shape},
-    alpha_at: {Gaussians: _gaussian_alpha, Betas: _beta_alpha, Discs: _disc_alpha},
     circle_of: {Gaussians: _no_circle, Betas: _no_circle, Discs: _disc_circle},
 }
 
 
-# What numba compiles in place of each of the five: the plain Python function for the class of the first argument.
+def _compile_by_class(function: Callable) -> None:
+    """Have numba compile, in place of the function, the plain Python one for the class of its first argument."""
+
+    def chosen(first, *others):
+        return _BY_CLASS[function][first.instance_class]
+
+    overload(function, inline="always", strict=False)(chosen)
 
 
-@overload(tile_splat, inline="always")
-def _(kernel, projected, row, x0, y0):
-    return _BY_CLASS[tile_splat][kernel.instance_class]
-
-
-@overload(segments_of, inline="always")
-def _(splat, state):
-    return _BY_CLASS[segments_of][splat.instance_class]
-
-
-@overload(shape_of, inline="always")
-def _(splat, state, segment):
-    return _BY_CLASS[shape_of][splat.instance_class]
-
-
-@overload(alpha_at, inline="always")
-def _(kernel, own, x, y):
-    return _BY_CLASS[alpha_at][kernel.instance_class]
-
-
-@overload(circle_of, inline="always")
-def _(kernel, own):
-    return _BY_CLASS[circle_of][kernel.instance_class]
+for _function in _BY_CLASS:
+    _compile_by_class(_function)
 
 
 # -------------------------------------------------------------------------------------------------- A tile's 256 rays
@@ -731,16 +680,16 @@ def _strongest(first, last, frame, rays, labels, slot_of, label_of, sums, image)
 
 
 def trace_rays(frame: Frame, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows of A for single pixels [n, 2] i32 (x, y).
+    """Rows of A for single pixels [n, 2] i32 (x, y), to the bit those of the A that the render knows.
 
     Returns:
         indptr [n + 1] i64, splats [nnz] i32 near to far, weights [nnz] f32.
     """
     indptr, size = np.zeros(len(pixels) + 1, np.int64), 1 << 12
     splats, weights = np.empty(size, np.int32), np.empty(size, np.float32)
-    done = 0
+    rays, done = new_rays(frame), 0
     while True:
-        done, needed = _trace(done, frame, pixels, indptr, splats, weights)
+        done, needed = _trace(done, frame, rays, pixels, indptr, splats, weights)
         if done == len(pixels):
             return indptr, splats[: indptr[-1]], weights[: indptr[-1]]
         more = max(len(splats), needed)
@@ -749,33 +698,30 @@ def trace_rays(frame: Frame, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 @kernel
-def _trace(first, frame, pixels, indptr, splats, weights):
-    """One ray at a time; alpha and T in float32, so that cut-offs fall as in the lanes."""
-    count = indptr[first]
-    floor, cap, stop = (
-        np.float32(frame.kernel.floor),
-        np.float32(frame.alpha_cap),
-        np.float32(frame.transmittance_stop),
-    )
+def _trace(first, frame, rays, pixels, indptr, splats, weights):
+    """One ray at a time through its tile, whose other rays are done."""
+    state, own, count = rays.state, np.zeros(LANES, np.float32), indptr[first]
     for i in range(first, pixels.shape[0]):
         x, y = pixels[i, 0], pixels[i, 1]
         tile = (y // TILE) * frame.columns + x // TILE
         needed = frame.starts[tile + 1] - frame.starts[tile]
         if count + needed > splats.shape[0]:
             return i, needed
-        transmittance = np.float32(1.0)
+        ray = place_of(y % TILE, x % TILE)
+        segment, lane = ray // LANES, ray % LANES
+        keep_lanes(state, TRANSMITTANCE + segment * LANES, no_lanes())
+        state[TRANSMITTANCE + ray] = 1.0
+        rays.active[0] = np.uint64(1) << np.uint64(segment)
         for step in range(frame.starts[tile], frame.starts[tile + 1]):
-            place = frame.items[step]
-            alpha = np.float32(alpha_at(frame.kernel, frame.projected[place], x + 0.5, y + 0.5))
-            if alpha < floor or alpha == 0:
+            splat = next_splat(frame, tile, step, float(x - x % TILE), float(y - y % TILE))
+            if not meets(rays, splat):
                 continue
-            weight = min(cap, alpha) * transmittance
-            if not weight < transmittance - stop:
+            keep_lanes(own, 0, blend(rays, splat, segment))
+            if own[lane] > 0:
+                splats[count], weights[count] = frame.ids[frame.items[step]], own[lane]
+                count += 1
+            elif state[TRANSMITTANCE + ray] == 0:
                 break
-            splats[count] = frame.ids[place]
-            weights[count] = weight
-            transmittance -= weight
-            count += 1
         indptr[i + 1] = count
     return pixels.shape[0], 0
 

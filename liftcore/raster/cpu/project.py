@@ -28,6 +28,7 @@ from liftcore.raster.base import (
     CompositingParams,
 )
 from liftcore.scene.kernel import Kernel
+from liftcore.scene.quaternions import rotation_rows
 
 if TYPE_CHECKING:
     from liftcore.scene.cameras import Camera
@@ -147,17 +148,7 @@ def _axes_of(splats: Splats) -> np.ndarray:
     quats = splats.quats.numpy().astype(np.float64)
     norms = np.linalg.norm(quats, axis=1, keepdims=True)
     unit = np.where(norms > 0, quats / np.where(norms > 0, norms, 1.0), np.array([1.0, 0.0, 0.0, 0.0]))
-    w, x, y, z = unit.T
-    rotation = np.empty((3, 3, splats.count))
-    rotation[0, 0] = 1 - 2 * (y * y + z * z)
-    rotation[0, 1] = 2 * (x * y - w * z)
-    rotation[0, 2] = 2 * (x * z + w * y)
-    rotation[1, 0] = 2 * (x * y + w * z)
-    rotation[1, 1] = 1 - 2 * (x * x + z * z)
-    rotation[1, 2] = 2 * (y * z - w * x)
-    rotation[2, 0] = 2 * (x * z - w * y)
-    rotation[2, 1] = 2 * (y * z + w * x)
-    rotation[2, 2] = 1 - 2 * (x * x + y * y)
+    rotation = np.array(rotation_rows(*unit.T))
     log_scales = splats.log_scales.numpy().astype(np.float64).clip(-MAX_LOG_SCALE, MAX_LOG_SCALE)
     return np.ascontiguousarray(rotation[:, : log_scales.shape[1]] * np.exp(log_scales.T))
 
@@ -341,9 +332,9 @@ def _keep_touching(begin, end, scene, antialiased, numbers, targets, row):
 # / depth of the crossing, so no large numbers are subtracted. Crossings behind the camera (d <= 0) are not on the ray
 # and count as none; where there is none, the low-pass 2 |p - mu|^2 stays.
 
-_MARGIN = 1e-3  # px that an outline is wider than the crossings, for float32 at its edge
-_RELATIVE = 1e-4  # and this share of its size
-_HORIZON = 1e-9  # a disc that comes this near to the camera's plane, in its depth squared, has a box for an outline
+MARGIN = 1e-3  # px that an outline is wider than the crossings, for float32 at its edge
+RELATIVE = 1e-4  # and this share of its size
+HORIZON = 1e-9  # a disc that comes this near to the camera's plane, in its depth squared, has a box for an outline
 
 
 @inlined
@@ -459,7 +450,7 @@ def _write_ellipse(own, middle, covariance, det):
 @inlined
 def _write_circle(own):
     """The low-pass alone."""
-    square = own[NEARBY] ** 2 + _MARGIN**2
+    square = own[NEARBY] ** 2 + MARGIN**2
     _write_ellipse(own, (own[CENTRE_X], own[CENTRE_Y]), (square, 0.0, square), square * square)
 
 
@@ -480,12 +471,12 @@ def _write_outline(own, centre, a, b, largest, view):
     room = z * z - largest * (w[0] * w[0] + w[1] * w[1])
     uu, vv, uv = u[0] * u[0] + u[1] * u[1], v[0] * v[0] + v[1] * v[1], u[0] * v[0] + u[1] * v[1]
     uw, vw = u[0] * w[0] + u[1] * w[1], v[0] * w[0] + v[1] * w[1]
-    if room > _HORIZON * z * z:
+    if room > HORIZON * z * z:
         g = largest / room
         x0, y0 = -g * uw, -g * vw
         xx, yy = x0 * x0 + g * uu, y0 * y0 + g * vv
         minor = g * (u[0] * v[1] - u[1] * v[0])
-        margin = _MARGIN**2 + _RELATIVE**2 * (xx + yy)
+        margin = MARGIN**2 + RELATIVE**2 * (xx + yy)
         det = minor * minor * (z * z / room) + margin * (xx + yy) + margin * margin
         covariance = xx + margin, x0 * y0 + g * uv, yy + margin
         _write_ellipse(own, (own[CENTRE_X] + x0, own[CENTRE_Y] + y0), covariance, det)
@@ -497,8 +488,8 @@ def _write_outline(own, centre, a, b, largest, view):
     own[EXTENT_X], own[EXTENT_Y] = half_x, half_y
     own[SLOPE] = own[LEAN] = 0.0
     # Half of the cutoff for each side: the ellipse through the corners of the box, of which the tiles know the sides.
-    own[ROOT_X] = 1.0 / max(_MARGIN, half_x)
-    own[KY] = 1.0 / max(_MARGIN, half_y) ** 2
+    own[ROOT_X] = 1.0 / max(MARGIN, half_x)
+    own[KY] = 1.0 / max(MARGIN, half_y) ** 2
     own[CUTOFF] = 2.0
 
 
@@ -516,6 +507,6 @@ def _reached(origin, p, q, room, size):
             high = q / (p + root)
         if p - root < 0:
             low = q / (p - root)
-    low = origin + low * (1.0 + _RELATIVE) - _MARGIN
-    high = origin + high * (1.0 + _RELATIVE) + _MARGIN
+    low = origin + low * (1.0 + RELATIVE) - MARGIN
+    high = origin + high * (1.0 + RELATIVE) + MARGIN
     return max(-1.0, low), min(size + 1.0, high)

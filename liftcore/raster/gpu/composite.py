@@ -25,14 +25,23 @@ from liftcore.scene.splats import Kernel
 GAUSSIANS, BETAS, DISCS = 0, 1, 2
 KINDS = {Kernel.GAUSSIAN_3D: GAUSSIANS, Kernel.BETA: BETAS, Kernel.GAUSSIAN_2D: DISCS}
 FLOORS = {Kernel.GAUSSIAN_3D: ALPHA_FLOOR, Kernel.BETA: 0.0, Kernel.GAUSSIAN_2D: ALPHA_FLOOR}
+CHUNK = 16  # splats at a time; no smaller, for the matrix products
+PART = CHUNK * TILE * TILE  # floats of a part of scratch
+PARTS = 2  # of scratch, twice as many with those of the evidence
 
+# What kernels read of all this.
+_CHUNK, _TILE, _PIXELS = tl.constexpr(CHUNK), tl.constexpr(TILE), tl.constexpr(TILE * TILE)
+_SCRATCH, _EVIDENCE = tl.constexpr(PARTS * PART), tl.constexpr(PARTS * PART)
+_WEIGHTS, _PLAIN_ALPHAS = tl.constexpr(PART), tl.constexpr(2 * PART)
+_LARGEST, _FRONT, _CENTRAL = tl.constexpr(LARGEST), tl.constexpr(FRONT), tl.constexpr(CENTRAL)
+_LATER = tl.constexpr(1 << 30)  # above every number of an item: a place that is still free
 _BETAS = tl.constexpr(BETAS)
 _DISCS = tl.constexpr(DISCS)
 _LARGEST_EXPONENT = tl.constexpr(LARGEST_EXPONENT)
 _SMALLEST_REST = tl.constexpr(2.0**-100)  # of 1 - sigma, where its logarithm is taken
 _LOG2_E = tl.constexpr(1.4426950408889634)
-_PLACE = tl.constexpr(scene.PLACE)
-_INK = tl.constexpr(scene.INK)
+_PLACE, _INK = tl.constexpr(scene.PLACE), tl.constexpr(scene.INK)
+_OPACITY, _PLAIN = tl.constexpr(scene.OPACITY), tl.constexpr(scene.PLAIN)
 _MX, _MY = tl.constexpr(scene.MX), tl.constexpr(scene.MY)  # of discs too: the projected centre
 _SLOPE, _KY = tl.constexpr(scene.SLOPE), tl.constexpr(scene.KY)
 _KX, _BETA = tl.constexpr(scene.KX), tl.constexpr(scene.BETA)
@@ -94,18 +103,6 @@ def _form(by_x, by_y, step, inside, dx, dy, at_centre, lane):
     coarse = tl.load(step, mask=inside, other=0.0)
     fine = tl.load(step + 1, mask=inside, other=0.0)
     return (rounded + coarse * lane) + (rest + fine * lane)
-
-
-CHUNK = 16  # splats at a time; no smaller, for the matrix products
-PART = CHUNK * TILE * TILE  # floats of a part of scratch
-PARTS = 2  # of scratch, twice as many with those of the evidence
-
-_CHUNK = tl.constexpr(CHUNK)
-_TILE = tl.constexpr(TILE)
-_PIXELS = tl.constexpr(TILE * TILE)
-_INK = tl.constexpr(scene.INK)
-_WEIGHTS, _PLAIN_ALPHAS = tl.constexpr(PART), tl.constexpr(2 * PART)
-_OPACITY, _PLAIN = tl.constexpr(scene.OPACITY), tl.constexpr(scene.PLAIN)
 
 
 @jit
@@ -171,11 +168,6 @@ def weights_of(scratch, count, pixel):
     number = tl.arange(0, _CHUNK)[:, None]
     own = scratch + _WEIGHTS + number * _PIXELS + pixel[None, :]
     return tl.load(own, mask=number < count, other=0.0)
-
-
-_SCRATCH, _EVIDENCE = tl.constexpr(PARTS * PART), tl.constexpr(PARTS * PART)
-_LARGEST, _FRONT, _CENTRAL = tl.constexpr(LARGEST), tl.constexpr(FRONT), tl.constexpr(CENTRAL)
-_LATER = tl.constexpr(1 << 30)  # above every number of an item: a place that is still free
 
 
 @jit

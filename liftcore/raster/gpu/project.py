@@ -10,8 +10,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from liftcore.raster.base import EDGE_ON, LOW_PASS, NEAR_PLANE
-from liftcore.raster.cpu.project import HALF_LOG2_E, Scene, View
+from liftcore.raster.base import EDGE_ON, NEAR_PLANE
+from liftcore.raster.cpu.project import HALF_LOG2_E, HORIZON, MARGIN, RELATIVE, Scene, View, low_pass_curvature
 from liftcore.scene.splats import Kernel
 
 # What the walk reads of a splat. PLACES [n, PLACE] f64 holds what is taken at a row's first pixel, where large
@@ -157,10 +157,8 @@ def _project_ellipses(
     )
     rows = seen.rows[kept]
     slope, kx, ky = xy / yy, unit * yy / det, unit / yy
-    none = mx[:0]
-    outlines = Outlines(
-        mx, my, slope, torch.sqrt(kx), ky, reach, extent_x, extent_y, xy / xx * extent_x, none, none, none
-    )  # fmt: skip
+    lean = xy / xx * extent_x
+    outlines = Outlines(mx, my, slope, torch.sqrt(kx), ky, reach, extent_x, extent_y, lean, *_no_circles(mx))
     places = mx.new_zeros(mx.shape[0], PLACE)
     places[:, MX], places[:, MY], places[:, SLOPE], places[:, KY] = mx, my, slope, ky
     inks = mx.new_zeros(mx.shape[0], INK, dtype=torch.float32)
@@ -171,29 +169,24 @@ def _project_ellipses(
     return ProjectedSplats((rows + seen.first).to(torch.int32), outlines, places, inks), z
 
 
-_MARGIN = 1e-3  # px that an outline is wider than the crossings, for float32 at its edge
-_RELATIVE = 1e-4  # and this share of its size
-_HORIZON = 1e-9  # a disc that comes this near to the camera's plane, in its depth squared, has a box for an outline
 _COARSE = -32  # a float32 without its last five bits: 19 are left, so its product with a lane below 16 is exact
-
-Ellipse = tuple["Tensor", "Tensor", "Tensor", "Tensor", "Tensor", "Tensor", "Tensor", "Tensor", "Tensor"]
-"""mx, my, slope, root_x, ky, reach, extent_x, extent_y, lean: the outline of ``Outlines``."""
 
 
 def _project_discs(scene: DeviceScene, view: View, seen: Seen) -> tuple[ProjectedSplats, Tensor]:
     """The discs that touch the image, and their depths [n] f64, in the block's order."""
     fx, fy, cx, cy = view.intrinsics.tolist()
-    curvature = 2.0 * HALF_LOG2_E * LOW_PASS / view.low_pass  # of exp(-g / 2), g = 2 |p - mu|^2 in full pixels
+    curvature = low_pass_curvature(view)
     near = torch.sqrt(seen.cutoff / curvature)
     mx, my = fx * seen.x / seen.z + cx, fy * seen.y / seen.z + cy
     crossed, forms = _crossing(seen, fx, fy)
-    ellipse = _chosen(crossed, _outline(seen, (mx, my), view), _circle(mx, my, near))
-    left, right = torch.minimum(mx - near, ellipse[0] - ellipse[6]), torch.maximum(mx + near, ellipse[0] + ellipse[6])
-    top, bottom = torch.minimum(my - near, ellipse[1] - ellipse[7]), torch.maximum(my + near, ellipse[1] + ellipse[7])
+    own = _chosen(crossed, _outline(seen, (mx, my), view), _circle(mx, my, near))
+    own = own._replace(circle_x=mx, circle_y=my, circle=near)
+    left, right = torch.minimum(mx - near, own.mx - own.extent_x), torch.maximum(mx + near, own.mx + own.extent_x)
+    top, bottom = torch.minimum(my - near, own.my - own.extent_y), torch.maximum(my + near, own.my + own.extent_y)
     # The nearest pixel centres lie half a pixel inside the image.
     touches = (right >= 0.5) & (left <= view.width - 0.5) & (bottom >= 0.5) & (top <= view.height - 0.5)
     kept = touches.nonzero()[:, 0]
-    outlines = Outlines(*ellipse, mx, my, near).at(kept)
+    outlines = own.at(kept)
     rows, mx, my, forms = seen.rows[kept], mx[kept], my[kept], forms[kept]
     places = mx.new_zeros(mx.shape[0], PLACE)
     places[:, CENTRE_X], places[:, CENTRE_Y] = mx, my
@@ -234,21 +227,28 @@ def _crossing(seen: Seen, fx: float, fy: float) -> tuple[Tensor, Tensor]:
     return crossed, torch.where(crossed[:, None], forms, nowhere)
 
 
-def _ellipse(middle: tuple[Tensor, Tensor], covariance: tuple[Tensor, Tensor, Tensor], det: Tensor) -> Ellipse:
+def _ellipse(middle: tuple[Tensor, Tensor], covariance: tuple[Tensor, Tensor, Tensor], det: Tensor) -> Outlines:
     """``(p - middle)^T covariance^-1 (p - middle) <= 1``; the determinant has digits of its own."""
     xx, xy, yy = covariance
-    slope, root_x, ky = xy / yy, torch.sqrt(yy / det), 1.0 / yy
-    half_width = torch.sqrt(xx)
-    return *middle, slope, root_x, ky, torch.ones_like(xx), half_width, torch.sqrt(yy), xy / half_width
+    root_x, half_width = torch.sqrt(yy / det), torch.sqrt(xx)
+    return Outlines(
+        *middle, xy / yy, root_x, 1.0 / yy, torch.ones_like(xx), half_width, torch.sqrt(yy), xy / half_width,
+        *_no_circles(xx),
+    )  # fmt: skip
 
 
-def _circle(mx: Tensor, my: Tensor, near: Tensor) -> Ellipse:
+def _no_circles(values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The circles of outlines that reach nothing beside them."""
+    return values[:0], values[:0], values[:0]
+
+
+def _circle(mx: Tensor, my: Tensor, near: Tensor) -> Outlines:
     """The low-pass alone."""
-    square = near * near + _MARGIN**2
+    square = near * near + MARGIN**2
     return _ellipse((mx, my), (square, torch.zeros_like(square), square), square * square)
 
 
-def _outline(seen: Seen, middle: tuple[Tensor, Tensor], view: View) -> Ellipse:
+def _outline(seen: Seen, middle: tuple[Tensor, Tensor], view: View) -> Outlines:
     """All pixels whose ray can cross the disc; see ``liftcore.raster.cpu.project._write_outline``."""
     fx, fy = view.intrinsics.tolist()[:2]
     z, largest = seen.z, seen.cutoff / HALF_LOG2_E
@@ -258,12 +258,12 @@ def _outline(seen: Seen, middle: tuple[Tensor, Tensor], view: View) -> Ellipse:
     w = [a[:, 2], b[:, 2]]
     room = z * z - largest * (w[0] * w[0] + w[1] * w[1])
     uu, vv, uv, uw, vw = (p[0] * q[0] + p[1] * q[1] for p, q in ((u, u), (v, v), (u, v), (u, w), (v, w)))
-    before = room > _HORIZON * z * z
+    before = room > HORIZON * z * z
     g = largest / torch.where(before, room, 1.0)
     x0, y0 = -g * uw, -g * vw
     xx, yy = x0 * x0 + g * uu, y0 * y0 + g * vv
     minor = g * (u[0] * v[1] - u[1] * v[0])
-    margin = _MARGIN**2 + _RELATIVE**2 * (xx + yy)
+    margin = MARGIN**2 + RELATIVE**2 * (xx + yy)
     det = minor * minor * (z * z / torch.where(before, room, 1.0)) + margin * (xx + yy) + margin * margin
     covariance = xx + margin, x0 * y0 + g * uv, yy + margin
     ellipse = _ellipse((middle[0] + x0, middle[1] + y0), covariance, det)
@@ -272,12 +272,15 @@ def _outline(seen: Seen, middle: tuple[Tensor, Tensor], view: View) -> Ellipse:
     return _chosen(before, ellipse, _box(left, right, top, bottom))
 
 
-def _box(left: Tensor, right: Tensor, top: Tensor, bottom: Tensor) -> Ellipse:
+def _box(left: Tensor, right: Tensor, top: Tensor, bottom: Tensor) -> Outlines:
     """Half of the reach for each side: the ellipse through the corners, of which the tiles know the sides."""
     half_x, half_y = 0.5 * (right - left), 0.5 * (bottom - top)
     zero = torch.zeros_like(left)
-    root_x, ky = 1.0 / half_x.clamp(min=_MARGIN), 1.0 / half_y.clamp(min=_MARGIN) ** 2
-    return left + half_x, top + half_y, zero, root_x, ky, torch.full_like(left, 2.0), half_x, half_y, zero
+    root_x, ky = 1.0 / half_x.clamp(min=MARGIN), 1.0 / half_y.clamp(min=MARGIN) ** 2
+    cutoff = torch.full_like(left, 2.0)
+    return Outlines(
+        left + half_x, top + half_y, zero, root_x, ky, cutoff, half_x, half_y, zero, *_no_circles(left)
+    )  # fmt: skip
 
 
 def _reached(origin: Tensor, p: Tensor, q: Tensor, room: Tensor, size: int) -> tuple[Tensor, Tensor]:
@@ -286,13 +289,11 @@ def _reached(origin: Tensor, p: Tensor, q: Tensor, room: Tensor, size: int) -> t
     met, root = square >= 0, torch.sqrt(square.clamp(min=0.0))
     high = torch.where(met & (p + root > 0), q / (p + root), math.inf)
     low = torch.where(met & (p - root < 0), q / (p - root), -math.inf)
-    low = origin + low * (1.0 + _RELATIVE) - _MARGIN
-    high = origin + high * (1.0 + _RELATIVE) + _MARGIN
+    low = origin + low * (1.0 + RELATIVE) - MARGIN
+    high = origin + high * (1.0 + RELATIVE) + MARGIN
     return low.clamp(min=-1.0), high.clamp(max=size + 1.0)
 
 
-def _chosen(mask: Tensor, yes: Ellipse, no: Ellipse) -> Ellipse:
-    first, second, third, fourth, fifth, sixth, seventh, eighth, ninth = (
-        torch.where(mask, own, other) for own, other in zip(yes, no, strict=True)
-    )
-    return first, second, third, fourth, fifth, sixth, seventh, eighth, ninth
+def _chosen(mask: Tensor, yes: Outlines, no: Outlines) -> Outlines:
+    """Row by row, of two that have no circles."""
+    return Outlines(*(torch.where(mask, *pair) if pair[0].numel() else pair[0] for pair in zip(yes, no, strict=True)))

@@ -20,7 +20,7 @@ NARROWEST = 16  # columns of a matrix product
 _CHUNK = tl.constexpr(CHUNK)
 _TILE = tl.constexpr(TILE)
 _PIXELS = tl.constexpr(TILE * TILE)
-_SCRATCH = tl.constexpr(PARTS * PART)
+_SCRATCH, _WEIGHTS = tl.constexpr(PARTS * PART), tl.constexpr(PART)
 _NO_LABEL = tl.constexpr(-1)
 
 
@@ -147,11 +147,6 @@ def _strongest_in(frame: Frame, lists: Lists, given: tuple[Tensor, int], image: 
             slots, label_starts, own_labels, image, lists.first_tile, first, *frame.size, *frame.cuts,
             KIND=frame.kind, COLUMNS=NARROWEST,
         )  # fmt: skip
-
-
-_CHUNK = tl.constexpr(CHUNK)
-_SCRATCH, _WEIGHTS = tl.constexpr(PARTS * PART), tl.constexpr(PART)
-_PIXELS = tl.constexpr(TILE * TILE)
 
 
 @jit

@@ -41,6 +41,21 @@ from liftcore.solve.weights import RegionWeights, one_view
 PIXELS = TILE * TILE
 NONE = -1
 _LARGEST_KEY = 1 << 62
+RUN = 32  # terms that one thread adds
+_RUNS_A_PROGRAM = 128  # runs a program
+COLUMNS = 16  # of a tile's matrix at a time
+BLOCK = 64  # of its rows: a thread has what it multiplies in registers, which are few
+WIDEST = 32  # channels of an image a walk
+
+_CHUNK = tl.constexpr(CHUNK)
+_TILE = tl.constexpr(TILE)
+_PIXELS = tl.constexpr(TILE * TILE)
+_SCRATCH = tl.constexpr(PARTS * PART)
+_COLUMNS, _BLOCK = tl.constexpr(COLUMNS), tl.constexpr(BLOCK)
+_INT32 = 1 << 31
+MARKS = 12  # of a ray's largest weights are found at a time, on all tiles of a launch
+_WIDE = 32  # ranks a ray that more warps share, or the registers of a thread would not hold its part
+_LARGEST, _FRONT = tl.constexpr(LARGEST), tl.constexpr(FRONT)
 
 
 class Slots(NamedTuple):
@@ -132,10 +147,6 @@ def _numbered(keys: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     return numbers, starts, row, by_key.indices[row, place]
 
 
-RUN = 32  # terms that one thread adds
-_RUNS_A_PROGRAM = 128  # runs a program
-
-
 class Sums(NamedTuple):
     """Sums by key, and the keys."""
 
@@ -208,21 +219,6 @@ def _sums(values: Tensor, order: Tensor | None, counts: Tensor) -> Tensor:
         if key.shape[0] == counts.shape[0]:
             return sums
         values, counts, order = sums, runs, None
-
-
-COLUMNS = 16  # of a tile's matrix at a time
-BLOCK = 64  # of its rows: a thread has what it multiplies in registers, which are few
-WIDEST = 32  # channels of an image a walk
-
-_CHUNK = tl.constexpr(CHUNK)
-_TILE = tl.constexpr(TILE)
-_PIXELS = tl.constexpr(TILE * TILE)
-_SCRATCH = tl.constexpr(PARTS * PART)
-_COLUMNS, _BLOCK = tl.constexpr(COLUMNS), tl.constexpr(BLOCK)
-_INT32 = 1 << 31
-MARKS = 12  # of a ray's largest weights are found at a time, on all tiles of a launch
-_WIDE = 32  # ranks a ray that more warps share, or the registers of a thread would not hold its part
-_LARGEST, _FRONT = tl.constexpr(LARGEST), tl.constexpr(FRONT)
 
 
 @jit

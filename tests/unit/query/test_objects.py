@@ -7,6 +7,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from liftcore.errors import InvalidQuery
 from liftcore.query import objects as module
@@ -15,7 +16,6 @@ from liftcore.query.export import object_ply
 from liftcore.query.objects import NEIGHBOURS, REACH, objects, touching
 from liftcore.query.scene import QueryScene
 from liftcore.query.terms import Query, Region
-from liftcore.raster.reference import rotation
 from liftcore.scene.splats import Kernel, Splats
 from tests.api.tiny_scene import SPLATS_A_CLUSTER, ply, splat_rows
 from tests.scenes import random_splats
@@ -120,7 +120,9 @@ def by_pairs(splats: Splats) -> np.ndarray:
     count = splats.count
     means = splats.means.double().numpy()
     axes = [
-        rotation(splats.quats[j].double().numpy())[:, : splats.log_scales.shape[1]]
+        Rotation.from_quat(splats.quats[j].double().numpy(), scalar_first=True).as_matrix()[
+            :, : splats.log_scales.shape[1]
+        ]
         * splats.log_scales[j].double().exp().numpy()
         for j in range(count)
     ]
