@@ -28,6 +28,7 @@ from liftcore.errors import InvalidInput, SplatliftError, Unavailable
 from liftcore.evaluate.accuracy import class_ious, cosine_figures, rendered_scores, view_cosines
 from liftcore.evaluate.hardware import hardware, peak_memory
 from liftcore.features.pack import Views, pair, read_features
+from liftcore.features.views import cells_under
 from liftcore.io.cameras import read_cameras
 from liftcore.io.class_masks import read_masks
 from liftcore.io.scene_files import open_files
@@ -295,8 +296,9 @@ def _reference(spec: RunSpec, made: LiftResult) -> tuple[Tensor, Tensor]:
 
 def _resized(labels: Tensor, mask: Tensor) -> Tensor:
     """The labels [H, W] at the centres of the mask's pixels, flat."""
-    rows = ((2 * torch.arange(mask.shape[0]) + 1) * labels.shape[0]) // (2 * mask.shape[0])
-    columns = ((2 * torch.arange(mask.shape[1]) + 1) * labels.shape[1]) // (2 * mask.shape[1])
+    rows, columns = (
+        cells_under(torch.arange(size), size, cells) for size, cells in zip(mask.shape, labels.shape, strict=True)
+    )
     return labels[rows][:, columns].flatten()
 
 

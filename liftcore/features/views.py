@@ -6,7 +6,7 @@ read by bilinear interpolation, four rows a pixel.
 
 import warnings
 from dataclasses import dataclass
-from typing import Self
+from typing import Self, TypeVar
 
 import numpy as np
 import torch
@@ -20,6 +20,12 @@ MAX_CHANNELS = 1 << 16
 INTEGERS = (torch.int32, torch.int16, torch.int64, torch.int8, torch.uint8)
 Array = Tensor | np.ndarray
 FLOATS = (torch.float16, torch.float32, torch.float64, torch.bfloat16)
+Numbers = TypeVar("Numbers", np.ndarray, Tensor)
+
+
+def cells_under(pixels: Numbers, size: int, cells: int) -> Numbers:
+    """``floor((p + 0.5) cells / size)`` of pixels p of a side of ``size``, in whole numbers: the cells they read."""
+    return (2 * pixels + 1) * cells // (2 * size)
 
 
 @dataclass(frozen=True, eq=False, init=False)

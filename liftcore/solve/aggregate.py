@@ -27,7 +27,7 @@ from scipy.sparse import csr_matrix
 from torch import Tensor
 
 from liftcore.features.levels import at_levels
-from liftcore.features.views import Regions, ViewFeatures
+from liftcore.features.views import Regions, ViewFeatures, cells_under
 from liftcore.progress import Progress
 from liftcore.raster.base import Raster
 from liftcore.settings import LiftSettings
@@ -418,8 +418,8 @@ def contingency(labels: np.ndarray, kappa: np.ndarray, rows: int, clusters: int)
     """[M, K + 1] i64: pixels of the image that read a region and show a cluster; the first column is for none."""
     height, width = kappa.shape
     levels, label_rows, label_columns = labels.shape
-    y = (2 * np.arange(height) + 1) * label_rows // (2 * height)
-    x = (2 * np.arange(width) + 1) * label_columns // (2 * width)
+    y = cells_under(np.arange(height), height, label_rows)
+    x = cells_under(np.arange(width), width, label_columns)
     shown = (kappa + 1).ravel()
     total = csr_matrix((rows, clusters + 1), dtype=np.int64)
     read: list[np.ndarray] = []

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from liftcore.features.levels import at_levels
 from liftcore.features.pack import Views, as_views, pair
-from liftcore.features.views import FeatureGrid, Regions, ViewFeatures
+from liftcore.features.views import FeatureGrid, Regions, ViewFeatures, cells_under
 from liftcore.one_thread import one_thread
 from liftcore.progress import Progress
 from liftcore.raster.base import CompositingParams, Raster, RayRows, ViewRequest
@@ -203,8 +203,7 @@ def read_pixels(observation: ViewFeatures, camera: Camera, pixels: Tensor) -> Re
     x, y = pixels.numpy().astype(np.int64).T
     if isinstance(observation, Regions):
         _, rows, columns = observation.labels.shape
-        label_y = (2 * y + 1) * rows // (2 * camera.height)
-        label_x = (2 * x + 1) * columns // (2 * camera.width)
+        label_y, label_x = cells_under(y, camera.height, rows), cells_under(x, camera.width, columns)
         labels = observation.labels.numpy()[:, label_y, label_x]
         level, ray = np.nonzero(labels >= 0)
         return Readout(ray, labels[level, ray][:, None].astype(np.int64), np.ones((ray.shape[0], 1)))

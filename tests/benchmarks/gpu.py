@@ -28,7 +28,7 @@ from liftcore.errors import SplatliftError
 from liftcore.evaluate.bench import run_bench, weigh_regions
 from liftcore.evaluate.hardware import hardware, machine_line
 from liftcore.evaluate.synthetic import room_cameras, room_regions, room_splats
-from liftcore.features.views import Regions
+from liftcore.features.views import Regions, cells_under
 from liftcore.io.lift_file import TENSORS, save_lift
 from liftcore.io.scene_files import lift_files as lift_paths
 from liftcore.raster import open_raster
@@ -179,8 +179,8 @@ def dense_target(regions: Regions, place: torch.device) -> Tensor:
 def at_pixels(regions: Regions, camera: Camera) -> Regions:
     """The regions with a label a pixel."""
     height, width = regions.labels.shape[1:]
-    y = (2 * torch.arange(camera.height) + 1) * height // (2 * camera.height)
-    x = (2 * torch.arange(camera.width) + 1) * width // (2 * camera.width)
+    y = cells_under(torch.arange(camera.height), camera.height, height)
+    x = cells_under(torch.arange(camera.width), camera.width, width)
     return Regions(regions.labels[:, y][:, :, x].contiguous(), regions.codebook)
 
 

@@ -31,7 +31,7 @@ from torch.nn.functional import cosine_similarity, embedding, embedding_bag, pad
 
 from liftcore.evaluate.bench import weigh_regions
 from liftcore.evaluate.synthetic import room_cameras, room_regions, room_splats
-from liftcore.features.views import Regions
+from liftcore.features.views import Regions, cells_under
 from liftcore.raster.base import ALPHA_FLOOR, TILE, CompositingParams, Weighting
 from liftcore.raster.cpu.composite import Frame
 from liftcore.raster.cpu.project import CUTOFF, KY, MX, MY, OPACITY, ROOT_X, SLOPE
@@ -90,8 +90,8 @@ def room(size: Size) -> Work:
 def dense_target(camera: Camera, regions: Regions) -> Tensor:
     """B and n of a view as an image [H, W, F + 1] f32, n last; levels are added up, a quarter of a peer's work."""
     rows, columns = regions.labels.shape[1:]
-    y = (2 * torch.arange(camera.height) + 1) * rows // (2 * camera.height)
-    x = (2 * torch.arange(camera.width) + 1) * columns // (2 * camera.width)
+    y = cells_under(torch.arange(camera.height), camera.height, rows)
+    x = cells_under(torch.arange(camera.width), camera.width, columns)
     labels = regions.labels[:, y][:, :, x].reshape(len(regions.labels), -1).T
     count, channels = regions.codebook.shape
     book = torch.zeros(count + 1, channels + 1)  # its last row is what an unlabelled level reads

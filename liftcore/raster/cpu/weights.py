@@ -25,7 +25,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from liftcore.features.views import Regions, ViewFeatures
+from liftcore.features.views import Regions, ViewFeatures, cells_under
 from liftcore.jit import inlined, kernel
 from liftcore.raster.base import TILE, CompositingParams
 from liftcore.raster.cpu.composite import (
@@ -122,8 +122,8 @@ def reading_of(observation: ViewFeatures, width: int, height: int, params: Compo
     if isinstance(observation, Regions):
         labels = np.ascontiguousarray(observation.labels.to(torch.int32).numpy())
         levels, rows, columns = labels.shape
-        label_x = np.ascontiguousarray(_nearest(width, columns)[left])
-        label_y = np.ascontiguousarray(_nearest(height, rows)[top])
+        label_x = cells_under(np.arange(width)[left], width, columns).astype(np.int32)
+        label_y = cells_under(np.arange(height)[top], height, rows).astype(np.int32)
         return Reading(
             False, levels, labels, label_x, label_y,
             no_ints, no_ints, no_floats, no_floats, 0, observation.codebook.shape[0],
@@ -133,11 +133,6 @@ def reading_of(observation: ViewFeatures, width: int, height: int, params: Compo
     cell_y, share_y = (np.ascontiguousarray(part[top]) for part in _taps(height, rows))
     no_labels = np.empty((0, 0, 0), np.int32)
     return Reading(True, 1, no_labels, no_ints, no_ints, cell_x, cell_y, share_x, share_y, columns, rows * columns)
-
-
-def _nearest(pixels: int, cells: int) -> np.ndarray:
-    """[pixels] i32: floor((p + 0.5) cells / pixels), in whole numbers."""
-    return ((2 * np.arange(pixels, dtype=np.int64) + 1) * cells // (2 * pixels)).astype(np.int32)
 
 
 def _taps(pixels: int, cells: int) -> tuple[np.ndarray, np.ndarray]:
