@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
-from typing import TYPE_CHECKING
+from typing import Any
+
+import pytest
+from fastapi.testclient import TestClient
 
 from service.jobs import supervisor as pace
 from service.store.jobs import LINE_CHARACTERS, LOG_LINES, EventKind, log_line, note
 from service.store.owners import SERVICE
+from service.store.store import Store
 from tests.crash.conftest import order
 
+from .conftest import Uploaded
 from .guarded import finish
-
-if TYPE_CHECKING:
-    import pytest
-
-    from service.store.store import Store
 
 TIMES = (20.0, 10.0, 30.0)
 NEWEST_FIRST = (2, 0, 1)
@@ -34,6 +34,16 @@ def test_lists_begin_with_the_newest(store: Store) -> None:
     assert [job.id for job in store.jobs.all(SERVICE)] == [jobs[place] for place in NEWEST_FIRST]
     assert [lift.id for lift in store.lifts.all(SERVICE)] == [jobs[place] for place in NEWEST_FIRST]
     assert [asset.id for asset in store.assets.all(SERVICE)] == [assets[place] for place in NEWEST_FIRST]
+
+
+def test_list_tells_of_a_lift_what_it_tells_of_it_alone(
+    client: TestClient, lift: dict[str, Any], uploaded: Uploaded
+) -> None:
+    (found,) = [entry for entry in client.get("/lifts").json()["lifts"] if entry["id"] == lift["id"]]
+    assert found == lift
+    assert (found["splats"], found["cameras"], found["features"]) == (
+        uploaded.splats, uploaded.cameras, [uploaded.features]
+    )  # fmt: skip
 
 
 def test_job_keeps_its_states_the_last_of_its_log_and_its_latest_progress(store: Store) -> None:

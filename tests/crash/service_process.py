@@ -19,7 +19,7 @@ from safetensors.numpy import load
 from service.jobs.process import MARK
 
 ROOT = Path(__file__).parents[2]
-PATIENCE_SECONDS = 300.0
+PATIENCE_SECONDS = 1800.0  # of a machine that has other things to do: no promise is about time here
 ENDED = ("succeeded", "failed", "canceled")
 
 
@@ -30,7 +30,7 @@ class ServiceProcess:
         self._data = data
         self._process: subprocess.Popen[str] | None = None
         # No connection is used twice: one that lay idle may be closed in the moment in which it is taken up again.
-        self.client = httpx.Client(timeout=120, limits=httpx.Limits(max_keepalive_connections=0))
+        self.client = httpx.Client(timeout=PATIENCE_SECONDS, limits=httpx.Limits(max_keepalive_connections=0))
         self.start(*options)
 
     def __enter__(self) -> Self:
@@ -61,6 +61,11 @@ class ServiceProcess:
         self._process.kill()
         self._process.wait()
         self._process.stdout.close()
+
+    def died(self) -> bool:
+        """Whether it has; a request may also be cut off while it lives."""
+        assert self._process is not None
+        return self._process.poll() is not None
 
     def wait(self) -> int:
         """Wait until it has died by itself."""
