@@ -26,7 +26,6 @@ KEYS_REQUIRED = "keys.required"  # there when a key was ever made
 RESERVE = "reserve"  # room for the transaction of a deletion on a full disk
 RESERVE_BYTES = 1 << 20
 BUSY_SECONDS = 10.0  # that a write waits for others, of this process and of others
-MAGIC = b"SQLite format 3\0"
 MOST_IDLE = 4  # connections kept for the next readers; those of a rush are closed after it
 CURSOR = r"^[0-9.e+-]{1,30}~[0-9a-z:]{1,80}$"  # when the last one of a page was made, and its id
 
@@ -121,6 +120,8 @@ class Database:
             raise _error("database is locked", "SQLITE_BUSY")
         try:
             self.require_same_file()
+            if counted:
+                self._require_readable()
             self._writer.execute("BEGIN IMMEDIATE")
             try:
                 generation = self._next_generation() if counted and not self._rebuilding else None
@@ -168,18 +169,26 @@ class Database:
             log.warning("there is no room for %s, from which deletions on a full disk live: %s", path, error)
 
     def require_same_file(self) -> None:
-        """See that the database is the file that was opened, and still one: else what is written would be lost.
+        """See that the database is the file that was opened: what is written to another one would be lost.
 
         Raises:
-            sqlite3.OperationalError: it is gone, another, or overwritten.
+            sqlite3.OperationalError: it is gone, or another.
         """
-        with suppress(FileNotFoundError):
-            if _identity(self._path) == self._identity:
-                with self._path.open("rb") as handle:
-                    if handle.read(len(MAGIC)) == MAGIC:
-                        return
-                raise _error("file is not a database", "SQLITE_NOTADB")
-        raise _error("another file, or none, is in the place of the database", "SQLITE_READONLY_DBMOVED")
+        try:
+            same = _identity(self._path) == self._identity
+        except OSError as error:  # a disk that tells nothing tells of no other file
+            same = not isinstance(error, FileNotFoundError)
+        if not same:
+            raise _error("another file, or none, is in the place of the database", "SQLITE_READONLY_DBMOVED")
+
+    def _require_readable(self) -> None:
+        """See that who comes anew finds a database, which an open connection does not notice.
+
+        Only SQLite may open the file: a process that closes it in any other way gives up all of SQLite's locks on it
+        (POSIX), and the next program that closes the database takes the WAL for its own and removes it.
+        """
+        with closing(open_to_read(self._path)) as connection:
+            connection.execute("PRAGMA schema_version").fetchone()
 
     def _next_generation(self) -> int:
         return self._writer.execute("UPDATE generation SET number = number + 1 RETURNING number").fetchone()[0]
@@ -223,8 +232,7 @@ class Database:
             sqlite3.Error, OSError: it is not so.
         """
         self.require_same_file()
-        with closing(open_to_read(self._path)) as connection:
-            connection.execute("SELECT count(*) FROM jobs WHERE state = 'queued'").fetchone()
+        self._require_readable()
         with self.write() as connection:
             version = connection.execute("PRAGMA user_version").fetchone()[0]
             connection.execute(f"PRAGMA user_version = {version}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import sqlite3
 import subprocess
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -24,6 +25,7 @@ from service.settings import ServiceSettings
 from service.store import database as databases
 from service.store.database import DATABASE, RESERVE, Database
 from service.store.keys import any_key
+from service.store.owners import SERVICE
 from service.store.store import Store
 
 from .conftest import ended, order, stand_in
@@ -136,8 +138,10 @@ def replaced(path: Path) -> None:
 
 @pytest.mark.parametrize("broken", [malformed, Path.unlink])
 def test_broken_database_is_told_by_readyz_and_takes_no_order(broken: Callable[[Path], None], tmp_path: Path) -> None:
-    with serving(tmp_path / "data") as (_, client, body):
+    with serving(tmp_path / "data") as (store, client, body):
         assert client.get("/healthz").status_code == 200
+        with store.database.read() as connection:  # what lies in the WAL alone would still be there
+            connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
         broken(tmp_path / "data" / DATABASE)
         for _ in range(3):
             reply = client.post("/lift", json=body)
@@ -150,6 +154,20 @@ def test_broken_database_is_told_by_readyz_and_takes_no_order(broken: Callable[[
         if broken is replaced:
             assert left.execute("SELECT count(*) FROM jobs").fetchone()[0] == 0  # nothing goes to a stranger
         left.close()
+
+
+def test_other_process_that_opens_and_closes_the_database_costs_no_commit(tmp_path: Path) -> None:
+    store = Store.open(tmp_path)
+    before, wal = order(store), (tmp_path / f"{DATABASE}-wal").stat().st_ino
+    look = (
+        "import sqlite3, sys; c = sqlite3.connect(sys.argv[1]); print(*c.execute('SELECT id FROM jobs')); c.close()"
+    )
+    command = [sys.executable, "-c", look, str(tmp_path / DATABASE)]
+    subprocess.run(command, check=True)
+    job = store.jobs.submit(SERVICE, before)[0]
+    assert (tmp_path / f"{DATABASE}-wal").stat().st_ino == wal  # it would go with the last one that has it open
+    assert job in subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    store.close()
 
 
 def test_lock_that_another_holds_for_long_is_503_with_retry_after(
