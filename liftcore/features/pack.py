@@ -60,7 +60,6 @@ class Views(Mapping[str, ViewFeatures]):
     encoder: str  # the 2D encoder as the packs tell it, "" when they do not
     text_space: str  # the text encoder that shares the space; "" unknown, "none" when there is none
     normalised: bool | None  # whether codebook rows and grid cells are unit vectors; None when not told
-    paths: tuple[Path, ...]  # the packs; () of values in memory
     _sources: Mapping[str, _Source] = field(repr=False)
     _cameras: Mapping[str, Camera] = field(default_factory=dict, repr=False)
 
@@ -144,7 +143,7 @@ def as_views(
     if isinstance(views, dict):  # other mappings may read files: theirs are checked one by one
         _check_channels((name, source.read()) for name, source in sources.items())
     channels = next(iter(sources.values())).read().codebook.shape[1]
-    return Views(channels, "", "", None, (), sources)
+    return Views(channels, "", "", None, sources)
 
 
 def read_features(*paths: str | Path) -> Views:
@@ -172,7 +171,7 @@ def read_features(*paths: str | Path) -> Views:
         raise InvalidFeatures("features", expected="the same channels in every view", got=got)
     normalised = {"true": True, "false": False}.get(_agreed(packs, "normalised").lower())
     encoder, text_space = _agreed(packs, "encoder"), _agreed(packs, "text_space")
-    return Views(next(iter(channels)), encoder, text_space, normalised, tuple(map(Path, paths)), sources)
+    return Views(next(iter(channels)), encoder, text_space, normalised, sources)
 
 
 def pair(views: Views, cameras: Mapping[str, Camera]) -> tuple[Views, list[str]]:
@@ -261,7 +260,7 @@ def _spooled(pairs: Iterable[tuple[str, ViewFeatures]], scratch: Path | None) ->
                 _write(handle, {name: _Given({name: features}, name).read()}, {}, silent)
         if not files:
             raise InvalidFeatures("features", expected="at least one view", got="none")
-        return replace(read_features(*files.values()), paths=())  # mapped: the files may lose their names
+        return read_features(*files.values())  # mapped: the files may lose their names
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -217,56 +218,63 @@ def _keys(path: Path) -> tuple[set[str], dict[str, str]]:
         raise InvalidInput(str(path), expected="a safetensors file", got=got) from None
 
 
+@dataclass(frozen=True)
+class _ViewFacts:
+    """What is counted of a view."""
+
+    is_regions: bool
+    size: str
+    sides: tuple[int, int]  # width and height of the map
+    rows: int  # of the codebook, or cells
+    zero: int  # rows without a length
+    unused: int  # rows that no label reads
+    unlabelled: float  # share of the labels
+    norms: tuple[float, float] | None  # the least and largest of rows with a length
+
+
 def describe_packs(packs: Views) -> dict[str, Any]:
     """Read every view: counts, ranges and warnings of feature packs."""
-    found = [_describe_view(packs[view], packs.is_regions(view)) for view in packs.views]
-    regions = [view for view in found if view["regions"]]
-    low = min((view["norms"][0] for view in found if view["norms"]), default=0.0)
-    high = max((view["norms"][1] for view in found if view["norms"]), default=0.0)
+    found = [_view_facts(view) for view in packs.values()]
+    regions = [view for view in found if view.is_regions]
+    norms = [view.norms for view in found if view.norms is not None] or [(0.0, 0.0)]
+    low, high = min(least for least, _ in norms), max(largest for _, largest in norms)
     return {
-        "views": len(packs.views),
-        "names": list(packs.views),
+        "views": len(packs),
+        "names": list(packs),
         "region_maps": len(regions),
         "grids": len(found) - len(regions),
         "channels": packs.channels,
         "encoder": packs.encoder,
         "text_space": packs.text_space,
         "normalised": packs.normalised,
-        "sizes": sorted({view["size"] for view in found}),
-        "codebook_rows": sum(view["rows"] for view in found),
+        "sizes": sorted({view.size for view in found}),
+        "codebook_rows": sum(view.rows for view in found),
         "norms": {"min": low, "max": high},
-        "unlabelled": sum(view["unlabelled"] for view in regions) / len(regions) if regions else 0.0,
+        "unlabelled": sum(view.unlabelled for view in regions) / len(regions) if regions else 0.0,
         "warnings": _pack_warnings(packs, found, low, high),
     }
 
 
-def _describe_view(observation: ViewFeatures, regions: bool) -> dict[str, Any]:
-    norms = torch.linalg.vector_norm(observation.codebook, dim=1, dtype=torch.float64)
-    zero = norms == 0
-    ends = [float(value) for value in torch.aminmax(norms[~zero])] if bool((~zero).any()) else []
-    view = {"regions": regions, "rows": len(norms), "zero": int(zero.sum()), "norms": ends, "unlabelled": 0.0}
-    if isinstance(observation, Regions):
-        empty = observation.labels == NO_LABEL
-        uses = torch.bincount(observation.labels.flatten() - NO_LABEL, minlength=len(norms) + 1)
-        unused = int((uses[1:] == 0).sum())
-        levels, height, width = observation.labels.shape
-        size = f"{levels} levels of {width}x{height}"
-        return {
-            **view,
-            "sides": (width, height),
-            "size": size,
-            "unlabelled": float(empty.float().mean()),
-            "unused": unused,
-        }
-    height, width, _ = observation.grid.shape
-    return {**view, "sides": (width, height), "size": f"{width}x{height} cells", "unused": 0}
+def _view_facts(view: ViewFeatures) -> _ViewFacts:
+    norms = torch.linalg.vector_norm(view.codebook, dim=1, dtype=torch.float64)
+    long = norms[norms > 0]
+    ends = (float(long.min()), float(long.max())) if len(long) else None
+    rows, zero = len(norms), len(norms) - len(long)
+    if not isinstance(view, Regions):
+        height, width, _ = view.grid.shape
+        return _ViewFacts(False, f"{width}x{height} cells", (width, height), rows, zero, 0, 0.0, ends)
+    levels, height, width = view.labels.shape
+    unused = int((torch.bincount(view.labels.flatten() - NO_LABEL, minlength=rows + 1)[1:] == 0).sum())
+    unlabelled = float((view.labels == NO_LABEL).float().mean())
+    size = f"{levels} levels of {width}x{height}"
+    return _ViewFacts(True, size, (width, height), rows, zero, unused, unlabelled, ends)
 
 
-def _pack_warnings(packs: Views, found: list[dict[str, Any]], low: float, high: float) -> list[str]:
-    rows = sum(view["rows"] for view in found)
-    zero = sum(view["zero"] for view in found)
-    unused = sum(view["unused"] for view in found)
-    empty = sum(view["unlabelled"] == 1.0 for view in found)
+def _pack_warnings(packs: Views, found: list[_ViewFacts], low: float, high: float) -> list[str]:
+    rows = sum(view.rows for view in found)
+    zero = sum(view.zero for view in found)
+    unused = sum(view.unused for view in found)
+    empty = sum(view.unlabelled == 1.0 for view in found)
     unit = abs(low - 1) < UNIT_TOLERANCE and abs(high - 1) < UNIT_TOLERANCE
     warnings = []
     if packs.normalised and not unit:
@@ -281,9 +289,9 @@ def _pack_warnings(packs: Views, found: list[dict[str, Any]], low: float, high: 
         warnings.append(f"{empty} views have no label at all")
     if not packs.encoder:
         warnings.append("the pack does not name its encoder")
-    narrow = next((view for view in found if max(view["sides"]) > NARROW * min(view["sides"])), None)
+    narrow = next((view for view in found if max(view.sides) > NARROW * min(view.sides)), None)
     if narrow is not None:
-        shape = f"maps of {narrow['size']}, which few images are like"
+        shape = f"maps of {narrow.size}, which few images are like"
         warnings.append(f"{shape}: where channels come first, pack them with --layout chw")
     return warnings
 
