@@ -16,9 +16,16 @@ from liftcore.device import CPU, Device
 from liftcore.errors import Unavailable
 from liftcore.features.pack import Views
 from liftcore.io.transforms import frame_warning
-from liftcore.planning.coverage import WELL_COVERED, spare_views, view_order, views_to_show
-from liftcore.planning.pilot import PILOT_VIEWS, fly_pilot
-from liftcore.planning.visibility import Visibility, visibility
+from liftcore.planning.views import (
+    PILOT_VIEWS,
+    WELL_COVERED,
+    Visibility,
+    fly_pilot,
+    spare_views,
+    view_order,
+    views_to_show,
+    visibility,
+)
 from liftcore.raster.base import TILE
 from liftcore.scene.cameras import Camera, distortion_warning
 from liftcore.scene.splats import Splats

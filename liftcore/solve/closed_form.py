@@ -20,7 +20,7 @@ from liftcore.device import CPU, Device, out_of_memory
 from liftcore.one_thread import one_thread
 from liftcore.progress import Progress, silent
 from liftcore.solve.codebook import Codebook
-from liftcore.solve.memory import zeros
+from liftcore.solve.memory import give_back, zeros
 from liftcore.solve.weights import BLOCK_ENTRIES, BLOCK_ROWS, RegionWeights, from_zero, row_blocks, run_each
 
 LONG = 256  # terms of a sum that float32 adds up one by one
@@ -65,6 +65,7 @@ def solve(
     X = zeros(shape, dtype, name="features", in_file=memory is not None and size > memory)
     seen = torch.nonzero(W.indptr.diff())[:, 0]
     squares = solve_rows(X, seen, W, codebook, progress, means=means, threads=threads, device=device)
+    give_back()
     return Solution(X, squares.sqrt().clamp(0.0, 1.0).float())
 
 
@@ -92,12 +93,14 @@ def solve_rows(
     most = (BLOCK_ROWS, BLOCK_ENTRIES) if device.kind == "cpu" else (DEVICE_ROWS, DEVICE_ENTRIES)
     blocks = row_blocks(W.indptr.diff()[rows].cpu().numpy(), *most)
     slices = list(codebook.slices())
+    inverse = None if codebook.unit or codebook.inverse_lengths is None else codebook.inverse_lengths.to(device.place)
     for number, channels in enumerate(slices):
-        tables = [codebook.values(channels, device.place)]
-        if not codebook.unit:
-            tables.append(codebook.unit_values(channels, device.place))
+        table = codebook.values(channels, device.place)
+        units = None if codebook.unit or inverse is not None else codebook.unit_values(channels, device.place)
 
-        def solve_block(first: int, last: int, tables: list[Tensor] = tables, channels: slice = channels) -> None:
+        def solve_block(
+            first: int, last: int, table: Tensor = table, units: Tensor | None = units, channels: slice = channels
+        ) -> None:
             own = rows[first:last]
             starts, entries = W.take(own)
             scales = scale[own].repeat_interleave(starts.diff(), output_size=entries.shape[0])
@@ -105,10 +108,12 @@ def solve_rows(
             region, starts = W.region.index_select(0, entries).to(device.place), starts.to(device.place)
             del entries, scales
             own = own.cpu()
-            sums = bag_sums(region, tables[0], starts, shares)
+            sums = bag_sums(region, table, starts, shares)
             X[:, channels].index_copy_(0, own, sums.to(X.dtype).cpu())
-            if len(tables) > 1:
-                sums = bag_sums(region, tables[1], starts, shares)
+            if units is not None:
+                sums = bag_sums(region, units, starts, shares)
+            elif inverse is not None:
+                sums = bag_sums(region, table, starts, shares.mul_(inverse.index_select(0, region)))
             squares[own] += torch.linalg.vector_norm(sums, dim=1).double().square().cpu()
 
         if device.kind == "cpu":

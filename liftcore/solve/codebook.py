@@ -19,11 +19,12 @@ from liftcore.features.levels import label_tuples
 from liftcore.features.views import NO_LABEL, Regions, ViewFeatures
 from liftcore.solve.weights import RegionWeights
 
-ROWS = 1 << 13  # of a codebook that are widened at a time
+ROWS = 1 << 10  # of a codebook that are widened at a time
 FLOAT16_MAX = 65_504.0
 FLOAT16_STEP = 2.0**-25  # the largest rounding error of its small values
 FLOAT16_ERROR = 1e-4  # of the longest vector, which float16 must hold
 UNIT_TOLERANCE = 5e-3  # float16 unit vectors are off by less
+SHORTEST = 1e-30  # of the vectors whose inverse length float32 takes well
 TABLE_BYTES = 1 << 28  # of float32 columns of E of all views at a time
 LEAST_CHANNELS = 8  # at a time, however many regions there are
 
@@ -87,6 +88,18 @@ class Codebook:
     def unit(self) -> bool:
         """Whether all rows are unit vectors, as float16 has them."""
         return all(bool(((length - 1).abs() < UNIT_TOLERANCE).all()) for length in self.lengths)
+
+    @cached_property
+    def inverse_lengths(self) -> Tensor | None:
+        """[M] f32, what makes a unit vector of what each region reads, zero for none.
+
+        None where a region reads the mean of several rows, or float32 does not hold its product with a weight.
+        """
+        lengths = torch.cat(self.lengths)
+        known = lengths > 0
+        if any(view.tuples is not None for view in self.views) or bool((lengths[known] < SHORTEST).any()):
+            return None
+        return torch.where(known, 1.0 / lengths, 0.0).float()
 
     def fits_float16(self) -> bool:
         """Whether float16 holds every value, and the longest row to FLOAT16_ERROR."""

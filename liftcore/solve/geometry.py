@@ -19,6 +19,7 @@ from liftcore.scene.cameras import Camera, Cameras
 from liftcore.settings import LiftSettings
 from liftcore.solve.checkpoint import Checkpoint
 from liftcore.solve.codebook import Codebook, ViewCodebook, as_regions
+from liftcore.solve.memory import give_back
 from liftcore.solve.weights import MEMORY_LIMIT, RegionWeights, stacked
 
 Given = Mapping[str, ViewFeatures] | Iterable[tuple[str, ViewFeatures]]
@@ -163,7 +164,10 @@ def weigh_views(
             samples.append(SampledRays(view.rows, readouts.popleft()))
             del view, part  # before the next one is made beside it
             progress("geometry", len(samples), len(views), "views")
-    return Geometry(stacked(parts, splats, threads), Codebook(tuple(codebooks)), tuple(samples), tuple(blind))
+    W = stacked(parts, splats, threads)
+    parts.clear()
+    give_back()
+    return Geometry(W, Codebook(tuple(codebooks)), tuple(samples), tuple(blind))
 
 
 def strided(params: CompositingParams, settings: LiftSettings, camera: Camera, number: int) -> CompositingParams:

@@ -24,8 +24,8 @@ from liftcore.solve.memory import zeros
 FORMAT = "splatlift-weights/1"
 MEMORY_LIMIT = 1 << 28  # bytes of W that stay in memory; what is beyond lies in mapped files
 MOST_REGIONS = 2**31 - 1  # of all views: an entry names its region in four bytes
-BLOCK_ENTRIES = 1 << 19  # that a thread works on at a time, unless a splat alone has more
-BLOCK_ROWS = 1 << 12
+BLOCK_ENTRIES = 1 << 17  # that a thread works on at a time, unless a splat alone has more
+BLOCK_ROWS = 1 << 11
 
 
 @dataclass(frozen=True)

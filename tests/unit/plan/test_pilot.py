@@ -16,9 +16,8 @@ from liftcore.io.cameras import read_cameras
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.ply import write_splats
 from liftcore.io.scene_files import lift_files, open_files
-from liftcore.planning.pilot import PILOT_VIEWS, Pilot, fly_pilot
 from liftcore.planning.plan import FEW_VIEWS
-from liftcore.planning.visibility import visibility
+from liftcore.planning.views import PILOT_VIEWS, Pilot, fly_pilot, visibility
 from liftcore.scene.cameras import Cameras
 from liftcore.settings import LiftSettings
 from liftcore.solve.geometry import LiftViews

@@ -7,16 +7,17 @@ import pytest
 import torch
 
 from liftcore.io.scene_files import lift_files
-from liftcore.planning.coverage import (
+from liftcore.planning.views import (
     ORDER_SPLATS,
     SIDES,
     WELL_COVERED,
+    Visibility,
     side_of,
     spare_views,
     view_order,
     views_to_show,
+    visibility,
 )
-from liftcore.planning.visibility import Visibility, visibility
 from liftcore.raster.base import CompositingParams, Weighting
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.splats import Kernel
