@@ -148,7 +148,7 @@ class Database:
             with self.write(counted=True) as connection:
                 freed = list(work(connection))
         except sqlite3.OperationalError as error:
-            if error.sqlite_errorcode & 0xFF not in (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR):
+            if getattr(error, "sqlite_errorcode", 0) & 0xFF not in (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR):
                 raise
             (self._path.parent / RESERVE).unlink(missing_ok=True)
             with self.write(counted=True) as connection:
@@ -206,6 +206,7 @@ class Database:
         try:
             connection = self._idle.get_nowait()
         except queue.Empty:
+            self.require_same_file()  # else the collector would find that no file belongs to anything
             connection = self._connect()
         try:
             yield connection

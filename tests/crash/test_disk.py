@@ -7,6 +7,7 @@ import sqlite3
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,6 +24,7 @@ from service.jobs.supervisor import Supervisor
 from service.queries.client import QueryClient
 from service.settings import ServiceSettings
 from service.store import database as databases
+from service.store.collect import collect
 from service.store.database import DATABASE, RESERVE, Database
 from service.store.keys import any_key
 from service.store.owners import SERVICE
@@ -154,6 +156,18 @@ def test_broken_database_is_told_by_readyz_and_takes_no_order(broken: Callable[[
         if broken is replaced:
             assert left.execute("SELECT count(*) FROM jobs").fetchone()[0] == 0  # nothing goes to a stranger
         left.close()
+
+
+def test_another_database_in_its_place_costs_no_file(tmp_path: Path) -> None:
+    store = Store.open(tmp_path)
+    asset = store.assets.get(SERVICE, order(store).splats)
+    replaced(tmp_path / DATABASE)
+    store.database._idle.get_nowait().close()  # as after a rush of readers
+    for look in (lambda: collect(store, time.time() + 1), lambda: store.assets.all(SERVICE)):
+        with pytest.raises(sqlite3.OperationalError, match="in the place of the database"):
+            look()
+    assert asset.whole
+    store.close()
 
 
 def test_other_process_that_opens_and_closes_the_database_costs_no_commit(tmp_path: Path) -> None:
