@@ -19,7 +19,7 @@ from PIL import Image
 from liftcore.features.encoders.encode import read_image
 from liftcore.features.pack import Views, pair
 from liftcore.features.views import FeatureGrid, Regions
-from liftcore.planning.visibility import visibility
+from liftcore.planning.views import visibility
 from liftcore.progress import Progress, silent
 from liftcore.query.render import in_photo
 from liftcore.query.splat_colours import seen_colours
