@@ -148,7 +148,7 @@ ALTER TABLE lifts ADD COLUMN brief TEXT NOT NULL DEFAULT '{}';   -- metadata wit
 ALTER TABLE lifts ADD COLUMN metadata_bytes INTEGER NOT NULL DEFAULT 0;
 ALTER TABLE lifts ADD COLUMN view_count INTEGER NOT NULL DEFAULT 0;
 ALTER TABLE lifts ADD COLUMN first_view TEXT;
-UPDATE lifts SET metadata_bytes = length(metadata), view_count = json_array_length(metadata, '$.views'),
+UPDATE lifts SET metadata_bytes = length(metadata), view_count = coalesce(json_array_length(metadata, '$.views'), 0),
     first_view = json_extract(metadata, '$.views[0]'), brief = json_remove(metadata, '$.views',
     '$.certificate.views_without_camera', '$.certificate.views_without_splats');
 """,

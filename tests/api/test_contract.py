@@ -1,4 +1,7 @@
-"""The service does what its OpenAPI document says, over real sockets. `make contract` is the long form."""
+"""The service does what its OpenAPI document says, over real sockets, with keys and one example of each operation.
+
+`make contract` is the long form: every corner of the schema, many examples, without keys too.
+"""
 
 from __future__ import annotations
 
@@ -19,12 +22,6 @@ def copied(data: Path, lift: dict[str, Any], tmp_path: Path) -> Path:
     return folder
 
 
-def test_every_corner_of_the_schema_is_answered_as_it_says(copied: Path, table: Path) -> None:
-    with served(copied, keys=False, encoder=f"table:{table}") as (address, secret):
-        # The corners of /query are those of its pictures, over again.
-        assert not conformance(address, secret, examples=1, phases=("coverage",), without="^/query/")
-
-
-def test_keys_are_asked_for_and_what_is_deleted_is_gone(copied: Path, table: Path) -> None:
+def test_answers_are_as_the_document_says_and_what_is_deleted_is_gone(copied: Path, table: Path) -> None:
     with served(copied, keys=True, encoder=f"table:{table}") as (address, secret):
         assert not conformance(address, secret, examples=1, phases=("fuzzing", "stateful"))

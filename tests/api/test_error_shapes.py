@@ -144,11 +144,6 @@ def test_long_bodies_are_413_where_bodies_are_read(client: TestClient, routes: d
             assert assert_problem(reply)["status"] == 413, path
 
 
-def test_unknown_encodings_are_415(client: TestClient) -> None:
-    reply = client.put("/assets/splats", content=b"x", headers={"Content-Encoding": "br"})
-    assert assert_problem(reply)["status"] == 415
-
-
 @pytest.fixture(scope="module")
 def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, int]]:
     """A server behind a socket, in no hurry."""

@@ -15,22 +15,26 @@ from contextlib import contextmanager
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import anyio
 import httpx
 import pytest
+import uvicorn
 from fastapi.testclient import TestClient
 from prometheus_client import REGISTRY
 from prometheus_client.parser import text_string_to_metric_families
 
+from service.__main__ import AnnouncingServer
 from service.errors import Busy
 from service.jobs.process import JobLimits
 from service.jobs.supervisor import Supervisor
 from service.models import AssetKind
 from service.observe import JsonLines, TextLines, current_id, working_for
+from service.state import Stopping
 from service.store.owners import SERVICE
 from service.store.store import Store
+from service.streams import EventStreams
 from service.uploads.intake import CheckLimits, check
 from tests.crash.conftest import order, stand_in, until
 from tests.crash.service_process import ServiceProcess, processes_of
@@ -381,3 +385,40 @@ def test_routes_are_described_without_another_host(client: TestClient) -> None:
     assert all(client.get(f"/{address}").status_code == 200 for address in asked if address != "data:,")
     assert "//" not in page.replace("<!-- ", "").split("<script>")[0]
     assert client.get("/redoc").status_code == 404
+
+
+class Idle:
+    """Stands in for the supervisor of jobs."""
+
+    def stop(self) -> None: ...
+
+
+async def nothing(*_: Any) -> None:
+    """No application."""
+
+
+def test_second_sigint_ends_the_notice() -> None:
+    stopping = Stopping(EventStreams(1, 1), cast("Supervisor", Idle()), notice_seconds=600)
+    server = AnnouncingServer(uvicorn.Config(nothing, lifespan="off"), stopping, print)
+    server.handle_exit(signal.SIGINT, None)
+    again = threading.Timer(0.3, server.handle_exit, (signal.SIGINT, None))
+
+    async def stop() -> None:
+        again.start()
+        with anyio.fail_after(60):
+            await stopping.begin(lambda: server.force_exit)
+
+    anyio.run(stop)
+    assert server.force_exit
+
+
+def test_notice_is_kept_while_nobody_hurries() -> None:
+    asked: list[int] = []
+
+    def hurried() -> bool:
+        asked.append(1)
+        return False
+
+    stopping = Stopping(EventStreams(1, 1), cast("Supervisor", Idle()), notice_seconds=0.5)
+    anyio.run(stopping.begin, hurried)
+    assert stopping.begun and len(asked) > 1

@@ -247,31 +247,6 @@ def test_body_that_trickles_on_after_its_answer_is_cut_off(curt: tuple[str, int]
     assert said.startswith(b"HTTP/1.1 200 ") and b"ok" in body
 
 
-@pytest.mark.parametrize(
-    "nonsense",
-    [
-        b"nonsense\r\n\r\n",
-        b"\x16\x03\x01" * 10 + b"\r\n\r\n",
-    ],
-    ids=["no HTTP", "TLS"],
-)
-def test_what_is_no_http_is_400_in_the_one_shape(patient: tuple[str, int], nonsense: bytes) -> None:
-    with client_of(patient) as client:
-        client.sendall(nonsense)
-        assert_problem(answer(client), 400, "malformed-request")
-
-
-def test_headers_without_an_end_are_431(patient: tuple[str, int]) -> None:
-    with client_of(patient) as client:
-        assert_problem(trickle(client, HEALTH[:-2] + b"A: " + b"a" * 200_000, b"a"), 431, "headers-too-large")
-
-
-def test_chunk_without_a_length_is_400_in_the_one_shape(patient: tuple[str, int]) -> None:
-    with client_of(patient) as client:
-        client.sendall(b"PUT /assets/splats HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\nzz\r\n")
-        assert_problem(answer(client), 400, "malformed-request")
-
-
 def test_more_connections_than_allowed_are_503_until_one_ends(tmp_path: Path) -> None:
     with served(tmp_path / "data", max_connections=2, header_seconds=60) as address:
         # They come in the order in which they are made, and stay as long as nothing is asked.
