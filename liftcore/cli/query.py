@@ -60,7 +60,8 @@ def run(options: argparse.Namespace) -> int:
 
     query = _query(options)
     scene = QueryScene.open(options.lift)
-    free_outputs(files, made_from(scene))
+    if files:
+        free_outputs(files, made_from(scene))
     encoder = _encoder(options, scene) if query.texts else None
     answer = ask(scene, query, encoder)
     seen = None

@@ -49,7 +49,8 @@ def run(options: argparse.Namespace) -> int:
     from liftcore.query.text import open_encoder
 
     scene = QueryScene.open(options.lift)
-    free_outputs(files, made_from(scene))
+    if files:
+        free_outputs(files, made_from(scene))
     encoder = open_encoder(encoder_spec(options, "" if options.table else scene.metadata.text_space))
     words = _words(options.words, encoder)
     vectors = encoder.encode(words)

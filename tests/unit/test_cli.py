@@ -274,30 +274,6 @@ def test_serve_becomes_the_service(monkeypatch: pytest.MonkeyPatch, capsys: pyte
     ]  # fmt: skip
 
 
-def test_demo_and_bench_pass_their_options_on(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    seen: list[Any] = []
-    fakes = {
-        "liftcore.demo.run": {"run_demo": lambda *arguments: seen.append(arguments) or 0},
-        "liftcore.evaluate.bench": {"run_bench": lambda options: seen.append(options) or {"seconds": 1.0}},
-    }
-    for name, functions in fakes.items():
-        module = type(sys)(name)
-        vars(module).update(functions)
-        monkeypatch.setitem(sys.modules, name, module)
-    assert run(capsys, "demo", "--out", tmp_path, "--json")[0] == 0
-    assert seen.pop() == (None, tmp_path, True, [])
-    assert run(capsys, "demo", "--out", tmp_path, "--ask", "a mug", "--ask", "a lamp")[0] == 0
-    assert seen.pop() == (None, tmp_path, False, ["a mug", "a lamp"])
-    status, out, _ = run(capsys, "bench", "--size", "986x728", "--splats", 1000, "--preset", "centre", "--json")
-    assert (status, json.loads(out)) == (0, {"seconds": 1.0})
-    assert seen[0]["size"] == "986x728"
-    assert seen[0]["splats"] == 1000
-    assert seen[0]["preset"] == "centre"
-    assert seen[0]["scene"] is None
-
-
 def test_json_replies_are_strict(capsys: pytest.CaptureFixture[str]) -> None:
     reply.reply({"a": float("nan"), "b": [float("inf"), (1, 2)], "c": {"d": -float("inf")}}, as_json=True)
     assert json.loads(capsys.readouterr().out) == {"a": None, "b": [None, [1, 2]], "c": {"d": None}}

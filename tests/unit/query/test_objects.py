@@ -192,14 +192,6 @@ def test_equal_places_and_extreme_sizes_are_no_trouble() -> None:
     assert len(set(groups[:30])) == 1 and groups[30] == groups[31]  # one as large as this reaches its neighbours
 
 
-def test_pieces_make_no_difference(monkeypatch) -> None:
-    splats = random_splats(5, 300, 4.0)
-    whole = touching(splats, np.arange(300))
-    assert len(set(whole)) > 3
-    monkeypatch.setattr(module, "_PIECE", 7)
-    assert (touching(splats, np.arange(300)) == whole).all()
-
-
 def test_a_quaternion_of_zero_turns_nothing() -> None:
     still = replace(needle(1.9, 0.1), quats=torch.zeros(3, 4))
     assert touching(still, np.arange(3)).tolist() == [0, 0, 1]

@@ -394,10 +394,3 @@ def test_the_rim_that_no_pinhole_sees_is_empty(dtype: torch.dtype) -> None:
     assert float(picture[80, 80]) == 1
     assert float(picture[0, 0]) == float(picture[80, 0]) == 0
     assert drawn_by(camera).width < 180
-
-
-def test_large_pictures_are_carried_in_bands_to_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
-    camera = behind_lens(PLAIN, BARREL)
-    whole = in_photo(camera, places)
-    monkeypatch.setattr("liftcore.query.render.BAND_PIXELS", 1)
-    assert torch.equal(in_photo(camera, places), whole)

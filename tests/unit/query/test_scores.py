@@ -50,10 +50,6 @@ def test_relevancy_is_the_least_softmax_over_negatives() -> None:
     np.testing.assert_allclose(relevancy(similarities.numpy(), 1), torch.stack(pairs).amin(dim=0).numpy(), rtol=1e-6)
 
 
-def test_relevancy_of_a_half_means_as_near_as_the_nearest_negative() -> None:
-    assert relevancy(np.array([[0.3, 0.3, 0.1]]), 1).item() == pytest.approx(0.5)
-
-
 def test_negatives_take_away_from_what_is_found_and_add_nothing() -> None:
     apple, table, wall = [0.9, 0.1], [0.1, 0.9], [0.0, -0.6]  # cosines to an apple and to a table
     scores = combine(np.array([apple, table, wall]), 1)
