@@ -35,12 +35,7 @@ SELECTIONS = (
     Weighting(2, Selection.FRONT_MASS, mass=0.6, floor=0.02),
     Weighting(1, Selection.CENTRE),
 )
-FOOTPRINTS = {
-    "3dgs": (Kernel.GAUSSIAN_3D, False),
-    "3dgs antialiased": (Kernel.GAUSSIAN_3D, True),
-    "2dgs": (Kernel.GAUSSIAN_2D, False),
-    "dbs": (Kernel.BETA, False),
-}
+FOOTPRINTS = {str(kernel): (kernel, False) for kernel in Kernel} | {"3dgs antialiased": (Kernel.GAUSSIAN_3D, True)}
 
 pytestmark = pytest.mark.usefixtures("every_kernel")
 every_footprint = pytest.mark.parametrize("footprint", FOOTPRINTS)

@@ -14,6 +14,8 @@ from liftcore.features.views import FeatureGrid
 
 from .command_line import run
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def photos(tmp_path: Path) -> Path:

@@ -36,6 +36,8 @@ from tests.distorted_scene import (
     write_distorted_scene,
 )
 
+pytestmark = pytest.mark.slow
+
 CLEAR = 0.1  # from the border of a quarter: two standard deviations of a splat, or three pixels
 
 

@@ -12,6 +12,8 @@ from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.splats import Kernel
 from tests.scenes import random_camera, random_grid, random_regions, random_splats
 
+pytestmark = pytest.mark.slow
+
 MOST = 120  # items of a band
 CAMERA = random_camera(3, 100, 70)
 PIXELS = torch.tensor([[x, y] for x in range(0, 100, 7) for y in range(0, 70, 5)], dtype=torch.int32)

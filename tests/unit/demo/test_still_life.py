@@ -13,6 +13,8 @@ from liftcore.demo.still_life import StillLife, still_life
 from liftcore.raster.base import CompositingParams
 from liftcore.raster.cpu.raster import CpuRaster
 
+pytestmark = pytest.mark.slow
+
 NONE = Mistakes(merged=0, split=0, misnamed=0, unlabelled=1e-9, displacement=0, noise=0)
 
 

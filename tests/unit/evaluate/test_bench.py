@@ -6,6 +6,8 @@ import pytest
 
 from liftcore import cli
 
+pytestmark = pytest.mark.slow
+
 SMALL = ["bench", "--splats", "2000", "--size", "64x48", "--views", "2", "--channels", "8"]
 
 

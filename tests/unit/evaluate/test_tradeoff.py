@@ -22,6 +22,8 @@ from liftcore.evaluate.tradeoff_report import table_of
 from liftcore.progress import silent
 from tests.unit.solve.test_lift_equals_dense import write_scene
 
+pytestmark = pytest.mark.slow
+
 
 def run_of(name: str, seconds: float, accuracy: float, kind: str = "dial") -> dict:
     names = ("cosine", "cosine_plain", "cosine_q05", "held_out_cosine")

@@ -30,6 +30,8 @@ from liftcore.features.pack import read_features
 from liftcore.features.views import FeatureGrid
 from liftcore.query.text.open_clip import OpenedModel, library
 
+pytestmark = pytest.mark.slow
+
 ORIENTATION = 0x0112
 
 

@@ -25,6 +25,8 @@ from tests.benchmarks.scenes import Room, write_room
 from tests.scenes import centred, random_splats
 from tests.unit.plan.test_views import ring
 
+pytestmark = pytest.mark.slow
+
 VIEWS, CHANNELS = FEW_VIEWS + 8, 48
 
 

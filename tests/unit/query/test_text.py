@@ -14,6 +14,8 @@ from liftcore.query.text import RememberingEncoder, open_encoder
 from liftcore.query.text.minilm import MiniLmEncoder
 from liftcore.query.text.open_clip import OpenClipEncoder
 
+pytestmark = pytest.mark.slow
+
 WORDS = ["alarm_clock", "Teapot", "the end", "a"]
 
 

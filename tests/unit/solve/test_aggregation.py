@@ -36,6 +36,8 @@ from liftcore.solve.aggregate import (
 from liftcore.solve.geometry import LiftViews
 from tests.scenes import centred, random_camera, random_grid, random_regions, random_splats
 
+pytestmark = pytest.mark.slow
+
 SETTINGS = LiftSettings.of(aggregation=True, aggregation_iou=0.3, certificate_rays=10)
 P, K = 40, 3
 

@@ -13,6 +13,8 @@ from liftcore.settings import LiftSettings
 from tests.scenes import observed, random_splats
 from tests.unit.solve.test_lift_equals_dense import write_scene
 
+pytestmark = pytest.mark.slow
+
 ALL_RAYS = 1_000_000
 
 

@@ -26,6 +26,8 @@ from liftcore.solve.checkpoint import Checkpoint, question
 
 from .test_lift_equals_dense import observed, write_scene
 
+pytestmark = pytest.mark.slow
+
 
 class Killed(Exception):
     """Stands for what ends a process between two calls."""

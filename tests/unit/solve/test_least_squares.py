@@ -16,6 +16,8 @@ from liftcore.solve.least_squares import BLOCK, Refinement, blocks, codebook_axe
 from tests.unit.solve.dense_rays import SmallScene
 from tests.unit.solve.test_lift_equals_dense import write_scene
 
+pytestmark = pytest.mark.slow
+
 SEEDS = st.integers(0, 2**16)
 few = settings(max_examples=6, deadline=None)
 

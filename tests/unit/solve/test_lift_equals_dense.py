@@ -21,6 +21,8 @@ from liftcore.scene.cameras import Cameras
 from liftcore.settings import LiftSettings
 from tests.scenes import centred, observed, random_camera, random_splats
 
+pytestmark = pytest.mark.slow
+
 PRESETS = {  # lambda, and what counts as a weight
     "row-sum": (1.0, Weighting(1)),
     "tikhonov": (1.2, Weighting(2)),

@@ -27,7 +27,7 @@ from tests.scenes import centred, random_camera, random_regions, random_splats
 if TYPE_CHECKING:
     from pathlib import Path
 
-pytestmark = pytest.mark.usefixtures("every_kernel")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("every_kernel")]
 
 
 def write_scene(folder: Path, kernel: Kernel) -> tuple[Path, Path, Path]:

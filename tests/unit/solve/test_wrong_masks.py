@@ -15,6 +15,8 @@ from liftcore.solve.least_squares import AllRays
 from tests.benchmarks.experiments import Truth, closed_form, follow, scored
 from tests.scenes import random_camera, random_splats
 
+pytestmark = pytest.mark.slow
+
 CLASSES = 4
 WRONG = 0.3  # of the regions carry another class's vector
 
