@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Self
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
-PATIENCE_SECONDS = 15.0  # for what takes a second; the machine may be busy
+PATIENCE_SECONDS = 60.0  # for what takes a second; the machine may be busy
 OPTIONS = (
     "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync",
     "--disable-background-networking", "--disable-component-update", "--disable-dev-shm-usage",
@@ -92,7 +92,7 @@ class Browser:
         deadline = time.monotonic() + PATIENCE_SECONDS
         while time.monotonic() < deadline:
             with contextlib.suppress(AssertionError):  # while one document makes room for the next
-                if self.value(script):
+                if self.value(f"Promise.resolve({script}).then(Boolean)"):
                     return
             time.sleep(0.05)
         raise AssertionError(f"never true: {script}; the page: {self.value('document.body.innerText')}")

@@ -127,9 +127,14 @@ def test_what_is_not_there_is_said_plainly(page: Browser) -> None:
 
 
 def test_example_that_nothing_understands_is_told_and_taken_back(page: Browser) -> None:
-    page.value("void splatlift.ask.example('nowhere:1,1')")
+    page.write("#example", "left:7,12")
+    page.press("#by-example button")
+    page.until(f"{EXAMPLES}.join() === 'left:7,12'")
+    page.until(FOUND)
+    page.write("#example", "nowhere:1,1")
+    page.press("#by-example button")
     page.until(TROUBLE)
-    assert "nowhere" in text_of(page, "#toast") and page.value(EXAMPLES) == []
+    assert "nowhere" in text_of(page, "#toast") and page.value(EXAMPLES) == ["left:7,12"]
 
 
 def test_words_of_users_never_become_markup(page: Browser) -> None:

@@ -11,6 +11,8 @@ export class Ask {
   constructor({ changed, fly }) {
     Object.assign(this, { changed, fly, questions: [], active: 0, thing: -1, heat: false, turn: 0, lift: null });
     at("query").addEventListener("submit", event => { event.preventDefault(); this.fromForm(); });
+    at("by-example").addEventListener("submit", event => { event.preventDefault(); this.typed(false); });
+    at("less").addEventListener("click", () => this.typed(true));
     at("clear").addEventListener("click", () => this.reset(true));
     at("heat").addEventListener("change", () => { this.heat = at("heat").checked; this.changed(); });
     at("previous").addEventListener("click", () => this.step(-1));
@@ -68,6 +70,13 @@ export class Ask {
     }
     this.now.threshold = "auto";
     return this.ask(this.now);
+  }
+
+  typed(less) {
+    const notation = at("example").value.trim();
+    if (!notation) return;
+    at("example").value = "";
+    this.example(notation, less);
   }
 
   // From a link.

@@ -188,6 +188,9 @@ export class Bring {
 
   async refreshAssets() {
     const { assets, next } = await json(`/assets?limit=${PAGE}`);
+    const told = JSON.stringify(assets);
+    if (told === this.toldAssets) return;
+    this.toldAssets = told;
     at("assets-count").textContent = assets.length ? `(${assets.length}${next ? "+" : ""})` : "(none)";
     at("assets").replaceChildren(...assets.map(asset => el("li", {},
       el("span", { className: "name" }, KINDS[asset.kind] || asset.kind), el("span", { className: "state" }, `${said(asset)} \u00b7 ${size(asset.bytes)} \u00b7 ${ago(asset.created)}`),
@@ -197,6 +200,9 @@ export class Bring {
   }
 
   showJobs() {
+    const told = JSON.stringify(this.jobs);
+    if (told === this.told) return; // buttons that ask once more, and open charts, stay
+    this.told = told;
     at("jobs-none").hidden = Boolean(this.jobs.length);
     at("jobs").replaceChildren(...this.jobs.map(job => this.job(job)));
   }
