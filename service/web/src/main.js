@@ -50,7 +50,7 @@ function repaint() {
   const begun = performance.now();
   const questions = ask.painted();
   viewer.hidden.value = at("hide").checked && questions.length ? 1 : 0;
-  paint(viewer.paints, viewer.rows, viewer.bytes, questions, { heat: ask.heated(), layer: look.painted() });
+  paint(viewer.paints, viewer.rows, viewer.shades, questions, { heat: ask.heated(), layer: look.painted() });
   viewer.outline(at("show-boxes").checked ? ask.boxes() : []);
   labels();
   viewer.painted();

@@ -31,44 +31,58 @@ export function countFrom(scores, cut) {
   return found;
 }
 
-// Paint every drawn splat. questions: [{scores, cut, high, low, rgb}] that light up; heat: one of them, or null;
-// layer: {colours: u8 [P, 3], cover: 0..1} beneath, or null; own: the .splat bytes, whose colours shades are made of.
-export function paint(paints, rows, own, questions, { heat = null, layer = null } = {}) {
-  const count = paints.length / 4;
-  const cover = layer ? Math.round(127 * layer.cover) : 0;
-  const warm = heat && heat.high > heat.low ? 255 / (heat.high - heat.low) : 0;
-  for (let place = 0, to = 0; place < count; place += 1, to += 4) {
-    const row = rows ? rows[place] : place;
-    let best = null;
-    let most = -1;
-    for (const question of questions) {
-      const score = question.scores[row];
-      if (score < question.cut || score <= UNKNOWN) continue;
-      const over = (score - question.cut) / (question.high - question.cut || 1);
-      if (over > most) { most = over; best = question; }
+const packed = (r, g, b, a) => (r | g << 8 | b << 16 | a << 24) >>> 0; // as bytes lie in memory
+
+// The shade of each drawn splat of a .splat file's bytes: what was not found is a dark grey of its own brightness.
+export function shades(own) {
+  const made = new Uint32Array(own.length / 32);
+  for (let place = 0, from = 24; place < made.length; place += 1, from += 32) {
+    const grey = (0.3 * own[from] + 0.59 * own[from + 1] + 0.11 * own[from + 2]) * 0.42 + 4;
+    made[place] = packed(grey, grey, grey, SHADE);
+  }
+  return made;
+}
+
+// Paint every drawn splat. paints: u32 [drawn], r g b and the byte of `painter`; rows: of the lift, as they are drawn,
+// or null. questions: [{scores, cut, high, low, rgb}] that light up; the one that a splat passes by most has it.
+// shade: of `shades`; heat: a question whose scores are shown instead, or null; layer: {colours: u8 [P, 3], cover:
+// 0..1} beneath, or null.
+export function paint(paints, rows, shade, questions, { heat = null, layer = null } = {}) {
+  const count = paints.length;
+  const cover = layer ? Math.round(127 * layer.cover * (questions.length ? 0.6 : 1)) : 0;
+  if (layer) {
+    const { colours } = layer;
+    for (let place = 0; place < count; place += 1) {
+      const from = 3 * (rows ? rows[place] : place);
+      paints[place] = packed(colours[from], colours[from + 1], colours[from + 2], cover);
     }
-    if (heat) {
-      const level = 3 * Math.max(0, Math.min(255, Math.round((heat.scores[row] - heat.low) * warm)));
-      paints[to] = heatMap[level];
-      paints[to + 1] = heatMap[level + 1];
-      paints[to + 2] = heatMap[level + 2];
-      paints[to + 3] = HEAT + (best ? 128 : 0);
-    } else if (best) {
-      [paints[to], paints[to + 1], paints[to + 2]] = best.rgb;
-      paints[to + 3] = 128 + TINT;
-    } else if (layer) {
-      paints[to] = layer.colours[3 * row];
-      paints[to + 1] = layer.colours[3 * row + 1];
-      paints[to + 2] = layer.colours[3 * row + 2];
-      paints[to + 3] = questions.length ? Math.round(cover * 0.6) : cover;
-    } else if (questions.length) {
-      const from = 32 * place + 24;
-      const grey = (0.3 * own[from] + 0.59 * own[from + 1] + 0.11 * own[from + 2]) * 0.42 + 4;
-      paints[to] = paints[to + 1] = paints[to + 2] = grey;
-      paints[to + 3] = SHADE;
-    } else {
-      paints[to + 3] = 0;
+  } else if (questions.length) {
+    paints.set(shade);
+  } else {
+    paints.fill(0);
+  }
+  const most = questions.length > 1 ? new Float32Array(count).fill(-1) : null;
+  for (const { scores, cut, high, rgb: [r, g, b] } of questions) {
+    const mine = packed(r, g, b, 128 + TINT);
+    const least = Math.max(cut, UNKNOWN);
+    for (let place = 0; place < count; place += 1) {
+      const score = scores[rows ? rows[place] : place];
+      if (score < least) continue;
+      if (most) {
+        const over = (score - cut) / (high - cut || 1);
+        if (over <= most[place]) continue;
+        most[place] = over;
+      }
+      paints[place] = mine;
     }
+  }
+  if (!heat) return;
+  const { scores, low, high } = heat;
+  const warm = high > low ? 255 / (high - low) : 0;
+  for (let place = 0; place < count; place += 1) {
+    const level = 3 * Math.max(0, Math.min(255, Math.round((scores[rows ? rows[place] : place] - low) * warm)));
+    const found = paints[place] >>> 31 ? 128 : 0;
+    paints[place] = packed(heatMap[level], heatMap[level + 1], heatMap[level + 2], HEAT + found);
   }
 }
 

@@ -3,6 +3,7 @@ import * as THREE from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import { dyno, readRgbaArray, RgbaArray, SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
 import { still } from "./dom.js";
+import { shades } from "./paint.js";
 
 const ROW = 32; // bytes of a splat in a .splat file
 export const MOST = 2_000_000; // splats that are drawn; of larger scenes every n-th is
@@ -132,7 +133,9 @@ export class Viewer {
       timer = setTimeout(() => reject(new Error("unpacking it takes too long")), LOADING);
     })]).finally(() => clearTimeout(timer));
     this.rgba = new RgbaArray({ capacity: this.count });
-    this.paints = this.rgba.ensureCapacity(this.count);
+    const room = this.rgba.ensureCapacity(this.count);
+    this.paints = new Uint32Array(room.buffer, room.byteOffset, this.count);
+    this.shades = shades(content);
     this.rgba.count = this.count;
     mesh.objectModifiers = [painter(this.rgba, this.hidden)];
     mesh.updateGenerator();
