@@ -8,6 +8,7 @@ rebinding; then the Host tells). Then the key, its scope, whether the server sto
 from __future__ import annotations
 
 import ipaddress
+import logging
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable
@@ -50,6 +51,9 @@ SCHEMES = {
 }
 
 
+log = logging.getLogger(__name__)
+
+
 @dataclass(frozen=True)
 class Caller:
     """Who asks."""
@@ -88,6 +92,9 @@ class Gate:
         require_one_length(headers)
         self._hosts.check(method, headers)
         caller = await self._caller(needed(method, scope["path"]), headers)
+        if caller.key is not None and caller.owner.sees_all:
+            told = {"key": caller.key, "method": method, "path": scope["path"]}
+            log.info("an admin key is used", extra={"fields": told})
         if self._stopping() and method not in WORKLESS:
             busy = Busy("server", expected="a running server", got="one that stops", hint="ask the next one")
             busy.headers |= CLOSE

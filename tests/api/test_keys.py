@@ -315,6 +315,18 @@ def test_keys_say_until_when_they_are_valid(
     assert "valid until" in capsys.readouterr().out
 
 
+def test_every_use_of_an_admin_key_is_one_line_of_the_log(house: Guarded, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.INFO):
+        house.ask("boss", "GET", "/jobs")
+        house.ask("boss", "DELETE", "/jobs/nothing")
+        house.ask("alice", "GET", "/jobs")
+    lines = [record for record in caplog.records if record.getMessage() == "an admin key is used"]
+    told = [vars(line)["fields"] for line in lines]
+    assert [(line["key"], line["method"], line["path"]) for line in told] == [
+        (house.ids["boss"], "GET", "/jobs"), (house.ids["boss"], "DELETE", "/jobs/nothing")
+    ]  # fmt: skip
+
+
 def test_key_that_is_revoked_again_was_revoked_the_first_time(house: Guarded) -> None:
     assert house.store.keys.revoke(house.ids["bob"]).revoked is not None
     with house.store.database.write() as connection:

@@ -22,6 +22,7 @@ from service.store.jobs import JobOrder, JobRecord
 from service.store.owners import SERVICE, Owner
 from service.store.store import Store
 
+METADATA = {"views": [], "certificate": {}}  # all that the store asks of a lift's
 Supervising = Callable[..., AbstractContextManager[Supervisor]]
 
 

@@ -27,7 +27,7 @@ from service.store.owners import SERVICE, Owner
 from service.store.store import Store
 from service.uploads import intake
 
-from .conftest import Supervising, alive, ended, order, state_of, supervised, until
+from .conftest import METADATA, Supervising, alive, ended, order, state_of, supervised, until
 
 
 def submit(store: Store, **settings: Any) -> str:
@@ -161,7 +161,7 @@ def test_draft_of_a_stale_attempt_never_becomes_the_lift(store: Store) -> None:
             store.jobs.lose(job, 1, "it was silent")
     with store.files.draft(".safetensors") as draft:
         draft.write_bytes(b"stale")
-        assert not store.lifts.finish(job, 1, FinishedLift(draft, "0" * 64, 1, 1, {}))
+        assert not store.lifts.finish(job, 1, FinishedLift(draft, "0" * 64, 1, 1, METADATA))
         assert draft.read_bytes() == b"stale" and not store.files.lift(job).exists()
     store.jobs.fail(job, 1, {"kind": "crashed"})
     store.jobs.advance(job, 1, {"stage": "old"})

@@ -138,7 +138,7 @@ def replaced(path: Path) -> None:
     Database(path, rebuilding=True).close()
 
 
-@pytest.mark.parametrize("broken", [malformed, Path.unlink])
+@pytest.mark.parametrize("broken", [malformed, Path.unlink, replaced])
 def test_broken_database_is_told_by_readyz_and_takes_no_order(broken: Callable[[Path], None], tmp_path: Path) -> None:
     with serving(tmp_path / "data") as (store, client, body):
         assert client.get("/healthz").status_code == 200

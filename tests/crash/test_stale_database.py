@@ -22,6 +22,7 @@ from service.store.database import DATABASE
 from service.store.files import DataDirectory
 from service.store.keys import Quota
 from service.store.owners import SERVICE
+from service.store.schema import MIGRATIONS
 from service.store.store import Store
 
 from .conftest import asset_of, often, until
@@ -88,13 +89,9 @@ def older(data: Path) -> None:
 
 def of_an_older_release(data: Path) -> None:
     """One that has no generation yet."""
+    gone(data)
     database = sqlite3.connect(data / DATABASE)
-    database.executescript(
-        "DROP TABLE generation; DROP INDEX jobs_by_age; DROP INDEX lifts_by_age;"
-        "ALTER TABLE assets DROP COLUMN brief; ALTER TABLE assets DROP COLUMN counts_bytes;"
-        "ALTER TABLE keys DROP COLUMN expires; ALTER TABLE keys DROP COLUMN old_digest;"
-        "ALTER TABLE keys DROP COLUMN old_until; PRAGMA user_version = 7;"
-    )
+    database.executescript("".join(MIGRATIONS[:7]) + "PRAGMA user_version = 7;")
     database.close()
 
 

@@ -25,6 +25,8 @@ from service.store.lifts import FinishedLift, FinishedTradeoff
 from service.store.owners import SERVICE, Owner, stored_bytes
 from service.store.store import Store
 
+from .conftest import METADATA
+
 MAX_QUEUED = 3
 ROOMS = ("blobs", "lifts", "work", "tmp")
 OWNERS = {
@@ -200,7 +202,7 @@ class StoreMachine(RuleBasedStateMachine):
         else:
             with self.store.files.draft(".safetensors") as draft:
                 draft.write_bytes(content)
-                done = self.store.lifts.finish(*attempt, FinishedLift(draft, "0" * 64, 1, 1, {}))
+                done = self.store.lifts.finish(*attempt, FinishedLift(draft, "0" * 64, 1, 1, METADATA))
         assert done == (model is not None and model.state == "running")
         if done and model is not None:
             model.result = content

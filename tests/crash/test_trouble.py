@@ -22,7 +22,7 @@ from service.store.lifts import FinishedLift
 from service.store.owners import SERVICE
 from service.store.store import Store
 
-from .conftest import Supervising, ended, order, until
+from .conftest import METADATA, Supervising, ended, order, until
 
 Trouble = Callable[[Store], AbstractContextManager[None]]
 
@@ -151,7 +151,7 @@ def test_lift_that_could_not_be_recorded_is_no_file_and_its_draft_is_kept(store:
     assert store.jobs.claim() is not None
     with store.files.draft(".safetensors") as draft:
         draft.write_bytes(b"made")
-        made = FinishedLift(draft, "0" * 64, 1, 1, {})
+        made = FinishedLift(draft, "0" * 64, 1, 1, METADATA)
         with store.database.write() as connection:
             connection.execute("ALTER TABLE lifts RENAME TO elsewhere")
         with pytest.raises(sqlite3.OperationalError):
