@@ -85,7 +85,7 @@ def lift(
     kept = Checkpoint(checkpoint) if isinstance(checkpoint, Path) else checkpoint
     with within_memory(work.device):
         geometry = work.weigh(found, plan, kept)
-        W = work.reweight(geometry, plan)
+        W = work.reweight(geometry)
         solution = work.solve(W, geometry, plan)
         sums = geometry.weights.row_sums().cpu().numpy()
         X, notes = work.refine(found, geometry, solution.features, sums > 0)
@@ -186,16 +186,16 @@ class _Lift:
                 threads=self.threads,
             )
 
-    def reweight(self, geometry: Geometry, plan: Plan) -> RegionWeights:
+    def reweight(self, geometry: Geometry) -> RegionWeights:
         """W as it is solved: each step gives factors of W's entries, which keep the sums of its rows."""
         W, settings = geometry.weights, self.settings
         with self.timings.stage("robust"):
             if settings.robust_steps:
                 W = W.cpu()
+                steps, means = settings.robust_steps, self.splats.means
                 factors = agreement_factors(
-                    W, geometry.codebook, settings.robust_steps, self.progress, means=self.splats.means,
-                    threads=self.threads,
-                )  # fmt: skip
+                    W, geometry.codebook, steps, self.progress, means=means, threads=self.threads
+                )
                 W = reweighted(W, factors)
         return W
 
