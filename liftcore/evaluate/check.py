@@ -31,7 +31,7 @@ from liftcore.scene.views import cameras_of_views, some_of
 
 VIEWS = 12  # that are looked at, evenly spread
 CONTROLS = 3  # other photos that a render is held against
-LEAST_ROW_SUM = 0.5  # below it rays mostly miss the splats
+LEAST_ROW_SUM = 0.05  # in the mean of a view: a scene of one object before nothing has a fifth or so
 LEAST_IN_VIEW = 0.05  # of the splats
 LEAST_GAIN = 3.0  # dB, of a render over other views' photos to its own
 LEAST_SMOOTHNESS = 0.1  # of neighbouring cells' agreement over that of any two, as a share of what is left to one

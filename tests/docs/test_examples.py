@@ -211,6 +211,22 @@ def test_the_way_from_own_maps_to_a_mask_leads_there(scene_folder: Path) -> None
     assert len(columns) > 0 and columns.max() < WIDTH // 2
 
 
+def test_questions_of_the_guide_are_answered(scene_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    files = ["scene.ply", "cameras.json", "features.safetensors"]
+    assert main(["lift", *files, "-o", "scene.lift.safetensors"]) == 0
+    check = text(GUIDE).partition("## Before the work")[2].partition("\n## ")[0]
+    assert main(shlex.split(f"check {' '.join(files)}")) == 0 and "splatlift check scene.ply sparse/0 photos" in check
+    shutil.copy("features.safetensors", "kept")
+    commands = commands_between(GUIDE, "## Asking", "### Text encoders", scene_folder)
+    shutil.copy("kept", "features.safetensors")
+    capsys.readouterr()
+    assert [command[0] for command in commands] == ["query"] * 3 + ["segment"] * 2
+    assert [main(command) for command in commands] == [0] * len(commands)
+    told = capsys.readouterr().out
+    assert "3 of 3 words are there" in told and "middle:6,12: apple " in told
+    assert all((scene_folder / name).is_file() for name in ("like.png", "words.png", "seen.png", "scores.ply"))
+
+
 def test_another_encoders_vectors_take_the_same_weights(scene_folder: Path) -> None:
     for name in ("clip", "siglip"):
         shutil.copy(scene_folder / "features.safetensors", scene_folder / f"{name}.safetensors")
