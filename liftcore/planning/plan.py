@@ -241,7 +241,8 @@ def memory_parts(
         "splats": inputs,
         "scene": splats.count * SCENE_BYTES,
         "view": 2 * view,  # two are in work, or one and what is made of it
-        "weights": 2 * min(weights, MEMORY_LIMIT),  # a view at a time, and of all views
+        "weights": min(weights, MEMORY_LIMIT),  # a view at a time
+        "gathered": min(weights, MEMORY_LIMIT),  # of all views, a row a splat
         "codebooks": size * sum(books) + min(8 * sum(books), 2 * TABLE_BYTES),
         "features": splats.count * channels * size,
     }
