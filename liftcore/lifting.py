@@ -14,6 +14,7 @@ from torch import Tensor
 
 from liftcore import __version__
 from liftcore.device import Device, choose_device, within_memory
+from liftcore.errors import InvalidSettings
 from liftcore.planning.plan import Plan, plan_lift
 from liftcore.progress import Progress, Timings
 from liftcore.raster import open_raster
@@ -25,10 +26,11 @@ from liftcore.settings import LiftSettings, Preset
 from liftcore.solve.aggregate import Aggregation, aggregate
 from liftcore.solve.checkpoint import Checkpoint
 from liftcore.solve.closed_form import Solution, solve, solve_rows
+from liftcore.solve.consensus import mask_consensus
 from liftcore.solve.diagnostics import certify, lift_warnings
 from liftcore.solve.geometry import Geometry, Given, LiftViews, as_read, weigh_views
 from liftcore.solve.least_squares import AllRays, reference, refine
-from liftcore.solve.reweight import agreement_factors, reweighted
+from liftcore.solve.reweight import Agreement, agreement_factors, reweighted
 from liftcore.solve.weights import RegionWeights
 from liftcore.warm_up import warm_up_lift
 
@@ -85,16 +87,18 @@ def lift(
     kept = Checkpoint(checkpoint) if isinstance(checkpoint, Path) else checkpoint
     with within_memory(work.device):
         geometry = work.weigh(found, plan, kept)
-        W = work.reweight(geometry)
+        W, agreement = work.reweight(geometry)
         solution = work.solve(W, geometry, plan)
         sums = geometry.weights.row_sums().cpu().numpy()
         X, notes = work.refine(found, geometry, solution.features, sums > 0)
         clusters = work.aggregate(found, geometry, W, X, sums, notes)
+        notes |= _reweighting(agreement, geometry) if agreement else {}
         diagnostics = work.diagnose(found, geometry, X, sums, plan, notes)
     made = LiftResult(
         features=X,
         evidence=geometry.evidence(),
         agreement=solution.agreement,
+        confidence=agreement.confidence if agreement else None,
         seen=torch.from_numpy(sums > 0),
         metadata=LiftMetadata(
             version=__version__,
@@ -129,6 +133,17 @@ def plan(
     check_antialiased(splats.kernel, chosen.antialiased)
     found = LiftViews.of(views, cameras, chosen)
     return plan_lift(splats, found, chosen, choose_device(chosen.device), threads)
+
+
+def _reweighting(found: Agreement, geometry: Geometry) -> dict[str, Any]:
+    """What reweighting tells of the scene's features, for the diagnostics."""
+    confident = found.confidence
+    facts: dict[str, Any] = {"masks": int((geometry.levels >= 0).sum())}
+    if found.reliability is not None:
+        facts["reliability_median"] = found.reliability
+    if confident is not None:
+        facts["confidence_mean"] = float(confident.mean())
+    return {"reweighting": facts}
 
 
 def log_warnings(plan: Plan) -> None:
@@ -186,18 +201,36 @@ class _Lift:
                 threads=self.threads,
             )
 
-    def reweight(self, geometry: Geometry) -> RegionWeights:
-        """W as it is solved: each step gives factors of W's entries, which keep the sums of its rows."""
-        W, settings = geometry.weights, self.settings
-        with self.timings.stage("robust"):
-            if settings.robust_steps:
+    def reweight(self, geometry: Geometry) -> tuple[RegionWeights, Agreement | None]:
+        """W as it is solved: steps give factors of W's entries, which keep the sums of its rows.
+
+        Raises:
+            InvalidSettings: consensus is asked for, and no view has masks.
+        """
+        W, settings, consensus = geometry.weights, self.settings, None
+        masks = bool((geometry.levels >= 0).any())
+        if settings.consensus is True and not masks:
+            expected, got = "views with masks: cells of a grid say nothing of what they show", "views of grids"
+            raise InvalidSettings("consensus", expected=expected, got=got, hint="leave it at auto")
+        if settings.consensus and masks:
+            with self.timings.stage("consensus"):
                 W = W.cpu()
-                steps, means = settings.robust_steps, self.splats.means
-                factors = agreement_factors(
-                    W, geometry.codebook, steps, self.progress, means=means, threads=self.threads
-                )
-                W = reweighted(W, factors)
-        return W
+                consensus = torch.from_numpy(mask_consensus(W, geometry.levels, self.threads))
+        with self.timings.stage("robust"):
+            if not settings.robust_steps:
+                return W, None
+            W = W.cpu()
+            found = agreement_factors(
+                W,
+                geometry.codebook,
+                settings.robust_steps,
+                self.progress,
+                means=self.splats.means,
+                threads=self.threads,
+                reliability=settings.reliability,
+                consensus=consensus,
+            )
+            return reweighted(W, found.factors), found
 
     def solve(self, W: RegionWeights, geometry: Geometry, plan: Plan) -> Solution:
         """The closed form."""

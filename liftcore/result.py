@@ -59,9 +59,10 @@ class LiftResult:
 
     features: Tensor  # [P, F] f16 or f32; zero rows where not seen
     evidence: Tensor  # [P] f32, sum of plain weights w over the feature views, each ray once
-    agreement: Tensor  # [P] f32 in 0..1, norm of the weighted mean of unit regions, or of unit cells of grids
+    agreement: Tensor  # [P] f32 in 0..1, norm of the mean of unit regions or cells; says little of being right
     seen: Tensor  # [P] bool, whether any labelled ray reached the splat
     metadata: LiftMetadata
+    confidence: Tensor | None = None  # [P] f32 in 0..1, how far views say the same; None: not reweighted
     cluster: Tensor | None = None  # [P] i32, -1 = in no cluster; None without aggregation
     cluster_features: Tensor | None = None  # [K, F] like features; a zero row: its splats keep their own
 

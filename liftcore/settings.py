@@ -23,8 +23,9 @@ _SHOWN = 80  # characters of a wrong value in an error
 
 
 class Preset(StrEnum):
-    """A published choice of weights on the same ray walk."""
+    """A published choice of weights on the same ray walk, or ours, which trusts no single mask."""
 
+    DEFAULT = "default"  # row-sum, reweighted by mask consensus, by region reliability and by view consistency
     ROW_SUM = "row-sum"  # x_j = sum w b / sum w, Eq. 6
     TIKHONOV = "tikhonov"  # x_j = sum w~^2 b / sum w~^2 with alpha~ = sigmoid(1.2 theta)
     ARGMAX = "argmax"  # the largest w of a ray alone
@@ -37,6 +38,7 @@ class Preset(StrEnum):
 _LINEAR = {"power": 1, "lift_gain": 1.0, "render_gain": 1.0}
 
 _PRESETS: dict[Preset, dict[str, Any]] = {
+    Preset.DEFAULT: {**_LINEAR, "robust_steps": 1, "reliability": True, "consensus": "auto"},
     Preset.ROW_SUM: _LINEAR,
     Preset.TIKHONOV: {"power": 2, "lift_gain": TIKHONOV_GAIN, "render_gain": TIKHONOV_GAIN},
     Preset.ARGMAX: {**_LINEAR, "selection": Selection.TOP_K, "k": 1},
@@ -111,6 +113,14 @@ class LiftSettings(BaseModel):
         "bilinear", description="what a pixel reads of a feature grid: four cells by distance, or the nearest alone"
     )
     robust_steps: int = Field(0, ge=0, le=100, description="times that regions are reweighted by their agreement")
+    reliability: bool = Field(
+        False, description="regions are weighted as a whole too, by what other views say of all their splats"
+    )
+    consensus: bool | Literal["auto"] = Field(
+        False,
+        description="regions are weighted by whether masks of other views keep their splats together; auto: where "
+        "there are masks, and grids stay as they are",
+    )
     dtype: Literal["float16", "float32"] = Field(
         "float16", description="how features are stored, if it can hold them"
     )
@@ -161,6 +171,9 @@ class LiftSettings(BaseModel):
     def _resolves_whole_regions(self) -> Self:
         if self.aggregation_resolve and self.levels == "composite":
             told = "other levels than composite, which cut to pieces the regions that aggregation_resolve drops"
+            raise PydanticCustomError("whole_regions", "{expected}", {"expected": told})
+        if (self.reliability or self.consensus) and not self.robust_steps:
+            told = "robust_steps of 1 or more beside reliability and consensus, which come in with a step"
             raise PydanticCustomError("whole_regions", "{expected}", {"expected": told})
         return self
 

@@ -4,7 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
+import torch
+
 from liftcore.raster.cpu.warm_up import warm_up
+from liftcore.solve.codebook import Codebook, ViewCodebook
+from liftcore.solve.consensus import mask_consensus
+from liftcore.solve.reweight import agreement_factors
+from liftcore.solve.weights import one_view
 
 if TYPE_CHECKING:
     from liftcore.device import Device
@@ -15,3 +22,9 @@ if TYPE_CHECKING:
 def warm_up_lift(kernel: Kernel, device: Device, settings: LiftSettings) -> None:
     """Compile what a lift with these settings runs, or load it from the disk cache; its diagnostics excepted."""
     warm_up(kernel, device, settings.lift_params, settings.weighting)
+    one = torch.zeros(1, dtype=torch.int32)
+    W = one_view(one, torch.tensor([0, 1]), one, torch.ones(1), one, torch.ones(1), regions=1)
+    if settings.consensus:
+        mask_consensus(W, np.zeros(1, np.int8), 1)
+    if settings.reliability:
+        agreement_factors(W, Codebook((ViewCodebook(torch.ones(1, 1)),)), 1, threads=1, reliability=True)

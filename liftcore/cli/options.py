@@ -7,7 +7,7 @@ from typing import Any, NoReturn
 from liftcore.errors import InvalidQuery
 
 BAD_INPUT = 2
-PRESETS = "row-sum, tikhonov (default), argmax, top-k, front-mass, centre or mean"
+PRESETS = "default, row-sum, tikhonov (if none is named), argmax, top-k, front-mass, centre or mean"
 THRESHOLDS = "auto, valley, paper, otsu, stability or a number"
 
 
@@ -51,7 +51,7 @@ def add_sources(parser: argparse.ArgumentParser) -> None:
 
 def add_settings(parser: argparse.ArgumentParser) -> None:
     """The settings of a lift."""
-    parser.add_argument("--preset", metavar="NAME", help=f"a published choice of weights: {PRESETS}")
+    parser.add_argument("--preset", metavar="NAME", help=f"a choice of weights: {PRESETS}")
     parser.add_argument("--speed", metavar="NAME", help="the dial: exact, balanced, fast or draft")
     add_device(parser)
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="one setting")

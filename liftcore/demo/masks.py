@@ -74,6 +74,12 @@ def observe(
     return observed
 
 
+def mistaken_regions(exact: Regions, mistakes: Mistakes, rng: Generator) -> Regions:
+    """The exact masks of a view with mistakes in them; rows of the codebook are what their levels show."""
+    words = exact.codebook.float().numpy()
+    return _stack([_mistaken(level.numpy().astype(np.int32), words, mistakes, rng) for level in exact.labels])
+
+
 def _stack(levels: Sequence[tuple[np.ndarray, np.ndarray]]) -> Regions:
     labels, codebook, rows = [], [], 0
     for level, vectors in levels:

@@ -19,6 +19,14 @@ BLOCK_FLOATS = 1 << 22  # summed at once
 Levels = Literal["rows", "composite"] | int
 
 
+def region_levels(regions: Regions) -> np.ndarray:
+    """[M] i8: the level that each codebook row is labelled on, the coarsest of several; -1 on none."""
+    found = np.full(regions.codebook.shape[0] + 1, NO_LABEL, np.int8)
+    for level in reversed(range(regions.labels.shape[0])):
+        found[regions.labels[level].numpy().ravel()] = level  # no label is the place after the last row
+    return found[:-1]
+
+
 def at_levels(features: ViewFeatures, levels: Levels, view: str) -> ViewFeatures:
     """The features as ``levels`` takes them; a grid is its own level 0.
 

@@ -1,9 +1,9 @@
 """The lift file: features on splats, with all that is needed to trust and to use them.
 
-A ``.safetensors`` file holds ``features`` [P, F], ``evidence`` [P], ``agreement`` [P] and ``seen`` [P]; after
-Post-Lifting Aggregation also ``cluster`` [P] i32, -1 for splats in none, and ``cluster_features`` [K, F]. Its
-metadata hold settings, inputs with digests, the encoder, the certificate, timings and the version, as JSON.
-Readers of the arrays need neither torch nor pydantic, which are loaded where values are made.
+A ``.safetensors`` file holds ``features`` [P, F], ``evidence`` [P], ``agreement`` [P] and ``seen`` [P]. After
+reweighting it has ``confidence`` [P] f32, which tells right splats from wrong ones, as agreement does not; after
+Post-Lifting Aggregation ``cluster`` [P] i32, -1 for splats in none, and ``cluster_features`` [K, F]. Its metadata
+hold settings, inputs with digests, the encoder, the certificate, timings and the version, as JSON.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from liftcore.result import InputFile, LiftMetadata, LiftResult
 
 TENSORS = ("features", "evidence", "agreement", "seen")
+CONFIDENCE = "confidence"  # in lifts that were reweighted
 CLUSTER_TENSORS = ("cluster", "cluster_features")  # in lifts with aggregation only
 
 
@@ -31,8 +32,8 @@ def save_lift(lift: LiftResult, path: Path | str) -> None:
     """Write the lift whole or not at all (temporary file, fsync, rename), with no copy of X in memory."""
     from liftcore.io.safetensors_file import write_tensors
 
-    present = TENSORS if lift.cluster is None else TENSORS + CLUSTER_TENSORS
-    tensors = {name: getattr(lift, name) for name in present}
+    names = (*TENSORS, CONFIDENCE, *CLUSTER_TENSORS)
+    tensors = {name: getattr(lift, name) for name in names if getattr(lift, name) is not None}
     write_tensors(Path(path), tensors, {"splatlift": lift.metadata.model_dump_json()})
 
 
@@ -66,7 +67,8 @@ def read_lift(path: Path | str) -> tuple[dict[str, np.ndarray], str]:
         missing = [name for name in TENSORS if name not in tensors]
         if missing:
             raise ValueError(f"no {missing[0]} in it")
-        arrays = {name: tensors[name] for name in TENSORS} | {n: tensors[n] for n in CLUSTER_TENSORS if n in tensors}
+        names = (*TENSORS, CONFIDENCE, *CLUSTER_TENSORS)
+        arrays = {name: tensors[name] for name in names if name in tensors}
     except FileNotFoundError:
         raise InvalidLift(str(path), expected="a lift file", got="no such file") from None
     except (SafetensorError, OSError, ValueError) as error:
@@ -99,6 +101,7 @@ def _check_shapes(arrays: dict[str, np.ndarray], path: Path | str) -> None:
     rows = features.shape[:1]
     fits = features.ndim == 2 and features.dtype in (np.float16, np.float32) and features.size
     columns = (("evidence", np.float32), ("agreement", np.float32), ("seen", np.bool_))
+    columns += ((CONFIDENCE, np.float32),) if CONFIDENCE in arrays else ()
     if not fits or any(arrays[name].shape != rows or arrays[name].dtype != dtype for name, dtype in columns):
         shapes = {name: list(arrays[name].shape) for name in TENSORS}
         raise InvalidLift(str(path), expected="one row a splat in every tensor of a lift", got=str(shapes))

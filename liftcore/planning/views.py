@@ -241,7 +241,7 @@ def fly_pilot(
     flown: list[int] = spread(total, count).tolist()
     chosen = replace(views, names=[views.names[view] for view in flown])
     longest = max(max(chosen.camera(k).width, chosen.camera(k).height) for k in range(count))
-    coarse = {"stride": max(1, longest // PILOT_SIDE), "certificate_rays": 0, "robust_steps": 0}
+    coarse = {"stride": max(1, longest // PILOT_SIDE), "certificate_rays": 0, "robust_steps": 0, "consensus": False}
     own = settings.model_copy(update=coarse)
     channels = views.features.channels
     axes = random_axes(channels, min(PILOT_CHANNELS, channels), settings.seed)

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from liftcore.features.levels import at_levels
+from liftcore.features.levels import at_levels, region_levels
 from liftcore.features.pack import Views, as_views, pair
 from liftcore.features.views import FeatureGrid, Regions, ViewFeatures, cells_under
 from liftcore.one_thread import one_thread
@@ -96,6 +96,7 @@ class Geometry:
     codebook: Codebook  # what its regions stand for
     samples: tuple[SampledRays, ...]  # for the diagnostics, one a view
     blind: tuple[str, ...]  # views that meet no splat
+    levels: np.ndarray  # [M] i8, of each region in its view; -1: a cell of a grid, or regions that are tuples
 
     @property
     def books(self) -> list[Tensor]:
@@ -131,7 +132,7 @@ def weigh_views(
         device_bytes: of W that may stay on the device that found it.
     """
     parts: list[RegionWeights] = []
-    samples, blind = [], []
+    samples, blind, levels = [], [], []
     readouts, codebooks = deque[Readout](), list[ViewCodebook]()
 
     def requests() -> Iterator[ViewRequest]:
@@ -143,6 +144,10 @@ def weigh_views(
             readouts.append(read_pixels(observation, camera, pixels))
             regions, own = as_regions(observation, by_rows)
             codebooks.append(own)
+            if isinstance(given, Regions) and isinstance(observation, Regions) and own.tuples is None:
+                levels.append(region_levels(observation))
+            else:
+                levels.append(np.full(own.regions, -1, np.int8))
             yield ViewRequest(camera, regions, params, settings.weighting, pixels)
 
     found = raster.iterate_views(requests()) if checkpoint is None else checkpoint.answers(raster, requests())
@@ -167,7 +172,7 @@ def weigh_views(
     W = stacked(parts, splats, threads)
     parts.clear()
     give_back()
-    return Geometry(W, Codebook(tuple(codebooks)), tuple(samples), tuple(blind))
+    return Geometry(W, Codebook(tuple(codebooks)), tuple(samples), tuple(blind), np.concatenate(levels))
 
 
 def strided(params: CompositingParams, settings: LiftSettings, camera: Camera, number: int) -> CompositingParams:

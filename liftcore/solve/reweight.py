@@ -24,25 +24,53 @@ before, and starts from the first W again. Nothing is tuned; each part has its r
 
 A splat of one view does not change. A region without direction (a zero vector, or the mean itself) has c_jm = 0, and
 where nothing in the scene has a direction nothing changes.
+
+**Region reliability** asks the same of a region as a whole. What misleads at one splat misleads at all: a wrong word,
+a mask of two things. With ``p`` as above, region m of view v has::
+
+    r_m = sum_j W_jm (1 - p_jv) c_jm / sum_j W_jm (1 - p_jv)        r = the median of r_m over the regions
+
+and all its entries get the factor ``r_m / r``. What other views do not see of a region says nothing about it, so the
+weights are those of the others. Taken once: a second pass judges by what the first made, and loses again.
+
+**Mask consensus** (`consensus`) comes in as ``q_jm^(SHARPNESS (1 - r))``: where features agree they tell wrong masks
+themselves, and geometry has the more to say the less they do. That exponent is what keeps right masks as they are.
+
+**Confidence** of a splat is the mean of c_jm over its entries, each by its final weight: how far views that do not
+know of each other say the same of it.
 """
 
-import warnings
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from liftcore.jit import kernel, vectorised
 from liftcore.one_thread import one_thread
 from liftcore.progress import Progress, silent
-from liftcore.solve.closed_form import bag_sums, morton_codes
-from liftcore.solve.codebook import Codebook
+from liftcore.solve.closed_form import morton_codes
+from liftcore.solve.codebook import LEAST_CHANNELS, TABLE_BYTES, Codebook
 from liftcore.solve.memory import zeros
-from liftcore.solve.weights import MEMORY_LIMIT, RegionWeights, row_blocks, run_each, segment_sums
+from liftcore.solve.weights import MEMORY_LIMIT, RegionWeights, row_blocks, run_each
 
+CPU = torch.device("cpu")
 ROWS = 1 << 14  # of a table in float64 at a time
 BLOCK_ROWS, BLOCK_ENTRIES = 1 << 11, 1 << 15  # a splat has a sum for each view of it
 NO_CONSENSUS = 1e-6  # of a splat's weight: a shorter r is what rounding leaves of inputs that cancel
+SHARPNESS = 4.0  # the most that costs right masks of no scene more than .001 of accuracy (docs/method.md)
+DIRECTIONS = 256  # of e, principal ones, in which cosines are taken where regions are few beside entries
+SAMPLE = 1 << 14  # regions that say which directions are principal
 NO_DIRECTION = 1e-6  # a unit vector nearer to the mean than that is the mean
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """What reweighting found."""
+
+    factors: Tensor  # [nnz] f32, of each entry of W; the sums of rows stay what they are
+    confidence: Tensor | None  # [P] f32 in 0..1; None after no step
+    reliability: float | None = None  # r, the median over regions; None where it was not asked for
 
 
 def reweighted(W: RegionWeights, factors: Tensor) -> RegionWeights:
@@ -59,43 +87,61 @@ def agreement_factors(
     *,
     means: Tensor | None = None,
     threads: int | None = None,
-) -> Tensor:
-    """What each entry of W is multiplied with after so many steps, [nnz] f32; the sums of rows stay what they are.
+    reliability: bool = False,
+    consensus: Tensor | None = None,
+) -> Agreement:
+    """What each entry of W is multiplied with after so many steps.
 
     Args:
         W: of all views by rows of codebooks, on the CPU. means: [P, 3] of the splats; neighbours are judged together.
         threads: None takes the cores that this process may use. The number changes no bit.
+        reliability: whether regions have factors as a whole. consensus: [nnz] f32 of each entry (`mask_consensus`).
     """
-    judge = _Judge(W, codebook, means, threads)
+    judge = _Judge(W, codebook, means, threads, reliability, consensus)
     factors = judge.array()
     factors += 1.0
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "Sparse CSR tensor support is in beta")
-        for step in range(steps):
-            factors = judge.step(factors)
-            progress("robust", step + 1, steps, "steps")
-    return factors
+    for step in range(steps):
+        factors = judge.step(factors)
+        progress("robust", step + 1, steps, "steps")
+    return Agreement(factors, judge.confidence if steps else None, judge.median)
 
 
 class _Judge:
     """What all steps share: the sums of rows and the directions of regions."""
 
-    def __init__(self, W: RegionWeights, codebook: Codebook, means: Tensor | None, threads: int | None) -> None:
+    def __init__(
+        self,
+        W: RegionWeights,
+        codebook: Codebook,
+        means: Tensor | None,
+        threads: int | None,
+        reliability: bool,
+        consensus: Tensor | None,
+    ) -> None:
         self.W, self.codebook, self.threads = W, codebook, threads
-        self.sums = W.row_sums()
+        self.reliability, self.consensus = reliability, consensus
+        self.regions, self.power, self.median = torch.ones(codebook.regions), 1.0, None
+        self.confidence = torch.zeros(W.splats.shape[0])
+        sums = W.row_sums()
+        self.inverse = torch.where(sums > 0, 1.0 / sums, 0.0)
+        self.view = torch.repeat_interleave(W.offsets.diff())
         self.rows = torch.nonzero(W.indptr.diff())[:, 0]
         if means is not None:
             self.rows = self.rows[torch.argsort(morton_codes(means[self.rows]))]
         self.blocks = row_blocks(W.indptr.diff()[self.rows].numpy(), BLOCK_ROWS, BLOCK_ENTRIES)
-        self.mean, self.distances = self._directions()
+        self.mean, self.distances, self.totals = self._directions()
+        self.axes = self._principal()
+        width = codebook.channels if self.axes is None else DIRECTIONS
+        step = max(LEAST_CHANNELS, TABLE_BYTES // (4 * max(codebook.regions, 1)))
+        self.slices = [slice(begin, min(begin + step, width)) for begin in range(0, width, step)]
 
     def array(self) -> Tensor:
         """Zeros for the entries of W, [nnz] f32."""
         size = self.W.weight.nbytes
         return zeros(tuple(self.W.weight.shape), torch.float32, name="weights", in_file=2 * size > MEMORY_LIMIT)
 
-    def _directions(self) -> tuple[Tensor, Tensor]:
-        """The scene's mean of unit vectors [F] f64, and the distance of each region's from it [M] f64."""
+    def _directions(self) -> tuple[Tensor, Tensor, Tensor]:
+        """The mean of unit vectors [F] f64, and of each region its distance from it and its weight [M] f64."""
         totals = torch.zeros(self.codebook.regions, dtype=torch.float64)
         for first in range(0, self.W.region.shape[0], BLOCK_ENTRIES << 5):
             own = slice(first, first + (BLOCK_ENTRIES << 5))
@@ -104,27 +150,54 @@ class _Judge:
         whole = float(totals[known].sum()) or 1.0
         mean, squares = torch.zeros(self.codebook.channels, dtype=torch.float64), torch.zeros_like(totals)
         for channels in self.codebook.slices():
-            unit = self.codebook.unit_values(channels, torch.device("cpu"))
+            unit = self.codebook.unit_values(channels, CPU)
             for part, own in zip(unit.split(ROWS), totals.split(ROWS), strict=True):
                 mean[channels] += own @ part.double() / whole
             for part, squared in zip(unit.split(ROWS), squares.split(ROWS), strict=True):
                 squared.add_((part.double() - mean[channels]).square().sum(dim=1))
         distances = squares.sqrt()
-        return mean, torch.where((distances > NO_DIRECTION) & known, distances, 0.0)
+        return mean, torch.where((distances > NO_DIRECTION) & known, distances, 0.0), totals
+
+    def _principal(self) -> Tensor | None:
+        """The directions [F, DIRECTIONS] f32 in which e spreads most, each region by its weight; None: all channels.
+
+        Of noise they keep what the regions share with one another, so cosines between noisy vectors grow alike. Where
+        a dense map has a region a few entries, to turn all of them would take longer than to compare them whole.
+        """
+        channels, entries = self.codebook.channels, self.W.region.shape[0]
+        if channels <= DIRECTIONS or entries <= DIRECTIONS * self.codebook.regions:
+            return None
+        step = -(-self.codebook.regions // SAMPLE)
+        e = self._whole_rows(slice(None, None, step)).double()
+        return torch.linalg.eigh((e * self.totals[::step, None]).T @ e)[1][:, -DIRECTIONS:].float().contiguous()
+
+    def _whole_rows(self, chosen: slice) -> Tensor:
+        """All channels of e of some regions, [m, F] f32."""
+        channels = list(self.codebook.slices())
+        parts = (self._centred(self.codebook.unit_values(own, CPU)[chosen], own, chosen) for own in channels)
+        return torch.cat(list(parts), dim=1)
+
+    def _centred(self, unit: Tensor, channels: slice, chosen: slice = slice(None)) -> Tensor:
+        """Unit vectors of regions [m, C] f32 become e, in place."""
+        distances = self.distances[chosen]
+        inverse = torch.where(distances > 0, 1.0 / distances, 0.0)
+        for part, own in zip(unit.split(ROWS), inverse.split(ROWS), strict=True):
+            part.copy_((part.double() - self.mean[channels]) * own[:, None])
+        return unit
 
     def _table(self, channels: slice) -> Tensor:
-        """Some channels of e of all regions, [M, C] f32; zeros where a region has no direction."""
-        table = self.codebook.unit_values(channels, torch.device("cpu"))
-        inverse = torch.where(self.distances > 0, 1.0 / self.distances, 0.0)
-        for part, own in zip(table.split(ROWS), inverse.split(ROWS), strict=True):
-            part.copy_((part.double() - self.mean[channels]) * own[:, None])
+        """Some channels, or principal directions, of e of all regions, [M, C] f32; zeros for none."""
+        if self.axes is None:
+            return self._centred(self.codebook.unit_values(channels, CPU), channels)
+        table = torch.zeros(self.codebook.regions, channels.stop - channels.start)
+        for own in self.codebook.slices():
+            table += self._centred(self.codebook.unit_values(own, CPU), own) @ self.axes[own, channels]
         return table
 
     def step(self, factors: Tensor) -> Tensor:
         """The factors after a step from those before it."""
         W, found, squares = self.W, self.array(), self.array()
-        slices = list(self.codebook.slices())
-        for channels in slices:
+        for channels in self.slices:
             table = self._table(channels)
             blocks = [(first, last, factors, table, found, squares) for first, last in self.blocks]
             run_each(self._compare, blocks, self.threads)
@@ -138,40 +211,116 @@ class _Judge:
             everything += float(W.weight[own].sum(dtype=torch.float64))
         del squares
         usual = agreeing / (everything or 1.0)
+        if self.reliability:
+            self._rely(factors, found)
         run_each(self._weigh, [(first, last, factors, usual, found) for first, last in self.blocks], self.threads)
         return found
-
-    def _taken(self, first: int, last: int, factors: Tensor) -> tuple[Tensor, ...]:
-        """Some rows: where they begin, their entries in W and the regions of these, what each entry is of its row
-        now [n] f32, and the runs: where they begin, and the row of each (`RegionWeights.runs`)."""
-        rows = self.rows[first:last]
-        starts, entries = self.W.take(rows)
-        region = self.W.region.index_select(0, entries)
-        sums = self.sums[rows].repeat_interleave(starts.diff())
-        now = self.W.weight.index_select(0, entries).double() * factors.index_select(0, entries)
-        shares = torch.where(sums > 0, now / sums, 0.0).float()
-        return starts, entries, region, shares, *self.W.runs(starts, region)
 
     def _compare(
         self, first: int, last: int, factors: Tensor, table: Tensor, products: Tensor, squares: Tensor
     ) -> None:
         """Add ``e_m . r_jv`` and ``|r_jv|^2`` of the entries of some rows, over the channels of the table."""
-        _, entries, region, shares, runs, row = self._taken(first, last, factors)
-        own, every = bag_sums(region, table, runs, shares), torch.arange(row.shape[0])
-        of_rows = torch.searchsorted(row, torch.arange(last - first + 1))
-        others = bag_sums(every, own, of_rows)[row] - own
-        nothing, shape = torch.zeros(region.shape[0]), (row.shape[0], table.shape[0])
-        pattern = torch.sparse_csr_tensor(runs, region.long(), nothing, size=shape, check_invariants=False)
-        products.scatter_add_(0, entries, torch.sparse.sampled_addmm(pattern, others, table.T, beta=0.0).values())
-        lengths = torch.linalg.vector_norm(others, dim=1).square()
-        squares.scatter_add_(0, entries, lengths.repeat_interleave(runs.diff()))
+        arrays = (self.inverse, self.view, table, products, squares)
+        compare_rows(*self._entries(first, last, factors), *(part.numpy() for part in arrays))
 
     def _weigh(self, first: int, last: int, factors: Tensor, usual: float, found: Tensor) -> None:
-        """Cosines of some rows become their factors ``s ((1 - p) c_m + p c)``."""
-        starts, entries, _, shares, runs, _ = self._taken(first, last, factors)
-        own = segment_sums(shares, runs).clamp_(0.0, 1.0).repeat_interleave(runs.diff())
-        weights = self.W.weight.index_select(0, entries).double()
-        kept = (1.0 - own) * found.index_select(0, entries) + own * usual
-        before, after = segment_sums(weights, starts), segment_sums(weights * kept, starts)
-        gain = torch.where(after > 0, before / after, 0.0).repeat_interleave(starts.diff())
-        found.scatter_(0, entries, torch.where(gain > 0, kept * gain, 1.0).float())
+        """Cosines of some rows become their factors ``s ((1 - p) c_m + p c) (r_m / r) q^power``."""
+        consensus = torch.zeros(0) if self.consensus is None else self.consensus
+        arrays = (self.inverse, self.view, found, self.regions, consensus, self.confidence)
+        numbers = usual, self.power
+        weigh_rows(*[*self._entries(first, last, factors), *(part.numpy() for part in arrays), *numbers])
+
+    def _entries(self, first: int, last: int, factors: Tensor) -> list[np.ndarray]:
+        """Some rows, and W with its factors."""
+        W = self.W
+        return [part.numpy() for part in (self.rows[first:last], W.indptr, W.region, W.weight, factors)]
+
+    def _rely(self, factors: Tensor, cosines: Tensor) -> None:
+        """The factors of regions, and how sharp the consensus is to be."""
+        W, sums = self.W, torch.zeros(2, self.codebook.regions, dtype=torch.float64)
+        arrays = (W.indptr, W.region, W.weight, factors, cosines, self.inverse, self.view, sums)
+        tally(*(part.numpy() for part in arrays))
+        known = sums[1] > 0
+        reliable = torch.where(known, sums[0] / sums[1], 0.0)
+        self.median = float(reliable[known].median()) if known.any() else 0.0
+        if self.median > 0:
+            self.regions = torch.where(known, reliable / self.median, 1.0).float()
+        self.power = SHARPNESS * (1.0 - self.median)
+
+
+@vectorised
+def compare_rows(rows, indptr, region, weight, factors, inverse, view, table, products, squares):
+    """`_Judge._compare` of some rows; sums in float64, for a splat may lie behind a million regions."""
+    width = table.shape[1]
+    total, others = np.empty(width), np.empty(width)
+    for row in rows:
+        first, last = indptr[row], indptr[row + 1]
+        total[:] = 0.0
+        for k in range(first, last):
+            line, share = table[region[k]], weight[k] * factors[k] * inverse[row]
+            for c in range(width):
+                total[c] += share * line[c]
+        k = first
+        while k < last:
+            begin, v = k, view[region[k]]
+            others[:] = 0.0
+            while k < last and view[region[k]] == v:
+                line, share = table[region[k]], weight[k] * factors[k] * inverse[row]
+                for c in range(width):
+                    others[c] += share * line[c]
+                k += 1
+            square = 0.0
+            for c in range(width):
+                others[c] = total[c] - others[c]
+                square += others[c] * others[c]
+            for n in range(begin, k):
+                line, product = table[region[n]], 0.0
+                for c in range(width):
+                    product += line[c] * others[c]
+                products[n] += product
+                squares[n] += square
+
+
+@kernel
+def weigh_rows(
+    rows, indptr, region, weight, factors, inverse, view, cosines, reliable, consensus, confidence, usual, power
+):
+    """`_Judge._weigh` of some rows, and their confidence."""
+    for row in rows:
+        first, last = indptr[row], indptr[row + 1]
+        before, after, told = 0.0, 0.0, 0.0
+        k = first
+        while k < last:
+            begin, v, own = k, view[region[k]], 0.0
+            while k < last and view[region[k]] == v:
+                own += weight[k] * factors[k] * inverse[row]
+                k += 1
+            own = min(own, 1.0)
+            for n in range(begin, k):
+                kept = ((1.0 - own) * cosines[n] + own * usual) * reliable[region[n]]
+                if consensus.size > 0:
+                    kept *= consensus[n] ** power
+                before += weight[n]
+                after += weight[n] * kept
+                told += weight[n] * kept * cosines[n]
+                cosines[n] = kept
+        gain = before / after if after > 0.0 else 0.0
+        for n in range(first, last):
+            cosines[n] = cosines[n] * gain if gain > 0.0 else 1.0
+        confidence[row] = told / after if after > 0.0 else 0.0
+
+
+@kernel
+def tally(indptr, region, weight, factors, cosines, inverse, view, sums):
+    """Of each region, what the splats' other views say of it, ``W (1 - p) c``, and ``W (1 - p)``: sums [2, M] f64."""
+    for row in range(indptr.shape[0] - 1):
+        k = indptr[row]
+        while k < indptr[row + 1]:
+            begin, v, own = k, view[region[k]], 0.0
+            while k < indptr[row + 1] and view[region[k]] == v:
+                own += weight[k] * factors[k] * inverse[row]
+                k += 1
+            others = max(1.0 - own, 0.0)
+            for n in range(begin, k):
+                sums[0, region[n]] += weight[n] * factors[n] * others * cosines[n]
+                sums[1, region[n]] += weight[n] * factors[n] * others

@@ -119,7 +119,7 @@ def still_life_rows(presets: Iterable[str]) -> Iterator[dict[str, Any]]:
             files = [Path(place) / part for part in ("point_cloud.ply", "cameras.json", "features.safetensors")]
             write_splats(made.splats, files[0])
             write_inria_cameras(made.cameras, files[1])
-            moved = {view: replace(part, codebook=_in_cone(part.codebook, cone)) for view, part in observed.items()}
+            moved = {view: replace(part, codebook=in_cone(part.codebook, cone)) for view, part in observed.items()}
             write_pack(files[2], moved, {"encoder": "generated", "text_space": "minilm", "normalised": "true"})
             for preset in presets:
                 lifted = opened(lift_files(files, preset=preset), raster)
@@ -127,7 +127,7 @@ def still_life_rows(presets: Iterable[str]) -> Iterator[dict[str, Any]]:
                 yield head | measure_phrases(lifted, made.things, encoder, held_out)
 
 
-def _in_cone(codebook: Tensor, share: float) -> Tensor:
+def in_cone(codebook: Tensor, share: float) -> Tensor:
     """Unit vectors drawn towards one fixed random direction, as CLIP's image vectors are: that much of each is it."""
     axis = torch.randn(codebook.shape[1], generator=torch.Generator().manual_seed(1))
     drawn = (1 - share**2) ** 0.5 * codebook.float() + share * torch.nn.functional.normalize(axis, dim=0)

@@ -26,7 +26,7 @@ LEVELS = "'rows' or 'composite' or a valid integer"
         ("lift_gain", 1e400, "less than or equal to 16"),
         ("levels", True, LEVELS),
         ("levels", "1", LEVELS),
-        ("preset", "\ud800", "'row-sum', 'tikhonov', 'argmax', 'top-k', 'front-mass', 'centre' or 'mean'"),
+        ("preset", "\ud800", "'default', 'row-sum', 'tikhonov', 'argmax', 'top-k', 'front-mass', 'centre' or 'mean'"),
         ("certificate_rays", 1_000_001, "at most 1000000 rays"),
         ("k", 1e300, "less than or equal to 64"),
     ],
