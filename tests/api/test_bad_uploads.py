@@ -37,9 +37,9 @@ from .tiny_scene import (
 
 
 def files_below(data: Path) -> set[str]:
-    """Every file but the database's own."""
+    """Every file but the database's own and the number beside it, which is written as the server starts."""
     found = (path for path in data.rglob("*") if path.is_file())
-    return {str(path) for path in found if not path.name.startswith("service.sqlite")}
+    return {str(path) for path in found if not path.name.startswith(("service.sqlite", "generation", ".generation"))}
 
 
 def truncated_ply() -> bytes:
