@@ -70,7 +70,7 @@ def robust_sums(rows: int, channels: int) -> float:
     every, starts = torch.arange(rows, dtype=torch.int32), torch.tensor([0, rows])
     W = stacked([_row(every, torch.from_numpy(view), starts) for view in weights], 1)
     codebook = Codebook([ViewCodebook(torch.from_numpy(book)) for book in books])
-    got = (W.weight * agreement_factors(W, codebook, 1)).numpy().reshape(2, rows)
+    got = (W.weight * agreement_factors(W, codebook, 1).factors).numpy().reshape(2, rows)
     exact = _robust_step(weights.astype(np.float64), books.astype(np.float64))
     return float(np.abs(got - exact).max() / exact.max())
 
