@@ -10,8 +10,8 @@ import torch
 
 from liftcore.demo.objects import FOOTPRINTS, Piece, still_life_pieces
 from liftcore.demo.surfaces import Samples, sample
-from liftcore.query.colours import SH_C0
 from liftcore.scene.cameras import Camera, Cameras
+from liftcore.scene.harmonics import SH_C0
 from liftcore.scene.splats import Splats
 
 if TYPE_CHECKING:

@@ -10,6 +10,7 @@
   Localised as P2 is.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -55,7 +56,7 @@ class Prediction:
     peak: tuple[int, int] | None  # x y of the highest value; None where the protocol has no such pixel
 
 
-class Segmenter:
+class Segmenter(ABC):
     """One protocol at work on one lift, for fixed texts.
 
     Args:
@@ -75,12 +76,12 @@ class Segmenter:
         self.threshold, self.negatives = threshold, tuple(negatives)
         self.prepare()
 
-    def prepare(self) -> None:
+    def prepare(self) -> None:  # noqa: B027  # most protocols have nothing to prepare
         """What is done once for all views."""
 
+    @abstractmethod
     def look(self, view: str) -> dict[str, Prediction]:
         """What each text finds in a view."""
-        raise NotImplementedError
 
     def answers(self) -> dict[str, Answer]:
         """Each text asked of the splats."""

@@ -12,7 +12,8 @@ import numpy as np
 
 from liftcore.errors import InvalidSplats
 from liftcore.io.ply import EXPORT, parse_elements, read_head
-from liftcore.io.quantised import Fields, constant_terms, decoded, field_shapes, logits, smallest_three
+from liftcore.io.quantised import Fields, decoded, field_shapes, logits, smallest_three
+from liftcore.scene.harmonics import constant_terms
 
 CHUNK_ROWS = 256
 AXES = ("x", "y", "z")

@@ -9,7 +9,6 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 BLOCK_ROWS = 1 << 16  # splats decoded at a time
-SH_C0 = 0.28209479177387814  # 1 / (2 sqrt(pi)), the constant spherical harmonic
 LEAST_ALPHA = 1e-6  # bytes say an opacity of 0 or 1 where the trained one was near: its logit stays finite
 MOST_GROWTH = 100  # decoded bytes for a byte of a compressed file: real scenes have 2 to 10
 
@@ -42,11 +41,6 @@ def logits(alpha: np.ndarray) -> np.ndarray:
     """The logits of opacities in 0..1, kept LEAST_ALPHA off both ends."""
     alpha = np.clip(np.asarray(alpha, np.float64), LEAST_ALPHA, 1 - LEAST_ALPHA)
     return np.log(alpha / (1 - alpha))
-
-
-def constant_terms(colours: np.ndarray) -> np.ndarray:
-    """The constant terms of the harmonics that show colours in 0..1."""
-    return (np.asarray(colours, np.float64) - 0.5) / SH_C0
 
 
 def smallest_three(parts: np.ndarray, largest: np.ndarray) -> np.ndarray:

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from liftcore.errors import InvalidSplats
-from liftcore.io.quantised import Fields, constant_terms, decoded, field_shapes, logits
+from liftcore.io.quantised import Fields, decoded, field_shapes, logits
+from liftcore.scene.harmonics import constant_terms
 
 ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("colours", "u1", 4), ("quats", "u1", 4)])
 LOOKED_AT = 1024  # rows by which a file is told to be one

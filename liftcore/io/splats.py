@@ -25,6 +25,7 @@ from liftcore.io.quantised import Fields
 from liftcore.io.sog import META, read_sog
 from liftcore.io.splat import looks_like_splat, read_splat
 from liftcore.io.spz import begins_like_spz, read_spz
+from liftcore.scene.harmonics import constant_terms
 from liftcore.scene.kernel import Kernel, kernel_named
 
 if TYPE_CHECKING:
@@ -165,14 +166,15 @@ def recoloured(path: Path, colours: np.ndarray) -> Iterator[bytes]:
     All else of a PLY is of its own bytes (`liftcore.io.ply.recoloured`); another format becomes a PLY of 3DGS.
 
     Args:
-        path: the file. colours: [P, 3] f32, the constant terms of the spherical harmonics.
+        path: the file. colours: [P, 3] u8 sRGB.
 
     Raises:
         InvalidSplats: the file is malformed, has another number of splats, or is a PLY that holds no colours.
     """
+    terms = constant_terms(colours / 255).astype(np.float32)
     if format_of(path) is SplatFormat.PLY:
-        return ply.recoloured(path, colours)
-    return ply.ply_blocks(replace(_of_count(path, len(colours), colour=False), sh=colours[:, None]))
+        return ply.recoloured(path, terms)
+    return ply.ply_blocks(replace(_of_count(path, len(terms), colour=False), sh=terms[:, None]))
 
 
 def is_splats(path: Path) -> bool:

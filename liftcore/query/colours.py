@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 
-SH_C0 = 0.28209479177387814  # 1 / (2 sqrt(pi)), the constant spherical harmonic
 NO_CLUSTER_COLOUR = (90, 90, 90)  # sRGB of splats in no cluster
 NOT_SEEN_COLOUR = (90, 90, 90)  # sRGB of splats without a score
 
@@ -46,11 +45,6 @@ def heat_colours(values: np.ndarray, known: np.ndarray) -> np.ndarray:
     picture = colours[np.round(level.clip(0.0, 1.0) * (len(colours) - 1)).astype(np.int64)]
     picture[~known] = 0
     return picture
-
-
-def constant_terms(colours: np.ndarray) -> np.ndarray:
-    """The terms [..., 3] f32 of the spherical harmonics that show colours [..., 3] u8 sRGB, alike from everywhere."""
-    return ((colours.astype(np.float32) / 255 - 0.5) / SH_C0).astype(np.float32)
 
 
 def cluster_colours(count: int) -> np.ndarray:

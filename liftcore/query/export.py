@@ -11,9 +11,10 @@ import numpy as np
 
 from liftcore.errors import InvalidQuery
 from liftcore.query.ask import Answer
-from liftcore.query.colours import NOT_SEEN_COLOUR, SH_C0, cluster_colours, constant_terms, heat_colours
+from liftcore.query.colours import NOT_SEEN_COLOUR, cluster_colours, heat_colours
 from liftcore.query.objects import objects
 from liftcore.query.scene import QueryScene, as_numpy
+from liftcore.scene.harmonics import SH_C0
 
 _BLOCK_ROWS = 1 << 16
 _GREY = 0.6  # of splats whose file holds no colours
@@ -57,7 +58,7 @@ def coloured_ply(scene: QueryScene, answer: Answer) -> Iterable[bytes]:
 
     colours = heat_colours(answer.scores, answer.seen)
     colours[~answer.seen] = NOT_SEEN_COLOUR
-    return recoloured(scene.splat_file, constant_terms(colours))
+    return recoloured(scene.splat_file, colours)
 
 
 def npy(values: np.ndarray) -> bytes:

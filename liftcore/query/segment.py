@@ -19,7 +19,7 @@ import numpy as np
 
 from liftcore.errors import InvalidQuery
 from liftcore.progress import Progress, silent
-from liftcore.query.colours import cluster_colours, constant_terms
+from liftcore.query.colours import cluster_colours
 from liftcore.query.directions import MINIMUM_ROW_SUM, directions
 from liftcore.query.objects import trimmed_box
 from liftcore.query.scene import QueryScene, as_numpy
@@ -186,7 +186,7 @@ def named_ply(scene: QueryScene, segmentation: Segmentation) -> Iterable[bytes]:
     """
     from liftcore.io.splats import recoloured
 
-    return recoloured(scene.splat_file, constant_terms(segmentation.colours[segmentation.values]))
+    return recoloured(scene.splat_file, segmentation.colours[segmentation.values])
 
 
 def word_map(scene: QueryScene, segmentation: Segmentation, view: str | Camera) -> np.ndarray:

@@ -6,9 +6,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from liftcore.query.colours import SH_C0
 from liftcore.query.scores import rows_at_a_time
 from liftcore.scene.cameras import Camera
+from liftcore.scene.harmonics import SH_C0
 from liftcore.scene.splats import Splats
 from liftcore.solve.aggregate import principal_axes
 

@@ -16,11 +16,11 @@ import torch
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
-from liftcore.device import CPU, Device, out_of_memory
+from liftcore.device import CPU, Device, give_back_memory, out_of_memory
 from liftcore.one_thread import one_thread
 from liftcore.progress import Progress, silent
 from liftcore.solve.codebook import Codebook
-from liftcore.solve.memory import give_back, zeros
+from liftcore.solve.memory import zeros
 from liftcore.solve.weights import BLOCK_ENTRIES, BLOCK_ROWS, RegionWeights, from_zero, row_blocks, run_each
 
 LONG = 256  # terms of a sum that float32 adds up one by one
@@ -65,7 +65,7 @@ def solve(
     X = zeros(shape, dtype, name="features", in_file=memory is not None and size > memory)
     seen = torch.nonzero(W.indptr.diff())[:, 0]
     squares = solve_rows(X, seen, W, codebook, progress, means=means, threads=threads, device=device)
-    give_back()
+    give_back_memory()
     return Solution(X, squares.sqrt().clamp(0.0, 1.0).float())
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from liftcore.device import give_back_memory
 from liftcore.features.levels import at_levels, region_levels
 from liftcore.features.pack import Views, as_views, pair
 from liftcore.features.views import FeatureGrid, Regions, ViewFeatures, cells_under
@@ -19,7 +20,6 @@ from liftcore.scene.cameras import Camera, Cameras
 from liftcore.settings import LiftSettings
 from liftcore.solve.checkpoint import Checkpoint
 from liftcore.solve.codebook import Codebook, ViewCodebook, as_regions
-from liftcore.solve.memory import give_back
 from liftcore.solve.weights import MEMORY_LIMIT, RegionWeights, stacked
 
 Given = Mapping[str, ViewFeatures] | Iterable[tuple[str, ViewFeatures]]
@@ -171,7 +171,7 @@ def weigh_views(
             progress("geometry", len(samples), len(views), "views")
     W = stacked(parts, splats, threads)
     parts.clear()
-    give_back()
+    give_back_memory()
     return Geometry(W, Codebook(tuple(codebooks)), tuple(samples), tuple(blind), np.concatenate(levels))
 
 

@@ -1,6 +1,5 @@
 """Large arrays: in memory, or in mapped files that have no name, which the system writes and drops as it needs."""
 
-import ctypes
 import mmap
 import os
 import shutil
@@ -45,16 +44,6 @@ def zeros(shape: tuple[int, ...], dtype: torch.dtype, *, name: str, in_file: boo
     finally:
         os.close(handle)
         Path(path).unlink()
-
-
-def give_back() -> None:
-    """Have the allocator return what is free; where there is no such call (glibc has it), nothing happens.
-
-    What was made bit by bit leaves hundreds of megabytes of pieces, and large arrays fit in none.
-    """
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-    if trim is not None:
-        trim(0)
 
 
 def check_disk(size: int, name: str) -> None:

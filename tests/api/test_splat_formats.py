@@ -12,8 +12,8 @@ import torch
 from fastapi.testclient import TestClient
 from plyfile import PlyData
 
-from liftcore.io.quantised import SH_C0
 from liftcore.io.splat import ROW
+from liftcore.scene.harmonics import SH_C0
 
 from .conftest import Uploaded
 from .following import ended

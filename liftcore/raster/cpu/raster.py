@@ -7,7 +7,6 @@ which share. The compiled kernels release the interpreter lock.
 from __future__ import annotations
 
 import copy
-import ctypes
 import os
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
@@ -19,6 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from liftcore.device import give_back_memory
 from liftcore.raster.base import (
     TILE,
     CompositingParams,
@@ -124,7 +124,7 @@ class CpuRaster:
             yield from side_by_side(rasters, chain(first, requests))
         finally:
             rasters.clear()
-            _give_back_free_memory()
+            give_back_memory()
 
     def _beside(self, threads: int) -> CpuRaster:
         """Another raster of the same scene, which may work at the same time."""
@@ -264,16 +264,6 @@ def _shares(total: int, count: int) -> list[tuple[int, int]]:
     """``count`` ranges that cover ``total`` items."""
     edges = [total * k // count for k in range(count + 1)]
     return list(pairwise(edges))
-
-
-def _give_back_free_memory() -> None:
-    """Have the allocator return what is free; where there is no such call (glibc has it), nothing happens.
-
-    Views leave hundreds of megabytes of pieces between what is kept, and the solution's large arrays fit in none.
-    """
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-    if trim is not None:
-        trim(0)
 
 
 # Views one after the other, or several at a time: two views on a core each leave nothing waiting for the last share

@@ -12,11 +12,12 @@ from liftcore.errors import InvalidLift, InvalidQuery
 from liftcore.io.scene_files import lift_files
 from liftcore.io.splats import read_splats
 from liftcore.query.ask import Answer, ask
-from liftcore.query.colours import NOT_SEEN_COLOUR, SH_C0, colour_map
+from liftcore.query.colours import NOT_SEEN_COLOUR, colour_map
 from liftcore.query.export import coloured_ply, object_ply
 from liftcore.query.render import attention_png, render, view_mask
 from liftcore.query.scene import QueryScene
 from liftcore.query.terms import Query, Region
+from liftcore.scene.harmonics import SH_C0
 from liftcore.settings import LiftSettings
 from tests.api.tiny_scene import SPLATS_A_CLUSTER, ply, splat_rows
 

@@ -15,7 +15,7 @@ from liftcore.query import objects as grouping
 from liftcore.query import render as module
 from liftcore.query import scene as scenes
 from liftcore.query.ask import Answer, ask
-from liftcore.query.colours import NO_CLUSTER_COLOUR, SH_C0, cluster_colours
+from liftcore.query.colours import NO_CLUSTER_COLOUR, cluster_colours
 from liftcore.query.objects import objects
 from liftcore.query.render import (
     attention_png,
@@ -35,6 +35,7 @@ from liftcore.raster.base import CompositingParams
 from liftcore.raster.reference import ReferenceRaster
 from liftcore.scene.cameras import Camera, Cameras, behind_lens, drawn_by
 from liftcore.scene.distortion import Brown, Distortion, Fisheye, photo_places
+from liftcore.scene.harmonics import SH_C0
 from liftcore.scene.splats import Kernel, Splats
 from tests.api.tiny_scene import HEIGHT, SPLATS_A_CLUSTER, WIDTH
 from tests.scenes import look_at, random_camera, random_splats

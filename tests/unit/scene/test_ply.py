@@ -15,7 +15,6 @@ from plyfile import PlyData
 from liftcore.errors import InvalidSplats
 from liftcore.io.ply import BLOCK_ROWS, write_splats
 from liftcore.io.splats import read_splats, recoloured, some_rows
-from liftcore.query.colours import constant_terms
 from liftcore.query.splat_colours import seen_colours
 from liftcore.scene.splats import Kernel, Splats
 from tests.scenes import look_at, random_splats
@@ -377,7 +376,7 @@ def test_elements_behind_the_vertices_are_no_rows_of_a_copy(tmp_path: Path) -> N
     others = b"element version 200\nproperty uchar number\n"  # as many bytes as two splats and more
     path = with_ply(tmp_path, plain.replace(b"end_header", others + b"end_header") + bytes(200))
     assert b"".join(some_rows(path, np.ones(5, bool))) == plain
-    copy = b"".join(recoloured(path, np.zeros((5, 3), np.float32)))
+    copy = b"".join(recoloured(path, np.zeros((5, 3), np.uint8)))
     assert len(copy) == len(plain) and len(rows_of(copy)) == 5
 
 
@@ -386,7 +385,7 @@ def test_colours_of_every_dialect_are_the_same_from_everywhere(dialect: str, tmp
     names = DIALECTS[dialect]
     path = with_ply(tmp_path, ply_bytes(names))
     wanted = np.random.default_rng(2).integers(0, 256, (5, 3)).astype(np.uint8)
-    (tmp_path / "coloured.ply").write_bytes(b"".join(recoloured(path, constant_terms(wanted))))
+    (tmp_path / "coloured.ply").write_bytes(b"".join(recoloured(path, wanted)))
     splats = read_splats(tmp_path / "coloured.ply")
     for centre in ([3.0, 1.0, -4.0], [-0.2, 0.1, 9.0], [0.0, -5.0, 0.3]):
         shown = seen_colours(splats, look_at("v", np.array(centre), 8, 8, 8.0))
@@ -402,8 +401,8 @@ def test_colours_of_every_dialect_are_the_same_from_everywhere(dialect: str, tmp
 def test_a_file_without_colours_or_with_another_count_is_refused(tmp_path: Path) -> None:
     path = with_ply(tmp_path, ply_bytes(DIALECTS["no colour"]))
     with pytest.raises(InvalidSplats, match="expected colours"):
-        list(recoloured(path, np.zeros((5, 3), np.float32)))
-    for copy in (some_rows(path, np.ones(4, bool)), recoloured(path, np.zeros((6, 3), np.float32))):
+        list(recoloured(path, np.zeros((5, 3), np.uint8)))
+    for copy in (some_rows(path, np.ones(4, bool)), recoloured(path, np.zeros((6, 3), np.uint8))):
         with pytest.raises(InvalidSplats, match="as many as were lifted, got 5"):
             list(copy)
 
@@ -413,7 +412,10 @@ def test_a_copy_takes_the_memory_of_a_few_blocks(tmp_path: Path) -> None:
     count = 10 * BLOCK_ROWS
     path = with_ply(tmp_path, ply_bytes(names, count=count))
     block = BLOCK_ROWS * 4 * len(names)
-    for make in (lambda: some_rows(path, np.ones(count, bool)), lambda: recoloured(path, np.zeros((count, 3)))):
+    for make in (
+        lambda: some_rows(path, np.ones(count, bool)),
+        lambda: recoloured(path, np.zeros((count, 3), np.uint8)),
+    ):
         tracemalloc.start()
         total = sum(map(len, make()))
         peak = tracemalloc.get_traced_memory()[1] - (24 * count)  # the colours, or less for the rows to keep

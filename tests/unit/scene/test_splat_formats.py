@@ -23,6 +23,7 @@ from liftcore.io.ply import write_splats
 from liftcore.io.quantised import LEAST_ALPHA
 from liftcore.io.splats import SplatFormat, format_of, read_splats, recoloured, require_kernel, some_rows
 from liftcore.io.spz import FRAME_EXTENSION, RDF
+from liftcore.scene.harmonics import constant_terms
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.splats import Splats
 from tests.scenes import random_splats
@@ -70,10 +71,11 @@ def test_exports_of_every_format_are_plys_of_the_same_rows(name: str, tmp_path: 
     some = read_splats(tmp_path / "some.ply")
     for field in ("means", "quats", "log_scales", "opacity_logits", "sh"):
         assert torch.equal(getattr(some, field), getattr(whole, field)[torch.from_numpy(kept)])
-    colours = np.random.default_rng(0).normal(size=(whole.count, 3)).astype(np.float32)
+    colours = np.random.default_rng(0).integers(0, 256, (whole.count, 3)).astype(np.uint8)
     (tmp_path / "coloured.ply").write_bytes(b"".join(recoloured(FILES / name, colours)))
     coloured = read_splats(tmp_path / "coloured.ply")
-    assert coloured.sh is not None and torch.equal(coloured.sh[:, 0], torch.from_numpy(colours))
+    terms = torch.from_numpy(constant_terms(colours / 255).astype(np.float32))
+    assert coloured.sh is not None and torch.equal(coloured.sh[:, 0], terms)
     assert torch.equal(coloured.means, whole.means)
     with pytest.raises(InvalidSplats, match=f"as many as were lifted, got {whole.count}"):
         list(some_rows(FILES / name, kept[:-1]))
