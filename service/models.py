@@ -485,7 +485,7 @@ class QueryAnswer(BaseModel):
     statistics: dict[str, Any] = Field(description="of the scores over the seen splats")
     threshold: Threshold
     count: int = Field(description="splats at or above the threshold")
-    present: bool = Field(description="whether what was found stands apart from the rest of the scene")
+    clear: bool = Field(description="whether what was found stands apart; no word on whether the thing is there")
     top: list[TopSplat]
     box: Box | None = Field(description="around all splats at or above the threshold, strays too: see objects")
     links: dict[str, str]
@@ -497,7 +497,7 @@ class ObjectsAnswer(BaseModel):
     lift: JobId
     threshold: Threshold
     count: int = Field(description="splats at or above the threshold")
-    present: bool = Field(description="whether they stand apart from the rest of the scene")
+    clear: bool = Field(description="whether they stand apart; no word on whether the thing is there")
     objects: list[FoundObject] = Field(description="those with the most evidence first")
     strays: int = Field(description="splats at or above the threshold in none of them")
 

@@ -85,7 +85,7 @@ class VectorAnswer:
     splats: Tensor  # [P] bool, seen and at or above the threshold
     threshold: float  # on the scores
     explanation: str  # one sentence on how it was found
-    present: bool  # whether some splats were found that stand apart from the others
+    clear: bool  # whether some splats were found that stand apart from the others; absent things may seem to
     objects: Objects | None  # the things that they make up, with boxes; None where no splats were given
 
 
@@ -142,8 +142,8 @@ def query_vectors(
         torch.from_numpy(array).to(result.features.device) for array in (answer.scores, answer.selected)
     )
     found = None if splats is None else objects(scene, answer)
-    present = answer.clear and answer.count > 0
-    return VectorAnswer(scores, selected, answer.threshold, answer.explanation, present, found)
+    clear = answer.clear and answer.count > 0
+    return VectorAnswer(scores, selected, answer.threshold, answer.explanation, clear, found)
 
 
 def _vectors(values: Any) -> tuple[Vector, ...]:

@@ -365,8 +365,8 @@ def _box(corners: tuple[Point, Point]) -> dict[str, Point]:
 
 def _found(answer: Answer) -> dict[str, Any]:
     cut = {"method": answer.threshold_method, "explanation": answer.explanation}
-    present = answer.clear and answer.count > 0
-    return {"threshold": {"value": finite(answer.threshold), **cut}, "count": answer.count, "present": present}
+    clear = answer.clear and answer.count > 0
+    return {"threshold": {"value": finite(answer.threshold), **cut}, "count": answer.count, "clear": clear}
 
 
 def reply_to(requests: list[dict[str, Any]], answers: Answers) -> Frame:

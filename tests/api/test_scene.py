@@ -63,9 +63,9 @@ def test_views_have_their_poses_in_pages(client: TestClient, lift: dict[str, Any
 
 def test_an_answer_says_whether_the_thing_stands_apart(client: TestClient, lift: dict[str, Any]) -> None:
     for route in ("/query", "/query/objects"):
-        assert client.get(route, params={"lift": lift["id"], "text": "lamp"}).json()["present"] is True
+        assert client.get(route, params={"lift": lift["id"], "text": "lamp"}).json()["clear"] is True
     nothing = client.get("/query", params={"lift": lift["id"], "text": "lamp", "threshold": 2}).json()
-    assert (nothing["present"], nothing["count"]) == (False, 0)
+    assert (nothing["clear"], nothing["count"]) == (False, 0)
 
 
 def test_other_kernels_are_shown_as_near_gaussians() -> None:

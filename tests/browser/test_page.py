@@ -117,10 +117,8 @@ def test_double_click_goes_there_and_asks_nothing(page: Browser) -> None:
 
 def test_what_is_not_there_is_said_plainly(page: Browser) -> None:
     ask(page, "lamp")
-    page.value(
-        "(() => { splatlift.ask.now.answer.present = false; splatlift.ask.show(); splatlift.ask.changed(); })()"
-    )
-    assert text_of(page, "#answer") == "\u201clamp\u201d is not here." and not columns(page, AMBER)
+    page.value("(() => { splatlift.ask.now.answer.clear = false; splatlift.ask.show(); splatlift.ask.changed(); })()")
+    assert text_of(page, "#answer") == "Nothing stands apart for \u201clamp\u201d." and not columns(page, AMBER)
     page.press("#nearest")
     page.until(FOUND)
     assert columns(page, AMBER) and "comes closest" in text_of(page, "#why")

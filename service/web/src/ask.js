@@ -261,7 +261,7 @@ export class Ask {
   }
 
   chip(question, place) {
-    const numbers = question.answer ? (lit(question) ? count(question.count) : "not here") : question.problem ? "!" : "\u2026";
+    const numbers = question.answer ? (lit(question) ? count(question.count) : "unclear") : question.problem ? "!" : "\u2026";
     return el("li", { className: question === this.now ? "chip now" : "chip", style: { "--mine": question.colour } },
       el("button", { type: "button", className: "pick", "aria-pressed": String(question === this.now),
         on: { click: () => { this.active = place; this.thing = -1; this.show(); this.changed(); } } },
@@ -296,8 +296,8 @@ export class Ask {
       at("answer").textContent = now.problem ? words(now.problem) : "Looking\u2026";
       at("why").textContent = "";
     } else if (!lit(now)) {
-      at("answer").textContent = `${quoted(now)} is not here.`;
-      at("why").textContent = "No part of the scene stands apart from the rest for it. Other words may help, or a click on an example.";
+      at("answer").textContent = `Nothing stands apart for ${quoted(now)}.`;
+      at("why").textContent = "Other words may help, or a click on an example.";
     } else {
       at("answer").textContent = now.count
         ? `${plural(now.count, "splat")} of ${count(now.scores.length)} (${percent(now.count / now.scores.length)}).`
@@ -326,14 +326,14 @@ export class Ask {
 const fresh = (terms, place) => ({ text: [], like: [], unlike: [], threshold: "auto", things: [], ...terms, colour: COLOURS[place % COLOURS.length] });
 const split = text => text.split(",").map(word => word.trim()).filter(Boolean);
 const number = given => (given === undefined || given === "" || Number.isNaN(Number(given)) ? "auto" : Number(given));
-const lit = question => question.anyway || question.threshold !== "auto" || question.answer.present;
+const lit = question => question.anyway || question.threshold !== "auto" || question.answer.clear;
 const shown = term => term.replace("splat:", "splat ");
 export const label = question => question.text.join(", ") || (question.like.length > 1 ? `like ${question.like.length} examples` : `like ${shown(question.like[0] || "")}`);
 const quoted = question => (question.text.length ? `\u201c${question.text.join(", ")}\u201d` : "Such a thing");
 const measures = ({ low, high }) => ` ${low.map((value, axis) => (high[axis] - value).toPrecision(2)).join(" \u00d7 ")}`;
 
 function decided({ answer, threshold, anyway }) {
-  if (!answer.present && threshold === "auto" && anyway) return "This is what comes closest; it hardly stands apart from the rest.";
+  if (!answer.clear && threshold === "auto" && anyway) return "This is what comes closest; it hardly stands apart from the rest.";
   if (threshold !== "auto") return "You set this cut. The dashes mark the automatic one.";
   const how = /least, in log-odds/.test(answer.threshold.explanation)
     ? "moving it a little changes least of what is found" : "no gap is clear, so it splits the scores into two groups";

@@ -121,11 +121,11 @@ def test_vectors_are_asked_as_their_words_are(scene: QueryScene) -> None:
     for positive in (torch.eye(CHANNELS)[0], 7 * np.eye(CHANNELS)[:1]):
         found = scene.lift.query(positive, torch.eye(CHANNELS)[1], splats=scene.splats)
         assert found.scores.numpy().tolist() == words.scores.tolist() and found.threshold == words.threshold
-        assert np.array_equal(found.splats.numpy(), words.selected) and found.present
+        assert np.array_equal(found.splats.numpy(), words.selected) and found.clear
         assert found.objects is not None and len(found.objects.found) == 1
     alike = replace(scene.lift, features=torch.ones(COUNT, CHANNELS))
     alone = alike.query(torch.eye(CHANNELS)[0])
-    assert not alone.present and alone.objects is None
+    assert not alone.clear and alone.objects is None
     for wrong in (torch.ones(5), torch.zeros(CHANNELS), torch.empty(0, CHANNELS)):
         with pytest.raises(InvalidQuery):
             scene.lift.query(wrong)
