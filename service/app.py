@@ -19,7 +19,7 @@ from service.middleware import AnswerHead, RecordedApp
 from service.observe import Metrics, versions
 from service.queries.client import QueryClient, QueryLimits
 from service.requests import KnownParameters
-from service.routes import assets, jobs, operations, queries, results, scene
+from service.routes import assets, jobs, operations, queries, results, scene, words
 from service.settings import ServiceSettings
 from service.state import AppState, Readiness, Stopping
 from service.store.collect import Collector
@@ -77,7 +77,7 @@ def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, work
     app.add_middleware(Gate, keys=store.keys, settings=settings, stopping=lambda: stopping.begun)
     problems.install(app)
     app.include_router(operations.router)  # probes and links to the page may carry what they like
-    for module in (assets, jobs, results, scene, queries):
+    for module in (assets, jobs, results, scene, queries, words):
         app.include_router(module.router, dependencies=[KnownParameters])
     return app
 

@@ -23,6 +23,7 @@ from pydantic import (
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, PydanticCustomError
 
+from liftcore.scene.distortion import MAX_SIDE
 from liftcore.settings import LiftSettings
 
 # How fields tell of what does not fit: one error, in words, whatever pydantic would make of it
@@ -415,6 +416,8 @@ Example = Annotated[
     takes("VIEW:x,y, region:VIEW:LEVEL:ID, splat:J, or a vector of 1 to 65536 finite numbers"),
 ]
 ViewName = Annotated[str, Field(min_length=1, max_length=VIEW_CHARACTERS, description="the name of a camera")]
+Coordinate = Annotated[float, Field(allow_inf_nan=False), NoBoolean]
+Pixels = Annotated[int, Field(ge=1, le=MAX_SIDE), NoBoolean]
 Number = Annotated[float, Field(ge=-1e6, le=1e6), NoBoolean]  # which NaN is not
 Method = Literal["auto", "valley", "paper", "otsu", "stability"]
 Cut = Annotated[Method | Number, takes(f"{', '.join(get_args(Method))}, or a number from -1e6 to 1e6")]
@@ -422,20 +425,47 @@ Count = Annotated[int, Field(ge=1, le=100), NoBoolean]
 Top = Annotated[int, Field(ge=0, le=1000), NoBoolean]
 
 
+MOST_WORDS = 4096  # that are asked at once
+Rendered = Literal["rgb", "depth", "pca", "cluster", "confidence"]
+RENDERED = (
+    "the splats' colours, expected depth, three principal components of features, clusters, or how far views agree"
+)
 SplatsOf = Literal["object", "scores"]
 SPLATS_OF = "the splats that were found and no others, or all splats in the colours of their scores"
 
 
-class Question(BaseModel):
-    """What all queries share: the words, and how to find what they mean."""
+class OwnCamera(Body):
+    """A camera that no file has, in the frame of the splats; an entry of GET /lifts/{lift}/views is one, too."""
+
+    width: Pixels = Field(description="pixels")
+    height: Pixels
+    fx: Coordinate = Field(description="pixels, like fy, cx and cy")
+    fy: Coordinate | None = Field(None, description="fx if left out")
+    cx: Coordinate | None = Field(None, description="from the left edge; the middle if left out, as cy")
+    cy: Coordinate | None = None
+    viewmat: Annotated[
+        list[Annotated[list[Coordinate], Field(min_length=4, max_length=4)]], Field(min_length=4, max_length=4)
+    ] = Field(description="[4, 4], world to camera, rigid; OpenCV axes: x right, y down, z forward")
+    name: ViewName = "camera"
+    lifted: bool | None = Field(None, description="of no meaning here")
+
+
+class LiftQuestion(BaseModel):
+    """Which lift is asked, and in whose words."""
 
     lift: JobId | None = Field(None, description="the lift; may be left out when there is exactly one")
+    encoder: str | None = Field(None, max_length=200, description="a text space that the operator set up, or default")
+    table: AssetId | None = Field(None, description="an uploaded text table that has the words, in place of encoder")
+
+
+class Question(LiftQuestion):
+    """What all queries share: the words, and how to find what they mean."""
+
     text: Texts = Field([], description="what to look for; may be given several times, 4000 characters in all")
     negatives: Texts = Field([], description="what it is not; likewise")
     threshold: Cut = Field("auto", description="how to find it, or the score from which a splat counts as found")
     instances: Count | None = Field(None, description="how many there are, if you know")
     keep: Literal["all", "largest"] = Field("all", description="of what was found, in masks, splats and objects")
-    encoder: str | None = Field(None, max_length=200, description="a text space that the operator set up, or default")
 
 
 class Asked(Question):
@@ -470,7 +500,80 @@ class AskedInBody(Question, Body):
     like: list[Example] = Field([], max_length=32, description="examples of it, or vectors")
     unlike: list[Example] = Field([], max_length=32, description="examples of what it is not, likewise")
     view: ViewName | None = Field(None, description="for pictures, and for the links")
+    camera: OwnCamera | None = Field(None, description="for pictures, in place of a view")
     top: Top = Field(10, description="how many of the best splats to list")
+
+
+class Words(LiftQuestion, Body):
+    """Many words at once."""
+
+    words: Annotated[list[Text], Field(max_length=MOST_WORDS)] | None = Field(
+        None, description="what may be there, each word once; all words of a table if left out"
+    )
+
+
+class AskedToSegment(Words):
+    """Every splat's best word."""
+
+    view: ViewName | None = Field(None, description="for pictures")
+    camera: OwnCamera | None = Field(None, description="for pictures, in place of a view")
+
+
+class AskedWhat(Words):
+    """What is this?"""
+
+    example: Example = Field(description="what is meant")
+    top: Annotated[int, Field(ge=1, le=1000), NoBoolean] = Field(5, description="how many words")
+
+
+class AskedToRender(Body):
+    """A picture of the scene."""
+
+    lift: JobId | None = Field(None, description="the lift; may be left out when there is exactly one")
+    view: ViewName | None = Field(None, description="the name of a camera")
+    camera: OwnCamera | None = Field(None, description="in place of a view")
+    what: Rendered = Field("rgb", description=RENDERED)
+
+
+class FoundWord(BaseModel):
+    """A word that is there."""
+
+    value: int = Field(description="of its splats and pixels in labels and maps; 0 is none")
+    word: str
+    splats: int = Field(description="how many it names")
+    share: float = Field(description="of the evidence of all seen splats")
+    score: float = Field(description="the mean cosine of its splats, by evidence")
+    margin: float = Field(description="the mean of how much nearer they are to it than to the nearest other word")
+    threshold: float = Field(description="of its cosines")
+    colour: list[int] = Field(description="sRGB, 0 to 255, in pictures")
+    box: Box = Field(description="of its splats' centres, but for a thousandth of the evidence at each end")
+
+
+class SegmentAnswer(BaseModel):
+    """What is there, of many words."""
+
+    lift: JobId
+    encoder: str = Field(description="the text encoder that was asked, without its file")
+    words: int = Field(description="how many were asked")
+    splats: int = Field(description="P")
+    none: int = Field(description="splats that none of the words names")
+    found: list[FoundWord] = Field(description="those that are there, with the most evidence first")
+
+
+class BestWord(BaseModel):
+    """How like a word something is."""
+
+    word: str
+    score: float = Field(description="their cosine")
+
+
+class WhatAnswer(BaseModel):
+    """The words that something is most like."""
+
+    lift: JobId
+    encoder: str
+    example: str
+    words: list[BestWord] = Field(description="the nearest first")
 
 
 class QueryAnswer(BaseModel):

@@ -34,7 +34,9 @@ def needed(method: str, path: str) -> Scope | None:
         return None
     if path == "/metrics":
         return Scope.METRICS
-    asks = method == "POST" and (path == "/query" or path.startswith("/query/"))  # a question may have a body
+    asks = method == "POST" and (
+        path in ("/query", "/render") or path.startswith("/query/")
+    )  # a question may have a body
     return Scope.READ if method in SAFE or asks else Scope.WRITE
 
 

@@ -79,12 +79,10 @@ def run(options: argparse.Namespace) -> int:
 
 def _words(path: Path | None, encoder: TextEncoder) -> list[str]:
     """Those of the file, one a line, or all that a table has."""
-    from liftcore.query.text.table import TableEncoder
+    from liftcore.query.segment import words_of
 
     if path is None:
-        if not isinstance(encoder, TableEncoder):
-            raise InvalidQuery("words", expected="--words FILE beside an encoder, or a --table", got="neither")
-        return list(dict.fromkeys(encoder.words))
+        return words_of(encoder)
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:

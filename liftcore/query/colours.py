@@ -40,8 +40,12 @@ def heat_colours(values: np.ndarray, known: np.ndarray) -> np.ndarray:
     if not known.any():
         return np.zeros((*values.shape, 3), dtype=np.uint8)
     low, high = np.quantile(values[known], _HEAT_RANGE)
+    return map_colours((values - low) / (high - low) if high > low else np.zeros_like(values), known)
+
+
+def map_colours(level: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Levels [...] from 0 to 1 through the colour map, [..., 3] u8 sRGB; black where not known."""
     colours = colour_map()
-    level = (values - low) / (high - low) if high > low else np.zeros_like(values)
     picture = colours[np.round(level.clip(0.0, 1.0) * (len(colours) - 1)).astype(np.int64)]
     picture[~known] = 0
     return picture

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from liftcore.errors import InvalidQuery
 from liftcore.query.ask import Answer
-from liftcore.query.colours import cluster_colours, heat_colours
+from liftcore.query.colours import cluster_colours, heat_colours, map_colours
 from liftcore.query.directions import MINIMUM_ROW_SUM
 from liftcore.query.objects import Objects, objects
 from liftcore.query.scene import QueryScene
@@ -118,15 +118,19 @@ def render(scene: QueryScene, view: str | Camera, what: str = "rgb") -> np.ndarr
 
     ``rgb`` takes the splats' own colours, ``pca`` the first three principal components of their features, and
     ``cluster`` one colour a cluster: that of the most weight on each ray, as aggregation saw it. There, grey is where
-    unclustered splats have the most.
+    unclustered splats have the most. ``confidence`` is the mean of the splats' on each ray through the colour map of
+    scores, which spans it from 0 to 1.
 
     Raises:
         NotFound: no camera has this name.
-        InvalidQuery: clusters are asked for, and the lift has none; or the image is larger than pictures may be.
+        InvalidQuery: clusters or confidence are asked for, and the lift has none; or the image is larger than
+            pictures may be.
         InvalidLift: the splats or the cameras moved or changed since the lift.
     """
     if what == "cluster":
         return _render_clusters(scene, view)
+    if what == "confidence":
+        return _render_confidence(scene, view)
     colours = scene.principal if what == "pca" else seen_colours(scene.splats, scene.camera(view))
     levels = scene.image(view, lambda camera: scene.raster.render(camera, colours, _as_trained(scene))).numpy()
     np.clip(levels, 0.0, 1.0, out=levels)  # in place: an image of floats is large
@@ -144,6 +148,17 @@ def _render_clusters(scene: QueryScene, view: str | Camera) -> np.ndarray:
     sums = scene.image(view, lambda camera: scene.raster.row_sums(camera, scene.compositing))
     picture[sums.numpy() <= 0] = 0
     return picture
+
+
+def _render_confidence(scene: QueryScene, view: str | Camera) -> np.ndarray:
+    if scene.confidence is None:
+        hint = "lift again with the preset default, or with robust_steps"
+        raise InvalidQuery("what", expected="a lift with confidence", got="a lift that was not reweighted", hint=hint)
+    values = torch.from_numpy(np.stack([scene.confidence, np.ones_like(scene.confidence)], axis=1))
+    image = scene.image(view, lambda camera: scene.raster.render(camera, values, scene.compositing)).numpy()
+    sums = image[..., 1]
+    means = image[..., 0] / np.where(sums > 0, sums, 1.0)
+    return map_colours(means, sums >= MINIMUM_ROW_SUM)
 
 
 def expected_depth(scene: QueryScene, view: str | Camera) -> tuple[np.ndarray, np.ndarray]:

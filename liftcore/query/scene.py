@@ -39,6 +39,7 @@ class QueryScene:
     evidence: np.ndarray  # [P] f32
     cluster: np.ndarray | None  # [P] i32, -1 = in no cluster; None without aggregation
     cluster_features: np.ndarray | None  # [K, F] like features
+    confidence: np.ndarray | None  # [P] f32 in 0..1; None where the lift was not reweighted
     _told: str  # the metadata of a lift file, as JSON
     _moved: dict[str, Path | None]  # files that lie elsewhere now, by their roles
 
@@ -49,7 +50,7 @@ class QueryScene:
         cameras: Cameras | None = None,
         packs: Views | None = None,
     ) -> None:
-        names = ("features", "evidence", "seen", "cluster", "cluster_features")
+        names = ("features", "evidence", "seen", "cluster", "cluster_features", "confidence")
         self._hold({name: as_numpy(getattr(result, name)) for name in names})
         self.path = Path("lift")
         given = {"lift": result, "metadata": result.metadata, "splats": splats, "cameras": cameras, "packs": packs}
@@ -58,6 +59,7 @@ class QueryScene:
     def _hold(self, arrays: dict[str, Any]) -> None:
         self.features, self.evidence, self._has_feature = (arrays[n] for n in ("features", "evidence", "seen"))
         self.cluster, self.cluster_features = arrays.get("cluster"), arrays.get("cluster_features")
+        self.confidence = arrays.get("confidence")
 
     @classmethod
     def open(cls, path: Path, *, splats: Path | None = None, cameras: Path | None = None) -> Self:

@@ -29,6 +29,7 @@ from liftcore.query.threshold import find_threshold
 
 if TYPE_CHECKING:
     from liftcore.query.ask import Point
+    from liftcore.query.text import TextEncoder
     from liftcore.scene.cameras import Camera
 
 NO_WORD = -1
@@ -72,6 +73,20 @@ class Segmentation:
     def colours(self) -> np.ndarray:
         """[len(found) + 1, 3] u8 sRGB, by ``values``: grey, then a colour a word."""
         return np.roll(cluster_colours(len(self.found)), 1, axis=0)
+
+
+def words_of(encoder: TextEncoder) -> list[str]:
+    """All words of a table, each once.
+
+    Raises:
+        InvalidQuery: the encoder is no table, and reads any text.
+    """
+    told: Sequence[str] = getattr(encoder, "words", ())
+    words = list(dict.fromkeys(told))
+    if not words:
+        expected, hint = f"words beside the encoder {encoder.name}", "say what may be there"
+        raise InvalidQuery("words", expected=expected, got="none", hint=hint)
+    return words
 
 
 def segment(scene: QueryScene, words: Sequence[str], vectors: Any, progress: Progress = silent) -> Segmentation:

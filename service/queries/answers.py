@@ -28,9 +28,10 @@ from liftcore.io.json_file import finite
 from liftcore.query.ask import Answer, Point, Question, answers, question, top
 from liftcore.query.export import coloured_ply, layer_colours, npy, object_ply, viewer_splats
 from liftcore.query.objects import Objects, objects
-from liftcore.query.render import ViewMask, attention_png, mask_png, render_png, view_mask
+from liftcore.query.render import ViewMask, attention_png, mask_png, render, render_png, view_mask
 from liftcore.query.scene import QueryScene
 from liftcore.query.scores import warm_up as warm_up_scores
+from liftcore.query.segment import Segmentation, best_words, map_png, picture_png, segment, word_map, words_of
 from liftcore.query.terms import Example, Query, Vector, parse_example
 from liftcore.query.text import RememberingEncoder, TextEncoder, open_encoder
 from liftcore.raster.cpu.warm_up import warm_up
@@ -110,7 +111,7 @@ class Answers:
 
     def __init__(self, *, scenes: int, cache_bytes: int) -> None:
         self._scenes: Kept[QueryScene] = Kept(scenes)
-        self._cache: Kept[Answer | Objects | ViewMask] = Kept(cache_bytes, bytes_of)
+        self._cache: Kept[Answer | Objects | ViewMask | Segmentation] = Kept(cache_bytes, bytes_of)
         self._encoders: dict[str, tuple[object, TextEncoder]] = {}  # spec -> version of its file, encoder
         self._opening = threading.RLock()  # of encoders, which the warm-up opens too
         self._warm: set[Kernel] = set()  # kernels of splats whose compiled code is loaded, or being loaded
@@ -125,6 +126,11 @@ class Answers:
             "scene": self._viewer_splats,
             "layer": self._layer,
             "views": self._views,
+            "segment": self._segment,
+            "word_labels": self._word_labels,
+            "word_map": self._word_map,
+            "word_picture": self._word_picture,
+            "what": self._what,
         }
 
     @property
@@ -211,12 +217,13 @@ class Answers:
         return made
 
     def _look(self, request: dict[str, Any]) -> ViewMask:
-        answer, view = self._answer(request), request["view"]
+        answer = self._answer(request)
 
         def make() -> ViewMask:
-            return view_mask(self._scene(request), answer, view, group=lambda *_: self._grouped(request))
+            return view_mask(self._scene(request), answer, view_of(request), group=lambda *_: self._grouped(request))
 
-        made = self._cache.get((_key(request), "view", view), make)
+        seen_from = json.dumps(request.get("camera", request.get("view")))
+        made = self._cache.get((_key(request), "view", seen_from), make)
         assert isinstance(made, ViewMask)
         return made
 
@@ -245,7 +252,7 @@ class Answers:
         return Frame({}, attention_png(self._look(request)))
 
     def _render(self, request: dict[str, Any]) -> Frame:
-        return Frame({}, render_png(self._scene(request), request["view"], request["what"]))
+        return Frame({}, render_png(self._scene(request), view_of(request), request["what"]))
 
     def _splats(self, request: dict[str, Any]) -> Frame:
         make = {"object": object_ply, "scores": coloured_ply}[request["what"]]
@@ -264,6 +271,39 @@ class Answers:
         names = list(itertools.islice(cameras, first, first + count))
         more = first + count < len(cameras)
         return Frame({"views": [describe_view(cameras[name], name) for name in names], "more": more})
+
+    def _words(self, request: dict[str, Any]) -> tuple[list[str], TextEncoder]:
+        """The words of a request, all of its table where it names none."""
+        encoder = self._encoder(request["encoder"], request["encoder_version"])
+        return words_of(encoder) if request["words"] is None else request["words"], encoder
+
+    def _named(self, request: dict[str, Any]) -> Segmentation:
+        def make() -> Segmentation:
+            words, encoder = self._words(request)
+            return segment(self._scene(request), words, encoder.encode(words))
+
+        made = self._cache.get((_key(request), "words"), make)
+        assert isinstance(made, Segmentation)
+        return made
+
+    def _segment(self, request: dict[str, Any]) -> Frame:
+        return Frame(describe_words(self._named(request)))
+
+    def _word_labels(self, request: dict[str, Any]) -> Frame:
+        return Frame({}, npy(self._named(request).values))
+
+    def _word_map(self, request: dict[str, Any]) -> Frame:
+        found = self._named(request)
+        return Frame({}, map_png(word_map(self._scene(request), found, view_of(request)), found))
+
+    def _word_picture(self, request: dict[str, Any]) -> Frame:
+        scene, view, found = self._scene(request), view_of(request), self._named(request)
+        return Frame({}, picture_png(render(scene, view), word_map(scene, found, view), found))
+
+    def _what(self, request: dict[str, Any]) -> Frame:
+        (words, encoder), example = self._words(request), _example(request["example"], "example")
+        best = best_words(self._scene(request), example, words, encoder.encode(words), request["top"])
+        return Frame({"words": [asdict(word) for word in best]})
 
 
 def write_draft(blocks: Iterable[bytes], draft: Path) -> None:
@@ -293,17 +333,19 @@ def use_one_library_thread() -> None:
 
 def _key(request: dict[str, Any]) -> str:
     """What an answer is kept by: a digest, as a question may be as long as a body."""
-    names = ("lift", "encoder", "encoder_version", "query")
+    names = ("lift", "encoder", "encoder_version", "query" if "query" in request else "words")
     return hashlib.sha256(json.dumps([request[name] for name in names]).encode()).hexdigest()
 
 
-def bytes_of(made: Answer | Objects | ViewMask) -> int:
-    """The memory that an answer, with its question, the objects of one or a view of one takes."""
+def bytes_of(made: Answer | Objects | ViewMask | Segmentation) -> int:
+    """The memory that an answer, with its question, the objects of one, a view of one or named splats take."""
     if isinstance(made, Answer):
         tensors = made.scores.nbytes + made.seen.nbytes + made.selected.nbytes
         return ENTRY_BYTES + tensors + sum(map(_term_bytes, (*made.query.positives, *made.query.negatives)))
     if isinstance(made, Objects):
         return ENTRY_BYTES + made.numbers.nbytes
+    if isinstance(made, Segmentation):
+        return ENTRY_BYTES + made.labels.nbytes + made.margin.nbytes + sum(len(word.encode()) for word in made.words)
     return ENTRY_BYTES + made.attention.nbytes + made.row_sums.nbytes + made.mask.nbytes
 
 
@@ -333,6 +375,20 @@ def _example(example: str | list[float], argument: str) -> Example:
     return parse_example(example, argument) if isinstance(example, str) else Vector(tuple(example))
 
 
+def view_of(request: dict[str, Any]) -> str | Camera:
+    """The camera of a picture: the name of one of the scene, or one that came with the request.
+
+    Raises:
+        InvalidCameras: what came is none.
+    """
+    own = request.get("camera")
+    if own is None:
+        return request["view"]
+    fy = own["fx"] if own["fy"] is None else own["fy"]
+    cx, cy = (side / 2 if own[at] is None else own[at] for at, side in (("cx", own["width"]), ("cy", own["height"])))
+    return Camera.pinhole(own["name"], own["width"], own["height"], own["fx"], fy, cx, cy, own["viewmat"])
+
+
 def open_scene(request: dict[str, Any]) -> QueryScene:
     """The lift, with its splats and cameras where the store has them now: data directories may move."""
     splats, cameras = Path(request["splats"]), Path(request["cameras"])
@@ -350,6 +406,16 @@ def describe_objects(found: Objects) -> dict[str, Any]:
     """The things that were found, as JSON takes them."""
     things = [asdict(thing) | {"box": _box(thing.box)} for thing in found.found]
     return {"objects": things, "strays": found.strays}
+
+
+def describe_words(found: Segmentation) -> dict[str, Any]:
+    """What is there, of many words, as JSON takes it."""
+    named = [
+        {**asdict(word), "value": value, "colour": found.colours[value].tolist(), "box": _box(word.box)}
+        for value, word in enumerate(found.found, 1)
+    ]
+    counts = {"words": len(found.words), "splats": len(found.labels), "none": int((found.labels < 0).sum())}
+    return {**counts, "found": named}
 
 
 def describe_view(camera: Camera, name: str) -> dict[str, Any]:

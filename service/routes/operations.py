@@ -24,6 +24,10 @@ WEB = Path(__file__).parents[1] / "web" / "built"  # by `make web`
 SWAGGER = Path(str(files("fastapi_offline"))) / "static"  # shipped, as a robot's network may lead nowhere
 NO_PICTURE = "data:,"  # the page asks another host for one unless it is told
 METRICS_TYPE = "text/plain; version=0.0.4; charset=utf-8"
+BODIES = (
+    models.LiftRequest, models.TradeoffRequest, models.AskedInBody, models.AskedToSegment, models.AskedWhat,
+    models.AskedToRender,
+)  # fmt: skip
 METRICS: dict[int | str, dict[str, Any]] = {
     200: {
         "description": "The Prometheus text format",
@@ -107,7 +111,7 @@ def page_licences() -> Response:
 @router.get("/openapi.json", include_in_schema=False)
 def document(request: Request, deps: Deps) -> JSONResponse:
     """The routes as OpenAPI has them, as things are now: with keys or without."""
-    found = with_bodies(request.app.openapi(), models.LiftRequest, models.TradeoffRequest, models.AskedInBody)
+    found = with_bodies(request.app.openapi(), *BODIES)
     required = deps.store.keys.under(deps.settings.keys).required()
     return JSONResponse(with_keys(found) if required else found)
 

@@ -7,7 +7,7 @@ import hashlib
 import json
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 from urllib.parse import urlencode
 
 from fastapi import APIRouter, Depends, Query, Request, Response
@@ -26,12 +26,14 @@ from service.store.lifts import LiftRecord
 router = APIRouter(tags=["queries"])
 
 Question = models.Asked | models.AskedInBody
-QUERY_BODY = json_body(models.AskedInBody)
+QUERY_BODY, RENDER_BODY = json_body(models.AskedInBody), json_body(models.AskedToRender)
 BODY = described_body(models.AskedInBody)
 ROW_BYTES = 32  # of a splat in the .splat format
+NO_ENCODER: dict[str, Any] = {"encoder": None, "encoder_version": None}  # of a question without words
 REGION = "region:"  # what needs the lift's feature packs begins with it
 MEDIA_TYPES = {"scores": "application/x-npy", "mask": "image/png", "attention": "image/png", "render": "image/png"}
-MEDIA_TYPES["layer"] = MEDIA_TYPES["scores"]  # both are arrays
+MEDIA_TYPES["layer"] = MEDIA_TYPES["word_labels"] = MEDIA_TYPES["scores"]  # these are arrays
+MEDIA_TYPES["word_map"] = MEDIA_TYPES["word_picture"] = MEDIA_TYPES["mask"]
 
 
 def bytes_of(media_type: str) -> dict[int | str, dict[str, Any]]:
@@ -123,14 +125,14 @@ def scores_by_body(deps: Deps, ask: Ask, asked: models.AskedInBody = QUERY_BODY)
 
 @router.post("/query/mask", responses=PNG, response_class=Response, openapi_extra=BODY)
 def mask_by_body(deps: Deps, ask: Ask, asked: models.AskedInBody = QUERY_BODY) -> Response:
-    """Where it is in a view, for a query in a body with a view."""
-    return _content("mask", asked, deps, ask, view=_view(asked))
+    """Where it is in a view, for a query in a body with a view or a camera of your own."""
+    return _content("mask", asked, deps, ask, **seen_from(asked))
 
 
 @router.post("/query/attention", responses=PNG, response_class=Response, openapi_extra=BODY)
 def attention_by_body(deps: Deps, ask: Ask, asked: models.AskedInBody = QUERY_BODY) -> Response:
-    """How well each pixel of a view answers to it, for a query in a body with a view."""
-    return _content("attention", asked, deps, ask, view=_view(asked))
+    """How well each pixel of a view answers to it, for a query in a body with a view or a camera of your own."""
+    return _content("attention", asked, deps, ask, **seen_from(asked))
 
 
 @router.post("/query/splats", responses=PLY, response_class=Response, openapi_extra=BODY)
@@ -151,29 +153,34 @@ def render(
     deps: Deps,
     ask: Ask,
     lift: LiftParameter = None,
-    what: Annotated[
-        Literal["rgb", "depth", "pca", "cluster"],
-        Query(description="the splats' colours, expected depth, three principal components of features, or clusters"),
-    ] = "rgb",
+    what: Annotated[models.Rendered, Query(description=models.RENDERED)] = "rgb",
 ) -> Response:
     """The splats from a view, in their colours or in those of their features or clusters, or their depth: a PNG.
 
     Depths are grey, near bright. The PNG's texts `depth-near` and `depth-far` tell the depths of its levels 255 and
     1, in scene units, with even steps between; what lies beyond has these levels too. 0 is where no splat is.
     """
-    found = _find_lift(lift, deps)
+    found = find_lift(lift, deps)
     wanted = scene_request("render", found, deps) | {"view": view, "what": what}
     return tagged_answer(request, deps, wanted, found, ask)
 
 
+@router.post("/render", responses=PNG, response_class=Response, openapi_extra=described_body(models.AskedToRender))
+def render_by_body(deps: Deps, ask: Ask, asked: models.AskedToRender = RENDER_BODY) -> Response:
+    """The same picture, from a view or from a camera of your own."""
+    lift = find_lift(asked.lift, deps)
+    wanted = scene_request("render", lift, deps) | seen_from(asked) | {"what": asked.what}
+    return made(deps, wanted, lift, ask, {})
+
+
 def _answer(asked: models.AskedWhere | models.AskedInBody, deps: AppState, ask: Ask) -> models.QueryAnswer:
-    lift = _find_lift(asked.lift, deps)
+    lift = find_lift(asked.lift, deps)
     request = query_request("query", asked, lift, deps) | {"view": asked.view, "top": asked.top}
     found = ask(request).header
     view = asked.view or lift.first_view
     return models.QueryAnswer(
         text=asked.text,
-        like=[_shown(example) for example in asked.like],
+        like=[shown(example) for example in asked.like],
         lift=lift.id,
         view=view,
         text_space=lift.metadata["text_space"],
@@ -184,28 +191,32 @@ def _answer(asked: models.AskedWhere | models.AskedInBody, deps: AppState, ask: 
 
 
 def _objects(asked: Question, deps: AppState, ask: Ask) -> models.ObjectsAnswer:
-    lift = _find_lift(asked.lift, deps)
+    lift = find_lift(asked.lift, deps)
     return models.ObjectsAnswer(lift=lift.id, **ask(query_request("objects", asked, lift, deps)).header)
 
 
-def _view(asked: models.AskedInBody) -> str:
-    if asked.view is None:
-        raise InvalidRequest(
-            "view", expected="the name of a camera", got="nothing", hint="in the body of the request"
-        )
-    return asked.view
+def seen_from(asked: models.AskedInBody | models.AskedToRender | models.AskedToSegment) -> dict[str, Any]:
+    """The camera of a picture: a view of the lift, or one of the client's own.
+
+    Raises:
+        InvalidRequest: neither is there, or both are.
+    """
+    if (asked.view is None) == (asked.camera is None):
+        expected, got = "a view's name or a camera", "nothing" if asked.view is None else "both"
+        raise InvalidRequest("view", expected=expected, got=got, hint="in the body of the request")
+    return {"view": asked.view} if asked.camera is None else {"camera": asked.camera.model_dump()}
 
 
 def _entity(operation: str, asked: Question, request: Request, deps: AppState, ask: Ask, **more: str) -> Response:
     """What a GET names, with its tag."""
-    lift = _find_lift(asked.lift, deps)
+    lift = find_lift(asked.lift, deps)
     return tagged_answer(request, deps, query_request(operation, asked, lift, deps) | more, lift, ask)
 
 
-def _content(operation: str, asked: Question, deps: AppState, ask: Ask, **more: str) -> Response:
+def _content(operation: str, asked: Question, deps: AppState, ask: Ask, **more: Any) -> Response:
     """What a POST asks for, which has no address and so no tag."""
-    lift = _find_lift(asked.lift, deps)
-    return _made(deps, query_request(operation, asked, lift, deps) | more, lift, ask, {})
+    lift = find_lift(asked.lift, deps)
+    return made(deps, query_request(operation, asked, lift, deps) | more, lift, ask, {})
 
 
 def tagged_answer(request: Request, deps: AppState, wanted: dict[str, Any], lift: LiftRecord, ask: Ask) -> Response:
@@ -216,11 +227,11 @@ def tagged_answer(request: Request, deps: AppState, wanted: dict[str, Any], lift
     same = unchanged(request, etag, found=False)  # nobody has looked whether the view is there
     if same is not None:
         return same
-    made = _made(deps, wanted, lift, ask, kept(etag))
-    return (None if isinstance(made, Draft) else unchanged(request, etag)) or made
+    answer = made(deps, wanted, lift, ask, kept(etag))
+    return (None if isinstance(answer, Draft) else unchanged(request, etag)) or answer
 
 
-def _made(deps: AppState, wanted: dict[str, Any], lift: LiftRecord, ask: Ask, headers: dict[str, str]) -> Response:
+def made(deps: AppState, wanted: dict[str, Any], lift: LiftRecord, ask: Ask, headers: dict[str, str]) -> Response:
     """The answer itself. Splats are too much for a pipe, so the query process writes them to a draft."""
     match wanted["operation"]:
         case "splats":
@@ -237,7 +248,7 @@ def _made(deps: AppState, wanted: dict[str, Any], lift: LiftRecord, ask: Ask, he
         return Draft(draft, filename=name, headers=headers)
 
 
-def _find_lift(lift: str | None, deps: AppState) -> LiftRecord:
+def find_lift(lift: str | None, deps: AppState) -> LiftRecord:
     """The lift that is meant; left out, the only one."""
     return deps.store.lifts.only(deps.owner) if lift is None else deps.store.lifts.get(deps.owner, lift)
 
@@ -262,22 +273,39 @@ def scene_request(operation: str, lift: LiftRecord, deps: AppState) -> dict[str,
 
 def query_request(operation: str, asked: Question, lift: LiftRecord, deps: AppState) -> dict[str, Any]:
     """The same with a query; texts bring their encoder, and examples of regions the lift's feature packs."""
-    request = scene_request(operation, lift, deps)
-    spec = None
-    if asked.text or asked.negatives:
-        spec = encoder_spec(deps.settings, lift.metadata["text_space"], asked.encoder)
-        file = encoder_file(spec)
-        request["names"] |= {} if file is None else {str(file): "the encoder's file"}
+    request: dict[str, Any] = scene_request(operation, lift, deps)
+    request = with_encoder(request, asked, lift, deps) if asked.text or asked.negatives else {**request, **NO_ENCODER}
     if any(isinstance(example, str) and example.startswith(REGION) for example in (*asked.like, *asked.unlike)):
         packs = [deps.store.assets.get(deps.owner, asset, most=0) for asset in lift.features]
         request["features"] = [str(pack.path) for pack in packs]
         request["names"] |= {str(pack.path): f"features {pack.id}" for pack in packs}
     terms = ("text", "negatives", "like", "unlike", "threshold", "instances", "keep")
-    return request | {
-        "encoder": spec,
-        "encoder_version": None if spec is None else encoder_version(spec),
-        "query": {name: getattr(asked, name) for name in terms},
-    }
+    return request | {"query": {name: getattr(asked, name) for name in terms}}
+
+
+def with_encoder(
+    request: dict[str, Any], asked: models.LiftQuestion, lift: LiftRecord, deps: AppState
+) -> dict[str, Any]:
+    """The request with the encoder of its words: an uploaded table, or one that the operator set up.
+
+    Raises:
+        InvalidRequest: there is none of the lift's space, or of two names.
+        NotFound: there is no such table.
+    """
+    names = dict(request["names"])
+    if asked.table is None:
+        spec = encoder_spec(deps.settings, lift.metadata["text_space"], asked.encoder)
+        file = encoder_file(spec)
+        names |= {} if file is None else {str(file): "the encoder's file"}
+    elif asked.encoder is not None:
+        raise InvalidRequest("table", expected="table or encoder", got="both", hint="leave one of them out")
+    else:
+        table = deps.store.assets.get(deps.owner, asked.table, most=0)
+        if table.kind is not models.AssetKind.TABLE:
+            raise InvalidRequest("table", expected="an uploaded text table", got=f"{table.kind} {table.id}")
+        spec = f"table:{table.path}"
+        names |= {str(table.path): f"table {table.id}", f"text table {table.path.name}": f"table {table.id}"}
+    return request | {"encoder": spec, "encoder_version": encoder_version(spec), "names": names}
 
 
 def _answer_links(asked: Question, lift: LiftRecord, view: str | None, *, found: bool) -> dict[str, str]:
@@ -297,7 +325,7 @@ def _answer_links(asked: Question, lift: LiftRecord, view: str | None, *, found:
     return links
 
 
-def _shown(example: str | list[float]) -> str:
+def shown(example: str | list[float]) -> str:
     """An example as an answer names it."""
     return example if isinstance(example, str) else f"a vector of {len(example)} channels"
 
@@ -312,5 +340,5 @@ def _link(path: str, asked: Question, **more: str) -> str:
     pairs.append(("threshold", str(asked.threshold)))
     pairs += [("instances", str(asked.instances))] if asked.instances is not None else []
     pairs += [("keep", asked.keep)] if asked.keep != "all" else []
-    pairs += [("encoder", asked.encoder)] if asked.encoder is not None else []
+    pairs += [(name, value) for name in ("encoder", "table") if (value := getattr(asked, name)) is not None]
     return f"{path}{'&' if '?' in path else '?'}{urlencode(pairs + list(more.items()))}"

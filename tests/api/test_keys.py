@@ -88,7 +88,7 @@ def test_every_route_wants_its_scope(house: Guarded) -> None:
     ("method", "path", "scope"),
     [
         ("GET", "/jobs", "read"), ("HEAD", "/jobs", "read"), ("POST", "/query", "read"),
-        ("POST", "/query/mask", "read"), ("POST", "/lift", "write"), ("PUT", "/assets/splats", "write"),
+        ("POST", "/query/mask", "read"), ("POST", "/render", "read"), ("POST", "/lift", "write"), ("PUT", "/assets/splats", "write"),
         ("DELETE", "/jobs/x", "write"), ("POST", "/jobs/x/cancel", "write"), ("GET", "/metrics", "metrics"),
         ("POST", "/queryx", "write"), ("POST", "/", "write"), ("GET", "/healthz/", "read"),
     ],
@@ -105,6 +105,9 @@ def naming(method: str, path: str, job: str, asset: str, house: Guarded) -> list
         if path == "/tradeoff":
             wrong.append({"labels": {"masks": asset, "table": asset, "classes": ["apple"]}})
         return [{"json": house.body() | place} for place in wrong]
+    if method == "POST" and (path in ("/render", "/query/what") or path.startswith("/query/segment")):
+        own = {"/render": {"view": "left"}, "/query/what": {"example": "splat:1"}}
+        return [{"json": own.get(path, {"words": ["apple"], "view": "left"}) | {"lift": job}}]
     if path.startswith("/query") or path == "/render":
         without_view = dict.fromkeys(("/query/scores", "/query/splats", "/query/objects"), ("view",))
         unknown = ({"/render": ("text",)} | without_view).get(path, ()) if method == "GET" else ()

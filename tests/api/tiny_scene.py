@@ -120,9 +120,10 @@ def pack(by_view: dict[str, np.ndarray], rows: np.ndarray | None = None) -> byte
     return save(tensors, metadata={"encoder": "by hand", "text_space": "tiny", "normalised": "true"})
 
 
-def text_table(channels: int = CHANNELS, words: tuple[str, ...] = WORDS) -> bytes:
+def text_table(channels: int = CHANNELS, words: tuple[str, ...] = WORDS, rows: np.ndarray | None = None) -> bytes:
     """A text table with the three words, or others."""
-    return save({"embeddings": codebook(channels)}, metadata={"words": json.dumps(words)})
+    rows = codebook(channels) if rows is None else rows
+    return save({"embeddings": rows}, metadata={"words": json.dumps(words)})
 
 
 def masks(by_view: dict[str, np.ndarray]) -> bytes:

@@ -102,6 +102,11 @@ class RememberingEncoder:
         """The other encoder's."""
         return self._encoder.channels
 
+    @property
+    def words(self) -> Sequence[str]:
+        """Those that the other encoder is limited to; none where it reads any text."""
+        return getattr(self._encoder, "words", ())
+
     def encode(self, texts: Sequence[str]) -> np.ndarray:
         """n texts -> [n, F] f32 unit rows; errors are the other encoder's, and are not remembered."""
         new = [text for text in dict.fromkeys(texts) if text not in self._rows]
