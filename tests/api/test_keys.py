@@ -88,7 +88,8 @@ def test_every_route_wants_its_scope(house: Guarded) -> None:
     ("method", "path", "scope"),
     [
         ("GET", "/jobs", "read"), ("HEAD", "/jobs", "read"), ("POST", "/query", "read"),
-        ("POST", "/query/mask", "read"), ("POST", "/render", "read"), ("POST", "/lift", "write"), ("PUT", "/assets/splats", "write"),
+        ("POST", "/query/mask", "read"), ("POST", "/render", "read"),
+        ("POST", "/lift", "write"), ("PUT", "/assets/splats", "write"),
         ("DELETE", "/jobs/x", "write"), ("POST", "/jobs/x/cancel", "write"), ("GET", "/metrics", "metrics"),
         ("POST", "/queryx", "write"), ("POST", "/", "write"), ("GET", "/healthz/", "read"),
     ],
