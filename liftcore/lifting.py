@@ -94,6 +94,7 @@ def lift(
         clusters = work.aggregate(found, geometry, W, X, sums, notes)
         notes |= _reweighting(agreement, geometry) if agreement else {}
         diagnostics = work.diagnose(found, geometry, X, sums, plan, notes)
+    table = found.features.table
     made = LiftResult(
         features=X,
         evidence=geometry.evidence(),
@@ -105,12 +106,14 @@ def lift(
             settings=chosen,
             encoder=found.features.encoder,
             text_space=found.features.text_space,
+            words=table.words if table else (),
             views=tuple(found.names),
             certificate=diagnostics,
             timings=work.timings.seconds,
         ),
         cluster=clusters.clusters if clusters else None,
         cluster_features=clusters.cluster_features if clusters else None,
+        embeddings=torch.from_numpy(table.embeddings) if table else None,
     )
     return made.to(work.device.place)
 

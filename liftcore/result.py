@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
     from liftcore.query.ask import VectorAnswer
     from liftcore.query.segment import Segmentation
+    from liftcore.query.text.table import TableEncoder
     from liftcore.scene.splats import Splats
 
 FORMAT = "splatlift-lift/1"
@@ -48,6 +49,7 @@ class LiftMetadata(BaseModel):
     features: tuple[InputFile, ...] = ()
     encoder: str = ""  # the 2D encoder's name as the pack tells it; "" when unknown
     text_space: str = ""  # the text encoder that shares the space; "" or "none" when there is none
+    words: tuple[str, ...] = ()  # that its packs brought: it is asked in these without an encoder
     views: tuple[str, ...]  # the views that were lifted
     certificate: dict[str, Any]
     timings: dict[str, float]  # seconds a stage
@@ -65,6 +67,7 @@ class LiftResult:
     confidence: Tensor | None = None  # [P] f32 in 0..1, how far views say the same; None: not reweighted
     cluster: Tensor | None = None  # [P] i32, -1 = in no cluster; None without aggregation
     cluster_features: Tensor | None = None  # [K, F] like features; a zero row: its splats keep their own
+    embeddings: Tensor | None = None  # [n, F] f32, the unit vectors of the metadata's words; None: it has none
 
     @property
     def settings(self) -> LiftSettings:
@@ -80,6 +83,13 @@ class LiftResult:
     def diagnostics(self) -> dict[str, Any]:
         """What the lift measured of itself (residual, bound, row sums, warnings, plan), as plain numbers."""
         return self.metadata.certificate
+
+    @property
+    def table(self) -> TableEncoder | None:
+        """The words that its packs brought, with their vectors (`.words`, `.encode(words)`); None without any."""
+        from liftcore.query.text.table import own_words
+
+        return own_words(self.metadata.words, None if self.embeddings is None else self.embeddings.cpu().numpy())
 
     def to(self, place: torch.device) -> LiftResult:
         """The same with its tensors there; where they are, if there is no room for them."""
@@ -111,17 +121,19 @@ class LiftResult:
         instances: int | None = None,
         keep: str = "all",
     ) -> VectorAnswer:
-        """Which splats answer vectors of the lift's text space, as a text encoder gives them.
+        """Which splats answer vectors of the lift's text space, as a text encoder gives them, or words of its own.
 
         Args:
-            positives: [n, F] or [F], torch or numpy, what is looked for; rows of any length above zero.
-            negatives: [m, F], what takes away from the scores.
+            positives: [n, F] or [F], torch or numpy, what is looked for; rows of any length above zero. Of a lift
+                that has words (`table`) also a word or some of them.
+            negatives: [m, F], or words, what takes away from the scores.
             splats: that were lifted; with them the answer has objects with boxes.
             threshold: auto, valley, paper, otsu, stability or a number on the scores.
             instances: how many things there are, where the caller knows. keep: of the objects, all or the largest.
 
         Raises:
-            InvalidQuery: a vector of another length, of zeros or not finite, or an unknown threshold.
+            InvalidQuery: a vector of another length, of zeros or not finite, a word that the lift lacks, or an
+                unknown threshold.
         """
         from liftcore.query.ask import query_vectors
 

@@ -14,7 +14,7 @@ from safetensors import SafetensorError, safe_open
 
 from liftcore.errors import InvalidInput
 from liftcore.io.safetensors_file import check_header
-from liftcore.query.text import ENCODER_SPECS, NO_WORDS
+from liftcore.query.text import ENCODER_SPECS, NO_WORDS, OWN_WORDS
 from service.errors import InvalidRequest, Misconfigured
 from service.settings import ServiceSettings
 
@@ -27,9 +27,13 @@ def encoder_spec(settings: ServiceSettings, text_space: str, asked: str | None) 
     The default stands in for a space that has none only where the operator chose it: scores of an encoder of
     another space look like any others, and mean nothing.
 
+    A lift that brings its words is asked in these: ``OWN_WORDS``.
+
     Raises:
         InvalidRequest: no encoder was set up under the name asked for, or for the lift's text space.
     """
+    if asked is None and text_space == OWN_WORDS:
+        return OWN_WORDS
     if asked == "default":
         return settings.encoder
     if asked is not None:

@@ -316,6 +316,7 @@ class LiftResult(BaseModel):
     settings: dict[str, Any]
     encoder: str = Field(description="the 2D encoder that made the features, as their packs tell it")
     text_space: str = Field(description="the text space that the features share")
+    words: list[str] = Field(description="that its packs brought: it is asked in these without an encoder")
     views: list[str] = Field(description="the views that were lifted; very many are at links.views alone")
     view_count: int = Field(description="how many these are")
     certificate: dict[str, Any]

@@ -1,4 +1,4 @@
-"""Masks as COCO writes them, made pixel by pixel: the twin of what `liftcore.features.masks` reads."""
+"""Masks as COCO writes them, made pixel by pixel: the twin of what `liftcore.features.mask_files` reads."""
 
 from __future__ import annotations
 

@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from liftcore.cli.options import THRESHOLDS, Parser, add_encoder, add_negative, encoder_spec
+from liftcore.cli.options import THRESHOLDS, Parser, add_encoder, add_negative, text_encoder
 from liftcore.cli.reply import progress_bars, reply
 from liftcore.errors import InvalidInput
 
@@ -48,7 +48,6 @@ def run(options: argparse.Namespace) -> int:
     from liftcore.evaluate.judging import evaluate_scene
     from liftcore.evaluate.published import published
     from liftcore.query.scene import QueryScene
-    from liftcore.query.text import open_encoder
 
     scenes = _labelled(options.dataset, options.data)
     lifts = find_lifts(options.lifts, scenes)
@@ -58,7 +57,7 @@ def run(options: argparse.Namespace) -> int:
     with progress_bars() as progress:
         for name, path in lifts.items():
             scene = QueryScene.open(path)
-            encoder = open_encoder(encoder_spec(options, scene.metadata.text_space))
+            encoder = text_encoder(options, scene)
             found, said = evaluate_scene(scenes[name], scene, encoder, settings, progress)
             results += found
             warnings += said

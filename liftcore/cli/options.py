@@ -1,10 +1,16 @@
 """What commands' parsers share: one line for wrong arguments, kinds of values, and options that many take."""
 
+from __future__ import annotations
+
 import argparse
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from liftcore.errors import InvalidQuery
+
+if TYPE_CHECKING:
+    from liftcore.query.scene import QueryScene
+    from liftcore.query.text import TextEncoder
 
 BAD_INPUT = 2
 PRESETS = "default, row-sum, tikhonov (if none is named), argmax, top-k, front-mass, centre or mean"
@@ -122,19 +128,22 @@ def whole(text: str) -> int:
     return int(text)
 
 
-def encoder_spec(options: argparse.Namespace, text_space: str, hint: str = "") -> str:
-    """The specification of the encoder that ``--table`` or ``--encoder`` names, else of the lift's text space.
+def text_encoder(options: argparse.Namespace, scene: QueryScene, hint: str = "") -> TextEncoder:
+    """The encoder that ``--table`` or ``--encoder`` names, else the lift's own words, else that of its text space.
 
     Args:
         hint: what else the command can do.
 
     Raises:
-        InvalidQuery: neither is given, and the lift's text space names no encoder.
+        InvalidQuery: neither is given, and the lift has no words and names no encoder.
     """
-    from liftcore.query.text import NO_WORDS
+    from liftcore.query.text import NO_WORDS, open_encoder
 
     if options.table:
-        return f"table:{options.table}"
+        return open_encoder(f"table:{options.table}")
+    if options.encoder is None and scene.table is not None:
+        return scene.table
+    text_space = scene.metadata.text_space
     spec = options.encoder or text_space
     if spec in ("", NO_WORDS):
         space = f"is {NO_WORDS!r}: its features share no space with words" if spec else "is not named"
@@ -142,4 +151,4 @@ def encoder_spec(options: argparse.Namespace, text_space: str, hint: str = "") -
             "encoder", expected="--table FILE or --encoder NAME", got=f"neither, and the lift's text space {space}",
             hint=hint,
         )  # fmt: skip
-    return spec
+    return open_encoder(spec)

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from liftcore.features.folders import ViewFolder
+    from liftcore.query.text.table import TableEncoder
 
 
 LARGEST_GREY = 65_535  # of a picture of 16 bits
@@ -35,6 +36,16 @@ def add_arguments(parser: Parser, shared: Parser) -> None:
         help="of label pictures, the value that means no mask: 0, and value 1 is of the first vector; with another "
         "(255) value 0 is of the first",
     )
+    prompts = formats.add_parser(
+        "prompts",
+        parents=[shared],
+        help="masks by phrase: PHRASE/VIEW.png, VIEW.json (COCO's), or named label pictures",
+    )
+    prompts.add_argument(
+        "--names", type=Path, metavar="FILE", help="of label pictures, JSON from values to names, or a name a line"
+    )
+    by = "what folders of binary PNGs are named by: phrases (PHRASE/VIEW.png) or views (VIEW/PHRASE.png)"
+    prompts.add_argument("--folders", choices=("phrases", "views"), default="phrases", help=by)
     space = (
         "the text encoder whose words lie in the space of the features, as query's --encoder names it "
         "(open_clip:ViT-B-32/openai): query opens it where no encoder is given, and a service takes the one that it "
@@ -42,10 +53,11 @@ def add_arguments(parser: Parser, shared: Parser) -> None:
         "must agree"
     )
     unit = "say that the vectors are unit vectors, or are not; this changes none of them"
-    for command in (langsplat, arrays, masks):
+    for command in (langsplat, arrays, masks, prompts):
         command.add_argument("folder", type=Path, help="the folder of the files")
         command.add_argument("-o", "--output", type=Path, required=True, metavar="PACK", help="the pack to write")
-        command.add_argument("--encoder-name", metavar="NAME", help="the 2D encoder that made the features")
+        command.add_argument("--encoder-name", metavar="NAME", help="what made the features or masks")
+    for command in (langsplat, arrays, masks):
         command.add_argument("--text-space", metavar="NAME", help=space)
         command.add_argument("--normalised", action=argparse.BooleanOptionalAction, help=unit)
 
@@ -62,10 +74,10 @@ def run(options: argparse.Namespace) -> int:
     from liftcore.features.pack import read_features, write_pack
     from liftcore.io.inspect import describe_packs
 
-    views = _views(options)
+    views, table, warnings = _views(options)
     out = free_output(options.output, views.inputs)
     with progress_bars() as progress, writing(out):
-        write_pack(out, views, _metadata(options), progress)
+        write_pack(out, views, _metadata(options), progress, table)
     packs = read_features(out)
     described = describe_packs(packs)
     document = {
@@ -78,8 +90,9 @@ def run(options: argparse.Namespace) -> int:
         "normalised": packs.normalised,
         "folders": folders_of(views),
         "sizes": described["sizes"],
-        "renamed": {} if options.format == "langsplat" else _renamed(views, options.folder),
-        "warnings": described["warnings"],
+        "renamed": {} if options.format in ("langsplat", "prompts") else _renamed(views, options.folder),
+        "words": list(table.words) if table else [],
+        "warnings": [*warnings, *described["warnings"]],
     }
     reply(document, as_json=options.json, lines=_lines(document))
     return 0
@@ -94,32 +107,47 @@ def _renamed(views: ViewFolder, folder: Path) -> dict[str, str]:
 def _lines(document: dict[str, Any]) -> Iterator[str]:
     yield f"{document['out']}: {document['views']} views, {document['channels']} channels, {document['bytes']} bytes"
     yield f"  {shown(document['sizes'])}"
+    if document["words"]:
+        yield f"  {len(document['words'])} words: {shown(document['words'])}"
     yield from told_folders(document["folders"])
     for name, view in list(document["renamed"].items())[:1]:
         yield f"  views are named without the suffix of their images, as cameras are: {name} is {view!r}"
     yield from (f"warning: {warning}" for warning in document["warnings"])
 
 
-def _views(options: argparse.Namespace) -> ViewFolder:
-    if options.format == "langsplat":
-        from liftcore.features.folders import langsplat_views
+def _views(options: argparse.Namespace) -> tuple[ViewFolder, TableEncoder | None, list[str]]:
+    """The views, words that they bring, and warnings."""
+    from liftcore.features import folders
 
-        return langsplat_views(options.folder)
+    if options.format == "langsplat":
+        return folders.langsplat_views(options.folder), None, []
+    if options.format == "npy":
+        return folders.array_views(options.folder, options.layout), None, []
     if options.format == "masks":
         from liftcore.features.masks import mask_views
 
-        return mask_views(options.folder, options.unlabelled)
-    from liftcore.features.folders import array_views
+        return mask_views(options.folder, options.unlabelled), None, []
+    from liftcore.features.prompts import prompt_views
 
-    return array_views(options.folder, options.layout)
+    found = prompt_views(options.folder, options.names, options.folders)
+    empty = [phrase for phrase, views in found.counts.items() if not views]
+    return found.views, found.table, [f"no view has a mask of {shown(empty)}: left out"] if empty else []
 
 
 def _metadata(options: argparse.Namespace) -> dict[str, str]:
-    metadata = {"source": options.format}
+    from liftcore.query.text import OWN_WORDS
+
+    told = {"source": options.format}
+    if options.format == "prompts":
+        return told | {
+            "encoder": options.encoder_name or "masks by prompt",
+            "text_space": OWN_WORDS,
+            "normalised": "true",
+        }
     if options.encoder_name:
-        metadata["encoder"] = options.encoder_name
+        told["encoder"] = options.encoder_name
     if options.text_space:
-        metadata["text_space"] = options.text_space
+        told["text_space"] = options.text_space
     if options.normalised is not None:
-        metadata["normalised"] = "true" if options.normalised else "false"
-    return metadata
+        told["normalised"] = "true" if options.normalised else "false"
+    return told

@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from liftcore.cli.options import THRESHOLDS, Parser, add_encoder, add_negative, add_view, count, encoder_spec, view_of
+from liftcore.cli.options import THRESHOLDS, Parser, add_encoder, add_negative, add_view, count, text_encoder, view_of
 from liftcore.cli.reply import free_outputs, reply, writing
 from liftcore.errors import InvalidQuery
 from liftcore.io.files import whole_file
@@ -62,7 +62,7 @@ def run(options: argparse.Namespace) -> int:
     scene = QueryScene.open(options.lift)
     if files:
         free_outputs(files, made_from(scene))
-    encoder = _encoder(options, scene) if query.texts else None
+    encoder = text_encoder(options, scene, "or ask by example, with --like") if query.texts else None
     answer = ask(scene, query, encoder)
     seen = None
     if view is not None:
@@ -108,16 +108,6 @@ def examples_of(notations: list[str], argument: str) -> list[Example]:
         read_vector(Path(notation)) if notation.endswith(".npy") else parse_example(notation, argument)
         for notation in notations
     ]
-
-
-def _encoder(options: argparse.Namespace, scene: QueryScene) -> TextEncoder:
-    from liftcore.query.text import open_encoder
-
-    return open_encoder(
-        encoder_spec(
-            options, "" if options.table else scene.metadata.text_space, hint="or ask by example, with --like"
-        )
-    )
 
 
 def _threshold(text: str) -> str | float:

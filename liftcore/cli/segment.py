@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from liftcore.cli.options import Parser, add_encoder, add_view, count, encoder_spec, view_of
+from liftcore.cli.options import Parser, add_encoder, add_view, count, text_encoder, view_of
 from liftcore.cli.query import examples_of, made_from, place_of, write_files
 from liftcore.cli.reply import free_outputs, progress_bars, reply
 from liftcore.errors import InvalidQuery
@@ -46,12 +46,11 @@ def run(options: argparse.Namespace) -> int:
     free_outputs(files, given)
     from liftcore.query.scene import QueryScene
     from liftcore.query.segment import best_words, segment
-    from liftcore.query.text import open_encoder
 
     scene = QueryScene.open(options.lift)
     if files:
         free_outputs(files, made_from(scene))
-    encoder = open_encoder(encoder_spec(options, "" if options.table else scene.metadata.text_space))
+    encoder = text_encoder(options, scene)
     words = _words(options.words, encoder)
     vectors = encoder.encode(words)
     document: dict[str, Any] = {"encoder": encoder.name, "words": len(words)}

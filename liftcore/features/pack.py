@@ -2,25 +2,29 @@
 
 A feature pack is a ``.safetensors`` file of what 2D encoders saw: it can be mapped and holds no code. A view ``V``
 is either regions, ``V/labels`` [L, h, w] (u8 with 255 for none, i16 or i32 with -1) with ``V/codebook`` [M, F], or a
-grid, ``V/grid`` [h, w, F].
+grid, ``V/grid`` [h, w, F]. A pack may bring its words: ``embeddings`` [n, F] and the metadata ``words``, as a table
+of text embeddings has them; a lift of it is asked in these without an encoder.
 """
 
+import json
 import math
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import IO, Any, Protocol, cast
 
 import torch
 from torch import Tensor
 
-from liftcore.errors import InvalidFeatures
+from liftcore.errors import InvalidFeatures, InvalidTable
 from liftcore.features.lens import as_pinhole_sees, grid_sides
 from liftcore.features.views import MAX_CHANNELS, NO_LABEL, FeatureGrid, Regions, ViewFeatures
 from liftcore.io.files import whole_file
 from liftcore.io.safetensors_file import MAX_HEADER_BYTES, TYPES, check_header, safetensors_header, tensor_bytes
 from liftcore.progress import Progress, silent
+from liftcore.query.text.table import TableEncoder
 from liftcore.scene.cameras import Camera
 from liftcore.scene.views import require_pairs
 
@@ -29,6 +33,7 @@ LARGEST_I16 = 32_767
 LABEL_TYPES = ("U8", "I16", "I32")
 FEATURE_TYPES = ("F16", "F32", "BF16")
 PARTS = ("labels", "codebook", "grid")
+TABLE = "embeddings"
 
 
 @dataclass(frozen=True)
@@ -61,6 +66,7 @@ class Views(Mapping[str, ViewFeatures]):
     text_space: str  # the text encoder that shares the space; "" unknown, "none" when there is none
     normalised: bool | None  # whether codebook rows and grid cells are unit vectors; None when not told
     _sources: Mapping[str, _Source] = field(repr=False)
+    table: TableEncoder | None = None  # the packs' own words
     _cameras: Mapping[str, Camera] = field(default_factory=dict, repr=False)
 
     @property
@@ -171,7 +177,8 @@ def read_features(*paths: str | Path) -> Views:
         raise InvalidFeatures("features", expected="the same channels in every view", got=got)
     normalised = {"true": True, "false": False}.get(_agreed(packs, "normalised").lower())
     encoder, text_space = _agreed(packs, "encoder"), _agreed(packs, "text_space")
-    return Views(next(iter(channels)), encoder, text_space, normalised, sources)
+    table = _table(packs, next(iter(channels)))
+    return Views(next(iter(channels)), encoder, text_space, normalised, sources, table)
 
 
 def pair(views: Views, cameras: Mapping[str, Camera]) -> tuple[Views, list[str]]:
@@ -185,7 +192,11 @@ def pair(views: Views, cameras: Mapping[str, Camera]) -> tuple[Views, list[str]]
 
 
 def write_pack(
-    path: Path, views: Mapping[str, ViewFeatures], metadata: Mapping[str, str], progress: Progress = silent
+    path: Path,
+    views: Mapping[str, ViewFeatures],
+    metadata: Mapping[str, str],
+    progress: Progress = silent,
+    table: TableEncoder | None = None,
 ) -> None:
     """Write views as a feature pack, whole or not at all.
 
@@ -197,6 +208,7 @@ def write_pack(
         views: view name -> what it observes.
         metadata: ``encoder``, ``text_space``, ``normalised`` ("true" or "false") and what else to keep.
         progress: told about the stages "check" and "pack", in views.
+        table: words of the pack's own, of as many channels.
 
     Raises:
         InvalidFeatures: there are no views, or their channels differ.
@@ -204,13 +216,20 @@ def write_pack(
     if not views:
         raise InvalidFeatures(str(path), expected="at least one view", got="none")
     with whole_file(path) as handle:
-        _write(handle, views, metadata, progress)
+        if table is None:
+            return _write(handle, views, metadata, progress)
+        own = {TABLE: torch.from_numpy(table.embeddings).half()}
+        _write(handle, views, {**metadata, "words": json.dumps(table.words)}, progress, own)
 
 
 def _write(
-    handle: IO[bytes], views: Mapping[str, ViewFeatures], metadata: Mapping[str, str], progress: Progress
+    handle: IO[bytes],
+    views: Mapping[str, ViewFeatures],
+    metadata: Mapping[str, str],
+    progress: Progress,
+    others: Mapping[str, Tensor] = MappingProxyType({}),
 ) -> None:
-    specs: list[tuple[str, torch.dtype, tuple[int, ...]]] = []
+    specs = [(name, one.dtype, tuple(one.shape)) for name, one in others.items()]
 
     def checked() -> Iterator[tuple[str, ViewFeatures]]:
         for done, (view, features) in enumerate(views.items(), start=1):
@@ -223,6 +242,9 @@ def _write(
     if len(header) > MAX_HEADER_BYTES:
         raise InvalidFeatures("views", expected="fewer views in a pack", got=str(len(views)))
     handle.write(header)
+    for name, tensor in others.items():
+        handle.seek(len(header) + offsets[name])
+        handle.write(tensor_bytes(tensor))
     for done, (view, features) in enumerate(views.items(), start=1):
         for part, tensor in _parts(features):
             handle.seek(len(header) + offsets[f"{view}/{part}"])
@@ -338,8 +360,10 @@ def _views(pack: _PackFile) -> list[str]:
     views: dict[str, None] = {}
     for key in pack.specs:
         view, _, part = key.rpartition("/")
+        if key == TABLE and len(pack.specs) > 1:
+            continue
         if not view or part not in PARTS:
-            hint = "a table of text embeddings belongs to a query" if key == "embeddings" else ""
+            hint = "a table of text embeddings belongs to a query" if key == TABLE else ""
             expected = "tensors 'VIEW/labels' with 'VIEW/codebook', or 'VIEW/grid'"
             raise InvalidFeatures(str(pack.path), expected=expected, got=repr(key)[:120], hint=hint)
         views[view] = None
@@ -361,6 +385,33 @@ def _check_specs(stored: _Stored) -> int:
             got = f"{spec.dtype} {list(spec.shape)}"
             raise InvalidFeatures(f"{stored.where} {part}", expected=expected, got=got)
     return specs["grid" if "grid" in specs else "codebook"].shape[-1]
+
+
+def _table(packs: Sequence[_PackFile], channels: int) -> TableEncoder | None:
+    """The words that the packs bring, the same in all that bring some."""
+    found: dict[Path, TableEncoder] = {}
+    for pack in packs:
+        if TABLE not in pack.specs:
+            continue
+        if pack.specs[TABLE].dtype not in ("F16", "F32"):
+            raise InvalidFeatures(f"{pack.path} {TABLE}", expected="F16 or F32", got=pack.specs[TABLE].dtype)
+        try:
+            rows = pack.handle.get_tensor(TABLE).numpy()
+            found[pack.path] = TableEncoder.of(f"words of {pack.path.name}", pack.metadata.get("words", "null"), rows)
+        except InvalidTable as error:
+            argument = f"{pack.path} {TABLE}"
+            raise InvalidFeatures(argument, expected=error.expected, got=error.got, hint=error.hint) from None
+        if found[pack.path].channels != channels:
+            expected, got = f"{channels} channels, as its views have", str(found[pack.path].channels)
+            raise InvalidFeatures(f"{pack.path} {TABLE}", expected=expected, got=got)
+    first = next(iter(found), None)
+    for path, table in found.items():
+        if first and not (table.words == found[first].words and (table.embeddings == found[first].embeddings).all()):
+            hint = "write the masks of all views into one pack"
+            raise InvalidFeatures(
+                "features", expected="one table in all packs", got=f"two in {first} and {path}", hint=hint
+            )
+    return found[first] if first else None
 
 
 def _agreed(packs: Sequence[_PackFile], key: str) -> str:

@@ -2,8 +2,9 @@
 
 A ``.safetensors`` file holds ``features`` [P, F], ``evidence`` [P], ``agreement`` [P] and ``seen`` [P]. After
 reweighting it has ``confidence`` [P] f32, which tells right splats from wrong ones, as agreement does not; after
-Post-Lifting Aggregation ``cluster`` [P] i32, -1 for splats in none, and ``cluster_features`` [K, F]. Its metadata
-hold settings, inputs with digests, the encoder, the certificate, timings and the version, as JSON.
+Post-Lifting Aggregation ``cluster`` [P] i32, -1 for splats in none, and ``cluster_features`` [K, F]; of packs with
+words their vectors, ``embeddings`` [n, F] f32. Its metadata hold settings, inputs with digests, the encoder, words,
+the certificate, timings and the version, as JSON.
 """
 
 from __future__ import annotations
@@ -26,14 +27,15 @@ if TYPE_CHECKING:
 TENSORS = ("features", "evidence", "agreement", "seen")
 CONFIDENCE = "confidence"  # in lifts that were reweighted
 CLUSTER_TENSORS = ("cluster", "cluster_features")  # in lifts with aggregation only
+EMBEDDINGS = "embeddings"  # in lifts of packs with words
+ALL = (*TENSORS, CONFIDENCE, *CLUSTER_TENSORS, EMBEDDINGS)
 
 
 def save_lift(lift: LiftResult, path: Path | str) -> None:
     """Write the lift whole or not at all (temporary file, fsync, rename), with no copy of X in memory."""
     from liftcore.io.safetensors_file import write_tensors
 
-    names = (*TENSORS, CONFIDENCE, *CLUSTER_TENSORS)
-    tensors = {name: getattr(lift, name) for name in names if getattr(lift, name) is not None}
+    tensors = {name: getattr(lift, name) for name in ALL if getattr(lift, name) is not None}
     write_tensors(Path(path), tensors, {"splatlift": lift.metadata.model_dump_json()})
 
 
@@ -67,8 +69,7 @@ def read_lift(path: Path | str) -> tuple[dict[str, np.ndarray], str]:
         missing = [name for name in TENSORS if name not in tensors]
         if missing:
             raise ValueError(f"no {missing[0]} in it")
-        names = (*TENSORS, CONFIDENCE, *CLUSTER_TENSORS)
-        arrays = {name: tensors[name] for name in names if name in tensors}
+        arrays = {name: tensors[name] for name in ALL if name in tensors}
     except FileNotFoundError:
         raise InvalidLift(str(path), expected="a lift file", got="no such file") from None
     except (SafetensorError, OSError, ValueError) as error:
@@ -105,6 +106,10 @@ def _check_shapes(arrays: dict[str, np.ndarray], path: Path | str) -> None:
     if not fits or any(arrays[name].shape != rows or arrays[name].dtype != dtype for name, dtype in columns):
         shapes = {name: list(arrays[name].shape) for name in TENSORS}
         raise InvalidLift(str(path), expected="one row a splat in every tensor of a lift", got=str(shapes))
+    words = arrays.get(EMBEDDINGS)
+    if words is not None and (words.shape[1:] != features.shape[1:] or words.dtype != np.float32):
+        expected, got = "a vector of the features' channels for each word", f"{list(words.shape)} {words.dtype}"
+        raise InvalidLift(str(path), expected=expected, got=got)
     cluster, means = arrays.get("cluster"), arrays.get("cluster_features")
     if cluster is None and means is None:
         return

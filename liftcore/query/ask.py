@@ -98,7 +98,8 @@ def ask(scene: QueryScene, query: Query | str, encoder: TextEncoder | None = Non
     Args:
         scene: an opened lift.
         query: words and examples, or one text alone.
-        encoder: the text encoder whose space the lifted features live in; examples need none.
+        encoder: the text encoder whose space the lifted features live in; examples and words that the lift brings
+            need none.
 
     Raises:
         InvalidQuery: a text without an encoder of the lift's space, or a term that has no feature.
@@ -119,12 +120,12 @@ def query_vectors(
     instances: int | None = None,
     keep: str = "all",
 ) -> VectorAnswer:
-    """Ask a lift for vectors of its text space, as a text encoder gives them.
+    """Ask a lift for vectors of its text space, as a text encoder gives them, or for words of its own.
 
     Args:
         result: the lift.
-        positives: [n, F] or [F], torch or numpy, what is looked for; rows of any length above zero.
-        negatives: [m, F], what takes away from the scores (`scores.combine`).
+        positives: [n, F] or [F], torch or numpy, what is looked for; rows of any length above zero; or words.
+        negatives: [m, F], or words, what takes away from the scores (`scores.combine`).
         splats: that were lifted; with them the answer has objects.
         threshold, instances: as in `find_threshold`. keep: of the objects, all or the largest.
 
@@ -134,7 +135,7 @@ def query_vectors(
     import torch
 
     scene = QueryScene(result, splats)
-    groups = [_vectors(values) for values in (positives, negatives)]
+    groups = [_terms(values) for values in (positives, negatives)]
     query = Query(*groups, threshold=threshold, instances=instances, keep=keep)
     rows = directions(scene, query, None)
     answer = answers(scene, [Question(query, rows, np.ones(len(rows), np.bool_))])[0]
@@ -146,7 +147,10 @@ def query_vectors(
     return VectorAnswer(scores, selected, answer.threshold, answer.explanation, clear, found)
 
 
-def _vectors(values: Any) -> tuple[Vector, ...]:
+def _terms(values: Any) -> tuple[str | Vector, ...]:
+    words = (values,) if isinstance(values, str) else tuple(values) if isinstance(values, list | tuple) else ()
+    if words and all(isinstance(word, str) for word in words):
+        return words
     rows = np.asarray(as_numpy(values), np.float64)
     return tuple(Vector(tuple(row.tolist())) for row in np.atleast_2d(rows)) if rows.size else ()
 

@@ -56,6 +56,7 @@ def _encode(scene: QueryScene, query: Query, encoder: TextEncoder | None) -> dic
     texts = {place: term for place, term in enumerate(query.terms) if isinstance(term, str)}
     if not texts:
         return {}
+    encoder = encoder or scene.table
     if encoder is None:
         space = scene.metadata.text_space or "not named"
         expected = f"a text encoder (the lift's text space: {space})"

@@ -12,6 +12,7 @@ import numpy as np
 from liftcore.errors import InvalidLift, InvalidQuery
 from liftcore.io.lift_file import read_lift
 from liftcore.query.scores import mean_direction, norms_of
+from liftcore.query.text.table import TableEncoder, own_words
 
 if TYPE_CHECKING:  # these load torch or pydantic, which scores do without
     from torch import Tensor
@@ -50,7 +51,7 @@ class QueryScene:
         cameras: Cameras | None = None,
         packs: Views | None = None,
     ) -> None:
-        names = ("features", "evidence", "seen", "cluster", "cluster_features", "confidence")
+        names = ("features", "evidence", "seen", "cluster", "cluster_features", "confidence", "embeddings")
         self._hold({name: as_numpy(getattr(result, name)) for name in names})
         self.path = Path("lift")
         given = {"lift": result, "metadata": result.metadata, "splats": splats, "cameras": cameras, "packs": packs}
@@ -60,6 +61,7 @@ class QueryScene:
         self.features, self.evidence, self._has_feature = (arrays[n] for n in ("features", "evidence", "seen"))
         self.cluster, self.cluster_features = arrays.get("cluster"), arrays.get("cluster_features")
         self.confidence = arrays.get("confidence")
+        self._embeddings = arrays.get("embeddings")
 
     @classmethod
     def open(cls, path: Path, *, splats: Path | None = None, cameras: Path | None = None) -> Self:
@@ -93,6 +95,15 @@ class QueryScene:
             if place is not None
         }
         return metadata.model_copy(update=files)
+
+    @cached_property
+    def table(self) -> TableEncoder | None:
+        """The words that its packs brought: an encoder for these; None without any.
+
+        Raises:
+            InvalidTable: its words and their vectors do not fit together.
+        """
+        return own_words(self.metadata.words, self._embeddings)
 
     @cached_property
     def lift(self) -> LiftResult:

@@ -33,7 +33,7 @@ from liftcore.query.scene import QueryScene
 from liftcore.query.scores import warm_up as warm_up_scores
 from liftcore.query.segment import Segmentation, best_words, map_png, picture_png, segment, word_map, words_of
 from liftcore.query.terms import Example, Query, Vector, parse_example
-from liftcore.query.text import RememberingEncoder, TextEncoder, open_encoder
+from liftcore.query.text import OWN_WORDS, RememberingEncoder, TextEncoder, open_encoder
 from liftcore.raster.cpu.warm_up import warm_up
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Kernel
@@ -208,7 +208,7 @@ class Answers:
 
     def _question(self, request: dict[str, Any]) -> Question:
         spec = request["encoder"]
-        encoder = None if spec is None else self._encoder(spec, request["encoder_version"])
+        encoder = None if spec in (None, OWN_WORDS) else self._encoder(spec, request["encoder_version"])
         return question(self._scene(request), query_of(request["query"]), encoder)
 
     def _answer(self, request: dict[str, Any]) -> Answer:

@@ -63,7 +63,7 @@ def shape_lift(lift: LiftRecord) -> models.LiftResult:
     own = f"/lifts/{lift.id}"
     links = {"self": own, "job": f"/jobs/{lift.id}", "features": f"{own}/features"}
     links |= {"views": f"{own}/views", "query": f"/query?lift={lift.id}&text="}
-    told = {"views": [], **lift.metadata, **vars(lift), "links": links}
+    told = {"views": [], "words": [], **lift.metadata, **vars(lift), "links": links}
     return models.LiftResult(**{name: told[name] for name in models.LiftResult.model_fields})
 
 

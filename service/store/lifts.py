@@ -42,7 +42,7 @@ class LiftRecord:
     path: Path
     count: int
     channels: int
-    metadata: dict[str, Any]  # without the names of views where these are very many
+    metadata: dict[str, Any]  # without the names of views and the words where these are very many
     view_count: int
     first_view: str | None
     created: float
@@ -80,6 +80,7 @@ class TradeoffRecord:
 FEATURES = "(SELECT json_group_array(asset) FROM (SELECT asset FROM job_features WHERE job = jobs.id ORDER BY place))"
 NAMES_OF_VIEWS = ("views_without_camera", "views_without_splats")  # in a certificate
 SHOWN_BYTES = 64 << 10  # of metadata; of more the names of views, which may be 49 MB, are told apart, in pages
+LONG = ("views", "words")  # what metadata leave out then
 VISIBLE = (
     "SELECT lifts.id, bytes, sha256, file, count, channels, view_count, first_view, lifts.created, splats, cameras,"
     f" CASE WHEN metadata_bytes <= {SHOWN_BYTES} THEN metadata ELSE brief END AS metadata, {FEATURES} AS features"
@@ -155,7 +156,7 @@ class LiftStore:
         self, connection: sqlite3.Connection, job: str, made: FinishedLift, size: int, created: float
     ) -> None:
         metadata, views = json.dumps(made.metadata), made.metadata["views"]
-        brief = {name: value for name, value in made.metadata.items() if name != "views"}
+        brief = {name: value for name, value in made.metadata.items() if name not in LONG}
         certificate = {name: value for name, value in brief["certificate"].items() if name not in NAMES_OF_VIEWS}
         row = {
             "id": job,

@@ -22,7 +22,7 @@ from pydantic import BaseModel
 
 import liftcore as lc
 from liftcore.cli import main
-from liftcore.features.masks import mask_of_runs, read_runs
+from liftcore.features.mask_files import mask_of_runs, read_runs
 from liftcore.features.pack import read_features
 from liftcore.io.splats import read_splats
 from service import models

@@ -16,6 +16,7 @@ ENCODER_SPECS = (
     "open_clip:MODEL@WEIGHTS_FILE",
 )
 NO_WORDS = "none"  # the text space of features that no text encoder shares
+OWN_WORDS = "prompts"  # of features whose packs bring their words
 REMEMBERED = 1_024  # texts; two megabytes at 512 channels
 
 

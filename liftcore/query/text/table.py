@@ -73,17 +73,35 @@ class TableEncoder:
         check_header(path, name, InvalidTable, expected=expected)
         try:
             tensors, metadata = map_tensors(path)
-            words = json.loads(metadata.get("words", "null"))
-        except (SafetensorError, OSError, ValueError, RecursionError) as error:
+        except (SafetensorError, OSError, ValueError) as error:
             raise InvalidTable(name, expected=expected, got=str(error)[:120]) from None
         if "embeddings" not in tensors:
             raise InvalidTable(name, expected=expected, got="no embeddings")
-        if not isinstance(words, list) or not all(isinstance(word, str) and not _HALF.search(word) for word in words):
+        return cls.of(name, metadata.get("words", "null"), tensors["embeddings"])
+
+    @classmethod
+    def of(cls, name: str, words: str, embeddings: np.ndarray) -> Self:
+        """A table as files hold it: ``words`` is a JSON list of n strings, ``embeddings`` [n, F] f16 or f32.
+
+        Raises:
+            InvalidTable: the words are no such list, or the embeddings do not fit them.
+        """
+        try:
+            listed = json.loads(words)
+        except (ValueError, RecursionError) as error:
+            raise InvalidTable(name, expected="metadata words, a JSON list", got=str(error)[:120]) from None
+        if not isinstance(listed, list) or not all(
+            isinstance(word, str) and not _HALF.search(word) for word in listed
+        ):
             raise InvalidTable(name, expected="metadata words, a JSON list of strings", got="none")
-        embeddings = tensors["embeddings"]
         if embeddings.dtype not in (np.float16, np.float32):
             raise InvalidTable(name, expected="float16 or float32", got=str(embeddings.dtype))
-        return cls(name, words, embeddings)
+        return cls(name, listed, embeddings)
+
+    @property
+    def embeddings(self) -> np.ndarray:
+        """[n, F] f32, the unit rows of the words."""
+        return self._unit
 
     def encode(self, texts: Sequence[str]) -> np.ndarray:
         """n words -> [n, F] f32 unit rows.
@@ -99,3 +117,8 @@ class TableEncoder:
             expected = f"one of the {len(self.words)} words of {self.name}"
             raise InvalidQuery("text", expected=expected, got=repr(text), hint=nearest_words(text, self._rows))
         return row
+
+
+def own_words(words: Sequence[str], embeddings: np.ndarray | None) -> TableEncoder | None:
+    """The table that a lift brings; None where it has none."""
+    return None if embeddings is None or not words else TableEncoder("the lift's own words", words, embeddings)

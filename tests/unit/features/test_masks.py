@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from liftcore.errors import InvalidFeatures
-from liftcore.features.masks import MAX_LEVELS, layered, mask_of_runs, mask_views, read_runs
+from liftcore.features.mask_files import mask_of_runs, read_runs
+from liftcore.features.masks import MAX_LEVELS, layered, mask_views
 from liftcore.features.pack import read_features, write_pack
 from liftcore.features.views import Regions
 from tests.run_lengths import compressed, lengths_of, sam_records
@@ -205,7 +206,7 @@ def test_json_that_holds_no_such_masks_is_refused(content: str, message: str, tm
 
 
 def test_json_beyond_the_limit_is_refused_unread(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("liftcore.features.masks.MAX_JSON_BYTES", 10)
+    monkeypatch.setattr("liftcore.features.mask_files.MAX_JSON_BYTES", 10)
     save_text(tmp_path / "a.json", sam_records(MASKS))
     np.save(tmp_path / "a.npy", VECTORS)
     with pytest.raises(InvalidFeatures, match=r"at most 10 bytes, got \d+ bytes; .*coco_rle"):

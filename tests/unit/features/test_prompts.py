@@ -1,0 +1,240 @@
+"""Masks by phrase become a pack that is asked in its phrases, the same from every kind of file."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from PIL.PngImagePlugin import PngInfo
+
+import liftcore as lc
+from liftcore.errors import InvalidFeatures, InvalidQuery
+from liftcore.features.pack import read_features, write_pack
+from liftcore.features.prompts import prompt_views
+from liftcore.features.views import Regions
+from tests.api.tiny_scene import labels, make_scene
+from tests.run_lengths import sam_records
+from tests.unit.command_line import assert_one_line, run
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+PHRASES = {0: "red_apple", 2: "Lamp"}  # the cluster between them has no phrase
+MASKS = {
+    view: {phrase: found[0] == cluster for cluster, phrase in PHRASES.items()} for view, found in labels().items()
+}
+
+
+def records(view: str, key: str = "class_name", *, as_string: bool = False) -> list[dict[str, Any]]:
+    found = sam_records(np.stack(list(MASKS[view].values())), as_string=as_string)
+    return [{**record, key: phrase} for record, phrase in zip(found, MASKS[view], strict=True)]
+
+
+def save_png(path: Path, values: np.ndarray, **options: Any) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(values).save(path, **options)
+
+
+def save_json(path: Path, content: Any) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(content), encoding="utf-8")
+
+
+def write_binary(folder: Path) -> None:
+    for view, masks in MASKS.items():
+        for phrase, mask in masks.items():
+            save_png(folder / phrase / f"{view}.png", 255 * mask.astype(np.uint8))
+
+
+def write_colours_by_view(folder: Path) -> None:
+    for view, masks in MASKS.items():
+        for phrase, mask in masks.items():
+            save_png(folder / view / f"{phrase}.png", np.repeat(mask[..., None], 3, axis=2).astype(np.uint8))
+
+
+def write_run_lengths(folder: Path, *, as_string: bool = False) -> None:
+    for view in MASKS:
+        save_json(folder / f"{view}.jpg.json", {"annotations": records(view, as_string=as_string)})
+
+
+def write_data_set(folder: Path) -> None:
+    numbers = {phrase: number for number, phrase in PHRASES.items()}
+    masks = [
+        {**record, "image_id": number, "category_id": numbers[record.pop("phrase")]}
+        for number, view in enumerate(MASKS)
+        for record in records(view, "phrase")
+    ]
+    save_json(
+        folder / "instances.json",
+        {
+            "images": [{"id": number, "file_name": f"{view}.jpg"} for number, view in enumerate(MASKS)],
+            "categories": [{"id": number, "name": phrase} for number, phrase in PHRASES.items()],
+            "annotations": masks,
+        },
+    )
+
+
+def write_pairs(folder: Path) -> None:
+    """As SA-Co does it: an image for each photo and phrase."""
+    pairs = [(view, phrase) for view in MASKS for phrase in PHRASES.values()]
+    masks = [record for view in MASKS for record in records(view, "phrase")]
+    content = {
+        "images": [
+            {"id": number, "file_name": f"{view}.jpg", "text_input": phrase}
+            for number, (view, phrase) in enumerate(pairs)
+        ],
+        "categories": [{"id": 1, "name": "object"}],
+        "annotations": [
+            {"image_id": number, "category_id": 1, "segmentation": record["segmentation"]}
+            for number, record in enumerate(masks)
+        ],
+    }
+    save_json(folder / "pairs.json", content)
+
+
+def numbered(view: str) -> np.ndarray:
+    return sum((7 * number * mask for number, mask in enumerate(MASKS[view].values(), 1)), np.zeros(())).astype("u1")
+
+
+def write_labels(folder: Path) -> None:
+    for view in MASKS:
+        save_png(folder / f"{view}.png", numbered(view))
+    save_json(folder / "names.json", {7: "red_apple", 14: "Lamp"})
+
+
+def write_legends(folder: Path) -> None:
+    for view in MASKS:
+        text = PngInfo()
+        text.add_text("legend", json.dumps({7: "red apple", 14: "Lamp", 21: "elsewhere"}))
+        save_png(folder / f"{view}.png", numbered(view), pnginfo=text)
+
+
+KINDS: dict[str, tuple[Callable[[Path], None], dict[str, str]]] = {
+    "binary PNGs": (write_binary, {}),
+    "binary PNGs a view": (write_colours_by_view, {"folders": "views"}),
+    "run lengths": (write_run_lengths, {}),
+    "run lengths as strings": (lambda folder: write_run_lengths(folder, as_string=True), {}),
+    "COCO's data set": (write_data_set, {}),
+    "SA-Co's pairs": (write_pairs, {}),
+    "label PNGs": (write_labels, {"names": "names.json"}),
+    "label PNGs with a legend": (write_legends, {}),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_makes_the_same_pack(kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write, options = KINDS[kind]
+    write(tmp_path / "masks")
+    options = {name: str(tmp_path / "masks" / told) if name == "names" else told for name, told in options.items()}
+    flags = [part for name, told in options.items() for part in (f"--{name}", told)]
+    pack = tmp_path / "pack.safetensors"
+    status, out, err = run(capsys, "pack", "prompts", tmp_path / "masks", "-o", pack, "--json", *flags)
+    assert (status, err) == (0, "")
+    assert (json.loads(out)["words"], json.loads(out)["text_space"]) == (["Lamp", "red apple"], "prompts")
+    views = read_features(pack)
+    assert views.table is not None and views.table.words == ("Lamp", "red apple")
+    assert views.views == tuple(sorted(MASKS))
+    for name, masks in MASKS.items():
+        view = views[name]
+        assert isinstance(view, Regions)
+        shown = view.codebook.numpy()[view.labels[0].numpy()]  # [h, w, 3]: a channel a phrase, and the rest
+        assert np.array_equal(shown[..., 0] == 1, masks["Lamp"])
+        assert np.array_equal(shown[..., 1] == 1, masks["red_apple"])
+        assert np.array_equal(shown.sum(axis=2), np.ones_like(shown[..., 0]))
+
+
+def test_a_lift_of_prompts_is_asked_in_its_words_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_binary(tmp_path / "masks")
+    tiny, pack, lifted = make_scene(), tmp_path / "pack.safetensors", tmp_path / "lift.safetensors"
+    (tmp_path / "scene.ply").write_bytes(tiny.splats)
+    (tmp_path / "cameras.json").write_bytes(tiny.cameras)
+    assert run(capsys, "pack", "prompts", tmp_path / "masks", "-o", pack)[0] == 0
+    assert run(capsys, "lift", tmp_path / "scene.ply", tmp_path / "cameras.json", pack, "-o", lifted)[0] == 0
+    pack.unlink()  # the lift alone is asked
+    status, out, err = run(capsys, "query", lifted, "a red apple", "--json")
+    assert (status, err, json.loads(out)["selected"]) == (0, "", 20)
+    status, out, _ = run(capsys, "segment", lifted, "--json")
+    assert (status, {named["word"] for named in json.loads(out)["found"]}) == (0, {"Lamp", "red apple"})
+    status, _, err = run(capsys, "query", lifted, "red ample")
+    assert status == 2 and "nearest: red apple" in err
+    assert_one_line(err)
+    result = lc.load_lift(lifted)
+    assert result.query("red apple").splats.nonzero().flatten().tolist() == list(range(20))
+    assert result.query(["lamp"], ["red apple"]).splats.nonzero().flatten().tolist() == list(range(40, 60))
+    with pytest.raises(InvalidQuery, match="one of the 2 words of the lift's own words, got 'mug'"):
+        result.query("mug")
+
+
+def test_masks_that_overlap_count_for_both_phrases(tmp_path: Path) -> None:
+    mask = MASKS["middle"]["Lamp"]
+    save_png(tmp_path / "lamp" / "a.png", mask)
+    save_png(tmp_path / "lamp" / "b.png", np.zeros_like(mask))
+    save_png(tmp_path / "thing" / "a.png", np.ones_like(mask))
+    save_png(tmp_path / "ghost" / "a.png", np.zeros_like(mask))
+    found = prompt_views(tmp_path)
+    assert found.table.words == ("lamp", "thing")
+    assert found.counts == {"ghost": 0, "lamp": 1, "thing": 1}
+    view = found.views["a"]
+    seen = [{tuple(view.codebook[row].tolist()) for row in pixel if row >= 0} for pixel in view.labels.flatten(1).T]
+    assert seen == [{(1, 0, 0), (0, 1, 0)} if inside else {(0, 1, 0)} for inside in mask.ravel()]
+    assert found.views["b"].codebook[found.views["b"].labels.flatten()].tolist() == [[0, 0, 1]]
+
+
+def test_packs_of_other_words_make_no_lift(tmp_path: Path) -> None:
+    for name, phrase in (("one", "lamp"), ("other", "mug")):
+        save_png(tmp_path / name / phrase / f"{name}.png", MASKS["middle"]["Lamp"])
+        found = prompt_views(tmp_path / name)
+        write_pack(tmp_path / f"{name}.pack", found.views, {}, table=found.table)
+    with pytest.raises(InvalidFeatures, match="one table in all packs"):
+        read_features(tmp_path / "one.pack", tmp_path / "other.pack")
+
+
+@pytest.mark.parametrize(
+    ("files", "message"),
+    [
+        ({}, "no such folder"),
+        ({"a.txt": "x"}, "got 1 other files"),
+        ({"a.png": MASKS["left"]["Lamp"]}, "in no phrase's folder and without names"),
+        ({"mug/a.png": numbered("left")}, r"one value beside 0, a mask, got values from 7 to 14"),
+        ({"mug/a.png": np.zeros((2, 2, 4), np.uint8)}, "colours with transparency"),
+        ({"mug/a.png": "x"}, "no PNG"),
+        ({"mug/a.png": np.zeros((2, 2), np.uint8)}, "1 to 4096 phrases with masks, got 0 of 1"),
+        ({"mug/a.png": MASKS["left"]["Lamp"], "a.json": "[]"}, "got a.json and a.png; name the file of names"),
+        ({"a.json": '[{"segmentation": {"size": [1, 2], "counts": [0, 2]}}]'}, r"a phrase \(phrase, .*got none"),
+        ({"a.json": '[{"phrase": "mug", "segmentation": [[0, 0, 4, 0, 4, 4]]}]'}, "got a polygon"),
+        ({"a.json": '{"images": [{"id": 1}], "annotations": []}'}, "a file_name of each"),
+        ({"a.json": '{"images": [{"id": 1, "file_name": "a"}], "annotations": [{}]}'}, "an image_id of the file"),
+        ({"a.json": "[3]"}, "a mask with a phrase, got int"),
+    ],
+)
+def test_what_is_no_such_folder_is_told(files: dict[str, Any], message: str, tmp_path: Path) -> None:
+    for name, content in files.items():
+        path = tmp_path / "masks" / name
+        if isinstance(content, np.ndarray):
+            save_png(path, content)
+        else:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(content, encoding="utf-8")
+    with pytest.raises(InvalidFeatures, match=message):
+        prompt_views(tmp_path / "masks")
+
+
+@pytest.mark.parametrize(
+    ("names", "message"), [("{}", "JSON of values"), ('{"7": 3}', "JSON of values"), ('["a"]', "the value 7")]
+)
+def test_names_that_do_not_fit_their_pictures_are_told(names: str, message: str, tmp_path: Path) -> None:
+    write_labels(tmp_path)
+    (tmp_path / "names.json").write_text(names, encoding="utf-8")
+    with pytest.raises(InvalidFeatures, match=message):
+        prompt_views(tmp_path, tmp_path / "names.json")
+
+
+def test_masks_of_several_sizes_in_a_view_are_refused(tmp_path: Path) -> None:
+    save_png(tmp_path / "lamp" / "a.png", np.ones((2, 2), np.uint8))
+    save_png(tmp_path / "mug" / "a.png", np.ones((2, 3), np.uint8))
+    with pytest.raises(InvalidFeatures, match="masks of one size, got 2 x 2 and 2 x 3"):
+        prompt_views(tmp_path).views["a"]
