@@ -6,6 +6,7 @@
     │   ├── InvalidCameras
     │   ├── InvalidFeatures
     │   ├── InvalidMasks
+    │   ├── InvalidPhotos
     │   ├── InvalidLift
     │   ├── InvalidSettings
     │   └── InvalidQuery           (an unknown word, a view that is not there)
@@ -81,6 +82,12 @@ class InvalidMasks(InvalidInput):
     """Masks to judge by, or their content, are malformed."""
 
     kind = "invalid-masks"
+
+
+class InvalidPhotos(InvalidInput):
+    """A zip of photos, or one of them, is malformed."""
+
+    kind = "invalid-photos"
 
 
 class InvalidLift(InvalidInput):

@@ -40,7 +40,7 @@ CALLER = "caller"  # of the scope's state
 LOOPBACK = frozenset({"localhost", "127.0.0.1", "::1"})
 BEARER = re.compile(r"bearer +([A-Za-z0-9._~+/-]+=*)", re.ASCII | re.IGNORECASE)  # RFC 6750, 2.1
 LOOKUPS = 4  # threads that look keys up, so that slow routes cannot keep anyone waiting at the gate
-UPLOADS = "/assets/"
+UPLOADS = re.compile("PUT /assets/.*|POST /lifts")
 WORKLESS = frozenset({"GET", "HEAD", "OPTIONS"})  # methods that start nothing: a stop refuses the others
 SCHEMES = {
     "key": {
@@ -100,7 +100,7 @@ class Gate:
             busy.headers |= CLOSE
             raise busy
         scope.setdefault("state", {})[CALLER] = caller
-        if method != "PUT" or not scope["path"].startswith(UPLOADS):
+        if UPLOADS.fullmatch(f"{method} {scope['path']}") is None:
             await self._app(scope, receive, send)
             return
         own, most = caller.owner.key, caller.max_uploads

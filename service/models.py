@@ -122,6 +122,8 @@ COMPARED = ("preset", "speed")  # what differs between the runs of a trade-off
 MAX_SETTINGS = 100
 SETTING_CHARACTERS = 1000  # of a name or a text among them
 VIEW_CHARACTERS = 500  # of a camera's name that can be asked for
+LIFT_NAME_CHARACTERS = 100
+PRINTABLE = r"^[^\x00-\x1f\x7f]*$"
 
 AssetId = Annotated[str, Field(pattern=ASSET_ID, description="sha256: and the digest of the bytes, in hex")]
 JobId = Annotated[str, Field(pattern=JOB_ID)]
@@ -138,6 +140,10 @@ class AssetKind(StrEnum):
     FEATURES = "features"
     MASKS = "masks"  # of views, to judge by
     TABLE = "table"  # of text embeddings
+    PHOTOS = "photos"  # of views, to look at
+
+
+UploadKind = AssetKind | Literal["lift"]
 
 
 class JobKind(StrEnum):
@@ -305,11 +311,13 @@ class LiftResult(BaseModel):
     """Features on splats. A lift has the id of the job that made it."""
 
     id: JobId
+    name: str | None = Field(description="that somebody gave it")
     bytes: int
     sha256: str
     splats: AssetId
     cameras: AssetId
     features: list[AssetId]
+    photos: AssetId | None = Field(description="of its views, to look at")
     count: int = Field(description="P, the number of splats")
     channels: int = Field(description="F, the number of feature channels")
     version: str
@@ -325,6 +333,15 @@ class LiftResult(BaseModel):
     links: dict[str, str]
 
 
+class LiftChange(Body):
+    """What to change of a lift; what is left out stays."""
+
+    name: Annotated[str, Field(max_length=LIFT_NAME_CHARACTERS, pattern=PRINTABLE)] | None = Field(
+        None, description="for people; null or an empty one takes the name away"
+    )
+    photos: AssetId | None = Field(None, description="an asset of kind photos; null takes them away")
+
+
 class Lifts(BaseModel):
     """All lifts, newest first."""
 
@@ -337,6 +354,7 @@ class View(BaseModel):
 
     name: str
     lifted: bool = Field(description="whether its features were lifted")
+    photo: bool = Field(description="whether the lift's photos have one of it")
     width: int = Field(description="pixels")
     height: int
     fx: float = Field(description="pixels, like fy, cx and cy")

@@ -44,6 +44,7 @@ TABLE: dict[type[SplatliftError], tuple[int, str]] = {
     core.InvalidCameras: (422, "The cameras are malformed or not supported"),
     core.InvalidFeatures: (422, "The features are malformed or do not fit the scene"),
     core.InvalidMasks: (422, "The masks are malformed"),
+    core.InvalidPhotos: (422, "The photos are malformed"),
     core.InvalidTable: (422, "The text table is malformed"),
     core.InvalidLift: (422, "The lift is not usable"),
     core.InvalidSettings: (422, "A setting is unknown or out of range"),

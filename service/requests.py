@@ -56,7 +56,7 @@ def _names(route: Dependant) -> Iterator[str]:
 async def _body(request: Request) -> bytes:
     """The body of a request that has one to read, within its limit."""
     body, limit = bytearray(), request.app.state.deps.settings.max_body_bytes
-    if request.method == "POST":
+    if request.method in ("POST", "PATCH"):
         async for chunk in request.stream():
             body += chunk
             if len(body) > limit:

@@ -46,6 +46,8 @@ class ServiceSettings(BaseSettings):
     max_features_bytes: int = Field(16 * GiB, gt=0, description="the largest feature pack, compressed or not")
     max_masks_bytes: int = Field(256 * MiB, gt=0, description="the largest file of masks, compressed or not")
     max_table_bytes: int = Field(64 * MiB, gt=0, description="the largest text table, compressed or not")
+    max_photos_bytes: int = Field(4 * GiB, gt=0, description="the largest zip of photos, compressed or not")
+    max_lift_bytes: int = Field(16 * GiB, gt=0, description="the largest lift file, compressed or not")
     max_body_bytes: int = Field(MiB, gt=0, description="the largest body of any request that is not an upload")
 
     min_bytes_per_second: int = Field(
@@ -118,5 +120,5 @@ class ServiceSettings(BaseSettings):
         return [name.strip() for name in given.split(",") if name.strip()] if isinstance(given, str) else given
 
     def max_upload_bytes(self, kind: str) -> int:
-        """The size limit of an asset kind."""
+        """The size limit of an asset kind, or of a ``lift``."""
         return getattr(self, f"max_{kind}_bytes")

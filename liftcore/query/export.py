@@ -109,10 +109,11 @@ def layer_colours(scene: QueryScene, what: str) -> np.ndarray:
     """Colours of all splats, [P, 3] u8 sRGB.
 
     ``pca`` are three principal components of the features, ``cluster`` a colour a cluster; ``evidence`` (by its
-    logarithm) and ``agreement`` go through the colour map of scores. Splats without a feature are grey.
+    logarithm), ``agreement`` and ``confidence`` go through the colour map of scores. Splats without a feature are
+    grey.
 
     Raises:
-        InvalidQuery: clusters are asked for, and the lift has none.
+        InvalidQuery: clusters or confidence are asked for, and the lift has none.
     """
     if what == "pca":
         colours = np.round(255 * scene.principal.numpy()).astype(np.uint8)
@@ -122,7 +123,12 @@ def layer_colours(scene: QueryScene, what: str) -> np.ndarray:
             raise InvalidQuery("what", expected="a lift with clusters", got="a lift without aggregation", hint=hint)
         colours = cluster_colours(len(scene.cluster_features))[scene.cluster]
     else:
-        values = as_numpy(getattr(scene.lift, what)).astype(np.float32)
+        told = getattr(scene.lift, what)
+        if told is None:
+            hint = "lift again with the setting robust_steps=1"
+            got = "a lift without reweighting"
+            raise InvalidQuery("what", expected=f"a lift with {what}", got=got, hint=hint)
+        values = as_numpy(told).astype(np.float32)
         known = scene.seen & np.isfinite(values)
         if what == "evidence":
             known &= values > 0

@@ -12,9 +12,10 @@ from fastapi.responses import JSONResponse
 
 from service import models
 from service.content import FILE, Cursor, Limit, StoredFile, file_answer, listed
-from service.state import Deps
+from service.errand import ErrandLimits
+from service.state import AppState, Deps
 from service.store.assets import AssetRecord
-from service.uploads.intake import CheckLimits, Intake, coding_of, require_size
+from service.uploads.intake import AssetIntake, Intake, Taken, coding_of, require_size
 
 T = TypeVar("T")
 BATCH = 1 << 20  # bytes gathered before a thread writes them
@@ -24,7 +25,7 @@ NAMES = 1000  # a page of them, unless another number is asked for
 
 router = APIRouter(prefix="/assets", tags=["assets"])
 # By the name of the other routes' part: to OpenAPI, two templates that match the same paths are one path twice.
-Kind = Annotated[models.AssetKind, Path(alias="asset", description="what it is")]
+AssetKind = Annotated[models.AssetKind, Path(alias="asset", description="what it is")]
 AssetId = Annotated[str, Path(description="sha256: and the digest of the bytes, in hex")]
 Sha256 = Annotated[
     str | None,
@@ -47,12 +48,21 @@ RAW_BODY = {
     responses={200: {"model": models.Asset, "description": "It was here already"}},
     openapi_extra=RAW_BODY,
 )
-async def upload(kind: Kind, request: Request, deps: Deps, sha256: Sha256 = None) -> Response:
-    """Upload splats (PLY), cameras (JSON or a zip of a COLMAP model), a feature pack, masks or a text table."""
+async def upload(kind: AssetKind, request: Request, deps: Deps, sha256: Sha256 = None) -> Response:
+    """Upload splats, cameras (JSON or a zip of a COLMAP model), a feature pack, masks, a text table or photos."""
+    asset, new = await taken(AssetIntake, kind, request, deps, sha256)
+    location = {"Location": f"/assets/{asset.id}"}
+    return JSONResponse(shape(asset).model_dump(mode="json"), 201 if new else 200, headers=location)
+
+
+async def taken(
+    into: Callable[..., Intake[Taken]], kind: models.UploadKind, request: Request, deps: AppState, sha256: str | None
+) -> tuple[Taken, bool]:
+    """Take the body of an upload in, check it whole and keep it; whether its owner did not have it before."""
     coding = coding_of(", ".join(request.headers.getlist("content-encoding")))
     limit = deps.settings.max_upload_bytes(kind)
     require_size(kind, _announced(request), limit)  # before a byte of it is asked for with 100 Continue
-    intake = Intake(deps.store, deps.owner, kind, limit, coding)
+    intake = into(deps.store, deps.owner, kind, limit, coding)
 
     async def write(step: Callable[..., T], *given: Any) -> T:
         return await anyio.to_thread.run_sync(step, *given, limiter=deps.writing)
@@ -62,11 +72,10 @@ async def upload(kind: Kind, request: Request, deps: Deps, sha256: Sha256 = None
         await _receive(request, partial(write, intake.feed))
         known = await write(intake.finish, sha256)
         if known is not None:
-            return _reply(known, 200)
-        allowed = CheckLimits(deps.settings.check_seconds, deps.settings.check_memory_bytes, deps.ending)
+            return known, False
+        allowed = ErrandLimits(deps.settings.check_seconds, deps.settings.check_memory_bytes, deps.ending)
         checked = await anyio.to_thread.run_sync(intake.check, allowed, limiter=deps.checks)
-        asset, new = await write(intake.keep, checked)
-        return _reply(asset, 201 if new else 200)
+        return await write(intake.keep, checked)
     finally:
         with anyio.CancelScope(shield=True):  # removing gigabytes takes its time
             await write(intake.close)
@@ -138,8 +147,3 @@ def shape(asset: AssetRecord) -> models.Asset:
         links={"self": own, "content": f"{own}/content"}
         | ({} if asset.kind is models.AssetKind.SPLATS else {"names": f"{own}/names"}),
     )
-
-
-def _reply(asset: AssetRecord, status: int) -> Response:
-    location = {"Location": f"/assets/{asset.id}"}
-    return JSONResponse(shape(asset).model_dump(mode="json"), status, headers=location)

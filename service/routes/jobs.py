@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Annotated, Any
@@ -15,7 +16,8 @@ from liftcore.settings import LiftSettings
 from service import models
 from service.child import error_of
 from service.content import Cursor, Limit, listed
-from service.errors import InvalidRequest
+from service.errand import ErrandLimits, run_errand
+from service.errors import InvalidRequest, OverLimit
 from service.jobs.fit import check_fit, check_kernel, check_labels, scratch_bytes
 from service.observe import current_id
 from service.problems import problem_of
@@ -75,6 +77,14 @@ async def submit(deps: Deps, order: models.LiftRequest = LIFT_BODY, key: Key = N
 
 
 @router.post(
+    "/lift/plan", response_model=models.Plan, tags=["jobs"], openapi_extra=described_body(models.LiftRequest)
+)
+async def plan(deps: Deps, order: models.LiftRequest = LIFT_BODY) -> models.Plan:
+    """What a lift would do and need, without doing it: the views that it takes, and the memory."""
+    return await anyio.to_thread.run_sync(_planned, order, deps, limiter=deps.checks)
+
+
+@router.post(
     "/tradeoff", name="submit", response_model=models.Job, status_code=202, responses=REPEATED, tags=["trade-offs"],
     openapi_extra=described_body(models.TradeoffRequest),
 )  # fmt: skip
@@ -86,6 +96,31 @@ async def submit_tradeoff(deps: Deps, order: models.TradeoffRequest = TRADEOFF_B
 def _lift(order: models.LiftRequest, deps: AppState, key: str | None) -> Response:
     settings = LiftSettings.of_json(order.settings).model_dump(mode="json")
     return _take(order, deps, key, sent=order.model_dump(mode="json"), settings=settings)
+
+
+def _planned(order: models.LiftRequest, deps: AppState) -> models.Plan:
+    settings = LiftSettings.of_json(order.settings).model_dump(mode="json")
+    wanted = JobOrder(order.splats, order.cameras, tuple(order.features), settings)
+    _require_fit(wanted, deps)
+    deps.devices.require(wanted.settings.get("device", "auto"))
+    limits = ErrandLimits(deps.settings.check_seconds, deps.settings.check_memory_bytes, deps.ending)
+    splats, cameras, *packs = [deps.store.assets.get(deps.owner, *named, most=0) for named in wanted.assets()]
+    document = {
+        "splats": str(splats.path), "cameras": str(cameras.path), "features": [str(pack.path) for pack in packs],
+        "settings": settings, "names": {str(one.path): f"{one.kind} {one.id}" for one in (splats, cameras, *packs)},
+    }  # fmt: skip
+    with deps.store.files.scratch() as scratch:
+        file = scratch / "order.json"
+        file.write_text(json.dumps(document))
+        heard = run_errand("service.jobs.planning", [str(file), str(limits.memory_bytes)], scratch, limits)
+    if heard is not None and heard.last["event"] == "valid":
+        return models.Plan.model_validate(heard.last["plan"])
+    if heard is not None and heard.last["event"] == "invalid":
+        raise error_of(heard.last["fault"])
+    raise OverLimit(
+        "plan", expected="a lift that is planned within the limits of an upload's check", got="one that needs more",
+        hint="order it without: its job plans too",
+    )  # fmt: skip
 
 
 def _compare(order: models.TradeoffRequest, deps: AppState, key: str | None) -> Response:

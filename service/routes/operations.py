@@ -26,7 +26,7 @@ NO_PICTURE = "data:,"  # the page asks another host for one unless it is told
 METRICS_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 BODIES = (
     models.LiftRequest, models.TradeoffRequest, models.AskedInBody, models.AskedToSegment, models.AskedWhat,
-    models.AskedToRender,
+    models.AskedToRender, models.LiftChange,
 )  # fmt: skip
 METRICS: dict[int | str, dict[str, Any]] = {
     200: {

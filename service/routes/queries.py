@@ -276,6 +276,10 @@ def query_request(operation: str, asked: Question, lift: LiftRecord, deps: AppSt
     request: dict[str, Any] = scene_request(operation, lift, deps)
     request = with_encoder(request, asked, lift, deps) if asked.text or asked.negatives else {**request, **NO_ENCODER}
     if any(isinstance(example, str) and example.startswith(REGION) for example in (*asked.like, *asked.unlike)):
+        if len(lift.features) < len(lift.metadata["features"]):
+            hint = "PUT /assets/features each of its packs before POST /lifts, or ask by splat:J or VIEW:x,y"
+            got = "one that was brought without some of them"
+            raise InvalidRequest("like", expected="a lift whose feature packs are here", got=got, hint=hint)
         packs = [deps.store.assets.get(deps.owner, asset, most=0) for asset in lift.features]
         request["features"] = [str(pack.path) for pack in packs]
         request["names"] |= {str(pack.path): f"features {pack.id}" for pack in packs}

@@ -6,12 +6,17 @@ from functools import partial
 from typing import Any
 
 from fastapi import APIRouter, Request, Response
+from fastapi.responses import JSONResponse
 
 from service import models
 from service.content import FILE, TAGGED, Cursor, Limit, StoredFile, file_answer, kept, listed, unchanged
+from service.requests import described_body, json_body
+from service.routes.assets import RAW_BODY, Sha256, taken
 from service.routes.queries import PNG
 from service.state import Deps
 from service.store.lifts import LiftRecord, TradeoffRecord
+from service.uploads import LIFT
+from service.uploads.intake import LiftIntake
 
 MARKDOWN_TYPE = "text/markdown; charset=utf-8"
 MARKDOWN: dict[int | str, dict[str, Any]] = {200: {"content": {MARKDOWN_TYPE: {"schema": {"type": "string"}}}}}
@@ -23,6 +28,35 @@ router = APIRouter()
 def list_lifts(deps: Deps, limit: Limit = None, cursor: Cursor = None) -> Response:
     """All lifts, newest first."""
     return listed("lifts", partial(deps.store.lifts.page, deps.owner), shape_lift, limit=limit, cursor=cursor)
+
+
+@router.post(
+    "/lifts",
+    response_model=models.LiftResult,
+    status_code=201,
+    responses={200: {"model": models.LiftResult, "description": "It was here already"}},
+    openapi_extra=RAW_BODY,
+    tags=["lifts"],
+)
+async def upload_lift(request: Request, deps: Deps, sha256: Sha256 = None) -> Response:
+    """Bring a lift file of the command line. The splats and cameras that it was made of must be here."""
+    lift, new = await taken(LiftIntake, LIFT, request, deps, sha256)
+    location = {"Location": f"/lifts/{lift.id}"}
+    return JSONResponse(shape_lift(lift).model_dump(mode="json"), 201 if new else 200, headers=location)
+
+
+CHANGE_BODY = json_body(models.LiftChange)
+
+
+@router.patch(
+    "/lifts/{lift}",
+    response_model=models.LiftResult,
+    openapi_extra=described_body(models.LiftChange),
+    tags=["lifts"],
+)
+def change_lift(lift: str, deps: Deps, change: models.LiftChange = CHANGE_BODY) -> models.LiftResult:
+    """Give a lift a name, or photos of its views; what is left out stays."""
+    return shape_lift(deps.store.lifts.change(deps.owner, lift, change.model_dump(exclude_unset=True)))
 
 
 @router.get("/lifts/{lift}", response_model=models.LiftResult, tags=["lifts"])

@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
+import hashlib
 from typing import Annotated, Any, Literal
 
 import anyio
 from fastapi import APIRouter, Query, Request, Response
+from fastapi.responses import StreamingResponse
 
+from liftcore.errors import NotFound
 from service import models
-from service.content import TAGGED, Limit
-from service.routes.queries import NPY, PLY, Ask, scene_request, tagged_answer
-from service.state import Deps
+from service.content import TAGGED, Limit, kept, unchanged
+from service.photos import names_with_photo, open_photo
+from service.routes.queries import NPY, PLY, Ask, View, scene_request, tagged_answer
+from service.state import AppState, Deps
 
 VIEWS = 1000  # a page of them, unless another number is asked for
+_BYTES = {"schema": {"type": "string", "format": "binary"}}
+PHOTO: dict[int | str, dict[str, Any]] = {200: {"content": {"image/jpeg": _BYTES, "image/png": _BYTES}}}
 
 router = APIRouter(prefix="/lifts/{lift}", tags=["lifts"])
 ViewsCursor = Annotated[int, Query(ge=0, le=10**9, description="the `next` of the page before")]
 Layer = Annotated[
-    Literal["pca", "cluster", "evidence", "agreement"],
-    Query(description="principal components of features, clusters, or evidence or agreement through a colour map"),
+    Literal["pca", "cluster", "evidence", "agreement", "confidence"],
+    Query(description="principal components of features, clusters, or one of the others through a colour map"),
 ]
 
 
@@ -39,6 +45,28 @@ def colours(lift: str, request: Request, deps: Deps, ask: Ask, what: Layer = "pc
     return tagged_answer(request, deps, scene_request("layer", found, deps) | {"what": what}, found, ask)
 
 
+@router.get("/photo", responses=PHOTO | TAGGED, response_class=Response)
+def photo(lift: str, view: View, request: Request, deps: Deps) -> Response:
+    """The photo of a view, as it was uploaded."""
+    found = deps.store.lifts.get(deps.owner, lift)
+    zipped = None if found.photos is None else deps.store.assets.get(deps.owner, found.photos, most=0)
+    opened = None if zipped is None else open_photo(zipped.path, view)
+    if zipped is None or opened is None:
+        got, hint = f"none of {view!r}"[:200], "PUT /assets/photos, then PATCH /lifts/{lift} with its id"
+        raise NotFound("view", expected="a view of which the lift has a photo", got=got, hint=hint)
+    media_type, size, blocks = opened
+    etag = f'"{hashlib.sha256(f"{zipped.id} {view}".encode()).hexdigest()}"'
+    headers = kept(etag) | {"Content-Length": str(size)}
+    return unchanged(request, etag) or StreamingResponse(blocks, media_type=media_type, headers=headers)
+
+
+def _with_photo(deps: AppState, lift: str, views: list[str]) -> set[str]:
+    photos = deps.store.lifts.get(deps.owner, lift).photos
+    return (
+        set() if photos is None else names_with_photo(deps.store.assets.get(deps.owner, photos, most=0).path, views)
+    )
+
+
 @router.get("/views", response_model=models.Views)
 async def views(lift: str, deps: Deps, ask: Ask, limit: Limit = VIEWS, cursor: ViewsCursor = 0) -> models.Views:
     """The cameras of the scene with their poses, in pages; also those that were not lifted."""
@@ -51,5 +79,8 @@ async def views(lift: str, deps: Deps, ask: Ask, limit: Limit = VIEWS, cursor: V
     answer = await anyio.to_thread.run_sync(page)
     names = [view["name"] for view in answer["views"]]
     lifted = await anyio.to_thread.run_sync(deps.store.lifts.lifted, deps.owner, lift, names, limiter=deps.naming)
-    told = [models.View(lifted=view["name"] in lifted, **view) for view in answer["views"]]
+    photos = await anyio.to_thread.run_sync(_with_photo, deps, lift, names, limiter=deps.naming)
+    told = [
+        models.View(lifted=view["name"] in lifted, photo=view["name"] in photos, **view) for view in answer["views"]
+    ]
     return models.Views(views=told, next=cursor + most if answer["more"] else None)

@@ -14,7 +14,7 @@ from typing import Any
 
 from liftcore.errors import NotFound
 from service.errors import InUse
-from service.models import AssetKind
+from service.models import AssetKind, UploadKind
 from service.store.database import Database, Page, after, insert, page_of, record_of
 from service.store.files import DataDirectory, is_whole
 from service.store.owners import SEEN, Owner, require_quota
@@ -53,7 +53,7 @@ class CheckedUpload:
     """A draft that is whole and valid, ready to become an asset."""
 
     draft: Path
-    kind: AssetKind
+    kind: UploadKind
     sha256: str
     suffix: str
     counts: dict[str, Any]
@@ -189,7 +189,8 @@ class AssetStore:
                 users = connection.execute(
                     f"SELECT id FROM jobs WHERE {SEEN} AND (splats = :asset OR cameras = :asset OR EXISTS"
                     " (SELECT 1 FROM job_features WHERE job = id AND asset = :asset) OR EXISTS"
-                    " (SELECT 1 FROM job_labels WHERE job = id AND asset = :asset)) LIMIT 4",
+                    " (SELECT 1 FROM job_labels WHERE job = id AND asset = :asset) OR EXISTS"
+                    " (SELECT 1 FROM lifts WHERE lifts.id = jobs.id AND photos = :asset)) LIMIT 4",
                     terms,
                 ).fetchall()
                 if users:

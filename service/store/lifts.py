@@ -5,9 +5,11 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import secrets
 import sqlite3
 import sys
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +20,7 @@ from service.store.assets import own
 from service.store.database import Database, Page, after, insert, page_of, parsed, record_of
 from service.store.files import DataDirectory
 from service.store.jobs import JobOrder, succeed, told
-from service.store.owners import SEEN, Owner
+from service.store.owners import SEEN, Owner, require_quota
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,7 @@ class LiftRecord:
     path: Path
     count: int
     channels: int
+    name: str | None  # that somebody gave it
     metadata: dict[str, Any]  # without the names of views and the words where these are very many
     view_count: int
     first_view: str | None
@@ -49,6 +52,7 @@ class LiftRecord:
     splats: str  # ids of the assets that it was made of
     cameras: str
     features: tuple[str, ...]
+    photos: str | None  # of its views
 
 
 @dataclass(frozen=True)
@@ -83,13 +87,24 @@ SHOWN_BYTES = 64 << 10  # of metadata; of more the names of views, which may be 
 LONG = ("views", "words")  # what metadata leave out then
 VISIBLE = (
     "SELECT lifts.id, bytes, sha256, file, count, channels, view_count, first_view, lifts.created, splats, cameras,"
-    f" CASE WHEN metadata_bytes <= {SHOWN_BYTES} THEN metadata ELSE brief END AS metadata, {FEATURES} AS features"
-    f" FROM lifts JOIN jobs USING (id) WHERE {SEEN}"
+    f" name, photos, CASE WHEN metadata_bytes <= {SHOWN_BYTES} THEN metadata ELSE brief END AS metadata,"
+    f" {FEATURES} AS features FROM lifts JOIN jobs USING (id) WHERE {SEEN}"
 )
 VISIBLE_TRADEOFFS = (
     "SELECT tradeoffs.*, splats, cameras, json_extract(parameters, '$.labels') AS labels,"
     f" {FEATURES} AS features FROM tradeoffs JOIN jobs USING (id) WHERE {SEEN}"
 )
+
+
+def order_of(metadata: Mapping[str, Any]) -> JobOrder:
+    """What a lift was made of, as its file remembers it: the order of its job.
+
+    Raises:
+        KeyError, TypeError: these are no metadata of a lift.
+    """
+    files = (metadata["splats"], metadata["cameras"], *metadata["features"])
+    splats, cameras, *features = [f"sha256:{file['sha256']}" for file in files]
+    return JobOrder(splats, cameras, tuple(features), metadata["settings"])
 
 
 class LiftStore:
@@ -120,17 +135,38 @@ class LiftStore:
             raise
         return True
 
-    def adopt(self, owner: Owner, job: str, order: JobOrder, made: FinishedLift) -> None:
-        """Keep a lift whose file lies where it belongs and whose row, and perhaps its job, was lost.
+    def take(self, owner: Owner, order: JobOrder, made: FinishedLift) -> LiftRecord:
+        """Keep a lift that was made elsewhere, as the result of a job that nobody waited for.
 
         Args:
-            owner: of the job, if it was lost.
+            owner: whose it is.
+            order: what it was made of; the assets are here.
+            made: of a draft that was checked.
+
+        Raises:
+            OverQuota: it would be more than the owner may store.
+            NotFound: an asset was deleted meanwhile.
+        """
+        job = secrets.token_hex(16)
+        try:
+            self.adopt(owner, job, order, made)
+        except sqlite3.IntegrityError:
+            raise NotFound("lift", expected="its splats and cameras", got="one was deleted a moment ago") from None
+        return self.get(owner, job)
+
+    def adopt(self, owner: Owner, job: str, order: JobOrder, made: FinishedLift) -> None:
+        """Keep a lift that has no row, and perhaps no job, from a draft or from where it belongs.
+
+        Args:
+            owner: of the job, if there is none.
             job: its id.
             order: what it was made of; the assets are here.
-            made: of the file itself, not of a draft.
+            made: of the draft, or of the file itself.
         """
-        status = made.draft.stat()
+        path, status = self._files.lift(job), made.draft.stat()
         with self._database.write(counted=True) as connection:
+            if made.draft != path:
+                require_quota(connection, owner, status.st_size)
             row = connection.execute(
                 "INSERT INTO jobs (id, owner, state, attempt, splats, cameras, settings, created, started, ended)"
                 " VALUES (:id, :owner, 'succeeded', 1, :splats, :cameras, :settings, :time, :time, :time)"
@@ -151,6 +187,43 @@ class LiftStore:
                 own(connection, asset, row["owner"])
             told(connection, row)
             self._insert(connection, job, made, status.st_size, status.st_mtime)
+            if made.draft != path:
+                self._files.publish(made.draft, path)
+
+    def change(self, owner: Owner, lift: str, changes: Mapping[str, str | None]) -> LiftRecord:
+        """Give a lift another ``name`` or other ``photos``, an asset that is here; None takes them away.
+
+        Raises:
+            NotFound: there is no such lift, or there are no such photos.
+        """
+        self.get(owner, lift)
+        with self._database.write(counted=True) as connection:
+            photos = changes.get("photos")
+            if photos is not None:
+                self._own_photos(connection, owner, lift, photos)
+            for column in changes.keys() & {"name", "photos"}:
+                connection.execute(f"UPDATE lifts SET {column} = ? WHERE id = ?", (changes[column] or None, lift))
+        return self.get(owner, lift)
+
+    def _own_photos(self, connection: sqlite3.Connection, owner: Owner, lift: str, photos: str) -> None:
+        """Within a write transaction: let the lift's owner have them, whoever of those who see them it is."""
+        row = connection.execute(
+            f"SELECT 1 FROM assets JOIN asset_owners ON asset = id WHERE id = :photos AND kind = 'photos' AND {SEEN}",
+            owner.terms(photos=photos),
+        ).fetchone()
+        if row is None:
+            hint = "PUT /assets/photos first"
+            raise NotFound("photos", expected="an asset of kind photos that is here", got=photos, hint=hint)
+        own(
+            connection, photos, connection.execute("SELECT owner FROM jobs WHERE id = ?", (lift,)).fetchone()["owner"]
+        )
+
+    def of_file(self, owner: Owner, sha256: str) -> LiftRecord | None:
+        """The lift of a file with that digest, None when there is none."""
+        with self._database.read() as connection:
+            terms = owner.terms(sha256=sha256)
+            row = connection.execute(f"{VISIBLE} AND sha256 = :sha256 LIMIT 1", terms).fetchone()
+        return None if row is None else self._record(row)
 
     def _insert(
         self, connection: sqlite3.Connection, job: str, made: FinishedLift, size: int, created: float

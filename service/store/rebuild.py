@@ -15,14 +15,15 @@ from safetensors import SafetensorError, safe_open
 
 from liftcore.errors import InvalidLift, NotFound, SplatliftError
 from liftcore.io.splats import SUFFIX
+from service.errand import ErrandLimits
 from service.models import JOB_ID, AssetKind
+from service.photos import holds_photos
 from service.settings import ServiceSettings
 from service.store.assets import CheckedUpload
-from service.store.jobs import JobOrder
-from service.store.lifts import FinishedLift
+from service.store.lifts import FinishedLift, order_of
 from service.store.owners import SERVICE
 from service.store.store import Store
-from service.uploads.intake import CheckLimits, check
+from service.uploads.intake import check
 
 
 def rebuild(store: Store, settings: ServiceSettings) -> dict[str, Any]:
@@ -61,7 +62,7 @@ def _add_asset(store: Store, settings: ServiceSettings, path: Path) -> AssetKind
         raise NotFound("asset", expected="a file named after its sha256", got=f"one whose sha256 is {digest}")
     kind = _kind_of(path)
     with store.files.scratch() as scratch:
-        limits = CheckLimits(settings.check_seconds, settings.check_memory_bytes, threading.Event())
+        limits = ErrandLimits(settings.check_seconds, settings.check_memory_bytes, threading.Event())
         report = check(kind, path, scratch, limits)
     # The file is its own draft: it stays where it is.
     store.assets.add(SERVICE, CheckedUpload(path, kind, digest, path.suffix, report.counts, report.warnings))
@@ -72,7 +73,7 @@ def _kind_of(path: Path) -> AssetKind:
     if path.suffix in SUFFIX.values():
         return AssetKind.SPLATS
     if path.suffix == ".json" or zipfile.is_zipfile(path):
-        return AssetKind.CAMERAS
+        return AssetKind.PHOTOS if path.suffix == ".zip" and holds_photos(path) else AssetKind.CAMERAS
     names = _header(path)[0]
     if names == {"embeddings"}:
         return AssetKind.TABLE
@@ -86,10 +87,7 @@ def _add_lift(store: Store, path: Path) -> None:
     _, metadata, shape = _header(path)
     try:
         told = json.loads(metadata["splatlift"])
-        splats, cameras, *features = [
-            f"sha256:{file['sha256']}" for file in (told["splats"], told["cameras"], *told["features"])
-        ]
-        order = JobOrder(splats, cameras, tuple(features), told["settings"])
+        order = order_of(told)
         count, channels = shape
     except (KeyError, TypeError, ValueError) as error:
         raise InvalidLift("lift", expected="the metadata of a lift", got=f"none that tell of it: {error!r}") from None

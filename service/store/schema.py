@@ -152,4 +152,10 @@ UPDATE lifts SET metadata_bytes = length(metadata), view_count = coalesce(json_a
     first_view = json_extract(metadata, '$.views[0]'), brief = json_remove(metadata, '$.views',
     '$.certificate.views_without_camera', '$.certificate.views_without_splats');
 """,
+    """
+ALTER TABLE lifts ADD COLUMN name TEXT;             -- that somebody gave it
+ALTER TABLE lifts ADD COLUMN photos TEXT REFERENCES assets (id);
+CREATE INDEX lifts_by_photos ON lifts (photos);
+CREATE INDEX lifts_by_digest ON lifts (sha256);
+""",
 )

@@ -2,14 +2,27 @@
 
 from __future__ import annotations
 
-from liftcore.errors import InvalidCameras, InvalidFeatures, InvalidInput, InvalidMasks, InvalidSplats, InvalidTable
-from service.models import AssetKind
+from liftcore.errors import (
+    InvalidCameras,
+    InvalidFeatures,
+    InvalidInput,
+    InvalidLift,
+    InvalidMasks,
+    InvalidPhotos,
+    InvalidSplats,
+    InvalidTable,
+)
+from service.models import AssetKind, UploadKind
+
+LIFT = "lift"
 
 # What a malformed file of a kind is told as.
-INVALID: dict[AssetKind, type[InvalidInput]] = {
+INVALID: dict[UploadKind, type[InvalidInput]] = {
     AssetKind.SPLATS: InvalidSplats,
     AssetKind.CAMERAS: InvalidCameras,
     AssetKind.FEATURES: InvalidFeatures,
     AssetKind.MASKS: InvalidMasks,
     AssetKind.TABLE: InvalidTable,
+    AssetKind.PHOTOS: InvalidPhotos,
+    LIFT: InvalidLift,
 }

@@ -10,20 +10,28 @@ import json
 import resource
 import sys
 import zipfile
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from liftcore.errors import InvalidCameras, InvalidInput, InvalidSplats, SplatliftError
+import numpy as np
+
+from liftcore.errors import InvalidCameras, InvalidInput, InvalidLift, InvalidSplats, SplatliftError
 from liftcore.features.pack import read_features
 from liftcore.io.checkpoint import EXPORT_PLY
 from liftcore.io.class_masks import describe_masks
 from liftcore.io.inspect import describe_camera_file, describe_packs, describe_splat_file, describe_table
 from liftcore.io.json_file import finite
+from liftcore.io.lift_file import parse_metadata, read_lift
 from liftcore.io.splats import SUFFIX, SplatFormat, format_of
 from liftcore.query.text.table import TableEncoder
 from service.child import die_with_parent, end_with_parent, fault_of, own_stdout
-from service.models import VIEW_CHARACTERS, AssetKind
-from service.uploads import INVALID
+from service.models import VIEW_CHARACTERS, AssetKind, UploadKind
+from service.photos import describe_photos
+from service.store.lifts import LONG, SHOWN_BYTES
+from service.uploads import INVALID, LIFT
+
+BLOCK_ROWS = 1 << 14  # of a lift, looked at together
 
 
 def check_splats(path: Path) -> dict[str, Any]:
@@ -38,14 +46,19 @@ def check_splats(path: Path) -> dict[str, Any]:
 def check_cameras(path: Path) -> dict[str, Any]:
     """Read and describe every camera; each must have a name that a query can say."""
     found = describe_camera_file(path)
-    for name in found["names"]:
+    require_view_names(found["names"], InvalidCameras)
+    return {"suffix": ".zip" if zipfile.is_zipfile(path) else ".json", "found": found}
+
+
+def require_view_names(names: Iterable[str], error: type[InvalidInput]) -> None:
+    """See that a query can say each of these names."""
+    for name in names:
         if not 1 <= len(name) <= VIEW_CHARACTERS:
-            raise InvalidCameras(
+            raise error(
                 "camera name", expected=f"1 to {VIEW_CHARACTERS} characters",
                 got=f"{len(name)}: {name[:40]!r}..." if name else "an empty one",
                 hint="name each image, without folders where that is enough",
             )  # fmt: skip
-    return {"suffix": ".zip" if zipfile.is_zipfile(path) else ".json", "found": found}
 
 
 def check_features(path: Path) -> dict[str, Any]:
@@ -64,16 +77,41 @@ def check_table(path: Path) -> dict[str, Any]:
     return {"suffix": ".safetensors", "found": describe_table(path) | {"words": words}}
 
 
-CHECKS = {
+def check_photos(path: Path) -> dict[str, Any]:
+    """Read every photo."""
+    return {"suffix": ".zip", "found": describe_photos(path)}
+
+
+def check_lift(path: Path) -> dict[str, Any]:
+    """Read every number of a lift, and bound what its metadata say; its names of views must be ones to query by."""
+    arrays, told = read_lift(path)
+    metadata = finite(json.loads(parse_metadata(told, path).model_dump_json()))
+    for name, values in arrays.items():
+        for first in range(0, len(values), BLOCK_ROWS):
+            if not np.isfinite(values[first : first + BLOCK_ROWS]).all():
+                raise InvalidLift("lift", expected="finite numbers", got=f"others in {name!r} from row {first} on")
+    require_view_names(metadata["views"], InvalidLift)
+    brief = len(json.dumps({name: value for name, value in metadata.items() if name not in LONG}))
+    if brief > SHOWN_BYTES:
+        expected = f"at most {SHOWN_BYTES} bytes of metadata beside the names of views and the words"
+        raise InvalidLift("lift", expected=expected, got=f"{brief}")
+    count, channels = arrays["features"].shape
+    found = {"count": count, "channels": channels, "metadata": metadata, "warnings": []}
+    return {"suffix": ".safetensors", "found": found}
+
+
+CHECKS: dict[UploadKind, Callable[[Path], dict[str, Any]]] = {
     AssetKind.SPLATS: check_splats,
     AssetKind.CAMERAS: check_cameras,
     AssetKind.FEATURES: check_features,
     AssetKind.MASKS: check_masks,
     AssetKind.TABLE: check_table,
+    AssetKind.PHOTOS: check_photos,
+    LIFT: check_lift,
 }
 
 
-def run(kind: AssetKind, path: Path) -> dict[str, Any]:
+def run(kind: UploadKind, path: Path) -> dict[str, Any]:
     """Check one file; the last message."""
     try:
         checked = CHECKS[kind](path)
@@ -90,11 +128,11 @@ def run(kind: AssetKind, path: Path) -> dict[str, Any]:
     }
 
 
-def _invalid(error: SplatliftError, kind: AssetKind, path: Path) -> dict[str, Any]:
+def _invalid(error: SplatliftError, kind: UploadKind, path: Path) -> dict[str, Any]:
     return {"event": "invalid", "fault": fault_of(error, {str(path): kind, f"text table {path.name}": kind})}
 
 
-def _out_of_memory(kind: AssetKind) -> InvalidInput:
+def _out_of_memory(kind: UploadKind) -> InvalidInput:
     return INVALID[kind](kind, expected="a file that fits the memory of a check", got="one that needs more")
 
 
@@ -105,7 +143,8 @@ def _say(out: BinaryIO, message: dict[str, Any]) -> None:
 
 def main() -> None:
     """Check the file that the command line names."""
-    kind, path, memory = AssetKind(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3])
+    kind: UploadKind = LIFT if sys.argv[1] == LIFT else AssetKind(sys.argv[1])
+    path, memory = Path(sys.argv[2]), int(sys.argv[3])
     out = own_stdout()
     die_with_parent()
     end_with_parent()  # it may have died before

@@ -9,27 +9,26 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import json
 import logging
-import os
-import signal
-import subprocess
-import sys
-import threading
-import time
 import zlib
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Generic, TypeVar
 
 import zstandard
 
+from liftcore.errors import InvalidLift
+from liftcore.scene.views import require_pairs
 from service.child import error_of
-from service.errors import Busy, Crashed, DigestMismatch, InvalidEncoding, TooLarge, UnsupportedEncoding
-from service.models import AssetKind
+from service.errand import ErrandLimits, run_errand
+from service.errors import Crashed, DigestMismatch, InvalidEncoding, TooLarge, UnsupportedEncoding
+from service.models import AssetKind, UploadKind
 from service.store.assets import AssetRecord, CheckedUpload
+from service.store.files import is_whole
+from service.store.lifts import FinishedLift, LiftRecord, order_of
 from service.store.owners import Owner
 from service.store.store import Store
 from service.uploads import INVALID
@@ -38,10 +37,9 @@ GZIP_WINDOW = 31  # zlib's name for "a gzip header and a 32 KiB window"
 ZSTD_WINDOW_BYTES = 8 << 20  # the largest that RFC 9659 lets a Content-Encoding ask for
 MAX_MEMBERS = 1_000_000  # of a concatenated body; bgzip makes one of each 64 KiB
 STEP = 4 << 20  # bytes of content between two looks at what may still be stored
-TICK_SECONDS = 0.5  # how soon the end of the server is seen by who waits for a check
 CHECK_BASE_BYTES, CHECK_FACTOR = 1 << 30, 16  # private memory of a check: a reader holds several copies of a file
 TRACE_CHARACTERS = 4000  # of a check that died, in the log
-HINTS = {AssetKind.FEATURES: "several feature packs may make one lift, so features can be cut"}
+HINTS: dict[UploadKind, str] = {AssetKind.FEATURES: "several feature packs may make one lift, so features can be cut"}
 
 log = logging.getLogger(__name__)
 
@@ -122,7 +120,7 @@ class Decoding:
         return InvalidEncoding("body", expected=expected, got=got, hint=hint)
 
 
-def require_size(kind: AssetKind, count: int, limit: int) -> None:
+def require_size(kind: UploadKind, count: int, limit: int) -> None:
     """See that a body of so many bytes may come.
 
     Raises:
@@ -134,30 +132,23 @@ def require_size(kind: AssetKind, count: int, limit: int) -> None:
         )
 
 
-@dataclass(frozen=True)
-class CheckLimits:
-    """What the check of one upload may take."""
-
-    seconds: float
-    memory_bytes: int  # whatever its size
-    ending: threading.Event  # set when the server must end, and every check with it
+Taken = TypeVar("Taken", AssetRecord, LiftRecord)
 
 
-class Intake:
+class Intake(ABC, Generic[Taken]):
     """One upload. All methods work on files: call them in threads, one at a time.
 
     Args:
         store: that takes it.
         owner: for whom.
-        kind: what the body is to be.
         limit: bytes that may come, and come out after decompression.
         coding: how the body is compressed.
     """
 
-    def __init__(self, store: Store, owner: Owner, kind: AssetKind, limit: int, coding: Coding | None) -> None:
+    def __init__(self, store: Store, owner: Owner, kind: UploadKind, limit: int, coding: Coding | None) -> None:
         self._store = store
         self._owner = owner
-        self._kind = kind
+        self._kind: UploadKind = kind
         self._limit = limit
         self._decoding = None if coding is None else Decoding(coding)
         self._received = self._written = self._permitted = 0
@@ -205,14 +196,14 @@ class Intake:
         self._digest.update(content)
         self._file.write(content)
 
-    def finish(self, promised: str | None) -> AssetRecord | None:
+    def finish(self, promised: str | None) -> Taken | None:
         """Call once after the last byte.
 
         Args:
             promised: the sha256 in hex that the client said, if it did.
 
         Returns:
-            The asset, when its owner has these very bytes already.
+            What there is, when its owner has these very bytes already.
 
         Raises:
             InvalidEncoding: a compressed body ended early.
@@ -225,10 +216,9 @@ class Intake:
         digest = self._digest.hexdigest()
         if promised is not None and digest != promised.lower():
             raise DigestMismatch("sha256", expected=promised, got=digest, hint="upload the file again")
-        known = self._store.assets.find(self._owner, f"sha256:{digest}")
-        return known if known is not None and known.kind is self._kind and known.whole else None
+        return self._known(digest)
 
-    def check(self, limits: CheckLimits) -> CheckedUpload:
+    def check(self, limits: ErrandLimits) -> CheckedUpload:
         """Read the whole draft in a process of its own.
 
         Raises:
@@ -240,13 +230,51 @@ class Intake:
         digest = self._digest.hexdigest()
         return CheckedUpload(self._draft, self._kind, digest, report.suffix, report.counts, report.warnings)
 
-    def keep(self, upload: CheckedUpload) -> tuple[AssetRecord, bool]:
-        """Make an asset of it; whether its owner did not have it before.
+    @abstractmethod
+    def _known(self, digest: str) -> Taken | None: ...
+
+    @abstractmethod
+    def keep(self, upload: CheckedUpload) -> tuple[Taken, bool]:
+        """Make of it what it is for; whether its owner did not have it before.
 
         Raises:
             OverQuota: it would be more than the owner may store.
+            NotFound, InvalidLift: it does not go with what is here.
         """
+
+
+class AssetIntake(Intake[AssetRecord]):
+    """The upload of an asset."""
+
+    def _known(self, digest: str) -> AssetRecord | None:
+        known = self._store.assets.find(self._owner, f"sha256:{digest}")
+        return known if known is not None and known.kind == self._kind and known.whole else None
+
+    def keep(self, upload: CheckedUpload) -> tuple[AssetRecord, bool]:
+        """Make an asset of it."""
         return self._store.assets.add(self._owner, upload)
+
+
+class LiftIntake(Intake[LiftRecord]):
+    """The upload of a lift that was made elsewhere: its splats and cameras are here, under their digests."""
+
+    def _known(self, digest: str) -> LiftRecord | None:
+        known = self._store.lifts.of_file(self._owner, digest)
+        return known if known is not None and is_whole(known.path, known.bytes) else None
+
+    def keep(self, upload: CheckedUpload) -> tuple[LiftRecord, bool]:
+        """Make a lift of it."""
+        told, assets = upload.counts, self._store.assets
+        order = order_of(told["metadata"])
+        splats = assets.get(self._owner, order.splats, AssetKind.SPLATS)
+        if splats.counts["splats"] != told["count"]:
+            got = f"{told['count']} for {splats.counts['splats']} splats"
+            raise InvalidLift("lift", expected="a row for each splat", got=got)
+        cameras = assets.get(self._owner, order.cameras, AssetKind.CAMERAS)
+        require_pairs(told["metadata"]["views"], cameras.counts["names"])
+        packs = tuple(pack for pack in order.features if assets.find(self._owner, pack, most=0) is not None)
+        made = FinishedLift(upload.draft, upload.sha256, told["count"], told["channels"], told["metadata"])
+        return self._store.lifts.take(self._owner, replace(order, features=packs), made), True
 
 
 @dataclass(frozen=True)
@@ -258,7 +286,7 @@ class Report:
     warnings: list[str]
 
 
-def check(kind: AssetKind, path: Path, scratch: Path, limits: CheckLimits) -> Report:
+def check(kind: UploadKind, path: Path, scratch: Path, limits: ErrandLimits) -> Report:
     """Read a whole file in a process of its own, which unpacks into ``scratch`` and ends with this process.
 
     Raises:
@@ -267,67 +295,24 @@ def check(kind: AssetKind, path: Path, scratch: Path, limits: CheckLimits) -> Re
         Busy: the server ended meanwhile.
     """
     memory = min(limits.memory_bytes, CHECK_BASE_BYTES + CHECK_FACTOR * _size(path))
-    process = subprocess.Popen(
-        [sys.executable, "-m", "service.uploads.check", kind, str(path), str(memory)],
-        stdin=subprocess.PIPE,  # its lifeline
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        start_new_session=True,
-        env=os.environ | {"TMPDIR": str(scratch)},
-    )
-    with process:
-        heard = _listen(process, limits)
-        if heard is None:
-            os.killpg(process.pid, signal.SIGKILL)
-            process.communicate()
-    if heard is not None:
-        return _report(kind, heard[0], process.returncode, heard[1])
-    if limits.ending.is_set():
-        raise Busy("upload", expected="a running server", got="one that stops", hint="send it again")
-    raise INVALID[kind](
-        kind, expected=f"a file that is read within {limits.seconds:g} s", got="one that takes longer"
-    )
+    heard = run_errand("service.uploads.check", [kind, str(path), str(memory)], scratch, limits)
+    if heard is None:
+        raise INVALID[kind](
+            kind, expected=f"a file that is read within {limits.seconds:g} s", got="one that takes longer"
+        )
+    if heard.last["event"] == "valid":
+        return Report(suffix=heard.last["suffix"], counts=heard.last["counts"], warnings=heard.last["warnings"])
+    if heard.last["event"] == "invalid":
+        raise error_of(heard.last["fault"])
+    log.error("the check of %s ended with %d: %s", kind, heard.returncode, heard.trace[-TRACE_CHARACTERS:])
+    if heard.last["event"] == "ready":
+        # It had started to read: whatever ended it, this file did.
+        raise INVALID[kind](
+            kind, expected="a file that its reader can take", got=f"one that ended it with {heard.returncode}",
+            hint="it may be broken, or need more memory than an upload may take",
+        )  # fmt: skip
+    raise Crashed("check", expected="a process that starts", got=f"one that ended with {heard.returncode}")
 
 
 def _size(path: Path) -> int:
     return path.stat().st_size if path.exists() else 0
-
-
-def _listen(process: subprocess.Popen[bytes], limits: CheckLimits) -> tuple[bytes, bytes] | None:
-    """What the process says on stdout and stderr until it ends; None when it must be ended."""
-    assert process.stdout is not None and process.stderr is not None
-    said: dict[str, bytes] = {}
-    pipes = {"out": process.stdout, "error": process.stderr}
-    # Not `communicate`, which closes stdin first.
-    readers = [
-        threading.Thread(target=lambda name=name, pipe=pipe: said.update({name: pipe.read()}), daemon=True)
-        for name, pipe in pipes.items()
-    ]
-    for reader in readers:
-        reader.start()
-    deadline = time.monotonic() + limits.seconds
-    while not limits.ending.is_set() and (left := deadline - time.monotonic()) > 0:
-        readers[0].join(min(left, TICK_SECONDS))
-        if not readers[0].is_alive():
-            readers[1].join()
-            process.wait()
-            return said["out"], said["error"]
-    return None
-
-
-def _report(kind: AssetKind, output: bytes, returncode: int, trace: bytes) -> Report:
-    messages = [json.loads(line) for line in output.splitlines()]
-    last: dict[str, Any] = messages[-1] if messages else {"event": "nothing"}
-    if last["event"] == "valid":
-        return Report(suffix=last["suffix"], counts=last["counts"], warnings=last["warnings"])
-    if last["event"] == "invalid":
-        raise error_of(last["fault"])
-    told = trace.decode(errors="replace")[-TRACE_CHARACTERS:]
-    log.error("the check of %s ended with %d: %s", kind, returncode, told)
-    if last["event"] == "ready":
-        # It had started to read: whatever ended it, this file did.
-        raise INVALID[kind](
-            kind, expected="a file that its reader can take", got=f"one that ended it with {returncode}",
-            hint="it may be broken, or need more memory than an upload may take",
-        )  # fmt: skip
-    raise Crashed("check", expected="a process that starts", got=f"one that ended with {returncode}")

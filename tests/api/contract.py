@@ -26,6 +26,7 @@ import httpx
 
 from service.__main__ import server_of
 from service.app import create_app, job_limits, query_limits
+from service.errand import Heard
 from service.jobs.supervisor import Supervisor
 from service.queries.client import QueryClient
 from service.scopes import Scope
@@ -55,8 +56,15 @@ def served(data: Path, *, keys: bool, **settings: Any) -> Iterator[tuple[str, st
     listener = socket.create_server(("127.0.0.1", 0))
     server = server_of(create_app(chosen, store, runner, QueryClient(query_limits(chosen))), chosen)
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
-    report = Report(".bin", {"names": ["v"], "channels": 1, "classes": 1, "words": ["apple"]}, [])
-    with mock.patch("service.uploads.intake.check", lambda *given: report):
+    nowhere = {"sha256": "0" * 64}
+    metadata = {"splats": nowhere, "cameras": nowhere, "features": [], "settings": {}, "views": ["v"]}
+    lift = {"metadata": metadata, "count": 1}
+    report = Report(".bin", {"names": ["v"], "channels": 1, "classes": 1, "words": ["apple"], **lift}, [])
+    planned = Heard({"event": "valid", "plan": {"summary": [], "warnings": []}}, 0, "")
+    with (
+        mock.patch("service.uploads.intake.check", lambda *given: report),
+        mock.patch("service.routes.jobs.run_errand", lambda *given: planned),
+    ):
         thread.start()
         try:
             until(lambda: server.started)

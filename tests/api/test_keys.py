@@ -40,6 +40,7 @@ PAGE = {"/", "/web/page.js", "/web/page.css", "/web/LICENSES.txt"}
 OPEN_ROUTES = {*PAGE, "/healthz", "/readyz", "/version", *DOCS}
 # Routes that name nothing of anybody: they show one's own things, or make new ones.
 NAMELESS = {("GET", "/metrics"), ("GET", "/assets"), ("PUT", "/assets/{asset}"), ("GET", "/jobs"), ("GET", "/lifts")}
+NAMELESS |= {("POST", "/lifts")}
 ASKING = {"text": "apple", "view": "v"}
 
 
@@ -100,7 +101,11 @@ def test_scopes_are_as_documented(method: str, path: str, scope: str) -> None:
 
 def naming(method: str, path: str, job: str, asset: str, house: Guarded) -> list[dict[str, Any]]:
     """Requests to a route that name a job, a lift or an asset, once for each place that takes a name."""
-    if path in ("/lift", "/tradeoff"):
+    if method == "PATCH":
+        return [{"json": {"name": "a name"}}]
+    if path.endswith("/photo"):
+        return [{"params": {"view": "v"}}]
+    if path in ("/lift", "/lift/plan", "/tradeoff"):
         absent = {"splats": asset, "cameras": asset, "features": [asset]}
         wrong = [{place: name} for place, name in absent.items()]
         if path == "/tradeoff":

@@ -26,6 +26,7 @@ from prometheus_client import REGISTRY
 from prometheus_client.parser import text_string_to_metric_families
 
 from service.__main__ import AnnouncingServer
+from service.errand import ErrandLimits
 from service.errors import Busy
 from service.jobs.process import JobLimits
 from service.jobs.supervisor import Supervisor
@@ -35,7 +36,7 @@ from service.state import Stopping
 from service.store.owners import SERVICE
 from service.store.store import Store
 from service.streams import EventStreams
-from service.uploads.intake import CheckLimits, check
+from service.uploads.intake import check
 from tests.crash.conftest import order, stand_in, until
 from tests.crash.service_process import ServiceProcess, processes_of
 
@@ -341,7 +342,7 @@ def test_stop_ends_a_check_that_would_take_long(tmp_path: Path) -> None:
     fifo = tmp_path / "never.ply"
     os.mkfifo(fifo)  # who opens it waits for a writer, for ever
     ending, ended = threading.Event(), []
-    limits = CheckLimits(300.0, 1 << 33, ending)
+    limits = ErrandLimits(300.0, 1 << 33, ending)
 
     def run() -> None:
         with pytest.raises(Busy):

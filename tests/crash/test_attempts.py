@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 
+from service import errand
 from service.jobs import process as processes
 from service.jobs.process import mark
 from service.jobs.supervisor import Lease
@@ -309,10 +310,10 @@ def test_check_may_take_memory_by_the_size_of_its_upload(
 
     with (tmp_path / "upload").open("wb") as handle:
         handle.truncate(size)
-    monkeypatch.setattr(intake.subprocess, "Popen", noted)
+    monkeypatch.setattr(errand.subprocess, "Popen", noted)
     with pytest.raises(OSError, match="noted"):
         intake.check(
-            AssetKind.SPLATS, tmp_path / "upload", tmp_path, intake.CheckLimits(1.0, 8 << 30, threading.Event())
+            AssetKind.SPLATS, tmp_path / "upload", tmp_path, errand.ErrandLimits(1.0, 8 << 30, threading.Event())
         )
     assert int(asked[-1]) == most
 

@@ -139,7 +139,7 @@ class StoreMachine(RuleBasedStateMachine):
         self, data: Any, key: str | None, print_: str, mistaken: bool, who: str, kind: JobKind, labelled: bool
     ) -> None:
         chosen = []
-        wanted = [*AssetKind] if labelled and kind is JobKind.TRADEOFF else [*AssetKind][:3]
+        wanted = [*AssetKind][:5] if labelled and kind is JobKind.TRADEOFF else [*AssetKind][:3]
         for needed in wanted:
             right = [asset for asset in sorted(self.assets) if self.assets[asset].startswith(needed.encode())]
             chosen.append(data.draw(st.sampled_from(sorted(self.assets) if mistaken or not right else right)))

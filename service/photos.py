@@ -1,0 +1,124 @@
+"""Photos of a scene: a zip of JPEG and PNG files that are named like its views."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from collections.abc import Collection, Iterator, Mapping
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from liftcore.errors import InvalidPhotos, NotFound
+from liftcore.scene.views import cameras_of_views, view_names
+
+MOST = 10_000  # photos in a zip
+LARGEST_BYTES = 64 << 20  # of a photo: 100 million pixels as a good JPEG
+SIDE = 20_000  # pixels: what browsers decode ends there
+SPARE_BYTES = 1 << 20  # beside twice the archive: photos hardly shrink in a zip, bombs grow a thousandfold out of it
+BLOCK_BYTES = 256 << 10
+MEDIA_TYPES = {".jpg": "image/jpeg", ".jpeg": "image/jpeg", ".png": "image/png"}
+FORMATS = {"image/jpeg": "JPEG", "image/png": "PNG"}
+ENCRYPTED = 0x1  # of a member's flags
+EXPECTED = "a zip of JPEG or PNG photos, named like the views"
+
+
+def describe_photos(path: Path) -> dict[str, Any]:
+    """Read a zip whole: how many ``photos``, their ``names`` as views have them, and ``warnings``.
+
+    Raises:
+        InvalidPhotos: it is no zip, a photo is none or too large, or it would unpack to much more than it is.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            entries = archive.infolist()
+            members = _members(entries)
+            _require_bounds(entries, members, path.stat().st_size)
+            for member in members.values():
+                _require_photo(archive, member)
+    except (zipfile.BadZipFile, NotImplementedError, EOFError, OSError, ValueError) as error:
+        raise InvalidPhotos("photos", expected=EXPECTED, got=f"{error}"[:200] or "a damaged one") from None
+    others = len(entries) - len(members)
+    warnings = [f"{others} entries are no .jpg, .jpeg or .png and are left alone"] if others else []
+    return {"photos": len(members), "names": list(members), "warnings": warnings}
+
+
+def _members(entries: Collection[zipfile.ZipInfo]) -> dict[str, zipfile.ZipInfo]:
+    """View -> photo, of what has the name of one; what systems put beside it (``__MACOSX``, dot files) has not."""
+    photos = [entry for entry in entries if _media_type(entry.filename) and not _beside(entry.filename)]
+    return dict(zip(view_names([photo.filename for photo in photos]), photos, strict=True))
+
+
+def _beside(name: str) -> bool:
+    path = PurePosixPath(name)
+    return path.name.startswith(".") or "__MACOSX" in path.parts
+
+
+def _media_type(name: str) -> str:
+    return MEDIA_TYPES.get(PurePosixPath(name).suffix.lower(), "")
+
+
+def _require_bounds(entries: Collection[zipfile.ZipInfo], members: Mapping[str, zipfile.ZipInfo], size: int) -> None:
+    unpacked = sum(member.file_size for member in members.values())
+    largest = max((member.file_size for member in members.values()), default=0)
+    if not 0 < len(members) <= MOST or len(entries) > 2 * MOST:
+        raise InvalidPhotos(
+            "photos", expected=f"1 to {MOST} photos", got=f"{len(members)} among {len(entries)} files"
+        )
+    if largest > LARGEST_BYTES or unpacked > 2 * size + SPARE_BYTES:
+        expected = f"photos of at most {LARGEST_BYTES} bytes, and together at most twice the zip"
+        raise InvalidPhotos("photos", expected=expected, got=f"{largest} bytes in one, {unpacked} in a zip of {size}")
+
+
+def _require_photo(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> None:
+    from PIL import Image, UnidentifiedImageError  # in the check of an upload alone
+
+    kind, shown = FORMATS[_media_type(member.filename)], member.filename[:80]
+    if member.flag_bits & ENCRYPTED:
+        raise InvalidPhotos(shown, expected="a photo that is not encrypted", got="one that is")
+    content = archive.read(member)  # all of it, so that its checksum is looked at
+    try:
+        with Image.open(io.BytesIO(content), formats=[kind]) as photo:
+            width, height = photo.size
+    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError):
+        raise InvalidPhotos(
+            shown, expected=f"a {kind} file, as its name says", got="another, or a damaged one"
+        ) from None
+    if max(width, height) > SIDE:
+        raise InvalidPhotos(shown, expected=f"sides of at most {SIDE} pixels", got=f"{width}x{height}")
+
+
+def holds_photos(path: Path) -> bool:
+    """Whether a zip holds photos, and no model of cameras beside them."""
+    with zipfile.ZipFile(path) as archive:
+        names = archive.namelist()
+    models = (".bin", ".txt", ".json")
+    return any(map(_media_type, names)) and not any(name.lower().endswith(models) for name in names)
+
+
+def names_with_photo(path: Path, views: Collection[str]) -> set[str]:
+    """Which of these views a checked zip has a photo of."""
+    return set(cameras_of_views(_members_at(path), views).values())
+
+
+def _members_at(path: Path) -> dict[str, zipfile.ZipInfo]:
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return _members(archive.infolist())
+    except (zipfile.BadZipFile, OSError) as error:
+        hint = "something else wrote there: upload them again"
+        raise NotFound("photos", expected="their zip in the data directory", got=str(error)[:80], hint=hint) from None
+
+
+def open_photo(path: Path, view: str) -> tuple[str, int, Iterator[bytes]] | None:
+    """The media type, the size and the blocks of a view's photo in a checked zip; None when it has none."""
+    members = _members_at(path)
+    name = next(iter(cameras_of_views(members, [view])), None)
+    if name is None:
+        return None
+
+    def blocks() -> Iterator[bytes]:
+        with zipfile.ZipFile(path) as archive, archive.open(members[name]) as photo:
+            while block := photo.read(BLOCK_BYTES):
+                yield block
+
+    return _media_type(members[name].filename), members[name].file_size, blocks()
