@@ -13,8 +13,13 @@ _COMPARED = 2000  # names that a hint looks at: all of a long list would hold up
 
 
 def nearest(text: str, names: Iterable[str], count: int) -> str:
-    """A hint that names the ``count`` names most like the text, of the first thousands and by their first letters."""
+    """A hint that names the ``count`` names most like the text, of the first thousands and by their first letters.
+
+    Names that begin with the whole text come first: "car (automobile)" for "car", before "scarf".
+    """
     from rapidfuzz import process
 
-    cut = [name[:_SHOWN] for name in islice(names, _COMPARED)]
-    return f"nearest: {', '.join(name for name, _, _ in process.extract(text[:_SHOWN], cut, limit=count))}"
+    text, cut = text[:_SHOWN], [name[:_SHOWN] for name in islice(names, _COMPARED)]
+    begin = [name for name in cut if text and name.startswith(f"{text} ")]
+    alike = [name for name, _, _ in process.extract(text, cut, limit=count)]
+    return f"nearest: {', '.join(list(dict.fromkeys([*begin, *alike]))[:count])}"

@@ -110,7 +110,7 @@ def options(arguments: Sequence[str]) -> dict[str, Any]:
     parser.add_argument("--host", help="the address to bind; beyond loopback only with keys")
     parser.add_argument("--port", type=int, help="the port to bind; 0 picks a free one")
     parser.add_argument("--data", help="the directory for the database and all files")
-    parser.add_argument("--encoder", metavar="SPEC", help="the default text encoder: minilm, table:FILE, ...")
+    parser.add_argument("--encoder", metavar="SPEC", help="the default text encoder: lvis, table:FILE, ...")
     parser.add_argument(
         "--text-space", action="append", dest="text_spaces", metavar="NAME=SPEC",
         help="the text encoder of a text space; may be given several times",

@@ -14,7 +14,7 @@ from safetensors import SafetensorError, safe_open
 
 from liftcore.errors import InvalidInput
 from liftcore.io.safetensors_file import check_header
-from liftcore.query.text import ENCODER_SPECS, NO_WORDS, OWN_WORDS
+from liftcore.query.text import BUILT_IN, ENCODER_SPECS, NO_WORDS, OWN_WORDS
 from service.errors import InvalidRequest, Misconfigured
 from service.settings import ServiceSettings
 
@@ -25,9 +25,8 @@ def encoder_spec(settings: ServiceSettings, text_space: str, asked: str | None) 
     """The text encoder of a query: the one of the space asked for, else of the lift's.
 
     The default stands in for a space that has none only where the operator chose it: scores of an encoder of
-    another space look like any others, and mean nothing.
-
-    A lift that brings its words is asked in these: ``OWN_WORDS``.
+    another space look like any others, and mean nothing. Encoders that need no file answer for their own spaces,
+    and a lift that brings its words is asked in these: ``OWN_WORDS``.
 
     Raises:
         InvalidRequest: no encoder was set up under the name asked for, or for the lift's text space.
@@ -48,6 +47,9 @@ def encoder_spec(settings: ServiceSettings, text_space: str, asked: str | None) 
         return settings.text_spaces[text_space]
     if text_space == settings.encoder or (text_space != NO_WORDS and "encoder" in settings.model_fields_set):
         return settings.encoder
+    for encoder, space in BUILT_IN.items():
+        if text_space == space:
+            return encoder
     raise _no_encoder(settings, text_space)
 
 
@@ -101,7 +103,7 @@ def require_encoder_files(settings: ServiceSettings) -> None:
     named |= {f"text_spaces, {space!r}": spec for space, spec in settings.text_spaces.items()}
     for argument, spec in named.items():
         path = encoder_file(spec)
-        if path is None and spec != "minilm" and not spec.startswith("open_clip:"):
+        if path is None and spec not in BUILT_IN and not spec.startswith("open_clip:"):
             raise Misconfigured(argument, expected=f"one of {', '.join(ENCODER_SPECS)}", got=repr(spec))
         if path is not None:
             _require_readable(argument, path)

@@ -100,9 +100,9 @@ class ServiceSettings(BaseSettings):
     max_streams: int = Field(32, ge=1, description="clients that may follow events at the same time; more get 503")
 
     encoder: str = Field(
-        "minilm",
+        "lvis",
         description="text encoder of its own space and, if you set it, of lifts whose text space has none: "
-        "minilm, table:FILE, open_clip:MODEL...",
+        "lvis, minilm, table:FILE, open_clip:MODEL...",
     )
     text_spaces: dict[str, str] = Field(
         default_factory=dict, description="text space -> text encoder, in the same notation (JSON object)"

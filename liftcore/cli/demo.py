@@ -1,4 +1,4 @@
-"""``splatlift demo``: the whole job on a small scene, through the real service."""
+"""``splatlift demo``: the whole job on published splat objects or a scene of yours, through the real service."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def add_arguments(parser: Parser) -> None:
     """The options of the command."""
     cameras = "cameras.json, transforms.json, cameras.zip or sparse/0"
     holds = f"its .ply, .sog, .spz or .splat; {cameras}; a feature pack; text_table.safetensors if any"
-    parser.add_argument("--scene", type=Path, metavar="DIR", help=f"a scene of your own ({holds}); else a still life")
+    parser.add_argument("--scene", type=Path, metavar="DIR", help=f"a scene of yours ({holds}); else the shipped one")
     parser.add_argument(
         "--ask", action="append", default=[], metavar="TEXT", help="what to look for; may be given several times"
     )
@@ -34,10 +34,10 @@ def add_arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Make or find the scene, run the service as a user would, and say what it found."""
+    """Find the scene, run the service as a user would, and say what it found."""
     from liftcore.demo.run import show
     from liftcore.demo.scene_folder import find_scene
-    from liftcore.demo.write_scene import write_still_life
+    from liftcore.demo.tabletop import unpack_tabletop
 
     def say(line: str) -> None:
         if not options.json:
@@ -46,10 +46,9 @@ def run(options: argparse.Namespace) -> int:
     begin, out, data = time.perf_counter(), options.out, options.out / "service"
     out.mkdir(parents=True, exist_ok=True)
     if options.scene is None:
-        say("Making a still life: a table, a mug, a bowl of fruit, a book, a lamp and a plant.")
-        subject = write_still_life(out / "scene", options.ask)
-    else:
-        subject = find_scene(options.scene, options.ask, out / "scene")
+        say("12 published splat objects on a table (sources: scene/LICENCES.md), with CLIP's vectors of words.")
+    folder = options.scene or unpack_tabletop(out / "scene")
+    subject = find_scene(folder, options.ask, out / "scene")
     with serving(data, subject.encoder, out / "service.log") as url:
         say(f"The service listens on {url}.")
         report = show(subject, url, out, say)

@@ -78,7 +78,7 @@ def add_encoder(parser: argparse.ArgumentParser) -> None:
     """Where the vectors of words come from."""
     words = parser.add_mutually_exclusive_group()
     words.add_argument("--table", type=Path, metavar="FILE", help="precomputed text embeddings")
-    specs = "minilm, open_clip:MODEL/TAG, open_clip:MODEL@FILE or table:FILE"
+    specs = "lvis, minilm, open_clip:MODEL/TAG, open_clip:MODEL@FILE or table:FILE"
     words.add_argument("--encoder", metavar="NAME", help=f"{specs}; else the one that the lift's text space names")
 
 

@@ -1,1 +1,1 @@
-"""The still life of `splatlift demo`: a scene made in code, and the walk through the service."""
+"""The demo: a scene of published splat objects that ships with the project, and the walk through the service."""

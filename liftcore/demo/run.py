@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
     from liftcore.demo.scene_folder import DemoScene
 
-NAMING = 200  # best splats that vote on the name of what was found
 POLL_SECONDS = 0.25
 TIMEOUT = httpx.Timeout(600.0, connect=10.0)  # the first query loads an encoder
 ENDED = ("succeeded", "failed", "canceled")
@@ -104,7 +103,8 @@ class Finding:
     """What one phrase found."""
 
     phrase: str
-    object: str | None  # the object that most of the best splats belong to, where somebody knows
+    there: bool | None  # whether the scene shows what it means, where somebody knows
+    object: str | None  # what the masks show most of, where somebody knows
     splats: int  # selected
     score: float  # the best cosine
     threshold: float | None  # on the splats' scores
@@ -191,7 +191,7 @@ def _why_nothing_is_asked(subject: DemoScene, pictures: dict[str, str]) -> list[
 def _find(client: Client, lift: str, phrase: str, subject: DemoScene, out: Path) -> Finding:
     asked = {"lift": lift, "text": phrase}
     begin = time.perf_counter()
-    answer = client.ask(lift, phrase, top=str(NAMING))
+    answer = client.ask(lift, phrase)
     answered = time.perf_counter()
     masks = {view: _pixels(client.picture("/query/mask", view=view, **asked)) > 0 for view in subject.views}
     mask_seconds = (time.perf_counter() - answered) / len(masks)
@@ -204,7 +204,8 @@ def _find(client: Client, lift: str, phrase: str, subject: DemoScene, out: Path)
     Image.fromarray(seen).save(out / names["found"])
     return Finding(
         phrase=phrase,
-        object=truth.name_of([entry["splat"] for entry in best]) if truth and best else None,
+        there=bool(truth.meant[phrase]) if truth and phrase in truth.meant else None,
+        object=truth.name_of(masks) if truth else None,
         splats=answer["count"],
         score=best[0]["score"] if best else float("nan"),
         threshold=answer["threshold"]["value"],
@@ -224,6 +225,8 @@ def _pixels(png: bytes) -> np.ndarray:
 
 def _lines(found: Finding) -> list[str]:
     what = f"the {found.object}" if found.object else "something"
+    if found.there is False:
+        what = f"is not there; closest comes {what}"
     bar = "no threshold" if found.threshold is None else f"threshold {found.threshold:.2f}"
     iou = "" if found.iou is None else f", IoU {found.iou:.2f} against the truth of views that were not lifted"
     lines = [

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from liftcore.errors import InvalidInput
-from liftcore.query.text import NO_WORDS
+from liftcore.query.text import BUILT_IN, NO_WORDS, OWN_WORDS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 _SPLATS = (".ply", ".sog", ".spz", ".splat")  # the first kind that is there
 _CAMERA_FILES = ("cameras.json", "transforms.json", "cameras.zip")
 _TABLE = "text_table.safetensors"
-_BUILT_IN = "minilm"  # the text encoder that needs no files
+_ENCODERS = {space: encoder for encoder, space in BUILT_IN.items()}
 _PHRASES = 3  # asked when nobody says which
 
 
@@ -28,9 +28,9 @@ class Truth:
     """What is really there."""
 
     names: tuple[str, ...]  # object names
-    splat_objects: np.ndarray  # [P] integers, rows of names; -1 = none
     masks: Mapping[str, np.ndarray]  # view -> [H, W] integers, rows of names; -1 = none
-    meant: Mapping[str, tuple[str, ...]]  # phrase -> the objects that it means
+    meant: Mapping[str, tuple[str, ...]]  # phrase -> the objects that it means, none where it means nothing here
+    asked: tuple[str, ...]  # phrases that the scene is to be asked
 
     def mask_of(self, phrase: str, view: str) -> np.ndarray | None:
         """[H, W] bool, where the phrase's objects are; None when the phrase or the view has no truth."""
@@ -39,10 +39,10 @@ class Truth:
         rows = [self.names.index(name) for name in self.meant[phrase]]
         return np.isin(self.masks[view], rows)
 
-    def name_of(self, splats: Sequence[int]) -> str | None:
-        """The object that most of these splats belong to; None where they are of none."""
-        objects = self.splat_objects[np.array(splats)]
-        known = objects[objects >= 0]
+    def name_of(self, masks: Mapping[str, np.ndarray]) -> str | None:
+        """The object that most pixels of these masks [H, W] bool show; None where they show none."""
+        shown = np.concatenate([self.masks[view][mask] for view, mask in masks.items() if view in self.masks])
+        known = shown[shown >= 0]
         return self.names[int(np.bincount(known).argmax())] if len(known) else None
 
     def mean_iou(self, phrase: str, masks: Mapping[str, np.ndarray]) -> float | None:
@@ -74,7 +74,8 @@ def find_scene(folder: Path, phrases: Sequence[str], scratch: Path) -> DemoScene
     Args:
         folder: holds splats (``.ply``, ``.sog``, ``.spz`` or ``.splat``), cameras (``cameras.json``,
             ``transforms.json``, ``sparse/0``) and a pack.
-        phrases: what to ask; empty = three objects of ``truth.json`` if the features have words, else nothing.
+        phrases: what to ask; empty = what ``truth.json`` says, else three of its objects, and nothing where the
+            features have no words.
         scratch: where to put the zipped model.
 
     Raises:
@@ -86,21 +87,21 @@ def find_scene(folder: Path, phrases: Sequence[str], scratch: Path) -> DemoScene
     cameras = _cameras(folder, scratch)
     table, features = folder / _TABLE, _features(folder)
     text_space = _text_space(features, table)
-    if phrases and not (table.is_file() or text_space == _BUILT_IN):
+    askable = table.is_file() or text_space in (*_ENCODERS, OWN_WORDS)
+    if phrases and not askable:
         raise InvalidInput(
             "--ask", expected=f"words in the space of the features, as {_TABLE} in {folder.name}",
             got=f"none, and features of the text space {text_space!r}",
             hint="or use 'splatlift lift' and 'splatlift query --encoder', which take any text encoder",
         )  # fmt: skip
-    asked = tuple(phrases) or (_phrases_of(truth) if text_space != NO_WORDS else ())
     return DemoScene(
         name=folder.name,
         splats=_splats(folder),
         cameras=cameras,
         features=features,
-        encoder=f"table:{table}" if table.is_file() else _BUILT_IN,
+        encoder=f"table:{table}" if table.is_file() else _ENCODERS.get(text_space, next(iter(BUILT_IN))),
         text_space=text_space,
-        phrases=asked,
+        phrases=tuple(phrases) or (truth.asked if truth and askable and text_space != NO_WORDS else ()),
         views=tuple(truth.masks) if truth else _some_views(cameras),
         truth=truth,
     )
@@ -159,7 +160,7 @@ def _text_space(features: Path, table: Path) -> str:
 
 
 def _read_truth(folder: Path) -> Truth | None:
-    """``truth.json`` names the objects, ``truth.safetensors`` holds ``splat_object`` and ``VIEW/mask``."""
+    """``truth.json``: the objects, what to ask, what phrases mean; ``truth.safetensors``: ``VIEW/mask``."""
     from safetensors.numpy import load_file
 
     names_file, arrays_file = folder / "truth.json", folder / "truth.safetensors"
@@ -169,16 +170,13 @@ def _read_truth(folder: Path) -> Truth | None:
     arrays = load_file(arrays_file)
     names = tuple(str(thing["class"]) for thing in document["objects"])
     meant = {f"the {name}": (name,) for name in names} | {name: (name,) for name in names}
+    masks = {key.removesuffix("/mask"): mask for key, mask in arrays.items() if key.endswith("/mask")}
     return Truth(
         names=names,
-        splat_objects=arrays["splat_object"],
-        masks={key.removesuffix("/mask"): mask for key, mask in arrays.items() if key.endswith("/mask")},
+        masks={view: masks[view] for view in document.get("held_out_views", masks)},
         meant=meant | {phrase: tuple(things) for phrase, things in document.get("phrases", {}).items()},
+        asked=tuple(document.get("ask", [f"the {name}" for name in names[:_PHRASES]])),
     )
-
-
-def _phrases_of(truth: Truth | None) -> tuple[str, ...]:
-    return () if truth is None else tuple(f"the {name}" for name in truth.names[:_PHRASES])
 
 
 def _some_views(cameras: Path) -> tuple[str, ...]:

@@ -186,7 +186,9 @@ def test_encoder_that_does_not_exist_is_told_before_the_start(
 def test_encoder_is_chosen_by_text_space_and_never_by_the_client(tmp_path: Path) -> None:
     settings = ServiceSettings.model_validate({"data": tmp_path, "text_spaces": {"clip": "open_clip:X@w.pt"}})
     assert encoder_spec(settings, "clip", None) == "open_clip:X@w.pt"
-    assert encoder_spec(settings, "minilm", None) == encoder_spec(settings, "clip", "default") == "minilm"
+    for space, encoder in (("open_clip:ViT-B-32/openai", "lvis"), ("minilm", "minilm")):  # they need no file
+        assert encoder_spec(settings, space, None) == encoder
+    assert encoder_spec(settings, "clip", "default") == "lvis"
     assert encoder_spec(settings, "none", "clip") == "open_clip:X@w.pt"
     for space, asked in (("clip", "table:secret"), ("none", None)):
         with pytest.raises(InvalidRequest, match="expected"):
@@ -198,7 +200,7 @@ def test_default_encoder_stands_in_for_other_spaces_only_where_the_operator_chos
     for space in ("dino", ""):
         with pytest.raises(InvalidRequest, match="SPLATLIFT_TEXT_SPACES"):
             encoder_spec(untouched, space, None)
-        assert encoder_spec(untouched, space, "default") == "minilm"
+        assert encoder_spec(untouched, space, "default") == "lvis"
     chosen = ServiceSettings.model_validate({"data": tmp_path, "encoder": "minilm"})
     assert encoder_spec(chosen, "dino", None) == encoder_spec(chosen, "", None) == "minilm"
     with pytest.raises(InvalidRequest, match="none"):

@@ -3,9 +3,9 @@
     python -m tests.benchmarks.consensus DIR [--packs NAME ...] [--mistakes NAME ...] [--seeds N ...] [--json]
 
 ``DIR`` is `tabletop`, with its packs of 52, 26 and 13 views. ``--mistakes`` are made on its exact masks (13 views),
-and on the demo's still life, with each seed. A row is a scene: splat accuracy / mIoU of held-out views as
-`tests.benchmarks.tabletop` has them, and how well confidence and agreement of the last lift rank splats by being
-right (AUROC). ``seconds`` are of the lift, over those of ``row-sum``.
+and on the tests' still life (its words need the extra ``minilm``), with each seed. A row is a scene: splat accuracy /
+mIoU of held-out views as `tests.benchmarks.tabletop` has them, and how well confidence and agreement of the last lift
+rank splats by being right (AUROC). ``seconds`` are of the lift, over those of ``row-sum``.
 """
 
 import time
@@ -20,8 +20,6 @@ from scipy.stats import rankdata
 from torch import Tensor
 
 import liftcore as lc
-from liftcore.demo.masks import Mistakes, mistaken_regions, observe, true_labels
-from liftcore.demo.still_life import still_life
 from liftcore.evaluate.accuracy import class_ious, rendered_scores
 from liftcore.features.pack import read_features
 from liftcore.features.views import Regions, ViewFeatures
@@ -31,6 +29,8 @@ from liftcore.scene.cameras import Cameras
 from tests.benchmarks.base import class_scores, command_line, splat_accuracy, tell
 from tests.benchmarks.tabletop import EVIDENCE_OVER, Tabletop
 from tests.benchmarks.thresholds import in_cone
+from tests.still_life.masks import Mistakes, mistaken_regions, observe, true_labels
+from tests.still_life.scene import still_life
 
 HARD = Mistakes(merged=0.30, split=0.15, misnamed=0.10, unlabelled=0.06, noise=0.45)
 MISTAKES = {
@@ -100,7 +100,7 @@ def with_mistakes(scene: Tabletop, kind: str, seed: int, every: int = 4) -> dict
 
 
 def still_life_scene(kind: str, seed: int) -> tuple[Truth, dict[str, ViewFeatures]]:
-    """The demo's scene with mistakes, and its truth."""
+    """The still life with mistakes, and its truth."""
     made, encoder, (mistakes, cone) = still_life(seed), open_encoder("minilm"), MISTAKES[kind]
     raster = CpuRaster(made.splats)
     seen = observe(made, raster, encoder, mistakes, seed)

@@ -8,7 +8,8 @@ P3), and ``best`` by the best possible threshold of each mask, which needs the t
 rendered`` are the mean shares of the image that masks cover where nothing of the phrase is to be seen.
 
 The scene is where the constants of ``valley`` were tuned; those of ``auto`` were not tuned. ``--still-life`` judges
-the same on the demo's scene with three kinds of mistakes. Examples in place of words: ``tests.benchmarks.examples``.
+the same on the tests' still life, whose words need the extra ``minilm``, with three kinds of mistakes. Examples in
+place of words: ``tests.benchmarks.examples``.
 """
 
 import json
@@ -98,13 +99,13 @@ def rows_of(folder: Path, packs: Iterable[str], presets: Iterable[str]) -> Itera
 
 
 def still_life_rows(presets: Iterable[str]) -> Iterator[dict[str, Any]]:
-    """The demo's scene with its usual mistakes, with hard ones, and with hard ones in a narrow cone of vectors."""
-    from liftcore.demo.masks import Mistakes, observe, true_labels
-    from liftcore.demo.still_life import still_life
+    """The still life with its usual mistakes, with hard ones, and with hard ones in a narrow cone of vectors."""
     from liftcore.features.pack import write_pack
     from liftcore.io.inria import write_inria_cameras
     from liftcore.io.ply import write_splats
     from liftcore.raster.cpu.raster import CpuRaster
+    from tests.still_life.masks import Mistakes, observe, true_labels
+    from tests.still_life.scene import still_life
 
     encoder = open_encoder("minilm")
     hard = Mistakes(merged=0.30, split=0.15, misnamed=0.10, unlabelled=0.06, noise=0.45)
@@ -140,7 +141,7 @@ def main() -> None:
         "tests.benchmarks.thresholds",
         __doc__,
         ("folder", {"type": Path}),
-        ("--still-life", {"action": "store_true", "help": "the demo's scene too, which nothing was tuned on"}),
+        ("--still-life", {"action": "store_true", "help": "the still life too, which nothing was tuned on"}),
         ("--features", {"nargs": "+", "default": PACKS, "choices": PACKS}),
         ("--presets", {"nargs": "+", "default": PRESETS, "metavar": "NAME"}),
     )

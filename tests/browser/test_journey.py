@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from liftcore.demo.still_life import still_life
-from liftcore.demo.write_scene import write_still_life
+from tests.still_life.files import write_still_life
+from tests.still_life.scene import still_life
 
 from .browser import Browser, chromium
 from .conftest import NO_BROWSER, browsing, serving
@@ -22,14 +22,15 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     if chromium() is None:
         pytest.skip(NO_BROWSER)
     folder = tmp_path_factory.mktemp("still-life")
-    write_still_life(folder, (), still_life(views=9, density=0.3))
+    write_still_life(folder, still_life(views=9, density=0.3))
     return folder
 
 
 def test_files_become_an_object_that_lights_up(
     scene: Path, tmp_path: Path, keep: Callable[[Browser, str], None]
 ) -> None:
-    with serving(tmp_path / "data") as (address, _), browsing(tmp_path / "profile") as page:
+    words = f"table:{scene}/text_table.safetensors"
+    with serving(tmp_path / "data", encoder=words) as (address, _), browsing(tmp_path / "profile") as page:
         page.window(1280, 800)
         page.open(address)
         page.until("globalThis.splatlift && !document.querySelector('#empty').hidden")
@@ -56,7 +57,7 @@ def test_files_become_an_object_that_lights_up(
                 continue
         assert page.value("document.querySelector('#jobs .failed')") is None
         page.until(READY)
-        ask(page, "something to drink coffee from")
+        ask(page, "mug")
         lit = columns(page, AMBER)
         keep(page, "found")
         assert len(lit) > 2000 and page.value("splatlift.ask.now.things.length") >= 1

@@ -7,6 +7,8 @@ import matplotlib
 import pytest
 from matplotlib import pyplot
 
+from liftcore.demo.scene_folder import find_scene
+
 from .readme import ROOT
 
 NOTEBOOK = ROOT / "docs" / "quickstart.ipynb"
@@ -26,8 +28,9 @@ def test_cells_run_in_order_and_print_what_is_saved(
         pictures = [output for output in cell["outputs"] if "image/png" in output.get("data", {})]
         assert len(pictures) == len(pyplot.get_fignums())
         pyplot.close("all")
-    mask, things = names["mask"], names["scene"].truth
-    truth = things.mask_of(names["phrase"], "view_07")
+    scene = find_scene(names["folder"], (), names["folder"])
+    assert scene.truth is not None
+    mask, truth = names["mask"], scene.truth.mask_of(names["phrase"], "view_030")
     assert (mask & truth).sum() / (mask | truth).sum() > 0.8
 
 

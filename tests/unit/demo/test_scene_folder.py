@@ -30,11 +30,10 @@ def folder(tmp_path: Path) -> Path:
     for name in ("cameras.bin", "images.bin"):
         (scene / "sparse" / "0" / name).write_bytes(b"model")
     save_file({"words": torch.ones(1)}, str(scene / "a.safetensors"))
-    save_file({"v/grid": torch.ones(1, 1, 2)}, str(scene / "grids.safetensors"), metadata={"text_space": "animals"})
+    save_file({"v/grid": torch.ones(1, 1, 2)}, str(scene / "grids.safetensors"), metadata={"text_space": "minilm"})
     objects = [{"class": name} for name in ("cat", "boat", "cow", "fish")]
     (scene / "truth.json").write_text(json.dumps({"objects": objects}))
-    truth = {"splat_object": np.array([0, 1], np.int16), "v/mask": np.array([[0, -1, 3]], np.int16)}
-    save_arrays(truth, str(scene / "truth.safetensors"))
+    save_arrays({"v/mask": np.array([[0, -1, 3]], np.int16)}, str(scene / "truth.safetensors"))
     return scene
 
 
@@ -92,7 +91,7 @@ def test_a_scene_that_says_nothing_of_itself_is_asked_nothing(folder: Path, tmp_
     (folder / "truth.json").unlink()
     (folder / "cameras.json").write_text(json.dumps([INRIA_CAMERA]))
     scene = find_scene(folder, (), tmp_path)
-    assert (scene.phrases, scene.text_space, scene.views) == ((), "animals", ("v",))
+    assert (scene.phrases, scene.text_space, scene.views) == ((), "minilm", ("v",))
 
 
 def test_features_without_words_are_asked_nothing(folder: Path, tmp_path: Path) -> None:

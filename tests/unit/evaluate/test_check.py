@@ -11,7 +11,6 @@ from PIL import Image
 from safetensors.torch import load_file, save_file
 
 from liftcore import cli
-from liftcore.demo.still_life import StillLife, still_life
 from liftcore.evaluate.check import check_scene
 from liftcore.features.pack import as_views, read_features, write_pack
 from liftcore.features.views import FeatureGrid, Regions
@@ -21,6 +20,7 @@ from liftcore.query.splat_colours import seen_colours
 from liftcore.raster.base import CompositingParams
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.cameras import Cameras
+from tests.still_life.scene import StillLife, still_life
 
 
 @pytest.fixture(scope="module")

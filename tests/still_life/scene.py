@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from liftcore.demo.objects import FOOTPRINTS, Piece, still_life_pieces
-from liftcore.demo.surfaces import Samples, sample
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.harmonics import SH_C0
 from liftcore.scene.splats import Splats
+from tests.still_life.objects import FOOTPRINTS, Piece, still_life_pieces
+from tests.still_life.surfaces import Samples, sample
 
 if TYPE_CHECKING:
     from numpy.random import Generator

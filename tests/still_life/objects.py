@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from liftcore.demo import paints, surfaces
+from tests.still_life import paints, surfaces
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from liftcore.demo.paints import Paint
+    from tests.still_life.paints import Paint
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,34 @@
+"""The still life written as a scene folder, in the formats of the field."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+from safetensors.numpy import save_file
+
+from liftcore.features.pack import write_pack
+from liftcore.io.inria import write_inria_cameras
+from liftcore.io.ply import write_splats
+from liftcore.query.text.table import TableEncoder
+from liftcore.raster.cpu.raster import CpuRaster
+from tests.still_life.masks import Mistakes, observe
+from tests.still_life.scene import StillLife
+
+SEED = 7
+CHANNELS = 64  # random directions of so many channels are nearly orthogonal
+
+
+def write_still_life(folder: Path, scene: StillLife) -> Path:
+    """Write ``point_cloud.ply``, ``cameras.json``, ``features.safetensors``, a table of words; the table's path."""
+    words = list(dict.fromkeys([*scene.things, *scene.parts]))
+    vectors = np.random.default_rng(SEED).standard_normal((len(words), CHANNELS)).astype(np.float32)
+    observed = observe(scene, CpuRaster(scene.splats), TableEncoder("words", words, vectors), Mistakes(), SEED)
+    write_splats(scene.splats, folder / "point_cloud.ply")
+    write_inria_cameras(scene.cameras, folder / "cameras.json")
+    told = {"encoder": "generated masks", "text_space": "words", "normalised": "true"}
+    write_pack(folder / "features.safetensors", observed, told)
+    table = folder / "text_table.safetensors"
+    save_file({"embeddings": vectors}, table, metadata={"words": json.dumps(words)})
+    return table
