@@ -14,6 +14,8 @@ from torch import Tensor
 
 from liftcore import __version__
 from liftcore.device import Device, choose_device, within_memory
+from liftcore.engine.base import Engine
+from liftcore.engine.lift import lift_in_blocks
 from liftcore.errors import InvalidSettings
 from liftcore.planning.plan import Plan, plan_lift
 from liftcore.progress import Progress, Timings
@@ -27,7 +29,7 @@ from liftcore.solve.aggregate import Aggregation, aggregate
 from liftcore.solve.checkpoint import Checkpoint
 from liftcore.solve.closed_form import Solution, solve, solve_rows
 from liftcore.solve.consensus import mask_consensus
-from liftcore.solve.diagnostics import certify, lift_warnings
+from liftcore.solve.diagnostics import certify, lift_warnings, measure_samples
 from liftcore.solve.geometry import Geometry, Given, LiftViews, as_read, weigh_views
 from liftcore.solve.least_squares import AllRays, reference, refine
 from liftcore.solve.reweight import Agreement, agreement_factors, reweighted
@@ -48,6 +50,7 @@ def lift(
     on_plan: Callable[[Plan], None] | None = None,
     threads: int | None = None,
     checkpoint: Checkpoint | Path | None = None,
+    engine: Engine | None = None,
     **settings: Any,
 ) -> LiftResult:
     """Lift the features of views onto splats: ``X = D^-1 A^T B`` A the weights of splats on rays.
@@ -63,6 +66,9 @@ def lift(
         threads: None takes the cores that this process may use. The number changes no bit of the result.
         checkpoint: a folder that keeps the weights of finished views. The same lift goes on from there, identical to
             the bit, and so does one that differs in features alone (another encoder's of the same regions).
+        engine: who works on the lift in blocks of views and of splats, for scenes whose W or X is more than a machine
+            should hold: `LocalEngine` or `RayEngine`, with the same bits. The closed form alone; the checkpoint is
+            then the folder of the blocks, which all workers share. None: the whole lift in this process's memory.
         settings: fields of `LiftSettings` that differ from the preset's.
 
     Returns:
@@ -81,6 +87,11 @@ def lift(
         own = chosen.model_dump(exclude_unset=True) if isinstance(preset, LiftSettings) else {"preset": preset}
         chosen = LiftSettings.of(**own | settings)
     check_antialiased(splats.kernel, chosen.antialiased)
+    if engine is not None:
+        known = cameras if isinstance(cameras, Cameras) else Cameras(cameras)
+        folder = checkpoint.folder if isinstance(checkpoint, Checkpoint) else checkpoint
+        given = {"progress": progress, "on_plan": on_plan or log_warnings, "folder": folder}
+        return lift_in_blocks(engine, splats, known, views, chosen, **given)
     work = _Lift(splats, chosen, threads, Timings(progress), choose_device(chosen.device))
     found = LiftViews.of(views, cameras, chosen)
     plan = work.planned(found, on_plan or log_warnings)
@@ -333,7 +344,8 @@ class _Lift:
         told = lift_warnings(self.splats, lifted, sums, self.settings.dtype, X.dtype, facts)
         facts["warnings"] = [*told, *plan.told]
         with self.timings.step("certify"):
-            return certify(geometry, X, sums, self.settings, self.threads) | notes | facts
+            measures = measure_samples(geometry.samples, X, geometry.books, self.threads)
+            return certify(measures, sums, geometry.evidence(), self.settings) | notes | facts
 
     def _raster(self) -> Raster:
         if self.raster is None:

@@ -67,6 +67,7 @@ class Views(Mapping[str, ViewFeatures]):
     normalised: bool | None  # whether codebook rows and grid cells are unit vectors; None when not told
     _sources: Mapping[str, _Source] = field(repr=False)
     table: TableEncoder | None = None  # the packs' own words
+    paths: tuple[Path, ...] = ()  # of the packs that it reads; () where views come from elsewhere
     _cameras: Mapping[str, Camera] = field(default_factory=dict, repr=False)
 
     @property
@@ -178,7 +179,8 @@ def read_features(*paths: str | Path) -> Views:
     normalised = {"true": True, "false": False}.get(_agreed(packs, "normalised").lower())
     encoder, text_space = _agreed(packs, "encoder"), _agreed(packs, "text_space")
     table = _table(packs, next(iter(channels)))
-    return Views(next(iter(channels)), encoder, text_space, normalised, sources, table)
+    told = (encoder, text_space, normalised, sources, table, tuple(pack.path for pack in packs))
+    return Views(next(iter(channels)), *told)
 
 
 def pair(views: Views, cameras: Mapping[str, Camera]) -> tuple[Views, list[str]]:
@@ -282,7 +284,7 @@ def _spooled(pairs: Iterable[tuple[str, ViewFeatures]], scratch: Path | None) ->
                 _write(handle, {name: _Given({name: features}, name).read()}, {}, silent)
         if not files:
             raise InvalidFeatures("features", expected="at least one view", got="none")
-        return read_features(*files.values())  # mapped: the files may lose their names
+        return replace(read_features(*files.values()), paths=())  # mapped: the files may lose their names
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,8 @@ A ``.safetensors`` file holds ``features`` [P, F], ``evidence`` [P], ``agreement
 reweighting it has ``confidence`` [P] f32, which tells right splats from wrong ones, as agreement does not; after
 Post-Lifting Aggregation ``cluster`` [P] i32, -1 for splats in none, and ``cluster_features`` [K, F]; of packs with
 words their vectors, ``embeddings`` [n, F] f32. Its metadata hold settings, inputs with digests, the encoder, words,
-the certificate, timings and the version, as JSON.
+the certificate, timings and the version, as JSON. A lift too large for one file is a folder of shards with the same
+tensors (`liftcore.io.shards`).
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import numpy as np
 
 from liftcore.errors import InvalidLift
 from liftcore.io.safetensors_file import map_tensors
+from liftcore.io.shards import INDEX, map_shards, write_shards
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -32,11 +34,19 @@ ALL = (*TENSORS, CONFIDENCE, *CLUSTER_TENSORS, EMBEDDINGS)
 
 
 def save_lift(lift: LiftResult, path: Path | str) -> None:
-    """Write the lift whole or not at all (temporary file, fsync, rename), with no copy of X in memory."""
+    """Write the lift whole or not at all (temporary file, fsync, rename), with no copy of X in memory.
+
+    Args:
+        path: a file; without ``.safetensors`` at its end, a folder of shards.
+    """
     from liftcore.io.safetensors_file import write_tensors
 
+    path, metadata = Path(path), lift.metadata.model_dump_json()
     tensors = {name: getattr(lift, name) for name in ALL if getattr(lift, name) is not None}
-    write_tensors(Path(path), tensors, {"splatlift": lift.metadata.model_dump_json()})
+    if path.suffix == ".safetensors":
+        write_tensors(path, tensors, {"splatlift": metadata})
+    else:
+        write_shards(path, tensors, metadata)
 
 
 def load_lift(path: Path | str) -> LiftResult:
@@ -63,7 +73,8 @@ def read_lift(path: Path | str) -> tuple[dict[str, np.ndarray], str]:
     from safetensors import SafetensorError
 
     try:
-        tensors, told = map_tensors(Path(path))
+        source = Path(path)
+        tensors, told = map_shards(source) if (source / INDEX).is_file() else map_tensors(source)
         if "splatlift" not in told:
             raise InvalidLift(str(path), expected="a lift file", got="safetensors without lift metadata")
         missing = [name for name in TENSORS if name not in tensors]

@@ -139,13 +139,20 @@ class Plan:
 
 
 def plan_lift(
-    splats: Splats, views: LiftViews, settings: LiftSettings, device: Device, threads: int | None = None
+    splats: Splats,
+    views: LiftViews,
+    settings: LiftSettings,
+    device: Device,
+    threads: int | None = None,
+    *,
+    apart: bool = False,
 ) -> Plan:
     """Plan the lift of the views; the settings' coverage and view_cosine may choose among them.
 
     Args:
         device: where it should run. A card with too little room leaves an ``auto`` lift to the processor.
         threads: that walk on the processor; None takes the cores that this process may use.
+        apart: whether others hold W and X, so that this machine needs no room for them.
 
     Raises:
         Unavailable: this machine has no room for the codebooks, or for the features in no place; or the card that
@@ -157,12 +164,12 @@ def plan_lift(
     seen = visibility(splats, cameras, settings.lift_params)
     chosen, expected = _choose_views(splats, views, settings, seen, threads)
     names, seen, cameras = [names[k] for k in chosen], seen.of(chosen), [cameras[k] for k in chosen]
-    short = check_card(device, splats.count, settings.device)
+    short = [] if apart else check_card(device, splats.count, settings.device)
     weights = weight_bytes(seen, features, names, settings)
     parts = memory_parts(splats, seen, cameras, features, names, settings)
-    free, on_card = free_memory(), None if short else device.free_bytes()
+    free, on_card = (None, None) if apart else (free_memory(), None if short else device.free_bytes())
     kept = 0 if on_card is None else min(weights, int(CARD_SPARE * on_card) // 4)
-    in_files = max(0, weights - MEMORY_LIMIT - kept)
+    in_files = 0 if apart else max(0, weights - MEMORY_LIMIT - kept)
     lifted = set(names)
     return Plan(
         kernel=str(splats.kernel),

@@ -79,13 +79,19 @@ def solve_rows(
     means: Tensor | None = None,
     threads: int | None = None,
     device: Device = CPU,
+    sums: Tensor | None = None,
+    unit: Tensor | None = None,
 ) -> Tensor:
     """Solve for some splats alone, by their numbers [n] i64, into their rows of X [P, F].
+
+    Args:
+        sums: [P] f64, of the rows of the W that this one is a part of: its part of ``D^-1 W E``. None: of its own.
+        unit: [P, F] f32, whose rows become the same means of unit vectors.
 
     Returns:
         [P] f64, squared lengths of the means of unit vectors; zero for the other splats.
     """
-    sums = W.row_sums()
+    sums = W.row_sums() if sums is None else sums
     scale = torch.where(sums > 0, 1.0 / sums, 0.0)
     squares = torch.zeros(X.shape[0], dtype=torch.float64)
     if means is not None:
@@ -114,6 +120,8 @@ def solve_rows(
                 sums = bag_sums(region, units, starts, shares)
             elif inverse is not None:
                 sums = bag_sums(region, table, starts, shares.mul_(inverse.index_select(0, region)))
+            if unit is not None:
+                unit[:, channels].index_copy_(0, own, sums.cpu())
             squares[own] += torch.linalg.vector_norm(sums, dim=1).double().square().cpu()
 
         if device.kind == "cpu":

@@ -7,7 +7,7 @@ for itself (reweighting, regions that the aggregation drops), regions are rows.
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -82,7 +82,7 @@ class Codebook:
     @cached_property
     def lengths(self) -> list[Tensor]:
         """[M] f64 a view: of the rows of its codebook."""
-        return [_lengths(view.rows) for view in self.views]
+        return [row_lengths(view.rows) for view in self.views]
 
     @cached_property
     def unit(self) -> bool:
@@ -102,12 +102,8 @@ class Codebook:
         return torch.where(known, 1.0 / lengths, 0.0).float()
 
     def fits_float16(self) -> bool:
-        """Whether float16 holds every value, and the longest row to FLOAT16_ERROR."""
-        books = [view.rows for view in self.views if view.rows.numel()]
-        if any(max(abs(float(end)) for end in torch.aminmax(book)) > FLOAT16_MAX for book in books):
-            return False
-        longest = max((float(length.max()) for length in self.lengths if length.numel()), default=0.0)
-        return longest == 0 or FLOAT16_STEP * math.sqrt(self.channels) <= FLOAT16_ERROR * longest
+        """Whether float16 holds what the rows are."""
+        return float16_holds(((view.rows, own) for view, own in zip(self.views, self.lengths, strict=True)))
 
     def slices(self) -> Iterator[slice]:
         """The channels that `values` gives at a time, so that a table takes TABLE_BYTES."""
@@ -152,7 +148,23 @@ def as_regions(observation: ViewFeatures, by_rows: bool) -> tuple[ViewFeatures, 
     return regions, replace(codebook, tuples=torch.from_numpy(tuples))
 
 
-def _lengths(rows: Tensor) -> Tensor:
+def float16_holds(books: Iterable[tuple[Tensor, Tensor]]) -> bool:
+    """Whether float16 holds every value, and the longest row to FLOAT16_ERROR.
+
+    Args:
+        books: codebooks [M, F], and the lengths [M] of their rows.
+    """
+    longest, channels = 0.0, 0
+    for rows, lengths in books:
+        if not rows.numel():
+            continue
+        if max(abs(float(end)) for end in torch.aminmax(rows)) > FLOAT16_MAX:
+            return False
+        longest, channels = max(longest, float(lengths.max())), rows.shape[1]
+    return longest == 0 or FLOAT16_STEP * math.sqrt(channels) <= FLOAT16_ERROR * longest
+
+
+def row_lengths(rows: Tensor) -> Tensor:
     """[M] f64: lengths of vectors [M, F] f16 or f32, some at a time: in float64 all take four times their place."""
     parts = [
         torch.linalg.vector_norm(part.float(), dim=1, dtype=torch.float64)  # two quick conversions for a slow one

@@ -31,7 +31,7 @@ from liftcore.raster.base import LOW_PASS, MAX_LOG_SCALE
 from liftcore.scene.cameras import Camera, photo_size
 from liftcore.scene.splats import Splats
 from liftcore.settings import LiftSettings
-from liftcore.solve.geometry import Geometry, SampledRays
+from liftcore.solve.geometry import SampledRays
 
 _CHUNK_VALUES = 1 << 21  # float32 values gathered at a time: 8 MB, as larger ones are fresh pages every time
 _READS_A_RAY = 8  # levels or taps of a ray; few scenes have more
@@ -49,22 +49,17 @@ class ViewMeasures:
 
 
 def certify(
-    geometry: Geometry,
-    features: Tensor,
-    sums: np.ndarray,
-    settings: LiftSettings,
-    threads: int | None = None,
+    measures: ViewMeasures, sums: np.ndarray, evidence: Tensor, settings: LiftSettings
 ) -> dict[str, Any]:
-    """Measure the lift on its sampled rays.
+    """What the sampled rays say of a lift.
 
     Args:
-        features: [P, F], as they are stored. sums: [P] f64, of rows of W.
-        threads: None takes the cores that this process may use. The number changes no bit.
+        measures: of the rays of all views (`measure_samples`).
+        sums: [P] f64, of rows of W. evidence: [P] f32.
 
     Returns:
         Plain numbers, ready for JSON; None where nothing was sampled.
     """
-    measures = measure_samples(geometry.samples, features, geometry.books, threads)
     row_sums, residuals = measures.row_sums, measures.residuals
     beta = quantiles(measures.betas)
     return {
@@ -79,7 +74,7 @@ def certify(
         "beta": beta,
         "bound": None if beta["max"] is None else 1.0 + beta["max"],
         "seen_share": float((sums > 0).mean()),
-        "evidence_over_half_share": float((geometry.evidence() > 0.5).float().mean()),
+        "evidence_over_half_share": float((evidence > 0.5).float().mean()),
     }
 
 
@@ -89,7 +84,11 @@ def measure_samples(
 ) -> ViewMeasures:
     """The measures of all views' sampled rays, one view after the other: features [P, C], codebooks [M, C]."""
     with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
-        views = list(pool.map(lambda sample, book: measure_view(sample, features, book), samples, codebooks))
+        return joined(list(pool.map(lambda sample, book: measure_view(sample, features, book), samples, codebooks)))
+
+
+def joined(views: Sequence[ViewMeasures]) -> ViewMeasures:
+    """The measures of all views, one view after the other."""
     names = [part.name for part in fields(ViewMeasures)]
     return ViewMeasures(*(np.concatenate([getattr(view, name) for view in views]) for name in names))
 

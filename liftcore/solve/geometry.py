@@ -15,7 +15,7 @@ from liftcore.features.pack import Views, as_views, pair
 from liftcore.features.views import FeatureGrid, Regions, ViewFeatures, cells_under
 from liftcore.one_thread import one_thread
 from liftcore.progress import Progress
-from liftcore.raster.base import CompositingParams, Raster, RayRows, ViewRequest
+from liftcore.raster.base import CompositingParams, Raster, RayRows, ViewRequest, ViewWeights
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.settings import LiftSettings
 from liftcore.solve.checkpoint import Checkpoint
@@ -110,6 +110,41 @@ class Geometry:
         return found
 
 
+@dataclass(frozen=True)
+class Question:
+    """What the raster is asked of one view, and what its answer will mean."""
+
+    request: ViewRequest
+    readout: Readout  # of the request's pixels
+    codebook: ViewCodebook
+    levels: np.ndarray  # [M] i8, as `Geometry` has them
+
+    def weights(self, found: ViewWeights) -> RegionWeights:
+        """W of the view by rays of the photo: a stride's stand for those between them."""
+        part = self.codebook.counted(found.weights)
+        rays = float(self.request.params.stride**2)
+        return replace(part, views=(self.request.camera.name,), evidence=part.evidence * rays)
+
+
+def question_of(views: LiftViews, number: int, settings: LiftSettings, by_rows: bool) -> Question:
+    """What a lift asks of the view of that number, which is read for it.
+
+    Args:
+        by_rows: whether a region is a row of a codebook in any case, or may be a tuple of labels (`as_regions`).
+    """
+    camera, given = views[number]
+    observation = as_read(given, settings, camera.name)
+    params = strided(settings.lift_params, settings, camera, number)
+    pixels = sample_pixels(camera, -(-settings.certificate_rays // len(views)), (settings.seed, number), params)
+    regions, codebook = as_regions(observation, by_rows)
+    if isinstance(given, Regions) and isinstance(observation, Regions) and codebook.tuples is None:
+        levels = region_levels(observation)
+    else:
+        levels = np.full(codebook.regions, -1, np.int8)
+    request = ViewRequest(camera, regions, params, settings.weighting, pixels)
+    return Question(request, read_pixels(observation, camera, pixels), codebook, levels)
+
+
 @one_thread()
 def weigh_views(
     raster: Raster,
@@ -132,31 +167,20 @@ def weigh_views(
         device_bytes: of W that may stay on the device that found it.
     """
     parts: list[RegionWeights] = []
-    samples, blind, levels = [], [], []
-    readouts, codebooks = deque[Readout](), list[ViewCodebook]()
+    samples, codebooks, blind, levels = list[SampledRays](), list[ViewCodebook](), [], []
+    waiting = deque[Question]()
 
     def requests() -> Iterator[ViewRequest]:
-        rays = -(-settings.certificate_rays // len(views))
-        for number, (camera, given) in enumerate(views):
-            observation = as_read(given, settings, camera.name)
-            params = strided(settings.lift_params, settings, camera, number)
-            pixels = sample_pixels(camera, rays, (settings.seed, number), params)
-            readouts.append(read_pixels(observation, camera, pixels))
-            regions, own = as_regions(observation, by_rows)
-            codebooks.append(own)
-            if isinstance(given, Regions) and isinstance(observation, Regions) and own.tuples is None:
-                levels.append(region_levels(observation))
-            else:
-                levels.append(np.full(own.regions, -1, np.int8))
-            yield ViewRequest(camera, regions, params, settings.weighting, pixels)
+        for number in range(len(views)):
+            waiting.append(question_of(views, number, settings, by_rows))
+            yield waiting[-1].request
 
     found = raster.iterate_views(requests()) if checkpoint is None else checkpoint.answers(raster, requests())
     on_device = in_memory = 0
     with closing(found):
         for view in found:
-            part = codebooks[len(parts)].counted(view.weights)
-            name = views.names[len(parts)]
-            part = replace(part, views=(name,), evidence=part.evidence * float(settings.stride**2))
+            asked = waiting.popleft()
+            part = asked.weights(view)
             if part.region.is_cuda and on_device + part.nbytes <= device_bytes:
                 on_device += part.nbytes
             else:
@@ -164,10 +188,12 @@ def weigh_views(
                 in_memory += part.nbytes
                 part = part if in_memory <= MEMORY_LIMIT else part.in_files()
             if not part.evidence.numel():
-                blind.append(name)
+                blind.append(asked.request.camera.name)
             parts.append(part)
-            samples.append(SampledRays(view.rows, readouts.popleft()))
-            del view, part  # before the next one is made beside it
+            samples.append(SampledRays(view.rows, asked.readout))
+            codebooks.append(asked.codebook)
+            levels.append(asked.levels)
+            del view, part, asked  # before the next one is made beside it
             progress("geometry", len(samples), len(views), "views")
     W = stacked(parts, splats, threads)
     parts.clear()

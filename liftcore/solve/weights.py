@@ -107,6 +107,23 @@ class RegionWeights:
         entries += torch.arange(total, device=entries.device)
         return starts, entries
 
+    def of_splats(self, first: int, last: int) -> Self:
+        """W and evidence of the splats ``first..last`` alone, counted from ``first`` on; a copy."""
+        bounds = torch.tensor([first, last], dtype=torch.int32, device=self.device)
+        begin, end = torch.searchsorted(self.splats, bounds).tolist()
+        met_begin, met_end = torch.searchsorted(self.evidence_splats, bounds).tolist()
+        starts = self.indptr[begin : end + 1]
+        own = slice(int(starts[0]), int(starts[-1]))
+        return replace(
+            self,
+            splats=self.splats[begin:end] - first,
+            indptr=starts - own.start,
+            region=self.region[own].clone(),
+            weight=self.weight[own].clone(),
+            evidence_splats=self.evidence_splats[met_begin:met_end] - first,
+            evidence=self.evidence[met_begin:met_end].clone(),
+        )
+
     def runs(self, starts: Tensor, region: Tensor) -> tuple[Tensor, Tensor]:
         """The runs of some rows, a run being the entries of one view in a row.
 

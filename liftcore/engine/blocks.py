@@ -1,0 +1,253 @@
+"""The pieces of a lift in blocks: W of a few views, X of a range of splats. Files in, files out.
+
+**Weighing** (`weigh`) reads WEIGHED views and writes a file each: its ``W = A'^T S`` (`RegionWeights`), the codebook E
+of its regions, and its sampled rays. It holds the splats that its views can see, and no others.
+
+**Solving** (`solve`) takes ROWS splats and adds up ``X = D^-1 sum_g W_g E_g`` over groups g of SUMMED views, in the
+order of their names: D first, from W alone, then the groups, of which one is in memory at a time. Where a cut falls
+decides the order of sums, so these numbers are part of the answer; who did which piece is not.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from contextlib import closing
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from liftcore.device import choose_device
+from liftcore.features.pack import pair, read_features
+from liftcore.io.safetensors_file import map_tensors, write_tensors
+from liftcore.io.shards import ROWS, features_file, write_rows
+from liftcore.one_thread import one_thread
+from liftcore.raster import open_raster
+from liftcore.raster.base import RayRows, ViewWeights
+from liftcore.raster.cpu.project import COLUMNS, Targets, activated, project, view_of
+from liftcore.scene.cameras import Camera, Cameras
+from liftcore.scene.kernel import Kernel
+from liftcore.scene.splats import Splats
+from liftcore.settings import LiftSettings
+from liftcore.solve.closed_form import solve_rows
+from liftcore.solve.codebook import Codebook, ViewCodebook
+from liftcore.solve.geometry import LiftViews, Question, Readout, SampledRays, question_of
+from liftcore.solve.weights import RegionWeights, run_each, stacked
+from liftcore.warm_up import warm_up_lift
+
+WEIGHED = 8  # views of a piece: some seconds of work, which is what a worker that dies loses
+SUMMED = 64  # views of a group, whose W and E of some splats are in memory together
+SELECTED = 1 << 22  # splats beyond which a worker holds only those that its views see: 1 GB as the raster has them
+STEP = 1 << 18  # splats that are looked at together for it
+SCENE = "scene.safetensors"
+
+
+@dataclass(frozen=True)
+class Job:
+    """A lift in blocks, as every worker knows it. Paths lead to the same files for all of them."""
+
+    folder: Path  # where pieces are written
+    packs: tuple[Path, ...]  # of the features
+    cameras: Cameras
+    names: tuple[str, ...]  # of the views, in the order of the sums
+    settings: LiftSettings
+    kernel: Kernel
+    splats: int  # P
+    channels: int  # F
+    dtype: torch.dtype = torch.float16  # of X
+    selected: int = SELECTED
+    rows: int = ROWS
+
+    @property
+    def weighings(self) -> int:
+        """Pieces of views."""
+        return -(-len(self.names) // WEIGHED)
+
+    @property
+    def solutions(self) -> int:
+        """Pieces of splats."""
+        return -(-self.splats // self.rows)
+
+    def view_file(self, number: int) -> Path:
+        """What was found of the view of that number."""
+        return self.folder / f"view-{number:05}.safetensors"
+
+    def features_file(self, number: int) -> Path:
+        """X of a range of splats."""
+        return self.folder / "lift" / features_file(number)
+
+    def columns_file(self, number: int) -> Path:
+        """What else is known of these splats."""
+        return self.folder / f"columns-{number:05}.safetensors"
+
+
+class FoundView(NamedTuple):
+    """What a weighing wrote of a view."""
+
+    weights: RegionWeights
+    codebook: ViewCodebook
+    sample: SampledRays
+
+
+# ---- weighing
+
+
+@one_thread()
+def weigh(job: Job, piece: int, threads: int | None) -> None:
+    """Write W, E and sampled rays of a few views; those that lie there already are left as they are.
+
+    Raises:
+        InvalidFeatures: a view is malformed.
+    """
+    numbers = range(WEIGHED * piece, min(WEIGHED * (piece + 1), len(job.names)))
+    numbers = [number for number in numbers if not job.view_file(number).exists()]
+    if not numbers:
+        return
+    device = choose_device(job.settings.device)
+    views = LiftViews(job.cameras, pair(_packs(*job.packs), job.cameras)[0], list(job.names), [])
+    cameras = [views.camera(number) for number in numbers]
+    splats, ids = seen_splats(job, cameras, threads)
+    warm_up_lift(job.kernel, device, job.settings)
+    raster = open_raster(splats, device, threads)
+    waiting = deque[Question]()
+
+    def requests():
+        for number in numbers:
+            waiting.append(question_of(views, number, job.settings, by_rows=False))
+            yield waiting[-1].request
+
+    with closing(raster.iterate_views(requests())) as found:
+        for number, view in zip(numbers, found, strict=True):
+            asked = waiting.popleft()
+            weights = asked.weights(_renumbered(view, ids)).cpu()
+            _write_view(job.view_file(number), weights, asked, replace(view.rows, splats=ids[view.rows.splats.long()]))
+
+
+def seen_splats(job: Job, cameras: list[Camera], threads: int | None) -> tuple[Splats, Tensor]:
+    """The splats that any of the cameras may show, as the raster's own projection decides, and their numbers [n] i32.
+
+    All of them where they are few, and the first alone where none is in sight. Their order stays, so rays meet the
+    same splats one after the other as in the whole scene.
+    """
+    scene = _scene(job.folder / SCENE, job.kernel)
+    if job.splats <= job.selected:
+        return scene, torch.arange(job.splats, dtype=torch.int32)
+    params, seen = job.settings.lift_params, np.zeros(job.splats, bool)
+    views = [view_of(camera, params) for camera in cameras]
+
+    def look(first: int, last: int) -> None:
+        some = activated(_rows(scene, slice(first, last)), params.opacity_logit_scale)
+        count = last - first
+        room = np.empty((count, COLUMNS[job.kernel])), np.empty(count, np.float32), np.empty(count, np.int32)
+        targets = Targets(*room)
+        for view in views:
+            found = project((0, count), some, view, job.kernel, params.antialiased, targets)
+            seen[first + targets.ids[:found]] = True
+
+    run_each(look, [(first, min(first + STEP, job.splats)) for first in range(0, job.splats, STEP)], threads)
+    ids = np.flatnonzero(seen).astype(np.int32)
+    ids = ids if ids.size else np.zeros(1, np.int32)
+    return _rows(scene, torch.from_numpy(ids).long()), torch.from_numpy(ids)
+
+
+def write_scene(splats: Splats, path: Path) -> None:
+    """Write the geometry of splats for workers to map."""
+    tensors = {name: getattr(splats, name) for name in ("means", "quats", "log_scales", "opacity_logits", "beta")}
+    write_tensors(path, {name: tensor.cpu() for name, tensor in tensors.items() if tensor is not None}, {})
+
+
+@lru_cache(maxsize=1)
+def _scene(path: Path, kernel: Kernel) -> Splats:
+    arrays, _ = map_tensors(path)
+    return Splats(**{name: torch.from_numpy(array) for name, array in arrays.items()}, kernel=kernel)
+
+
+def _rows(splats: Splats, rows: slice | Tensor) -> Splats:
+    beta = None if splats.beta is None else splats.beta[rows]
+    parts = splats.means[rows], splats.quats[rows], splats.log_scales[rows], splats.opacity_logits[rows]
+    return Splats(*parts, splats.kernel, beta=beta)
+
+
+_packs = lru_cache(maxsize=1)(read_features)  # whose headers are read once a worker
+
+
+def _renumbered(view: ViewWeights, ids: Tensor) -> ViewWeights:
+    """The same with the scene's numbers of its splats."""
+    weights = view.weights
+    numbers = ids.to(weights.device)
+    own = {name: numbers[getattr(weights, name).long()] for name in ("splats", "evidence_splats")}
+    return replace(view, weights=replace(weights, **own))
+
+
+# A view's file: W by the names of its own, and beside it the codebook and the sampled rays.
+
+
+def _write_view(path: Path, weights: RegionWeights, asked: Question, rows: RayRows) -> None:
+    readout, tuples = asked.readout, asked.codebook.tuples
+    others = {f"rays/{name}": getattr(rows, name) for name in ("indptr", "splats", "weights")}
+    others |= {f"read/{name}": torch.from_numpy(getattr(readout, name)) for name in ("rays", "columns", "shares")}
+    others["codebook"] = asked.codebook.rows
+    weights.save(path, others | ({} if tuples is None else {"tuples": tuples}))
+
+
+def read_view(path: Path) -> FoundView:
+    """What a weighing wrote, mapped."""
+    weights, others = RegionWeights.load_with_others(path)
+    rows = RayRows(**{name: others[f"rays/{name}"] for name in ("indptr", "splats", "weights")})
+    readout = Readout(**{name: others[f"read/{name}"].numpy() for name in ("rays", "columns", "shares")})
+    return FoundView(weights, ViewCodebook(others["codebook"], others.get("tuples")), SampledRays(rows, readout))
+
+
+# ---- solving
+
+
+@one_thread()
+def solve(job: Job, piece: int, threads: int | None) -> None:
+    """Write X of a range of splats, and what supports it: evidence, agreement, and the sums of W."""
+    if job.columns_file(piece).exists() and job.features_file(piece).exists():
+        return
+    first, last = piece * job.rows, min((piece + 1) * job.rows, job.splats)
+    sums = torch.zeros(last - first, dtype=torch.float64)
+    evidence = torch.zeros(last - first, dtype=torch.float64)
+    for number in range(len(job.names)):
+        own = read_view(job.view_file(number)).weights.of_splats(first, last)
+        sums[own.splats.long()] += own.row_sums()
+        evidence[own.evidence_splats.long()] += own.evidence.double()
+    X, unit = _summed(job, (first, last), sums, threads)
+    write_rows(job.features_file(piece), X.to(job.dtype))
+    agreement = torch.linalg.vector_norm(unit, dim=1).clamp(0.0, 1.0)
+    columns = {"evidence": evidence.float(), "agreement": agreement, "seen": sums > 0, "sums": sums}
+    write_tensors(job.columns_file(piece), columns, {})
+
+
+def _summed(job: Job, bounds: tuple[int, int], sums: Tensor, threads: int | None) -> tuple[Tensor, Tensor]:
+    """The weighted means [n, F] f32 of what the splats' regions say, and of the unit vectors of it."""
+    first, last = bounds
+    device = choose_device(job.settings.device)
+    means = _scene(job.folder / SCENE, job.kernel).means[first:last]
+    X = torch.zeros(last - first, job.channels)
+    unit = None  # the same as X for as long as all codebooks are of unit vectors
+    for begin in range(0, len(job.names), SUMMED):
+        parts, books = [], []
+        for number in range(begin, min(begin + SUMMED, len(job.names))):
+            found = read_view(job.view_file(number))
+            own = found.weights.of_splats(first, last)
+            if own.splats.numel():
+                parts.append(own)
+                books.append(found.codebook)
+        if not parts:
+            continue
+        W, codebook = stacked(parts, last - first, threads), Codebook(tuple(books))
+        rows = torch.nonzero(W.indptr.diff())[:, 0]
+        if not codebook.unit and unit is None:
+            unit = X.clone()
+        part, unit_part = torch.zeros_like(X), None if unit is None else torch.zeros_like(X)
+        solve_rows(part, rows, W, codebook, means=means, threads=threads, device=device, sums=sums, unit=unit_part)
+        X += part
+        if unit is not None and unit_part is not None:
+            unit += unit_part
+    return X, X if unit is None else unit

@@ -1,0 +1,155 @@
+"""A lift in shards: a folder with X cut by rows, and an index, for lifts that no single file should hold.
+
+The layout is that of sharded safetensors: ``lift.safetensors.index.json`` names the file of every tensor. X lies in
+``features-00000.safetensors`` and so on, ROWS splats each, and the columns of the splats in ``columns.safetensors``.
+A shard's rows begin at a page, and fill whole pages, so that all shards are mapped side by side: readers see one
+array [P, F], as of one file, and nothing is gathered in memory.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import mmap
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from liftcore.io.files import whole_file
+from liftcore.io.safetensors_file import DTYPES, map_tensors, safetensors_header, tensor_bytes, write_tensors
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+INDEX = "lift.safetensors.index.json"
+COLUMNS = "columns.safetensors"
+ROWS = 1 << 17  # splats of a shard: with 512 channels of float16, 128 MiB
+PAGE = 1 << 16  # bytes: the largest page of the machines that run this
+NO_RESERVE = 0x4000 if sys.platform == "linux" else 0  # flags of mmap, which Python does not name
+FIXED = 0x10
+
+
+class Shard(NamedTuple):
+    """The rows of X that a file holds."""
+
+    path: Path
+    begin: int  # byte of the file
+    shape: tuple[int, int]
+    dtype: np.dtype
+
+
+def features_file(number: int) -> str:
+    """The name of a shard's file."""
+    return f"features-{number:05}.safetensors"
+
+
+def shards_of(splats: int, rows: int = ROWS) -> list[tuple[int, int]]:
+    """(first, last + 1) splat of every shard."""
+    return [(first, min(first + rows, splats)) for first in range(0, splats, rows)]
+
+
+def write_rows(path: Path, features: Tensor) -> None:
+    """Write one shard of X [n, F], whole or not at all; its rows begin at a page."""
+    name = path.name.partition(".")[0]
+    header, _ = safetensors_header([(name, features.dtype, tuple(features.shape))], {})
+    text = header[8:] + b" " * (-len(header) % PAGE)
+    with whole_file(path) as handle:
+        handle.write(len(text).to_bytes(8, "little") + text)
+        handle.write(tensor_bytes(features))
+
+
+def write_index(folder: Path, columns: Mapping[str, Tensor], shards: int, metadata: str) -> None:
+    """Write the columns and, last of all, the index, which makes a lift of the shards that lie there.
+
+    Args:
+        columns: whatever else a lift file has, by name. metadata: of the lift, as JSON.
+    """
+    write_tensors(folder / COLUMNS, columns, {})
+    files = [features_file(number) for number in range(shards)]
+    named = {file.partition(".")[0]: file for file in files} | dict.fromkeys(columns, COLUMNS)
+    total = sum((folder / file).stat().st_size for file in {*named.values()})
+    with whole_file(folder / INDEX) as handle:
+        told = {"metadata": {"total_size": total, "splatlift": metadata}, "weight_map": named}
+        handle.write(json.dumps(told).encode())
+
+
+def write_shards(folder: Path, tensors: Mapping[str, Tensor], metadata: str) -> None:
+    """Write a lift's tensors in shards; the folder becomes a lift when all of them are there."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / INDEX).unlink(missing_ok=True)
+    features = tensors["features"]
+    bounds = shards_of(features.shape[0])
+    for number, (first, last) in enumerate(bounds):
+        write_rows(folder / features_file(number), features[first:last])
+    columns = {name: tensor for name, tensor in tensors.items() if name != "features"}
+    write_index(folder, columns, len(bounds), metadata)
+
+
+def map_shards(folder: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    """The tensors of a sharded lift, and its metadata, as `map_tensors` has those of one file.
+
+    Raises:
+        SafetensorError, OSError, ValueError: a file is missing, is none, or does not fit the others.
+    """
+    told = json.loads((folder / INDEX).read_bytes())
+    try:
+        metadata, named = told["metadata"], dict(told["weight_map"])
+        files = sorted({str(file) for file in named.values()} - {COLUMNS})
+    except (TypeError, KeyError, ValueError):
+        raise ValueError("an index without metadata and weight_map") from None
+    strangers = [file for file in files if Path(file).name != file]
+    if strangers or files != [features_file(number) for number in range(len(files))] or not files:
+        raise ValueError(f"an index of {strangers or files}"[:200])
+    arrays, _ = map_tensors(folder / COLUMNS)
+    return arrays | {"features": map_rows([shard_at(folder / file) for file in files])}, metadata
+
+
+def shard_at(path: Path) -> Shard:
+    """What a shard's header says of it.
+
+    Raises:
+        OSError, ValueError: there is no whole shard.
+    """
+    with path.open("rb") as handle:
+        begin = 8 + int.from_bytes(handle.read(8), "little")
+        if begin % PAGE or begin > 2 * PAGE:
+            raise ValueError(f"{path.name} is no shard: its rows begin at byte {begin}")
+        told = json.loads(handle.read(begin - 8))[path.name.partition(".")[0]]
+        size = os.fstat(handle.fileno()).st_size
+    dtype, shape = np.dtype(DTYPES[told["dtype"]]), tuple(told["shape"])
+    if len(shape) != 2 or size != begin + shape[0] * shape[1] * dtype.itemsize:
+        raise ValueError(f"{path.name} has {size} bytes, which are not {list(shape)} of {dtype}")
+    return Shard(path, begin, shape, dtype)
+
+
+def map_rows(shards: Sequence[Shard]) -> np.ndarray:
+    """One array [P, F] over the rows of all shards, mapped; what is written into it stays in memory.
+
+    Raises:
+        OSError: they cannot be mapped. ValueError: shards differ, or one but the last ends within a page.
+    """
+    first = shards[0]
+    sizes = [shard.shape[0] * shard.shape[1] * shard.dtype.itemsize for shard in shards]
+    if any((shard.shape[1], shard.dtype) != (first.shape[1], first.dtype) for shard in shards):
+        raise ValueError("shards of different channels or types")
+    if any(size % PAGE for size in sizes[:-1]):
+        raise ValueError("a shard that ends within a page, before the last")
+    place = mmap.mmap(-1, sum(sizes), flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | NO_RESERVE)
+    address = ctypes.addressof(ctypes.c_char.from_buffer(place))
+    system = ctypes.CDLL(None, use_errno=True)
+    system.mmap.restype = ctypes.c_void_p
+    system.mmap.argtypes = [ctypes.c_void_p, ctypes.c_size_t, *[ctypes.c_int] * 3, ctypes.c_long]
+    for shard, size in zip(shards, sizes, strict=True):
+        with shard.path.open("rb") as handle:
+            flags = mmap.MAP_PRIVATE | FIXED | NO_RESERVE
+            got = system.mmap(address, size, mmap.PROT_READ | mmap.PROT_WRITE, flags, handle.fileno(), shard.begin)
+        if got != address:
+            code = ctypes.get_errno()
+            raise OSError(code, os.strerror(code), str(shard.path))
+        address += size
+    rows = sum(shard.shape[0] for shard in shards)
+    return np.frombuffer(place, first.dtype).reshape(rows, first.shape[1])
