@@ -109,4 +109,6 @@ def job_limits(settings: ServiceSettings) -> JobLimits:
         memory_bytes=settings.lift_memory_bytes,
         lease_seconds=settings.lease_seconds,
         checkpoint_seconds=settings.checkpoint_seconds,
+        engine=settings.engine,
+        ray_address=settings.ray_address,
     )

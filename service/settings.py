@@ -82,6 +82,11 @@ class ServiceSettings(BaseSettings):
     lift_threads: int | None = Field(
         None, ge=1, description="threads of a job; not set = the cores shared out among the parallel jobs"
     )
+    engine: Literal["local", "ray"] | None = Field(
+        None,
+        description="who lifts in blocks, of bounded memory: this machine, or a Ray cluster; not set = lifts in memory",
+    )
+    ray_address: str = Field("auto", description="of that cluster, host:port; auto takes RAY_ADDRESS")
     parallel_lifts: int = Field(1, ge=1, le=64, description="jobs that run at the same time")
     max_queued: int = Field(100, ge=1, description="jobs that may wait in line; more are answered 503")
     lift_seconds: float = Field(86_400, gt=0, description="wall time that one attempt at a job may take")

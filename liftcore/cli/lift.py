@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from liftcore.cli.options import Parser, add_settings, add_sources, count
 from liftcore.cli.reply import free_output, progress_bars, reply, shown, writing
+from liftcore.engine import ENGINES, engine_named
 from liftcore.errors import InvalidInput, InvalidSettings
 from liftcore.nearest import nearest
 from liftcore.progress import one_step
@@ -32,6 +33,9 @@ def add_arguments(parser: Parser) -> None:
     goes_on = "a killed lift goes on from there, and one of the same regions with other features walks none again"
     parser.add_argument("--checkpoint", type=Path, metavar="DIR", help=f"keep walked views there: {goes_on}")
     parser.add_argument("--threads", type=count, metavar="N", help="else as many as there are cores")
+    blocks = "lift in blocks, whose memory is bounded: in this process, or by the workers of a Ray cluster"
+    parser.add_argument("--engine", choices=ENGINES, help=f"{blocks}; OUTPUT may then be a folder of shards")
+    parser.add_argument("--address", metavar="HOST:PORT", help="of the Ray cluster, or auto; else one of this machine")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -40,9 +44,13 @@ def run(options: argparse.Namespace) -> int:
     from liftcore.io.cameras import camera_source
     from liftcore.io.lift_file import save_lift
     from liftcore.io.scene_files import lift_files
+    from liftcore.io.shards import INDEX
 
     views = camera_source(options.cameras).files
-    out = free_output(options.output, [options.splats, *views, *options.features])
+    inputs = [options.splats, *views, *options.features]
+    sharded = options.output.suffix != ".safetensors"
+    out = free_output(options.output / INDEX if sharded else options.output, inputs)
+    engine = engine_named(options.engine, options.address, options.threads)
     checkpoint = checkpoint_in(options.checkpoint) if options.checkpoint else None
 
     plans: list[Plan] = []
@@ -62,12 +70,13 @@ def run(options: argparse.Namespace) -> int:
             progress=progress,
             on_plan=take,
             checkpoint=checkpoint,
+            engine=engine,
         )
         with writing(out), one_step(progress, "save"):
-            save_lift(result, out)
+            save_lift(result, options.output)
     (plan,) = plans
     warnings = result.metadata.certificate["warnings"]
-    document = {"out": str(out), **_summary(result), "warnings": [*plan.warnings, *warnings]}
+    document = {"out": str(options.output), **_summary(result), "warnings": [*plan.warnings, *warnings]}
     new = [warning for warning in warnings if warning not in plan.told]  # the others were printed with the plan
     reply(document, as_json=options.json, lines=_lines(document | {"warnings": new}))
     return 0

@@ -39,14 +39,19 @@ from liftcore.solve.geometry import Given, LiftViews
 IDENTITY = "lift.json"  # of what the pieces in a folder are
 
 
+def needs_all(settings: LiftSettings) -> list[str]:
+    """The settings that need all regions or all splats in one place, as they are set."""
+    names = ("robust_steps", "aggregation", "cg_steps", "reference_channels")
+    return [f"{name}={getattr(settings, name)}" for name in names if getattr(settings, name)]
+
+
 def check_settings(settings: LiftSettings) -> None:
     """Refuse, before the work, what needs W or X in one place.
 
     Raises:
         InvalidSettings: reweighting, aggregation, or least squares.
     """
-    whole = ("robust_steps", "aggregation", "cg_steps", "reference_channels")
-    asked = [f"{name}={getattr(settings, name)}" for name in whole if getattr(settings, name)]
+    asked = needs_all(settings)
     if asked:
         raise InvalidSettings(
             "engine",
@@ -67,12 +72,15 @@ def lift_in_blocks(
     progress: Progress | None = None,
     on_plan: Callable[[Plan], None],
     folder: Path | None = None,
+    rows: int = ROWS,
+    selected: int = SELECTED,
 ) -> LiftResult:
     """`liftcore.lift` by an engine: each piece is a file in a folder, and X lies in shards that are mapped.
 
     Args:
         folder: that all workers share. A lift that was cut off goes on from the pieces there; None: one that is gone
             at the end.
+        rows: splats that are solved together, whole pages of X. selected: splats of scenes that workers hold whole.
 
     Raises:
         InvalidSettings: the settings need W or X in one place.
@@ -97,6 +105,8 @@ def lift_in_blocks(
                 splats.kernel,
                 splats.count,
                 found.features.channels,
+                rows=rows,
+                selected=selected,
             )
             _begin(job, splats, given)
         with timings.stage("geometry"):
@@ -174,6 +184,7 @@ def _begin(job: Job, splats: Splats, given: Views) -> None:
     """Write the scene, and leave of earlier pieces those of this same lift."""
     facts = choose_device(job.settings.device).facts()
     told = [Checkpoint(job.folder).of(splats, facts).identity, job.settings.model_dump_json(), job.names, job.rows]
+    told += [job.kernel]
     told += [[_facts(camera) for camera in job.cameras.values()]]
     told += [[(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in job.packs] if given.paths else []]
     identity = hashlib.sha256(json.dumps(told).encode()).hexdigest()

@@ -72,8 +72,8 @@ def read_lift(path: Path | str) -> tuple[dict[str, np.ndarray], str]:
     """
     from safetensors import SafetensorError
 
+    source = Path(path)
     try:
-        source = Path(path)
         tensors, told = map_shards(source) if (source / INDEX).is_file() else map_tensors(source)
         if "splatlift" not in told:
             raise InvalidLift(str(path), expected="a lift file", got="safetensors without lift metadata")
@@ -81,8 +81,10 @@ def read_lift(path: Path | str) -> tuple[dict[str, np.ndarray], str]:
         if missing:
             raise ValueError(f"no {missing[0]} in it")
         arrays = {name: tensors[name] for name in ALL if name in tensors}
-    except FileNotFoundError:
-        raise InvalidLift(str(path), expected="a lift file", got="no such file") from None
+    except FileNotFoundError as error:
+        lacking = Path(str(error.filename or ""))
+        got = f"no {lacking.name} in it" if lacking.parent == source else "no such file"
+        raise InvalidLift(str(path), expected="a lift file", got=got) from None
     except (SafetensorError, OSError, ValueError) as error:
         raise _no_lift(path, error) from None
     _check_shapes(arrays, path)

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from liftcore.device import choose_device
+from liftcore.engine.base import Engine
 from liftcore.errors import InvalidFeatures
 from liftcore.features.pack import Views, read_features
 from liftcore.io.cameras import read_cameras
@@ -33,6 +34,7 @@ def lift_files(
     progress: Progress | None = None,
     on_plan: Callable[[Plan], None] | None = None,
     checkpoint: Checkpoint | None = None,
+    engine: Engine | None = None,
 ) -> LiftResult:
     """Lift the features of packs onto the splats of a file, as `liftcore.lift` does.
 
@@ -50,7 +52,8 @@ def lift_files(
         sources = open_files(*paths, settings)
     with timings.step("digest"):
         inputs = input_files(*paths)
-    made = lift(*sources, settings, threads=threads, progress=progress, on_plan=on_plan, checkpoint=checkpoint)
+    given = {"threads": threads, "progress": progress, "on_plan": on_plan, "checkpoint": checkpoint, "engine": engine}
+    made = lift(*sources, settings, **given)
     own = {"splats": inputs[0], "cameras": inputs[1], "features": tuple(inputs[2:])}
     own["timings"] = timings.seconds | made.metadata.timings
     return replace(made, metadata=made.metadata.model_copy(update=own))

@@ -8,6 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from liftcore.engine import engine_named
+from liftcore.engine.lift import needs_all
 from liftcore.io.json_file import finite
 from liftcore.io.lift_file import save_lift, sha256_of
 from liftcore.io.scene_files import lift_files
@@ -35,15 +37,19 @@ def lift_as_ordered(order: dict[str, Any], report: Reporter) -> dict[str, Any]:
         log_warnings(plan)  # the operator's log has them too
         report.plan(plan_document(plan, order["names"]))
 
+    settings = LiftSettings.of(**order["settings"])
+    address = order["ray_address"] if order["engine"] == "ray" else None
+    engine = None if needs_all(settings) else engine_named(order["engine"], address, order["threads"])
     made = lift_files(
         Path(order["splats"]),
         Path(order["cameras"]),
         [Path(path) for path in order["features"]],
-        LiftSettings.of(**order["settings"]),
+        settings,
         threads=order["threads"],
         progress=report,
         on_plan=planned,
         checkpoint=Checkpoint(Path(order["work"]), order["checkpoint_seconds"]),
+        engine=engine,
     )
     made = replace(made, metadata=_as_clients_know(made.metadata, order["file_names"]))
     output = Path(order["output"])

@@ -36,6 +36,8 @@ class JobLimits:
     seconds: float = 86_400.0  # wall time of an attempt
     memory_bytes: int | None = None  # private memory of a job's processes; None sets no limit
     lease_seconds: float = 30.0  # silence after which an attempt is lost, unless it computes
+    engine: str | None = None  # who lifts in blocks; None: lifts are made in memory
+    ray_address: str = "auto"  # of that cluster
     checkpoint_seconds: float = 2.0  # work that a killed lift may lose, beside the views in work
 
 

@@ -393,6 +393,8 @@ class Attempt:
             "threads": self._limits.threads,
             "work": str(files.work(job.id)),
             "checkpoint_seconds": self._limits.checkpoint_seconds,
+            "engine": self._limits.engine,
+            "ray_address": self._limits.ray_address,
             "output": str(draft),
             "file_names": {str(asset.path): asset.file_name for asset in assets},
             "names": {str(asset.path): f"{asset.kind} {asset.id}" for asset in (*assets, *labels)},

@@ -1,0 +1,152 @@
+"""A lift in blocks is the lift: the same bits where its views are one group, whoever does which piece, and when."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from tests.scenes import look_at, random_splats
+
+import liftcore as lc
+from liftcore.engine import blocks
+from liftcore.engine.base import LocalEngine
+from liftcore.engine.lift import lift_in_blocks
+from liftcore.features.pack import write_pack
+from liftcore.io.lift_file import TENSORS
+from liftcore.settings import LiftSettings
+
+ROWS = 1 << 15  # of a shard, whose rows fill pages with two bytes a channel
+COUNT = 2 * ROWS + 500
+VIEWS = 10  # two pieces
+
+
+class Shuffled(LocalEngine):
+    """Does pieces in any order, some of them twice."""
+
+    def run(self, work: Any, job: Any, pieces: int) -> Iterator[int]:
+        order = np.random.default_rng(pieces).permutation(pieces).tolist()
+        for piece in order:
+            work(job, piece, self.threads)
+        work(job, order[0], self.threads)
+        yield from order
+
+
+@pytest.fixture(scope="module")
+def scene() -> dict[str, Any]:
+    """Splats of which a view sees a part, in three blocks, and views of regions and of grids."""
+    rng = np.random.default_rng(1)
+    splats = random_splats(3, COUNT, spread=6.0)
+    cameras = {
+        name: look_at(name, rng.normal(0, 1, 3) + [0, 0, -4], 32, 24, 30.0) for name in map("v{}".format, range(VIEWS))
+    }
+    views = {}
+    for number, name in enumerate(cameras):
+        book = torch.from_numpy(rng.normal(0, 1, (6, 4)).astype(np.float32))
+        if number % 2:
+            views[name] = lc.Regions(rng.integers(-1, 6, (2, 12, 16)), book)
+        else:
+            views[name] = lc.FeatureGrid(rng.normal(0, 1, (6, 8, 4)).astype(np.float32))
+    return {"splats": splats, "cameras": lc.Cameras(cameras), "views": views}
+
+
+def in_blocks(engine: Any, scene: dict[str, Any], settings: LiftSettings, **more: Any) -> lc.LiftResult:
+    given = {"on_plan": lambda _: None, "rows": ROWS, "selected": 1000, **more}
+    return lift_in_blocks(engine, *scene.values(), settings, **given)
+
+
+def assert_same(one: lc.LiftResult, other: lc.LiftResult) -> None:
+    for name in TENSORS:
+        first, second = getattr(one, name), getattr(other, name)
+        assert torch.equal(first.contiguous().view(torch.uint8), second.contiguous().view(torch.uint8)), name
+
+
+def test_blocks_give_the_bits_of_a_lift_in_memory(scene: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = LiftSettings.of(certificate_rays=200)
+    whole = lc.lift(*scene.values(), settings)
+    for engine in (LocalEngine(1), Shuffled(2)):
+        found = in_blocks(engine, scene, settings)
+        assert_same(found, whole)
+        measured = {name: value for name, value in found.diagnostics.items() if name != "plan"}
+        assert measured == {name: whole.diagnostics[name] for name in measured}
+    monkeypatch.setattr(blocks, "SUMMED", 3)
+    grouped = in_blocks(LocalEngine(2), scene, settings.model_copy(update={"dtype": "float32"}))
+    assert float((grouped.features - whole.features).abs().max()) < 2e-3
+    assert float((grouped.agreement - whole.agreement).abs().max()) < 1e-5
+    assert_same(in_blocks(Shuffled(1), scene, settings), in_blocks(LocalEngine(2), scene, settings))
+
+
+def test_worker_holds_the_splats_that_its_views_see(scene: dict[str, Any], tmp_path: Path) -> None:
+    told: list[tuple[int, int]] = []
+
+    class Watching(LocalEngine):
+        def run(self, work: Any, job: Any, pieces: int) -> Iterator[int]:
+            cameras = [job.cameras[name] for name in job.names[:2]]
+            splats, ids = blocks.seen_splats(job, cameras, 1)
+            told.append((splats.count, len(ids)))
+            yield from super().run(work, job, pieces)
+
+    in_blocks(Watching(1), scene, LiftSettings.of(), folder=tmp_path)
+    assert 0 < told[0][0] == told[0][1] < 0.9 * COUNT
+
+
+def test_lift_goes_on_from_the_pieces_in_its_folder(scene: dict[str, Any], tmp_path: Path) -> None:
+    write_pack(tmp_path / "pack.safetensors", scene["views"], {"text_space": "words"})
+    stored = {**scene, "views": lc.read_features(tmp_path / "pack.safetensors")}
+    folder, settings = tmp_path / "work", LiftSettings.of()
+
+    def stop(stage: str, done: int, total: int, unit: str) -> None:
+        if (stage, done) == ("solve", 1):
+            raise InterruptedError
+
+    with pytest.raises(InterruptedError):
+        in_blocks(LocalEngine(1), stored, settings, folder=folder, progress=stop)
+    written = {path: path.stat().st_mtime_ns for path in folder.rglob("*.safetensors")}
+    assert len(written) >= VIEWS + 3
+    found = in_blocks(LocalEngine(1), stored, settings, folder=folder)
+    assert {path: path.stat().st_mtime_ns for path in written} == written
+    assert found.metadata.text_space == "words"
+    assert_same(found, in_blocks(LocalEngine(1), scene, settings))
+    other = in_blocks(LocalEngine(1), stored, LiftSettings.of(power=1), folder=folder)  # pieces of another lift
+    assert_same(other, in_blocks(LocalEngine(1), scene, LiftSettings.of(power=1)))
+
+
+@pytest.mark.parametrize("asked", [{"preset": "default"}, {"aggregation": True}, {"cg_steps": 2}])
+def test_what_needs_all_regions_is_refused_before(scene: dict[str, Any], asked: dict[str, Any]) -> None:
+    with pytest.raises(lc.InvalidSettings, match=r"engine: expected settings of the closed form alone.*; take a"):
+        lc.lift(*scene.values(), engine=LocalEngine(), **asked)
+
+
+def test_shards_read_as_one_file(scene: dict[str, Any], tmp_path: Path) -> None:
+    from safetensors import safe_open
+
+    lift = lc.lift(*scene.values())
+    lift.save(tmp_path / "one.safetensors")
+    lift.save(tmp_path / "shards")
+    assert_same(lc.load_lift(tmp_path / "shards"), lc.load_lift(tmp_path / "one.safetensors"))
+    with safe_open(tmp_path / "shards/features-00000.safetensors", framework="pt") as file:  # as anybody reads them
+        assert torch.equal(file.get_tensor("features-00000"), lift.features)
+    answer = lc.load_lift(tmp_path / "shards").query(np.ones((1, 4)), splats=scene["splats"])
+    assert answer.scores.shape == (COUNT,)
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "message"),
+    [
+        ("lift.safetensors.index.json", b"{}", "an index without metadata"),
+        ("lift.safetensors.index.json", b'{"metadata": {}, "weight_map": {"a": "../../etc/x"}}', "an index of"),
+        ("features-00000.safetensors", b"\x08\0\0\0\0\0\0\0{}      ", "is no shard"),
+        ("features-00000.safetensors", None, "got no features-00000.safetensors in it"),
+    ],
+)
+def test_broken_shards_are_refused(
+    scene: dict[str, Any], tmp_path: Path, file: str, content: bytes | None, message: str
+) -> None:
+    lc.lift(*scene.values()).save(tmp_path / "shards")
+    path = tmp_path / "shards" / file
+    path.unlink() if content is None else path.write_bytes(content)
+    with pytest.raises(lc.InvalidLift, match=message):
+        lc.load_lift(tmp_path / "shards")

@@ -1,0 +1,112 @@
+"""Ray's workers lift to the same bits as one process, also where a worker or a node dies in the middle."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import liftcore as lc
+from liftcore.engine import engine_named
+from liftcore.engine.base import LocalEngine
+from liftcore.engine.ray import RayEngine, check_reach
+from liftcore.features.pack import write_pack
+from liftcore.settings import LiftSettings
+
+from .test_blocks import assert_same, in_blocks, scene
+
+__all__ = ["scene"]  # the fixture
+with_ray = pytest.mark.filterwarnings("ignore")  # Ray's own
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Any]:
+    """Two nodes of one core each, which ask for a token; a third for tests that take one away."""
+    os.environ["RAY_AUTH_MODE"], os.environ["RAY_AUTH_TOKEN"] = "token", secrets.token_hex(16)  # read at the import
+    pytest.importorskip("ray", reason="Ray is not installed: pip install 'splatlift[ray]'")
+    from ray.cluster_utils import Cluster
+
+    node = {"num_cpus": 1, "object_store_memory": 80_000_000}
+    made = Cluster(initialize_head=True, head_node_args={**node, "include_dashboard": False})
+    made.add_node(**node)
+    import ray
+
+    ray.init(address=made.address, log_to_driver=False, configure_logging=False)
+    yield made
+    ray.shutdown()
+    made.shutdown()
+    for name in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN"):
+        del os.environ[name]
+
+
+@pytest.fixture(scope="module")
+def stored(scene: dict[str, Any], tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    path = tmp_path_factory.mktemp("scene") / "pack.safetensors"
+    write_pack(path, scene["views"], {})
+    return {**scene, "views": lc.read_features(path)}
+
+
+class Deadly(RayEngine):
+    """Its workers die of some pieces, once each."""
+
+    def run(self, work: Any, job: Any, pieces: int) -> Iterator[int]:
+        def deadly(job: Any, piece: int, threads: int | None) -> None:
+            died = job.folder / f"{work.__name__}-{piece}.died"
+            if piece == 1 and not died.exists():
+                died.touch()
+                os.kill(os.getpid(), signal.SIGKILL)
+            work(job, piece, threads)
+
+        yield from super().run(deadly, job, pieces)
+
+
+@with_ray
+@pytest.mark.slow
+def test_workers_and_nodes_may_die(cluster: Any, stored: dict[str, Any], scene: dict[str, Any], tmp_path: Path) -> None:
+    settings = LiftSettings.of(certificate_rays=100)
+    expected = in_blocks(LocalEngine(1), stored, settings)
+    folder = tmp_path / "killed"
+    assert_same(in_blocks(Deadly("auto"), stored, settings, folder=folder), expected)
+    assert sorted(path.name for path in folder.glob("*.died")) == ["solve-1.died", "weigh-1.died"]
+    third = cluster.add_node(num_cpus=1, object_store_memory=80_000_000)
+
+    def remove(stage: str, done: int, total: int, unit: str) -> None:
+        if stage == "geometry" and third in cluster.list_all_nodes():
+            cluster.remove_node(third, allow_graceful=False)
+
+    assert_same(in_blocks(RayEngine("auto"), scene, settings, progress=remove), expected)  # values, not files
+    with pytest.raises(lc.InvalidFeatures, match="channels"):  # as the piece says it
+        in_blocks(RayEngine("auto"), {**stored, "views": _broken(stored["views"])}, settings)
+
+
+def _broken(views: Any) -> Any:
+    """A view of another number of channels than its header lets one expect, which only its reader notices."""
+    from dataclasses import replace
+
+    return replace(views, channels=views.channels + 1, paths=())
+
+
+def test_cluster_that_others_reach_must_ask_for_a_token(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("RAY_AUTH_MODE", raising=False)
+    for address in ("127.0.0.1:6379", "localhost:1", "ray://[::1]:2"):
+        check_reach(address)
+    with pytest.raises(lc.Unavailable, match=r"got 192\.0\.2\.1:6379 without RAY_AUTH_MODE=token"):
+        check_reach("192.0.2.1:6379")
+    monkeypatch.setenv("RAY_AUTH_MODE", "token")
+    check_reach("192.0.2.1:6379")
+    with pytest.raises(lc.Unavailable, match="host:port of a Ray cluster"):
+        check_reach("no host.invalid:1")
+
+
+def test_engines_are_named() -> None:
+    assert engine_named(None) is None
+    assert isinstance(engine_named("local", threads=1), LocalEngine)
+    with pytest.raises(lc.InvalidSettings, match="engine: expected local or ray, got 'dask'"):
+        engine_named("dask")
+    with pytest.raises(lc.InvalidSettings, match="an address beside the engine ray alone"):
+        engine_named("local", "auto")
