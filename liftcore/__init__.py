@@ -20,6 +20,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from liftcore.engine.base import LocalEngine as LocalEngine
+    from liftcore.engine.ray import RayEngine as RayEngine
     from liftcore.errors import InvalidCameras as InvalidCameras
     from liftcore.errors import InvalidFeatures as InvalidFeatures
     from liftcore.errors import InvalidInput as InvalidInput
@@ -68,6 +70,8 @@ _PUBLIC = {  # name -> the module that defines it
     "lift": "liftcore.lifting",
     "plan": "liftcore.lifting",
     "Plan": "liftcore.planning.plan",
+    "LocalEngine": "liftcore.engine.base",
+    "RayEngine": "liftcore.engine.ray",
     "LiftResult": "liftcore.result",
     "load_lift": "liftcore.io.lift_file",
     "VectorAnswer": "liftcore.query.ask",
@@ -104,10 +108,12 @@ __all__ = [
     "InvalidSplats",
     "LiftResult",
     "LiftSettings",
+    "LocalEngine",
     "NamedSplats",
     "NotFound",
     "Objects",
     "Plan",
+    "RayEngine",
     "RegionWeights",
     "Regions",
     "Segmentation",

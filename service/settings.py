@@ -84,7 +84,7 @@ class ServiceSettings(BaseSettings):
     )
     engine: Literal["local", "ray"] | None = Field(
         None,
-        description="who lifts in blocks, of bounded memory: this machine, or a Ray cluster; not set = lifts in memory",
+        description="who lifts in blocks, of bounded memory: local or ray (a cluster); not set = in memory",
     )
     ray_address: str = Field("auto", description="of that cluster, host:port; auto takes RAY_ADDRESS")
     parallel_lifts: int = Field(1, ge=1, le=64, description="jobs that run at the same time")

@@ -35,7 +35,7 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument("--threads", type=count, metavar="N", help="else as many as there are cores")
     blocks = "lift in blocks, whose memory is bounded: in this process, or by the workers of a Ray cluster"
     parser.add_argument("--engine", choices=ENGINES, help=f"{blocks}; OUTPUT may then be a folder of shards")
-    parser.add_argument("--address", metavar="HOST:PORT", help="of the Ray cluster, or auto; else one of this machine")
+    parser.add_argument("--address", metavar="HOST:PORT", help="of the Ray cluster, or auto; else of this machine")
 
 
 def run(options: argparse.Namespace) -> int:

@@ -1,7 +1,7 @@
 """The pieces of a lift in blocks: W of a few views, X of a range of splats. Files in, files out.
 
-**Weighing** (`weigh`) reads WEIGHED views and writes a file each: its ``W = A'^T S`` (`RegionWeights`), the codebook E
-of its regions, and its sampled rays. It holds the splats that its views can see, and no others.
+**Weighing** (`weigh`) reads WEIGHED views and writes a file each: its ``W = A'^T S`` (`RegionWeights`), the codebook
+E of its regions, and its sampled rays. It holds the splats that its views can see, and no others.
 
 **Solving** (`solve`) takes ROWS splats and adds up ``X = D^-1 sum_g W_g E_g`` over groups g of SUMMED views, in the
 order of their names: D first, from W alone, then the groups, of which one is in memory at a time. Where a cut falls
@@ -124,7 +124,9 @@ def weigh(job: Job, piece: int, threads: int | None) -> None:
         for number, view in zip(numbers, found, strict=True):
             asked = waiting.popleft()
             weights = asked.weights(_renumbered(view, ids)).cpu()
-            _write_view(job.view_file(number), weights, asked, replace(view.rows, splats=ids[view.rows.splats.long()]))
+            _write_view(
+                job.view_file(number), weights, asked, replace(view.rows, splats=ids[view.rows.splats.long()])
+            )
 
 
 def seen_splats(job: Job, cameras: list[Camera], threads: int | None) -> tuple[Splats, Tensor]:
@@ -162,8 +164,9 @@ def write_scene(splats: Splats, path: Path) -> None:
 
 @lru_cache(maxsize=1)
 def _scene(path: Path, kernel: Kernel) -> Splats:
-    arrays, _ = map_tensors(path)
-    return Splats(**{name: torch.from_numpy(array) for name, array in arrays.items()}, kernel=kernel)
+    found = {name: torch.from_numpy(array) for name, array in map_tensors(path)[0].items()}
+    means, quats, log_scales, logits = (found[name] for name in ("means", "quats", "log_scales", "opacity_logits"))
+    return Splats(means, quats, log_scales, logits, kernel, beta=found.get("beta"))
 
 
 def _rows(splats: Splats, rows: slice | Tensor) -> Splats:

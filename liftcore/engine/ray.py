@@ -10,6 +10,7 @@ import ipaddress
 import os
 import socket
 from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -56,7 +57,7 @@ class RayEngine:
     def run(self, work: Work, job: Job, pieces: int) -> Iterator[int]:
         """See `liftcore.engine.base.Engine`."""
         ray = self._ray
-        needs = {"num_cpus": self._cpus, "max_retries": RETRIES}
+        needs: dict[str, float] = {"num_cpus": self._cpus, "max_retries": RETRIES}
         if job.settings.device == "cuda":
             needs["num_gpus"] = self._gpus
         task, told = ray.remote(**needs)(work), ray.put(job)
@@ -100,7 +101,7 @@ class RayEngine:
 def _connected(address: str | None) -> Any:
     """Ray, connected."""
     try:
-        import ray
+        ray: Any = import_module("ray")
     except ImportError:
         hint = "pip install 'splatlift[ray]'"
         raise Unavailable("engine", expected="Ray, which is an extra", got="none", hint=hint) from None

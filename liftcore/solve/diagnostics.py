@@ -48,9 +48,7 @@ class ViewMeasures:
     betas: np.ndarray  # [rows] f64
 
 
-def certify(
-    measures: ViewMeasures, sums: np.ndarray, evidence: Tensor, settings: LiftSettings
-) -> dict[str, Any]:
+def certify(measures: ViewMeasures, sums: np.ndarray, evidence: Tensor, settings: LiftSettings) -> dict[str, Any]:
     """What the sampled rays say of a lift.
 
     Args:

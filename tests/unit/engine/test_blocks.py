@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from tests.scenes import look_at, random_splats
 
 import liftcore as lc
 from liftcore.engine import blocks
@@ -18,6 +17,7 @@ from liftcore.engine.lift import lift_in_blocks
 from liftcore.features.pack import write_pack
 from liftcore.io.lift_file import TENSORS
 from liftcore.settings import LiftSettings
+from tests.scenes import look_at, random_splats
 
 ROWS = 1 << 15  # of a shard, whose rows fill pages with two bytes a channel
 COUNT = 2 * ROWS + 500
@@ -41,7 +41,7 @@ def scene() -> dict[str, Any]:
     rng = np.random.default_rng(1)
     splats = random_splats(3, COUNT, spread=6.0)
     cameras = {
-        name: look_at(name, rng.normal(0, 1, 3) + [0, 0, -4], 32, 24, 30.0) for name in map("v{}".format, range(VIEWS))
+        name: look_at(name, rng.normal((0, 0, -4), 1), 32, 24, 30.0) for name in map("v{}".format, range(VIEWS))
     }
     views = {}
     for number, name in enumerate(cameras):
@@ -55,7 +55,7 @@ def scene() -> dict[str, Any]:
 
 def in_blocks(engine: Any, scene: dict[str, Any], settings: LiftSettings, **more: Any) -> lc.LiftResult:
     given = {"on_plan": lambda _: None, "rows": ROWS, "selected": 1000, **more}
-    return lift_in_blocks(engine, *scene.values(), settings, **given)
+    return lift_in_blocks(engine, scene["splats"], scene["cameras"], scene["views"], settings, **given)
 
 
 def assert_same(one: lc.LiftResult, other: lc.LiftResult) -> None:
@@ -66,7 +66,7 @@ def assert_same(one: lc.LiftResult, other: lc.LiftResult) -> None:
 
 def test_blocks_give_the_bits_of_a_lift_in_memory(scene: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
     settings = LiftSettings.of(certificate_rays=200)
-    whole = lc.lift(*scene.values(), settings)
+    whole = lc.lift(scene["splats"], scene["cameras"], scene["views"], settings)
     for engine in (LocalEngine(1), Shuffled(2)):
         found = in_blocks(engine, scene, settings)
         assert_same(found, whole)

@@ -6,6 +6,8 @@ import os
 import secrets
 import signal
 from collections.abc import Iterator
+from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -28,14 +30,11 @@ with_ray = pytest.mark.filterwarnings("ignore")  # Ray's own
 def cluster() -> Iterator[Any]:
     """Two nodes of one core each, which ask for a token; a third for tests that take one away."""
     os.environ["RAY_AUTH_MODE"], os.environ["RAY_AUTH_TOKEN"] = "token", secrets.token_hex(16)  # read at the import
-    pytest.importorskip("ray", reason="Ray is not installed: pip install 'splatlift[ray]'")
-    from ray.cluster_utils import Cluster
-
+    ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'splatlift[ray]'")
+    Cluster = import_module("ray.cluster_utils").Cluster
     node = {"num_cpus": 1, "object_store_memory": 80_000_000}
     made = Cluster(initialize_head=True, head_node_args={**node, "include_dashboard": False})
     made.add_node(**node)
-    import ray
-
     ray.init(address=made.address, log_to_driver=False, configure_logging=False)
     yield made
     ray.shutdown()
@@ -67,7 +66,9 @@ class Deadly(RayEngine):
 
 @with_ray
 @pytest.mark.slow
-def test_workers_and_nodes_may_die(cluster: Any, stored: dict[str, Any], scene: dict[str, Any], tmp_path: Path) -> None:
+def test_workers_and_nodes_may_die(
+    cluster: Any, stored: dict[str, Any], scene: dict[str, Any], tmp_path: Path
+) -> None:
     settings = LiftSettings.of(certificate_rays=100)
     expected = in_blocks(LocalEngine(1), stored, settings)
     folder = tmp_path / "killed"
@@ -86,8 +87,6 @@ def test_workers_and_nodes_may_die(cluster: Any, stored: dict[str, Any], scene: 
 
 def _broken(views: Any) -> Any:
     """A view of another number of channels than its header lets one expect, which only its reader notices."""
-    from dataclasses import replace
-
     return replace(views, channels=views.channels + 1, paths=())
 
 
