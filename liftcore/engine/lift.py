@@ -117,7 +117,7 @@ def lift_in_blocks(
             for done, _ in enumerate(engine.run(solve, job, job.solutions), start=1):
                 timings.progress("solve", done, job.solutions, "blocks")
         with timings.step("certify"):
-            columns = _columns(job)
+            columns, table = _columns(job), found.features.table
             sums = columns.pop("sums").numpy()
             certificate = _certificate(job, splats, found, plan, sums, columns["evidence"])
         metadata = LiftMetadata(
@@ -125,10 +125,13 @@ def lift_in_blocks(
             settings=settings,
             encoder=found.features.encoder,
             text_space=found.features.text_space,
+            words=table.words if table else (),
             views=job.names,
             certificate=certificate,
             timings=timings.seconds,
         )
+        if table:
+            columns["embeddings"] = torch.from_numpy(table.embeddings)
         write_index(place / "lift", columns, job.solutions, metadata.model_dump_json())
         return load_lift(place / "lift")  # mapped: the files may lose their names
 

@@ -69,8 +69,11 @@ def test_everything_that_is_copied_is_here_and_in_the_build_context() -> None:
     assert {source for words in copied for source in words[:-1]} == set(kept)
 
 
+FILES = ("docker/Dockerfile", "docker/compose.yaml", "docker/compose.ray.yaml")
+
+
 def test_every_variable_is_a_setting() -> None:
-    named = set(re.findall(r"SPLATLIFT_[A-Z_]+", text("docker/Dockerfile") + text("docker/compose.yaml")))
+    named = set(re.findall(r"SPLATLIFT_[A-Z_]+", "".join(map(text, FILES))))
     assert named
     assert {name.removeprefix("SPLATLIFT_").lower() for name in named} <= ServiceSettings.model_fields.keys()
 
