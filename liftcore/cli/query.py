@@ -45,7 +45,8 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument("--mask", type=Path, metavar="PNG", help="write the mask of the view")
     parser.add_argument("--attention", type=Path, metavar="PNG", help="write the attention map of the view")
     parser.add_argument("--scores", type=Path, metavar="NPY", help="write the scores [P], float32")
-    parser.add_argument("--object", type=Path, metavar="PLY", help="write the splats that were found, and no others")
+    only = "write the splats that were found, and no others: .ply with all their properties, .splat or .spz"
+    parser.add_argument("--object", type=Path, metavar="FILE", help=only)
     parser.add_argument("--coloured", type=Path, metavar="PLY", help="write all splats, coloured by their scores")
 
 
@@ -76,7 +77,7 @@ def run(options: argparse.Namespace) -> int:
     if options.objects:
         found = objects(scene, answer)
         document |= {"objects": [asdict(thing) for thing in found.found], "strays": found.strays}
-    document["files"] = write_files(files, _contents(scene, answer, seen))
+    document["files"] = write_files(files, _contents(options, scene, answer, seen))
     reply(document, as_json=options.json, lines=_lines(document))
     return 0
 
@@ -138,11 +139,13 @@ def _document(answer: Answer, seen: ViewMask | None, encoder: TextEncoder | None
     return document
 
 
-def _contents(scene: QueryScene, answer: Answer, seen: ViewMask | None) -> dict[str, Callable[[], Iterable[bytes]]]:
-    from liftcore.query.export import coloured_ply, npy, object_ply
+def _contents(
+    options: argparse.Namespace, scene: QueryScene, answer: Answer, seen: ViewMask | None
+) -> dict[str, Callable[[], Iterable[bytes]]]:
+    from liftcore.query.export import coloured_ply, npy, object_splats
 
     contents: dict[str, Callable[[], Iterable[bytes]]] = {
-        "object": lambda: object_ply(scene, answer),
+        "object": lambda: object_splats(scene, answer, options.object.suffix.lower()),
         "coloured": lambda: coloured_ply(scene, answer),
         "scores": lambda: [npy(answer.scores)],
     }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import asdict
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from liftcore.query.text import TextEncoder
     from liftcore.scene.cameras import Camera
 
-OUTPUTS = ("labels", "picture", "coloured", "splat_labels")  # options that name a file to write
+OUTPUTS = ("labels", "picture", "coloured", "splat_labels", "labelled")  # options that name a file to write
 
 
 def add_arguments(parser: Parser) -> None:
@@ -36,12 +37,16 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument("--picture", type=Path, metavar="PNG", help="write the view in their colours, with a legend")
     parser.add_argument("--coloured", type=Path, metavar="PLY", help="write all splats in the colours of their words")
     parser.add_argument("--splat-labels", type=Path, metavar="NPY", help="write the numbers [P] of the splats' words")
+    labelled = "write all splats with class_id, instance_id, score and confidence, and names and boxes to PLY.json"
+    parser.add_argument("--labelled", type=Path, metavar="PLY", help=labelled)
 
 
 def run(options: argparse.Namespace) -> int:
     """Name the splats, write what was asked for, and say which words are there; or name the examples alone."""
     view = view_of(options, "labels", "picture")
     files = {kind: path for kind in OUTPUTS if (path := getattr(options, kind)) is not None}
+    if options.labelled is not None:
+        files["names"] = options.labelled.with_name(f"{options.labelled.name}.json")
     given = [path for path in (options.lift, options.table, options.words, options.camera) if path]
     free_outputs(files, given)
     from liftcore.query.scene import QueryScene
@@ -91,6 +96,7 @@ def _words(path: Path | None, encoder: TextEncoder) -> list[str]:
 
 def _contents(scene: QueryScene, found: Segmentation, view: str | Camera) -> dict[str, Callable[[], Iterable[bytes]]]:
     from liftcore.query.export import npy
+    from liftcore.query.labels import document_bytes, labelled_ply, labels
     from liftcore.query.segment import map_png, named_ply, picture_png, word_map
 
     def picture() -> bytes:
@@ -98,7 +104,10 @@ def _contents(scene: QueryScene, found: Segmentation, view: str | Camera) -> dic
 
         return picture_png(render(scene, view), word_map(scene, found, view), found)
 
+    made = cache(lambda: labels(scene, found))
     return {
+        "labelled": lambda: labelled_ply(scene, made()),
+        "names": lambda: [document_bytes(made())],
         "coloured": lambda: named_ply(scene, found),
         "splat_labels": lambda: [npy(found.values)],
         "labels": lambda: [map_png(word_map(scene, found, view), found)],

@@ -187,6 +187,36 @@ def recoloured(path: Path, colours: np.ndarray) -> Iterator[bytes]:
         yield rows.tobytes()
 
 
+def with_columns(path: Path, columns: Mapping[str, np.ndarray]) -> Iterator[bytes]:
+    """A PLY with more properties behind those that it has, which keep their bytes; of one name, the new one stays.
+
+    Args:
+        path: the file. columns: name -> [P] i32 or f32.
+
+    Yields:
+        The bytes of the copy, in blocks.
+
+    Raises:
+        InvalidSplats: the file is malformed, or has another number of splats.
+    """
+    header = _header_of(path, len(next(iter(columns.values()))))
+    kept = [name for name in header.names if name not in columns]
+    codes = {name: values.dtype.str[1:] for name, values in columns.items()}
+    dtype = np.dtype([(name, header.dtype[name]) for name in kept] + [(name, f"<{codes[name]}") for name in codes])
+    properties = [line for line in header.lines if line.split()[:1] == ["property"]]
+    replaced = {line for line in properties if line.split()[-1] in columns}
+    *lines, end = (line for line in header.lines if line not in replaced)
+    ending = "\r" if end.endswith("\r") else ""
+    yield header_bytes([*lines, *(f"property {SPELLING[code]} {name}{ending}" for name, code in codes.items()), end])
+    for first, rows in _blocks(path, header):
+        made = np.empty(len(rows), dtype)
+        for name in kept:
+            made[name] = rows[name]
+        for name, values in columns.items():
+            made[name] = values[first : first + len(rows)]
+        yield made.tobytes()
+
+
 def _header_of(path: Path, count: int) -> PlyHeader:
     header = read_header(path)
     if header.count != count:

@@ -1,16 +1,30 @@
 """What formats of quantised splats share: fields decoded in blocks, and how bytes say opacities, colours, rotations.
 
 A reader gives the fields of `Splats` by their names: ``means`` [P, 3], ``quats`` [P, 4] (w x y z), ``log_scales``
-[P, 3], ``opacity_logits`` [P] and ``sh`` [P, K, 3], all f32.
+[P, 3], ``opacity_logits`` [P] and ``sh`` [P, K, 3], all f32. A writer takes any splats as 3D Gaussians
+(`gaussian_rows`).
 """
 
-from collections.abc import Callable, Mapping
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from liftcore.scene.harmonics import SH_C0
+
+if TYPE_CHECKING:
+    from liftcore.scene.splats import Splats
 
 BLOCK_ROWS = 1 << 16  # splats decoded at a time
 LEAST_ALPHA = 1e-6  # bytes say an opacity of 0 or 1 where the trained one was near: its logit stays finite
 MOST_GROWTH = 100  # decoded bytes for a byte of a compressed file: real scenes have 2 to 10
+GREY = 0.6  # of splats that have no colours
+THIN = 0.01  # of a disc's smaller scale: the thickness that it is shown with
+OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # places of a quaternion but each
+LARGEST_SCALE = 80.0  # log: its exponential is a float32
 
 Fields = dict[str, np.ndarray]
 
@@ -49,9 +63,54 @@ def smallest_three(parts: np.ndarray, largest: np.ndarray) -> np.ndarray:
     Args:
         parts: [n, 3]. largest: [n] of 0..3, the place of the part that is not among them; it is not negative.
     """
-    places = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[largest]
+    places = OTHERS[largest]
     quats = np.empty((len(parts), 4))
     np.put_along_axis(quats, places, parts, axis=1)
     left = np.sqrt(np.maximum(0.0, 1 - (parts**2).sum(axis=1)))
     np.put_along_axis(quats, largest[:, None], left[:, None], axis=1)
     return quats
+
+
+@dataclass(frozen=True)
+class GaussianRows:
+    """Some splats after activation."""
+
+    means: np.ndarray  # [n, 3] f32
+    scales: np.ndarray  # [n, 3] f32, above zero or zero
+    quats: np.ndarray  # [n, 4] f64, unit, w x y z
+    opacities: np.ndarray  # [n] f32 in 0..1
+    colours: np.ndarray  # [n, 3] f32, the constant ones, mostly in 0..1
+    sh: np.ndarray  # [n, K - 1, 3] f32, the higher harmonics
+
+
+def gaussian_rows(splats: Splats) -> Iterator[GaussianRows]:
+    """The splats as 3D Gaussians, in their order, a block at a time.
+
+    A disc (2DGS) becomes a thin one, and a DBS kernel ``(1 - r^2)^beta`` the one of its variance in the image,
+    ``1 / (2 (beta + 2))``. Splats without colours are grey; lobes of DBS are left out.
+    """
+
+    def array(values: Any) -> Any:
+        return None if values is None else values.detach().cpu().numpy()
+
+    fields = (splats.means, splats.log_scales, splats.quats, splats.opacity_logits, splats.beta, splats.sh)
+    means, scales, quats, logits, betas, sh = map(array, fields)
+    for first in range(0, len(means), BLOCK_ROWS):
+        block = slice(first, first + BLOCK_ROWS)
+        size = np.exp(scales[block].clip(-LARGEST_SCALE, LARGEST_SCALE))
+        if size.shape[1] == 2:
+            size = np.concatenate([size, THIN * size.min(axis=1, keepdims=True)], axis=1)
+        if betas is not None:
+            beta = 4 * np.exp(betas[block].clip(-LARGEST_SCALE, LARGEST_SCALE))
+            size = size / np.sqrt(2 * (beta + 2))[:, None]
+        length = np.linalg.norm(quats[block].astype(np.float64), axis=1, keepdims=True)
+        with np.errstate(over="ignore"):
+            opacities = 1 / (1 + np.exp(-logits[block]))
+        yield GaussianRows(
+            means=means[block],
+            scales=size,
+            quats=np.where(length > 0, quats[block] / np.where(length > 0, length, 1.0), (1.0, 0.0, 0.0, 0.0)),
+            opacities=opacities,
+            colours=np.full((len(size), 3), GREY, "f4") if sh is None else 0.5 + SH_C0 * sh[block, 0],
+            sh=np.zeros((len(size), 0, 3), "f4") if sh is None else sh[block, 1:],
+        )

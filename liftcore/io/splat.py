@@ -4,13 +4,20 @@ Means and scales (linear) are f32, then red, green, blue and opacity u8, then th
 w x y z.
 """
 
+from __future__ import annotations
+
+from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from liftcore.errors import InvalidSplats
-from liftcore.io.quantised import Fields, decoded, field_shapes, logits
+from liftcore.io.quantised import Fields, decoded, field_shapes, gaussian_rows, logits
 from liftcore.scene.harmonics import constant_terms
+
+if TYPE_CHECKING:
+    from liftcore.scene.splats import Splats
 
 ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("colours", "u1", 4), ("quats", "u1", 4)])
 LOOKED_AT = 1024  # rows by which a file is told to be one
@@ -51,3 +58,14 @@ def read_splat(path: Path, *, colour: bool = True) -> Fields:
         return fields | ({"sh": constant_terms(rgba[:, None, :3])} if colour else {})
 
     return decoded(len(table), field_shapes(1 if colour else 0), decode)
+
+
+def splat_blocks(splats: Splats) -> Iterator[bytes]:
+    """The bytes of a ``.splat`` file of any splats (`gaussian_rows`), in blocks; colours are the constant ones."""
+    for some in gaussian_rows(splats):
+        rows = np.zeros(len(some.means), ROW)
+        rows["means"], rows["scales"] = some.means, some.scales
+        rows["colours"][:, :3] = np.round(255 * some.colours.clip(0, 1))
+        rows["colours"][:, 3] = np.round(255 * some.opacities)
+        rows["quats"] = np.round(128 + 128 * some.quats).clip(0, 255)
+        yield rows.tobytes()

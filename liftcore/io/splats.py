@@ -7,7 +7,7 @@ what it is and what to do.
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from enum import StrEnum
@@ -23,8 +23,8 @@ from liftcore.io.compressed_ply import read_compressed_ply
 from liftcore.io.files import BROKEN_ZIP, LFS_HINT, LFS_POINTER
 from liftcore.io.quantised import Fields
 from liftcore.io.sog import META, read_sog
-from liftcore.io.splat import looks_like_splat, read_splat
-from liftcore.io.spz import begins_like_spz, read_spz
+from liftcore.io.splat import looks_like_splat, read_splat, splat_blocks
+from liftcore.io.spz import begins_like_spz, read_spz, spz_blocks
 from liftcore.scene.harmonics import constant_terms
 from liftcore.scene.kernel import Kernel, kernel_named
 
@@ -62,6 +62,7 @@ _READERS: dict[SplatFormat, Callable[..., Fields]] = {
     SplatFormat.SOG: read_sog,
     SplatFormat.CHECKPOINT: read_checkpoint,
 }
+_WRITERS: dict[str, Callable[[Splats], Iterator[bytes]]] = {".splat": splat_blocks, ".spz": spz_blocks}
 _WEB_PAGE = ("a web page", "the download went wrong: fetch the file itself")
 _OTHERS = {  # by their first bytes
     LFS_POINTER: ("a Git LFS pointer, which stands for the file", LFS_HINT),
@@ -138,26 +139,44 @@ def require_kernel(path: Path, kernel: Kernel, source: str) -> None:
         raise InvalidSplats(source, expected="the property 'beta' of a dbs splat", got=f"{found}, which has none")
 
 
-def some_rows(path: Path, kept: np.ndarray) -> Iterator[bytes]:
-    """Some rows of a file, in its order, as the bytes of a PLY in blocks.
+def some_rows(path: Path, kept: np.ndarray, suffix: str = ".ply") -> Iterator[bytes]:
+    """Some rows of a file, in its order, as the bytes of a PLY, a ``.splat`` or an ``.spz`` in blocks.
 
-    A PLY gives its own bytes (`liftcore.io.ply.some_rows`); what is of another format becomes a PLY of 3DGS.
+    A PLY gives its own bytes to one (`liftcore.io.ply.some_rows`); of another format comes a PLY of 3DGS.
 
     Args:
-        path: the file. kept: [P] bool, the rows to keep.
+        path: the file. kept: [P] bool, the rows to keep. suffix: of what is written; a PLY where it is unknown.
 
     Raises:
         InvalidSplats: the file is malformed, or has another number of splats.
     """
-    if format_of(path) is SplatFormat.PLY:
+    write = _WRITERS.get(suffix, ply.ply_blocks)
+    if write is ply.ply_blocks and format_of(path) is SplatFormat.PLY:
         return ply.some_rows(path, kept)
     splats = _of_count(path, len(kept))
     import torch
 
     rows = torch.from_numpy(np.flatnonzero(kept))
-    fields = ("means", "quats", "log_scales", "opacity_logits", "sh")
-    values = {name: getattr(splats, name) for name in fields if getattr(splats, name) is not None}
-    return ply.ply_blocks(replace(splats, **{name: value[rows] for name, value in values.items()}))
+    fields = ("means", "quats", "log_scales", "opacity_logits", "beta", "sh", "sb_params")
+    values = {name: getattr(splats, name)[rows] for name in fields if getattr(splats, name) is not None}
+    return write(replace(splats, **values, extras={}, layout=(), header=()))
+
+
+def with_columns(path: Path, columns: Mapping[str, np.ndarray]) -> Iterator[bytes]:
+    """A file with more properties a splat, as the bytes of a PLY in blocks; those that it has are replaced.
+
+    Args:
+        path: the file. columns: name -> [P] i32 or f32.
+
+    Raises:
+        InvalidSplats: the file is malformed, or has another number of splats.
+    """
+    if format_of(path) is SplatFormat.PLY:
+        return ply.with_columns(path, columns)
+    import torch
+
+    splats = _of_count(path, len(next(iter(columns.values()))))
+    return ply.ply_blocks(replace(splats, extras={name: torch.from_numpy(told) for name, told in columns.items()}))
 
 
 def recoloured(path: Path, colours: np.ndarray) -> Iterator[bytes]:

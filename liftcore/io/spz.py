@@ -7,17 +7,36 @@ magnitude, behind two bits for the largest of x y z w) and higher harmonics u8, 
 sizes of the sections' zstd streams, then these.
 
 The frame is right, up, back (RUB) unless an extension declares another. PLYs and cameras are in right, down, front
-(RDF): axes are turned, and quaternions and harmonics with them. The format is of nianticlabs/spz.
+(RDF): axes are turned, and quaternions and harmonics with them. The format is of nianticlabs/spz. What is written has
+version 3.
 """
+
+from __future__ import annotations
 
 import struct
 import zlib
+from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from liftcore.errors import InvalidSplats
-from liftcore.io.quantised import MOST_GROWTH, Fields, decoded, field_shapes, logits, smallest_three
+from liftcore.io.quantised import (
+    MOST_GROWTH,
+    OTHERS,
+    Fields,
+    GaussianRows,
+    decoded,
+    field_shapes,
+    gaussian_rows,
+    logits,
+    smallest_three,
+)
+from liftcore.scene.harmonics import SH_C0
+
+if TYPE_CHECKING:
+    from liftcore.scene.splats import Splats
 
 MAGIC = b"NGSP"
 VERSIONS = (1, 2, 3, 4)
@@ -30,6 +49,9 @@ MAX_FRACTIONAL_BITS = 24
 COLOUR_SCALE = 0.15  # of the constant term
 FRAME_EXTENSION = 0xADBE0003
 RUB, RDF = 4, 6  # frames as spz numbers them: 1 + (x is right) + 2 (y is up) + 4 (z is front), up to 8
+WRITTEN_VERSION, WRITTEN_DEGREE = 3, 3  # and the highest degree of harmonics, as of 3DGS
+WRITTEN_BITS = 20  # fractional bits of means at most: a millionth of a scene unit
+LARGEST_MEAN = (1 << 23) - 1  # of 24 bits with their sign
 HINT = "export it again, or as PLY"
 # Which axes' signs change a harmonic of degree 1 to 4; the last as the library has it that writes these files.
 SH_AXES = (
@@ -76,6 +98,63 @@ def read_spz(path: Path, *, colour: bool = True) -> Fields:
     return _decoded(sections, version, degree if colour else 0, 2.0**-bits, frame, colour=colour)
 
 
+def spz_blocks(splats: Splats) -> Iterator[bytes]:
+    """The bytes of an ``.spz`` file of any splats (`gaussian_rows`), in blocks, in the format's frame.
+
+    Means have as many fractional bits as their reach leaves, 20 at most. Harmonics above degree 3 are left out.
+
+    Raises:
+        InvalidSplats: a mean lies beyond what 24 bits reach.
+    """
+    reach = float(splats.means.abs().amax())
+    bits = int(np.clip(np.floor(np.log2(LARGEST_MEAN / max(reach, 1e-9))), 0, WRITTEN_BITS))
+    if bits < 1:
+        got = f"one at {reach:.3g}"
+        raise InvalidSplats("means", expected=f"centres within {LARGEST_MEAN // 2} of the origin", got=got)
+    degree = min(splats.sh_degree or 0, WRITTEN_DEGREE)
+    sections: list[list[bytes]] = [[] for _ in range(6)]
+    for some in gaussian_rows(splats):
+        for section, part in zip(sections, _encoded(some, bits, (degree + 1) ** 2 - 1), strict=True):
+            section.append(part.tobytes())
+    packing = zlib.compressobj(wbits=31)
+    header = struct.pack(HEADER, MAGIC, WRITTEN_VERSION, splats.count, degree, bits, 0, 0)
+    for part in (header, *(part for section in sections for part in section)):
+        yield packing.compress(part)
+    yield packing.flush()
+
+
+def _encoded(rows: GaussianRows, bits: int, higher: int) -> tuple[np.ndarray, ...]:
+    """The sections of some splats, as `_decoded` reads those of version 3."""
+    means = np.round(rows.means * (1.0, -1.0, -1.0) * 2.0**bits).astype(np.int32)
+    with np.errstate(divide="ignore"):
+        scales = np.round((np.log(rows.scales.astype(np.float64)) + 10) * 16)
+    signs = np.array([np.prod([-1.0 if axis in "yz" else 1.0 for axis in axes]) for axes in SH_AXES[:higher]])
+    return (
+        means.astype("<i4").view(np.uint8).reshape(-1, 3, 4)[:, :, :3],
+        _bytes(np.round(255 * rows.opacities)),
+        _bytes(np.round(255 * ((rows.colours - 0.5) / SH_C0 * COLOUR_SCALE + 0.5))),
+        _bytes(scales),
+        _packed_quats(rows.quats * (1, 1, -1, -1)),
+        _bytes(np.round(128 * (rows.sh[:, :higher] * signs[:, None] + 1))) if higher else np.empty(0, np.uint8),
+    )
+
+
+def _bytes(values: np.ndarray) -> np.ndarray:
+    return values.clip(0, 255).astype(np.uint8)
+
+
+def _packed_quats(quats: np.ndarray) -> np.ndarray:
+    """[n] u32: the smallest three of x y z w of unit quaternions [n, 4] w x y z, behind the largest's place."""
+    parts = np.roll(quats, -1, axis=1)
+    largest = np.abs(parts).argmax(axis=1)
+    chosen = np.take_along_axis(parts, largest[:, None], axis=1)
+    parts = np.where(chosen < 0, -parts, parts)
+    others = np.take_along_axis(parts, OTHERS[largest], axis=1)
+    sizes = np.round(np.abs(others) / np.sqrt(0.5) * 511).clip(0, 511).astype(np.uint32)
+    words = sizes | np.where(others < 0, 512, 0).astype(np.uint32)
+    return (largest.astype(np.uint32) << 30 | words[:, 0] << 20 | words[:, 1] << 10 | words[:, 2]).astype("<u4")
+
+
 def _header(start: bytes, path: Path) -> tuple[int, int, int, int, int]:
     """Version, number of splats, degree of the harmonics, fractional bits of means, number of streams."""
     if len(start) < HEADER_BYTES or (start[4:8] == b"\4\0\0\0" and len(start) < STREAMS_HEADER_BYTES):
@@ -98,7 +177,7 @@ def _section_bytes(version: int, count: int, degree: int) -> list[int]:
     return [count * size for size in (6 if version == 1 else 9, 1, 3, 3, 4 if version >= 3 else 3, 3 * higher)]
 
 
-def _inflated(unpacking: "zlib._Decompress", content: bytes, size: int, path: Path) -> bytes:
+def _inflated(unpacking: zlib._Decompress, content: bytes, size: int, path: Path) -> bytes:
     """The next ``size`` bytes of a gzip stream; with 0 what is left is looked at, where its checksum may be."""
     try:
         found = unpacking.decompress(content, size or MAX_EXTENSION_BYTES)

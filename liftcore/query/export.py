@@ -14,16 +14,10 @@ from liftcore.query.ask import Answer
 from liftcore.query.colours import NOT_SEEN_COLOUR, cluster_colours, heat_colours
 from liftcore.query.objects import objects
 from liftcore.query.scene import QueryScene, as_numpy
-from liftcore.scene.harmonics import SH_C0
-
-_BLOCK_ROWS = 1 << 16
-_GREY = 0.6  # of splats whose file holds no colours
-_THIN = 0.01  # of a disc's smaller scale: the thickness that it is shown with
-_LARGEST_SCALE = 80.0  # log: its exponential is a float32
 
 
-def object_ply(scene: QueryScene, answer: Answer) -> Iterable[bytes]:
-    """The splats that were selected, as a file in blocks; every property of theirs to the byte.
+def object_splats(scene: QueryScene, answer: Answer, suffix: str = ".ply") -> Iterable[bytes]:
+    """The splats that were selected, as a file in blocks: a PLY with every property to the byte, .splat or .spz.
 
     A query that keeps the largest gets the largest object alone (`objects`).
 
@@ -41,7 +35,7 @@ def object_ply(scene: QueryScene, answer: Answer) -> Iterable[bytes]:
             hint="name a lower threshold, or ask in other words or by example",
         )
     largest = answer.query.keep == "largest"
-    return some_rows(scene.splat_file, objects(scene, answer).numbers == 0 if largest else answer.selected)
+    return some_rows(scene.splat_file, objects(scene, answer).numbers == 0 if largest else answer.selected, suffix)
 
 
 def coloured_ply(scene: QueryScene, answer: Answer) -> Iterable[bytes]:
@@ -69,40 +63,14 @@ def npy(values: np.ndarray) -> bytes:
 
 
 def viewer_splats(scene: QueryScene) -> Iterator[bytes]:
-    """The scene in the ``.splat`` format of web viewers, [P] `io.splat.ROW` in the lift's order, in blocks.
-
-    A row is centre and scales in f32, the constant colour with the opacity, and the quaternion w x y z as bytes
-    ``128 + 128 q``. Colours that change with the direction are left out, and grey stands in where there are none.
-    What is no 3D Gaussian is shown as the nearest one: a disc (2DGS) as a thin one, and a DBS kernel
-    ``(1 - r^2)^beta`` as the one of its variance in the image, ``1 / (2 (beta + 2))``.
+    """The scene in the ``.splat`` format of web viewers, in the lift's order, in blocks.
 
     Raises:
         InvalidLift: the splats moved or changed since the lift.
     """
-    from liftcore.io.splat import ROW
+    from liftcore.io.splat import splat_blocks
 
-    splats = scene.splats
-    fields = (splats.means, splats.log_scales, splats.quats, splats.opacity_logits, splats.beta, splats.sh)
-    means, scales, quats, logits, betas, sh = map(as_numpy, fields)
-    for first in range(0, len(means), _BLOCK_ROWS):
-        block = slice(first, first + _BLOCK_ROWS)
-        rows = np.zeros(len(means[block]), ROW)
-        rows["means"] = means[block]
-        size = np.exp(scales[block].clip(-_LARGEST_SCALE, _LARGEST_SCALE))
-        if size.shape[1] == 2:
-            size = np.concatenate([size, _THIN * size.min(axis=1, keepdims=True)], axis=1)
-        if betas is not None:
-            beta = 4 * np.exp(betas[block].clip(-_LARGEST_SCALE, _LARGEST_SCALE))
-            size = size / np.sqrt(2 * (beta + 2))[:, None]
-        rows["scales"] = size
-        colour = np.full((len(rows), 3), _GREY, np.float32) if sh is None else 0.5 + SH_C0 * sh[block, 0]
-        rows["colours"][:, :3] = np.round(255 * colour.clip(0, 1))
-        with np.errstate(over="ignore"):
-            rows["colours"][:, 3] = np.round(255 / (1 + np.exp(-logits[block])))
-        length = np.linalg.norm(quats[block].astype(np.float64), axis=1, keepdims=True)
-        unit = np.where(length > 0, quats[block] / np.where(length > 0, length, 1.0), (1.0, 0.0, 0.0, 0.0))
-        rows["quats"] = np.round(128 + 128 * unit).clip(0, 255)
-        yield rows.tobytes()
+    return splat_blocks(scene.splats)
 
 
 def layer_colours(scene: QueryScene, what: str) -> np.ndarray:

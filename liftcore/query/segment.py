@@ -59,6 +59,7 @@ class Segmentation:
 
     words: tuple[str, ...]  # as asked
     labels: np.ndarray  # [P] i32, rows of words; -1 where none of them is
+    score: np.ndarray  # [P] f32, the cosine to its word; 0 where it has none
     margin: np.ndarray  # [P] f32, the cosine to its word less that to the nearest other; 0 where it has none
     found: tuple[NamedSplats, ...]  # those that are there, with the most evidence first
 
@@ -126,6 +127,7 @@ def segment(scene: QueryScene, words: Sequence[str], vectors: Any, progress: Pro
         named.take(row, np.where(scene.seen & (scores >= thresholds[row]), scores, -np.inf))
     labels = np.where(named.score > -np.inf, named.row, NO_WORD).astype(np.int32)
     other = np.where(named.row == nearest.row, nearest.second, nearest.score)
+    score = np.where(labels != NO_WORD, named.score, 0.0).astype(np.float32)
     margin = np.where((labels != NO_WORD) & (other > -np.inf), named.score - other, 0.0).astype(np.float32)
     found = [
         NamedSplats(
@@ -141,7 +143,7 @@ def segment(scene: QueryScene, words: Sequence[str], vectors: Any, progress: Pro
         for row in np.unique(labels[labels != NO_WORD]).tolist()
         if weights[mine := np.flatnonzero(labels == row)].any()
     ]
-    return Segmentation(words, labels, margin, tuple(sorted(found, key=lambda one: -one.share)))
+    return Segmentation(words, labels, score, margin, tuple(sorted(found, key=lambda one: -one.share)))
 
 
 class _Nearest:

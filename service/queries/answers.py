@@ -26,7 +26,7 @@ import torch
 from liftcore.errors import SplatliftError
 from liftcore.io.json_file import finite
 from liftcore.query.ask import Answer, Point, Question, answers, question, top
-from liftcore.query.export import coloured_ply, layer_colours, npy, object_ply, viewer_splats
+from liftcore.query.export import coloured_ply, layer_colours, npy, object_splats, viewer_splats
 from liftcore.query.objects import Objects, objects
 from liftcore.query.render import ViewMask, attention_png, mask_png, render, render_png, view_mask
 from liftcore.query.scene import QueryScene
@@ -255,7 +255,7 @@ class Answers:
         return Frame({}, render_png(self._scene(request), view_of(request), request["what"]))
 
     def _splats(self, request: dict[str, Any]) -> Frame:
-        make = {"object": object_ply, "scores": coloured_ply}[request["what"]]
+        make = {"object": object_splats, "scores": coloured_ply}[request["what"]]
         write_draft(make(self._scene(request), self._answer(request)), Path(request["draft"]))
         return Frame({})
 

@@ -13,7 +13,7 @@ from liftcore.io.scene_files import lift_files
 from liftcore.io.splats import read_splats
 from liftcore.query.ask import Answer, ask
 from liftcore.query.colours import NOT_SEEN_COLOUR, colour_map
-from liftcore.query.export import coloured_ply, object_ply
+from liftcore.query.export import coloured_ply, object_splats
 from liftcore.query.render import attention_png, render, view_mask
 from liftcore.query.scene import QueryScene
 from liftcore.query.terms import Query, Region
@@ -36,7 +36,7 @@ def of_lamp(scene: QueryScene, threshold: float = 0.5) -> Answer:
 
 def test_the_object_is_what_was_selected_and_can_be_lifted_again(scene: QueryScene, tmp_path: Path) -> None:
     answer = of_lamp(scene)
-    (tmp_path / "lamp.ply").write_bytes(b"".join(object_ply(scene, answer)))
+    (tmp_path / "lamp.ply").write_bytes(b"".join(object_splats(scene, answer)))
     rows = splat_rows()[answer.selected[:-1]]
     assert SPLATS_A_CLUSTER * 0.8 <= len(rows) <= SPLATS_A_CLUSTER * 1.2
     assert (tmp_path / "lamp.ply").read_bytes() == ply(rows)
@@ -47,14 +47,28 @@ def test_the_object_is_what_was_selected_and_can_be_lifted_again(scene: QuerySce
 
 def test_every_selected_row_is_in_the_object_whatever_the_threshold(scene: QueryScene, tmp_path: Path) -> None:
     answer = of_lamp(scene, -1.0)
-    (tmp_path / "all.ply").write_bytes(b"".join(object_ply(scene, answer)))
+    (tmp_path / "all.ply").write_bytes(b"".join(object_splats(scene, answer)))
     assert (tmp_path / "all.ply").read_bytes() == ply(splat_rows())
     assert np.array_equal(answer.selected, answer.seen)
 
 
+@pytest.mark.parametrize("suffix", [".splat", ".spz"])
+def test_the_object_as_an_editors_file_has_the_same_rows(suffix: str, scene: QueryScene, tmp_path: Path) -> None:
+    answer = of_lamp(scene)
+    for name in ("lamp.ply", f"lamp{suffix}"):
+        (tmp_path / name).write_bytes(b"".join(object_splats(scene, answer, Path(name).suffix)))
+    plain, made = read_splats(tmp_path / "lamp.ply"), read_splats(tmp_path / f"lamp{suffix}")
+    assert made.count == plain.count > 10
+    np.testing.assert_allclose(made.means, plain.means, atol=1e-6)
+    np.testing.assert_allclose(made.log_scales, plain.log_scales, atol=0.04)
+    np.testing.assert_allclose(made.opacity_logits.sigmoid(), plain.opacity_logits.sigmoid(), atol=0.003)
+    assert made.sh is not None and plain.sh is not None
+    np.testing.assert_allclose(made.sh, plain.sh, atol=0.02)
+
+
 def test_nothing_selected_is_no_file(scene: QueryScene, tmp_path: Path) -> None:
     with pytest.raises(InvalidQuery, match=r"none of 61.*lower threshold"):
-        (tmp_path / "lamp.ply").write_bytes(b"".join(object_ply(scene, of_lamp(scene, 2.0))))
+        (tmp_path / "lamp.ply").write_bytes(b"".join(object_splats(scene, of_lamp(scene, 2.0))))
     assert not (tmp_path / "lamp.ply").exists()
 
 
@@ -87,11 +101,11 @@ def test_the_coloured_scene_looks_like_the_attention(scene: QueryScene, tmp_path
 
 def test_exports_load_no_splats_and_know_when_their_file_changed(scene: QueryScene, tmp_path: Path) -> None:
     answer = of_lamp(scene)
-    for make in (object_ply, coloured_ply):
+    for make in (object_splats, coloured_ply):
         assert list(make(scene, answer))
     assert "splats" not in scene.__dict__ and "raster" not in scene.__dict__
     (tmp_path / "s.ply").write_bytes(ply(splat_rows()))
     other = QueryScene.open(scene.path)
-    for make in (object_ply, coloured_ply):
+    for make in (object_splats, coloured_ply):
         with pytest.raises(InvalidLift, match="splats changed since the lift"):
             make(other, answer)

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from liftcore.errors import InvalidQuery
 from liftcore.query import objects as module
 from liftcore.query.ask import Answer, ask
-from liftcore.query.export import object_ply
+from liftcore.query.export import object_splats
 from liftcore.query.objects import NEIGHBOURS, REACH, objects, touching
 from liftcore.query.scene import QueryScene
 from liftcore.query.terms import Query, Region
@@ -68,9 +68,9 @@ def test_who_keeps_the_largest_gets_it_alone_also_as_a_file(scene: QueryScene) -
     both, largest = objects(scene, of(scene, 0, 2)), objects(scene, of(scene, 0, 2, keep="largest"))
     assert largest.found == both.found[:1]
     assert largest.strays == both.found[1].splats
-    kept = b"".join(object_ply(scene, of(scene, 0, 2, keep="largest")))
+    kept = b"".join(object_splats(scene, of(scene, 0, 2, keep="largest")))
     assert kept == ply(splat_rows()[both.numbers == 0])
-    assert b"".join(object_ply(scene, of(scene, 0, 2))) == ply(splat_rows()[both.numbers >= 0])
+    assert b"".join(object_splats(scene, of(scene, 0, 2))) == ply(splat_rows()[both.numbers >= 0])
 
 
 def test_nothing_found_is_no_object(scene: QueryScene) -> None:

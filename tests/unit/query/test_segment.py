@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from plyfile import PlyData
 
 from liftcore import cli
 from liftcore.errors import InvalidQuery
@@ -122,6 +123,31 @@ def test_coloured_splats_have_the_colours_of_their_words(clear: QueryScene, tmp_
     seen = seen_colours(read_splats(tmp_path / "named.ply"), clear.cameras["middle"]).numpy()
     np.testing.assert_allclose(255 * seen, found.colours[found.values], atol=1e-2)
     assert tuple(found.colours[0]) == NO_CLUSTER_COLOUR
+
+
+def test_labels_go_out_as_columns_and_a_document(tiny_lift: Path, tmp_path: Path, capsys) -> None:
+    out = tmp_path / "labels.ply"
+    (tmp_path / "table.safetensors").write_bytes(text_table())
+    command = ["segment", str(tiny_lift), "--table", str(tmp_path / "table.safetensors"), "--json", "--labelled"]
+    assert cli.main([*command, str(out)]) == 0
+    assert json.loads(capsys.readouterr().out)["files"] == {"labelled": str(out), "names": f"{out}.json"}
+    document = json.loads((tmp_path / "labels.ply.json").read_text(encoding="utf-8"))
+    assert (document["frame"], document["splats"]) == ("file", 60)
+    names = {one["class_id"]: one["name"] for one in document["classes"]}
+    assert set(names.values()) == {"apple", "book", "lamp"}
+    rows = PlyData.read(out)["vertex"]
+    source = PlyData.read(tiny_lift.with_name("s.ply"))["vertex"]
+    assert all(np.array_equal(rows[column.name], source[column.name]) for column in source.properties)
+    assert [names[value] for value in rows["class_id"][::20]] == ["apple", "book", "lamp"]
+    assert rows["score"].min() > 0.5 and rows["class_id"].dtype == np.int32
+    for one in document["instances"]:
+        inside = rows["instance_id"] == one["instance_id"]
+        assert set(rows["class_id"][inside]) == {one["class_id"]} and inside.sum() == one["splats"]
+        box, axes = one["oriented_box"], np.array(one["oriented_box"]["axes"])
+        places = np.stack([rows[axis][inside] for axis in "xyz"], axis=1) - box["centre"]
+        assert (np.abs(places @ axes.T) <= np.array(box["half_sizes"]) + 1e-5).all()
+        assert np.linalg.det(axes) == pytest.approx(1)
+    assert cli.main([*command, str(tiny_lift)]) == 2
 
 
 def test_best_words_of_an_example_come_first(clear: QueryScene) -> None:

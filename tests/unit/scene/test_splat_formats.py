@@ -22,7 +22,7 @@ from liftcore.errors import InvalidSplats
 from liftcore.io.ply import write_splats
 from liftcore.io.quantised import LEAST_ALPHA
 from liftcore.io.splats import SplatFormat, format_of, read_splats, recoloured, require_kernel, some_rows
-from liftcore.io.spz import FRAME_EXTENSION, RDF
+from liftcore.io.spz import FRAME_EXTENSION, RDF, spz_blocks
 from liftcore.scene.harmonics import constant_terms
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.splats import Splats
@@ -301,6 +301,18 @@ def test_large_files_are_decoded_in_blocks_to_the_same_rows(monkeypatch: pytest.
         assert again.sh is not None and splats.sh is not None
         assert torch.equal(again.means, splats.means) and torch.equal(again.sh, splats.sh)
         assert torch.equal(again.quats, splats.quats)
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_an_spz_that_we_write_is_read_as_the_file_that_it_is_of(version: int, tmp_path: Path) -> None:
+    splats = read_splats(FILES / f"degree3.v{version}.spz")
+    (tmp_path / "again.spz").write_bytes(b"".join(spz_blocks(splats)))
+    again = read_splats(tmp_path / "again.spz")
+    turned = again.quats * torch.nn.functional.normalize(splats.quats, dim=1)
+    assert float(turned.sum(dim=1).abs().min()) > 0.99999
+    for field, most in (("means", 1e-6), ("log_scales", 1e-6), ("sh", 1e-6)):
+        assert torch.allclose(getattr(again, field), getattr(splats, field), atol=most), field
+    assert torch.allclose(again.opacity_logits.sigmoid(), splats.opacity_logits.sigmoid(), atol=1e-6)
 
 
 def test_random_bytes_are_no_splats(tmp_path: Path) -> None:
