@@ -41,7 +41,7 @@ def quick(store: Store) -> Quick:
     @contextmanager
     def serve(behaviour: str, **settings: Any) -> Iterator[tuple[TestClient, dict[str, Any]]]:
         chosen = ServiceSettings.model_validate({"data": store.files.root, **settings})
-        worker = QueryClient(QueryLimits(waiting=1, seconds=1, scenes=1, cache_bytes=0, encoder="minilm"))
+        worker = QueryClient(QueryLimits(waiting=1, seconds=1, scenes=1, cache_bytes=0, encoder="lvis"))
         supervisor = Supervisor(store, JobLimits(), command=stand_in(behaviour))
         known = order(store)
         body = {"splats": known.splats, "cameras": known.cameras, "features": list(known.features)}

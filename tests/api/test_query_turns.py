@@ -77,7 +77,7 @@ def start(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Start]:
         return original([command[0], "-c", STAND_IN, str(tmp_path)], **how)
 
     def begin(*, seconds: float = 120.0, of_a_key: int | None = None, waiting: int = 16) -> QueryClient:
-        limits = QueryLimits(waiting, seconds, scenes=1, cache_bytes=0, encoder="minilm", of_a_key=of_a_key)
+        limits = QueryLimits(waiting, seconds, scenes=1, cache_bytes=0, encoder="lvis", of_a_key=of_a_key)
         started.append(QueryClient(limits))
         started[-1].start()
         return started[-1]
@@ -191,7 +191,7 @@ def test_closed_connection_is_a_client_that_left(tmp_path: Path, method: str) ->
     head = f"{method} {path} HTTP/1.1\r\nHost: localhost\r\nAuthorization: Bearer {secret}\r\n"
     sent = {"GET": "\r\n", "POST": f"Content-Type: application/json\r\nContent-Length: {len(body)}\r\n\r\n{body}"}
     queries = Patient()
-    chosen = {"text_spaces": {"t": "minilm"}}
+    chosen = {"text_spaces": {"t": "lvis"}}
     with running(tmp_path / "data", queries=cast("QueryClient", queries), **chosen) as server:
         with socket.create_connection(server.servers[0].sockets[0].getsockname(), timeout=60) as connection:
             connection.sendall((head + sent[method]).encode())

@@ -1,4 +1,4 @@
-"""The scene that ships, from the shared `tabletop`: ``python -m tests.benchmarks.demo_scene ../shared/data``.
+"""The scene that ships, made from the shared data: ``python -m tests.benchmarks.demo_scene ../shared/data``.
 
 Every third view that has features in ``features_hard``, all splats as SPZ, the truth of the held-out views, and the
 table of words, which is the text encoder ``lvis``. The same files come at every run. gsply, a published writer of
@@ -96,9 +96,14 @@ def _compressed(content: bytes, path: Path) -> None:
     path.write_bytes(zstandard.ZstdCompressor(level=19).compress(content))
 
 
-if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("data", type=Path)
+def main() -> None:
+    """Make the files and print their sizes."""
+    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.demo_scene", description=__doc__)
+    parser.add_argument("data", type=Path, help="the shared data")
     make(parser.parse_args().data, SHIPPED)
     for file in sorted([*SHIPPED.iterdir(), LVIS_TABLE]):
         print(f"{file.stat().st_size:>9,} {file.name}")
+
+
+if __name__ == "__main__":
+    main()
