@@ -118,9 +118,11 @@ class Browser:
         self._call("Input.dispatchKeyEvent", type="keyDown" if text else "rawKeyDown", **told, **text)
         self._call("Input.dispatchKeyEvent", type="keyUp", **told)
 
-    def window(self, width: int, height: int, scheme: str = "dark") -> None:
-        """The window's size in CSS pixels, and whether its user likes it ``dark`` or ``light``."""
+    def window(self, width: int, height: int, scheme: str = "dark", zoom: int = 1) -> None:
+        """The window's size in CSS pixels, whether its user likes it ``dark`` or ``light``, and device pixels a CSS
+        pixel: who zooms in has more of these, in a smaller window."""
         size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 500}
+        size["deviceScaleFactor"] = zoom
         self._call("Emulation.setDeviceMetricsOverride", **size)
         self._call("Emulation.setEmulatedMedia", features=[
             {"name": "prefers-color-scheme", "value": scheme}, {"name": "prefers-reduced-motion", "value": "reduce"},
@@ -131,6 +133,13 @@ class Browser:
         node = self._call("DOM.getDocument")["root"]["nodeId"]
         found = self._call("DOM.querySelector", nodeId=node, selector=selector)["nodeId"]
         self._call("DOM.setFileInputFiles", nodeId=found, files=[str(file) for file in files])
+
+    def drop(self, files: list[Path]) -> None:
+        """Drag files of this machine over the middle of the window, and let them go there."""
+        size = self.value("({x: innerWidth / 2, y: innerHeight / 2})")
+        data = {"items": [], "files": [str(file) for file in files], "dragOperationsMask": 1}
+        for kind in ("dragEnter", "dragOver", "drop"):
+            self._call("Input.dispatchDragEvent", type=kind, data=data, **size)
 
     def screenshot(self) -> bytes:
         """The window as a PNG."""

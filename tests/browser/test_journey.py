@@ -42,7 +42,7 @@ def test_files_become_an_object_that_lights_up(
         assert "expected" in text_of(page, ".file.bad .state") and "got" in text_of(page, ".file.bad .state")
         assert page.value("document.querySelector('#lift-it').disabled") is True
         page.press(".file.bad .away")
-        page.give("#files", [scene / "point_cloud.ply", scene / "features.safetensors"])
+        page.drop([scene / "point_cloud.ply", scene / "features.safetensors"])
         page.until("!document.querySelector('#lift-it').disabled")
         assert "views" in text_of(page, "#sent")
         keep(page, "bring")

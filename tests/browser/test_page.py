@@ -19,6 +19,8 @@ AXE = (Path(__file__).parent / "axe.min.js").read_text(encoding="utf-8")
 EXAMPLES = "splatlift.ask.questions.flatMap(asked => [...asked.like, ...asked.unlike.map(term => `not ${term}`)])"
 WORDS = "splatlift.ask.questions.flatMap(asked => asked.text)"
 APPLE, LAMP = 5, 45  # splats of these
+ABSENT = """splatlift.ask.now.anyway = false;
+  Object.assign(splatlift.ask.now.answer, { clear: true, present: false, why: 'No view shows one.' })"""
 CLEAR = """(() => {
   const canvas = document.querySelector('#mask');
   const pixels = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data;
@@ -122,6 +124,11 @@ def test_what_is_not_there_is_said_plainly(page: Browser) -> None:
     page.press("#nearest")
     page.until(FOUND)
     assert columns(page, AMBER) and "comes closest" in text_of(page, "#why")
+    page.value(
+        f"(() => {{ {ABSENT}; splatlift.ask.now.anyway = false; splatlift.ask.show(); splatlift.ask.changed(); }})()"
+    )
+    assert text_of(page, "#answer") == "\u201clamp\u201d is not here." and not columns(page, AMBER)
+    assert text_of(page, "#why") == "No view shows one." and "not here" in text_of(page, "#chips")
 
 
 def test_example_that_nothing_understands_is_told_and_taken_back(page: Browser) -> None:
@@ -223,9 +230,9 @@ def test_accessibility_check_finds_nothing_serious(page: Browser, scheme: str, k
         keep(page, f"{scheme}-{tab}")
 
 
-@pytest.mark.parametrize(("width", "height"), [(1280, 800), (768, 1024), (390, 844), (450, 400)])
-def test_nothing_is_wider_than_the_window(page: Browser, width: int, height: int, keep: Keep) -> None:
-    page.window(width, height)
+@pytest.mark.parametrize(("width", "height", "zoom"), [(1280, 800, 1), (768, 1024, 1), (390, 844, 1), (640, 400, 2)])
+def test_nothing_is_wider_than_the_window(page: Browser, width: int, height: int, zoom: int, keep: Keep) -> None:
+    page.window(width, height, zoom=zoom)
     ask(page, "lamp")
     for tab in ("bring", "take", "look", "ask"):
         page.press(f"#tab-{tab}")

@@ -1,6 +1,7 @@
 // The panel of asking: words and examples, each a question with a colour; what they found, and where to cut.
 import { at, count, el, percent, plural, tell } from "./dom.js";
-import { COLOURS, countFrom, drawHistogram, histogram, rgb } from "./paint.js";
+import { countFrom, drawHistogram, histogram } from "./histogram.js";
+import { COLOURS, rgb } from "./painter.js";
 import { bytes, json, npy, words } from "./service.js";
 
 const MOST = COLOURS.length; // questions at a time
@@ -261,7 +262,7 @@ export class Ask {
   }
 
   chip(question, place) {
-    const numbers = question.answer ? (lit(question) ? count(question.count) : "unclear") : question.problem ? "!" : "\u2026";
+    const numbers = question.answer ? (lit(question) ? count(question.count) : question.answer.present === false ? "not here" : "unclear") : question.problem ? "!" : "\u2026";
     return el("li", { className: question === this.now ? "chip now" : "chip", style: { "--mine": question.colour } },
       el("button", { type: "button", className: "pick", "aria-pressed": String(question === this.now),
         on: { click: () => { this.active = place; this.thing = -1; this.show(); this.changed(); } } },
@@ -295,6 +296,9 @@ export class Ask {
     if (!answer) {
       at("answer").textContent = now.problem ? words(now.problem) : "Looking\u2026";
       at("why").textContent = "";
+    } else if (!lit(now) && answer.present === false) {
+      at("answer").textContent = `${quoted(now)} is not here.`;
+      at("why").textContent = answer.why;
     } else if (!lit(now)) {
       at("answer").textContent = `Nothing stands apart for ${quoted(now)}.`;
       at("why").textContent = "Other words may help, or a click on an example.";
@@ -326,13 +330,14 @@ export class Ask {
 const fresh = (terms, place) => ({ text: [], like: [], unlike: [], threshold: "auto", things: [], ...terms, colour: COLOURS[place % COLOURS.length] });
 const split = text => text.split(",").map(word => word.trim()).filter(Boolean);
 const number = given => (given === undefined || given === "" || Number.isNaN(Number(given)) ? "auto" : Number(given));
-const lit = question => question.anyway || question.threshold !== "auto" || question.answer.clear;
+const lit = question => question.anyway || question.threshold !== "auto" || (question.answer.clear && question.answer.present !== false);
 const shown = term => term.replace("splat:", "splat ");
 export const label = question => question.text.join(", ") || (question.like.length > 1 ? `like ${question.like.length} examples` : `like ${shown(question.like[0] || "")}`);
 const quoted = question => (question.text.length ? `\u201c${question.text.join(", ")}\u201d` : "Such a thing");
 const measures = ({ low, high }) => ` ${low.map((value, axis) => (high[axis] - value).toPrecision(2)).join(" \u00d7 ")}`;
 
 function decided({ answer, threshold, anyway }) {
+  if (answer.present === false && threshold === "auto") return `This is what comes closest. ${answer.why}`;
   if (!answer.clear && threshold === "auto" && anyway) return "This is what comes closest; it hardly stands apart from the rest.";
   if (threshold !== "auto") return "You set this cut. The dashes mark the automatic one.";
   const how = /least, in log-odds/.test(answer.threshold.explanation)

@@ -1,14 +1,18 @@
 // The panel of bringing: files by drag and drop, the settings of a lift from the schema, jobs as they run, and what
 // is here already.
-import { ago, at, count, el, plural, size, tell } from "./dom.js";
-import { events, json, picture, post, remove, upload, words } from "./service.js";
+import { ago, at, count, el, plural, size, tell, twice } from "./dom.js";
+import { gathered, kindOf } from "./files.js";
+import { events, json, patch, picture, post, remove, upload, words } from "./service.js";
 
 const PAGE = 20; // of each list
 const LOOK = 15_000; // ms between looks for jobs of others, while the panel is open
 const ENDED = ["succeeded", "failed", "canceled"];
 const KINDS = { splats: "Splats", cameras: "Cameras", features: "Features" };
+const OTHERS = { photos: "Photos", lift: "Lift", masks: "Masks", table: "Words" };
+const KNOWN = 1000; // assets among which those of a lift file are looked for
 const WANTED = { splats: ".ply, .splat, .spz or .sog", cameras: "cameras.json, transforms.json, or a .zip of a COLMAP model", features: ".safetensors packs" };
 const PRESETS = {
+  default: ["Careful", "Masks that other views contradict count less; splats get a confidence."],
   tikhonov: ["Sharp", "The paper's best: strong weights count more."],
   "row-sum": ["Plain", "Every splat takes the mean of what its rays see."],
   "top-k": ["Front splats", "The largest weights of each ray alone."],
@@ -17,24 +21,25 @@ const SPEEDS = { exact: "every pixel", balanced: "every 4th pixel", fast: "fewer
 const STAGES = { read: "Reading files", digest: "Reading files", compile: "Compiling kernels", plan: "Planning", geometry: "Looking through the views",
   solve: "Solving", robust: "Comparing views", certify: "Checking the result", save: "Saving" };
 
-const kindOf = name => (/\.(ply|splat|spz|sog)$/i.test(name) ? "splats" : /\.(json|zip)$/i.test(name) ? "cameras" : /\.safetensors$/i.test(name) ? "features" : null);
-
 export class Bring {
   // opened: with a lift that is to be shown; gone: after lifts were deleted.
-  constructor({ opened, gone }) {
-    Object.assign(this, { opened, gone, files: [], followed: new Map(), jobs: [] });
+  // open: the id of the lift that is shown, or null; raised: to bring the panel to the front.
+  constructor({ opened, gone, open, raised }) {
+    Object.assign(this, { opened, gone, open, raised, files: [], followed: new Map(), charts: new Map(), jobs: [] });
     const stop = event => { if ([...event.dataTransfer.types].includes("Files")) event.preventDefault(); };
     addEventListener("dragover", event => { stop(event); document.body.classList.add("dragging"); });
     addEventListener("dragleave", event => { if (!event.relatedTarget) document.body.classList.remove("dragging"); });
     addEventListener("drop", event => {
       stop(event);
       document.body.classList.remove("dragging");
-      if (event.dataTransfer.files.length) { this.open?.(); this.add([...event.dataTransfer.files]); }
+      if (event.dataTransfer.files.length) { this.raised(); this.add([...event.dataTransfer.files]); }
     });
     at("choose").addEventListener("click", () => at("files").click());
     at("files").addEventListener("change", () => { this.add([...at("files").files]); at("files").value = ""; });
     at("order").addEventListener("submit", event => { event.preventDefault(); this.order("/lift"); });
     at("compare").addEventListener("click", () => this.order("/tradeoff"));
+    at("plan-it").addEventListener("click", () => this.plan());
+    at("order").addEventListener("change", () => { at("plan").hidden = true; });
     at("preset").replaceChildren(...Object.entries(PRESETS).map(([name, [title, why]], place) => choice("preset", name, title, why, place === 0)));
     at("speed").replaceChildren(...Object.entries(SPEEDS).map(([name, why], place) => choice("speed", name, name, why, place === 0)));
     at("more-settings").addEventListener("toggle", () => { if (at("more-settings").open) this.schema(); });
@@ -42,20 +47,21 @@ export class Bring {
     this.show();
   }
 
-  add(files) {
-    for (const file of files) {
-      const kind = kindOf(file.name);
-      const one = { name: file.name, bytes: file.size, kind, sent: 0, asset: null, problem: null };
-      if (!kind) one.problem = { title: "Not sent", detail: /\.bin$/i.test(file.name) ? "zip the folder of the COLMAP model, and drop the zip" : `it is none of ${Object.values(WANTED).join("; ")}` };
+  async add(files) {
+    for (const file of await gathered(files)) {
+      const { kind, needs } = await kindOf(file);
+      const one = { name: file.name, bytes: file.size, kind, needs, file, sent: 0, asset: null, problem: null };
+      if (!kind) one.problem = { title: "Not sent", detail: /\.bin$/i.test(file.name) ? "zip the folder of the COLMAP model, and drop the zip" : `it is none of ${Object.values(WANTED).join("; ")}; photos; or a lift file` };
       if (kind && kind !== "features") this.files = this.files.filter(known => known.kind !== kind || !known.asset);
       this.files.push(one);
-      if (kind) this.send(one, file);
+      if (kind === "lift") this.sendLift(one);
+      else if (kind) this.send(one);
     }
     this.show();
   }
 
-  async send(one, file) {
-    const sending = upload(one.kind, file, sent => { one.sent = sent; this.show(); });
+  async send(one) {
+    const sending = upload(one.kind, one.file, sent => { one.sent = sent; this.show(); });
     one.end = sending.end;
     try {
       one.asset = await sending.done;
@@ -63,7 +69,39 @@ export class Bring {
       one.problem = problem;
     }
     this.show();
-    if (one.asset) this.refreshAssets();
+    if (!one.asset) return;
+    if (one.kind === "lift") {
+      this.files = this.files.filter(known => known !== one);
+      this.show();
+      this.opened(one.asset.id);
+      return;
+    }
+    this.refreshAssets();
+    for (const waiting of this.files) if (waiting.missing?.length) this.sendLift(waiting);
+  }
+
+  // A lift file of the command line goes up once its splats and cameras are here.
+  async sendLift(one) {
+    try {
+      const here = (await json(`/assets?limit=${KNOWN}`)).assets.map(({ id }) => id);
+      const waited = one.missing;
+      one.missing = one.needs.filter(({ id }) => !here.includes(id));
+      this.show();
+      if (!one.missing.length && !one.sent && (waited === undefined || waited.length)) await this.send(one);
+    } catch (problem) {
+      one.problem = problem;
+      this.show();
+    }
+  }
+
+  // Photos beside the lift that is open.
+  async beside(one) {
+    try {
+      await patch(`/lifts/${this.open()}`, { photos: one.asset.id });
+      this.opened(this.open());
+    } catch (problem) {
+      tell(words(problem), true);
+    }
   }
 
   // An asset that is here already, taken for the next lift.
@@ -79,23 +117,26 @@ export class Bring {
     at("sent").replaceChildren(...this.files.map(one => this.line(one)));
     const has = kind => this.files.some(one => one.kind === kind && one.asset);
     const missing = Object.keys(KINDS).filter(kind => !has(kind));
-    const busy = this.files.some(one => !one.asset && !one.problem);
+    const busy = this.files.some(one => !one.asset && !one.problem && !one.missing?.length);
     at("needs").replaceChildren(...Object.keys(KINDS).map(kind => el("li", { className: has(kind) ? "done" : "" },
       el("b", {}, KINDS[kind]), ` ${has(kind) ? "ready" : WANTED[kind]}`)));
-    at("lift-it").disabled = at("compare").disabled = Boolean(missing.length) || busy;
-    at("settings").hidden = missing.length === 3 && !this.files.length;
+    at("lift-it").disabled = at("compare").disabled = at("plan-it").disabled = Boolean(missing.length) || busy;
+    at("settings").hidden = missing.length === 3;
+    at("plan").hidden = true;
   }
 
   line(one) {
     const done = one.asset || one.problem;
     const share = one.bytes ? one.sent / one.bytes : 1;
     const state = one.problem ? words(one.problem) : one.asset ? said(one.asset)
+      : one.missing?.length ? `This lift was made of ${one.missing.map(({ kind, name }) => `${name || "its"} (${kind})`).join(" and ")}: drop ${one.missing.length > 1 ? "them" : "it"} here, too.`
       : share >= 1 ? "checking it\u2026" : `${size(one.sent)} of ${size(one.bytes)}`;
     return el("li", { className: one.problem ? "file bad" : one.asset ? "file done" : "file" },
       el("span", { className: "name" }, one.name), el("span", { className: "kind" }, one.kind || ""),
-      done ? null : el("progress", share >= 1 ? { "aria-label": `checking ${one.name}` } : { max: 1, value: share, "aria-label": `upload of ${one.name}` }),
+      done || one.missing?.length ? null : el("progress", share >= 1 ? { "aria-label": `checking ${one.name}` } : { max: 1, value: share, "aria-label": `upload of ${one.name}` }),
       el("span", { className: "state" }, state),
       ...(one.asset?.warnings || []).map(warning => el("span", { className: "state warning" }, `Note: ${warning}`)),
+      one.kind === "photos" && one.asset && this.open() ? el("span", { className: "actions" }, el("button", { type: "button", on: { click: () => this.beside(one) } }, "Show beside this scene")) : null,
       el("button", { type: "button", className: "away", "aria-label": `Take ${one.name} away`,
         on: { click: () => { if (!done) one.end?.(); this.files = this.files.filter(known => known !== one); this.show(); } } }, "\u00d7"));
   }
@@ -128,10 +169,28 @@ export class Bring {
     return chosen;
   }
 
+  ids(kind) {
+    return this.files.filter(one => one.kind === kind && one.asset).map(one => one.asset.id);
+  }
+
+  body() {
+    return { splats: this.ids("splats").at(-1), cameras: this.ids("cameras").at(-1), features: this.ids("features"), settings: this.settings() };
+  }
+
+  // What the lift would do and need, before it is ordered.
+  async plan() {
+    at("plan").hidden = false;
+    at("plan").replaceChildren(el("li", {}, "Planning\u2026"));
+    try {
+      at("plan").replaceChildren(...lines(await post("/lift/plan", this.body())));
+    } catch (problem) {
+      at("plan").replaceChildren(el("li", { className: "bad" }, words(problem)));
+    }
+  }
+
   async order(path) {
-    const ids = kind => this.files.filter(one => one.kind === kind && one.asset).map(one => one.asset.id);
-    const settings = this.settings();
-    const body = { splats: ids("splats").at(-1), cameras: ids("cameras").at(-1), features: ids("features"), settings };
+    const body = this.body();
+    const { settings } = body;
     if (path === "/tradeoff") {
       delete settings.preset;
       delete settings.speed;
@@ -142,7 +201,7 @@ export class Bring {
       at("order-problem").hidden = true;
       this.jobs = [job, ...this.jobs.filter(known => known.id !== job.id)];
       this.showJobs();
-      this.follow(job, true);
+      this.follow(job, true, this.ids("photos").at(-1));
       at("jobs").scrollIntoView({ block: "nearest" });
     } catch (problem) {
       at("order-problem").textContent = words(problem);
@@ -151,7 +210,7 @@ export class Bring {
   }
 
   // Live progress, until the job has ended. What was ordered here is opened when it is done.
-  async follow(job, ordered = false) {
+  async follow(job, ordered = false, photos = undefined) {
     if (this.followed.has(job.id) || ENDED.includes(job.state)) return;
     const end = new AbortController();
     this.followed.set(job.id, end);
@@ -164,6 +223,7 @@ export class Bring {
       }
       Object.assign(job, await json(`/jobs/${job.id}`));
       this.showJobs();
+      if (photos && job.state === "succeeded" && job.kind === "lift") await patch(`/lifts/${job.id}`, { photos });
       if (ordered && job.state === "succeeded" && job.kind === "lift") this.opened(job.id);
       else if (job.state === "succeeded") this.gone();
     } catch (problem) {
@@ -193,15 +253,15 @@ export class Bring {
     this.toldAssets = told;
     at("assets-count").textContent = assets.length ? `(${assets.length}${next ? "+" : ""})` : "(none)";
     at("assets").replaceChildren(...assets.map(asset => el("li", {},
-      el("span", { className: "name" }, KINDS[asset.kind] || asset.kind), el("span", { className: "state" }, `${said(asset)} \u00b7 ${size(asset.bytes)} \u00b7 ${ago(asset.created)}`),
+      el("span", { className: "name" }, KINDS[asset.kind] || OTHERS[asset.kind] || asset.kind), el("span", { className: "state" }, `${said(asset)} \u00b7 ${size(asset.bytes)} \u00b7 ${ago(asset.created)}`),
       el("span", { className: "actions" },
         KINDS[asset.kind] ? el("button", { type: "button", on: { click: () => this.take(asset) } }, "Lift it again") : null,
         twice("Delete", () => remove(`/assets/${asset.id}`).then(() => this.refreshAssets()))))));
   }
 
-  showJobs() {
+  showJobs(anew = false) {
     const told = JSON.stringify(this.jobs);
-    if (told === this.told) return; // buttons that ask once more, and open charts, stay
+    if (told === this.told && !anew) return; // buttons that ask once more stay
     this.told = told;
     at("jobs-none").hidden = Boolean(this.jobs.length);
     at("jobs").replaceChildren(...this.jobs.map(job => this.job(job)));
@@ -216,18 +276,18 @@ export class Bring {
       parts.push(el("progress", { max: step.total || 1, value: step.done, "aria-label": name }),
         el("span", { className: "state" }, `${name}${step.total > 1 ? `: ${count(step.done)} of ${count(step.total)} ${step.unit}` : ""}${step.eta_s ? `, ${Math.ceil(step.eta_s)} s left` : ""}`));
     }
-    if (job.plan && !ENDED.includes(job.state)) parts.push(el("ul", { className: "plan" }, ...[...job.plan.summary, ...job.plan.warnings.map(warning => `Note: ${warning}`)].map(line => el("li", {}, line))));
+    if (job.plan && !ENDED.includes(job.state)) parts.push(el("ul", { className: "plan" }, ...lines(job.plan)));
     if (job.problem) parts.push(el("span", { className: "state bad" }, words(job.problem)));
     if (ENDED.includes(job.state) && job.ended) parts.push(el("span", { className: "state" }, `${job.started ? `took ${(job.ended - job.started).toFixed(1)} s, ` : ""}${ago(job.ended)}`));
     const actions = el("span", { className: "actions" });
     if (job.state === "succeeded" && job.kind === "lift") actions.append(el("button", { type: "button", on: { click: () => this.opened(job.id) } }, "Open"));
-    if (job.state === "succeeded" && job.kind === "tradeoff") actions.append(el("button", { type: "button", on: { click: event => this.chart(job, event.target.closest("li")) } }, "Show chart"));
+    if (job.state === "succeeded" && job.kind === "tradeoff") actions.append(el("button", { type: "button", "aria-expanded": String(this.charts.has(job.id)), on: { click: () => this.chart(job) } }, this.charts.has(job.id) ? "Hide chart" : "Show chart"));
     if (["queued", "running"].includes(job.state)) actions.append(el("button", { type: "button", on: { click: () => this.cancel(job) } }, "Cancel"));
     if (ENDED.includes(job.state)) {
       const going = job.state !== "succeeded" ? "" : job.kind === "lift" ? "?with_lift=true" : "?with_tradeoff=true";
       actions.append(twice("Delete", () => remove(`/jobs/${job.id}${going}`).then(() => { this.jobs = this.jobs.filter(known => known !== job); this.showJobs(); this.gone(); })));
     }
-    return el("li", { className: "job", data: { state: job.state } }, ...parts, actions);
+    return el("li", { className: "job", data: { state: job.state } }, ...parts, actions, this.charts.get(job.id));
   }
 
   async cancel(job) {
@@ -239,35 +299,20 @@ export class Bring {
     }
   }
 
-  async chart(job, line) {
+  async chart(job) {
     try {
+      if (this.charts.delete(job.id)) return this.showJobs(true);
       const [image, { choice }] = await Promise.all([picture(`/tradeoffs/${job.id}/chart`), json(`/tradeoffs/${job.id}`)]);
       image.alt = "Seconds against accuracy of each run";
-      line.append(el("figure", { className: "chart" }, image, el("figcaption", {}, choice.why || "")));
+      this.charts.set(job.id, el("figure", { className: "chart" }, image, el("figcaption", {}, choice.why || "")));
+      this.showJobs(true);
     } catch (problem) {
       tell(words(problem), true);
     }
   }
 }
 
-// A button that asks once more before it does what cannot be undone.
-function twice(label, action) {
-  const button = el("button", { type: "button", className: "danger" }, label);
-  button.addEventListener("click", async () => {
-    if (!button.dataset.sure) {
-      button.dataset.sure = "yes";
-      button.textContent = "Really?";
-      setTimeout(() => { delete button.dataset.sure; button.textContent = label; }, 4000);
-      return;
-    }
-    try {
-      await action();
-    } catch (problem) {
-      tell(words(problem), true);
-    }
-  });
-  return button;
-}
+const lines = ({ summary, warnings }) => [...summary, ...warnings.map(warning => `Note: ${warning}`)].map(line => el("li", {}, line));
 
 function choice(group, value, title, why, checked) {
   return el("label", { className: "choice" }, el("input", { type: "radio", name: group, value, checked }), el("span", {}, el("b", {}, title), el("small", {}, why)));
@@ -285,8 +330,8 @@ function field(told) {
 }
 
 // What the check found in a file.
-function said({ kind, counts }) {
-  const told = { splats: ["splats", "kernel"], cameras: ["views"], features: ["views", "channels", "text_space"] }[kind] || Object.keys(counts);
+function said({ kind, counts = {} }) {
+  const told = { splats: ["splats", "kernel"], cameras: ["views"], features: ["views", "channels", "text_space"], photos: ["photos"] }[kind] || Object.keys(counts);
   const parts = told.filter(name => ["number", "string"].includes(typeof counts[name])).map(name => {
     if (typeof counts[name] === "string") return name === "text_space" ? `words of ${counts[name]}` : counts[name];
     return plural(counts[name], name.replace(/s$/, "").replaceAll("_", " "));

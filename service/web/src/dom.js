@@ -46,3 +46,22 @@ export function tell(text, bad = false) {
 }
 
 export const still = () => matchMedia("(prefers-reduced-motion: reduce)").matches;
+
+// A button that asks once more before it does what cannot be undone.
+export function twice(label, action) {
+  const button = el("button", { type: "button", className: "danger" }, label);
+  button.addEventListener("click", async () => {
+    if (!button.dataset.sure) {
+      button.dataset.sure = "yes";
+      button.textContent = "Really?";
+      setTimeout(() => { delete button.dataset.sure; button.textContent = label; }, 4000);
+      return;
+    }
+    try {
+      await action();
+    } catch (problem) {
+      tell(problem.detail || problem.title || String(problem), true);
+    }
+  });
+  return button;
+}

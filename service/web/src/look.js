@@ -10,6 +10,8 @@ const LAYERS = {
   cluster: "A colour for each cluster that aggregation found; grey is in none.",
   evidence: "How much the views say of each splat, by its logarithm: bright is much.",
   agreement: "How well the views agree on each splat: bright is well.",
+  confidence: "How surely each splat's feature is right, by what other views say of the same regions: bright is surely.",
+  photo: "The photo of the view, where one was brought.",
   depth: "The depth of the splats: near is bright.",
 };
 const IN_VIEWS = ["rgb", "pca", "cluster", "depth"]; // that the service draws of a view
@@ -42,6 +44,8 @@ export class Look {
     this.showLayer("rgb");
     const clusters = lift.certificate?.clusters ?? lift.settings?.aggregation;
     at("layer-cluster").hidden = !clusters;
+    at("layer-confidence").hidden = !lift.settings?.robust_steps;
+    at("layer-photo").hidden = !lift.photos;
     let { views, next } = await json(`/lifts/${lift.id}/views?limit=${PAGE}`);
     this.views = views;
     this.choices(wanted);
@@ -85,6 +89,7 @@ export class Look {
 
   switch(mode) {
     this.mode = this.fallback ? "view" : mode;
+    if (this.mode === "scene" && ["depth", "photo"].includes(this.what)) this.choose("rgb"); // of views alone
     at("stage").dataset.mode = this.mode;
     document.querySelector(`input[name=mode][value=${this.mode}]`).checked = true;
     this.draw();
@@ -100,7 +105,7 @@ export class Look {
   async choose(what) {
     this.showLayer(what);
     this.draw();
-    if (what === "rgb" || what === "depth" || this.fallback) {
+    if (["rgb", "depth", "photo"].includes(what) || this.fallback) {
       this.layer = null;
       return this.changed();
     }
@@ -134,7 +139,9 @@ export class Look {
       image.hidden = !made;
     };
     const place = new URLSearchParams({ lift: this.lift.id, view: this.view.name });
-    const over = IN_VIEWS.includes(this.what) && this.what !== "rgb" ? `/render?${place}&what=${this.what}` : null;
+    const over = this.what === "photo" ? this.view.photo && `/lifts/${this.lift.id}/photo?view=${encodeURIComponent(this.view.name)}`
+      : IN_VIEWS.includes(this.what) && this.what !== "rgb" ? `/render?${place}&what=${this.what}` : null;
+    at("layer-words").textContent = this.what === "photo" && !this.view.photo ? "There is no photo of this view." : LAYERS[this.what];
     at("picture-box").classList.add("busy");
     try {
       await Promise.all([shown("render", `/render?${place}&what=rgb`), shown("over", over), this.mask(mine)]);

@@ -1,11 +1,13 @@
 // The page: a lift on the stage, what is asked of it, and a link that opens the same again.
 import { Ask, label } from "./ask.js";
 import { Bring } from "./bring.js";
-import { ago, at, count, el, fill, size, tell } from "./dom.js";
+import { at, count, el, fill, size, tell } from "./dom.js";
+import { Lifts, title } from "./lifts.js";
 import { Look } from "./look.js";
-import { COLOURS, paint, rgb } from "./paint.js";
+import { COLOURS, rgb } from "./painter.js";
 import { bytes, json, keyOf, onRefused, useKey, words } from "./service.js";
 import { Take } from "./take.js";
+import { Things } from "./things.js";
 import { MOST, Viewer, webgl } from "./viewer.js";
 
 const PAGE = 100; // lifts to choose from
@@ -23,8 +25,9 @@ let busy = false;
 const ask = new Ask({ changed, fly: box => viewer?.toBox(box) });
 const look = new Look({ changed: () => { repaint(); link(); }, fly: view => viewer?.to(view), pick: (term, less) => ask.example(term, less), fallback: !webgl() });
 const take = new Take({ ask, look, shot });
-const bring = new Bring({ opened: id => open(id, true), gone: () => refreshLifts() });
-bring.open = () => tab("bring");
+const bring = new Bring({ opened: id => open(id, true), gone: () => refreshLifts(), open: () => lift?.id ?? null, raised: () => tab("bring") });
+const lifts = new Lifts({ opened: id => open(id, true), changed: () => refreshLifts() });
+const things = new Things({ changed: () => repaint(), fly: box => viewer?.toBox(box) });
 
 look.asked = view => {
   const question = ask.painted().length ? ask.now : null;
@@ -37,6 +40,7 @@ let drawn = "";
 
 // After what is asked, or how it is shown, has changed.
 function changed() {
+  if (ask.questions.length) things.rest();
   repaint();
   link();
   take.show();
@@ -49,21 +53,19 @@ function repaint() {
   if (!viewer?.mesh) return;
   const begun = performance.now();
   const questions = ask.painted();
-  viewer.hidden.value = at("hide").checked && questions.length ? 1 : 0;
-  paint(viewer.paints, viewer.rows, viewer.shades, questions, { heat: ask.heated(), layer: look.painted() });
-  viewer.outline(at("show-boxes").checked ? ask.boxes() : []);
-  labels();
-  viewer.painted();
+  viewer.paint(questions, { heat: ask.heated(), layer: look.painted(), hide: at("hide").checked });
+  const boxes = at("show-boxes").checked ? [...ask.boxes(), ...things.boxes()] : [];
+  viewer.outline(boxes);
+  labels(boxes);
   document.body.dataset.painted = (performance.now() - begun).toFixed(1);
 }
 
 // Names at the boxes; the chosen one is larger.
-function labels() {
-  const boxes = at("show-boxes").checked ? ask.boxes() : [];
+function labels(boxes) {
   at("labels").replaceChildren(...boxes.slice(0, 40).map(box => el("button", {
     type: "button", className: box.strong ? "label strong" : "label", tabIndex: -1, style: { "--mine": box.colour },
     data: { at: JSON.stringify([(box.low[0] + box.high[0]) / 2, (box.low[1] + box.high[1]) / 2, (box.low[2] + box.high[2]) / 2]), box: JSON.stringify([box.low, box.high]) },
-    on: { click: () => ask.choose(box.question, box.thing) },
+    on: { click: () => (box.question ? ask.choose(box.question, box.thing) : viewer.toBox(box)) },
   }, box.of > 1 ? `${box.name} ${box.thing + 1}` : box.name)));
 }
 
@@ -117,19 +119,21 @@ function trouble(text) {
 }
 
 async function refreshLifts() {
-  const { lifts, next } = await json(`/lifts?limit=${PAGE}`);
-  at("lift-label").hidden = !lifts.length;
-  fill(at("lift"), [...lifts, ...(lift && next && !lifts.some(known => known.id === lift.id) ? [lift] : [])].map(known => [known.id,
-    `${count(known.count)} splats, ${known.text_space === "none" ? "no words" : known.text_space || "own words"}, ${ago(known.created)}`]), lift?.id);
-  if (lift && !next && !lifts.some(known => known.id === lift.id)) { // it was deleted
+  const { lifts: known, next } = await json(`/lifts?limit=${PAGE}`);
+  const gone = lift && !known.some(({ id }) => id === lift.id);
+  at("lift-label").hidden = !known.length;
+  fill(at("lift"), [...known, ...(gone && next ? [lift] : [])].map(one => [one.id, title(one)]), lift?.id);
+  lifts.show(known, lift?.id);
+  if (gone && !next) { // it was deleted
     lift = null;
     viewer?.clear();
     ask.of(null);
-    if (lifts.length) open(lifts[0].id);
+    things.of(null);
+    if (known.length) open(known[0].id);
   }
-  at("empty").hidden = Boolean(lifts.length);
-  document.body.classList.toggle("no-lifts", !lifts.length);
-  return lifts;
+  at("empty").hidden = Boolean(known.length);
+  document.body.classList.toggle("no-lifts", !known.length);
+  return known;
 }
 
 async function open(id, fresh = false) {
@@ -146,8 +150,9 @@ async function open(id, fresh = false) {
     document.body.classList.remove("no-lifts");
     ask.of(lift);
     at("mask").hidden = true;
-    if (fresh) { await refreshLifts(); tab("ask"); }
-    at("lift").value = id;
+    things.of(lift);
+    refreshLifts().catch(problem => tell(words(problem), true));
+    if (fresh) tab("ask");
     viewer?.clear();
     const [content] = await Promise.all([
       look.fallback ? null : bytes(`/lifts/${id}/splats`, { progress: (got, total) => mine === turn && loading(`Loading ${size(got)}${total ? ` of ${size(total)}` : ""}`, total ? got / total : null) }),
@@ -322,15 +327,15 @@ at("forget").hidden = !keyOf();
 dark.addEventListener("change", () => { viewer?.background(ground()); repaint(); ask.bars(); });
 
 // For tests, and for the curious in the console.
-Object.assign(globalThis, { splatlift: { ask, look, bring, take, get viewer() { return viewer; }, get lift() { return lift; }, label, COLOURS } });
+Object.assign(globalThis, { splatlift: { ask, look, bring, take, things, get viewer() { return viewer; }, get lift() { return lift; }, label, COLOURS } });
 
 async function begin() {
   if (look.fallback) fallBack();
   look.showLayer("rgb");
   tab("ask");
   try {
-    const lifts = await refreshLifts();
-    const wanted = started.get("lift") || lifts[0]?.id;
+    const known = await refreshLifts();
+    const wanted = started.get("lift") || known[0]?.id;
     if (wanted) return await open(wanted);
     tab("bring");
   } catch (problem) {

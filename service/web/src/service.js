@@ -34,6 +34,7 @@ export async function call(path, { method = "GET", body, signal, more = {} } = {
 
 export const json = async (path, how) => (await call(path, how)).json();
 export const post = (path, body) => json(path, { method: "POST", body });
+export const patch = (path, body) => json(path, { method: "PATCH", body });
 export const remove = path => call(path, { method: "DELETE" });
 
 // A picture of the service, whole; free its address when nobody shows it any more.
@@ -107,9 +108,10 @@ export async function* events(path, signal) {
 
 // A file on its way up: fetch tells of no progress, so this is the older way.
 export function upload(kind, file, progress) {
+  const [method, path] = kind === "lift" ? ["POST", "/lifts"] : ["PUT", `/assets/${kind}`];
   const request = new XMLHttpRequest();
   const done = new Promise((resolve, reject) => {
-    request.open("PUT", address(`/assets/${kind}`));
+    request.open(method, address(path));
     for (const [name, value] of Object.entries(headers({}))) request.setRequestHeader(name, value);
     request.upload.onprogress = event => progress(event.loaded, event.total);
     request.onload = () => {

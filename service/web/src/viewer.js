@@ -1,38 +1,15 @@
-// The scene in 3D: three.js and Spark draw the splats; colours are painted by row, without loading anything anew.
+// The scene in 3D: three.js and Spark draw the splats.
 import * as THREE from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
-import { dyno, readRgbaArray, RgbaArray, SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
+import { SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
 import { still } from "./dom.js";
-import { shades } from "./paint.js";
+import { Painter } from "./painter.js";
 
 const ROW = 32; // bytes of a splat in a .splat file
 export const MOST = 2_000_000; // splats that are drawn; of larger scenes every n-th is
 const FLIGHT = 700; // ms
 const LOADING = 60_000; // ms that the unpacking of a scene may take before that is told
 const OPAQUE = 40; // of 255: fainter splats are not what somebody points at
-
-// A painted row is r g b and a byte: from 128 on it was found, and 127 parts of the colour cover its own.
-function painter(rgba, hidden) {
-  return dyno.dynoBlock({ gsplat: dyno.Gsplat }, { gsplat: dyno.Gsplat }, ({ gsplat }) => {
-    const { index } = dyno.splitGsplat(gsplat).outputs;
-    const mixed = new dyno.Dyno({
-      inTypes: { gsplat: dyno.Gsplat, told: "vec4", hidden: "float" },
-      outTypes: { gsplat: dyno.Gsplat },
-      inputs: { gsplat, told: readRgbaArray(rgba.dyno, index), hidden },
-      globals: () => [dyno.defineGsplat],
-      statements: ({ inputs: { gsplat: own, told, hidden: hide }, outputs: { gsplat: out } }) => [
-        `${out} = ${own};`,
-        "{",
-        `  float found = step(127.5, ${told}.a * 255.0);`,
-        `  float cover = clamp((${told}.a * 255.0 - 128.0 * found) / 127.0, 0.0, 1.0);`,
-        `  ${out}.rgba.rgb = mix(${own}.rgba.rgb, ${told}.rgb, cover);`,
-        `  ${out}.rgba.a *= 1.0 - ${hide} * (1.0 - found);`,
-        "}",
-      ],
-    });
-    return { gsplat: mixed.outputs.gsplat };
-  });
-}
 
 export function webgl() {
   try {
@@ -59,7 +36,6 @@ export class Viewer {
     this.controls.addEventListener("start", () => { this.flight = null; });
     this.moved = () => {};
     this.controls.addEventListener("end", () => this.moved());
-    this.hidden = dyno.dynoFloat(0);
     this.boxes = new THREE.Group();
     this.scene.add(this.boxes);
     this.spark = new SparkRenderer({
@@ -132,24 +108,20 @@ export class Viewer {
     await Promise.race([mesh.initialized, new Promise((_, reject) => {
       timer = setTimeout(() => reject(new Error("unpacking it takes too long")), LOADING);
     })]).finally(() => clearTimeout(timer));
-    this.rgba = new RgbaArray({ capacity: this.count });
-    const room = this.rgba.ensureCapacity(this.count);
-    this.paints = new Uint32Array(room.buffer, room.byteOffset, this.count);
-    this.shades = shades(content);
-    this.rgba.count = this.count;
-    mesh.objectModifiers = [painter(this.rgba, this.hidden)];
+    this.painter = new Painter(this.count, this.rows);
+    mesh.objectModifiers = [this.painter.modifier];
     mesh.updateGenerator();
     this.mesh = mesh;
     this.scene.add(mesh);
     this.measure();
-    this.painted();
+    this.paint([]);
   }
 
   clear() {
     if (this.mesh) {
       this.scene.remove(this.mesh);
       this.mesh.dispose();
-      this.rgba.dispose();
+      this.painter.dispose();
       this.mesh = null;
     }
     this.outline([]);
@@ -173,18 +145,11 @@ export class Viewer {
     return this.rows ? this.rows[place] : place;
   }
 
-  // After the paints were written.
-  painted() {
-    if (!this.mesh) return;
-    this.rgba.needsUpdate = true;
+  // Colours of what is asked, as `Painter` has it.
+  paint(questions, how) {
+    this.painter.paint(questions, how);
     this.mesh.updateVersion();
     this.draw();
-  }
-
-  hide(share) {
-    if (this.hidden.value === share) return;
-    this.hidden.value = share;
-    this.painted();
   }
 
   // Which way is up, and what all the views look at. Cameras are seldom rolled: up is the mean of their own, but for

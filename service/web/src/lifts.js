@@ -1,0 +1,35 @@
+// The list of lifts: names that people give, what to open, what to delete.
+import { ago, at, count, el, tell, twice } from "./dom.js";
+import { patch, remove, words } from "./service.js";
+
+export const title = lift => lift.name || `${count(lift.count)} splats, ${lift.text_space === "none" ? "no words" : lift.text_space || "own words"}, ${ago(lift.created)}`;
+
+export class Lifts {
+  // opened: with the lift to show; changed: after one was named or deleted.
+  constructor({ opened, changed }) {
+    Object.assign(this, { opened, changed });
+  }
+
+  show(lifts, open) {
+    const told = JSON.stringify([lifts.map(({ id, name }) => [id, name]), open]);
+    if (told === this.told) return; // a name that is being written stays
+    this.told = told;
+    at("lifts-head").hidden = !lifts.length;
+    at("lifts").replaceChildren(...lifts.map(lift => el("li", { className: lift.id === open ? "now" : "" },
+      el("input", { type: "text", className: "name", value: lift.name || "", maxLength: 100, placeholder: "Give it a name", "aria-label": `Name of the lift of ${ago(lift.created)}`,
+        on: { change: event => this.name(lift, event.target.value.trim()) } }),
+      el("span", { className: "state" }, `${count(lift.count)} splats \u00b7 ${lift.view_count} views \u00b7 ${lift.text_space === "none" ? "no words" : lift.text_space || "own words"} \u00b7 ${ago(lift.created)}`),
+      el("span", { className: "actions" },
+        lift.id === open ? el("span", { className: "quiet" }, "Open") : el("button", { type: "button", on: { click: () => this.opened(lift.id) } }, "Open"),
+        twice("Delete", () => remove(`/jobs/${lift.id}?with_lift=true`).then(() => this.changed()))))));
+  }
+
+  async name(lift, name) {
+    try {
+      Object.assign(lift, await patch(`/lifts/${lift.id}`, { name: name || null }));
+      this.changed();
+    } catch (problem) {
+      tell(words(problem), true);
+    }
+  }
+}
