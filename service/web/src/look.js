@@ -14,7 +14,7 @@ const LAYERS = {
   photo: "The photo of the view, where one was brought.",
   depth: "The depth of the splats: near is bright.",
 };
-const IN_VIEWS = ["rgb", "pca", "cluster", "depth"]; // that the service draws of a view
+const IN_VIEWS = ["rgb", "pca", "cluster", "confidence", "depth"]; // that the service draws of a view
 
 export class Look {
   // changed: when colours or the link must follow; fly: with a view; pick: with an example's notation.
