@@ -14,7 +14,7 @@ from safetensors import SafetensorError, safe_open
 
 from liftcore.errors import InvalidInput
 from liftcore.io.safetensors_file import check_header
-from liftcore.query.text import BUILT_IN, ENCODER_SPECS, NO_WORDS, OWN_WORDS
+from liftcore.query.text import BUILT_IN, ENCODER_SPECS, NO_WORDS, OWN_WORDS, without_templates
 from service.errors import InvalidRequest, Misconfigured
 from service.settings import ServiceSettings
 
@@ -78,7 +78,7 @@ def encoder_file(spec: str) -> Path | None:
     if spec.startswith("table:"):
         return Path(spec.removeprefix("table:"))
     if spec.startswith("open_clip:") and "@" in spec:
-        return Path(spec.partition("@")[2])
+        return Path(without_templates(spec)[0].partition("@")[2])
     return Path(spec) if spec.endswith(".safetensors") else None
 
 

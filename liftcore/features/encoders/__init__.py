@@ -64,6 +64,7 @@ def open_image_encoder(spec: str, device: str = "cpu") -> ImageEncoder:
     |---|---|
     | ``maskclip:...`` | MaskCLIP (Zhou et al., ECCV 2022): what the last attention reads there, projected |
     | ``clip:...`` | the last block's token through the layers that the class token goes through |
+    | both, of a tower with a timm trunk | each cell alone through the tower's own pooling and head |
     | ``timm:...`` | the normed token of the last block, or the last feature map of a convolutional network |
 
     Args:

@@ -2,6 +2,10 @@
 
 CLIP itself gives one vector an image. MaskCLIP (Zhou, Loy and Dai, ECCV 2022) takes away the pooling: the last
 attention's values, each patch its own, go through the output layers alone, and stay in the space of the texts.
+
+Towers whose trunk is timm's (SigLIP, SigLIP 2, MobileCLIP, ConvNeXt) pool after the trunk: there each cell alone goes
+through the tower's own pooling and head. Of SigLIP's attention pooling that is the value path, as in MaskCLIP; a mean
+over cells it leaves out.
 """
 
 from collections.abc import Callable
@@ -62,8 +66,11 @@ class ClipImageEncoder:
 def _dense(kind: str, model_name: str, tower: Any) -> Callable[[Any, Tensor], Tensor]:
     library()
     from open_clip.modified_resnet import ModifiedResNet
+    from open_clip.timm_model import TimmModel
     from open_clip.transformer import ResidualAttentionBlock, VisionTransformer
 
+    if isinstance(tower, TimmModel):
+        return _trunk(kind, model_name, tower)
     if isinstance(tower, ModifiedResNet):
         if kind == "clip":
             raise InvalidInput(
@@ -84,6 +91,40 @@ def _dense(kind: str, model_name: str, tower: Any) -> Callable[[Any, Tensor], Te
     return vit_values if kind == "maskclip" else vit_patches
 
 
+def _trunk(kind: str, model_name: str, tower: Any) -> Callable[[Any, Tensor], Tensor]:
+    """`trunk_cells`, once the tower is known to give a cell a patch for images of other sizes than its own."""
+    if kind == "maskclip" and getattr(tower.trunk, "global_pool", "") == "token":
+        hint = f"clip:{model_name}... takes the patches' tokens through the class token's layers"
+        expected, got = "a tower that pools its cells for maskclip:", f"{model_name}, which reads its class token"
+        raise InvalidInput("--encoder", expected=expected, got=got, hint=hint)
+    if getattr(tower.trunk, "dynamic_img_size", True) is False:  # positions are then resampled to an image's grid
+        tower.trunk.dynamic_img_size, tower.trunk.patch_embed.strict_img_size = True, False
+        tower.trunk.patch_embed.flatten, tower.trunk.patch_embed.output_fmt = False, "NHWC"
+    patch = _trunk_patch(tower)
+    try:
+        with torch.inference_mode():
+            shape = tuple(trunk_cells(tower, torch.zeros(1, 3, 2 * patch, 3 * patch, device=_place(tower))).shape)
+        if shape[:3] == (1, 2, 3):
+            return trunk_cells
+        got = f"a grid of {shape[1:3]} for 2x3 patches"
+    except (AssertionError, RuntimeError, ValueError, AttributeError, IndexError, TypeError) as error:
+        got = str(error)
+    raise InvalidInput(
+        "--encoder",
+        expected="a tower that gives a cell a patch of images of any size",
+        got=f"{model_name} ({got[:120]})",
+        hint="encode crops of masks with it, and pack them: 'splatlift pack masks'",
+    )
+
+
+def _trunk_patch(tower: Any) -> int:
+    return int(tower.trunk.feature_info[-1]["reduction"])
+
+
+def _place(tower: Any) -> torch.device:
+    return next(tower.parameters()).device
+
+
 def _pixels(model: Any, tower: Any) -> Pixels:
     from open_clip.transform import PreprocessCfg
 
@@ -92,6 +133,7 @@ def _pixels(model: Any, tower: Any) -> Pixels:
     settings = vars(PreprocessCfg()) | told  # open_clip's defaults where the weights say nothing
     sides = (size, size) if isinstance(size, int) else tuple(size)
     patch = getattr(tower, "patch_size", (RESNET_PATCH, RESNET_PATCH))
+    patch = (_trunk_patch(tower),) if hasattr(tower, "trunk") else patch
     return Pixels(
         patch=int(patch[0]),
         shorter=min(sides),
@@ -147,6 +189,31 @@ def resnet_values(tower: Any, images: Tensor) -> Tensor:
         cells = layer(cells)
     pool = tower.attnpool
     return pool.c_proj(pool.v_proj(cells.permute(0, 2, 3, 1)))
+
+
+def trunk_cells(tower: Any, images: Tensor) -> Tensor:
+    """Each cell of a timm trunk through the pooling and the head that the tower has for all of them.
+
+    A softmax over one cell is one, so that an attention pooling gives ``x + mlp(norm(x))`` of
+    ``x = W_o (W_v cell + b_v) + b_o``. Where the tower takes a mean and then linear layers, the mean over the cells
+    is the image's vector.
+
+    Args:
+        tower: open_clip's TimmModel. images: [n, 3, h p, w p] f32.
+
+    Returns:
+        [n, h, w, F] f32.
+    """
+    trunk, patch = tower.trunk, _trunk_patch(tower)
+    found = trunk.forward_features(images)
+    rows, columns = (side // patch for side in images.shape[-2:])
+    if found.ndim == 4:  # a feature map
+        alone = found.permute(0, 2, 3, 1).reshape(-1, found.shape[1], 1, 1)
+    else:  # tokens; the pooling skips as many as have no patch, so a cell stands for these too
+        before = trunk.num_prefix_tokens
+        alone = found[:, before:].reshape(-1, 1, found.shape[-1]).expand(-1, before + 1, -1)
+    cells = tower.head(trunk.forward_head(alone))
+    return cells.reshape(len(images), rows, columns, -1)
 
 
 def _embed(tower: Any, images: Tensor) -> Tensor:

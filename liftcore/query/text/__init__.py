@@ -15,10 +15,12 @@ ENCODER_SPECS = (
     "minilm",
     "open_clip:MODEL/PRETRAINED_TAG",
     "open_clip:MODEL@WEIGHTS_FILE",
+    "open_clip:...#7 or #80, templates",
 )
 # Encoders that need no file of the user's, and the text space of each: what answers when nobody chose an encoder.
 BUILT_IN = {"lvis": "open_clip:ViT-B-32/openai", "minilm": "minilm"}
 LVIS_TABLE = Path(__file__).with_name("lvis_clip_vit_b_32.safetensors")  # its licences: liftcore/demo/tabletop
+TEMPLATES = (1, 7, 80)  # sentences that open_clip's encoders put a word into: the word alone, or CLIP's for ImageNet
 NO_WORDS = "none"  # the text space of features that no text encoder shares
 OWN_WORDS = "prompts"  # of features whose packs bring their words
 REMEMBERED = 1_024  # texts; two megabytes at 512 channels
@@ -46,18 +48,27 @@ class TextEncoder(Protocol):
         ...
 
 
+def without_templates(spec: str) -> tuple[str, int]:
+    """A specification without its ``#7`` or ``#80``, and how many templates it asks for."""
+    bare, mark, count = spec.rpartition("#")
+    known = mark and spec.startswith("open_clip:") and count in map(str, TEMPLATES)
+    return (bare, int(count)) if known else (spec, 1)
+
+
 def open_encoder(spec: str) -> TextEncoder:
     """Open a text encoder by its specification.
 
     Args:
         spec: ``table:FILE`` or a path ending in ``.safetensors`` (precomputed embeddings); ``lvis`` (a table of the
             1,203 words of LVIS by CLIP ViT-B/32, shipped); ``minilm`` (a small sentence encoder, offline);
-            ``open_clip:MODEL/TAG`` or ``open_clip:MODEL@FILE``.
+            ``open_clip:MODEL/TAG`` or ``open_clip:MODEL@FILE``, with ``#7`` or ``#80`` behind for the mean over as
+            many of CLIP's sentences for ImageNet ("a photo of the small mug.").
 
     Raises:
         InvalidQuery: the specification is none of these, or a table is malformed.
         Unavailable: the encoder's weights are not on this machine.
     """
+    spec, templates = without_templates(spec)
     kind, _, rest = spec.partition(":")
     # A bare path may hold a colon itself, so the suffix is asked first.
     if kind != "table" and spec.endswith(".safetensors") and not spec.startswith("open_clip:"):
@@ -73,7 +84,7 @@ def open_encoder(spec: str) -> TextEncoder:
     if kind == "open_clip" and rest:
         from liftcore.query.text.open_clip import OpenClipEncoder
 
-        return OpenClipEncoder.open(rest)
+        return OpenClipEncoder.open(rest, templates)
     raise InvalidQuery("encoder", expected=f"one of {', '.join(ENCODER_SPECS)}", got=repr(spec))
 
 

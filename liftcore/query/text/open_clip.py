@@ -166,14 +166,15 @@ class OpenClipEncoder:
     Build it with `open`: a model never runs with random weights unless a test asks for them.
     """
 
-    def __init__(self, name: str, model: Any, tokenizer: Callable[[list[str]], Any]) -> None:
-        self.name = name
+    def __init__(self, name: str, model: Any, tokenizer: Callable[[list[str]], Any], templates: int = 1) -> None:
+        self.name = name if templates == 1 else f"{name}#{templates}"
+        self._templates = _templates(templates)
         self._model = model.eval()
         self._tokenizer = tokenizer
         self.channels = int(self._encode(["a"]).shape[1])
 
     @classmethod
-    def open(cls, spec: str) -> Self:
+    def open(cls, spec: str, templates: int = 1) -> Self:
         """Load ``MODEL/PRETRAINED_TAG`` (cached or downloaded by open_clip) or ``MODEL@WEIGHTS_FILE``.
 
         Local files are read with ``weights_only``: a pickle that holds more than tensors is refused.
@@ -183,13 +184,13 @@ class OpenClipEncoder:
             Unavailable: no weights were named, or they cannot be had here.
         """
         opened = open_model("open_clip", spec)
-        return cls(opened.name, _without_images(opened.model), tokenizer_of(opened.model_name))
+        return cls(opened.name, _without_images(opened.model), tokenizer_of(opened.model_name), templates)
 
     @classmethod
-    def _with_random_weights(cls, model_name: str) -> Self:
+    def _with_random_weights(cls, model_name: str, templates: int = 1) -> Self:
         """A model of the right shape that knows nothing: tests of plumbing only."""
         model = _without_images(create_model(model_name, None))
-        return cls(f"open_clip:{model_name} (random)", model, tokenizer_of(model_name))
+        return cls(f"open_clip:{model_name} (random)", model, tokenizer_of(model_name), templates)
 
     def encode(self, texts: Sequence[str]) -> np.ndarray:
         """n texts -> [n, F] f32 unit rows.
@@ -198,12 +199,26 @@ class OpenClipEncoder:
             InvalidQuery: an empty text.
         """
         refuse_empty(texts)
-        return self._encode(list(texts)) if texts else np.empty((0, self.channels), np.float32)
+        if not texts:
+            return np.empty((0, self.channels), np.float32)
+        if not self._templates:
+            return self._encode(list(texts))
+        means = [self._encode([said(text) for said in self._templates]).mean(axis=0) for text in texts]
+        return np.stack([mean / np.linalg.norm(mean) for mean in means])
 
     def _encode(self, texts: list[str]) -> np.ndarray:
         with torch.no_grad():
             rows = self._model.encode_text(self._tokenizer(texts)).to(torch.float32)
             return (rows / torch.linalg.vector_norm(rows, dim=1, keepdim=True)).numpy()
+
+
+def _templates(count: int) -> Sequence[Callable[[str], str]]:
+    """CLIP's sentences for ImageNet, all 80 or the 7 that its notebook of prompts chose; none of the word alone."""
+    library()
+    from open_clip import zero_shot_metadata
+
+    known = {7: zero_shot_metadata.SIMPLE_IMAGENET_TEMPLATES, 80: zero_shot_metadata.OPENAI_IMAGENET_TEMPLATES}
+    return known.get(count, ())
 
 
 def _without_images(model: Any) -> Any:

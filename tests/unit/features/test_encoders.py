@@ -517,6 +517,41 @@ def test_a_pickle_that_holds_code_is_refused(spec: str, tmp_path: Path) -> None:
         open_image_encoder(f"{spec}@{tmp_path / 'weights.pt'}")
 
 
+def small_trunk(name: str, pool: str, proj: Any) -> Any:
+    library()
+    from open_clip.timm_model import TimmModel
+
+    torch.manual_seed(8)
+    return TimmModel(name, F, image_size=64, pool=pool, proj=proj).eval()
+
+
+def test_a_trunk_that_takes_a_mean_gives_cells_whose_mean_is_the_image() -> None:
+    tower = small_trunk("fastvit_t8", "avg", None)  # of MobileCLIP's family
+    encoder, images = small_encoder("maskclip", tower), torch.randn(2, 3, 64, 96)
+    cells = encoder.encode(images)
+    assert (encoder.pixels.patch, tuple(cells.shape)) == (32, (2, 2, 3, F))
+    with torch.no_grad():
+        torch.testing.assert_close(cells.mean(dim=(1, 2)), tower(images), rtol=1e-3, atol=1e-4)
+
+
+def test_a_trunk_that_attends_gives_the_value_path_of_its_pooling() -> None:
+    tower = small_trunk("vit_tiny_patch16_224", "map", "none")  # as SigLIP has it
+    encoder, images = small_encoder("maskclip", tower), torch.randn(1, 3, 32, 48)
+    pool = tower.trunk.attn_pool
+    with torch.no_grad():
+        tokens = tower.trunk.forward_features(images)[:, tower.trunk.num_prefix_tokens :]
+        values = pool.proj(pool.kv(tokens)[..., pool.kv.out_features // 2 :])
+        expected = tower.head(tower.trunk.fc_norm(values + pool.mlp(pool.norm(values))))
+        torch.testing.assert_close(encoder.encode(images), expected.reshape(1, 2, 3, -1))
+
+
+def test_a_trunk_with_a_class_token_has_no_values_to_take() -> None:
+    tower = small_trunk("vit_tiny_patch16_224", "token", "linear")
+    assert small_encoder("clip", tower).encode(torch.randn(1, 3, 32, 16)).shape == (1, 2, 1, F)
+    with pytest.raises(InvalidInput, match="reads its class token; clip:small"):
+        small_encoder("maskclip", tower)
+
+
 def test_towers_without_a_value_path_are_refused() -> None:
     with pytest.raises(InvalidInput, match="attention pooler"):
         small_encoder("maskclip", small_vit(attentional_pool=True, attn_pooler_heads=2))

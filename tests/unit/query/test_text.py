@@ -11,7 +11,7 @@ import torch
 from safetensors.torch import save_file
 
 from liftcore.errors import InvalidQuery, Unavailable
-from liftcore.query.text import RememberingEncoder, open_encoder
+from liftcore.query.text import RememberingEncoder, open_encoder, without_templates
 from liftcore.query.text.open_clip import OpenClipEncoder, tokenizer_of
 
 pytestmark = pytest.mark.slow
@@ -125,6 +125,18 @@ def test_open_clip_gives_unit_rows_of_its_width(clip: OpenClipEncoder) -> None:
     rows = clip.encode(["a cat", "a dog on a mat"])
     assert rows.shape == (2, 512) and clip.channels == 512
     np.testing.assert_allclose(np.linalg.norm(rows, axis=1), 1.0, rtol=1e-6)
+
+
+def test_templates_give_the_mean_over_their_sentences(clip: OpenClipEncoder, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert without_templates("open_clip:ViT-B-32@a#1.pt") == ("open_clip:ViT-B-32@a#1.pt", 1)
+    monkeypatch.setattr(OpenClipEncoder, "open", lambda spec, count: (spec, count))
+    assert open_encoder("open_clip:ViT-B-32/openai#80") == ("ViT-B-32/openai", 80)
+    seven = OpenClipEncoder("small", clip._model, tokenizer_of("ViT-B-32"), 7)
+    said = ["itap of a mug.", "a bad photo of the mug.", "a origami mug.", "a photo of the large mug."]
+    said += ["a mug in a video game.", "art of the mug.", "a photo of the small mug."]
+    mean = clip.encode(said).mean(axis=0)
+    assert seven.name == "small#7"
+    np.testing.assert_allclose(seven.encode(["mug"])[0], mean / np.linalg.norm(mean), atol=1e-6)
 
 
 def test_open_clip_without_weights_is_unavailable_and_never_random() -> None:
