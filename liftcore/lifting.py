@@ -229,7 +229,8 @@ class _Lift:
         if settings.consensus and masks:
             with self.timings.stage("consensus"):
                 W = W.cpu()
-                consensus = torch.from_numpy(mask_consensus(W, geometry.levels, self.threads))
+                found = mask_consensus(W, geometry.levels, self.threads, means=self.splats.means)
+                consensus = torch.from_numpy(found)
         with self.timings.stage("robust"):
             if not settings.robust_steps:
                 return W, None

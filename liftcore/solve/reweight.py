@@ -57,6 +57,7 @@ from liftcore.solve.weights import MEMORY_LIMIT, RegionWeights, row_blocks, run_
 CPU = torch.device("cpu")
 ROWS = 1 << 14  # of a table in float64 at a time
 BLOCK_ROWS, BLOCK_ENTRIES = 1 << 11, 1 << 15  # a splat has a sum for each view of it
+LONG = 256  # terms of a sum that float32 adds up one by one
 NO_CONSENSUS = 1e-6  # of a splat's weight: a shorter r is what rounding leaves of inputs that cancel
 SHARPNESS = 4.0  # the most that costs right masks of no scene more than .001 of accuracy (docs/method.md)
 DIRECTIONS = 256  # of e, principal ones, in which cosines are taken where regions are few beside entries
@@ -250,35 +251,55 @@ class _Judge:
 
 @vectorised
 def compare_rows(rows, indptr, region, weight, factors, inverse, view, table, products, squares):
-    """`_Judge._compare` of some rows; sums in float64, for a splat may lie behind a million regions."""
-    width = table.shape[1]
-    total, others = np.empty(width), np.empty(width)
+    """`_Judge._compare` of some rows.
+
+    The sum of the others is that of the views before and that of the views behind: a difference of two float32 sums
+    would be mostly rounding where a view has most of the weight. Of a view float32 adds up LONG entries one by one.
+    """
+    width, most = table.shape[1], 0
+    for row in rows:
+        most = max(most, indptr[row + 1] - indptr[row])
+    most = min(most, view[-1] + 1)
+    said, before = np.empty((most + 1, width), np.float32), np.empty((most + 1, width), np.float32)
+    behind, others = np.empty(width, np.float32), np.empty(width, np.float32)
     for row in rows:
         first, last = indptr[row], indptr[row + 1]
-        total[:] = 0.0
-        for k in range(first, last):
-            line, share = table[region[k]], weight[k] * factors[k] * inverse[row]
-            for c in range(width):
-                total[c] += share * line[c]
-        k = first
+        before[0] = behind[:] = 0.0
+        k, number = first, 0
         while k < last:
             begin, v = k, view[region[k]]
-            others[:] = 0.0
             while k < last and view[region[k]] == v:
-                line, share = table[region[k]], weight[k] * factors[k] * inverse[row]
-                for c in range(width):
-                    others[c] += share * line[c]
-                k += 1
-            square = 0.0
+                target = number if k - begin < LONG else most
+                said[target] = 0.0
+                for n in range(k, min(k + LONG, last)):
+                    m = region[n]
+                    if view[m] != v:
+                        break
+                    share = np.float32(weight[n] * factors[n] * inverse[row])
+                    for c in range(width):
+                        said[target, c] += share * table[m, c]
+                    k += 1
+                if target != number:
+                    for c in range(width):
+                        said[number, c] += said[target, c]
             for c in range(width):
-                others[c] = total[c] - others[c]
+                before[number + 1, c] = before[number, c] + said[number, c]
+            number += 1
+        k = last - 1
+        while k >= first:
+            number -= 1
+            v, square = view[region[k]], np.float32(0.0)
+            for c in range(width):
+                others[c] = before[number, c] + behind[c]
                 square += others[c] * others[c]
-            for n in range(begin, k):
-                line, product = table[region[n]], 0.0
+                behind[c] += said[number, c]
+            while k >= first and view[region[k]] == v:
+                m, product = region[k], np.float32(0.0)
                 for c in range(width):
-                    product += line[c] * others[c]
-                products[n] += product
-                squares[n] += square
+                    product += table[m, c] * others[c]
+                products[k] += product
+                squares[k] += square
+                k -= 1
 
 
 @kernel
@@ -286,6 +307,7 @@ def weigh_rows(
     rows, indptr, region, weight, factors, inverse, view, cosines, reliable, consensus, confidence, usual, power
 ):
     """`_Judge._weigh` of some rows, and their confidence."""
+    sharp = np.float32(power)
     for row in rows:
         first, last = indptr[row], indptr[row + 1]
         before, after, told = 0.0, 0.0, 0.0
@@ -299,7 +321,7 @@ def weigh_rows(
             for n in range(begin, k):
                 kept = ((1.0 - own) * cosines[n] + own * usual) * reliable[region[n]]
                 if consensus.size > 0:
-                    kept *= consensus[n] ** power
+                    kept *= consensus[n] ** sharp
                 before += weight[n]
                 after += weight[n] * kept
                 told += weight[n] * kept * cosines[n]

@@ -55,7 +55,7 @@ def defined(W: RegionWeights, levels: np.ndarray) -> np.ndarray:
     view = np.searchsorted(offsets, np.arange(levels.size), side="right") - 1
     groups = [np.flatnonzero((view == v) & (levels == level)) for v in range(offsets.size - 1) for level in (0, 1)]
     groups = [group for group in groups if group.size]
-    B = np.zeros_like(whole)
+    B = np.zeros_like(whole, dtype=bool)
     for group in groups:
         sums = whole[:, group].sum(axis=1, keepdims=True)
         B[:, group] = (sums > FAINT) & (whole[:, group] >= BELONGS * sums) & (whole[:, group] > 0)
@@ -65,16 +65,9 @@ def defined(W: RegionWeights, levels: np.ndarray) -> np.ndarray:
         if levels[m] < 0:
             continue
         for v in range(offsets.size - 1):
-            shares = [
-                R[m, n] / R[m, group].sum()
-                for group in groups
-                for n in group
-                if v != view[m]
-                and view[n] == v
-                and B[j, n]
-                and R[m, group].sum() >= OBSERVES * R[m, m]
-                and R[m, group].sum() > 0
-            ]
+            seen = [(group, R[m, group].sum()) for group in groups if v == view[group[0]] != view[m]]
+            seen = [(group, sum_) for group, sum_ in seen if sum_ >= OBSERVES * R[m, m] and sum_ > 0]
+            shares = [R[m, n] / sum_ for group, sum_ in seen for n in group[B[j, group]]]
             if shares:
                 asked[j, m] += max(shares)
                 views[j, m] += 1
@@ -91,7 +84,10 @@ def entries(W: RegionWeights, values: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("levels", [1, 2])
 def test_consensus_equals_its_definition(seed: int, levels: int) -> None:
     W, own = random_scene(seed, levels=levels)
-    np.testing.assert_allclose(entries(W, mask_consensus(W, own)), defined(W, own), rtol=2e-5, atol=1e-6)
+    means = torch.from_numpy(np.random.default_rng(seed).normal(size=(SPLATS, 3)))
+    for order in (None, means):  # in which splats are read
+        got = entries(W, mask_consensus(W, own, means=order))
+        np.testing.assert_allclose(got, defined(W, own), rtol=2e-5, atol=1e-6)
 
 
 def test_cells_of_grids_take_no_part() -> None:
@@ -129,18 +125,32 @@ def test_threads_and_blocks_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> No
     one = mask_consensus(W, levels, 1)
     assert mask_consensus(W, levels, 2).tobytes() == one.tobytes()
     taken: list[int] = []
-    whole = consensus.by_region
+    whole = consensus.agree
 
     def counted(*arguments: object) -> None:
-        taken.append(np.asarray(arguments[7]).size)
+        taken.append(np.asarray(arguments[5]).size)
         whole(*arguments)
 
-    monkeypatch.setattr(consensus, "by_region", counted)
+    monkeypatch.setattr(consensus, "agree", counted)
     monkeypatch.setattr(consensus, "BLOCK_ENTRIES", 256)  # the memory that it takes beside an entry's own numbers
     assert mask_consensus(W, levels, 2).tobytes() == one.tobytes()
     widest = int(np.bincount(W.region.numpy()).max())
     assert len(taken) > 2
     assert max(taken) <= 256 + widest
+
+
+def test_more_tuples_than_the_first_table_holds_are_told_apart() -> None:
+    rng = np.random.default_rng(1)
+    parts = []
+    for _ in range(40):
+        view = np.zeros((SPLATS, 60))
+        view[np.arange(SPLATS), rng.integers(0, 30, SPLATS)] = view[
+            np.arange(SPLATS), rng.integers(30, 60, SPLATS)
+        ] = 1
+        parts.append(of_dense(view))
+    W, levels = stacked(parts, SPLATS), np.repeat([0, 1], 30).astype(np.int8)
+    levels = np.tile(levels, 40)
+    np.testing.assert_allclose(entries(W, mask_consensus(W, levels)), defined(W, levels), rtol=2e-5, atol=1e-6)
 
 
 def test_a_scene_without_entries_has_none() -> None:
