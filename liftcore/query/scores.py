@@ -21,6 +21,7 @@ LOWEST_COSINE = -1.0  # what a splat without a feature scores
 # An example's score is 1 for the same and 0 for what the scene is on the whole; words have no such scale.
 LEAST_LIKENESS = 0.4  # of an example, below which the automatic threshold is not sought
 LEAST_OFFSET = 1e-3  # from the mean, of unit features: what is nearer has no direction that float16 could tell
+FAINTEST = 1e-30  # of the squares that float32 adds up without loss
 RELEVANCY_SHARPNESS = 10.0  # the softmax's inverse temperature in LERF and LangSplat
 
 # A float16 shifted to float32's place is the number times 2^-112, as the exponents' biases are 127 and 15.
@@ -70,7 +71,14 @@ def _measure(first, last, bits, half, scale, norms):
         _widen(bits[j], half, words)
         for c in range(row.shape[0]):
             row[c] *= scale
-        norms[j] = np.sqrt(_dot(row, row))
+        square = _dot(row, row)
+        if not FAINTEST < square < np.inf:  # where float32 has no squares
+            wide = 0.0
+            for c in range(row.shape[0]):
+                wide += np.float64(row[c]) * np.float64(row[c])
+            norms[j] = np.sqrt(wide)
+        else:
+            norms[j] = np.sqrt(square)
 
 
 def norms_of(features: np.ndarray) -> np.ndarray:
@@ -130,7 +138,9 @@ def mean_direction(features: np.ndarray, norms: np.ndarray, weights: np.ndarray)
     Args:
         features: [P, F] f16 or f32. norms: [P] f32, from `norms_of`. weights: [P] f32, at least zero.
     """
-    shares = np.where(norms > 0, weights / np.maximum(norms, 1e-30).astype(np.float64), 0.0).astype(np.float32)
+    shares = np.where(
+        norms > 0, weights / np.maximum(norms, np.finfo(np.float32).tiny).astype(np.float64), 0.0
+    ).astype(np.float32)
     total = np.zeros(features.shape[1])
     step = rows_at_a_time(features.shape[1])
     for first in range(0, len(features), step):

@@ -8,8 +8,9 @@ that were kept. With a stride, rays are sampled among those that the lift saw; B
     Delta_ij = || x_j - B_i ||,  mu_i = sum_j a_ij Delta_ij,  beta_i = sum_j a_ij (Delta_ij^2 - mu_i^2) / mu_i^2
 
 ``L <= J`` (Jensen) where rows sum to one; a ray that meets nothing has ``L = ||B||^2`` and ``J = 0``.
-Here ``a_ij = A_ij / sum_j A_ij``. A ray has a row i for each labelled level. The paper defines beta at the optimum
-x^; here it is measured at the answer x', which is what a user has, and so ``1 + beta`` here is a sign and no proof.
+Here ``a_ij = A_ij / sum_j A_ij``; a ray that meets nothing has no beta. A ray has a row i for each labelled level.
+The paper defines beta at the optimum x^; here it is measured at the answer x', which is what a user has, and so
+``1 + beta`` here is a sign and no proof.
 `least_squares.reference` finds x^, and says which beta the theorem is about.
 """
 
@@ -31,11 +32,13 @@ from liftcore.raster.base import LOW_PASS, MAX_LOG_SCALE
 from liftcore.scene.cameras import Camera, photo_size
 from liftcore.scene.splats import Splats
 from liftcore.settings import LiftSettings
+from liftcore.solve.codebook import row_lengths
 from liftcore.solve.geometry import SampledRays
 
 _CHUNK_VALUES = 1 << 21  # float32 values gathered at a time: 8 MB, as larger ones are fresh pages every time
 _READS_A_RAY = 8  # levels or taps of a ray; few scenes have more
-_MU_FLOOR = 1e-6  # a row whose splats all equal what it observed has no dispersion to speak of
+_MU_FLOOR = 1e-6  # of the longest vector: a row whose splats all equal what it observed has no dispersion
+_SCALES = 120  # powers of two that float32 divides and multiplies by without a rounding
 
 
 @dataclass(frozen=True)
@@ -45,7 +48,7 @@ class ViewMeasures:
     row_sums: np.ndarray  # [n] f64, a value a ray
     residuals: np.ndarray  # [rows] f64, ||A x - B||^2
     surrogates: np.ndarray  # [rows] f64, sum_j A ||x_j - B||^2
-    betas: np.ndarray  # [rows] f64
+    betas: np.ndarray  # [rows] f64; NaN where the ray meets nothing
 
 
 def certify(measures: ViewMeasures, sums: np.ndarray, evidence: Tensor, settings: LiftSettings) -> dict[str, Any]:
@@ -99,13 +102,17 @@ def measure_view(sample: SampledRays, features: Tensor, codebook: Tensor) -> Vie
     weights = sample.rows.weights.numpy().astype(np.float64)
     row_sums = np.bincount(ray_of_entry, weights, minlength=lengths.size)
     readout, splats = sample.readout, sample.rows.splats.long()
+    longest = float(row_lengths(codebook).max()) if codebook.numel() else 0.0
+    scale = 2.0 ** round(math.log2(min(max(longest, 2.0**-_SCALES), 2.0**_SCALES)))  # squares of others have no place
     measures, by_ray = np.zeros((readout.rays.size, 3)), np.argsort(readout.rays, kind="stable")
     for first, last in _ray_chunks(starts, _CHUNK_VALUES // features.shape[1]):
         chosen = by_ray[slice(*np.searchsorted(readout.rays, [first, last], sorter=by_ray))]
-        X = features[splats[starts[first] : starts[last]]].float().numpy()  # [entries, F]
-        B = readout.rows(chosen).observed(codebook).numpy()  # [rows, F]
+        X = features[splats[starts[first] : starts[last]]].float().div_(scale).numpy()  # [entries, F]
+        B = readout.rows(chosen).observed(codebook).div_(scale).numpy()  # [rows, F]
         own_starts, own_weights = starts[first : last + 1] - starts[first], weights[starts[first] : starts[last]]
         measures[chosen] = measure_rows(readout.rays[chosen] - first, own_starts, own_weights, X, B)
+    measures[:, :2] *= scale**2
+    measures[row_sums[readout.rays] == 0, 2] = np.nan
     return ViewMeasures(row_sums, measures[:, 0], measures[:, 1], measures[:, 2])
 
 
@@ -162,7 +169,8 @@ def _mean(values: np.ndarray) -> float | None:
 
 
 def quantiles(values: np.ndarray) -> dict[str, float | None]:
-    """Median, p99 and max; None where there is no value, or no finite one."""
+    """Median, p99 and max of what is a number; None where there is none, or no finite one."""
+    values = values[~np.isnan(values)]
     if not values.size:
         return {"median": None, "p99": None, "max": None}
     found = {"median": np.median(values), "p99": np.quantile(values, 0.99), "max": values.max()}

@@ -489,11 +489,14 @@ def reference(
 
 
 def row_betas(measures: ViewMeasures) -> np.ndarray:
-    """beta_i [rows] f64 of the theorem: ``sum_j A_ij |x_j - B_i|^2 / mu_i^2 - 1``; infinite where only mu is zero."""
+    """beta_i [rows] f64 of the theorem, ``sum_j A_ij |x_j - B_i|^2 / mu_i^2 - 1``.
+
+    Infinite where mu alone is zero, and NaN where the ray meets no splat.
+    """
     ratio = np.ones_like(measures.surrogates)
     np.divide(measures.surrogates, measures.residuals, out=ratio, where=measures.residuals > 0)
     ratio[(measures.residuals == 0) & (measures.surrogates > 0)] = np.inf
-    return np.maximum(ratio - 1.0, 0.0)
+    return np.where(np.isnan(measures.betas), np.nan, np.maximum(ratio - 1.0, 0.0))
 
 
 def _measured(measures: ViewMeasures) -> dict[str, Any]:
@@ -517,7 +520,7 @@ def _message(found: dict[str, Any]) -> str:
         else f"not converged, so it is at least that; gradient {found['gradient']:.2g}"
     )
     said = f"L(x') is {found['ratio']:.3f} times L(x^) after {found['steps']} steps ({end})"
-    if found["bound"] is None:
+    if found["bound"] is None or found["surrogate_bound"] is None:
         return f"{said}; no bound, for no row was sampled or one is met exactly."
     return (
         f"{said}; on the sampled rays J(x^) / L(x^) is {found['surrogate_bound']:.3f} and 1 + beta is "

@@ -23,6 +23,25 @@ def test_agreement_is_the_same_at_any_length_of_the_vectors():
     assert torch.allclose(runs[0], runs[2], atol=1e-5)
 
 
+@pytest.mark.parametrize("scale", [1e-30, 1e-7, 1e15])
+def test_a_certificate_and_scores_are_the_same_at_any_length(scale):
+    views = [{f"v{k}": checkerboard(5 + k, 40, size) for k in range(2)} for size in (1.0, scale)]
+    one, other = (lifted(own, preset="row-sum", reference_channels=4) for own in views)
+    for key in ("beta", "bound", "reference"):
+        assert numbers(other.diagnostics[key]) == pytest.approx(numbers(one.diagnostics[key]), rel=2e-3, abs=1e-3)
+    question = one.features[one.seen][:1].numpy()
+    assert torch.allclose(other.query(question).scores, one.query(question).scores, atol=1e-5)
+
+
+def numbers(told: object) -> list[float]:
+    """The numbers of a part of a certificate that have no unit."""
+    if not isinstance(told, dict):
+        return [told] if isinstance(told, float) else []
+    return [
+        n for name, part in told.items() if name not in ("residual", "optimum", "gradient") for n in numbers(part)
+    ]
+
+
 def without_plan(certificate: dict[str, object]) -> dict[str, object]:
     return {key: value for key, value in certificate.items() if key != "plan"}
 

@@ -43,6 +43,8 @@ def dense_measures(X: np.ndarray, seed: int, cameras, gain: float, grids: bool) 
         "residual": np.concatenate(residuals).mean(),
         "surrogate": np.concatenate(surrogates).mean(),
         "bound": 1 + np.concatenate(betas).max(),
+        "median": np.median(np.concatenate(betas)),
+        "p99": np.quantile(np.concatenate(betas), 0.99),
     }
 
 
@@ -53,7 +55,7 @@ def test_a_certificate_over_all_rays_equals_the_papers_definitions(tmp_path, pre
     settings = LiftSettings.of(preset=preset, certificate_rays=ALL_RAYS, dtype="float32")
     result = lift_files(paths[0], paths[1], [paths[2]], settings)
     expected = dense_measures(result.features.double().numpy(), 3, read_cameras(paths[1]), settings.lift_gain, grids)
-    certificate = result.metadata.certificate
+    certificate = result.metadata.certificate | result.metadata.certificate["beta"]
     for name, value in expected.items():
         assert certificate[name] == pytest.approx(value, rel=1e-3, abs=1e-6), name
 
