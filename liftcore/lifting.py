@@ -343,6 +343,7 @@ class _Lift:
         }
         lifted = [views.camera(number) for number in range(len(views))]
         told = lift_warnings(self.splats, lifted, sums, self.settings.dtype, X.dtype, facts)
+        told += [part["warning"] for part in notes.values() if "warning" in part]
         facts["warnings"] = [*told, *plan.told]
         with self.timings.step("certify"):
             measures = measure_samples(geometry.samples, X, geometry.books, self.threads)

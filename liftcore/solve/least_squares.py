@@ -45,6 +45,7 @@ from liftcore.progress import Progress, silent
 from liftcore.raster.base import CompositingParams, Raster, Weighting
 from liftcore.scene.cameras import Camera
 from liftcore.settings import LiftSettings
+from liftcore.solve.codebook import row_lengths
 from liftcore.solve.diagnostics import ViewMeasures, measure_samples, quantiles
 from liftcore.solve.geometry import Readout, SampledRays, read_pixels
 
@@ -54,6 +55,7 @@ EXTRA_AXES = 8  # directions that the iteration carries beyond those asked for
 ROUNDS = 12  # of the subspace iteration
 FLOAT16_MAX = 65_504.0
 TOLERANCE = 1e-4  # of the gradient, relative to the closed form's; float32 products give little more
+FAR_LONGER = 10.0  # than any input: a mean of inputs never is, and with damping 1 hardly a splat (tests/stability)
 FAINTEST = 1e-30  # a diagonal entry below this says nothing of its splat, and its inverse would overflow
 STEPS = 100  # of conjugate gradients towards the optimum, unless the gradient has vanished before
 
@@ -122,6 +124,11 @@ def codebook_axes(codebooks: Sequence[Tensor], count: int) -> Tensor:
         values, vectors = torch.linalg.eigh(axes.T @ image)
         order = torch.argsort(values, descending=True, stable=True)[:count]
         return (axes @ vectors[:, order]).float()
+
+
+def longest_row(books: Sequence[Tensor]) -> float:
+    """The largest length of the rows of several [n, F]."""
+    return max((float(row_lengths(book).max()) for book in books if book.numel()), default=0.0)
 
 
 def random_axes(channels: int, count: int, seed: int) -> Tensor:
@@ -370,7 +377,12 @@ def refine(
         solved.append(replace(block, step=np.empty(0)))  # which is as large as its part of X
         del block  # before the next one is solved beside it
         progress("refine", done + settings.cg_steps, total, "steps")
-    return _summary(features, solved, parts[-1].end, settings, rays.rows)
+    made = _summary(features, solved, parts[-1].end, settings, rays.rows)
+    inputs, found = longest_row(codebooks), longest_row([features])
+    if found > FAR_LONGER * inputs:
+        told = f"least squares made features up to {found / inputs:.0f} times as long as any input"
+        made.stats["warning"] = f"{told}: see whether damping=1, which holds them back, serves better"
+    return made
 
 
 def solve_block(

@@ -33,6 +33,13 @@ def test_a_certificate_and_scores_are_the_same_at_any_length(scale):
     assert torch.allclose(other.query(question).scores, one.query(question).scores, atol=1e-5)
 
 
+@pytest.mark.parametrize(("damping", "told"), [(0.0, True), (1.0, False)])
+def test_least_squares_that_runs_away_is_told(damping, told):
+    got = lifted({f"v{k}": checkerboard(5 + k, 40) for k in range(3)}, preset="row-sum", cg_steps=20, damping=damping)
+    warned = [text for text in got.diagnostics["warnings"] if "times as long as any input" in text]
+    assert bool(warned) == told
+
+
 def numbers(told: object) -> list[float]:
     """The numbers of a part of a certificate that have no unit."""
     if not isinstance(told, dict):
