@@ -31,6 +31,7 @@ from liftcore.scene.cameras import Camera, distortion_warning
 from liftcore.scene.splats import Splats
 from liftcore.settings import LiftSettings
 from liftcore.solve.codebook import TABLE_BYTES
+from liftcore.solve.consensus import BLOCK_ENTRIES
 from liftcore.solve.diagnostics import shape_warnings
 from liftcore.solve.geometry import LiftViews
 from liftcore.solve.memory import check_disk, lack_of_disk
@@ -44,6 +45,9 @@ SCENE_BYTES = 230  # of a splat: as the raster has it, its order and counts in a
 RECORD_BYTES = 240  # of a splat that a view shows: projected, with its row of W
 TILE_BYTES = 100  # of a splat in a tile: its place in the tile's list, and what the tile found of it
 ENTRY_BYTES, ROW_BYTES = 8, 20  # of W: region and weight; a splat's number, row start and evidence
+JUDGED_BYTES = 12  # of an entry: factors, and the products and squares that they are made of
+CONSENSUS_BYTES = 10  # of an entry: what it gets, of how many views, whether it belongs; the tuple of its view
+BLOCK_BYTES = 9  # of an entry that lies by region
 CG_VECTORS, CG_CHANNELS = 14, 32  # [P, 32] f32 of conjugate gradients, with the images of a view
 CLUSTERING = 80_000_000  # of hdbscan and what it stands on
 SPARE = 0.9  # of the free memory: 10 % are left to other processes
@@ -220,11 +224,20 @@ def _choose_views(
 
 
 def weight_bytes(seen: Visibility, features: Views, names: Sequence[str], settings: LiftSettings) -> int:
-    """Bytes of W of all views, about: a splat meets a region or four cells in each tile and level that it touches."""
-    parts = max(_parts_a_tile(features, name, settings) for name in names)
-    shown = int(seen.in_view.sum()) / seen.areas.shape[1] * seen.splats
+    """Bytes of W of all views, about."""
     judged = 4 if settings.robust_steps else 0
-    return int(shown * (ROW_BYTES + (ENTRY_BYTES + judged) * parts * _tiles(seen)))
+    return int(ROW_BYTES * _shown(seen) + (ENTRY_BYTES + judged) * _entries(seen, features, names, settings))
+
+
+def _shown(seen: Visibility) -> float:
+    """Splats that the views show, each as often as views show it."""
+    return int(seen.in_view.sum()) / seen.areas.shape[1] * seen.splats
+
+
+def _entries(seen: Visibility, features: Views, names: Sequence[str], settings: LiftSettings) -> float:
+    """Of W of all views, about: a splat meets a region or four cells in each tile and level that it touches."""
+    parts = max(_parts_a_tile(features, name, settings) for name in names)
+    return _shown(seen) * parts * _tiles(seen)
 
 
 def memory_parts(
@@ -253,6 +266,11 @@ def memory_parts(
         "codebooks": size * sum(books) + min(8 * sum(books), 2 * TABLE_BYTES),
         "features": splats.count * channels * size,
     }
+    if settings.robust_steps:
+        entries = _entries(seen, features, names, settings)
+        parts["reweighting"] = int(JUDGED_BYTES * min(entries, MEMORY_LIMIT / ENTRY_BYTES))  # more lies in files
+        if settings.consensus:
+            parts["reweighting"] += int(CONSENSUS_BYTES * entries + BLOCK_BYTES * min(entries, BLOCK_ENTRIES))
     if settings.cg_steps or settings.reference_channels:
         parts["refinement"] = 4 * (splats.count * (CG_VECTORS * CG_CHANNELS) + 3 * largest * CG_CHANNELS)
     if settings.aggregation:

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from typing import TYPE_CHECKING, Any
 
 import pytest
 import torch
 
+from liftcore import lifting
 from liftcore.features.pack import read_features, write_pack
 from liftcore.features.views import FeatureGrid
 from liftcore.io.scene_files import lift_files
 from liftcore.planning.plan import ENTRY_BYTES
 from liftcore.settings import LiftSettings
+from liftcore.solve import reweight
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -29,10 +32,15 @@ def fine_maps(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     return path
 
 
+def certified(scene: Path, pack: Path, own: dict[str, Any]) -> dict[str, Any]:
+    """The certificate of a lift."""
+    settings = LiftSettings.of(**own, certificate_rays=100, device="cpu")
+    return lift_files(scene / "point_cloud.ply", scene / "cameras.json", [pack], settings).metadata.certificate
+
+
 def told(scene: Path, pack: Path, own: dict[str, Any]) -> tuple[float, float]:
     """Bytes of W that the plan expects, and those of the entries that the lift made."""
-    settings = LiftSettings.of(**own, certificate_rays=100, device="cpu")
-    certificate = lift_files(scene / "point_cloud.ply", scene / "cameras.json", [pack], settings).metadata.certificate
+    certificate = certified(scene, pack, own)
     plan = certificate["plan"]
     return plan["memory"]["weights"], ENTRY_BYTES * certificate["weights_entries"]
 
@@ -60,3 +68,24 @@ def test_plan_has_room_for_the_region_weights_there_will_be(shared_data, name, o
 def test_fine_maps_are_planned_with_their_many_weights(shared_data, fine_maps, reading, most):
     planned, found = told(shared_data / "tabletop", fine_maps, {"grid_reading": reading})
     assert found < planned < most * found
+
+
+def test_plan_has_room_for_what_reweighting_holds(shared_data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    held, made = [], (reweight.zeros, lifting.mask_consensus)
+
+    def array(*arguments: Any, **own: Any) -> torch.Tensor:
+        held.append(made[0](*arguments, **own))
+        return held[-1]
+
+    def consensus(*arguments: Any, **own: Any) -> Any:
+        tracemalloc.start()
+        found = made[1](*arguments, **own)
+        held.append(torch.empty(tracemalloc.get_traced_memory()[1], dtype=torch.uint8))
+        tracemalloc.stop()
+        return found
+
+    monkeypatch.setattr(reweight, "zeros", array)
+    monkeypatch.setattr(lifting, "mask_consensus", consensus)
+    scene, own = shared_data / "tabletop", {"view_stride": 6, "preset": "default"}
+    planned = certified(scene, scene / "features_hard.safetensors", own)["plan"]["memory"]["reweighting"]
+    assert sum(part.nbytes for part in held) < planned
