@@ -6,8 +6,14 @@
 and on the tests' still life (its words need the extra ``minilm``), with each seed. A row is a scene: splat accuracy /
 mIoU of held-out views as `tests.benchmarks.tabletop` has them, and how well confidence and agreement of the last lift
 rank splats by being right (AUROC). ``seconds`` are of the lift, over those of ``row-sum``.
+
+    python -m tests.benchmarks.consensus --generated M
+
+The seconds and the memory of `mask_consensus` for M regions in a W that is made for it: 300,000 splats in a row, each
+in 30 views, which part them on two levels.
 """
 
+import os
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -20,13 +26,20 @@ from scipy.stats import rankdata
 from torch import Tensor
 
 import liftcore as lc
+from liftcore.device import CPU
 from liftcore.evaluate.accuracy import class_ious, rendered_scores
 from liftcore.features.pack import read_features
 from liftcore.features.views import Regions, ViewFeatures
 from liftcore.query.text import open_encoder
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.cameras import Cameras
+from liftcore.scene.kernel import Kernel
+from liftcore.settings import LiftSettings
+from liftcore.solve.consensus import mask_consensus
+from liftcore.solve.weights import RegionWeights
+from liftcore.warm_up import warm_up_lift
 from tests.benchmarks.base import class_scores, command_line, splat_accuracy, tell
+from tests.benchmarks.memory import high_water
 from tests.benchmarks.tabletop import EVIDENCE_OVER, Tabletop
 from tests.benchmarks.thresholds import in_cone
 from tests.still_life.masks import Mistakes, mistaken_regions, observe, true_labels
@@ -152,12 +165,44 @@ def rows_of(
             yield measured(f"still life, {kind} {seed}", own, views, settings)
 
 
+def generated(
+    regions: int, splats: int = 300_000, seen: int = 30, level: int = 50
+) -> tuple[RegionWeights, np.ndarray]:
+    """W of so many regions, half of them on each of two levels, of views that see a stretch of splats; and levels."""
+    rng, views = np.random.default_rng(0), max(regions // (2 * level), seen)
+    place = np.sort(rng.random(splats))
+    first = (place * (views - seen)).astype(np.int64)[:, None] + np.arange(seen)
+    inside = (place[:, None] * views - first + seen) / (2 * seen) % 1.0  # where in the view's picture
+    wobble = rng.normal(0, 0.1 / level, first.shape)
+    cut = ((inside + wobble) % 1.0 * level).astype(np.int64) % level
+    whole = 2 * level * first
+    region = np.stack([whole + cut, whole + level + cut // 3], axis=2).reshape(splats, -1)
+    indptr = torch.arange(splats + 1) * region.shape[1]
+    every, one = torch.arange(splats, dtype=torch.int32), torch.ones(splats)
+    entries = torch.from_numpy(region.astype(np.int32).ravel())
+    offsets = torch.arange(views + 1) * 2 * level
+    W = RegionWeights(every, indptr, entries, torch.ones(entries.shape[0]), every, one, offsets)
+    return W, np.tile(np.repeat([0, 1], level), views).astype(np.int8)
+
+
+def of_generated(regions: int) -> Iterator[dict[str, Any]]:
+    """A row: what mask consensus takes."""
+    W, levels = generated(regions)
+    warm_up_lift(Kernel.GAUSSIAN_3D, CPU, LiftSettings.of(preset="default"))
+    Path("/proc/self/clear_refs").write_text("5")  # the most that was held so far is what is held now
+    before, start, busy = high_water(os.getpid()), time.perf_counter(), time.process_time()
+    mask_consensus(W, levels)
+    seconds = {"seconds": time.perf_counter() - start, "processor seconds": time.process_time() - busy}
+    yield {"regions": levels.size, "entries": W.region.shape[0], **seconds, "MB": high_water(os.getpid()) - before}
+
+
 def main() -> None:
     """Print the table, or one JSON object."""
     parser = command_line(
         "tests.benchmarks.consensus",
         __doc__,
-        ("folder", {"type": Path}),
+        ("folder", {"type": Path, "nargs": "?"}),
+        ("--generated", {"type": int, "metavar": "M"}),
         ("--packs", {"nargs": "*", "default": PACKS, "choices": PACKS}),
         ("--strides", {"nargs": "*", "type": int, "default": (1, 2, 4)}),
         ("--mistakes", {"nargs": "*", "default": tuple(MISTAKES), "choices": tuple(MISTAKES)}),
@@ -165,7 +210,12 @@ def main() -> None:
         ("--settings", {"nargs": "*", "default": tuple(SETTINGS), "choices": tuple(SETTINGS)}),
     )
     chosen = parser.parse_args()
-    made = rows_of(chosen.folder, chosen.packs, chosen.strides, chosen.mistakes, chosen.seeds, chosen.settings)
+    if chosen.generated:
+        made = of_generated(chosen.generated)
+    elif chosen.folder:
+        made = rows_of(chosen.folder, chosen.packs, chosen.strides, chosen.mistakes, chosen.seeds, chosen.settings)
+    else:
+        parser.error("a folder, or --generated M")
     tell(made, as_json=chosen.json)
 
 
