@@ -95,9 +95,11 @@ export class Viewer {
     this.rows = null;
     if (step > 1) {
       this.rows = Uint32Array.from({ length: Math.floor(this.total / step) }, (_, place) => place * step);
-      const thinned = new Uint8Array(this.rows.length * ROW);
-      this.rows.forEach((row, place) => thinned.set(content.subarray(row * ROW, (row + 1) * ROW), place * ROW));
-      content = thinned;
+      const whole = content.byteOffset % 4 ? content.slice() : content;
+      const words = new Uint32Array(whole.buffer, whole.byteOffset, whole.length / 4);
+      const thinned = new Uint32Array(this.rows.length * ROW / 4);
+      for (let place = 0; place < thinned.length; place += 1) thinned[place] = words[place % 8 + 8 * step * Math.floor(place / 8)];
+      content = new Uint8Array(thinned.buffer);
     }
     this.count = content.length / ROW;
     if (content.byteOffset % 4) content = content.slice();
