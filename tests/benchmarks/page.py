@@ -28,7 +28,8 @@ SCENE = """(async count => {
   await splatlift.viewer.load(bytes);
   const loaded = performance.now() - begun;
   const scores = Float32Array.from({ length: count }, Math.random);
-  const question = { ...splatlift.ask.now, scores, low: 0, high: 1, cut: 0.5, bins: new Uint32Array(96).fill(1), things: [] };
+  const bins = new Uint32Array(96).fill(1);
+  const question = { ...splatlift.ask.now, scores, low: 0, high: 1, cut: 0.5, bins, things: [] };
   splatlift.ask.questions = [question];
   const laid = performance.now();
   splatlift.ask.cut(0.5);
