@@ -120,6 +120,8 @@ class LiftResult:
         threshold: str | float = "auto",
         instances: int | None = None,
         keep: str = "all",
+        absent: str = "drop",
+        references: Any = None,
     ) -> VectorAnswer:
         """Which splats answer vectors of the lift's text space, as a text encoder gives them, or words of its own.
 
@@ -130,6 +132,9 @@ class LiftResult:
             splats: that were lifted; with them the answer has objects with boxes.
             threshold: auto, valley, paper, otsu, stability or a number on the scores.
             instances: how many things there are, where the caller knows. keep: of the objects, all or the largest.
+            absent: drop what is not there, so that nothing is selected, or keep what is most like it.
+            references: [n, F], the vectors of 200 words or more, by which presence is known; None = those of the
+                lift's text space, where it has some.
 
         Raises:
             InvalidQuery: a vector of another length, of zeros or not finite, a word that the lift lacks, or an
@@ -138,8 +143,9 @@ class LiftResult:
         from liftcore.query.ask import query_vectors
 
         return query_vectors(
-            self.cpu(), positives, negatives, splats=splats, threshold=threshold, instances=instances, keep=keep
-        )
+            self.cpu(), positives, negatives, splats=splats, threshold=threshold, instances=instances, keep=keep,
+            absent=absent, references=references,
+        )  # fmt: skip
 
     def segment(self, words: Sequence[str], vectors: Any, splats: Splats) -> Segmentation:
         """Name every splat by the word that it is most like, or by none (`liftcore.query.segment`).

@@ -394,7 +394,7 @@ class Tradeoff(BaseModel):
 class Threshold(BaseModel):
     """Which scores count as found, and why."""
 
-    value: float | None = Field(description="null when no score stands out")
+    value: float | None = Field(description="null when no score stands out, or nothing asked for is there")
     method: str
     explanation: str = Field(description="one sentence on how it was found")
 
@@ -485,6 +485,9 @@ class Question(LiftQuestion):
     threshold: Cut = Field("auto", description="how to find it, or the score from which a splat counts as found")
     instances: Count | None = Field(None, description="how many there are, if you know")
     keep: Literal["all", "largest"] = Field("all", description="of what was found, in masks, splats and objects")
+    absent: Literal["drop", "keep"] = Field(
+        "drop", description="words for what is not there: select nothing for them, or what is most like them"
+    )
 
 
 class Asked(Question):
@@ -607,7 +610,10 @@ class QueryAnswer(BaseModel):
     statistics: dict[str, Any] = Field(description="of the scores over the seen splats")
     threshold: Threshold
     count: int = Field(description="splats at or above the threshold")
-    clear: bool = Field(description="whether what was found stands apart; no word on whether the thing is there")
+    clear: bool = Field(description="whether what was found stands apart")
+    present: bool | None = Field(description="whether it is there; null when that is not known")
+    presence: float | None = Field(description="how sure that is, in 0..1: there from 0.5 on; null when not known")
+    why: str = Field(description="one sentence on how it is known whether it is there, or why it is not")
     top: list[TopSplat]
     box: Box | None = Field(description="around all splats at or above the threshold, strays too: see objects")
     links: dict[str, str]
@@ -619,7 +625,10 @@ class ObjectsAnswer(BaseModel):
     lift: JobId
     threshold: Threshold
     count: int = Field(description="splats at or above the threshold")
-    clear: bool = Field(description="whether they stand apart; no word on whether the thing is there")
+    clear: bool = Field(description="whether they stand apart")
+    present: bool | None = Field(description="whether they are what was asked for; null when that is not known")
+    presence: float | None = Field(description="how sure that is, in 0..1: there from 0.5 on; null when not known")
+    why: str = Field(description="one sentence on how it is known whether it is there, or why it is not")
     objects: list[FoundObject] = Field(description="those with the most evidence first")
     strays: int = Field(description="splats at or above the threshold in none of them")
 

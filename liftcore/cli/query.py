@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -39,6 +40,8 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument("--instances", type=count, metavar="N", help="how many there are, if you know")
     keep = "of what was found, all or the largest alone: in the mask, in --object and in --objects"
     parser.add_argument("--keep", choices=("all", "largest"), default="all", help=keep)
+    absent = "of a word for what is not there, drop it and select nothing, or keep what is most like it"
+    parser.add_argument("--absent", choices=("drop", "keep"), default="drop", help=absent)
     parser.add_argument("--top", type=count, default=0, metavar="N", help="name the best N splats")
     parser.add_argument("--objects", action="store_true", help="name the things found, with their places and boxes")
     add_view(parser)
@@ -98,6 +101,7 @@ def _query(options: argparse.Namespace) -> Query:
         threshold=_threshold(options.threshold),
         instances=options.instances,
         keep=options.keep,
+        absent=options.absent,
     )
 
 
@@ -128,6 +132,9 @@ def _document(answer: Answer, seen: ViewMask | None, encoder: TextEncoder | None
         "threshold": answer.threshold,
         "threshold_method": answer.threshold_method,
         "explanation": answer.explanation,
+        "present": answer.presence.present,
+        "presence": answer.presence.presence,
+        "why": answer.presence.why,
         "statistics": dict(answer.statistics),
     }
     if seen is not None:
@@ -172,10 +179,14 @@ def write_files(files: Mapping[str, Path], contents: Mapping[str, Callable[[], I
 
 
 def _lines(document: dict[str, Any]) -> Iterable[str]:
-    yield (
-        f"{', '.join(map(repr, document['query']))}: {document['selected']} of {document['splats']} splats "
-        f"at or above {document['threshold']:.4g} ({document['explanation']})"
-    )
+    asked = ", ".join(map(repr, document["query"]))
+    if document["present"] is not None or document["encoder"]:
+        yield document["why"]
+    if document["threshold"] < math.inf:
+        found = f"{document['selected']} of {document['splats']} splats at or above {document['threshold']:.4g}"
+        yield f"{asked}: {found} ({document['explanation']})"
+    else:
+        yield f"{asked}: nothing is selected; --absent keep selects what is most like it"
     if "view" in document:
         view = document["view"]
         yield f"  view {view['name']}: {view['mask_share']:.2%} of the image ({view['explanation']})"

@@ -49,6 +49,7 @@ def run(options: argparse.Namespace) -> int:
         files["names"] = options.labelled.with_name(f"{options.labelled.name}.json")
     given = [path for path in (options.lift, options.table, options.words, options.camera) if path]
     free_outputs(files, given)
+    from liftcore.query.presence import references_of
     from liftcore.query.scene import QueryScene
     from liftcore.query.segment import best_words, segment
 
@@ -67,7 +68,7 @@ def run(options: argparse.Namespace) -> int:
         }
     if files or not options.what:
         with progress_bars() as progress:
-            found = segment(scene, words, vectors, progress)
+            found = segment(scene, words, vectors, progress, references_of(encoder, scene.metadata.text_space))
         document |= {
             "splats": len(found.labels),
             "none": int((found.labels < 0).sum()),

@@ -103,7 +103,8 @@ class Finding:
     """What one phrase found."""
 
     phrase: str
-    there: bool | None  # whether the scene shows what it means, where somebody knows
+    there: bool | None  # whether the scene has it; None: not known
+    why: str  # how that is known
     object: str | None  # what the masks show most of, where somebody knows
     splats: int  # selected
     score: float  # the best cosine
@@ -204,7 +205,8 @@ def _find(client: Client, lift: str, phrase: str, subject: DemoScene, out: Path)
     Image.fromarray(seen).save(out / names["found"])
     return Finding(
         phrase=phrase,
-        there=bool(truth.meant[phrase]) if truth and phrase in truth.meant else None,
+        there=answer["present"],
+        why=answer["why"],
         object=truth.name_of(masks) if truth else None,
         splats=answer["count"],
         score=best[0]["score"] if best else float("nan"),
@@ -226,7 +228,7 @@ def _pixels(png: bytes) -> np.ndarray:
 def _lines(found: Finding) -> list[str]:
     what = f"the {found.object}" if found.object else "something"
     if found.there is False:
-        what = f"is not there; closest comes {what}"
+        return [f'  "{found.phrase}" finds nothing', f"      {found.why}"]
     bar = "no threshold" if found.threshold is None else f"threshold {found.threshold:.2f}"
     iou = "" if found.iou is None else f", IoU {found.iou:.2f} against the truth of views that were not lifted"
     lines = [

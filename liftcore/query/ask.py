@@ -6,13 +6,22 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from liftcore.query.directions import directions
 from liftcore.query.objects import Objects, objects
+from liftcore.query.presence import (
+    NOT_IN_WORDS,
+    Presence,
+    References,
+    judge,
+    references_beside,
+    references_of,
+    together,
+)
 from liftcore.query.scene import QueryScene, as_numpy
 from liftcore.query.scores import LEAST_LIKENESS, LOWEST_COSINE, combine, cosines, cosines_about
 from liftcore.query.terms import Query, Vector
@@ -35,6 +44,7 @@ class Question:
     query: Query
     rows: np.ndarray  # [n, F] f32, the unit direction of each term
     plain: np.ndarray  # [n] bool, the terms that are compared by plain cosines: words
+    references: References | str  # of the words' space, or why there are none
 
 
 @dataclass(frozen=True)
@@ -50,6 +60,12 @@ class Answer:
     selected: np.ndarray  # [P] bool, seen and at or above the threshold
     statistics: Mapping[str, float]  # min, max, mean and quantiles q01..q99 of the seen scores
     clear: bool = True  # whether the scores have what the threshold's method looks for
+    presence: Presence = NOT_IN_WORDS  # whether it is there at all
+
+    @property
+    def dropped(self) -> bool:
+        """Whether it is not there, so that nothing is selected and pictures show nothing."""
+        return self.presence.present is False and self.query.absent == "drop"
 
     @property
     def count(self) -> int:
@@ -85,7 +101,10 @@ class VectorAnswer:
     splats: Tensor  # [P] bool, seen and at or above the threshold
     threshold: float  # on the scores
     explanation: str  # one sentence on how it was found
-    clear: bool  # whether some splats were found that stand apart from the others; absent things may seem to
+    clear: bool  # whether some splats were found that stand apart from the others
+    present: bool | None  # whether it is there; None: not known
+    presence: float | None  # in 0..1, present from 0.5 on
+    why: str  # one sentence on how that is known
     objects: Objects | None  # the things that they make up, with boxes; None where no splats were given
 
 
@@ -93,7 +112,9 @@ def ask(scene: QueryScene, query: Query | str, encoder: TextEncoder | None = Non
     """Score every splat for a query and choose those that answer it.
 
     A splat counts in the histogram by its evidence: what hardly a ray met scores by the chance of a few pixels. It is
-    still selected by its score.
+    still selected by its score. A word for what is not there (`liftcore.query.presence`) is left out of the scores,
+    and where no other positive is left nothing is selected, unless the query keeps what is absent. Negatives and
+    examples are not questioned.
 
     Args:
         scene: an opened lift.
@@ -119,6 +140,8 @@ def query_vectors(
     threshold: str | float = "auto",
     instances: int | None = None,
     keep: str = "all",
+    absent: str = "drop",
+    references: Any = None,
 ) -> VectorAnswer:
     """Ask a lift for vectors of its text space, as a text encoder gives them, or for words of its own.
 
@@ -128,6 +151,9 @@ def query_vectors(
         negatives: [m, F], or words, what takes away from the scores (`scores.combine`).
         splats: that were lifted; with them the answer has objects.
         threshold, instances: as in `find_threshold`. keep: of the objects, all or the largest.
+        absent: drop what is not there, so that nothing is selected, or keep what is most like it.
+        references: [n, F], the vectors of 200 words or more, by which presence is known; None = those of the lift's
+            text space, where it has some (`liftcore.query.presence`).
 
     Raises:
         InvalidQuery: a vector of another length, of zeros or not finite; or what `Query` refuses.
@@ -136,15 +162,24 @@ def query_vectors(
 
     scene = QueryScene(result, splats)
     groups = [_terms(values) for values in (positives, negatives)]
-    query = Query(*groups, threshold=threshold, instances=instances, keep=keep)
+    query = Query(*groups, threshold=threshold, instances=instances, keep=keep, absent=absent)
     rows = directions(scene, query, None)
-    answer = answers(scene, [Question(query, rows, np.ones(len(rows), np.bool_))])[0]
+    if references is not None:
+        others = References.of(references, scene.channels)
+    elif query.texts and scene.table is not None:
+        others = references_of(scene.table, scene.metadata.text_space)
+    else:
+        others = references_beside(rows, scene.metadata.text_space)
+    answer = answers(scene, [Question(query, rows, np.ones(len(rows), np.bool_), others)])[0]
     scores, selected = (
         torch.from_numpy(array).to(result.features.device) for array in (answer.scores, answer.selected)
     )
     found = None if splats is None else objects(scene, answer)
     clear = answer.clear and answer.count > 0
-    return VectorAnswer(scores, selected, answer.threshold, answer.explanation, clear, found)
+    told = answer.presence
+    return VectorAnswer(
+        scores, selected, answer.threshold, answer.explanation, clear, told.present, told.presence, told.why, found
+    )
 
 
 def _terms(values: Any) -> tuple[str | Vector, ...]:
@@ -158,7 +193,11 @@ def _terms(values: Any) -> tuple[str | Vector, ...]:
 def question(scene: QueryScene, query: Query, encoder: TextEncoder | None) -> Question:
     """A query with the directions of its terms; what can be wrong with a query is found here (see `ask`)."""
     words = np.array([isinstance(term, str) for term in query.terms])
-    return Question(query, directions(scene, query, encoder), words)
+    rows = directions(scene, query, encoder)
+    encoder = encoder or scene.table
+    if encoder is None or not words[: len(query.positives)].any():
+        return Question(query, rows, words, "")
+    return Question(query, rows, words, references_of(encoder, scene.metadata.text_space))
 
 
 def answers(scene: QueryScene, questions: Sequence[Question]) -> list[Answer]:
@@ -213,12 +252,15 @@ def _similarities(scene: QueryScene, questions: Sequence[Question]) -> list[np.n
 
 def _answer(scene: QueryScene, asked: Question, similarities: np.ndarray) -> Answer:
     query, seen = asked.query, scene.seen
-    scores = combine(similarities, len(query.positives))
+    presence, kept = _presence(scene, asked, similarities)
+    scores = combine(similarities if kept.all() else similarities[:, kept], int(kept[: len(query.positives)].sum()))
     if not scene.all_seen:
         scores = np.where(seen, scores, np.float32(LOWEST_COSINE))
     known = scores if scene.all_seen else scores[seen]
-    least = -math.inf if asked.plain[: len(query.positives)].any() else LEAST_LIKENESS
+    least = -math.inf if (asked.plain & kept)[: len(query.positives)].any() else LEAST_LIKENESS
     found = find_threshold(known, query.threshold, scene.weights, query.instances, least)
+    if presence.present is False and query.absent == "drop":
+        found = replace(found, value=math.inf, explanation=presence.why, clear=False)
     return Answer(
         query=query,
         scores=scores,
@@ -229,7 +271,26 @@ def _answer(scene: QueryScene, asked: Question, similarities: np.ndarray) -> Ans
         selected=seen & (scores >= np.float32(found.value)),
         statistics=_statistics(known),
         clear=found.clear,
+        presence=presence,
     )
+
+
+def _presence(scene: QueryScene, asked: Question, similarities: np.ndarray) -> tuple[Presence, np.ndarray]:
+    """Whether any of the positives is there; and the terms that count, [n] bool: all, or without absent words."""
+    kept, positives = np.ones(len(asked.rows), np.bool_), len(asked.query.positives)
+    words = np.flatnonzero(asked.plain[:positives]).tolist()
+    if not words:
+        return NOT_IN_WORDS, kept
+    if isinstance(asked.references, str):
+        return Presence(None, None, asked.references), kept
+    names = [repr(term) if isinstance(term, str) else str(term) for term in asked.query.positives]
+    told = [judge(scene, names[k], asked.rows[k], similarities[:, k], asked.references) for k in words]
+    here = together(told)
+    if not here.present and len(words) < positives:  # examples are not questioned
+        here = replace(here, present=None)
+    if here.present is not False and asked.query.absent == "drop":
+        kept[[k for k, one in zip(words, told, strict=True) if not one.present]] = False
+    return here, kept
 
 
 def _statistics(scores: np.ndarray) -> dict[str, float]:

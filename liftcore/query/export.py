@@ -22,11 +22,15 @@ def object_splats(scene: QueryScene, answer: Answer, suffix: str = ".ply") -> It
     A query that keeps the largest gets the largest object alone (`objects`).
 
     Raises:
-        InvalidQuery: none was selected: most viewers open no file without splats; or more than objects are made of.
+        InvalidQuery: none was selected, or nothing asked for is there: most viewers open no file without splats; or
+            more were selected than objects are made of.
         InvalidLift: the splats moved or changed since the lift.
     """
     from liftcore.io.splats import some_rows
 
+    if answer.dropped:
+        hint = "absent=keep takes what is most like it; or ask in other words or by example"
+        raise InvalidQuery("object", expected="something that is there", got=answer.presence.why, hint=hint)
     if answer.count == 0:
         raise InvalidQuery(
             "object",
@@ -41,8 +45,9 @@ def object_splats(scene: QueryScene, answer: Answer, suffix: str = ".ply") -> It
 def coloured_ply(scene: QueryScene, answer: Answer) -> Iterable[bytes]:
     """All splats in the colours of their scores, as a file in blocks.
 
-    The colour map spans the scores of the seen splats as a picture of the attention spans its pixels; splats without
-    a score are grey. Colours are the same from everywhere; all else is kept to the byte.
+    The colour map spans the scores of the seen splats as a picture of the attention spans its pixels. Splats without
+    a score are grey, and so are all where nothing asked for is there. Colours are the same from everywhere; all else
+    is kept to the byte.
 
     Raises:
         InvalidLift: the splats moved or changed since the lift.
@@ -51,7 +56,7 @@ def coloured_ply(scene: QueryScene, answer: Answer) -> Iterable[bytes]:
     from liftcore.io.splats import recoloured
 
     colours = heat_colours(answer.scores, answer.seen)
-    colours[~answer.seen] = NOT_SEEN_COLOUR
+    colours[~answer.seen | answer.dropped] = NOT_SEEN_COLOUR
     return recoloured(scene.splat_file, colours)
 
 

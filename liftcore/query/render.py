@@ -35,7 +35,7 @@ class ViewMask:
     """An answer seen from one camera."""
 
     view: str  # the name of its camera
-    attention: np.ndarray  # [H, W] f32, A s: the scores rendered with the lift's rendering scale of opacity
+    attention: np.ndarray  # [H, W] f32, A s: scores rendered with the lift's scale of opacity; 0 of an absent thing
     row_sums: np.ndarray  # [H, W] f32, A 1
     mask: np.ndarray  # [H, W] bool, where at least half of a ray that meets the scene is of what was found
     explanation: str  # one sentence on what the mask shows
@@ -80,7 +80,7 @@ def view_mask(
         members, count = found.numbers >= 0, len(found.found)
         shown = f"the {count} object{'s' * (count != 1)} that {'were' if count != 1 else 'was'} found"
     # A splat without a feature adds nothing to a ray; its score of -1 would count against its neighbours.
-    scores = np.where(answer.seen, answer.scores, np.float32(0.0))
+    scores = np.where(answer.seen & (not answer.dropped), answer.scores, np.float32(0.0))
     values = torch.from_numpy(np.stack([scores, members.astype(np.float32), np.ones_like(scores)], axis=1))
     image = scene.image(camera, lambda of: scene.raster.render(of, values, scene.compositing)).numpy()
     attention, weights, row_sums = (np.ascontiguousarray(image[..., column]) for column in range(3))

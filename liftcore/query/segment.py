@@ -4,7 +4,8 @@ A word alone is asked as a query is: its automatic threshold says which splats a
 nearest of the words that it answers, and by none where it answers none. Asked for what is not there, a threshold
 finds what is most like it; beside other words such a word wins hardly a splat that it answers, as these are more like
 their own. So a word is there if it is the nearest of all words for at least a quarter of its answer, by evidence, and
-words that are not there name nothing.
+if reference words do not say that it is not (`liftcore.query.presence`; the words themselves, where they are many).
+Words that are not there name nothing.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from liftcore.progress import Progress, silent
 from liftcore.query.colours import cluster_colours
 from liftcore.query.directions import MINIMUM_ROW_SUM, directions
 from liftcore.query.objects import trimmed_box
+from liftcore.query.presence import LEAST_WORDS, References, judge, references_beside
 from liftcore.query.scene import QueryScene, as_numpy
 from liftcore.query.scores import cosines, norms_of
 from liftcore.query.terms import Example, Query
@@ -90,13 +92,21 @@ def words_of(encoder: TextEncoder) -> list[str]:
     return words
 
 
-def segment(scene: QueryScene, words: Sequence[str], vectors: Any, progress: Progress = silent) -> Segmentation:
+def segment(
+    scene: QueryScene,
+    words: Sequence[str],
+    vectors: Any,
+    progress: Progress = silent,
+    references: References | str | None = None,
+) -> Segmentation:
     """Name every splat by the word that it is most like, or by none.
 
     Args:
         scene: an opened lift.
         words: n different ones. vectors: [n, F], torch or numpy, their text vectors, of any length above zero.
         progress: told about a stage "words".
+        references: of the words' encoder (`liftcore.query.presence.references_of`); None = the words themselves where
+            they are many, else those of the lift's text space.
 
     Raises:
         InvalidQuery: no words, one word twice, too many, or vectors that are no directions of the lift's space.
@@ -123,7 +133,13 @@ def segment(scene: QueryScene, words: Sequence[str], vectors: Any, progress: Pro
     own = nearest.score >= thresholds[nearest.row]
     shares = np.bincount(nearest.row[own], weights[own], len(words)) / np.maximum(answered, 1e-30)
     named = _Nearest(len(weights))
+    unit = rows / np.linalg.norm(rows, axis=1, keepdims=True)
+    if references is None:
+        many = len(words) >= LEAST_WORDS
+        references = References(words, unit) if many else references_beside(unit, scene.metadata.text_space)
     for row, scores in _scores(scene, rows, np.flatnonzero(shares >= LEAST_OWN).tolist()):
+        if isinstance(references, References) and not judge(scene, words[row], unit[row], scores, references).present:
+            continue
         named.take(row, np.where(scene.seen & (scores >= thresholds[row]), scores, -np.inf))
     labels = np.where(named.score > -np.inf, named.row, NO_WORD).astype(np.int32)
     other = np.where(named.row == nearest.row, nearest.second, nearest.score)

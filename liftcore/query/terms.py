@@ -22,6 +22,7 @@ from liftcore.query.threshold import check_method
 
 NOTATIONS = "VIEW:x,y, region:VIEW:LEVEL:ID or splat:J"
 KEPT = ("all", "largest")
+ABSENT = ("drop", "keep")
 MOST_TERMS = 64  # for and against together
 _PIXEL = re.compile(r"(.+):\s*(-?\d{1,9})\s*,\s*(-?\d{1,9})\s*", re.ASCII | re.DOTALL)
 _REGION = re.compile(r"region:(.+):(\d{1,9}):(\d{1,9})", re.ASCII | re.DOTALL)
@@ -84,7 +85,7 @@ class Query:
     ``liftcore.query.scores.combine``.
 
     Raises:
-        InvalidQuery: no positive, too many terms, an unknown threshold, or instances that it cannot count.
+        InvalidQuery: no positive, too many terms, an unknown choice, or instances that it cannot count.
     """
 
     positives: tuple[Term, ...]
@@ -92,6 +93,7 @@ class Query:
     threshold: str | float = "auto"  # a method of liftcore.query.threshold, or a number on the scores
     instances: int | None = None  # how many there are, where the user knows
     keep: str = "all"  # of the objects that are found: all, or the largest alone
+    absent: str = "drop"  # words for what is not there: drop them, or keep what is most like them
     names: tuple[str, ...] = ()  # what errors call each of the terms; () = what they are themselves
 
     def __post_init__(self) -> None:
@@ -106,6 +108,8 @@ class Query:
             raise InvalidQuery("query", expected=f"at most {MOST_TERMS} texts and examples", got=str(count))
         if self.keep not in KEPT:
             raise InvalidQuery("keep", expected=f"one of {', '.join(KEPT)}", got=repr(self.keep))
+        if self.absent not in ABSENT:
+            raise InvalidQuery("absent", expected=f"one of {', '.join(ABSENT)}", got=repr(self.absent))
         check_method(self.threshold, self.instances)
 
     @property

@@ -28,6 +28,7 @@ from liftcore.io.json_file import finite
 from liftcore.query.ask import Answer, Point, Question, answers, question, top
 from liftcore.query.export import coloured_ply, layer_colours, npy, object_splats, viewer_splats
 from liftcore.query.objects import Objects, objects
+from liftcore.query.presence import references_of
 from liftcore.query.render import ViewMask, attention_png, mask_png, render, render_png, view_mask
 from liftcore.query.scene import QueryScene
 from liftcore.query.scores import warm_up as warm_up_scores
@@ -280,7 +281,9 @@ class Answers:
     def _named(self, request: dict[str, Any]) -> Segmentation:
         def make() -> Segmentation:
             words, encoder = self._words(request)
-            return segment(self._scene(request), words, encoder.encode(words))
+            scene = self._scene(request)
+            references = references_of(encoder, scene.metadata.text_space)
+            return segment(scene, words, encoder.encode(words), references=references)
 
         made = self._cache.get((_key(request), "words"), make)
         assert isinstance(made, Segmentation)
@@ -367,6 +370,7 @@ def query_of(asked: dict[str, Any]) -> Query:
         threshold=asked["threshold"],
         instances=asked["instances"],
         keep=asked["keep"],
+        absent=asked["absent"],
         names=tuple(itertools.chain.from_iterable(names.values())),
     )
 
@@ -431,8 +435,8 @@ def _box(corners: tuple[Point, Point]) -> dict[str, Point]:
 
 def _found(answer: Answer) -> dict[str, Any]:
     cut = {"method": answer.threshold_method, "explanation": answer.explanation}
-    clear = answer.clear and answer.count > 0
-    return {"threshold": {"value": finite(answer.threshold), **cut}, "count": answer.count, "clear": clear}
+    told = {"count": answer.count, "clear": answer.clear and answer.count > 0, **asdict(answer.presence)}
+    return {"threshold": {"value": finite(answer.threshold), **cut}, **told}
 
 
 def reply_to(requests: list[dict[str, Any]], answers: Answers) -> Frame:

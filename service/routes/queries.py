@@ -283,7 +283,7 @@ def query_request(operation: str, asked: Question, lift: LiftRecord, deps: AppSt
         packs = [deps.store.assets.get(deps.owner, asset, most=0) for asset in lift.features]
         request["features"] = [str(pack.path) for pack in packs]
         request["names"] |= {str(pack.path): f"features {pack.id}" for pack in packs}
-    terms = ("text", "negatives", "like", "unlike", "threshold", "instances", "keep")
+    terms = ("text", "negatives", "like", "unlike", "threshold", "instances", "keep", "absent")
     return request | {"query": {name: getattr(asked, name) for name in terms}}
 
 
@@ -344,5 +344,6 @@ def _link(path: str, asked: Question, **more: str) -> str:
     pairs.append(("threshold", str(asked.threshold)))
     pairs += [("instances", str(asked.instances))] if asked.instances is not None else []
     pairs += [("keep", asked.keep)] if asked.keep != "all" else []
+    pairs += [("absent", asked.absent)] if asked.absent != "drop" else []
     pairs += [(name, value) for name in ("encoder", "table") if (value := getattr(asked, name)) is not None]
     return f"{path}{'&' if '?' in path else '?'}{urlencode(pairs + list(more.items()))}"

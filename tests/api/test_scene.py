@@ -61,9 +61,13 @@ def test_views_have_their_poses_in_pages(client: TestClient, lift: dict[str, Any
         np.testing.assert_allclose(-pose[:3, :3].T @ pose[:3, 3], (VIEWS[view["name"]], 0, 0), atol=1e-6)
 
 
-def test_an_answer_says_whether_the_thing_stands_apart(client: TestClient, lift: dict[str, Any]) -> None:
+def test_an_answer_says_what_is_known_of_presence(client: TestClient, lift: dict[str, Any]) -> None:
     for route in ("/query", "/query/objects"):
-        assert client.get(route, params={"lift": lift["id"], "text": "lamp"}).json()["clear"] is True
+        told = client.get(route, params={"lift": lift["id"], "text": "lamp"}).json()
+        assert told["clear"] is True and told["present"] is None and "200 words" in told["why"]
+    kept = client.get("/query", params={"lift": lift["id"], "text": "lamp", "absent": "keep"}).json()
+    assert "absent=keep" in kept["links"]["objects"] and kept["count"] > 0
+    assert client.get("/query", params={"text": "lamp", "absent": "hide"}).status_code == 422
     nothing = client.get("/query", params={"lift": lift["id"], "text": "lamp", "threshold": 2}).json()
     assert (nothing["clear"], nothing["count"]) == (False, 0)
 

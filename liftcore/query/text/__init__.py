@@ -105,29 +105,29 @@ class RememberingEncoder:
     """
 
     def __init__(self, encoder: TextEncoder, size: int = REMEMBERED) -> None:
-        self._encoder = encoder
+        self.source = encoder
         self._size = size
         self._rows: OrderedDict[str, np.ndarray] = OrderedDict()
 
     @property
     def name(self) -> str:
         """The other encoder's."""
-        return self._encoder.name
+        return self.source.name
 
     @property
     def channels(self) -> int:
         """The other encoder's."""
-        return self._encoder.channels
+        return self.source.channels
 
     @property
     def words(self) -> Sequence[str]:
         """Those that the other encoder is limited to; none where it reads any text."""
-        return getattr(self._encoder, "words", ())
+        return getattr(self.source, "words", ())
 
     def encode(self, texts: Sequence[str]) -> np.ndarray:
         """n texts -> [n, F] f32 unit rows; errors are the other encoder's, and are not remembered."""
         new = [text for text in dict.fromkeys(texts) if text not in self._rows]
-        rows = dict(zip(new, self._encoder.encode(new), strict=True)) if new else {}
+        rows = dict(zip(new, self.source.encode(new), strict=True)) if new else {}
         for text in texts:
             if text in self._rows:
                 rows[text] = self._rows[text]

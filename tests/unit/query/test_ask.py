@@ -36,6 +36,8 @@ class Axes:
         self.channels = channels
 
     def encode(self, texts: Sequence[str]) -> np.ndarray:
+        if not all(text in ("x", "y", "z") for text in texts):
+            raise InvalidQuery("text", expected="x, y or z", got=str(texts)[:80])
         return np.eye(self.channels, dtype=np.float32)[["xyz".index(text) for text in texts]]
 
 

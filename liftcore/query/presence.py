@@ -1,0 +1,244 @@
+"""Whether a thing is there at all: a word's best splats, asked for other words too.
+
+A score says where a scene is most like a word, never whether it is there. So the splats that are most like the word
+are compared with some hundreds of **reference words** of the same encoder. A thing that is there is among the first
+of them; for one that is not, the words of what really is there come first, and many more with them.
+
+    presence = share, by evidence, of the word's best splats at which at most MOST_AHEAD of the references are nearer
+
+and it is present from a half on. A phrase that is none of the references may have twice as many ahead: they are more
+to the point than it is. The best splats are the few with LEAST_SHARE of the scene's evidence: less is no
+thing to a threshold either. A reference that means nearly the same takes nothing away: those related to the word,
+with RELATED of the similarity of the word's nearest reference, are left out (an encoder's words share a cone, so they
+are compared about their mean). ``tests.benchmarks.presence`` is where the constants are measured.
+
+Reference words are a table's own where it has enough of them, else those that ship for CLIP ViT-B/32, else what the
+encoder makes once of the same words and keeps in the user's cache.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cache, cached_property
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+
+from liftcore.errors import InvalidQuery, InvalidTable, Unavailable
+from liftcore.query.scene import QueryScene, as_numpy
+from liftcore.query.scores import cosines
+from liftcore.query.text import LVIS_TABLE, RememberingEncoder, TextEncoder
+from liftcore.query.text.table import TableEncoder
+from liftcore.query.threshold import LEAST_SHARE
+
+LEAST_WORDS = 200  # of a table, to be references
+EVERY = 4  # of the shipped words, that another encoder is asked for: 301 take it seconds
+MOST_AHEAD = 0.0033  # of the references, that may be nearer to a splat than what is there: synonyms, wrong masks
+_ITSELF = 0.9  # similarity about the mean from which a word is one of the references
+RELATED = 0.55  # of the similarity of a word's nearest reference, from which references are left out
+MOST_SPLATS = 256  # of the best ones that are looked at, those with the most evidence
+_FIRST = 1_024  # splats in which the best ones are looked for at first
+_SAME = 0.99  # cosine of two vectors of one text that come from one encoder
+_IN_CONE = 0.5  # cosine to the shipped words' mean direction: they have .75 to .93, other spaces' vectors about 0
+
+
+@dataclass(frozen=True)
+class Presence:
+    """Whether what was asked for is there."""
+
+    present: bool | None  # None: not known
+    presence: float | None  # in 0..1, present from 0.5 on; None: not known
+    why: str  # one sentence for the user
+
+
+@dataclass(frozen=True)
+class References:
+    """Words of a text space that others are compared with."""
+
+    words: tuple[str, ...]
+    vectors: np.ndarray  # [n, F] f32, unit
+
+    @classmethod
+    def of(cls, vectors: Any, channels: int) -> Self:
+        """Of vectors [n, F], torch or numpy, of any length above zero.
+
+        Raises:
+            InvalidQuery: too few, of another length, of zeros or not finite.
+        """
+        rows = np.asarray(as_numpy(vectors), np.float32)
+        lengths = np.linalg.norm(rows, axis=-1)
+        if (
+            rows.ndim != 2
+            or len(rows) < LEAST_WORDS
+            or rows.shape[1] != channels
+            or not (np.isfinite(lengths) & (lengths > 0)).all()
+        ):
+            expected = f"finite vectors of {LEAST_WORDS} words or more, [n, {channels}], each with a direction"
+            raise InvalidQuery("references", expected=expected, got=f"the shape {list(rows.shape)}, or zeros or NaN")
+        return cls(tuple(f"number {row}" for row in range(len(rows))), _unit(rows))
+
+    @cached_property
+    def mean(self) -> np.ndarray:
+        """[F] f32, what all words share."""
+        return self.vectors.mean(axis=0, dtype=np.float64).astype(np.float32)
+
+    @cached_property
+    def _about_mean(self) -> np.ndarray:
+        return _unit(self.vectors - self.mean)
+
+    def against(self, direction: np.ndarray) -> tuple[np.ndarray, int]:
+        """What a unit vector [F] of the same space is compared with.
+
+        Returns:
+            [m] i64, the words that mean something else, and how many of them may be nearer to what is there.
+        """
+        similar = self._about_mean @ _unit(direction - self.mean)
+        nearest = float(similar.max())
+        allowed = math.ceil(MOST_AHEAD * len(self.words) * (1 if nearest >= _ITSELF else 2))
+        return np.flatnonzero(similar < max(RELATED * nearest, np.finfo(np.float32).eps)), allowed
+
+
+def judge(
+    scene: QueryScene, name: str, direction: np.ndarray, scores: np.ndarray, references: References
+) -> Presence:
+    """Say whether a word is there.
+
+    Args:
+        scene: an opened lift. name: of the word, as the answer tells it.
+        direction: [F] f32, its unit vector. scores: [P] f32, every splat's cosine to it.
+        references: of its text space.
+    """
+    best, weights = best_splats(scene, scores)
+    if not len(best):
+        return Presence(False, 0.0, f"{name} is not there: no splat has a feature.")
+    others, allowed = references.against(direction)
+    near = cosines(scene.features[best], scene.norms[best], references.vectors[others])
+    ahead = (near >= scores[best, None]).sum(axis=1)
+    count = len(references.words)
+    presence = float(weights[ahead <= allowed].sum() / weights.sum())
+    if presence >= 0.5:
+        told = f"at {presence:.0%} of its best splats at most {allowed} of {count} reference words are nearer"
+        return Presence(True, presence, f"{name} is there: {told}.")
+    order = np.argsort(ahead, kind="stable")
+    middle = int(ahead[order[np.searchsorted(np.cumsum(weights[order]), weights.sum() / 2)]])
+    nearest = references.words[others[int((weights @ near).argmax())]].replace("_", " ")
+    told = f"its best splats are nearer to {middle} of {count} reference words, first of all to {nearest!r}"
+    return Presence(False, presence, f"{name} is not there: {told}.")
+
+
+NOT_IN_WORDS = Presence(None, None, "Nothing was asked in words: what an example shows is not questioned.")
+
+
+def together(words: Sequence[Presence]) -> Presence:
+    """Whether any of one or more words is there."""
+    first = max(words, key=lambda one: one.presence or 0.0)
+    return Presence(first.present, first.presence, " ".join(one.why for one in words))
+
+
+def best_splats(scene: QueryScene, scores: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The splats of the highest scores [P] that have LEAST_SHARE of the evidence, and how much each counts.
+
+    Returns:
+        [m] i64, at most MOST_SPLATS, descending by score; and [m] f64, their evidence.
+    """
+    evidence = np.where(scene.seen, scene.evidence, np.float32(0.0))
+    evidence = evidence if evidence.any() else scene.seen.astype(np.float32)
+    least, count = LEAST_SHARE * float(evidence.sum(dtype=np.float64)), min(_FIRST, len(scores))
+    ranked = -scores if scene.all_seen else np.where(scene.seen, -scores, np.float32(np.inf))
+    while True:
+        rows = np.argpartition(ranked, count - 1)[:count] if count < len(ranked) else np.arange(count)
+        if count == len(ranked) or evidence[rows].sum(dtype=np.float64) >= least:
+            break
+        count = min(4 * count, len(ranked))
+    rows = rows[np.lexsort((rows, ranked[rows]))]
+    rows = rows[: int(np.searchsorted(np.cumsum(evidence[rows], dtype=np.float64), least)) + 1]
+    rows = rows[evidence[rows] > 0]
+    heaviest = np.sort(np.argsort(-evidence[rows], kind="stable")[:MOST_SPLATS])
+    return rows[heaviest], evidence[rows[heaviest]].astype(np.float64)
+
+
+def references_of(encoder: TextEncoder, text_space: str) -> References | str:
+    """The reference words of an encoder, or why there are none.
+
+    A table with enough words has its own. Any other encoder is asked once for some hundreds of words.
+
+    Args:
+        encoder: that makes the words' vectors. text_space: that the lift names, "" for none.
+    """
+    source = encoder.source if isinstance(encoder, RememberingEncoder) else encoder
+    if isinstance(source, TableEncoder):
+        if len(source.words) >= LEAST_WORDS:
+            return References(source.words, source.embeddings)
+        return references_beside(source.embeddings, text_space)
+    shipped, kept = _shipped(), _kept(encoder.name)
+    try:
+        for known, first in ((shipped, f"a {shipped.words[0]}"), (kept, shipped.words[0])):
+            if known is not None and known.vectors.shape[1] == encoder.channels:
+                (vector,) = encoder.encode([first])
+                if float(known.vectors[0] @ _unit(np.asarray(vector, np.float32))) >= _SAME:
+                    return known
+        words = shipped.words[::EVERY]
+        made = References(words, _unit(np.asarray(encoder.encode(words), np.float32)))
+    except (InvalidQuery, Unavailable) as error:
+        return f"Whether it is there is not known: {encoder.name} makes no reference words ({error})."
+    _keep(encoder.name, made)
+    return made
+
+
+def references_beside(vectors: np.ndarray, text_space: str) -> References | str:
+    """The reference words of the space that unit vectors [n, F] of words lie in, or why there are none.
+
+    Without an encoder nothing is computed: references kept for the space that the lift names are taken, and the
+    shipped ones where all of the vectors lie in the narrow cone of that encoder's words.
+    """
+    kept, channels = _kept(text_space) if text_space else None, vectors.shape[1]
+    if kept is not None and kept.vectors.shape[1] == channels:
+        return kept
+    if channels == _shipped().vectors.shape[1] and (vectors @ _unit(_shipped().mean) >= _IN_CONE).all():
+        return _shipped()
+    space = f"the text space {text_space!r}" if text_space else "a text space without a name"
+    needed = f"a text table of {LEAST_WORDS} words or more, or a text encoder, has some"
+    return f"Whether it is there is not known: {space} has no reference words here; {needed}."
+
+
+@cache
+def _shipped() -> References:
+    table = TableEncoder.open(LVIS_TABLE)
+    return References(table.words, table.embeddings)
+
+
+def _place(name: str) -> Path:
+    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return base / "splatlift" / "references" / f"{hashlib.sha256(name.encode()).hexdigest()[:16]}.safetensors"
+
+
+def _kept(name: str) -> References | None:
+    """What this machine keeps of an encoder's name; a broken file is none."""
+    with suppress(InvalidTable, OSError):
+        if (path := _place(name)).is_file():
+            table = TableEncoder.open(path)
+            return References(table.words, table.embeddings)
+    return None
+
+
+def _keep(name: str, made: References) -> None:
+    """Keep them for the next time; a cache that cannot be written keeps nothing."""
+    from safetensors.numpy import save
+
+    from liftcore.io.files import whole_file
+
+    told = {"encoder": name, "words": json.dumps(made.words)}
+    with suppress(OSError), whole_file(_place(name)) as file:
+        file.write(save({"embeddings": made.vectors.astype(np.float16)}, metadata=told))
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    """Rows [.., F] f32 of length one; zeros stay."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), np.float32(1e-30))

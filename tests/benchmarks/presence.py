@@ -1,0 +1,129 @@
+"""Whether a thing is there: what is said of words of things that are in a scene, and of words of things that are not.
+
+    python -m tests.benchmarks.presence DIR [--features NAME ...] [--presets NAME ...] [--strides N ...] [--json]
+
+``DIR`` is `tabletop`; its table's words are the references. A row is a lift. ``missed`` are present classes that are
+called absent, ``lowest`` the least presence of one, ``nothing`` the share of 200 absent words, drawn from the table
+with a seed, that select nothing, and ``known without`` the same two with every fourth word as references, where
+a word has no vector of its own among them. ``--still-life`` asks the demo's scene in sentences, with the words that
+the encoder makes itself.
+"""
+
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from liftcore.features.pack import read_features
+from liftcore.io.cameras import read_cameras
+from liftcore.lifting import lift
+from liftcore.query.presence import References, judge, references_of
+from liftcore.query.scene import QueryScene
+from liftcore.query.scores import cosines
+from liftcore.query.text import open_encoder
+from liftcore.query.text.table import TableEncoder
+from liftcore.raster.cpu.raster import CpuRaster
+from tests.benchmarks.base import PACKS, command_line, tell
+from tests.benchmarks.consensus import HARD
+from tests.benchmarks.tabletop import Tabletop
+from tests.still_life.masks import Mistakes, observe
+from tests.still_life.scene import still_life
+
+PRESETS = ("default", "row-sum", "tikhonov")
+ABSENT = 200
+THERE = ("the mug", "a cup", "something to drink coffee from", "fresh fruit", "an apple", "a banana", "reading light",
+         "a novel", "a plant", "tableware")  # fmt: skip
+NOT_THERE = ("a sofa", "a dog", "a car", "a guitar", "a bicycle", "a shoe", "an elephant", "an airplane", "a laptop",
+             "a hammer", "a person", "a television", "a newspaper", "a knife", "a musical instrument", "a pet",
+             "something to wear", "a place to sleep", "a penguin", "a bus")  # fmt: skip
+
+
+def told(scene: QueryScene, vectors: np.ndarray, references: References) -> np.ndarray:
+    """[n] f64, the presence of words with these vectors [n, F]."""
+    scores = np.ascontiguousarray(cosines(scene.features, scene.norms, vectors).T)
+    found = (judge(scene, "", vector, row, references) for vector, row in zip(vectors, scores, strict=True))
+    return np.array([one.presence for one in found])
+
+
+def figures(present: np.ndarray, absent: np.ndarray) -> dict[str, Any]:
+    """Of the presence of things that are there, and of others."""
+    return {
+        "missed": int((present < 0.5).sum()),
+        "lowest": float(present.min()),
+        "nothing": float((absent < 0.5).mean()),
+    }
+
+
+def measured(scene: QueryScene, table: TableEncoder, present: Sequence[int]) -> dict[str, Any]:
+    """A row, of the table's words at these rows."""
+    others = np.setdiff1d(np.arange(len(table.words)), present)
+    absent = np.random.default_rng(0).choice(others, ABSENT, replace=False)
+    asked = table.embeddings[[*present, *absent]]
+    row: dict[str, Any] = {}
+    every = np.arange(len(table.words))
+    for name, rows in (("", every), (" without", np.setdiff1d(every[::4], [*present, *absent]))):
+        references = References(tuple(table.words[k] for k in rows), table.embeddings[rows])
+        found = told(scene, asked, references)
+        row |= {key + name: value for key, value in figures(found[: len(present)], found[len(present) :]).items()}
+    return row
+
+
+def tabletop_rows(
+    folder: Path, packs: Iterable[str], presets: Iterable[str], strides: Iterable[int]
+) -> Iterator[dict[str, Any]]:
+    """One row a lift of the tabletop scene."""
+    scene, table = Tabletop(folder), TableEncoder.open(folder / "text_table.safetensors")
+    present = [int(np.argmax(table.embeddings @ row)) for row in scene.classes.numpy()]
+    cameras, presets, strides = read_cameras(folder / "cameras.json"), list(presets), list(strides)
+    for pack in packs:
+        whole = read_features(folder / f"{pack}.safetensors")
+        for stride in strides if pack != "grids" else (1,):
+            views = {view: whole[view] for view in whole.views[::stride]}
+            for preset in presets:
+                lifted = lift(scene.raster.splats, cameras, views, preset=preset, certificate_rays=0)
+                head = {"scene": f"{pack}, {len(views)} views", "preset": preset}
+                yield head | measured(QueryScene(lifted), table, present)
+
+
+def still_life_rows(presets: Iterable[str]) -> Iterator[dict[str, Any]]:
+    """The demo's scene with its usual and with hard mistakes, asked in sentences."""
+    encoder = open_encoder("minilm")
+    references = references_of(encoder, "minilm")
+    assert isinstance(references, References)
+    presets = list(presets)
+    for seed, (name, mistakes) in enumerate((("usual", Mistakes()), ("hard", HARD)), start=7):
+        made = still_life(seed)
+        views = observe(made, CpuRaster(made.splats), encoder, mistakes, seed)
+        for preset in presets:
+            scene = QueryScene(lift(made.splats, made.cameras, views, preset=preset, certificate_rays=0))
+            present, absent = (told(scene, encoder.encode(words), references) for words in (THERE, NOT_THERE))
+            wrong = [word for word, one in zip(THERE, present, strict=True) if one < 0.5]
+            wrong += [word for word, one in zip(NOT_THERE, absent, strict=True) if one >= 0.5]
+            yield {
+                "scene": f"still life, {name}",
+                "preset": preset,
+                **figures(present, absent),
+                "wrong": ", ".join(wrong),
+            }
+
+
+def main() -> None:
+    """Print the table, or one JSON object."""
+    parser = command_line(
+        "tests.benchmarks.presence",
+        __doc__,
+        ("folder", {"type": Path}),
+        ("--still-life", {"action": "store_true", "help": "the demo's scene too"}),
+        ("--features", {"nargs": "*", "default": PACKS, "choices": PACKS}),
+        ("--presets", {"nargs": "+", "default": PRESETS, "metavar": "NAME"}),
+        ("--strides", {"nargs": "+", "type": int, "default": (1, 2, 4)}),
+    )
+    options = parser.parse_args()
+    rows = list(tabletop_rows(options.folder, options.features, options.presets, options.strides))
+    rows += still_life_rows(options.presets) if options.still_life else []
+    tell(rows, as_json=options.json)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,169 @@
+"""Whether a thing is there: real CLIP vectors of words on splats, with the noise and the cone of image vectors."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from liftcore.errors import InvalidQuery
+from liftcore.query.ask import Answer, ask
+from liftcore.query.export import object_splats
+from liftcore.query.objects import objects
+from liftcore.query.presence import References, references_of
+from liftcore.query.render import view_mask
+from liftcore.query.scene import QueryScene
+from liftcore.query.segment import segment
+from liftcore.query.terms import OneSplat, Query
+from liftcore.query.text import LVIS_TABLE, RememberingEncoder
+from liftcore.query.text.table import TableEncoder
+from tests.api.tiny_scene import SPLATS_A_CLUSTER
+
+COUNT = 3 * SPLATS_A_CLUSTER
+THINGS = ("cat", "boat", "pizza")
+
+
+@pytest.fixture(scope="module")
+def table() -> TableEncoder:
+    return TableEncoder.open(LVIS_TABLE)
+
+
+@pytest.fixture
+def clip(scene: QueryScene, table: TableEncoder) -> QueryScene:
+    """The three clusters are a cat, a boat and a pizza, as photos are: .29 like their words, .22 like others."""
+    rng = np.random.default_rng(0)
+    words = np.repeat(table.encode(THINGS), SPLATS_A_CLUSTER, axis=0)
+    gap, noise = rng.normal(size=512), rng.normal(size=(COUNT, 512))
+    gap -= (
+        table.embeddings.mean(axis=0)
+        * (gap @ table.embeddings.mean(axis=0))
+        / np.square(table.embeddings.mean(axis=0)).sum()
+    )
+    rows = (
+        0.28 * words + 0.9 * gap / np.linalg.norm(gap) + 0.25 * noise / np.linalg.norm(noise, axis=1, keepdims=True)
+    )
+    ones = torch.ones(COUNT)
+    given = {"evidence": ones, "agreement": ones, "seen": ones > 0}
+    lifted = replace(scene.lift, features=torch.from_numpy(rows.astype(np.float32)), **given)
+    return QueryScene(lifted, scene.splats, scene.cameras)
+
+
+def test_absent_words_select_nothing_and_present_ones_do(clip: QueryScene, table: TableEncoder) -> None:
+    others = [word for word in table.words if word not in THINGS]
+    absent = np.random.default_rng(1).choice(others, 200, replace=False).tolist()
+    for word in THINGS:
+        found = ask(clip, word, table)
+        assert found.presence.present and found.count > 0 and "is there" in found.presence.why
+    answers = [ask(clip, word, table) for word in absent]
+    assert sum(one.count == 0 for one in answers) >= 190
+    assert all((one.presence.present is False) == (one.count == 0) for one in answers)
+
+
+def test_absent_thing_shows_nothing_unless_kept(clip: QueryScene, table: TableEncoder) -> None:
+    nothing = ask(clip, "sofa", table)
+    assert nothing.threshold == np.inf and nothing.explanation == nothing.presence.why
+    assert objects(clip, nothing).found == ()
+    seen = view_mask(clip, nothing, "middle")
+    assert not seen.mask.any() and not seen.attention.any()
+    with pytest.raises(InvalidQuery, match="absent=keep"):
+        object_splats(clip, nothing)
+    assert ask(clip, Query(("sofa",), threshold=0.0), table).count == 0
+    kept = ask(clip, Query(("sofa",), absent="keep"), table)
+    assert kept.count > 0 and kept.presence == nothing.presence
+    with pytest.raises(InvalidQuery, match="drop, keep"):
+        Query(("sofa",), absent="hide")
+
+
+def test_of_several_words_the_absent_ones_are_left_out(clip: QueryScene, table: TableEncoder) -> None:
+    def same(one: Answer, other: Answer) -> bool:
+        return np.array_equal(one.scores, other.scores) and np.array_equal(one.selected, other.selected)
+
+    cat = ask(clip, "cat", table)
+    both = ask(clip, Query(("sofa", "cat")), table)
+    assert same(both, cat) and both.presence.present and "'sofa' is not there" in both.presence.why
+    assert not same(ask(clip, Query(("sofa", "cat"), absent="keep"), table), cat)
+    assert ask(clip, Query(("cat",), ("sofa",)), table).presence == cat.presence  # negatives are not questioned
+    example = Query((OneSplat(0), "sofa"))
+    assert same(ask(clip, example, table), ask(clip, Query((OneSplat(0),)))) and ask(clip, example, table).count > 0
+    assert ask(clip, Query((OneSplat(0),))).presence.present is None
+
+
+def test_references_that_mean_the_same_hide_nothing(clip: QueryScene, table: TableEncoder) -> None:
+    rng = np.random.default_rng(2)
+    near = table.encode(["cat"] * 30) + 0.01 * rng.normal(size=(30, 512))
+    crowded = TableEncoder("crowded", (*table.words, *(f"cat {k}" for k in range(30))),
+                           np.concatenate([table.embeddings, near]).astype(np.float32))  # fmt: skip
+    assert ask(clip, "cat", crowded).presence.present
+    assert ask(clip, "sofa", crowded).presence.present is False
+
+
+def test_small_evidence_does_not_make_a_thing(clip: QueryScene, table: TableEncoder) -> None:
+    stray = torch.cat([clip.lift.features, torch.from_numpy(table.encode(["sofa"]))])
+    ones = torch.ones(COUNT + 1)
+    given = {"features": stray, "agreement": ones, "seen": ones > 0}
+    evidence = torch.cat([torch.ones(COUNT), torch.tensor([1e-4])])
+    for weight, present in ((1e-4, False), (1.0, True)):
+        evidence[-1] = weight
+        lifted = QueryScene(replace(clip.lift, evidence=evidence.clone(), **given))
+        assert ask(lifted, "sofa", table).presence.present is present
+
+
+class Asked:
+    """An encoder of the shipped words in another space; it knows what it was asked."""
+
+    channels = 64
+
+    def __init__(self, seed: int) -> None:
+        self.name, self.texts = "asked", list[str]()
+        self._turn = np.random.default_rng(seed).normal(size=(512, 64))
+        self._table = TableEncoder.open(LVIS_TABLE)
+
+    def encode(self, texts: Sequence[str]) -> np.ndarray:
+        self.texts += texts
+        rows = self._table.encode(texts) @ self._turn
+        return (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
+
+
+def test_an_encoder_makes_its_references_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    first, again, other = Asked(0), Asked(0), Asked(1)
+    made = references_of(first, "")
+    assert isinstance(made, References) and 200 <= len(made.words) <= len(first.texts)
+    kept = references_of(RememberingEncoder(again), "")
+    assert isinstance(kept, References) and kept.words == made.words and len(again.texts) == 1
+    np.testing.assert_allclose(kept.vectors, made.vectors, atol=1e-3)
+    anew = references_of(other, "")  # of the same name, but it says something else
+    assert isinstance(anew, References) and len(other.texts) > len(anew.words)
+
+
+def test_without_references_presence_is_not_known(clip: QueryScene, table: TableEncoder) -> None:
+    axes = TableEncoder("axes", ("cat",), np.eye(512, dtype=np.float32)[:1])
+    unknown = ask(clip, "cat", axes)
+    assert (unknown.presence.present, unknown.presence.presence) == (None, None) and unknown.count > 0
+    assert "200 words" in unknown.presence.why
+    few = TableEncoder("few", ("cat", "sofa"), table.encode(["cat", "sofa"]))  # of CLIP's, as its vectors tell
+    assert ask(clip, "sofa", few).presence == ask(clip, "sofa", table).presence
+
+
+def test_vectors_of_words_are_present_or_absent_too(clip: QueryScene, table: TableEncoder) -> None:
+    cat, sofa = table.encode(["cat", "sofa"])
+    assert clip.lift.query(cat).present and clip.lift.query(sofa).present is False
+    assert not clip.lift.query(sofa, splats=clip.splats).splats.any()
+    assert clip.lift.query(sofa, absent="keep").splats.any()
+    turn = np.linalg.qr(np.random.default_rng(3).normal(size=(512, 512)))[0].astype(np.float32)
+    turned = replace(clip.lift, features=clip.lift.features @ torch.from_numpy(turn))
+    assert turned.query(sofa @ turn).present is None
+    told = turned.query(sofa @ turn, references=table.embeddings @ turn)
+    assert told.present is False and told.presence is not None and told.presence < 0.5
+    for wrong in (table.embeddings[:9], table.embeddings[:, :9], np.zeros((300, 512))):
+        with pytest.raises(InvalidQuery, match="references"):
+            clip.lift.query(sofa, references=wrong)
+
+
+def test_many_words_follow_the_same_rule(clip: QueryScene, table: TableEncoder) -> None:
+    words = ["cat", "sofa", "lamp"]  # without its nearest words, a sofa would have splats of its own
+    found = segment(clip, words, table.encode(words))
+    assert [one.word for one in found.found] == ["cat"]
+    assert set(found.labels.tolist()) <= {-1, 0}
