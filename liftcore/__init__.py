@@ -44,6 +44,8 @@ if TYPE_CHECKING:
     from liftcore.operators import render as render
     from liftcore.planning.plan import Plan as Plan
     from liftcore.query.ask import VectorAnswer as VectorAnswer
+    from liftcore.query.catalogue import Catalogue as Catalogue
+    from liftcore.query.catalogue import SceneObject as SceneObject
     from liftcore.query.objects import FoundObject as FoundObject
     from liftcore.query.objects import Objects as Objects
     from liftcore.query.segment import NamedSplats as NamedSplats
@@ -77,6 +79,8 @@ _PUBLIC = {  # name -> the module that defines it
     "VectorAnswer": "liftcore.query.ask",
     "Segmentation": "liftcore.query.segment",
     "NamedSplats": "liftcore.query.segment",
+    "Catalogue": "liftcore.query.catalogue",
+    "SceneObject": "liftcore.query.catalogue",
     "Objects": "liftcore.query.objects",
     "FoundObject": "liftcore.query.objects",
     "region_weights": "liftcore.operators",
@@ -97,6 +101,7 @@ _PUBLIC = {  # name -> the module that defines it
 __all__ = [
     "Camera",
     "Cameras",
+    "Catalogue",
     "FeatureGrid",
     "FoundObject",
     "InvalidCameras",
@@ -116,6 +121,7 @@ __all__ = [
     "RayEngine",
     "RegionWeights",
     "Regions",
+    "SceneObject",
     "Segmentation",
     "SplatliftError",
     "Splats",

@@ -32,6 +32,7 @@ from liftcore.solve.consensus import mask_consensus
 from liftcore.solve.diagnostics import certify, lift_warnings, measure_samples
 from liftcore.solve.geometry import Geometry, Given, LiftViews, as_read, weigh_views
 from liftcore.solve.least_squares import AllRays, reference, refine
+from liftcore.solve.objects import RegionObjects, region_objects
 from liftcore.solve.reweight import Agreement, agreement_factors, reweighted
 from liftcore.solve.weights import RegionWeights
 from liftcore.warm_up import warm_up_lift
@@ -98,12 +99,14 @@ def lift(
     kept = Checkpoint(checkpoint) if isinstance(checkpoint, Path) else checkpoint
     with within_memory(work.device):
         geometry = work.weigh(found, plan, kept)
+        things = work.find_objects(geometry)
         W, agreement = work.reweight(geometry)
         solution = work.solve(W, geometry, plan)
         sums = geometry.weights.row_sums().cpu().numpy()
         X, notes = work.refine(found, geometry, solution.features, sums > 0)
         clusters = work.aggregate(found, geometry, W, X, sums, notes)
         notes |= _reweighting(agreement, geometry) if agreement else {}
+        notes |= _objects(things) if things else {}
         diagnostics = work.diagnose(found, geometry, X, sums, plan, notes)
     table = found.features.table
     made = LiftResult(
@@ -125,6 +128,8 @@ def lift(
         cluster=clusters.clusters if clusters else None,
         cluster_features=clusters.cluster_features if clusters else None,
         embeddings=torch.from_numpy(table.embeddings) if table else None,
+        object=torch.from_numpy(things.labels) if things else None,
+        object_views=torch.from_numpy(things.views) if things else None,
     )
     return made.to(work.device.place)
 
@@ -158,6 +163,12 @@ def _reweighting(found: Agreement, geometry: Geometry) -> dict[str, Any]:
     if confident is not None:
         facts["confidence_mean"] = float(confident.mean())
     return {"reweighting": facts}
+
+
+def _objects(found: RegionObjects) -> dict[str, Any]:
+    """What the graph of regions held together, for the diagnostics."""
+    share = float((found.labels >= 0).mean())
+    return {"objects": {"found": len(found.views), "splats_share": share, "regions": int((found.regions >= 0).sum())}}
 
 
 def log_warnings(plan: Plan) -> None:
@@ -209,11 +220,28 @@ class _Lift:
                 views,
                 self.settings,
                 self.progress,
-                by_rows=bool(self.settings.robust_steps or self.settings.aggregation_resolve),
+                by_rows=bool(
+                    self.settings.robust_steps or self.settings.aggregation_resolve or self.settings.objects is True
+                ),
                 checkpoint=checkpoint.of(self.splats, self.device.facts()) if checkpoint else None,
                 device_bytes=plan.kept_on_card,
                 threads=self.threads,
             )
+
+    def find_objects(self, geometry: Geometry) -> RegionObjects | None:
+        """What masks of many views keep together, or None where they are not looked for.
+
+        Raises:
+            InvalidSettings: objects are asked for, and no view has masks.
+        """
+        masks = bool((geometry.levels >= 0).any())
+        if self.settings.objects is True and not masks:
+            expected = "views with masks: objects are what masks of several views keep together"
+            raise InvalidSettings("objects", expected=expected, got="views of grids", hint="leave it at auto")
+        if not self.settings.objects or not masks:
+            return None
+        with self.timings.stage("objects"):
+            return region_objects(geometry.weights.cpu(), geometry.levels, geometry.evidence().numpy(), self.threads)
 
     def reweight(self, geometry: Geometry) -> tuple[RegionWeights, Agreement | None]:
         """W as it is solved: steps give factors of W's entries, which keep the sums of its rows.

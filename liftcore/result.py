@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from liftcore.query.ask import VectorAnswer
+    from liftcore.query.catalogue import Catalogue
     from liftcore.query.segment import Segmentation
     from liftcore.query.text.table import TableEncoder
     from liftcore.scene.splats import Splats
@@ -68,6 +69,8 @@ class LiftResult:
     cluster: Tensor | None = None  # [P] i32, -1 = in no cluster; None without aggregation
     cluster_features: Tensor | None = None  # [K, F] like features; a zero row: its splats keep their own
     embeddings: Tensor | None = None  # [n, F] f32, the unit vectors of the metadata's words; None: it has none
+    object: Tensor | None = None  # [P] i32, -1 = of no object; None: objects were not looked for
+    object_views: Tensor | None = None  # [N, 5] i32, places in ``views`` that show most of each, -1 after the last
 
     @property
     def settings(self) -> LiftSettings:
@@ -161,6 +164,22 @@ class LiftResult:
         from liftcore.query.segment import segment
 
         return segment(QueryScene(self.cpu(), splats), words, vectors)
+
+    def objects(self, splats: Splats, words: Sequence[str] = (), vectors: Any = None) -> Catalogue:
+        """The objects that masks of many views agree on, found at lift time without a word; the largest first.
+
+        Args:
+            splats: that were lifted.
+            words: n, that objects are named by. vectors: [n, F], torch or numpy, their text vectors, of any length
+                above zero.
+
+        Raises:
+            InvalidQuery: words without vectors, or vectors that are no directions of the lift's space.
+        """
+        from liftcore.query.catalogue import catalogue
+        from liftcore.query.scene import QueryScene
+
+        return catalogue(QueryScene(self.cpu(), splats), words, vectors)
 
     def save(self, path: Path | str) -> None:
         """Write a lift file (`liftcore.io.lift_file`), whole or not at all."""

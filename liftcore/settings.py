@@ -121,6 +121,11 @@ class LiftSettings(BaseModel):
         description="regions are weighted by whether masks of other views keep their splats together; auto: where "
         "there are masks, and grids stay as they are",
     )
+    objects: bool | Literal["auto"] = Field(
+        "auto",
+        description="find objects without words, by what masks of many views keep together; auto: where the lift "
+        "has a region for each mask",
+    )
     dtype: Literal["float16", "float32"] = Field(
         "float16", description="how features are stored, if it can hold them"
     )

@@ -10,6 +10,7 @@ import torch
 from liftcore.raster.cpu.warm_up import warm_up
 from liftcore.solve.codebook import Codebook, ViewCodebook
 from liftcore.solve.consensus import mask_consensus
+from liftcore.solve.objects import region_objects
 from liftcore.solve.reweight import agreement_factors
 from liftcore.solve.weights import one_view
 
@@ -24,6 +25,8 @@ def warm_up_lift(kernel: Kernel, device: Device, settings: LiftSettings) -> None
     warm_up(kernel, device, settings.lift_params, settings.weighting)
     one = torch.zeros(1, dtype=torch.int32)
     W = one_view(one, torch.tensor([0, 1]), one, torch.ones(1), one, torch.ones(1), regions=1)
+    if settings.objects:
+        region_objects(W, np.zeros(1, np.int8), np.ones(1), 1)
     if settings.consensus:
         mask_consensus(W, np.zeros(1, np.int8), 1)
     if settings.reliability:

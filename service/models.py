@@ -633,6 +633,43 @@ class ObjectsAnswer(BaseModel):
     strays: int = Field(description="splats at or above the threshold in none of them")
 
 
+class SceneObject(BaseModel):
+    """A thing that masks of many views keep together."""
+
+    id: int = Field(description="the same for the same lift; 0 has the most evidence")
+    name: str | None = Field(description="the nearest word of the vocabulary; null without one")
+    score: float | None = Field(description="its cosine with the object's mean feature")
+    splats: int = Field(description="how many")
+    share: float = Field(description="of the evidence of all splats")
+    centre: list[float] = Field(description="the middle of its box: x y z, frame of the splat file")
+    box: Box = Field(description="of its splats' centres, but for a thousandth of the evidence at each end")
+    views: list[str] = Field(description="that show most of it, the best first")
+    feature: list[float] | None = Field(description="with features=true: the mean of its unit features [F], unit")
+
+
+class AskedForSceneObjects(BaseModel):
+    """Which objects to list, and what names them."""
+
+    table: AssetId | None = Field(None, description="an uploaded text table: objects are named by its words")
+    encoder: str | None = Field(
+        None, max_length=200, description="a text space that the operator set up as a table, or default: likewise"
+    )
+    features: Annotated[bool, Field(description="with the mean feature of each")] = False
+    limit: int = Field(100, ge=1, le=1000, description="how many to list")
+    cursor: int = Field(0, ge=0, le=10**9, description="the `next` of the page before")
+
+
+class SceneObjects(BaseModel):
+    """Some of the objects of a lift, those with the most evidence first."""
+
+    lift: JobId
+    encoder: str | None = Field(description="what named them, without its file; null for nothing")
+    explanation: str = Field(description="why there are so many; or why there are none")
+    count: int = Field(description="of all pages")
+    objects: list[SceneObject]
+    next: int | None = Field(description="the cursor of the page after this one; null at the end")
+
+
 class Health(BaseModel):
     """Whether the HTTP process answers."""
 

@@ -24,6 +24,7 @@ COMMANDS = {
     "plan": "what a lift would do and need",
     "query": "find words and examples in a lift",
     "segment": "name every splat of a lift by the best of many words",
+    "objects": "the things in a lift, found without a word",
     "pack": "make a feature pack of the field's formats",
     "encode": "make a feature pack of images",
     "inspect": "what is in a file, and what is wrong",

@@ -57,7 +57,7 @@ def run(options: argparse.Namespace) -> int:
     if files:
         free_outputs(files, made_from(scene))
     encoder = text_encoder(options, scene)
-    words = _words(options.words, encoder)
+    words = read_words(options.words, encoder)
     vectors = encoder.encode(words)
     document: dict[str, Any] = {"encoder": encoder.name, "words": len(words)}
     if options.what:
@@ -82,8 +82,8 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _words(path: Path | None, encoder: TextEncoder) -> list[str]:
-    """Those of the file, one a line, or all that a table has."""
+def read_words(path: Path | None, encoder: TextEncoder) -> list[str]:
+    """The words of a file, one a line, or all that a table has."""
     from liftcore.query.segment import words_of
 
     if path is None:

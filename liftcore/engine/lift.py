@@ -41,22 +41,22 @@ IDENTITY = "lift.json"  # of what the pieces in a folder are
 
 def needs_all(settings: LiftSettings) -> list[str]:
     """The settings that need all regions or all splats in one place, as they are set."""
-    names = ("robust_steps", "aggregation", "cg_steps", "reference_channels")
-    return [f"{name}={getattr(settings, name)}" for name in names if getattr(settings, name)]
+    names = ("robust_steps", "objects", "aggregation", "cg_steps", "reference_channels")
+    return [f"{name}={value}" for name in names if (value := getattr(settings, name)) and value != "auto"]
 
 
 def check_settings(settings: LiftSettings) -> None:
     """Refuse, before the work, what needs W or X in one place.
 
     Raises:
-        InvalidSettings: reweighting, aggregation, or least squares.
+        InvalidSettings: reweighting, objects, aggregation, or least squares.
     """
     asked = needs_all(settings)
     if asked:
         raise InvalidSettings(
             "engine",
-            expected="settings of the closed form alone: reweighting, aggregation and least squares need all regions "
-            "or splats in one place",
+            expected="settings of the closed form alone: reweighting, objects, aggregation and least squares need "
+            "all regions or splats in one place",
             got=", ".join(asked),
             hint="take a preset without them (row-sum, tikhonov), or lift without an engine",
         )

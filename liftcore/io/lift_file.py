@@ -2,9 +2,10 @@
 
 A ``.safetensors`` file holds ``features`` [P, F], ``evidence`` [P], ``agreement`` [P] and ``seen`` [P]. After
 reweighting it has ``confidence`` [P] f32, which tells right splats from wrong ones, as agreement does not; after
-Post-Lifting Aggregation ``cluster`` [P] i32, -1 for splats in none, and ``cluster_features`` [K, F]; of packs with
-words their vectors, ``embeddings`` [n, F] f32. Its metadata hold settings, inputs with digests, the encoder, words,
-the certificate, timings and the version, as JSON. A lift too large for one file is a folder of shards with the same
+Post-Lifting Aggregation ``cluster`` [P] i32, -1 for splats in none, and ``cluster_features`` [K, F]; where objects
+were looked for ``object`` [P] i32, -1 for none, and ``object_views`` [N, 5] i32 (`LiftResult`); of packs with words
+their vectors, ``embeddings`` [n, F] f32. Its metadata hold settings, inputs with digests, the encoder, words, the
+certificate, timings and the version, as JSON. A lift too large for one file is a folder of shards with the same
 tensors (`liftcore.io.shards`).
 """
 
@@ -29,8 +30,9 @@ if TYPE_CHECKING:
 TENSORS = ("features", "evidence", "agreement", "seen")
 CONFIDENCE = "confidence"  # in lifts that were reweighted
 CLUSTER_TENSORS = ("cluster", "cluster_features")  # in lifts with aggregation only
+OBJECT_TENSORS = ("object", "object_views")  # in lifts that looked for objects
 EMBEDDINGS = "embeddings"  # in lifts of packs with words
-ALL = (*TENSORS, CONFIDENCE, *CLUSTER_TENSORS, EMBEDDINGS)
+ALL = (*TENSORS, CONFIDENCE, *CLUSTER_TENSORS, *OBJECT_TENSORS, EMBEDDINGS)
 
 
 def save_lift(lift: LiftResult, path: Path | str) -> None:
@@ -123,16 +125,20 @@ def _check_shapes(arrays: dict[str, np.ndarray], path: Path | str) -> None:
     if words is not None and (words.shape[1:] != features.shape[1:] or words.dtype != np.float32):
         expected, got = "a vector of the features' channels for each word", f"{list(words.shape)} {words.dtype}"
         raise InvalidLift(str(path), expected=expected, got=got)
-    cluster, means = arrays.get("cluster"), arrays.get("cluster_features")
-    if cluster is None and means is None:
-        return
-    if cluster is None or means is None:
-        raise InvalidLift(str(path), expected="cluster and cluster_features, or neither", got="one of them")
-    fits = cluster.shape == rows and cluster.dtype == np.int32
-    fits &= means.ndim == 2 and means.shape[1:] == features.shape[1:] and means.dtype == features.dtype
-    if not fits or int(cluster.min()) < -1 or int(cluster.max()) >= len(means):
-        got = f"{list(cluster.shape)} {cluster.dtype} and {list(means.shape)} {means.dtype}"
-        raise InvalidLift(str(path), expected="a cluster of -1 or a row of cluster_features for each splat", got=got)
+    for pair, channels, dtype in (
+        (CLUSTER_TENSORS, features.shape[1], features.dtype),
+        (OBJECT_TENSORS, None, np.dtype(np.int32)),
+    ):
+        one, table = (arrays.get(name) for name in pair)
+        if one is None and table is None:
+            continue
+        if one is None or table is None:
+            raise InvalidLift(str(path), expected=f"{pair[0]} and {pair[1]}, or neither", got="one of them")
+        fits = one.shape == rows and one.dtype == np.int32 and table.ndim == 2 and table.dtype == dtype
+        fits &= channels is None or table.shape[1] == channels
+        if not fits or int(one.min()) < -1 or int(one.max()) >= len(table):
+            got = f"{list(one.shape)} {one.dtype} and {list(table.shape)} {table.dtype}"
+            raise InvalidLift(str(path), expected=f"a {pair[0]} of -1 or a row of {pair[1]} for each splat", got=got)
 
 
 def input_files(splats: Path, cameras: Path, features: Sequence[Path]) -> list[InputFile]:

@@ -41,6 +41,8 @@ class QueryScene:
     cluster: np.ndarray | None  # [P] i32, -1 = in no cluster; None without aggregation
     cluster_features: np.ndarray | None  # [K, F] like features
     confidence: np.ndarray | None  # [P] f32 in 0..1; None where the lift was not reweighted
+    object: np.ndarray | None  # [P] i32, -1 = of no object; None: objects were not looked for
+    object_views: np.ndarray | None  # [N, V] i32, of `LiftResult`
     _told: str  # the metadata of a lift file, as JSON
     _moved: dict[str, Path | None]  # files that lie elsewhere now, by their roles
 
@@ -52,6 +54,7 @@ class QueryScene:
         packs: Views | None = None,
     ) -> None:
         names = ("features", "evidence", "seen", "cluster", "cluster_features", "confidence", "embeddings")
+        names += ("object", "object_views")
         self._hold({name: as_numpy(getattr(result, name)) for name in names})
         self.path = Path("lift")
         given = {"lift": result, "metadata": result.metadata, "splats": splats, "cameras": cameras, "packs": packs}
@@ -62,6 +65,7 @@ class QueryScene:
         self.cluster, self.cluster_features = arrays.get("cluster"), arrays.get("cluster_features")
         self.confidence = arrays.get("confidence")
         self._embeddings = arrays.get("embeddings")
+        self.object, self.object_views = arrays.get("object"), arrays.get("object_views")
 
     @classmethod
     def open(cls, path: Path, *, splats: Path | None = None, cameras: Path | None = None) -> Self:

@@ -26,6 +26,7 @@ import torch
 from liftcore.errors import SplatliftError
 from liftcore.io.json_file import finite
 from liftcore.query.ask import Answer, Point, Question, answers, question, top
+from liftcore.query.catalogue import Catalogue, catalogue, one_object_ply
 from liftcore.query.export import coloured_ply, layer_colours, npy, object_splats, viewer_splats
 from liftcore.query.objects import Objects, objects
 from liftcore.query.presence import references_of
@@ -112,7 +113,7 @@ class Answers:
 
     def __init__(self, *, scenes: int, cache_bytes: int) -> None:
         self._scenes: Kept[QueryScene] = Kept(scenes)
-        self._cache: Kept[Answer | Objects | ViewMask | Segmentation] = Kept(cache_bytes, bytes_of)
+        self._cache: Kept[Answer | Objects | ViewMask | Segmentation | Catalogue] = Kept(cache_bytes, bytes_of)
         self._encoders: dict[str, tuple[object, TextEncoder]] = {}  # spec -> version of its file, encoder
         self._opening = threading.RLock()  # of encoders, which the warm-up opens too
         self._warm: set[Kernel] = set()  # kernels of splats whose compiled code is loaded, or being loaded
@@ -132,6 +133,7 @@ class Answers:
             "word_map": self._word_map,
             "word_picture": self._word_picture,
             "what": self._what,
+            "catalogue": self._catalogue,
         }
 
     @property
@@ -256,8 +258,12 @@ class Answers:
         return Frame({}, render_png(self._scene(request), view_of(request), request["what"]))
 
     def _splats(self, request: dict[str, Any]) -> Frame:
+        scene = self._scene(request)
+        if "object" in request:
+            write_draft(one_object_ply(scene, request["object"]), Path(request["draft"]))
+            return Frame({})
         make = {"object": object_splats, "scores": coloured_ply}[request["what"]]
-        write_draft(make(self._scene(request), self._answer(request)), Path(request["draft"]))
+        write_draft(make(scene, self._answer(request)), Path(request["draft"]))
         return Frame({})
 
     def _viewer_splats(self, request: dict[str, Any]) -> Frame:
@@ -308,6 +314,26 @@ class Answers:
         best = best_words(self._scene(request), example, words, encoder.encode(words), request["top"])
         return Frame({"words": [asdict(word) for word in best]})
 
+    def _catalogue(self, request: dict[str, Any]) -> Frame:
+        key = ("catalogue", request["lift"], request["encoder"], json.dumps(request["encoder_version"]))
+        found = self._cache.get(key, lambda: self._named_objects(request))
+        assert isinstance(found, Catalogue)
+        first, last = request["first"], request["first"] + request["count"]
+        things = [asdict(one) | {"box": _box(one.box), "feature": None} for one in found.objects[first:last]]
+        if request["means"]:
+            for thing, row in zip(things, found.features[first:last], strict=True):
+                thing["feature"] = row.tolist()
+        after = last if last < len(found.objects) else None
+        told = {"explanation": found.explanation, "count": len(found.objects), "next": after}
+        return Frame(told | {"objects": things})
+
+    def _named_objects(self, request: dict[str, Any]) -> Catalogue:
+        """The objects of a lift; all words of the table that the request names, if it does, name them."""
+        if request["encoder"] is None:
+            return catalogue(self._scene(request))
+        words, encoder = self._words(request)
+        return catalogue(self._scene(request), words, encoder.encode(words))
+
 
 def write_draft(blocks: Iterable[bytes], draft: Path) -> None:
     """Write what is too much for a pipe where the HTTP process finds it, and removes it.
@@ -340,7 +366,7 @@ def _key(request: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps([request[name] for name in names]).encode()).hexdigest()
 
 
-def bytes_of(made: Answer | Objects | ViewMask | Segmentation) -> int:
+def bytes_of(made: Answer | Objects | ViewMask | Segmentation | Catalogue) -> int:
     """The memory that an answer, with its question, the objects of one, a view of one or named splats take."""
     if isinstance(made, Answer):
         tensors = made.scores.nbytes + made.seen.nbytes + made.selected.nbytes
@@ -349,6 +375,8 @@ def bytes_of(made: Answer | Objects | ViewMask | Segmentation) -> int:
         return ENTRY_BYTES + made.numbers.nbytes
     if isinstance(made, Segmentation):
         return ENTRY_BYTES + made.labels.nbytes + made.margin.nbytes + sum(len(word.encode()) for word in made.words)
+    if isinstance(made, Catalogue):
+        return ENTRY_BYTES * (1 + len(made.objects)) + made.features.nbytes
     return ENTRY_BYTES + made.attention.nbytes + made.row_sums.nbytes + made.mask.nbytes
 
 

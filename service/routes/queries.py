@@ -288,7 +288,10 @@ def query_request(operation: str, asked: Question, lift: LiftRecord, deps: AppSt
 
 
 def with_encoder(
-    request: dict[str, Any], asked: models.LiftQuestion, lift: LiftRecord, deps: AppState
+    request: dict[str, Any],
+    asked: models.LiftQuestion | models.AskedForSceneObjects,
+    lift: LiftRecord,
+    deps: AppState,
 ) -> dict[str, Any]:
     """The request with the encoder of its words: an uploaded table, or one that the operator set up.
 

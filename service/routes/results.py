@@ -96,7 +96,7 @@ def shape_lift(lift: LiftRecord) -> models.LiftResult:
     """A lift as clients get it; paths of this machine stay here."""
     own = f"/lifts/{lift.id}"
     links = {"self": own, "job": f"/jobs/{lift.id}", "features": f"{own}/features"}
-    links |= {"views": f"{own}/views", "query": f"/query?lift={lift.id}&text="}
+    links |= {"views": f"{own}/views", "objects": f"{own}/objects", "query": f"/query?lift={lift.id}&text="}
     told = {"views": [], "words": [], **lift.metadata, **vars(lift), "links": links}
     return models.LiftResult(**{name: told[name] for name in models.LiftResult.model_fields})
 

@@ -1,4 +1,4 @@
-"""/lifts/{lift}/splats, /colours and /views: what a viewer draws of a lift."""
+"""/lifts/{lift}/splats, /colours, /views and /objects: what a viewer draws of a lift."""
 
 from __future__ import annotations
 
@@ -6,14 +6,15 @@ import hashlib
 from typing import Annotated, Any, Literal
 
 import anyio
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
 from liftcore.errors import NotFound
 from service import models
 from service.content import TAGGED, Limit, kept, unchanged
+from service.encoders import encoder_label
 from service.photos import names_with_photo, open_photo
-from service.routes.queries import NPY, PLY, Ask, View, scene_request, tagged_answer
+from service.routes.queries import NO_ENCODER, NPY, PLY, Ask, View, scene_request, tagged_answer, with_encoder
 from service.state import AppState, Deps
 
 VIEWS = 1000  # a page of them, unless another number is asked for
@@ -22,6 +23,7 @@ PHOTO: dict[int | str, dict[str, Any]] = {200: {"content": {"image/jpeg": _BYTES
 
 router = APIRouter(prefix="/lifts/{lift}", tags=["lifts"])
 ViewsCursor = Annotated[int, Query(ge=0, le=10**9, description="the `next` of the page before")]
+ObjectId = Annotated[int, Path(ge=0, le=10**9, description="the id of an object of the lift")]
 Layer = Annotated[
     Literal["pca", "cluster", "evidence", "agreement", "confidence"],
     Query(description="principal components of features, clusters, or one of the others through a colour map"),
@@ -84,3 +86,25 @@ async def views(lift: str, deps: Deps, ask: Ask, limit: Limit = VIEWS, cursor: V
         models.View(lifted=view["name"] in lifted, photo=view["name"] in photos, **view) for view in answer["views"]
     ]
     return models.Views(views=told, next=cursor + most if answer["more"] else None)
+
+
+@router.get("/objects", response_model=models.SceneObjects)
+def scene_objects(
+    lift: str, deps: Deps, ask: Ask, asked: Annotated[models.AskedForSceneObjects, Query()]
+) -> models.SceneObjects:
+    """The things in the scene, found by masks alone when it was lifted; a vocabulary names them."""
+    found = deps.store.lifts.get(deps.owner, lift)
+    wanted: dict[str, Any] = scene_request("catalogue", found, deps) | NO_ENCODER | {"words": None}
+    if asked.table is not None or asked.encoder is not None:
+        wanted = with_encoder(wanted, asked, found, deps)
+    named = None if wanted["encoder"] is None else encoder_label(wanted["encoder"])
+    wanted |= {"first": asked.cursor, "count": asked.limit, "means": asked.features}
+    return models.SceneObjects(lift=found.id, encoder=named, **ask(wanted).header)
+
+
+@router.get("/objects/{thing}/splats", responses=PLY | TAGGED, response_class=Response)
+def object_splats(lift: str, thing: ObjectId, request: Request, deps: Deps, ask: Ask) -> Response:
+    """The splats of one object and no others: a PLY of the dialect that was lifted."""
+    found = deps.store.lifts.get(deps.owner, lift)
+    wanted = scene_request("splats", found, deps) | {"what": f"object-{thing}", "object": thing}
+    return tagged_answer(request, deps, wanted, found, ask)

@@ -133,5 +133,5 @@ def every_route(app: FastAPI) -> list[tuple[str, str]]:
 
 def address(path: str, job: str, asset: str) -> str:
     """A route's path with the ids in their places."""
-    path = path.replace("{kind}", "cameras").replace("{asset}", asset)
+    path = path.replace("{kind}", "cameras").replace("{asset}", asset).replace("{thing}", "0")
     return re.sub(r"\{(job|lift|tradeoff)\}", job, path)

@@ -28,7 +28,7 @@ def addresses(lift: dict[str, Any], uploaded: Uploaded) -> list[str]:
         "/jobs", f"/jobs/{lift['id']}", f"/jobs/{lift['id']}/events", "/lifts", own, f"{own}/features",
         f"/query?{asked}", f"/query/objects?{asked}", f"/query/scores?{asked}",
         f"/query/mask?{asked}&view=left",
-        f"/render?lift={lift['id']}&view=left",
+        f"{own}/objects", f"{own}/objects/0/splats", f"/render?lift={lift['id']}&view=left",
     ]  # fmt: skip
 
 

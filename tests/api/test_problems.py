@@ -44,6 +44,8 @@ ROUTES = {
     "/lifts/{lift}/splats",
     "/lifts/{lift}/colours",
     "/lifts/{lift}/views",
+    "/lifts/{lift}/objects",
+    "/lifts/{lift}/objects/{thing}/splats",
     "/query",
     "/query/objects",
     "/query/scores",

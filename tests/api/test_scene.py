@@ -13,7 +13,7 @@ from liftcore.io.splat import ROW
 from liftcore.query.scene import QueryScene
 
 from .test_problems import assert_problem
-from .tiny_scene import FOCAL, HEIGHT, SPLATS_A_CLUSTER, VIEWS, WIDTH, splat_rows
+from .tiny_scene import FOCAL, HEIGHT, SPLATS_A_CLUSTER, VIEWS, WIDTH, WORDS, TinyScene, splat_rows
 
 
 def test_splats_come_in_the_rows_of_the_lift(client: TestClient, lift: dict[str, Any]) -> None:
@@ -59,6 +59,48 @@ def test_views_have_their_poses_in_pages(client: TestClient, lift: dict[str, Any
         assert (view["width"], view["height"], view["fx"]) == (WIDTH, HEIGHT, FOCAL)
         pose = np.array(view["viewmat"])
         np.testing.assert_allclose(-pose[:3, :3].T @ pose[:3, 3], (VIEWS[view["name"]], 0, 0), atol=1e-6)
+
+
+def test_objects_are_there_without_words_and_a_table_names_them(
+    client: TestClient, lift: dict[str, Any], scene: TinyScene
+) -> None:
+    route = lift["links"]["objects"]
+    whole = client.get(route).json()
+    assert (whole["count"], whole["next"], whole["encoder"]) == (3, None, None)
+    assert [one["id"] for one in whole["objects"]] == [0, 1, 2]
+    assert all(one["name"] is None and set(one["views"]) <= set(VIEWS) for one in whole["objects"])
+    assert sum(one["splats"] for one in whole["objects"]) == lift["count"]
+    pages = [client.get(route, params={"limit": 2, "cursor": first}).json() for first in (0, 2)]
+    assert pages[0]["objects"] + pages[1]["objects"] == whole["objects"]
+    assert (pages[0]["next"], pages[1]["next"]) == (2, None)
+    table = client.put("/assets/table", content=scene.table).json()["id"]
+    for how in ({"table": table}, {"encoder": "default"}):
+        named = client.get(route, params={**how, "features": True}).json()["objects"]
+        for one in named:
+            middle = one["centre"][0]
+            assert one["name"] == WORDS[round(middle / 1.2) + 1] and one["score"] > 0.9
+            assert one["box"]["low"][0] < middle < one["box"]["high"][0] and len(one["feature"]) == lift["channels"]
+    ply = client.get(f"{route}/1/splats")
+    rows = np.frombuffer(ply.content[ply.content.index(b"end_header\n") + 11 :], "<f4").reshape(-1, 14)
+    assert len(rows) == whole["objects"][1]["splats"]
+    assert np.abs(rows[:, 0] - whole["objects"][1]["centre"][0]).max() < 0.5
+
+
+@pytest.mark.parametrize(
+    ("path", "how", "status"),
+    [
+        ("objects", {"table": "sha256:" + "0" * 64}, 404),
+        ("objects", {"table": "sha256:" + "0" * 64, "encoder": "default"}, 422),
+        ("objects", {"encoder": "nowhere"}, 422),
+        ("objects", {"limit": 0}, 422),
+        ("objects/3/splats", {}, 404),
+        ("objects/-1/splats", {}, 422),
+    ],
+)
+def test_wrong_questions_for_objects_are_problems(
+    client: TestClient, lift: dict[str, Any], path: str, how: dict[str, Any], status: int
+) -> None:
+    assert assert_problem(client.get(f"/lifts/{lift['id']}/{path}", params=how))["status"] == status
 
 
 def test_an_answer_says_what_is_known_of_presence(client: TestClient, lift: dict[str, Any]) -> None:

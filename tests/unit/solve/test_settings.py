@@ -66,3 +66,7 @@ def test_published_schema_has_every_setting_and_what_a_new_lift_may_have() -> No
                 LiftSettings.of_json({name: field[end]})
     with pytest.raises(InvalidSettings):
         LiftSettings.of_json({"certificate_rays": fields["certificate_rays"]["maximum"] + 1})
+
+
+def test_regions_are_kept_from_the_papers_tau_on() -> None:
+    assert LiftSettings().aggregation_iou == 0.75  # tau of the paper, Post Aggregation Filtering

@@ -1,0 +1,83 @@
+"""``splatlift objects``: the things that a lift holds, found without a word; a vocabulary names them."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from liftcore.cli.options import Parser, add_encoder, text_encoder
+from liftcore.cli.query import made_from, place_of, write_files
+from liftcore.cli.reply import free_output, free_outputs, reply
+from liftcore.cli.segment import read_words
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from liftcore.query.scene import QueryScene
+
+
+def add_arguments(parser: Parser) -> None:
+    """The options of the command."""
+    parser.add_argument("lift", type=Path, help="a lift (.safetensors)")
+    named = "name each by the nearest of these words: a file of one a line, or a text table (.safetensors)"
+    parser.add_argument("--vocabulary", type=Path, metavar="FILE", help=named)
+    add_encoder(parser)
+    parser.add_argument("--features", action="store_true", help="with --json: each one's mean feature, too")
+    parser.add_argument("--csv", type=Path, metavar="CSV", help="write the list as a table")
+    parser.add_argument("--splats", type=Path, metavar="FOLDER", help="write one PLY an object, object-ID.ply")
+
+
+def run(options: argparse.Namespace) -> int:
+    """List the objects, and write what was asked for."""
+    files = {"csv": options.csv} if options.csv else {}
+    given = [path for path in (options.lift, options.table, options.vocabulary) if path]
+    free_outputs(files, given)
+    from liftcore.query.catalogue import catalogue, one_object_ply, table_csv
+    from liftcore.query.scene import QueryScene
+
+    scene = QueryScene.open(options.lift)
+    if files or options.splats:
+        free_outputs(files, made_from(scene))
+    encoder, words, vectors = _vocabulary(options, scene)
+    found = catalogue(scene, words, vectors)
+    things = [asdict(one) for one in found.objects]
+    if options.features:
+        things = [one | {"feature": row.tolist()} for one, row in zip(things, found.features, strict=True)]
+    document: dict[str, Any] = {"encoder": encoder, "explanation": found.explanation, "objects": things}
+    contents: dict[str, Any] = {"csv": lambda: [table_csv(found)]}
+    if options.splats:
+        for one in found.objects:
+            name = f"object-{one.id}"
+            files[name] = free_output(options.splats / f"{name}.ply", [*given, *made_from(scene)])
+            contents[name] = lambda number=one.id: one_object_ply(scene, number)
+    document["files"] = write_files(files, contents)
+    reply(document, as_json=options.json, lines=_lines(document))
+    return 0
+
+
+def _vocabulary(options: argparse.Namespace, scene: QueryScene) -> tuple[str | None, list[str], Any]:
+    """The encoder's name, the words and their vectors; none where objects get no names."""
+    if options.vocabulary is None and not options.table and not options.encoder and scene.table is None:
+        return None, [], None
+    if options.vocabulary is not None and options.vocabulary.suffix == ".safetensors":
+        from liftcore.query.text import open_encoder
+
+        encoder, file = open_encoder(f"table:{options.vocabulary}"), None
+    else:
+        encoder, file = text_encoder(options, scene), options.vocabulary
+    words = read_words(file, encoder)
+    return encoder.name, words, encoder.encode(words)
+
+
+def _lines(document: dict[str, Any]) -> Iterable[str]:
+    yield document["explanation"]
+    for one in document["objects"]:
+        low, high = one["box"]
+        name = "" if one["name"] is None else f" {one['name']} ({one['score']:.3f})"
+        yield (
+            f"  {one['id']}{name}: {one['splats']} splats, {one['share']:.1%} of the evidence, at "
+            f"{place_of(one['centre'])}, from {place_of(low)} to {place_of(high)}, best in {', '.join(one['views'])}"
+        )
+    yield from (f"  {kind}: {path}" for kind, path in document["files"].items())

@@ -1,0 +1,136 @@
+"""Objects without words: the chains against all pairs in float64, and what they promise on scenes of known things."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from liftcore.solve import objects
+from liftcore.solve.consensus import BELONGS, FAINT
+from liftcore.solve.objects import CONTAINS, LEAST_VIEWS, OBSERVES, TOGETHER, clustered, region_objects
+from liftcore.solve.weights import RegionWeights, stacked
+from tests.unit.solve.sparse_views import dense, of_dense
+from tests.unit.solve.test_consensus import SPLATS, of_things, random_scene
+
+
+def mistaken_scene(seed: int, views: int = 7) -> tuple[RegionWeights, np.ndarray]:
+    """Five things of two parts, masks of them and of their parts, with splats astray, unseen, and masks merged."""
+    rng, parts, levels = np.random.default_rng(seed), [], []
+    part = np.arange(SPLATS) // 6
+    for _ in range(views):
+        columns = []
+        for level, right in enumerate((part // 2, part)):
+            labels = np.where(rng.random(SPLATS) < 0.1, rng.integers(0, right.max() + 1, SPLATS), right)
+            if rng.random() < 0.5:
+                labels[labels == rng.integers(1, right.max() + 1)] = 0
+            view = np.zeros((SPLATS, right.max() + 1))
+            view[np.arange(SPLATS), labels] = rng.uniform(0.1, 3.0, SPLATS) * (rng.random(SPLATS) < 0.8)
+            columns.append(view)
+            levels += [level] * view.shape[1]
+        parts.append(of_dense(np.concatenate(columns, axis=1)))
+    return stacked(parts, SPLATS), np.array(levels, np.int8)
+
+
+def defined(W: RegionWeights, levels: np.ndarray) -> np.ndarray:
+    """The cluster of each region that any splat belongs to, by the module's words, line by line; -1 for none."""
+    whole, offsets = dense(W, SPLATS), W.offsets.numpy()
+    view = np.searchsorted(offsets, np.arange(levels.size), side="right") - 1
+    B, groups = np.zeros(whole.shape, bool), {}
+    for v in range(offsets.size - 1):
+        for level in np.unique(levels[view == v]):
+            own = groups[v, level] = np.flatnonzero((view == v) & (levels == level))
+            sums = whole[:, own].sum(axis=1, keepdims=True)
+            B[:, own] = (sums > FAINT) & (whole[:, own] >= BELONGS * sums) & (whole[:, own] > 0)
+    R = B.T @ (np.sqrt(whole.sum(axis=1))[:, None] * B)
+    size = levels.size
+    supports, observes = np.zeros((size, size)), np.zeros((size, size))
+    for v in range(offsets.size - 1):
+        sees, both = np.zeros(size, bool), np.zeros((size, size), bool)
+        for (of, _), own in groups.items():
+            if of != v:
+                continue
+            held = R[:, own].sum(axis=1)
+            seen = (held > 0) & (held >= OBSERVES * np.diag(R))
+            best = own[R[:, own].argmax(axis=1)]
+            kept = seen & (R[:, own].max(axis=1) >= CONTAINS * held)
+            sees |= seen
+            both |= kept[:, None] & kept[None] & (best[:, None] == best[None])
+        supports += both
+        observes += sees[:, None] & sees[None]
+    clusters = [[int(m)] for m in np.flatnonzero(B.any(axis=0))]
+    while len(clusters) > 1:
+        rates = {}
+        for i in range(len(clusters)):
+            for j in range(i):
+                pair = np.ix_(clusters[i], clusters[j])
+                rates[i, j] = supports[pair].sum() / max(observes[pair].sum(), 1e-9)
+        i, j = max(rates, key=lambda pair: rates[pair])
+        if rates[i, j] < TOGETHER:
+            break
+        clusters[j] += clusters.pop(i)
+    found = np.full(size, -1)
+    kept = [own for own in clusters if np.unique(view[own]).size >= min(LEAST_VIEWS, offsets.size - 1)]
+    for number, own in enumerate(kept):
+        found[own] = number
+    return found
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_objects_are_those_of_the_definition(seed: int) -> None:
+    W, levels = mistaken_scene(seed)
+    found, expected = region_objects(W, levels, np.ones(SPLATS)), defined(W, levels)
+    sums = np.zeros((SPLATS, expected.max() + 2))
+    for m, own in enumerate(expected):
+        sums[:, own + 1] += dense(W, SPLATS)[:, m]
+    best, whole = sums[:, 1:].argmax(axis=1), sums[:, 1:].sum(axis=1)
+    assert expected.max() >= 2
+    labels = np.where((whole > 0) & (2 * sums[:, 1:].max(axis=1) >= whole), best, -1)
+    same = found.labels[:, None] == found.labels[None]
+    np.testing.assert_array_equal(same, labels[:, None] == labels[None])
+    np.testing.assert_array_equal(found.labels < 0, labels < 0)
+
+
+def test_merged_and_split_masks_do_not_change_the_things() -> None:
+    right = [0, 1, 2, 3]
+    merged, split = [0, 0, 1, 2], [0, 1, 2, 2]
+    found = region_objects(*of_things([right, merged, right, split, right, right]), evidence=np.arange(SPLATS) + 1.0)
+    np.testing.assert_array_equal(found.labels, np.repeat([3, 2, 1, 0], SPLATS // 4))  # most evidence first
+    assert len(found.views) == 4 and set(found.views[0][found.views[0] >= 0]) <= set(range(6))
+
+
+def test_parts_are_held_together_by_masks_of_the_whole() -> None:
+    rows = np.zeros((SPLATS, 4))  # level 0: two things; level 1: the first one in two parts
+    rows[:30, 0], rows[30:, 1], rows[:15, 2], rows[15:30, 3] = 1, 1, 1, 1
+    W = stacked([of_dense(rows)] * 4, SPLATS)
+    labels = region_objects(W, np.tile(np.array([0, 0, 1, 1], np.int8), 4), np.ones(SPLATS)).labels
+    assert [len(np.unique(labels[part])) for part in (slice(0, 30), slice(30, 60))] == [1, 1]
+    assert labels[0] != labels[-1]
+
+
+def test_grids_have_no_objects() -> None:
+    W, levels = random_scene(0)
+    found = region_objects(W, np.full_like(levels, -1), np.ones(SPLATS))
+    assert (found.labels == -1).all() and found.views.shape[0] == 0
+
+
+def test_views_beyond_the_bound_join_what_the_others_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(objects, "MOST_REGIONS", 20)
+    monkeypatch.setattr(objects, "FEWEST_VIEWS", 5)
+    W, levels = of_things([[0, 1, 2, 3]] * 12)
+    found = region_objects(W, levels, np.ones(SPLATS))
+    assert len(found.views) == 4 and (found.regions >= 0).all()
+    np.testing.assert_array_equal(found.regions.reshape(12, 4), found.regions[:4][None].repeat(12, axis=0))
+
+
+def test_the_number_of_threads_changes_no_label() -> None:
+    W, levels = mistaken_scene(3, views=9)
+    one, many = (region_objects(W, levels, np.ones(SPLATS), threads) for threads in (1, 5))
+    np.testing.assert_array_equal(one.labels, many.labels)
+
+
+def test_pairs_that_no_view_sees_neither_join_nor_part() -> None:
+    supports = np.array(
+        [[1, 1, 0], [1, 2, 1], [0, 1, 1]], np.float32
+    )  # the first and the last are never seen together
+    observes = np.array([[1, 1, 0], [1, 2, 1], [0, 1, 1]], np.float32)
+    assert clustered(supports, observes).tolist() == [0, 0, 0]
