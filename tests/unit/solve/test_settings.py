@@ -69,4 +69,4 @@ def test_published_schema_has_every_setting_and_what_a_new_lift_may_have() -> No
 
 
 def test_regions_are_kept_from_the_papers_tau_on() -> None:
-    assert LiftSettings().aggregation_iou == 0.75  # tau of the paper, Post Aggregation Filtering
+    assert LiftSettings.of().aggregation_iou == 0.75  # tau of the paper, Post Aggregation Filtering
