@@ -17,6 +17,7 @@ from liftcore.errors import SplatliftError
 COMMANDS = {
     "demo": "the whole job, through the real service",
     "serve": "run the HTTP service",
+    "view": "one lift on the service's page, until Ctrl-C",
     "keys": "who may use the HTTP service",
     "store": "mend the HTTP service's data directory",
     "check": "do splats, cameras, photos and features belong together",

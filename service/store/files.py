@@ -167,7 +167,12 @@ class DataDirectory:
             (self.root / name).mkdir()
 
     def publish(self, draft: Path, path: Path) -> None:
-        """Make a draft the file at ``path``: on the disk first, then there at once or not at all."""
+        """Make a draft the file at ``path``: on the disk first, then there at once or not at all.
+
+        A file that is its own draft is there.
+        """
+        if draft == path:
+            return
         path.parent.mkdir(exist_ok=True)
         with draft.open("rb") as handle:
             os.fsync(handle.fileno())

@@ -74,7 +74,7 @@ def _kind_of(path: Path) -> AssetKind:
         return AssetKind.SPLATS
     if path.suffix == ".json" or zipfile.is_zipfile(path):
         return AssetKind.PHOTOS if path.suffix == ".zip" and holds_photos(path) else AssetKind.CAMERAS
-    names = _header(path)[0]
+    names = header_of(path)[0]
     if names == {"embeddings"}:
         return AssetKind.TABLE
     return AssetKind.MASKS if any(name.endswith("/mask") for name in names) else AssetKind.FEATURES
@@ -84,7 +84,7 @@ def _add_lift(store: Store, path: Path) -> None:
     """A lift remembers the settings and the digests of what it was made of: that is its job's order."""
     if not re.match(JOB_ID, path.stem) or path != store.files.lift(path.stem):
         raise InvalidLift("lift", expected="a file named after its job", got=path.name)
-    _, metadata, shape = _header(path)
+    _, metadata, shape = header_of(path)
     try:
         told = json.loads(metadata["splatlift"])
         order = order_of(told)
@@ -98,7 +98,7 @@ def _add_lift(store: Store, path: Path) -> None:
     store.lifts.adopt(SERVICE, path.stem, order, FinishedLift(path, digest, count, channels, told))
 
 
-def _header(path: Path) -> tuple[set[str], dict[str, str], list[int]]:
+def header_of(path: Path) -> tuple[set[str], dict[str, str], list[int]]:
     """Names of tensors, metadata and the shape of ``features``, of a safetensors file."""
     try:
         handle: Any

@@ -1,0 +1,73 @@
+"""`splatlift view`: one lift on the page of a server of its own, by links, until it is interrupted."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import httpx
+
+from liftcore.io.lift_file import save_lift
+from liftcore.io.scene_files import lift_files
+from liftcore.settings import LiftSettings
+
+from .tiny_scene import colmap_zip, make_scene
+
+if TYPE_CHECKING:
+    import pytest
+
+ROOT = Path(__file__).parents[2]
+
+
+def test_a_lift_is_shown_by_links_until_it_is_interrupted(tmp_path: Path) -> None:
+    import zipfile
+
+    tiny, temporary = make_scene(), tmp_path / "temporary"
+    temporary.mkdir()
+    (tmp_path / "cameras.zip").write_bytes(colmap_zip())
+    zipfile.ZipFile(tmp_path / "cameras.zip").extractall(tmp_path / "scene")
+    for name, content in (("scene.ply", tiny.splats), ("f.safetensors", tiny.features)):
+        (tmp_path / name).write_bytes(content)
+    made = lift_files(
+        tmp_path / "scene.ply", tmp_path / "scene", [tmp_path / "f.safetensors"], LiftSettings.of(preset="row-sum")
+    )
+    save_lift(made, tmp_path / "l.safetensors")
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    command = [sys.executable, "-m", "liftcore.cli", "view", str(tmp_path / "l.safetensors"), "--no-browser"]
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "TMPDIR": str(temporary)}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as server:
+        assert server.stdout is not None
+        line = server.stdout.readline()
+        found = re.match(r"(http://127\.0\.0\.1:\d+)/\?lift=(\w+) ", line)
+        assert found, line
+        with httpx.Client(base_url=found[1], timeout=600) as client:
+            assert client.get(f"/?lift={found[2]}").status_code == 200
+            assert client.get(f"/lifts/{found[2]}").json()["count"] == 60
+            answer = client.get("/query", params={"like": "region:left:0:2", "threshold": 0.5}).json()
+            assert answer["count"] == 20
+            assert client.get("/render", params={"view": "middle"}).status_code == 200
+            deleted = client.delete(f"/jobs/{found[2]}", params={"with_lift": True})
+            assert deleted.status_code == 204
+        server.send_signal(signal.SIGINT)
+        assert server.wait(timeout=600) == 0
+    assert not list(temporary.iterdir())
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+
+
+def test_a_lift_whose_files_moved_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from service.view import main
+
+    tiny = make_scene()
+    for name, content in (("s.ply", tiny.splats), ("c.json", tiny.cameras), ("f.safetensors", tiny.features)):
+        (tmp_path / name).write_bytes(content)
+    files = tmp_path / "s.ply", tmp_path / "c.json", [tmp_path / "f.safetensors"]
+    save_lift(lift_files(*files, LiftSettings.of(preset="row-sum")), tmp_path / "l.safetensors")
+    (tmp_path / "s.ply").unlink()
+    for lift, told in (("l.safetensors", "its splats at"), ("f.safetensors", "a lift file")):
+        assert main([str(tmp_path / lift), "--no-browser"]) == 2
+        assert told in capsys.readouterr().err
