@@ -34,7 +34,7 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument("--checkpoint", type=Path, metavar="DIR", help=f"keep walked views there: {goes_on}")
     parser.add_argument("--threads", type=count, metavar="N", help="else as many as there are cores")
     blocks = "lift in blocks, whose memory is bounded: in this process, or by the workers of a Ray cluster"
-    parser.add_argument("--engine", choices=ENGINES, help=f"{blocks}; OUTPUT may then be a folder of shards")
+    parser.add_argument("--engine", choices=ENGINES, help=f"{blocks}; X.shards as LIFT is a folder of shards")
     parser.add_argument("--address", metavar="HOST:PORT", help="of the Ray cluster, or auto; else of this machine")
 
 
@@ -44,12 +44,11 @@ def run(options: argparse.Namespace) -> int:
     from liftcore.io.cameras import camera_source
     from liftcore.io.lift_file import save_lift
     from liftcore.io.scene_files import lift_files
-    from liftcore.io.shards import INDEX
+    from liftcore.io.shards import INDEX, SUFFIX
 
     views = camera_source(options.cameras).files
     inputs = [options.splats, *views, *options.features]
-    sharded = options.output.suffix != ".safetensors"
-    out = free_output(options.output / INDEX if sharded else options.output, inputs)
+    out = free_output(options.output / INDEX if options.output.suffix == SUFFIX else options.output, inputs)
     engine = engine_named(options.engine, options.address, options.threads)
     checkpoint = checkpoint_in(options.checkpoint) if options.checkpoint else None
 

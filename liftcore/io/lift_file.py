@@ -20,7 +20,7 @@ import numpy as np
 
 from liftcore.errors import InvalidLift
 from liftcore.io.safetensors_file import map_tensors
-from liftcore.io.shards import INDEX, map_shards, write_shards
+from liftcore.io.shards import INDEX, SUFFIX, map_shards, write_shards
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -39,16 +39,16 @@ def save_lift(lift: LiftResult, path: Path | str) -> None:
     """Write the lift whole or not at all (temporary file, fsync, rename), with no copy of X in memory.
 
     Args:
-        path: a file; without ``.safetensors`` at its end, a folder of shards.
+        path: a file; with ``.shards`` at its end, a folder of shards.
     """
     from liftcore.io.safetensors_file import write_tensors
 
     path, metadata = Path(path), lift.metadata.model_dump_json()
     tensors = {name: getattr(lift, name) for name in ALL if getattr(lift, name) is not None}
-    if path.suffix == ".safetensors":
-        write_tensors(path, tensors, {"splatlift": metadata})
-    else:
+    if path.suffix == SUFFIX:
         write_shards(path, tensors, metadata)
+    else:
+        write_tensors(path, tensors, {"splatlift": metadata})
 
 
 def load_lift(path: Path | str) -> LiftResult:

@@ -25,6 +25,7 @@ from liftcore.io.safetensors_file import DTYPES, map_tensors, safetensors_header
 if TYPE_CHECKING:
     from torch import Tensor
 
+SUFFIX = ".shards"  # of the folder's name
 INDEX = "lift.safetensors.index.json"
 COLUMNS = "columns.safetensors"
 ROWS = 1 << 17  # splats of a shard: with 512 channels of float16, 128 MiB

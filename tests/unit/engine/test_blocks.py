@@ -125,11 +125,13 @@ def test_shards_read_as_one_file(scene: dict[str, Any], tmp_path: Path) -> None:
 
     lift = lc.lift(*scene.values())
     lift.save(tmp_path / "one.safetensors")
-    lift.save(tmp_path / "shards")
-    assert_same(lc.load_lift(tmp_path / "shards"), lc.load_lift(tmp_path / "one.safetensors"))
-    with safe_open(tmp_path / "shards/features-00000.safetensors", framework="pt") as file:  # as anybody reads them
+    lift.save(tmp_path / "lift.shards")
+    assert_same(lc.load_lift(tmp_path / "lift.shards"), lc.load_lift(tmp_path / "one.safetensors"))
+    with safe_open(
+        tmp_path / "lift.shards/features-00000.safetensors", framework="pt"
+    ) as file:  # as anybody reads them
         assert torch.equal(file.get_tensor("features-00000"), lift.features)
-    answer = lc.load_lift(tmp_path / "shards").query(np.ones((1, 4)), splats=scene["splats"])
+    answer = lc.load_lift(tmp_path / "lift.shards").query(np.ones((1, 4)), splats=scene["splats"])
     assert answer.scores.shape == (COUNT,)
 
 
@@ -145,8 +147,8 @@ def test_shards_read_as_one_file(scene: dict[str, Any], tmp_path: Path) -> None:
 def test_broken_shards_are_refused(
     scene: dict[str, Any], tmp_path: Path, file: str, content: bytes | None, message: str
 ) -> None:
-    lc.lift(*scene.values()).save(tmp_path / "shards")
-    path = tmp_path / "shards" / file
+    lc.lift(*scene.values()).save(tmp_path / "lift.shards")
+    path = tmp_path / "lift.shards" / file
     path.unlink() if content is None else path.write_bytes(content)
     with pytest.raises(lc.InvalidLift, match=message):
-        lc.load_lift(tmp_path / "shards")
+        lc.load_lift(tmp_path / "lift.shards")
