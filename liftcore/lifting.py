@@ -17,6 +17,7 @@ from liftcore.device import Device, choose_device, within_memory
 from liftcore.engine.base import Engine
 from liftcore.engine.lift import lift_in_blocks
 from liftcore.errors import InvalidSettings
+from liftcore.io.lift_file import poses_of
 from liftcore.planning.plan import Plan, plan_lift
 from liftcore.progress import Progress, Timings
 from liftcore.raster import open_raster
@@ -122,6 +123,7 @@ def lift(
             text_space=found.features.text_space,
             words=table.words if table else (),
             views=tuple(found.names),
+            poses=poses_of([found.camera(number) for number in range(len(found))]),
             certificate=diagnostics,
             timings=work.timings.seconds,
         ),

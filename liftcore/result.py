@@ -52,6 +52,7 @@ class LiftMetadata(BaseModel):
     text_space: str = ""  # the text encoder that shares the space; "" or "none" when there is none
     words: tuple[str, ...] = ()  # that its packs brought: it is asked in these without an encoder
     views: tuple[str, ...]  # the views that were lifted
+    poses: str = ""  # of their cameras (`liftcore.io.lift_file.poses_of`); "" in older lifts
     certificate: dict[str, Any]
     timings: dict[str, float]  # seconds a stage
 

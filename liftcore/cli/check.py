@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import time
 from dataclasses import asdict
 from pathlib import Path
+from statistics import median
 from typing import TYPE_CHECKING
 
-from liftcore.cli.options import BAD_INPUT, Parser
+from liftcore.cli.options import BAD_INPUT, Parser, add_verbose
 from liftcore.cli.reply import free_output, progress_bars, reply, writing
 
 if TYPE_CHECKING:
@@ -22,6 +24,7 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument("cameras", type=Path, help="COLMAP folder or .zip, transforms.json or cameras.json")
     parser.add_argument("others", type=Path, nargs="*", help="folders of photos, and feature packs (.safetensors)")
     parser.add_argument("--worst", type=Path, metavar="PNG", help="write the worst view: its photo and the render")
+    add_verbose(parser)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -36,6 +39,7 @@ def run(options: argparse.Namespace) -> int:
         free_output(options.worst, [options.splats])
     packs = [path for path in options.others if path.suffix == ".safetensors"]
     photos = [path for path in options.others if path not in packs]
+    begin = time.perf_counter()
     with progress_bars() as progress:
         found = check_scene(
             read_splats(options.splats),
@@ -45,24 +49,34 @@ def run(options: argparse.Namespace) -> int:
             progress,
         )
     document = {name: value for name, value in asdict(found).items() if name != "worst"}
-    document["healthy"] = not found.wrong
+    document |= {"healthy": not found.wrong, "seconds": time.perf_counter() - begin}
     if options.worst and found.worst is not None:
         with writing(options.worst):
             options.worst.write_bytes(found.worst)
         document["worst"] = str(options.worst)
-    reply(document, as_json=options.json, lines=_lines(found, document))
+    reply(document, as_json=options.json, lines=_lines(found, document, options.verbose))
     return BAD_INPUT if found.wrong else 0
 
 
-def _lines(found: CheckReport, document: dict) -> Iterable[str]:
-    for view in found.views:
-        compared = "" if view.psnr is None else f", {view.psnr:.1f} dB to its photo"
-        control = "" if view.others is None else f" and {view.others:.1f} to others"
-        yield f"  {view.view}: row sums {view.row_sum:.3f}{compared}{control}"
-    yield f"  {found.in_view:.1%} of the splats are in some view"
-    yield from (f"  features, {name.replace('_', ' ')}: {value:.3f}" for name, value in found.features.items())
+def _lines(found: CheckReport, document: dict, verbose: bool) -> Iterable[str]:
+    if verbose:
+        for view in found.views:
+            compared = "" if view.psnr is None else f", {view.psnr:.1f} dB to its photo"
+            control = "" if view.others is None else f" and {view.others:.1f} to others"
+            yield f"  {view.view}: row sums {view.row_sum:.3f}{compared}{control}"
+        yield f"  {found.in_view:.1%} of the splats are in some view"
+        yield from (f"  features, {name.replace('_', ' ')}: {value:.3f}" for name, value in found.features.items())
+    compared = [view for view in found.views if view.psnr is not None]
+    if compared:
+        worst = min(compared, key=lambda view: view.psnr or 0.0)
+        typical = median(view.psnr for view in compared if view.psnr is not None)
+        yield f"renders are {typical:.1f} dB from their photos in the median, {worst.psnr:.1f} in {worst.view}"
     yield from (f"note: {text}" for text in found.notes)
     yield from (f"wrong: {text}" for text in found.wrong)
     if "worst" in document:
         yield f"  worst: {document['worst']}"
-    yield "something is wrong" if found.wrong else "healthy: nothing contradicts anything that was given"
+    if found.wrong:
+        yield "not healthy: mend what is wrong before you lift"
+    else:
+        took = f"{document['seconds']:.0f} s"
+        yield f"healthy: nothing contradicts anything that was given ({took}); splatlift lift is next"

@@ -8,12 +8,14 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from liftcore.cli.options import Parser, add_settings, add_sources, count
+from liftcore.cli.options import Parser, add_settings, add_sources, add_verbose, count
 from liftcore.cli.reply import free_output, progress_bars, reply, shown, writing
 from liftcore.engine import ENGINES, engine_named
 from liftcore.errors import InvalidInput, InvalidSettings
 from liftcore.nearest import nearest
 from liftcore.progress import one_step
+
+FILLED = 0.9  # of a ray, in a scene that was trained with its background
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -30,6 +32,7 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="LIFT", help="the lift to write")
     add_settings(parser)
     parser.add_argument("--explain", action="store_true", help="print the plan before the work")
+    add_verbose(parser)
     goes_on = "a killed lift goes on from there, and one of the same regions with other features walks none again"
     parser.add_argument("--checkpoint", type=Path, metavar="DIR", help=f"keep walked views there: {goes_on}")
     parser.add_argument("--threads", type=count, metavar="N", help="else as many as there are cores")
@@ -57,7 +60,7 @@ def run(options: argparse.Namespace) -> int:
     def take(plan: Plan) -> None:
         plans.append(plan)
         if not options.json:
-            print(*(plan.lines() if options.explain else _in_short(plan)), sep="\n", flush=True)
+            print(*(plan.lines() if options.explain else in_short(plan)), sep="\n", flush=True)
 
     with progress_bars() as progress:
         result = lift_files(
@@ -77,7 +80,7 @@ def run(options: argparse.Namespace) -> int:
     warnings = result.metadata.certificate["warnings"]
     document = {"out": str(options.output), **_summary(result), "warnings": [*plan.warnings, *warnings]}
     new = [warning for warning in warnings if warning not in plan.told]  # the others were printed with the plan
-    reply(document, as_json=options.json, lines=_lines(document | {"warnings": new}))
+    reply(document, as_json=options.json, lines=_lines(document | {"warnings": new}, options.verbose))
     return 0
 
 
@@ -159,11 +162,17 @@ def plan_of(options: argparse.Namespace, settings: LiftSettings) -> Plan:
     )
 
 
-def _in_short(plan: Plan) -> Iterable[str]:
+def in_short(plan: Plan) -> Iterable[str]:
+    """The plan in a few lines, with its verdict."""
     head, *rest = plan.summary()
     yield f"plan: {head}"
     yield from (f"  {line}" for line in rest)
-    yield from (f"warning: {warning}" for warning in (*plan.warnings, *plan.told))
+    if plan.seconds is not None:
+        yield f"  about {max(plan.seconds, 1):.0f} s to look through the views on this machine"
+    warnings = (*plan.warnings, *plan.told)
+    yield from (f"warning: {warning}" for warning in warnings)
+    if not warnings:
+        yield "  healthy: nothing contradicts anything that was given"
 
 
 def _summary(result: LiftResult) -> dict[str, Any]:
@@ -173,6 +182,7 @@ def _summary(result: LiftResult) -> dict[str, Any]:
         "seen_share": float(result.seen.float().mean()),
         "channels": result.features.shape[1],
         "views": len(metadata.views),
+        "lifted": list(metadata.views),
         "encoder": metadata.encoder,
         "text_space": metadata.text_space,
         "certificate": metadata.certificate,
@@ -181,14 +191,34 @@ def _summary(result: LiftResult) -> dict[str, Any]:
     }
 
 
-def _lines(document: dict[str, Any]) -> Iterable[str]:
+def _lines(document: dict[str, Any], verbose: bool) -> Iterable[str]:
     yield (
         f"{document['out']}: {document['splats']} splats x {document['channels']} channels "
-        f"from {document['views']} views, {document['seen_share']:.1%} of the splats seen"
+        f"from {document['views']} views, {document['seen_share']:.1%} of the splats seen, "
+        f"in {sum(document['timings'].values()):.1f} s"
     )
+    yield from (f"warning: {warning}" for warning in document["warnings"])
+    yield from _verdict(document)
+    if not verbose:
+        return
     for key, value in document["certificate"].items():
         if key not in ("plan", "warnings"):  # the plan in full is what --explain prints
             yield f"  {key}: {shown(value)}"
     yield "timings:"
     yield from (f"  {stage}: {seconds:.3f} s" for stage, seconds in document["timings"].items())
-    yield from (f"warning: {warning}" for warning in document["warnings"])
+
+
+def _verdict(document: dict[str, Any]) -> Iterable[str]:
+    """What is healthy, what to look at, and what to do."""
+    from liftcore.query.text import NO_WORDS
+
+    certificate = document["certificate"]
+    filled = certificate["row_sum_mean"]
+    if filled is not None:
+        usual = "as of a scene without holes" if filled >= FILLED else "the rest of a ray meets nothing"
+        yield f"splats fill {filled:.1%} of a ray, {usual}"
+    if certificate["warnings"]:
+        yield "look at the warnings: splatlift check says whether photos, cameras and splats belong together"
+    words = document["text_space"] not in ("", NO_WORDS)
+    how = "WORD" if words else f"--like {next(iter(document['lifted']), 'VIEW')}:x,y"
+    yield f"next: splatlift query {document['out']} {how}  (--verbose shows all figures)"

@@ -82,6 +82,31 @@ def add_encoder(parser: argparse.ArgumentParser) -> None:
     words.add_argument("--encoder", metavar="NAME", help=f"{specs}; else the one that the lift's text space names")
 
 
+def add_lift(parser: argparse.ArgumentParser) -> None:
+    """A lift, and where its splats and cameras are now."""
+    parser.add_argument("lift", type=Path, help="a lift (.safetensors)")
+    parser.add_argument("--splats", type=Path, metavar="FILE", help="its splats; else where they were, or beside it")
+    parser.add_argument(
+        "--cameras", type=Path, metavar="PATH", help="its cameras, likewise; more of them may be there"
+    )
+
+
+def opened_lift(options: argparse.Namespace) -> QueryScene:
+    """The lift that the options name.
+
+    Raises:
+        InvalidLift: it is none.
+    """
+    from liftcore.query.scene import QueryScene
+
+    return QueryScene.open(options.lift, splats=options.splats, cameras=options.cameras)
+
+
+def add_verbose(parser: argparse.ArgumentParser) -> None:
+    """More than the verdict."""
+    parser.add_argument("--verbose", action="store_true", help="print all figures, not the verdict alone")
+
+
 def add_view(parser: argparse.ArgumentParser) -> None:
     """The camera of pictures."""
     parser.add_argument("--view", metavar="NAME", help="the camera to see it from")

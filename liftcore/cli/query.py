@@ -8,7 +8,18 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from liftcore.cli.options import THRESHOLDS, Parser, add_encoder, add_negative, add_view, count, text_encoder, view_of
+from liftcore.cli.options import (
+    THRESHOLDS,
+    Parser,
+    add_encoder,
+    add_lift,
+    add_negative,
+    add_view,
+    count,
+    opened_lift,
+    text_encoder,
+    view_of,
+)
 from liftcore.cli.reply import free_outputs, reply, writing
 from liftcore.errors import InvalidQuery
 from liftcore.io.files import whole_file
@@ -16,20 +27,23 @@ from liftcore.io.files import whole_file
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
+    from PIL.Image import Image
+
     from liftcore.query.ask import Answer
     from liftcore.query.render import ViewMask
     from liftcore.query.scene import QueryScene
     from liftcore.query.terms import Example, Query
     from liftcore.query.text import TextEncoder
+    from liftcore.scene.cameras import Camera
 
 
-OUTPUTS = ("object", "coloured", "scores", "mask", "attention")  # options that name a file to write
+OUTPUTS = ("object", "coloured", "scores", "mask", "attention", "overlay")  # options that name a file to write
 
 
 def add_arguments(parser: Parser) -> None:
     """The options of the command."""
     parser.last = "text"
-    parser.add_argument("lift", type=Path, help="a lift (.safetensors)")
+    add_lift(parser)
     parser.add_argument("text", nargs="?", help="what to look for, in quotes; may be left out beside --like")
     like = "VIEW:x,y (a pixel), region:VIEW:LEVEL:ID, splat:J or a vector FILE.npy; may be given several times"
     parser.add_argument("--like", action="append", default=[], metavar="EXAMPLE", help=f"more of this: {like}")
@@ -47,6 +61,9 @@ def add_arguments(parser: Parser) -> None:
     add_view(parser)
     parser.add_argument("--mask", type=Path, metavar="PNG", help="write the mask of the view")
     parser.add_argument("--attention", type=Path, metavar="PNG", help="write the attention map of the view")
+    shows = "write the view with what was found outlined, and a caption"
+    parser.add_argument("--overlay", type=Path, metavar="PNG", help=shows)
+    parser.add_argument("--photo", type=Path, metavar="FILE", help="of the view, for --overlay; else a render")
     parser.add_argument("--scores", type=Path, metavar="NPY", help="write the scores [P], float32")
     only = "write the splats that were found, and no others: .ply with all their properties, .splat or .spz"
     parser.add_argument("--object", type=Path, metavar="FILE", help=only)
@@ -55,15 +72,14 @@ def add_arguments(parser: Parser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Ask, look where a view is named, write what was asked for, and say what was found."""
-    view = view_of(options, "mask", "attention")
+    view = view_of(options, "mask", "attention", "overlay")
     files = {kind: path for kind in OUTPUTS if (path := getattr(options, kind)) is not None}
     free_outputs(files, [path for path in (options.lift, options.table, options.camera) if path])
     from liftcore.query.ask import ask, top
     from liftcore.query.objects import objects
-    from liftcore.query.scene import QueryScene
 
     query = _query(options)
-    scene = QueryScene.open(options.lift)
+    scene = opened_lift(options)
     if files:
         free_outputs(files, made_from(scene))
     encoder = text_encoder(options, scene, "or ask by example, with --like") if query.texts else None
@@ -80,7 +96,7 @@ def run(options: argparse.Namespace) -> int:
     if options.objects:
         found = objects(scene, answer)
         document |= {"objects": [asdict(thing) for thing in found.found], "strays": found.strays}
-    document["files"] = write_files(files, _contents(options, scene, answer, seen))
+    document["files"] = write_files(files, _contents(options, scene, answer, seen, view))
     reply(document, as_json=options.json, lines=_lines(document))
     return 0
 
@@ -147,7 +163,7 @@ def _document(answer: Answer, seen: ViewMask | None, encoder: TextEncoder | None
 
 
 def _contents(
-    options: argparse.Namespace, scene: QueryScene, answer: Answer, seen: ViewMask | None
+    options: argparse.Namespace, scene: QueryScene, answer: Answer, seen: ViewMask | None, view: str | Camera | None
 ) -> dict[str, Callable[[], Iterable[bytes]]]:
     from liftcore.query.export import coloured_ply, npy, object_splats
 
@@ -156,11 +172,19 @@ def _contents(
         "coloured": lambda: coloured_ply(scene, answer),
         "scores": lambda: [npy(answer.scores)],
     }
-    if seen is not None:
-        from liftcore.query.render import attention_png, mask_png
+    if seen is not None and view is not None:
+        from liftcore.query.render import attention_png, mask_png, overlay_png
 
         contents |= {"mask": lambda: [mask_png(seen)], "attention": lambda: [attention_png(seen)]}
+        named = ", ".join(map(str, answer.query.positives))
+        contents["overlay"] = lambda: [overlay_png(scene, seen, view, named, _picture(options.photo))]
     return contents
+
+
+def _picture(photo: Path | None) -> Image | None:
+    from liftcore.features.encoders.encode import read_image
+
+    return None if photo is None else read_image(photo)[0]
 
 
 def made_from(scene: QueryScene) -> list[Path]:

@@ -3,16 +3,18 @@
 import json
 import os
 import sys
+import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from liftcore.errors import InvalidInput
-from liftcore.progress import Progress, silent
+from liftcore.progress import Progress
 
 SHOWN_ITEMS = 6  # of a list, for people
 SHOWN_FOLDERS = 8
+LINE_SECONDS = 10.0  # between two lines of progress where nothing draws bars
 
 
 def reply(document: Mapping[str, Any], *, as_json: bool, lines: Iterable[str] | None = None) -> None:
@@ -110,15 +112,25 @@ def told_folders(folders: Sequence[str]) -> list[str]:
 
 @contextmanager
 def progress_bars() -> Iterator[Progress]:
-    """Progress that draws one bar a stage on a terminal, and nothing elsewhere."""
+    """Progress that draws one bar a stage on a terminal; elsewhere it says a line every ten seconds."""
     if not sys.stderr.isatty():
-        yield silent
+        yield _Lines()
         return
     bars = _Bars()
     try:
         yield bars
     finally:
         bars.close()
+
+
+class _Lines:
+    def __init__(self) -> None:
+        self.next = time.monotonic() + LINE_SECONDS
+
+    def __call__(self, stage: str, done: int, total: int, unit: str) -> None:
+        if time.monotonic() >= self.next:
+            print(f"{stage}: {done} of {total} {unit}", file=sys.stderr, flush=True)
+            self.next = time.monotonic() + LINE_SECONDS
 
 
 class _Bars:

@@ -8,7 +8,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from liftcore.cli.options import Parser, add_encoder, add_view, count, text_encoder, view_of
+from liftcore.cli.options import Parser, add_encoder, add_lift, add_view, count, opened_lift, text_encoder, view_of
 from liftcore.cli.query import examples_of, made_from, place_of, write_files
 from liftcore.cli.reply import free_outputs, progress_bars, reply
 from liftcore.errors import InvalidQuery
@@ -26,7 +26,7 @@ OUTPUTS = ("labels", "picture", "coloured", "splat_labels", "labelled")  # optio
 
 def add_arguments(parser: Parser) -> None:
     """The options of the command."""
-    parser.add_argument("lift", type=Path, help="a lift (.safetensors)")
+    add_lift(parser)
     parser.add_argument("--words", type=Path, metavar="FILE", help="the words, one a line; else all of the table's")
     add_encoder(parser)
     what = "what is this? VIEW:x,y (a pixel), region:VIEW:LEVEL:ID, splat:J or a vector FILE.npy"
@@ -50,10 +50,9 @@ def run(options: argparse.Namespace) -> int:
     given = [path for path in (options.lift, options.table, options.words, options.camera) if path]
     free_outputs(files, given)
     from liftcore.query.presence import references_of
-    from liftcore.query.scene import QueryScene
     from liftcore.query.segment import best_words, segment
 
-    scene = QueryScene.open(options.lift)
+    scene = opened_lift(options)
     if files:
         free_outputs(files, made_from(scene))
     encoder = text_encoder(options, scene)

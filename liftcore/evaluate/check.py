@@ -1,8 +1,7 @@
 """Do splats, cameras, photos and features belong together? What is wrong is told before the work.
 
 Nothing here knows how good a scene is. Each measure has its own control: a render is held against other views' photos
-too, neighbouring cells of a grid against any two cells and against other readings of the same bytes, and the edges of
-masks against the same masks mirrored.
+too, the edges of masks against the same masks mirrored, and features as `liftcore.planning.contradictions` has it.
 """
 
 from __future__ import annotations
@@ -19,6 +18,18 @@ from PIL import Image
 from liftcore.features.encoders.encode import read_image
 from liftcore.features.pack import Views, pair
 from liftcore.features.views import FeatureGrid, Regions
+from liftcore.planning.contradictions import (
+    FRAME,
+    LEAST_AGREEMENT,
+    LEAST_IN_VIEW,
+    LEAST_ROW_SUM,
+    agreement_of_views,
+    disagreement,
+    empty,
+    smoothness,
+    unlike_maps,
+    unseen,
+)
 from liftcore.planning.views import visibility
 from liftcore.progress import Progress, silent
 from liftcore.query.render import in_photo
@@ -28,15 +39,13 @@ from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.cameras import Camera, Cameras, photo_size
 from liftcore.scene.splats import Splats
 from liftcore.scene.views import cameras_of_views, some_of
+from liftcore.settings import LiftSettings
+from liftcore.solve.geometry import LiftViews
 
 VIEWS = 12  # that are looked at, evenly spread
 CONTROLS = 3  # other photos that a render is held against
-LEAST_ROW_SUM = 0.05  # in the mean of a view: a scene of one object before nothing has a fifth or so
-LEAST_IN_VIEW = 0.05  # of the splats
 LEAST_GAIN = 3.0  # dB, of a render over other views' photos to its own
-LEAST_SMOOTHNESS = 0.1  # of neighbouring cells' agreement over that of any two, as a share of what is left to one
 LEAST_EDGES = 1.1  # of the photo's edges under masks, over those under mirrored ones
-READINGS = {"[F, h, w]": (1, 2, 0), "[w, h, F]": (1, 0, 2)}  # of the same bytes, and how their axes become h, w, F
 
 
 @dataclass(frozen=True)
@@ -83,7 +92,8 @@ def check_scene(
     paired = cameras_of_views(photos, cameras)
     files = {camera: photos[view] for view, camera in paired.items()}
     if not photos:
-        notes.append("photos: none were given, so nothing tells whether these cameras are those of the splats")
+        what = "so the features alone tell" if features is not None else "so nothing tells"
+        notes.append(f"photos: none were given, {what} whether these cameras are those of the splats")
     elif not files:
         named = f"{some_of(photos)}, but the cameras {some_of(cameras)}"
         wrong.append(f"photos: none is named as a camera: the photos are {named}")
@@ -104,6 +114,13 @@ def check_scene(
     figures: dict[str, float] = {}
     if features is not None:
         figures, told = _check_features(features, cameras, files)
+        agreement = agreement_of_views(splats, LiftViews.of(features, cameras, LiftSettings.of()), LiftSettings.of())[
+            1
+        ]
+        if agreement is not None:
+            figures["agreement_of_views"] = agreement
+            # Other cameras than those of the scene are told already, and broken maps agree nowhere.
+            told += [disagreement(agreement)] if agreement < LEAST_AGREEMENT and not (told or wrong) else []
         wrong += told
     compared = [view for view in views if view.psnr is not None]
     worst = min(compared, key=lambda view: view.psnr or 0.0).view if compared else None
@@ -143,16 +160,15 @@ def _psnr(one: np.ndarray, other: np.ndarray) -> float:
 
 def _wrong_cameras(views: Sequence[ViewCheck], in_view: float) -> list[str]:
     wrong, row_sum = [], float(np.median([view.row_sum for view in views]))
-    frame = "cameras and splats must share a frame: look for the trainer's transform, a scale or another scene"
     if row_sum < LEAST_ROW_SUM:
-        wrong.append(f"cameras: splats fill {row_sum:.1%} of the rays of a view; {frame}")
+        wrong.append(empty(row_sum))
     if in_view < LEAST_IN_VIEW:
-        wrong.append(f"cameras: no camera can see {1 - in_view:.1%} of the splats; {frame}")
+        wrong.append(unseen(in_view))
     gains = [view.psnr - view.others for view in views if view.psnr is not None and view.others is not None]
     if gains and float(np.median(gains)) < LEAST_GAIN:
         psnr = float(np.median([view.psnr for view in views if view.psnr is not None]))
         told = f"renders are hardly more like their own photos ({psnr:.1f} dB) than like other views'"
-        wrong.append(f"photos: {told} ({np.median(gains):+.1f} dB); {frame}, and photos must be those of the cameras")
+        wrong.append(f"photos: {told} ({np.median(gains):+.1f} dB); {FRAME}, and photos must be those of the cameras")
     return wrong
 
 
@@ -161,53 +177,31 @@ def _check_features(
 ) -> tuple[dict[str, float], list[str]]:
     """Medians over some views, and what is wrong by them."""
     views = pair(features, cameras)[0]
-    rows: dict[str, list[float]] = {}
-
-    def take(name: str, value: float) -> None:
-        rows.setdefault(name, []).append(value)
-
+    grids: list[np.ndarray] = []
+    rows: list[tuple[float, float]] = []
     for name in _some(views.views, VIEWS):
         observed = views[name]
         if isinstance(observed, FeatureGrid):
-            grid = observed.grid.float().numpy()
-            neighbours, anyone = _agreement(grid)
-            take("smoothness", (neighbours - anyone) / max(1 - anyone, 1e-6))
-            take("neighbours", neighbours)
-            for reading, axes in READINGS.items():
-                shape = np.array(grid.shape)[np.argsort(axes)]
-                take(reading, _agreement(grid.reshape(shape).transpose(axes))[0])
+            grids.append(observed.grid.float().numpy())
         elif isinstance(observed, Regions) and name in files:
             labels = observed.labels[-1].numpy()
             photo = _pixels(read_image(files[name])[0], labels.shape[::-1]).mean(axis=2)
-            own, mirrored = _edges(labels, photo), max(_edges(labels[:, ::-1], photo), _edges(labels[::-1], photo))
-            take("edges", own)
-            take("edges_of_mirrored", mirrored)
-    figures = {name: float(np.median(values)) for name, values in rows.items()}
-    wrong = []
-    if "neighbours" in figures:
-        best = max(READINGS, key=lambda reading: figures[reading])
-        gap = figures[best] - figures["neighbours"]
-        agree = f"neighbouring cells agree to {figures['neighbours']:.2f}"
-        if gap > LEAST_SMOOTHNESS:
-            told = f"read as {best} they would to {figures[best]:.2f}: the bytes lie in that order"
-            wrong.append(f"features: {agree}, {told}; write the maps anew, from arrays that are contiguous")
-        elif figures["smoothness"] < LEAST_SMOOTHNESS:
-            wrong.append(f"features: {agree}, as any two cells do: the maps show nothing of the photos")
-    if "edges" in figures and figures["edges"] < LEAST_EDGES * figures["edges_of_mirrored"]:
-        told = f"edges of photos are {figures['edges']:.2f} of the mean under the masks' borders"
-        control = f"{figures['edges_of_mirrored']:.2f} under mirrored ones"
-        wrong.append(f"features: {told}, {control}: masks must be of these photos, upright, whole, not transposed")
+            mirrored = max(_edges(labels[:, ::-1], photo), _edges(labels[::-1], photo))
+            rows.append((_edges(labels, photo), mirrored))
+    figures, wrong = {}, unlike_maps(grids)
+    if grids:
+        found = smoothness(grids)
+        figures |= {"neighbouring_cells": found.neighbours, "any_two_cells": found.anyone, **found.readings}
+    if rows:
+        own, mirrored = np.median(np.array(rows), axis=0).tolist()
+        figures |= {"edges": own, "edges_of_mirrored": mirrored}
+        if own < LEAST_EDGES * mirrored:
+            told = f"edges of photos are {own:.2f} of the mean under the masks' borders"
+            control = f"{mirrored:.2f} under mirrored ones"
+            wrong.append(
+                f"features: {told}, {control}: masks must be of these photos, upright, whole, not transposed"
+            )
     return figures, wrong
-
-
-def _agreement(grid: np.ndarray) -> tuple[float, float]:
-    """The mean cosine of neighbouring cells of a grid [h, w, F], and of any two."""
-    unit = grid / np.maximum(np.linalg.norm(grid, axis=2, keepdims=True), 1e-12)
-    down, across = (unit[1:] * unit[:-1]).sum(axis=2), (unit[:, 1:] * unit[:, :-1]).sum(axis=2)
-    mean = unit.reshape(-1, unit.shape[2]).mean(axis=0)
-    count = unit.shape[0] * unit.shape[1]
-    anyone = (count * float(mean @ mean) - 1) / max(count - 1, 1)
-    return float(np.concatenate([down.ravel(), across.ravel()]).mean()) if count > 1 else 1.0, anyone
 
 
 def _edges(labels: np.ndarray, photo: np.ndarray) -> float:

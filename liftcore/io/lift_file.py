@@ -13,22 +13,26 @@ from __future__ import annotations
 
 import hashlib
 import os
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from liftcore.errors import InvalidLift
+from liftcore.errors import InvalidInput, InvalidLift
 from liftcore.io.safetensors_file import map_tensors
 from liftcore.io.shards import INDEX, SUFFIX, map_shards, write_shards
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from liftcore.result import InputFile, LiftMetadata, LiftResult
+    from liftcore.scene.cameras import Camera
 
 TENSORS = ("features", "evidence", "agreement", "seen")
 CONFIDENCE = "confidence"  # in lifts that were reweighted
+NEAR = 3  # folders of an input's path, and above a lift, among which it is looked for
+MOST_BESIDE = 16  # files of one kind beside a lift, that are read to know one of them
 CLUSTER_TENSORS = ("cluster", "cluster_features")  # in lifts with aggregation only
 OBJECT_TENSORS = ("object", "object_views")  # in lifts that looked for objects
 EMBEDDINGS = "embeddings"  # in lifts of packs with words
@@ -170,6 +174,53 @@ def camera_input(path: Path) -> InputFile:
     for part in files:
         total.update(f"{os.path.relpath(part, folder)} {sha256_of(part)}\n".encode())
     return InputFile(path=str(given), sha256=total.hexdigest())
+
+
+def found_input(role: str, remembered: InputFile, metadata: LiftMetadata, lift: Path | None) -> Path | None:
+    """Where an input of a lift is: where it was, or beside the lift under its name or another; None if nowhere.
+
+    Cameras will do if those of the lifted views are what they were, whatever others there are.
+
+    Args:
+        role: splats, cameras or features. lift: the lift's file; None looks at the remembered path alone.
+    """
+    path = Path(remembered.path)
+    places = [path] if lift is None else [path, *_beside(lift, path)]
+    of = camera_input if role == "cameras" else input_file
+    for place in places:
+        if place.exists():
+            with suppress(InvalidInput, OSError):
+                if of(place).sha256 == remembered.sha256 or (role == "cameras" and _has_poses(place, metadata)):
+                    return place
+    return None
+
+
+def _beside(lift: Path, path: Path) -> Iterator[Path]:
+    """Where an input may have moved to: under its name, with some of its folders; else any of its kind."""
+    folder, parts = Path(os.path.abspath(lift)).parent, path.parts[1:]
+    for above in (folder, *folder.parents[:NEAR]):
+        yield from (above.joinpath(*parts[-count:]) for count in range(1, min(len(parts), NEAR) + 1))
+    if path.suffix:
+        yield from sorted(other for other in folder.glob(f"*{path.suffix}") if other != lift)[:MOST_BESIDE]
+
+
+def _has_poses(place: Path, metadata: LiftMetadata) -> bool:
+    from liftcore.io.cameras import read_cameras
+
+    if not metadata.poses:
+        return False
+    cameras = read_cameras(place, choosing=False)
+    known = [cameras[view] for view in metadata.views if view in cameras]
+    return len(known) == len(metadata.views) and poses_of(known) == metadata.poses
+
+
+def poses_of(cameras: Sequence[Camera]) -> str:
+    """A digest of what cameras see, in their order."""
+    total = hashlib.sha256()
+    for camera in cameras:
+        total.update(camera.viewmat.tobytes() + camera.K.tobytes())
+        total.update(repr((camera.name, camera.width, camera.height, camera.lens)).encode())
+    return total.hexdigest()
 
 
 def sha256_of(path: Path) -> str:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 import tempfile
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from liftcore.device import CPU, Device
 from liftcore.errors import Unavailable
 from liftcore.features.pack import Views
 from liftcore.io.transforms import frame_warning
+from liftcore.planning.contradictions import contradictions
 from liftcore.planning.views import (
     PILOT_VIEWS,
     WELL_COVERED,
@@ -26,18 +28,21 @@ from liftcore.planning.views import (
     views_to_show,
     visibility,
 )
+from liftcore.progress import silent
 from liftcore.raster.base import TILE
+from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.cameras import Camera, distortion_warning
 from liftcore.scene.splats import Splats
 from liftcore.settings import LiftSettings
 from liftcore.solve.codebook import TABLE_BYTES
 from liftcore.solve.consensus import BLOCK_ENTRIES
 from liftcore.solve.diagnostics import shape_warnings
-from liftcore.solve.geometry import LiftViews
+from liftcore.solve.geometry import LiftViews, weigh_views
 from liftcore.solve.memory import check_disk, lack_of_disk
 from liftcore.solve.weights import MEMORY_LIMIT
 
 FEW_VIEWS = 32  # and below, view_cosine takes all: a pilot would cost what it saves
+TIMED_VIEWS = 32  # and more have one of them timed: it costs a part of what it tells
 SHOWN_VIEWS = 6  # names in a line for people
 MIB, GIB = 2**20, 2**30
 LIBRARIES = 450_000_000  # of torch, numba, numpy and the compiled kernels, before anything is read
@@ -80,6 +85,7 @@ class Plan:
     device: Device  # that will walk and solve
     kept_on_card: int  # bytes of W that may stay on a card between the phases
     features_room: int | None  # bytes of this machine's memory that X may take today; None for no limit
+    seconds: float | None  # that looking through the views takes on this machine today, about; None for few views
     warnings: tuple[str, ...]  # of this machine, today
     told: tuple[str, ...]  # warnings of what is lifted, which the certificate of the lift has too
 
@@ -166,6 +172,7 @@ def plan_lift(
     names = views.names
     cameras = [views.cameras[name] for name in names]
     seen = visibility(splats, cameras, settings.lift_params)
+    wrong = contradictions(splats, views, settings, seen, threads)
     chosen, expected = _choose_views(splats, views, settings, seen, threads)
     names, seen, cameras = [names[k] for k in chosen], seen.of(chosen), [cameras[k] for k in chosen]
     short = [] if apart else check_card(device, splats.count, settings.device)
@@ -192,11 +199,13 @@ def plan_lift(
         device=CPU if short else device,
         kept_on_card=kept,
         features_room=features_room(parts, free),
+        seconds=_seconds(splats, views, names, settings, threads) if device.kind == "cpu" or short else None,
         warnings=(*short, *check_memory(parts, free), *check_weights(in_files)),
         told=(
             *frame_warning(views.cameras),
             *distortion_warning(cameras),
             *shape_warnings(features, cameras),
+            *wrong,
         ),
     )
 
@@ -221,6 +230,19 @@ def _choose_views(
     pilot = fly_pilot(splats, views, settings, seen, threads)
     count, expected = pilot.views_for(settings.view_cosine, order, least)
     return sorted(order[:count]), expected
+
+
+def _seconds(
+    splats: Splats, views: LiftViews, names: Sequence[str], settings: LiftSettings, threads: int | None
+) -> float | None:
+    """About how long the views take, by the one in the middle."""
+    if len(names) < TIMED_VIEWS:
+        return None
+    begin = time.perf_counter()
+    one = replace(views, names=[names[len(names) // 2]])
+    own = settings.model_copy(update={"certificate_rays": 0})
+    weigh_views(CpuRaster(splats, threads), splats.count, one, own, silent, by_rows=False, threads=threads)
+    return len(names) * (time.perf_counter() - begin)
 
 
 def weight_bytes(seen: Visibility, features: Views, names: Sequence[str], settings: LiftSettings) -> int:

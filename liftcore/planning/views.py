@@ -250,7 +250,7 @@ def fly_pilot(
     with one_thread():
         geometry = weigh_views(raster, splats.count, chosen, own, silent, by_rows=False, threads=threads)
         read = [view.means(view.rows.float() @ axes) for view in geometry.codebook.views]
-        said = _Said(geometry.weights, torch.cat(read), torch.from_numpy(rows))
+        said = Said(geometry.weights, torch.cat(read), torch.from_numpy(rows))
     evidence = _evidence(geometry.evidence().numpy()[rows], seen.areas, seen.areas[flown])
     if not evidence.any():  # no ray met a splat, so nothing is known of any view
         return Pilot(seen.areas, np.ones(len(evidence)), np.ones(len(evidence)))
@@ -260,8 +260,8 @@ def fly_pilot(
     return Pilot(seen.areas, _errors(variance, by_area * share / _mean(by_area, evidence)), evidence)
 
 
-class _Said:
-    """What the pilot's views say of the sampled splats, in sums over the views."""
+class Said:
+    """What views say of some splats, in sums over the views."""
 
     def __init__(self, W: RegionWeights, read: Tensor, rows: Tensor) -> None:
         """Args: read: [M, C] f32, what all regions read. rows: [n] i64, the splats."""
@@ -271,22 +271,30 @@ class _Said:
         said, total = bag_sums(region, read, runs, weight).double(), segment_sums(weight, runs)
         of_rows = torch.searchsorted(row, torch.arange(len(rows) + 1))
         squares = torch.where(total > 0, said.square().sum(dim=1) / total, 0.0)
-        self._weights, self._squared_weights, self._squares = (
+        self.weights, self._squared_weights, self._squares = (
             segment_sums(part, of_rows).numpy() for part in (total, total.square(), squares)
         )
         self._vectors = bag_sums(torch.arange(len(row)), said.float(), of_rows).double().numpy()
 
+    def means(self, weights: np.ndarray) -> tuple[float, float, float]:
+        """Means by these weights [n] of the splats, over those that a labelled ray met; one of them counts at least.
+
+        Of the squared length of what one view says, of that of what all say together, and of b.
+        """
+        met, total = self.weights > 0, self.weights**2
+        means = (
+            _ratio(self._squares, self.weights),
+            _ratio((self._vectors**2).sum(axis=1), total),
+            _ratio(self._squared_weights, total),
+        )
+        alone, mean, together = (_mean(values[met], weights[met]) for values in means)
+        return alone, mean, together
+
     def disagreement(self, evidence: np.ndarray) -> tuple[float, float]:
         """v, infinite where the views have nothing in common, and b, over the splats that a labelled ray met."""
-        met = self._weights > 0
-        if not (evidence[met] > 0).any():
+        if not (evidence[self.weights > 0] > 0).any():
             return np.inf, 1.0
-        means = (
-            _ratio(self._squares, self._weights),
-            _ratio((self._vectors**2).sum(axis=1), self._weights**2),
-            _ratio(self._squared_weights, self._weights**2),
-        )
-        alone, mean, together = (_mean(values[met], evidence[met]) for values in means)
+        alone, mean, together = self.means(evidence)
         if together >= 1.0:
             return np.inf, 1.0
         error = max(0.0, alone - mean) / (1.0 - together)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from PIL import Image
+from PIL import Image, ImageDraw, ImageFont
 from PIL.PngImagePlugin import PngInfo
 from torch import Tensor
 
@@ -27,6 +27,7 @@ BAND_PIXELS = 1 << 20  # of a distorted photo, carried at a time
 _SHOWN = (0.01, 0.99)  # quantiles of the covered pixels' depths: a floater before the lens dims no picture
 _LEVELS = 254  # between the farthest covered pixel, at 1, and the nearest, at 255; 0 is for what no splat covers
 _DIM = 0.35  # brightness that an overlay leaves to what was not found
+_TINT = 0.25  # of the outline's colour, in what was found
 _OUTLINE = np.array([255, 209, 64], dtype=np.uint8)  # sRGB of the line around what was found
 
 
@@ -240,9 +241,33 @@ def _read(image: Tensor, u: Tensor, v: Tensor) -> Tensor:
     return found
 
 
+def overlay_png(
+    scene: QueryScene, seen: ViewMask, view: str | Camera, name: str, photo: Image.Image | None = None
+) -> bytes:
+    """What was found, in the photo of its view or else a render, with a caption that says its share of the picture.
+
+    Raises:
+        NotFound, InvalidQuery, InvalidLift: as `render` does.
+    """
+    height, width = seen.mask.shape
+    image = render(scene, view) if photo is None else np.asarray(photo.convert("RGB").resize((width, height)))
+    size = max(12, height // 30)
+    canvas = Image.new("RGB", (width, height + 2 * size), "white")
+    canvas.paste(Image.fromarray(overlay(image, seen.mask)), (0, 0))
+    caption = f"{name}: {seen.mask.mean():.1%} of {seen.view}"
+    ImageDraw.Draw(canvas).text(
+        (size // 2, height + size // 2), caption, fill="black", font=ImageFont.load_default(size)
+    )
+    return _png(np.asarray(canvas))
+
+
 def overlay(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """[H, W, 3] u8: an image with a mask [H, W] bool bright and outlined, and the rest dimmed."""
-    picture = np.where(mask[..., None], image, (_DIM * image).astype(np.uint8))
+    """[H, W, 3] u8: an image with a mask [H, W] bool tinted and outlined, and the rest dimmed.
+
+    The tint tells a mask of everything from none at all.
+    """
+    tinted = (1 - _TINT) * image + _TINT * _OUTLINE
+    picture = np.where(mask[..., None], tinted, _DIM * image).astype(np.uint8)
     padded, (height, width) = np.pad(mask, 1), mask.shape
     near = np.zeros_like(mask)  # pixels that touch the mask, sideways or diagonally
     for dy in range(3):

@@ -258,24 +258,24 @@ class QueryScene:
         if not remembered.path:
             raise InvalidLift(str(self.path), expected=f"a lift that knows its {role}", got="one of values in memory",
                               hint=f"give the {role} to QueryScene, too")  # fmt: skip
-        path = Path(remembered.path)
-        if not path.exists():
-            raise InvalidLift(
-                str(self.path), expected=f"its {role} at {path}", got="nothing there",
-                hint=f"move the {role} back to {path}, or lift again from where they are now",
-            )  # fmt: skip
-        # The lift's own digest: one definition for files and folders, where it was taken and where it is checked.
-        from liftcore.io.lift_file import camera_input, input_file
+        from liftcore.io.lift_file import found_input
         from liftcore.io.transforms import FRAME_FILE
 
-        found = (camera_input if role == "cameras" else input_file)(path)
-        if found.sha256 != remembered.sha256:
-            beside = f" ({FRAME_FILE} beside them counts too)" if role == "cameras" else ""
+        path, moved = Path(remembered.path), getattr(self, "_moved", {}).get(role) is not None
+        found = found_input(role, remembered, self.metadata, None if moved else self.path)
+        if found is not None:
+            return found
+        option = f"say where they are with --{role}, or " if role in ("splats", "cameras") else ""
+        if not path.exists():
             raise InvalidLift(
-                str(self.path), expected=f"the {role} that were lifted at {path}", got="a file with another SHA-256",
-                hint=f"the {role} changed since the lift{beside}: restore them, or lift again",
+                str(self.path), expected=f"its {role} at {path}, or beside the lift", got="nothing there",
+                hint=f"{option}move the {role} back or beside the lift",
             )  # fmt: skip
-        return path
+        beside = f" ({FRAME_FILE} beside them counts too)" if role == "cameras" else ""
+        raise InvalidLift(
+            str(self.path), expected=f"the {role} that were lifted at {path}", got="a file with another SHA-256",
+            hint=f"the {role} changed since the lift{beside}: {option}restore them, or lift again",
+        )  # fmt: skip
 
 
 def as_numpy(array: Any) -> Any:

@@ -281,7 +281,8 @@ class Answers:
 
     def _words(self, request: dict[str, Any]) -> tuple[list[str], TextEncoder]:
         """The words of a request, all of its table where it names none."""
-        encoder = self._encoder(request["encoder"], request["encoder_version"])
+        own = self._scene(request).table if request["encoder"] == OWN_WORDS else None
+        encoder = own or self._encoder(request["encoder"], request["encoder_version"])
         return words_of(encoder) if request["words"] is None else request["words"], encoder
 
     def _named(self, request: dict[str, Any]) -> Segmentation:

@@ -176,7 +176,7 @@ def test_a_lift_answers_from_any_folder_until_its_splats_move(scene: Path, capsy
     capsys.readouterr()
     assert cli.main(ask) == 0
     assert json.loads(capsys.readouterr().out)["view"]["name"] == "v0"
-    (scene / "splats.ply").rename(scene / "moved.ply")
+    (scene / "splats.ply").rename(elsewhere / "moved.bin")
     (elsewhere / "m.png").unlink()
     assert_refused(capsys, scene, ask[:-1], "nothing there")
 

@@ -78,7 +78,7 @@ def test_scene_is_lifted_inspected_and_queried(scene: Path, capsys: pytest.Captu
     assert thing["splats"] == 1 and thing["box"] == [thing["centre"]] * 2 and json.loads(out)["strays"] == 0
     status, out, err = run(capsys, "inspect", scene / "lift.safetensors", "--json")
     assert json.loads(out)["kind"] == "lift"
-    certificate, timings = run(capsys, *lift_arguments(scene))[1].split("timings:\n")
+    certificate, timings = run(capsys, *lift_arguments(scene, "--verbose"))[1].split("timings:\n")
     assert "row_sum_mean: " in certificate
     stages = [line for line in timings.splitlines() if not line.startswith("warning: ")]
     assert stages and all(re.fullmatch(r"  [a-z]+: \d+\.\d{3} s", line) for line in stages)

@@ -1,5 +1,6 @@
 """Questions to a lift: what is selected, by words, examples and vectors, and what is said when it cannot be."""
 
+import json
 import math
 import subprocess
 import sys
@@ -153,25 +154,39 @@ def test_words_of_a_table_are_asked_without_torch(tiny_lift: Path) -> None:
     subprocess.run([sys.executable, "-c", code, str(tiny_lift)], check=True)
 
 
-def test_scene_that_moved_is_told_with_where_it_was(lift_tiny: Callable[..., Path], tmp_path: Path) -> None:
-    scene = QueryScene.open(lift_tiny(tmp_path))
-    (tmp_path / "s.ply").rename(tmp_path / "elsewhere.ply")
-    assert ask(scene, Query((OneSplat(0),))).count > 0  # scores need no splats
-    with pytest.raises(InvalidLift, match=r"splats at .*s\.ply"):
-        _ = scene.splats
-    moved = QueryScene.open(scene.path, splats=tmp_path / "elsewhere.ply")
-    assert moved.splats.count == COUNT
+def test_lift_finds_its_files_beside_it_or_where_told(lift_tiny: Callable[..., Path], tmp_path: Path) -> None:
+    """A folder that moved, a file of another name, a file elsewhere, and one that is nowhere."""
+    before, after, away = tmp_path / "before", tmp_path / "after", tmp_path / "away"
+    for folder in (before, away):
+        folder.mkdir()
+    lift = lift_tiny(before).name
+    before.rename(after)
+    (after / "s.ply").rename(after / "another.ply")
+    scene = QueryScene.open(after / lift)
+    assert scene.splats.count == COUNT and len(scene.cameras) == 3
+    assert ask(scene, Query((Region("left", 0, 0),))).count > 0
+    (after / "another.ply").rename(away / "s.ply")
+    lost = QueryScene.open(after / lift)
+    assert ask(lost, Query((OneSplat(0),))).count > 0  # scores need no splats
+    with pytest.raises(InvalidLift, match=r"splats at .*s\.ply, or beside the lift.*--splats"):
+        _ = lost.splats
+    assert QueryScene.open(after / lift, splats=away / "s.ply").splats.count == COUNT
 
 
-def test_files_that_changed_are_not_taken_for_the_old(lift_tiny: Callable[..., Path], tmp_path: Path) -> None:
-    scene = QueryScene.open(lift_tiny(tmp_path))
-    for name in ("c.json", "f.st"):
-        with (tmp_path / name).open("a") as file:
-            file.write(" ")
+def test_cameras_may_be_added_but_not_moved(lift_tiny: Callable[..., Path], tmp_path: Path) -> None:
+    lift, file = lift_tiny(tmp_path), tmp_path / "c.json"
+    document = json.loads(file.read_text())
+    document["frames"].append({**document["frames"][0], "file_path": "images/new.png"})
+    file.write_text(json.dumps(document))
+    assert "new" in QueryScene.open(lift).cameras
+    document["frames"][0]["transform_matrix"][0][3] += 0.5
+    file.write_text(json.dumps(document))
     with pytest.raises(InvalidLift, match="cameras changed since the lift"):
-        _ = scene.cameras
+        _ = QueryScene.open(lift).cameras
+    with (tmp_path / "f.st").open("a") as pack:
+        pack.write(" ")
     with pytest.raises(InvalidLift, match="features changed since the lift"):
-        ask(scene, Query((Region("left", 0, 0),)))
+        ask(QueryScene.open(lift), Query((Region("left", 0, 0),)))
 
 
 @pytest.mark.parametrize("cluster", range(3))

@@ -1,0 +1,39 @@
+"""``splatlift render``: a lifted scene from any camera, in its colours, features, clusters or confidence."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from liftcore.cli.options import Parser, add_lift, add_view, opened_lift, view_of
+from liftcore.cli.query import made_from, write_files
+from liftcore.cli.reply import free_outputs, reply
+from liftcore.errors import InvalidQuery
+
+WHAT = ("rgb", "depth", "pca", "confidence", "cluster")
+
+
+def add_arguments(parser: Parser) -> None:
+    """The options of the command."""
+    add_lift(parser)
+    add_view(parser)
+    parser.add_argument("--what", choices=WHAT, default="rgb", help="; ".join((
+        "rgb: the splats' colours", "depth: near is bright", "pca: principal components of features",
+        "confidence: how far views agree, of lifts with a robust step", "cluster: of lifts with aggregation",
+    )))  # fmt: skip
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="PNG", help="the picture to write")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Draw it, and say what was written."""
+    view, files = view_of(options), {"output": options.output}
+    if view is None:
+        raise InvalidQuery("--view", expected="a view to see it from", got="no --view and no --camera")
+    free_outputs(files, [path for path in (options.lift, options.camera) if path])
+    from liftcore.query.render import render_png
+
+    scene = opened_lift(options)
+    free_outputs(files, made_from(scene))
+    written = write_files(files, {"output": lambda: [render_png(scene, view, options.what)]})
+    reply({"what": options.what, "out": written["output"]}, as_json=options.json, lines=[written["output"]])
+    return 0

@@ -1,0 +1,184 @@
+"""Inputs that contradict each other, told before the work: cameras, splats and features that do not belong together.
+
+**Do views say the same of what they see?** A few views are weighed at coarse pixels. Let ``c_r`` be the unit vector
+of region or cell r less the mean of all, by the weight that it gives. Over the splats, m is the squared length of
+what all views share of what one of them says, as a share (`liftcore.planning.views` has the sums): one where views
+agree, and none where they say anything of it. How alike it could be, the features tell without any geometry: each
+region's cosine to the most similar one of another view. The ratio of the two is .39 to .91 on the scenes that this
+was made with, noisy, merged and wrong masks among them. With positions times 0.3 it is .05 to .17 (.31 where all
+cameras look at one table from around, and still do), and with another scene's cameras below zero.
+
+**Do neighbouring cells agree?** Maps of photos are smooth: neighbours are more alike than any two cells. Bytes that
+lie in another order of axes than their shape says are smooth in that order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from liftcore.features.views import FeatureGrid
+from liftcore.one_thread import one_thread
+from liftcore.planning.views import PILOT_CHANNELS, SAMPLE, Said, Visibility, spread
+from liftcore.progress import silent
+from liftcore.raster.cpu.raster import CpuRaster
+from liftcore.scene.splats import Splats
+from liftcore.settings import LiftSettings
+from liftcore.solve.geometry import Geometry, LiftViews, weigh_views
+from liftcore.solve.least_squares import random_axes
+
+FLOWN = 8  # views that are weighed
+FEWEST = 4  # and fewer say nothing
+SIDE = 80  # pixels of an image's longer side, about
+RAYS = 2_000  # whose sums are taken
+MOST_REGIONS = 2_048  # that are compared with each other
+MOST_ALONE = 0.8  # chance that two looks at a splat are from one view: beyond it, too little is seen twice
+LEAST_AGREEMENT = 0.25  # of what the features allow
+LEAST_ROW_SUM = 0.05  # in the mean: a scene of one object before nothing has a fifth or so
+LEAST_IN_VIEW = 0.05  # of the splats
+LEAST_SMOOTHNESS = 0.1  # of neighbouring cells' agreement over that of any two, as a share of what is left to one
+READINGS = {"[F, h, w]": (1, 2, 0), "[w, h, F]": (1, 0, 2)}  # of the same bytes, and how their axes become h, w, F
+LOOKED_AT = 4  # grids whose order of axes is looked at; of fewer none
+FRAME = "cameras and splats must share a frame: look for the trainer's transform, a scale or another scene"
+HINT = "splatlift check with the photos tells more"
+
+
+def contradictions(
+    splats: Splats, views: LiftViews, settings: LiftSettings, seen: Visibility, threads: int | None = None
+) -> list[str]:
+    """What of these inputs cannot be true together, a sentence each.
+
+    Args:
+        seen: how large the splats are in all views. threads: None takes the cores that this process may use.
+    """
+    grids = [read for view in _some(views.names, LOOKED_AT) if isinstance(read := views.features[view], FeatureGrid)]
+    told = unlike_maps([grid.grid.float().numpy() for grid in grids]) if len(grids) == LOOKED_AT else []
+    if seen.seen_share < LEAST_IN_VIEW:
+        return [*told, unseen(seen.seen_share)]
+    row_sum, agreement = agreement_of_views(splats, views, settings, threads)
+    if row_sum < LEAST_ROW_SUM:
+        return [*told, empty(row_sum)]
+    if not told and agreement is not None and agreement < LEAST_AGREEMENT:  # broken maps agree nowhere
+        told.append(disagreement(agreement))
+    return told
+
+
+def unseen(seen_share: float) -> str:
+    """That no camera sees the splats."""
+    return f"cameras: no camera can see {1 - seen_share:.1%} of the splats; {FRAME}"
+
+
+def empty(row_sum: float) -> str:
+    """That rays meet nothing."""
+    return f"cameras: splats fill {row_sum:.1%} of the rays of a view; {FRAME}"
+
+
+def disagreement(agreement: float) -> str:
+    """That views contradict each other."""
+    what = f"views agree on what they see to {max(agreement, 0):.0%} of what their most similar regions would allow"
+    return f"cameras: {what}; {FRAME}, and features must be of these photos; {HINT}"
+
+
+@dataclass(frozen=True)
+class Smoothness:
+    """How alike the cells of maps are, means over them."""
+
+    neighbours: float  # cosine of neighbouring cells
+    anyone: float  # of any two
+    readings: dict[str, float]  # of neighbouring cells, were the bytes read so
+
+    @property
+    def share(self) -> float:
+        """What neighbours agree more, as a share of what is left to one."""
+        return (self.neighbours - self.anyone) / max(1 - self.anyone, 1e-6)
+
+
+def smoothness(grids: Sequence[np.ndarray]) -> Smoothness:
+    """Of maps [h, w, F] f32, one at least."""
+    rows = []
+    for grid in grids:
+        readings = [
+            _agreement(grid.reshape(np.array(grid.shape)[np.argsort(axes)]).transpose(axes))[0]
+            for axes in READINGS.values()
+        ]
+        rows.append([*_agreement(grid), *readings])
+    neighbours, anyone, *others = np.median(np.array(rows), axis=0).tolist()
+    return Smoothness(neighbours, anyone, dict(zip(READINGS, others, strict=True)))
+
+
+def unlike_maps(grids: Sequence[np.ndarray]) -> list[str]:
+    """What is wrong with maps [h, w, F] whose neighbouring cells are not alike."""
+    if not grids:
+        return []
+    found = smoothness(grids)
+    best = max(found.readings, key=lambda reading: found.readings[reading])
+    agree = f"neighbouring cells agree to {found.neighbours:.2f}"
+    if found.readings[best] - found.neighbours > LEAST_SMOOTHNESS:
+        told = f"read as {best} they would to {found.readings[best]:.2f}: the bytes lie in that order"
+        return [f"features: {agree}, {told}; write the maps anew, from arrays that are contiguous"]
+    if found.share < LEAST_SMOOTHNESS:
+        return [f"features: {agree}, as any two cells do: the maps show nothing of the photos"]
+    return []
+
+
+def _agreement(grid: np.ndarray) -> tuple[float, float]:
+    """The mean cosine of neighbouring cells of a grid [h, w, F], and of any two."""
+    grid = grid / np.maximum(np.abs(grid).max(axis=2, keepdims=True), 1e-30)  # no square overflows or vanishes
+    unit = grid / np.maximum(np.linalg.norm(grid, axis=2, keepdims=True), 1e-30)
+    down, across = (unit[1:] * unit[:-1]).sum(axis=2), (unit[:, 1:] * unit[:, :-1]).sum(axis=2)
+    mean = unit.reshape(-1, unit.shape[2]).mean(axis=0)
+    count = unit.shape[0] * unit.shape[1]
+    anyone = (count * float(mean @ mean) - 1) / max(count - 1, 1)
+    return float(np.concatenate([down.ravel(), across.ravel()]).mean()) if count > 1 else 1.0, anyone
+
+
+def agreement_of_views(
+    splats: Splats, views: LiftViews, settings: LiftSettings, threads: int | None = None
+) -> tuple[float, float | None]:
+    """The mean sum of weights of a ray, and how far views agree, of what their features allow.
+
+    None for the latter where they are too few, see too little in common, or have nothing to tell apart.
+    """
+    few = replace(views, names=_some(views.names, FLOWN))
+    longest = max(max(few.camera(k).width, few.camera(k).height) for k in range(len(few)))
+    coarse = {"stride": max(1, longest // SIDE), "certificate_rays": RAYS, "robust_steps": 0, "consensus": False}
+    own = settings.model_copy(update=coarse)
+    with one_thread():
+        raster = CpuRaster(splats, threads)
+        geometry = weigh_views(raster, splats.count, few, own, silent, by_rows=False, threads=threads)
+    sums = sum(float(sample.rows.weights.sum()) for sample in geometry.samples)
+    rays = sum(len(sample.rows.indptr) - 1 for sample in geometry.samples)
+    return sums / max(rays, 1), None if len(few) < FEWEST else _agreement_of(geometry)
+
+
+def _agreement_of(geometry: Geometry) -> float | None:
+    W, books = geometry.weights, geometry.codebook.views
+    mass = torch.zeros(sum(book.regions for book in books)).index_add_(0, W.region.long(), W.weight)
+    if not bool(mass.any()):
+        return None
+    owner = torch.cat([torch.full((book.regions,), number) for number, book in enumerate(books)])
+    read = torch.nn.functional.normalize(torch.cat([book.means(book.rows.float()) for book in books]), dim=1)
+    read = read - (mass / mass.sum()) @ read
+    channels, rows = read.shape[1], torch.from_numpy(spread(len(W.indptr) - 1, min(SAMPLE, len(W.indptr) - 1)))
+    said = Said(W, read @ random_axes(channels, min(PILOT_CHANNELS, channels), 0), rows)
+    if not said.weights.any():
+        return None
+    alone, together, once = said.means(said.weights)
+    chosen = torch.nonzero(mass)[:, 0]
+    if len(chosen) > MOST_REGIONS:  # by their weight, so that each of them counts alike
+        chosen = chosen[torch.argsort(mass[chosen], descending=True)[:MOST_REGIONS]]
+    own = read[chosen]
+    cosines = torch.where(owner[chosen][:, None] == owner[chosen][None], -torch.inf, own @ own.T)
+    best, weight = cosines.max(dim=1).values, mass[chosen]
+    possible = float((weight * best).sum() / (weight * own.square().sum(dim=1)).sum())
+    if once > MOST_ALONE or alone <= 0 or not possible > 0:
+        return None
+    return (together - once * alone) / (1 - once) / alone / possible
+
+
+def _some(names: Sequence[str], count: int) -> list[str]:
+    """As many of the names, evenly spread."""
+    return [names[int(place)] for place in spread(len(names), min(count, len(names)))]
