@@ -466,7 +466,8 @@ class OwnCamera(Body):
         list[Annotated[list[Coordinate], Field(min_length=4, max_length=4)]], Field(min_length=4, max_length=4)
     ] = Field(description="[4, 4], world to camera, rigid; OpenCV axes: x right, y down, z forward")
     name: ViewName = "camera"
-    lifted: bool | None = Field(None, description="of no meaning here")
+    lifted: bool | None = Field(None, description="of no meaning here, like photo")
+    photo: bool | None = None
 
 
 class LiftQuestion(BaseModel):
