@@ -323,7 +323,9 @@ def choose(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     floor = _value(best, accuracy) - WITHIN * abs(_value(best, accuracy))
     taken = by_name[next(name for name in front if _value(by_name[name], accuracy) >= floor)]
     figure, value, seconds = NAMES[accuracy], f"{_value(taken, accuracy):.4f}", f"{taken['cpu_s']:.2f} s"
-    if taken is best:
+    if len(runs) == 1:
+        why = f"{taken['name']} alone fitted the budget: nothing can be recommended; a larger one compares more"
+    elif taken is best:
         why = (
             f"{taken['name']} has the best {figure} ({value}), and none within {WITHIN:.0%} of it takes less than "
             f"its {seconds} of processor time"

@@ -13,7 +13,7 @@ import numpy as np
 from liftcore.errors import InvalidCameras, NotFound
 from liftcore.nearest import nearest
 from liftcore.scene.distortion import MAX_SIDE, Distortion, Lens, Rectangle, shared_lens
-from liftcore.scene.views import cameras_of_views
+from liftcore.scene.views import cameras_of_views, without_image_suffix
 
 if TYPE_CHECKING:  # torch is taken, and not loaded for it
     from torch import Tensor
@@ -214,7 +214,9 @@ class Cameras(Mapping[str, Camera]):
         Raises:
             NotFound: no view has it; the error, which is a KeyError, names the nearest ones.
         """
-        found = self._by_name.get(name) or self._by_name.get(cameras_of_views([name], self).get(name, ""))
+        plain = without_image_suffix(name)  # a photo's file names its view
+        found = self._by_name.get(name) or self._by_name.get(plain)
+        found = found or self._by_name.get(cameras_of_views([plain], self).get(plain, ""))
         if found is None:
             got, hint = repr(name[:SHOWN]), nearest(name, self, NEAREST)
             raise NotFound("view", expected="the name of a camera", got=got, hint=hint)
