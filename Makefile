@@ -10,7 +10,7 @@ OUT ?= demo-output
 TORCH_PIP ?=
 CUDA_TORCH_PIP ?=
 
-.PHONY: demo test check kernels soak contract load gpu lint format serve web bench setup clean
+.PHONY: demo test check kernels soak contract load gpu lint format serve web bench sbom setup clean
 
 demo: $(READY)  ## the whole job through the real service; SCENE=DIR takes a scene of your own, ASK=TEXT a question
 	$(BIN)/splatlift demo --out "$(OUT)" $(if $(SCENE),--scene "$(SCENE)") $(if $(ASK),--ask "$(ASK)")
@@ -45,8 +45,9 @@ gpu:  ## all that a card is for: CUDA's torch, conformance, speed, accuracy, gsp
 	@nvidia-smi -L 2>/dev/null | grep -q GPU || { echo "make gpu: nvidia-smi lists no card here, so nothing was run" >&2; exit 2; }
 	@$(MAKE) --no-print-directory setup
 	@$(BIN)/python -c 'import sys, torch; sys.exit(torch.version.cuda is None)' || { echo "installing torch's CUDA build" \
-	&& $(BIN)/python -m pip install --quiet --force-reinstall $(CUDA_TORCH_PIP) $$(grep -E '^torch(vision)?==' requirements.lock) \
-	&& grep -vE '^(torch|torchvision|triton)==' requirements.lock | $(BIN)/python -m pip install --quiet -r /dev/stdin; }
+	&& $(BIN)/python -m pip install --quiet --force-reinstall $(CUDA_TORCH_PIP) $$(sed -nE 's/^(torch(vision)?==[^ ]*).*/\1/p' requirements.lock) \
+	&& awk '/^[a-z]/ { kept = !/^(torch|torchvision|triton)==/ } kept' requirements.lock \
+	| $(BIN)/python -m pip install --quiet --require-hashes -r /dev/stdin; }
 	@$(BIN)/python -m tests.benchmarks.gpu --look
 	@$(BIN)/python -m pip install --quiet gsplat==1.5.3 ninja || echo "gsplat does not install here"
 	@held=0; env -u TRITON_INTERPRET $(BIN)/python -m pytest -rs tests/gpu tests/properties tests/unit/solve/test_on_device.py \
@@ -71,6 +72,10 @@ web:  ## the page, from service/web/src into service/web/built
 	cd service/web && npm ci --silent && node build.mjs
 	cp service/web/node_modules/axe-core/axe.min.js tests/browser/axe.min.js
 
+sbom: $(READY)  ## what is installed, as CycloneDX: sbom.json, by a tool in an environment of its own
+	$(PYTHON) -m venv .venv/sbom && .venv/sbom/bin/python -m pip install --quiet cyclonedx-bom==7.5.0
+	.venv/sbom/bin/cyclonedx-py environment --pyproject pyproject.toml --output-file sbom.json $(BIN)/python
+
 bench: $(READY)
 	$(BIN)/splatlift bench $(if $(SCENE),--scene "$(SCENE)")
 
@@ -81,12 +86,12 @@ $(READY): requirements.lock pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "splatlift needs Python 3.11 or later")'
 	@echo "making .venv: a few minutes, once"
 	[ -x $(BIN)/python ] || $(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet $(TORCH_PIP) "$$(grep '^torch==' requirements.lock)"
-	$(BIN)/python -m pip install --quiet -r requirements.lock
+	$(BIN)/python -m pip install --quiet $(TORCH_PIP) "$$(sed -nE 's/^(torch==[^ ]*).*/\1/p' requirements.lock)"
+	$(BIN)/python -m pip install --quiet --require-hashes -r requirements.lock
 	$(BIN)/python -m pip install --quiet --no-deps -e .
 	@echo "compiling the kernels of 3DGS: a minute, once"
 	$(BIN)/python -m tests.kernels 3dgs
 	touch $@
 
 clean:
-	rm -rf .venv build dist *.egg-info .pytest_cache .ruff_cache .hypothesis .import_linter_cache demo-output
+	rm -rf .venv build dist *.egg-info .pytest_cache .ruff_cache .hypothesis .import_linter_cache demo-output sbom.json
