@@ -15,7 +15,7 @@ from service.auth import STRANGER, Gate
 from service.jobs.device import Devices
 from service.jobs.process import JobLimits
 from service.jobs.supervisor import Supervisor
-from service.middleware import AnswerHead, RecordedApp
+from service.middleware import AnswerHead, RecordedApp, Turns
 from service.observe import Metrics, versions
 from service.queries.client import QueryClient, QueryLimits
 from service.requests import KnownParameters
@@ -49,7 +49,6 @@ def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, work
             writing=threads(8),  # uploads: a stalled disk stops them, and no other route
             parsing=threads(2),  # JSON bodies
             ordering=threads(2),  # orders, which are compared with all names in their assets: these take memory
-            naming=threads(1),  # pages of names, of which all are read for each
             scrapes=threads(1),  # the metrics
         )  # fmt: skip
         await anyio.to_thread.run_sync(worker.start)
@@ -75,6 +74,7 @@ def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, work
     app.state.stopping, app.state.metrics = stopping, metrics
     app.add_middleware(AnswerHead)
     app.add_middleware(Gate, keys=store.keys, settings=settings, stopping=lambda: stopping.begun)
+    app.add_middleware(Turns)
     problems.install(app)
     app.include_router(operations.router)  # probes and links to the page may carry what they like
     for module in (assets, jobs, results, scene, queries, words):

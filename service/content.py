@@ -110,19 +110,20 @@ class _FileAnswer(FileResponse):
 
 
 class Draft(StreamingResponse):
-    """A file that was made for this answer alone, to be saved under a name.
+    """A file that was made for this answer alone, perhaps to be saved under a name.
 
     It is held open, so its entry may go as soon as this is made; its room goes with the answer, however that ends.
     """
 
-    def __init__(self, draft: Path, *, filename: str, headers: Mapping[str, str]) -> None:
+    def __init__(self, draft: Path, media_type: str, *, filename: str | None, headers: Mapping[str, str]) -> None:
         self.file: BinaryIO = draft.open("rb")
         told = {
             "Content-Length": str(os.fstat(self.file.fileno()).st_size),
-            "Content-Disposition": f'attachment; filename="{filename}"',
             "Cache-Control": "private, no-cache",
         }
-        super().__init__(iter(lambda: self.file.read(BLOCK_BYTES), b""), 200, told | dict(headers), BINARY)
+        if filename is not None:
+            told["Content-Disposition"] = f'attachment; filename="{filename}"'
+        super().__init__(iter(lambda: self.file.read(BLOCK_BYTES), b""), 200, told | dict(headers), media_type)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import time
 from typing import Any
 
@@ -13,6 +14,9 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from service.auth import CALLER
 from service.observe import Metrics, access, chosen_id, working_for
 
+PLACES = 4  # of requests that are begun at the same time
+TURN_SECONDS = 0.05  # many times what the event loop needs for a request
+PROBES = frozenset({"/healthz", "/readyz"})
 PATH_CHARACTERS = 200  # of a path in the log
 # For browsers: nothing here is guessed at, framed or allowed to load anything; pages bring a policy of their own.
 SAFE_HEADERS = {
@@ -101,6 +105,39 @@ def _who(scope: Scope) -> dict[str, Any]:
     if caller is None or caller.key is None:
         return {}
     return {"key": caller.key} | ({"admin": True} if caller.owner.sees_all else {})
+
+
+class Turns:
+    """Few requests are begun at a time, and the others wait for nothing but a place: so however many come at once,
+    the event loop is soon done with what it has begun, and probes, which pass the line, are answered at once.
+
+    What takes longer than a turn waits for a query, a disk or its client, and gives up its place to the next.
+    """
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+        self._places = anyio.Semaphore(PLACES)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass the request on in its turn."""
+        if scope["type"] != "http" or scope["path"] in PROBES:
+            await self._app(scope, receive, send)
+            return
+        await self._places.acquire()
+        held = True
+
+        def give_up() -> None:
+            nonlocal held
+            if held:
+                held = False
+                self._places.release()
+
+        timer = asyncio.get_running_loop().call_later(TURN_SECONDS, give_up)
+        try:
+            await self._app(scope, receive, send)
+        finally:
+            timer.cancel()
+            give_up()
 
 
 class AnswerHead:

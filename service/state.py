@@ -148,7 +148,6 @@ class AppState:
     writing: anyio.CapacityLimiter
     parsing: anyio.CapacityLimiter
     ordering: anyio.CapacityLimiter
-    naming: anyio.CapacityLimiter
     scrapes: anyio.CapacityLimiter
     ending: threading.Event = field(default_factory=threading.Event)  # set when what still runs must end
 

@@ -42,7 +42,7 @@ from liftcore.scene.splats import Kernel
 from service.child import fault_of, own_stdout
 from service.encoders import encoder_version
 from service.errors import NoSpace
-from service.queries.client import Frame, write_frame
+from service.queries.client import PIPE_BYTES, Frame, write_frame
 
 TERMS = ("text", "like", "negatives", "unlike")  # in the order in which a query has them
 WARM_UP_TEXT = "something"
@@ -246,16 +246,16 @@ class Answers:
         return Frame(_found(self._answer(request)) | describe_objects(self._grouped(request)))
 
     def _scores(self, request: dict[str, Any]) -> Frame:
-        return Frame({}, npy(self._answer(request).scores))
+        return _file(npy(self._answer(request).scores), request)
 
     def _mask(self, request: dict[str, Any]) -> Frame:
-        return Frame({}, mask_png(self._look(request)))
+        return _file(mask_png(self._look(request)), request)
 
     def _attention(self, request: dict[str, Any]) -> Frame:
-        return Frame({}, attention_png(self._look(request)))
+        return _file(attention_png(self._look(request)), request)
 
     def _render(self, request: dict[str, Any]) -> Frame:
-        return Frame({}, render_png(self._scene(request), view_of(request), request["what"]))
+        return _file(render_png(self._scene(request), view_of(request), request["what"]), request)
 
     def _splats(self, request: dict[str, Any]) -> Frame:
         scene = self._scene(request)
@@ -271,7 +271,7 @@ class Answers:
         return Frame({})
 
     def _layer(self, request: dict[str, Any]) -> Frame:
-        return Frame({}, npy(layer_colours(self._scene(request), request["what"])))
+        return _file(npy(layer_colours(self._scene(request), request["what"])), request)
 
     def _views(self, request: dict[str, Any]) -> Frame:
         cameras, first, count = self._scene(request).cameras, request["first"], request["count"]
@@ -300,15 +300,15 @@ class Answers:
         return Frame(describe_words(self._named(request)))
 
     def _word_labels(self, request: dict[str, Any]) -> Frame:
-        return Frame({}, npy(self._named(request).values))
+        return _file(npy(self._named(request).values), request)
 
     def _word_map(self, request: dict[str, Any]) -> Frame:
         found = self._named(request)
-        return Frame({}, map_png(word_map(self._scene(request), found, view_of(request)), found))
+        return _file(map_png(word_map(self._scene(request), found, view_of(request)), found), request)
 
     def _word_picture(self, request: dict[str, Any]) -> Frame:
         scene, view, found = self._scene(request), view_of(request), self._named(request)
-        return Frame({}, picture_png(render(scene, view), word_map(scene, found, view), found))
+        return _file(picture_png(render(scene, view), word_map(scene, found, view), found), request)
 
     def _what(self, request: dict[str, Any]) -> Frame:
         (words, encoder), example = self._words(request), _example(request["example"], "example")
@@ -334,6 +334,14 @@ class Answers:
             return catalogue(self._scene(request))
         words, encoder = self._words(request)
         return catalogue(self._scene(request), words, encoder.encode(words))
+
+
+def _file(content: bytes, request: dict[str, Any]) -> Frame:
+    """An array or a picture: through the pipe, or in the draft."""
+    if len(content) <= PIPE_BYTES:
+        return Frame({}, content)
+    write_draft([content], Path(request["draft"]))
+    return Frame({})
 
 
 def write_draft(blocks: Iterable[bytes], draft: Path) -> None:

@@ -21,6 +21,7 @@ from service.errors import Busy, ClientLeft, Crashed, TimedOut, require_share
 
 # Without these each array of a query is mapped anew and its pages are faulted in one by one: a fifth of its time.
 MEMORY = {"MALLOC_MMAP_THRESHOLD_": str(64 << 20), "MALLOC_TRIM_THRESHOLD_": str(256 << 20)}
+PIPE_BYTES = 256 << 10  # of an answer; the HTTP process holds it in memory while a client reads it: more is a file
 AHEAD_BYTES = 1 << 20  # of requests that are sent along with the one before them
 
 log = logging.getLogger(__name__)

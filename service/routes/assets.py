@@ -8,19 +8,17 @@ from typing import Annotated, Any, TypeVar
 
 import anyio
 from fastapi import APIRouter, Path, Query, Request, Response
-from fastapi.responses import JSONResponse
 
 from service import models
 from service.content import FILE, Cursor, Limit, StoredFile, file_answer, listed
 from service.errand import ErrandLimits
 from service.state import AppState, Deps
-from service.store.assets import AssetRecord
+from service.store.assets import SHOWN_CHARACTERS, AssetRecord
 from service.uploads.intake import AssetIntake, Intake, Taken, coding_of, require_size
 
 T = TypeVar("T")
 BATCH = 1 << 20  # bytes gathered before a thread writes them
 MAX_DIGITS = 20  # of a Content-Length: h11 takes no more
-SHOWN_CHARACTERS = 256 << 10  # of an asset's counts; of more the names are told apart, in pages
 NAMES = 1000  # a page of them, unless another number is asked for
 
 router = APIRouter(prefix="/assets", tags=["assets"])
@@ -51,8 +49,7 @@ RAW_BODY = {
 async def upload(kind: AssetKind, request: Request, deps: Deps, sha256: Sha256 = None) -> Response:
     """Upload splats, cameras (JSON or a zip of a COLMAP model), a feature pack, masks, a text table or photos."""
     asset, new = await taken(AssetIntake, kind, request, deps, sha256)
-    location = {"Location": f"/assets/{asset.id}"}
-    return JSONResponse(shape(asset).model_dump(mode="json"), 201 if new else 200, headers=location)
+    return _reply(asset, 201 if new else 200)
 
 
 async def taken(
@@ -106,24 +103,21 @@ def list_assets(deps: Deps, limit: Limit = None, cursor: Cursor = None) -> Respo
 @router.get("/{asset}", response_model=models.Asset)
 def get_asset(asset: AssetId, deps: Deps) -> Response:
     """One asset. Where its names or words are very many, they are at ``links.names`` alone."""
-    found = shape(deps.store.assets.get(deps.owner, asset, most=SHOWN_CHARACTERS))
-    return Response(found.model_dump_json(), media_type="application/json")
+    return _reply(deps.store.assets.get(deps.owner, asset, most=SHOWN_CHARACTERS), 200)
 
 
 @router.get("/{asset}/names", response_model=models.Names)
-async def get_names(asset: AssetId, deps: Deps, limit: Limit = NAMES, cursor: NamesCursor = 0) -> models.Names:
+def get_names(asset: AssetId, deps: Deps, limit: Limit = NAMES, cursor: NamesCursor = 0) -> models.Names:
     """The names of views, or the words, that an asset holds, in pages."""
     most = limit or NAMES
-    names = await anyio.to_thread.run_sync(
-        deps.store.assets.names, deps.owner, asset, cursor, most + 1, limiter=deps.naming
-    )
+    names = deps.store.assets.names(deps.owner, asset, cursor, most + 1)
     return models.Names(names=names[:most], next=cursor + most if len(names) > most else None)
 
 
 @router.get("/{asset}/content", response_class=Response, responses=FILE)
 def get_content(asset: AssetId, request: Request, deps: Deps) -> Response:
     """The bytes of an asset, or a range of them."""
-    found = deps.store.assets.get(deps.owner, asset, most=0)
+    found = deps.store.assets.get(deps.owner, asset)
     digest = found.id.removeprefix("sha256:")
     return file_answer(request, StoredFile(found.path, found.bytes, digest, found.file_name))
 
@@ -147,3 +141,8 @@ def shape(asset: AssetRecord) -> models.Asset:
         links={"self": own, "content": f"{own}/content"}
         | ({} if asset.kind is models.AssetKind.SPLATS else {"names": f"{own}/names"}),
     )
+
+
+def _reply(asset: AssetRecord, status: int) -> Response:
+    location = {"Location": f"/assets/{asset.id}"}
+    return Response(shape(asset).model_dump_json(), status, media_type="application/json", headers=location)

@@ -23,6 +23,7 @@ from service.observe import current_id
 from service.problems import problem_of
 from service.requests import described_body, json_body
 from service.state import AppState, Deps
+from service.store.assets import ALL
 from service.store.jobs import Event, EventKind, JobOrder, JobRecord, fingerprint, labels_of
 
 router = APIRouter()
@@ -104,7 +105,7 @@ def _planned(order: models.LiftRequest, deps: AppState) -> models.Plan:
     _require_fit(wanted, deps)
     deps.devices.require(wanted.settings.get("device", "auto"))
     limits = ErrandLimits(deps.settings.check_seconds, deps.settings.check_memory_bytes, deps.ending)
-    splats, cameras, *packs = [deps.store.assets.get(deps.owner, *named, most=0) for named in wanted.assets()]
+    splats, cameras, *packs = [deps.store.assets.get(deps.owner, *named) for named in wanted.assets()]
     document = {
         "splats": str(splats.path), "cameras": str(cameras.path), "features": [str(pack.path) for pack in packs],
         "settings": settings, "names": {str(one.path): f"{one.kind} {one.id}" for one in (splats, cameras, *packs)},
@@ -155,12 +156,13 @@ def _take(order: models.LiftRequest, deps: AppState, key: str | None, *, sent: d
 
 def _require_fit(order: JobOrder, deps: AppState) -> None:
     """Refuse an order that cannot be lifted, or that there is no room for."""
-    cameras = deps.store.assets.get(deps.owner, order.cameras, models.AssetKind.CAMERAS)
-    packs = [deps.store.assets.get(deps.owner, pack, models.AssetKind.FEATURES) for pack in order.features]
-    splats = deps.store.assets.get(deps.owner, order.splats, models.AssetKind.SPLATS)
+    get = partial(deps.store.assets.get, deps.owner, most=ALL)  # names are compared with names
+    cameras = get(order.cameras, models.AssetKind.CAMERAS)
+    packs = [get(pack, models.AssetKind.FEATURES) for pack in order.features]
+    splats = get(order.splats, models.AssetKind.SPLATS)
     check_kernel(splats, order.settings)
     check_fit(cameras, packs)
-    judges = [deps.store.assets.get(deps.owner, *named) for named in labels_of(order.parameters)]
+    judges = [get(*named) for named in labels_of(order.parameters)]
     if judges:
         check_labels(order, cameras, packs, *judges)
     deps.store.files.require_room(scratch_bytes(order.kind, splats, packs))

@@ -14,10 +14,10 @@ from fastapi import APIRouter, Depends, Query, Request, Response
 
 from liftcore import __version__
 from service import models
-from service.content import TAGGED, Draft, kept, unchanged
+from service.content import BINARY, TAGGED, Draft, kept, unchanged
 from service.encoders import encoder_file, encoder_label, encoder_spec, encoder_version
 from service.errors import InvalidRequest
-from service.queries.client import Asker, Frame
+from service.queries.client import PIPE_BYTES, Asker, Frame
 from service.requests import BodyBytes, described_body, json_body
 from service.state import AppState, Deps
 from service.store.assets import kernel_of
@@ -28,12 +28,13 @@ router = APIRouter(tags=["queries"])
 Question = models.Asked | models.AskedInBody
 QUERY_BODY, RENDER_BODY = json_body(models.AskedInBody), json_body(models.AskedToRender)
 BODY = described_body(models.AskedInBody)
-ROW_BYTES = 32  # of a splat in the .splat format
+ROW_BYTES, SCORE_BYTES = 32, 4  # of a splat in the .splat format, and in an array
 NO_ENCODER: dict[str, Any] = {"encoder": None, "encoder_version": None}  # of a question without words
 REGION = "region:"  # what needs the lift's feature packs begins with it
 MEDIA_TYPES = {"scores": "application/x-npy", "mask": "image/png", "attention": "image/png", "render": "image/png"}
 MEDIA_TYPES["layer"] = MEDIA_TYPES["word_labels"] = MEDIA_TYPES["scores"]  # these are arrays
 MEDIA_TYPES["word_map"] = MEDIA_TYPES["word_picture"] = MEDIA_TYPES["mask"]
+MEDIA_TYPES["splats"] = MEDIA_TYPES["scene"] = BINARY
 
 
 def bytes_of(media_type: str) -> dict[int | str, dict[str, Any]]:
@@ -232,20 +233,25 @@ def tagged_answer(request: Request, deps: AppState, wanted: dict[str, Any], lift
 
 
 def made(deps: AppState, wanted: dict[str, Any], lift: LiftRecord, ask: Ask, headers: dict[str, str]) -> Response:
-    """The answer itself. Splats are too much for a pipe, so the query process writes them to a draft."""
+    """The answer itself. What is large the query process writes to a draft, so that no client, however slowly it
+    reads, keeps it in memory.
+    """
+    files, name, size = deps.store.files, None, 0
     match wanted["operation"]:
         case "splats":
-            name = f"{wanted['what']}-{lift.id}.ply"
-            size = deps.store.assets.get(deps.owner, lift.splats, most=0).bytes
+            name, size = f"{wanted['what']}-{lift.id}.ply", deps.store.assets.get(deps.owner, lift.splats).bytes
         case "scene":
             name, size = f"scene-{lift.id}.splat", ROW_BYTES * lift.count
-        case operation:
-            return Response(ask(wanted).body, media_type=MEDIA_TYPES[operation], headers=headers)
-    files = deps.store.files
-    files.require_room(size)
-    with files.draft(Path(name).suffix) as draft:
-        ask(wanted | {"draft": str(draft)})
-        return Draft(draft, filename=name, headers=headers)
+        case "scores" | "layer" | "word_labels" if SCORE_BYTES * lift.count > PIPE_BYTES:
+            size = SCORE_BYTES * lift.count
+    if size:
+        files.require_room(size)
+    media_type = MEDIA_TYPES[wanted["operation"]]
+    with files.draft("" if name is None else Path(name).suffix) as draft:
+        body = ask(wanted | {"draft": str(draft)}).body
+        if draft.exists():
+            return Draft(draft, media_type, filename=name, headers=headers)
+    return Response(body, media_type=media_type, headers=headers)
 
 
 def find_lift(lift: str | None, deps: AppState) -> LiftRecord:
@@ -256,7 +262,7 @@ def find_lift(lift: str | None, deps: AppState) -> LiftRecord:
 def scene_request(operation: str, lift: LiftRecord, deps: AppState) -> dict[str, Any]:
     """What the query process must know of a lift's files; ``names`` says what the client calls them."""
     job = deps.store.jobs.get(deps.owner, lift.id)
-    splats, cameras = (deps.store.assets.get(deps.owner, asset, most=0) for asset in (job.splats, job.cameras))
+    splats, cameras = (deps.store.assets.get(deps.owner, asset) for asset in (job.splats, job.cameras))
     return {
         "operation": operation,
         "lift": str(lift.path),
@@ -280,7 +286,7 @@ def query_request(operation: str, asked: Question, lift: LiftRecord, deps: AppSt
             hint = "PUT /assets/features each of its packs before POST /lifts, or ask by splat:J or VIEW:x,y"
             got = "one that was brought without some of them"
             raise InvalidRequest("like", expected="a lift whose feature packs are here", got=got, hint=hint)
-        packs = [deps.store.assets.get(deps.owner, asset, most=0) for asset in lift.features]
+        packs = [deps.store.assets.get(deps.owner, asset) for asset in lift.features]
         request["features"] = [str(pack.path) for pack in packs]
         request["names"] |= {str(pack.path): f"features {pack.id}" for pack in packs}
     terms = ("text", "negatives", "like", "unlike", "threshold", "instances", "keep", "absent")
@@ -307,7 +313,7 @@ def with_encoder(
     elif asked.encoder is not None:
         raise InvalidRequest("table", expected="table or encoder", got="both", hint="leave one of them out")
     else:
-        table = deps.store.assets.get(deps.owner, asked.table, most=0)
+        table = deps.store.assets.get(deps.owner, asked.table)
         if table.kind is not models.AssetKind.TABLE:
             raise InvalidRequest("table", expected="an uploaded text table", got=f"{table.kind} {table.id}")
         spec = f"table:{table.path}"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 from typing import Annotated, Any, Literal
 
-import anyio
 from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
@@ -16,6 +15,7 @@ from service.encoders import encoder_label
 from service.photos import names_with_photo, open_photo
 from service.routes.queries import NO_ENCODER, NPY, PLY, Ask, View, scene_request, tagged_answer, with_encoder
 from service.state import AppState, Deps
+from service.store.lifts import LiftRecord
 
 VIEWS = 1000  # a page of them, unless another number is asked for
 _BYTES = {"schema": {"type": "string", "format": "binary"}}
@@ -51,7 +51,7 @@ def colours(lift: str, request: Request, deps: Deps, ask: Ask, what: Layer = "pc
 def photo(lift: str, view: View, request: Request, deps: Deps) -> Response:
     """The photo of a view, as it was uploaded."""
     found = deps.store.lifts.get(deps.owner, lift)
-    zipped = None if found.photos is None else deps.store.assets.get(deps.owner, found.photos, most=0)
+    zipped = None if found.photos is None else deps.store.assets.get(deps.owner, found.photos)
     opened = None if zipped is None else open_photo(zipped.path, view)
     if zipped is None or opened is None:
         got, hint = f"none of {view!r}"[:200], "PUT /assets/photos, then PATCH /lifts/{lift} with its id"
@@ -62,26 +62,20 @@ def photo(lift: str, view: View, request: Request, deps: Deps) -> Response:
     return unchanged(request, etag) or StreamingResponse(blocks, media_type=media_type, headers=headers)
 
 
-def _with_photo(deps: AppState, lift: str, views: list[str]) -> set[str]:
-    photos = deps.store.lifts.get(deps.owner, lift).photos
-    return (
-        set() if photos is None else names_with_photo(deps.store.assets.get(deps.owner, photos, most=0).path, views)
-    )
+def _with_photo(deps: AppState, lift: LiftRecord, views: list[str]) -> set[str]:
+    if lift.photos is None:
+        return set()
+    return names_with_photo(deps.store.assets.get(deps.owner, lift.photos).path, views)
 
 
 @router.get("/views", response_model=models.Views)
-async def views(lift: str, deps: Deps, ask: Ask, limit: Limit = VIEWS, cursor: ViewsCursor = 0) -> models.Views:
+def views(lift: str, deps: Deps, ask: Ask, limit: Limit = VIEWS, cursor: ViewsCursor = 0) -> models.Views:
     """The cameras of the scene with their poses, in pages; also those that were not lifted."""
     most = limit or VIEWS
-
-    def page() -> dict[str, Any]:
-        found = deps.store.lifts.get(deps.owner, lift)
-        return ask(scene_request("views", found, deps) | {"first": cursor, "count": most}).header
-
-    answer = await anyio.to_thread.run_sync(page)
+    found = deps.store.lifts.get(deps.owner, lift)
+    answer = ask(scene_request("views", found, deps) | {"first": cursor, "count": most}).header
     names = [view["name"] for view in answer["views"]]
-    lifted = await anyio.to_thread.run_sync(deps.store.lifts.lifted, deps.owner, lift, names, limiter=deps.naming)
-    photos = await anyio.to_thread.run_sync(_with_photo, deps, lift, names, limiter=deps.naming)
+    lifted, photos = deps.store.lifts.lifted(deps.owner, lift, names), _with_photo(deps, found, names)
     told = [
         models.View(lifted=view["name"] in lifted, photo=view["name"] in photos, **view) for view in answer["views"]
     ]

@@ -60,6 +60,6 @@ def what(deps: Deps, ask: Ask, asked: models.AskedWhat = WHAT_BODY) -> models.Wh
 
 def _wanted(operation: str, asked: models.Words, lift: LiftRecord, deps: AppState) -> dict[str, Any]:
     request = with_encoder(scene_request(operation, lift, deps), asked, lift, deps)
-    packs = [deps.store.assets.get(deps.owner, asset, most=0) for asset in lift.features]
+    packs = [deps.store.assets.get(deps.owner, asset) for asset in lift.features]
     names = request["names"] | {str(pack.path): f"features {pack.id}" for pack in packs}
     return request | {"words": asked.words, "features": [str(pack.path) for pack in packs], "names": names}

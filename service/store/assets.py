@@ -8,7 +8,6 @@ import sys
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -28,14 +27,9 @@ class AssetRecord:
     kind: AssetKind
     bytes: int
     path: Path
-    counted: str = "{}"  # counts as JSON: names of a hundred thousand views are parsed by who asks for them
+    counts: dict[str, Any] = field(default_factory=dict)  # what its check found: splats, views, channels and so on
     warnings: list[str] = field(default_factory=list)
     created: float = 0.0  # seconds since 1970
-
-    @cached_property
-    def counts(self) -> dict[str, Any]:
-        """What its check found in it: splats, views, channels, names and so on."""
-        return json.loads(self.counted)
 
     @property
     def file_name(self) -> str:
@@ -60,16 +54,21 @@ class CheckedUpload:
     warnings: list[str]
 
 
-# What several owners have is one file and one row; each has it since its own upload. Only small columns are grouped:
-# SQLite copies whatever else a grouped statement names, and counts may be 49 MB.
-IN_BRIEF = (
-    "SELECT id, kind, bytes, file, brief AS counts, warnings, created FROM (SELECT asset, min(created) AS created"
+# What several owners have is one file and one row; each has it since its own upload.
+VISIBLE = (
+    "SELECT assets.*, created FROM (SELECT asset, min(created) AS created"
     f" FROM asset_owners WHERE {SEEN} GROUP BY asset) JOIN assets ON asset = id"
 )
-SHOWN = IN_BRIEF.replace("brief", "CASE WHEN counts_bytes <= :most THEN counts ELSE brief END").replace(
-    "GROUP", "AND asset = :asset GROUP"
-)
-LONG = ("names", "words")  # of counts: what there may be a hundred thousand of
+ONE = VISIBLE.replace("GROUP", "AND asset = :asset GROUP")
+
+
+SHOWN_CHARACTERS = 256 << 10  # of counts; of more the names, or words, are told apart, in pages
+ALL = sys.maxsize
+
+
+def _long(kind: UploadKind) -> str:
+    """Of counts: what there may be a hundred thousand of, and which has a table of its own."""
+    return "words" if kind is AssetKind.TABLE else "names"
 
 
 class AssetStore:
@@ -100,25 +99,28 @@ class AssetStore:
                 own(connection, asset, owner.key)
             elif not self.get(owner, asset).whole:
                 self._publish(connection, asset, upload)
-        return self.get(owner, asset), owned is None
+        return self.get(owner, asset, most=SHOWN_CHARACTERS), owned is None
 
     def _publish(self, connection: sqlite3.Connection, asset: str, upload: CheckedUpload) -> None:
         """The bytes and the row; both may be there, and then the bytes are replaced by equal ones."""
         row = connection.execute("SELECT file FROM assets WHERE id = ?", (asset,)).fetchone()
         path = self._files.blob(upload.sha256, upload.suffix) if row is None else self._files.root / row["file"]
-        size, counts = upload.draft.stat().st_size, json.dumps(upload.counts)
+        size, long = upload.draft.stat().st_size, _long(upload.kind)
         self._files.publish(upload.draft, path)
         row = {
             "id": asset,
             "kind": upload.kind,
             "bytes": size,
             "file": self._files.relative(path),
-            "counts": counts,
-            "brief": json.dumps({name: value for name, value in upload.counts.items() if name not in LONG}),
-            "counts_bytes": len(counts),
+            "counts": json.dumps({name: value for name, value in upload.counts.items() if name != long}),
+            "counts_bytes": len(json.dumps(upload.counts)),
             "warnings": json.dumps(upload.warnings),
         }
         insert(connection, "assets", row, known="IGNORE")
+        connection.executemany(
+            "INSERT OR IGNORE INTO asset_names (asset, place, name) VALUES (?, ?, ?)",
+            ((asset, place, name) for place, name in enumerate(upload.counts.get(long, ()))),
+        )
 
     def require_quota(self, owner: Owner, coming: int = 1) -> None:
         """See that the owner may store more, before bytes are on their way.
@@ -129,24 +131,25 @@ class AssetStore:
         with self._database.read() as connection:
             require_quota(connection, owner, coming)
 
-    def find(self, owner: Owner, asset: str, *, most: int = sys.maxsize) -> AssetRecord | None:
-        """The asset of that id, None when there is none; without names and words if all counts are above ``most``
-        characters."""
+    def find(self, owner: Owner, asset: str, *, most: int = 0) -> AssetRecord | None:
+        """The asset of that id, None when there is none; its counts with names, or words, if they are of at most so
+        many characters."""
         with self._database.read() as connection:
-            row = connection.execute(SHOWN, owner.terms(asset=asset, most=most)).fetchone()
-        return None if row is None else self._record(row)
+            row = connection.execute(ONE, owner.terms(asset=asset)).fetchone()
+            if row is None:
+                return None
+            found = self._record(row)
+            if found.kind is not AssetKind.SPLATS and row["counts_bytes"] <= most:
+                found.counts[_long(found.kind)] = _names(connection, asset, 0, -1)
+            return found
 
     def names(self, owner: Owner, asset: str, first: int, limit: int) -> list[str]:
         """So many of the names, or words, that an asset holds, from the one of that number on."""
+        self.get(owner, asset)
         with self._database.read() as connection:
-            rows = connection.execute(
-                "SELECT value FROM assets, json_each(counts, iif(json_type(counts, '$.words') IS NULL, '$.names',"
-                " '$.words')) WHERE assets.id = ? LIMIT ? OFFSET ?",
-                (self.get(owner, asset, most=0).id, limit, first),
-            ).fetchall()
-        return [row["value"] for row in rows]
+            return _names(connection, asset, first, limit)
 
-    def get(self, owner: Owner, asset: str, kind: AssetKind | None = None, *, most: int = sys.maxsize) -> AssetRecord:
+    def get(self, owner: Owner, asset: str, kind: AssetKind | None = None, *, most: int = 0) -> AssetRecord:
         """The asset of that id, as `find` has it.
 
         Raises:
@@ -165,7 +168,7 @@ class AssetStore:
         terms = owner.terms(most=limit + 1, **after(cursor))
         with self._database.read() as connection:
             rows = connection.execute(
-                f"{IN_BRIEF} WHERE created < :created OR (created = :created AND id > :after)"
+                f"{VISIBLE} WHERE created < :created OR (created = :created AND id > :after)"
                 " ORDER BY created DESC, id LIMIT :most",
                 terms,
             ).fetchall()
@@ -183,7 +186,7 @@ class AssetStore:
             InUse: a job or a lift of theirs refers to it.
         """
         with self._files.blobs_changing:
-            found, terms = self.get(owner, asset, most=0), owner.terms(asset=asset)
+            found, terms = self.get(owner, asset), owner.terms(asset=asset)
 
             def forget(connection: sqlite3.Connection) -> list[Path]:
                 users = connection.execute(
@@ -214,7 +217,7 @@ class AssetStore:
             row,
             kind=AssetKind(row["kind"]),
             path=self._files.root / row["file"],
-            counted=row["counts"],
+            counts=json.loads(row["counts"]),
             warnings=json.loads(row["warnings"]),
         )
 
@@ -223,6 +226,13 @@ def kernel_of(splats: AssetRecord, settings: Mapping[str, Any]) -> str:
     """The kernel that a lift of those settings takes the splats for."""
     asked = settings.get("kernel", "auto")
     return splats.counts.get("kernel", "3dgs") if asked == "auto" else asked
+
+
+def _names(connection: sqlite3.Connection, asset: str, first: int, limit: int) -> list[str]:
+    rows = connection.execute(
+        "SELECT name FROM asset_names WHERE asset = ? AND place >= ? ORDER BY place LIMIT ?", (asset, first, limit)
+    )
+    return [name for (name,) in rows]
 
 
 def own(connection: sqlite3.Connection, asset: str, owner: str) -> None:

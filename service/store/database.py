@@ -25,8 +25,8 @@ GENERATION = "generation"  # the number that the newest counted transaction had
 KEYS_REQUIRED = "keys.required"  # there when a key was ever made
 RESERVE = "reserve"  # room for the transaction of a deletion on a full disk
 RESERVE_BYTES = 1 << 20
-BUSY_SECONDS = 10.0  # that a write waits for others, of this process and of others
-MOST_IDLE = 4  # connections kept for the next readers; those of a rush are closed after it
+BUSY_SECONDS = 10.0  # that a write waits for others, of this process and of others, and a read for other reads
+READERS = 4  # at once: more threads in SQLite and with what it gave only keep the event loop from its turn
 CURSOR = r"^[0-9.e+-]{1,30}~[0-9a-z:]{1,80}$"  # when the last one of a page was made, and its id
 
 R = TypeVar("R")
@@ -54,7 +54,9 @@ class Database:
         if least is not None:
             require_database(path)
         self._write_lock = threading.Lock()
-        self._idle: queue.LifoQueue[sqlite3.Connection] = queue.LifoQueue()
+        self._readers: queue.LifoQueue[sqlite3.Connection | None] = queue.LifoQueue()
+        for _ in range(READERS):
+            self._readers.put(None)  # opened by the first who needs it
         self._writer = self._connect("rwc")
         self._identity = _identity(path)
         try:
@@ -202,22 +204,24 @@ class Database:
 
     @contextmanager
     def read(self) -> Iterator[sqlite3.Connection]:
-        """A connection to read with; readers never wait for the writer."""
+        """A connection to read with; readers never wait for the writer. A thread must not hold two.
+
+        Raises:
+            sqlite3.OperationalError: others read for too long, or the file is no longer the one that was opened.
+        """
         try:
-            connection = self._idle.get_nowait()
+            connection = self._readers.get(timeout=BUSY_SECONDS)
         except queue.Empty:
-            self.require_same_file()  # else the collector would find that no file belongs to anything
-            connection = self._connect()
+            raise _error("others read it", "SQLITE_BUSY") from None
         try:
+            self.require_same_file()  # else the collector would find that no file belongs to anything
+            connection = connection or self._connect()
             yield connection
         except sqlite3.Error:
             self.require_same_file()  # what another file has to say is no news
             raise
         finally:
-            if self._idle.qsize() < MOST_IDLE:
-                self._idle.put(connection)
-            else:
-                connection.close()
+            self._readers.put(connection)
 
     def catch_up(self) -> None:
         """Say that this is the newest database of its directory: what was lost of it was made again."""
@@ -242,8 +246,9 @@ class Database:
         """Close every connection."""
         with self._write_lock:
             self._writer.close()
-        while not self._idle.empty():
-            self._idle.get_nowait().close()
+        while not self._readers.empty():
+            if (connection := self._readers.get_nowait()) is not None:
+                connection.close()
 
 
 def expected_generation(data: Path) -> int | None:

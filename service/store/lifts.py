@@ -83,13 +83,9 @@ class TradeoffRecord:
 # A result belongs to whom its job does. One statement, so that none is without its job.
 FEATURES = "(SELECT json_group_array(asset) FROM (SELECT asset FROM job_features WHERE job = jobs.id ORDER BY place))"
 NAMES_OF_VIEWS = ("views_without_camera", "views_without_splats")  # in a certificate
-SHOWN_BYTES = 64 << 10  # of metadata; of more the names of views, which may be 49 MB, are told apart, in pages
+SHOWN_BYTES = 64 << 10  # of metadata; of more the names of views are told apart, in pages
 LONG = ("views", "words")  # what metadata leave out then
-VISIBLE = (
-    "SELECT lifts.id, bytes, sha256, file, count, channels, view_count, first_view, lifts.created, splats, cameras,"
-    f" name, photos, CASE WHEN metadata_bytes <= {SHOWN_BYTES} THEN metadata ELSE brief END AS metadata,"
-    f" {FEATURES} AS features FROM lifts JOIN jobs USING (id) WHERE {SEEN}"
-)
+VISIBLE = f"SELECT lifts.*, splats, cameras, {FEATURES} AS features FROM lifts JOIN jobs USING (id) WHERE {SEEN}"
 VISIBLE_TRADEOFFS = (
     "SELECT tradeoffs.*, splats, cameras, json_extract(parameters, '$.labels') AS labels,"
     f" {FEATURES} AS features FROM tradeoffs JOIN jobs USING (id) WHERE {SEEN}"
@@ -229,8 +225,9 @@ class LiftStore:
         self, connection: sqlite3.Connection, job: str, made: FinishedLift, size: int, created: float
     ) -> None:
         metadata, views = json.dumps(made.metadata), made.metadata["views"]
-        brief = {name: value for name, value in made.metadata.items() if name not in LONG}
-        certificate = {name: value for name, value in brief["certificate"].items() if name not in NAMES_OF_VIEWS}
+        if len(metadata) > SHOWN_BYTES:
+            certificate = _without(made.metadata["certificate"], *NAMES_OF_VIEWS)
+            metadata = json.dumps(_without(made.metadata, *LONG) | {"certificate": certificate})
         row = {
             "id": job,
             "bytes": size,
@@ -239,13 +236,12 @@ class LiftStore:
             "count": made.count,
             "channels": made.channels,
             "metadata": metadata,
-            "metadata_bytes": len(metadata),
-            "brief": json.dumps(brief | {"certificate": certificate}),
             "view_count": len(views),
             "first_view": next(iter(views), None),
             "created": created,
         }
         insert(connection, "lifts", row)
+        connection.executemany("INSERT OR IGNORE INTO lifted_views VALUES (?, ?)", ((job, view) for view in views))
 
     def find(self, owner: Owner, lift: str) -> LiftRecord | None:
         """The lift of that id, None when there is none."""
@@ -268,13 +264,9 @@ class LiftStore:
 
     def lifted(self, owner: Owner, lift: str, names: list[str]) -> set[str]:
         """Which of these views were lifted."""
+        asked, known = "SELECT 1 FROM lifted_views WHERE lift = ? AND name = ?", self.get(owner, lift).id
         with self._database.read() as connection:
-            rows = connection.execute(
-                "SELECT value FROM lifts, json_each(metadata, '$.views') WHERE lifts.id = ?"
-                " AND value IN (SELECT value FROM json_each(?))",
-                (self.get(owner, lift).id, json.dumps(names)),
-            ).fetchall()
-        return {row["value"] for row in rows}
+            return {name for name in names if connection.execute(asked, (known, name)).fetchone()}
 
     def only(self, owner: Owner) -> LiftRecord:
         """The one lift that is here.
@@ -316,6 +308,10 @@ class LiftStore:
             metadata=json.loads(row["metadata"]),
             features=tuple(json.loads(row["features"])),
         )
+
+
+def _without(values: dict[str, Any], *names: str) -> dict[str, Any]:
+    return {name: value for name, value in values.items() if name not in names}
 
 
 class TradeoffStore:

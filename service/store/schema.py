@@ -158,4 +158,28 @@ ALTER TABLE lifts ADD COLUMN photos TEXT REFERENCES assets (id);
 CREATE INDEX lifts_by_photos ON lifts (photos);
 CREATE INDEX lifts_by_digest ON lifts (sha256);
 """,
+    # A hundred thousand names in one value were 49 MB, through which SQLite walks to every column after it.
+    """
+CREATE TABLE asset_names (          -- of views, or the words of a table: a page of them is a range of rows
+    asset TEXT NOT NULL REFERENCES assets (id) ON DELETE CASCADE,
+    place INTEGER NOT NULL,
+    name TEXT NOT NULL,
+    PRIMARY KEY (asset, place)
+) STRICT, WITHOUT ROWID;
+INSERT INTO asset_names
+    SELECT assets.id, key, value FROM assets,
+        json_each(counts, iif(json_type(counts, '$.words') IS NULL, '$.names', '$.words'));
+UPDATE assets SET counts = brief;
+ALTER TABLE assets DROP COLUMN brief;
+
+CREATE TABLE lifted_views (
+    lift TEXT NOT NULL REFERENCES lifts (id) ON DELETE CASCADE,
+    name TEXT NOT NULL,
+    PRIMARY KEY (lift, name)
+) STRICT, WITHOUT ROWID;
+INSERT OR IGNORE INTO lifted_views SELECT lifts.id, value FROM lifts, json_each(metadata, '$.views');
+UPDATE lifts SET metadata = brief WHERE metadata_bytes > 65536;
+ALTER TABLE lifts DROP COLUMN brief;
+ALTER TABLE lifts DROP COLUMN metadata_bytes;
+""",
 )

@@ -91,6 +91,8 @@ def check_lift(path: Path) -> dict[str, Any]:
             if not np.isfinite(values[first : first + BLOCK_ROWS]).all():
                 raise InvalidLift("lift", expected="finite numbers", got=f"others in {name!r} from row {first} on")
     require_view_names(metadata["views"], InvalidLift)
+    if None in metadata["timings"].values():  # as JSON has what is not finite
+        raise InvalidLift("lift", expected="finite timings", got="others", hint="a list of lifts tells them")
     brief = len(json.dumps({name: value for name, value in metadata.items() if name not in LONG}))
     if brief > SHOWN_BYTES:
         expected = f"at most {SHOWN_BYTES} bytes of metadata beside the names of views and the words"

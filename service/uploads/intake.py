@@ -26,7 +26,7 @@ from service.child import error_of
 from service.errand import ErrandLimits, run_errand
 from service.errors import Crashed, DigestMismatch, InvalidEncoding, TooLarge, UnsupportedEncoding
 from service.models import AssetKind, UploadKind
-from service.store.assets import AssetRecord, CheckedUpload
+from service.store.assets import ALL, SHOWN_CHARACTERS, AssetRecord, CheckedUpload
 from service.store.files import is_whole
 from service.store.lifts import FinishedLift, LiftRecord, order_of
 from service.store.owners import Owner
@@ -247,7 +247,7 @@ class AssetIntake(Intake[AssetRecord]):
     """The upload of an asset."""
 
     def _known(self, digest: str) -> AssetRecord | None:
-        known = self._store.assets.find(self._owner, f"sha256:{digest}")
+        known = self._store.assets.find(self._owner, f"sha256:{digest}", most=SHOWN_CHARACTERS)
         return known if known is not None and known.kind == self._kind and known.whole else None
 
     def keep(self, upload: CheckedUpload) -> tuple[AssetRecord, bool]:
@@ -270,9 +270,9 @@ class LiftIntake(Intake[LiftRecord]):
         if splats.counts["splats"] != told["count"]:
             got = f"{told['count']} for {splats.counts['splats']} splats"
             raise InvalidLift("lift", expected="a row for each splat", got=got)
-        cameras = assets.get(self._owner, order.cameras, AssetKind.CAMERAS)
+        cameras = assets.get(self._owner, order.cameras, AssetKind.CAMERAS, most=ALL)
         require_pairs(told["metadata"]["views"], cameras.counts["names"])
-        packs = tuple(pack for pack in order.features if assets.find(self._owner, pack, most=0) is not None)
+        packs = tuple(pack for pack in order.features if assets.find(self._owner, pack) is not None)
         made = FinishedLift(upload.draft, upload.sha256, told["count"], told["channels"], told["metadata"])
         return self._store.lifts.take(self._owner, replace(order, features=packs), made), True
 

@@ -129,6 +129,9 @@ def test_broken_lift_files_are_refused(client: TestClient, lift: dict[str, Any],
     more = '"certificate":{"x":"' + "y" * 70_000 + '",'
     long = {"splatlift": metadata["splatlift"].replace('"certificate":{', more)}
     assert "metadata" in assert_problem(client.post("/lifts", content=save(tensors, long)))["expected"]
+    endless_time = {"splatlift": metadata["splatlift"].replace('"timings":{', '"timings":{"x":1e999,')}
+    assert "timings" in assert_problem(client.post("/lifts", content=save(tensors, endless_time)))["expected"]
+    assert client.get("/lifts").status_code == 200
     assert assert_problem(client.post("/lifts", content=b"\x80\x04pickle"))["type"] == "/problems/invalid-lift"
 
 

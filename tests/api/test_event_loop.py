@@ -11,14 +11,16 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
+import anyio
 import pytest
 from fastapi.testclient import TestClient
 
+from service import middleware
 from service.errors import NoSpace
 from service.models import MAX_SETTINGS, AssetKind
 from service.observe import SAME_A_MINUTE, Sparing
 from service.queries.client import Frame
-from service.routes.assets import SHOWN_CHARACTERS
+from service.store.assets import SHOWN_CHARACTERS
 from service.store.database import Database
 from service.store.files import DataDirectory
 from service.store.owners import SERVICE
@@ -119,6 +121,34 @@ def test_upload_to_a_stalled_disk_keeps_nobody_else_waiting(
             released.set()
             for upload in uploads:
                 upload.join()
+
+
+@pytest.mark.parametrize(("seconds", "at_once"), [(1000.0, middleware.PLACES), (0.001, 2 * middleware.PLACES)])
+def test_few_requests_begin_at_a_time_and_none_waits_for_slow_ones(
+    monkeypatch: pytest.MonkeyPatch, seconds: float, at_once: int
+) -> None:
+    monkeypatch.setattr(middleware, "TURN_SECONDS", seconds)
+    begun: list[str] = []
+
+    async def ask_all() -> None:
+        go_on = anyio.Event()
+
+        async def app(scope: Any, receive: Any, send: Any) -> None:
+            begun.append(scope["path"])
+            if scope["path"] == "/slow":
+                await go_on.wait()
+
+        turns: Any = middleware.Turns(app)
+        async with anyio.create_task_group() as asked:
+            for path in ["/slow"] * 2 * middleware.PLACES + ["/healthz"]:
+                asked.start_soon(turns, {"type": "http", "path": path}, None, None)
+            while "/healthz" not in begun or begun.count("/slow") < at_once:
+                await anyio.sleep(0.001)
+            assert begun.count("/slow") == at_once
+            go_on.set()
+        assert begun.count("/slow") == 2 * middleware.PLACES
+
+    anyio.run(ask_all)
 
 
 def test_settings_are_bounded_before_they_are_looked_at(client: TestClient, uploaded: Uploaded) -> None:

@@ -21,6 +21,7 @@ from service.jobs.supervisor import Supervisor
 from service.models import JobState
 from service.queries.client import QueryClient, QueryLimits
 from service.settings import ServiceSettings
+from service.store.assets import ALL
 from service.store.owners import SERVICE
 from service.store.schema import MIGRATIONS
 from service.store.store import Store
@@ -234,8 +235,11 @@ def test_database_of_the_first_schema_is_taken_over(tmp_path: Path) -> None:
     old.executescript(f"BEGIN; {MIGRATIONS[0]} PRAGMA user_version = 1; COMMIT;")
     old.executemany(
         "INSERT INTO assets VALUES (?, ?, 1, 'blobs/x', '{}', '[]', 0)",
-        [("s", "splats"), ("c", "cameras"), ("f", "features")],
+        [("s", "splats"), ("c", "cameras"), ("f", "features"), ("t", "table")],
     )
+    for asset, counts in (("c", {"views": 2, "names": ["w", "v"]}), ("t", {"words": ["apple"], "channels": 1})):
+        old.execute("UPDATE assets SET counts = ? WHERE id = ?", (json.dumps(counts), asset))
+    old.execute("INSERT INTO lifts VALUES ('c', 1, 'd', 'lifts/c', 1, 1, ?, 0)", (json.dumps({"views": ["v"]}),))
     problem = json.dumps({"kind": "crashed", "argument": "job", "expected": "a", "got": "b", "hint": ""})
     for job, state, told in (("a", "running", None), ("b", "queued", None), ("c", "failed", problem)):
         old.execute(
@@ -248,6 +252,12 @@ def test_database_of_the_first_schema_is_taken_over(tmp_path: Path) -> None:
     old.close()
     store = Store.open(tmp_path / "data")
     assert store.jobs.get(SERVICE, "a").features == ("f",) and store.jobs.get(SERVICE, "a").plan is None
+    assert store.assets.get(SERVICE, "c").counts == {"views": 2}
+    assert store.assets.get(SERVICE, "c", most=ALL).counts == {"views": 2, "names": ["w", "v"]}
+    assert store.assets.get(SERVICE, "t", most=ALL).counts == {"channels": 1, "words": ["apple"]}
+    assert store.assets.names(SERVICE, "c", 1, 9) == ["v"]
+    assert store.lifts.lifted(SERVICE, "c", ["w", "v"]) == {"v"}
+    assert store.lifts.get(SERVICE, "c").metadata == {"views": ["v"]}
     store.jobs.release_all("the server died")
     assert [store.jobs.get(SERVICE, job).state for job in "abc"] == [
         JobState.QUEUED,

@@ -7,6 +7,7 @@ import signal
 import threading
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -82,6 +83,18 @@ def test_questions_asked_together_are_answered_as_alone_to_the_bit(request_of: C
     assert found == alone
     assert sum("fault" in header for header, _ in found if isinstance(header, dict)) == 3
     assert len({body for _, body in found}) > len(QUESTIONS)
+
+
+def test_large_answer_is_a_file_and_the_same_bytes(
+    request_of: Callable[..., dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked, kept = {"draft": str(tmp_path / "draft")}, Answers(scenes=1, cache_bytes=1 << 20)
+    requests = [request_of(operation, text=["apple"]) | asked for operation in ("scores", "mask", "attention")]
+    small = [reply_to([request], kept).body for request in requests]
+    assert all(small) and not list(tmp_path.iterdir())
+    monkeypatch.setattr(answers, "PIPE_BYTES", 10)
+    for request, content in zip(requests, small, strict=True):
+        assert reply_to([request], kept) == Frame({}) and (tmp_path / "draft").read_bytes() == content
 
 
 def test_questions_asked_together_take_one_pass_over_the_features(

@@ -17,9 +17,10 @@ from plyfile import PlyData
 from starlette.requests import ClientDisconnect
 
 from liftcore.errors import SplatliftError
-from service.content import BLOCK_BYTES, Draft
+from service.content import BINARY, BLOCK_BYTES, Draft
 from service.errors import NoSpace
 from service.queries import answers
+from service.queries.client import Frame
 
 from .conftest import parts_of
 from .following import ended
@@ -118,6 +119,26 @@ def test_too_little_disk_is_said_before_anything_is_made(start: Callable[..., An
         assert client.get("/query", params=LAMP).status_code == 200
 
 
+def test_large_array_is_sent_from_a_file(
+    client: TestClient, lift: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    content = bytes(3 * BLOCK_BYTES + 7)
+
+    def call(wanted: dict[str, Any], asker: object) -> Frame:
+        Path(wanted["draft"]).write_bytes(content)
+        return Frame({})
+
+    monkeypatch.setattr(parts_of(client).queries, "call", call)
+    for reply in (
+        client.get("/query/scores", params=LAMP | {"lift": lift["id"]}),
+        client.post("/query/scores", json={"text": ["lamp"], "lift": lift["id"]}),
+        client.get(f"/lifts/{lift['id']}/colours"),
+    ):
+        assert reply.content == content and reply.headers["content-type"] == "application/x-npy"
+        assert "content-disposition" not in reply.headers
+    assert not drafts(client)
+
+
 def test_a_disk_that_fills_up_meanwhile_is_no_fault_of_ours() -> None:
     with pytest.raises(NoSpace) as refused:
         answers.write_draft([b"x"], Path("/dev/full"))
@@ -130,7 +151,7 @@ def test_a_disk_that_fills_up_meanwhile_is_no_fault_of_ours() -> None:
 def test_a_draft_is_sent_without_its_name_and_closed_however_that_ends(tmp_path: Path, leaves: bool) -> None:
     content = np.random.default_rng(0).bytes(3 * BLOCK_BYTES + 17)
     (tmp_path / "draft").write_bytes(content)
-    reply = Draft(tmp_path / "draft", filename="object.ply", headers={})
+    reply = Draft(tmp_path / "draft", BINARY, filename="object.ply", headers={})
     (tmp_path / "draft").unlink()
     sent: list[bytes] = []
 

@@ -96,7 +96,7 @@ def at_once(count: int, ask: Callable[[httpx.Client, int], object]) -> Load:
     return run
 
 
-def never_read(paths: tuple[str, ...], count: int = 80, seconds: float = 20.0) -> Load:
+def never_read(paths: tuple[str, ...], count: int = 80, seconds: float = 20.0, pipelined: int = 20) -> Load:
     """So many clients that ask again and again over their connection and read nothing."""
 
     def run(url: str) -> None:
@@ -106,7 +106,7 @@ def never_read(paths: tuple[str, ...], count: int = 80, seconds: float = 20.0) -
                 client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
                 client.connect(("127.0.0.1", urlsplit(url).port or 80))
                 path = paths[number % len(paths)]
-                client.sendall(f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n".encode() * 20)
+                client.sendall(f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n".encode() * pipelined)
             time.sleep(seconds)
 
     return run
@@ -121,12 +121,14 @@ def of_a_megabyte(client: httpx.Client, number: int) -> None:
 
 def loads(asset: str, lift: str) -> dict[str, Load]:
     """The loads by name."""
+    scores = f"/query/scores?like=splat:0&lift={lift.removeprefix('/lifts/')}"
     return {
         "nothing": lambda url: time.sleep(5),
         "40 at once: GET /assets/ID": at_once(40, lambda client, _: client.get(asset)),
         "40 at once: pages of its names": at_once(40, lambda client, n: client.get(f"{asset}/names?cursor={n}000")),
         "40 at once: GET /lifts/ID and /lifts": at_once(40, lambda ask, _: (ask.get(lift), ask.get("/lifts"))),
         "80 clients that do not read": never_read(("/jobs", asset, f"{asset}/names", lift, "/lifts")),
+        "80 that do not read 32 MB of scores": never_read((scores,), pipelined=1),
         "32 orders with settings of 1 MB": at_once(32, of_a_megabyte),
         "8 at once: GET /jobs whole": at_once(8, lambda client, _: client.get("/jobs")),
     }

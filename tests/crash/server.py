@@ -15,11 +15,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
-from service.__main__ import server_of
+from service.__main__ import keep_pauses_short, server_of
 from service.app import create_app, job_limits
 from service.jobs.process import JobProcess
 from service.jobs.supervisor import CHILD, Supervisor
-from service.queries.client import QueryClient
+from service.queries.client import Frame, QueryClient
 from service.settings import ServiceSettings
 from service.store.files import DataDirectory
 from service.store.jobs import JobStore
@@ -44,6 +44,9 @@ POINTS: dict[str, tuple[type, str, str]] = {
 }
 
 
+ANSWER_BYTES = 32 << 20  # scores of eight million splats
+
+
 class NoQueries:
     """Stands in for the query worker, which takes seconds to start and has no part in this."""
 
@@ -58,6 +61,12 @@ class NoQueries:
 
     def revive(self) -> bool:
         return True
+
+    def call(self, request: dict[str, Any], asker: Any) -> Frame:
+        """An answer as of a large lift."""
+        with Path(request["draft"]).open("wb") as draft:
+            draft.truncate(ANSWER_BYTES)
+        return Frame({})
 
     restarts = 0
 
@@ -92,6 +101,7 @@ def main() -> None:
     runner = Supervisor(store, job_limits(settings), command=command)
     app = create_app(settings, store, runner, cast("QueryClient", NoQueries()))
     listener = socket.create_server(("127.0.0.1", 0))
+    keep_pauses_short()
     server_of(app, settings).run(sockets=[listener])
     store.close()
 
