@@ -26,14 +26,14 @@ from liftcore.features.mask_files import mask_of_runs, read_runs
 from liftcore.features.pack import read_features
 from liftcore.io.splats import read_splats
 from service import models
-from service.routes import assets, jobs, operations, queries, results, scene
+from service.routes import assets, jobs, operations, queries, results, scene, words
 from service.scopes import OPEN
 from tests.api.tiny_scene import WIDTH, WORDS, codebook, colmap_zip, labels, make_scene
 from tests.run_lengths import sam_records
 
 from .readme import FOR_USERS, GUIDE, PYTHON, SERVICE, SETTINGS, blocks, text
 
-ROUTES: tuple[ModuleType, ...] = (operations, assets, jobs, results, scene, queries)
+ROUTES: tuple[ModuleType, ...] = (operations, assets, jobs, results, scene, queries, words)
 SHAPES: dict[str, type[BaseModel]] = {  # a field that no other answer has -> the answer
     "counts": models.Asset,
     "attempt": models.Job,
