@@ -26,16 +26,17 @@ def encoder_spec(settings: ServiceSettings, text_space: str, asked: str | None) 
 
     The default stands in for a space that has none only where the operator chose it: scores of an encoder of
     another space look like any others, and mean nothing. Encoders that need no file answer for their own spaces,
-    and a lift that brings its words is asked in these: ``OWN_WORDS``.
+    and a lift that brings its words is asked in these: ``OWN_WORDS``. A lift's own space may
+    be asked for by its name.
 
     Raises:
         InvalidRequest: no encoder was set up under the name asked for, or for the lift's text space.
     """
-    if asked is None and text_space == OWN_WORDS:
-        return OWN_WORDS
     if asked == "default":
         return settings.encoder
-    if asked is not None:
+    if asked in (None, text_space) and text_space == OWN_WORDS:
+        return OWN_WORDS
+    if asked not in (None, text_space):
         if asked not in settings.text_spaces:
             known = ", ".join(["default", *sorted(settings.text_spaces)])
             raise InvalidRequest(

@@ -474,7 +474,9 @@ class LiftQuestion(BaseModel):
     """Which lift is asked, and in whose words."""
 
     lift: JobId | None = Field(None, description="the lift; may be left out when there is exactly one")
-    encoder: str | None = Field(None, max_length=200, description="a text space that the operator set up, or default")
+    encoder: str | None = Field(
+        None, max_length=200, description="a text space that the operator set up, the lift's own, or default"
+    )
     table: AssetId | None = Field(None, description="an uploaded text table that has the words, in place of encoder")
 
 
@@ -653,7 +655,9 @@ class AskedForSceneObjects(BaseModel):
 
     table: AssetId | None = Field(None, description="an uploaded text table: objects are named by its words")
     encoder: str | None = Field(
-        None, max_length=200, description="a text space that the operator set up as a table, or default: likewise"
+        None,
+        max_length=200,
+        description="a text space that the operator set up as a table, the lift's own, or default: likewise",
     )
     features: Annotated[bool, Field(description="with the mean feature of each")] = False
     limit: int = Field(100, ge=1, le=1000, description="how many to list")

@@ -74,7 +74,7 @@ def test_objects_are_there_without_words_and_a_table_names_them(
     assert pages[0]["objects"] + pages[1]["objects"] == whole["objects"]
     assert (pages[0]["next"], pages[1]["next"]) == (2, None)
     table = client.put("/assets/table", content=scene.table).json()["id"]
-    for how in ({"table": table}, {"encoder": "default"}):
+    for how in ({"table": table}, {"encoder": "default"}, {"encoder": lift["text_space"]}):
         named = client.get(route, params={**how, "features": True}).json()["objects"]
         for one in named:
             middle = one["centre"][0]

@@ -187,7 +187,7 @@ def test_encoder_is_chosen_by_text_space_and_never_by_the_client(tmp_path: Path)
     settings = ServiceSettings.model_validate({"data": tmp_path, "text_spaces": {"clip": "open_clip:X@w.pt"}})
     assert encoder_spec(settings, "clip", None) == "open_clip:X@w.pt"
     for space, encoder in (("open_clip:ViT-B-32/openai", "lvis"), ("minilm", "minilm")):  # they need no file
-        assert encoder_spec(settings, space, None) == encoder
+        assert encoder_spec(settings, space, None) == encoder_spec(settings, space, space) == encoder
     assert encoder_spec(settings, "clip", "default") == "lvis"
     assert encoder_spec(settings, "none", "clip") == "open_clip:X@w.pt"
     for space, asked in (("clip", "table:secret"), ("none", None)):

@@ -63,7 +63,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
         with httpx.Client(base_url=address, timeout=60) as client:
             put = {kind: getattr(scene, kind) for kind in ("splats", "cameras", "features")}
             ids = {kind: client.put(f"/assets/{kind}", content=body).json()["id"] for kind, body in put.items()}
-            order = ids | {"features": [ids["features"]], "settings": {"preset": "row-sum"}}
+            order = ids | {"features": [ids["features"]], "settings": {"preset": "row-sum", "objects": True}}
             job = ended(client, client.post("/lift", json=order).headers["location"])
         assert job["state"] == "succeeded", job
         yield Served(address, job["id"], store)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -129,6 +130,24 @@ def test_what_is_not_there_is_said_plainly(page: Browser) -> None:
     )
     assert text_of(page, "#answer") == "\u201clamp\u201d is not here." and not columns(page, AMBER)
     assert text_of(page, "#why") == "No view shows one." and "not here" in text_of(page, "#chips")
+    page.press("#nearest")
+    page.until(FOUND)
+    assert columns(page, AMBER) and "It is not here; this is what comes closest" in text_of(page, "#why")
+    asked = [address for address in page.asked if "/query/objects" in address][-1]
+    assert "absent=keep" in asked and "threshold=auto" not in asked and "&threshold=" in page.value("location.search")
+
+
+def test_things_are_listed_without_a_question_and_shown(page: Browser, keep: Keep) -> None:
+    page.until("splatlift.things.found.length === 3")
+    assert sorted(page.value("splatlift.things.found.map(thing => thing.name)")) == ["apple", "book", "lamp"]
+    before = page.value("splatlift.viewer.place3d")
+    page.press("#catalogue-list button")
+    page.until("splatlift.viewer.settled && document.querySelector('#labels .label')")
+    keep(page, "things")
+    assert text_of(page, "#labels .label") == page.value("splatlift.things.found[0].name")
+    assert page.value("splatlift.viewer.place3d") != before
+    ask(page, "lamp")
+    assert page.value("splatlift.things.chosen") is None
 
 
 def test_example_that_nothing_understands_is_told_and_taken_back(page: Browser) -> None:
@@ -241,9 +260,14 @@ def test_nothing_is_wider_than_the_window(page: Browser, width: int, height: int
 
 
 def test_lines_to_take_away_ask_the_same(page: Browser) -> None:
+    page.write("#but", "book")
     ask(page, "apple")
     page.press("#tab-take")
-    assert "text=apple" in text_of(page, "#curl") and '"apple"' in text_of(page, "#python")
+    assert "text=apple" in text_of(page, "#curl") and "negatives=book" in text_of(page, "#curl")
+    found: dict[str, Any] = {}
+    exec(text_of(page, "#python"), found)  # over HTTP, as this encoder is a table of the server
+    assert found["found"]["count"] == page.value("splatlift.ask.now.count") > 0
+    assert found["found"]["threshold"]["value"] == pytest.approx(page.value("splatlift.ask.now.cut"))
     addresses = ["object", "boxes", "mask", "scores", "coloured"]
     asked = f"{json.dumps(addresses)}.map(what => fetch(splatlift.take.address(what)).then(reply => reply.status))"
     assert page.value(f"Promise.all({asked})") == [200] * 5

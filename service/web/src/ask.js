@@ -20,12 +20,16 @@ export class Ask {
     at("next").addEventListener("click", () => this.step(1));
     at("cut").addEventListener("input", () => this.cut(Number(at("cut").value)));
     at("auto").addEventListener("click", () => this.automatic());
-    at("nearest").addEventListener("click", () => { this.now.anyway = true; this.show(); this.changed(); this.things(this.now); });
+    at("nearest").addEventListener("click", () => this.nearest());
     new ResizeObserver(() => this.bars()).observe(at("histogram"));
   }
 
   get now() {
     return this.questions[this.active];
+  }
+
+  get negatives() {
+    return split(at("but").value);
   }
 
   // Another lift: nothing of the old one's answers stays.
@@ -99,7 +103,7 @@ export class Ask {
     for (const question of this.questions) {
       for (const name of ["text", "like", "unlike"]) for (const term of question[name]) parameters.append(name, term);
     }
-    for (const text of split(at("but").value)) if (this.questions.length) parameters.append("negatives", text);
+    for (const text of this.negatives) if (this.questions.length) parameters.append("negatives", text);
     const cuts = this.questions.map(question => question.threshold);
     if (cuts.some(cut => cut !== "auto")) for (const cut of cuts) parameters.append("threshold", cut);
     if (this.heat) parameters.set("heat", "1");
@@ -109,7 +113,8 @@ export class Ask {
   parameters(question, more = {}) {
     const asked = new URLSearchParams({ lift: this.lift.id, threshold: question.threshold, ...more });
     for (const name of ["text", "like", "unlike"]) for (const term of question[name]) asked.append(name, term);
-    for (const text of split(at("but").value)) asked.append("negatives", text);
+    for (const text of this.negatives) asked.append("negatives", text);
+    if (question.threshold !== "auto" && !question.answer?.present) asked.set("absent", "keep"); // its cut holds all the same
     return asked;
   }
 
@@ -193,6 +198,19 @@ export class Ask {
     this.bars();
     clearTimeout(this.soon);
     this.soon = setTimeout(() => this.things(question), SOON);
+  }
+
+  // What is not there has no cut of its own: its best hundredth is shown.
+  nearest() {
+    const { now } = this;
+    now.anyway = true;
+    if (now.answer.present === false) {
+      now.cut = now.threshold = now.answer.statistics.q99;
+      now.count = countFrom(now.scores, now.cut);
+    }
+    this.show();
+    this.changed();
+    this.things(now);
   }
 
   automatic() {
@@ -298,7 +316,7 @@ export class Ask {
       at("why").textContent = "";
     } else if (!lit(now) && answer.present === false) {
       at("answer").textContent = `${quoted(now)} is not here.`;
-      at("why").textContent = answer.why;
+      at("why").textContent = reason(answer);
     } else if (!lit(now)) {
       at("answer").textContent = `Nothing stands apart for ${quoted(now)}.`;
       at("why").textContent = "Other words may help, or a click on an example.";
@@ -336,8 +354,10 @@ export const label = question => question.text.join(", ") || (question.like.leng
 const quoted = question => (question.text.length ? `\u201c${question.text.join(", ")}\u201d` : "Such a thing");
 const measures = ({ low, high }) => ` ${low.map((value, axis) => (high[axis] - value).toPrecision(2)).join(" \u00d7 ")}`;
 
+const reason = ({ why }) => why.replace(/^(?:'.*?'|".*?") is not there: (.)/, (_, first) => first.toUpperCase());
+
 function decided({ answer, threshold, anyway }) {
-  if (answer.present === false && threshold === "auto") return `This is what comes closest. ${answer.why}`;
+  if (answer.present === false) return `It is not here; this is what comes closest. ${reason(answer)}`;
   if (!answer.clear && threshold === "auto" && anyway) return "This is what comes closest; it hardly stands apart from the rest.";
   if (threshold !== "auto") return "You set this cut. The dashes mark the automatic one.";
   const how = /least, in log-odds/.test(answer.threshold.explanation)

@@ -2,7 +2,10 @@
 import { ago, at, count, el, tell, twice } from "./dom.js";
 import { patch, remove, words } from "./service.js";
 
-export const title = lift => lift.name || `${count(lift.count)} splats, ${lift.text_space === "none" ? "no words" : lift.text_space || "own words"}, ${ago(lift.created)}`;
+export const title = lift => lift.name || `${count(lift.count)} splats, ${ago(lift.created)}, ${space(lift)}`;
+
+const SPACES = { none: "no words", prompts: "own words", "": "words of no known encoder" };
+const space = ({ text_space: name }) => SPACES[name] || `words of ${name}`;
 
 export class Lifts {
   // opened: with the lift to show; changed: after one was named or deleted.
@@ -18,7 +21,7 @@ export class Lifts {
     at("lifts").replaceChildren(...lifts.map(lift => el("li", { className: lift.id === open ? "now" : "" },
       el("input", { type: "text", className: "name", value: lift.name || "", maxLength: 100, placeholder: "Give it a name", "aria-label": `Name of the lift of ${ago(lift.created)}`,
         on: { change: event => this.name(lift, event.target.value.trim()) } }),
-      el("span", { className: "state" }, `${count(lift.count)} splats \u00b7 ${lift.view_count} views \u00b7 ${lift.text_space === "none" ? "no words" : lift.text_space || "own words"} \u00b7 ${ago(lift.created)}`),
+      el("span", { className: "state" }, `${count(lift.count)} splats \u00b7 ${lift.view_count} views \u00b7 ${space(lift)} \u00b7 ${ago(lift.created)}`),
       el("span", { className: "actions" },
         lift.id === open ? el("span", { className: "quiet" }, "Open") : el("button", { type: "button", on: { click: () => this.opened(lift.id) } }, "Open"),
         twice("Delete", () => remove(`/jobs/${lift.id}?with_lift=true`).then(() => this.changed()))))));

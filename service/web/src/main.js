@@ -27,7 +27,7 @@ const look = new Look({ changed: () => { repaint(); link(); }, fly: view => view
 const take = new Take({ ask, look, shot });
 const bring = new Bring({ opened: id => open(id, true), gone: () => refreshLifts(), open: () => lift?.id ?? null, raised: () => tab("bring") });
 const lifts = new Lifts({ opened: id => open(id, true), changed: () => refreshLifts() });
-const things = new Things({ changed: () => repaint(), fly: box => viewer?.toBox(box) });
+const things = new Things({ changed: () => repaint(), fly: (box, view) => (look.mode === "view" ? look.go(view) : viewer?.toBox(box, look.views.find(({ name }) => name === view))) });
 
 look.asked = view => {
   const question = ask.painted().length ? ask.now : null;
@@ -69,14 +69,17 @@ function labels(boxes) {
   }, box.of > 1 ? `${box.name} ${box.thing + 1}` : box.name)));
 }
 
-// After each frame: labels lie at the top of their boxes as these are seen.
+// After each frame: labels lie at the top of their boxes as these are seen, whole where a part of the box is.
 function placed(place) {
   for (const shown of at("labels").children) {
     const [low, high] = JSON.parse(shown.dataset.box);
     const corners = [0, 1, 2, 3, 4, 5, 6, 7].map(which => place([0, 1, 2].map(axis => (which >> axis & 1 ? high : low)[axis])));
-    const x = (Math.min(...corners.map(corner => corner.x)) + Math.max(...corners.map(corner => corner.x))) / 2;
-    const y = Math.min(...corners.map(corner => corner.y));
     shown.hidden = corners.some(corner => !corner.before);
+    const [left, right] = [Math.min(...corners.map(corner => corner.x)), Math.max(...corners.map(corner => corner.x))];
+    const { clientWidth: width } = at("labels");
+    const half = shown.offsetWidth / 2 + 4;
+    const x = right < 0 || left > width ? (left + right) / 2 : Math.max(half, Math.min(width - half, (left + right) / 2));
+    const y = Math.min(...corners.map(corner => corner.y));
     shown.style.transform = `translate(-50%, -100%) translate(${x.toFixed(1)}px, ${Math.max(18, y - 4).toFixed(1)}px)`;
   }
 }

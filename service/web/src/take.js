@@ -31,24 +31,46 @@ export class Take {
   show() {
     const { now, lift } = this.ask;
     const ready = Boolean(now?.answer && lift);
+    at("lift-file").replaceChildren(lift ? el("button", { type: "button", on: { click: () => save(`/lifts/${lift.id}/features`).catch(problem => tell(words(problem), true)) } },
+      `Lift file (${(lift.bytes / 1e6).toFixed(1)} MB)`) : "");
     at("take-none").hidden = ready;
     at("take-question").hidden = !ready;
     if (!ready) return;
     const key = keyOf() ? ' -H "Authorization: Bearer $KEY"' : "";
     const asked = [...this.ask.parameters(now)].map(([name, value]) => ` \\\n  --data-urlencode ${quote(`${name}=${value}`)}`).join("");
-    at("curl").textContent = `curl -fsSG${key} ${location.origin}/query${asked}`;
-    const terms = [...now.text, ...now.like].map(term => JSON.stringify(term)).join(", ");
-    const cut = now.threshold === "auto" ? "" : `, threshold=${now.threshold}`;
-    at("python").textContent = now.text.length && !now.like.length && !now.unlike.length && lift.text_space === "minilm"
-      ? ["import liftcore as lc", "from liftcore.query.text import open_encoder", "",
-        `lift = lc.load_lift("lift-${lift.id}.safetensors")`, `words = open_encoder("minilm").encode([${terms}])`,
-        `found = lift.query(words${cut})`, "print(found.splats.sum(), found.explanation)"].join("\n")
-      : ["import httpx", "", `asked = ${JSON.stringify(Object.fromEntries(["text", "like", "unlike"].map(name => [name, now[name]])))}`,
-        `asked |= {"lift": "${lift.id}", "threshold": ${JSON.stringify(now.threshold)}}`,
-        `found = httpx.post("${location.origin}/query", json=asked).json()`, 'print(found["count"], found["threshold"])'].join("\n");
-    at("lift-file").replaceChildren(el("button", { type: "button", on: { click: () => save(`/lifts/${lift.id}/features`).catch(problem => tell(words(problem), true)) } },
-      `Lift file (${(lift.bytes / 1e6).toFixed(1)} MB)`));
+    at("curl").textContent = `curl -fsSG${key} ${address()}${asked}`;
+    at("python").textContent = (local(now) ? ofFile : overHttp)(this.ask.parameters(now), now.answer.encoder).join("\n");
   }
+}
+
+// Encoders that open on any machine by their name alone; `prompts` are the lift's own words.
+const local = ({ text, like, unlike, answer }) => text.length && !like.length && !unlike.length && ["lvis", "minilm", "prompts"].includes(answer.encoder);
+const address = () => new URL("query", document.baseURI); // also behind a proxy's prefix
+const list = terms => `[${terms.map(term => JSON.stringify(term)).join(", ")}]`;
+
+const TERMS = ["text", "like", "unlike", "negatives"];
+
+// The question in Python, of the lift file.
+function ofFile(asked, encoder) {
+  const vectors = name => (encoder === "prompts" ? list(asked.getAll(name)) : `words.encode(${list(asked.getAll(name))})`);
+  const given = [vectors("text"), asked.has("negatives") && vectors("negatives"), asked.get("threshold") !== "auto" && `threshold=${asked.get("threshold")}`,
+    asked.has("absent") && 'absent="keep"'].filter(Boolean).join(", ");
+  const open = encoder === "prompts" ? [] : ["from liftcore.query.text import open_encoder"];
+  const words = encoder === "prompts" ? [] : [`words = open_encoder("${encoder}")`];
+  return ["import liftcore as lc", ...open, "", `lift = lc.load_lift("lift-${asked.get("lift")}.safetensors")`, ...words,
+    `found = lift.query(${given})`, "print(int(found.splats.sum()), found.why, found.explanation)"];
+}
+
+// The same, of this service.
+function overHttp(asked) {
+  const cut = asked.get("threshold");
+  const told = [["lift", JSON.stringify(asked.get("lift"))], ...TERMS.filter(name => asked.has(name)).map(name => [name, list(asked.getAll(name))]),
+    ["threshold", cut === "auto" ? '"auto"' : cut], ...(asked.has("absent") ? [["absent", '"keep"']] : [])];
+  const key = keyOf();
+  return [...(key ? ["import os", ""] : []), "import httpx", "", `asked = {${told.map(([name, value]) => `"${name}": ${value}`).join(", ")}}`,
+    ...(key ? [`headers = {"Authorization": f"Bearer {os.environ['KEY']}"}`] : []),
+    `found = httpx.post("${address()}", json=asked${key ? ", headers=headers" : ""}).raise_for_status().json()`,
+    'print(found["count"], found["why"], found["threshold"])'];
 }
 
 async function copied(text) {

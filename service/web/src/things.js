@@ -6,9 +6,9 @@ const MOST = 100; // things in the list
 const COLOUR = "#ffffff";
 
 export class Things {
-  // changed: when the chosen box must follow; fly: with a box to look at; named: with the words of a thing to ask for.
-  constructor({ changed, fly, named }) {
-    Object.assign(this, { changed, fly, named, found: [], chosen: null });
+  // changed: when the chosen box must follow; fly: with a box to look at, and the view that shows most of it.
+  constructor({ changed, fly }) {
+    Object.assign(this, { changed, fly, found: [], chosen: null });
   }
 
   async of(lift) {
@@ -16,8 +16,9 @@ export class Things {
     this.show();
     if (!lift?.links.objects) return; // of a lift from before there were any
     try {
-      const named = ["", "none", null].includes(lift.text_space) ? "" : "&encoder=default";
-      const { objects } = await json(`/lifts/${lift.id}/objects?limit=${MOST}${named}`).catch(() => json(`/lifts/${lift.id}/objects?limit=${MOST}`));
+      const route = `/lifts/${lift.id}/objects?limit=${MOST}`;
+      const named = `${route}&encoder=${encodeURIComponent(lift.text_space)}`; // refused where that space has no table of words
+      const { objects } = lift.text_space === "none" ? await json(route) : await json(named).catch(() => json(route));
       if (lift === this.lift) this.found = objects;
     } catch { /* asked in words all the same */ }
     this.show();
@@ -44,7 +45,7 @@ export class Things {
     this.chosen = thing === this.chosen ? null : thing;
     this.show();
     this.changed();
-    if (this.chosen) this.fly(thing.box);
+    if (this.chosen) this.fly(thing.box, thing.views[0]);
   }
 }
 

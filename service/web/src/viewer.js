@@ -185,14 +185,16 @@ export class Viewer {
     this.go(pose.position, target, quick);
   }
 
-  // Keep the direction, and look at a box or a point.
-  toBox({ low, high }) {
+  // Look at a box or a point: from where one is, or from a view that shows it. That view itself shows a box which no
+  // picture nearer by would hold.
+  toBox({ low, high }, view = null) {
     const box = new THREE.Box3(new THREE.Vector3(...low), new THREE.Vector3(...high));
     const sphere = box.getBoundingSphere(new THREE.Sphere());
-    const back = this.camera.position.clone().sub(this.controls.target).normalize();
+    const away = view ? poseOf(view).position.sub(sphere.center) : this.camera.position.clone().sub(this.controls.target);
     const angle = this.camera.fov * Math.PI / 360;
     const far = 1.9 * Math.max(sphere.radius, this.reach / 100) / Math.sin(Math.min(angle, Math.atan(Math.tan(angle) * this.camera.aspect)));
-    this.go(sphere.center.clone().addScaledVector(back, far), sphere.center);
+    if (view && far > away.length()) return this.to(view);
+    this.go(sphere.center.clone().addScaledVector(away.normalize(), far), sphere.center);
   }
 
   toPoint(point) {
