@@ -8,7 +8,7 @@ from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from liftcore.errors import InvalidPhotos, NotFound
+from liftcore.errors import InvalidCameras, InvalidPhotos, NotFound
 from liftcore.scene.views import cameras_of_views, view_names
 
 MOST = 10_000  # photos in a zip
@@ -35,6 +35,8 @@ def describe_photos(path: Path) -> dict[str, Any]:
             _require_bounds(entries, members, path.stat().st_size)
             for member in members.values():
                 _require_photo(archive, member)
+    except InvalidCameras as error:  # of names, which are those of views
+        raise InvalidPhotos("image name", expected=error.expected, got=error.got) from None
     except (zipfile.BadZipFile, NotImplementedError, EOFError, OSError, ValueError) as error:
         raise InvalidPhotos("photos", expected=EXPECTED, got=f"{error}"[:200] or "a damaged one") from None
     others = len(entries) - len(members)

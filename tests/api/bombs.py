@@ -6,6 +6,7 @@ import io
 import json
 import struct
 import zipfile
+import zlib
 from typing import Any
 
 from .tiny_scene import cameras_document, cameras_json
@@ -142,7 +143,29 @@ WORDS = {
 }
 
 
-CORPUS = {"splats": splats, "cameras": cameras, "features": features, "masks": masks, "table": table}
+def photos() -> dict[str, bytes]:
+    """Zips of photos that are none, too many, or larger than they look."""
+
+    def png(side: int) -> bytes:
+        head = b"IHDR" + struct.pack(">IIBBBBB", side, side, 8, 2, 0, 0, 0)
+        return b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + head + struct.pack(">I", zlib.crc32(head))
+
+    return {
+        "no zip": b"photos",
+        "nothing": zipped([]),
+        "no photo": zipped([("notes.txt", b"x")]),
+        "zeros": zip_of_zeros(("a.png", png(2)), "b.jpg", 200),
+        "many": zipped([(f"{number}.jpg", b"") for number in range(10_001)]),
+        "sides": zipped([("a.png", png(1_000_000))]),
+        "another format": zipped([("a.jpg", png(2))]),
+        "cut": zipped([("a.png", png(2))])[:-9],
+        "a name of two lines": zipped([("a\n.png", png(2))]),
+    }
+
+
+CORPUS = {
+    "splats": splats, "cameras": cameras, "features": features, "masks": masks, "table": table, "photos": photos
+}  # fmt: skip
 
 
 def zipped(members: list[tuple[str, bytes]]) -> bytes:

@@ -23,7 +23,7 @@ from .bombs import camera_documents, features
 from .tiny_scene import TinyScene, colmap_zip, labels, make_scene, masks
 
 ROOT = Path(__file__).parents[2]
-BOMBS = {"splats": 10, "cameras": 23, "features": 18, "masks": 22, "table": 26}  # how many there are
+BOMBS = {"splats": 10, "cameras": 23, "features": 18, "masks": 22, "table": 26, "photos": 9}  # how many there are
 MEMORY_BYTES = 1 << 30  # private memory for the whole corpus of a kind, made and read in one process
 SECONDS = 300  # for the same; it takes a few, and the machine may be busy
 ALL_IN_ONE_PROCESS = """
