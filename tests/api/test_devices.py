@@ -80,6 +80,7 @@ def test_job_that_meets_no_card_fails_in_words(tmp_path: Path, monkeypatch: pyte
     order = {
         "kind": "lift", "splats": "s", "cameras": "c", "features": ["f"], "settings": {"device": "cuda"},
         "threads": 1, "work": str(tmp_path), "checkpoint_seconds": 1, "output": str(tmp_path / "o"), "names": {},
+        "engine": None,
     }  # fmt: skip
     told = child.run(order, Reporter(io.BytesIO()))
     assert told == {"event": "fault", "fault": fault_of(LACK)}

@@ -422,4 +422,4 @@ def test_notice_is_kept_while_nobody_hurries() -> None:
 
     stopping = Stopping(EventStreams(1, 1), cast("Supervisor", Idle()), notice_seconds=0.5)
     anyio.run(stopping.begin, hurried)
-    assert stopping.begun and len(asked) > 1
+    assert stopping.begun and asked

@@ -30,6 +30,7 @@ ROUTES = {
     "/assets/{asset}/content",
     "/assets/{asset}/names",
     "/lift",
+    "/lift/plan",
     "/jobs",
     "/jobs/{job}",
     "/jobs/{job}/events",
@@ -43,6 +44,7 @@ ROUTES = {
     "/lifts/{lift}/features",
     "/lifts/{lift}/splats",
     "/lifts/{lift}/colours",
+    "/lifts/{lift}/photo",
     "/lifts/{lift}/views",
     "/lifts/{lift}/objects",
     "/lifts/{lift}/objects/{thing}/splats",
@@ -52,6 +54,11 @@ ROUTES = {
     "/query/mask",
     "/query/attention",
     "/query/splats",
+    "/query/segment",
+    "/query/segment/labels",
+    "/query/segment/map",
+    "/query/segment/picture",
+    "/query/what",
     "/render",
 }
 NOBODY = "0" * 32

@@ -6,6 +6,7 @@ splats are loaded. Drawing itself is the card's; here it is software, and not co
 
 from __future__ import annotations
 
+import argparse
 import statistics
 import tempfile
 import time
@@ -47,6 +48,7 @@ SCENE = """(async count => {
 
 def main() -> None:
     """Print the table."""
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     scene = make_scene()
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / "table.safetensors").write_bytes(scene.table)

@@ -54,7 +54,7 @@ def test_what_belongs_together_is_healthy(scene: StillLife, photos, grids) -> No
     assert found.wrong == () and found.notes == ()
     assert {view.view for view in found.views} == set(scene.cameras) and found.in_view > 0.9
     assert all(view.psnr and view.others and view.psnr > 30 > view.others for view in found.views)
-    assert found.features["neighbours"] > found.features["[F, h, w]"] and found.worst is not None
+    assert found.features["neighbouring_cells"] > found.features["[F, h, w]"] and found.worst is not None
 
 
 def test_cameras_of_another_scale_are_told_by_the_photos(scene: StillLife, photos) -> None:
