@@ -134,7 +134,10 @@ def test_odd_bodies_are_refused_as_problems(client: TestClient, routes: dict[str
     for path, taken in routes.items():
         for body in ODD_BODIES if "POST" in taken else ():
             reply = client.post(address(path), content=body, headers={"Content-Type": media})
-            if path.startswith("/query/segment") and reply.status_code == 200:  # which needs not be told anything
+            nothing_said = path.startswith("/query/segment") and body.endswith(
+                b"{}"
+            )  # which needs not be told anything
+            if nothing_said and media == "application/json" and reply.status_code == 200:
                 continue
             assert assert_problem(reply)["status"] in (400, 404, 415, 422), (path, media, body[:40])
 
