@@ -645,7 +645,7 @@ class SceneObject(BaseModel):
     splats: int = Field(description="how many")
     share: float = Field(description="of the evidence of all splats")
     centre: list[float] = Field(description="the middle of its box: x y z, frame of the splat file")
-    box: Box = Field(description="of its splats' centres, but for a thousandth of the evidence at each end")
+    box: Box = Field(description="of its largest group of splats that touch, without outliers elsewhere")
     views: list[str] = Field(description="that show most of it, the best first")
     feature: list[float] | None = Field(description="with features=true: the mean of its unit features [F], unit")
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from liftcore.errors import InvalidQuery, NotFound
-from liftcore.query.objects import trimmed_box
+from liftcore.query.objects import largest_box
 from liftcore.query.scene import QueryScene, as_numpy
 from liftcore.query.scores import cosines, norms_of
 
@@ -42,7 +42,7 @@ class SceneObject:
     splats: int  # how many
     share: float  # of the evidence of all splats
     centre: Point  # the middle of its box, frame of the splat file, scene units
-    box: tuple[Point, Point]  # least and greatest corner of its splats' centres, but for a thousandth at each end
+    box: tuple[Point, Point]  # of its largest group of splats that touch (`largest_box`)
     views: tuple[str, ...]  # that show most of it, the best first
 
 
@@ -73,12 +73,12 @@ def catalogue(scene: QueryScene, words: Sequence[str] = (), vectors: Any = None)
     order = np.argsort(labels, kind="stable")
     ends = np.searchsorted(labels[order], np.arange(number + 1))
     evidence = scene.evidence.astype(np.float64)
-    whole, means, known = evidence.sum() or 1.0, as_numpy(scene.splats.means), scene.metadata.views
+    whole, known = evidence.sum() or 1.0, scene.metadata.views
     found = []
     for one in range(number):
         rows = order[ends[one] : ends[one + 1]]
         weights = evidence[rows] if evidence[rows].any() else np.ones(rows.size)
-        box = trimmed_box(means[rows], weights)
+        box = largest_box(scene.splats, rows, weights)
         x, y, z = np.mean(box, axis=0).tolist()
         found.append(
             SceneObject(

@@ -152,6 +152,20 @@ def _covariances(splats: "Splats", rows: np.ndarray) -> np.ndarray:
     return np.stack([product.sum(axis=0) for product in products], axis=1)
 
 
+def largest_box(splats: "Splats", rows: np.ndarray, weights: np.ndarray) -> "tuple[Point, Point]":
+    """The box of one thing without its strays: `trimmed_box` of the group of touching splats with the most weight.
+
+    Args:
+        splats: the scene. rows: [n] i64, at least one; more than are grouped have the box of all. weights: [n].
+    """
+    means = as_numpy(splats.means)[rows]
+    if len(rows) > MOST_SPLATS:
+        return trimmed_box(means, weights)
+    groups = touching(splats, rows)
+    inside = groups == np.bincount(groups, weights).argmax()
+    return trimmed_box(means[inside], weights[inside])
+
+
 def trimmed_box(means: np.ndarray, weights: np.ndarray) -> "tuple[Point, Point]":
     """The corners between which all but a thousandth of the weight at each end lies, axis by axis.
 

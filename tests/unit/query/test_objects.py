@@ -62,6 +62,11 @@ def test_single_splats_elsewhere_are_strays_and_stretch_no_box(scene: QueryScene
     assert with_stray.numbers[2 * SPLATS_A_CLUSTER] == -1
     assert with_stray.found[0].box == alone.found[0].box
     assert with_stray.found[0].share < alone.found[0].share == 1.0
+    cluster = np.arange(SPLATS_A_CLUSTER)  # likewise of a thing that is given
+    box = module.largest_box(scene.splats, cluster, np.ones(len(cluster)))
+    strayed = np.append(cluster, 2 * SPLATS_A_CLUSTER)
+    assert module.largest_box(scene.splats, strayed, np.ones(len(strayed))) == box
+    assert module.trimmed_box(scene.splats.means.numpy()[strayed], np.ones(len(strayed))) != box
 
 
 def test_who_keeps_the_largest_gets_it_alone_also_as_a_file(scene: QueryScene) -> None:
