@@ -42,6 +42,8 @@ if TYPE_CHECKING:
     from liftcore.lifting import plan as plan
     from liftcore.operators import region_weights as region_weights
     from liftcore.operators import render as render
+    from liftcore.planning.photos import PhotoPlan as PhotoPlan
+    from liftcore.planning.photos import plan_photos as plan_photos
     from liftcore.planning.plan import Plan as Plan
     from liftcore.query.ask import VectorAnswer as VectorAnswer
     from liftcore.query.catalogue import Catalogue as Catalogue
@@ -72,6 +74,8 @@ _PUBLIC = {  # name -> the module that defines it
     "lift": "liftcore.lifting",
     "plan": "liftcore.lifting",
     "Plan": "liftcore.planning.plan",
+    "plan_photos": "liftcore.planning.photos",
+    "PhotoPlan": "liftcore.planning.photos",
     "LocalEngine": "liftcore.engine.base",
     "RayEngine": "liftcore.engine.ray",
     "LiftResult": "liftcore.result",
@@ -117,6 +121,7 @@ __all__ = [
     "NamedSplats",
     "NotFound",
     "Objects",
+    "PhotoPlan",
     "Plan",
     "RayEngine",
     "RegionWeights",
@@ -130,6 +135,7 @@ __all__ = [
     "lift",
     "load_lift",
     "plan",
+    "plan_photos",
     "read_cameras",
     "read_features",
     "read_splats",

@@ -48,11 +48,15 @@ def shared_options() -> Parser:
     return shared
 
 
-def add_sources(parser: argparse.ArgumentParser) -> None:
-    """Splats, cameras and feature packs."""
+def add_sources(parser: argparse.ArgumentParser, features: str = "+", without: str = "") -> None:
+    """Splats, cameras and feature packs.
+
+    Args:
+        features: how many, as argparse says it. without: what happens where there is none.
+    """
     parser.add_argument("splats", type=Path, help="trained splats (.ply, .splat, .spz, .sog, or a checkpoint)")
     parser.add_argument("cameras", type=Path, help="COLMAP folder or .zip, transforms.json or cameras.json")
-    parser.add_argument("features", type=Path, nargs="+", help="feature packs (.safetensors)")
+    parser.add_argument("features", type=Path, nargs=features, help=f"feature packs (.safetensors){without}")
 
 
 def add_settings(parser: argparse.ArgumentParser) -> None:

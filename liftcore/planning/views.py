@@ -36,7 +36,7 @@ Vectors are compared in PILOT_CHANNELS random projections.
 
 import heapq
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -157,18 +157,30 @@ def view_order(seen: Visibility) -> Iterator[int]:
         before = places[view]
         return float((np.sqrt(held[before] + added[view]) - roots[before]).sum(dtype=np.float64))
 
-    queue = [(-gain(view), view) for view in range(len(shown))]
+    def take(view: int) -> None:
+        held[places[view]] += added[view]
+        roots[places[view]] = np.sqrt(held[places[view]])
+
+    return greedy(len(shown), gain, take)
+
+
+def greedy(count: int, gain: Callable[[int], float], take: Callable[[int], None]) -> Iterator[int]:
+    """All numbers below ``count``, each next the one with the largest gain, of equal ones the first.
+
+    Args:
+        gain: of a number, beside what was taken; it never grows. take: called with each number as it is taken.
+    """
+    queue = [(-gain(number), number) for number in range(count)]
     heapq.heapify(queue)
     while queue:
-        _, view = queue[0]
-        now = (-gain(view), view)
+        _, number = queue[0]
+        now = (-gain(number), number)
         if len(queue) > 1 and now > min(queue[1:3]):
             heapq.heapreplace(queue, now)
             continue
         heapq.heappop(queue)
-        held[places[view]] += added[view]
-        roots[places[view]] = np.sqrt(held[places[view]])
-        yield view
+        take(number)
+        yield number
 
 
 def side_of(directions: np.ndarray) -> np.ndarray:
