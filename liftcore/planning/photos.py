@@ -110,7 +110,7 @@ def plan_photos(
         InvalidCameras: there is no camera.
         InvalidSettings: ``antialiased`` does not suit the splats' kernel.
     """
-    settings = settings or LiftSettings()
+    settings = settings or LiftSettings.of()
     check_antialiased(splats.kernel, settings.antialiased)
     known = cameras if isinstance(cameras, Cameras) else Cameras(cameras)
     views = list(known.values())[:: settings.view_stride]
