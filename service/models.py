@@ -437,9 +437,9 @@ Example = Annotated[
 ViewName = Annotated[str, Field(min_length=1, max_length=VIEW_CHARACTERS, description="the name of a camera")]
 Coordinate = Annotated[float, Field(allow_inf_nan=False), NoBoolean]
 Pixels = Annotated[int, Field(ge=1, le=MAX_SIDE), NoBoolean]
-Number = Annotated[float, Field(ge=-1e6, le=1e6), NoBoolean]  # which NaN is not
+Score = Annotated[float, Field(ge=-1, le=1), NoBoolean]  # a cosine, which NaN is not
 Method = Literal["auto", "valley", "paper", "otsu", "stability"]
-Cut = Annotated[Method | Number, takes(f"{', '.join(get_args(Method))}, or a number from -1e6 to 1e6")]
+Cut = Annotated[Method | Score, takes(f"{', '.join(get_args(Method))}, or a number from -1 to 1")]
 Count = Annotated[int, Field(ge=1, le=100), NoBoolean]
 Top = Annotated[int, Field(ge=0, le=1000), NoBoolean]
 
@@ -486,7 +486,7 @@ class Question(LiftQuestion):
     text: Texts = Field([], description="what to look for; may be given several times, 4000 characters in all")
     negatives: Texts = Field([], description="what it is not; likewise")
     threshold: Cut = Field("auto", description="how to find it, or the score from which a splat counts as found")
-    instances: Count | None = Field(None, description="how many there are, if you know")
+    instances: Count | None = Field(None, description="how many there are: so many objects are kept, the best")
     keep: Literal["all", "largest"] = Field("all", description="of what was found, in masks, splats and objects")
     absent: Literal["drop", "keep"] = Field(
         "drop", description="words for what is not there: select nothing for them, or what is most like them"

@@ -51,7 +51,7 @@ def add_arguments(parser: Parser) -> None:
     add_encoder(parser)
     add_negative(parser, ", so TEXT goes before it")
     parser.add_argument("--threshold", default="auto", metavar="T", help=THRESHOLDS)
-    parser.add_argument("--instances", type=count, metavar="N", help="how many there are, if you know")
+    parser.add_argument("--instances", type=count, metavar="N", help="how many there are: the N best are kept")
     keep = "of what was found, all or the largest alone: in the mask, in --object and in --objects"
     parser.add_argument("--keep", choices=("all", "largest"), default="all", help=keep)
     absent = "of a word for what is not there, drop it and select nothing, or keep what is most like it"

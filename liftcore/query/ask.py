@@ -150,7 +150,7 @@ def query_vectors(
         positives: [n, F] or [F], torch or numpy, what is looked for; rows of any length above zero; or words.
         negatives: [m, F], or words, what takes away from the scores (`scores.combine`).
         splats: that were lifted; with them the answer has objects.
-        threshold, instances: as in `find_threshold`. keep: of the objects, all or the largest.
+        threshold: as in `find_threshold`. instances: keep so many objects, the best. keep: all or the largest.
         absent: drop what is not there, so that nothing is selected, or keep what is most like it.
         references: [n, F], the vectors of 200 words or more, by which presence is known; None = those of the lift's
             text space, where it has some (`liftcore.query.presence`).
@@ -258,7 +258,7 @@ def _answer(scene: QueryScene, asked: Question, similarities: np.ndarray) -> Ans
         scores = np.where(seen, scores, np.float32(LOWEST_COSINE))
     known = scores if scene.all_seen else scores[seen]
     least = -math.inf if (asked.plain & kept)[: len(query.positives)].any() else LEAST_LIKENESS
-    found = find_threshold(known, query.threshold, scene.weights, query.instances, least)
+    found = find_threshold(known, query.threshold, scene.weights, least)
     if presence.present is False and query.absent == "drop":
         found = replace(found, value=math.inf, explanation=presence.why, clear=False)
     return Answer(

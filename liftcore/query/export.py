@@ -12,18 +12,18 @@ import numpy as np
 from liftcore.errors import InvalidQuery
 from liftcore.query.ask import Answer
 from liftcore.query.colours import NOT_SEEN_COLOUR, cluster_colours, heat_colours
-from liftcore.query.objects import objects
+from liftcore.query.objects import MOST_SPLATS, objects
 from liftcore.query.scene import QueryScene, as_numpy
 
 
 def object_splats(scene: QueryScene, answer: Answer, suffix: str = ".ply") -> Iterable[bytes]:
-    """The splats that were selected, as a file in blocks: a PLY with every property to the byte, .splat or .spz.
+    """The splats of an answer's objects, as a file in blocks: a PLY with every property to the byte, .splat or .spz.
 
-    A query that keeps the largest gets the largest object alone (`objects`).
+    They are those that `objects` and masks show, without strays; of more than are grouped, all that were selected.
 
     Raises:
         InvalidQuery: none was selected, or nothing asked for is there: most viewers open no file without splats; or
-            more were selected than objects are made of.
+            some objects are to be kept, and more were selected than objects are made of.
         InvalidLift: the splats moved or changed since the lift.
     """
     from liftcore.io.splats import some_rows
@@ -38,8 +38,8 @@ def object_splats(scene: QueryScene, answer: Answer, suffix: str = ".ply") -> It
             got=f"none of {len(answer.scores)}: nothing stands out",
             hint="name a lower threshold, or ask in other words or by example",
         )
-    largest = answer.query.keep == "largest"
-    return some_rows(scene.splat_file, objects(scene, answer).numbers == 0 if largest else answer.selected, suffix)
+    whole = answer.count > MOST_SPLATS and not answer.query.keeps_some
+    return some_rows(scene.splat_file, answer.selected if whole else objects(scene, answer).numbers >= 0, suffix)
 
 
 def coloured_ply(scene: QueryScene, answer: Answer) -> Iterable[bytes]:

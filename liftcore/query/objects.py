@@ -50,7 +50,8 @@ def objects(scene: QueryScene, answer: "Answer") -> Objects:
 
     Things are splats that touch (`touching`). What has less than a twentieth of the evidence of the largest is no
     thing but strays: single splats and specks whose scores happen to reach the threshold, anywhere in the scene. A
-    query that keeps the largest has one object, and all else are strays.
+    query that knows how many instances there are has so many objects at most, those of the highest scores, and one
+    that keeps the largest has one; all else are strays.
 
     Raises:
         InvalidQuery: more splats were selected than are grouped.
@@ -68,12 +69,15 @@ def objects(scene: QueryScene, answer: "Answer") -> Objects:
     groups = touching(scene.splats, rows)
     sums = np.bincount(groups, weights)
     order = np.argsort(-sums, kind="stable")
-    large = 1 if answer.query.keep == "largest" else int((sums >= LEAST_EVIDENCE * sums.max()).sum())
+    kept = order[: 1 if answer.query.keep == "largest" else int((sums >= LEAST_EVIDENCE * sums.max()).sum())]
+    if answer.query.instances is not None and len(kept) > answer.query.instances:
+        scores = np.bincount(groups, weights * answer.scores[rows])[kept] / sums[kept]
+        kept = kept[np.sort(np.argsort(-scores, kind="stable")[: answer.query.instances])]
     places = np.full(len(sums), -1, np.int32)
-    places[order[:large]] = np.arange(large)
+    places[kept] = np.arange(len(kept))
     numbers[rows] = places[groups]
     means, found = as_numpy(scene.splats.means), []
-    for number in range(large):
+    for number in range(len(kept)):
         inside = numbers[rows] == number
         box = trimmed_box(means[rows[inside]], weights[inside])
         found.append(

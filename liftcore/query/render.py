@@ -61,7 +61,7 @@ def view_mask(
 
     The mask is ``A m >= A 1 / 2``, with m = 1 for the splats of the answer's objects: what was found in the scene,
     where nothing hides it. It has no threshold of its own, so a view that does not see it has an empty mask. Of more
-    than 131,072 selected splats strays are not told apart, unless the query keeps the largest object.
+    than 131,072 selected splats strays are not told apart, unless the query keeps some of the objects.
 
     Args:
         scene: the opened lift. answer: of that lift.
@@ -74,7 +74,7 @@ def view_mask(
         InvalidLift: the splats or the cameras moved or changed since the lift.
     """
     camera = scene.camera(view)  # a name that is not there is told before anything is grouped
-    if answer.count > MOST_GROUPED and answer.query.keep == "all":
+    if answer.count > MOST_GROUPED and not answer.query.keeps_some:
         members, shown = answer.selected, f"all {answer.count} selected splats, too many to tell strays apart"
     else:
         found = group(scene, answer)

@@ -24,6 +24,7 @@ NOTATIONS = "VIEW:x,y, region:VIEW:LEVEL:ID or splat:J"
 KEPT = ("all", "largest")
 ABSENT = ("drop", "keep")
 MOST_TERMS = 64  # for and against together
+MOST_INSTANCES = 100
 _PIXEL = re.compile(r"(.+):\s*(-?\d{1,9})\s*,\s*(-?\d{1,9})\s*", re.ASCII | re.DOTALL)
 _REGION = re.compile(r"region:(.+):(\d{1,9}):(\d{1,9})", re.ASCII | re.DOTALL)
 _SPLAT = re.compile(r"splat:(\d{1,18})", re.ASCII)
@@ -91,7 +92,7 @@ class Query:
     positives: tuple[Term, ...]
     negatives: tuple[Term, ...] = ()
     threshold: str | float = "auto"  # a method of liftcore.query.threshold, or a number on the scores
-    instances: int | None = None  # how many there are, where the user knows
+    instances: int | None = None  # how many there are, where the user knows: so many objects are kept, the best
     keep: str = "all"  # of the objects that are found: all, or the largest alone
     absent: str = "drop"  # words for what is not there: drop them, or keep what is most like them
     names: tuple[str, ...] = ()  # what errors call each of the terms; () = what they are themselves
@@ -110,12 +111,19 @@ class Query:
             raise InvalidQuery("keep", expected=f"one of {', '.join(KEPT)}", got=repr(self.keep))
         if self.absent not in ABSENT:
             raise InvalidQuery("absent", expected=f"one of {', '.join(ABSENT)}", got=repr(self.absent))
-        check_method(self.threshold, self.instances)
+        if self.instances is not None and not 1 <= self.instances <= MOST_INSTANCES:
+            raise InvalidQuery("instances", expected=f"1 to {MOST_INSTANCES}", got=str(self.instances))
+        check_method(self.threshold)
 
     @property
     def terms(self) -> tuple[Term, ...]:
         """Positives, then negatives."""
         return (*self.positives, *self.negatives)
+
+    @property
+    def keeps_some(self) -> bool:
+        """Whether some of the objects are kept and others not, as all else than strays is."""
+        return self.keep == "largest" or self.instances is not None
 
     @property
     def texts(self) -> list[str]:

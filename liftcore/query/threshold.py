@@ -27,7 +27,6 @@ BINS = 300  # a multiple of the sweep's 100 steps
 SMOOTHING = BINS / 64  # bins, standard deviation of the Gaussian that removes a histogram's ripples
 LEAST_SHARE = 3e-4  # of the scores: less than this above a threshold is stray (SAM drops masks this small)
 MOST_SHARE = 0.8  # a question that four fifths of a scene answer is rare; .5 to .9 are alike (docs/method.md)
-MOST_INSTANCES = 100  # more hills than a histogram can show
 DEPTH = 0.6  # a valley must fall to this share of its peak, else it is a ripple; tuned on one scene's masks
 # The sweep of Occam's LGS: thresholds in steps, the slope of the share found after a median filter, and how long a
 # stretch, of which slopes and shares, is stable.
@@ -70,31 +69,24 @@ class Histogram:
 Found = tuple[float, str, bool]  # a threshold, a sentence about it, and whether the method found what it looks for
 
 
-def check_method(method: str | float, instances: int | None = None) -> None:
+def check_method(method: str | float) -> None:
     """Refuse a method that `find_threshold` does not know, before any work is done.
 
     Raises:
-        InvalidQuery: an unknown method, a number that is not finite, or instances that no method can count.
+        InvalidQuery: an unknown method, or a number that no score can be.
     """
     if isinstance(method, int | float):
-        if not math.isfinite(method):
-            raise InvalidQuery("threshold", expected="a finite number", got=str(method))
+        if not -1 <= method <= 1:
+            expected = "a number from -1 to 1, as scores are cosines"
+            raise InvalidQuery("threshold", expected=expected, got=f"{method:g}", hint="or leave it out")
     elif method not in METHODS:
         raise InvalidQuery("threshold", expected=f"a number or one of {', '.join(METHODS)}", got=repr(method))
-    if instances is None:
-        return
-    if not 1 <= instances <= MOST_INSTANCES:
-        raise InvalidQuery("instances", expected=f"1 to {MOST_INSTANCES}", got=str(instances))
-    if method not in ("auto", "valley"):
-        hint = "leave the threshold out, or the instances"
-        raise InvalidQuery("instances", expected="threshold auto or valley", got=f"threshold {method}", hint=hint)
 
 
 def find_threshold(
     scores: ArrayLike,
     method: str | float = "auto",
     weights: ArrayLike | None = None,
-    instances: int | None = None,
     least: float = -math.inf,
 ) -> Threshold:
     """A threshold on scores by one of the methods above.
@@ -108,14 +100,12 @@ def find_threshold(
         method: one of ``METHODS``, or a number to use as it is.
         weights: [n] f32, how much each score counts, at least zero: the evidence of splats; None = equally, as the
             pixels of a view do.
-        instances: how many things the user says there are: the valley is then the one below as many hills, counted
-            from the top. With it ``auto`` takes the valley. Only the user can know it; None = not said.
         least: ``auto`` takes no lower score, unless too few lie above it.
 
     Raises:
         InvalidQuery: what `check_method` refuses, or scores that are not finite.
     """
-    check_method(method, instances)
+    check_method(method)
     if isinstance(method, int | float):
         return Threshold(float(method), "fixed", f"The threshold {method:.4g} was given.")
     values = np.asarray(scores, np.float32).ravel()
@@ -127,10 +117,7 @@ def find_threshold(
     histogram = _count(values, low, high, weights)
     if histogram is None:
         return Threshold(low, method, f"All scores are {low:.4g}: the histogram has no valley.", clear=False)
-    if instances is not None:
-        value, explanation, clear = valley(histogram, instances)
-    else:
-        value, explanation, clear = steady(histogram, least) if method == "auto" else METHODS[method](histogram)
+    value, explanation, clear = steady(histogram, least) if method == "auto" else METHODS[method](histogram)
     value = min(max(value, low), high)
     above = np.append(histogram.above(), 0.0)
     share = float(np.interp((value - low) / histogram.width, np.arange(len(above)), above))
@@ -193,29 +180,23 @@ def steady(histogram: Histogram, least: float = -math.inf) -> Found:
     return value, f"{found}, {lack}.", False
 
 
-def valley(histogram: Histogram, instances: int = 1) -> Found:
-    """From the top down, the first hill, or the one that makes it ``instances``, then the valley before it.
+def valley(histogram: Histogram) -> Found:
+    """From the top down, the first hill whose valley is deep and that is large enough, then the valley before it.
 
-    The paper's code counts the instances in the ground truth; here the user may, else it is one. Where there are
-    fewer hills, the lowest one is taken. Hills are those whose valley is deep and that are large enough.
+    The paper's code goes on to as many hills as the ground truth has instances. Things that are alike share a hill,
+    so here a user's count chooses objects (`liftcore.query.objects`).
     """
     smooth, above = histogram.smoothed(), histogram.above()
     peaks, valleys = _extrema(smooth)
-    hills: list[tuple[int, int]] = []
     for peak in reversed(peaks):
         place = max((place for place in valleys if place < peak), default=None)
-        if place is None or len(hills) == instances:
+        if place is None:
             break
         if above[place] >= LEAST_SHARE and smooth[place] <= DEPTH * smooth[peak]:
-            hills.append((peak, place))
-    if not hills:
-        return _stand_in(histogram, "no hill with a valley before it")
-    peak, place = hills[-1]
-    value = histogram.edge(place)
-    which = "first hill" if instances == 1 else f"hill {len(hills)}"
-    lack = "" if len(hills) == instances else f" (there are no {instances})"
-    lies = f"lies at {histogram.edge(peak):.4g} and the valley before it at {value:.4g}"
-    return value, f"From the top down, the histogram's {which}{lack} {lies}.", True
+            value = histogram.edge(place)
+            lies = f"lies at {histogram.edge(peak):.4g} and the valley before it at {value:.4g}"
+            return value, f"From the top down, the histogram's first hill {lies}.", True
+    return _stand_in(histogram, "no hill with a valley before it")
 
 
 def paper(histogram: Histogram) -> Found:

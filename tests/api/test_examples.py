@@ -123,7 +123,6 @@ def test_features_without_words_are_asked_by_example_only(start: Callable[..., A
         ({"text": "apple", "negatives": ["lamp", "zeppelin"], "like": "splat:1"}, 422, "negatives.1"),
         ({"like": ["splat:1"] * 33}, 422, "like"),
         ({"like": "splat:1", "instances": 0}, 422, "instances"),
-        ({"like": "splat:1", "instances": 2, "threshold": "otsu"}, 422, "instances"),
         ({"like": "splat:1", "keep": "some"}, 422, "keep"),
     ],
 )  # fmt: skip

@@ -100,7 +100,7 @@ def test_splats_of_a_vector_are_asked_by_post(client: TestClient, lift: dict[str
 
 
 def test_nothing_found_is_a_problem_that_says_what_to_try(client: TestClient, lift: dict[str, Any]) -> None:
-    params = {**LAMP, "threshold": 2, "lift": lift["id"]}
+    params = {**LAMP, "negatives": "book", "threshold": 1, "lift": lift["id"]}
     assert "object" not in client.get("/query", params=params).json()["links"]
     problem = assert_problem(client.get("/query/splats", params=params))
     assert (problem["status"], problem["type"]) == (422, "/problems/invalid-query")

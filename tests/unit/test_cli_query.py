@@ -124,7 +124,7 @@ def test_what_a_query_found_is_written_as_splats(scene: Path, capsys: pytest.Cap
 def test_nothing_found_is_no_file_and_a_word_on_what_to_try(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(capsys, *lift_arguments(scene))[0] == 0
     before = sorted(scene.iterdir())
-    question = ["query", scene / "lift.safetensors", "--like", "splat:1", "--threshold", "2"]
+    question = ["query", scene / "lift.safetensors", "--like", "splat:1", "--unlike", "splat:1", "--threshold", "1"]
     status, out, err = run(capsys, *question, "--scores", scene / "s.npy", "--object", scene / "o.ply")
     assert (status, out) == (2, "")
     assert "nothing stands out" in err

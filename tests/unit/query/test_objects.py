@@ -21,9 +21,11 @@ from tests.api.tiny_scene import SPLATS_A_CLUSTER, ply, splat_rows
 from tests.scenes import random_splats
 
 
-def of(scene: QueryScene, *clusters: int, keep: str = "all", rows: tuple[int, ...] = ()) -> Answer:
+def of(
+    scene: QueryScene, *clusters: int, keep: str = "all", instances: int | None = None, rows: tuple[int, ...] = ()
+) -> Answer:
     """An answer that selected these clusters and rows, with scores of .5 and more the later they stand."""
-    answer = ask(scene, Query((Region("left", 0, 2),), threshold=0.5, keep=keep))
+    answer = ask(scene, Query((Region("left", 0, 2),), threshold=0.5, keep=keep, instances=instances))
     selected = np.zeros(3 * SPLATS_A_CLUSTER, np.bool_)
     for cluster in clusters:
         selected[cluster * SPLATS_A_CLUSTER : (cluster + 1) * SPLATS_A_CLUSTER] = True
@@ -75,7 +77,21 @@ def test_who_keeps_the_largest_gets_it_alone_also_as_a_file(scene: QueryScene) -
     assert largest.strays == both.found[1].splats
     kept = b"".join(object_splats(scene, of(scene, 0, 2, keep="largest")))
     assert kept == ply(splat_rows()[both.numbers == 0])
-    assert b"".join(object_splats(scene, of(scene, 0, 2))) == ply(splat_rows()[both.numbers >= 0])
+    with_stray = of(scene, 0, 2, rows=(3 * SPLATS_A_CLUSTER // 2,))
+    assert b"".join(object_splats(scene, with_stray)) == ply(splat_rows()[both.numbers >= 0])
+
+
+def test_so_many_instances_are_kept_by_their_scores(scene: QueryScene) -> None:
+    all_three, two = objects(scene, of(scene, 0, 1, 2)), objects(scene, of(scene, 0, 1, 2, instances=2))
+    assert len(all_three.found) == 3 and two.strays == SPLATS_A_CLUSTER
+    assert (two.numbers[:SPLATS_A_CLUSTER] == -1).all()  # the later clusters have the higher scores
+    assert two.found == tuple(
+        thing for thing in all_three.found if thing.score > min(t.score for t in all_three.found)
+    )
+    assert objects(scene, of(scene, 0, 2, instances=9)).found == objects(scene, of(scene, 0, 2)).found
+    for count in (0, 101):
+        with pytest.raises(InvalidQuery, match="instances: expected 1 to 100"):
+            of(scene, 0, instances=count)
 
 
 def test_nothing_found_is_no_object(scene: QueryScene) -> None:
