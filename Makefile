@@ -81,13 +81,15 @@ bench: $(READY)
 
 setup: $(READY)
 
-# torch first: were it installed as what another package needs, pip would take the newest build instead.
+# torch and torchvision first, from one index: each build of the one loads beside its own build of the other alone,
+# and the lock has digests of PyPI's.
 $(READY): requirements.lock pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "splatlift needs Python 3.11 or later")'
 	@echo "making .venv: a few minutes, once"
 	[ -x $(BIN)/python ] || $(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet $(TORCH_PIP) "$$(sed -nE 's/^(torch==[^ ]*).*/\1/p' requirements.lock)"
-	$(BIN)/python -m pip install --quiet --require-hashes -r requirements.lock
+	$(BIN)/python -m pip install --quiet $(TORCH_PIP) $$(sed -nE 's/^(torch(vision)?==[^ ]*).*/\1/p' requirements.lock)
+	awk '/^[a-z]/ { kept = !/^(torch|torchvision)==/ } kept' requirements.lock \
+	| $(BIN)/python -m pip install --quiet --require-hashes -r /dev/stdin
 	$(BIN)/python -m pip install --quiet --no-deps -e .
 	@echo "compiling the kernels of 3DGS: a minute, once"
 	$(BIN)/python -m tests.kernels 3dgs

@@ -49,7 +49,7 @@ class LiftMetadata(BaseModel):
     cameras: InputFile = NO_FILE
     features: tuple[InputFile, ...] = ()
     encoder: str = ""  # the 2D encoder's name as the pack tells it; "" when unknown
-    text_space: str = ""  # the text encoder that shares the space; "" or "none" when there is none
+    text_space: str = ""  # the text encoder that shares the space; "" not named, "none" when there is none
     words: tuple[str, ...] = ()  # that its packs brought: it is asked in these without an encoder
     views: tuple[str, ...]  # the views that were lifted
     poses: str = ""  # of their cameras (`liftcore.io.lift_file.poses_of`); "" in older lifts

@@ -333,6 +333,16 @@ class LiftResult(BaseModel):
     links: dict[str, str]
 
 
+Named = Annotated[str, Field(min_length=1, max_length=SETTING_CHARACTERS, pattern=PRINTABLE)]
+
+
+class PackChange(Body):
+    """Names of a feature pack; what is left out stays as the pack says it."""
+
+    encoder: Named | None = Field(None, description="what made the features")
+    text_space: Named | None = Field(None, description="the text encoder that shares their space; 'none' for none")
+
+
 class LiftChange(Body):
     """What to change of a lift; what is left out stays."""
 

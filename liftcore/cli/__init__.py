@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from importlib import import_module
 
 from liftcore import __version__
-from liftcore.cli.options import BAD_INPUT, Parser, shared_options
+from liftcore.cli.options import BAD_INPUT, Parser, misplaced, shared_options
 from liftcore.errors import SplatliftError
 
 COMMANDS = {
@@ -50,7 +50,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stdout.flush()
         return status
     except SplatliftError as error:
-        print(f"splatlift: {error}", file=sys.stderr)
+        print(f"splatlift: {misplaced(options) or error}", file=sys.stderr)
         return BAD_INPUT
     except KeyboardInterrupt:
         print("splatlift: interrupted", file=sys.stderr)

@@ -30,6 +30,7 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument(
         "--ask", action="append", default=[], metavar="TEXT", help="what to look for; may be given several times"
     )
+    parser.add_argument("--pack", type=Path, metavar="FILE", help="of several feature packs of the scene, which one")
     parser.add_argument("--out", type=Path, default=Path("demo-output"), metavar="DIR", help="of pictures and lift")
 
 
@@ -48,7 +49,10 @@ def run(options: argparse.Namespace) -> int:
     if options.scene is None:
         say("12 published splat objects on a table (sources: scene/LICENCES.md), with CLIP's vectors of words.")
     folder = options.scene or unpack_tabletop(out / "scene")
-    subject = find_scene(folder, options.ask, out / "scene")
+    subject = find_scene(folder, options.ask, out / "scene", options.pack)
+    if subject.other_packs:
+        others = ", ".join(subject.other_packs)
+        say(f"Features are those of {subject.features.name}; --pack takes others that are here: {others}.")
     with serving(data, subject.encoder, out / "service.log") as url:
         say(f"The service listens on {url}.")
         report = show(subject, url, out, say)

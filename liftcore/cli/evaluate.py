@@ -61,7 +61,7 @@ def run(options: argparse.Namespace) -> int:
             found, said = evaluate_scene(scenes[name], scene, encoder, settings, progress)
             results += found
             warnings += said
-    rows = published(options.dataset)
+    rows = published(options.dataset, lifts)
     document = _document(options, lifts, settings, results, rows) | {"warnings": warnings}
     lines = [*_table(results, rows), *(f"warning: {text}" for text in warnings)]
     reply(document, as_json=options.json, lines=lines)
@@ -179,8 +179,7 @@ def _table(results: Sequence[SceneResult], rows: Sequence[Published]) -> Iterabl
     from liftcore.evaluate.judging import mean_over_scenes
 
     scenes = tuple(dict.fromkeys(result.scene for result in results))
-    columns = tuple(dict.fromkeys([*scenes, *(name for row in rows for name in row.scenes)]))
-    head = ("", "protocol", "metric", "frames", *columns, "mean", "method", "source")
+    head = ("", "protocol", "metric", "frames", *scenes, "mean", "method", "source")
     lines: list[tuple[str, ...]] = [head]
     for protocol, groups in mean_over_scenes(results).items():
         by_scene = {result.scene: result.means() for result in results if result.protocol == protocol}
@@ -188,17 +187,16 @@ def _table(results: Sequence[SceneResult], rows: Sequence[Published]) -> Iterabl
             for key, label in _SHOWN[protocol].items():
                 if getattr(overall, key) is None:
                     continue
-                cells = [
-                    _percent(getattr(by_scene[name][group], key)) if name in by_scene else "" for name in columns
-                ]
+                cells = [_percent(getattr(by_scene[name][group], key)) if name in by_scene else "" for name in scenes]
                 mean = _percent(getattr(overall, key))
                 about = _lifted(results, protocol, group)
                 lines.append(("measured", protocol, label, group, *cells, mean, "this lift", about))
     for row in rows:
-        cells = [f"{row.scenes[name]:.1f}" if name in row.scenes else "" for name in columns]
+        cells = [f"{row.scenes[name]:.1f}" if name in row.scenes else "" for name in scenes]
+        mean = f"{row.mean:.1f}" if row.scenes.keys() <= set(scenes) else ""  # over the paper's scenes
         known = row.protocol if row.protocol in _SHOWN else "unknown"
         source = f"{row.source}, {row.note}" if row.note else row.source
-        lines.append(("published", known, row.metric, "", *cells, f"{row.mean:.1f}", row.method, source))
+        lines.append(("published", known, row.metric, "", *cells, mean, row.method, source))
     widths = [max(len(line[k]) for line in lines) for k in range(len(head))]
     for line in lines:
         yield "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip()

@@ -18,5 +18,7 @@ def run(options: argparse.Namespace) -> int:
     """Describe a file of any kind."""
     from liftcore.io.inspect import inspect_file
 
-    reply({"file": str(options.file), **inspect_file(options.file)}, as_json=options.json)
+    document = {"file": str(options.file), **inspect_file(options.file)}
+    unnamed = {name: "not named" for name in ("encoder", "text_space") if document.get(name) == ""}
+    reply(document if options.json else document | unnamed, as_json=options.json)
     return 0

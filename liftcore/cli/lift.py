@@ -219,6 +219,8 @@ def _verdict(document: dict[str, Any]) -> Iterable[str]:
         yield f"splats fill {filled:.1%} of a ray, {usual}"
     if certificate["warnings"]:
         yield "look at the warnings: splatlift check says whether photos, cameras and splats belong together"
-    words = document["text_space"] not in ("", NO_WORDS)
-    how = "WORD" if words else f"--like {next(iter(document['lifted']), 'VIEW')}:x,y"
+    space = document["text_space"]
+    if not space:
+        yield "the packs' text space is not named: splatlift pack retag names it, or ask with --table FILE"
+    how = "WORD" if space not in ("", NO_WORDS) else f"--like {next(iter(document['lifted']), 'VIEW')}:x,y"
     yield f"next: splatlift query {document['out']} {how}  (--verbose shows all figures)"

@@ -6,13 +6,16 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from liftcore.errors import InvalidQuery
+from liftcore.errors import InvalidInput, InvalidQuery
 
 if TYPE_CHECKING:
     from liftcore.query.scene import QueryScene
     from liftcore.query.text import TextEncoder
 
 BAD_INPUT = 2
+ROLES = {  # of arguments that name files: what belongs there
+    "splats": "splats", "cameras": "cameras", "features": "features", "lift": "lift", "table": "table",
+}  # fmt: skip
 PRESETS = "default, row-sum, tikhonov (if none is named), argmax, top-k, front-mass, centre or mean"
 THRESHOLDS = "auto, valley, paper, otsu, stability or a number"
 
@@ -38,6 +41,20 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         self.exit(BAD_INPUT, f"{self.prog}: {' '.join(message.split())}; see '{self.prog} --help'\n")
+
+
+def misplaced(options: argparse.Namespace) -> InvalidInput | None:
+    """What to say of files that stand in each other's place; None where none does."""
+    from liftcore.io.kinds import kind_of
+
+    for name, wanted in ROLES.items():
+        given = getattr(options, name, None) or []
+        for path in given if isinstance(given, list) else [given]:
+            kind = kind_of(path) if isinstance(path, Path) else None
+            if kind not in (None, wanted):
+                hint = "the order is SPLATS CAMERAS FEATURES" if hasattr(options, "features") else ""
+                return InvalidInput(str(path), expected=f"{wanted}, as {name}", got=kind, hint=hint)
+    return None
 
 
 def shared_options() -> Parser:

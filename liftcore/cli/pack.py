@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from liftcore.cli.options import Parser
 from liftcore.cli.reply import folders_of, free_output, progress_bars, reply, shown, told_folders, writing
+from liftcore.errors import InvalidInput
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -46,6 +47,7 @@ def add_arguments(parser: Parser, shared: Parser) -> None:
     )
     by = "what folders of binary PNGs are named by: phrases (PHRASE/VIEW.png) or views (VIEW/PHRASE.png)"
     prompts.add_argument("--folders", choices=("phrases", "views"), default="phrases", help=by)
+    retag = formats.add_parser("retag", parents=[shared], help="a pack under other names of its encoder or space")
     space = (
         "the text encoder whose words lie in the space of the features, as query's --encoder names it "
         "(open_clip:ViT-B-32/openai): query opens it where no encoder is given, and a service takes the one that it "
@@ -55,10 +57,13 @@ def add_arguments(parser: Parser, shared: Parser) -> None:
     unit = "say that the vectors are unit vectors, or are not; this changes none of them"
     for command in (langsplat, arrays, masks, prompts):
         command.add_argument("folder", type=Path, help="the folder of the files")
+    retag.add_argument("pack", type=Path, help="the pack as it is")
+    for command in (langsplat, arrays, masks, prompts, retag):
         command.add_argument("-o", "--output", type=Path, required=True, metavar="PACK", help="the pack to write")
         command.add_argument("--encoder-name", metavar="NAME", help="what made the features or masks")
-    for command in (langsplat, arrays, masks):
+    for command in (langsplat, arrays, masks, retag):
         command.add_argument("--text-space", metavar="NAME", help=space)
+    for command in (langsplat, arrays, masks):
         command.add_argument("--normalised", action=argparse.BooleanOptionalAction, help=unit)
 
 
@@ -74,6 +79,8 @@ def run(options: argparse.Namespace) -> int:
     from liftcore.features.pack import read_features, write_pack
     from liftcore.io.inspect import describe_packs
 
+    if options.format == "retag":
+        return _retag(options)
     views, table, warnings = _views(options)
     out = free_output(options.output, views.inputs)
     with progress_bars() as progress, writing(out):
@@ -95,6 +102,27 @@ def run(options: argparse.Namespace) -> int:
         "warnings": [*warnings, *described["warnings"]],
     }
     reply(document, as_json=options.json, lines=_lines(document))
+    return 0
+
+
+def _retag(options: argparse.Namespace) -> int:
+    """Write the pack under its new names, and say them."""
+    from liftcore.features.pack import read_features
+    from liftcore.io.files import whole_file
+    from liftcore.io.safetensors_file import with_metadata
+
+    given = {"encoder": options.encoder_name, "text_space": options.text_space}
+    names = {name: value for name, value in given.items() if value}
+    if not names:
+        raise InvalidInput("retag", expected="--text-space NAME or --encoder-name NAME", got="neither")
+    out = free_output(options.output, [options.pack])
+    read_features(options.pack)  # what is no pack leaves no file
+    with writing(out), whole_file(out) as handle:
+        handle.writelines(with_metadata(options.pack, names))
+    packs = read_features(out)
+    document = {"out": str(out), "encoder": packs.encoder, "text_space": packs.text_space}
+    said = f"{out}: encoder {packs.encoder or 'not named'}, text space {packs.text_space or 'not named'}"
+    reply(document, as_json=options.json, lines=[said])
     return 0
 
 

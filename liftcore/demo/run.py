@@ -65,10 +65,6 @@ class Client:
             raise _refusal("lift", job.get("problem") or {}, job["state"])
         return job, self.get(f"/lifts/{job['id']}")
 
-    def ask(self, lift: str, text: str, **more: str) -> dict[str, Any]:
-        """``GET /query``: the answer."""
-        return self.get("/query", lift=lift, text=text, **more)
-
     def get(self, path: str, **parameters: str) -> dict[str, Any]:
         """The JSON of any route."""
         return self._call("GET", path, params=parameters).json()
@@ -138,15 +134,16 @@ def show(subject: DemoScene, url: str, out: Path, say: Callable[[str], None]) ->
         pictures = {"rgb": f"render-{subject.views[0]}.png", "pca": f"features-{subject.views[0]}.png"}
         for what, name in pictures.items():
             (out / name).write_bytes(client.picture("/render", lift=lift["id"], view=subject.views[0], what=what))
-        if subject.phrases:
-            # The first question opens the lift; it is asked once apart, so that times are of warm queries.
-            client.ask(lift["id"], subject.phrases[0], threshold="0")
-        else:
-            for line in _why_nothing_is_asked(subject, pictures):
+        kind, asked = "text", subject.phrases
+        if not asked:
+            kind, asked = "like", (_middle(out / pictures["rgb"], subject.views[0]),)
+            for line in _why_no_words(subject, asked[0]):
                 say(line)
+        # The first question opens the lift; it is asked once apart, so that times are of warm queries.
+        client.get("/query", lift=lift["id"], **{kind: asked[0]}, threshold="0")
         findings = []
-        for phrase in subject.phrases:
-            findings.append(_find(client, lift["id"], phrase, subject, out))
+        for phrase in asked:
+            findings.append(_find(client, lift["id"], kind, phrase, subject, out))
             for line in _lines(findings[-1]):
                 say(line)
     finally:
@@ -181,18 +178,26 @@ def _show_progress(job: dict[str, Any]) -> None:
     print(f"\r\033[K{text}", end="", file=sys.stderr, flush=True)
 
 
-def _why_nothing_is_asked(subject: DemoScene, pictures: dict[str, str]) -> list[str]:
+def _middle(render: Path, view: str) -> str:
+    """The pixel in the middle of a view, as an example of what to look for."""
+    with Image.open(render) as picture:
+        return f"{view}:{picture.width // 2},{picture.height // 2}"
+
+
+def _why_no_words(subject: DemoScene, example: str) -> list[str]:
     if subject.text_space == NO_WORDS:
-        why = "Its features share a space with no text encoder: they have no words, so no phrase is asked."
+        why = "Its features share a space with no text encoder: they have no words"
+    elif not subject.text_space:
+        why = "Its pack does not name its text space (`splatlift pack retag` does)"
     else:
-        why = "Nothing says what this scene shows, so no phrase is asked; `--ask TEXT` asks yours."
-    return [f"  {why}", f"      {pictures['pca']} shows three principal components of the features as colours."]
+        why = "Nothing says what this scene shows (`--ask TEXT` asks in words)"
+    return [f"  {why}, so it is asked for more of what the middle of the view shows, {example}."]
 
 
-def _find(client: Client, lift: str, phrase: str, subject: DemoScene, out: Path) -> Finding:
-    asked = {"lift": lift, "text": phrase}
+def _find(client: Client, lift: str, kind: str, phrase: str, subject: DemoScene, out: Path) -> Finding:
+    asked = {"lift": lift, kind: phrase}
     begin = time.perf_counter()
-    answer = client.ask(lift, phrase)
+    answer = client.get("/query", **asked)
     answered = time.perf_counter()
     masks = {view: _pixels(client.picture("/query/mask", view=view, **asked)) > 0 for view in subject.views}
     mask_seconds = (time.perf_counter() - answered) / len(masks)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from liftcore.errors import InvalidInput
+from liftcore.features.pack import read_features
 from liftcore.query.text import BUILT_IN, NO_WORDS, OWN_WORDS
 
 if TYPE_CHECKING:
@@ -61,6 +62,7 @@ class DemoScene:
     splats: Path
     cameras: Path
     features: Path
+    other_packs: tuple[str, ...]  # file names of packs beside it that were not taken
     encoder: str  # specification of the text encoder
     text_space: str  # of the features; "none" when no text encoder shares it, "" when the pack does not say
     phrases: tuple[str, ...]  # empty = nothing can be asked, or nobody knows what
@@ -68,15 +70,16 @@ class DemoScene:
     truth: Truth | None
 
 
-def find_scene(folder: Path, phrases: Sequence[str], scratch: Path) -> DemoScene:
+def find_scene(folder: Path, phrases: Sequence[str], scratch: Path, pack: Path | None = None) -> DemoScene:
     """A scene folder as it is: the files are found by name, a COLMAP model is zipped for the upload.
 
     Args:
         folder: holds splats (``.ply``, ``.sog``, ``.spz`` or ``.splat``), cameras (``cameras.json``,
             ``transforms.json``, ``sparse/0``) and a pack.
-        phrases: what to ask; empty = what ``truth.json`` says, else three of its objects, and nothing where the
-            features have no words.
+        phrases: what to ask; empty = what ``truth.json`` says, else the three of its objects that fill most of the
+            pictured view, and nothing where the features have no words.
         scratch: where to put the zipped model.
+        pack: the feature pack; None takes ``features.safetensors``, else the first by name.
 
     Raises:
         InvalidInput: something is missing, or there are no words to ask the phrases with; the error says what.
@@ -85,13 +88,14 @@ def find_scene(folder: Path, phrases: Sequence[str], scratch: Path) -> DemoScene
         raise InvalidInput("--scene", expected="a folder", got=f"nothing at {folder}")
     truth = _read_truth(folder)
     cameras = _cameras(folder, scratch)
-    table, features = folder / _TABLE, _features(folder)
-    text_space = _text_space(features, table)
+    packs = _packs(folder)
+    table, features = folder / _TABLE, pack or packs[0]
+    text_space = read_features(features).text_space
     askable = table.is_file() or text_space in (*_ENCODERS, OWN_WORDS)
     if phrases and not askable:
         raise InvalidInput(
             "--ask", expected=f"words in the space of the features, as {_TABLE} in {folder.name}",
-            got=f"none, and features of the text space {text_space!r}",
+            got=f"none, and features whose text space is {text_space or 'not named'}",
             hint="or use 'splatlift lift' and 'splatlift query --encoder', which take any text encoder",
         )  # fmt: skip
     return DemoScene(
@@ -99,6 +103,7 @@ def find_scene(folder: Path, phrases: Sequence[str], scratch: Path) -> DemoScene
         splats=_splats(folder),
         cameras=cameras,
         features=features,
+        other_packs=tuple(one.name for one in packs if not one.exists() or one.resolve() != features.resolve()),
         encoder=f"table:{table}" if table.is_file() else _ENCODERS.get(text_space, next(iter(BUILT_IN))),
         text_space=text_space,
         phrases=tuple(phrases) or (truth.asked if truth and askable and text_space != NO_WORDS else ()),
@@ -135,28 +140,14 @@ def _cameras(folder: Path, scratch: Path) -> Path:
     return packed
 
 
-def _features(folder: Path) -> Path:
-    from safetensors import SafetensorError, safe_open
+def _packs(folder: Path) -> list[Path]:
+    """The feature packs of a folder, ``features.safetensors`` first."""
+    from liftcore.io.kinds import kind_of
 
-    preferred = folder / "features.safetensors"
-    for path in [preferred, *sorted(folder.glob("*.safetensors"))]:
-        try:
-            with safe_open(str(path), framework="pt") as handle:
-                names = list(handle.keys())
-                if any(name.endswith(("/codebook", "/grid")) for name in names):
-                    return path
-        except (SafetensorError, OSError):
-            continue
-    raise InvalidInput(f"features of {folder.name}", expected="a feature pack (.safetensors)", got="none")
-
-
-def _text_space(features: Path, table: Path) -> str:
-    """What the pack says; a pack that says nothing has words if a table of them lies beside it."""
-    from safetensors import safe_open
-
-    with safe_open(str(features), framework="pt") as handle:
-        told = (handle.metadata() or {}).get("text_space")
-    return told or ("" if table.is_file() else NO_WORDS)
+    found = [path for path in sorted(folder.glob("*.safetensors")) if kind_of(path) == "features"]
+    if not found:
+        raise InvalidInput(f"features of {folder.name}", expected="a feature pack (.safetensors)", got="none")
+    return sorted(found, key=lambda path: path.name != "features.safetensors")
 
 
 def _read_truth(folder: Path) -> Truth | None:
@@ -175,8 +166,15 @@ def _read_truth(folder: Path) -> Truth | None:
         names=names,
         masks={view: masks[view] for view in document.get("held_out_views", masks)},
         meant=meant | {phrase: tuple(things) for phrase, things in document.get("phrases", {}).items()},
-        asked=tuple(document.get("ask", [f"the {name}" for name in names[:_PHRASES]])),
+        asked=tuple(document.get("ask", [f"the {name}" for name in _in_view(names, masks, document)])),
     )
+
+
+def _in_view(names: Sequence[str], masks: Mapping[str, np.ndarray], document: Mapping) -> list[str]:
+    """The objects that fill most of the pictured view."""
+    shown = next((masks[view] for view in document.get("held_out_views", masks) if view in masks), np.empty(0, int))
+    counts = np.bincount(shown[(shown >= 0) & (shown < len(names))], minlength=len(names))
+    return [names[int(row)] for row in np.argsort(-counts, kind="stable")[:_PHRASES] if counts[row]]
 
 
 def _some_views(cameras: Path) -> tuple[str, ...]:

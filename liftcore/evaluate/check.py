@@ -17,6 +17,7 @@ from PIL import Image
 
 from liftcore.features.encoders.encode import read_image
 from liftcore.features.pack import Views, pair
+from liftcore.features.smoothness import smoothness, unlike_maps
 from liftcore.features.views import FeatureGrid, Regions
 from liftcore.planning.contradictions import (
     FRAME,
@@ -26,8 +27,6 @@ from liftcore.planning.contradictions import (
     agreement_of_views,
     disagreement,
     empty,
-    smoothness,
-    unlike_maps,
     unseen,
 )
 from liftcore.planning.views import visibility

@@ -185,11 +185,11 @@ def evaluate_scene(
 
     Raises:
         InvalidInput: the labels are malformed, no labelled frame has a camera, or none is among the held-out ones.
-        InvalidQuery: the encoder cannot read a category or a negative, or is not of the lift's space.
+        InvalidQuery: the encoder can read none of the categories, or not a negative, or is not of the lift's space.
         InvalidLift: the splats or the cameras moved or changed since the lift.
     """
     if encoder.channels != scene.channels:
-        space = scene.metadata.text_space or "none"
+        space = scene.metadata.text_space or "not named"
         expected = f"{scene.channels} channels as the lift of {labels.name} has (its text space: {space})"
         raise InvalidQuery("encoder", expected=expected, got=f"{encoder.name} with {encoder.channels}")
     truth, warnings = _truth(labels, scene, settings.held_out)
@@ -198,7 +198,10 @@ def evaluate_scene(
         warnings.append(f"{labels.name}: {_named(lifted)} were lifted, though the list holds them out")
     elif lifted:
         warnings.append(f"{labels.name}: {len(lifted)} of {len(truth)} judged frames were lifted: {_named(lifted)}")
-    texts = tuple(dict.fromkeys(thing.category for things in truth.values() for thing in things))
+    texts, unknown = _readable(truth, encoder)
+    if unknown:
+        warnings.append(f"{labels.name}: {encoder.name} lacks {_named(unknown)}: left out")
+        truth = {view: [thing for thing in things if thing.category in texts] for view, things in truth.items()}
     results = []
     for protocol in settings.protocols:
         segmenter = SEGMENTERS[protocol](scene, texts, encoder, settings.threshold, settings.negatives)
@@ -208,6 +211,27 @@ def evaluate_scene(
             progress(f"{labels.name} {protocol}", done, len(truth), "frames")
         results.append(SceneResult(labels.name, protocol, tuple(rows)))
     return results, warnings
+
+
+def _readable(
+    truth: Mapping[str, Sequence[LabelledObject]], encoder: TextEncoder
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """The categories that the encoder can read, and those that it cannot.
+
+    Raises:
+        InvalidQuery: it can read none.
+    """
+    known, unknown, last = [], [], None
+    for text in dict.fromkeys(thing.category for things in truth.values() for thing in things):
+        try:
+            encoder.encode([text])
+            known.append(text)
+        except InvalidQuery as error:
+            unknown.append(text)
+            last = error
+    if last is not None and not known:
+        raise last
+    return tuple(known), tuple(unknown)
 
 
 def mean_over_scenes(results: Sequence[SceneResult]) -> dict[EvaluationProtocol, dict[str, Means]]:

@@ -6,7 +6,7 @@ the methods' official code. Its ablation table swaps the columns Teatime and Ram
 those of the main table, which the appendix confirms.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 LERF_OVS, THREE_D_OVS = "lerf-ovs", "3d-ovs"
@@ -74,9 +74,13 @@ class Published:
     note: str  # what the paper's mark says; "" = its own row
 
 
-def published(dataset: str) -> list[Published]:
-    """The rows that were printed for a dataset."""
-    return _lerf_ovs() if dataset == LERF_OVS else _three_d_ovs()
+def published(dataset: str, scenes: Collection[str] | None = None) -> list[Published]:
+    """The rows that were printed for a dataset, or of some scenes of it: means alone only where all are there."""
+    rows = _lerf_ovs() if dataset == LERF_OVS else _three_d_ovs()
+    if scenes is None:
+        return rows
+    whole = set(_LERF_SCENES if dataset == LERF_OVS else _3D_SCENES) <= set(scenes)
+    return [row for row in rows if row.scenes.keys() & set(scenes) or (whole and not row.scenes)]
 
 
 def _lerf_ovs() -> list[Published]:

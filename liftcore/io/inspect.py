@@ -12,9 +12,11 @@ import torch
 
 from liftcore.errors import InvalidInput, InvalidTable
 from liftcore.features.pack import read_features
+from liftcore.features.smoothness import some_grids, unlike_maps
 from liftcore.features.views import NO_LABEL, Regions
 from liftcore.io.cameras import TRANSFORMS, camera_source, has_nerfstudio_beside, other_models, read_cameras
 from liftcore.io.class_masks import describe_masks
+from liftcore.io.kinds import LIFT_KEY, keys_of, looks_like_safetensors
 from liftcore.io.ply import nearest_dialect
 from liftcore.io.splats import SplatFormat, format_of, is_splats, read_splats
 from liftcore.io.transforms import FRAME_FILE, frame_warning
@@ -46,7 +48,6 @@ MOVING = ("motion_", "trbf_", "omega_")  # what spacetime splats add
 FLAT = 100  # times thinner than wide: what converters make of discs
 NARROW = 4  # times longer than wide, or wider: photos are not
 UNIT_TOLERANCE = 0.01  # a float16 unit vector of 512 channels is within it
-LIFT_KEY = "splatlift"  # of the metadata of a lift
 
 
 def inspect_file(path: Path) -> dict[str, Any]:
@@ -63,11 +64,11 @@ def inspect_file(path: Path) -> dict[str, Any]:
     if is_splats(path):
         found = describe_splat_file(path)  # first: what is no file is told better by who reads it
         return {"kind": "splats", "bytes": path.stat().st_size, **found}
-    if path.is_dir() or not _looks_like_safetensors(path):
+    if path.is_dir() or not looks_like_safetensors(path):
         found = describe_camera_file(path)  # first: which of its files are there is told better by who reads them
         size = sum(file.stat().st_size for file in camera_source(path).files)
         return {"kind": "cameras", "bytes": size, **found}
-    keys, metadata = _keys(path)
+    keys, metadata = keys_of(path)
     size = path.stat().st_size
     if LIFT_KEY in metadata:
         from liftcore.io.lift_file import load_lift
@@ -201,23 +202,6 @@ def _camera_warnings(cameras: Cameras, centres: np.ndarray) -> list[str]:
     return warnings
 
 
-def _looks_like_safetensors(path: Path) -> bool:
-    with path.open("rb") as handle:
-        start = handle.read(9)
-    return path.suffix.lower() == ".safetensors" or start[8:] == b"{"
-
-
-def _keys(path: Path) -> tuple[set[str], dict[str, str]]:
-    from safetensors import SafetensorError, safe_open
-
-    try:
-        with safe_open(str(path), framework="pt") as handle:
-            return set(handle.keys()), handle.metadata() or {}
-    except (SafetensorError, OSError) as error:
-        got = f"one that does not open ({str(error)[:120]})"
-        raise InvalidInput(str(path), expected="a safetensors file", got=got) from None
-
-
 @dataclass(frozen=True)
 class _ViewFacts:
     """What is counted of a view."""
@@ -230,6 +214,7 @@ class _ViewFacts:
     unused: int  # rows that no label reads
     unlabelled: float  # share of the labels
     norms: tuple[float, float] | None  # the least and largest of rows with a length
+    alone: bool = False  # whether all labels are of one region
 
 
 def describe_packs(packs: Views) -> dict[str, Any]:
@@ -251,7 +236,7 @@ def describe_packs(packs: Views) -> dict[str, Any]:
         "codebook_rows": sum(view.rows for view in found),
         "norms": {"min": low, "max": high},
         "unlabelled": sum(view.unlabelled for view in regions) / len(regions) if regions else 0.0,
-        "warnings": _pack_warnings(packs, found, low, high),
+        "warnings": [*_pack_warnings(packs, found, low, high), *unlike_maps(some_grids(packs, packs.views))],
     }
 
 
@@ -267,7 +252,8 @@ def _view_facts(view: ViewFeatures) -> _ViewFacts:
     unused = int((torch.bincount(view.labels.flatten() - NO_LABEL, minlength=rows + 1)[1:] == 0).sum())
     unlabelled = float((view.labels == NO_LABEL).float().mean())
     size = f"{levels} levels of {width}x{height}"
-    return _ViewFacts(True, size, (width, height), rows, zero, unused, unlabelled, ends)
+    alone = bool((view.labels == view.labels[0, 0, 0]).all()) and unlabelled == 0.0
+    return _ViewFacts(True, size, (width, height), rows, zero, unused, unlabelled, ends, alone)
 
 
 def _pack_warnings(packs: Views, found: list[_ViewFacts], low: float, high: float) -> list[str]:
@@ -287,6 +273,10 @@ def _pack_warnings(packs: Views, found: list[_ViewFacts], low: float, high: floa
         warnings.append(f"{unused} of {rows} codebook rows are read by no label")
     if empty:
         warnings.append(f"{empty} views have no label at all")
+    if len(alone := [view for view in found if view.alone]) > len(found) / 2:
+        warnings.append(
+            f"{len(alone)} views have one region alone, over all of their pixels: masks tell nothing apart"
+        )
     if not packs.encoder:
         warnings.append("the pack does not name its encoder")
     narrow = next((view for view in found if max(view.sides) > NARROW * min(view.sides)), None)

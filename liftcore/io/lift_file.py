@@ -151,11 +151,13 @@ def input_files(splats: Path, cameras: Path, features: Sequence[Path]) -> list[I
 
 
 def input_file(path: Path) -> InputFile:
-    """Where a file is, and its digest."""
+    """Where a file, or a folder of a SOG, is, and its digest."""
     from liftcore.result import InputFile
 
     resolved = path.resolve()
-    return InputFile(path=str(resolved), sha256=sha256_of(resolved))
+    if not resolved.is_dir():
+        return InputFile(path=str(resolved), sha256=sha256_of(resolved))
+    return InputFile(path=str(resolved), sha256=_digest_of_several(sorted(resolved.iterdir()), resolved))
 
 
 def camera_input(path: Path) -> InputFile:
@@ -170,10 +172,14 @@ def camera_input(path: Path) -> InputFile:
     files = camera_source(given).files
     if files == [given]:
         return InputFile(path=str(given), sha256=sha256_of(given))
-    folder, total = given if given.is_dir() else given.parent, hashlib.sha256()
+    return InputFile(path=str(given), sha256=_digest_of_several(files, given if given.is_dir() else given.parent))
+
+
+def _digest_of_several(files: Sequence[Path], folder: Path) -> str:
+    total = hashlib.sha256()
     for part in files:
         total.update(f"{os.path.relpath(part, folder)} {sha256_of(part)}\n".encode())
-    return InputFile(path=str(given), sha256=total.hexdigest())
+    return total.hexdigest()
 
 
 def found_input(role: str, remembered: InputFile, metadata: LiftMetadata, lift: Path | None) -> Path | None:

@@ -7,7 +7,7 @@ import json
 import math
 import mmap
 import struct
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -37,6 +37,7 @@ TYPES = {
     "torch.int16": "I16",
     "torch.bool": "BOOL",
 }
+COPIED_BYTES = 1 << 20
 MAX_HEADER_BYTES = 32 * 1024 * 1024
 _START = 9  # bytes: the header's length, and the brace that it begins with
 
@@ -109,9 +110,24 @@ def safetensors_header(specs: "Iterable[Spec]", metadata: Mapping[str, str]) -> 
         offsets[key] = end
         end += math.prod(shape) * dtype.itemsize
         header[key] = {"dtype": TYPES[str(dtype)], "shape": shape, "data_offsets": (offsets[key], end)}
+    return header_bytes(header), offsets
+
+
+def header_bytes(header: Mapping[str, object]) -> bytes:
+    """What a file begins with: the header as JSON after its length, padded so that tensors lie aligned."""
     text = json.dumps(header, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 8)
-    return len(text).to_bytes(8, "little") + text, offsets
+    return len(text).to_bytes(8, "little") + text
+
+
+def with_metadata(path: Path, changes: Mapping[str, str]) -> Iterator[bytes]:
+    """The bytes of a safetensors file with other metadata, in blocks; all else of it stays to the byte."""
+    with path.open("rb") as handle:
+        header = json.loads(handle.read(int.from_bytes(handle.read(8), "little")))
+        header["__metadata__"] = (header.get("__metadata__") or {}) | dict(changes)
+        yield header_bytes(header)
+        while block := handle.read(COPIED_BYTES):
+            yield block
 
 
 def tensor_bytes(tensor: "Tensor") -> memoryview:

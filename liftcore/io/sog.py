@@ -1,4 +1,4 @@
-"""PlayCanvas's ``.sog`` of version 2: a zip of lossless WebP pictures, a pixel a splat, and ``meta.json``.
+"""PlayCanvas's ``.sog`` of version 2: a zip or folder of lossless WebP pictures, a pixel a splat, and ``meta.json``.
 
 Means have 16 bits an axis in two pictures, between bounds, of ``sign(v) log(1 + |v|)``; quaternions their smallest
 three parts and 252 to 255 for the largest of w x y z; log scales and constant terms are rows of codebooks of 256;
@@ -10,7 +10,7 @@ import io
 import json
 import warnings
 import zipfile
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -30,24 +30,26 @@ HINT = "export it again with SuperSplat or splat-transform, or as PLY"
 
 
 def read_sog(path: Path, *, colour: bool = True) -> Fields:
-    """The fields of a ``.sog`` file.
+    """The fields of a ``.sog`` file, or of a folder of what such a file holds.
 
     Raises:
         InvalidSplats: the file is malformed, of another version, or has more splats than its size can be of.
     """
     try:
+        if path.is_dir():
+            return _Pictures(path, path, sum(file.stat().st_size for file in path.iterdir())).fields(colour=colour)
         with zipfile.ZipFile(path) as archive:
-            return _Pictures(archive, path).fields(colour=colour)
+            return _Pictures(zipfile.Path(archive), path, path.stat().st_size).fields(colour=colour)
     except BROKEN_ZIP as error:
         got = f"one that does not open ({str(error)[:120]})"
         raise InvalidSplats(str(path), expected="a .sog file", got=got, hint=HINT) from None
 
 
 class _Pictures:
-    """What is in an open file."""
+    """What is in an open file, or a folder."""
 
-    def __init__(self, archive: zipfile.ZipFile, path: Path) -> None:
-        self.archive, self.path, self.size = archive, path, path.stat().st_size
+    def __init__(self, members: zipfile.Path | Path, path: Path, size: int) -> None:
+        self.members, self.path, self.size = members, path, size
         try:
             self.meta: Any = json.loads(self._member(META, MAX_META_BYTES))
         except (ValueError, RecursionError) as error:
@@ -144,11 +146,10 @@ class _Pictures:
             raise self._refused(f"a WebP picture as {names[index]!r}", str(error)[:120]) from None
 
     def _member(self, name: str, most: int) -> bytes:
-        try:
-            member = self.archive.getinfo(name)
-        except KeyError:
-            raise self._refused(f"{name!r} in the zip", "none") from None
-        with self.archive.open(member) as file:
+        member = self.members / name
+        if PurePosixPath(name).name != name or not member.is_file():  # beside meta.json, and nowhere else
+            raise self._refused(f"{name!r} beside {META}", "none")
+        with member.open("rb") as file:
             content = file.read(most + 1)
         if len(content) > most:
             raise self._refused(f"at most {most} bytes of {name!r}", "more")

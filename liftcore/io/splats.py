@@ -107,6 +107,8 @@ def format_of(path: Path) -> SplatFormat:
     Raises:
         InvalidSplats: it is of none; the error says what it is, if that can be told.
     """
+    if (path / META).is_file():
+        return SplatFormat.SOG
     head, size = ply.read_head(path)
     suffix = path.suffix.lower()
     if head[:4] in (b"ply\n", b"ply\r"):
@@ -201,7 +203,7 @@ def is_splats(path: Path) -> bool:
     if path.suffix.lower() in SUFFIXES:
         return True
     try:
-        return path.is_file() and bool(format_of(path))
+        return (path.is_file() or (path / META).is_file()) and bool(format_of(path))
     except InvalidSplats:
         return False
 

@@ -8,19 +8,17 @@ region's cosine to the most similar one of another view. The ratio of the two is
 was made with, noisy, merged and wrong masks among them. With positions times 0.3 it is .05 to .17 (.31 where all
 cameras look at one table from around, and still do), and with another scene's cameras below zero.
 
-**Do neighbouring cells agree?** Maps of photos are smooth: neighbours are more alike than any two cells. Bytes that
-lie in another order of axes than their shape says are smooth in that order.
+Maps are also looked at alone (`liftcore.features.smoothness`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
-import numpy as np
 import torch
 
-from liftcore.features.views import FeatureGrid
+from liftcore.features.smoothness import some_grids, unlike_maps
 from liftcore.one_thread import one_thread
 from liftcore.planning.views import PILOT_CHANNELS, SAMPLE, Said, Visibility, spread
 from liftcore.progress import silent
@@ -39,9 +37,6 @@ MOST_ALONE = 0.8  # chance that two looks at a splat are from one view: beyond i
 LEAST_AGREEMENT = 0.25  # of what the features allow
 LEAST_ROW_SUM = 0.05  # in the mean: a scene of one object before nothing has a fifth or so
 LEAST_IN_VIEW = 0.05  # of the splats
-LEAST_SMOOTHNESS = 0.1  # of neighbouring cells' agreement over that of any two, as a share of what is left to one
-READINGS = {"[F, h, w]": (1, 2, 0), "[w, h, F]": (1, 0, 2)}  # of the same bytes, and how their axes become h, w, F
-LOOKED_AT = 4  # grids whose order of axes is looked at; of fewer none
 FRAME = "cameras and splats must share a frame: look for the trainer's transform, a scale or another scene"
 HINT = "splatlift check with the photos tells more"
 
@@ -54,8 +49,7 @@ def contradictions(
     Args:
         seen: how large the splats are in all views. threads: None takes the cores that this process may use.
     """
-    grids = [read for view in _some(views.names, LOOKED_AT) if isinstance(read := views.features[view], FeatureGrid)]
-    told = unlike_maps([grid.grid.float().numpy() for grid in grids]) if len(grids) == LOOKED_AT else []
+    told = unlike_maps(some_grids(views.features, views.names))
     if seen.seen_share < LEAST_IN_VIEW:
         return [*told, unseen(seen.seen_share)]
     row_sum, agreement = agreement_of_views(splats, views, settings, threads)
@@ -80,59 +74,6 @@ def disagreement(agreement: float) -> str:
     """That views contradict each other."""
     what = f"views agree on what they see to {max(agreement, 0):.0%} of what their most similar regions would allow"
     return f"cameras: {what}; {FRAME}, and features must be of these photos; {HINT}"
-
-
-@dataclass(frozen=True)
-class Smoothness:
-    """How alike the cells of maps are, means over them."""
-
-    neighbours: float  # cosine of neighbouring cells
-    anyone: float  # of any two
-    readings: dict[str, float]  # of neighbouring cells, were the bytes read so
-
-    @property
-    def share(self) -> float:
-        """What neighbours agree more, as a share of what is left to one."""
-        return (self.neighbours - self.anyone) / max(1 - self.anyone, 1e-6)
-
-
-def smoothness(grids: Sequence[np.ndarray]) -> Smoothness:
-    """Of maps [h, w, F] f32, one at least."""
-    rows = []
-    for grid in grids:
-        readings = [
-            _agreement(grid.reshape(np.array(grid.shape)[np.argsort(axes)]).transpose(axes))[0]
-            for axes in READINGS.values()
-        ]
-        rows.append([*_agreement(grid), *readings])
-    neighbours, anyone, *others = np.median(np.array(rows), axis=0).tolist()
-    return Smoothness(neighbours, anyone, dict(zip(READINGS, others, strict=True)))
-
-
-def unlike_maps(grids: Sequence[np.ndarray]) -> list[str]:
-    """What is wrong with maps [h, w, F] whose neighbouring cells are not alike."""
-    if not grids:
-        return []
-    found = smoothness(grids)
-    best = max(found.readings, key=lambda reading: found.readings[reading])
-    agree = f"neighbouring cells agree to {found.neighbours:.2f}"
-    if found.readings[best] - found.neighbours > LEAST_SMOOTHNESS:
-        told = f"read as {best} they would to {found.readings[best]:.2f}: the bytes lie in that order"
-        return [f"features: {agree}, {told}; write the maps anew, from arrays that are contiguous"]
-    if found.share < LEAST_SMOOTHNESS:
-        return [f"features: {agree}, as any two cells do: the maps show nothing of the photos"]
-    return []
-
-
-def _agreement(grid: np.ndarray) -> tuple[float, float]:
-    """The mean cosine of neighbouring cells of a grid [h, w, F], and of any two."""
-    grid = grid / np.maximum(np.abs(grid).max(axis=2, keepdims=True), 1e-30)  # no square overflows or vanishes
-    unit = grid / np.maximum(np.linalg.norm(grid, axis=2, keepdims=True), 1e-30)
-    down, across = (unit[1:] * unit[:-1]).sum(axis=2), (unit[:, 1:] * unit[:, :-1]).sum(axis=2)
-    mean = unit.reshape(-1, unit.shape[2]).mean(axis=0)
-    count = unit.shape[0] * unit.shape[1]
-    anyone = (count * float(mean @ mean) - 1) / max(count - 1, 1)
-    return float(np.concatenate([down.ravel(), across.ravel()]).mean()) if count > 1 else 1.0, anyone
 
 
 def agreement_of_views(

@@ -236,7 +236,8 @@ def _keep(name: str, made: References) -> None:
 
     told = {"encoder": name, "words": json.dumps(made.words)}
     with suppress(OSError), whole_file(_place(name)) as file:
-        file.write(save({"embeddings": made.vectors.astype(np.float16)}, metadata=told))
+        vectors = np.ascontiguousarray(made.vectors, np.float16)  # `save` writes memory as it lies
+        file.write(save({"embeddings": vectors}, metadata=told))
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:

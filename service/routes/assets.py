@@ -9,9 +9,11 @@ from typing import Annotated, Any, TypeVar
 import anyio
 from fastapi import APIRouter, Path, Query, Request, Response
 
+from liftcore.io.safetensors_file import with_metadata
 from service import models
 from service.content import FILE, Cursor, Limit, StoredFile, file_answer, listed
 from service.errand import ErrandLimits
+from service.requests import described_body, json_body
 from service.state import AppState, Deps
 from service.store.assets import SHOWN_CHARACTERS, AssetRecord
 from service.uploads.intake import AssetIntake, Intake, Taken, coding_of, require_size
@@ -29,6 +31,7 @@ Sha256 = Annotated[
     str | None,
     Query(pattern="^[0-9a-fA-F]{64}$", description="of the content after decompression; checked if given"),
 ]
+CHANGE_BODY = json_body(models.PackChange)
 NamesCursor = Annotated[int, Query(ge=0, le=10**9, description="the `next` of the page before")]
 RAW_BODY = {
     "requestBody": {
@@ -120,6 +123,34 @@ def get_content(asset: AssetId, request: Request, deps: Deps) -> Response:
     found = deps.store.assets.get(deps.owner, asset)
     digest = found.id.removeprefix("sha256:")
     return file_answer(request, StoredFile(found.path, found.bytes, digest, found.file_name))
+
+
+@router.patch(
+    "/{asset}",
+    response_model=models.Asset,
+    status_code=201,
+    responses={200: {"model": models.Asset, "description": "It was here already"}},
+    openapi_extra=described_body(models.PackChange),
+)
+async def change_pack(asset: AssetId, deps: Deps, change: models.PackChange = CHANGE_BODY) -> Response:
+    """Name the encoder or the text space of a feature pack: the same features under these names, as another asset."""
+    made, new = await anyio.to_thread.run_sync(_retagged, asset, change, deps, limiter=deps.checks)
+    return _reply(made, 201 if new else 200)
+
+
+def _retagged(asset: str, change: models.PackChange, deps: AppState) -> tuple[AssetRecord, bool]:
+    found = deps.store.assets.get(deps.owner, asset, models.AssetKind.FEATURES)
+    allowed = ErrandLimits(deps.settings.check_seconds, deps.settings.check_memory_bytes, deps.ending)
+    limit = deps.settings.max_upload_bytes(models.AssetKind.FEATURES)
+    intake = AssetIntake(deps.store, deps.owner, models.AssetKind.FEATURES, limit, None)
+    try:
+        intake.open()
+        for block in with_metadata(found.path, change.model_dump(exclude_none=True)):
+            intake.feed(block)
+        known = intake.finish(None)
+        return (known, False) if known is not None else intake.keep(intake.check(allowed))
+    finally:
+        intake.close()
 
 
 @router.delete("/{asset}", status_code=204)

@@ -22,6 +22,7 @@ from liftcore.io.checkpoint import EXPORT_PLY
 from liftcore.io.class_masks import describe_masks
 from liftcore.io.inspect import describe_camera_file, describe_packs, describe_splat_file, describe_table
 from liftcore.io.json_file import finite
+from liftcore.io.kinds import kind_of
 from liftcore.io.lift_file import parse_metadata, read_lift
 from liftcore.io.splats import SUFFIX, SplatFormat, format_of
 from liftcore.query.text.table import TableEncoder
@@ -118,7 +119,7 @@ def run(kind: UploadKind, path: Path) -> dict[str, Any]:
     try:
         checked = CHECKS[kind](path)
     except SplatliftError as error:
-        return _invalid(error, kind, path)
+        return _invalid(_of_another_kind(kind, path) or error, kind, path)
     except MemoryError:
         return _invalid(_out_of_memory(kind), kind, path)
     counts = finite(checked["found"])  # norms of float32 rows may be infinite
@@ -132,6 +133,15 @@ def run(kind: UploadKind, path: Path) -> dict[str, Any]:
 
 def _invalid(error: SplatliftError, kind: UploadKind, path: Path) -> dict[str, Any]:
     return {"event": "invalid", "fault": fault_of(error, {str(path): kind, f"text table {path.name}": kind})}
+
+
+def _of_another_kind(kind: UploadKind, path: Path) -> InvalidInput | None:
+    """What to say of a file that belongs elsewhere; None where it looks like what it was sent as, or like nothing."""
+    found = kind_of(path)
+    if found in (None, kind):
+        return None
+    hint = "POST it to /lifts" if found == LIFT else f"PUT it to /assets/{found}"
+    return INVALID[kind](kind, expected=f"a file of {kind}", got=f"one of {found}", hint=hint)
 
 
 def _out_of_memory(kind: UploadKind) -> InvalidInput:

@@ -55,6 +55,25 @@ def test_same_bytes_are_the_same_asset(client: TestClient, uploaded: Uploaded, s
     assert uploaded.splats == f"sha256:{hashlib.sha256(scene.splats).hexdigest()}"
 
 
+def test_packs_are_named_anew_as_assets_of_their_own(client: TestClient, uploaded: Uploaded) -> None:
+    at = f"/assets/{uploaded.features}"
+    before = client.get(at).json()["counts"]
+    made = client.patch(at, json={"text_space": "minilm", "encoder": "a CNN"})
+    assert made.status_code == 201 and made.headers["location"] != at
+    assert made.json()["counts"] == before | {"text_space": "minilm", "encoder": "a CNN"}
+    assert client.patch(at, json={"text_space": "minilm", "encoder": "a CNN"}).status_code == 200
+    assert client.patch(at, json={}).json()["id"] == uploaded.features
+    assert client.get(at).json()["counts"] == before
+    assert_problem(client.patch(f"/assets/{uploaded.splats}", json={"encoder": "x"}))
+    for wrong in ({"encoder": ""}, {"text_space": "a\nb"}, {"words": "x"}):
+        assert assert_problem(client.patch(at, json=wrong))["status"] == 422
+
+
+def test_files_sent_as_another_kind_are_told_where_they_belong(client: TestClient, scene: TinyScene) -> None:
+    told = assert_problem(client.put("/assets/splats", content=scene.cameras))
+    assert "cameras" in told["got"] and "/assets/cameras" in told["hint"]
+
+
 @pytest.mark.parametrize("coding", ["gzip", "x-gzip", "zstd", "ZSTD"])
 def test_compressed_upload_gives_the_asset_of_the_content(
     client: TestClient, uploaded: Uploaded, scene: TinyScene, coding: str

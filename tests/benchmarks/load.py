@@ -62,7 +62,7 @@ def measure(seconds: float, rounds: int, splats: int) -> dict[str, Any]:
             large = _upload(client, folder / "large", Room(splats, 4, (640, 480), 512))
             job, _ = client.lift(large, lambda _: None)
             other = _upload(client, folder / "other", OTHER)
-            client.ask(job["id"], next(words))
+            client.get("/query", lift=job["id"], text=next(words))
             alone = _questions(url, job["id"], words, rounds)
             quiet = probe(url, _after(seconds / 4))
             stop = threading.Event()

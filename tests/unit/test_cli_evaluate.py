@@ -10,10 +10,19 @@ from typing import Any
 
 import pytest
 import torch
-from safetensors.torch import save_file
+from safetensors.torch import load_file, save_file
 
 from liftcore.io.lift_file import load_lift, save_lift
-from tests.labelled_scene import FRAMES, LIFTED, isat, rectangle, write_3d_ovs_labels, write_lerf_labels, write_lift
+from tests.labelled_scene import (
+    FRAMES,
+    LIFTED,
+    WORDS,
+    isat,
+    rectangle,
+    write_3d_ovs_labels,
+    write_lerf_labels,
+    write_lift,
+)
 
 from .command_line import run
 
@@ -106,22 +115,39 @@ def test_only_held_out_frames_are_judged_and_lifted_ones_are_named(
         assert (status, out) == (2, "") and message in err and err.count("\n") == 1
 
 
-def test_published_rows_stand_beside_and_never_in_a_mean(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    lift = folder / "kitchen.lift.safetensors"
-    arguments = ["lerf-ovs", lift, "--data", folder / "lerf_ovs", "--protocol", "P3", "--threshold", "0.5"]
+def test_categories_that_a_table_lacks_are_left_out_with_a_note(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    table = load_file(folder / "words.safetensors")["embeddings"]
+    few = tmp_path / "few.safetensors"
+    save_file({"embeddings": table[1:2].clone()}, str(few), metadata={"words": json.dumps(WORDS[1:2])})
+    arguments = ["lerf-ovs", folder / "kitchen.lift.safetensors", "--data", folder / "lerf_ovs", "--table", few]
+    document = evaluate(capsys, *arguments, "--protocol", "P3")
+    (row,) = document["measured"]
+    assert len(row["classes"]) == 1 and any("lacks" in told and "left out" in told for told in document["warnings"])
+    assert not any(row["scenes"] for row in document["published"])  # kitchen is none of the papers' scenes
+
+
+def test_published_rows_stand_beside_and_never_in_a_mean(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(folder / "lerf_ovs" / "label" / "kitchen", tmp_path / "label" / "ramen")
+    lift = f"ramen={folder / 'kitchen.lift.safetensors'}"
+    arguments = ["lerf-ovs", lift, "--data", tmp_path, "--protocol", "P3", "--threshold", "0.5"]
     document = evaluate(capsys, *arguments)
     assert {row["dataset"] for row in document["published"]} == {"lerf-ovs"}
-    assert all(row["source"] and row["protocol"] for row in document["published"])
+    assert all(row["source"] and row["protocol"] and row["scenes"]["ramen"] for row in document["published"])
     assert document["mean_of_scenes"]["P3"]["all labelled"]["object_micro"] > 0.9
     status, out, err = run(capsys, "evaluate", *arguments)
     assert (status, err) == (0, "")
     lines = out.splitlines()
+    assert "teatime" not in lines[0]
     kinds = [line.split()[0] for line in lines[1:]]
     assert set(kinds) == {"measured", "published", "warning:"} and kinds == sorted(kinds)
     measured = [line for line in lines if line.startswith("measured")]
     assert all(" P3 " in line for line in measured)
-    ours = next(line for line in lines if "65.1" in line)
-    assert ours.split()[:7] == ["published", "P3", "mIoU", "67.6", "68.5", "62.3", "62.1"]
+    ours = next(line for line in lines if "62.3" in line)
+    assert ours.split()[:5] == ["published", "P3", "mIoU", "62.3", "Splat"]
 
 
 def test_frames_without_cameras_or_objects_are_named(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -151,3 +152,20 @@ def test_sub_folders_are_told_and_no_input_is_written_over(
         status, _, err = run(capsys, "pack", "masks", folder, "-o", folder / "camA" / name)
         assert status == 2 and "another file than the inputs" in err
         assert (folder / "camA" / name).read_bytes() == before
+
+
+def test_a_pack_is_named_anew_and_else_kept_to_the_byte(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "maps").mkdir()
+    np.save(tmp_path / "maps" / "a.npy", np.arange(60, dtype=np.float32).reshape(3, 4, 5))
+    pack, named = tmp_path / "p.safetensors", tmp_path / "n.safetensors"
+    assert run(capsys, "pack", "npy", tmp_path / "maps", "-o", pack, "--encoder-name", "toy")[0] == 0
+    status, out, _ = run(capsys, "pack", "retag", pack, "-o", named, "--text-space", "minilm")
+    assert status == 0 and "encoder toy, text space minilm" in out
+    before, after = read_features(pack), read_features(named)
+    assert (before.text_space, after.text_space, after.encoder) == ("", "minilm", "toy")
+    assert (after["a"].codebook == before["a"].codebook).all()
+    assert re.search("text space +not named", run(capsys, "inspect", pack)[1])
+    for wrong in (["retag", pack], ["retag", tmp_path / "maps" / "a.npy", "--text-space", "x"]):
+        status, out, err = run(capsys, "pack", *wrong, "-o", tmp_path / "w.safetensors")
+        assert (status, out) == (2, "") and not (tmp_path / "w.safetensors").exists()
+        assert_one_line(err)

@@ -124,6 +124,21 @@ def test_features_are_described_and_their_faults_counted(tmp_path: Path) -> None
     ]
 
 
+def test_maps_in_another_order_and_masks_of_one_region_are_told(tmp_path: Path) -> None:
+    rows, columns = torch.meshgrid(torch.linspace(0, 3, 12), torch.linspace(0, 4, 16), indexing="ij")
+    waves = torch.stack([torch.cos(k * rows + columns + k) for k in range(8)], dim=2)
+    right = {f"v{k}": FeatureGrid(waves.roll(k, 0)) for k in range(4)}
+    turned = {
+        name: FeatureGrid(grid.grid.permute(2, 0, 1).contiguous().reshape(12, 16, 8)) for name, grid in right.items()
+    }
+    alone = {f"v{k}": Regions(torch.zeros(1, 4, 4, dtype=torch.int32), torch.eye(1, 8)) for k in range(4)}
+    told = []
+    for number, views in enumerate((right, turned, alone)):
+        write_pack(tmp_path / f"{number}.safetensors", views, {"encoder": "x", "normalised": "false"})
+        told.append(inspected(tmp_path / f"{number}.safetensors")["warnings"])
+    assert told[0] == [] and "read as [F, h, w]" in told[1][0] and "one region alone" in told[2][0]
+
+
 def test_lift_is_described(tmp_path: Path) -> None:
     gone = InputFile(path="/nowhere/s.ply", sha256="0")
     metadata = LiftMetadata(

@@ -13,6 +13,7 @@ from liftcore.features.encoders import Pixels
 from liftcore.nearest import nearest
 from liftcore.query.text.open_clip import WEIGHT_SUFFIXES
 from liftcore.query.text.torchvision_ops import import_torchvision
+from liftcore.query.text.weights import fetched
 
 # What checkpoints hold beside the backbone: classifiers, and what only the training needed.
 _LEFT_OVER = ("mask_token",)
@@ -109,15 +110,7 @@ def _by_name(label: str, name: str) -> Any:
         raise Unavailable(
             label, expected="weights: a name that timm has them for, or a file", got="none", hint=f"timm:{name}@FILE"
         )
-    try:
-        return _create(name, pretrained=True)
-    except Exception as error:  # the hub's clients raise their own, urllib's and OSError's kinds
-        raise Unavailable(
-            label,
-            expected="weights in the cache or a network to fetch them",
-            got=str(error)[:200],
-            hint=f"download them elsewhere and use timm:{name}@FILE",
-        ) from None
+    return fetched(label, lambda: _create(name, pretrained=True), f"download them elsewhere and use timm:{name}@FILE")
 
 
 def _from_file(label: str, name: str, path: Path) -> Any:

@@ -18,6 +18,7 @@ from liftcore.errors import InvalidQuery, Unavailable
 from liftcore.nearest import nearest
 from liftcore.query.text import BUILT_IN, refuse_empty
 from liftcore.query.text.torchvision_ops import import_torchvision
+from liftcore.query.text.weights import fetched
 
 # open_clip and timm read these with weights_only; the loader of big_vision .npz files has no such switch.
 WEIGHT_SUFFIXES = (".safetensors", ".pt", ".pth", ".bin", ".ckpt")
@@ -122,16 +123,9 @@ def _from_tag(kind: str, model_name: str, tag: str) -> Any:
         )
     if tag not in tags:
         raise InvalidQuery(label, expected=f"one of the tags {', '.join(tags) or '(none)'}", got=repr(tag))
-    try:
-        return create_model(model_name, tag)
-    except Exception as error:  # the hub's clients raise their own, urllib's and OSError's kinds
-        words = "; the encoder lvis has 1,203 words of it" if label == f"encoder {BUILT_IN['lvis']}" else ""
-        raise Unavailable(
-            label,
-            expected="weights in the cache or a network to fetch them",
-            got=str(error)[:200],
-            hint=f"download them elsewhere and use {kind}:{model_name}@FILE{words}",
-        ) from None
+    words = "; the encoder lvis has 1,203 words of it" if label == f"encoder {BUILT_IN['lvis']}" else ""
+    hint = f"download them elsewhere and use {kind}:{model_name}@FILE{words}"
+    return fetched(label, lambda: create_model(model_name, tag), hint)
 
 
 def _from_file(label: str, model_name: str, path: Path) -> Any:

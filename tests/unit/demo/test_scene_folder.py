@@ -43,7 +43,7 @@ def test_a_scene_is_found_by_what_its_files_are(folder: Path, tmp_path: Path) ->
     assert scene.features.name == "grids.safetensors"
     assert scene.encoder == "minilm"
     assert zipfile.ZipFile(scene.cameras).namelist() == ["cameras.bin", "images.bin"]
-    assert scene.phrases == ("the cat", "the boat", "the cow")
+    assert scene.phrases == ("the cat", "the fish")  # what the view shows
     assert scene.views == ("v",)
     assert scene.truth is not None
     mask = scene.truth.mask_of("the fish", "v")
@@ -70,6 +70,9 @@ def test_phrases_of_the_user_come_first_and_a_table_is_the_encoder(folder: Path,
     assert scene.phrases == ("a whale",)
     assert scene.encoder == f"table:{folder / 'text_table.safetensors'}"
     assert (scene.cameras.name, scene.features.name) == ("cameras.json", "features.safetensors")
+    assert scene.other_packs == ("grids.safetensors",)
+    other = find_scene(folder, ["a whale"], tmp_path, folder / "grids.safetensors")
+    assert (other.features.name, other.other_packs) == ("grids.safetensors", ("features.safetensors",))
 
 
 @pytest.mark.parametrize(
@@ -97,13 +100,15 @@ def test_a_scene_that_says_nothing_of_itself_is_asked_nothing(folder: Path, tmp_
 def test_features_without_words_are_asked_nothing(folder: Path, tmp_path: Path) -> None:
     save_file({"v/grid": torch.ones(1, 1, 2)}, str(folder / "grids.safetensors"))
     scene = find_scene(folder, (), tmp_path)
-    assert (scene.phrases, scene.text_space) == ((), "none")
+    assert (scene.phrases, scene.text_space) == ((), "")  # not named
 
 
 @pytest.mark.parametrize("space", ["none", "animals"])
 def test_phrases_without_an_encoder_for_them_are_refused(folder: Path, tmp_path: Path, space: str) -> None:
     save_file({"v/grid": torch.ones(1, 1, 2)}, str(folder / "grids.safetensors"), metadata={"text_space": space})
-    with pytest.raises(InvalidInput, match=rf"--ask: expected words .* as text_table.safetensors in .*'{space}'"):
+    with pytest.raises(
+        InvalidInput, match=rf"--ask: expected words .* as text_table.safetensors in .*space is {space}"
+    ):
         find_scene(folder, ["a whale"], tmp_path)
 
 
@@ -111,4 +116,4 @@ def test_a_pack_that_names_no_text_space_has_the_words_of_the_table_beside_it(fo
     save_file({"v/grid": torch.ones(1, 1, 2)}, str(folder / "grids.safetensors"))
     assert find_scene(folder, (), tmp_path / "bare").phrases == ()
     (folder / "text_table.safetensors").touch()
-    assert find_scene(folder, (), tmp_path / "worded").phrases == ("the cat", "the boat", "the cow")
+    assert find_scene(folder, (), tmp_path / "worded").phrases == ("the cat", "the fish")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -28,6 +29,7 @@ from liftcore.features.encoders.encode import (
 from liftcore.features.encoders.timm_backbone import TimmEncoder, cell_shift
 from liftcore.features.pack import read_features
 from liftcore.features.views import FeatureGrid
+from liftcore.query.text import weights
 from liftcore.query.text.open_clip import OpenedModel, library
 
 pytestmark = pytest.mark.slow
@@ -498,16 +500,23 @@ def test_missing_weights_are_unavailable_and_never_random(spec: str, message: st
 
 
 @pytest.mark.parametrize("spec", ["maskclip:ViT-B-32/openai", "timm:resnet18.a1_in1k"])
-def test_weights_that_cannot_be_fetched_say_how_to_go_on(spec: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    def offline(*_: object, **__: object) -> None:
-        raise OSError("no route to host")
+def test_weights_are_asked_of_the_cache_and_once_of_the_network(
+    spec: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from huggingface_hub import constants
 
-    import timm
-
-    monkeypatch.setattr(timm, "create_model", offline)
-    monkeypatch.setattr(library(), "create_model", offline)
-    with pytest.raises(Unavailable, match=r"no route to host; download them elsewhere and use .*@FILE"):
-        open_image_encoder(spec)
+    monkeypatch.setenv("no_proxy", "127.0.0.1")
+    with socket.create_server(("127.0.0.1", 0)) as silent:  # which takes connections and never answers
+        silent.setblocking(False)
+        monkeypatch.setattr(constants, "ENDPOINT", f"http://127.0.0.1:{silent.getsockname()[1]}")
+        monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path))
+        monkeypatch.setattr(weights, "SECONDS", 0.3)
+        with pytest.raises(Unavailable, match=r"not answer within 0.3 s; download them elsewhere and use .*@FILE"):
+            open_image_encoder(spec)
+        silent.accept()[0].close()
+        with pytest.raises(BlockingIOError):
+            silent.accept()
+    assert weights.fetched("x", lambda: 7, "") == 7  # what is in the cache asks nobody
 
 
 @pytest.mark.parametrize("spec", ["maskclip:ViT-S-32-alt", "timm:resnet18"])

@@ -2,6 +2,7 @@
 
 import io
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -67,8 +68,9 @@ def test_the_object_as_an_editors_file_has_the_same_rows(suffix: str, scene: Que
 
 
 def test_nothing_selected_is_no_file(scene: QueryScene, tmp_path: Path) -> None:
+    nothing = replace(of_lamp(scene), selected=np.zeros(61, np.bool_))
     with pytest.raises(InvalidQuery, match=r"none of 61.*lower threshold"):
-        (tmp_path / "lamp.ply").write_bytes(b"".join(object_splats(scene, of_lamp(scene, 2.0))))
+        (tmp_path / "lamp.ply").write_bytes(b"".join(object_splats(scene, nothing)))
     assert not (tmp_path / "lamp.ply").exists()
 
 
@@ -101,9 +103,8 @@ def test_the_coloured_scene_looks_like_the_attention(scene: QueryScene, tmp_path
 
 def test_exports_load_no_splats_and_know_when_their_file_changed(scene: QueryScene, tmp_path: Path) -> None:
     answer = of_lamp(scene)
-    for make in (object_splats, coloured_ply):
-        assert list(make(scene, answer))
-    assert "splats" not in scene.__dict__ and "raster" not in scene.__dict__
+    assert list(coloured_ply(scene, answer)) and "splats" not in scene.__dict__
+    assert list(object_splats(scene, answer)) and "raster" not in scene.__dict__
     (tmp_path / "s.ply").write_bytes(ply(splat_rows()))
     other = QueryScene.open(scene.path)
     for make in (object_splats, coloured_ply):
