@@ -21,7 +21,6 @@ from liftcore.features.smoothness import smoothness, unlike_maps
 from liftcore.features.views import FeatureGrid, Regions
 from liftcore.planning.contradictions import (
     FRAME,
-    LEAST_AGREEMENT,
     LEAST_IN_VIEW,
     LEAST_ROW_SUM,
     agreement_of_views,
@@ -113,13 +112,13 @@ def check_scene(
     figures: dict[str, float] = {}
     if features is not None:
         figures, told = _check_features(features, cameras, files)
-        agreement = agreement_of_views(splats, LiftViews.of(features, cameras, LiftSettings.of()), LiftSettings.of())[
-            1
-        ]
+        settings = LiftSettings.of()
+        lifted = LiftViews.of(features, cameras, settings)
+        agreement = agreement_of_views(splats, lifted, settings)[1]
         if agreement is not None:
             figures["agreement_of_views"] = agreement
-            # Other cameras than those of the scene are told already, and broken maps agree nowhere.
-            told += [disagreement(agreement)] if agreement < LEAST_AGREEMENT and not (told or wrong) else []
+            if not (told or wrong):  # other cameras are told already, and broken maps agree nowhere
+                told += disagreement(splats, lifted, settings, agreement)
         wrong += told
     compared = [view for view in views if view.psnr is not None]
     worst = min(compared, key=lambda view: view.psnr or 0.0).view if compared else None

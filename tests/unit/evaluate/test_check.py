@@ -17,9 +17,11 @@ from liftcore.features.views import FeatureGrid, Regions
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.ply import write_splats
 from liftcore.query.splat_colours import seen_colours
+from liftcore.query.text.table import TableEncoder
 from liftcore.raster.base import CompositingParams
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.cameras import Cameras
+from tests.still_life.masks import Mistakes, observe
 from tests.still_life.scene import StillLife, still_life
 
 
@@ -65,6 +67,18 @@ def test_cameras_of_another_scale_are_told_by_the_photos(scene: StillLife, photo
         moved.append(camera.replace(viewmat=pose))
     (told,) = check_scene(scene.splats, Cameras(tuple(moved)), photos).wrong
     assert told.startswith("photos: renders are hardly more like their own photos")
+
+
+def test_cameras_of_another_scale_are_told_by_features_alone() -> None:
+    scene = still_life(seed=7, views=12, density=0.1)
+    words = TableEncoder("words", [*scene.things, *scene.parts], np.eye(len(scene.things) + len(scene.parts)))
+    masks = as_views(observe(scene, CpuRaster(scene.splats), words, Mistakes(), 7))
+    scale = np.ones((4, 4))
+    scale[:3, 3] = 0.3
+    moved = Cameras([camera.replace(viewmat=camera.viewmat * scale) for camera in scene.cameras.values()])
+    assert check_scene(scene.splats, scene.cameras, features=masks).wrong == ()
+    (told,) = check_scene(scene.splats, moved, features=masks).wrong
+    assert "with positions times about" in told
 
 
 def test_cameras_that_see_nothing_are_told_without_photos(scene: StillLife) -> None:

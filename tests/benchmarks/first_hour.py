@@ -1,0 +1,170 @@
+"""A stranger's first hour: inputs that contradict each other are told, healthy ones are not, the demo takes a scene.
+
+    python -m tests.benchmarks.first_hour SHARED [--demo] [--json]
+
+SHARED holds the folders ``plush`` and ``tabletop``; the still life is generated. Each case is a row: ``done`` or
+``NOT DONE``, and what was seen. A healthy scene is done where `check` finds nothing wrong with all of its views, 20,
+10 and 6 of them, a broken one where it is told, with photos and without:
+
+- ``positions x 0.3``, ``x 0.5``: the cameras' positions in another scale than the splats;
+- ``foreign cameras``: the other scene's, under the names of its own;
+- ``[F, h, w] under [h, w, F]``: a grid whose bytes lie in another order than its shape says.
+
+``--demo`` also runs ``splatlift demo --scene`` on both folders, which takes some minutes.
+"""
+
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from liftcore.evaluate.check import check_scene
+from liftcore.features.encoders.encode import find_images
+from liftcore.features.pack import Views, as_views, read_features
+from liftcore.features.views import FeatureGrid
+from liftcore.io.cameras import read_cameras
+from liftcore.io.splats import read_splats
+from liftcore.scene.cameras import Cameras
+from liftcore.scene.splats import Splats
+from tests.benchmarks.base import command_line
+from tests.still_life.files import write_still_life
+from tests.still_life.scene import still_life
+
+COUNTS = (None, 20, 10, 6)  # of views; None: all
+MOST_SECONDS = 20.0  # that `check` may take on plush
+PACKS = {
+    "plush": ("grids", "regions"),
+    "tabletop": ("features", "features_clean", "features_hard", "grids"),
+    "still life": ("features",),
+}
+
+
+class Case(NamedTuple):
+    """What was tried, whether it is as it should be, and what was seen."""
+
+    what: str
+    done: bool
+    seen: str
+
+
+class Scene(NamedTuple):
+    """A scene as `check` takes it."""
+
+    splats: Splats
+    cameras: Cameras
+    photos: Mapping[str, Path] | None
+    packs: Mapping[str, Views]
+
+
+def main() -> int:
+    """Run the cases and print them; 1 where one is not done."""
+    parser = command_line("tests.benchmarks.first_hour", __doc__)
+    parser.add_argument("shared", type=Path)
+    parser.add_argument("--demo", action="store_true")
+    options = parser.parse_args()
+    cases = []
+    with tempfile.TemporaryDirectory() as scratch:
+        for case in _cases(options.shared, Path(scratch), demo=options.demo):
+            cases.append(case)
+            if not options.json:
+                print(f"{'done' if case.done else 'NOT DONE':<9} {case.what}: {case.seen}", flush=True)
+    done = sum(case.done for case in cases)
+    print(json.dumps([case._asdict() for case in cases]) if options.json else f"{done} of {len(cases)} are done")
+    return 0 if done == len(cases) else 1
+
+
+def _cases(shared: Path, scratch: Path, *, demo: bool) -> Iterator[Case]:
+    write_still_life(scratch, still_life())
+    folders = {"plush": shared / "plush", "tabletop": shared / "tabletop", "still life": scratch}
+    scenes = {name: _opened(folder, PACKS[name]) for name, folder in folders.items()}
+    for name, scene in scenes.items():
+        foreign = scenes["tabletop" if name == "plush" else "plush"].cameras
+        for pack, views in scene.packs.items():
+            yield from _healthy(f"{name} {pack}", scene, views)
+            yield from _broken(f"{name} {pack}", scene, views, foreign)
+    yield _seconds(scenes["plush"])
+    if demo:
+        yield from (_demo(folder, scratch / f"out-{name}") for name, folder in list(folders.items())[:2])
+
+
+def _opened(folder: Path, packs: tuple[str, ...]) -> Scene:
+    photos = folder / "images"
+    return Scene(
+        read_splats(folder / "point_cloud.ply"),
+        read_cameras(folder / "cameras.json"),
+        find_images([photos]) if photos.is_dir() else None,
+        {pack: read_features(folder / f"{pack}.safetensors") for pack in packs},
+    )
+
+
+def _healthy(name: str, scene: Scene, views: Views) -> Iterator[Case]:
+    for count in COUNTS:
+        if count is not None and count >= len(views):
+            continue
+        some = [views.views[int(k)] for k in np.linspace(0, len(views) - 1, count or len(views))]
+        found = check_scene(scene.splats, scene.cameras, scene.photos, as_views({view: views[view] for view in some}))
+        agreement = found.features.get("agreement_of_views", float("nan"))
+        said = found.wrong[0] if found.wrong else f"nothing is told, views agree to {agreement:.2f}"
+        yield Case(f"{name}, healthy, {len(some)} views", not found.wrong, said)
+
+
+def _broken(name: str, scene: Scene, views: Views, foreign: Cameras) -> Iterator[Case]:
+    renamed = [
+        camera.replace(name=own)
+        for own, camera in zip(scene.cameras, list(foreign.values()) * len(scene.cameras), strict=False)
+    ]
+    broken = {
+        "positions x 0.3": (_scaled(scene.cameras, 0.3), views),
+        "positions x 0.5": (_scaled(scene.cameras, 0.5), views),
+        "foreign cameras": (Cameras(renamed), views),
+    }
+    if not views.is_regions(views.views[0]):
+        broken["[F, h, w] under [h, w, F]"] = (scene.cameras, _turned(views))
+    for what, (cameras, given) in broken.items():
+        for photos in {True: scene.photos, False: None}.values() if scene.photos else (None,):
+            found = check_scene(scene.splats, cameras, photos, given)
+            beside = "with photos" if photos else "without photos"
+            said = found.wrong[0] if found.wrong else "nothing is told"
+            yield Case(f"{name}, {what}, {beside}", bool(found.wrong), said)
+
+
+def _scaled(cameras: Cameras, factor: float) -> Cameras:
+    scale = np.ones((4, 4))
+    scale[:3, 3] = factor
+    return Cameras([camera.replace(viewmat=camera.viewmat * scale) for camera in cameras.values()])
+
+
+def _turned(views: Views) -> Views:
+    made = {}
+    for name, view in views.items():
+        assert isinstance(view, FeatureGrid)
+        made[name] = FeatureGrid(torch.clone(view.grid.permute(2, 0, 1).contiguous()).reshape(view.grid.shape))
+    return as_views(made)
+
+
+def _seconds(plush: Scene) -> Case:
+    begin = time.perf_counter()
+    check_scene(plush.splats, plush.cameras, plush.photos, plush.packs["grids"])
+    took = time.perf_counter() - begin
+    return Case(f"check of plush within {MOST_SECONDS:g} s", took <= MOST_SECONDS, f"{took:.1f} s")
+
+
+def _demo(folder: Path, out: Path) -> Case:
+    """The demo on a folder: it names the pack that it took, and asks about something that is in view."""
+    command = [sys.executable, "-m", "liftcore.cli", "demo", "--scene", str(folder), "--out", str(out)]
+    ran = subprocess.run(command, capture_output=True, text=True, check=False)
+    told = "--pack takes others" in ran.stdout
+    found = [line.strip() for line in ran.stdout.splitlines() if " splats, best score " in line]
+    seen = found[0] if found else (ran.stderr.strip().splitlines() or ["nothing was found"])[-1]
+    return Case(f"demo on {folder.name}", ran.returncode == 0 and told and bool(found), seen)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
