@@ -91,6 +91,8 @@ $(READY): requirements.lock pyproject.toml
 	awk '/^[a-z]/ { kept = !/^(torch|torchvision)==/ } kept' requirements.lock \
 	| $(BIN)/python -m pip install --quiet --require-hashes -r /dev/stdin
 	$(BIN)/python -m pip install --quiet --no-deps -e .
+	@$(BIN)/python -c "import torchvision" 2>/dev/null || echo "torchvision does not load beside this torch: scripts that" \
+	"import open_clip or segment-anything need both of one index (TORCH_PIP='--index-url ...'); splatlift does without"
 	@echo "compiling the kernels of 3DGS: a minute, once"
 	$(BIN)/python -m tests.kernels 3dgs
 	touch $@

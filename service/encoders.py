@@ -64,8 +64,10 @@ def _no_encoder(settings: ServiceSettings, text_space: str) -> InvalidRequest:
     return InvalidRequest(
         "lift", expected="features of a text space that this server has an encoder for",
         got=f"text space {text_space!r}" if text_space else "features that name no text space",
-        hint=f"ask by example, with like=; or the operator sets SPLATLIFT_TEXT_SPACES='{example}' or"
-        f" SPLATLIFT_ENCODER; encoder=default asks {encoder_label(settings.encoder)} all the same",
+        hint="ask with table=ID of an uploaded text table, or by example, with like="
+        + ("" if text_space else "; PATCH /assets/{asset} names a pack's text space, for a lift of it")
+        + f"; or the operator sets SPLATLIFT_TEXT_SPACES='{example}' or SPLATLIFT_ENCODER;"
+        f" encoder=default asks {encoder_label(settings.encoder)} all the same",
     )  # fmt: skip
 
 

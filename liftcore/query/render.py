@@ -86,8 +86,7 @@ def view_mask(
     image = scene.image(camera, lambda of: scene.raster.render(of, values, scene.compositing)).numpy()
     attention, weights, row_sums = (np.ascontiguousarray(image[..., column]) for column in range(3))
     mask = (row_sums >= MINIMUM_ROW_SUM) & (weights >= LEAST_SHARE * row_sums)
-    name = view if isinstance(view, str) else camera.name
-    return ViewMask(name, attention, row_sums, mask, f"at least half of the ray is of {shown}")
+    return ViewMask(camera.name, attention, row_sums, mask, f"at least half of the ray is of {shown}")
 
 
 def mask_png(seen: ViewMask) -> bytes:

@@ -25,6 +25,7 @@ from liftcore.cli import main
 from liftcore.features.mask_files import mask_of_runs, read_runs
 from liftcore.features.pack import read_features
 from liftcore.io.splats import read_splats
+from liftcore.query.text.table import TableEncoder
 from service import models
 from service.routes import assets, jobs, operations, queries, results, scene, words
 from service.scopes import OPEN
@@ -73,9 +74,13 @@ def test_sams_masks_make_a_lift_that_knows_the_words(scene_folder: Path, monkeyp
         Image.fromarray((80 * clusters[0] + 40).astype(np.uint8)).save(scene_folder / "photos" / f"{view}.jpg")
     for name, module in stand_ins().items():
         monkeypatch.setitem(sys.modules, name, module)
-    (scene_folder / "words.safetensors").unlink()
     run_example(GUIDE, "from segment_anything import")
-    run_example(GUIDE, "open_clip.get_tokenizer")
+    table = TableEncoder.open(scene_folder / "words.safetensors")
+    (scene_folder / "words.safetensors").unlink()
+    monkeypatch.setattr("liftcore.query.text.open_encoder", lambda spec: table)  # whose weights are not here
+    run_example(GUIDE, "import open_encoder")
+    monkeypatch.undo()
+    monkeypatch.chdir(scene_folder)
     commands = commands_between(GUIDE, "### From SAM's masks", "\n### ", scene_folder)
     assert [command[0] for command in commands] == ["pack", "lift"]
     question = ["query", "scene.lift.safetensors", "apple", "--table", "words.safetensors", "--view", "middle"]

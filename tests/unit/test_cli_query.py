@@ -6,8 +6,10 @@ import json
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from liftcore import cli
 from liftcore.io.lift_file import load_lift, save_lift
@@ -72,6 +74,29 @@ def test_words_to_a_lift_without_a_text_encoder_are_refused_with_its_text_space(
     assert (status, out) == (2, "")
     assert told in err and "--like" in err
     assert_one_line(err)
+
+
+def test_overlays_show_what_was_found_and_say_its_share(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(capsys, *lift_arguments(scene))[0] == 0
+    photo = np.full((48, 96, 3), 100, np.uint8)  # thrice the camera's size
+    Image.fromarray(photo).save(scene / "photo.png")
+    shares, pictures = [], []
+    for number, cut in enumerate((0.5, -1)):  # one of the two splats, and both
+        asked = ["--like", "splat:1", "--threshold", cut, "--view", "front.jpg", "--photo", scene / "photo.png"]
+        out = scene / f"{number}.png"
+        status, told, _ = run(capsys, "query", scene / "lift.safetensors", *asked, "--overlay", out, "--json")
+        assert status == 0
+        view = json.loads(told)["view"]
+        shares.append(view["mask_share"])
+        with Image.open(out) as picture:
+            pictures.append(np.asarray(picture).astype(int))
+        assert view["name"] == "front"
+    assert 0 < shares[0] < shares[1]
+    for share, picture in zip(shares, pictures, strict=True):
+        assert picture.shape[1] == 32 and picture.shape[0] > 16 and picture[16:].min() < 128  # a caption below
+        shown = picture[:16]
+        tinted, dimmed = shown[..., 0] > 100, shown[..., 0] < 50
+        assert np.mean(tinted) >= share and np.mean(dimmed) <= 1 - share  # the outline is beside the mask
 
 
 def test_picture_without_a_view_is_refused(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
