@@ -16,6 +16,7 @@ BAD_INPUT = 2
 ROLES = {  # of arguments that name files: what belongs there
     "splats": "splats", "cameras": "cameras", "features": "features", "lift": "lift", "table": "table",
 }  # fmt: skip
+ORDERED = ("lift", "plan", "check", "tradeoff")  # commands that take splats, cameras and features
 PRESETS = "default, row-sum, tikhonov (if none is named), argmax, top-k, front-mass, centre or mean"
 THRESHOLDS = "auto, valley, paper, otsu, stability or a number"
 
@@ -52,8 +53,8 @@ def misplaced(options: argparse.Namespace) -> InvalidInput | None:
         for path in given if isinstance(given, list) else [given]:
             kind = kind_of(path) if isinstance(path, Path) else None
             if kind not in (None, wanted):
-                hint = "the order is SPLATS CAMERAS FEATURES" if hasattr(options, "features") else ""
-                return InvalidInput(str(path), expected=f"{wanted}, as {name}", got=kind, hint=hint)
+                hint = "the order is SPLATS CAMERAS FEATURES" if options.command in ORDERED else ""
+                return InvalidInput(str(path), expected=f"{wanted} as {name.upper()}", got=kind, hint=hint)
     return None
 
 

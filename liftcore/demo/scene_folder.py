@@ -96,7 +96,8 @@ def find_scene(folder: Path, phrases: Sequence[str], scratch: Path, pack: Path |
         raise InvalidInput(
             "--ask", expected=f"words in the space of the features, as {_TABLE} in {folder.name}",
             got=f"none, and features whose text space is {text_space or 'not named'}",
-            hint="or use 'splatlift lift' and 'splatlift query --encoder', which take any text encoder",
+            hint="leave --ask out, and it is asked by example" if text_space == NO_WORDS
+            else "or use 'splatlift lift' and 'splatlift query --encoder', which take any text encoder",
         )  # fmt: skip
     return DemoScene(
         name=folder.name,

@@ -53,7 +53,8 @@ def unlike_maps(grids: Sequence[np.ndarray]) -> list[str]:
     agree = f"neighbouring cells agree to {found.neighbours:.2f}"
     if found.readings[best] - found.neighbours > LEAST_SMOOTHNESS:
         told = f"read as {best} they would to {found.readings[best]:.2f}: the bytes lie in that order"
-        return [f"features: {agree}, {told}; write the maps anew, from arrays that are contiguous"]
+        hint = "pack maps of channels first with --layout chw, and write others from contiguous arrays"
+        return [f"features: {agree}, {told}; {hint}"]
     if found.share < LEAST_SMOOTHNESS:
         return [f"features: {agree}, as any two cells do: the maps show nothing of the photos"]
     return []

@@ -143,9 +143,9 @@ def test_a_folder_in_place_of_a_pack_is_told_how_one_is_made(scene: Path, capsys
 @pytest.mark.parametrize(
     ("order", "told"),
     [
-        ((1, 0, 2), "cameras.json: expected splats, as splats, got cameras; the order is SPLATS CAMERAS FEATURES"),
-        ((0, 2, 1), "pack.safetensors: expected cameras, as cameras, got features"),
-        ((0, 1, 1), "cameras.json: expected features, as features, got cameras"),
+        ((1, 0, 2), "cameras.json: expected splats as SPLATS, got cameras; the order is SPLATS CAMERAS FEATURES"),
+        ((0, 2, 1), "pack.safetensors: expected cameras as CAMERAS, got features"),
+        ((0, 1, 1), "cameras.json: expected features as FEATURES, got cameras"),
     ],
 )
 def test_files_in_each_others_place_are_told_as_that(
@@ -156,7 +156,7 @@ def test_files_in_each_others_place_are_told_as_that(
     assert (status, out) == (2, "") and told in err
     assert_one_line(err)
     status, out, err = run(capsys, "query", files[2], "word")
-    assert (status, out) == (2, "") and "pack.safetensors: expected lift, as lift, got features" in err
+    assert (status, out) == (2, "") and "pack.safetensors: expected lift as LIFT, got features" in err
 
 
 def test_output_is_never_an_input_or_a_folder(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
