@@ -23,7 +23,7 @@ from service.store.owners import SERVICE
 from service.store.schema import MIGRATIONS
 from service.store.store import Store
 
-from .conftest import Supervising, asset_of, ended, order
+from .conftest import Supervising, asset_of, ended, order, supervised, until
 
 
 @pytest.fixture
@@ -59,6 +59,21 @@ def test_backup_beside_a_server_is_restored_as_it_was(
     assert files(again.files.root) == before == files(tmp_path / "backup")
     assert again.jobs.all(SERVICE) == jobs and again.keys.required()
     assert (tmp_path / "again" / KEYS_REQUIRED).exists()
+    again.close()
+
+
+def test_job_that_runs_during_a_backup_ends_in_the_restored(
+    store: Store, supervising: Supervising, tmp_path: Path
+) -> None:
+    job = store.jobs.submit(SERVICE, order(store))[0]
+    with supervising("hang"):
+        until(lambda: store.jobs.get(SERVICE, job).plan)
+        back_up(store.files.root, tmp_path / "backup")
+    assert verify(tmp_path / "backup") == []
+    restore(tmp_path / "backup", tmp_path / "again")
+    again = Store.open(tmp_path / "again")
+    with supervised(again, "answer"):
+        assert ended(again, job).state is JobState.SUCCEEDED
     again.close()
 
 
