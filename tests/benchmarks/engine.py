@@ -1,10 +1,12 @@
 """What lifts in blocks cost, and what they hold: against a lift in memory, by Ray's workers, of a scene too large.
 
     python -m tests.benchmarks.engine overhead SCENE
+    python -m tests.benchmarks.engine weak SCENE
     python -m tests.benchmarks.engine large [--splats N] [--channels F] [--views V]
 
 The first prints seconds in memory, by LocalEngine, and by one and two workers of Ray. SCENE is a folder with
-``point_cloud.ply``, cameras and ``regions.safetensors`` or ``features.safetensors``. The second flies over a made
+``point_cloud.ply``, cameras and ``regions.safetensors`` or ``features.safetensors``. The second gives one worker of
+a core half of the views, and then two of them all views. The third flies over a made
 city, where each view looks down on a part of it: seconds, bytes, and the memory that the process holds for itself
 (RssAnon, the most of all looks; pages of mapped files may be dropped). From its costs follows the model that it
 prints, of fifty million splats, ten thousand views and 512 channels on more workers.
@@ -18,6 +20,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
 from threading import Event, Thread
 from typing import Any
@@ -169,13 +172,35 @@ def overhead(scene: Path, turns: int) -> None:
         print(f"{name}: {middle:.2f} s, {middle / base:.2f} of a lift in memory, the same bits")
 
 
+def weak(scene: Path, turns: int) -> None:
+    """Print the seconds of half of the views by one worker of a core, and of all views by two."""
+    ray = import_module("ray")
+    pack = next(path for name in ("regions", "features") if (path := scene / f"{name}.safetensors").exists())
+    splats, cameras, views = lc.read_splats(scene / "point_cloud.ply"), lc.read_cameras(scene), lc.read_features(pack)
+    middles = []
+    for workers in (1, 2):
+        ray.init(num_cpus=workers, include_dashboard=False, log_to_driver=False, _node_ip_address="127.0.0.1")
+        given = {"preset": "row-sum", "engine": lc.RayEngine("auto", cpus=1), "view_stride": 3 - workers}
+        found, took = lc.lift(splats, cameras, views, **given), []  # the first warms up
+        for _ in range(turns):
+            begun = time.perf_counter()
+            found = lc.lift(splats, cameras, views, **given)
+            took.append(time.perf_counter() - begun)
+        ray.shutdown()
+        middles.append(float(np.median(took)))
+        stages = ", ".join(f"{name} {seconds:.1f}" for name, seconds in found.metadata.timings.items())
+        print(f"{workers} workers, {len(found.views)} views: {middles[-1]:.2f} s ({stages})")
+    print(f"twice the views by twice the workers: {middles[1] / middles[0]:.2f} of the time")
+
+
 def main() -> None:
     """Run what was asked for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(dest="command", required=True)
-    one = commands.add_parser("overhead")
-    one.add_argument("scene", type=Path)
-    one.add_argument("--turns", type=int, default=3)
+    for name in ("overhead", "weak"):
+        one = commands.add_parser(name)
+        one.add_argument("scene", type=Path)
+        one.add_argument("--turns", type=int, default=3)
     two = commands.add_parser("large")
     two.add_argument("--splats", type=int, default=20_000_000)
     two.add_argument("--channels", type=int, default=64)
@@ -183,6 +208,8 @@ def main() -> None:
     options = parser.parse_args()
     if options.command == "overhead":
         overhead(options.scene, options.turns)
+    elif options.command == "weak":
+        weak(options.scene, options.turns)
     else:
         tell_large(options.splats, options.channels, options.views)
 
