@@ -37,8 +37,7 @@ def add_arguments(parser: Parser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Find the scene, run the service as a user would, and say what it found."""
     from liftcore.demo.run import show
-    from liftcore.demo.scene_folder import find_scene
-    from liftcore.demo.tabletop import unpack_tabletop
+    from liftcore.demo.scene_folder import find_scene, unpack_tabletop
 
     def say(line: str) -> None:
         if not options.json:

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
     from liftcore.planning.plan import Plan
     from liftcore.result import LiftResult
-    from liftcore.scene.cameras import Camera
     from liftcore.settings import LiftSettings
     from liftcore.solve.checkpoint import Checkpoint
 
@@ -45,7 +44,7 @@ def add_arguments(parser: Parser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Lift, write the lift whole or not at all, and say what came of it."""
     settings = settings_of(options)
-    from liftcore.io.cameras import camera_source, read_cameras
+    from liftcore.io.cameras import camera_source
     from liftcore.io.lift_file import save_lift
     from liftcore.io.scene_files import lift_files
     from liftcore.io.shards import INDEX, SUFFIX
@@ -79,19 +78,21 @@ def run(options: argparse.Namespace) -> int:
             save_lift(result, options.output)
     (plan,) = plans
     warnings = result.metadata.certificate["warnings"]
-    example = example_of(read_cameras(options.cameras, choosing=False)[result.metadata.views[0]])
     document = {"out": str(options.output), **_summary(result), "warnings": [*plan.warnings, *warnings]}
     new = [warning for warning in warnings if warning not in plan.told]  # the others were printed with the plan
-    reply(document, as_json=options.json, lines=_lines(document | {"warnings": new}, example, options.verbose))
+    reply(
+        document, as_json=options.json, lines=_lines(document | {"warnings": new}, options.cameras, options.verbose)
+    )
     return 0
 
 
-def example_of(camera: Camera) -> str:
+def example_in(view: str, cameras: Path) -> str:
     """The pixel in the middle of a view, as an example of what to look for."""
+    from liftcore.io.cameras import read_cameras
     from liftcore.scene.cameras import photo_size
 
-    width, height = photo_size(camera)
-    return f"{camera.name}:{width // 2},{height // 2}"
+    width, height = photo_size(read_cameras(cameras, choosing=False)[view])
+    return f"{view}:{width // 2},{height // 2}"
 
 
 def checkpoint_in(folder: Path) -> Checkpoint:
@@ -201,14 +202,14 @@ def _summary(result: LiftResult) -> dict[str, Any]:
     }
 
 
-def _lines(document: dict[str, Any], example: str, verbose: bool) -> Iterable[str]:
+def _lines(document: dict[str, Any], cameras: Path, verbose: bool) -> Iterable[str]:
     yield (
         f"{document['out']}: {document['splats']} splats x {document['channels']} channels "
         f"from {document['views']} views, {document['seen_share']:.1%} of the splats seen, "
         f"in {sum(document['timings'].values()):.1f} s"
     )
     yield from (f"warning: {warning}" for warning in document["warnings"])
-    yield from _verdict(document, example)
+    yield from _verdict(document, cameras)
     if not verbose:
         return
     for key, value in document["certificate"].items():
@@ -218,7 +219,7 @@ def _lines(document: dict[str, Any], example: str, verbose: bool) -> Iterable[st
     yield from (f"  {stage}: {seconds:.3f} s" for stage, seconds in document["timings"].items())
 
 
-def _verdict(document: dict[str, Any], example: str) -> Iterable[str]:
+def _verdict(document: dict[str, Any], cameras: Path) -> Iterable[str]:
     """What is healthy, what to look at, and what to do."""
     from liftcore.query.text import NO_WORDS
 
@@ -232,5 +233,5 @@ def _verdict(document: dict[str, Any], example: str) -> Iterable[str]:
     space = document["text_space"]
     if not space:
         yield "the packs' text space is not named: splatlift pack retag names it, or ask with --table FILE"
-    how = "WORD" if space not in ("", NO_WORDS) else f"--like {example}"
+    how = "WORD" if space not in ("", NO_WORDS) else f"--like {example_in(document['lifted'][0], cameras)}"
     yield f"next: splatlift query {document['out']} {how}  (--verbose shows all figures)"

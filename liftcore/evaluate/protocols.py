@@ -14,6 +14,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -74,10 +75,6 @@ class Segmenter(ABC):
     ) -> None:
         self.scene, self.texts, self.encoder = scene, tuple(texts), encoder
         self.threshold, self.negatives = threshold, tuple(negatives)
-        self.prepare()
-
-    def prepare(self) -> None:  # noqa: B027  # most protocols have nothing to prepare
-        """What is done once for all views."""
 
     @abstractmethod
     def look(self, view: str) -> dict[str, Prediction]:
@@ -97,12 +94,13 @@ class RenderedFeatures(Segmenter):
     against the negatives, sharpened tenfold.
     """
 
-    def prepare(self) -> None:
-        """The products of splats and words, for all views."""
+    @cached_property
+    def _products(self) -> Tensor:
+        """[P, n + N], the products of splats and words, for all views."""
         vectors = torch.as_tensor(self.encoder.encode([*self.texts, *(self.negatives or DEFAULT_NEGATIVES)]))
         # <A X, t> = A (X t): the products with the texts are rendered, not the features again for each.
         blocks = [block.float() @ vectors.T for block in self.scene.lift.features.split(65_536)]
-        self._products = torch.cat(blocks)  # [P, n + N]
+        return torch.cat(blocks)
 
     def look(self, view: str) -> dict[str, Prediction]:
         """What each text finds in a view."""
@@ -152,9 +150,10 @@ def _majority(mask: np.ndarray) -> np.ndarray:
 class SelectedSplats(Segmenter):
     """P2: splats are selected in 3D, and their silhouette is seen alone: what stood before them hides nothing."""
 
-    def prepare(self) -> None:
-        """The answers of the splats, for all views."""
-        self._selected = {text: answer.selected for text, answer in self.answers().items()}
+    @cached_property
+    def _selected(self) -> dict[str, np.ndarray]:
+        """The splats that each text selects, for all views."""
+        return {text: answer.selected for text, answer in self.answers().items()}
 
     def look(self, view: str) -> dict[str, Prediction]:
         """What each text finds in a view."""
@@ -170,12 +169,13 @@ class SelectedSplats(Segmenter):
 class RenderedScores(Segmenter):
     """P3: splats are scored in 3D, and scores are rendered; each map has a threshold of its own."""
 
-    def prepare(self) -> None:
-        """The answers of the splats, for all views."""
+    @cached_property
+    def _values(self) -> Tensor:
+        """[P, n + 1], the scores of the splats and ones, for all views."""
         # A splat without a feature adds nothing to a ray.
         columns = [np.where(answer.seen, answer.scores, np.float32(0.0)) for answer in self.answers().values()]
         columns.append(np.ones(len(self.scene.features), np.float32))
-        self._values = torch.from_numpy(np.stack(columns, axis=1))  # [P, n + 1]
+        return torch.from_numpy(np.stack(columns, axis=1))
 
     def look(self, view: str) -> dict[str, Prediction]:
         """What each text finds in a view."""
@@ -193,10 +193,15 @@ class RenderedScores(Segmenter):
 class OwnMasks(Segmenter):
     """Our own way: the masks that ``splatlift query --mask`` makes, of the objects that were found."""
 
-    def prepare(self) -> None:
+    @cached_property
+    def _answers(self) -> dict[str, Answer]:
         """The answers of the splats, for all views."""
-        self._answers = self.answers()
-        self._objects: dict[str, Objects] = {}  # once for all views
+        return self.answers()
+
+    @cached_property
+    def _objects(self) -> dict[str, Objects]:
+        """What each text found, filled as views ask for it."""
+        return {}
 
     def look(self, view: str) -> dict[str, Prediction]:
         """What each text finds in a view."""

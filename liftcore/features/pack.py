@@ -22,13 +22,7 @@ from liftcore.errors import InvalidFeatures, InvalidTable
 from liftcore.features.lens import as_pinhole_sees, grid_sides
 from liftcore.features.views import MAX_CHANNELS, NO_LABEL, FeatureGrid, Regions, ViewFeatures
 from liftcore.io.files import whole_file
-from liftcore.io.safetensors_file import (
-    MAX_HEADER_BYTES,
-    TYPES,
-    check_header,
-    safetensors_header,
-    tensor_bytes,
-)
+from liftcore.io.safetensors_file import MAX_HEADER_BYTES, TYPES, check_header, safetensors_header, tensor_bytes
 from liftcore.progress import Progress, silent
 from liftcore.query.text.table import TableEncoder
 from liftcore.scene.cameras import Camera

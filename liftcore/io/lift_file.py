@@ -157,7 +157,10 @@ def input_file(path: Path) -> InputFile:
     resolved = path.resolve()
     if not resolved.is_dir():
         return InputFile(path=str(resolved), sha256=sha256_of(resolved))
-    return InputFile(path=str(resolved), sha256=_digest_of_several(sorted(resolved.iterdir()), resolved))
+    return InputFile(
+        path=str(resolved),
+        sha256=_digest_of_several(sorted(file for file in resolved.iterdir() if file.is_file()), resolved),
+    )
 
 
 def camera_input(path: Path) -> InputFile:

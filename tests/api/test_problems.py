@@ -147,12 +147,8 @@ def test_one_pack_twice_is_refused(client: TestClient, uploaded: Uploaded) -> No
         ("/query/objects", {"threshold": "high"}, 422, "invalid-request"),
         ("/query/objects", {"text": "zeppelin"}, 422, "invalid-query"),
         ("/query/scores", {"lift": "../../etc/passwd"}, 422, "invalid-request"),
-        (
-            "/query/splats",
-            {"negatives": "book", "threshold": "1"},
-            422,
-            "invalid-query",
-        ),  # nothing was found, so there is no object
+        # Nothing is found, so there is no object.
+        ("/query/splats", {"negatives": "book", "threshold": "1"}, 422, "invalid-query"),
         ("/query/splats", {"what": "mesh"}, 422, "invalid-request"),
         ("/render", {"view": "behind"}, 404, "not-found"),
         ("/render", {"view": "left", "what": "x-rays"}, 422, "invalid-request"),

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from liftcore.cli import demo
-from liftcore.demo.tabletop import SHIPPED
+from liftcore.demo.scene_folder import SHIPPED
 from liftcore.errors import Unavailable
 from liftcore.io.lift_file import load_lift
 from liftcore.query.text import LVIS_TABLE

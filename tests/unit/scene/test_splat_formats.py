@@ -65,7 +65,11 @@ def test_every_format_is_read_as_its_own_tool_reads_it(name: str, tmp_path: Path
             archive.extractall(tmp_path / "folder")
         assert is_splats(tmp_path / "folder") and format_of(tmp_path / "folder") is SplatFormat.SOG
         assert_alike(read_splats(tmp_path / "folder"), expected)
-        assert input_file(tmp_path / "folder").sha256 == input_file(tmp_path / "folder").sha256
+        before = input_file(tmp_path / "folder").sha256
+        (tmp_path / "folder" / "others").mkdir()  # which are none of it
+        assert input_file(tmp_path / "folder").sha256 == before
+        (tmp_path / "folder" / "meta.json").write_text("{}")
+        assert input_file(tmp_path / "folder").sha256 != before
     bare, whole = read_splats(unnamed, colour=False), read_splats(unnamed)
     assert bare.sh is None and torch.equal(bare.means, whole.means) and torch.equal(bare.quats, whole.quats)
 
