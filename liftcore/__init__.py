@@ -9,7 +9,7 @@ scene, ``B`` [rays x channels] the 2D features of its photos, ``X`` [splats x ch
     splats = lc.read_splats("scene.ply")  # or lc.Splats(...), of torch or numpy
     cameras = lc.read_cameras("sparse/0")  # or {"0001": lc.Camera(...)}
     views = lc.read_features("pack.safetensors")  # or {"0001": lc.FeatureGrid(map)}, or an iterator of pairs
-    result = lc.lift(splats, cameras, views, preset="tikhonov")
+    result = lc.lift(splats, cameras, views)
     result.save("scene.lift.safetensors")
 
 What is listed here is the public interface. It is loaded when it is asked for: ``import liftcore`` loads neither

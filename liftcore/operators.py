@@ -66,7 +66,7 @@ def region_weights(
     splats: Splats,
     cameras: Cameras | Mapping[str, Camera],
     views: Given,
-    preset: Preset | str | LiftSettings = Preset.TIKHONOV,
+    preset: Preset | str | LiftSettings = Preset.DEFAULT,
     *,
     progress: Progress = silent,
     threads: int | None = None,

@@ -23,7 +23,7 @@ _SHOWN = 80  # characters of a wrong value in an error
 
 
 class Preset(StrEnum):
-    """A published choice of weights on the same ray walk, or ours, which trusts no single mask."""
+    """Ours, which trusts no single mask, or a published choice of weights on the same ray walk."""
 
     DEFAULT = "default"  # row-sum, reweighted by mask consensus, by region reliability and by view consistency
     ROW_SUM = "row-sum"  # x_j = sum w b / sum w, Eq. 6
@@ -35,17 +35,16 @@ class Preset(StrEnum):
     MEAN = "mean"  # the same ray, and the plain mean over the views that see the splat (Semantic Gaussians)
 
 
-_LINEAR = {"power": 1, "lift_gain": 1.0, "render_gain": 1.0}
-
+_REWEIGHTED = {"reliability": True, "consensus": "auto"}
 _PRESETS: dict[Preset, dict[str, Any]] = {
-    Preset.DEFAULT: {**_LINEAR, "robust_steps": 1, "reliability": True, "consensus": "auto"},
-    Preset.ROW_SUM: _LINEAR,
+    Preset.DEFAULT: {"robust_steps": 1, **_REWEIGHTED},
+    Preset.ROW_SUM: {},
     Preset.TIKHONOV: {"power": 2, "lift_gain": TIKHONOV_GAIN, "render_gain": TIKHONOV_GAIN},
-    Preset.ARGMAX: {**_LINEAR, "selection": Selection.TOP_K, "k": 1},
-    Preset.TOP_K: {**_LINEAR, "selection": Selection.TOP_K, "k": 40},
-    Preset.FRONT_MASS: {**_LINEAR, "selection": Selection.FRONT_MASS, "mass": 0.75},
-    Preset.CENTRE: {**_LINEAR, "selection": Selection.CENTRE},
-    Preset.MEAN: {**_LINEAR, "selection": Selection.CENTRE, "power": 0, "weight_floor": VISIBLE_WEIGHT},
+    Preset.ARGMAX: {"selection": Selection.TOP_K, "k": 1},
+    Preset.TOP_K: {"selection": Selection.TOP_K, "k": 40},
+    Preset.FRONT_MASS: {"selection": Selection.FRONT_MASS, "mass": 0.75},
+    Preset.CENTRE: {"selection": Selection.CENTRE},
+    Preset.MEAN: {"selection": Selection.CENTRE, "power": 0, "weight_floor": VISIBLE_WEIGHT},
 }
 
 
@@ -86,15 +85,15 @@ class LiftSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    preset: Preset = Preset.TIKHONOV
+    preset: Preset = Preset.DEFAULT
     speed: Speed = Field(Speed.EXACT, description="the dial: sets stride, cut-off, views and certificate rays")
     selection: Selection = Field(Selection.ALL, description="which of a ray's weights count")
     k: int = Field(40, ge=1, le=MOST_OF_A_RAY, description="how many weights of a ray top-k keeps")
     mass: float = Field(0.75, gt=0, le=1, description="the share of the light within which front-mass keeps weights")
     weight_floor: float = Field(0.0, ge=0, lt=1, description="smaller weights count none, in every selection")
-    power: int = Field(2, ge=0, le=2, description="a kept weight's exponent: 1, w or w^2")
-    lift_gain: float = Field(TIKHONOV_GAIN, gt=0, le=16, description="lambda on the opacity logits, lifting")
-    render_gain: float = Field(TIKHONOV_GAIN, gt=0, le=16, description="lambda on the opacity logits, rendering")
+    power: int = Field(1, ge=0, le=2, description="a kept weight's exponent: 1, w or w^2")
+    lift_gain: float = Field(1.0, gt=0, le=16, description="lambda on the opacity logits, lifting")
+    render_gain: float = Field(1.0, gt=0, le=16, description="lambda on the opacity logits, rendering")
     alpha_cap: float = Field(0.99, gt=0, le=LARGEST_ALPHA, description="the largest alpha of a splat on a ray")
     transmittance_stop: float = Field(1e-4, ge=0, lt=1, description="a ray ends before T falls to this")
     antialiased: bool = Field(False, description="opacities compensated for the low-pass (mip filter), 3DGS only")
@@ -167,9 +166,11 @@ class LiftSettings(BaseModel):
     def _fill_from_preset_and_speed(cls, values: Any) -> Any:
         if not isinstance(values, dict):
             return values
-        preset, speed = values.get("preset", Preset.TIKHONOV), values.get("speed", Speed.EXACT)
+        preset, speed = values.get("preset", Preset.DEFAULT), values.get("speed", Speed.EXACT)
         weights = _PRESETS[Preset(preset)] if isinstance(preset, str) and preset in set(Preset) else {}
         effort = _SPEEDS[Speed(speed)] if isinstance(speed, str) and speed in set(Speed) else {}
+        if values.get("robust_steps") in (0, "0"):  # what comes in with a step goes with it, unless it is asked for
+            weights = {name: value for name, value in weights.items() if name not in _REWEIGHTED}
         return {**weights, **effort, **values}
 
     @model_validator(mode="after")

@@ -216,7 +216,7 @@ class LiftRequest(Body):
     settings: Annotated[dict[str, Scalar], Bounded, Published(LiftSettings)] = Field(
         default_factory=dict,
         description="preset and knobs of the lift; those left out take the values of the preset and the speed",
-        examples=[{"preset": "tikhonov", "speed": "balanced"}],
+        examples=[{"preset": "default", "speed": "balanced"}],
     )
 
 

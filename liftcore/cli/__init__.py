@@ -13,6 +13,7 @@ from importlib import import_module
 from liftcore import __version__
 from liftcore.cli.options import BAD_INPUT, Parser, misplaced, shared_options
 from liftcore.errors import SplatliftError
+from liftcore.io.remote import Elsewhere, local_path
 
 COMMANDS = {
     "demo": "the whole job, through the real service",
@@ -46,6 +47,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except SystemExit as end:
         return end.code if isinstance(end.code, int) else 0
     try:
+        bring(options)
         status = import_module(f"liftcore.cli.{options.command}").run(options)
         sys.stdout.flush()
         return status
@@ -65,6 +67,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         what = " ".join(f"{type(error).__name__}: {error}".split())[:400]
         print(f"splatlift: our fault: {what} (--debug shows where)", file=sys.stderr)
         return OUR_FAULT
+
+
+def bring(options: argparse.Namespace) -> None:
+    """Put paths of this machine in the place of inputs that lie elsewhere."""
+    for name, value in vars(options).items():
+        if name == "output":
+            continue
+        if isinstance(value, Elsewhere):
+            setattr(options, name, local_path(value))
+        elif isinstance(value, list):
+            setattr(options, name, [local_path(one) if isinstance(one, Elsewhere) else one for one in value])
 
 
 def build_parser() -> argparse.ArgumentParser:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from liftcore.cli.options import BAD_INPUT, Parser, add_verbose
 from liftcore.cli.reply import free_output, progress_bars, reply, writing
+from liftcore.io.remote import place
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -20,9 +21,9 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: Parser) -> None:
     """The options of the command."""
-    parser.add_argument("splats", type=Path, help="trained splats")
-    parser.add_argument("cameras", type=Path, help="COLMAP folder or .zip, transforms.json or cameras.json")
-    parser.add_argument("others", type=Path, nargs="*", help="folders of photos, and feature packs (.safetensors)")
+    parser.add_argument("splats", type=place, help="trained splats")
+    parser.add_argument("cameras", type=place, help="COLMAP folder or .zip, transforms.json or cameras.json")
+    parser.add_argument("others", type=place, nargs="*", help="folders of photos, and feature packs (.safetensors)")
     parser.add_argument("--worst", type=Path, metavar="PNG", help="write the worst view: its photo and the render")
     add_verbose(parser)
 

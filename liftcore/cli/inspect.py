@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 from liftcore.cli.options import Parser
 from liftcore.cli.reply import reply
+from liftcore.io.remote import place
 
 
 def add_arguments(parser: Parser) -> None:
     """The options of the command."""
-    parser.add_argument("file", type=Path, help="splats, cameras, features, a lift, masks or a text table")
+    parser.add_argument("file", type=place, help="splats, cameras, features, a lift, masks or a text table")
 
 
 def run(options: argparse.Namespace) -> int:

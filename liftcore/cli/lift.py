@@ -12,6 +12,7 @@ from liftcore.cli.options import Parser, add_settings, add_sources, add_verbose,
 from liftcore.cli.reply import free_output, progress_bars, reply, shown, writing
 from liftcore.engine import ENGINES, engine_named
 from liftcore.errors import InvalidInput, InvalidSettings
+from liftcore.io.remote import is_remote, place
 from liftcore.nearest import nearest
 from liftcore.progress import one_step
 
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 def add_arguments(parser: Parser) -> None:
     """The options of the command."""
     add_sources(parser)
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="LIFT", help="the lift to write")
+    parser.add_argument("-o", "--output", type=place, required=True, metavar="LIFT", help="the lift to write")
     add_settings(parser)
     parser.add_argument("--explain", action="store_true", help="print the plan before the work")
     add_verbose(parser)
@@ -51,7 +52,9 @@ def run(options: argparse.Namespace) -> int:
 
     views = camera_source(options.cameras).files
     inputs = [options.splats, *views, *options.features]
-    out = free_output(options.output / INDEX if options.output.suffix == SUFFIX else options.output, inputs)
+    out = options.output
+    if not is_remote(out):
+        out = free_output(out / INDEX if out.suffix == SUFFIX else out, inputs)
     engine = engine_named(options.engine, options.address, options.threads)
     checkpoint = checkpoint_in(options.checkpoint) if options.checkpoint else None
 

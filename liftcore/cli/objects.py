@@ -11,6 +11,7 @@ from liftcore.cli.options import Parser, add_encoder, text_encoder
 from liftcore.cli.query import made_from, place_of, write_files
 from liftcore.cli.reply import free_output, free_outputs, reply
 from liftcore.cli.segment import read_words
+from liftcore.io.remote import place
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: Parser) -> None:
     """The options of the command."""
-    parser.add_argument("lift", type=Path, help="a lift (.safetensors)")
+    parser.add_argument("lift", type=place, help="a lift (.safetensors)")
     named = "name each by the nearest of these words: a file of one a line, or a text table (.safetensors)"
     parser.add_argument("--vocabulary", type=Path, metavar="FILE", help=named)
     add_encoder(parser)

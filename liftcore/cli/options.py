@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from liftcore.errors import InvalidInput, InvalidQuery
+from liftcore.io.remote import place
 
 if TYPE_CHECKING:
     from liftcore.query.scene import QueryScene
@@ -17,7 +18,7 @@ ROLES = {  # of arguments that name files: what belongs there
     "splats": "splats", "cameras": "cameras", "features": "features", "lift": "lift", "table": "table",
 }  # fmt: skip
 ORDERED = ("lift", "plan", "check", "tradeoff")  # commands that take splats, cameras and features
-PRESETS = "default, row-sum, tikhonov (if none is named), argmax, top-k, front-mass, centre or mean"
+PRESETS = "default, row-sum, tikhonov, argmax, top-k, front-mass, centre or mean"
 THRESHOLDS = "auto, valley, paper, otsu, stability or a number"
 
 
@@ -72,9 +73,9 @@ def add_sources(parser: argparse.ArgumentParser, features: str = "+", without: s
     Args:
         features: how many, as argparse says it. without: what happens where there is none.
     """
-    parser.add_argument("splats", type=Path, help="trained splats (.ply, .splat, .spz, .sog, or a checkpoint)")
-    parser.add_argument("cameras", type=Path, help="COLMAP folder or .zip, transforms.json or cameras.json")
-    parser.add_argument("features", type=Path, nargs=features, help=f"feature packs (.safetensors){without}")
+    parser.add_argument("splats", type=place, help="trained splats (.ply, .splat, .spz, .sog, or a checkpoint)")
+    parser.add_argument("cameras", type=place, help="COLMAP folder or .zip, transforms.json or cameras.json")
+    parser.add_argument("features", type=place, nargs=features, help=f"feature packs (.safetensors){without}")
 
 
 def add_settings(parser: argparse.ArgumentParser) -> None:
@@ -106,10 +107,10 @@ def add_encoder(parser: argparse.ArgumentParser) -> None:
 
 def add_lift(parser: argparse.ArgumentParser) -> None:
     """A lift, and where its splats and cameras are now."""
-    parser.add_argument("lift", type=Path, help="a lift (.safetensors)")
-    parser.add_argument("--splats", type=Path, metavar="FILE", help="its splats; else where they were, or beside it")
+    parser.add_argument("lift", type=place, help="a lift (.safetensors)")
+    parser.add_argument("--splats", type=place, metavar="FILE", help="its splats; else where they were, or beside it")
     parser.add_argument(
-        "--cameras", type=Path, metavar="PATH", help="its cameras, likewise; more of them may be there"
+        "--cameras", type=place, metavar="PATH", help="its cameras, likewise; more of them may be there"
     )
 
 

@@ -61,7 +61,7 @@ def free_outputs(files: Mapping[str, Path], inputs: Sequence[Path]) -> None:
 
 
 @contextmanager
-def writing(path: Path) -> Iterator[None]:
+def writing(path: Path | str) -> Iterator[None]:
     """Say which output failed, and why, when the disk is full or the folder is not for us to write.
 
     Raises:

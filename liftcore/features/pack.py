@@ -22,6 +22,7 @@ from liftcore.errors import InvalidFeatures, InvalidTable
 from liftcore.features.lens import as_pinhole_sees, grid_sides
 from liftcore.features.views import MAX_CHANNELS, NO_LABEL, FeatureGrid, Regions, ViewFeatures
 from liftcore.io.files import whole_file
+from liftcore.io.remote import local_path
 from liftcore.io.safetensors_file import MAX_HEADER_BYTES, TYPES, check_header, safetensors_header, tensor_bytes
 from liftcore.progress import Progress, silent
 from liftcore.query.text.table import TableEncoder
@@ -157,10 +158,11 @@ def read_features(*paths: str | Path) -> Views:
     """Open feature packs as one set of views; only headers are read.
 
     Raises:
+        InvalidInput: one lies elsewhere (`io.remote`), and does not come.
         InvalidFeatures: a file is no feature pack, a view is malformed or in two packs, or the packs do not
             share their channels and their encoder.
     """
-    packs = [_open(Path(path)) for path in paths]
+    packs = [_open(local_path(path)) for path in paths]
     sources: dict[str, _Stored] = {}
     channels: dict[int, str] = {}
     for pack in packs:

@@ -19,6 +19,7 @@ from liftcore.io.colmap import MODEL_FILES, has_model, is_whole, model_files, re
 from liftcore.io.files import BROKEN_ZIP, refuse_pointer
 from liftcore.io.inria import parse_inria
 from liftcore.io.json_file import read_json
+from liftcore.io.remote import local_path
 from liftcore.io.transforms import FRAME_FILE, OF_NERFSTUDIO, parse_transforms, read_frame
 from liftcore.scene.cameras import Cameras, cameras_from
 
@@ -82,10 +83,11 @@ def read_cameras(path: Path | str, *, choosing: bool = True) -> Cameras:
         choosing: whether distorted cameras beside undistorted ones are refused, as somebody has to choose.
 
     Raises:
+        InvalidInput: it lies elsewhere (`io.remote`), and does not come.
         InvalidCameras: nothing here is a camera format that we know, or what it holds is malformed.
         Unavailable: the temporary folder has no room for what is in a zip.
     """
-    path = Path(path)
+    path = local_path(path)
     if path.is_dir():
         return _from_folder(path, choosing=choosing)
     if not path.is_file():

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from liftcore.errors import InvalidInput, InvalidLift
+from liftcore.io.remote import landing, local_path
 from liftcore.io.safetensors_file import map_tensors
 from liftcore.io.shards import INDEX, SUFFIX, map_shards, write_shards
 
@@ -43,16 +44,20 @@ def save_lift(lift: LiftResult, path: Path | str) -> None:
     """Write the lift whole or not at all (temporary file, fsync, rename), with no copy of X in memory.
 
     Args:
-        path: a file; with ``.shards`` at its end, a folder of shards.
+        path: a file; with ``.shards`` at its end, a folder of shards. Either may lie elsewhere (`io.remote`).
+
+    Raises:
+        InvalidInput: it lies elsewhere and cannot be sent there.
     """
     from liftcore.io.safetensors_file import write_tensors
 
-    path, metadata = Path(path), lift.metadata.model_dump_json()
+    metadata = lift.metadata.model_dump_json()
     tensors = {name: getattr(lift, name) for name in ALL if getattr(lift, name) is not None}
-    if path.suffix == SUFFIX:
-        write_shards(path, tensors, metadata)
-    else:
-        write_tensors(path, tensors, {"splatlift": metadata})
+    with landing(path) as place:
+        if place.suffix == SUFFIX:
+            write_shards(place, tensors, metadata)
+        else:
+            write_tensors(place, tensors, {"splatlift": metadata})
 
 
 def load_lift(path: Path | str) -> LiftResult:
@@ -78,7 +83,7 @@ def read_lift(path: Path | str) -> tuple[dict[str, np.ndarray], str]:
     """
     from safetensors import SafetensorError
 
-    source = Path(path)
+    source = local_path(path)
     try:
         tensors, told = map_shards(source) if (source / INDEX).is_file() else map_tensors(source)
         if "splatlift" not in told:

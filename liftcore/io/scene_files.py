@@ -12,6 +12,7 @@ from liftcore.errors import InvalidFeatures
 from liftcore.features.pack import Views, read_features
 from liftcore.io.cameras import read_cameras
 from liftcore.io.lift_file import input_files
+from liftcore.io.remote import local_path
 from liftcore.io.splats import read_splats
 from liftcore.lifting import lift
 from liftcore.planning.plan import Plan
@@ -46,7 +47,7 @@ def lift_files(
         Unavailable: there is no such device as asked for.
     """
     choose_device(settings.device)  # told before gigabytes are read
-    paths = Path(splats), Path(cameras), _checked(features)
+    paths = local_path(splats), local_path(cameras), _checked(features)
     timings = Timings(progress)
     with timings.step("read"):
         sources = open_files(*paths, settings)
@@ -75,4 +76,4 @@ def open_files(
 def _checked(features: Sequence[Path | str]) -> list[Path]:
     if isinstance(features, str | Path):  # a text is a sequence too, of letters
         raise InvalidFeatures("features", expected="a list of feature packs", got=f"{str(features)!r} alone")
-    return [Path(pack) for pack in features]
+    return [local_path(pack) for pack in features]

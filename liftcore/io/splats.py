@@ -22,6 +22,7 @@ from liftcore.io.checkpoint import EXPORT_PLY, read_checkpoint
 from liftcore.io.compressed_ply import read_compressed_ply
 from liftcore.io.files import BROKEN_ZIP, LFS_HINT, LFS_POINTER
 from liftcore.io.quantised import Fields
+from liftcore.io.remote import local_path
 from liftcore.io.sog import META, read_sog
 from liftcore.io.splat import looks_like_splat, read_splat, splat_blocks
 from liftcore.io.spz import begins_like_spz, read_spz, spz_blocks
@@ -83,10 +84,11 @@ def read_splats(path: Path | str, kernel: Kernel | str = "auto", *, colour: bool
     More of PLYs is in `liftcore.io.ply.read_ply`. Checkpoints are opened for tensors alone: no code of theirs runs.
 
     Raises:
+        InvalidInput: it lies elsewhere (`io.remote`), and does not come.
         InvalidSplats: the file is malformed or of no such format, lacks a property of the kernel, or holds NaN or no
             splats.
     """
-    path = Path(path)
+    path = local_path(path)
     found = format_of(path)
     with _naming(path):
         if found is SplatFormat.PLY:

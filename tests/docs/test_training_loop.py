@@ -75,7 +75,7 @@ def test_tensors_of_a_training_loop_lift_as_their_files_do(loop: dict[str, Any],
     write_pack(tmp_path / "features.safetensors", grids, {})
     filed = lc.lift(
         lc.read_splats(tmp_path / "scene.ply"), lc.read_cameras(tmp_path / "cameras.json"),
-        lc.read_features(tmp_path / "features.safetensors"), preset="tikhonov",
+        lc.read_features(tmp_path / "features.safetensors"),
     )  # fmt: skip
     assert torch.allclose(filed.features.float(), features, atol=2e-3)  # packs and poses are rounded, values are not
     assert torch.equal(filed.seen, loop["result"].seen)

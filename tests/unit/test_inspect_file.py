@@ -159,7 +159,7 @@ def test_lift_is_described(tmp_path: Path) -> None:
     )
     found = inspected(tmp_path / "l")
     assert (found["kind"], found["splats"], found["channels"], found["seen_share"]) == ("lift", 2, 3, 0.5)
-    assert found["settings"]["preset"] == "tikhonov"
+    assert found["settings"]["preset"] == "default"
     assert found["warnings"][0] == "1 of 2 splats were reached by no labelled ray; their features are zero"
     assert "no longer at" in found["warnings"][1]
 

@@ -79,7 +79,7 @@ def test_every_stage_is_told_from_its_beginning_and_none_goes_back(tmp_path: Pat
     for stage in ONE_STEP:
         assert [word for word in said if word[0] == stage] == [(stage, 0, 1, "steps"), (stage, 1, 1, "steps")]
     order = list(dict.fromkeys(stage for stage, *_ in said))
-    assert order == ["read", "digest", "compile", "plan", "geometry", "solve", "certify"]
+    assert order == ["read", "digest", "compile", "plan", "geometry", "robust", "solve", "certify"]
     assert set(order) <= made.metadata.timings.keys()
     for stage in order:
         done = [word[1] for word in said if word[0] == stage]

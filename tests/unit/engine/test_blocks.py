@@ -65,7 +65,7 @@ def assert_same(one: lc.LiftResult, other: lc.LiftResult) -> None:
 
 
 def test_blocks_give_the_bits_of_a_lift_in_memory(scene: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
-    settings = LiftSettings.of(certificate_rays=200)
+    settings = LiftSettings.of(preset="row-sum", certificate_rays=200)
     whole = lc.lift(scene["splats"], scene["cameras"], scene["views"], settings)
     for engine in (LocalEngine(1), Shuffled(2)):
         found = in_blocks(engine, scene, settings)
@@ -89,14 +89,14 @@ def test_worker_holds_the_splats_that_its_views_see(scene: dict[str, Any], tmp_p
             told.append((splats.count, len(ids)))
             yield from super().run(work, job, pieces)
 
-    in_blocks(Watching(1), scene, LiftSettings.of(), folder=tmp_path)
+    in_blocks(Watching(1), scene, LiftSettings.of(preset="tikhonov"), folder=tmp_path)
     assert 0 < told[0][0] == told[0][1] < 0.9 * COUNT
 
 
 def test_lift_goes_on_from_the_pieces_in_its_folder(scene: dict[str, Any], tmp_path: Path) -> None:
     write_pack(tmp_path / "pack.safetensors", scene["views"], {"text_space": "words"})
     stored = {**scene, "views": lc.read_features(tmp_path / "pack.safetensors")}
-    folder, settings = tmp_path / "work", LiftSettings.of()
+    folder, settings = tmp_path / "work", LiftSettings.of(preset="tikhonov")
 
     def stop(stage: str, done: int, total: int, unit: str) -> None:
         if (stage, done) == ("solve", 1):
@@ -110,8 +110,9 @@ def test_lift_goes_on_from_the_pieces_in_its_folder(scene: dict[str, Any], tmp_p
     assert {path: path.stat().st_mtime_ns for path in written} == written
     assert found.metadata.text_space == "words"
     assert_same(found, in_blocks(LocalEngine(1), scene, settings))
-    other = in_blocks(LocalEngine(1), stored, LiftSettings.of(power=1), folder=folder)  # pieces of another lift
-    assert_same(other, in_blocks(LocalEngine(1), scene, LiftSettings.of(power=1)))
+    settings = LiftSettings.of(preset="row-sum")
+    other = in_blocks(LocalEngine(1), stored, settings, folder=folder)  # pieces of another lift
+    assert_same(other, in_blocks(LocalEngine(1), scene, settings))
 
 
 @pytest.mark.parametrize("asked", [{"preset": "default"}, {"aggregation": True}, {"cg_steps": 2}])

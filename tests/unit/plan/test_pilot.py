@@ -52,8 +52,8 @@ def disagreeing(folder, error: float, gap: bool = False, labelled: bool = True):
 @pytest.mark.parametrize("error", [0.3, 1.0, 2.0])
 def test_a_pilot_foresees_how_near_fewer_views_come(tmp_path, error):
     splats, cameras, pack = disagreeing(tmp_path / "scene", error)
-    whole = lift_files(splats, cameras, [pack], LiftSettings.of())
-    fewer = lift_files(splats, cameras, [pack], LiftSettings.of(view_cosine=0.98))
+    whole = lift_files(splats, cameras, [pack], LiftSettings.of(preset="tikhonov"))
+    fewer = lift_files(splats, cameras, [pack], LiftSettings.of(preset="tikhonov", view_cosine=0.98))
     expected = fewer.metadata.certificate["plan"]["view_cosine"]
     found = cosine_figures(fewer.features, whole.features, whole.evidence)["cosine"]
     assert expected >= 0.98

@@ -193,7 +193,7 @@ def test_what_takes_no_cluster_is_solved_again_as_if_the_other_regions_had_never
     labels[:, :, 7:13] = 2
     wrong = Regions(labels, torch.cat([first.codebook, torch.eye(6)[5:].to(first.codebook.dtype)]))
     write_pack(features, maps | {"v0": wrong}, {"encoder": "random"})
-    knobs = KNOBS | {"aggregation_iou": 0.3, "dtype": "float32"}
+    knobs = KNOBS | {"preset": "tikhonov", "aggregation_iou": 0.3, "dtype": "float32"}
     result = lift_files(
         splats, cameras, [features], LiftSettings.of(aggregation=True, aggregation_resolve=True, **knobs)
     )

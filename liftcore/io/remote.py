@@ -1,0 +1,127 @@
+"""Files that lie elsewhere (``s3://``, ``gs://``, ``https://`` and whatever else fsspec opens).
+
+Readers map their files, which only files of this machine can be. So what is read is copied here whole, once for each
+version that its storage tells apart, and what is written is written here first and then sent.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from liftcore.errors import InvalidInput
+
+REMOTE = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+(::[^:]+)*://")
+OPENED = "a file or folder that fsspec opens, such as s3://bucket/scene.ply (needs s3fs) or file:///scene.ply"
+
+
+def is_remote(path: Path | str) -> bool:
+    """Whether a text names a protocol. A ``Path`` never does: it takes ``s3://b`` for ``s3:/b``."""
+    return isinstance(path, str) and REMOTE.match(path) is not None
+
+
+class Elsewhere(str):
+    """The text of an argument that names a protocol."""
+
+
+def place(text: str) -> Path | Elsewhere:
+    """An argument of the command line: a path, or where a file lies elsewhere."""
+    return Elsewhere(text) if is_remote(text) else Path(text)
+
+
+def local_path(path: Path | str) -> Path:
+    """The path of a file or folder of this machine: the given one, or that of a copy of what lies elsewhere.
+
+    Copies lie in ``splatlift/remote`` of the user's cache folder (XDG_CACHE_HOME), which may be emptied at any time.
+
+    Raises:
+        InvalidInput: nothing is there, or it cannot be opened or copied; the error says why.
+    """
+    if not is_remote(path):
+        return Path(path)
+    url = str(path)
+    with _told(url):
+        storage, place = _opened(url)
+        found: dict[str, Any] = storage.find(place, detail=True)
+        if not found:
+            raise FileNotFoundError("nothing is there")
+        versions = sorted((name, storage.ukey(name)) for name in found)
+        base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "splatlift" / "remote"
+        name = PurePosixPath(place.rstrip("/")).name
+        copy = base / hashlib.sha256(repr((url, versions)).encode()).hexdigest()[:32] / name
+        if copy.exists():
+            return copy
+        base.mkdir(parents=True, exist_ok=True)
+        draft = Path(tempfile.mkdtemp(dir=base, prefix=".part-"))
+        try:
+            for one in found:
+                inside = PurePosixPath(one).relative_to(place.rstrip("/"))
+                to = draft / name / inside
+                to.parent.mkdir(parents=True, exist_ok=True)
+                storage.get_file(one, str(to))
+            copy.parent.mkdir(exist_ok=True)
+            if not copy.exists():  # else another process was quicker
+                (draft / name).rename(copy)
+        finally:
+            shutil.rmtree(draft, ignore_errors=True)
+        return copy
+
+
+@contextmanager
+def landing(path: Path | str) -> Iterator[Path]:
+    """Where to write a file or folder: at the path itself, or in a temporary folder from where it is sent.
+
+    Of a folder the file that sorts last is sent last, and taken away first: of a lift in shards the index.
+
+    Raises:
+        InvalidInput: it cannot be sent.
+    """
+    if not is_remote(path):
+        yield Path(path)
+        return
+    url = str(path)
+    with tempfile.TemporaryDirectory(prefix="splatlift-") as folder:
+        with _told(url):
+            storage, place = _opened(url)
+        made = Path(folder, PurePosixPath(place.rstrip("/")).name)
+        yield made
+        with _told(url):
+            if made.is_file():
+                storage.makedirs(str(PurePosixPath(place).parent), exist_ok=True)
+                storage.put_file(str(made), place)
+                return
+            files = sorted(one for one in made.rglob("*") if one.is_file())
+            last = f"{place.rstrip('/')}/{files[-1].relative_to(made)}"
+            if storage.exists(last):
+                storage.rm_file(last)
+            storage.makedirs(place, exist_ok=True)
+            for one in files:
+                storage.put_file(str(one), f"{place.rstrip('/')}/{one.relative_to(made)}")
+
+
+def _opened(url: str) -> tuple[Any, str]:
+    """The storage of a URL, and the path within it."""
+    from fsspec.core import url_to_fs
+
+    storage, place = url_to_fs(url)
+    storage.invalidate_cache()  # listings of before
+    return storage, str(place)
+
+
+@contextmanager
+def _told(url: str) -> Iterator[None]:
+    """Name the URL in whatever a storage raises: each has errors of its own."""
+    try:
+        yield
+    except InvalidInput:
+        raise
+    except Exception as error:
+        got = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        raise InvalidInput(url[:200], expected=OPENED, got=got) from None

@@ -1,0 +1,91 @@
+"""Inputs and outputs that lie elsewhere, on fsspec's memory and local file systems."""
+
+from __future__ import annotations
+
+import json
+import uuid
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import fsspec
+import pytest
+import torch
+
+import liftcore as lc
+from liftcore.cli import main
+from liftcore.features.pack import write_pack
+from liftcore.io.inria import write_inria_cameras
+from liftcore.io.ply import write_splats
+from liftcore.io.shards import INDEX
+from tests.scenes import centred, observed, random_camera, random_splats
+
+FILES = ("splats.ply", "cameras.json", "features.safetensors")
+
+
+@pytest.fixture(params=["memory", "file"])
+def elsewhere(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """A folder elsewhere that holds the files of a scene."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    views = tuple(centred(random_camera(k, 32, 24, name=f"v{k}")) for k in range(3))
+    write_splats(random_splats(1, 50), tmp_path / FILES[0])
+    write_inria_cameras(lc.Cameras(views), tmp_path / FILES[1])
+    write_pack(tmp_path / FILES[2], {one.name: observed(1, k, False) for k, one in enumerate(views)}, {})
+    base = f"memory://{uuid.uuid4()}" if request.param == "memory" else f"file://{tmp_path}/elsewhere"
+    storage = fsspec.filesystem(request.param)
+    storage.makedirs(base, exist_ok=True)
+    for name in FILES:
+        storage.put_file(str(tmp_path / name), f"{base}/{name}")
+    return base
+
+
+def read(base: str) -> tuple[Any, ...]:
+    return (
+        lc.read_splats(f"{base}/{FILES[0]}"),
+        lc.read_cameras(f"{base}/{FILES[1]}"),
+        lc.read_features(f"{base}/{FILES[2]}"),
+    )
+
+
+@pytest.mark.parametrize("name", ["one.safetensors", "many.shards"])
+def test_lift_of_inputs_elsewhere_is_saved_there_and_opened(elsewhere: str, name: str, tmp_path: Path) -> None:
+    lift = lc.lift(*read(elsewhere), certificate_rays=0)
+    here = lc.lift(*read(str(tmp_path)), certificate_rays=0)
+    assert torch.equal(lift.features, here.features)
+    for _ in range(2):  # over another of the same name, too
+        lift.save(f"{elsewhere}/out/{name}")
+    opened = lc.load_lift(f"{elsewhere}/out/{name}")
+    assert torch.equal(opened.features, lift.features) and torch.equal(opened.evidence, lift.evidence)
+    storage, place = fsspec.url_to_fs(f"{elsewhere}/out")
+    left = {path.removeprefix(place).lstrip("/") for path in storage.find(place)}
+    assert left == {name} if name.endswith("safetensors") else f"{name}/{INDEX}" in left
+
+
+def test_folder_of_cameras_comes_whole_and_what_changed_comes_anew(elsewhere: str, tmp_path: Path) -> None:
+    storage, place = fsspec.url_to_fs(f"{elsewhere}/model")
+    storage.makedirs(place, exist_ok=True)
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 32 24 30 30 16 12\n")
+    storage.put_file(str(tmp_path / "cameras.txt"), f"{place}/cameras.txt")
+    for count in (1, 2):
+        lines = [f"{number} 1 0 0 0 0 0 {number} 1 v{number}.png\n\n" for number in range(1, count + 1)]
+        (tmp_path / "images.txt").write_text("".join(lines))
+        storage.put_file(str(tmp_path / "images.txt"), f"{place}/images.txt")
+        assert len(lc.read_cameras(f"{elsewhere}/model")) == count
+
+
+@pytest.mark.parametrize("reader", [lc.read_splats, lc.read_cameras, lc.read_features, lc.load_lift])
+@pytest.mark.parametrize("url", ["memory://nowhere/at-all", "nothing-like-it://bucket/file"])
+def test_what_is_not_there_is_told_with_its_url(reader: Callable[[str], Any], url: str) -> None:
+    with pytest.raises(lc.InvalidInput, match=url.partition(":")[0]) as error:
+        reader(url)
+    assert error.value.argument == url and "fsspec" in error.value.expected
+
+
+def test_commands_take_inputs_and_write_lifts_elsewhere(elsewhere: str, capsys: pytest.CaptureFixture[str]) -> None:
+    inputs, out = [f"{elsewhere}/{name}" for name in FILES], f"{elsewhere}/lift.safetensors"
+    assert main(["lift", *inputs, "-o", out, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["out"] == out
+    assert main(["inspect", out, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["kind"] == "lift"
+    assert main(["inspect", f"{elsewhere}/nothing"]) == 2
+    assert f"{elsewhere}/nothing" in capsys.readouterr().err
