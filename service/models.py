@@ -660,6 +660,24 @@ class SceneObject(BaseModel):
     feature: list[float] | None = Field(description="with features=true: the mean of its unit features [F], unit")
 
 
+class CoveringRegion(BaseModel):
+    """A region that covers a pixel."""
+
+    example: str = Field(description="its notation, for like and unlike")
+    view: str
+    level: int = Field(description="of the view's label map")
+    region: int = Field(description="its label there")
+    share: float = Field(description="of the view's pixels that it covers")
+
+
+class CoveringRegions(BaseModel):
+    """The regions that cover a pixel."""
+
+    lift: JobId
+    view: str
+    regions: list[CoveringRegion] = Field(description="one a level at most, the smallest first")
+
+
 class AskedForSceneObjects(BaseModel):
     """Which objects to list, and what names them."""
 

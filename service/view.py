@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from liftcore.errors import InvalidLift, SplatliftError
-from liftcore.query.text import NO_WORDS, OWN_WORDS
+from liftcore.query.text import BUILT_IN, NO_WORDS, OWN_WORDS
 from service.__main__ import bind, server_of
 from service.app import assemble
 from service.encoders import require_encoder_files
@@ -93,10 +93,13 @@ def _link(store: Store, settings: ServiceSettings, kind: AssetKind, file: dict[s
 
 
 def settings_of(folder: Path, port: int, text_space: str) -> ServiceSettings:
-    """Settings of a server for this machine alone, with the encoder of the lift's text space, if it is here."""
+    """Settings of a server for this machine alone, with the encoder of the lift's text space, if it is here.
+
+    Spaces of encoders that ship, and those that the environment names, are answered as by any server.
+    """
     own: dict[str, Any] = {"data": folder, "host": "127.0.0.1", "port": port}
     settings = ServiceSettings(**own)
-    if text_space in ("", NO_WORDS, OWN_WORDS):
+    if text_space in ("", NO_WORDS, OWN_WORDS, *BUILT_IN.values(), *settings.text_spaces):
         return settings
     known = settings.model_copy(update={"text_spaces": {**settings.text_spaces, text_space: text_space}})
     try:

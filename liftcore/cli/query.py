@@ -175,7 +175,7 @@ def _contents(
     if seen is not None and view is not None:
         from liftcore.query.render import attention_png, mask_png, overlay_png
 
-        contents |= {"mask": lambda: [mask_png(seen)], "attention": lambda: [attention_png(seen)]}
+        contents |= {"mask": lambda: [mask_png(seen.mask)], "attention": lambda: [attention_png(seen)]}
         named = ", ".join(map(str, answer.query.positives))
         contents["overlay"] = lambda: [overlay_png(scene, seen, view, named, _picture(options.photo))]
     return contents

@@ -204,7 +204,7 @@ def found_input(role: str, remembered: InputFile, metadata: LiftMetadata, lift: 
     for place in places:
         if place.exists():
             with suppress(InvalidInput, OSError):
-                if of(place).sha256 == remembered.sha256 or (role == "cameras" and _has_poses(place, metadata)):
+                if of(place).sha256 == remembered.sha256 or (role == "cameras" and has_poses(place, metadata)):
                     return place
     return None
 
@@ -218,7 +218,14 @@ def _beside(lift: Path, path: Path) -> Iterator[Path]:
         yield from sorted(other for other in folder.glob(f"*{path.suffix}") if other != lift)[:MOST_BESIDE]
 
 
-def _has_poses(place: Path, metadata: LiftMetadata) -> bool:
+def has_poses(place: Path, metadata: LiftMetadata) -> bool:
+    """Whether a file or folder has the cameras of the lifted views as they were, whatever others it has.
+
+    Lifts from before poses were kept have none to compare: then it has not.
+
+    Raises:
+        InvalidCameras: it does not read.
+    """
     from liftcore.io.cameras import read_cameras
 
     if not metadata.poses:

@@ -6,17 +6,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import groupby
 from operator import itemgetter
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from liftcore.errors import InvalidQuery, NotFound
+from liftcore.query.regions import codebook_row, regions_of
 from liftcore.query.scene import QueryScene, as_numpy
 from liftcore.query.terms import OneSplat, Pixel, Query, Region, Vector
 from liftcore.query.text import TextEncoder
-
-if TYPE_CHECKING:
-    from liftcore.features.views import Regions
 
 MINIMUM_ROW_SUM = 0.5  # below it a ray mostly misses the scene: no histogram, no mask and no example takes it
 
@@ -85,34 +82,9 @@ def _regions(scene: QueryScene, query: Query) -> dict[int, np.ndarray]:
         regions = None  # one view at a time: maps are large
         for _, place, term in of_view:
             with _named(query, place):
-                regions = regions or _view_regions(scene, term)
-                rows[place] = _unit(_codebook_row(regions, term), str(term))
+                regions = regions or regions_of(scene, term.view, str(term))
+                rows[place] = _unit(codebook_row(regions, term), str(term))
     return rows
-
-
-def _view_regions(scene: QueryScene, example: Region) -> Regions:
-    from liftcore.features.views import Regions
-    from liftcore.scene.views import cameras_of_views
-
-    packs = scene.packs
-    view = cameras_of_views([example.view], packs.views).get(example.view)  # named as the pack or its camera is
-    if view is None:
-        raise NotFound(str(example), expected="a view of the lift's feature packs", got=repr(example.view))
-    found = packs[view]
-    if not isinstance(found, Regions):
-        hint = "ask by a pixel, VIEW:x,y"
-        raise InvalidQuery(str(example), expected="a view with regions", got="a feature grid", hint=hint)
-    return found
-
-
-def _codebook_row(regions: Regions, example: Region) -> np.ndarray:
-    levels = regions.labels.shape[0]
-    if example.level >= levels:
-        raise NotFound(str(example), expected=f"a level in 0..{levels - 1}", got=str(example.level))
-    if not bool((regions.labels[example.level] == example.region).any()):
-        expected = f"a label of level {example.level} in view {example.view!r}"
-        raise NotFound(str(example), expected=expected, got=str(example.region))
-    return as_numpy(regions.codebook[example.region])
 
 
 def _feature(scene: QueryScene, example: Pixel | OneSplat | Vector) -> np.ndarray:

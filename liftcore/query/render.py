@@ -89,9 +89,9 @@ def view_mask(
     return ViewMask(camera.name, attention, row_sums, mask, f"at least half of the ray is of {shown}")
 
 
-def mask_png(seen: ViewMask) -> bytes:
-    """The mask, white where found, one 8-bit channel [H, W]."""
-    return _png(seen.mask.astype(np.uint8) * 255)
+def mask_png(mask: np.ndarray) -> bytes:
+    """A mask [H, W] bool as one 8-bit channel, white where it is."""
+    return _png(mask.astype(np.uint8) * 255)
 
 
 def attention_png(seen: ViewMask) -> bytes:

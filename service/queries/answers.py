@@ -30,11 +30,12 @@ from liftcore.query.catalogue import Catalogue, catalogue, one_object_ply
 from liftcore.query.export import coloured_ply, layer_colours, npy, object_splats, viewer_splats
 from liftcore.query.objects import Objects, objects
 from liftcore.query.presence import references_of
+from liftcore.query.regions import region_mask, regions_at
 from liftcore.query.render import ViewMask, attention_png, mask_png, render, render_png, view_mask
 from liftcore.query.scene import QueryScene
 from liftcore.query.scores import warm_up as warm_up_scores
 from liftcore.query.segment import Segmentation, best_words, map_png, picture_png, segment, word_map, words_of
-from liftcore.query.terms import Example, Query, Vector, parse_example
+from liftcore.query.terms import Example, Query, Region, Vector, parse_example
 from liftcore.query.text import OWN_WORDS, RememberingEncoder, TextEncoder, open_encoder
 from liftcore.raster.cpu.warm_up import warm_up
 from liftcore.scene.cameras import Camera
@@ -134,6 +135,8 @@ class Answers:
             "word_picture": self._word_picture,
             "what": self._what,
             "catalogue": self._catalogue,
+            "regions": self._regions,
+            "region_mask": self._region_mask,
         }
 
     @property
@@ -249,7 +252,7 @@ class Answers:
         return _file(npy(self._answer(request).scores), request)
 
     def _mask(self, request: dict[str, Any]) -> Frame:
-        return _file(mask_png(self._look(request)), request)
+        return _file(mask_png(self._look(request).mask), request)
 
     def _attention(self, request: dict[str, Any]) -> Frame:
         return _file(attention_png(self._look(request)), request)
@@ -327,6 +330,15 @@ class Answers:
         after = last if last < len(found.objects) else None
         told = {"explanation": found.explanation, "count": len(found.objects), "next": after}
         return Frame(told | {"objects": things})
+
+    def _regions(self, request: dict[str, Any]) -> Frame:
+        found = regions_at(self._scene(request), request["view"], request["x"], request["y"])
+        told = [vars(one.example) | {"example": str(one.example), "share": one.share} for one in found]
+        return Frame({"regions": told})
+
+    def _region_mask(self, request: dict[str, Any]) -> Frame:
+        example = Region(request["view"], request["level"], request["region"])
+        return _file(mask_png(region_mask(self._scene(request), example)), request)
 
     def _named_objects(self, request: dict[str, Any]) -> Catalogue:
         """The objects of a lift; all words of the table that the request names, if it does, name them."""

@@ -33,7 +33,7 @@ NO_ENCODER: dict[str, Any] = {"encoder": None, "encoder_version": None}  # of a 
 REGION = "region:"  # what needs the lift's feature packs begins with it
 MEDIA_TYPES = {"scores": "application/x-npy", "mask": "image/png", "attention": "image/png", "render": "image/png"}
 MEDIA_TYPES["layer"] = MEDIA_TYPES["word_labels"] = MEDIA_TYPES["scores"]  # these are arrays
-MEDIA_TYPES["word_map"] = MEDIA_TYPES["word_picture"] = MEDIA_TYPES["mask"]
+MEDIA_TYPES["word_map"] = MEDIA_TYPES["word_picture"] = MEDIA_TYPES["region_mask"] = MEDIA_TYPES["mask"]
 MEDIA_TYPES["splats"] = MEDIA_TYPES["scene"] = BINARY
 
 
@@ -282,15 +282,24 @@ def query_request(operation: str, asked: Question, lift: LiftRecord, deps: AppSt
     request: dict[str, Any] = scene_request(operation, lift, deps)
     request = with_encoder(request, asked, lift, deps) if asked.text or asked.negatives else {**request, **NO_ENCODER}
     if any(isinstance(example, str) and example.startswith(REGION) for example in (*asked.like, *asked.unlike)):
-        if len(lift.features) < len(lift.metadata["features"]):
-            hint = "PUT /assets/features each of its packs before POST /lifts, or ask by splat:J or VIEW:x,y"
-            got = "one that was brought without some of them"
-            raise InvalidRequest("like", expected="a lift whose feature packs are here", got=got, hint=hint)
-        packs = [deps.store.assets.get(deps.owner, asset) for asset in lift.features]
-        request["features"] = [str(pack.path) for pack in packs]
-        request["names"] |= {str(pack.path): f"features {pack.id}" for pack in packs}
+        request = with_packs(request, lift, deps, "like")
     terms = ("text", "negatives", "like", "unlike", "threshold", "instances", "keep", "absent")
     return request | {"query": {name: getattr(asked, name) for name in terms}}
+
+
+def with_packs(request: dict[str, Any], lift: LiftRecord, deps: AppState, argument: str) -> dict[str, Any]:
+    """The request with the lift's feature packs, which have its regions.
+
+    Raises:
+        InvalidRequest: they are not all here.
+    """
+    if len(lift.features) < len(lift.metadata["features"]):
+        hint = "PUT /assets/features each of its packs before POST /lifts, or ask by splat:J or VIEW:x,y"
+        got = "one that was brought without some of them"
+        raise InvalidRequest(argument, expected="a lift whose feature packs are here", got=got, hint=hint)
+    packs = [deps.store.assets.get(deps.owner, asset) for asset in lift.features]
+    names = request["names"] | {str(pack.path): f"features {pack.id}" for pack in packs}
+    return request | {"features": [str(pack.path) for pack in packs], "names": names}
 
 
 def with_encoder(

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
+from typing import Annotated, Any
 
-from fastapi import APIRouter, Request, Response
+from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import JSONResponse
 
 from service import models
@@ -20,6 +20,14 @@ from service.uploads.intake import LiftIntake
 
 MARKDOWN_TYPE = "text/markdown; charset=utf-8"
 MARKDOWN: dict[int | str, dict[str, Any]] = {200: {"content": {MARKDOWN_TYPE: {"schema": {"type": "string"}}}}}
+
+LiftCameras = Annotated[
+    str | None,
+    Query(
+        pattern=models.ASSET_ID,
+        description="an asset with the cameras of its views, in place of those that it was made with",
+    ),
+]
 
 router = APIRouter()
 
@@ -38,9 +46,9 @@ def list_lifts(deps: Deps, limit: Limit = None, cursor: Cursor = None) -> Respon
     openapi_extra=RAW_BODY,
     tags=["lifts"],
 )
-async def upload_lift(request: Request, deps: Deps, sha256: Sha256 = None) -> Response:
+async def upload_lift(request: Request, deps: Deps, sha256: Sha256 = None, cameras: LiftCameras = None) -> Response:
     """Bring a lift file of the command line. The splats and cameras that it was made of must be here."""
-    lift, new = await taken(LiftIntake, LIFT, request, deps, sha256)
+    lift, new = await taken(partial(LiftIntake, cameras=cameras), LIFT, request, deps, sha256)
     location = {"Location": f"/lifts/{lift.id}"}
     return JSONResponse(shape_lift(lift).model_dump(mode="json"), 201 if new else 200, headers=location)
 

@@ -1,4 +1,4 @@
-"""/lifts/{lift}/splats, /colours, /views and /objects: what a viewer draws of a lift."""
+"""/lifts/{lift}/splats, /colours, /views, /regions and /objects: what a viewer draws of a lift."""
 
 from __future__ import annotations
 
@@ -13,7 +13,18 @@ from service import models
 from service.content import TAGGED, Limit, kept, unchanged
 from service.encoders import encoder_label
 from service.photos import names_with_photo, open_photo
-from service.routes.queries import NO_ENCODER, NPY, PLY, Ask, View, scene_request, tagged_answer, with_encoder
+from service.routes.queries import (
+    NO_ENCODER,
+    NPY,
+    PLY,
+    PNG,
+    Ask,
+    View,
+    scene_request,
+    tagged_answer,
+    with_encoder,
+    with_packs,
+)
 from service.state import AppState, Deps
 from service.store.lifts import LiftRecord
 
@@ -23,6 +34,8 @@ PHOTO: dict[int | str, dict[str, Any]] = {200: {"content": {"image/jpeg": _BYTES
 
 router = APIRouter(prefix="/lifts/{lift}", tags=["lifts"])
 ViewsCursor = Annotated[int, Query(ge=0, le=10**9, description="the `next` of the page before")]
+Pixel = Annotated[int, Query(ge=0, le=10**9, description="of the photo: x from the left, y from the top")]
+Level = Annotated[int, Query(ge=0, le=10**9, description="as GET /lifts/{lift}/regions tells it")]
 ObjectId = Annotated[int, Path(ge=0, le=10**9, description="the id of an object of the lift")]
 Layer = Annotated[
     Literal["pca", "cluster", "evidence", "agreement", "confidence"],
@@ -80,6 +93,25 @@ def views(lift: str, deps: Deps, ask: Ask, limit: Limit = VIEWS, cursor: ViewsCu
         models.View(lifted=view["name"] in lifted, photo=view["name"] in photos, **view) for view in answer["views"]
     ]
     return models.Views(views=told, next=cursor + most if answer["more"] else None)
+
+
+@router.get("/regions", response_model=models.CoveringRegions)
+def regions(lift: str, view: View, x: Pixel, y: Pixel, deps: Deps, ask: Ask) -> models.CoveringRegions:
+    """The regions of the lift's feature packs that cover a pixel of a view's photo: each is an example to ask by."""
+    found = deps.store.lifts.get(deps.owner, lift)
+    wanted = with_packs(scene_request("regions", found, deps), found, deps, "view") | {"view": view, "x": x, "y": y}
+    return models.CoveringRegions(lift=found.id, view=view, **ask(wanted).header)
+
+
+@router.get("/regions/mask", responses=PNG | TAGGED, response_class=Response)
+def region_mask(
+    lift: str, view: View, level: Level, region: Level, request: Request, deps: Deps, ask: Ask
+) -> Response:
+    """The pixels of a view's photo that one region covers: a PNG, white where it is."""
+    found = deps.store.lifts.get(deps.owner, lift)
+    wanted = with_packs(scene_request("region_mask", found, deps), found, deps, "view")
+    wanted |= {"view": view, "level": level, "region": region}
+    return tagged_answer(request, deps, wanted, found, ask)
 
 
 @router.get("/objects", response_model=models.SceneObjects)

@@ -1,6 +1,7 @@
 """The process that reads an upload before it becomes an asset.
 
-Run as ``python -m service.uploads.check KIND PATH MEMORY_BYTES``. It says ``ready`` once it can read, then
+Run as ``python -m service.uploads.check KIND PATH MEMORY_BYTES``, of a lift with the path of its cameras where these
+have another digest than it remembers. It says ``ready`` once it can read, then
 ``valid`` with what it found, or ``invalid`` with the error: JSON lines on stdout.
 """
 
@@ -23,7 +24,7 @@ from liftcore.io.class_masks import describe_masks
 from liftcore.io.inspect import describe_camera_file, describe_packs, describe_splat_file, describe_table
 from liftcore.io.json_file import finite
 from liftcore.io.kinds import kind_of
-from liftcore.io.lift_file import parse_metadata, read_lift
+from liftcore.io.lift_file import has_poses, parse_metadata, read_lift
 from liftcore.io.splats import SUFFIX, SplatFormat, format_of
 from liftcore.query.text.table import TableEncoder
 from service.child import die_with_parent, end_with_parent, fault_of, own_stdout
@@ -83,10 +84,18 @@ def check_photos(path: Path) -> dict[str, Any]:
     return {"suffix": ".zip", "found": describe_photos(path)}
 
 
-def check_lift(path: Path) -> dict[str, Any]:
-    """Read every number of a lift, and bound what its metadata say; its names of views must be ones to query by."""
+def check_lift(path: Path, cameras: Path | None = None) -> dict[str, Any]:
+    """Read every number of a lift, and bound what its metadata say; its names of views must be ones to query by.
+
+    ``cameras`` are an asset that stands for those that it was made with: they must see what these saw.
+    """
     arrays, told = read_lift(path)
-    metadata = finite(json.loads(parse_metadata(told, path).model_dump_json()))
+    parsed = parse_metadata(told, path)
+    metadata = finite(json.loads(parsed.model_dump_json()))
+    if cameras is not None and not has_poses(cameras, parsed):
+        got = "others" if parsed.poses else "a lift from before lifts remembered what their cameras saw"
+        hint = "bring the folder or file that was lifted with; a zip of the folder will do"
+        raise InvalidLift("cameras", expected="cameras that see what the lift's did", got=got, hint=hint)
     for name, values in arrays.items():
         for first in range(0, len(values), BLOCK_ROWS):
             if not np.isfinite(values[first : first + BLOCK_ROWS]).all():
@@ -103,7 +112,7 @@ def check_lift(path: Path) -> dict[str, Any]:
     return {"suffix": ".safetensors", "found": found}
 
 
-CHECKS: dict[UploadKind, Callable[[Path], dict[str, Any]]] = {
+CHECKS: dict[UploadKind, Callable[..., dict[str, Any]]] = {
     AssetKind.SPLATS: check_splats,
     AssetKind.CAMERAS: check_cameras,
     AssetKind.FEATURES: check_features,
@@ -114,10 +123,10 @@ CHECKS: dict[UploadKind, Callable[[Path], dict[str, Any]]] = {
 }
 
 
-def run(kind: UploadKind, path: Path) -> dict[str, Any]:
+def run(kind: UploadKind, path: Path, *more: Path) -> dict[str, Any]:
     """Check one file; the last message."""
     try:
-        checked = CHECKS[kind](path)
+        checked = CHECKS[kind](path, *more)
     except SplatliftError as error:
         return _invalid(_of_another_kind(kind, path) or error, kind, path)
     except MemoryError:
@@ -163,7 +172,7 @@ def main() -> None:
     # Private memory and not address space: mapped files, however large, cost none.
     resource.setrlimit(resource.RLIMIT_DATA, (memory, memory))
     _say(out, {"event": "ready"})
-    _say(out, run(kind, path))
+    _say(out, run(kind, path, *map(Path, sys.argv[4:])))
 
 
 if __name__ == "__main__":

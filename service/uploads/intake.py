@@ -20,7 +20,7 @@ from typing import Any, BinaryIO, Generic, TypeVar
 
 import zstandard
 
-from liftcore.errors import InvalidLift
+from liftcore.errors import InvalidLift, NotFound
 from liftcore.scene.views import require_pairs
 from service.child import error_of
 from service.errand import ErrandLimits, run_errand
@@ -223,12 +223,17 @@ class Intake(ABC, Generic[Taken]):
 
         Raises:
             InvalidInput, Crashed, Busy: as `check` has it.
+            NotFound: what it is checked beside is not here.
         """
         assert self._draft is not None
         with self._store.files.scratch() as scratch:
-            report = check(self._kind, self._draft, scratch, limits)
+            report = check(self._kind, self._draft, scratch, limits, *self._beside())
         digest = self._digest.hexdigest()
         return CheckedUpload(self._draft, self._kind, digest, report.suffix, report.counts, report.warnings)
+
+    def _beside(self) -> tuple[Path, ...]:
+        """Files that it is checked beside."""
+        return ()
 
     @abstractmethod
     def _known(self, digest: str) -> Taken | None: ...
@@ -256,7 +261,20 @@ class AssetIntake(Intake[AssetRecord]):
 
 
 class LiftIntake(Intake[LiftRecord]):
-    """The upload of a lift that was made elsewhere: its splats and cameras are here, under their digests."""
+    """The upload of a lift that was made elsewhere: its splats and cameras are here, under their digests.
+
+    Args:
+        cameras: an asset that has the lift's cameras, in place of that digest: of a folder there is no such file.
+    """
+
+    def __init__(self, *given: Any, cameras: str | None = None) -> None:
+        super().__init__(*given)
+        self._cameras = cameras
+
+    def _beside(self) -> tuple[Path, ...]:
+        if self._cameras is None:
+            return ()
+        return (self._store.assets.get(self._owner, self._cameras, AssetKind.CAMERAS).path,)
 
     def _known(self, digest: str) -> LiftRecord | None:
         known = self._store.lifts.of_file(self._owner, digest)
@@ -266,11 +284,16 @@ class LiftIntake(Intake[LiftRecord]):
         """Make a lift of it."""
         told, assets = upload.counts, self._store.assets
         order = order_of(told["metadata"])
+        order = order if self._cameras is None else replace(order, cameras=self._cameras)
         splats = assets.get(self._owner, order.splats, AssetKind.SPLATS)
         if splats.counts["splats"] != told["count"]:
             got = f"{told['count']} for {splats.counts['splats']} splats"
             raise InvalidLift("lift", expected="a row for each splat", got=got)
-        cameras = assets.get(self._owner, order.cameras, AssetKind.CAMERAS, most=ALL)
+        try:
+            cameras = assets.get(self._owner, order.cameras, AssetKind.CAMERAS, most=ALL)
+        except NotFound as error:
+            hint = "PUT its file of cameras first; in place of a folder a zip of it, named here as ?cameras=ID"
+            raise NotFound(error.argument, expected=error.expected, got=error.got, hint=hint) from None
         require_pairs(told["metadata"]["views"], cameras.counts["names"])
         packs = tuple(pack for pack in order.features if assets.find(self._owner, pack) is not None)
         made = FinishedLift(upload.draft, upload.sha256, told["count"], told["channels"], told["metadata"])
@@ -286,16 +309,19 @@ class Report:
     warnings: list[str]
 
 
-def check(kind: UploadKind, path: Path, scratch: Path, limits: ErrandLimits) -> Report:
+def check(kind: UploadKind, path: Path, scratch: Path, limits: ErrandLimits, *beside: Path) -> Report:
     """Read a whole file in a process of its own, which unpacks into ``scratch`` and ends with this process.
+
+    Args:
+        beside: of a lift, cameras that must see what its own saw.
 
     Raises:
         InvalidInput: the file is malformed, or it takes more time or memory than it may.
         Crashed: the process did not get as far as opening the file.
         Busy: the server ended meanwhile.
     """
-    memory = min(limits.memory_bytes, CHECK_BASE_BYTES + CHECK_FACTOR * _size(path))
-    heard = run_errand("service.uploads.check", [kind, str(path), str(memory)], scratch, limits)
+    memory = min(limits.memory_bytes, CHECK_BASE_BYTES + CHECK_FACTOR * sum(map(_size, (path, *beside))))
+    heard = run_errand("service.uploads.check", [kind, str(path), str(memory), *map(str, beside)], scratch, limits)
     if heard is None:
         raise INVALID[kind](
             kind, expected=f"a file that is read within {limits.seconds:g} s", got="one that takes longer"

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import io
+import json
 import zipfile
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,9 +16,14 @@ from PIL import Image
 from safetensors import safe_open
 from safetensors.numpy import load, save
 
-from .conftest import Uploaded
+from liftcore.io.scene_files import lift_files
+from liftcore.settings import LiftSettings
+from service.store.__main__ import main
+from service.store.database import DATABASE
+
+from .conftest import Uploaded, serving
 from .test_problems import assert_problem
-from .tiny_scene import TinyScene
+from .tiny_scene import TinyScene, cameras_document, colmap_zip
 
 
 def photos(**named: bytes) -> bytes:
@@ -111,6 +118,35 @@ def test_lift_file_from_elsewhere_becomes_a_lift(
         assert "packs" in assert_problem(other.get("/query", params=region))["expected"]
         assert other.delete(f"/jobs/{brought['id']}?with_lift=true").status_code == 204
         assert other.get("/lifts").json()["lifts"] == []
+
+
+def test_lift_of_a_folder_of_cameras_takes_a_zip_of_them(
+    scene: TinyScene, table: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "cameras.zip").write_bytes(colmap_zip())
+    zipfile.ZipFile(tmp_path / "cameras.zip").extractall(tmp_path / "scene")
+    for name, content in (("s.ply", scene.splats), ("f.safetensors", scene.features)):
+        (tmp_path / name).write_bytes(content)
+    files = tmp_path / "s.ply", tmp_path / "scene", [tmp_path / "f.safetensors"]
+    lift_files(*files, LiftSettings.of(preset="row-sum")).save(tmp_path / "lift.safetensors")
+    lift = (tmp_path / "lift.safetensors").read_bytes()
+    data = tmp_path / "data"
+    with serving(data, table) as client:
+        client.put("/assets/splats", content=scene.splats)
+        told = assert_problem(client.post("/lifts", content=lift))
+        assert told["status"] == 404 and "a zip of it" in told["hint"]
+        moved = json.dumps({**cameras_document(), "fl_x": 31.0}).encode()
+        others, same = (client.put("/assets/cameras", content=body).json()["id"] for body in (moved, colmap_zip()))
+        told = assert_problem(client.post("/lifts", params={"cameras": others}, content=lift))
+        assert (told["type"], told["argument"]) == ("/problems/invalid-lift", "cameras")
+        made = client.post("/lifts", params={"cameras": same}, content=lift)
+        assert made.status_code == 201 and made.json()["cameras"] == same
+        assert client.get("/query/mask", params={"text": "lamp", "view": "left"}).status_code == 200
+    (data / DATABASE).unlink()
+    assert main(["rebuild", "--data", str(data), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["lifts"] == 1
+    with serving(data, table) as client:
+        assert client.get("/lifts").json()["lifts"][0]["cameras"] == same
 
 
 def test_broken_lift_files_are_refused(client: TestClient, lift: dict[str, Any], tmp_path: Any) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from fastapi.testclient import TestClient
+from PIL import Image
 
 from liftcore.io.splat import ROW
 from liftcore.query.scene import QueryScene
@@ -132,3 +133,18 @@ def test_other_kernels_are_shown_as_near_gaussians() -> None:
     np.testing.assert_allclose(shown[1]["scales"], np.sqrt(1 / 12), rtol=1e-5)  # (1 - r^2)^4 in the image
     assert shown[0]["colours"].tolist() == [[153, 153, 153, 255], [153, 153, 153, 0]]  # no colours: grey
     assert (shown[0]["quats"][:, 0] == 255).all()  # of no length: no turn
+
+
+def test_regions_at_a_pixel_are_examples_to_ask_by(client: TestClient, lift: dict[str, Any]) -> None:
+    at, lamp = f"/lifts/{lift['id']}/regions", {"view": "middle", "x": 26, "y": 12}
+    (region,) = client.get(at, params=lamp).json()["regions"]
+    assert (region["example"], region["level"], region["region"]) == ("region:middle:0:2", 0, WORDS.index("lamp"))
+    answer = client.get("/query", params={"lift": lift["id"], "like": region["example"], "threshold": 0.5}).json()
+    assert {splat["splat"] // SPLATS_A_CLUSTER for splat in answer["top"]} == {WORDS.index("lamp")}
+    where = {name: region[name] for name in ("view", "level", "region")}
+    mask = client.get(f"{at}/mask", params=where)
+    pixels = np.asarray(Image.open(io.BytesIO(mask.content)))
+    assert pixels.shape == (HEIGHT, WIDTH) and pixels[12, 26] == 255 and pixels.mean() == 255 * region["share"]
+    for path, asked, status in ((at, lamp | {"x": WIDTH}, 422), (at, lamp | {"view": "nowhere"}, 404),
+                                (f"{at}/mask", where | {"region": 3}, 404)):  # fmt: skip
+        assert assert_problem(client.get(path, params=asked))["status"] == status

@@ -77,6 +77,15 @@ export class Ask {
     return this.ask(this.now);
   }
 
+  // Another example in the place of one, such as a larger mask.
+  swap(old, term) {
+    for (const question of this.questions) {
+      for (const kind of ["like", "unlike"]) question[kind] = question[kind].map(known => (known === old ? term : known));
+    }
+    this.now.threshold = "auto";
+    return this.ask(this.now);
+  }
+
   typed(less) {
     const notation = at("example").value.trim();
     if (!notation) return;
@@ -349,7 +358,7 @@ const fresh = (terms, place) => ({ text: [], like: [], unlike: [], threshold: "a
 const split = text => text.split(",").map(word => word.trim()).filter(Boolean);
 const number = given => (given === undefined || given === "" || Number.isNaN(Number(given)) ? "auto" : Number(given));
 const lit = question => question.anyway || question.threshold !== "auto" || (question.answer.clear && question.answer.present !== false);
-const shown = term => term.replace("splat:", "splat ");
+const shown = term => term.replace(/^splat:/, "splat ").replace(/^region:(.*):(\d+):(\d+)$/, "a mask of $1");
 export const label = question => question.text.join(", ") || (question.like.length > 1 ? `like ${question.like.length} examples` : `like ${shown(question.like[0] || "")}`);
 const quoted = question => (question.text.length ? `\u201c${question.text.join(", ")}\u201d` : "Such a thing");
 const measures = ({ low, high }) => ` ${low.map((value, axis) => (high[axis] - value).toPrecision(2)).join(" \u00d7 ")}`;

@@ -1,7 +1,7 @@
 // The panel of bringing: files by drag and drop, the settings of a lift from the schema, jobs as they run, and what
 // is here already.
 import { ago, at, count, el, plural, size, tell, twice } from "./dom.js";
-import { gathered, kindOf } from "./files.js";
+import { dropped, gathered, kindOf } from "./files.js";
 import { events, json, patch, picture, post, remove, upload, words } from "./service.js";
 
 const PAGE = 20; // of each list
@@ -10,7 +10,7 @@ const ENDED = ["succeeded", "failed", "canceled"];
 const KINDS = { splats: "Splats", cameras: "Cameras", features: "Features" };
 const OTHERS = { photos: "Photos", lift: "Lift", masks: "Masks", table: "Words" };
 const KNOWN = 1000; // assets among which those of a lift file are looked for
-const WANTED = { splats: ".ply, .splat, .spz or .sog", cameras: "cameras.json, transforms.json, or a .zip of a COLMAP model", features: ".safetensors packs" };
+const WANTED = { splats: ".ply, .splat, .spz or .sog", cameras: "cameras.json, transforms.json, or a COLMAP model: its folder or a .zip", features: ".safetensors packs" };
 const PRESETS = {
   default: ["Careful", "Masks that other views contradict count less; splats get a confidence."],
   tikhonov: ["Sharp", "The paper's best: strong weights count more."],
@@ -32,7 +32,7 @@ export class Bring {
     addEventListener("drop", event => {
       stop(event);
       document.body.classList.remove("dragging");
-      if (event.dataTransfer.files.length) { this.raised(); this.add([...event.dataTransfer.files]); }
+      if (event.dataTransfer.files.length) { this.raised(); dropped(event.dataTransfer).then(files => this.add(files)); }
     });
     at("choose").addEventListener("click", () => at("files").click());
     at("files").addEventListener("change", () => { this.add([...at("files").files]); at("files").value = ""; });
@@ -51,7 +51,7 @@ export class Bring {
     for (const file of await gathered(files)) {
       const { kind, needs } = await kindOf(file);
       const one = { name: file.name, bytes: file.size, kind, needs, file, sent: 0, asset: null, problem: null };
-      if (!kind) one.problem = { title: "Not sent", detail: /\.bin$/i.test(file.name) ? "zip the folder of the COLMAP model, and drop the zip" : `it is none of ${Object.values(WANTED).join("; ")}; photos; or a lift file` };
+      if (!kind) one.problem = { title: "Not sent", detail: /\.bin$/i.test(file.name) ? "drop the folder of the COLMAP model, or a zip of it" : `it is none of ${Object.values(WANTED).join("; ")}; photos; or a lift file` };
       if (kind && kind !== "features") this.files = this.files.filter(known => known.kind !== kind || !known.asset);
       this.files.push(one);
       if (kind === "lift") this.sendLift(one);
@@ -60,8 +60,8 @@ export class Bring {
     this.show();
   }
 
-  async send(one) {
-    const sending = upload(one.kind, one.file, sent => { one.sent = sent; this.show(); });
+  async send(one, cameras) {
+    const sending = upload(one.kind, one.file, sent => { one.sent = sent; this.show(); }, cameras);
     one.end = sending.end;
     try {
       one.asset = await sending.done;
@@ -80,7 +80,8 @@ export class Bring {
     for (const waiting of this.files) if (waiting.missing?.length) this.sendLift(waiting);
   }
 
-  // A lift file of the command line goes up once its splats and cameras are here.
+  // A lift file of the command line goes up once its splats and cameras are here. Its cameras may have been a folder,
+  // of which there is no file: then those that were dropped stand for them, if they see the same.
   async sendLift(one) {
     try {
       const here = (await json(`/assets?limit=${KNOWN}`)).assets.map(({ id }) => id);
@@ -88,6 +89,10 @@ export class Bring {
       one.missing = one.needs.filter(({ id }) => !here.includes(id));
       this.show();
       if (!one.missing.length && !one.sent && (waited === undefined || waited.length)) await this.send(one);
+      const others = this.ids("cameras").at(-1);
+      if (one.missing.length !== 1 || one.missing[0].kind !== "cameras" || !others || others === one.tried) return;
+      Object.assign(one, { tried: others, problem: null });
+      await this.send(one, others);
     } catch (problem) {
       one.problem = problem;
       this.show();
@@ -129,11 +134,11 @@ export class Bring {
     const done = one.asset || one.problem;
     const share = one.bytes ? one.sent / one.bytes : 1;
     const state = one.problem ? words(one.problem) : one.asset ? said(one.asset)
-      : one.missing?.length ? `This lift was made of ${one.missing.map(({ kind, name }) => `${name || "its"} (${kind})`).join(" and ")}: drop ${one.missing.length > 1 ? "them" : "it"} here, too.`
+      : one.missing?.length && !one.sent ? `This lift was made of ${one.missing.map(({ kind, name }) => `${name || "its"} (${kind})`).join(" and ")}: drop ${one.missing.length > 1 ? "them" : "it"} here, too.`
       : share >= 1 ? "checking it\u2026" : `${size(one.sent)} of ${size(one.bytes)}`;
     return el("li", { className: one.problem ? "file bad" : one.asset ? "file done" : "file" },
       el("span", { className: "name" }, one.name), el("span", { className: "kind" }, one.kind || ""),
-      done || one.missing?.length ? null : el("progress", share >= 1 ? { "aria-label": `checking ${one.name}` } : { max: 1, value: share, "aria-label": `upload of ${one.name}` }),
+      done || (one.missing?.length && !one.sent) ? null : el("progress", share >= 1 ? { "aria-label": `checking ${one.name}` } : { max: 1, value: share, "aria-label": `upload of ${one.name}` }),
       el("span", { className: "state" }, state),
       ...(one.asset?.warnings || []).map(warning => el("span", { className: "state warning" }, `Note: ${warning}`)),
       one.kind === "photos" && one.asset && this.open() ? el("span", { className: "actions" }, el("button", { type: "button", on: { click: () => this.beside(one) } }, "Show beside this scene")) : null,

@@ -3,6 +3,8 @@ import { Zip, ZipPassThrough } from "fflate";
 
 const HEADER = 32 << 20; // bytes of a safetensors header that are read here
 const TAIL = 1 << 20; // of a zip: its list of names lies at its end
+const DEPTH = 5; // folders down
+const CAMERAS = /(^|\/)((cameras|images|frames|rigs)\.(bin|txt)|(dataparser_)?transforms\.json|cameras\.json)$/;
 const PHOTO = /\.(jpe?g|png)$/i;
 
 // {kind} of a file, null for what is not known; a lift file brings what it `needs`: [{kind, id, name}].
@@ -32,17 +34,48 @@ async function safetensors(file) {
   }
 }
 
+// What was dropped: files, and of folders the cameras as one zip, or all files where there are none.
+export async function dropped({ items, files }) {
+  const entries = [...items].map(item => item.webkitGetAsEntry?.()).filter(Boolean); // while the event lasts
+  if (!entries.some(entry => entry.isDirectory)) return [...files];
+  const found = await Promise.all(entries.map(async entry => {
+    const inner = await within(entry);
+    const cameras = inner.filter(({ path }) => CAMERAS.test(path));
+    if (!entry.isDirectory || !cameras.length) return inner.map(({ file }) => file);
+    return [await zipped(cameras, `${entry.name}.zip`)];
+  }));
+  return found.flat();
+}
+
+// The files at or below an entry: [{path, file}].
+async function within(entry, depth = 0) {
+  if (entry.isFile) return [{ path: entry.fullPath.slice(1), file: await new Promise((done, failed) => { entry.file(done, failed); }) }];
+  if (depth === DEPTH || entry.name.startsWith(".")) return [];
+  const inner = [];
+  for (const reader = entry.createReader(); ;) { // a hundred at a time
+    const more = await new Promise((done, failed) => { reader.readEntries(done, failed); });
+    if (!more.length) break;
+    inner.push(...more);
+  }
+  return (await Promise.all(inner.map(one => within(one, depth + 1)))).flat();
+}
+
+async function zipped(parts, name) {
+  const content = [];
+  const zip = new Zip((_, part) => content.push(part));
+  for (const { path, file } of parts) {
+    const entry = new ZipPassThrough(path);
+    zip.add(entry);
+    entry.push(new Uint8Array(await file.arrayBuffer()), true);
+  }
+  zip.end();
+  return new File(content, name);
+}
+
 // Photos that were dropped one by one are sent as one zip, without packing them: they are packed already.
 export async function gathered(files) {
   const photos = files.filter(file => PHOTO.test(file.name));
   if (!photos.length) return files;
-  const parts = [];
-  const zip = new Zip((_, part) => parts.push(part));
-  for (const photo of photos) {
-    const entry = new ZipPassThrough(photo.name);
-    zip.add(entry);
-    entry.push(new Uint8Array(await photo.arrayBuffer()), true);
-  }
-  zip.end();
-  return [...files.filter(file => !photos.includes(file)), new File(parts, photos.length > 1 ? `${photos.length} photos.zip` : `${photos[0].name}.zip`)];
+  const name = photos.length > 1 ? `${photos.length} photos.zip` : `${photos[0].name}.zip`;
+  return [...files.filter(file => !photos.includes(file)), await zipped(photos.map(file => ({ path: file.name, file })), name)];
 }

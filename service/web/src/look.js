@@ -1,6 +1,7 @@
 // The panel of looking: layers of colours in 3D and in the pictures of views, the list of views, and the pictures
 // themselves, which need no WebGL.
 import { at, el, fill, tell } from "./dom.js";
+import { edge } from "./masks.js";
 import { bytes, json, npy, picture, words } from "./service.js";
 
 const PAGE = 1000; // views that are asked for at a time
@@ -144,7 +145,8 @@ export class Look {
     at("layer-words").textContent = this.what === "photo" && !this.view.photo ? "There is no photo of this view." : LAYERS[this.what];
     at("picture-box").classList.add("busy");
     try {
-      await Promise.all([shown("render", `/render?${place}&what=rgb`), shown("over", over), this.mask(mine)]);
+      const examples = this.examples?.() || [];
+      await Promise.all([shown("render", `/render?${place}&what=rgb`), shown("over", over), this.mask(mine), this.masks?.outline(this.view.name, examples)]);
       this.marks();
     } catch (problem) {
       if (mine === this.turn) tell(words(problem), true);
@@ -157,26 +159,14 @@ export class Look {
     const canvas = at("mask");
     const asked = this.asked?.(this.view.name);
     if (!asked) { canvas.hidden = true; return; }
-    const image = await picture(asked.mask);
+    const image = await picture(asked.path, asked.body);
     URL.revokeObjectURL(image.src);
     if (mine !== this.turn) return;
     canvas.width = image.naturalWidth;
     canvas.height = image.naturalHeight;
     const context = canvas.getContext("2d", { willReadFrequently: true });
     context.drawImage(image, 0, 0);
-    const pixels = context.getImageData(0, 0, canvas.width, canvas.height);
-    const { data } = pixels;
-    const [r, g, b] = asked.rgb;
-    const found = place => data[4 * place] > 127;
-    const out = new Uint8ClampedArray(data.length);
-    for (let place = 0; place < data.length / 4; place += 1) {
-      const x = place % canvas.width;
-      if (!found(place)) { out.set([8, 10, 14, 190], 4 * place); continue; }
-      const edge = !x || x === canvas.width - 1 || !found(place - 1) || !found(place + 1) || place < canvas.width
-        || place >= data.length / 4 - canvas.width || !found(place - canvas.width) || !found(place + canvas.width);
-      out.set(edge ? [r, g, b, 255] : [r, g, b, 0], 4 * place);
-    }
-    context.putImageData(new ImageData(out, canvas.width, canvas.height), 0, 0);
+    context.putImageData(asked.paint(context.getImageData(0, 0, canvas.width, canvas.height)), 0, 0);
     canvas.hidden = false;
     canvas.dataset.view = this.view.name;
   }
@@ -206,6 +196,16 @@ export class Look {
     const x = Math.floor((event.clientX - box.left) / box.width * image.naturalWidth);
     const y = Math.floor((event.clientY - box.top) / box.height * image.naturalHeight);
     if (x < 0 || y < 0 || x >= image.naturalWidth || y >= image.naturalHeight) return;
-    this.pick(`${this.view.name}:${x},${y}`, event.shiftKey);
+    if (this.masks?.picking) this.masks.at(this.view.name, x, y, event.shiftKey);
+    else this.pick(`${this.view.name}:${x},${y}`, event.shiftKey);
   }
+}
+
+// What a mask leaves out, under a veil; its edge in a colour.
+export function veiled(mask, [r, g, b]) {
+  const { data, width, height } = mask;
+  const out = new ImageData(width, height);
+  for (let place = 0; place < data.length; place += 4) if (data[place] < 128) out.data.set([8, 10, 14, 190], place);
+  edge(mask, place => out.data.set([r, g, b, 255], 4 * place));
+  return out;
 }

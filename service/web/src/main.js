@@ -3,9 +3,11 @@ import { Ask, label } from "./ask.js";
 import { Bring } from "./bring.js";
 import { at, count, el, fill, size, tell } from "./dom.js";
 import { Lifts, title } from "./lifts.js";
-import { Look } from "./look.js";
+import { Look, veiled } from "./look.js";
+import { Masks } from "./masks.js";
+import { Names } from "./names.js";
 import { COLOURS, rgb } from "./painter.js";
-import { bytes, json, keyOf, onRefused, useKey, words } from "./service.js";
+import { bytes, json, keyOf, onRefused, picture, useKey, words } from "./service.js";
 import { Take } from "./take.js";
 import { Things } from "./things.js";
 import { MOST, Viewer, webgl } from "./viewer.js";
@@ -13,6 +15,7 @@ import { MOST, Viewer, webgl } from "./viewer.js";
 const PAGE = 100; // lifts to choose from
 const TURN = Math.PI / 24; // of an arrow key
 const TWICE = 260; // ms within which a second click makes a double one
+const POSTER = 960; // pixels of the service's picture that is shown until the splats are here
 const SHIFTED = 5; // pixels that the pointer may move in a click
 
 const started = new URLSearchParams(location.search);
@@ -23,28 +26,32 @@ let turn = 0; // of opening lifts: what an older one loads is late and is droppe
 let busy = false;
 
 const ask = new Ask({ changed, fly: box => viewer?.toBox(box) });
-const look = new Look({ changed: () => { repaint(); link(); }, fly: view => viewer?.to(view), pick: (term, less) => ask.example(term, less), fallback: !webgl() });
-const take = new Take({ ask, look, shot });
+const look = new Look({ changed: () => { repaint(); link(); }, fly: view => viewer?.to(view), pick: (term, less) => pointed(term, less), fallback: !webgl() });
+const names = new Names({ changed, centres: (values, most) => viewer?.mesh ? viewer.centres(values, most) : [], alone: () => ask.reset(true), more: term => { tab("ask"); ask.example(term, false); } });
+const masks = new Masks({ pick: (term, less) => { tab("ask"); ask.example(term, less); }, swap: (old, term) => ask.swap(old, term) });
+const take = new Take({ ask, look, names, shot });
 const bring = new Bring({ opened: id => open(id, true), gone: () => refreshLifts(), open: () => lift?.id ?? null, raised: () => tab("bring") });
 const lifts = new Lifts({ opened: id => open(id, true), changed: () => refreshLifts() });
 const things = new Things({ changed: () => repaint(), fly: (box, view) => (look.mode === "view" ? look.go(view) : viewer?.toBox(box, look.views.find(({ name }) => name === view))) });
 
 look.asked = view => {
   const question = ask.painted().length ? ask.now : null;
-  if (!question?.answer || !ask.painted().some(({ scores }) => scores === question.scores)) return null;
-  return { mask: `/query/mask?${ask.parameters(question, { view })}`, rgb: rgb(question.colour) };
+  if (!question?.answer || !ask.painted().some(({ scores }) => scores === question.scores)) return names.map(view);
+  return { path: `/query/mask?${ask.parameters(question, { view })}`, paint: mask => veiled(mask, rgb(question.colour)) };
 };
+look.masks = masks;
 look.examples = () => ask.questions.flatMap(({ like, unlike }) => [...like.map(term => ({ term })), ...unlike.map(term => ({ term, unlike: true }))]);
 
 let drawn = "";
 
 // After what is asked, or how it is shown, has changed.
 function changed() {
-  if (ask.questions.length) things.rest();
+  if (ask.questions.length) { things.rest(); names.rest(); }
+  masks.list(look.examples());
   repaint();
   link();
   take.show();
-  const question = ask.now?.answer ? `${ask.parameters(ask.now)}` : "";
+  const question = ask.now?.answer ? `${ask.parameters(ask.now)}` : names.shown ? JSON.stringify([names.asked, ...names.only]) : "";
   clearTimeout(changed.soon);
   if (question !== drawn) changed.soon = setTimeout(() => { drawn = question; look.draw(); }, 150); // the slider moves often
 }
@@ -53,8 +60,8 @@ function repaint() {
   if (!viewer?.mesh) return;
   const begun = performance.now();
   const questions = ask.painted();
-  viewer.paint(questions, { heat: ask.heated(), layer: look.painted(), hide: at("hide").checked });
-  const boxes = at("show-boxes").checked ? [...ask.boxes(), ...things.boxes()] : [];
+  viewer.paint(questions, { heat: ask.heated(), layer: names.painted() || look.painted(), hide: at("hide").checked });
+  const boxes = at("show-boxes").checked ? [...ask.boxes(), ...things.boxes(), ...names.boxes()] : [];
   viewer.outline(boxes);
   labels(boxes);
   document.body.dataset.painted = (performance.now() - begun).toFixed(1);
@@ -65,12 +72,13 @@ function labels(boxes) {
   at("labels").replaceChildren(...boxes.slice(0, 40).map(box => el("button", {
     type: "button", className: box.strong ? "label strong" : "label", tabIndex: -1, style: { "--mine": box.colour },
     data: { at: JSON.stringify([(box.low[0] + box.high[0]) / 2, (box.low[1] + box.high[1]) / 2, (box.low[2] + box.high[2]) / 2]), box: JSON.stringify([box.low, box.high]) },
-    on: { click: () => (box.question ? ask.choose(box.question, box.thing) : viewer.toBox(box)) },
+    on: { click: () => (box.question ? ask.choose(box.question, box.thing) : box.named ? names.press(box.named) : viewer.toBox(box)) },
   }, box.of > 1 ? `${box.name} ${box.thing + 1}` : box.name)));
 }
 
 // After each frame: labels lie at the top of their boxes as these are seen, whole where a part of the box is.
 function placed(place) {
+  if (viewer?.settled && !at("stage").classList.contains("ready")) appear(turn);
   for (const shown of at("labels").children) {
     const [low, high] = JSON.parse(shown.dataset.box);
     const corners = [0, 1, 2, 3, 4, 5, 6, 7].map(which => place([0, 1, 2].map(axis => (which >> axis & 1 ? high : low)[axis])));
@@ -90,6 +98,7 @@ function link() {
   const parameters = new URLSearchParams({ lift: lift.id });
   if (look.view) parameters.set("view", look.view.name);
   ask.link(parameters);
+  names.link(parameters);
   if (look.what !== "rgb") parameters.set("what", look.what);
   if (look.mode !== "scene" && !look.fallback) parameters.set("show", look.mode);
   if (at("hide").checked) parameters.set("hide", "1");
@@ -106,6 +115,7 @@ function tab(name) {
   }
   if (name === "bring") bring.refresh();
   if (name === "take") take.show();
+  repaint();
 }
 
 function loading(text, share = null) {
@@ -130,8 +140,7 @@ async function refreshLifts() {
   if (gone && !next) { // it was deleted
     lift = null;
     viewer?.clear();
-    ask.of(null);
-    things.of(null);
+    of(null);
     if (known.length) open(known[0].id);
   }
   at("empty").hidden = Boolean(known.length);
@@ -151,15 +160,16 @@ async function open(id, fresh = false) {
     lift = found;
     at("empty").hidden = true;
     document.body.classList.remove("no-lifts");
-    ask.of(lift);
-    at("mask").hidden = true;
-    things.of(lift);
+    of(lift);
+    at("mask").hidden = at("outline").hidden = true;
     refreshLifts().catch(problem => tell(words(problem), true));
     if (fresh) tab("ask");
     viewer?.clear();
+    at("stage").classList.remove("ready");
+    at("poster").hidden = true;
     const [content] = await Promise.all([
       look.fallback ? null : bytes(`/lifts/${id}/splats`, { progress: (got, total) => mine === turn && loading(`Loading ${size(got)}${total ? ` of ${size(total)}` : ""}`, total ? got / total : null) }),
-      look.of(lift, parameters.get("view")),
+      look.of(lift, parameters.get("view")).then(() => { if (mine === turn) aim(parameters, mine); }),
     ]);
     if (mine !== turn) return;
     if (content) await show(content, parameters);
@@ -170,6 +180,7 @@ async function open(id, fresh = false) {
     loading(null);
     busy = false;
     await ask.restore(parameters);
+    if (parameters.has("named")) { tab("name"); names.restore(parameters); }
     link();
   } catch (problem) {
     if (mine !== turn) return;
@@ -179,11 +190,44 @@ async function open(id, fresh = false) {
   }
 }
 
+// What belongs to a lift.
+function of(known) {
+  ask.of(known);
+  for (const panel of [things, names, masks]) panel.of(known).catch(problem => tell(words(problem), true));
+}
+
+// The camera of the link or of the first view; the service's picture of it is there before the splats are drawn.
+async function aim(parameters, mine) {
+  viewer ||= look.fallback ? null : made();
+  if (!viewer) return;
+  stand(parameters);
+  const own = viewer.own(POSTER);
+  if (!own.width || !look.views.length) return;
+  try {
+    const image = await picture("/render", { lift: lift.id, camera: own });
+    if (mine !== turn || at("stage").classList.contains("ready")) return URL.revokeObjectURL(image.src);
+    if (at("poster").src) URL.revokeObjectURL(at("poster").src);
+    at("poster").src = image.src;
+    at("poster").hidden = false;
+  } catch { /* the splats are on their way */ }
+}
+
 async function show(content, parameters) {
-  viewer ||= made();
   if (!viewer) return;
   loading("Unpacking the splats");
   await viewer.load(content);
+  if (!viewer.focused) stand(parameters); // now that the scene's middle is known
+}
+
+// The splats in place of the poster.
+async function appear(mine) {
+  await viewer.drawn();
+  if (mine !== turn) return;
+  at("stage").classList.add("ready");
+  setTimeout(() => { if (mine === turn) at("poster").hidden = true; }, 600); // it lies below while they fade in
+}
+
+function stand(parameters) {
   viewer.settle(look.views);
   if (look.view) viewer.to(look.view, true);
   const camera = (parameters.get("camera") || "").split(",").map(Number);
@@ -192,7 +236,6 @@ async function show(content, parameters) {
     viewer.controls.target.set(...camera.slice(3));
     viewer.draw();
   }
-  at("stage").classList.add("ready");
 }
 
 // The 3D view, or, where it does not start after all, the pictures of views.
@@ -252,14 +295,19 @@ function pointing(canvas, built) {
     }
     last = event.timeStamp;
     const less = event.shiftKey;
-    waiting = setTimeout(() => pointed(at3d(event), less), TWICE);
+    waiting = setTimeout(() => hit(at3d(event), less), TWICE);
   });
   canvas.addEventListener("keydown", event => keyed(event, built));
 }
 
-function pointed(hit, less) {
-  if (!hit) return tell("There is no splat there.");
-  return ask.example(`splat:${hit.splat}`, less);
+function hit(found, less) {
+  if (!found) return tell("There is no splat there.");
+  return pointed(`splat:${found.splat}`, less, found.point.toArray());
+}
+
+// Somebody points at a thing: more of it, or with the panel of names what it is.
+function pointed(term, less, point = null) {
+  return at("panel-name").hidden ? ask.example(term, less) : names.what(term, point);
 }
 
 function keyed(event, built) {
@@ -268,7 +316,7 @@ function keyed(event, built) {
   if (turns[event.key]) built.turn(...turns[event.key]);
   else if (event.key === "+" || event.key === "=") built.zoom(0.85);
   else if (event.key === "-") built.zoom(1 / 0.85);
-  else if (event.key === "Enter") pointed(built.pick(at("scene").clientWidth / 2, at("scene").clientHeight / 2), event.shiftKey);
+  else if (event.key === "Enter") hit(built.pick(at("scene").clientWidth / 2, at("scene").clientHeight / 2), event.shiftKey);
   else return;
   event.preventDefault();
 }
@@ -280,7 +328,7 @@ async function shot() {
   canvas.width = image.naturalWidth;
   canvas.height = image.naturalHeight;
   const context = canvas.getContext("2d");
-  for (const part of [image, at("over"), at("mask")]) {
+  for (const part of [image, at("over"), at("mask"), at("outline")]) {
     if (part.hidden) continue;
     context.globalAlpha = part === image ? 1 : Number(part.style.opacity || 1);
     context.drawImage(part, 0, 0, canvas.width, canvas.height);
@@ -297,7 +345,7 @@ addEventListener("keydown", event => {
   const action = {
     "/": () => at("words").focus(), "[": () => look.step(-1), "]": () => look.step(1), n: () => ask.step(1), p: () => ask.step(-1),
     h: () => at("hide").click(), b: () => at("show-boxes").click(), m: () => at("heat").click(), r: () => look.view && viewer?.to(look.view),
-    "?": () => at("help").showModal(), Escape: () => ask.reset(true),
+    "?": () => at("help").showModal(), Escape: () => { names.rest(); ask.reset(true); },
   }[event.key];
   if (!action || at("help").open || at("door").open) return;
   event.preventDefault();
@@ -330,7 +378,7 @@ at("forget").hidden = !keyOf();
 dark.addEventListener("change", () => { viewer?.background(ground()); repaint(); ask.bars(); });
 
 // For tests, and for the curious in the console.
-Object.assign(globalThis, { splatlift: { ask, look, bring, take, things, get viewer() { return viewer; }, get lift() { return lift; }, label, COLOURS } });
+Object.assign(globalThis, { splatlift: { ask, look, bring, take, things, names, masks, get viewer() { return viewer; }, get lift() { return lift; }, label, COLOURS } });
 
 async function begin() {
   if (look.fallback) fallBack();

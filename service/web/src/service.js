@@ -38,16 +38,16 @@ export const patch = (path, body) => json(path, { method: "PATCH", body });
 export const remove = path => call(path, { method: "DELETE" });
 
 // A picture of the service, whole; free its address when nobody shows it any more.
-export async function picture(path, signal) {
+export async function picture(path, body) {
   const image = new Image();
-  image.src = URL.createObjectURL(await (await call(path, { signal })).blob());
+  image.src = URL.createObjectURL(await (await call(path, body && { method: "POST", body })).blob());
   await image.decode();
   return image;
 }
 
 // All bytes of an answer, told of as they come.
-export async function bytes(path, { signal, progress = () => {} } = {}) {
-  const reply = await call(path, { signal });
+export async function bytes(path, { body, progress = () => {} } = {}) {
+  const reply = await call(path, body && { method: "POST", body });
   const total = Number(reply.headers.get("Content-Length")) || 0;
   let whole = new Uint8Array(total || 1 << 20);
   let got = 0;
@@ -72,7 +72,7 @@ export function npy(content) {
   const start = 10 + view.getUint16(8, true);
   const header = new TextDecoder("latin1").decode(content.subarray(10, start));
   const body = content.slice(start); // a copy begins where a Float32Array may
-  return header.includes("<f4") ? new Float32Array(body.buffer) : body;
+  return header.includes("<f4") ? new Float32Array(body.buffer) : header.includes("<i4") ? new Int32Array(body.buffer) : body;
 }
 
 // Server-sent events by a streaming fetch, which can send the key. Ends with the stream.
@@ -107,8 +107,8 @@ export async function* events(path, signal) {
 }
 
 // A file on its way up: fetch tells of no progress, so this is the older way.
-export function upload(kind, file, progress) {
-  const [method, path] = kind === "lift" ? ["POST", "/lifts"] : ["PUT", `/assets/${kind}`];
+export function upload(kind, file, progress, cameras) {
+  const [method, path] = kind === "lift" ? ["POST", `/lifts${cameras ? `?cameras=${cameras}` : ""}`] : ["PUT", `/assets/${kind}`];
   const request = new XMLHttpRequest();
   const done = new Promise((resolve, reject) => {
     request.open(method, address(path));
@@ -140,8 +140,8 @@ export function words(problem) {
 const sentence = text => `${text[0].toUpperCase()}${text.slice(1)}${/[.!?]$/.test(text) ? "" : "."}`;
 
 // What a link leads to, saved under its name.
-export async function save(path, fallback) {
-  const reply = await call(path);
+export async function save(path, fallback, body) {
+  const reply = await call(path, body && { method: "POST", body });
   const named = /filename="([^"]+)"/.exec(reply.headers.get("Content-Disposition") || "");
   saveBlob(await reply.blob(), named ? named[1] : fallback);
 }

@@ -3,8 +3,8 @@ import { at, el, tell } from "./dom.js";
 import { keyOf, save, saveBlob, words } from "./service.js";
 
 export class Take {
-  constructor({ ask, look, shot }) {
-    Object.assign(this, { ask, look, shot });
+  constructor({ ask, look, names, shot }) {
+    Object.assign(this, { ask, look, names, shot });
     for (const button of document.querySelectorAll("[data-take]")) button.addEventListener("click", () => this.take(button.dataset.take));
     at("shot").addEventListener("click", async () => saveBlob(await this.shot(), "splatlift.png"));
     at("copy-link").addEventListener("click", () => copied(location.href));
@@ -20,32 +20,50 @@ export class Take {
   }
 
   async take(what) {
-    const name = { scores: "scores.npy", mask: `mask-${this.look.view?.name}.png`, object: "object.ply", coloured: "scene.ply", boxes: "boxes.json" }[what];
+    const view = this.look.view?.name;
+    const [path, body, own] = {
+      labels: ["/query/segment/labels", this.named(), "words.npy"], map: ["/query/segment/map", this.named(view), `words-${view}.png`],
+      legend: ["/query/segment/picture", this.named(view), `legend-${view}.png`],
+    }[what] || [];
+    const name = own || { scores: "scores.npy", mask: `mask-${this.look.view?.name}.png`, object: "object.ply", coloured: "scene.ply", boxes: "boxes.json" }[what];
     try {
-      await save(this.address(what), name.replaceAll("/", "-"));
+      await save(path || this.address(what), name.replaceAll("/", "-"), body);
     } catch (problem) {
       tell(words(problem), true);
     }
   }
 
+  // What names everything, as the service takes it.
+  named(view) {
+    return { lift: this.ask.lift.id, ...this.names.asked, ...(view ? { view } : {}) };
+  }
+
   show() {
     const { now, lift } = this.ask;
-    const ready = Boolean(now?.answer && lift);
+    const named = Boolean(lift && this.names.shown);
+    const ready = named || Boolean(now?.answer && lift);
     at("lift-file").replaceChildren(lift ? el("button", { type: "button", on: { click: () => save(`/lifts/${lift.id}/features`).catch(problem => tell(words(problem), true)) } },
       `Lift file (${(lift.bytes / 1e6).toFixed(1)} MB)`) : "");
     at("take-none").hidden = ready;
     at("take-question").hidden = !ready;
+    at("take-answer").hidden = named;
+    at("take-names").hidden = !named;
     if (!ready) return;
     const key = keyOf() ? ' -H "Authorization: Bearer $KEY"' : "";
+    if (named) {
+      at("curl").textContent = `curl -fsS${key} ${address("segment")} \\\n  --json ${quote(JSON.stringify(this.named()))}`;
+      at("python").textContent = posted("segment", JSON.stringify(this.named(), null, 1), ['for word in found["found"]:', '    print(word["value"], word["word"], word["splats"])']);
+      return;
+    }
     const asked = [...this.ask.parameters(now)].map(([name, value]) => ` \\\n  --data-urlencode ${quote(`${name}=${value}`)}`).join("");
     at("curl").textContent = `curl -fsSG${key} ${address()}${asked}`;
-    at("python").textContent = (local(now) ? ofFile : overHttp)(this.ask.parameters(now), now.answer.encoder).join("\n");
+    at("python").textContent = (local(now) ? ofFile : overHttp)(this.ask.parameters(now), now.answer.encoder);
   }
 }
 
 // Encoders that open on any machine by their name alone; `prompts` are the lift's own words.
 const local = ({ text, like, unlike, answer }) => text.length && !like.length && !unlike.length && ["lvis", "minilm", "prompts"].includes(answer.encoder);
-const address = () => new URL("query", document.baseURI); // also behind a proxy's prefix
+const address = what => new URL(what ? `query/${what}` : "query", document.baseURI); // also behind a proxy's prefix
 const list = terms => `[${terms.map(term => JSON.stringify(term)).join(", ")}]`;
 
 const TERMS = ["text", "like", "unlike", "negatives"];
@@ -58,7 +76,7 @@ function ofFile(asked, encoder) {
   const open = encoder === "prompts" ? [] : ["from liftcore.query.text import open_encoder"];
   const words = encoder === "prompts" ? [] : [`words = open_encoder("${encoder}")`];
   return ["import liftcore as lc", ...open, "", `lift = lc.load_lift("lift-${asked.get("lift")}.safetensors")`, ...words,
-    `found = lift.query(${given})`, "print(int(found.splats.sum()), found.why, found.explanation)"];
+    `found = lift.query(${given})`, "print(int(found.splats.sum()), found.why, found.explanation)"].join("\n");
 }
 
 // The same, of this service.
@@ -66,11 +84,15 @@ function overHttp(asked) {
   const cut = asked.get("threshold");
   const told = [["lift", JSON.stringify(asked.get("lift"))], ...TERMS.filter(name => asked.has(name)).map(name => [name, list(asked.getAll(name))]),
     ["threshold", cut === "auto" ? '"auto"' : cut], ...(asked.has("absent") ? [["absent", '"keep"']] : [])];
+  return posted("", `{${told.map(([name, value]) => `"${name}": ${value}`).join(", ")}}`, ['print(found["count"], found["why"], found["threshold"])']);
+}
+
+// A question of the service in Python, from its body and what is printed of the answer.
+function posted(what, body, printed) {
   const key = keyOf();
-  return [...(key ? ["import os", ""] : []), "import httpx", "", `asked = {${told.map(([name, value]) => `"${name}": ${value}`).join(", ")}}`,
+  return [...(key ? ["import os", ""] : []), "import httpx", "", `asked = ${body}`,
     ...(key ? [`headers = {"Authorization": f"Bearer {os.environ['KEY']}"}`] : []),
-    `found = httpx.post("${address()}", json=asked${key ? ", headers=headers" : ""}).raise_for_status().json()`,
-    'print(found["count"], found["why"], found["threshold"])'];
+    `found = httpx.post("${address(what)}", json=asked${key ? ", headers=headers" : ""}, timeout=600).raise_for_status().json()`, ...printed].join("\n");
 }
 
 async function copied(text) {

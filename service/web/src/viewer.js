@@ -9,6 +9,7 @@ const ROW = 32; // bytes of a splat in a .splat file
 export const MOST = 2_000_000; // splats that are drawn; of larger scenes every n-th is
 const FLIGHT = 700; // ms
 const LOADING = 60_000; // ms that the unpacking of a scene may take before that is told
+const SAMPLE = 200_000; // splats among which middles are looked for
 const OPAQUE = 40; // of 255: fainter splats are not what somebody points at
 
 export function webgl() {
@@ -38,6 +39,8 @@ export class Viewer {
     this.controls.addEventListener("end", () => this.moved());
     this.boxes = new THREE.Group();
     this.scene.add(this.boxes);
+    this.middle = new THREE.Vector3();
+    this.reach = 1;
     this.spark = new SparkRenderer({
       renderer: this.renderer, preBlurAmount: 0.3, blurAmount: 0, sortRadial: false, maxStdDev: 3, minAlpha: 1 / 255,
       onDirty: () => this.draw(),
@@ -79,6 +82,15 @@ export class Viewer {
   get settled() {
     const { activeSplats, sorting, sortDirty, dirty } = this.spark;
     return Boolean(this.mesh) && !this.asked && !this.flight && activeSplats > 0 && !sorting && !sortDirty && !dirty;
+  }
+
+  // Once the card has drawn all that it was told to.
+  async drawn() {
+    const gl = this.renderer.getContext();
+    const fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    gl.flush();
+    while (gl.clientWaitSync(fence, 0, 0) === gl.TIMEOUT_EXPIRED) await new Promise(later => setTimeout(later, 30));
+    gl.deleteSync(fence);
   }
 
   place(point) {
@@ -166,6 +178,7 @@ export class Viewer {
     const side = poses.reduce((sum, { position, forward }) => sum.add(position).addScaledVector(forward, -position.dot(forward)), new THREE.Vector3());
     const found = Math.abs(across.determinant()) > 1e-6 * poses.length ** 3 ? side.applyMatrix3(across.invert()) : null;
     const inFront = found && poses.filter(pose => found.clone().sub(pose.position).dot(pose.forward) > 0).length > poses.length / 2;
+    this.focused = Boolean(inFront);
     this.focus = inFront ? found : this.middle.clone();
   }
 
@@ -276,6 +289,29 @@ export class Viewer {
       }
     }
     return best < 0 ? null : { splat: this.row(best), point: hit.point };
+  }
+
+  // The middle of the splats of each value, from a value a row of the file: medians, as strays count for nothing.
+  centres(values, most) {
+    const rows = Array.from({ length: most + 1 }, () => []);
+    const every = Math.max(1, Math.floor(this.count / SAMPLE));
+    for (let place = 0; place < this.count; place += every) rows[values[this.row(place)]].push(place);
+    return rows.map(places => (places.length ? [0, 1, 2].map(axis => {
+      const along = places.map(place => this.floats[8 * place + axis]).sort((a, b) => a - b);
+      return along[along.length >> 1];
+    }) : null));
+  }
+
+  // This camera as the service draws it, in a picture so many pixels wide at most.
+  own(most) {
+    const { clientWidth, clientHeight } = this.canvas.parentElement;
+    const width = Math.min(clientWidth, most);
+    const height = Math.round(clientHeight * width / clientWidth);
+    this.camera.lookAt(this.controls.target); // the controls do it before the next frame
+    this.camera.updateMatrixWorld();
+    const m = this.camera.matrixWorldInverse.elements; // column by column, OpenGL's axes
+    const viewmat = [0, 1, 2, 3].map(row => [0, 1, 2, 3].map(column => (row === 1 || row === 2 ? -1 : 1) * m[4 * column + row]));
+    return { width, height, fx: height / 2 / Math.tan(this.camera.fov * Math.PI / 360), viewmat };
   }
 
   // Boxes of things: [{low, high, colour, strong}].

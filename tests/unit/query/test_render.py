@@ -187,13 +187,13 @@ def test_clusters_have_their_colours_and_the_rest_is_grey(scene: QueryScene) -> 
 def test_pictures_have_the_size_and_the_mode_they_promise(scene: QueryScene) -> None:
     seen = view_mask(scene, of(scene, 0), "middle")
     assert overlay(render(scene, "middle"), seen.mask).shape == (HEIGHT, WIDTH, 3)
-    made = {"L": [mask_png(seen)], "RGB": [attention_png(seen), render_png(scene, "middle"),
+    made = {"L": [mask_png(seen.mask)], "RGB": [attention_png(seen), render_png(scene, "middle"),
                                           render_png(scene, "middle", "pca")]}  # fmt: skip
     for mode, pictures in made.items():
         for content in pictures:
             with Image.open(io.BytesIO(content)) as picture:
                 assert (picture.size, picture.mode) == ((WIDTH, HEIGHT), mode)
-    with Image.open(io.BytesIO(mask_png(seen))) as picture:
+    with Image.open(io.BytesIO(mask_png(seen.mask))) as picture:
         assert np.array_equal(np.asarray(picture) > 0, seen.mask)
 
 

@@ -1,0 +1,104 @@
+"""The regions of a lift's feature packs: those of a view, which of them cover a pixel, and their masks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from liftcore.errors import InvalidQuery, NotFound
+from liftcore.query.scene import QueryScene, as_numpy
+from liftcore.query.terms import Region
+
+if TYPE_CHECKING:
+    from liftcore.features.views import Regions
+
+
+@dataclass(frozen=True)
+class CoveringRegion:
+    """A region that covers a pixel: an example of a question by its notation."""
+
+    example: Region
+    share: float  # of the pixels of its view's label map
+
+
+def regions_of(scene: QueryScene, view: str, argument: str) -> Regions:
+    """The regions that the packs have of a view, which may be named as the pack or as its camera is.
+
+    Raises:
+        NotFound: the packs lack the view. InvalidQuery: it is a grid. InvalidLift: a pack moved or changed.
+    """
+    from liftcore.features.views import Regions
+    from liftcore.scene.views import cameras_of_views
+
+    packs = scene.packs
+    name = cameras_of_views([view], packs.views).get(view)
+    if name is None:
+        raise NotFound(argument, expected="a view of the lift's feature packs", got=repr(view))
+    found = packs[name]
+    if not isinstance(found, Regions):
+        hint = "ask by a pixel, VIEW:x,y"
+        raise InvalidQuery(argument, expected="a view with regions", got="a feature grid", hint=hint)
+    return found
+
+
+def codebook_row(regions: Regions, example: Region) -> np.ndarray:
+    """[F], the vector of a region.
+
+    Raises:
+        NotFound: the view's map has no such level, or no such label there.
+    """
+    _labelled(regions, example)
+    return as_numpy(regions.codebook[example.region])
+
+
+def regions_at(scene: QueryScene, view: str, x: int, y: int) -> tuple[CoveringRegion, ...]:
+    """The regions that cover pixel (x, y) of a view's photo, one a level at most, the smallest first.
+
+    Raises:
+        InvalidQuery: the pixel is outside the photo; or as `regions_of`, like NotFound and InvalidLift.
+    """
+    labels = as_numpy(regions_of(scene, view, "view").labels)
+    rows, columns = _map_places(scene, view, labels)
+    if not (0 <= x < len(columns) and 0 <= y < len(rows)):
+        expected = f"a pixel with x in 0..{len(columns) - 1} and y in 0..{len(rows) - 1}"
+        raise InvalidQuery("x, y", expected=expected, got=f"{x},{y}")
+    found = [
+        CoveringRegion(Region(view, level, int(label)), float((labels[level] == label).mean()))
+        for level, label in enumerate(labels[:, rows[y], columns[x]])
+        if label >= 0
+    ]
+    return tuple(sorted(found, key=lambda one: one.share))
+
+
+def region_mask(scene: QueryScene, example: Region) -> np.ndarray:
+    """[H, W] bool, the pixels of the view's photo that a region covers.
+
+    Raises:
+        NotFound, InvalidQuery, InvalidLift: as `regions_of` and `codebook_row`.
+    """
+    regions = regions_of(scene, example.view, "view")
+    rows, columns = _map_places(scene, example.view, as_numpy(regions.labels))
+    return _labelled(regions, example)[np.ix_(rows, columns)]
+
+
+def _labelled(regions: Regions, example: Region) -> np.ndarray:
+    """[h, w] bool, where a level of the map has the example's label."""
+    levels = regions.labels.shape[0]
+    if example.level >= levels:
+        raise NotFound(str(example), expected=f"a level in 0..{levels - 1}", got=str(example.level))
+    inside = as_numpy(regions.labels[example.level]) == example.region
+    if not inside.any():
+        expected = f"a label of level {example.level} in view {example.view!r}"
+        raise NotFound(str(example), expected=expected, got=str(example.region))
+    return inside
+
+
+def _map_places(scene: QueryScene, view: str, labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """[H] and [W], the row and column of the label map [L, h, w] that each row and column of the photo reads."""
+    from liftcore.scene.cameras import photo_size
+
+    width, height = photo_size(scene.cameras[view])
+    rows, columns = ((np.arange(n) + 0.5) * m / n for n, m in zip((height, width), labels.shape[1:], strict=True))
+    return rows.astype(np.int64), columns.astype(np.int64)

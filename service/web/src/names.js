@@ -1,0 +1,205 @@
+// The panel of naming: many words at once, every splat in the colour of its best one; and what a clicked thing is.
+import { at, count, el, fill, percent, plural, tell } from "./dom.js";
+import { bytes, json, npy, post, words } from "./service.js";
+
+const OWN = "own"; // the words of the form
+const COVER = 0.78; // of a word's colour over the splats' own
+const REST = [38, 42, 50]; // splats of no word, or of words that are not looked at
+const SHOWN = 14; // words with a label at their place
+const PAGE = 100; // tables to choose from
+
+export class Names {
+  // changed: when colours, labels or the link must follow; centres: with a value a splat, the middle of each value's.
+  // more: with an example to ask by; alone: when something is named, and no question is asked any more.
+  constructor({ changed, centres, more, alone }) {
+    Object.assign(this, { changed, centres, more, alone, lift: null, shown: false, only: new Set(), turn: 0 });
+    at("naming").addEventListener("submit", event => { event.preventDefault(); this.fromForm(); });
+    at("vocabulary").addEventListener("change", () => { at("own-words-label").hidden = at("vocabulary").value !== OWN; });
+    at("unname").addEventListener("click", () => (this.shown ? this.rest() : this.bring()));
+    at("what-more").addEventListener("click", () => this.more(this.spot.example));
+  }
+
+  async of(lift) {
+    Object.assign(this, { lift, asked: null, found: null, values: null, shown: false, spot: null });
+    this.only.clear();
+    this.turn += 1;
+    at("own-words").value = "";
+    this.show();
+    const wordless = !lift || lift.text_space === "none";
+    const vocabularies = wordless ? [] : [["", lift.words.length ? `The lift's own ${count(lift.words.length)} words` : "All words that the service knows"]];
+    this.choose([...vocabularies, [OWN, "Words that you type"]]);
+    if (!lift) return;
+    const { assets } = await json(`/assets?limit=${PAGE}`);
+    const tables = assets.filter(({ kind }) => kind === "table");
+    if (lift === this.lift) this.choose([...vocabularies, ...tables.map(({ id }, place) => [id, `The words of table ${place + 1}`]), [OWN, "Words that you type"]]);
+  }
+
+  choose(vocabularies) {
+    fill(at("vocabulary"), vocabularies);
+    at("own-words-label").hidden = at("vocabulary").value !== OWN;
+  }
+
+  // What the service is asked: words of one's own, or all of a table.
+  body() {
+    const chosen = at("vocabulary").value;
+    if (chosen !== OWN) return chosen ? { table: chosen } : {};
+    return { words: [...new Set(at("own-words").value.split(/[,\n]/).map(word => word.trim()).filter(Boolean))] };
+  }
+
+  fromForm() {
+    const asked = this.body();
+    if (asked.words && !asked.words.length) {
+      at("own-words").focus();
+      return tell("Type some words first, with commas between.");
+    }
+    return this.name(asked);
+  }
+
+  async name(asked, only = []) {
+    const mine = ++this.turn;
+    at("named").textContent = "Naming every splat\u2026";
+    at("stage").classList.add("asking");
+    try {
+      const { lift } = this;
+      const body = { lift: lift.id, ...asked };
+      const found = await post("/query/segment", body);
+      const values = npy(await bytes("/query/segment/labels", { body }));
+      if (mine !== this.turn) return;
+      Object.assign(this, { asked, found, values, none: found.none });
+      this.only = new Set(found.found.filter(({ word }) => only.includes(word)).map(({ value }) => value));
+      this.middles = this.centres(values, found.found.length);
+      this.bring();
+    } catch (problem) {
+      if (mine !== this.turn) return;
+      at("named").textContent = "";
+      tell(problem.argument === "words" && !asked.words ? "Its text encoder takes any word, so there is no list of them: type the words that may be here." : words(problem), true);
+      if (problem.argument === "words" && !asked.words) this.typing();
+    } finally {
+      if (mine === this.turn) at("stage").classList.remove("asking");
+    }
+  }
+
+  typing() {
+    at("vocabulary").value = OWN;
+    at("own-words-label").hidden = false;
+    at("own-words").focus();
+  }
+
+  // Colours of words in place of a question's.
+  bring() {
+    this.shown = Boolean(this.found);
+    this.paint();
+    if (this.shown) this.alone();
+    this.show();
+    this.changed();
+  }
+
+  rest() {
+    if (!this.shown) return;
+    this.shown = false;
+    this.show();
+    this.changed();
+  }
+
+  // A word alone, and with others after it; a second press takes it back.
+  press(value) {
+    if (!this.only.delete(value)) this.only.add(value);
+    this.bring();
+  }
+
+  is(value) {
+    return value > 0 && (!this.only.size || this.only.has(value));
+  }
+
+  paint() {
+    if (!this.found) return;
+    const palette = [REST, ...this.found.found.map(({ value, colour }) => (this.is(value) ? colour : REST))];
+    const colours = new Uint8Array(3 * this.values.length);
+    this.values.forEach((value, row) => colours.set(palette[value], 3 * row));
+    this.layer = { colours, cover: COVER };
+  }
+
+  painted() {
+    return this.shown ? this.layer : null;
+  }
+
+  // Where words stand, for their labels: points, which are boxes without a size.
+  boxes() {
+    const spot = this.spot?.point && this.spot.words.length && !at("panel-name").hidden
+      ? [{ low: this.spot.point, high: this.spot.point, colour: "#ffffff", name: this.spot.words[0].word, of: 1, strong: true }] : [];
+    if (!this.shown) return spot;
+    const named = this.found.found.filter(({ value }) => this.is(value) && this.middles[value]).slice(0, SHOWN);
+    return [...spot, ...named.map(({ value, word, colour }) => ({ low: this.middles[value], high: this.middles[value], colour: hex(colour), name: word, of: 1, strong: this.only.has(value), named: value }))];
+  }
+
+  // The map of a view, and how its colours are shown over the view; null where there is none to show.
+  map(view) {
+    if (!this.shown || this.found.found.length > 255) return null; // of more words a map has greys
+    const known = new Map(this.found.found.map(({ value, colour }) => [colour.join(), value]));
+    const paint = ({ data, width, height }) => {
+      const out = new Uint8ClampedArray(data.length);
+      for (let place = 0; place < data.length; place += 4) {
+        const colour = [data[place], data[place + 1], data[place + 2]];
+        out.set(this.is(known.get(colour.join()) ?? 0) ? [...colour, 175] : [8, 10, 14, 190], place);
+      }
+      return new ImageData(out, width, height);
+    };
+    return { path: "/query/segment/map", body: { lift: this.lift.id, ...this.asked, view }, paint };
+  }
+
+  // What is this? point: where it was clicked in 3D.
+  async what(example, point = null) {
+    const { lift } = this;
+    this.spot = { example, point, words: [] };
+    this.show();
+    const asked = this.shown ? this.asked : this.body();
+    const told = asked.words && !asked.words.length ? {} : asked;
+    try {
+      const answer = await post("/query/what", { lift: lift.id, example, ...told, top: 5 });
+      if (this.spot?.example !== example) return;
+      this.spot.words = answer.words;
+    } catch (problem) {
+      this.spot = null;
+      tell(words(problem), true);
+      if (problem.argument === "words") this.typing();
+    }
+    this.show();
+    this.changed();
+  }
+
+  restore(parameters) {
+    const named = parameters.getAll("named");
+    const table = parameters.get("table");
+    if (!named.length) return;
+    const own = named[0] !== "*";
+    if (own) at("own-words").value = named.join(", ");
+    at("vocabulary").value = own ? OWN : table ?? "";
+    at("own-words-label").hidden = !own;
+    this.name(own ? { words: named } : table ? { table } : {}, parameters.getAll("only"));
+  }
+
+  link(parameters) {
+    if (!this.shown) return;
+    for (const word of this.asked.words ?? ["*"]) parameters.append("named", word);
+    if (this.asked.table) parameters.set("table", this.asked.table);
+    for (const { value, word } of this.found.found) if (this.only.has(value)) parameters.append("only", word);
+  }
+
+  show() {
+    const { found, spot } = this;
+    at("unname").hidden = !found;
+    at("unname").textContent = this.shown ? "Show the scene's colours" : "Show the words again";
+    at("named").textContent = found ? `${plural(found.found.length, "word")} of ${count(found.words)} ${found.found.length === 1 ? "is" : "are"} here; ${percent(found.none / found.splats)} of the splats have none.` : "";
+    at("legend").replaceChildren(...(found ? [...found.found.map(named => line(named, this)), none(found)] : []));
+    at("what").hidden = !spot;
+    if (!spot) return;
+    at("what-of").textContent = spot.words.length ? `Most like \u201c${spot.words[0].word}\u201d` : "Looking\u2026";
+    at("what-words").replaceChildren(...spot.words.map(({ word, score }) => el("li", {}, el("span", {}, word), el("span", { className: "score" }, score.toFixed(3)))));
+  }
+}
+
+const line = (named, names) => el("li", {}, el("button", { type: "button", className: "thing", style: { "--mine": hex(named.colour) }, "aria-pressed": String(names.only.has(named.value)), on: { click: () => names.press(named.value) } },
+  el("span", { className: "swatch", "aria-hidden": "true" }), el("span", {}, named.word), el("span", { className: "score" }, count(named.splats))));
+const none = found => el("li", {}, el("span", { className: "thing rest", style: { "--mine": hex(REST) } },
+  el("span", { className: "swatch", "aria-hidden": "true" }), el("span", {}, "none"), el("span", { className: "score" }, count(found.none))));
+const hex = colour => `#${colour.map(value => value.toString(16).padStart(2, "0")).join("")}`;

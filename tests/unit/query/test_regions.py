@@ -1,0 +1,51 @@
+"""Which regions cover a pixel, and the pixels that a region covers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from liftcore.errors import InvalidQuery, NotFound
+from liftcore.features.pack import as_views
+from liftcore.features.views import FeatureGrid, Regions
+from liftcore.query.regions import region_mask, regions_at
+from liftcore.query.scene import QueryScene
+from liftcore.query.terms import Region
+from tests.api.tiny_scene import CHANNELS, HEIGHT, WIDTH, codebook
+
+
+@pytest.fixture
+def levels(scene: QueryScene) -> QueryScene:
+    """The tiny lift with other packs: a map of half the size, its left half on one level, a cell on another."""
+    labels = np.full((3, HEIGHT // 2, WIDTH // 2), -1, np.int32)
+    labels[0, :, : WIDTH // 4], labels[2, 3, 5] = 0, 2
+    grid = FeatureGrid(np.ones((2, 2, CHANNELS), np.float32))
+    packs = as_views({"left": Regions(labels, codebook()), "middle": grid})
+    return QueryScene(scene.lift, scene.splats, scene.cameras, packs)
+
+
+def test_regions_of_a_pixel_come_with_the_smallest_first(levels: QueryScene) -> None:
+    found = regions_at(levels, "left", 11, 6)
+    assert [one.example for one in found] == [Region("left", 2, 2), Region("left", 0, 0)]
+    assert [one.share for one in found] == [4 / (WIDTH * HEIGHT), 0.5]
+    assert regions_at(levels, "left", WIDTH - 1, 0) == ()
+    mask = region_mask(levels, Region("left", 2, 2))
+    assert mask.shape == (HEIGHT, WIDTH) and np.argwhere(mask).tolist() == [[6, 10], [6, 11], [7, 10], [7, 11]]
+    for y, x in np.ndindex(mask.shape):  # each says what the other does
+        assert mask[y, x] == (Region("left", 2, 2) in [one.example for one in regions_at(levels, "left", x, y)])
+
+
+@pytest.mark.parametrize(
+    ("view", "x", "error", "said"),
+    [
+        ("left", WIDTH, InvalidQuery, f"x in 0..{WIDTH - 1}"),
+        ("middle", 0, InvalidQuery, "a view with regions"),
+        ("right", 0, NotFound, "a view of the lift's feature packs"),
+        ("nowhere", 0, NotFound, "a view of the lift's feature packs"),
+    ],
+)
+def test_where_no_regions_are_is_told(
+    levels: QueryScene, view: str, x: int, error: type[Exception], said: str
+) -> None:
+    with pytest.raises(error, match=said):
+        regions_at(levels, view, x, 0)
