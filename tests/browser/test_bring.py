@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import httpx
 import pytest
 from PIL import Image
 
-from tests.api.tiny_scene import make_scene
+from tests.api.tiny_scene import colmap_zip, make_scene
 
 from .browser import Browser
 from .conftest import Served, serving
@@ -63,6 +64,7 @@ def test_dropped_files_are_planned_compared_and_cancelled(
             break
         except AssertionError:
             continue
+    empty.until("splatlift.bring.followed.size === 0")  # the list is as it stays
     empty.press("#jobs .job:last-child .actions button")
     empty.until(CHART)
     keep(empty, "chart")
@@ -81,6 +83,16 @@ def test_lift_file_asks_for_what_it_was_made_of_and_opens(
     empty.until(READY)
     ask(empty, "lamp")
     assert min(columns(empty, AMBER)) > 50
+
+
+def test_dropped_folder_brings_its_cameras(empty: Browser, tmp_path: Path) -> None:
+    model = tmp_path / "model"
+    with zipfile.ZipFile(io.BytesIO(colmap_zip())) as archive:
+        archive.extractall(model)
+    (model / "sparse" / "0" / "notes.md").write_text("not a camera")
+    empty.drop([model])
+    empty.until("document.querySelector('.file.done')")
+    assert text_of(empty, ".file .name") == "model.zip" and "3 views" in text_of(empty, ".file .state")
 
 
 def test_lift_takes_a_name_and_photos(browser: Browser, served: Served, tmp_path: Path) -> None:

@@ -31,6 +31,7 @@ CLEAR = """(() => {
   }
   return clear;
 })()"""
+MODE_VIEW = "input[name=mode][value=view] + span"
 Keep = Callable[[Browser, str], None]
 
 
@@ -137,6 +138,51 @@ def test_what_is_not_there_is_said_plainly(page: Browser) -> None:
     assert "absent=keep" in asked and "threshold=auto" not in asked and "&threshold=" in page.value("location.search")
 
 
+def test_everything_is_named_and_one_word_is_seen_alone(page: Browser, keep: Keep) -> None:
+    page.press("#tab-name")
+    page.press("#naming button.main")
+    page.until("document.querySelectorAll('#legend button').length === 3 && splatlift.viewer.settled")
+    keep(page, "named")
+    assert text_of(page, "#named").startswith("3 words of 3 are here")
+    names = page.value("[...document.querySelectorAll('#labels .label')].map(label => label.textContent)")
+    assert sorted(names) == ["apple", "book", "lamp"]
+    legend = page.value("[...document.querySelectorAll('#legend button')].map(line => line.textContent)")
+    lamp = next(place for place, line in enumerate(legend) if line.startswith("lamp")) + 1
+    colour = page.value(f"splatlift.names.found.found[{lamp - 1}].colour.join()")
+    page.press(f"#legend li:nth-child({lamp}) button")
+    assert page.value("[...document.querySelectorAll('#labels .label')].map(label => label.textContent)") == ["lamp"]
+    lit = columns(page, colour)
+    assert lit and min(lit) > 50  # the lamp is the right one of three
+    page.press("#scene", *splat_at(page, APPLE))
+    page.until("document.querySelector('#what-words li')")
+    assert text_of(page, "#what-words li").startswith("apple") and page.value(EXAMPLES) == []
+    assert "named=*" in page.value("location.search") and "only=lamp" in page.value("location.search")
+    page.open(page.value("location.href"))  # the link tells all of it
+    page.until("splatlift.names.shown && splatlift.names.only.size === 1")
+    page.value("document.querySelector('#vocabulary').value = 'own'")
+    page.value("document.querySelector('#vocabulary').dispatchEvent(new Event('change'))")
+    page.write("#own-words", "lamp, book")
+    page.press("#naming button.main")
+    page.until("document.querySelectorAll('#legend button').length === 2")
+    page.press("#tab-ask")
+    ask(page, "lamp")
+    assert page.value("splatlift.names.shown") is False and min(columns(page, AMBER)) > 50
+
+
+def test_mask_under_a_click_is_an_example(page: Browser, keep: Keep) -> None:
+    page.press(MODE_VIEW)
+    page.until("document.querySelector('#render').naturalWidth > 0")
+    page.press("#pick-mask")
+    page.press("#render", 0.95, 0.5)
+    page.until(f"{EXAMPLES}.length === 1")
+    page.until(FOUND)
+    page.until("!document.querySelector('#outline').hidden")
+    keep(page, "mask")
+    (example,) = page.value(EXAMPLES)
+    assert example.startswith("region:") and page.value("splatlift.ask.now.count") > 0
+    assert text_of(page, "#chips .chip").startswith("like a mask of")
+
+
 def test_things_are_listed_without_a_question_and_shown(page: Browser, keep: Keep) -> None:
     page.until("splatlift.things.found.length === 3")
     assert sorted(page.value("splatlift.things.found.map(thing => thing.name)")) == ["apple", "book", "lamp"]
@@ -241,8 +287,11 @@ def test_accessibility_check_finds_nothing_serious(page: Browser, scheme: str, k
     page.window(1280, 800, scheme)
     ask(page, "lamp")
     page.value(f"(() => {{ {AXE}; }})()")
-    for tab in ("ask", "look", "bring", "take"):
+    for tab in ("ask", "name", "look", "bring", "take"):
         page.press(f"#tab-{tab}")
+        if tab == "name":
+            page.press("#naming button.main")
+            page.until("document.querySelector('#legend button')")
         found = page.value("axe.run(document).then(all => all.violations)")
         told = {rule["id"]: [node["html"] for node in rule["nodes"]] for rule in found if rule["impact"] != "minor"}
         assert told == {}, tab

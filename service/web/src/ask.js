@@ -327,7 +327,7 @@ export class Ask {
       at("answer").textContent = `${quoted(now)} is not here.`;
       at("why").textContent = reason(answer);
     } else if (!lit(now)) {
-      at("answer").textContent = `Nothing stands apart for ${quoted(now)}.`;
+      at("answer").textContent = now.text.length ? `Nothing stands apart for ${quoted(now)}.` : "Nothing like it stands apart.";
       at("why").textContent = "Other words may help, or a click on an example.";
     } else {
       at("answer").textContent = now.count

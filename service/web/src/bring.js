@@ -267,6 +267,10 @@ export class Bring {
   showJobs(anew = false) {
     const told = JSON.stringify(this.jobs);
     if (told === this.told && !anew) return; // buttons that ask once more stay
+    if (at("jobs").matches(":active")) { // a press that goes on would lose its button
+      addEventListener("pointerup", () => setTimeout(() => this.showJobs(anew)), { once: true });
+      return;
+    }
     this.told = told;
     at("jobs-none").hidden = Boolean(this.jobs.length);
     at("jobs").replaceChildren(...this.jobs.map(job => this.job(job)));
