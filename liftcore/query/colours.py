@@ -1,5 +1,6 @@
 """Colours of scores and clusters, as people read them: arcs through OKLab (Ottosson 2020)."""
 
+import functools
 import math
 
 import numpy as np
@@ -17,6 +18,7 @@ _HEAT_RANGE = (0.01, 0.999)  # quantiles that the map spans: one hot pixel dims 
 
 _CLUSTER_LIGHTNESS = (0.72, 0.86, 0.58)
 _CLUSTER_CHROMA = 0.13
+_HUES = 72
 
 
 def colour_map() -> np.ndarray:
@@ -52,16 +54,25 @@ def map_colours(level: np.ndarray, known: np.ndarray) -> np.ndarray:
 
 
 def cluster_colours(count: int) -> np.ndarray:
-    """[count + 1, 3] u8 sRGB: a colour a cluster, and grey last, where label -1 points.
-
-    Three levels of lightness take turns. The hues of each turn by the golden angle, so that any first few are far
-    apart, and those of neighbouring levels stand a third of it aside.
-    """
-    turn, level = np.divmod(np.arange(count), len(_CLUSTER_LIGHTNESS))
-    hue = (turn + level / len(_CLUSTER_LIGHTNESS)) * math.pi * (3 - math.sqrt(5))
-    lightness = np.array(_CLUSTER_LIGHTNESS)[level]
-    colours = _srgb(lightness, _CLUSTER_CHROMA * np.cos(hue), _CLUSTER_CHROMA * np.sin(hue))
+    """[count + 1, 3] u8 sRGB: a colour a cluster, and grey last, where label -1 points; beyond 216 they repeat."""
+    colours = _apart()[np.arange(count) % len(_apart())]
     return np.concatenate([colours, np.array([NO_CLUSTER_COLOUR], dtype=np.uint8)])
+
+
+@functools.cache
+def _apart() -> np.ndarray:
+    """[216, 3] u8 sRGB, each as far as can be from all before it (Gonzalez 1985), hue before lightness.
+
+    A scene's own shading changes the lightness of what is painted over it, so that counts less.
+    """
+    hue, lightness = np.meshgrid(np.linspace(0, 2 * np.pi, _HUES, endpoint=False), _CLUSTER_LIGHTNESS)
+    hue, lightness = hue.ravel(), lightness.ravel()
+    places = np.stack([_CLUSTER_CHROMA * np.cos(hue), _CLUSTER_CHROMA * np.sin(hue), lightness / 2], axis=1)
+    order, nearest = [0], np.full(len(places), np.inf)
+    while len(order) < len(places):
+        nearest = np.minimum(nearest, np.linalg.norm(places - places[order[-1]], axis=1))
+        order.append(int(nearest.argmax()))
+    return _srgb(lightness[order], *places[order, :2].T)
 
 
 def _srgb(lightness: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:

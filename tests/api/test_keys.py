@@ -105,6 +105,9 @@ def naming(method: str, path: str, job: str, asset: str, house: Guarded) -> list
         return [{"json": {"encoder" if path.startswith("/assets") else "name": "a name"}}]
     if path.endswith("/photo"):
         return [{"params": {"view": "v"}}]
+    if "/regions" in path:
+        place = {"level": 0, "region": 0} if path.endswith("/mask") else {"x": 1, "y": 1}
+        return [{"params": {"view": "left"} | place}]
     if path in ("/lift", "/lift/plan", "/tradeoff"):
         absent = {"splats": asset, "cameras": asset, "features": [asset]}
         wrong = [{place: name} for place, name in absent.items()]
