@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict
 from liftcore.settings import LiftSettings
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     import torch
     from torch import Tensor
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from liftcore.query.catalogue import Catalogue
     from liftcore.query.segment import Segmentation
     from liftcore.query.text.table import TableEncoder
+    from liftcore.scene.cameras import Camera
     from liftcore.scene.splats import Splats
 
 FORMAT = "splatlift-lift/1"
@@ -187,3 +188,26 @@ class LiftResult:
         from liftcore.io.lift_file import save_lift
 
         save_lift(self, path)
+
+    def show(
+        self,
+        splats: Splats | None = None,
+        cameras: Mapping[str, Camera] | None = None,
+        *,
+        port: int = 0,
+        browser: bool = True,
+    ) -> None:
+        """Show it on the service's page at a port of this machine, until Ctrl-C or a notebook's interrupt.
+
+        Args:
+            splats: that were lifted. cameras: of its views. Both may be left out where the lift was made of files
+                that are where they were.
+            port: 0 picks a free one. browser: whether to open one; the address is printed.
+
+        Raises:
+            InvalidInput: splats or cameras that it needs are not given, or not those of the lift.
+            Unavailable: the package ``service`` is not installed.
+        """
+        from liftcore.page import show
+
+        show(self, splats, cameras, port=port, browser=browser)

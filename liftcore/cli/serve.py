@@ -4,12 +4,11 @@ import argparse
 import os
 import sys
 from collections.abc import Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from typing import NoReturn
 
 from liftcore.cli.options import Parser
-from liftcore.errors import Unavailable
+from liftcore.page import require_service
 
 
 def add_arguments(parser: Parser) -> None:
@@ -31,13 +30,12 @@ def run(options: argparse.Namespace) -> int:
 
 
 def become(program: str, arguments: Sequence[str]) -> NoReturn:
-    """Go on as ``python -m PROGRAM``: the library itself knows neither HTTP nor the service's database.
+    """Go on as ``python -m PROGRAM``.
 
     Raises:
         Unavailable: the service is not installed.
     """
-    if find_spec("service") is None:
-        raise Unavailable(program, expected="the package 'service'", got="an installation without it")
+    require_service()
     sys.stdout.flush()
     sys.stderr.flush()
     os.execv(sys.executable, [sys.executable, "-m", program, *arguments])

@@ -74,6 +74,18 @@ def parse_transforms(document: Any, source: str) -> Cameras:
     return Cameras(cameras, of_nerfstudio=any(key in document for key in OF_NERFSTUDIO))
 
 
+def transforms_of(cameras: Mapping[str, Camera]) -> dict[str, Any]:
+    """A transforms.json document of pinholes, with intrinsics of their own and without lenses of distorted photos."""
+    frames = []
+    for name, camera in cameras.items():
+        pose = np.linalg.inv(camera.viewmat)
+        pose[:3, :3] *= OPENGL_TO_OPENCV
+        lens = {"w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy}
+        lens |= {"cx": camera.cx, "cy": camera.cy}
+        frames.append({"file_path": f"images/{name}.png", "transform_matrix": pose.tolist(), **lens})
+    return {"frames": frames}
+
+
 def _camera(name: str, keys: ChainMap[str, Any], source: str) -> Camera:
     where = f"{source} frame {name!r}"
     distortion = _distortion(keys, where)

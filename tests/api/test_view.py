@@ -59,6 +59,39 @@ def test_a_lift_is_shown_by_links_until_it_is_interrupted(tmp_path: Path) -> Non
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
 
 
+def test_lift_in_memory_is_shown_until_it_is_interrupted(tmp_path: Path) -> None:
+    tiny = make_scene()
+    for name, content in (("s.ply", tiny.splats), ("c.json", tiny.cameras), ("f.safetensors", tiny.features)):
+        (tmp_path / name).write_bytes(content)
+    script = """if True:
+        import liftcore as lc
+        splats, cameras = lc.read_splats("s.ply"), dict(lc.read_cameras("c.json"))
+        result = lc.lift(splats, cameras, lc.read_features("f.safetensors"), preset="row-sum")
+        two = {name: getattr(splats, name)[:2] for name in ("means", "quats", "log_scales", "opacity_logits")}
+        for given in ({}, {"splats": splats}, {"splats": lc.Splats(**two, kernel="3dgs"), "cameras": cameras}):
+            try:
+                result.show(**given)
+            except lc.InvalidInput as error:
+                print(error.argument, flush=True)
+        result.show(splats, cameras, browser=False)
+        print("ended", flush=True)
+    """
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "TMPDIR": str(tmp_path)}
+    command = [sys.executable, "-c", script]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment, cwd=tmp_path) as process:
+        assert process.stdout is not None
+        assert [process.stdout.readline().strip() for _ in range(3)] == ["splats", "cameras", "splats"]
+        line = process.stdout.readline()
+        found = re.match(r"(http://127\.0\.0\.1:\d+)/\?lift=(\w+) ", line)
+        assert found, line
+        with httpx.Client(base_url=found[1], timeout=600) as client:
+            assert client.get("/query", params={"like": "splat:45", "threshold": 0.5}).json()["count"] == 20
+            assert client.get("/render", params={"view": "middle"}).status_code == 200
+        process.send_signal(signal.SIGINT)
+        assert process.stdout.readline() == "ended\n" and process.wait(timeout=600) == 0
+    assert not list(tmp_path.glob("splatlift*"))
+
+
 def test_a_lift_whose_files_moved_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     from service.view import main
 

@@ -53,19 +53,6 @@ def write_files(folder: Path, files: dict[str, bytes]) -> Path:
     return folder
 
 
-FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
-
-
-def transforms_of(cameras: Cameras) -> dict[str, Any]:
-    frames = []
-    for camera in cameras.values():
-        pose = np.linalg.inv(camera.viewmat) @ FLIP
-        size = {"w": camera.width, "h": camera.height}
-        lens = {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
-        frames.append({"file_path": f"images/{camera.name}.png", "transform_matrix": pose.tolist(), **size, **lens})
-    return {"frames": frames}
-
-
 def with_json(tmp_path: Path, document: Any) -> Path:
     path = tmp_path / "document.json"
     path.write_text(json.dumps(document))

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from camera_files import CAMERAS, FLIP, assert_same, binary_files, transforms_of, with_json, write_files
+from camera_files import CAMERAS, assert_same, binary_files, with_json, write_files
 from scipy.spatial.transform import Rotation
 
 from liftcore.errors import InvalidCameras, Unavailable
@@ -21,7 +21,7 @@ from liftcore.io.cameras import read_cameras
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.inspect import inspect_file
 from liftcore.io.lift_file import camera_input
-from liftcore.io.transforms import FRAME_FILE
+from liftcore.io.transforms import FRAME_FILE, transforms_of
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.distortion import Brown, Fisheye, Lens
 
@@ -183,7 +183,8 @@ def expected(run: Path, model: Path) -> Cameras:
     views = []
     for camera, pose in zip(read_cameras(model).values(), poses.values(), strict=True):
         sizes = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-        views.append(Camera.pinhole(camera.name, *sizes, viewmat=np.linalg.inv(np.array(pose) @ FLIP)))
+        opencv = np.array(pose) * [1.0, -1.0, -1.0, 1.0]  # axes are columns
+        views.append(Camera.pinhole(camera.name, *sizes, viewmat=np.linalg.inv(opencv)))
     return Cameras(tuple(views))
 
 

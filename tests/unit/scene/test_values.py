@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from camera_files import CAMERAS, IMAGES, binary_files, text_files, transforms_of, with_json, write_files
+from camera_files import CAMERAS, IMAGES, binary_files, text_files, with_json, write_files
 
 from liftcore.errors import InvalidCameras, InvalidSplats, NotFound
 from liftcore.io.cameras import read_cameras
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.inspect import describe_splats
+from liftcore.io.transforms import transforms_of
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.splats import Splats
