@@ -10,6 +10,9 @@ OUT ?= demo-output
 TORCH_PIP ?=
 CUDA_TORCH_PIP ?=
 
+export PIP_DISABLE_PIP_VERSION_CHECK = 1
+export PIP_ROOT_USER_ACTION = ignore
+
 .PHONY: demo test check kernels soak contract load gpu lint format serve web bench sbom setup clean
 
 demo: $(READY)  ## the whole job through the real service; SCENE=DIR takes a scene of your own, ASK=TEXT a question

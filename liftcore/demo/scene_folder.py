@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,14 +32,15 @@ class Truth:
 
     names: tuple[str, ...]  # object names
     masks: Mapping[str, np.ndarray]  # view -> [H, W] integers, rows of names; -1 = none
-    meant: Mapping[str, tuple[str, ...]]  # phrase -> the objects that it means, none where it means nothing here
+    meant: Mapping[str, tuple[str, ...]]  # phrase, no article -> the objects that it means, none where nothing here
     asked: tuple[str, ...]  # phrases that the scene is to be asked
 
     def mask_of(self, phrase: str, view: str) -> np.ndarray | None:
         """[H, W] bool, where the phrase's objects are; None when the phrase or the view has no truth."""
-        if phrase not in self.meant or view not in self.masks:
+        meant = self.meant.get(_bare(phrase))
+        if meant is None or view not in self.masks:
             return None
-        rows = [self.names.index(name) for name in self.meant[phrase]]
+        rows = [self.names.index(name) for name in meant]
         return np.isin(self.masks[view], rows)
 
     def name_of(self, masks: Mapping[str, np.ndarray]) -> str | None:
@@ -182,14 +184,19 @@ def _read_truth(folder: Path) -> Truth | None:
     document = json.loads(names_file.read_text())
     arrays = load_file(arrays_file)
     names = tuple(str(thing["class"]) for thing in document["objects"])
-    meant = {f"the {name}": (name,) for name in names} | {name: (name,) for name in names}
+    meant = {_bare(name): (name,) for name in names}
     masks = {key.removesuffix("/mask"): mask for key, mask in arrays.items() if key.endswith("/mask")}
     return Truth(
         names=names,
         masks={view: masks[view] for view in document.get("held_out_views", masks)},
-        meant=meant | {phrase: tuple(things) for phrase, things in document.get("phrases", {}).items()},
+        meant=meant | {_bare(phrase): tuple(things) for phrase, things in document.get("phrases", {}).items()},
         asked=tuple(document.get("ask", [f"the {name}" for name in _in_view(names, masks, document)])),
     )
+
+
+def _bare(phrase: str) -> str:
+    """A phrase without its article, in small letters."""
+    return re.sub(r"^(an?|the)\s+", "", phrase.strip().casefold())
 
 
 def _in_view(names: Sequence[str], masks: Mapping[str, np.ndarray], document: Mapping) -> list[str]:

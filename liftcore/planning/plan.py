@@ -121,7 +121,7 @@ class Plan:
     def summary(self) -> Iterator[str]:
         """The plan in short, for people: what is lifted, what it is made of, and what that takes."""
         seen = f"{self.seen_share:.1%} in some view's field"
-        spare = f", {len(self.spare)} of which add nothing new" if self.spare else ""
+        spare = f", {len(self.spare)} of them see nothing that {WELL_COVERED} others do not" if self.spare else ""
         yield f"{self.splats} splats ({self.kernel}), {seen}; {len(self.views)} of {self.there} views{spare}"
         yield f"{self.channels} channels, stored as {self.dtype}"
         files = f", {self.in_files / MIB:.0f} MiB of region weights in files" if self.in_files else ""

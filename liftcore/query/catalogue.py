@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 MOST_WORDS = 65_536  # of a vocabulary: their vectors take 130 MB at 512 channels
 NOT_LOOKED_FOR = (
-    "this lift holds no objects: they are found by lifts of masks, with preset=default or objects=true; "
+    "this lift holds no objects: they are found by lifts of masks, by the preset default or the setting objects; "
     "grids have no masks"
 )
 NONE_FOUND = "no object: masks of three views never keep the same splats together"

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import ast
 import json
 import re
 import shlex
+from collections.abc import Iterator
 from importlib.util import find_spec
+from pathlib import Path
 
 import pytest
 
@@ -101,6 +104,33 @@ def test_commands_within_sentences_and_tables_parse(document: str, capsys: pytes
         except SystemExit:  # it names a command and no more, or has NAME for one of its words
             said = capsys.readouterr().err
             assert "arguments are required" in said or "choice: 'NAME'" in said, said
+
+
+def test_commands_that_errors_and_hints_name_exist() -> None:
+    named = {words for room in ("liftcore", "service") for words in _named_in_sentences(ROOT / room)}
+    assert {"pack retag", "keys create", "store rebuild", "pack npy"} <= {" ".join(words) for words in named}
+    for words in named:
+        parser = _commands()[words[0]]
+        nested = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
+        assert not nested or len(words) == 1 or words[1] in nested[0].choices, words
+        known = {option for action in _actions(parser) for option in action.option_strings}
+        assert {word for word in words if word.startswith("--")} <= known, words
+
+
+def _named_in_sentences(room: Path) -> Iterator[tuple[str, ...]]:
+    """Commands with their options, of all strings of the sources but names of programs."""
+    for path in sorted(room.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.JoinedStr):
+                parts = (part.value if isinstance(part, ast.Constant) else "X" for part in node.values)
+                told = "".join(map(str, parts))
+            else:
+                told = node.value if isinstance(node, ast.Constant) and isinstance(node.value, str) else ""
+            for found in re.findall(r"splatlift ([a-z]+(?: (?:--?)?[\w./={}-]+)*)", told):
+                command, *more = found.split()
+                if command in _commands():
+                    nested = more[:1] if command in ("pack", "keys", "store") else []
+                    yield (command, *nested, *(word.rstrip(".") for word in more if word.startswith("--")))
 
 
 def test_every_command_is_told_with_all_its_options() -> None:

@@ -48,6 +48,8 @@ def test_a_scene_is_found_by_what_its_files_are(folder: Path, tmp_path: Path) ->
     assert scene.truth is not None
     mask = scene.truth.mask_of("the fish", "v")
     assert mask is not None and mask.tolist() == [[False, False, True]]
+    again = scene.truth.mask_of("A Fish", "v")
+    assert again is not None and np.array_equal(again, mask)
     assert scene.truth.mask_of("the unknown", "v") is None
 
 
