@@ -118,7 +118,7 @@ Bounded = BeforeValidator(_bounded)
 
 ASSET_ID = r"^sha256:[0-9a-f]{64}$"
 JOB_ID = r"^[0-9a-f]{32}$"
-COMPARED = ("preset", "speed")  # what differs between the runs of a trade-off
+COMPARED = "speed"  # what only the runs of a trade-off set
 MAX_SETTINGS = 100
 SETTING_CHARACTERS = 1000  # of a name or a text among them
 VIEW_CHARACTERS = 500  # of a camera's name that can be asked for
@@ -233,9 +233,9 @@ class Labels(Body):
 class TradeoffRequest(LiftRequest):
     """What to compare: lifts of these assets, each with another preset or place of the dial."""
 
-    settings: Annotated[dict[str, Scalar], Bounded, Published(LiftSettings, without=COMPARED)] = Field(
+    settings: Annotated[dict[str, Scalar], Bounded, Published(LiftSettings, without=(COMPARED,))] = Field(
         default_factory=dict,
-        description="of all runs: knobs of the lift beside preset and speed, which are compared",
+        description="of all runs: knobs of the lift beside speed, which is compared; the dial starts from a preset",
         examples=[{"robust_steps": 1}],
     )
     budget_s: Annotated[float, Field(ge=10, le=86_400), NoBoolean] = Field(

@@ -1,4 +1,4 @@
-"""Speed against accuracy on a scene of the user's: the settings ``speed`` and the presets, under a budget of time.
+"""Speed against accuracy on a scene of the user's: the dial ``speed``, presets and aggregation, in a budget of time.
 
 Each run is a process of its own (``python -m liftcore.evaluate.tradeoff``: a pickled `RunSpec` on stdin, figures as
 JSON on stdout), so that its memory is its own. Time is processor time: on a machine that others use too it says what
@@ -6,7 +6,6 @@ a run costs, where wall time says who else ran.
 """
 
 import json
-import math
 import os
 import pickle
 import subprocess
@@ -16,25 +15,31 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from liftcore.device import choose_device
-from liftcore.errors import InvalidInput, SplatliftError, Unavailable
-from liftcore.evaluate.accuracy import class_ious, cosine_figures, rendered_scores, view_cosines
+from liftcore.errors import InvalidInput, InvalidSettings, SplatliftError, Unavailable
+from liftcore.evaluate.accuracy import centred_cosines, cosine_figures, rendered_scores, shared_pixels
 from liftcore.evaluate.hardware import hardware, peak_memory
+from liftcore.evaluate.ranking import accuracy_of, choose
 from liftcore.features.pack import Views, pair, read_features
 from liftcore.features.views import cells_under
 from liftcore.io.cameras import read_cameras
 from liftcore.io.class_masks import read_masks
 from liftcore.io.scene_files import open_files
 from liftcore.lifting import lift
+from liftcore.planning.views import spread
 from liftcore.progress import Progress
-from liftcore.query.render import in_photo
+from liftcore.query.ask import ask
+from liftcore.query.objects import objects
+from liftcore.query.render import in_photo, view_mask
+from liftcore.query.scene import QueryScene
+from liftcore.query.terms import Query
 from liftcore.query.text.table import TableEncoder
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.result import LiftResult
@@ -45,19 +50,15 @@ from liftcore.settings import LiftSettings
 from liftcore.warm_up import warm_up_lift
 
 HOLD_OUT = 8  # every n-th view is held out of the lifts
+LEAST_HELD_OUT = 6  # where there are three times as many: five that agree may do so by chance (1 of 32)
 EXACT_OVER_DRAFT = 5.0  # how much longer an exact view takes, at most, as far as the budget is planned
 EXACT_SHARE = 1 / 3  # of the budget, that the exact run may take
-PRESET_OVER_EXACT = 1.5  # top-k walks tiles twice, the robust step goes over W again
 LEAST_VIEWS = 4
 LONGEST = 86_400  # seconds that one run may take: longer, it hangs
 APART = ("read", "digest", "compile")  # stages that the seconds of a lift leave out
 BAD_INPUT = 2
-WITHIN = 0.01  # of the best accuracy
-NAMES = {  # what runs are judged by, the first that all of them have
-    "mask_iou": "held-out mask IoU",
-    "held_out_cosine": "held-out view cosine",
-    "cosine": "cosine against exact",
-}
+MOST_PHRASES = 32  # that are asked for alone, each in
+PHRASE_VIEWS = 4  # of the views that show it
 
 
 @dataclass(frozen=True)
@@ -67,24 +68,41 @@ class Candidate:
     name: str
     kind: str  # "dial" or "preset"
     settings: dict[str, Any] = field(default_factory=dict)
+    times: float = 1.0  # the seconds of the exact run, that it may take at most
 
 
-EXACT = Candidate("exact", "dial", {"speed": "exact"})
+EXACT = Candidate("exact", "dial", {"speed": "exact"})  # the settings of the order as they are
 DRAFT = Candidate("draft", "dial", {"speed": "draft"})
-CANDIDATES = (
+CANDIDATES = (  # in the order in which a budget is spent; the dial and aggregation keep the order's preset
     EXACT,
     Candidate("fast", "dial", {"speed": "fast"}),
-    DRAFT,
-    Candidate("balanced", "dial", {"speed": "balanced"}),
+    Candidate("default", "preset", {"preset": "default"}, 1.6),
     Candidate("row-sum", "preset", {"preset": "row-sum"}),
-    Candidate("robust", "preset", {"robust_steps": 1}),
-    Candidate("fast + robust", "preset", {"speed": "fast", "robust_steps": 1}),
+    Candidate("tikhonov", "preset", {"preset": "tikhonov"}),
+    DRAFT,
+    Candidate("aggregation", "preset", {"aggregation": True}, 2.5),
+    Candidate("tikhonov + aggregation", "preset", {"preset": "tikhonov", "aggregation": True}, 2.5),
+    Candidate("balanced", "dial", {"speed": "balanced"}),
     Candidate("front-mass", "preset", {"preset": "front-mass"}),
     Candidate("argmax", "preset", {"preset": "argmax"}),
     Candidate("centre", "preset", {"preset": "centre"}),
-    Candidate("top-k", "preset", {"preset": "top-k"}),
+    Candidate("top-k", "preset", {"preset": "top-k"}, 1.5),  # walks tiles twice
     Candidate("mean", "preset", {"preset": "mean"}),
 )
+
+
+def candidates_of(settings: Mapping[str, Any]) -> list[Candidate]:
+    """Those that the settings of an order allow, `EXACT` first; of two whose lifts would be the same the first."""
+    lifts: dict[str, Candidate] = {}
+    for candidate in CANDIDATES:
+        try:
+            made = LiftSettings.of(**{**settings, **candidate.settings})
+        except InvalidSettings:  # as reliability without the robust step, which a preset has
+            if candidate is EXACT:
+                raise
+            continue
+        lifts.setdefault(made.model_dump_json(exclude={"preset", "speed"}), candidate)
+    return list(lifts.values())
 
 
 @dataclass(frozen=True)
@@ -145,33 +163,36 @@ def compare(
         InvalidInput: the scene lacks what is needed; or whatever a lift refuses.
         Unavailable: a run did not end within a day.
     """
-    start, runs, skipped = time.monotonic(), [], []
+    start, runs, judged, skipped = time.monotonic(), [], [], []
     with tempfile.TemporaryDirectory(prefix="splatlift-tradeoff-") as folder:
         spec = _plan_runs(scene, settings, threads, Path(folder))
         lifted = len(spec.lifted)
         spec = _fitting(spec, budget)
-        for number, candidate in enumerate(CANDIDATES):
-            if candidate is EXACT or time.monotonic() - start + _expected(candidate, runs[0]) <= budget:
+        candidates = candidates_of(settings)
+        for number, candidate in enumerate(candidates):
+            if candidate is EXACT or time.monotonic() - start + candidate.times * runs[0]["process_s"] <= budget:
                 named = {
                     "name": candidate.name,
                     "kind": candidate.kind,
                     "options": {**settings, **candidate.settings},
                 }
-                runs.append(named | _run(spec, candidate))
+                found = _run(spec, candidate)
+                judged.append(found.pop("judged"))
+                runs.append(named | found | accuracy_of(judged[-1]))
                 if runs[0]["cosine"] is None:  # no run could be set beside the exact one
                     got = "an exact run that gave no splat a feature"
                     hint = "splats and cameras must share their frame, and features must not be zero"
                     raise InvalidInput("features", expected="views that lift", got=got, hint=hint)
             else:
                 skipped.append(candidate.name)
-            progress("tradeoff", number + 1, len(CANDIDATES), "runs")
+            progress("tradeoff", number + 1, len(candidates), "runs")
     for run in runs:
         for name in ("wall", "cpu", "wall_with_reading", "cpu_with_reading"):
             run[f"{name}_ratio"] = runs[0][f"{name}_s"] / run[f"{name}_s"]
     return {
         "runs": runs,
         "skipped": skipped,
-        "choice": choose(runs),
+        "choice": choose(runs, judged),
         "views": {"lifted": len(spec.lifted), "of": lifted, "held_out": len(spec.held_out)},
         "labelled_views": len(spec.labelled),
         "budget_s": budget,
@@ -193,13 +214,18 @@ def _plan_runs(scene: Scene, settings: Mapping[str, Any], threads: int | None, f
             raise InvalidInput("table", expected=expected, got=f"{classes.shape[1]}")
         if not masks:
             raise InvalidInput("labels", expected="VIEW/mask of some camera", got="none")
-    free = [name for name in names if name not in masks]
-    held_out = free[HOLD_OUT // 2 :: HOLD_OUT] if len(free) >= HOLD_OUT else free[1:2]
-    lifted = [name for name in free if name not in set(held_out)]
+    lifted, held_out = hold_out([name for name in names if name not in masks])
     if not lifted:
         raise InvalidInput("features", expected="views besides those with labels", got=f"{len(names)} views")
     own = {**settings, "view_stride": 1}  # the views are named
     return RunSpec(scene, own, tuple(lifted), tuple(held_out), tuple(sorted(masks)), threads, folder, False)
+
+
+def hold_out(names: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Of the views with features those that are lifted, and those that judge; they lie between each other."""
+    step = min(HOLD_OUT, max(3, len(names) // LEAST_HELD_OUT))
+    judges = list(names[step // 2 :: step] if len(names) >= HOLD_OUT else names[1:2])
+    return [name for name in names if name not in set(judges)], judges
 
 
 def _fitting(spec: RunSpec, budget: float) -> RunSpec:
@@ -209,12 +235,6 @@ def _fitting(spec: RunSpec, budget: float) -> RunSpec:
     keep = EXACT_SHARE * budget / exact
     step = 1 if keep >= 1 else min(round(1 / keep), len(spec.lifted) // LEAST_VIEWS)
     return replace(spec, lifted=spec.lifted[:: max(1, step)])
-
-
-def _expected(candidate: Candidate, exact: Mapping[str, Any]) -> float:
-    """Seconds that a run may take with all around it, guessed from the exact run's, which comes first."""
-    slower = candidate.kind == "preset" and "speed" not in candidate.settings
-    return exact["process_s"] * (PRESET_OVER_EXACT if slower else 1.0)
 
 
 def _run(spec: RunSpec, candidate: Candidate) -> dict[str, Any]:
@@ -264,21 +284,43 @@ def measured(spec: RunSpec) -> dict[str, Any]:
 
 
 def _judge(spec: RunSpec, splats: Splats, cameras: Cameras, features: Views, made: LiftResult) -> dict[str, Any]:
-    """The figures of accuracy; None where there is nothing to compare with."""
-    figures: dict[str, Any] = cosine_figures(made.features, *_reference(spec, made))
+    """How near the run is to the exact one, and what `liftcore.evaluate.ranking` judges it by, a view at a time."""
     raster, params = CpuRaster(splats, spec.threads), made.metadata.settings.render_params
-    rows = [view_cosines(raster, cameras[view], features[view], made.features, params) for view in spec.held_out]
-    figures |= {"held_out_cosine": float(np.concatenate(rows).mean()) if rows else None, "mask_iou": None}
-    if not spec.labelled:
-        return figures
-    masks, classes = spec.scene.truth(cameras)
-    found, truth = [], []
-    for view in spec.labelled:
-        scores = in_photo(cameras[view], lambda of: rendered_scores(raster, of, made.features, classes, params))
-        found.append(_resized(scores.argmax(dim=2), masks[view]))
-        truth.append(masks[view].flatten())
-    mean = float(class_ious(torch.cat(found), torch.cat(truth), len(classes)).nanmean())
-    return figures | {"mask_iou": None if math.isnan(mean) else mean}  # masks that name no class
+    cosines = centred_cosines(
+        raster, [(cameras[view], features[view]) for view in spec.held_out], made.features, params
+    )
+    judged: dict[str, Any] = {"centred_cosine": cosines, "intersections": [], "unions": [], "phrase_iou": []}
+    if spec.labelled:
+        masks, classes = spec.scene.truth(cameras)
+        for view in spec.labelled:
+            scores = in_photo(cameras[view], lambda of: rendered_scores(raster, of, made.features, classes, params))
+            shared, joined = shared_pixels(_resized(scores.argmax(dim=2), masks[view]), masks[view], len(classes))
+            judged["intersections"].append(shared.tolist())
+            judged["unions"].append(joined.tolist())
+        judged["phrase_iou"] = _phrase_ious(spec, QueryScene(made, splats, cameras), masks)
+    return {**cosine_figures(made.features, *_reference(spec, made)), "judged": judged}
+
+
+def _phrase_ious(spec: RunSpec, scene: QueryScene, masks: Mapping[str, Tensor]) -> list[float]:
+    """IoU of the masks that words give, each class asked for alone, in labelled views that show it."""
+    assert spec.scene.table is not None  # there are labels
+    encoder, ious = TableEncoder.open(spec.scene.table), list[float]()
+    showing = [
+        [view for view in spec.labelled if (masks[view] == number).any()] for number in range(len(spec.scene.classes))
+    ]
+    for number in _some([number for number, views in enumerate(showing) if views], MOST_PHRASES):
+        answer = ask(scene, Query((spec.scene.classes[number],)), encoder)
+        found = cache(partial(objects, scene, answer))  # once for all views, if they ask for it
+        for view in _some(showing[number], PHRASE_VIEWS):
+            seen = view_mask(scene, answer, view, group=lambda *_, found=found: found())
+            mine, real = _resized(torch.from_numpy(seen.mask), masks[view]), masks[view] == number
+            ious.append(int((mine & real).sum()) / int((mine | real).sum()))
+    return ious
+
+
+def _some(items: Sequence[Any], most: int) -> list[Any]:
+    """As many of them, evenly spread."""
+    return [items[int(place)] for place in spread(len(items), min(most, len(items)))]
 
 
 def _reference(spec: RunSpec, made: LiftResult) -> tuple[Tensor, Tensor]:
@@ -295,54 +337,11 @@ def _reference(spec: RunSpec, made: LiftResult) -> tuple[Tensor, Tensor]:
 
 
 def _resized(labels: Tensor, mask: Tensor) -> Tensor:
-    """The labels [H, W] at the centres of the mask's pixels, flat."""
+    """The labels [H, W] at the centres of the mask's pixels, [h, w]."""
     rows, columns = (
         cells_under(torch.arange(size), size, cells) for size, cells in zip(mask.shape, labels.shape, strict=True)
     )
-    return labels[rows][:, columns].flatten()
-
-
-def pareto(runs: Sequence[Mapping[str, Any]], accuracy: str) -> list[str]:
-    """The names of runs that none beats in both time and accuracy, the fastest first."""
-    best, names = float("-inf"), []
-    for run in sorted(runs, key=lambda run: (run["cpu_s"], -_value(run, accuracy))):
-        if _value(run, accuracy) > best:
-            best = _value(run, accuracy)
-            names.append(run["name"])
-    return names
-
-
-def choose(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """The fastest run whose accuracy is within WITHIN of the best one's, and why, in a sentence.
-
-    The accuracy is that of masks when there are some, else of held-out views, else the cosine to the exact run.
-    """
-    accuracy = next((name for name in NAMES if all(run[name] is not None for run in runs)), "cosine")
-    front, by_name = pareto(runs, accuracy), {run["name"]: run for run in runs}
-    best = by_name[front[-1]]
-    floor = _value(best, accuracy) - WITHIN * abs(_value(best, accuracy))
-    taken = by_name[next(name for name in front if _value(by_name[name], accuracy) >= floor)]
-    figure, value, seconds = NAMES[accuracy], f"{_value(taken, accuracy):.4f}", f"{taken['cpu_s']:.2f} s"
-    if len(runs) == 1:
-        why = f"{taken['name']} alone fitted the budget: nothing can be recommended; a larger one compares more"
-    elif taken is best:
-        why = (
-            f"{taken['name']} has the best {figure} ({value}), and none within {WITHIN:.0%} of it takes less than "
-            f"its {seconds} of processor time"
-        )
-    else:
-        why = (
-            f"{taken['name']} is the fastest whose {figure} ({value}) is within {WITHIN:.0%} of the best "
-            f"({best['name']}, {_value(best, accuracy):.4f}): {seconds} of processor time against "
-            f"{best['cpu_s']:.2f} s"
-        )
-    return {"name": taken["name"], "options": taken["options"], "accuracy": accuracy, "front": front, "why": why}
-
-
-def _value(run: Mapping[str, Any], accuracy: str) -> float:
-    """What is no number is the worst."""
-    value = run[accuracy]
-    return -1.0 if value is None or math.isnan(value) else float(value)
+    return labels[rows][:, columns]
 
 
 def main() -> int:

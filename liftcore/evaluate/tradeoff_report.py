@@ -10,15 +10,20 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from liftcore.evaluate.hardware import machine_line
-from liftcore.evaluate.tradeoff import NAMES
+from liftcore.evaluate.ranking import NAMES
 from liftcore.io.files import whole_file
 
-HEADS = ("run", "views", "wall s", "CPU s", "faster", "faster by CPU", "peak MiB",
-         "cosine", "plain", "5 %", "held-out cosine", "mask IoU")  # fmt: skip
+HEADS = ("run", "views", "wall s", "CPU s", "faster by CPU", "peak MiB", "cosine", "5 %", "lost", "centred",
+         "mask IoU", "phrase IoU", "95 %")  # fmt: skip
 KEY = (
-    "Seconds are of the lift without reading its files. *cosine* is against the exact run, over the splats that it "
-    "saw: the mean by evidence, the plain mean, and the value that 5 % of the splats stay below."
+    "*exact* is your settings as they are (`default` where they name no preset), which the dial and *aggregation* "
+    "keep. Seconds are of the lift without reading its files. *cosine* is against the exact run, over the splats "
+    "that it saw: the mean by evidence, and what 5 % of the splats stay below; *lost* is the share of them without a "
+    "feature. *centred* is the cosine of what is rendered into views that no run lifted with what these observe, "
+    "both less the mean of what is observed, a region at a time. *95 %* is the interval of what runs are judged by, "
+    "over draws of its views."
 )
+LOST = 0.001  # of the splats, that are worth a sentence
 
 
 def save(document: Mapping[str, Any], out: Path) -> list[Path]:
@@ -49,7 +54,7 @@ def page_of(document: Mapping[str, Any]) -> list[str]:
         "",
         KEY,
         "",
-        f"**Take {document['choice']['name']}**: {document['choice']['why']}.",
+        verdict_of(document),
         "",
         f"`{document['command']}`, {document['date']}, {document['seconds']:.0f} s; {views['lifted']} views lifted"
         f"{subset}, {views['held_out']} with features and {document['labelled_views']} with masks held out.{skipped} "
@@ -57,26 +62,43 @@ def page_of(document: Mapping[str, Any]) -> list[str]:
     ]
 
 
+def verdict_of(document: Mapping[str, Any]) -> str:
+    """What to take, or that nothing can be recommended; and which runs leave splats without a feature."""
+    choice, exact = document["choice"], document["runs"][0]["name"]
+    verdict = f"**Take {choice['name']}**: {choice['why']}" if choice["recommended"] else choice["why"]
+    lost = [
+        f"{run['name']} leaves {run['lost_share']:.1%} of the splats without the feature that {exact} gives them"
+        for run in document["runs"]
+        if run["kind"] == "dial" and run["lost_share"] > LOST  # of presets the table tells it
+    ]
+    return ". ".join([verdict, *lost]) + "."
+
+
 def table_of(document: Mapping[str, Any]) -> list[str]:
     """The runs as a Markdown table, the fastest first; those of the front in bold."""
     rows = sorted(document["runs"], key=lambda run: run["cpu_s"])
     lines = [" | ".join(HEADS), "|".join("---" for _ in HEADS)]
-    lines += [" | ".join(_cells(run, run["name"] in document["choice"]["front"])) for run in rows]
+    lines += [" | ".join(_cells(run, document["choice"])) for run in rows]
     return [f"|{line}|" if line.startswith("---") else f"| {line} |" for line in lines]
 
 
-def _cells(run: Mapping[str, Any], on_front: bool) -> list[str]:
-    figures = [run[key] for key in ("cosine", "cosine_plain", "cosine_q05", "held_out_cosine", "mask_iou")]
+def _cells(run: Mapping[str, Any], choice: Mapping[str, Any]) -> list[str]:
     return [
-        f"**{run['name']}**" if on_front else run["name"],
+        f"**{run['name']}**" if run["name"] in choice["front"] else run["name"],
         str(run["views"]),
         f"{run['wall_s']:.2f}",
         f"{run['cpu_s']:.2f}",
-        f"{run['wall_ratio']:.1f}",
         f"{run['cpu_ratio']:.1f}",
         f"{run['peak_memory_bytes'] / 2**20:.0f}",
-        *("-" if figure is None else f"{figure:.4f}" for figure in figures),
+        *(_number(run[key]) for key in ("cosine", "cosine_q05")),
+        f"{run['lost_share']:.1%}",
+        *(_number(run[key]) for key in ("centred_cosine", "mask_iou", "phrase_iou")),
+        " to ".join(map(_number, choice["intervals"].get(run["name"], [None]))),
     ]
+
+
+def _number(figure: float | None) -> str:
+    return "-" if figure is None else f"{figure:.4f}"
 
 
 COLOURS = {"dial": "#1b6ca8", "preset": "#b5651d"}
@@ -92,9 +114,8 @@ def draw(figure: Figure, document: Mapping[str, Any]) -> None:
     _accuracy(left, document["runs"], choice)
     _faithful(right, document["runs"])
     views = document["views"]
-    figure.suptitle(
-        f"{document['scene']}: {views['lifted']} views lifted, take {choice['name']!r}", fontsize="medium"
-    )
+    verdict = f"take {choice['name']!r}" if choice["recommended"] else "nothing can be recommended"
+    figure.suptitle(f"{document['scene']}: {views['lifted']} views lifted, {verdict}", fontsize="medium")
 
 
 def _accuracy(axes: Axes, runs: Sequence[Mapping[str, Any]], choice: Mapping[str, Any]) -> None:
@@ -106,9 +127,9 @@ def _accuracy(axes: Axes, runs: Sequence[Mapping[str, Any]], choice: Mapping[str
         own = [run for run in shown if run["kind"] == kind]
         places = [run["cpu_s"] for run in own], [run[accuracy] for run in own]
         axes.scatter(*places, color=COLOURS[kind], marker=marker, s=34, zorder=2, label=kind)
-    taken = next(run for run in shown if run["name"] == choice["name"])
+    taken = [run for run in shown if choice["recommended"] and run["name"] == choice["name"]]
     ring = {"facecolors": "none", "edgecolors": "#222222", "s": 130, "zorder": 3}
-    axes.scatter([taken["cpu_s"]], [taken[accuracy]], label="taken", **ring)
+    axes.scatter([run["cpu_s"] for run in taken], [run[accuracy] for run in taken], label="taken", **ring)
     axes.set_xscale("log")
     axes.xaxis.set_major_formatter("{x:g}")
     axes.xaxis.set_minor_formatter(_few_ticks)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from liftcore.device import Device, choose_device
-from liftcore.evaluate.tradeoff import CANDIDATES, EXACT, Scene, compare
+from liftcore.evaluate.tradeoff import Scene, candidates_of, compare
 from liftcore.evaluate.tradeoff_report import page_of, save
 from liftcore.io.json_file import finite
 from liftcore.progress import Progress, one_step
@@ -32,7 +32,7 @@ def compare_as_ordered(order: dict[str, Any], progress: Progress) -> dict[str, A
     device = choose_device(settings.get("device", "auto"))
     with one_step(progress, "compile"):
         _compile(Kernel(order["kernel"]), device, settings)
-    progress("tradeoff", 0, len(CANDIDATES), "runs")
+    progress("tradeoff", 0, len(candidates_of(settings)), "runs")
     found = compare(scene, parameters["budget_s"], settings, order["threads"], progress)
     named = {
         "title": "Speed against accuracy",
@@ -48,7 +48,7 @@ def compare_as_ordered(order: dict[str, Any], progress: Progress) -> dict[str, A
 
 def _compile(kernel: Kernel, device: Device, settings: dict[str, Any]) -> None:
     """What the runs load: else the first of a kind on a machine eats up the budget."""
-    for candidate in (EXACT, *CANDIDATES):
+    for candidate in candidates_of(settings):
         warm_up_lift(kernel, device, LiftSettings.of(**settings | candidate.settings))
 
 

@@ -125,9 +125,9 @@ def _planned(order: models.LiftRequest, deps: AppState) -> models.Plan:
 
 
 def _compare(order: models.TradeoffRequest, deps: AppState, key: str | None) -> Response:
-    for name in models.COMPARED:
-        if name in order.settings:
-            raise InvalidSettings(name, expected="settings that are the same in all runs", got="one that is compared")
+    if models.COMPARED in order.settings:
+        expected, got = "settings that are the same in all runs", "one that is compared"
+        raise InvalidSettings(models.COMPARED, expected=expected, got=got)
     LiftSettings.of_json(order.settings)
     if order.budget_s > deps.settings.tradeoff_seconds:
         most = f"at most {deps.settings.tradeoff_seconds:g} s, as the operator allows"

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
+from liftcore.evaluate.ranking import accuracy_of
 from liftcore.evaluate.tradeoff import RunSpec, Scene, measured
 from service.models import AssetKind, JobKind
 from service.store.assets import CheckedUpload
@@ -81,10 +82,12 @@ def test_masks_judge_over_http_as_they_do_on_the_command_line(
     )  # fmt: skip
     settings = {"certificate_rays": 0, "speed": "exact"}
     exact = measured(RunSpec(files, settings, ("left",), ("middle",), ("right",), 1, tmp_path, exact=True))
+    exact |= accuracy_of(exact["judged"])
     assert exact["mask_iou"] > 0.5
     run = found["runs"][0]
     assert (run["name"], run["mask_iou"]) == ("exact", exact["mask_iou"])
-    assert (run["held_out_cosine"], found["labelled_views"]) == (exact["held_out_cosine"], 1)
+    assert (run["centred_cosine"], run["phrase_iou"]) == (exact["centred_cosine"], exact["phrase_iou"])
+    assert found["labelled_views"] == 1
     assert (found["labels"], found["choice"]["accuracy"]) == (judged, "mask_iou")
     table = client.get(found["links"]["table"]).text
     assert f"{exact['mask_iou']:.4f}" in table and judged["masks"] in table

@@ -115,7 +115,7 @@ def test_texts_have_a_length_together(client: TestClient, name: str) -> None:
 def test_settings_have_the_types_that_the_document_shows(client: TestClient) -> None:
     order = {"splats": NO_ASSET, "cameras": NO_ASSET, "features": [NO_ASSET]}
     shown = client.get("/openapi.json").json()["components"]["schemas"]
-    for path, schema, left_out in (("/lift", "LiftRequest", set()), ("/tradeoff", "TradeoffRequest", set(COMPARED))):
+    for path, schema, left_out in (("/lift", "LiftRequest", set()), ("/tradeoff", "TradeoffRequest", {COMPARED})):
         fields = shown[schema]["properties"]["settings"]
         assert set(fields["properties"]) == set(LiftSettings.model_fields) - left_out
         assert fields["additionalProperties"] is False

@@ -1,0 +1,84 @@
+"""How good the recommendations of ``splatlift tradeoff`` are that see no labels: judged by truth.
+
+    python -m tests.benchmarks.tradeoff TABLETOP [--cases NAME ...] [--json]
+
+Cases are packs of `tabletop` (``features_hard/4`` takes every fourth view), and ``KIND SEED``: mistakes that are made
+on the tests' still life (its words need the extra ``minilm``). All runs lift the views that a trade-off lifts, and
+are judged by those that it holds out, in one process. A row is a case: the run that is taken, its mIoU by truth in
+views that no run saw, the best run by truth, and how far the taken one is below it (``worse``). The bar is .01.
+"""
+
+import time
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+from liftcore.device import CPU
+from liftcore.evaluate.accuracy import centred_cosines
+from liftcore.evaluate.ranking import accuracy_of, choose
+from liftcore.evaluate.tradeoff import candidates_of, hold_out
+from liftcore.features.pack import read_features
+from liftcore.features.views import ViewFeatures
+from liftcore.lifting import lift
+from liftcore.settings import LiftSettings
+from liftcore.warm_up import warm_up_lift
+from tests.benchmarks.base import command_line, tell
+from tests.benchmarks.consensus import Truth, still_life_scene, tabletop_truth
+from tests.benchmarks.tabletop import Tabletop
+
+CASES = (
+    "grids", "features_hard", "features_hard/2", "features_hard/4", "features", "features/4", "features_clean/4",
+    "usual 7", "hard 7", "hard 8", "merged 7",
+)  # fmt: skip
+
+
+def measured(case: str, truth: Truth, views: dict[str, ViewFeatures]) -> dict[str, Any]:
+    """The row of a case, and under ``runs`` what it comes from."""
+    lifted, judges = hold_out(list(views))
+    seen, runs, judged = [(truth.cameras[view], views[view]) for view in judges], [], []
+    for candidate in candidates_of({}):
+        settings = LiftSettings.of(**{"certificate_rays": 0, **candidate.settings})
+        warm_up_lift(truth.raster.splats.kernel, CPU, settings)
+        busy = time.process_time()
+        made = lift(truth.raster.splats, truth.cameras, {view: views[view] for view in lifted}, settings)
+        seconds = time.process_time() - busy
+        cosines = centred_cosines(truth.raster, seen, made.features, settings.render_params)
+        judged.append({"centred_cosine": cosines, "intersections": [], "unions": [], "phrase_iou": []})
+        own = {"name": candidate.name, "options": candidate.settings, "cpu_s": seconds, "cosine": 1.0}
+        runs.append({**own, **accuracy_of(judged[-1]), "miou": truth.judge(made)[1], "views": cosines})
+    choice, miou = choose(runs, judged), {run["name"]: run["miou"] for run in runs}
+    best = max(miou, key=lambda name: miou[name])
+    row = {"case": f"{case}, {len(lifted)} and {len(judges)} views", "taken": choice["name"]}
+    row |= {"mIoU": miou[choice["name"]], "best": best, "its mIoU": miou[best]}
+    return row | {"worse": miou[best] - miou[choice["name"]], "runs": runs}
+
+
+def rows_of(folder: Path, cases: Iterable[str]) -> Iterator[dict[str, Any]]:
+    """A row a case."""
+    tabletop = tabletop_truth(Tabletop(folder))
+    for case in cases:
+        if " " in case:
+            kind, seed = case.split()
+            own, views = still_life_scene(kind, int(seed))
+            yield measured(f"still life, {case}", own, dict(views))
+        else:
+            pack, _, every = case.partition("/")
+            read = read_features(folder / f"{pack}.safetensors")
+            yield measured(case, tabletop, {view: read[view] for view in read.views[:: int(every or 1)]})
+
+
+def main() -> None:
+    """Print the table, or one JSON object."""
+    parser = command_line(
+        "tests.benchmarks.tradeoff",
+        __doc__,
+        ("folder", {"type": Path}),
+        ("--cases", {"nargs": "+", "default": CASES, "metavar": "NAME"}),
+    )
+    asked = parser.parse_args()
+    rows = list(rows_of(asked.folder, asked.cases))
+    tell(rows, as_json=asked.json, columns=() if asked.json else [name for name in rows[0] if name != "runs"])
+
+
+if __name__ == "__main__":
+    main()
