@@ -202,7 +202,7 @@ def _begin(job: Job, splats: Splats, given: Views) -> None:
 
 def _facts(camera: Camera) -> list[Any]:
     size = camera.width, camera.height
-    return [camera.name, *size, camera.K.tolist(), camera.viewmat.tolist(), repr(camera.lens)]
+    return [camera.name, *size, camera.K.tolist(), camera.viewmat.tolist(), repr(camera.lens or camera.face)]
 
 
 def _dtype(job: Job) -> torch.dtype:

@@ -16,6 +16,7 @@ import torch
 from PIL import Image
 
 from liftcore.features.encoders.encode import read_image
+from liftcore.features.lens import photo_as_pinhole_sees
 from liftcore.features.pack import Views, pair
 from liftcore.features.smoothness import smoothness, unlike_maps
 from liftcore.features.views import FeatureGrid, Regions
@@ -35,6 +36,7 @@ from liftcore.query.splat_colours import seen_colours
 from liftcore.raster.base import CompositingParams
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.cameras import Camera, Cameras, photo_size
+from liftcore.scene.panorama import with_panoramas
 from liftcore.scene.splats import Splats
 from liftcore.scene.views import cameras_of_views, some_of
 from liftcore.settings import LiftSettings
@@ -87,8 +89,11 @@ def check_scene(
     wrong: list[str] = []
     notes: list[str] = []
     photos = photos or {}
-    paired = cameras_of_views(photos, cameras)
-    files = {camera: photos[view] for view, camera in paired.items()}
+    paired = cameras_of_views(photos, with_panoramas(cameras))
+    files = {camera: photos[view] for view, camera in paired.items() if camera in cameras}
+    taken = {name: photos[view] for view, name in paired.items()}
+    faces = {name: camera.face.photo for name, camera in cameras.items() if camera.face is not None}
+    files |= {name: taken[photo] for name, photo in faces.items() if photo in taken}
     if not photos:
         what = "so the features alone tell" if features is not None else "so nothing tells"
         notes.append(f"photos: none were given, {what} whether these cameras are those of the splats")
@@ -101,7 +106,7 @@ def check_scene(
         notes += [f"photos: {len(lost)} have no camera: {some_of(lost)}"] if lost else []
     names = _some(list(files) or list(cameras), VIEWS)
     shown = [name for name in names if name in files]
-    pictures = {name: _pixels(read_image(files[name])[0], photo_size(cameras[name])) for name in shown}
+    pictures = {name: _photo(files[name], cameras[name], photo_size(cameras[name])) for name in shown}
     raster, views, renders = CpuRaster(splats, threads=None), [], {}
     for number, name in enumerate(names):
         row_sum, renders[name] = _render(raster, splats, cameras[name])
@@ -139,9 +144,12 @@ def _render(raster: CpuRaster, splats: Splats, camera: Camera) -> tuple[float, n
     return float(image[..., 3].mean()), image[..., :3].clip(0.0, 1.0)
 
 
-def _pixels(image: Image.Image, size: tuple[int, int]) -> np.ndarray:
-    """[H, W, 3] f32 in 0..1 of an image in a size (width, height)."""
-    return np.asarray(image.convert("RGB").resize(size, Image.Resampling.BOX), np.float32) / 255
+def _photo(path: Path, camera: Camera, size: tuple[int, int]) -> np.ndarray:
+    """[H, W, 3] f32 in 0..1, a camera's photo in a size (width, height); of a panorama what its face shows."""
+    face = camera.face
+    size = size if face is None else (face.width, face.height)
+    pixels = np.asarray(read_image(path)[0].convert("RGB").resize(size, Image.Resampling.BOX), np.float32) / 255
+    return pixels if face is None else photo_as_pinhole_sees(pixels, camera)
 
 
 def _against(name: str, row_sum: float, render: np.ndarray | None, pictures: Mapping[str, np.ndarray]) -> ViewCheck:
@@ -183,7 +191,7 @@ def _check_features(
             grids.append(observed.grid.float().numpy())
         elif isinstance(observed, Regions) and name in files:
             labels = observed.labels[-1].numpy()
-            photo = _pixels(read_image(files[name])[0], labels.shape[::-1]).mean(axis=2)
+            photo = _photo(files[name], cameras[name], labels.shape[::-1]).mean(axis=2)
             mirrored = max(_edges(labels[:, ::-1], photo), _edges(labels[::-1], photo))
             rows.append((_edges(labels, photo), mirrored))
     figures, wrong = {}, unlike_maps(grids)

@@ -1,4 +1,4 @@
-"""What a camera's pinhole observes of a distorted photo: its maps, carried from the photo's pixels to its own."""
+"""What a camera's pinhole observes of a distorted photo or a panorama: maps, carried from the photo's pixels."""
 
 from functools import lru_cache
 from typing import NamedTuple
@@ -10,20 +10,21 @@ from torch import Tensor
 from liftcore.features.views import FeatureGrid, Regions, ViewFeatures
 from liftcore.scene.cameras import Camera
 from liftcore.scene.distortion import Lens
+from liftcore.scene.panorama import Face
 
 BAND_VALUES = 1 << 22  # of a grid, carried at a time in float32
 BAND_PIXELS = 1 << 15  # whose rays are bent at a time: what that takes stays in the cache
-KEPT_PINHOLES = 2  # whose labels' places are kept: mostly one lens took all photos, and labels are of one size
+KEPT_PINHOLES = 6  # whose labels' places are kept: mostly one lens took all photos, or all are panoramas
 
 
 def as_pinhole_sees(observation: ViewFeatures, camera: Camera) -> ViewFeatures:
-    """The observation of a camera's photo as one of its pinhole; itself where the camera has no lens.
+    """The observation of a camera's photo as one of its pinhole; itself where that is the photo's own.
 
     A pixel of the pinhole reads the label of the pixel of the photo that shows the same ray, so labels get the
     pinhole's size. A grid keeps the size of its cells, and each is read bilinearly where the ray of its centre
     meets the photo: smoother than the given one by less than a cell.
     """
-    if camera.lens is None:
+    if camera.lens is None and camera.face is None:
         return observation
     if isinstance(observation, Regions):
         return Regions.unchecked(_labels(observation.labels, camera), observation.codebook)
@@ -32,10 +33,19 @@ def as_pinhole_sees(observation: ViewFeatures, camera: Camera) -> ViewFeatures:
 
 def grid_sides(height: int, width: int, camera: Camera) -> tuple[int, int]:
     """Rows and columns of a grid [height, width] of the camera's photo, as its pinhole sees it."""
-    if camera.lens is None:
+    photo = camera.lens or camera.face
+    if photo is None:
         return height, width
-    rows, columns = height * camera.height / camera.lens.height, width * camera.width / camera.lens.width
+    rows, columns = height * camera.height / photo.height, width * camera.width / photo.width
     return max(1, round(rows)), max(1, round(columns))
+
+
+def photo_as_pinhole_sees(photo: np.ndarray, camera: Camera) -> np.ndarray:
+    """[height, width, C], the nearest pixels of a photo [h, w, C]; itself where the camera's picture is the photo."""
+    if camera.lens is None and camera.face is None:
+        return photo
+    places = _label_places(_pinhole(camera), *photo.shape[:2]).numpy()
+    return photo.reshape(-1, photo.shape[2])[places].reshape(camera.height, camera.width, -1)
 
 
 def _labels(labels: Tensor, camera: Camera) -> Tensor:
@@ -67,7 +77,9 @@ def _grid(grid: Tensor, camera: Camera) -> Tensor:
         (np.arange(columns) + 0.5) * camera.width / columns, (np.arange(rows) + 0.5) * camera.height / rows
     )
     x, y = _shares(*centres, _pinhole(camera))
-    u, v = (x * width - 0.5).clip(0, width - 1), (y * height - 0.5).clip(0, height - 1)
+    u, v = x * width - 0.5, (y * height - 0.5).clip(0, height - 1)
+    if camera.face is None:  # a panorama's last column meets its first
+        u = u.clip(0, width - 1)
     left, top = np.floor(u).astype(np.int64), np.floor(v).astype(np.int64)
     cells = grid.reshape(-1, channels)
     carried = torch.empty((*x.shape, channels), dtype=grid.dtype)
@@ -78,7 +90,7 @@ def _grid(grid: Tensor, camera: Camera) -> Tensor:
         for row in (0, 1):
             for column in (0, 1):
                 share = (1 - np.abs(u - left - column)) * (1 - np.abs(v - top - row))
-                place = (top + row).clip(max=height - 1) * width + (left + column).clip(max=width - 1)
+                place = (top + row).clip(max=height - 1) * width + (left + column) % width
                 taken = cells[torch.from_numpy(place[here])].to(torch.float32)
                 total += taken * torch.from_numpy(share[here].astype(np.float32))[..., None]
         carried[here] = total.to(grid.dtype)
@@ -86,9 +98,9 @@ def _grid(grid: Tensor, camera: Camera) -> Tensor:
 
 
 class _Pinhole(NamedTuple):
-    """A camera with a lens, by what its maps depend on."""
+    """A camera of a photo that is not its own picture, by what its maps depend on."""
 
-    lens: Lens
+    photo: Lens | Face
     width: int
     height: int
     cx: float
@@ -96,13 +108,14 @@ class _Pinhole(NamedTuple):
 
 
 def _pinhole(camera: Camera) -> _Pinhole:
-    if camera.lens is None:
-        raise ValueError("the camera has no lens")
-    return _Pinhole(camera.lens, camera.width, camera.height, camera.cx, camera.cy)
+    photo = camera.lens or camera.face
+    if photo is None:
+        raise ValueError("the camera has no lens, and is no face of a panorama")
+    return _Pinhole(photo, camera.width, camera.height, camera.cx, camera.cy)
 
 
 def _shares(u: np.ndarray, v: np.ndarray, pinhole: _Pinhole) -> tuple[np.ndarray, np.ndarray]:
     """Where on the photo the rays of places (u, v) of a pinhole lie, as shares of its sides."""
-    lens = pinhole.lens
-    x, y = lens.on_photo((u - pinhole.cx) / lens.fx, (v - pinhole.cy) / lens.fy)
-    return x / lens.width, y / lens.height
+    photo = pinhole.photo
+    x, y = photo.on_photo((u - pinhole.cx) / photo.fx, (v - pinhole.cy) / photo.fy)
+    return x / photo.width, y / photo.height

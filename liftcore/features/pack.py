@@ -100,7 +100,7 @@ class Views(Mapping[str, ViewFeatures]):
         """The tensors of a view by part (labels and codebook, or grid), from the header alone."""
         specs = dict(self._find(view).specs)
         camera = self._cameras.get(view)
-        if camera is None or camera.lens is None:
+        if camera is None or (camera.lens is None and camera.face is None):
             return specs
         if "grid" in specs:
             height, width, channels = specs["grid"].shape
@@ -114,10 +114,17 @@ class Views(Mapping[str, ViewFeatures]):
         height, width = specs["labels"].shape[-2:] if "labels" in specs else specs["grid"].shape[:2]
         return width, height
 
-    def seen_by(self, names: Mapping[str, str], cameras: Mapping[str, Camera]) -> "Views":
-        """The views that ``names`` gives the name of a camera, under it and as it sees them, and no others."""
-        sources = {name: self._find(view) for view, name in names.items()}
-        return replace(self, _sources=sources, _cameras={name: cameras[name] for name in sources})
+    def seen_by(self, views: Mapping[str, str], cameras: Mapping[str, Camera]) -> "Views":
+        """The views that ``views`` names for cameras, and no others, each under its camera's name, as that sees it.
+
+        Of a panorama's face that a view is named like, the view is a map of the face itself.
+        """
+        sources, seeing = {}, {}
+        for name, view in views.items():
+            sources[name] = self._find(view)
+            own = cameras[name].replace(face=None) if name == view else cameras[name]
+            seeing[name] = self._cameras.get(view, own)
+        return replace(self, _sources=sources, _cameras=seeing)
 
     def _find(self, view: str) -> _Source:
         if view not in self._sources:
@@ -188,11 +195,19 @@ def read_features(*paths: str | Path) -> Views:
 def pair(views: Views, cameras: Mapping[str, Camera]) -> tuple[Views, list[str]]:
     """The views that have a camera, named like it, and the names of those that have none, to be skipped and told.
 
+    A panorama's view is one of each of its faces.
+
     Raises:
         InvalidFeatures: no view has a camera.
     """
-    names = require_pairs(views.views, cameras)
-    return views.seen_by(names, cameras), [view for view in views if view not in names]
+    faces: dict[str, list[str]] = {}
+    for name, camera in cameras.items():
+        if camera.face is not None:
+            faces.setdefault(camera.face.photo, []).append(name)
+    names = require_pairs(views.views, {*cameras, *faces})
+    seen = {face: view for view, name in names.items() for face in faces.get(name, [])}
+    seen |= {name: view for view, name in names.items() if name not in faces}
+    return views.seen_by(seen, cameras), [view for view in views if view not in names]
 
 
 def write_pack(

@@ -11,7 +11,7 @@ import numpy as np
 
 from liftcore.errors import InvalidCameras
 from liftcore.io.files import refuse_pointer
-from liftcore.scene.cameras import Camera, Cameras, behind_lens, cameras_from, check_count
+from liftcore.scene.cameras import Camera, Cameras, behind_lens, cameras_from, check_count, faces_of
 from liftcore.scene.distortion import Brown, Distortion, Fisheye
 from liftcore.scene.quaternions import rotation_matrices
 from liftcore.scene.views import view_names
@@ -42,7 +42,7 @@ class CameraModel(NamedTuple):
     name: str
     parameters: int
     focals: int
-    distortion: tuple[str, ...] | None  # the names of the distortion's parameters; None: a model that is not read
+    distortion: tuple[str, ...] | None  # the names of the distortion's parameters; None: a model without a pinhole
     fisheye: bool = False
 
 
@@ -68,7 +68,10 @@ COLMAP_MODELS = (
     CameraModel("EQUIRECTANGULAR", 2, 0, None),
 )
 MODELS_BY_NAME = {model.name: model for model in COLMAP_MODELS}
-READ_MODELS = ", ".join(model.name for model in COLMAP_MODELS if model.distortion is not None)
+PANORAMA = "EQUIRECTANGULAR"
+READ_MODELS = ", ".join(
+    model.name for model in COLMAP_MODELS if model.distortion is not None or model.name == PANORAMA
+)
 
 
 @dataclass(frozen=True)
@@ -121,23 +124,26 @@ def read_colmap(folder: Path) -> Cameras:
     with cameras_from(str(folder)):
         names = view_names([image.name for image in images])
         pairs = zip(names, images, strict=True)
-        return Cameras(tuple(_camera(name, image, sensors, (camera_file, image_file)) for name, image in pairs))
+        files = camera_file, image_file
+        return Cameras([camera for name, image in pairs for camera in _cameras(name, image, sensors, files)])
 
 
-def _camera(name: str, image: _Image, sensors: Mapping[int, _Sensor], files: tuple[Path, Path]) -> Camera:
-    """The view of an image; only a camera that an image uses has to be of a model that is read."""
+def _cameras(name: str, image: _Image, sensors: Mapping[int, _Sensor], files: tuple[Path, Path]) -> list[Camera]:
+    """The view of an image, or the six of a panorama; only what images use has to be of a model that is read."""
     sensor, source = sensors.get(image.camera), str(files[1])
     if sensor is None:
         raise InvalidCameras(source, expected="images of known cameras", got=f"{name!r} of camera {image.camera}")
-    intrinsics, distortion = calibration(sensor.model, sensor.parameters, f"{files[0]} camera {image.camera}")
     pose = np.eye(4)
     if not np.isfinite(image.quaternion).all() or not any(image.quaternion):
         expected, got = "a finite quaternion that is not zero", str(list(image.quaternion))
         raise InvalidCameras(f"{source} image {name!r}", expected=expected, got=got)
     pose[:3, :3] = rotation_matrices(np.array(image.quaternion))
     pose[:3, 3] = image.translation
+    if sensor.model.name == PANORAMA:
+        return faces_of(name, sensor.width, sensor.height, pose)
+    intrinsics, distortion = calibration(sensor.model, sensor.parameters, f"{files[0]} camera {image.camera}")
     camera = Camera.pinhole(name, sensor.width, sensor.height, *intrinsics, viewmat=pose)
-    return camera if distortion is None else behind_lens(camera, distortion)
+    return [camera if distortion is None else behind_lens(camera, distortion)]
 
 
 class _Bytes:
@@ -194,7 +200,7 @@ class _Bytes:
 
 def _read_binary(camera_file: Path, image_file: Path) -> tuple[dict[int, _Sensor], list[_Image]]:
     cameras = _Bytes(camera_file)
-    sensors = dict(_binary_sensor(cameras) for _ in cameras.views("cameras", 24 + 3 * 8))
+    sensors = dict(_binary_sensor(cameras) for _ in cameras.views("cameras", 24 + 2 * 8))
     images = _Bytes(image_file)
     return sensors, [_binary_image(images) for _ in images.views("images", 64 + 1 + 8)]
 

@@ -240,7 +240,8 @@ def poses_of(cameras: Sequence[Camera]) -> str:
     total = hashlib.sha256()
     for camera in cameras:
         total.update(camera.viewmat.tobytes() + camera.K.tobytes())
-        total.update(repr((camera.name, camera.width, camera.height, camera.lens)).encode())
+        seen = (camera.name, camera.width, camera.height, camera.lens)
+        total.update(repr(seen if camera.face is None else (*seen, camera.face)).encode())
     return total.hexdigest()
 
 

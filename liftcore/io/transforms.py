@@ -13,9 +13,9 @@ from typing import Any, Self
 import numpy as np
 
 from liftcore.errors import InvalidCameras
-from liftcore.io.colmap import Intrinsics, distortion_of
+from liftcore.io.colmap import PANORAMA, Intrinsics, distortion_of
 from liftcore.io.json_file import FORMATS, entry, matrix, number, pixels, read_json
-from liftcore.scene.cameras import Camera, Cameras, behind_lens, check_count, viewmat_of
+from liftcore.scene.cameras import Camera, Cameras, behind_lens, check_count, faces_of, viewmat_of
 from liftcore.scene.distortion import Distortion
 from liftcore.scene.views import view_names
 
@@ -70,7 +70,7 @@ def parse_transforms(document: Any, source: str) -> Cameras:
     check_count(len(frames), f"{source} frames")
     files = [str(entry(frame, "file_path", f"{source} frame {i}")) for i, frame in enumerate(frames)]
     views = zip(view_names(files), frames, strict=True)
-    cameras = tuple(_camera(name, ChainMap(frame, document), source) for name, frame in views)
+    cameras = [one for name, frame in views for one in _cameras(name, ChainMap(frame, document), source)]
     return Cameras(cameras, of_nerfstudio=any(key in document for key in OF_NERFSTUDIO))
 
 
@@ -86,9 +86,11 @@ def transforms_of(cameras: Mapping[str, Camera]) -> dict[str, Any]:
     return {"frames": frames}
 
 
-def _camera(name: str, keys: ChainMap[str, Any], source: str) -> Camera:
+def _cameras(name: str, keys: ChainMap[str, Any], source: str) -> list[Camera]:
+    """The view of a frame, or the six of a panorama."""
     where = f"{source} frame {name!r}"
-    distortion = _distortion(keys, where)
+    panorama = keys.get("camera_model") == PANORAMA
+    distortion = None if panorama else _distortion(keys, where)
     if "w" not in keys or "h" not in keys:
         hint = 'add the size of the photos as "w" and "h" at the top level of the file'
         raise InvalidCameras(where, expected="an image size, w and h", got="none", hint=hint)
@@ -98,9 +100,11 @@ def _camera(name: str, keys: ChainMap[str, Any], source: str) -> Camera:
         got = " ".join(f"{value:g}" for value in given[3])
         raise InvalidCameras(f"{where} transform_matrix", expected="0 0 0 1 as the last row", got=got)
     pose = viewmat_of(given[:3, :3] * OPENGL_TO_OPENCV, given[:3, 3])
+    if panorama:
+        return faces_of(name, width, height, pose)
     intrinsics = _intrinsics(keys, width, height, where)
     camera = Camera.pinhole(name, width, height, *intrinsics, viewmat=pose)
-    return camera if distortion is None else behind_lens(camera, distortion)
+    return [camera if distortion is None else behind_lens(camera, distortion)]
 
 
 def _intrinsics(keys: Mapping[str, Any], width: int, height: int, where: str) -> Intrinsics:
@@ -135,7 +139,9 @@ def _distortion(keys: ChainMap[str, Any], where: str) -> Distortion | None:
     other = next((key for scope in keys.maps for key in OTHER_LENSES if scope.get(key)), None)
     if model not in (*PERSPECTIVE, FISHEYE) or other:
         got = other or repr(model)[:60]
-        raise InvalidCameras(where, expected=f"a perspective camera or {FISHEYE}", got=got, hint=UNDISTORT)
+        raise InvalidCameras(
+            where, expected=f"a perspective camera, {FISHEYE} or {PANORAMA}", got=got, hint=UNDISTORT
+        )
     fisheye = model == FISHEYE or bool(keys.get("is_fisheye"))
     found = [given for scope in keys.maps if (given := _given(scope, where)) is not None]
     if any(given != found[0] for given in found):  # programs differ in which of them counts

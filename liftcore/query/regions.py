@@ -29,11 +29,14 @@ def regions_of(scene: QueryScene, view: str, argument: str) -> Regions:
     Raises:
         NotFound: the packs lack the view. InvalidQuery: it is a grid. InvalidLift: a pack moved or changed.
     """
+    from liftcore.features.pack import pair
     from liftcore.features.views import Regions
     from liftcore.scene.views import cameras_of_views
 
     packs = scene.packs
     name = cameras_of_views([view], packs.views).get(view)
+    if name is None and view.rpartition("@")[0] in packs.views and view in scene.cameras:
+        packs, name = pair(packs, {view: scene.cameras[view]})[0], view  # a face of a panorama
     if name is None:
         raise NotFound(argument, expected="a view of the lift's feature packs", got=repr(view))
     found = packs[name]

@@ -13,6 +13,7 @@ import numpy as np
 from liftcore.errors import InvalidCameras, NotFound
 from liftcore.nearest import nearest
 from liftcore.scene.distortion import MAX_SIDE, Distortion, Lens, Rectangle, shared_lens
+from liftcore.scene.panorama import TURNS, Face
 from liftcore.scene.views import cameras_of_views, without_image_suffix
 
 if TYPE_CHECKING:  # torch is taken, and not loaded for it
@@ -47,6 +48,7 @@ class Camera:
         K: [3, 3] pixels, (fx 0 cx; 0 fy cy; 0 0 1), likewise.
         width: pixels. height: pixels.
         lens: of a distorted photo, which this pinhole stands for; None: the photo is as it says.
+        face: of a panorama, whose features this pinhole reads; None: of no panorama.
         name: the image's name without its extension; pairs the view with its features.
 
     Raises:
@@ -58,13 +60,22 @@ class Camera:
     width: int
     height: int
     lens: Lens | None
+    face: Face | None
     name: str
 
     def __init__(
-        self, viewmat: Matrix, K: Matrix, width: int, height: int, *, lens: Lens | None = None, name: str = ""
+        self,
+        viewmat: Matrix,
+        K: Matrix,
+        width: int,
+        height: int,
+        *,
+        lens: Lens | None = None,
+        face: Face | None = None,
+        name: str = "",
     ) -> None:
         fields = {"viewmat": _matrix(viewmat), "K": _matrix(K), "width": width, "height": height}
-        for field, value in {**fields, "lens": lens, "name": name}.items():
+        for field, value in {**fields, "lens": lens, "face": face, "name": name}.items():
             object.__setattr__(self, field, value)
         if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
             self._refuse("size", f"width and height in 1..{MAX_SIDE}", f"{width}x{height}")
@@ -287,6 +298,25 @@ def behind_lens(camera: Camera, distortion: Distortion) -> Camera:
         ) from None
 
 
+def faces_of(name: str, width: int, height: int, viewmat: np.ndarray) -> list[Camera]:
+    """The six faces of a panorama: pinholes of 90 degrees, square.
+
+    Args:
+        name: of the panorama. width: pixels of its photo. height: likewise. viewmat: [4, 4] world to its camera.
+
+    Raises:
+        InvalidCameras: a size or the pose is out of range.
+    """
+    Camera.pinhole(name, width, height, 1.0, 1.0, 0.0, 0.0, viewmat)  # refuses under the panorama's own name
+    found = []
+    for turn in TURNS:
+        face, pose = Face(name, width, height, turn), np.array(viewmat, dtype=np.float64)
+        pose[:3] = face.rotation @ pose[:3]
+        lens = (face.side, face.side, face.fx, face.fy, face.side / 2, face.side / 2)
+        found.append(Camera.pinhole(f"{name}@{turn}", *lens, viewmat=pose).replace(face=face))
+    return found
+
+
 def photo_size(camera: Camera) -> tuple[int, int]:
     """Width and height in pixels of the photo that a camera stands for."""
     whole = camera.lens or camera
@@ -311,14 +341,17 @@ def pixel_of(camera: Camera, x: int, y: int) -> tuple[int, int] | None:
 
 def distortion_warning(views: Sequence[Camera]) -> list[str]:
     """What is to be said of distorted views, if there are some."""
+    faces = sum(camera.face is not None for camera in views)
+    told = [f"{faces} of {len(views)} views are faces of panoramas, and read the features of those"] if faces else []
     shares = [camera.lens.share for camera in views if camera.lens is not None]
     if not shares:
-        return []
+        return told
     least = min(shares)
     lifted = "nearly all" if least > NEARLY_ALL else f"{least:.0%} or more"
     return [
+        *told,
         f"{len(shares)} of {len(views)} views are of distorted photos, of each of which {lifted} is "
-        "lifted: features must be of the photos as they were taken, not of undistorted ones"
+        "lifted: features must be of the photos as they were taken, not of undistorted ones",
     ]
 
 

@@ -269,9 +269,10 @@ def shape_warnings(packs: Views, views: Sequence[Camera]) -> list[str]:
     odd, stretched = [], []
     for camera in views:
         size = packs.map_size(camera.name)
-        if _odd(size, photo_size(camera)):
+        photo = _photo(camera)
+        if _odd(size, photo):
             odd.append(camera)
-        elif _stretched(size, photo_size(camera)):
+        elif _stretched(size, photo):
             stretched.append(camera)
     advice = {
         "of another shape than their images{}: see that they are [rows, columns], channels last": odd,
@@ -286,8 +287,12 @@ def shape_warnings(packs: Views, views: Sequence[Camera]) -> list[str]:
 
 
 def _shapes(packs: Views, camera: Camera) -> str:
-    (width, height), (W, H) = packs.map_size(camera.name), photo_size(camera)
+    (width, height), (W, H) = packs.map_size(camera.name), _photo(camera)
     return f" ({camera.name}: {width}x{height} for {W}x{H})"
+
+
+def _photo(camera: Camera) -> tuple[int, int]:
+    return photo_size(camera) if camera.face is None else (camera.face.width, camera.face.height)
 
 
 def _odd(size: tuple[int, int], photo: tuple[int, int]) -> bool:

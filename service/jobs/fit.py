@@ -10,6 +10,7 @@ from liftcore.io.splats import require_kernel
 from liftcore.query.text.table import nearest_words, plain
 from liftcore.raster.base import check_antialiased
 from liftcore.scene.kernel import Kernel
+from liftcore.scene.panorama import with_panoramas
 from liftcore.scene.views import cameras_of_views, require_pairs, some_of
 from liftcore.settings import LiftSettings
 from service.errors import InvalidRequest
@@ -37,7 +38,7 @@ def check_fit(cameras: AssetRecord, features: Sequence[AssetRecord]) -> None:
     if len(channels) > 1:
         got = " and ".join(f"{count} in {pack}" for count, pack in channels.items())
         raise InvalidFeatures("features", expected="packs with the same channels", got=got)
-    require_pairs(owner, cameras.counts["names"])
+    require_pairs(owner, with_panoramas(cameras.counts["names"]))
 
 
 def check_kernel(splats: AssetRecord, settings: Mapping[str, Any]) -> None:
