@@ -27,8 +27,7 @@ from tests.benchmarks.consensus import Truth, still_life_scene, tabletop_truth
 from tests.benchmarks.tabletop import Tabletop
 
 CASES = (
-    "grids", "features_hard", "features_hard/2", "features_hard/4", "features", "features/4", "features_clean/4",
-    "usual 7", "hard 7", "hard 8", "merged 7",
+    "features_hard", "features_hard/2", "features_hard/4", "features", "features/4", "usual 7", "hard 7", "grids",
 )  # fmt: skip
 
 
