@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from liftcore.features.folders import ViewFolder
+    from liftcore.features.views import Regions
+    from liftcore.progress import Progress
     from liftcore.query.text.table import TableEncoder
 
 
@@ -37,6 +39,10 @@ def add_arguments(parser: Parser, shared: Parser) -> None:
         help="of label pictures, the value that means no mask: 0, and value 1 is of the first vector; with another "
         "(255) value 0 is of the first",
     )
+    by = "make the vectors: of each mask's crop of its photo, open_clip:MODEL/TAG or open_clip:MODEL@FILE"
+    masks.add_argument("--encoder", metavar="SPEC", help=by)
+    masks.add_argument("--photos", type=Path, nargs="+", metavar="PATH", help="of --encoder, or their folders")
+    masks.add_argument("--device", default="cpu", metavar="NAME", help="where the model runs, as torch names it")
     prompts = formats.add_parser(
         "prompts",
         parents=[shared],
@@ -81,10 +87,11 @@ def run(options: argparse.Namespace) -> int:
 
     if options.format == "retag":
         return _retag(options)
-    views, table, warnings = _views(options)
-    out = free_output(options.output, views.inputs)
-    with progress_bars() as progress, writing(out):
-        write_pack(out, views, _metadata(options), progress, table)
+    with progress_bars() as progress:
+        views, table, warnings = _views(options, progress)
+        out = free_output(options.output, views.inputs)
+        with writing(out):
+            write_pack(out, views, _metadata(options), progress, table)
     packs = read_features(out)
     described = describe_packs(packs)
     document = {
@@ -97,7 +104,7 @@ def run(options: argparse.Namespace) -> int:
         "normalised": packs.normalised,
         "folders": folders_of(views),
         "sizes": described["sizes"],
-        "renamed": {} if options.format in ("langsplat", "prompts") else _renamed(views, options.folder),
+        "renamed": _renamed(views, options),
         "words": list(table.words) if table else [],
         "warnings": [*warnings, *described["warnings"]],
     }
@@ -126,9 +133,11 @@ def _retag(options: argparse.Namespace) -> int:
     return 0
 
 
-def _renamed(views: ViewFolder, folder: Path) -> dict[str, str]:
-    """The views that lost the suffix of an image, by their files."""
-    files = {path.relative_to(folder).as_posix(): view for view, path in views.files.items()}
+def _renamed(views: ViewFolder, options: argparse.Namespace) -> dict[str, str]:
+    """The views that lost the suffix of an image, by their files of vectors."""
+    if options.format in ("langsplat", "prompts") or getattr(options, "encoder", None):
+        return {}
+    files = {path.relative_to(options.folder).as_posix(): view for view, path in views.files.items()}
     return {name: view for name, view in files.items() if name != f"{view}.npy"}
 
 
@@ -143,7 +152,26 @@ def _lines(document: dict[str, Any]) -> Iterator[str]:
     yield from (f"warning: {warning}" for warning in document["warnings"])
 
 
-def _views(options: argparse.Namespace) -> tuple[ViewFolder, TableEncoder | None, list[str]]:
+def _encoded_masks(options: argparse.Namespace, progress: Progress) -> ViewFolder[Regions]:
+    """Masks with vectors of their crops; what the encoder tells of itself is noted where the caller names nothing."""
+    from liftcore.features.encoders import device_named
+    from liftcore.features.encoders.crops import CropEncoder, crop_vectors
+    from liftcore.features.encoders.encode import find_images
+    from liftcore.features.masks import mask_files, mask_views
+
+    if not options.photos:
+        raise InvalidInput("--photos", expected="the photos that the masks are of, for --encoder", got="none")
+    files, photos = mask_files(options.folder), find_images(options.photos)
+    free_output(options.output, [*files.values(), *photos.values()])  # told before the work
+    encoder = CropEncoder.open(options.encoder, device_named(options.device))
+    made = crop_vectors(files, photos, encoder, options.unlabelled, progress)
+    options.encoder_name = options.encoder_name or f"crops of masks, {encoder.name}"
+    options.text_space = options.text_space or encoder.text_space
+    options.normalised = True
+    return mask_views(options.folder, options.unlabelled, made)
+
+
+def _views(options: argparse.Namespace, progress: Progress) -> tuple[ViewFolder, TableEncoder | None, list[str]]:
     """The views, words that they bring, and warnings."""
     from liftcore.features import folders
 
@@ -154,6 +182,8 @@ def _views(options: argparse.Namespace) -> tuple[ViewFolder, TableEncoder | None
     if options.format == "masks":
         from liftcore.features.masks import mask_views
 
+        if options.encoder is not None:
+            return _encoded_masks(options, progress), None, []
         return mask_views(options.folder, options.unlabelled), None, []
     from liftcore.features.prompts import prompt_views
 

@@ -14,7 +14,7 @@ segment-anything's ``SamAutomaticMaskGenerator`` and SA-1B keep a list of object
 lengths (`liftcore.features.mask_files`), alone or under ``annotations``. Mask k is the list's k-th.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -27,25 +27,76 @@ from liftcore.io.npy import NUMBERS, open_npy, read_floats
 
 VECTORS = ".npy"
 ARRAY, RUNS, PICTURE = "_masks.npy", ".json", ".png"
+OVERLAP = "photos belong in another folder than their masks"
 MAX_LEVELS = 32  # a hierarchy of four partitions, with masks 1 to 4 pixels over their neighbours, took 13 to 18
 
 
-def mask_views(folder: Path, unlabelled: int = 0) -> ViewFolder[Regions]:
+def mask_files(folder: Path) -> dict[str, Path]:
+    """View -> its file of masks, of a folder and its sub-folders that hold no vectors.
+
+    Raises:
+        InvalidFeatures: the folder has none, or vectors, or a view has two.
+    """
+    if not folder.is_dir():
+        raise InvalidFeatures(str(folder), expected="a folder of masks", got="no such folder")
+    arrays = [path for path in files_below(folder) if path.name.endswith(VECTORS)]
+    vectors = [path.name for path in arrays if not path.name.endswith(ARRAY)]
+    if vectors:
+        hint = "leave the encoder out: these are packed as they are"
+        raise InvalidFeatures(str(folder), expected="masks without vectors", got=vectors[0], hint=hint)
+    found = files_by_view([*arrays, *_pictures(folder)], folder, ARRAY, what="file of masks", hint=OVERLAP)
+    if not found:
+        expected = f"masks as IMG{RUNS}, IMG{ARRAY} or IMG{PICTURE}"
+        raise InvalidFeatures(str(folder), expected=expected, got="no such files")
+    return found
+
+
+def labels_alone(path: Path, unlabelled: int = 0) -> tuple[np.ndarray, int]:
+    """[L, h, w] i32 of a view's masks, -1 for none, and how many masks it has, without vectors to be held to.
+
+    Raises:
+        InvalidFeatures: as `mask_views` has it.
+    """
+    if path.suffix.lower() == RUNS:
+        rows = len(mask_records(read_mask_json(path), path))
+    elif path.suffix.lower() == PICTURE:
+        values = label_png(path)[0]
+        high = int(values.max(initial=0, where=values != unlabelled))
+        rows = high + (unlabelled != 0 and bool((values != unlabelled).any()))
+    else:
+        stored = open_npy(path, kinds=NUMBERS + "b")
+        rows = len(stored) if stored.dtype.kind == "b" else max(0, int(stored.max(initial=-1))) + 1
+    if not rows:
+        raise InvalidFeatures(
+            str(path), expected="one mask or more", got="none", hint="leave out views without masks"
+        )
+    return _labels(path, rows, unlabelled), rows
+
+
+def mask_views(
+    folder: Path, unlabelled: int = 0, made: Mapping[str, np.ndarray] | None = None
+) -> ViewFolder[Regions]:
     """The regions of a folder and its sub-folders: labels are rows of the vectors, in the order of the masks.
 
     Args:
         folder: the folder. unlabelled: what pixels without a mask have in label pictures.
+        made: view -> vectors [M, F], of a folder that has none (`liftcore.features.encoders.crops`).
 
     Raises:
         InvalidFeatures: the folder has no vectors, vectors lack masks or masks vectors, or a view has two files of
             one of them. Reading a view: a file is malformed, masks and vectors are not as many, or masks take too
             many levels.
     """
+    if made is not None:
+        files = mask_files(folder)
+
+        def with_made(view: str) -> Regions:
+            return Regions(_labels(files[view], len(made[view]), unlabelled), made[view], where=f"view {view!r}")
+
+        return ViewFolder(files, with_made)
     arrays = npy_files(folder, VECTORS)
-    pictures = [path for path in files_below(folder) if path.suffix.lower() in (RUNS, PICTURE)]
-    overlap = "photos belong in another folder than their masks"
-    found = [*(path for path in arrays if path.name.endswith(ARRAY)), *pictures]
-    masks = files_by_view(found, folder, ARRAY, what="file of masks", hint=overlap)
+    found = [*(path for path in arrays if path.name.endswith(ARRAY)), *_pictures(folder)]
+    masks = files_by_view(found, folder, ARRAY, what="file of masks", hint=OVERLAP)
     found = [path for path in arrays if not path.name.endswith(ARRAY)]
     vectors = files_by_view(found, folder, what="file of vectors")
     for view, path in vectors.items():
@@ -65,6 +116,10 @@ def mask_views(folder: Path, unlabelled: int = 0) -> ViewFolder[Regions]:
         return Regions(_labels(masks[view], len(codebook), unlabelled), codebook, where=f"view {view!r}")
 
     return ViewFolder(vectors, read, masks.values())
+
+
+def _pictures(folder: Path) -> list[Path]:
+    return [path for path in files_below(folder) if path.suffix.lower() in (RUNS, PICTURE)]
 
 
 def _labels(path: Path, rows: int, unlabelled: int) -> np.ndarray:

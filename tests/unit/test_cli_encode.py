@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
-from PIL import ExifTags, Image
+from PIL import ExifTags, Image, ImageOps
 
 from liftcore.features.pack import read_features
 from liftcore.features.views import FeatureGrid
@@ -91,6 +93,62 @@ def test_encoded_photos_are_lifted_and_asked_in_the_text_space_of_their_pack(
     status, out, err = run(capsys, "query", lifted, "an apple", "--json")
     assert (status, err) == (0, "")
     assert json.loads(out)["encoder"] == "open_clip:ViT-S-32-alt"
+
+
+def test_masks_get_vectors_of_their_crops(
+    photos: Path, weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    masks, pack = tmp_path / "masks", tmp_path / "pack.safetensors"
+    masks.mkdir()
+    planes = np.zeros((3, 24, 32), bool)  # half of the photos' size; two overlap
+    planes[0, 2:20, 3:9], planes[1, 5:12, 4:30], planes[2, 20:, 20:] = True, True, True
+    ids = np.full((48, 64), 255, np.uint8)
+    ids[10:30, 20:50] = 0
+    np.save(masks / "left_masks.npy", planes)
+    Image.fromarray(ids).save(masks / "middle.png")
+    asked = [
+        "pack",
+        "masks",
+        masks,
+        "-o",
+        pack,
+        "--unlabelled",
+        255,
+        "--encoder",
+        f"open_clip:ViT-S-32-alt@{weights}",
+    ]
+    status, out, err = run(capsys, *asked, "--photos", photos, "--json")
+    assert (status, err) == (0, "")
+    document = json.loads(out)
+    assert (document["views"], document["channels"], document["normalised"]) == (2, 256, True)
+    assert document["text_space"] == f"open_clip:ViT-S-32-alt@{weights}" and "crops of masks" in document["encoder"]
+    import open_clip
+
+    made: Any = open_clip.create_model_and_transforms("ViT-S-32-alt", pretrained=str(weights))
+    model, _, prepare = made
+    model.eval()
+    packs = read_features(pack)
+    for view, suffix, number, inside in [
+        *(("left", "png", k, plane.repeat(2, 0).repeat(2, 1)) for k, plane in enumerate(planes)),
+        ("middle", "jpg", 0, ids == 0),
+    ]:
+        with Image.open(photos / f"{view}.{suffix}") as photo:
+            alone = np.where(inside[..., None], np.asarray(photo.convert("RGB")), 0)
+        rows, columns = np.flatnonzero(inside.any(1)), np.flatnonzero(inside.any(0))
+        crop = Image.fromarray(alone[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1])
+        with torch.no_grad():
+            vector = model.encode_image(prepare(ImageOps.pad(crop, (224, 224)))[None])[0]
+        own = packs[view].codebook[number].float()
+        assert torch.allclose(own, torch.nn.functional.normalize(vector, dim=0), atol=2e-3)
+    for more, message in (
+        (asked, "--photos"),
+        ([*asked, "--photos", photos / "right.png"], "photo of each view"),
+        ([*asked[:-1], "timm:resnet18", "--photos", photos], "open_clip:MODEL/TAG"),
+    ):
+        status, _, err = run(capsys, *more)
+        assert status == 2 and message in err
+    np.save(masks / "left.npy", np.ones((3, 4), np.float32))
+    assert "without vectors" in run(capsys, *asked, "--photos", photos)[2]
 
 
 def test_backbones_without_words_say_so(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -78,7 +78,7 @@ def open_image_encoder(spec: str, device: str = "cpu") -> ImageEncoder:
     kind, _, rest = spec.partition(":")
     if not rest or kind not in ("maskclip", "clip", "timm"):
         raise InvalidInput("--encoder", expected=f"one of {', '.join(IMAGE_ENCODERS)}", got=repr(spec))
-    where = _device(device)
+    where = device_named(device)
     if kind == "timm":
         from liftcore.features.encoders.timm_backbone import TimmEncoder
 
@@ -88,7 +88,12 @@ def open_image_encoder(spec: str, device: str = "cpu") -> ImageEncoder:
     return ClipImageEncoder.open(kind, rest, where)
 
 
-def _device(name: str) -> torch.device:
+def device_named(name: str) -> torch.device:
+    """A device as torch names it.
+
+    Raises:
+        Unavailable: torch has none of that name here.
+    """
     try:
         device = torch.device(name)
         torch.empty(0, device=device)

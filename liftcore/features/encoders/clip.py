@@ -125,22 +125,21 @@ def _place(tower: Any) -> torch.device:
     return next(tower.parameters()).device
 
 
-def _pixels(model: Any, tower: Any) -> Pixels:
+def training_pixels(model: Any, tower: Any) -> tuple[int, tuple[float, ...], tuple[float, ...], str]:
+    """The shorter side that a model was trained at, the mean and deviation of its colours, and how it resizes."""
     from open_clip.transform import PreprocessCfg
 
     told = library().get_model_preprocess_cfg(model)
     size = told.get("size") or tower.image_size
     settings = vars(PreprocessCfg()) | told  # open_clip's defaults where the weights say nothing
-    sides = (size, size) if isinstance(size, int) else tuple(size)
+    shorter = size if isinstance(size, int) else min(size)
+    return int(shorter), tuple(settings["mean"]), tuple(settings["std"]), settings["interpolation"] or "bicubic"
+
+
+def _pixels(model: Any, tower: Any) -> Pixels:
     patch = getattr(tower, "patch_size", (RESNET_PATCH, RESNET_PATCH))
     patch = (_trunk_patch(tower),) if hasattr(tower, "trunk") else patch
-    return Pixels(
-        patch=int(patch[0]),
-        shorter=min(sides),
-        mean=tuple(settings["mean"]),
-        std=tuple(settings["std"]),
-        interpolation=settings["interpolation"] or "bicubic",
-    )
+    return Pixels(int(patch[0]), *training_pixels(model, tower))
 
 
 def vit_values(tower: Any, images: Tensor) -> Tensor:
