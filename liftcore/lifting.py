@@ -105,8 +105,9 @@ def lift(
         solution = work.solve(W, geometry, plan)
         sums = geometry.weights.row_sums().cpu().numpy()
         X, notes = work.refine(found, geometry, solution.features, sums > 0)
-        clusters = work.aggregate(found, geometry, W, X, sums, notes)
+        clusters = work.aggregate(found, geometry, W, X, sums, notes, agreement, things)
         notes |= _reweighting(agreement, geometry) if agreement else {}
+        things = things if chosen.objects else None
         notes |= _objects(things) if things else {}
         diagnostics = work.diagnose(found, geometry, X, sums, plan, notes)
     table = found.features.table
@@ -223,24 +224,36 @@ class _Lift:
                 self.settings,
                 self.progress,
                 by_rows=bool(
-                    self.settings.robust_steps or self.settings.aggregation_resolve or self.settings.objects is True
+                    self.settings.robust_steps
+                    or self.settings.aggregation_resolve
+                    or self.settings.objects is True
+                    or self._by_masks
                 ),
                 checkpoint=checkpoint.of(self.splats, self.device.facts()) if checkpoint else None,
                 device_bytes=plan.kept_on_card,
                 threads=self.threads,
             )
 
+    @property
+    def _by_masks(self) -> bool:
+        """Whether masks, where there are any, make the clusters of the aggregation; then no region is dropped."""
+        settings = self.settings
+        chosen = settings.aggregation_clusters == "auto" and not settings.aggregation_resolve
+        return settings.aggregation and (chosen or settings.aggregation_clusters == "graph")
+
     def find_objects(self, geometry: Geometry) -> RegionObjects | None:
         """What masks of many views keep together, or None where they are not looked for.
 
         Raises:
-            InvalidSettings: objects are asked for, and no view has masks.
+            InvalidSettings: objects are asked for, or clusters that masks make, and no view has masks.
         """
         masks = bool((geometry.levels >= 0).any())
-        if self.settings.objects is True and not masks:
-            expected = "views with masks: objects are what masks of several views keep together"
-            raise InvalidSettings("objects", expected=expected, got="views of grids", hint="leave it at auto")
-        if not self.settings.objects or not masks:
+        graph = self.settings.aggregation and self.settings.aggregation_clusters == "graph"
+        for name, asked in (("objects", self.settings.objects is True), ("aggregation_clusters", graph)):
+            if asked and not masks:
+                expected = "views with masks: objects are what masks of several views keep together"
+                raise InvalidSettings(name, expected=expected, got="views of grids", hint="take auto")
+        if not masks or not (self.settings.objects or self._by_masks):
             return None
         with self.timings.stage("objects"):
             return region_objects(geometry.weights.cpu(), geometry.levels, geometry.evidence().numpy(), self.threads)
@@ -324,14 +337,29 @@ class _Lift:
         X: Tensor,
         sums: np.ndarray,
         notes: dict[str, Any],
+        agreement: Agreement | None,
+        things: RegionObjects | None,
     ) -> Aggregation | None:
         """Aggregate X in place, if the settings ask for it."""
         settings = self.settings
         if not settings.aggregation:
             return None
         with self.timings.stage("aggregate"):
-            evidence = geometry.evidence().numpy()
-            found = aggregate(X, evidence, self._raster(), views, settings, self.progress, self.threads)
+            evidence, judged = geometry.evidence().numpy(), None
+            if settings.aggregation_guard and agreement and agreement.explained is not None:
+                judged = W.cpu(), agreement.directions, agreement.explained
+            found = aggregate(
+                X,
+                evidence,
+                self.splats,
+                self._raster(),
+                views,
+                settings,
+                self.progress,
+                self.threads,
+                things=things if self._by_masks else None,
+                judged=judged,
+            )
         notes["aggregation"] = found.facts
         if settings.aggregation_resolve:
             notes["aggregation"]["resolved"] = self._resolve(W.cpu(), geometry, found, X, sums)

@@ -35,9 +35,9 @@ class Preset(StrEnum):
     MEAN = "mean"  # the same ray, and the plain mean over the views that see the splat (Semantic Gaussians)
 
 
-_REWEIGHTED = {"reliability": True, "consensus": "auto"}
+_REWEIGHTED = {"reliability": True, "consensus": "auto", "aggregation_guard": True}  # what asks for a robust step
 _PRESETS: dict[Preset, dict[str, Any]] = {
-    Preset.DEFAULT: {"robust_steps": 1, **_REWEIGHTED},
+    Preset.DEFAULT: {"robust_steps": 1, **_REWEIGHTED, "aggregation_clusters": "auto"},
     Preset.ROW_SUM: {},
     Preset.TIKHONOV: {"power": 2, "lift_gain": TIKHONOV_GAIN, "render_gain": TIKHONOV_GAIN},
     Preset.ARGMAX: {"selection": Selection.TOP_K, "k": 1},
@@ -129,6 +129,16 @@ class LiftSettings(BaseModel):
         "float16", description="how features are stored, if it can hold them"
     )
     aggregation: bool = Field(False, description="Post-Lifting Aggregation: one feature a cluster of splats")
+    aggregation_clusters: Literal["hdbscan", "touching", "graph", "auto"] = Field(
+        "hdbscan",
+        description="what makes clusters: HDBSCAN on features; touching, its clusters parted in space; the graph of "
+        "regions, which other views keep together; auto: the graph where there are masks, else touching",
+    )
+    aggregation_guard: bool = Field(
+        False,
+        description="splats take their cluster's feature only where it explains what views say of them as well as "
+        "their own",
+    )
     aggregation_iou: float = Field(0.75, gt=0, le=1, description="from which IoU with its cluster a region is kept")
     aggregation_cluster_size: int = Field(500, ge=2, le=10_000_000, description="splats at least in a cluster")
     aggregation_neighbours: int = Field(10, ge=1, le=1_000, description="neighbours that a splat's density reaches")
@@ -178,8 +188,11 @@ class LiftSettings(BaseModel):
         if self.aggregation_resolve and self.levels == "composite":
             told = "other levels than composite, which cut to pieces the regions that aggregation_resolve drops"
             raise PydanticCustomError("whole_regions", "{expected}", {"expected": told})
-        if (self.reliability or self.consensus) and not self.robust_steps:
-            told = "robust_steps of 1 or more beside reliability and consensus, which come in with a step"
+        if self.aggregation_resolve and self.aggregation_clusters == "graph":
+            told = "aggregation_clusters=hdbscan beside aggregation_resolve: masks that make clusters are all kept"
+            raise PydanticCustomError("whole_regions", "{expected}", {"expected": told})
+        if (self.reliability or self.consensus or self.aggregation_guard) and not self.robust_steps:
+            told = "robust_steps of 1 or more beside reliability, consensus and aggregation_guard, which need a step"
             raise PydanticCustomError("whole_regions", "{expected}", {"expected": told})
         return self
 

@@ -8,8 +8,10 @@ import numpy as np
 import torch
 
 from liftcore.raster.cpu.warm_up import warm_up
+from liftcore.solve.aggregate import explained_by
 from liftcore.solve.codebook import Codebook, ViewCodebook
 from liftcore.solve.consensus import mask_consensus
+from liftcore.solve.directions import RegionDirections
 from liftcore.solve.objects import region_objects
 from liftcore.solve.reweight import agreement_factors
 from liftcore.solve.weights import one_view
@@ -25,9 +27,12 @@ def warm_up_lift(kernel: Kernel, device: Device, settings: LiftSettings) -> None
     warm_up(kernel, device, settings.lift_params, settings.weighting)
     one = torch.zeros(1, dtype=torch.int32)
     W = one_view(one, torch.tensor([0, 1]), one, torch.ones(1), one, torch.ones(1), regions=1)
-    if settings.objects:
+    book = Codebook((ViewCodebook(torch.ones(1, 1)),))
+    if settings.objects or settings.aggregation:
         region_objects(W, np.zeros(1, np.int8), np.ones(1), 1)
     if settings.consensus:
         mask_consensus(W, np.zeros(1, np.int8), 1)
     if settings.reliability:
-        agreement_factors(W, Codebook((ViewCodebook(torch.ones(1, 1)),)), 1, threads=1, reliability=True)
+        agreement_factors(W, book, 1, threads=1, reliability=True)
+    if settings.aggregation:
+        explained_by(W, RegionDirections(W, book), one, torch.ones(1, 1), 1)

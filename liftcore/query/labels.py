@@ -13,8 +13,9 @@ import numpy as np
 
 from liftcore import __version__
 from liftcore.errors import InvalidLift
-from liftcore.query.objects import LEAST_EVIDENCE, touching, trimmed_box
+from liftcore.query.objects import LEAST_EVIDENCE, trimmed_box
 from liftcore.query.scene import QueryScene, as_numpy
+from liftcore.scene.touching import touching
 
 if TYPE_CHECKING:
     from liftcore.query.segment import Segmentation
@@ -38,7 +39,7 @@ def labels(scene: QueryScene, segmentation: Segmentation) -> Labels:
     """The labels of a segmentation.
 
     ``class_id`` is the value of a splat's word (`Segmentation.values`), ``instance_id`` counts groups of splats of
-    one word that touch (`liftcore.query.objects.touching`), with the most evidence first; 0 is none of both. Groups
+    one word that touch (`liftcore.scene.touching`), with the most evidence first; 0 is none of both. Groups
     with less than a twentieth of the evidence of their word's largest have a class alone. ``score`` is the cosine to
     the word. ``confidence`` is the lift's, where it was reweighted; other lifts have none.
 

@@ -10,7 +10,7 @@ from liftcore.query.scores import rows_at_a_time
 from liftcore.scene.cameras import Camera
 from liftcore.scene.harmonics import SH_C0
 from liftcore.scene.splats import Splats
-from liftcore.solve.aggregate import principal_axes
+from liftcore.solve.clusters import principal_axes
 
 # Real spherical harmonics, in the field's order and signs (Condon-Shortley phase left in).
 SH_C1 = math.sqrt(3 / (4 * math.pi))

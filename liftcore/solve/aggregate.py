@@ -1,23 +1,27 @@
-"""Post-Lifting Aggregation (paper, Post Aggregation Filtering): one feature a cluster, from the regions it confirms.
+"""Post-Lifting Aggregation (paper, Post Aggregation Filtering): one feature a cluster.
 
-1. Cluster the splats by their lifted features: principal components, HDBSCAN on a sample, the nearest centre for all.
-2. Show the clusters in every lifted view: ``kappa = argmax(A onehot(cluster))``, unclustered splats being a class.
+The paper's way, where features make the clusters (``aggregation_clusters=hdbscan``):
+
+1. Cluster the splats by their lifted features (`liftcore.solve.clusters`).
+2. Show the clusters in every lifted view: ``kappa = argmax(A onehot(cluster))``. Unclustered splats are a class, to
+   which rays belong that the scene fills by less than half: what is left of their light tells no cluster.
 3. Keep the regions whose IoU with their majority cluster's footprint reaches tau (`filter_regions`).
 4. A cluster's feature is the mean of its kept regions' codebook rows, and its splats take it.
 
-Splats in no cluster, and those of clusters without a kept region, keep their own features, or with
-``aggregation_resolve`` are solved for again from the kept regions alone, if these have most of their weight. Grids
-have no regions to filter: where no view has any, a cluster's feature is the mean of its splats' features, weighted by
-evidence.
+Where masks make the clusters (``graph``), these are the objects that other views keep together
+(`liftcore.solve.objects`): they need no footprint to confirm them. As on grids, which have no regions to filter, a
+cluster's feature is the mean of its splats' features, weighted by evidence.
 
-A splat's **direction** is its unit feature less the scene's mean of these, made unit again: features of one encoder
-lie in a narrow cone, and the angle at the cone's axis tells objects apart where the angle at the origin does not.
+Splats in no cluster, and those of clusters without a kept region, keep their own features, or with
+``aggregation_resolve`` are solved for again from the kept regions alone, if these have most of their weight.
+
+**The guard** (``aggregation_guard``) lets no thing vanish in a cluster that is mostly another: a splat takes a
+cluster's feature only where that explains what the views say of it at least as well as its own does. With e, c_jm,
+p_jv, c and the weights W' of the reweighting (`liftcore.solve.reweight`), which asks other views for each word::
+
+    sum_m W'_jm max(0, cos(e_m, e_cluster))  >=  sum_m W'_jm ((1 - p_jv) c_jm + p_jv c)
 """
 
-import os
-from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -28,224 +32,20 @@ from torch import Tensor
 
 from liftcore.features.levels import at_levels
 from liftcore.features.views import Regions, ViewFeatures, cells_under
+from liftcore.jit import kernel
+from liftcore.one_thread import one_thread
 from liftcore.progress import Progress
 from liftcore.raster.base import Raster
+from liftcore.scene.splats import Splats
 from liftcore.settings import LiftSettings
+from liftcore.solve.clusters import BLOCK, NO_CLUSTER, RESOLUTION, Clustering, cluster_splats, parted
+from liftcore.solve.codebook import TABLE_BYTES
+from liftcore.solve.directions import RegionDirections
 from liftcore.solve.geometry import LiftViews
+from liftcore.solve.objects import RegionObjects
+from liftcore.solve.weights import RegionWeights, run_each
 
-NO_CLUSTER = -1
-BLOCK = 8_192  # rows widened to float32 at once; fixed, so that products have one shape on any machine
-ENOUGH_EVIDENCE = 1.0  # a splat that adds up to a whole ray is drawn with full odds, a fainter one with less
-REACH = 1.5  # a cluster takes splats up to so many times the distance from its centre
-REACH_SHARE = 0.9  # within which this share of its own sample lies: HDBSCAN's clusters have stragglers
-RESOLUTION = 1e-3  # of float16 unit vectors: nearer ones count as equal
-
-
-@dataclass(frozen=True)
-class Clustering:
-    """Which cluster each splat belongs to, and how that was found."""
-
-    labels: Tensor  # [P] i32, -1 = in no cluster
-    count: int  # K
-    sample: int  # splats that HDBSCAN saw
-    smallest: int  # the fewest of them that make a cluster
-    sample_noise: float  # share of them that HDBSCAN left out
-
-
-@dataclass(frozen=True)
-class Directions:
-    """How features become coordinates: ``unit(unit(x) - centre) axes``."""
-
-    centre: np.ndarray  # [F] f32, mean of unit features
-    axes: np.ndarray  # [F, D] f32, orthonormal
-
-    def coordinates(self, rows: Tensor) -> np.ndarray:
-        """[n, F] f16 or f32 -> [n, D] f32; a feature at the centre has no direction and becomes zero."""
-        return self.of(rows) @ self.axes
-
-    def of(self, rows: Tensor) -> np.ndarray:
-        """[n, F] -> [n, F] f32, the directions themselves."""
-        return _unit(_unit(rows.to(torch.float32).numpy()) - self.centre, RESOLUTION)
-
-
-def cluster_splats(
-    features: Tensor, evidence: np.ndarray, settings: LiftSettings, threads: int | None = None
-) -> Clustering:
-    """Cluster splats by feature.
-
-    Args:
-        features: [P, F] f16 or f32; zero rows belong to no cluster.
-        evidence: [P], sums of plain weights; splats are drawn for the sample with odds ``min(evidence, 1)``.
-        settings: the ``aggregation_*`` knobs and the seed.
-        threads: None takes the cores that this process may use. The number changes no bit.
-    """
-    count = features.shape[0]
-    known = nonzero_rows(features)
-    odds = np.where(known, np.minimum(evidence, ENOUGH_EVIDENCE), 0.0)
-    rows = draw(odds, settings.aggregation_sample, settings.seed)
-    share = rows.size / max(int((odds > 0).sum()), 1)
-    smallest = max(2 * settings.aggregation_neighbours, 2, round(settings.aggregation_cluster_size * share))
-    nothing = Clustering(torch.full((count,), NO_CLUSTER, dtype=torch.int32), 0, rows.size, smallest, 1.0)
-    if rows.size < 2 * smallest:
-        return nothing
-    sample = features[torch.from_numpy(rows)]
-    directions = directions_of(sample, settings.aggregation_channels)
-    if directions is None:
-        return nothing
-    with one_blas_thread():
-        points = directions.coordinates(sample)
-    found = hdbscan_labels(points, smallest, settings.aggregation_neighbours, settings.seed)
-    clusters = int(found.max()) + 1
-    if clusters == 0:
-        return nothing
-    labels = assign(features, known, directions, cluster_balls(points, found, clusters), threads)
-    return Clustering(torch.from_numpy(labels), clusters, rows.size, smallest, float((found < 0).mean()))
-
-
-def nonzero_rows(features: Tensor) -> np.ndarray:
-    """[P] bool: whether any channel differs from zero."""
-    known = np.zeros(features.shape[0], bool)
-    for first in range(0, features.shape[0], BLOCK):
-        known[first : first + BLOCK] = (features[first : first + BLOCK] != 0).any(dim=1).numpy()
-    return known
-
-
-def draw(odds: np.ndarray, size: int, seed: int) -> np.ndarray:
-    """Ascending rows [<= size] i64, drawn with the given odds [P], each once (Efraimidis and Spirakis 2006)."""
-    possible = np.flatnonzero(odds > 0)
-    if possible.size <= size:
-        return possible
-    draws = np.random.default_rng(seed).exponential(size=odds.size)[possible]
-    order = np.argsort(draws / odds[possible], kind="stable")
-    return np.sort(possible[order[:size]])
-
-
-def directions_of(sample: Tensor, channels: int) -> Directions | None:
-    """The centre and the principal axes of a sample [n, F]; None when all its unit features are equal."""
-    unit = _unit(sample.to(torch.float32).numpy())
-    centre = unit.mean(axis=0, dtype=np.float64).astype(np.float32)
-    offsets = unit - centre
-    if np.abs(offsets).max() < RESOLUTION:
-        return None
-    directions = _unit(offsets, RESOLUTION)
-    return Directions(centre, principal_axes(directions - directions.mean(axis=0), channels))
-
-
-def hdbscan_labels(points: np.ndarray, smallest: int, neighbours: int, seed: int) -> np.ndarray:
-    """HDBSCAN's labels [n] i64 of points [n, D], -1 = noise (Campello, Moulavi and Sander 2013).
-
-    Equal points would have infinite density, so each moves by the resolution of float16 first, seeded.
-    """
-    import hdbscan
-
-    shift = np.random.default_rng(seed).normal(size=points.shape)
-    shift *= RESOLUTION / max(np.sqrt(points.shape[1]), 1.0)
-    # Prim's algorithm is exact, and its time depends on n alone; Boruvka's, the default, is up to twice as slow here.
-    model = hdbscan.HDBSCAN(
-        min_cluster_size=smallest, min_samples=neighbours, algorithm="prims_kdtree", core_dist_n_jobs=1
-    )
-    return model.fit(points.astype(np.float64) + shift).labels_
-
-
-def cluster_balls(points: np.ndarray, labels: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Centres [K, D] f32 of the clusters, and the squared distance [K] f32 up to which each takes splats."""
-    centres = np.zeros((count, points.shape[1]), np.float32)
-    reaches = np.zeros(count, np.float32)
-    for k in range(count):
-        members = points[labels == k]
-        centres[k] = members.mean(axis=0, dtype=np.float64)
-        squares = ((members - centres[k]) ** 2).sum(axis=1)
-        reaches[k] = REACH**2 * np.quantile(squares, REACH_SHARE, method="higher")
-    return centres, reaches
-
-
-def assign(
-    features: Tensor,
-    known: np.ndarray,
-    directions: Directions,
-    balls: tuple[np.ndarray, np.ndarray],
-    threads: int | None = None,
-) -> np.ndarray:
-    """[P] i32: the cluster with the nearest centre, or -1 beyond its reach.
-
-    Args:
-        features: [P, F]. known: [P] bool, splats that may belong to a cluster. balls: of `cluster_balls`.
-    """
-    centres, reaches = balls
-    halves = (centres * centres).sum(axis=1) / 2
-    labels = np.full(features.shape[0], NO_CLUSTER, np.int32)
-
-    def assign_block(first: int) -> None:
-        block = slice(first, first + BLOCK)
-        points = directions.coordinates(features[block])
-        nearest = (points @ centres.T - halves).argmax(axis=1)
-        distances = ((points - centres[nearest]) ** 2).sum(axis=1)
-        inside = known[block] & (distances <= reaches[nearest])
-        labels[block][inside] = nearest[inside]
-
-    with one_blas_thread(), ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
-        list(pool.map(assign_block, range(0, features.shape[0], BLOCK)))
-    return labels
-
-
-def _unit(rows: np.ndarray, floor: float = 0.0) -> np.ndarray:
-    """Rows [n, F] f32 of length one; those not longer than the floor become zero."""
-    # The largest entry goes out first: the square of a small or large float32 is none.
-    largest = np.abs(rows).max(axis=1, keepdims=True)
-    scaled = np.divide(rows, largest, out=np.zeros_like(rows), where=largest > 0)
-    lengths = np.sqrt(np.einsum("nf,nf->n", scaled, scaled))[:, None]
-    return np.divide(scaled, lengths, out=np.zeros_like(rows), where=lengths * largest > floor)
-
-
-EXACT_CHANNELS = 1_024  # up to here all eigenvectors at once; beyond, the cost grows with the cube of F
-_OVERSAMPLE = 16  # more directions than asked for, so that the last ones are found well too
-_ITERATIONS = 6
-_SEED = 0
-
-
-@contextmanager
-def one_blas_thread() -> Iterator[None]:
-    """Products of NumPy on one thread each: their sums have one order then, whatever the machine's cores."""
-    from threadpoolctl import threadpool_limits
-
-    with threadpool_limits(limits=1, user_api="blas"):
-        yield
-
-
-def principal_axes(centred: np.ndarray, count: int) -> np.ndarray:
-    """The directions of the largest variance.
-
-    All eigenvectors of the covariance where F is small; subspace iteration from a seeded start (Halko, Martinsson
-    and Tropp 2011) where it is not. Signs are fixed: the largest entry of an axis is positive.
-
-    Args:
-        centred: [n, F] f32, a sample without its mean.
-        count: how many axes at most.
-
-    Returns:
-        [F, min(count, F)] f32, orthonormal columns, the largest variance first.
-    """
-    channels = centred.shape[1]
-    count = min(count, channels)
-    with one_blas_thread():
-        if channels <= EXACT_CHANNELS:
-            covariance = (centred.T @ centred).astype(np.float64)
-            axes = np.linalg.eigh(covariance)[1][:, ::-1][:, :count]
-        else:
-            axes = _subspace(centred, count)
-    rows = np.abs(axes).argmax(axis=0)
-    return (axes * np.sign(axes[rows, np.arange(count)])).astype(np.float32)
-
-
-def _subspace(centred: np.ndarray, count: int) -> np.ndarray:
-    width = min(count + _OVERSAMPLE, centred.shape[1])
-    start = np.random.default_rng(_SEED).standard_normal((centred.shape[1], width)).astype(np.float32)
-    basis = np.linalg.qr(start)[0]
-    for _ in range(_ITERATIONS):
-        basis = np.linalg.qr(centred.T @ (centred @ basis))[0]
-    shown = (centred @ basis).astype(np.float64)
-    turn = np.linalg.eigh(shown.T @ shown)[1][:, ::-1][:, :count]
-    return basis @ turn
+LEAST_LIGHT = 0.5  # of a ray, that splats must take for it to show a cluster: as for masks of answers
 
 
 @dataclass(frozen=True)
@@ -278,35 +78,55 @@ class KeptRegions:
 def aggregate(
     features: Tensor,
     evidence: np.ndarray,
+    splats: Splats,
     raster: Raster,
     views: LiftViews,
     settings: LiftSettings,
     progress: Progress,
     threads: int | None = None,
+    *,
+    things: RegionObjects | None = None,
+    judged: tuple[RegionWeights, RegionDirections, Tensor] | None = None,
 ) -> Aggregation:
     """Aggregate lifted features, in place.
 
     Args:
-        features: [P, F] f16 or f32; rows of splats whose cluster has a feature are overwritten with it.
+        features: [P, F] f16 or f32; rows of splats that take their cluster's feature are overwritten with it.
         evidence: [P] f64, sums of plain weights.
         views: that were lifted.
         threads: None takes the cores that this process may use. The number changes no bit.
+        things: the clusters; None: those of features.
+        judged: what the guard asks: reweighted W on the CPU, directions of its regions, and how well the splats' own
+            features explain them, [P] f32 (`Agreement`); None: there is no guard.
     """
     names = views.names
     progress("aggregate", 0, len(names), "views")
-    clustering = cluster_splats(features, evidence, settings, threads)
-    region_views = [name for name in names if views.features.is_regions(name)]
+    if things is not None:
+        clustering = Clustering(torch.from_numpy(things.labels), len(things.views), {"clustered_by": "graph"})
+    else:
+        clustering = cluster_splats(features, evidence, settings, threads)
+        if settings.aggregation_clusters != "hdbscan":
+            clustering = parted(clustering, splats, settings.aggregation_cluster_size)
     masks: dict[str, np.ndarray] = {}
     if clustering.count == 0:
         merged, facts = torch.zeros(0, features.shape[1], dtype=features.dtype), {}
-    elif region_views:
+    elif things is not None:
+        merged, facts = evidence_means(features, evidence, clustering), {"filter": "none: masks made the clusters"}
+    elif any(views.features.is_regions(name) for name in names):
         kept = filter_regions(clustering, features.shape[1], raster, views, settings, progress)
         merged, masks = kept_means(kept, features.dtype), kept.masks
         facts = {"filter": "iou", "regions": kept.regions, "kept_regions": int(kept.counts.sum())}
     else:
         merged = evidence_means(features, evidence, clustering)
         facts = {"filter": "none: grids have no regions"}
-    taken = spread(features, clustering.labels, merged)
+    taken = with_feature(clustering.labels, merged)
+    if judged is not None and clustering.count:
+        W, directions, own = judged
+        explained = explained_by(W, directions, clustering.labels, merged, threads)
+        guarded = taken & (explained < own - RESOLUTION)  # what differs by less is one vector in float16
+        taken &= ~guarded
+        facts |= {"guarded": float(guarded.float().mean())}
+    spread(features, clustering.labels, merged, taken)
     progress("aggregate", len(names), len(names), "views")
     facts = clustering_facts(clustering, merged) | facts | {"changed": float(taken.float().mean())}
     return Aggregation(clustering.labels, merged, facts, ~taken, tuple(masks.get(name) for name in names))
@@ -318,10 +138,44 @@ def clustering_facts(clustering: Clustering, merged: Tensor) -> dict[str, Any]:
         "clusters": clustering.count,
         "clusters_with_feature": int((merged != 0).any(dim=1).sum()),
         "unclustered_share": float((clustering.labels == NO_CLUSTER).float().mean()),
-        "sample": clustering.sample,
-        "smallest_in_sample": clustering.smallest,
-        "sample_noise_share": clustering.sample_noise,
+        **clustering.facts,
     }
+
+
+@one_thread()
+def explained_by(
+    W: RegionWeights, directions: RegionDirections, labels: Tensor, merged: Tensor, threads: int | None = None
+) -> Tensor:
+    """``sum_m W_jm max(0, cos(e_m, e_k)) / sum_m W_jm`` of each splat j and its cluster k: [P] f32, 0 without one.
+
+    Args:
+        W: on the CPU. labels: [P] i32, -1 for none. merged: [K, F], the clusters' features.
+        threads: None takes the cores that this process may use. The number changes no bit.
+    """
+    told, own, regions = np.zeros(labels.shape[0], np.float32), directions.of(merged), directions.totals.shape[0]
+    indptr, region, weight = (part.numpy() for part in (W.indptr, W.region, W.weight))
+    blocks, step = W.blocks(), max(TABLE_BYTES // (4 * max(regions, 1)), 1)
+    for begin in range(0, own.shape[0], step):
+        chosen = own[begin : begin + step]
+        cosines = torch.zeros(chosen.shape[0], regions)
+        for columns in directions.slices():
+            cosines += chosen[:, columns] @ directions.table(columns).T
+        given = indptr, region, weight, labels.numpy(), begin, cosines.numpy(), told
+        run_each(explain, [(first, last, *given) for first, last in blocks], threads)
+    return torch.from_numpy(told)
+
+
+@kernel
+def explain(first, last, indptr, region, weight, labels, begin, cosines, told):
+    """`explained_by` of splats ``first..last``, for the clusters from ``begin`` on whose cosines are given."""
+    for j in range(first, last):
+        k = labels[j] - begin
+        if 0 <= k < cosines.shape[0]:
+            whole, said = 0.0, 0.0
+            for n in range(indptr[j], indptr[j + 1]):
+                whole += weight[n]
+                said += weight[n] * max(cosines[k, region[n]], 0.0)
+            told[j] = said / whole if whole > 0.0 else 0.0
 
 
 def filter_regions(
@@ -340,6 +194,7 @@ def filter_regions(
         observation = masks_of(given, settings, name)
         if isinstance(observation, Regions):
             kappa = raster.strongest_labels(camera, clustering.labels, params).numpy()
+            kappa = np.where(raster.row_sums(camera, params).numpy() < LEAST_LIGHT, NO_CLUSTER, kappa)
             rows = observation.codebook.shape[0]
             matches = match_regions(observation.labels.numpy(), kappa, rows, clustering.count)
             reliable = (matches.clusters >= 0) & (matches.ious >= settings.aggregation_iou)
@@ -378,14 +233,18 @@ def evidence_means(features: Tensor, evidence: np.ndarray, clustering: Clusterin
     return torch.from_numpy(means).to(features.dtype)
 
 
-def spread(features: Tensor, labels: Tensor, merged: Tensor) -> Tensor:
-    """Give every splat its cluster's feature, where there is one; which splats took one, [P] bool."""
-    filled = torch.cat([(merged != 0).any(dim=1), torch.zeros(1, dtype=torch.bool)])  # the last is label -1
-    taken = filled[labels.long()]
+def with_feature(labels: Tensor, merged: Tensor) -> Tensor:
+    """[P] bool: the splats whose cluster has a feature."""
+    return torch.cat([(merged != 0).any(dim=1), torch.zeros(1, dtype=torch.bool)])[
+        labels.long()
+    ]  # the last is for -1
+
+
+def spread(features: Tensor, labels: Tensor, merged: Tensor, taken: Tensor) -> None:
+    """Give the splats that are to take one [P] bool their clusters' features."""
     for first in range(0, features.shape[0], BLOCK):
         rows = first + torch.nonzero(taken[first : first + BLOCK])[:, 0]
         features[rows] = merged[labels[rows].long()]
-    return taken
 
 
 @dataclass(frozen=True)

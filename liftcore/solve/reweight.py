@@ -1,7 +1,6 @@
 """The robust step on W: each region keeps as much of its weight at a splat as the other views agree with it.
 
-With u_m the unit vector of region m, ``mu = sum W u / sum W`` the scene's mean over all splats and views, and
-``e_m = (u_m - mu) / |u_m - mu|``, the weight of region m of view v at splat j becomes::
+With e_m the direction of region m (`liftcore.solve.directions`), its weight in view v at splat j becomes::
 
     W'_jm = s_j W_jm ((1 - p_jv) c_jm + p_jv c),     c_jm = max(0, cos(e_m, r_jv))
     r_jv = sum of W_jn e_n over the regions n of all other views,     c = sum W c_jm / sum W over the scene
@@ -17,7 +16,6 @@ before, and starts from the first W again. Nothing is tuned; each part has its r
 - **Its own view agrees, with its share.** Without ``p c`` a minority of agreeing views outvotes a view that holds
   most of the weight, and splats that one view sees well turn into what leaks to them in the others. Its own
   agreement counts as what is usual in the scene, c, for the measured one would be the noise again.
-- **Centred on the scene's mean**, as the vectors of CLIP lie in one narrow cone: raw cosines are all alike.
 - **The cosine itself is the weight.** If ``e_m = a_m x + noise``, the cosine estimates a_m up to a factor, and
   weights in proportion to the signal give the least noise. There is no bandwidth; a region merged of two things
   keeps part of its weight, and one that points away from the others loses it.
@@ -37,7 +35,8 @@ weights are those of the others. Taken once: a second pass judges by what the fi
 themselves, and geometry has the more to say the less they do. That exponent is what keeps right masks as they are.
 
 **Confidence** of a splat is the mean of c_jm over its entries, each by its final weight: how far views that do not
-know of each other say the same of it.
+know of each other say the same of it. **What its own feature explains** of a splat is the same mean of
+``(1 - p) c_jm + p c``: what a splat of one view says is worth what is usual, not nothing.
 """
 
 from dataclasses import dataclass, replace
@@ -50,19 +49,15 @@ from liftcore.jit import kernel, vectorised
 from liftcore.one_thread import one_thread
 from liftcore.progress import Progress, silent
 from liftcore.solve.closed_form import morton_codes
-from liftcore.solve.codebook import LEAST_CHANNELS, TABLE_BYTES, Codebook
+from liftcore.solve.codebook import Codebook
+from liftcore.solve.directions import RegionDirections
 from liftcore.solve.memory import zeros
 from liftcore.solve.weights import MEMORY_LIMIT, RegionWeights, row_blocks, run_each
 
-CPU = torch.device("cpu")
-ROWS = 1 << 14  # of a table in float64 at a time
 BLOCK_ROWS, BLOCK_ENTRIES = 1 << 11, 1 << 15  # a splat has a sum for each view of it
 LONG = 256  # terms of a sum that float32 adds up one by one
 NO_CONSENSUS = 1e-6  # of a splat's weight: a shorter r is what rounding leaves of inputs that cancel
 SHARPNESS = 4.0  # the most that costs right masks of no scene more than .001 of accuracy (docs/method.md)
-DIRECTIONS = 256  # of e, principal ones, in which cosines are taken where regions are few beside entries
-SAMPLE = 1 << 14  # regions that say which directions are principal
-NO_DIRECTION = 1e-6  # a unit vector nearer to the mean than that is the mean
 
 
 @dataclass(frozen=True)
@@ -70,7 +65,9 @@ class Agreement:
     """What reweighting found."""
 
     factors: Tensor  # [nnz] f32, of each entry of W; the sums of rows stay what they are
+    directions: RegionDirections  # by which regions were compared
     confidence: Tensor | None  # [P] f32 in 0..1; None after no step
+    explained: Tensor | None  # [P] f32 in 0..1, how well a splat's own feature explains what views say; None likewise
     reliability: float | None = None  # r, the median over regions; None where it was not asked for
 
 
@@ -104,7 +101,8 @@ def agreement_factors(
     for step in range(steps):
         factors = judge.step(factors)
         progress("robust", step + 1, steps, "steps")
-    return Agreement(factors, judge.confidence if steps else None, judge.median)
+    confidence, explained = judge.told if steps else (None, None)
+    return Agreement(factors, judge.directions, confidence, explained, judge.median)
 
 
 class _Judge:
@@ -119,10 +117,10 @@ class _Judge:
         reliability: bool,
         consensus: Tensor | None,
     ) -> None:
-        self.W, self.codebook, self.threads = W, codebook, threads
+        self.W, self.threads = W, threads
         self.reliability, self.consensus = reliability, consensus
         self.regions, self.power, self.median = torch.ones(codebook.regions), 1.0, None
-        self.confidence = torch.zeros(W.splats.shape[0])
+        self.told = torch.zeros(2, W.splats.shape[0])
         sums = W.row_sums()
         self.inverse = torch.where(sums > 0, 1.0 / sums, 0.0)
         self.view = torch.repeat_interleave(W.offsets.diff())
@@ -130,76 +128,18 @@ class _Judge:
         if means is not None:
             self.rows = self.rows[torch.argsort(morton_codes(means[self.rows]))]
         self.blocks = row_blocks(W.indptr.diff()[self.rows].numpy(), BLOCK_ROWS, BLOCK_ENTRIES)
-        self.mean, self.distances, self.totals = self._directions()
-        self.axes = self._principal()
-        width = codebook.channels if self.axes is None else DIRECTIONS
-        step = max(LEAST_CHANNELS, TABLE_BYTES // (4 * max(codebook.regions, 1)))
-        self.slices = [slice(begin, min(begin + step, width)) for begin in range(0, width, step)]
+        self.directions = RegionDirections(W, codebook)
 
     def array(self) -> Tensor:
         """Zeros for the entries of W, [nnz] f32."""
         size = self.W.weight.nbytes
         return zeros(tuple(self.W.weight.shape), torch.float32, name="weights", in_file=2 * size > MEMORY_LIMIT)
 
-    def _directions(self) -> tuple[Tensor, Tensor, Tensor]:
-        """The mean of unit vectors [F] f64, and of each region its distance from it and its weight [M] f64."""
-        totals = torch.zeros(self.codebook.regions, dtype=torch.float64)
-        for first in range(0, self.W.region.shape[0], BLOCK_ENTRIES << 5):
-            own = slice(first, first + (BLOCK_ENTRIES << 5))
-            totals.index_add_(0, self.W.region[own], self.W.weight[own].double())
-        known = torch.cat(self.codebook.lengths) > 0
-        whole = float(totals[known].sum()) or 1.0
-        mean, squares = torch.zeros(self.codebook.channels, dtype=torch.float64), torch.zeros_like(totals)
-        for channels in self.codebook.slices():
-            unit = self.codebook.unit_values(channels, CPU)
-            for part, own in zip(unit.split(ROWS), totals.split(ROWS), strict=True):
-                mean[channels] += own @ part.double() / whole
-            for part, squared in zip(unit.split(ROWS), squares.split(ROWS), strict=True):
-                squared.add_((part.double() - mean[channels]).square().sum(dim=1))
-        distances = squares.sqrt()
-        return mean, torch.where((distances > NO_DIRECTION) & known, distances, 0.0), totals
-
-    def _principal(self) -> Tensor | None:
-        """The directions [F, DIRECTIONS] f32 in which e spreads most, each region by its weight; None: all channels.
-
-        Of noise they keep what the regions share with one another, so cosines between noisy vectors grow alike. Where
-        a dense map has a region a few entries, to turn all of them would take longer than to compare them whole.
-        """
-        channels, entries = self.codebook.channels, self.W.region.shape[0]
-        if channels <= DIRECTIONS or entries <= DIRECTIONS * self.codebook.regions:
-            return None
-        step = -(-self.codebook.regions // SAMPLE)
-        e = self._whole_rows(slice(None, None, step)).double()
-        return torch.linalg.eigh((e * self.totals[::step, None]).T @ e)[1][:, -DIRECTIONS:].float().contiguous()
-
-    def _whole_rows(self, chosen: slice) -> Tensor:
-        """All channels of e of some regions, [m, F] f32."""
-        channels = list(self.codebook.slices())
-        parts = (self._centred(self.codebook.unit_values(own, CPU)[chosen], own, chosen) for own in channels)
-        return torch.cat(list(parts), dim=1)
-
-    def _centred(self, unit: Tensor, channels: slice, chosen: slice = slice(None)) -> Tensor:
-        """Unit vectors of regions [m, C] f32 become e, in place."""
-        distances = self.distances[chosen]
-        inverse = torch.where(distances > 0, 1.0 / distances, 0.0)
-        for part, own in zip(unit.split(ROWS), inverse.split(ROWS), strict=True):
-            part.copy_((part.double() - self.mean[channels]) * own[:, None])
-        return unit
-
-    def _table(self, channels: slice) -> Tensor:
-        """Some channels, or principal directions, of e of all regions, [M, C] f32; zeros for none."""
-        if self.axes is None:
-            return self._centred(self.codebook.unit_values(channels, CPU), channels)
-        table = torch.zeros(self.codebook.regions, channels.stop - channels.start)
-        for own in self.codebook.slices():
-            table += self._centred(self.codebook.unit_values(own, CPU), own) @ self.axes[own, channels]
-        return table
-
     def step(self, factors: Tensor) -> Tensor:
         """The factors after a step from those before it."""
         W, found, squares = self.W, self.array(), self.array()
-        for channels in self.slices:
-            table = self._table(channels)
+        for columns in self.directions.slices():
+            table = self.directions.table(columns)
             blocks = [(first, last, factors, table, found, squares) for first, last in self.blocks]
             run_each(self._compare, blocks, self.threads)
         everything = agreeing = 0.0
@@ -227,7 +167,7 @@ class _Judge:
     def _weigh(self, first: int, last: int, factors: Tensor, usual: float, found: Tensor) -> None:
         """Cosines of some rows become their factors ``s ((1 - p) c_m + p c) (r_m / r) q^power``."""
         consensus = torch.zeros(0) if self.consensus is None else self.consensus
-        arrays = (self.inverse, self.view, found, self.regions, consensus, self.confidence)
+        arrays = (self.inverse, self.view, found, self.regions, consensus, self.told)
         numbers = usual, self.power
         weigh_rows(*[*self._entries(first, last, factors), *(part.numpy() for part in arrays), *numbers])
 
@@ -238,7 +178,7 @@ class _Judge:
 
     def _rely(self, factors: Tensor, cosines: Tensor) -> None:
         """The factors of regions, and how sharp the consensus is to be."""
-        W, sums = self.W, torch.zeros(2, self.codebook.regions, dtype=torch.float64)
+        W, sums = self.W, torch.zeros(2, self.regions.shape[0], dtype=torch.float64)
         arrays = (W.indptr, W.region, W.weight, factors, cosines, self.inverse, self.view, sums)
         tally(*(part.numpy() for part in arrays))
         known = sums[1] > 0
@@ -304,13 +244,13 @@ def compare_rows(rows, indptr, region, weight, factors, inverse, view, table, pr
 
 @kernel
 def weigh_rows(
-    rows, indptr, region, weight, factors, inverse, view, cosines, reliable, consensus, confidence, usual, power
+    rows, indptr, region, weight, factors, inverse, view, cosines, reliable, consensus, told, usual, power
 ):
-    """`_Judge._weigh` of some rows, and their confidence."""
+    """`_Judge._weigh` of some rows, and what views say of them: confidence, and what their own feature explains."""
     sharp = np.float32(power)
     for row in rows:
         first, last = indptr[row], indptr[row + 1]
-        before, after, told = 0.0, 0.0, 0.0
+        before, after, confirmed, explained = 0.0, 0.0, 0.0, 0.0
         k = first
         while k < last:
             begin, v, own = k, view[region[k]], 0.0
@@ -319,17 +259,20 @@ def weigh_rows(
                 k += 1
             own = min(own, 1.0)
             for n in range(begin, k):
-                kept = ((1.0 - own) * cosines[n] + own * usual) * reliable[region[n]]
+                said = (1.0 - own) * cosines[n] + own * usual
+                kept = said * reliable[region[n]]
                 if consensus.size > 0:
                     kept *= consensus[n] ** sharp
                 before += weight[n]
                 after += weight[n] * kept
-                told += weight[n] * kept * cosines[n]
+                confirmed += weight[n] * kept * cosines[n]
+                explained += weight[n] * kept * said
                 cosines[n] = kept
         gain = before / after if after > 0.0 else 0.0
         for n in range(first, last):
             cosines[n] = cosines[n] * gain if gain > 0.0 else 1.0
-        confidence[row] = told / after if after > 0.0 else 0.0
+        told[0, row] = confirmed / after if after > 0.0 else 0.0
+        told[1, row] = explained / after if after > 0.0 else usual
 
 
 @kernel

@@ -1,11 +1,12 @@
-"""Reweighting under wrong masks: what each part gains, over scenes and seeds of mistakes.
+"""Reweighting and aggregation under wrong masks: what each part gains, over scenes and seeds of mistakes.
 
     python -m tests.benchmarks.consensus DIR [--packs NAME ...] [--mistakes NAME ...] [--seeds N ...] [--json]
 
 ``DIR`` is `tabletop`, with its packs of 52, 26 and 13 views. ``--mistakes`` are made on its exact masks (13 views),
-and on the tests' still life (its words need the extra ``minilm``), with each seed. A row is a scene: splat accuracy /
-mIoU of held-out views as `tests.benchmarks.tabletop` has them, and how well confidence and agreement of the last lift
-rank splats by being right (AUROC). ``seconds`` are of the lift, over those of ``row-sum``.
+and on the tests' still life and small things (their words need the extra ``minilm``), with each seed. A row is a
+scene: splat accuracy / mIoU of held-out views as `tests.benchmarks.tabletop` has them / the least IoU of a class, and
+how well confidence and agreement of ``default`` rank splats by being right (AUROC). ``seconds`` are of the lift, over
+those of ``row-sum``.
 
     python -m tests.benchmarks.consensus --generated M
 
@@ -15,7 +16,7 @@ in 30 views, which part them on two levels.
 
 import os
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -43,6 +44,7 @@ from tests.benchmarks.memory import high_water
 from tests.benchmarks.tabletop import EVIDENCE_OVER, Tabletop
 from tests.benchmarks.thresholds import in_cone
 from tests.still_life.masks import Mistakes, mistaken_regions, observe, true_labels
+from tests.still_life.objects import Piece, small_things
 from tests.still_life.scene import still_life
 
 HARD = Mistakes(merged=0.30, split=0.15, misnamed=0.10, unlabelled=0.06, noise=0.45)
@@ -56,12 +58,16 @@ MISTAKES = {
     "misnamed": (Mistakes(0, 0, 0.3, 0, 1.0), 0.0),
 }
 PACKS = ("features_hard", "features", "features_clean", "grids")
+AGGREGATED = {"aggregation": True}
 SETTINGS: dict[str, dict[str, Any]] = {
     "row-sum": {"preset": "row-sum"},
     "tikhonov": {"preset": "tikhonov"},
     "robust": {"preset": "row-sum", "robust_steps": 1},
     "and reliability": {"preset": "default", "consensus": False},
     "default": {"preset": "default"},
+    "published": {"preset": "default", **AGGREGATED, "aggregation_clusters": "hdbscan", "aggregation_guard": False},
+    "touching": {"preset": "default", **AGGREGATED, "aggregation_clusters": "touching"},
+    "aggregated": {"preset": "default", **AGGREGATED},
 }
 
 
@@ -76,15 +82,16 @@ class Truth:
     counted: Tensor  # [P] bool
     masks: Mapping[str, Tensor]  # held-out view -> [H, W], classes
 
-    def judge(self, lifted: lc.LiftResult) -> tuple[float, float]:
-        """Splat accuracy and mIoU."""
+    def judge(self, lifted: lc.LiftResult) -> tuple[float, float, float]:
+        """Splat accuracy, mIoU, and the least IoU of a class: a thing that vanishes has none."""
         params = lifted.settings.render_params
         maps = [
             rendered_scores(self.raster, self.cameras[v], lifted.features, self.classes, params) for v in self.masks
         ]
         best, shown = torch.stack([image.argmax(dim=2) for image in maps]), torch.stack(list(self.masks.values()))
         accuracy = splat_accuracy(class_scores(lifted.features, self.classes), self.splats, self.counted)
-        return accuracy, float(class_ious(best, shown, len(self.classes)).nanmean())
+        ious = class_ious(best, shown, len(self.classes))
+        return accuracy, float(ious.nanmean()), float(ious[~ious.isnan()].min())
 
     def ranked(self, lifted: lc.LiftResult, values: Tensor) -> float:
         """AUROC of values on splats for being right."""
@@ -112,9 +119,11 @@ def with_mistakes(scene: Tabletop, kind: str, seed: int, every: int = 4) -> dict
     return made
 
 
-def still_life_scene(kind: str, seed: int) -> tuple[Truth, dict[str, ViewFeatures]]:
-    """The still life with mistakes, and its truth."""
-    made, encoder, (mistakes, cone) = still_life(seed), open_encoder("minilm"), MISTAKES[kind]
+def still_life_scene(
+    kind: str, seed: int, pieces: Sequence[Piece] | None = None
+) -> tuple[Truth, dict[str, ViewFeatures]]:
+    """The still life, or other pieces in its place, with mistakes, and its truth."""
+    made, encoder, (mistakes, cone) = still_life(seed, pieces=pieces), open_encoder("minilm"), MISTAKES[kind]
     raster = CpuRaster(made.splats)
     seen = observe(made, raster, encoder, mistakes, seed)
     views: dict[str, ViewFeatures] = {
@@ -151,7 +160,7 @@ def rows_of(
     folder: Path, packs: Iterable[str], strides: Iterable[int], mistakes: Iterable[str], seeds: Iterable[int],
     settings: Iterable[str],
 ) -> Iterator[dict[str, Any]]:  # fmt: skip
-    """Packs of tabletop, then mistakes on it and on the still life."""
+    """Packs of tabletop, then mistakes on it, on the still life and on small things."""
     scene, settings = Tabletop(folder), list(settings)
     truth = tabletop_truth(scene)
     for pack in packs:
@@ -161,8 +170,9 @@ def rows_of(
     for kind in mistakes:
         for seed in seeds:
             yield measured(f"tabletop, {kind} {seed}", truth, with_mistakes(scene, kind, seed), settings)
-            own, views = still_life_scene(kind, seed)
-            yield measured(f"still life, {kind} {seed}", own, views, settings)
+            for name, pieces in (("still life", None), ("small things", small_things())):
+                own, views = still_life_scene(kind, seed, pieces)
+                yield measured(f"{name}, {kind} {seed}", own, views, settings)
 
 
 def generated(

@@ -30,7 +30,7 @@ from liftcore.query.ask import Answer, ask
 from liftcore.query.objects import objects
 from liftcore.query.scene import QueryScene
 from liftcore.query.text import open_encoder
-from liftcore.solve.aggregate import cluster_splats
+from liftcore.solve.clusters import cluster_splats
 from tests.benchmarks.base import PACKS, PRESETS, command_line, lift_files, opened, scene_files, tell
 from tests.benchmarks.tabletop import Tabletop
 

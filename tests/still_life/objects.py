@@ -33,6 +33,33 @@ def still_life_pieces() -> list[Piece]:
     return [*_room(), *_mug(), *_bowl(), *_fruit(), *_book(), *_lamp(), *_plant()]
 
 
+def small_things() -> list[Piece]:
+    """A sword, a ring and a nut beside larger things on a cloth, with nothing around. Frame as above."""
+    cloth = surfaces.rectangle((-4.0, -3.0, 0.0), (8.0, 0.0, 0.0), (0.0, 6.0, 0.0))
+    kettle = surfaces.lathe((-1.6, 0.9, 0.0), (0.9, 1.15, 1.0, 0.5, 0.1), (0.0, 0.5, 1.2, 1.7, 1.9))
+
+    def blade(t: np.ndarray) -> np.ndarray:
+        return np.stack([-1.2 + 4.4 * t, np.full_like(t, -1.7), np.full_like(t, 0.18)], axis=1)
+
+    def round_(t: np.ndarray) -> np.ndarray:
+        angle = 2 * np.pi * t
+        return np.stack([-2.4 + 0.24 * np.cos(angle), -1.5 + 0.24 * np.sin(angle), np.full_like(t, 0.07)], axis=1)
+
+    sword = surfaces.tube(blade, lambda t: 0.17 - 0.1 * t, (0.0, 0.0, 1.0))
+    ring = surfaces.tube(round_, lambda t: np.full_like(t, 0.06), (0.0, 0.0, 1.0))
+    nut = surfaces.lathe((0.6, 0.2, 0.0), (0.2, 0.24, 0.24, 0.2), (0.0, 0.08, 0.26, 0.34))
+    pear = surfaces.ellipsoid((2.2, 0.9, 0.8), (0.75, 0.75, 0.8))
+    steel = paints.plain(0.66, 0.66, 0.7)
+    return [
+        Piece("cloth", "cloth", cloth, paints.plain(0.7, 0.2, 0.2), 3000),
+        Piece("kettle", "kettle", kettle, steel, 1300),
+        Piece("pear", "pear", pear, paints.plain(0.7, 0.75, 0.2), 900),
+        Piece("sword", "sword", sword, steel, 360),
+        Piece("ring", "ring", ring, steel, 90),
+        Piece("nut", "nut", nut, steel, 70),
+    ]
+
+
 # Bases on the table, for contact shadows: centre x, y and radius.
 FOOTPRINTS = ((-2.5, -1.5, 0.62), (0.1, -0.1, 1.0), (2.5, -1.55, 1.15), (3.2, 1.3, 0.75), (-3.3, 1.2, 0.75))
 

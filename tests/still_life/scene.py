@@ -15,6 +15,8 @@ from tests.still_life.objects import FOOTPRINTS, Piece, still_life_pieces
 from tests.still_life.surfaces import Samples, sample
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.random import Generator
 
 WIDTH, HEIGHT, FOCAL = 480, 360, 430.0  # pixels
@@ -45,16 +47,20 @@ class StillLife:
         return np.array(self.thing_of_part, dtype=np.int32)[self.splat_parts]
 
 
-def still_life(seed: int = 7, views: int = 22, density: float = 1.0) -> StillLife:
+def still_life(
+    seed: int = 7, views: int = 22, density: float = 1.0, pieces: Sequence[Piece] | None = None
+) -> StillLife:
     """Build the scene.
 
     Args:
         seed: of everything random in it.
         views: how many cameras stand on the arc; every fifth is held out.
         density: share of the usual number of splats; fewer ones are larger.
+        pieces: what stands there; None: the still life.
     """
     rng = np.random.default_rng(seed)
-    pieces = [replace(piece, splats=max(1, round(density * piece.splats))) for piece in still_life_pieces()]
+    chosen = still_life_pieces() if pieces is None else pieces
+    pieces = [replace(piece, splats=max(1, round(density * piece.splats))) for piece in chosen]
     samples = [sample(piece.surface, piece.splats, rng) for piece in pieces]
     parts = tuple(dict.fromkeys(piece.part for piece in pieces))
     things = tuple(dict.fromkeys(piece.thing for piece in pieces))

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from liftcore.settings import LiftSettings
-from liftcore.solve.aggregate import NO_CLUSTER, cluster_splats, draw, principal_axes
+from liftcore.solve.clusters import NO_CLUSTER, Clustering, cluster_splats, draw, parted, principal_axes
+from tests.scenes import random_splats
 
 SETTINGS = LiftSettings.of(aggregation=True, aggregation_cluster_size=20, aggregation_neighbours=5)
 
@@ -40,7 +41,7 @@ def test_splats_outside_the_sample_join_their_cluster():
     few = SETTINGS.model_copy(update={"aggregation_sample": 400, "aggregation_cluster_size": 250})
     found = cluster_splats(features, np.ones(5_000), few)
     labels = found.labels.numpy()
-    assert found.sample == 400 and found.smallest == 20
+    assert (found.facts["sample"], found.facts["smallest_in_sample"]) == (400, 20)
     assert (labels >= 0).mean() > 0.9
     assert same_partition(labels[labels >= 0], group[labels >= 0])
 
@@ -101,7 +102,7 @@ def test_splats_without_evidence_are_never_drawn_and_faint_ones_less_often():
 
 
 def test_wide_features_have_the_same_axes_as_by_all_eigenvectors(monkeypatch):
-    monkeypatch.setattr("liftcore.solve.aggregate.EXACT_CHANNELS", 8)
+    monkeypatch.setattr("liftcore.solve.clusters.EXACT_CHANNELS", 8)
     rng = np.random.default_rng(0)
     F = 60
     rows = (rng.normal(size=(300, 5)) * [9, 7, 5, 4, 3]) @ rng.normal(size=(5, F)) + 0.1 * rng.normal(size=(300, F))
@@ -110,3 +111,17 @@ def test_wide_features_have_the_same_axes_as_by_all_eigenvectors(monkeypatch):
     axes = principal_axes(rows, 5)
     assert np.abs(np.abs((exact * axes).sum(axis=0)) - 1).max() < 1e-4
     assert np.abs(axes.T @ axes - np.eye(5)).max() < 1e-5
+
+
+def test_groups_that_lie_apart_are_clusters_of_their_own_unless_few() -> None:
+    splats = random_splats(3, 120, 0.05)
+    place = np.random.default_rng(0).permutation(np.repeat([0, 1, 2, 3], [50, 40, 25, 5]))
+    splats.means[:, 0] += torch.from_numpy(100.0 * place).float()
+    labels = np.where(place < 2, 0, np.where(place == 2, 2, 0)).astype(np.int32)  # no splat in cluster 1
+    labels[np.flatnonzero(place == 2)[:4]] = NO_CLUSTER
+    found = parted(Clustering(torch.from_numpy(labels), 3, {}), splats, 6)
+    numbers = found.labels.numpy()
+    assert found.count == 3
+    assert (numbers[(place == 3) | (labels == NO_CLUSTER)] == NO_CLUSTER).all()
+    others = (place < 3) & (labels != NO_CLUSTER)
+    assert same_partition(numbers[others], place[others]) and set(numbers[others]) == {0, 1, 2}

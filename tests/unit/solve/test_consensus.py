@@ -172,7 +172,7 @@ def books_of(W: RegionWeights, seed: int) -> list[torch.Tensor]:
 
 
 def step_of(W: RegionWeights, books: list[torch.Tensor], q: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Weights after a step with reliability and consensus [P, M], confidence [P], and the median reliability."""
+    """Of a step with both: weights [P, M], confidence and what is explained [2, P], and the median reliability."""
     whole, offsets = dense(W, SPLATS), W.offsets.numpy()
     view = np.searchsorted(offsets, np.arange(whole.shape[1]), side="right") - 1
     unit = torch.nn.functional.normalize(torch.cat(books).double(), dim=1).numpy()
@@ -195,7 +195,8 @@ def step_of(W: RegionWeights, books: list[torch.Tensor], q: np.ndarray) -> tuple
     factors = np.where(known, r / median, 1.0) * q ** (SHARPNESS * (1 - median))
     after = whole * ((1 - p) * c + p * usual) * factors
     after *= sums / np.maximum(after.sum(axis=1, keepdims=True), 1e-300)
-    return after, (after * c).sum(axis=1) / sums[:, 0], median
+    told = np.stack([(after * c).sum(axis=1), (after * ((1 - p) * c + p * usual)).sum(axis=1)])
+    return after, told / sums[:, 0], median
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -203,11 +204,13 @@ def test_reliability_and_confidence_equal_their_definition(seed: int) -> None:
     W, levels = random_scene(seed, views=5)
     books, q = books_of(W, seed), mask_consensus(W, levels)
     got = agreement_factors(W, codebook_of(books), 1, reliability=True, consensus=torch.from_numpy(q))
-    after, confidence, median = step_of(W, books, entries(W, q))
+    after, (confidence, explained), median = step_of(W, books, entries(W, q))
     assert got.reliability == pytest.approx(median, rel=1e-4)
     np.testing.assert_allclose(entries(W, (W.weight * got.factors).numpy()), after, rtol=2e-3, atol=1e-5)
-    assert got.confidence is not None
+    assert got.confidence is not None and got.explained is not None
     np.testing.assert_allclose(got.confidence.numpy(), confidence, rtol=2e-3, atol=1e-5)
+    met = got.explained.numpy()[W.row_sums().numpy() > 0]
+    np.testing.assert_allclose(met, explained[W.row_sums().numpy() > 0], rtol=2e-3, atol=1e-5)
 
 
 def test_reliability_changes_no_bit_with_threads() -> None:

@@ -12,7 +12,9 @@ from hypothesis import strategies as st
 
 from liftcore.io.scene_files import lift_files
 from liftcore.settings import LiftSettings
+from liftcore.solve.aggregate import explained_by
 from liftcore.solve.closed_form import LONG
+from liftcore.solve.directions import RegionDirections
 from liftcore.solve.reweight import NO_CONSENSUS, agreement_factors, reweighted
 from liftcore.solve.weights import RegionWeights, stacked
 from tests.unit.solve.sparse_views import codebook_of, dense, of_dense
@@ -45,18 +47,25 @@ def over(values: np.ndarray, lengths: np.ndarray) -> np.ndarray:
     return np.divide(values, lengths, out=np.zeros_like(values), where=lengths > 0)
 
 
-def defined(scene: Scene, steps: int) -> list[np.ndarray]:
-    """The module's equation, line by line."""
+def defined_directions(scene: Scene) -> tuple[np.ndarray, list[np.ndarray]]:
+    """The scene's mean, and e of every view."""
     first = [view.astype(np.float64) for view in scene.weights]
     books = [book.double().numpy() for book in scene.books]
     units = [over(book, np.linalg.norm(book, axis=1, keepdims=True)) for book in books]
     columns = [view.sum(axis=0) * (np.linalg.norm(book, axis=1) > 0) for view, book in zip(first, books, strict=True)]
-    mean = sum(c @ u for c, u in zip(columns, units, strict=True)) / (sum(c.sum() for c in columns) or 1.0)
+    parts = [c @ u for c, u in zip(columns, units, strict=True)]
+    mean = np.sum(parts, axis=0) / (sum(c.sum() for c in columns) or 1.0)
     e = []
     for unit in units:
         away = np.where(unit.any(axis=1, keepdims=True), unit - mean, 0.0)
         lengths = np.linalg.norm(away, axis=1, keepdims=True)
         e.append(over(away, np.where(lengths > 1e-6, lengths, 0.0)))
+    return mean, e
+
+
+def defined(scene: Scene, steps: int) -> list[np.ndarray]:
+    """The module's equation, line by line."""
+    first, e = [view.astype(np.float64) for view in scene.weights], defined_directions(scene)[1]
     D, current = scene.denominators[:, None], first
     for _ in range(steps):
         everything = sum(w @ v for w, v in zip(current, e, strict=True))
@@ -127,6 +136,30 @@ def test_neither_threads_nor_files_nor_order_change_a_bit_and_the_first_weights_
     assert torch.equal(W.weight, before)
 
 
+@pytest.mark.parametrize("table_bytes", [None, 1])
+def test_what_a_cluster_explains_is_its_mean_cosine_in_float64(monkeypatch, table_bytes):
+    if table_bytes:
+        monkeypatch.setattr("liftcore.solve.aggregate.TABLE_BYTES", table_bytes)
+        monkeypatch.setattr("liftcore.solve.directions.TABLE_BYTES", table_bytes)
+    scene, rng = random_scene(1, count=700, channels=40), np.random.default_rng(2)
+    merged, labels = scene.books[0][:5].double().numpy(), rng.integers(-1, 5, 700)
+    merged[3] = 0  # a cluster without a feature explains nothing
+    W, given = scene.stacked(), (torch.from_numpy(labels).int(), torch.from_numpy(merged).float())
+    directions = RegionDirections(W, codebook_of(scene.books))
+    found = explained_by(W, directions, *given, threads=1)
+    assert torch.equal(found, explained_by(W, directions, *given, threads=3))
+    mean, e = defined_directions(scene)
+    away = np.where(
+        merged.any(axis=1, keepdims=True), over(merged, np.linalg.norm(merged, axis=1)[:, None]) - mean, 0
+    )
+    cosines = np.concatenate(e) @ over(away, np.linalg.norm(away, axis=1, keepdims=True)).T
+    whole = np.concatenate(scene.weights, axis=1).astype(np.float64)
+    expected = over((whole @ np.maximum(cosines, 0))[np.arange(700), labels], scene.denominators)
+    expected[labels < 0] = 0
+    assert expected.max() > 0.2
+    np.testing.assert_allclose(found.numpy(), expected, atol=1e-6)
+
+
 @pytest.mark.parametrize("steps", [1, 2, 3])
 @pytest.mark.parametrize("seed", range(6))
 def test_steps_that_change_much_equal_their_definition_to_the_last_digits(seed, steps):
@@ -144,7 +177,7 @@ def test_steps_that_change_much_equal_their_definition_to_the_last_digits(seed, 
 def test_slices_of_channels_are_judged_together(monkeypatch):
     scene = random_scene(3, count=500)
     whole = scene.after(2)
-    for module in ("codebook", "reweight"):
+    for module in ("codebook", "directions"):
         monkeypatch.setattr(f"liftcore.solve.{module}.TABLE_BYTES", 1)
     for sliced, expected in zip(scene.after(2), whole, strict=True):
         np.testing.assert_allclose(sliced, expected, rtol=1e-4, atol=1e-5)

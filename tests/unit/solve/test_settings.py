@@ -54,6 +54,10 @@ def test_what_is_wrong_is_told_in_our_words(made: Any) -> None:
         made({"lambda": 1.2})
     with pytest.raises(InvalidSettings, match=r"^settings: expected other levels than composite"):
         made({"aggregation_resolve": True, "levels": "composite"})
+    with pytest.raises(InvalidSettings, match=r"^settings: expected aggregation_clusters=hdbscan"):
+        made({"aggregation_resolve": True, "aggregation_clusters": "graph"})
+    with pytest.raises(InvalidSettings, match=r"^settings: expected robust_steps of 1 or more"):
+        made({"robust_steps": 0, "aggregation_guard": True})
 
 
 def test_published_schema_has_every_setting_and_what_a_new_lift_may_have() -> None:

@@ -1,0 +1,84 @@
+"""Splats that touch, directly or through others: which of them hang together."""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from liftcore.raster.base import MAX_LOG_SCALE
+from liftcore.scene.quaternions import rotation_matrices
+
+if TYPE_CHECKING:
+    from liftcore.scene.splats import Splats
+
+NEIGHBOURS = 16  # that each splat looks at, the nearest by their centres
+REACH = 2.0  # standard deviations to which a splat touches
+_PIECE = 1 << 12  # splats whose neighbours are looked at at once: what is made of them stays in the cache
+_TOLD_APART = 1e-12  # of the farthest coordinate
+
+
+def touching(splats: Splats, rows: np.ndarray) -> np.ndarray:
+    """Put splats that touch, directly or through others, into one group.
+
+    Two splats touch where ``|m_j - m_k| <= 2 (s_j + s_k)``, with s the standard deviation of each along the line
+    between their centres, ``sqrt(d^T Sigma d)``: a rule without a length of its own, as scenes have no common unit.
+    Each looks at its 16 nearest among the rows.
+
+    Args:
+        splats: the scene. rows: [n] i64, the splats to group; the others do not connect.
+
+    Returns:
+        [n] i32, the number of each row's group, from 0 in the order of their first rows.
+    """
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import KDTree
+
+    count = len(rows)
+    if count < 2:
+        return np.zeros(count, np.int32)
+    means = splats.means.cpu().numpy()[rows].astype(np.float64)
+    shapes = np.concatenate([means, _covariances(splats, rows)], axis=1)
+    # Points at one place make a leaf that no search can divide: told apart by less than float32 can, they are.
+    extent = float(np.abs(means).max()) or 1.0
+    places = means + _TOLD_APART * extent * np.random.default_rng(0).random(means.shape)
+    tree = KDTree(places)
+    order = tree.indices  # leaf by leaf: splats that are looked at one after the other have the same neighbours
+
+    def look(first: int) -> tuple[np.ndarray, np.ndarray]:
+        own = order[first : first + _PIECE]
+        near = np.asarray(tree.query(places[own], min(NEIGHBOURS + 1, count))[1])  # itself among them
+        touch = _touch(shapes[own], shapes[near])
+        return np.repeat(own, touch.sum(axis=1)), near[touch]
+
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        looks = list(pool.map(look, range(0, count, _PIECE)))
+    pairs = tuple(np.concatenate(parts) for parts in zip(*looks, strict=True))
+    graph = csr_array((np.ones(len(pairs[0]), np.int8), pairs), shape=(count, count))
+    return connected_components(graph, directed=True, connection="weak")[1]
+
+
+def _touch(own: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """[m, k] bool, which of its neighbours ``near`` [m, k, 9] each splat of ``own`` [m, 9] touches; centre, Sigma."""
+    own = own[:, None]
+    x, y, z = (near[..., axis] - own[..., axis] for axis in range(3))
+    squares = (x * x, y * y, z * z, x * y, x * z, y * z)
+    # s |d| of both sides, so that nothing is divided by a distance of zero.
+    mine, theirs = np.zeros(x.shape), np.zeros(x.shape)
+    for place, square in enumerate(squares, start=3):
+        mine += own[..., place] * square
+        theirs += near[..., place] * square
+    reach = REACH * (np.sqrt(np.maximum(mine, 0.0)) + np.sqrt(np.maximum(theirs, 0.0)))
+    return squares[0] + squares[1] + squares[2] <= reach
+
+
+def _covariances(splats: Splats, rows: np.ndarray) -> np.ndarray:
+    """[n, 6] f64, Sigma of each splat: xx, yy, zz, and twice xy, xz, yz."""
+    scales = np.exp(splats.log_scales.cpu().numpy()[rows].astype(np.float64).clip(-MAX_LOG_SCALE, MAX_LOG_SCALE))
+    turned = rotation_matrices(splats.quats.cpu().numpy()[rows])[:, :, : scales.shape[1]]  # a disc has two axes
+    x, y, z = (turned * scales[:, None]).transpose(1, 2, 0)
+    products = (x * x, y * y, z * z, 2 * x * y, 2 * x * z, 2 * y * z)
+    return np.stack([product.sum(axis=0) for product in products], axis=1)

@@ -1,0 +1,114 @@
+"""Directions of regions: what their vectors say beyond what all of a scene's say.
+
+With u_m the unit vector of region m and ``mu = sum W u / sum W`` the scene's mean over all splats and views, its
+direction is ``e_m = (u_m - mu) / |u_m - mu|``: the vectors of an encoder lie in a narrow cone, so raw cosines are all
+alike. A zero vector and the mean itself have none, and are zero.
+
+Where the channels are many and a region has many entries, directions are written in DIRECTIONS principal ones. Of
+noise these keep what regions share with one another, so cosines between noisy vectors grow alike.
+"""
+
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+from liftcore.solve.codebook import LEAST_CHANNELS, TABLE_BYTES, Codebook
+from liftcore.solve.weights import RegionWeights
+
+CPU = torch.device("cpu")
+ROWS = 1 << 14  # of a table in float64 at a time
+ENTRIES = 1 << 20  # of W likewise
+DIRECTIONS = 256  # principal ones, in which cosines are taken where regions are few beside entries
+SAMPLE = 1 << 14  # regions that say which directions are principal
+NO_DIRECTION = 1e-6  # a unit vector nearer to the mean than that is the mean
+
+
+class RegionDirections:
+    """e of the regions of W, [M, D] f32 in slices of its columns; work of one thread, whose bits are fixed.
+
+    Args:
+        W: of all views by rows of codebooks, on the CPU, before any reweighting.
+    """
+
+    mean: Tensor  # [F] f64, mu
+    totals: Tensor  # [M] f64, the weight of each region
+
+    def __init__(self, W: RegionWeights, codebook: Codebook) -> None:
+        self._codebook = codebook
+        self.totals = torch.zeros(codebook.regions, dtype=torch.float64)
+        for first in range(0, W.region.shape[0], ENTRIES):
+            own = slice(first, first + ENTRIES)
+            self.totals.index_add_(0, W.region[own], W.weight[own].double())
+        self.mean, self._distances = self._measured()
+        self._axes = self._principal(W.region.shape[0])
+
+    @property
+    def width(self) -> int:
+        """D, how many numbers a direction has."""
+        return self._codebook.channels if self._axes is None else DIRECTIONS
+
+    def slices(self) -> Iterator[slice]:
+        """The columns that `table` gives at a time, so that it takes TABLE_BYTES."""
+        step = max(LEAST_CHANNELS, TABLE_BYTES // (4 * max(self._codebook.regions, 1)))
+        return (slice(begin, min(begin + step, self.width)) for begin in range(0, self.width, step))
+
+    def table(self, columns: slice) -> Tensor:
+        """Some columns of e of all regions, [M, C] f32; zeros for none."""
+        if self._axes is None:
+            return self._centred(self._codebook.unit_values(columns, CPU), columns)
+        table = torch.zeros(self._codebook.regions, columns.stop - columns.start)
+        for own in self._codebook.slices():
+            table += self._centred(self._codebook.unit_values(own, CPU), own) @ self._axes[own, columns]
+        return table
+
+    def of(self, vectors: Tensor) -> Tensor:
+        """Directions [K, D] f32 of other vectors [K, F], of length one in these columns; zeros for none."""
+        wide = vectors.double()
+        lengths = torch.linalg.vector_norm(wide, dim=1, keepdim=True)
+        known = lengths > 0
+        offsets = torch.where(known, wide / torch.where(known, lengths, 1.0) - self.mean, 0.0)
+        offsets[torch.linalg.vector_norm(offsets, dim=1) <= NO_DIRECTION] = 0.0
+        shown = offsets if self._axes is None else offsets @ self._axes.double()
+        return torch.nn.functional.normalize(shown, dim=1, eps=NO_DIRECTION).float()
+
+    def _measured(self) -> tuple[Tensor, Tensor]:
+        """mu, and the distance of each region's unit vector from it [M] f64, zero where it has no direction."""
+        codebook, totals = self._codebook, self.totals
+        known = torch.cat(codebook.lengths) > 0
+        whole = float(totals[known].sum()) or 1.0
+        mean, squares = torch.zeros(codebook.channels, dtype=torch.float64), torch.zeros_like(totals)
+        for channels in codebook.slices():
+            unit = codebook.unit_values(channels, CPU)
+            for part, own in zip(unit.split(ROWS), totals.split(ROWS), strict=True):
+                mean[channels] += own @ part.double() / whole
+            for part, squared in zip(unit.split(ROWS), squares.split(ROWS), strict=True):
+                squared.add_((part.double() - mean[channels]).square().sum(dim=1))
+        distances = squares.sqrt()
+        return mean, torch.where((distances > NO_DIRECTION) & known, distances, 0.0)
+
+    def _principal(self, entries: int) -> Tensor | None:
+        """The axes [F, DIRECTIONS] f32 in which e spreads most, each region by its weight; None: all channels.
+
+        Where a dense map has a region a few entries, turning them all takes longer than comparing them whole.
+        """
+        codebook = self._codebook
+        if codebook.channels <= DIRECTIONS or entries <= DIRECTIONS * codebook.regions:
+            return None
+        step = -(-codebook.regions // SAMPLE)
+        e = self._whole_rows(slice(None, None, step)).double()
+        return torch.linalg.eigh((e * self.totals[::step, None]).T @ e)[1][:, -DIRECTIONS:].float().contiguous()
+
+    def _whole_rows(self, chosen: slice) -> Tensor:
+        """All channels of e of some regions, [m, F] f32."""
+        channels = list(self._codebook.slices())
+        parts = (self._centred(self._codebook.unit_values(own, CPU)[chosen], own, chosen) for own in channels)
+        return torch.cat(list(parts), dim=1)
+
+    def _centred(self, unit: Tensor, channels: slice, chosen: slice = slice(None)) -> Tensor:
+        """Unit vectors of regions [m, C] f32 become e, in place."""
+        distances = self._distances[chosen]
+        inverse = torch.where(distances > 0, 1.0 / distances, 0.0)
+        for part, own in zip(unit.split(ROWS), inverse.split(ROWS), strict=True):
+            part.copy_((part.double() - self.mean[channels]) * own[:, None])
+        return unit

@@ -1,0 +1,75 @@
+"""Aggregation beside thin and small things: a sword, a ring and a nut, in steel like the kettle beside them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import liftcore as lc
+from liftcore.query.ask import ask
+from liftcore.query.render import view_mask
+from liftcore.query.scene import QueryScene
+from liftcore.query.terms import Query
+from liftcore.query.text.table import TableEncoder
+from liftcore.raster.cpu.raster import CpuRaster
+from tests.benchmarks.base import mask_iou
+from tests.still_life.masks import Mistakes, observe, true_labels
+from tests.still_life.objects import small_things
+from tests.still_life.scene import StillLife, still_life
+
+pytestmark = pytest.mark.slow
+
+SMALL = ("sword", "ring", "nut")
+FEW = Mistakes(merged=0.1, split=0.05, misnamed=0.05, unlabelled=0.03, displacement=0.7, noise=0.35)
+
+
+class Scene:
+    """The scene, what views observe of it, and words: those of steel are alike."""
+
+    def __init__(self) -> None:
+        self.made: StillLife = still_life(views=10, pieces=small_things())
+        self.raster = CpuRaster(self.made.splats)
+        rows = np.random.default_rng(0).standard_normal((len(self.made.things) + 1, 64)).astype(np.float32)
+        rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+        vectors = rows[1:] + [[0.7 * (thing in SMALL)] for thing in self.made.things] * rows[:1]
+        vectors = (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
+        self.encoder = TableEncoder("words", list(self.made.things), vectors)
+        self.views = observe(self.made, self.raster, self.encoder, FEW, seed=1)
+        self.truth = {
+            view: torch.from_numpy(true_labels(self.made, self.raster, view)[0]) for view in self.made.held_out
+        }
+
+    def ious(self, **settings: Any) -> dict[str, float]:
+        """IoU of each thing's mask in the held-out views, asked for by its word."""
+        made = lc.lift(
+            self.made.splats, self.made.cameras, self.views, preset="default", certificate_rays=0, **settings
+        )
+        scene = QueryScene(made, self.made.splats, self.made.cameras)
+        scene.raster = self.raster
+        return {
+            thing: float(np.mean([self._iou(scene, thing, view) for view in self.truth]))
+            for thing in self.made.things
+        }
+
+    def _iou(self, scene: QueryScene, thing: str, view: str) -> float:
+        mask = view_mask(scene, ask(scene, Query((thing,), absent="keep"), self.encoder), view).mask
+        return mask_iou(mask, self.truth[view] == self.made.things.index(thing))
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return Scene()
+
+
+@pytest.mark.parametrize("clusters", ["hdbscan", "graph"])
+def test_small_things_keep_their_masks_where_the_guard_stands(scene: Scene, clusters: str) -> None:
+    # In two channels steel is one cluster, of which the sword has most.
+    merged = {"aggregation": True, "aggregation_clusters": clusters, "aggregation_channels": 2}
+    guarded = scene.ious(**merged)
+    assert min(guarded.values()) > 0.85
+    if clusters == "hdbscan":
+        lost = scene.ious(**merged, aggregation_guard=False)
+        assert lost["sword"] < 0.85 and max(lost["ring"], lost["nut"]) < 0.1  # it is the guard that keeps them
