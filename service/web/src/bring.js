@@ -197,7 +197,6 @@ export class Bring {
     const body = this.body();
     const { settings } = body;
     if (path === "/tradeoff") {
-      delete settings.preset;
       delete settings.speed;
       body.budget_s = Number(at("budget").value);
     }
