@@ -90,6 +90,7 @@ class Truth:
         ]
         best, shown = torch.stack([image.argmax(dim=2) for image in maps]), torch.stack(list(self.masks.values()))
         accuracy = splat_accuracy(class_scores(lifted.features, self.classes), self.splats, self.counted)
+        best[shown < 0] = -1  # rays that meet nothing show no class
         ious = class_ious(best, shown, len(self.classes))
         return accuracy, float(ious.nanmean()), float(ious[~ious.isnan()].min())
 
