@@ -15,6 +15,7 @@ import { MOST, Viewer, webgl } from "./viewer.js";
 const PAGE = 100; // lifts to choose from
 const TURN = Math.PI / 24; // of an arrow key
 const TWICE = 260; // ms within which a second click makes a double one
+const POSTER_WAIT = 1000; // milliseconds that splats wait for that picture at most
 const POSTER = 960; // pixels of the service's picture that is shown until the splats are here
 const SHIFTED = 5; // pixels that the pointer may move in a click
 
@@ -167,10 +168,13 @@ async function open(id, fresh = false) {
     viewer?.clear();
     at("stage").classList.remove("ready");
     at("poster").hidden = true;
+    let poster = null;
     const [content] = await Promise.all([
       look.fallback ? null : bytes(`/lifts/${id}/splats`, { progress: (got, total) => mine === turn && loading(`Loading ${size(got)}${total ? ` of ${size(total)}` : ""}`, total ? got / total : null) }),
-      look.of(lift, parameters.get("view")).then(() => { if (mine === turn) aim(parameters, mine); }),
+      look.of(lift, parameters.get("view")).then(() => { poster = mine === turn ? aim(parameters, mine) : null; }),
     ]);
+    // The first drawing of the splats may hold this page for seconds: what is shown meanwhile has to be there before.
+    await Promise.race([poster, new Promise(late => setTimeout(late, POSTER_WAIT))]);
     if (mine !== turn) return;
     if (content) await show(content, parameters);
     about();
@@ -209,6 +213,7 @@ async function aim(parameters, mine) {
     if (at("poster").src) URL.revokeObjectURL(at("poster").src);
     at("poster").src = image.src;
     at("poster").hidden = false;
+    await new Promise(painted => requestAnimationFrame(() => setTimeout(painted)));
   } catch { /* the splats are on their way */ }
 }
 
