@@ -1,9 +1,9 @@
 """What a browser waits for on the page: the first picture, the script of moving the cut, and the whole journey.
 
 ``python -m tests.benchmarks.page [--shared DIR]`` prints seconds until the first picture, which the service makes,
-and until the splats are drawn, by software here: of the tiny scene and of a room of 180,000 splats (plush of the shared
-data, or random ones of its spread where it is not there). Then milliseconds of moving the cut on the tiny scene's
-page, into which scenes of random splats are loaded; drawing is not counted there.
+and until the splats are drawn, by software here: of the tiny scene and of a room of 180,000 splats (plush of the
+shared data, or random ones of its spread where it is not there). Then milliseconds of moving the cut on the tiny
+scene's page, into which scenes of random splats are loaded; drawing is not counted there.
 """
 
 from __future__ import annotations
