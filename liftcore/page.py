@@ -59,6 +59,10 @@ def show(
                 with suppress(subprocess.TimeoutExpired):
                     server.wait(ENDING_SECONDS)
                 server.kill()
+                return
+        if server.returncode:
+            got = f"one that ended with status {server.returncode}; what it said stands above"
+            raise Unavailable("the page", expected="a server that starts", got=got)
 
 
 def _splats_file(lift: LiftResult, splats: Splats | None, folder: Path) -> InputFile:
@@ -74,7 +78,8 @@ def _splats_file(lift: LiftResult, splats: Splats | None, folder: Path) -> Input
 
 
 def _cameras_file(metadata: LiftMetadata, cameras: Mapping[str, Camera] | None, folder: Path) -> InputFile:
-    if cameras is None:
+    there = found_input("cameras", metadata.cameras, metadata, None) if metadata.cameras.path else None
+    if cameras is None or there is not None:  # a file knows lenses and panoramas, too
         return _remembered("cameras", metadata)
     from liftcore.io.transforms import transforms_of
 

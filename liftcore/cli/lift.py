@@ -12,7 +12,7 @@ from liftcore.cli.options import Parser, add_settings, add_sources, add_verbose,
 from liftcore.cli.reply import free_output, progress_bars, reply, shown, writing
 from liftcore.engine import ENGINES, engine_named
 from liftcore.errors import InvalidInput, InvalidSettings
-from liftcore.io.remote import is_remote, place
+from liftcore.io.remote import is_remote, place, require_storage
 from liftcore.nearest import nearest
 from liftcore.progress import one_step
 
@@ -53,7 +53,9 @@ def run(options: argparse.Namespace) -> int:
     views = camera_source(options.cameras).files
     inputs = [options.splats, *views, *options.features]
     out = options.output
-    if not is_remote(out):
+    if is_remote(out):
+        require_storage(str(out))
+    else:
         out = free_output(out / INDEX if out.suffix == SUFFIX else out, inputs)
     engine = engine_named(options.engine, options.address, options.threads)
     checkpoint = checkpoint_in(options.checkpoint) if options.checkpoint else None

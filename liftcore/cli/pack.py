@@ -159,6 +159,8 @@ def _encoded_masks(options: argparse.Namespace, progress: Progress) -> ViewFolde
     from liftcore.features.encoders.encode import find_images
     from liftcore.features.masks import mask_files, mask_views
 
+    if options.normalised is False:
+        raise InvalidInput("--no-normalised", expected="unit vectors, which --encoder makes", got="--no-normalised")
     if not options.photos:
         raise InvalidInput("--photos", expected="the photos that the masks are of, for --encoder", got="none")
     files, photos = mask_files(options.folder), find_images(options.photos)
@@ -184,6 +186,8 @@ def _views(options: argparse.Namespace, progress: Progress) -> tuple[ViewFolder,
 
         if options.encoder is not None:
             return _encoded_masks(options, progress), None, []
+        if options.photos:
+            raise InvalidInput("--encoder", expected="what makes vectors of the masks in --photos", got="none")
         return mask_views(options.folder, options.unlabelled), None, []
     from liftcore.features.prompts import prompt_views
 

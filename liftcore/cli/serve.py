@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import NoReturn
 
 from liftcore.cli.options import Parser
-from liftcore.page import require_service
 
 
 def add_arguments(parser: Parser) -> None:
@@ -35,6 +34,8 @@ def become(program: str, arguments: Sequence[str]) -> NoReturn:
     Raises:
         Unavailable: the service is not installed.
     """
+    from liftcore.page import require_service
+
     require_service()
     sys.stdout.flush()
     sys.stderr.flush()

@@ -90,10 +90,11 @@ def check_scene(
     notes: list[str] = []
     photos = photos or {}
     paired = cameras_of_views(photos, with_panoramas(cameras))
-    files = {camera: photos[view] for view, camera in paired.items() if camera in cameras}
     taken = {name: photos[view] for view, name in paired.items()}
     faces = {name: camera.face.photo for name, camera in cameras.items() if camera.face is not None}
-    files |= {name: taken[photo] for name, photo in faces.items() if photo in taken}
+    files = {name: taken[photo] for name, photo in faces.items() if photo in taken and name not in taken}
+    panoramas = frozenset(files)  # of which a file is the panorama, and not the camera's own photo
+    files |= {name: file for name, file in taken.items() if name in cameras}
     if not photos:
         what = "so the features alone tell" if features is not None else "so nothing tells"
         notes.append(f"photos: none were given, {what} whether these cameras are those of the splats")
@@ -106,7 +107,8 @@ def check_scene(
         notes += [f"photos: {len(lost)} have no camera: {some_of(lost)}"] if lost else []
     names = _some(list(files) or list(cameras), VIEWS)
     shown = [name for name in names if name in files]
-    pictures = {name: _photo(files[name], cameras[name], photo_size(cameras[name])) for name in shown}
+    whole = {name: cameras[name] if name in panoramas else None for name in files}
+    pictures = {name: _photo(files[name], photo_size(cameras[name]), whole[name]) for name in shown}
     raster, views, renders = CpuRaster(splats, threads=None), [], {}
     for number, name in enumerate(names):
         row_sum, renders[name] = _render(raster, splats, cameras[name])
@@ -116,7 +118,7 @@ def check_scene(
     wrong += _wrong_cameras(views, in_view)
     figures: dict[str, float] = {}
     if features is not None:
-        figures, told = _check_features(features, cameras, files)
+        figures, told = _check_features(features, cameras, files, whole)
         settings = LiftSettings.of()
         lifted = LiftViews.of(features, cameras, settings)
         agreement = agreement_of_views(splats, lifted, settings)[1]
@@ -144,12 +146,13 @@ def _render(raster: CpuRaster, splats: Splats, camera: Camera) -> tuple[float, n
     return float(image[..., 3].mean()), image[..., :3].clip(0.0, 1.0)
 
 
-def _photo(path: Path, camera: Camera, size: tuple[int, int]) -> np.ndarray:
-    """[H, W, 3] f32 in 0..1, a camera's photo in a size (width, height); of a panorama what its face shows."""
-    face = camera.face
-    size = size if face is None else (face.width, face.height)
-    pixels = np.asarray(read_image(path)[0].convert("RGB").resize(size, Image.Resampling.BOX), np.float32) / 255
-    return pixels if face is None else photo_as_pinhole_sees(pixels, camera)
+def _photo(path: Path, size: tuple[int, int], panorama: Camera | None) -> np.ndarray:
+    """[H, W, 3] f32 in 0..1, a photo in a size (width, height); of a ``panorama`` what that camera, a face, sees."""
+    image = read_image(path)[0].convert("RGB")
+    if panorama is not None and panorama.face is not None:
+        whole = image.resize((panorama.face.width, panorama.face.height), Image.Resampling.BOX)
+        image = Image.fromarray(photo_as_pinhole_sees(np.asarray(whole), panorama))
+    return np.asarray(image.resize(size, Image.Resampling.BOX), np.float32) / 255
 
 
 def _against(name: str, row_sum: float, render: np.ndarray | None, pictures: Mapping[str, np.ndarray]) -> ViewCheck:
@@ -179,7 +182,7 @@ def _wrong_cameras(views: Sequence[ViewCheck], in_view: float) -> list[str]:
 
 
 def _check_features(
-    features: Views, cameras: Cameras, files: Mapping[str, Path]
+    features: Views, cameras: Cameras, files: Mapping[str, Path], whole: Mapping[str, Camera | None]
 ) -> tuple[dict[str, float], list[str]]:
     """Medians over some views, and what is wrong by them."""
     views = pair(features, cameras)[0]
@@ -191,7 +194,7 @@ def _check_features(
             grids.append(observed.grid.float().numpy())
         elif isinstance(observed, Regions) and name in files:
             labels = observed.labels[-1].numpy()
-            photo = _photo(files[name], cameras[name], labels.shape[::-1]).mean(axis=2)
+            photo = _photo(files[name], labels.shape[::-1], whole[name]).mean(axis=2)
             mirrored = max(_edges(labels[:, ::-1], photo), _edges(labels[::-1], photo))
             rows.append((_edges(labels, photo), mirrored))
     figures, wrong = {}, unlike_maps(grids)

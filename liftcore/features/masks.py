@@ -65,7 +65,10 @@ def labels_alone(path: Path, unlabelled: int = 0) -> tuple[np.ndarray, int]:
         rows = high + (unlabelled != 0 and bool((values != unlabelled).any()))
     else:
         stored = open_npy(path, kinds=NUMBERS + "b")
-        rows = len(stored) if stored.dtype.kind == "b" else max(0, int(stored.max(initial=-1))) + 1
+        high = float(stored.max())
+        if not np.isfinite(high):
+            raise InvalidFeatures(str(path), expected="mask ids, or booleans", got="numbers that are not finite")
+        rows = len(stored) if stored.dtype.kind == "b" else max(-1, int(high)) + 1
     if not rows:
         raise InvalidFeatures(
             str(path), expected="one mask or more", got="none", hint="leave out views without masks"

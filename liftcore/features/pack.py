@@ -115,16 +115,14 @@ class Views(Mapping[str, ViewFeatures]):
         return width, height
 
     def seen_by(self, views: Mapping[str, str], cameras: Mapping[str, Camera]) -> "Views":
-        """The views that ``views`` names for cameras, and no others, each under its camera's name, as that sees it.
-
-        Of a panorama's face that a view is named like, the view is a map of the face itself.
-        """
-        sources, seeing = {}, {}
-        for name, view in views.items():
-            sources[name] = self._find(view)
-            own = cameras[name].replace(face=None) if name == view else cameras[name]
-            seeing[name] = self._cameras.get(view, own)
+        """The views that ``views`` names for cameras, and no others, each as its camera sees it, under its name."""
+        sources = {name: self._find(view) for name, view in views.items()}
+        seeing = {name: self._cameras.get(view, cameras[name]) for name, view in views.items()}
         return replace(self, _sources=sources, _cameras=seeing)
+
+    def seeing(self, view: str) -> Camera | None:
+        """The camera whose pinhole sees the view; None of views that are not paired."""
+        return self._cameras.get(view)
 
     def _find(self, view: str) -> _Source:
         if view not in self._sources:
@@ -195,7 +193,7 @@ def read_features(*paths: str | Path) -> Views:
 def pair(views: Views, cameras: Mapping[str, Camera]) -> tuple[Views, list[str]]:
     """The views that have a camera, named like it, and the names of those that have none, to be skipped and told.
 
-    A panorama's view is one of each of its faces.
+    A panorama's view is one of each of its faces; a view that is named like a face is a map of the face itself.
 
     Raises:
         InvalidFeatures: no view has a camera.
@@ -206,8 +204,9 @@ def pair(views: Views, cameras: Mapping[str, Camera]) -> tuple[Views, list[str]]
             faces.setdefault(camera.face.photo, []).append(name)
     names = require_pairs(views.views, {*cameras, *faces})
     seen = {face: view for view, name in names.items() for face in faces.get(name, [])}
-    seen |= {name: view for view, name in names.items() if name not in faces}
-    return views.seen_by(seen, cameras), [view for view in views if view not in names]
+    own = {name: view for view, name in names.items() if name not in faces}
+    seeing = {**cameras, **{name: cameras[name].replace(face=None) for name in own}}
+    return views.seen_by(seen | own, seeing), [view for view in views if view not in names]
 
 
 def write_pack(

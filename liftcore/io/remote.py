@@ -52,7 +52,8 @@ def local_path(path: Path | str) -> Path:
         found: dict[str, Any] = storage.find(place, detail=True)
         if not found:
             raise FileNotFoundError("nothing is there")
-        versions = sorted((name, storage.ukey(name)) for name in found)
+        # Of HTTP ukey is the address alone: what is told of a file (ETag, size, time) tells its versions apart.
+        versions = sorted((name, storage.ukey(name), sorted(map(str, told.items()))) for name, told in found.items())
         base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "splatlift" / "remote"
         name = PurePosixPath(place.rstrip("/")).name
         copy = base / hashlib.sha256(repr((url, versions)).encode()).hexdigest()[:32] / name
@@ -72,6 +73,17 @@ def local_path(path: Path | str) -> Path:
         finally:
             shutil.rmtree(draft, ignore_errors=True)
         return copy
+
+
+def require_storage(url: str) -> None:
+    """Look at where something is to be written: an hour of work is not lost over a missing package or key.
+
+    Raises:
+        InvalidInput: its storage does not open.
+    """
+    with _told(url):
+        storage, place = _opened(url)
+        storage.exists(place)
 
 
 @contextmanager

@@ -82,7 +82,7 @@ def transforms_of(cameras: Mapping[str, Camera]) -> dict[str, Any]:
         pose[:3, :3] *= OPENGL_TO_OPENCV
         lens = {"w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy}
         lens |= {"cx": camera.cx, "cy": camera.cy}
-        frames.append({"file_path": f"images/{name}.png", "transform_matrix": pose.tolist(), **lens})
+        frames.append({"file_path": f"{name}.png", "transform_matrix": pose.tolist(), **lens})
     return {"frames": frames}
 
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from liftcore.errors import InvalidQuery, NotFound
+from liftcore.errors import InvalidFeatures, InvalidQuery, NotFound
 from liftcore.query.scene import QueryScene, as_numpy
 from liftcore.query.terms import Region
 
@@ -35,8 +36,9 @@ def regions_of(scene: QueryScene, view: str, argument: str) -> Regions:
 
     packs = scene.packs
     name = cameras_of_views([view], packs.views).get(view)
-    if name is None and view.rpartition("@")[0] in packs.views and view in scene.cameras:
-        packs, name = pair(packs, {view: scene.cameras[view]})[0], view  # a face of a panorama
+    if name is None and "@" in view and view in scene.cameras:
+        with suppress(InvalidFeatures):
+            packs, name = pair(packs, {view: scene.cameras[view]})[0], view  # a face of a panorama
     if name is None:
         raise NotFound(argument, expected="a view of the lift's feature packs", got=repr(view))
     found = packs[name]

@@ -269,7 +269,7 @@ def shape_warnings(packs: Views, views: Sequence[Camera]) -> list[str]:
     odd, stretched = [], []
     for camera in views:
         size = packs.map_size(camera.name)
-        photo = _photo(camera)
+        photo = _photo(packs, camera)
         if _odd(size, photo):
             odd.append(camera)
         elif _stretched(size, photo):
@@ -287,12 +287,13 @@ def shape_warnings(packs: Views, views: Sequence[Camera]) -> list[str]:
 
 
 def _shapes(packs: Views, camera: Camera) -> str:
-    (width, height), (W, H) = packs.map_size(camera.name), _photo(camera)
+    (width, height), (W, H) = packs.map_size(camera.name), _photo(packs, camera)
     return f" ({camera.name}: {width}x{height} for {W}x{H})"
 
 
-def _photo(camera: Camera) -> tuple[int, int]:
-    return photo_size(camera) if camera.face is None else (camera.face.width, camera.face.height)
+def _photo(packs: Views, camera: Camera) -> tuple[int, int]:
+    face = (packs.seeing(camera.name) or camera).face  # None of a map of the face itself
+    return photo_size(camera) if face is None else (face.width, face.height)
 
 
 def _odd(size: tuple[int, int], photo: tuple[int, int]) -> bool:

@@ -99,7 +99,7 @@ def views(lift: str, deps: Deps, ask: Ask, limit: Limit = VIEWS, cursor: ViewsCu
 def regions(lift: str, view: View, x: Pixel, y: Pixel, deps: Deps, ask: Ask) -> models.CoveringRegions:
     """The regions of the lift's feature packs that cover a pixel of a view's photo: each is an example to ask by."""
     found = deps.store.lifts.get(deps.owner, lift)
-    wanted = with_packs(scene_request("regions", found, deps), found, deps, "view") | {"view": view, "x": x, "y": y}
+    wanted = with_packs(scene_request("regions", found, deps), found, deps, "lift") | {"view": view, "x": x, "y": y}
     return models.CoveringRegions(lift=found.id, view=view, **ask(wanted).header)
 
 
@@ -109,7 +109,7 @@ def region_mask(
 ) -> Response:
     """The pixels of a view's photo that one region covers: a PNG, white where it is."""
     found = deps.store.lifts.get(deps.owner, lift)
-    wanted = with_packs(scene_request("region_mask", found, deps), found, deps, "view")
+    wanted = with_packs(scene_request("region_mask", found, deps), found, deps, "lift")
     wanted |= {"view": view, "level": level, "region": region}
     return tagged_answer(request, deps, wanted, found, ask)
 

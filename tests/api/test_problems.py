@@ -46,6 +46,8 @@ ROUTES = {
     "/lifts/{lift}/colours",
     "/lifts/{lift}/photo",
     "/lifts/{lift}/views",
+    "/lifts/{lift}/regions",
+    "/lifts/{lift}/regions/mask",
     "/lifts/{lift}/objects",
     "/lifts/{lift}/objects/{thing}/splats",
     "/query",

@@ -30,7 +30,7 @@ COLUMNS = """((wanted, near) => {
     const pixel = [data[i], data[i + 1], data[i + 2]];
     const most = Math.max(...pixel);
     const strong = most > 60 && most - Math.min(...pixel) > 40;
-    if (wanted ? strong && Math.abs(hue(pixel) - hue(wanted)) < near : most > 45) {
+    if (wanted ? strong && Math.cos(hue(pixel) - hue(wanted)) > Math.cos(near) : most > 45) {
       found.push(Math.floor(100 * ((i / 4) % flat.width) / flat.width));
     }
   }

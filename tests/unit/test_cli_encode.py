@@ -106,6 +106,7 @@ def test_masks_get_vectors_of_their_crops(
     ids[10:30, 20:50] = 0
     np.save(masks / "left_masks.npy", planes)
     Image.fromarray(ids).save(masks / "middle.png")
+    np.save(masks / "right_masks.npy", np.pad(np.full((4, 4), 1, np.uint8), 10))  # ids: 0 around, and 1
     asked = [
         "pack",
         "masks",
@@ -120,7 +121,7 @@ def test_masks_get_vectors_of_their_crops(
     status, out, err = run(capsys, *asked, "--photos", photos, "--json")
     assert (status, err) == (0, "")
     document = json.loads(out)
-    assert (document["views"], document["channels"], document["normalised"]) == (2, 256, True)
+    assert (document["views"], document["channels"], document["normalised"]) == (3, 256, True)
     assert document["text_space"] == f"open_clip:ViT-S-32-alt@{weights}" and "crops of masks" in document["encoder"]
     import open_clip
 
@@ -143,6 +144,8 @@ def test_masks_get_vectors_of_their_crops(
     for more, message in (
         (asked, "--photos"),
         ([*asked, "--photos", photos / "right.png"], "photo of each view"),
+        ([*asked[:-2], "--photos", photos], "--encoder"),
+        ([*asked, "--photos", photos, "--no-normalised"], "--no-normalised"),
         ([*asked[:-1], "timm:resnet18", "--photos", photos], "open_clip:MODEL/TAG"),
     ):
         status, _, err = run(capsys, *more)

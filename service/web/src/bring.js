@@ -32,7 +32,7 @@ export class Bring {
     addEventListener("drop", event => {
       stop(event);
       document.body.classList.remove("dragging");
-      if (event.dataTransfer.files.length) { this.raised(); dropped(event.dataTransfer).then(files => this.add(files)); }
+      if (event.dataTransfer.files.length) { this.raised(); dropped(event.dataTransfer).then(files => this.add(files)).catch(problem => tell(words(problem), true)); }
     });
     at("choose").addEventListener("click", () => at("files").click());
     at("files").addEventListener("change", () => { this.add([...at("files").files]); at("files").value = ""; });
@@ -66,7 +66,7 @@ export class Bring {
     try {
       one.asset = await sending.done;
     } catch (problem) {
-      one.problem = problem;
+      Object.assign(one, { problem, sent: 0 }); // a lift may go up again, with other cameras
     }
     this.show();
     if (!one.asset) return;
@@ -88,7 +88,10 @@ export class Bring {
       const waited = one.missing;
       one.missing = one.needs.filter(({ id }) => !here.includes(id));
       this.show();
-      if (!one.missing.length && !one.sent && (waited === undefined || waited.length)) await this.send(one);
+      if (!one.missing.length && !one.sent && (waited === undefined || waited.length)) {
+        one.problem = null;
+        await this.send(one);
+      }
       const others = this.ids("cameras").at(-1);
       if (one.missing.length !== 1 || one.missing[0].kind !== "cameras" || !others || others === one.tried) return;
       Object.assign(one, { tried: others, problem: null });

@@ -5,6 +5,8 @@ const HEADER = 32 << 20; // bytes of a safetensors header that are read here
 const TAIL = 1 << 20; // of a zip: its list of names lies at its end
 const DEPTH = 5; // folders down
 const CAMERAS = /(^|\/)((cameras|images|frames|rigs)\.(bin|txt)|(dataparser_)?transforms\.json|cameras\.json)$/;
+const SPLATS = /\.(ply|splat|spz|sog)$/i;
+const PACK = /\.safetensors$/i;
 const PHOTO = /\.(jpe?g|png)$/i;
 
 // {kind} of a file, null for what is not known; a lift file brings what it `needs`: [{kind, id, name}].
@@ -34,7 +36,8 @@ async function safetensors(file) {
   }
 }
 
-// What was dropped: files, and of folders the cameras as one zip, or all files where there are none.
+// What was dropped: files, and of folders the cameras as one zip, the newest splats and the packs; or all files where there
+// are no cameras. Photos of a folder stay: they may be gigabytes.
 export async function dropped({ items, files }) {
   const entries = [...items].map(item => item.webkitGetAsEntry?.()).filter(Boolean); // while the event lasts
   if (!entries.some(entry => entry.isDirectory)) return [...files];
@@ -42,7 +45,9 @@ export async function dropped({ items, files }) {
     const inner = await within(entry);
     const cameras = inner.filter(({ path }) => CAMERAS.test(path));
     if (!entry.isDirectory || !cameras.length) return inner.map(({ file }) => file);
-    return [await zipped(cameras, `${entry.name}.zip`)];
+    const splats = inner.filter(({ path }) => SPLATS.test(path)).sort((one, other) => other.file.lastModified - one.file.lastModified);
+    const packs = inner.filter(({ path }) => PACK.test(path));
+    return [await zipped(cameras, `${entry.name}.zip`), ...[...splats.slice(0, 1), ...packs].map(({ file }) => file)];
   }));
   return found.flat();
 }

@@ -40,7 +40,7 @@ export class Masks {
       this.around = regions;
       return this.pick(regions[0].example, less);
     } catch (problem) {
-      return tell(problem.argument === "view" ? "This view was not lifted, so it has no masks: take another." : words(problem), true);
+      return tell(problem.status === 404 ? "This view was not lifted, so it has no masks: take another." : words(problem), true);
     }
   }
 

@@ -6,6 +6,7 @@ const OWN = "own"; // the words of the form
 const COVER = 0.78; // of a word's colour over the splats' own
 const REST = [38, 42, 50]; // splats of no word, or of words that are not looked at
 const SHOWN = 14; // words with a label at their place
+const COLOURS = 216; // that differ
 const PAGE = 100; // tables to choose from
 
 export class Names {
@@ -134,7 +135,7 @@ export class Names {
 
   // The map of a view, and how its colours are shown over the view; null where there is none to show.
   map(view) {
-    if (!this.shown || this.found.found.length > 255) return null; // of more words a map has greys
+    if (!this.shown || this.found.found.length > COLOURS) return null; // of more words some share a colour
     const known = new Map(this.found.found.map(({ value, colour }) => [colour.join(), value]));
     const paint = ({ data, width, height }) => {
       const out = new Uint8ClampedArray(data.length);

@@ -154,6 +154,12 @@ def test_things_all_around_are_found_and_asked_by_their_masks() -> None:
     faces = {name: as_pinhole_sees(regions, camera) for name, camera in cameras.items()}
     of_faces = lc.lift(splats, cameras, faces, preset="row-sum")  # maps of the faces themselves
     assert torch.equal(result.features, of_faces.features)
+    foldered = pair(as_views({f"set/{name}": found for name, found in faces.items()}), cameras)[0]
+    assert shape_warnings(foldered, list(cameras.values())) == []
+    for name, found in faces.items():
+        seen = foldered[name]
+        assert isinstance(seen, lc.Regions) and isinstance(found, lc.Regions)
+        assert torch.equal(seen.labels, found.labels)
     assert result.metadata.poses == poses_of([cameras[view] for view in result.views])
     scene = QueryScene(result, splats, cameras, as_views({"pano": regions}))
     camera = cameras["pano@back"]
@@ -182,6 +188,8 @@ def test_photos_of_panoramas_are_checked_face_by_face(tmp_path: Path) -> None:
     report = check_scene(splats, cameras, {"pano": tmp_path / "pano.png"})
     assert len(report.views) == 6 and all(view.psnr is not None for view in report.views)
     assert not [note for note in report.notes if "no camera" in note or "have none" in note]
+    own = lc.Regions(np.arange(64 * 80, dtype=np.int32).reshape(1, 64, 80) // 1280, np.eye(4, dtype=np.float32))
+    check_scene(splats, cameras, {"pano": tmp_path / "pano.png"}, as_views(dict.fromkeys(cameras, own)))
 
 
 def test_names_of_faces_stand_for_their_panorama() -> None:
