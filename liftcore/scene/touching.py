@@ -20,7 +20,7 @@ _PIECE = 1 << 12  # splats whose neighbours are looked at at once: what is made 
 _TOLD_APART = 1e-12  # of the farthest coordinate
 
 
-def touching(splats: Splats, rows: np.ndarray) -> np.ndarray:
+def touching(splats: Splats, rows: np.ndarray, threads: int | None = None) -> np.ndarray:
     """Put splats that touch, directly or through others, into one group.
 
     Two splats touch where ``|m_j - m_k| <= 2 (s_j + s_k)``, with s the standard deviation of each along the line
@@ -29,6 +29,7 @@ def touching(splats: Splats, rows: np.ndarray) -> np.ndarray:
 
     Args:
         splats: the scene. rows: [n] i64, the splats to group; the others do not connect.
+        threads: None takes the cores that this process may use. The number changes no bit.
 
     Returns:
         [n] i32, the number of each row's group, from 0 in the order of their first rows.
@@ -54,7 +55,7 @@ def touching(splats: Splats, rows: np.ndarray) -> np.ndarray:
         touch = _touch(shapes[own], shapes[near])
         return np.repeat(own, touch.sum(axis=1)), near[touch]
 
-    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+    with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
         looks = list(pool.map(look, range(0, count, _PIECE)))
     pairs = tuple(np.concatenate(parts) for parts in zip(*looks, strict=True))
     graph = csr_array((np.ones(len(pairs[0]), np.int8), pairs), shape=(count, count))

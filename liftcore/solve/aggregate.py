@@ -106,7 +106,7 @@ def aggregate(
     else:
         clustering = cluster_splats(features, evidence, settings, threads)
         if settings.aggregation_clusters != "hdbscan":
-            clustering = parted(clustering, splats, settings.aggregation_cluster_size)
+            clustering = parted(clustering, splats, settings.aggregation_cluster_size, threads)
     masks: dict[str, np.ndarray] = {}
     if clustering.count == 0:
         merged, facts = torch.zeros(0, features.shape[1], dtype=features.dtype), {}
@@ -235,9 +235,8 @@ def evidence_means(features: Tensor, evidence: np.ndarray, clustering: Clusterin
 
 def with_feature(labels: Tensor, merged: Tensor) -> Tensor:
     """[P] bool: the splats whose cluster has a feature."""
-    return torch.cat([(merged != 0).any(dim=1), torch.zeros(1, dtype=torch.bool)])[
-        labels.long()
-    ]  # the last is for -1
+    known = torch.cat([(merged != 0).any(dim=1), torch.zeros(1, dtype=torch.bool)])  # the last is for -1
+    return known[labels.long()]
 
 
 def spread(features: Tensor, labels: Tensor, merged: Tensor, taken: Tensor) -> None:

@@ -89,7 +89,7 @@ def cluster_splats(
     return Clustering(torch.from_numpy(labels), clusters, facts)
 
 
-def parted(found: Clustering, splats: Splats, smallest: int) -> Clustering:
+def parted(found: Clustering, splats: Splats, smallest: int, threads: int | None = None) -> Clustering:
     """Each cluster's groups of splats that touch, as clusters of their own; no cluster where they are fewer.
 
     Masks show one thing: of two that look alike, neither's mask matches the footprint of both.
@@ -98,7 +98,7 @@ def parted(found: Clustering, splats: Splats, smallest: int) -> Clustering:
     labels = np.full(before.size, NO_CLUSTER, np.int32)
     for cluster in range(found.count):
         rows = np.flatnonzero(before == cluster)
-        groups = touching(splats, rows)
+        groups = touching(splats, rows, threads)
         kept = np.bincount(groups) >= smallest
         numbers = np.where(kept, count + np.cumsum(kept) - 1, NO_CLUSTER)
         labels[rows] = numbers[groups]

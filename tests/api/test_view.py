@@ -64,6 +64,7 @@ def test_lift_in_memory_is_shown_until_it_is_interrupted(tmp_path: Path) -> None
     for name, content in (("s.ply", tiny.splats), ("c.json", tiny.cameras), ("f.safetensors", tiny.features)):
         (tmp_path / name).write_bytes(content)
     script = """if True:
+        import socket
         import liftcore as lc
         splats, cameras = lc.read_splats("s.ply"), dict(lc.read_cameras("c.json"))
         result = lc.lift(splats, cameras, lc.read_features("f.safetensors"), preset="row-sum")
@@ -73,6 +74,11 @@ def test_lift_in_memory_is_shown_until_it_is_interrupted(tmp_path: Path) -> None
                 result.show(**given)
             except lc.InvalidInput as error:
                 print(error.argument, flush=True)
+        try:
+            with socket.create_server(("127.0.0.1", 0)) as taken:
+                result.show(splats, cameras, port=taken.getsockname()[1], browser=False)
+        except lc.Unavailable as error:
+            print(error.argument, flush=True)
         result.show(splats, cameras, browser=False)
         print("ended", flush=True)
     """
@@ -80,7 +86,8 @@ def test_lift_in_memory_is_shown_until_it_is_interrupted(tmp_path: Path) -> None
     command = [sys.executable, "-c", script]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment, cwd=tmp_path) as process:
         assert process.stdout is not None
-        assert [process.stdout.readline().strip() for _ in range(3)] == ["splats", "cameras", "splats"]
+        told = [process.stdout.readline().strip() for _ in range(4)]
+        assert told == ["splats", "cameras", "splats", "the page"]
         line = process.stdout.readline()
         found = re.match(r"(http://127\.0\.0\.1:\d+)/\?lift=(\w+) ", line)
         assert found, line

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -11,7 +12,9 @@ import httpx
 import pytest
 from PIL import Image
 
-from tests.api.tiny_scene import colmap_zip, make_scene
+from liftcore.io.scene_files import lift_files
+from liftcore.settings import LiftSettings
+from tests.api.tiny_scene import cameras_document, colmap_zip, make_scene
 
 from .browser import Browser
 from .conftest import Served, serving
@@ -90,9 +93,28 @@ def test_dropped_folder_brings_its_cameras(empty: Browser, tmp_path: Path) -> No
     with zipfile.ZipFile(io.BytesIO(colmap_zip())) as archive:
         archive.extractall(model)
     (model / "sparse" / "0" / "notes.md").write_text("not a camera")
+    (model / "point_cloud.ply").write_bytes(make_scene().splats)
     empty.drop([model])
-    empty.until("document.querySelector('.file.done')")
-    assert text_of(empty, ".file .name") == "model.zip" and "3 views" in text_of(empty, ".file .state")
+    empty.until("document.querySelectorAll('.file.done').length === 2")
+    names = empty.value("[...document.querySelectorAll('.file.done .name')].map(name => name.textContent)")
+    assert sorted(names) == ["model.zip", "point_cloud.ply"] and "3 views" in text_of(empty, "#sent")
+
+
+def test_lift_file_waits_for_other_cameras_after_wrong_ones(
+    empty: Browser, files: dict[str, Path], tmp_path: Path
+) -> None:
+    model, lift = tmp_path / "model", tmp_path / "made.safetensors"
+    with zipfile.ZipFile(io.BytesIO(colmap_zip())) as archive:
+        archive.extractall(model)
+    lift_files(files["splats"], model, [files["features"]], LiftSettings.of(preset="row-sum")).save(lift)
+    wrong = tmp_path / "wrong.json"
+    wrong.write_text(json.dumps({**cameras_document(), "fl_x": 31.0}), encoding="utf-8")
+    empty.drop([lift, files["splats"], wrong])
+    empty.until("document.querySelector('.file.bad .state')?.textContent.includes('cameras that see')")
+    empty.drop([model])  # the right ones, which are another asset than the folder that was lifted with
+    empty.until(READY)
+    ask(empty, "lamp")
+    assert min(columns(empty, AMBER)) > 50
 
 
 def test_lift_takes_a_name_and_photos(browser: Browser, served: Served, tmp_path: Path) -> None:

@@ -46,10 +46,7 @@ class ClipImageEncoder:
             Unavailable: no weights were named, or they cannot be had here.
         """
         opened = open_model(kind, spec)
-        _, at, file = spec.partition("@")
-        # Weights of a file have no name but their path: it is what the query side opens again.
-        space = f"{opened.name}@{Path(file).resolve()}" if at else opened.name
-        return cls(kind, opened, space, device)
+        return cls(kind, opened, space_of(opened, spec), device)
 
     @classmethod
     def _with_random_weights(cls, kind: str, model_name: str) -> Self:
@@ -61,6 +58,12 @@ class ClipImageEncoder:
         """Images [n, 3, h p, w p] f32 -> grids [n, h, w, F] f32 on the CPU."""
         with torch.inference_mode():
             return self._dense(self._tower, images.to(self._device)).to("cpu", torch.float32).clone()
+
+
+def space_of(opened: OpenedModel, spec: str) -> str:
+    """The text space of a model: its name, and of weights from a file their path, by which queries open it again."""
+    _, at, file = spec.partition("@")
+    return f"{opened.name}@{Path(file).resolve()}" if at else opened.name
 
 
 def _dense(kind: str, model_name: str, tower: Any) -> Callable[[Any, Tensor], Tensor]:

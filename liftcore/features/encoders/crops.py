@@ -7,6 +7,7 @@ also those that give no dense features.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from itertools import islice
 from pathlib import Path
 from typing import Any, Self
 
@@ -19,12 +20,12 @@ from torch.nn import functional
 
 from liftcore.errors import InvalidInput
 from liftcore.features.encoders import Pixels
-from liftcore.features.encoders.clip import training_pixels
+from liftcore.features.encoders.clip import space_of, training_pixels
 from liftcore.features.encoders.encode import prepare, read_image
 from liftcore.features.masks import labels_alone
 from liftcore.features.views import check_finite
 from liftcore.progress import Progress, silent
-from liftcore.query.text.open_clip import OpenedModel, create_model, open_model
+from liftcore.query.text.open_clip import OpenedModel, open_model
 
 SPEC = "open_clip:MODEL/TAG or open_clip:MODEL@FILE"
 BATCH = 32  # crops that are encoded together
@@ -53,14 +54,7 @@ class CropEncoder:
         if kind != "open_clip" or not rest:
             raise InvalidInput("--encoder", expected=SPEC, got=repr(spec))
         opened = open_model(kind, rest)
-        _, at, file = rest.partition("@")
-        return cls(opened, f"{opened.name}@{Path(file).resolve()}" if at else opened.name, device)
-
-    @classmethod
-    def _with_random_weights(cls, model_name: str) -> Self:
-        """A model of the right shape that knows nothing: tests of plumbing only."""
-        opened = OpenedModel(f"open_clip:{model_name} (random)", model_name, create_model(model_name, None))
-        return cls(opened, "none", torch.device("cpu"))
+        return cls(opened, space_of(opened, rest), device)
 
     def encode(self, images: Tensor) -> Tensor:
         """Images [n, 3, side, side] f32, prepared as `pixels` says -> unit vectors [n, F] f32 on the CPU."""
@@ -93,8 +87,8 @@ def crop_vectors(
         labels, rows = labels_alone(path, unlabelled)
         side = encoder.pixels.shorter
         crops = (prepare(crop, encoder.pixels, side) for crop in _crops(photos[view], labels, rows, side))
-        vectors = [encoder.encode(torch.stack(batch)) for batch in _batches(crops)]
-        whole = torch.cat(vectors)
+        batches = (torch.stack(list(islice(crops, BATCH))) for _ in range(0, rows, BATCH))
+        whole = torch.cat([encoder.encode(batch) for batch in batches])
         check_finite(whole, f"vectors of the masks of {view!r}")
         found[view] = whole.half().numpy()
         progress("encode", done, len(masks), "views")
@@ -121,14 +115,3 @@ def _crops(photo: Path, labels: np.ndarray, rows: int, side: int) -> Iterator[Im
         if not alone.size:  # no pixels of the mask, or none of the photo
             alone = np.zeros((1, 1, 3), np.uint8)
         yield ImageOps.pad(Image.fromarray(alone), (side, side))
-
-
-def _batches(crops: Iterator[Tensor]) -> Iterator[list[Tensor]]:
-    waiting: list[Tensor] = []
-    for crop in crops:
-        waiting.append(crop)
-        if len(waiting) == BATCH:
-            yield waiting
-            waiting = []
-    if waiting:
-        yield waiting

@@ -89,3 +89,13 @@ def test_commands_take_inputs_and_write_lifts_elsewhere(elsewhere: str, capsys: 
     assert json.loads(capsys.readouterr().out)["kind"] == "lift"
     assert main(["inspect", f"{elsewhere}/nothing"]) == 2
     assert f"{elsewhere}/nothing" in capsys.readouterr().err
+
+
+def test_storage_that_does_not_open_is_told_before_the_lift(
+    elsewhere: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("liftcore.io.scene_files.lift_files", None)  # the work, which would be our fault
+    status = main(
+        ["lift", *(f"{elsewhere}/{name}" for name in FILES), "-o", "nothing-like-it://bucket/x.safetensors"]
+    )
+    assert status == 2 and "nothing-like-it" in capsys.readouterr().err
