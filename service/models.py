@@ -393,6 +393,7 @@ class Tradeoff(BaseModel):
     labels: Labels | None = Field(description="the masks that it was judged by")
     runs: list[dict[str, Any]] = Field(description="one for each preset or place of the dial: seconds and accuracy")
     skipped: list[str] = Field(description="what did not fit the budget")
+    refused: list[str] = Field(default=[], description="what the order's settings forbid")
     choice: dict[str, Any] = Field(description="which run to take, and why")
     views: dict[str, int] = Field(description="how many were lifted, of how many, and held out")
     budget_s: float

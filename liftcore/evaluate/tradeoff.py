@@ -94,15 +94,19 @@ CANDIDATES = (  # in the order in which a budget is spent; the dial and aggregat
 def candidates_of(settings: Mapping[str, Any]) -> list[Candidate]:
     """Those that the settings of an order allow, `EXACT` first; of two whose lifts would be the same the first."""
     lifts: dict[str, Candidate] = {}
+    LiftSettings.of(**{**settings, **EXACT.settings})
     for candidate in CANDIDATES:
-        try:
-            made = LiftSettings.of(**{**settings, **candidate.settings})
-        except InvalidSettings:  # as reliability without the robust step, which a preset has
-            if candidate is EXACT:
-                raise
-            continue
-        lifts.setdefault(made.model_dump_json(exclude={"preset", "speed"}), candidate)
+        made = _allowed(settings, candidate)
+        if made is not None:
+            lifts.setdefault(made.model_dump_json(exclude={"preset", "speed"}), candidate)
     return list(lifts.values())
+
+
+def _allowed(settings: Mapping[str, Any], candidate: Candidate) -> LiftSettings | None:
+    try:
+        return LiftSettings.of(**{**settings, **candidate.settings})
+    except InvalidSettings:  # as reliability without the robust step, which a preset has
+        return None
 
 
 @dataclass(frozen=True)
@@ -157,7 +161,8 @@ def compare(
         settings: of all runs, beside what they compare.
 
     Returns:
-        Plain numbers: the ``runs``, what was ``skipped``, which ``views`` were lifted, and the ``choice``.
+        Plain numbers: the ``runs``, what was ``skipped`` for want of time, what the settings ``refused``, which
+        ``views`` were lifted, and the ``choice``.
 
     Raises:
         InvalidInput: the scene lacks what is needed; or whatever a lift refuses.
@@ -192,6 +197,7 @@ def compare(
     return {
         "runs": runs,
         "skipped": skipped,
+        "refused": [candidate.name for candidate in CANDIDATES if _allowed(settings, candidate) is None],
         "choice": choose(runs, judged),
         "views": {"lifted": len(spec.lifted), "of": lifted, "held_out": len(spec.held_out)},
         "labelled_views": len(spec.labelled),

@@ -48,6 +48,8 @@ def page_of(document: Mapping[str, Any]) -> list[str]:
     """The table with what it says and how it was made, as Markdown."""
     views, machine = document["views"], document["hardware"]
     skipped = f" Not run for want of time: {', '.join(document['skipped'])}." if document["skipped"] else ""
+    forbidden = ", ".join(document["refused"])
+    refused = f" Not compared, as your settings forbid it: {forbidden}." if forbidden else ""
     subset = "" if views["lifted"] == views["of"] else f" (every n-th of {views['of']}, to fit the budget)"
     return [
         *table_of(document),
@@ -57,8 +59,8 @@ def page_of(document: Mapping[str, Any]) -> list[str]:
         verdict_of(document),
         "",
         f"`{document['command']}`, {document['date']}, {document['seconds']:.0f} s; {views['lifted']} views lifted"
-        f"{subset}, {views['held_out']} with features and {document['labelled_views']} with masks held out.{skipped} "
-        + machine_line(machine),
+        f"{subset}, {views['held_out']} with features and {document['labelled_views']} with masks held out."
+        f"{skipped}{refused} {machine_line(machine)}",
     ]
 
 

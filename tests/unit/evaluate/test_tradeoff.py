@@ -201,7 +201,8 @@ def test_chart_table_and_json_are_written(tmp_path):
     lossy = [RUNS[0], RUNS[1], RUNS[2] | {"lost_share": 0.125}, RUNS[3]]
     runs = [{**run, **accuracy_of(run["judged"])} for run in lossy]
     document = {
-        "title": "t", "scene": "s", "command": "c", "runs": runs, "skipped": ["mean"], "choice": chosen(*RUNS),
+        "title": "t", "scene": "s", "command": "c", "runs": runs, "skipped": ["mean"], "refused": ["argmax"],
+        "choice": chosen(*RUNS),
         "views": {"lifted": 2, "of": 4, "held_out": 6}, "labelled_views": 0, "budget_s": 1.0, "seconds": 2.0,
         "date": "2026-11-21", "hardware": {"cpu": "x"},
     }  # fmt: skip
@@ -213,6 +214,7 @@ def test_chart_table_and_json_are_written(tmp_path):
     assert "**Take equal**" in page
     assert "told apart leaves 12.5% of the splats without the feature that exact gives them." in page
     assert "every n-th of 4" in page
+    assert "want of time: mean. Not compared, as your settings forbid it: argmax." in page
     assert "Not run for want of time: mean." in page
     assert [line.split(" | ")[0] for line in table_of(document)[2:]] == [
         "| **unclear**", "| **told apart**", "| **equal**", "| **exact**",
