@@ -181,9 +181,11 @@ def mask_noise(subject: Subject) -> Rows:
     maps = {name: observed for name, observed in seen.items() if isinstance(observed, Regions)}
     methods: dict[str, dict[str, Any]] = {
         "row-sum": {"preset": "row-sum"},
-        "tikhonov": {},
-        "tikhonov + robust step": {"robust_steps": 1},
-        "tikhonov + aggregation": {"aggregation": True},
+        "tikhonov": {"preset": "tikhonov"},
+        "tikhonov + robust step": {"preset": "tikhonov", "robust_steps": 1},
+        "tikhonov + aggregation": {"preset": "tikhonov", "aggregation": True},
+        "default": {},
+        "default + aggregation": {"aggregation": True},
     }
     for rate in (0.0, 0.1, 0.2, 0.4, 0.6):
         wrong = noisy_masks(maps, rate, seed=0)

@@ -25,6 +25,7 @@ def main() -> None:
         ("--features", {"default": "features", "metavar": "NAME", "help": "the pack in FOLDER"}),
         ("--speeds", {"nargs": "+", "default": list(map(str, Speed)), "choices": list(map(str, Speed))}),
         ("--rounds", {"type": int, "default": 2}),
+        ("--preset", {"default": "tikhonov", "metavar": "NAME"}),
     )
     options = parser.parse_args()
     splats, cameras, pack = scene_files(options.folder, options.features)
@@ -33,7 +34,8 @@ def main() -> None:
     for number in range(1 + max(1, options.rounds)):  # the first round compiles
         for speed in dict.fromkeys(["exact", *options.speeds]):
             start = time.process_time()
-            made[speed] = lift_files(splats, cameras, [pack], LiftSettings.of(speed=speed, device="cpu"), threads=1)
+            settings = LiftSettings.of(preset=options.preset, speed=speed, device="cpu")
+            made[speed] = lift_files(splats, cameras, [pack], settings, threads=1)
             if number:
                 seconds[speed] = min(seconds.get(speed, float("inf")), time.process_time() - start)
     exact = made["exact"]

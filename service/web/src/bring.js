@@ -279,7 +279,7 @@ export class Bring {
   }
 
   job(job) {
-    const kind = job.kind === "tradeoff" ? `Comparison within ${job.parameters.budget_s} s` : `Lift, ${job.settings.preset || "tikhonov"}`;
+    const kind = job.kind === "tradeoff" ? `Comparison within ${job.parameters.budget_s} s` : `Lift, ${job.settings.preset}`;
     const parts = [el("span", { className: "name" }, kind), el("span", { className: `kind ${job.state}` }, job.state)];
     const step = job.progress;
     if (job.state === "running" && step) {
