@@ -252,7 +252,7 @@ class _Lift:
         for name, asked in (("objects", self.settings.objects is True), ("aggregation_clusters", graph)):
             if asked and not masks:
                 expected = "views with masks: objects are what masks of several views keep together"
-                raise InvalidSettings(name, expected=expected, got="views of grids", hint="take auto")
+                raise InvalidSettings(name, expected=expected, got="grids, or maps without a label", hint="take auto")
         if not masks or not (self.settings.objects or self._by_masks):
             return None
         with self.timings.stage("objects"):
@@ -267,7 +267,8 @@ class _Lift:
         W, settings, consensus = geometry.weights, self.settings, None
         masks = bool((geometry.levels >= 0).any())
         if settings.consensus is True and not masks:
-            expected, got = "views with masks: cells of a grid say nothing of what they show", "views of grids"
+            expected = "views with masks: cells of a grid say nothing of what they show"
+            got = "grids, or maps without a label"
             raise InvalidSettings("consensus", expected=expected, got=got, hint="leave it at auto")
         if settings.consensus and masks:
             with self.timings.stage("consensus"):

@@ -59,7 +59,7 @@ def certify(measures: ViewMeasures, sums: np.ndarray, evidence: Tensor, settings
         sums: [P] f64, of rows of W. evidence: [P] f32.
 
     Returns:
-        Plain numbers, ready for JSON; None where nothing was sampled.
+        Plain numbers, ready for JSON; None where nothing was sampled, or where float32 has no squares.
     """
     row_sums, residuals = measures.row_sums, measures.residuals
     beta = quantiles(measures.betas)
@@ -165,7 +165,7 @@ def measure_rows(rays, starts, weights, X, B):
 
 
 def _mean(values: np.ndarray) -> float | None:
-    return float(values.mean()) if values.size else None
+    return float(values.mean()) if values.size and np.isfinite(values).all() else None
 
 
 def quantiles(values: np.ndarray) -> dict[str, float | None]:
@@ -173,7 +173,8 @@ def quantiles(values: np.ndarray) -> dict[str, float | None]:
     values = values[~np.isnan(values)]
     if not values.size:
         return {"median": None, "p99": None, "max": None}
-    found = {"median": np.median(values), "p99": np.quantile(values, 0.99), "max": values.max()}
+    with np.errstate(invalid="ignore"):  # between two infinite values NumPy finds no number
+        found = {"median": np.median(values), "p99": np.quantile(values, 0.99), "max": values.max()}
     return {name: float(value) if np.isfinite(value) else None for name, value in found.items()}
 
 

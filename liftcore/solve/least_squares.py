@@ -87,16 +87,15 @@ class Channels:
 
         They are changed in place, unless float16 cannot hold the result: then a float32 copy is.
         """
-        if features.dtype == torch.float16 and float(np.abs(step).max(initial=0)) > FLOAT16_MAX / 4:
-            features = features.float()
         axes = None if self.axes is None else self.axes[:, self.begin : self.end].T.contiguous()
+        channels = slice(self.begin, self.end) if axes is None else slice(None)
         with one_thread():
             for first in range(0, features.shape[0], ROWS):
                 part = torch.from_numpy(step[first : first + ROWS])
-                target = features[first : first + ROWS]
-                if axes is None:
-                    target = target[:, self.begin : self.end]
-                target += (part if axes is None else part @ axes).to(features.dtype)
+                rows = features[first : first + ROWS, channels] + (part if axes is None else part @ axes)
+                if features.dtype == torch.float16 and bool((rows.abs() > FLOAT16_MAX).any()):
+                    features = features.float()
+                features[first : first + ROWS, channels] = rows
         return features
 
 
@@ -468,7 +467,7 @@ def reference(
         features: [P, F], x'. seen: [P] bool. samples, codebooks: of every view.
 
     Returns:
-        Plain numbers, ready for JSON; None where nothing was sampled or a row is met exactly.
+        Plain numbers, ready for JSON; None where nothing was sampled or measurable, or a row is met exactly.
     """
     axes = random_axes(features.shape[1], settings.reference_channels, settings.seed)
     parts = blocks(features.shape[1], axes)
@@ -513,11 +512,11 @@ def row_betas(measures: ViewMeasures) -> np.ndarray:
 
 def _measured(measures: ViewMeasures) -> dict[str, Any]:
     beta = quantiles(row_betas(measures))
-    residual = measures.residuals.sum()
+    residual, surrogate = measures.residuals.sum(), measures.surrogates.sum()
     return {
         "beta": beta,
         "bound": None if beta["max"] is None else 1.0 + beta["max"],
-        "surrogate_bound": float(measures.surrogates.sum() / residual) if residual > 0 else None,
+        "surrogate_bound": float(surrogate / residual) if residual > 0 and np.isfinite(surrogate) else None,
         "beta_of_lengths": quantiles(measures.betas),
     }
 

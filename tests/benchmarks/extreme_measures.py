@@ -3,6 +3,8 @@
 The float64 reference is `liftcore.raster.reference`; of features, the dense definition of the closed form over it.
 """
 
+import json
+import math
 import re
 import tempfile
 from collections.abc import Callable, Mapping
@@ -21,6 +23,7 @@ from liftcore.io.inria import write_inria_cameras
 from liftcore.io.inspect import describe_cameras, describe_packs, describe_splats
 from liftcore.io.ply import write_splats
 from liftcore.io.scene_files import lift_files
+from liftcore.query.threshold import METHODS
 from liftcore.raster.base import NEAR_PLANE, CompositingParams, Weighting
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.raster.reference import DenseView, dense_view, projected_gaussian, reading_matrix
@@ -210,6 +213,8 @@ class Task:
 def lifted(name: str, task: Task, claim: Callable[[Any], bool] = always, **more: Any) -> Extreme:
     """An extreme whose features are held to the dense definition, relative to the longest value that came in.
 
+    All else that a lift may do after it (EVERYTHING), and questions by each threshold, must give finite numbers.
+
     Args:
         name: of the row. task: what is lifted. claim: what exact arithmetic says of the lift.
         more: kernels, bound and told of the Extreme.
@@ -273,6 +278,7 @@ def _measure_lift(task: Task, claim: Callable[[LiftResult], bool], kernel: Kerne
     faint = (totals > 0) & (totals < FAINT)
     errors = np.abs(made.features.double().numpy() - X) / (longest or 1.0)
     sound = bool(made.features.isfinite().all() & made.evidence.isfinite().all() & made.agreement.isfinite().all())
+    sound &= _survives(task, splats)
     sound &= np.array_equal(made.seen.numpy()[~faint], totals[~faint] > 0) and not bool(
         made.features[~made.seen].any()
     )
@@ -282,6 +288,23 @@ def _measure_lift(task: Task, claim: Callable[[LiftResult], bool], kernel: Kerne
         gives += f"; {int(faint.sum())} too faint, off by {errors[faint].max():.2g}"
     told = tuple(warnings + made.metadata.certificate["warnings"])
     return Found(gives, float(errors[~faint].max(initial=0)), told, sound and claim(made))
+
+
+EVERYTHING = {"preset": "default", "aggregation": True, "aggregation_cluster_size": 3}
+EVERYTHING |= {"cg_steps": 3, "damping": 0.0, "reference_channels": 2}
+
+
+def _survives(task: Task, splats: Splats) -> bool:
+    """Whether least squares, reference, reweighting and aggregation give finite numbers, and questions a score."""
+    made = run(replace(task, settings={**task.settings, **EVERYTHING}), splats)[0]
+    json.dumps(made.diagnostics, allow_nan=False)
+    asked = next(iter(task.views.values())).codebook[:1].float()
+    if not asked.any():
+        return bool(made.features.isfinite().all())
+    answers = [made.query(asked, threshold=method) for method in METHODS]
+    parts = [made.features, made.agreement, *(answer.scores for answer in answers)]
+    found = all(not math.isnan(answer.threshold) and not answer.splats[~made.seen].any() for answer in answers)
+    return found and all(bool(part.isfinite().all()) for part in parts)
 
 
 def _refusal(work: Callable[[], object], _: Kernel) -> Found:

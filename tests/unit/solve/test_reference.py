@@ -13,7 +13,7 @@ from liftcore.progress import silent
 from liftcore.raster.base import CompositingParams
 from liftcore.scene.splats import Splats
 from liftcore.settings import LARGEST_ALPHA, LiftSettings
-from liftcore.solve.diagnostics import ViewMeasures, measure_rows
+from liftcore.solve.diagnostics import ViewMeasures, measure_rows, quantiles
 from liftcore.solve.geometry import SampledRays, read_pixels, sample_pixels
 from liftcore.solve.least_squares import reference, row_betas
 from tests.scenes import look_at, random_splats
@@ -101,6 +101,7 @@ def test_the_papers_beta_of_lengths_is_no_bound():
 def test_a_row_that_is_met_exactly_has_no_finite_beta_unless_its_splats_agree():
     measures = ViewMeasures(np.ones(3), np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 3.0]), np.zeros(3))
     assert row_betas(measures).tolist() == [0.0, np.inf, 2.0]
+    assert quantiles(np.array([np.nan, 1.0, np.inf, 3.0, 2.0, np.inf])) == {"median": 3.0, "p99": None, "max": None}
 
 
 @settings(max_examples=6, deadline=None)
