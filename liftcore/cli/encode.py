@@ -22,9 +22,9 @@ def add_arguments(parser: Parser) -> None:
         "--encoder",
         required=True,
         metavar="SPEC",
-        help="maskclip:MODEL/TAG, clip:MODEL/TAG or timm:NAME; with weights of a file maskclip:MODEL@FILE, "
-        "clip:MODEL@FILE or timm:NAME@FILE",
+        help="maskclip:MODEL/TAG, clip:MODEL/TAG or timm:NAME; with --weights maskclip:MODEL or clip:MODEL",
     )
+    parser.add_argument("--weights", type=Path, metavar="FILE", help="its weights, as ENCODER@FILE names them too")
     parser.add_argument("--size", type=count, metavar="PX", help="the images' shorter side; else the model's own")
     parser.add_argument("--batch", type=count, default=1, metavar="N", help="images that are encoded together")
     parser.add_argument("--device", default="cpu", metavar="NAME", help="where the model runs, as torch names it")
@@ -40,7 +40,8 @@ def run(options: argparse.Namespace) -> int:
 
     images = find_images(options.images)
     out = free_output(options.output, list(images.values()))
-    encoder = open_image_encoder(options.encoder, options.device)
+    spec = f"{options.encoder}@{options.weights}" if options.weights else options.encoder
+    encoder = open_image_encoder(spec, options.device)
     settings = EncodeSettings(options.size, options.batch, options.normalised)
     with progress_bars() as progress, writing(out):
         encoded = encode_images(images, encoder, out, settings, progress)

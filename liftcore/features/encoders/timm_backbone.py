@@ -1,7 +1,9 @@
 """Backbones of timm (DINO, DINOv2, ViT, ResNet and their kin): features that have no words."""
 
+import logging
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any, Self
 
@@ -20,6 +22,8 @@ _LEFT_OVER = ("mask_token",)
 _PROBE = (2, 3)  # rows and columns of the grid that a new encoder must give
 _STRIDED = (nn.Conv2d, nn.MaxPool2d, nn.AvgPool2d)
 
+log = logging.getLogger(__name__)
+
 
 class TimmEncoder:
     """Normed patch tokens of the last block, or the last feature map (``ImageEncoder``)."""
@@ -37,6 +41,8 @@ class TimmEncoder:
     @classmethod
     def open(cls, spec: str, device: torch.device) -> Self:
         """Load ``NAME`` (cached or downloaded by timm) or ``NAME@WEIGHTS_FILE`` (tensors only).
+
+        A file that has none of timm's names is taken for the same network in another program's, `in_order`.
 
         Raises:
             InvalidInput: an unknown model, one that takes a single image size, or a file that is not its weights.
@@ -123,7 +129,14 @@ def _from_file(label: str, name: str, path: Path) -> Any:
         stored = _library().models.load_state_dict(str(path), device="cpu", weights_only=True)
         # Each family of timm translates the names of its authors' checkpoints.
         translate = getattr(sys.modules[type(model).__module__], "checkpoint_filter_fn", None)
-        state = translate(stored, model) if translate else stored
+        state = translate(dict(stored), model) if translate else stored
+        if not state.keys() & model.state_dict().keys():
+            if path.suffix == ".safetensors":
+                raise ValueError(
+                    "other names, and this format sorts by name: bring a file that keeps the order (.pth)"
+                )
+            state = in_order(stored, model.state_dict())
+            log.warning("%s: %s has other names; its tensors are taken in their order", label, path.name)
         missing, unexpected = model.load_state_dict(state, strict=False)
     except Exception as error:  # unpickling and state dicts fail in many kinds; all mean "not these weights"
         raise _not_weights(label, name, path, str(error)) from None
@@ -132,6 +145,42 @@ def _from_file(label: str, name: str, path: Path) -> Any:
         part = ", ".join([*(f"no {key}" for key in missing[:2]), *(f"a strange {key}" for key in unexpected[:2])])
         raise _not_weights(label, name, path, part)
     return model
+
+
+def in_order(stored: Mapping[str, Tensor], named: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The tensors of a file under a model's names, for a file that names the same network in another way.
+
+    Tensor k of the one is taken for tensor k of the other if their shapes and the last parts of their names
+    (`weight`, `running_var`) are the same. A classifier may follow in the file, and either may lack the counters of
+    batch norm.
+
+    Args:
+        stored: the file's, in its order. named: the model's, in its order.
+
+    Raises:
+        ValueError: a tensor differs, which is named.
+    """
+    theirs, ours = ([*_without_counters(tensors).items()] for tensors in (stored, named))
+    classifier = [tuple(tensor.shape[:1]) for _, tensor in theirs[len(ours) :]]
+    if len(classifier) == 2 and classifier[0] == classifier[1]:
+        theirs = theirs[: len(ours)]
+    for number, (their, our) in enumerate(zip_longest(theirs, ours)):
+        if their is None or our is None or _kind(*their) != _kind(*our):
+            file, model = (_told(*entry) if entry else "nothing" for entry in (their, our))
+            raise ValueError(f"other names, and in order tensor {number} is {file} where the model has {model}")
+    return {name: tensor for (name, _), (_, tensor) in zip(ours, theirs, strict=True)}
+
+
+def _without_counters(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    return {name: tensor for name, tensor in tensors.items() if not name.endswith("num_batches_tracked")}
+
+
+def _kind(name: str, tensor: Tensor) -> tuple[str, tuple[int, ...]]:
+    return name.rpartition(".")[2], tuple(tensor.shape)
+
+
+def _told(name: str, tensor: Tensor) -> str:
+    return f"{name} {list(tensor.shape)}"
 
 
 def _not_weights(label: str, name: str, path: Path, got: str) -> InvalidInput:

@@ -455,6 +455,30 @@ def test_weights_from_a_file_give_the_same_features(tmp_path: Path, vit: TimmEnc
             open_image_encoder(f"timm:vit_tiny_patch16_224@{tmp_path / name}.safetensors")
 
 
+def test_weights_under_other_names_are_taken_in_their_order(tmp_path: Path, resnet: TimmEncoder) -> None:
+    from safetensors.torch import save_file
+
+    own = [*resnet._model.state_dict().items()]
+    other = {f"_part{k}.{name.rpartition('.')[2]}": tensor for k, (name, tensor) in enumerate(own)}
+    head = {"_fc.weight": torch.zeros(10, 512), "_fc.bias": torch.zeros(10)}
+    torch.save(other | head, tmp_path / "renamed.pth")
+    images = torch.randn(1, 3, 64, 96)
+    opened = open_image_encoder(f"timm:resnet18@{tmp_path / 'renamed.pth'}")
+    assert torch.equal(opened.encode(images), resnet.encode(images))
+    swapped = [*other.items()]
+    swapped[1], swapped[2] = swapped[2], swapped[1]  # a weight and a bias of one shape
+    torch.save(dict(swapped), tmp_path / "swapped.pth")
+    torch.save(other | {"_more.weight": torch.zeros(2)}, tmp_path / "long.pth")
+    save_file({name: tensor.clone() for name, tensor in other.items()}, tmp_path / "sorted.safetensors")
+    for name, what in (
+        ("swapped.pth", r"tensor 1 is _part2.bias \[64\] where the model has bn1.weight \[64\]"),
+        ("long.pth", r"_more.weight \[2\] where the model has nothing"),
+        ("sorted.safetensors", "sorts by name"),
+    ):
+        with pytest.raises(InvalidInput, match=what):
+            open_image_encoder(f"timm:resnet18@{tmp_path / name}")
+
+
 def test_clip_from_a_file_has_the_text_space_that_opens_it(tmp_path: Path) -> None:
     from liftcore.query.text import open_encoder
     from liftcore.query.text.open_clip import create_model
