@@ -165,9 +165,9 @@ def in_order(stored: Mapping[str, Tensor], named: Mapping[str, Tensor]) -> dict[
     if len(classifier) == 2 and classifier[0] == classifier[1]:
         theirs = theirs[: len(ours)]
     for number, (their, our) in enumerate(zip_longest(theirs, ours)):
-        if their is None or our is None or _kind(*their) != _kind(*our):
-            file, model = (_told(*entry) if entry else "nothing" for entry in (their, our))
-            raise ValueError(f"other names, and in order tensor {number} is {file} where the model has {model}")
+        if their is None or our is None or _kind(their) != _kind(our):
+            got = f"tensor {number} is {_told(their)} where the model has {_told(our)}"
+            raise ValueError(f"other names, and in order {got}")
     return {name: tensor for (name, _), (_, tensor) in zip(ours, theirs, strict=True)}
 
 
@@ -175,12 +175,12 @@ def _without_counters(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return {name: tensor for name, tensor in tensors.items() if not name.endswith("num_batches_tracked")}
 
 
-def _kind(name: str, tensor: Tensor) -> tuple[str, tuple[int, ...]]:
-    return name.rpartition(".")[2], tuple(tensor.shape)
+def _kind(entry: tuple[str, Tensor]) -> tuple[str, tuple[int, ...]]:
+    return entry[0].rpartition(".")[2], tuple(entry[1].shape)
 
 
-def _told(name: str, tensor: Tensor) -> str:
-    return f"{name} {list(tensor.shape)}"
+def _told(entry: tuple[str, Tensor] | None) -> str:
+    return f"{entry[0]} {list(entry[1].shape)}" if entry else "nothing"
 
 
 def _not_weights(label: str, name: str, path: Path, got: str) -> InvalidInput:
