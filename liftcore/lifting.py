@@ -33,6 +33,7 @@ from liftcore.solve.consensus import mask_consensus
 from liftcore.solve.diagnostics import certify, lift_warnings, measure_samples
 from liftcore.solve.geometry import Geometry, Given, LiftViews, as_read, weigh_views
 from liftcore.solve.least_squares import AllRays, reference, refine
+from liftcore.solve.loss import huber_factors
 from liftcore.solve.objects import RegionObjects, region_objects
 from liftcore.solve.reweight import Agreement, agreement_factors, reweighted
 from liftcore.solve.weights import RegionWeights
@@ -225,6 +226,7 @@ class _Lift:
                 self.progress,
                 by_rows=bool(
                     self.settings.robust_steps
+                    or self.settings.loss == "huber"
                     or self.settings.aggregation_resolve
                     or self.settings.objects is True
                     or self._by_masks
@@ -259,7 +261,7 @@ class _Lift:
             return region_objects(geometry.weights.cpu(), geometry.levels, geometry.evidence().numpy(), self.threads)
 
     def reweight(self, geometry: Geometry) -> tuple[RegionWeights, Agreement | None]:
-        """W as it is solved: steps give factors of W's entries, which keep the sums of its rows.
+        """W as it is solved: steps give factors of W's entries, and so does a loss that is not of squares.
 
         Raises:
             InvalidSettings: consensus is asked for, and no view has masks.
@@ -275,21 +277,26 @@ class _Lift:
                 W = W.cpu()
                 found = mask_consensus(W, geometry.levels, self.threads, means=self.splats.means)
                 consensus = torch.from_numpy(found)
+        agreement = None
         with self.timings.stage("robust"):
-            if not settings.robust_steps:
-                return W, None
-            W = W.cpu()
-            found = agreement_factors(
-                W,
-                geometry.codebook,
-                settings.robust_steps,
-                self.progress,
-                means=self.splats.means,
-                threads=self.threads,
-                reliability=settings.reliability,
-                consensus=consensus,
-            )
-            return reweighted(W, found.factors), found
+            if settings.robust_steps:
+                W = W.cpu()
+                agreement = agreement_factors(
+                    W,
+                    geometry.codebook,
+                    settings.robust_steps,
+                    self.progress,
+                    means=self.splats.means,
+                    threads=self.threads,
+                    reliability=settings.reliability,
+                    consensus=consensus,
+                )
+                W = reweighted(W, agreement.factors)
+        if settings.loss == "huber":
+            with self.timings.stage("loss"):
+                W, how = W.cpu(), {"means": self.splats.means, "threads": self.threads}
+                W = reweighted(W, huber_factors(W, geometry.codebook, self.progress, **how))
+        return W, agreement
 
     def solve(self, W: RegionWeights, geometry: Geometry, plan: Plan) -> Solution:
         """The closed form."""

@@ -125,6 +125,9 @@ class LiftSettings(BaseModel):
         description="find objects without words, by what masks of many views keep together; auto: where the lift "
         "has a region for each mask",
     )
+    loss: Literal["l2", "huber"] = Field(
+        "l2", description="what features are nearest by: squares, or Huber's loss, by a few reweighted closed forms"
+    )
     dtype: Literal["float16", "float32"] = Field(
         "float16", description="how features are stored, if it can hold them"
     )
@@ -191,6 +194,9 @@ class LiftSettings(BaseModel):
         if self.aggregation_resolve and self.aggregation_clusters == "graph":
             told = "aggregation_clusters=hdbscan beside aggregation_resolve: masks that make clusters are all kept"
             raise PydanticCustomError("whole_regions", "{expected}", {"expected": told})
+        if self.loss == "huber" and self.cg_steps:
+            told = "cg_steps=0 beside loss=huber: such steps go towards the least squares"
+            raise PydanticCustomError("one_loss", "{expected}", {"expected": told})
         if (self.reliability or self.consensus or self.aggregation_guard) and not self.robust_steps:
             told = "robust_steps of 1 or more beside reliability, consensus and aggregation_guard, which need a step"
             raise PydanticCustomError("whole_regions", "{expected}", {"expected": told})

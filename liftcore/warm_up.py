@@ -12,6 +12,7 @@ from liftcore.solve.aggregate import explained_by
 from liftcore.solve.codebook import Codebook, ViewCodebook
 from liftcore.solve.consensus import mask_consensus
 from liftcore.solve.directions import RegionDirections
+from liftcore.solve.loss import huber_factors
 from liftcore.solve.objects import region_objects
 from liftcore.solve.reweight import agreement_factors
 from liftcore.solve.weights import one_view
@@ -34,5 +35,7 @@ def warm_up_lift(kernel: Kernel, device: Device, settings: LiftSettings) -> None
         mask_consensus(W, np.zeros(1, np.int8), 1)
     if settings.reliability:
         agreement_factors(W, book, 1, threads=1, reliability=True)
+    if settings.loss == "huber":
+        huber_factors(W, book, threads=1)
     if settings.aggregation:
         explained_by(W, RegionDirections(W, book), one, torch.ones(1, 1), 1)

@@ -41,22 +41,22 @@ IDENTITY = "lift.json"  # of what the pieces in a folder are
 
 def needs_all(settings: LiftSettings) -> list[str]:
     """The settings that need all regions or all splats in one place, as they are set."""
-    names = ("robust_steps", "objects", "aggregation", "cg_steps", "reference_channels")
-    return [f"{name}={value}" for name in names if (value := getattr(settings, name)) and value != "auto"]
+    names = ("robust_steps", "loss", "objects", "aggregation", "cg_steps", "reference_channels")
+    return [f"{name}={value}" for name in names if (value := getattr(settings, name)) not in (0, "auto", "l2")]
 
 
 def check_settings(settings: LiftSettings) -> None:
     """Refuse, before the work, what needs W or X in one place.
 
     Raises:
-        InvalidSettings: reweighting, objects, aggregation, or least squares.
+        InvalidSettings: reweighting, Huber's loss, objects, aggregation, or least squares.
     """
     asked = needs_all(settings)
     if asked:
         raise InvalidSettings(
             "engine",
-            expected="settings of the closed form alone: reweighting, objects, aggregation and least squares need "
-            "all regions or splats in one place",
+            expected="settings of the closed form alone: reweighting, Huber's loss, objects, aggregation and least "
+            "squares need all regions or splats in one place",
             got=", ".join(asked),
             hint="take a preset without them (row-sum, tikhonov), or lift without an engine",
         )

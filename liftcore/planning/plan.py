@@ -247,7 +247,7 @@ def _seconds(
 
 def weight_bytes(seen: Visibility, features: Views, names: Sequence[str], settings: LiftSettings) -> int:
     """Bytes of W of all views, about."""
-    judged = 4 if settings.robust_steps else 0
+    judged = 4 if settings.robust_steps or settings.loss == "huber" else 0
     return int(ROW_BYTES * _shown(seen) + (ENTRY_BYTES + judged) * _entries(seen, features, names, settings))
 
 
@@ -288,7 +288,7 @@ def memory_parts(
         "codebooks": size * sum(books) + min(8 * sum(books), 2 * TABLE_BYTES),
         "features": splats.count * channels * size,
     }
-    if settings.robust_steps:
+    if settings.robust_steps or settings.loss == "huber":
         entries = _entries(seen, features, names, settings)
         parts["reweighting"] = int(JUDGED_BYTES * min(entries, MEMORY_LIMIT / ENTRY_BYTES))  # more lies in files
         if settings.consensus:

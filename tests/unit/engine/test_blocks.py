@@ -115,7 +115,9 @@ def test_lift_goes_on_from_the_pieces_in_its_folder(scene: dict[str, Any], tmp_p
     assert_same(other, in_blocks(LocalEngine(1), scene, settings))
 
 
-@pytest.mark.parametrize("asked", [{"preset": "default"}, {"aggregation": True}, {"cg_steps": 2}])
+@pytest.mark.parametrize(
+    "asked", [{"preset": "default"}, {"preset": "row-sum", "loss": "huber"}, {"aggregation": True}, {"cg_steps": 2}]
+)
 def test_what_needs_all_regions_is_refused_before(scene: dict[str, Any], asked: dict[str, Any]) -> None:
     with pytest.raises(lc.InvalidSettings, match=r"engine: expected settings of the closed form alone.*; take a"):
         lc.lift(*scene.values(), engine=LocalEngine(), **asked)

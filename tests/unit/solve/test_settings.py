@@ -58,6 +58,8 @@ def test_what_is_wrong_is_told_in_our_words(made: Any) -> None:
         made({"aggregation_resolve": True, "aggregation_clusters": "graph"})
     with pytest.raises(InvalidSettings, match=r"^settings: expected robust_steps of 1 or more"):
         made({"robust_steps": 0, "aggregation_guard": True})
+    with pytest.raises(InvalidSettings, match=r"^settings: expected cg_steps=0 beside loss=huber"):
+        made({"loss": "huber", "cg_steps": 1})
 
 
 def test_published_schema_has_every_setting_and_what_a_new_lift_may_have() -> None:
