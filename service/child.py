@@ -24,12 +24,16 @@ def own_stdout() -> BinaryIO:
     return out
 
 
-def end_with_parent() -> None:
-    """End this process, and its group, when its stdin closes: the server's end does, however the server ended."""
-    stdin = os.fdopen(os.dup(0), "rb", buffering=0)
+def end_with_parent(lifeline: int | None = None) -> None:
+    """End this process, and its group, when a pipe closes: the server's end does, however the server ended.
+
+    Args:
+        lifeline: the pipe's file number, which is this function's from now on. None takes a copy of stdin.
+    """
+    pipe = os.fdopen(os.dup(0) if lifeline is None else lifeline, "rb", buffering=0)
 
     def wait() -> None:
-        stdin.read()
+        pipe.read()
         if os.getpgrp() == os.getpid():  # the server gave us a group of our own: all in it is our doing
             os.killpg(0, signal.SIGKILL)
         os._exit(ORPHANED)

@@ -113,7 +113,7 @@ def _planned(order: models.LiftRequest, deps: AppState) -> models.Plan:
     with deps.store.files.scratch() as scratch:
         file = scratch / "order.json"
         file.write_text(json.dumps(document))
-        heard = run_errand("service.jobs.planning", [str(file), str(limits.memory_bytes)], scratch, limits)
+        heard = run_errand("service.jobs.planning", [str(file)], scratch, limits)
     if heard is not None and heard.last["event"] == "valid":
         return models.Plan.model_validate(heard.last["plan"])
     if heard is not None and heard.last["event"] == "invalid":

@@ -1,19 +1,12 @@
-"""The process that reads an upload before it becomes an asset.
-
-Run as ``python -m service.uploads.check KIND PATH MEMORY_BYTES``, of a lift with the path of its cameras where these
-have another digest than it remembers. It says ``ready`` once it can read, then
-``valid`` with what it found, or ``invalid`` with the error: JSON lines on stdout.
-"""
+"""The errand that reads an upload before it becomes an asset (`service.errand`)."""
 
 from __future__ import annotations
 
 import json
-import resource
-import sys
 import zipfile
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
@@ -27,7 +20,7 @@ from liftcore.io.kinds import kind_of
 from liftcore.io.lift_file import has_poses, parse_metadata, read_lift
 from liftcore.io.splats import SUFFIX, SplatFormat, format_of
 from liftcore.query.text.table import TableEncoder
-from service.child import die_with_parent, end_with_parent, fault_of, own_stdout
+from service.child import fault_of
 from service.models import VIEW_CHARACTERS, AssetKind, UploadKind
 from service.photos import describe_photos
 from service.store.lifts import LONG, SHOWN_BYTES
@@ -123,10 +116,16 @@ CHECKS: dict[UploadKind, Callable[..., dict[str, Any]]] = {
 }
 
 
-def run(kind: UploadKind, path: Path, *more: Path) -> dict[str, Any]:
-    """Check one file; the last message."""
+def run(named: str, file: str, *more: str) -> dict[str, Any]:
+    """Check one file of a kind: ``valid`` with what was found, or ``invalid`` with the error.
+
+    Args:
+        more: of a lift, the path of its cameras where these have another digest than it remembers.
+    """
+    kind: UploadKind = LIFT if named == LIFT else AssetKind(named)
+    path = Path(file)
     try:
-        checked = CHECKS[kind](path, *more)
+        checked = CHECKS[kind](path, *map(Path, more))
     except SplatliftError as error:
         return _invalid(_of_another_kind(kind, path) or error, kind, path)
     except MemoryError:
@@ -155,25 +154,3 @@ def _of_another_kind(kind: UploadKind, path: Path) -> InvalidInput | None:
 
 def _out_of_memory(kind: UploadKind) -> InvalidInput:
     return INVALID[kind](kind, expected="a file that fits the memory of a check", got="one that needs more")
-
-
-def _say(out: BinaryIO, message: dict[str, Any]) -> None:
-    out.write(json.dumps(message).encode() + b"\n")
-    out.flush()
-
-
-def main() -> None:
-    """Check the file that the command line names."""
-    kind: UploadKind = LIFT if sys.argv[1] == LIFT else AssetKind(sys.argv[1])
-    path, memory = Path(sys.argv[2]), int(sys.argv[3])
-    out = own_stdout()
-    die_with_parent()
-    end_with_parent()  # it may have died before
-    # Private memory and not address space: mapped files, however large, cost none.
-    resource.setrlimit(resource.RLIMIT_DATA, (memory, memory))
-    _say(out, {"event": "ready"})
-    _say(out, run(kind, path, *map(Path, sys.argv[4:])))
-
-
-if __name__ == "__main__":
-    main()

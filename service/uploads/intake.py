@@ -321,7 +321,8 @@ def check(kind: UploadKind, path: Path, scratch: Path, limits: ErrandLimits, *be
         Busy: the server ended meanwhile.
     """
     memory = min(limits.memory_bytes, CHECK_BASE_BYTES + CHECK_FACTOR * sum(map(_size, (path, *beside))))
-    heard = run_errand("service.uploads.check", [kind, str(path), str(memory), *map(str, beside)], scratch, limits)
+    given = [kind, str(path), *map(str, beside)]
+    heard = run_errand("service.uploads.check", given, scratch, replace(limits, memory_bytes=memory))
     if heard is None:
         raise INVALID[kind](
             kind, expected=f"a file that is read within {limits.seconds:g} s", got="one that takes longer"
@@ -330,7 +331,7 @@ def check(kind: UploadKind, path: Path, scratch: Path, limits: ErrandLimits, *be
         return Report(suffix=heard.last["suffix"], counts=heard.last["counts"], warnings=heard.last["warnings"])
     if heard.last["event"] == "invalid":
         raise error_of(heard.last["fault"])
-    log.error("the check of %s ended with %d: %s", kind, heard.returncode, heard.trace[-TRACE_CHARACTERS:])
+    log.error("the check of %s ended with %s: %s", kind, heard.returncode, heard.trace[-TRACE_CHARACTERS:])
     if heard.last["event"] == "ready":
         # It had started to read: whatever ended it, this file did.
         raise INVALID[kind](

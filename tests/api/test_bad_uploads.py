@@ -214,7 +214,7 @@ def test_malformed_upload_is_refused_and_gone(
 def test_every_malformed_file_is_told_in_one_line(tmp_path: Path, kind: str, make: Callable[[], bytes]) -> None:
     path = tmp_path / f"draft.{kind}"
     path.write_bytes(make())
-    said = json.loads(json.dumps(check.run(AssetKind(kind), path), allow_nan=False))
+    said = json.loads(json.dumps(check.run(kind, str(path)), allow_nan=False))
     assert said["event"] == "invalid"
     problem = problem_of(error_of(said["fault"]))
     assert (problem.status, problem.type) == (422, f"/problems/invalid-{kind}")
@@ -226,7 +226,7 @@ def test_names_of_cameras_are_as_long_as_a_query_may_say(tmp_path: Path) -> None
     for image, said in (("a" * 500, None), ("a" * 501, "501: 'aaa"), ("", "an empty one")):
         path = tmp_path / "draft.cameras"
         path.write_bytes(camera_of(image))
-        told = check.run(AssetKind.CAMERAS, path)
+        told = check.run(AssetKind.CAMERAS, str(path))
         assert told["event"] == ("valid" if said is None else "invalid")
         if said is not None:
             fault = told["fault"]

@@ -40,7 +40,7 @@ resource.setrlimit(resource.RLIMIT_DATA, (int(sys.argv[3]),) * 2)
 for name, content in corpus.items():
     path = folder / f"draft.{kind}"
     path.write_bytes(content)
-    found[name] = check.run(kind, path)
+    found[name] = check.run(kind, str(path))
 print(json.dumps(found))
 """
 
@@ -119,7 +119,7 @@ def test_real_file_with_changed_bytes_is_taken_or_refused_and_never_crashes(
     content = content[: round(end * len(content))] if end < 1 else content
     path = tmp_path / f"draft.{kind}"
     path.write_bytes(gzip.compress(content) if packed else content)
-    said = check.run(kind, path)
+    said = check.run(kind, str(path))
     if said["event"] == "valid":
         json.dumps(said, allow_nan=False, ensure_ascii=False).encode()
     else:

@@ -52,7 +52,7 @@ def put(client: TestClient, kind: AssetKind, content: bytes) -> str:
         draft.write_bytes(content)
         copy = folder / "copy"
         copy.write_bytes(content)
-        said = check.run(kind, copy)
+        said = check.run(kind, str(copy))
         digest = hashlib.sha256(content).hexdigest()
         upload = CheckedUpload(draft, kind, digest, said["suffix"], said["counts"], said["warnings"])
         return store.assets.add(SERVICE, upload)[0].id

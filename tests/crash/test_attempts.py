@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import pytest
 
@@ -274,48 +274,56 @@ def test_what_a_job_process_started_ends_when_its_server_does() -> None:
     until(lambda: not alive(grandchild))
 
 
+DEAF = """
+import os, pathlib
+
+def run(told):
+    pathlib.Path(told).write_text(str(os.getpid()))
+    sum(range(10**15))  # in one call of C
+"""
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="asks the kernel of Linux for it")
 def test_check_that_cannot_listen_ends_when_its_server_is_killed(tmp_path: Path) -> None:
-    deaf = "import service.uploads.check as c; c.run = lambda *given: sum(range(10**15)); c.main()"  # in one C call
+    (tmp_path / "deaf.py").write_text(DEAF)
+    told = tmp_path / "told"
     code = f"""if True:
-        import subprocess, sys
-        command = [sys.executable, "-c", {deaf!r}, "splats", "none", str(1 << 30)]
-        check = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True)
-        print(check.pid, check.stdout.readline(), flush=True)
-        check.wait()
+        import pathlib, threading
+        from service.errand import ErrandLimits, run_errand
+        limits = ErrandLimits(600, 8 << 30, threading.Event())
+        run_errand("deaf", [{str(told)!r}], pathlib.Path({str(tmp_path)!r}), limits)
     """
-    server = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
-    assert server.stdout is not None
-    check, ready = server.stdout.readline().split(maxsplit=1)
+    found = {"PYTHONPATH": f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"}
+    server = subprocess.Popen([sys.executable, "-c", code], env=os.environ | found)
+    check = None
     try:
-        assert "ready" in ready and alive(int(check))
+        until(lambda: told.exists() and told.read_text() != "")
+        check = int(told.read_text())
+        assert alive(check)
         server.kill()
         server.wait()
         until(lambda: not alive(int(check)))
     finally:
-        server.stdout.close()
-        with contextlib.suppress(ProcessLookupError):
-            os.kill(int(check), signal.SIGKILL)
+        server.kill()
+        if check is not None:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(check, signal.SIGKILL)
 
 
 @pytest.mark.parametrize(("size", "most"), [(1 << 20, 1040 << 20), (1 << 40, 8 << 30)])
 def test_check_may_take_memory_by_the_size_of_its_upload(
     size: int, most: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked: list[str] = []
-
-    def noted(command: list[str], **how: Any) -> None:
-        asked.extend(command)
-        raise OSError("noted")
+    def noted(module: str, given: list[str], scratch: Path, limits: errand.ErrandLimits) -> NoReturn:
+        raise OSError(f"may take {limits.memory_bytes}")
 
     with (tmp_path / "upload").open("wb") as handle:
         handle.truncate(size)
-    monkeypatch.setattr(errand.subprocess, "Popen", noted)
-    with pytest.raises(OSError, match="noted"):
+    monkeypatch.setattr(intake, "run_errand", noted)
+    with pytest.raises(OSError, match=f"may take {most}$"):
         intake.check(
             AssetKind.SPLATS, tmp_path / "upload", tmp_path, errand.ErrandLimits(1.0, 8 << 30, threading.Event())
         )
-    assert int(asked[-1]) == most
 
 
 def environment(pid: int) -> bytes:
