@@ -81,7 +81,7 @@ def open_encoder(spec: str) -> TextEncoder:
         from liftcore.query.text.minilm import MiniLmEncoder
 
         return MiniLmEncoder()
-    if kind == "open_clip" and rest:
+    if kind == "open_clip" and rest and ("@" in rest or "#" not in rest):
         from liftcore.query.text.open_clip import OpenClipEncoder
 
         return OpenClipEncoder.open(rest, templates)

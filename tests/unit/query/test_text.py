@@ -84,7 +84,7 @@ def test_a_file_that_is_no_table_is_refused(tmp_path: Path) -> None:
         open_encoder(str(path))
 
 
-@pytest.mark.parametrize("spec", ["", "clip", "table:", "open_clip:", "minilm:large"])
+@pytest.mark.parametrize("spec", ["", "clip", "table:", "open_clip:", "open_clip:ViT-B-32/openai#5", "minilm:large"])
 def test_an_unknown_encoder_is_refused_with_those_that_exist(spec: str) -> None:
     with pytest.raises(InvalidQuery, match="minilm"):
         open_encoder(spec)
