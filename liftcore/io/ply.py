@@ -100,6 +100,12 @@ def read_ply(path: Path, kernel: Kernel | str = "auto", *, colour: bool = True) 
     return Splats(**fields, kernel=kernel, extras=tensors, layout=layout, header=lines)
 
 
+def read_places(path: Path) -> np.ndarray:
+    """[P, 3] f32, the means alone of a file that `read_ply` takes, in its frame and unit; without torch."""
+    header = read_header(path)
+    return _read_columns(path, header, {axis: Slot("means", (k,)) for k, axis in enumerate("xyz")}, ())[0]["means"]
+
+
 def write_splats(splats: Splats, path: Path) -> None:
     """Write splats whole or not at all: the layout they were read with, or else their kernel's usual one.
 

@@ -103,6 +103,17 @@ def read_splats(path: Path | str, kernel: Kernel | str = "auto", *, colour: bool
         return Splats(**fields, kernel=chosen)
 
 
+def read_places(path: Path) -> np.ndarray:
+    """[P, 3] f32, the means alone of a file that `read_splats` takes, in its frame and unit. Only checkpoints need
+    torch for that, which takes a second to import.
+
+    Raises:
+        InvalidSplats: the file is of no format of splats.
+    """
+    found = format_of(path)
+    return ply.read_places(path) if found is SplatFormat.PLY else _READERS[found](path, colour=False)["means"]
+
+
 def format_of(path: Path) -> SplatFormat:
     """The format of a file, by its content.
 

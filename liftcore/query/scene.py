@@ -177,7 +177,11 @@ class QueryScene:
     @cached_property
     def axes(self) -> np.ndarray:
         """[3, P] f32, the splats' places axis by axis: a box around many of them is found five times faster so."""
-        return np.ascontiguousarray(as_numpy(self.splats.means).T)
+        if "splats" in self.__dict__:
+            return np.ascontiguousarray(as_numpy(self.splats.means).T)
+        from liftcore.io.splats import read_places
+
+        return np.ascontiguousarray(read_places(self.splat_file).T)
 
     @cached_property
     def cameras(self) -> Cameras:

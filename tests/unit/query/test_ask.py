@@ -146,10 +146,11 @@ def test_scene_made_of_values_needs_no_files(scene: QueryScene) -> None:
 
 def test_words_of_a_table_are_asked_without_torch(tiny_lift: Path) -> None:
     code = (
-        "import sys; from pathlib import Path; from liftcore.query.ask import ask; "
+        "import sys; from pathlib import Path; from liftcore.query.ask import ask, top; "
         "from liftcore.query.scene import QueryScene; from liftcore.query.terms import OneSplat, Query; "
         "import liftcore.query.text.table; "
-        "ask(QueryScene.open(Path(sys.argv[1])), Query((OneSplat(0),))); assert 'torch' not in sys.modules"
+        "scene = QueryScene.open(Path(sys.argv[1])); answer = ask(scene, Query((OneSplat(0),))); "
+        "assert top(answer, scene, 3).best and 'torch' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code, str(tiny_lift)], check=True)
 

@@ -22,7 +22,16 @@ from liftcore.errors import InvalidSplats
 from liftcore.io.lift_file import input_file
 from liftcore.io.ply import write_splats
 from liftcore.io.quantised import LEAST_ALPHA
-from liftcore.io.splats import SplatFormat, format_of, is_splats, read_splats, recoloured, require_kernel, some_rows
+from liftcore.io.splats import (
+    SplatFormat,
+    format_of,
+    is_splats,
+    read_places,
+    read_splats,
+    recoloured,
+    require_kernel,
+    some_rows,
+)
 from liftcore.io.spz import FRAME_EXTENSION, RDF, spz_blocks
 from liftcore.scene.harmonics import constant_terms
 from liftcore.scene.kernel import Kernel
@@ -72,6 +81,8 @@ def test_every_format_is_read_as_its_own_tool_reads_it(name: str, tmp_path: Path
         assert input_file(tmp_path / "folder").sha256 != before
     bare, whole = read_splats(unnamed, colour=False), read_splats(unnamed)
     assert bare.sh is None and torch.equal(bare.means, whole.means) and torch.equal(bare.quats, whole.quats)
+    assert np.array_equal(read_places(unnamed), whole.means.numpy())
+    assert np.array_equal(read_places(FILES / f"{name}.decoded.ply"), expected.means.numpy())
 
 
 @pytest.mark.parametrize("name", FORMATS)
