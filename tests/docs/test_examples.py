@@ -22,7 +22,8 @@ from pydantic import BaseModel
 
 import liftcore as lc
 from liftcore.cli import main
-from liftcore.features.mask_files import mask_of_runs, read_runs
+from liftcore.features.encoders import Pixels
+from liftcore.features.encoders.crops import CropEncoder
 from liftcore.features.pack import read_features
 from liftcore.io.splats import read_splats
 from liftcore.query.text.table import TableEncoder
@@ -81,6 +82,7 @@ def test_sams_masks_make_a_lift_that_knows_the_words(scene_folder: Path, monkeyp
     run_example(GUIDE, "import open_encoder")
     monkeypatch.undo()
     monkeypatch.chdir(scene_folder)
+    monkeypatch.setattr(CropEncoder, "open", GreyEncoder)  # nor are these
     commands = commands_between(GUIDE, "### From SAM's masks", "\n### ", scene_folder)
     assert [command[0] for command in commands] == ["pack", "lift"]
     question = ["query", "scene.lift.safetensors", "apple", "--table", "words.safetensors", "--view", "middle"]
@@ -141,47 +143,31 @@ def run_example(page: str, start: str) -> dict[str, Any]:
 
 
 def stand_ins() -> dict[str, ModuleType]:
-    """segment-anything and open_clip by the names that are used of them: they tell clusters by their grey.
-
-    Masks are run lengths of what is of one grey; a crop's vector is the codebook's row of its brightest pixel's grey,
-    a word's vector the row of the word, three times as long.
-    """
+    """segment-anything by the names that are used of it: masks are run lengths of what is of one grey."""
 
     def generate(image: np.ndarray) -> list[dict[str, Any]]:
         clusters = np.rint((image[..., 0].astype(float) - 40) / 80)
-        found = sam_records(np.stack([clusters == k for k in range(3)]))
-        for k, record in enumerate(found):
-            rows, columns = np.nonzero(clusters == k)
-            corner = [int(columns.min()), int(rows.min())]
-            record["bbox"] = [*corner, int(columns.max()) - corner[0], int(rows.max()) - corner[1]]
-        return found
+        return sam_records(np.stack([clusters == k for k in range(3)]))
 
-    def rle_to_mask(segmentation: dict[str, Any]) -> np.ndarray:
-        return mask_of_runs(*read_runs(segmentation, "a mask"))
-
-    def encode(images: torch.Tensor) -> torch.Tensor:
-        clusters = ((images.cpu().flatten(1).amax(dim=1) - 40) / 80).round().long()
-        return torch.from_numpy(codebook()).float()[clusters]
-
-    model = SimpleNamespace(
-        eval=lambda: None, to=lambda device: model, encode_image=encode,
-        encode_text=lambda rows: 3 * torch.from_numpy(codebook()).float()[rows],
-    )  # fmt: skip
-    generator = SimpleNamespace(generate=generate)
-    modules = {name: ModuleType(name) for name in ("segment_anything", "segment_anything.utils.amg", "open_clip")}
-    modules["segment_anything.utils"] = ModuleType("segment_anything.utils")
-    vars(modules["segment_anything"]).update(
+    module, generator = ModuleType("segment_anything"), SimpleNamespace(generate=generate)
+    vars(module).update(
         SamAutomaticMaskGenerator=lambda sam, output_mode: generator,
         build_sam_vit_h=lambda checkpoint: SimpleNamespace(to=lambda device: None),
     )
-    vars(modules["segment_anything.utils.amg"]).update(rle_to_mask=rle_to_mask)
-    vars(modules["open_clip"]).update(
-        create_model_and_transforms=lambda name, pretrained: (
-            model, None, lambda crop: torch.from_numpy(np.array(crop)).float(),
-        ),
-        get_tokenizer=lambda name: lambda texts: torch.tensor([WORDS.index(text) for text in texts]),
-    )  # fmt: skip
-    return modules
+    return {"segment_anything": module}
+
+
+class GreyEncoder:
+    """In place of an open_clip model: a crop's vector is the codebook's row of its brightest pixel's grey."""
+
+    pixels = Pixels(patch=8, shorter=8, mean=(0.0, 0.0, 0.0), std=(1.0, 1.0, 1.0), interpolation="nearest")
+
+    def __init__(self, spec: str, _: torch.device) -> None:
+        self.name = self.text_space = spec
+
+    def encode(self, images: torch.Tensor) -> torch.Tensor:
+        clusters = ((255 * images.flatten(1).amax(dim=1) - 40) / 80).round().long()
+        return torch.from_numpy(codebook()).float()[clusters]
 
 
 def test_command_line_example_writes_its_files(scene_folder: Path) -> None:
