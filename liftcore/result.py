@@ -126,6 +126,7 @@ class LiftResult:
         instances: int | None = None,
         keep: str = "all",
         absent: str = "drop",
+        weigh: str = "evidence",
         references: Any = None,
     ) -> VectorAnswer:
         """Which splats answer vectors of the lift's text space, as a text encoder gives them, or words of its own.
@@ -138,6 +139,8 @@ class LiftResult:
             threshold: auto, valley, paper, otsu, stability or a number on the scores.
             instances: how many things there are, where the caller knows. keep: of the objects, all or the largest.
             absent: drop what is not there, so that nothing is selected, or keep what is most like it.
+            weigh: what splats count by in the threshold's histogram and in objects: evidence, or that times
+                `confidence`.
             references: [n, F], the vectors of 200 words or more, by which presence is known; None = those of the
                 lift's text space, where it has some.
 
@@ -149,7 +152,7 @@ class LiftResult:
 
         return query_vectors(
             self.cpu(), positives, negatives, splats=splats, threshold=threshold, instances=instances, keep=keep,
-            absent=absent, references=references,
+            absent=absent, weigh=weigh, references=references,
         )  # fmt: skip
 
     def segment(self, words: Sequence[str], vectors: Any, splats: Splats) -> Segmentation:

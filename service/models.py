@@ -502,6 +502,10 @@ class Question(LiftQuestion):
     absent: Literal["drop", "keep"] = Field(
         "drop", description="words for what is not there: select nothing for them, or what is most like them"
     )
+    weigh: Literal["evidence", "confidence"] = Field(
+        "evidence",
+        description="what splats count by in the threshold's histogram and in objects; confidence: times it",
+    )
 
 
 class Asked(Question):

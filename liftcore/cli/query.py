@@ -56,6 +56,8 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument("--keep", choices=("all", "largest"), default="all", help=keep)
     absent = "of a word for what is not there, drop it and select nothing, or keep what is most like it"
     parser.add_argument("--absent", choices=("drop", "keep"), default="drop", help=absent)
+    weigh = "what splats count by in the threshold's histogram and in objects: evidence, or that times confidence"
+    parser.add_argument("--weigh", choices=("evidence", "confidence"), default="evidence", help=weigh)
     parser.add_argument("--top", type=count, default=0, metavar="N", help="name the best N splats")
     parser.add_argument("--objects", action="store_true", help="name the things found, with their places and boxes")
     add_view(parser)
@@ -118,6 +120,7 @@ def _query(options: argparse.Namespace) -> Query:
         instances=options.instances,
         keep=options.keep,
         absent=options.absent,
+        weigh=options.weigh,
     )
 
 

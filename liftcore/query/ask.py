@@ -112,9 +112,9 @@ def ask(scene: QueryScene, query: Query | str, encoder: TextEncoder | None = Non
     """Score every splat for a query and choose those that answer it.
 
     A splat counts in the histogram by its evidence: what hardly a ray met scores by the chance of a few pixels. It is
-    still selected by its score. A word for what is not there (`liftcore.query.presence`) is left out of the scores,
-    and where no other positive is left nothing is selected, unless the query keeps what is absent. Negatives and
-    examples are not questioned.
+    still selected by its score. With ``weigh`` its confidence counts too. A word for what is not there
+    (`liftcore.query.presence`) is left out of the scores, and where no other positive is left nothing is selected,
+    unless the query keeps what is absent. Negatives and examples are not questioned.
 
     Args:
         scene: an opened lift.
@@ -123,7 +123,8 @@ def ask(scene: QueryScene, query: Query | str, encoder: TextEncoder | None = Non
             need none.
 
     Raises:
-        InvalidQuery: a text without an encoder of the lift's space, or a term that has no feature.
+        InvalidQuery: a text without an encoder of the lift's space, a term that has no feature, or a lift without
+            the confidence that is asked for.
         NotFound: an example names a view or a region that is not there.
         InvalidLift: an example needs the scene's files, and they moved or changed.
     """
@@ -141,6 +142,7 @@ def query_vectors(
     instances: int | None = None,
     keep: str = "all",
     absent: str = "drop",
+    weigh: str = "evidence",
     references: Any = None,
 ) -> VectorAnswer:
     """Ask a lift for vectors of its text space, as a text encoder gives them, or for words of its own.
@@ -152,6 +154,7 @@ def query_vectors(
         splats: that were lifted; with them the answer has objects.
         threshold: as in `find_threshold`. instances: keep so many objects, the best. keep: all or the largest.
         absent: drop what is not there, so that nothing is selected, or keep what is most like it.
+        weigh: what splats count by in the threshold's histogram and in objects: evidence, or that times confidence.
         references: [n, F], the vectors of 200 words or more, by which presence is known; None = those of the lift's
             text space, where it has some (`liftcore.query.presence`).
 
@@ -162,7 +165,7 @@ def query_vectors(
 
     scene = QueryScene(result, splats)
     groups = [_terms(values) for values in (positives, negatives)]
-    query = Query(*groups, threshold=threshold, instances=instances, keep=keep, absent=absent)
+    query = Query(*groups, threshold=threshold, instances=instances, keep=keep, absent=absent, weigh=weigh)
     rows = directions(scene, query, None)
     if references is not None:
         others = References.of(references, scene.channels)
@@ -194,6 +197,7 @@ def question(scene: QueryScene, query: Query, encoder: TextEncoder | None) -> Qu
     """A query with the directions of its terms; what can be wrong with a query is found here (see `ask`)."""
     words = np.array([isinstance(term, str) for term in query.terms])
     rows = directions(scene, query, encoder)
+    scene.counted(query.weigh)
     encoder = encoder or scene.table
     if encoder is None or not words[: len(query.positives)].any():
         return Question(query, rows, words, "")
@@ -258,7 +262,9 @@ def _answer(scene: QueryScene, asked: Question, similarities: np.ndarray) -> Ans
         scores = np.where(seen, scores, np.float32(LOWEST_COSINE))
     known = scores if scene.all_seen else scores[seen]
     least = -math.inf if (asked.plain & kept)[: len(query.positives)].any() else LEAST_LIKENESS
-    found = find_threshold(known, query.threshold, scene.weights, least)
+    alike = query.weigh == "evidence"
+    weights = scene.weights if alike else scene.seen_alone(scene.counted(query.weigh))
+    found = find_threshold(known, query.threshold, weights, least)
     if presence.present is False and query.absent == "drop":
         found = replace(found, value=math.inf, explanation=presence.why, clear=False)
     return Answer(

@@ -57,8 +57,8 @@ def objects(scene: QueryScene, answer: "Answer") -> Objects:
     numbers = np.full(len(answer.scores), -1, np.int32)
     if not len(rows):
         return Objects((), numbers, 0)
-    evidence = scene.evidence[rows].astype(np.float64)
-    weights = evidence if evidence.any() else np.ones(len(rows))
+    weights = scene.counted(answer.query.weigh)[rows].astype(np.float64)
+    weights = weights if weights.any() else np.ones(len(rows))
     groups = touching(scene.splats, rows)
     sums = np.bincount(groups, weights)
     order = np.argsort(-sums, kind="stable")

@@ -139,7 +139,24 @@ class QueryScene:
     @cached_property
     def weights(self) -> np.ndarray | None:
         """How much each seen splat counts in a histogram, its evidence; None when none has evidence."""
-        weights = self.evidence[self.seen]
+        return self.seen_alone(self.evidence)
+
+    def counted(self, weigh: str) -> np.ndarray:
+        """[P] f32, how much each splat counts: by its evidence, or by that times its confidence.
+
+        Raises:
+            InvalidQuery: the lift has no confidence.
+        """
+        if weigh == "evidence":
+            return self.evidence
+        if self.confidence is None:
+            hint, got = "lift again with the preset default, or with robust_steps", "a lift that was not reweighted"
+            raise InvalidQuery("weigh", expected="a lift with confidence", got=got, hint=hint)
+        return self.evidence * self.confidence
+
+    def seen_alone(self, weights: np.ndarray) -> np.ndarray | None:
+        """Weights [P] of the seen splats; None when none is above zero, so that they count alike."""
+        weights = weights[self.seen]
         return weights if bool((weights > 0).any()) else None
 
     @cached_property

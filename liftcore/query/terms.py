@@ -23,6 +23,7 @@ from liftcore.query.threshold import check_method
 NOTATIONS = "VIEW:x,y, region:VIEW:LEVEL:ID or splat:J"
 KEPT = ("all", "largest")
 ABSENT = ("drop", "keep")
+WEIGH = ("evidence", "confidence")
 MOST_TERMS = 64  # for and against together
 MOST_INSTANCES = 100
 _PIXEL = re.compile(r"(.+):\s*(-?\d{1,9})\s*,\s*(-?\d{1,9})\s*", re.ASCII | re.DOTALL)
@@ -95,6 +96,7 @@ class Query:
     instances: int | None = None  # how many there are, where the user knows: so many objects are kept, the best
     keep: str = "all"  # of the objects that are found: all, or the largest alone
     absent: str = "drop"  # words for what is not there: drop them, or keep what is most like them
+    weigh: str = "evidence"  # what a splat counts by in histograms and objects: evidence, or that times confidence
     names: tuple[str, ...] = ()  # what errors call each of the terms; () = what they are themselves
 
     def __post_init__(self) -> None:
@@ -107,10 +109,9 @@ class Query:
         count = len(self.terms)
         if count > MOST_TERMS:
             raise InvalidQuery("query", expected=f"at most {MOST_TERMS} texts and examples", got=str(count))
-        if self.keep not in KEPT:
-            raise InvalidQuery("keep", expected=f"one of {', '.join(KEPT)}", got=repr(self.keep))
-        if self.absent not in ABSENT:
-            raise InvalidQuery("absent", expected=f"one of {', '.join(ABSENT)}", got=repr(self.absent))
+        for name, known in (("keep", KEPT), ("absent", ABSENT), ("weigh", WEIGH)):
+            if (chosen := getattr(self, name)) not in known:
+                raise InvalidQuery(name, expected=f"one of {', '.join(known)}", got=repr(chosen))
         if self.instances is not None and not 1 <= self.instances <= MOST_INSTANCES:
             raise InvalidQuery("instances", expected=f"1 to {MOST_INSTANCES}", got=str(self.instances))
         check_method(self.threshold)

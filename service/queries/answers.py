@@ -420,6 +420,7 @@ def query_of(asked: dict[str, Any]) -> Query:
         instances=asked["instances"],
         keep=asked["keep"],
         absent=asked["absent"],
+        weigh=asked["weigh"],
         names=tuple(itertools.chain.from_iterable(names.values())),
     )
 

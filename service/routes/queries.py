@@ -283,7 +283,7 @@ def query_request(operation: str, asked: Question, lift: LiftRecord, deps: AppSt
     request = with_encoder(request, asked, lift, deps) if asked.text or asked.negatives else {**request, **NO_ENCODER}
     if any(isinstance(example, str) and example.startswith(REGION) for example in (*asked.like, *asked.unlike)):
         request = with_packs(request, lift, deps, "like")
-    terms = ("text", "negatives", "like", "unlike", "threshold", "instances", "keep", "absent")
+    terms = ("text", "negatives", "like", "unlike", "threshold", "instances", "keep", "absent", "weigh")
     return request | {"query": {name: getattr(asked, name) for name in terms}}
 
 
@@ -363,5 +363,6 @@ def _link(path: str, asked: Question, **more: str) -> str:
     pairs += [("instances", str(asked.instances))] if asked.instances is not None else []
     pairs += [("keep", asked.keep)] if asked.keep != "all" else []
     pairs += [("absent", asked.absent)] if asked.absent != "drop" else []
+    pairs += [("weigh", asked.weigh)] if asked.weigh != "evidence" else []
     pairs += [(name, value) for name in ("encoder", "table") if (value := getattr(asked, name)) is not None]
     return f"{path}{'&' if '?' in path else '?'}{urlencode(pairs + list(more.items()))}"

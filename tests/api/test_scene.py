@@ -111,6 +111,8 @@ def test_an_answer_says_what_is_known_of_presence(client: TestClient, lift: dict
     kept = client.get("/query", params={"lift": lift["id"], "text": "lamp", "absent": "keep"}).json()
     assert "absent=keep" in kept["links"]["objects"] and kept["count"] > 0
     assert client.get("/query", params={"text": "lamp", "absent": "hide"}).status_code == 422
+    refused = client.get("/query", params={"lift": lift["id"], "text": "lamp", "weigh": "confidence"})
+    assert assert_problem(refused)["argument"] == "weigh"  # this lift was not reweighted
     nothing = client.get(
         "/query", params={"lift": lift["id"], "text": "lamp", "negatives": "book", "threshold": 1}
     ).json()

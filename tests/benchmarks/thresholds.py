@@ -1,6 +1,6 @@
 """Masks on the tabletop scene: mean IoU in the views that were not lifted, a phrase at a time.
 
-    python -m tests.benchmarks.thresholds DIR [--lifts NAME ...] [--every N] [--json]
+    python -m tests.benchmarks.thresholds DIR [--lifts NAME ...] [--every N] [--weigh confidence] [--json]
 
 Each phrase is asked alone, no other phrase and no truth is known to the threshold. A column a method: masks of the
 objects that it finds; ``worst`` is the phrase that ``auto`` shows least well. ``rendered`` cuts the rendered scores
@@ -30,7 +30,7 @@ from liftcore.query.directions import MINIMUM_ROW_SUM
 from liftcore.query.objects import objects
 from liftcore.query.render import view_mask
 from liftcore.query.scene import QueryScene
-from liftcore.query.terms import Query
+from liftcore.query.terms import WEIGH, Query
 from liftcore.query.text import TextEncoder, open_encoder
 from liftcore.query.threshold import METHODS, find_threshold
 from tests.benchmarks.base import PACKS, command_line, lift_files, mask_iou, opened, scene_files, tell
@@ -62,7 +62,11 @@ def best_iou(attention: np.ndarray, met: np.ndarray, truth: Tensor) -> float:
 
 
 def measure_phrases(
-    scene: QueryScene, phrases: Sequence[str], encoder: TextEncoder, held_out: Mapping[str, Tensor]
+    scene: QueryScene,
+    phrases: Sequence[str],
+    encoder: TextEncoder,
+    held_out: Mapping[str, Tensor],
+    weigh: str = "evidence",
 ) -> dict[str, float]:
     """Mean IoU over phrases and views, by method and for cuts of the rendered scores; the worst phrase of ``auto``.
 
@@ -71,12 +75,13 @@ def measure_phrases(
         phrases: [K], asked one at a time.
         encoder: of the lift's text space.
         held_out: view -> [H, W] int, the phrase that each pixel shows.
+        weigh: what splats count by.
     """
     rows: dict[str, list[float]] = {name: [] for name in COLUMNS}
     of_phrase: list[list[float]] = [[] for _ in phrases]
     for number, phrase in enumerate(phrases):
         for method in METHODS:
-            answer = ask(scene, Query((phrase,), threshold=method), encoder)
+            answer = ask(scene, Query((phrase,), threshold=method, weigh=weigh), encoder)
             found = objects(scene, answer)  # once for all views
             for view, labels in held_out.items():
                 truth = labels == number
@@ -99,7 +104,9 @@ def measure_phrases(
     return {name: float(np.mean(values)) for name, values in rows.items() if values} | {"worst": worst}
 
 
-def rows_of(folder: Path, packs: Iterable[str], lifts: Iterable[str], every: int) -> Iterator[dict[str, Any]]:
+def rows_of(
+    folder: Path, packs: Iterable[str], lifts: Iterable[str], every: int, weigh: str
+) -> Iterator[dict[str, Any]]:
     """One row a lift of the tabletop scene."""
     scene = Tabletop(folder)
     phrases = [thing["class"] for thing in json.loads((folder / "truth.json").read_text())["objects"]]
@@ -108,7 +115,7 @@ def rows_of(folder: Path, packs: Iterable[str], lifts: Iterable[str], every: int
         made = lift_files(scene_files(folder, pack), **LIFTS[name], view_stride=every)
         lifted = opened(made, scene.raster)
         head = {"scene": "tabletop", "features": f"{pack}, {len(made.views)} views", "lift": name}
-        yield head | measure_phrases(lifted, phrases, encoder, scene.held_out)
+        yield head | measure_phrases(lifted, phrases, encoder, scene.held_out, weigh)
 
 
 def still_life_rows(lifts: Sequence[str]) -> Iterator[dict[str, Any]]:
@@ -157,10 +164,11 @@ def main() -> None:
         ("--still-life", {"action": "store_true", "help": "the still life too, which nothing was tuned on"}),
         ("--features", {"nargs": "+", "default": PACKS, "choices": PACKS}),
         ("--lifts", {"nargs": "+", "default": tuple(LIFTS), "choices": tuple(LIFTS)}),
+        ("--weigh", {"default": WEIGH[0], "choices": WEIGH, "help": "what splats of tabletop count by"}),
         ("--every", {"type": int, "default": 1, "metavar": "N", "help": "tabletop's every N-th view alone"}),
     )
     options = parser.parse_args()
-    rows = list(rows_of(options.folder, options.features, options.lifts, options.every))
+    rows = list(rows_of(options.folder, options.features, options.lifts, options.every, options.weigh))
     rows += still_life_rows(options.lifts) if options.still_life else []
     tell(rows, as_json=options.json, columns=("scene", "features", "lift", "worst", *COLUMNS))
 

@@ -117,10 +117,13 @@ def test_every_term_and_option_is_part_of_the_query(
 
     monkeypatch.setattr("liftcore.query.ask.ask", ask)
     question = ["query", scene / "lift.safetensors", "--like", "splat:1", "--unlike", "splat:0"]
-    for options in ([], ["--threshold", "0.25", "--keep", "largest"], ["--instances", "3"]):
+    for options in ([], ["--threshold", "0.25", "--keep", "largest"], ["--instances", "3", "--weigh", "confidence"]):
         assert run(capsys, *question, *options)[0] == cli.INTERRUPTED
-    told = [(query.threshold, query.keep, query.instances) for query in asked]
-    assert told == [("auto", "all", None), (0.25, "largest", None), ("auto", "all", 3)]
+    told = [(query.threshold, query.keep, query.instances, query.weigh) for query in asked]
+    plain = "evidence"
+    assert told == [
+        ("auto", "all", None, plain), (0.25, "largest", None, plain), ("auto", "all", 3, "confidence"),
+    ]  # fmt: skip
     assert {(*map(str, query.positives), *map(str, query.negatives)) for query in asked} == {("splat:1", "splat:0")}
 
 

@@ -71,13 +71,17 @@ def test_unseen_splat_is_never_selected(exact: QueryScene) -> None:
         assert answer.count == COUNT - 1
 
 
-def test_splats_without_evidence_do_not_decide_the_threshold(exact: QueryScene) -> None:
+@pytest.mark.parametrize("weigh", ["evidence", "confidence"])
+def test_splats_without_evidence_or_confidence_do_not_decide_the_threshold(exact: QueryScene, weigh: str) -> None:
     plain = ask(exact, "x", Axes())
     stray = np.zeros((COUNT, CHANNELS))
     stray[:, 0], stray[:, 1] = 1.0, np.linspace(0.0, 3.0, COUNT)  # scores all over the range
-    evidence = torch.cat([torch.ones(COUNT), torch.full((COUNT,), 1e-4)])
-    crowd = of(exact, np.concatenate([exact.features, stray]), evidence=evidence)
-    answer = ask(crowd, "x", Axes())
+    weights = torch.cat([torch.ones(COUNT), torch.full((COUNT,), 1e-4)])
+    crowd = of(exact, np.concatenate([exact.features, stray]), **{weigh: weights})
+    answer = ask(crowd, Query(("x",), weigh=weigh), Axes())
+    plainly = ask(crowd, Query(("x",)), Axes())
+    assert np.array_equal(answer.scores, plainly.scores)
+    assert (answer.explanation == plainly.explanation) == (weigh == "evidence")  # which tells the share above it
     assert np.array_equal(answer.selected[:COUNT], plain.selected)
     assert answer.selected[COUNT] and answer.count > plain.count  # they are selected all the same
 
@@ -142,6 +146,16 @@ def test_scene_made_of_values_needs_no_files(scene: QueryScene) -> None:
     assert np.array_equal(ask(bare, query).selected, ask(scene, query).selected)
     with pytest.raises(InvalidLift, match="give the splats"):
         _ = QueryScene(lift).splats
+
+
+def test_who_weighs_by_confidence_needs_a_reweighted_lift(scene: QueryScene) -> None:
+    with pytest.raises(InvalidQuery, match=r"weigh: expected a lift with confidence.*preset default"):
+        question(scene, Query(("x",), weigh="confidence"), Axes())
+    with pytest.raises(InvalidQuery, match="weigh: expected one of evidence, confidence"):
+        Query(("x",), weigh="light")
+    sure = replace(scene.lift, confidence=torch.ones(len(scene.features)))
+    told, plain = (sure.query(np.eye(CHANNELS)[0], weigh=weigh) for weigh in ("confidence", "evidence"))
+    assert torch.equal(told.splats, plain.splats) and told.threshold == plain.threshold
 
 
 def test_words_of_a_table_are_asked_without_torch(tiny_lift: Path) -> None:

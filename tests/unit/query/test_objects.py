@@ -102,6 +102,21 @@ def test_without_evidence_splats_count_alike(scene: QueryScene) -> None:
     assert sum(thing.share for thing in found.found) <= 1.0
 
 
+def test_scores_of_objects_may_be_weighted_by_confidence(scene: QueryScene) -> None:
+    confidence = torch.rand(len(scene.features), generator=torch.Generator().manual_seed(0))
+    sure = QueryScene(replace(scene.lift, confidence=confidence), scene.splats)
+    answer = of(scene, 1, 2)
+    answer = replace(answer, query=replace(answer.query, weigh="confidence"))
+    found = objects(sure, answer)
+    for number, thing in enumerate(found.found):
+        own = found.numbers == number
+        weights = (scene.evidence * confidence.numpy())[own]
+        assert thing.score == pytest.approx(np.average(answer.scores[own], weights=weights))
+        assert thing.share == pytest.approx(
+            weights.sum() / (scene.evidence * confidence.numpy())[answer.selected].sum()
+        )
+
+
 def test_tails_of_a_thousandth_are_not_in_the_box() -> None:
     means = np.zeros((2001, 3))
     means[:, 0] = np.arange(2001)
