@@ -9,7 +9,7 @@ from liftcore.evaluate.labels import LabelledObject, LabelledScene
 from liftcore.evaluate.protocols import SEGMENTERS, EvaluationProtocol, Prediction
 from liftcore.progress import Progress, silent
 from liftcore.query.scene import QueryScene
-from liftcore.query.text import TextEncoder
+from liftcore.query.text import RememberingEncoder, TextEncoder
 from liftcore.scene.cameras import photo_size
 
 
@@ -198,6 +198,7 @@ def evaluate_scene(
         warnings.append(f"{labels.name}: {_named(lifted)} were lifted, though the list holds them out")
     elif lifted:
         warnings.append(f"{labels.name}: {len(lifted)} of {len(truth)} judged frames were lifted: {_named(lifted)}")
+    encoder = RememberingEncoder(encoder)  # each protocol asks for the same words
     texts, unknown = _readable(truth, encoder)
     if unknown:
         warnings.append(f"{labels.name}: {encoder.name} lacks {_named(unknown)}: left out")

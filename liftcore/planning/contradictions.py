@@ -8,7 +8,8 @@ region's cosine to the most similar one of another view. The ratio of the two is
 was made with, noisy, merged and wrong masks among them (.26 with 6 views). With positions times 0.3 it is .05 to .31,
 and with another scene's cameras .15 at most. Where it is low, positions times other factors are the control: of
 healthy scenes these reach .42 of it at most, and of scenes whose positions are off by .3 or .5 at least 1.4 of it
-(``python -m tests.benchmarks.first_hour``).
+(``python -m tests.benchmarks.first_hour``). Half and double come first: where there is some agreement, and it falls
+on both sides, the scale is the right one, and the others are not tried.
 
 Maps are also looked at alone (`liftcore.features.smoothness`).
 """
@@ -40,7 +41,7 @@ MOST_REGIONS = 2_048  # that are compared with each other
 MOST_ALONE = 0.8  # chance that two looks at a splat are from one view: beyond it, too little is seen twice
 LEAST_AGREEMENT = 0.2  # of what the features allow: healthy scenes have .26 or more, foreign cameras .15 or less
 LOW_AGREEMENT = 0.6  # below it, other scales are tried
-SCALES = (0.25, 0.5, 2.0, 3.0, 4.0)  # of the cameras' positions
+NEAR_SCALES, FAR_SCALES = (0.5, 2.0), (0.25, 3.0, 4.0)  # of the cameras' positions
 LEAST_GAIN = 1.25  # of another scale's agreement over the given one's: cameras near one place agree at any scale
 LEAST_ROW_SUM = 0.05  # in the mean: a scene of one object before nothing has a fifth or so
 LEAST_IN_VIEW = 0.05  # of the splats
@@ -83,8 +84,14 @@ def disagreement(
     """That views contradict each other, if they do; and the scale at which they would not."""
     if agreement >= LOW_AGREEMENT:
         return []
-    tried = {factor: agreement_of_views(splats, _scaled(views, factor), settings, threads)[1] for factor in SCALES}
-    known = {factor: found for factor, found in tried.items() if found is not None}
+    known: dict[float, float] = {}
+    for factors in (NEAR_SCALES, FAR_SCALES):
+        if known and agreement >= max(LEAST_AGREEMENT, *known.values()):
+            return []
+        for factor in factors:
+            found = agreement_of_views(splats, _scaled(views, factor), settings, threads, rays=0)[1]
+            if found is not None:
+                known[factor] = found
     best = max(known, key=lambda factor: known[factor], default=None)
     what = f"views agree on what they see to {max(agreement, 0):.0%} of what their most similar regions would allow"
     if best is not None and known[best] > max(LEAST_AGREEMENT, LEAST_GAIN * agreement):
@@ -104,22 +111,22 @@ def _scaled(views: LiftViews, factor: float) -> LiftViews:
 
 
 def agreement_of_views(
-    splats: Splats, views: LiftViews, settings: LiftSettings, threads: int | None = None
+    splats: Splats, views: LiftViews, settings: LiftSettings, threads: int | None = None, *, rays: int = RAYS
 ) -> tuple[float, float | None]:
-    """The mean sum of weights of a ray, and how far views agree, of what their features allow.
+    """The mean sum of weights of so many rays, and how far views agree, of what their features allow.
 
     None for the latter where they are too few, see too little in common, or have nothing to tell apart.
     """
     few = replace(views, names=_some(views.names, FLOWN))
     longest = max(max(few.camera(k).width, few.camera(k).height) for k in range(len(few)))
-    coarse = {"stride": max(1, longest // SIDE), "certificate_rays": RAYS, "robust_steps": 0, "consensus": False}
+    coarse = {"stride": max(1, longest // SIDE), "certificate_rays": rays, "robust_steps": 0, "consensus": False}
     own = settings.model_copy(update=coarse)
     with one_thread():
         raster = CpuRaster(splats, threads)
         geometry = weigh_views(raster, splats.count, few, own, silent, by_rows=False, threads=threads)
     sums = sum(float(sample.rows.weights.sum()) for sample in geometry.samples)
-    rays = sum(len(sample.rows.indptr) - 1 for sample in geometry.samples)
-    return sums / max(rays, 1), None if len(few) < FEWEST else _agreement_of(geometry)
+    taken = sum(len(sample.rows.indptr) - 1 for sample in geometry.samples)
+    return sums / max(taken, 1), None if len(few) < FEWEST else _agreement_of(geometry)
 
 
 def _agreement_of(geometry: Geometry) -> float | None:

@@ -47,11 +47,12 @@ def touching(splats: Splats, rows: np.ndarray, threads: int | None = None) -> np
     extent = float(np.abs(means).max()) or 1.0
     places = means + _TOLD_APART * extent * np.random.default_rng(0).random(means.shape)
     tree = KDTree(places)
-    order = tree.indices  # leaf by leaf: splats that are looked at one after the other have the same neighbours
+    # Leaf by leaf: splats that are looked at one after the other have the same neighbours.
+    order = tree.indices.astype(np.int32)
 
     def look(first: int) -> tuple[np.ndarray, np.ndarray]:
         own = order[first : first + _PIECE]
-        near = np.asarray(tree.query(places[own], min(NEIGHBOURS + 1, count))[1])  # itself among them
+        near = np.asarray(tree.query(places[own], min(NEIGHBOURS + 1, count))[1], np.int32)  # itself among them
         touch = _touch(shapes[own], shapes[near])
         return np.repeat(own, touch.sum(axis=1)), near[touch]
 
