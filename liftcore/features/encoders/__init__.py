@@ -77,7 +77,8 @@ def open_image_encoder(spec: str, device: str = "cpu") -> ImageEncoder:
     """
     kind, _, rest = spec.partition(":")
     if not rest or kind not in ("maskclip", "clip", "timm"):
-        raise InvalidInput("--encoder", expected=f"one of {', '.join(IMAGE_ENCODERS)}", got=repr(spec))
+        hint = "SigLIP, MobileCLIP and the like are maskclip:MODEL/TAG; maps of FeatUp and others come by pack npy"
+        raise InvalidInput("--encoder", expected=f"one of {', '.join(IMAGE_ENCODERS)}", got=repr(spec), hint=hint)
     where = device_named(device)
     if kind == "timm":
         from liftcore.features.encoders.timm_backbone import TimmEncoder

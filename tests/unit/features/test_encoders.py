@@ -499,6 +499,7 @@ def test_clip_from_a_file_has_the_text_space_that_opens_it(tmp_path: Path) -> No
         ("", "one of maskclip"),
         ("maskclip", "one of maskclip"),
         ("sam:vit", "one of maskclip"),
+        ("featup:dino", "pack npy"),
         ("maskclip:ViT-B-33/openai", "ViT-B-32"),
         ("clip:ViT-B-32/nothing", "one of the tags"),
         ("timm:resnet19", "resnet18"),
