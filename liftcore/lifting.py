@@ -149,6 +149,9 @@ def plan(
 ) -> Plan:
     """What `lift` with the same arguments would do, and what it would take: views, memory, warnings.
 
+    A few views are weighed to see whether splats, cameras and features contradict each other, as `lift` itself does
+    with views that lie in files.
+
     Raises:
         InvalidFeatures, InvalidSettings, Unavailable: as `lift` has it.
     """
@@ -206,7 +209,9 @@ class _Lift:
         """The plan, which may leave views out and take another device."""
         self.compile()
         with self.timings.step("plan"):
-            plan = plan_lift(self.splats, views, self.settings, self.device, self.threads)
+            # Values come from a program, perhaps a training loop: to look at them may take longer than to lift them.
+            look = bool(views.features.paths)
+            plan = plan_lift(self.splats, views, self.settings, self.device, self.threads, look=look)
             views.names = list(plan.views)
         on_plan(plan)
         if plan.device != self.device:

@@ -17,6 +17,7 @@ from liftcore.device import CPU, Device
 from liftcore.errors import Unavailable
 from liftcore.features.pack import Views
 from liftcore.io.transforms import frame_warning
+from liftcore.one_thread import one_thread
 from liftcore.planning.contradictions import contradictions
 from liftcore.planning.views import (
     PILOT_VIEWS,
@@ -149,6 +150,7 @@ class Plan:
         return f"; {len(self.spare)} add nothing that {WELL_COVERED} others do not show: {some}"
 
 
+@one_thread()
 def plan_lift(
     splats: Splats,
     views: LiftViews,
@@ -157,6 +159,7 @@ def plan_lift(
     threads: int | None = None,
     *,
     apart: bool = False,
+    look: bool = True,
 ) -> Plan:
     """Plan the lift of the views; the settings' coverage and view_cosine may choose among them.
 
@@ -164,6 +167,7 @@ def plan_lift(
         device: where it should run. A card with too little room leaves an ``auto`` lift to the processor.
         threads: that walk on the processor; None takes the cores that this process may use.
         apart: whether others hold W and X, so that this machine needs no room for them.
+        look: whether to weigh a few views, coarsely, to tell inputs that contradict each other.
 
     Raises:
         Unavailable: this machine has no room for the codebooks, or for the features in no place; or the card that
@@ -173,7 +177,7 @@ def plan_lift(
     names = views.names
     cameras = [views.cameras[name] for name in names]
     seen = visibility(splats, cameras, settings.lift_params)
-    wrong = contradictions(splats, views, settings, seen, threads)
+    wrong = contradictions(splats, views, settings, seen, threads) if look else ()
     chosen, expected = _choose_views(splats, views, settings, seen, threads)
     names, seen, cameras = [names[k] for k in chosen], seen.of(chosen), [cameras[k] for k in chosen]
     short = [] if apart else check_card(device, splats.count, settings.device)
