@@ -7,10 +7,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 
 from service.scopes import Scope
 from service.store.keys import Quota
+from tests.api.tiny_scene import make_scene
 
 from .browser import Browser
 from .conftest import Served, browsing
@@ -167,6 +169,15 @@ def test_everything_is_named_and_one_word_is_seen_alone(page: Browser, keep: Kee
     page.press("#tab-ask")
     ask(page, "lamp")
     assert page.value("splatlift.names.shown") is False and min(columns(page, AMBER)) > 50
+
+
+def test_link_to_the_words_of_a_table_says_so_in_the_form(page: Browser, served: Served) -> None:
+    scene = make_scene()
+    table = httpx.put(f"{served.address}/assets/table", content=scene.table).json()["id"]
+    page.open(f"{served.address}/?lift={served.lift}&named=*&table={table}")
+    page.until("splatlift.names.shown && document.querySelectorAll('#vocabulary option').length === 3")
+    assert page.value("document.querySelector('#vocabulary').value") == table
+    assert httpx.delete(f"{served.address}/assets/{table}").status_code == 204
 
 
 def test_mask_under_a_click_is_an_example(page: Browser, keep: Keep) -> None:

@@ -15,13 +15,16 @@ export class Names {
   constructor({ changed, centres, more, alone }) {
     Object.assign(this, { changed, centres, more, alone, lift: null, shown: false, only: new Set(), turn: 0 });
     at("naming").addEventListener("submit", event => { event.preventDefault(); this.fromForm(); });
-    at("vocabulary").addEventListener("change", () => { at("own-words-label").hidden = at("vocabulary").value !== OWN; });
+    at("vocabulary").addEventListener("change", () => {
+      this.chosen = at("vocabulary").value;
+      at("own-words-label").hidden = this.chosen !== OWN;
+    });
     at("unname").addEventListener("click", () => (this.shown ? this.rest() : this.bring()));
     at("what-more").addEventListener("click", () => this.more(this.spot.example));
   }
 
   async of(lift) {
-    Object.assign(this, { lift, asked: null, found: null, values: null, shown: false, spot: null });
+    Object.assign(this, { lift, asked: null, found: null, values: null, shown: false, spot: null, chosen: null });
     this.only.clear();
     this.turn += 1;
     at("own-words").value = "";
@@ -36,7 +39,7 @@ export class Names {
   }
 
   choose(vocabularies) {
-    fill(at("vocabulary"), vocabularies);
+    fill(at("vocabulary"), vocabularies, this.chosen ?? at("vocabulary").value); // a link may name a table before they are listed
     at("own-words-label").hidden = at("vocabulary").value !== OWN;
   }
 
@@ -81,7 +84,7 @@ export class Names {
   }
 
   typing() {
-    at("vocabulary").value = OWN;
+    at("vocabulary").value = this.chosen = OWN;
     at("own-words-label").hidden = false;
     at("own-words").focus();
   }
@@ -174,7 +177,7 @@ export class Names {
     if (!named.length) return;
     const own = named[0] !== "*";
     if (own) at("own-words").value = named.join(", ");
-    at("vocabulary").value = own ? OWN : table ?? "";
+    at("vocabulary").value = this.chosen = own ? OWN : table ?? "";
     at("own-words-label").hidden = !own;
     this.name(own ? { words: named } : table ? { table } : {}, parameters.getAll("only"));
   }
