@@ -158,7 +158,7 @@ def plan(
     chosen = preset if isinstance(preset, LiftSettings) else LiftSettings.of(preset=preset, **settings)
     check_antialiased(splats.kernel, chosen.antialiased)
     found = LiftViews.of(views, cameras, chosen)
-    return plan_lift(splats, found, chosen, choose_device(chosen.device), threads)
+    return plan_lift(splats, found, chosen, choose_device(chosen.device), threads, look=True)
 
 
 def _reweighting(found: Agreement, geometry: Geometry) -> dict[str, Any]:
@@ -209,9 +209,7 @@ class _Lift:
         """The plan, which may leave views out and take another device."""
         self.compile()
         with self.timings.step("plan"):
-            # Values come from a program, perhaps a training loop: to look at them may take longer than to lift them.
-            look = bool(views.features.paths)
-            plan = plan_lift(self.splats, views, self.settings, self.device, self.threads, look=look)
+            plan = plan_lift(self.splats, views, self.settings, self.device, self.threads)
             views.names = list(plan.views)
         on_plan(plan)
         if plan.device != self.device:

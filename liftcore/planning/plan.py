@@ -159,7 +159,7 @@ def plan_lift(
     threads: int | None = None,
     *,
     apart: bool = False,
-    look: bool = True,
+    look: bool = False,
 ) -> Plan:
     """Plan the lift of the views; the settings' coverage and view_cosine may choose among them.
 
@@ -167,7 +167,9 @@ def plan_lift(
         device: where it should run. A card with too little room leaves an ``auto`` lift to the processor.
         threads: that walk on the processor; None takes the cores that this process may use.
         apart: whether others hold W and X, so that this machine needs no room for them.
-        look: whether to weigh a few views, coarsely, to tell inputs that contradict each other.
+        look: whether a few views are weighed, coarsely, to tell inputs that contradict each other. Views of files
+            are in any case. Others come from a program, perhaps a training loop: to look at them may take longer
+            than to lift them.
 
     Raises:
         Unavailable: this machine has no room for the codebooks, or for the features in no place; or the card that
@@ -177,7 +179,7 @@ def plan_lift(
     names = views.names
     cameras = [views.cameras[name] for name in names]
     seen = visibility(splats, cameras, settings.lift_params)
-    wrong = contradictions(splats, views, settings, seen, threads) if look else ()
+    wrong = contradictions(splats, views, settings, seen, threads) if look or features.paths else ()
     chosen, expected = _choose_views(splats, views, settings, seen, threads)
     names, seen, cameras = [names[k] for k in chosen], seen.of(chosen), [cameras[k] for k in chosen]
     short = [] if apart else check_card(device, splats.count, settings.device)
