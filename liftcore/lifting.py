@@ -291,7 +291,7 @@ class _Lift:
                     self.progress,
                     means=self.splats.means,
                     threads=self.threads,
-                    reliability=settings.reliability,
+                    reliability=self._whole_regions(geometry.levels),
                     consensus=consensus,
                 )
                 W = reweighted(W, agreement.factors)
@@ -300,6 +300,13 @@ class _Lift:
                 W, how = W.cpu(), {"means": self.splats.means, "threads": self.threads}
                 W = reweighted(W, huber_factors(W, geometry.codebook, self.progress, **how))
         return W, agreement
+
+    def _whole_regions(self, levels: np.ndarray) -> Tensor | None:
+        """The regions that are weighted as a whole, [M] bool: with ``auto`` those of masks; None where none is."""
+        chosen = (
+            levels >= 0 if self.settings.reliability == "auto" else np.full(levels.shape, self.settings.reliability)
+        )
+        return torch.from_numpy(chosen) if chosen.any() else None
 
     def solve(self, W: RegionWeights, geometry: Geometry, plan: Plan) -> Solution:
         """The closed form."""

@@ -35,7 +35,7 @@ class Preset(StrEnum):
     MEAN = "mean"  # the same ray, and the plain mean over the views that see the splat (Semantic Gaussians)
 
 
-_REWEIGHTED = {"reliability": True, "consensus": "auto", "aggregation_guard": True}  # what asks for a robust step
+_REWEIGHTED = {"reliability": "auto", "consensus": "auto", "aggregation_guard": True}  # what asks for a robust step
 _PRESETS: dict[Preset, dict[str, Any]] = {
     Preset.DEFAULT: {"robust_steps": 1, **_REWEIGHTED, "aggregation_clusters": "auto"},
     Preset.ROW_SUM: {},
@@ -112,8 +112,10 @@ class LiftSettings(BaseModel):
         "bilinear", description="what a pixel reads of a feature grid: four cells by distance, or the nearest alone"
     )
     robust_steps: int = Field(0, ge=0, le=100, description="times that regions are reweighted by their agreement")
-    reliability: bool = Field(
-        False, description="regions are weighted as a whole too, by what other views say of all their splats"
+    reliability: bool | Literal["auto"] = Field(
+        False,
+        description="regions are weighted as a whole too, by what other views say of all their splats; auto: those "
+        "of masks, and grids stay as they are",
     )
     consensus: bool | Literal["auto"] = Field(
         False,

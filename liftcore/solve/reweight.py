@@ -29,7 +29,8 @@ a mask of two things. With ``p`` as above, region m of view v has::
     r_m = sum_j W_jm (1 - p_jv) c_jm / sum_j W_jm (1 - p_jv)        r = the median of r_m over the regions
 
 and all its entries get the factor ``r_m / r``. What other views do not see of a region says nothing about it, so the
-weights are those of the others. Taken once: a second pass judges by what the first made, and loses again.
+weights are those of the others. Taken once: a second pass judges by what the first made, and loses again. Cells of a
+grid are no claim that all their splats are one thing: those that lie across an edge would lose their say there.
 
 **Mask consensus** (`consensus`) comes in as ``q_jm^(SHARPNESS (1 - r))``: where features agree they tell wrong masks
 themselves, and geometry has the more to say the less they do. That exponent is what keeps right masks as they are.
@@ -85,7 +86,7 @@ def agreement_factors(
     *,
     means: Tensor | None = None,
     threads: int | None = None,
-    reliability: bool = False,
+    reliability: Tensor | None = None,
     consensus: Tensor | None = None,
 ) -> Agreement:
     """What each entry of W is multiplied with after so many steps.
@@ -93,7 +94,8 @@ def agreement_factors(
     Args:
         W: of all views by rows of codebooks, on the CPU. means: [P, 3] of the splats; neighbours are judged together.
         threads: None takes the cores that this process may use. The number changes no bit.
-        reliability: whether regions have factors as a whole. consensus: [nnz] f32 of each entry (`mask_consensus`).
+        reliability: [M] bool, the regions that have factors as a whole; None: none has.
+        consensus: [nnz] f32 of each entry (`mask_consensus`).
     """
     judge = _Judge(W, codebook, means, threads, reliability, consensus)
     factors = judge.array()
@@ -114,7 +116,7 @@ class _Judge:
         codebook: Codebook,
         means: Tensor | None,
         threads: int | None,
-        reliability: bool,
+        reliability: Tensor | None,
         consensus: Tensor | None,
     ) -> None:
         self.W, self.threads = W, threads
@@ -152,8 +154,8 @@ class _Judge:
             everything += float(W.weight[own].sum(dtype=torch.float64))
         del squares
         usual = agreeing / (everything or 1.0)
-        if self.reliability:
-            self._rely(factors, found)
+        if self.reliability is not None:
+            self._rely(factors, found, self.reliability)
         run_each(self._weigh, [(first, last, factors, usual, found) for first, last in self.blocks], self.threads)
         return found
 
@@ -176,12 +178,12 @@ class _Judge:
         W = self.W
         return [part.numpy() for part in (self.rows[first:last], W.indptr, W.region, W.weight, factors)]
 
-    def _rely(self, factors: Tensor, cosines: Tensor) -> None:
-        """The factors of regions, and how sharp the consensus is to be."""
+    def _rely(self, factors: Tensor, cosines: Tensor, whole: Tensor) -> None:
+        """The factors of regions as a whole [M] bool, and how sharp the consensus is to be."""
         W, sums = self.W, torch.zeros(2, self.regions.shape[0], dtype=torch.float64)
         arrays = (W.indptr, W.region, W.weight, factors, cosines, self.inverse, self.view, sums)
         tally(*(part.numpy() for part in arrays))
-        known = sums[1] > 0
+        known = (sums[1] > 0) & whole
         reliable = torch.where(known, sums[0] / sums[1], 0.0)
         self.median = float(reliable[known].median()) if known.any() else 0.0
         if self.median > 0:

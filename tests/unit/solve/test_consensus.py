@@ -171,8 +171,18 @@ def books_of(W: RegionWeights, seed: int) -> list[torch.Tensor]:
     return [torch.from_numpy(rng.normal(size=(int(n), 5)).astype(np.float32)) for n in W.offsets.diff()]
 
 
-def step_of(W: RegionWeights, books: list[torch.Tensor], q: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Of a step with both: weights [P, M], confidence and what is explained [2, P], and the median reliability."""
+def every(W: RegionWeights) -> torch.Tensor:
+    """All regions, [M] bool."""
+    return torch.ones(int(W.offsets[-1]), dtype=torch.bool)
+
+
+def step_of(
+    W: RegionWeights, books: list[torch.Tensor], q: np.ndarray, masks: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Of a step with both: weights [P, M], confidence and what is explained [2, P], and the median reliability.
+
+    Reliability is that of the masks [M] bool alone.
+    """
     whole, offsets = dense(W, SPLATS), W.offsets.numpy()
     view = np.searchsorted(offsets, np.arange(whole.shape[1]), side="right") - 1
     unit = torch.nn.functional.normalize(torch.cat(books).double(), dim=1).numpy()
@@ -188,7 +198,7 @@ def step_of(W: RegionWeights, books: list[torch.Tensor], q: np.ndarray) -> tuple
         c[:, own] = np.where(lengths > 1e-6, (others / np.maximum(lengths, 1e-300)) @ e[own].T, 0.0).clip(0, 1)
         p[:, own] = shares[:, own].sum(axis=1, keepdims=True)
     told, counted = (whole * (1 - p) * c).sum(axis=0), (whole * (1 - p)).sum(axis=0)
-    known = counted > 1e-12
+    known = (counted > 1e-12) & masks
     r = np.divide(told, counted, out=np.zeros_like(told), where=known)
     median = float(np.sort(r[known])[(known.sum() - 1) // 2])
     usual = (whole * c).sum() / whole.sum()
@@ -199,12 +209,14 @@ def step_of(W: RegionWeights, books: list[torch.Tensor], q: np.ndarray) -> tuple
     return after, told / sums[:, 0], median
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(4))
 def test_reliability_and_confidence_equal_their_definition(seed: int) -> None:
     W, levels = random_scene(seed, views=5)
+    masks = every(W)
+    masks[: int(W.offsets[seed % 3])] = False  # of some views, as those of grids
     books, q = books_of(W, seed), mask_consensus(W, levels)
-    got = agreement_factors(W, codebook_of(books), 1, reliability=True, consensus=torch.from_numpy(q))
-    after, (confidence, explained), median = step_of(W, books, entries(W, q))
+    got = agreement_factors(W, codebook_of(books), 1, reliability=masks, consensus=torch.from_numpy(q))
+    after, (confidence, explained), median = step_of(W, books, entries(W, q), masks.numpy())
     assert got.reliability == pytest.approx(median, rel=1e-4)
     np.testing.assert_allclose(entries(W, (W.weight * got.factors).numpy()), after, rtol=2e-3, atol=1e-5)
     assert got.confidence is not None and got.explained is not None
@@ -218,7 +230,9 @@ def test_reliability_changes_no_bit_with_threads() -> None:
     q = torch.from_numpy(mask_consensus(W, levels))
 
     def made(threads: int) -> Agreement:
-        return agreement_factors(W, codebook_of(books_of(W, 3)), 1, threads=threads, reliability=True, consensus=q)
+        return agreement_factors(
+            W, codebook_of(books_of(W, 3)), 1, threads=threads, reliability=every(W), consensus=q
+        )
 
     one, two = made(1), made(2)
     assert torch.equal(one.factors, two.factors)
@@ -231,9 +245,11 @@ def test_a_region_with_a_wrong_word_loses_weight_everywhere() -> None:
     words = torch.eye(4)
     wrong = words[[1, 1, 2, 3]]  # of the last view's first region
     books = [words] * 4 + [wrong]
-    plain, relied = (agreement_factors(W, codebook_of(books), 1, reliability=told).factors for told in (False, True))
+    plain, relied = (
+        agreement_factors(W, codebook_of(books), 1, reliability=told).factors for told in (None, every(W))
+    )
     lying = int(W.offsets[4])
     assert float(relied[W.region == lying].max()) <= float(plain[W.region == lying].min())
-    got = agreement_factors(W, codebook_of(books), 1, reliability=True)
+    got = agreement_factors(W, codebook_of(books), 1, reliability=every(W))
     assert got.confidence is not None
     assert float(got.confidence[15:].min()) > 0.5

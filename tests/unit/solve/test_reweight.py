@@ -264,6 +264,15 @@ def test_nothing_changes_where_no_vector_has_a_direction(value):
     assert all(np.array_equal(a, b) for a, b in zip(same.after(2), scene.weights, strict=True))
 
 
+def test_the_default_leaves_cells_of_grids_as_a_robust_step_weighs_them(tmp_path):
+    paths = write_scene(tmp_path, 9, grids=True)
+    step = {"preset": "row-sum", "robust_steps": 1}
+    asked = ({"preset": "default"}, step, {**step, "reliability": True})
+    default, robust, relied = (lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of(**how)) for how in asked)
+    assert torch.equal(default.features, robust.features)
+    assert not torch.equal(default.features, relied.features)
+
+
 def test_a_robust_lift_keeps_what_is_seen_and_how_much(tmp_path):
     paths = write_scene(tmp_path, 9)
     plain, robust = (
