@@ -9,7 +9,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -281,33 +281,58 @@ def run(told):
     pathlib.Path(told).write_text(str(os.getpid()))
     sum(range(10**15))  # in one call of C
 """
+TWICE = """
+import os, pathlib, time
+
+def run(told):
+    first = not pathlib.Path(told).exists()
+    pathlib.Path(told).write_text(str(os.getppid()))
+    if first:
+        time.sleep(600)
+    return {"event": "valid"}
+"""
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="asks the kernel of Linux for it")
-def test_check_that_cannot_listen_ends_when_its_server_is_killed(tmp_path: Path) -> None:
-    (tmp_path / "deaf.py").write_text(DEAF)
-    told = tmp_path / "told"
+@contextlib.contextmanager
+def errand_of(content: str, folder: Path) -> Iterator[tuple[subprocess.Popen[str], int]]:
+    """A server whose errand is this module's, and the number that the errand wrote."""
+    (folder / "task.py").write_text(content)
+    told = folder / "told"
     code = f"""if True:
         import pathlib, threading
         from service.errand import ErrandLimits, run_errand
         limits = ErrandLimits(600, 8 << 30, threading.Event())
-        run_errand("deaf", [{str(told)!r}], pathlib.Path({str(tmp_path)!r}), limits)
+        print(run_errand("task", [{str(told)!r}], pathlib.Path({str(folder)!r}), limits).last["event"])
     """
-    found = {"PYTHONPATH": f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"}
-    server = subprocess.Popen([sys.executable, "-c", code], env=os.environ | found)
-    check = None
-    try:
-        until(lambda: told.exists() and told.read_text() != "")
-        check = int(told.read_text())
+    found = {"PYTHONPATH": f"{folder}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"}
+    with subprocess.Popen(
+        [sys.executable, "-c", code], env=os.environ | found, stdout=subprocess.PIPE, text=True
+    ) as server:
+        try:
+            until(lambda: told.exists() and told.read_text() != "")
+            yield server, int(told.read_text())
+        finally:
+            server.kill()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="asks the kernel of Linux for it")
+def test_check_that_cannot_listen_ends_when_its_server_is_killed(tmp_path: Path) -> None:
+    with errand_of(DEAF, tmp_path) as (server, check):
         assert alive(check)
         server.kill()
         server.wait()
-        until(lambda: not alive(int(check)))
-    finally:
-        server.kill()
-        if check is not None:
+        try:
+            until(lambda: not alive(check))
+        finally:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(check, signal.SIGKILL)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="asks the kernel of Linux for it")
+def test_check_that_ended_with_its_template_is_run_again(tmp_path: Path) -> None:
+    with errand_of(TWICE, tmp_path) as (server, template):
+        os.kill(template, signal.SIGKILL)
+        assert server.stdout is not None and server.stdout.read() == "valid\n"
 
 
 @pytest.mark.parametrize(("size", "most"), [(1 << 20, 1040 << 20), (1 << 40, 8 << 30)])
