@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from liftcore.cli.options import Parser, count
 from liftcore.cli.reply import folders_of, free_output, progress_bars, reply, told_folders, writing
+from liftcore.errors import InvalidInput
 
 if TYPE_CHECKING:
     from liftcore.features.encoders import ImageEncoder
@@ -22,9 +23,11 @@ def add_arguments(parser: Parser) -> None:
         "--encoder",
         required=True,
         metavar="SPEC",
-        help="maskclip:MODEL/TAG, clip:MODEL/TAG or timm:NAME; with --weights maskclip:MODEL or clip:MODEL",
+        help="maskclip:MODEL/TAG, clip:MODEL/TAG or timm:NAME; with --weights also maskclip:MODEL or clip:MODEL",
     )
-    parser.add_argument("--weights", type=Path, metavar="FILE", help="its weights, as ENCODER@FILE names them too")
+    parser.add_argument(
+        "--weights", type=Path, metavar="FILE", help="the file of its weights; the same as ENCODER@FILE"
+    )
     parser.add_argument("--size", type=count, metavar="PX", help="the images' shorter side; else the model's own")
     parser.add_argument("--batch", type=count, default=1, metavar="N", help="images that are encoded together")
     parser.add_argument("--device", default="cpu", metavar="NAME", help="where the model runs, as torch names it")
@@ -40,7 +43,13 @@ def run(options: argparse.Namespace) -> int:
 
     images = find_images(options.images)
     out = free_output(options.output, list(images.values()))
-    spec = f"{options.encoder}@{options.weights}" if options.weights else options.encoder
+    spec = options.encoder
+    if options.weights:
+        kind, _, named = spec.partition(":")
+        if "@" in named or (kind != "timm" and "/" in named):
+            expected = "an encoder that names no weights itself, beside --weights"
+            raise InvalidInput("--encoder", expected=expected, got=repr(spec), hint=f"{kind}:MODEL, or no --weights")
+        spec = f"{spec}@{options.weights}"
     encoder = open_image_encoder(spec, options.device)
     settings = EncodeSettings(options.size, options.batch, options.normalised)
     with progress_bars() as progress, writing(out):

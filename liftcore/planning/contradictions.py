@@ -8,8 +8,9 @@ region's cosine to the most similar one of another view. The ratio of the two is
 was made with, noisy, merged and wrong masks among them (.26 with 6 views). With positions times 0.3 it is .05 to .31,
 and with another scene's cameras .15 at most. Where it is low, positions times other factors are the control: of
 healthy scenes these reach .42 of it at most, and of scenes whose positions are off by .3 or .5 at least 1.4 of it
-(``python -m tests.benchmarks.first_hour``). Half and double come first: where there is some agreement, and it falls
-on both sides, the scale is the right one, and the others are not tried.
+(``python -m tests.benchmarks.first_hour``). Half and double come first: where the given scale has LEAST_AGREEMENT or
+more and neither of these has as much, the others are not tried, which is half of the work. All cases of that command
+are told as before.
 
 Maps are also looked at alone (`liftcore.features.smoothness`).
 """
@@ -86,7 +87,7 @@ def disagreement(
         return []
     known: dict[float, float] = {}
     for factors in (NEAR_SCALES, FAR_SCALES):
-        if known and agreement >= max(LEAST_AGREEMENT, *known.values()):
+        if len(known) == len(NEAR_SCALES) and agreement >= max(LEAST_AGREEMENT, *known.values()):
             return []
         for factor in factors:
             found = agreement_of_views(splats, _scaled(views, factor), settings, threads, rays=0)[1]

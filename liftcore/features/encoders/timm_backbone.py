@@ -127,6 +127,8 @@ def _from_file(label: str, name: str, path: Path) -> Any:
     model = _create(name, pretrained=False)
     try:
         stored = _library().models.load_state_dict(str(path), device="cpu", weights_only=True)
+        if not isinstance(stored, dict) or not all(isinstance(value, Tensor) for value in stored.values()):
+            raise ValueError("it holds something else than tensors by their names")
         # Each family of timm translates the names of its authors' checkpoints.
         translate = getattr(sys.modules[type(model).__module__], "checkpoint_filter_fn", None)
         state = translate(dict(stored), model) if translate else stored

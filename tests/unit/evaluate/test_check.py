@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from liftcore.features.pack import as_views, read_features, write_pack
 from liftcore.features.views import FeatureGrid, Regions
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.ply import write_splats
+from liftcore.planning import contradictions
 from liftcore.query.splat_colours import seen_colours
 from liftcore.query.text.table import TableEncoder
 from liftcore.raster.base import CompositingParams
@@ -142,3 +144,19 @@ def test_command_says_what_is_wrong_and_exits_2(scene: StillLife, photos, grids,
     assert read_features(tmp_path / "b.safetensors").views
     assert cli.main([*command, str(tmp_path / "b.safetensors")]) == 2
     assert "wrong: features: " in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("near", "tried"), [((0.3, 0.39), 2), ((0.3, 0.41), 5), ((None, 0.3), 5), ((None, None), 5)], ids=str
+)
+def test_far_scales_are_left_out_where_both_near_ones_agree_less(
+    near: tuple[float | None, ...], tried: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = [*near, 0.1, 0.9, 0.1]  # three times the scale is the right one
+    asked = iter(found)
+    monkeypatch.setattr(contradictions, "agreement_of_views", lambda *_, **__: (1.0, next(asked)))
+    monkeypatch.setattr(contradictions, "_scaled", lambda views, factor: views)
+    nothing: Any = None
+    told = contradictions.disagreement(nothing, nothing, nothing, 0.4)
+    assert len(found) - len(list(asked)) == tried
+    assert [text.partition(":")[0] for text in told] == (["cameras"] if tried == 5 else [])
