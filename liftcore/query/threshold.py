@@ -156,6 +156,7 @@ def steady(histogram: Histogram, least: float = -math.inf) -> Found:
     """
     density = histogram.smoothed()
     density = density / density.sum()
+    density[density <= LEAST_SHARE / len(density)] = 0.0  # strays all over the range leave it empty
     above = np.cumsum(density[::-1])[::-1] - density / 2  # at the middles of the bins
     counted = np.minimum(above, 1 - above) >= LEAST_SHARE  # some are: no smoothed bin has more than a fifth of all
     high = counted & (histogram.low + (np.arange(len(density)) + 0.5) * histogram.width >= least)

@@ -46,6 +46,12 @@ def test_paper_takes_the_valley_next_to_the_largest_peak_and_auto_the_topmost() 
     assert 0.22 < find_threshold(scores, "auto").value < 0.29
 
 
+def test_strays_in_a_wide_gap_leave_it_empty() -> None:
+    things = hills((0.25, 0.015, 97_000), (0.48, 0.005, 1000), (0.60, 0.005, 1000), (0.99, 0.003, 1000))
+    scores = torch.cat([things, torch.linspace(0.66, 0.93, 6)])
+    assert 0.65 < find_threshold(scores, "auto").value < 0.95
+
+
 def test_a_few_stray_scores_are_no_object() -> None:
     scores = torch.cat([hills((0.2, 0.01, 50_000), (0.3, 0.01, 5000)), torch.tensor([0.5, 0.51])])
     for method in ("auto", "valley"):
