@@ -429,8 +429,10 @@ class FoundObject(BaseModel):
     """Splats at or above the threshold that hang together."""
 
     splats: int = Field(description="how many")
-    share: float = Field(description="of the evidence of all splats at or above the threshold")
-    score: float = Field(description="the mean of its splats' scores, by their evidence")
+    share: float = Field(
+        description="of the evidence of all splats at or above the threshold, or of what `weigh` says"
+    )
+    score: float = Field(description="the mean of its splats' scores, by the same")
     centre: list[float] = Field(description="the middle of its box: x y z, world frame")
     box: Box = Field(description="of its splats' centres, but for a thousandth of the evidence at each end")
 

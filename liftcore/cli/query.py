@@ -222,7 +222,7 @@ def _lines(document: dict[str, Any]) -> Iterable[str]:
     for number, thing in enumerate(document.get("objects", []), 1):
         low, high = thing["box"]
         yield (
-            f"  object {number}: {thing['splats']} splats, {thing['share']:.1%} of the evidence, score "
+            f"  object {number}: {thing['splats']} splats, {thing['share']:.1%} of what is selected, score "
             f"{thing['score']:.4g}, at {place_of(thing['centre'])}, from {place_of(low)} to {place_of(high)}"
         )
     if document.get("strays"):

@@ -262,9 +262,10 @@ def _answer(scene: QueryScene, asked: Question, similarities: np.ndarray) -> Ans
         scores = np.where(seen, scores, np.float32(LOWEST_COSINE))
     known = scores if scene.all_seen else scores[seen]
     least = -math.inf if (asked.plain & kept)[: len(query.positives)].any() else LEAST_LIKENESS
-    alike = query.weigh == "evidence"
-    weights = scene.weights if alike else scene.seen_alone(scene.counted(query.weigh))
-    found = find_threshold(known, query.threshold, weights, least)
+    plain = query.weigh == "evidence"
+    weights = scene.weights if plain else scene.seen_alone(scene.counted(query.weigh))
+    counted = "evidence" if plain else "evidence times confidence"
+    found = find_threshold(known, query.threshold, weights, least, counted)
     if presence.present is False and query.absent == "drop":
         found = replace(found, value=math.inf, explanation=presence.why, clear=False)
     return Answer(

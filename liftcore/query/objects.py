@@ -23,8 +23,8 @@ class FoundObject:
     """Selected splats that hang together."""
 
     splats: int  # how many
-    share: float  # of the evidence of all selected splats
-    score: float  # the mean of its splats' scores, by their evidence
+    share: float  # of the evidence of all selected splats; with weigh=confidence of that times confidence
+    score: float  # the mean of its splats' scores, by the same
     centre: "Point"  # the middle of its box, world frame, scene units
     box: "tuple[Point, Point]"  # least and greatest corner of the splats' centres, but for a thousandth at each end
 

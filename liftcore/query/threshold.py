@@ -88,6 +88,7 @@ def find_threshold(
     method: str | float = "auto",
     weights: ArrayLike | None = None,
     least: float = -math.inf,
+    counted: str = "evidence",
 ) -> Threshold:
     """A threshold on scores by one of the methods above.
 
@@ -100,6 +101,7 @@ def find_threshold(
         method: one of ``METHODS``, or a number to use as it is.
         weights: [n] f32, how much each score counts, at least zero: the evidence of splats; None = equally, as the
             pixels of a view do.
+        counted: what the weights are, for the explanation.
         least: ``auto`` takes no lower score, unless too few lie above it.
 
     Raises:
@@ -121,7 +123,7 @@ def find_threshold(
     value = min(max(value, low), high)
     above = np.append(histogram.above(), 0.0)
     share = float(np.interp((value - low) / histogram.width, np.arange(len(above)), above))
-    told = f"{share:.1%} of the {'pixels' if weights is None else 'evidence'} at or above {value:.4g}"
+    told = f"{share:.1%} of the {'pixels' if weights is None else counted} at or above {value:.4g}"
     return Threshold(value, method, f"{explanation.removesuffix('.')}; {told}.", clear)
 
 

@@ -24,7 +24,8 @@ from liftcore.solve.codebook import Codebook
 from liftcore.solve.memory import zeros
 from liftcore.solve.weights import BLOCK_ENTRIES, BLOCK_ROWS, MEMORY_LIMIT, RegionWeights, row_blocks, run_each
 
-STEPS = 3  # of reweighting: 30 move a feature by at most .0007 of its length at 99 % of tabletop's splats
+STEPS = 3  # of reweighting, which hardly move features further
+MOST_SCALE = 126  # the power of two
 
 
 @one_thread()
@@ -46,9 +47,8 @@ def huber_factors(
     rows = rows if means is None else rows[torch.argsort(morton_codes(means[rows]))]
     blocks = row_blocks(W.indptr.diff()[rows].numpy(), BLOCK_ROWS, BLOCK_ENTRIES)
     longest = max((float(own.max()) for own in codebook.lengths if own.numel()), default=0.0)
-    scale = (
-        2.0 ** -round(math.log2(longest)) if longest > 0 else 1.0
-    )  # squares of very long and short rows have no place
+    # Squares of very long and short rows have no place in float32, nor has the scale of what it hardly holds itself.
+    scale = 2.0 ** min(-round(math.log2(longest)), MOST_SCALE) if longest > 0 else 1.0
     in_file = 8 * W.weight.shape[0] > MEMORY_LIMIT
     factors, delta = zeros(tuple(W.weight.shape), torch.float32, name="weights", in_file=in_file), 0.0
     factors += 1.0
@@ -58,13 +58,13 @@ def huber_factors(
             table = codebook.values(columns, CPU.place).mul_(scale).numpy()
             arrays = [part.numpy() for part in (W.indptr, W.region, W.weight, factors, squares)]
             run_each(add_squares, [(rows[first:last].numpy(), *arrays, table) for first, last in blocks], threads)
-        squares.sqrt_()
+        distances = squares.sqrt_()
         parts = [slice(first, first + BLOCK_ENTRIES) for first in range(0, squares.shape[0], BLOCK_ENTRIES)]
         if step == 0:
-            moved = sum(float(W.weight[own].double() @ squares[own].double()) for own in parts)
+            moved = sum(float(W.weight[own].double() @ distances[own].double()) for own in parts)
             delta = moved / (float(W.row_sums().sum()) or 1.0)
         for own in parts:
-            factors[own] = torch.where(squares[own] > delta, delta / squares[own], 1.0)
+            factors[own] = torch.where(distances[own] > delta, delta / distances[own], 1.0)
         progress("loss", step + 1, STEPS, "steps")
     return factors
 
