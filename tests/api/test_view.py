@@ -64,8 +64,9 @@ def test_lift_in_memory_is_shown_until_it_is_interrupted(tmp_path: Path) -> None
     for name, content in (("s.ply", tiny.splats), ("c.json", tiny.cameras), ("f.safetensors", tiny.features)):
         (tmp_path / name).write_bytes(content)
     script = """if True:
-        import socket
+        import signal, socket
         import liftcore as lc
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # who runs tests in the background ignores it
         splats, cameras = lc.read_splats("s.ply"), dict(lc.read_cameras("c.json"))
         result = lc.lift(splats, cameras, lc.read_features("f.safetensors"), preset="row-sum")
         two = {name: getattr(splats, name)[:2] for name in ("means", "quats", "log_scales", "opacity_logits")}
