@@ -187,8 +187,7 @@ def _heard(request: dict[str, Any], limits: ErrandLimits) -> Heard | None:
     task = _TEMPLATE.fork(request)
     try:
         last = _listen(task.said, limits)
-        if last is None:
-            # Its end of the pipe is open, so it lives, and the number is its own.
+        if last is None and not _readable(task.status):  # else it has ended, and the number may be another's
             with contextlib.suppress(ProcessLookupError):
                 os.kill(task.pid, signal.SIGKILL)
         status = os.read(task.status, 64)  # once it has ended
@@ -204,12 +203,10 @@ def _heard(request: dict[str, Any], limits: ErrandLimits) -> Heard | None:
 
 def _listen(said: int, limits: ErrandLimits) -> dict[str, Any] | None:
     """The last that a task says until it ends; None when it must be ended."""
-    poll = select.poll()  # not select(), which takes no file of a number above 1023
-    poll.register(said, select.POLLIN)
     heard = bytearray()
     deadline = time.monotonic() + limits.seconds
     while not limits.ending.is_set() and (left := deadline - time.monotonic()) > 0:
-        if not poll.poll(1000 * min(left, TICK_SECONDS)):
+        if not _readable(said, min(left, TICK_SECONDS)):
             continue
         piece = os.read(said, PIECE)
         if not piece:
@@ -217,6 +214,13 @@ def _listen(said: int, limits: ErrandLimits) -> dict[str, Any] | None:
             return json.loads(lines[-1]) if lines else {"event": "nothing"}
         heard += piece
     return None
+
+
+def _readable(pipe: int, seconds: float = 0.0) -> bool:
+    """Whether there is something to read of a pipe, or it is closed, within so many seconds."""
+    poll = select.poll()  # not select(), which takes no file of a number above 1023
+    poll.register(pipe, select.POLLIN)
+    return bool(poll.poll(1000 * seconds))
 
 
 def main() -> None:
