@@ -52,8 +52,10 @@ def local_path(path: Path | str) -> Path:
         found: dict[str, Any] = storage.find(place, detail=True)
         if not found:
             raise FileNotFoundError("nothing is there")
-        # Of HTTP ukey is the address alone: what is told of a file (ETag, size, time) tells its versions apart.
-        versions = sorted((name, storage.ukey(name), sorted(map(str, told.items()))) for name, told in found.items())
+        # Of HTTP ukey is the address alone: what is told of a file (ETag, size, time) tells its versions apart. Of a
+        # file that is asked for itself, and of no folder, `find` tells nothing.
+        told = {name: known or storage.info(name) for name, known in found.items()}
+        versions = sorted((name, storage.ukey(name), sorted(map(str, told[name].items()))) for name in found)
         base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "splatlift" / "remote"
         name = PurePosixPath(place.rstrip("/")).name
         copy = base / hashlib.sha256(repr((url, versions)).encode()).hexdigest()[:32] / name

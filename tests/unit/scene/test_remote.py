@@ -17,6 +17,7 @@ from liftcore.cli import main
 from liftcore.features.pack import write_pack
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.ply import write_splats
+from liftcore.io.remote import local_path
 from liftcore.io.shards import INDEX
 from tests.scenes import centred, observed, random_camera, random_splats
 
@@ -71,6 +72,37 @@ def test_folder_of_cameras_comes_whole_and_what_changed_comes_anew(elsewhere: st
         (tmp_path / "images.txt").write_text("".join(lines))
         storage.put_file(str(tmp_path / "images.txt"), f"{place}/images.txt")
         assert len(lc.read_cameras(f"{elsewhere}/model")) == count
+
+
+class Tagged(fsspec.AbstractFileSystem):
+    """As HTTP is: addresses, sizes and entity tags, and no lists of folders."""
+
+    protocol = "tagged"
+    content = b"one"
+
+    def ls(self, path: str, detail: bool = True, **_: Any) -> list[Any]:
+        raise FileNotFoundError(path)
+
+    def isfile(self, path: str) -> bool:
+        return True
+
+    def info(self, path: str, **_: Any) -> dict[str, Any]:
+        return {"name": path, "size": len(self.content), "ETag": self.content.decode()}
+
+    def ukey(self, path: str) -> str:
+        return path
+
+    def get_file(self, rpath: str, lpath: str, **_: Any) -> None:
+        Path(lpath).write_bytes(self.content)
+
+
+def test_file_with_another_entity_tag_comes_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    fsspec.register_implementation("tagged", Tagged, clobber=True)
+    first = local_path("tagged://host/file")
+    assert local_path("tagged://host/file") == first and first.read_bytes() == b"one"
+    monkeypatch.setattr(Tagged, "content", b"two")
+    assert local_path("tagged://host/file").read_bytes() == b"two"
 
 
 @pytest.mark.parametrize("reader", [lc.read_splats, lc.read_cameras, lc.read_features, lc.load_lift])
