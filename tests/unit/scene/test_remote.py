@@ -92,7 +92,7 @@ class Tagged(fsspec.AbstractFileSystem):
     def ukey(self, path: str) -> str:
         return path
 
-    def get_file(self, rpath: str, lpath: str, **_: Any) -> None:
+    def get_file(self, rpath: Any, lpath: Any, *_: Any, **__: Any) -> None:
         Path(lpath).write_bytes(self.content)
 
 
