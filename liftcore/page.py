@@ -48,8 +48,8 @@ def show(
         path = Path(folder, "lift.safetensors")
         save_lift(replace(lift.cpu(), metadata=lift.metadata.model_copy(update=inputs)), path)
         command = [sys.executable, "-m", "service.view", str(path), "--port", str(port)]
-        command += ["--no-browser"] * (not browser)
-        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
+        command += ["--until-stdin-closes", *["--no-browser"] * (not browser)]  # a notebook's kernel may be killed
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as server:
             assert server.stdout is not None
             try:
                 for line in server.stdout:

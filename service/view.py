@@ -9,7 +9,9 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import os
 import secrets
+import signal
 import sys
 import tempfile
 import threading
@@ -18,7 +20,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from liftcore.errors import InvalidLift, SplatliftError
 from liftcore.query.text import BUILT_IN, NO_WORDS, OWN_WORDS
@@ -115,7 +117,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("lift", type=Path)
     parser.add_argument("--port", type=int, default=0)
     parser.add_argument("--no-browser", action="store_true")
+    parser.add_argument(
+        "--until-stdin-closes", action="store_true", help="end with the process that started this one"
+    )
     given = parser.parse_args(arguments)
+    if given.until_stdin_closes:
+        threading.Thread(target=stop_when_closed, args=(sys.stdin.buffer,), daemon=True).start()
     with tempfile.TemporaryDirectory(prefix="splatlift-view-") as folder:
         try:
             settings = settings_of(Path(folder), given.port, metadata_of(given.lift)[0].get("text_space", ""))
@@ -133,6 +140,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(f"splatlift: {error}", file=sys.stderr)
             return 2
     return 0
+
+
+def stop_when_closed(pipe: BinaryIO) -> None:
+    """Stop this process in order once nobody holds the other end of a pipe, however that one ended."""
+    pipe.read()
+    os.kill(os.getpid(), signal.SIGTERM)
 
 
 def announce(address: str, *, lift: str, browser: bool) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -15,6 +16,7 @@ import httpx
 from liftcore.io.lift_file import save_lift
 from liftcore.io.scene_files import lift_files
 from liftcore.settings import LiftSettings
+from tests.crash.conftest import until
 
 from .tiny_scene import colmap_zip, make_scene
 
@@ -59,7 +61,7 @@ def test_a_lift_is_shown_by_links_until_it_is_interrupted(tmp_path: Path) -> Non
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
 
 
-def test_lift_in_memory_is_shown_until_it_is_interrupted(tmp_path: Path) -> None:
+def test_lift_in_memory_is_shown_until_it_is_interrupted_or_killed(tmp_path: Path) -> None:
     tiny = make_scene()
     for name, content in (("s.ply", tiny.splats), ("c.json", tiny.cameras), ("f.safetensors", tiny.features)):
         (tmp_path / name).write_bytes(content)
@@ -82,10 +84,12 @@ def test_lift_in_memory_is_shown_until_it_is_interrupted(tmp_path: Path) -> None
             print(error.argument, flush=True)
         result.show(splats, cameras, browser=False)
         print("ended", flush=True)
+        input()
+        result.show(splats, cameras, browser=False)
     """
     environment = os.environ | {"PYTHONPATH": str(ROOT), "TMPDIR": str(tmp_path)}
-    command = [sys.executable, "-c", script]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment, cwd=tmp_path) as process:
+    command, pipe = [sys.executable, "-c", script], subprocess.PIPE
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, env=environment, cwd=tmp_path) as process:
         assert process.stdout is not None
         told = [process.stdout.readline().strip() for _ in range(4)]
         assert told == ["splats", "cameras", "splats", "the page"]
@@ -96,8 +100,14 @@ def test_lift_in_memory_is_shown_until_it_is_interrupted(tmp_path: Path) -> None
             assert client.get("/query", params={"like": "splat:45", "threshold": 0.5}).json()["count"] == 20
             assert client.get("/render", params={"view": "middle"}).status_code == 200
         process.send_signal(signal.SIGINT)
-        assert process.stdout.readline() == "ended\n" and process.wait(timeout=600) == 0
-    assert not list(tmp_path.glob("splatlift*"))
+        assert process.stdout.readline() == "ended\n"
+        assert not list(tmp_path.glob("splatlift*"))
+        assert process.stdin is not None
+        print(file=process.stdin, flush=True)
+        found = re.match(r"http://(127\.0\.0\.1):(\d+)/", process.stdout.readline())
+        assert found
+        process.kill()  # as a notebook's kernel may be
+    until(lambda: not _answers(found[1], int(found[2])))
 
 
 def test_a_lift_whose_files_moved_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -112,3 +122,11 @@ def test_a_lift_whose_files_moved_is_told(tmp_path: Path, capsys: pytest.Capture
     for lift, told in (("l.safetensors", "its splats at"), ("f.safetensors", "a lift file")):
         assert main([str(tmp_path / lift), "--no-browser"]) == 2
         assert told in capsys.readouterr().err
+
+
+def _answers(host: str, port: int) -> bool:
+    try:
+        socket.create_connection((host, port)).close()
+    except ConnectionRefusedError:
+        return False
+    return True
