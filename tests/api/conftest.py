@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -13,9 +14,13 @@ from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
 from service.app import assemble
+from service.models import AssetKind
 from service.settings import ServiceSettings
 from service.state import AppState
+from service.store.assets import CheckedUpload
+from service.store.owners import SERVICE
 from service.store.store import Store
+from service.uploads import check
 
 from .following import ended
 from .tiny_scene import CHANNELS, TinyScene, make_scene, text_table
@@ -52,6 +57,19 @@ def app_of(client: TestClient) -> FastAPI:
 def parts_of(client: TestClient) -> AppState:
     """What that application was made of."""
     return app_of(client).state.deps
+
+
+def put(client: TestClient, kind: AssetKind, content: bytes) -> str:
+    """Store what the check takes, without a process; the id."""
+    store = parts_of(client).store
+    with store.files.draft(".part") as draft, store.files.scratch() as folder:
+        draft.write_bytes(content)
+        copy = folder / "copy"
+        copy.write_bytes(content)
+        said = check.run(kind, str(copy))
+        digest = hashlib.sha256(content).hexdigest()
+        upload = CheckedUpload(draft, kind, digest, said["suffix"], said["counts"], said["warnings"])
+        return store.assets.add(SERVICE, upload)[0].id
 
 
 @dataclass(frozen=True)

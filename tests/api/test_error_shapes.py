@@ -20,18 +20,8 @@ from .test_problems import NO_ASSET, NOBODY, assert_problem
 from .test_slow_clients import answer, client_of, served
 
 METHODS = ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS", "TRACE", "BREW")
-ODD_PARTS = (
-    "%00",
-    "%FF%FE",
-    "%ED%A0%80",
-    "..%2F..%2Fetc%2Fpasswd",
-    "%E2%80%A8",
-    "%20",
-    "a" * 6000,
-    "%0d%0aX:y",
-    "-1",
-)
-ODD_VALUES = ("", "%00", "%FF%FE", "%ED%A0%80", "nan", "-1", "1e999", "9" * 5000, "%0d%0aX:y", "%5B%5D", "null")
+ODD_PARTS = ("%00", "%FF%FE", "%ED%A0%80", "..%2F..%2Fetc%2Fpasswd", "a" * 6000, "%0d%0aX:y", "-1")
+ODD_VALUES = ("", "%00", "%ED%A0%80", "nan", "-1", "1e999", "9" * 5000, "%0d%0aX:y")
 ODD_HEADERS = (
     {"Idempotency-Key": b"\xe4"}, {"Idempotency-Key": b"k" * 300}, {"Last-Event-ID": b"x"}, {"Last-Event-ID": b"-1"},
     {"Last-Event-ID": b"9" * 5000}, {"Content-Type": b"\xff"}, {"Content-Type": b"application/json; charset=utf-7"},
@@ -41,7 +31,9 @@ ODD_HEADERS = (
 )  # fmt: skip
 ODD_BODIES = (
     b"", b"{", b"[]", b"null", b"\xff\xfe", b'"\xed\xa0\x80"', b"[" * 60_000, b'{"text": NaN}', b'{"\\ud800": 1}',
-    b"1" * 5000, b'{"text": [1], "text": {}}', b"\xef\xbb\xbf{}",
+    b"1" * 5000, b'{"text": [1], "text": {}}', b"\xef\xbb\xbf{}", b'{"like": [[]]}', b'{"like": [[1e999]]}',
+    b'{"like": [null]}', b'{"like": [{"a": 1}]}', b'{"like": ["\\ud800:1,1"]}', b'{"text": ["\\ud800"]}',
+    b'{"like": [[1' + b"0" * 400 + b"]]}", b'{"settings": {"power": 1' + b"0" * 5000 + b"}}",
 )  # fmt: skip
 
 
@@ -102,9 +94,9 @@ def test_unknown_paths_are_404_for_every_method(client: TestClient, path: str) -
 
 
 def test_odd_parts_of_paths_are_refused_as_problems(client: TestClient, routes: dict[str, set[str]]) -> None:
-    for path in routes:
+    for path, taken in routes.items():
         for part in ODD_PARTS if "{" in path else ():
-            for method in ("GET", "PUT", "POST", "DELETE"):
+            for method in taken - {"HEAD"}:
                 reply = client.request(method, address(path, part))
                 assert 400 <= assert_problem(reply)["status"] < 500, (method, path, part)
 
@@ -122,21 +114,20 @@ def test_odd_values_in_queries_break_nothing(client: TestClient, routes: dict[st
 
 def test_odd_headers_break_nothing(client: TestClient, routes: dict[str, set[str]]) -> None:
     for path, taken in routes.items():
+        method = min(taken - {"HEAD"})  # one is enough, as what reads headers knows no methods
         for odd in ODD_HEADERS:
             headers = {name.encode(): value for name, value in odd.items()}
-            for method in taken:
-                reply = client.request(method, address(path), headers=headers)
-                assert_no_fault_of_ours(reply, (method, path, odd))
+            assert_no_fault_of_ours(client.request(method, address(path), headers=headers), (method, path, odd))
 
 
-@pytest.mark.parametrize("media", ["application/json", "text/plain", "multipart/form-data; boundary=x", "nonsense"])
-def test_odd_bodies_are_refused_as_problems(client: TestClient, routes: dict[str, set[str]], media: str) -> None:
-    for path, taken in routes.items():
-        for body in ODD_BODIES if "POST" in taken else ():
+def test_odd_bodies_are_refused_as_problems(client: TestClient, routes: dict[str, set[str]]) -> None:
+    asked = [(body, "application/json") for body in ODD_BODIES]
+    asked += [(body, media) for body in ODD_BODIES[:5] for media in ("multipart/form-data; boundary=x", "nonsense")]
+    for path in (path for path, taken in routes.items() if "POST" in taken):
+        for body, media in asked:
             reply = client.post(address(path), content=body, headers={"Content-Type": media})
-            empty = body.endswith(b"{}") and media == "application/json"
             # Many words at once need to be told nothing.
-            if empty and path.startswith("/query/segment") and reply.status_code == 200:
+            if body.endswith(b"{}") and path.startswith("/query/segment") and reply.status_code == 200:
                 continue
             assert assert_problem(reply)["status"] in (400, 404, 415, 422), (path, media, body[:40])
 

@@ -28,9 +28,8 @@ from service.store.store import DATABASE, Store
 from tests.crash.conftest import order, until
 from tests.crash.server import NoQueries
 
-from .conftest import Uploaded, app_of, parts_of
+from .conftest import Uploaded, app_of, parts_of, put
 from .guarded import address, every_route, guarded
-from .test_labels import put
 from .test_problems import assert_problem
 from .tiny_scene import TinyScene, cameras_document
 

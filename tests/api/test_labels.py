@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Iterator
 from dataclasses import replace
@@ -15,15 +14,13 @@ from fastapi.testclient import TestClient
 from liftcore.evaluate.ranking import accuracy_of
 from liftcore.evaluate.tradeoff import RunSpec, Scene, measured
 from service.models import AssetKind, JobKind
-from service.store.assets import CheckedUpload
 from service.store.jobs import fingerprint
-from service.store.owners import SERVICE, Owner
+from service.store.owners import Owner
 from service.store.store import Store
-from service.uploads import check
 from tests.crash.conftest import labels as stored_labels
 from tests.crash.conftest import order
 
-from .conftest import Uploaded, parts_of
+from .conftest import Uploaded, put
 from .following import ended
 from .test_jobs import Quick, quick
 from .test_problems import NO_ASSET, assert_problem
@@ -43,19 +40,6 @@ def judged(client: TestClient, uploaded: Uploaded, scene: TinyScene) -> Iterator
     yield {**ids, "classes": CLASSES}
     for asset in ids.values():
         assert client.delete(f"/assets/{asset}").status_code == 204
-
-
-def put(client: TestClient, kind: AssetKind, content: bytes) -> str:
-    """Store what the check takes, without a process; the id."""
-    store = parts_of(client).store
-    with store.files.draft(".part") as draft, store.files.scratch() as folder:
-        draft.write_bytes(content)
-        copy = folder / "copy"
-        copy.write_bytes(content)
-        said = check.run(kind, str(copy))
-        digest = hashlib.sha256(content).hexdigest()
-        upload = CheckedUpload(draft, kind, digest, said["suffix"], said["counts"], said["warnings"])
-        return store.assets.add(SERVICE, upload)[0].id
 
 
 def test_masks_and_tables_tell_what_orders_are_held_to(client: TestClient, judged: dict[str, Any]) -> None:

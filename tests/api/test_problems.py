@@ -14,8 +14,10 @@ from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
 from liftcore.errors import SplatliftError
+from liftcore.settings import LiftSettings
 from service import problems
 from service.child import error_of, fault_of
+from service.models import COMPARED
 from service.problems import TABLE, problem_of
 
 from .conftest import Uploaded
@@ -84,26 +86,17 @@ def every_route(client: TestClient) -> list[tuple[str, str]]:
 
 
 @pytest.mark.parametrize(
-    "path",
-    [f"/jobs/{NOBODY}", f"/lifts/{NOBODY}", f"/lifts/{NOBODY}/features", f"/assets/{NO_ASSET}/content"],
-)
-def test_unknown_thing_is_404(client: TestClient, path: str) -> None:
-    assert assert_problem(client.get(path))["type"] == "/problems/not-found"
-
-
-@pytest.mark.parametrize(
     ("change", "status", "kind"),
     [
         ({"settings": {"preset": "magic"}}, 422, "invalid-settings"),
         ({"settings": {"power": 3}}, 422, "invalid-settings"),
-        ({"settings": {"prest": "row-sum"}}, 422, "invalid-settings"),
-        ({"settings": {"cls": 1}}, 422, "invalid-settings"),
         ({"settings": {"self": 1}}, 422, "invalid-settings"),
+        ({"settings": {"a\nb": 1}}, 422, "invalid-settings"),
+        ({"settings": {"\ud800": 1}}, 422, "invalid-settings"),
+        ({"settings": {"preset": "\ud800"}}, 422, "invalid-settings"),
         ({"settings": {"preset": ["row-sum"]}}, 422, "invalid-request"),
-        ({"settings": {"alpha_cap": math.inf}}, 422, "invalid-settings"),
         ({"settings": {"lift_gain": math.nan}}, 422, "invalid-settings"),
         ({"splats": NO_ASSET}, 404, "not-found"),
-        ({"features": [NO_ASSET]}, 404, "not-found"),
         ({"features": []}, 422, "invalid-request"),
         ({"cameras": "sha256:short"}, 422, "invalid-request"),
         ({"extra": 1}, 422, "invalid-request"),
@@ -120,100 +113,36 @@ def test_bad_order_is_refused_before_it_is_a_job(
     assert len(client.get("/jobs").json()["jobs"]) == before
 
 
-def test_assets_in_the_wrong_place_are_refused(client: TestClient, uploaded: Uploaded) -> None:
+def test_assets_in_a_wrong_place_and_one_pack_twice_are_refused(client: TestClient, uploaded: Uploaded) -> None:
     body = assert_problem(client.post("/lift", json=uploaded.order() | {"splats": uploaded.cameras}))
     assert body["status"] == 404 and "cameras" in body["got"]
-
-
-def test_one_pack_twice_is_refused(client: TestClient, uploaded: Uploaded) -> None:
     twice = uploaded.order() | {"features": [uploaded.features, uploaded.features]}
     assert assert_problem(client.post("/lift", json=twice))["type"] == "/problems/invalid-features"
 
 
+FULL = sqlite3.OperationalError("disk is full")
+FULL.sqlite_errorcode = sqlite3.SQLITE_FULL
+
+
 @pytest.mark.parametrize(
-    ("path", "change", "status", "kind"),
+    ("error", "status", "kind"),
     [
-        ("/query", {"text": ""}, 422, "invalid-request"),
-        ("/query", {"text": "   "}, 422, "invalid-query"),
-        ("/query", {"text": "zeppelin"}, 422, "invalid-query"),
-        ("/query", {"lift": NOBODY}, 404, "not-found"),
-        ("/query", {"view": "behind"}, 404, "not-found"),
-        ("/query", {"threshold": "high"}, 422, "invalid-request"),
-        ("/query", {"threshold": "nan"}, 422, "invalid-request"),
-        ("/query", {"top": "-1"}, 422, "invalid-request"),
-        ("/query", {"negatives": "zeppelin"}, 422, "invalid-query"),
-        ("/query", {"encoder": "table:/etc/passwd"}, 422, "invalid-request"),
-        ("/query", {"encoder": "spare"}, 422, "invalid-query"),  # 5 channels and not 8
-        ("/query/mask", {"view": "behind"}, 404, "not-found"),
-        ("/query/mask", {}, 422, "invalid-request"),
-        ("/query/objects", {"threshold": "high"}, 422, "invalid-request"),
-        ("/query/objects", {"text": "zeppelin"}, 422, "invalid-query"),
-        ("/query/scores", {"lift": "../../etc/passwd"}, 422, "invalid-request"),
-        # Nothing is found, so there is no object.
-        ("/query/splats", {"negatives": "book", "threshold": "1"}, 422, "invalid-query"),
-        ("/query/splats", {"what": "mesh"}, 422, "invalid-request"),
-        ("/render", {"view": "behind"}, 404, "not-found"),
-        ("/render", {"view": "left", "what": "x-rays"}, 422, "invalid-request"),
+        (RuntimeError("the secret"), 500, "internal"),
+        (OSError(errno.ENOSPC, "the secret"), 507, "no-space"),
+        (FULL, 507, "no-space"),
     ],
 )
-def test_bad_query_is_a_problem(
-    client: TestClient, lift: dict[str, Any], path: str, change: dict[str, str], status: int, kind: str
-) -> None:
-    asked = {"lift": lift["id"]} if path == "/render" else {"text": "apple", "lift": lift["id"]}
-    reply = client.get(path, params=asked | change)
-    body = assert_problem(reply)
-    assert (body["status"], body["type"]) == (status, f"/problems/{kind}"), body
-
-
-def test_unexpected_error_says_nothing_of_itself() -> None:
+def test_error_that_nobody_foresaw_says_nothing_of_itself(error: Exception, status: int, kind: str) -> None:
     app = FastAPI()
     problems.install(app)
 
     @app.get("/broken")
     def broken() -> None:
-        raise RuntimeError("the secret")
-
-    reply = TestClient(app, raise_server_exceptions=False).get("/broken")
-    assert assert_problem(reply)["type"] == "/problems/internal"
-    assert "secret" not in reply.text
-
-
-@pytest.mark.parametrize(
-    "body",
-    [
-        b'{"\\ud800": 1}',
-        b'{"settings": {"\\ud800": 1}}',
-        b'{"settings": {"a\\nb": 1}}',
-        b'{"settings": {"preset": "\\ud800"}}',
-        b'{"settings": {"power": 1' + b"0" * 5000 + b"}}",
-        b"[" * 100_000,
-        b"\xff\xfe",
-    ],
-)
-def test_no_body_makes_it_our_fault(client: TestClient, uploaded: Uploaded, body: bytes) -> None:
-    if body.startswith(b'{"settings'):  # the rest of the order is right, so that the settings are read
-        body = (
-            json.dumps({name: value for name, value in uploaded.order().items() if name != "settings"}).encode()[:-1]
-            + b", "
-            + body[1:]
-        )
-    reply = client.post("/lift", content=body, headers={"Content-Type": "application/json"})
-    assert 400 <= assert_problem(reply)["status"] < 500
-
-
-@pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "full"), sqlite3.OperationalError("disk is full")])
-def test_full_disk_is_507(error: Exception) -> None:
-    if isinstance(error, sqlite3.OperationalError):
-        error.sqlite_errorcode = sqlite3.SQLITE_FULL
-    app = FastAPI()
-    problems.install(app)
-
-    @app.get("/")
-    def full() -> None:
         raise error
 
-    reply = TestClient(app, raise_server_exceptions=False).get("/")
-    assert (assert_problem(reply)["type"], reply.status_code) == ("/problems/no-space", 507)
+    reply = TestClient(app, raise_server_exceptions=False).get("/broken")
+    assert (reply.status_code, assert_problem(reply)["type"]) == (status, f"/problems/{kind}")
+    assert "secret" not in reply.text
 
 
 def test_every_error_has_a_row_and_crosses_processes() -> None:
@@ -232,3 +161,171 @@ def test_openapi_names_the_problem_and_the_routes(client: TestClient) -> None:
     assert "Problem" in document["components"]["schemas"]
     assert "HTTPValidationError" not in document["components"]["schemas"]
     assert set(document["paths"]) == ROUTES
+
+
+JSON = {"Content-Type": "application/json"}
+THRESHOLD = "auto, valley, paper, otsu, stability, or a number from -1 to 1"
+EXAMPLE = "VIEW:x,y, region:VIEW:LEVEL:ID, splat:J, or a vector of 1 to 65536 finite numbers"
+
+
+@pytest.mark.parametrize("media", [None, "application/x-www-form-urlencoded", "text/plain"])
+def test_json_that_nothing_calls_json_is_told_of_the_header(client: TestClient, media: str | None) -> None:
+    headers = {} if media is None else {"Content-Type": media}
+    told = assert_problem(client.post("/query", content=b'{"text": ["apple"]}', headers=headers))
+    assert (told["status"], told["argument"], told["expected"]) == (422, "Content-Type", "application/json")
+    assert told["got"] == ("nothing" if media is None else repr(media))
+    assert "Content-Type: application/json" in told["hint"]
+
+
+@pytest.mark.parametrize(
+    ("body", "got"),
+    [(b"{", "its end at character 2"), (b'{"text": x}', "'x}' at character 10"), (b"{} {}", "'{}' at character 4")],
+)
+def test_what_is_no_json_says_where(client: TestClient, body: bytes, got: str) -> None:
+    told = assert_problem(client.post("/query", content=body, headers=JSON))
+    assert (told["status"], told["argument"], told["expected"]) == (422, "body", "JSON")
+    assert told["got"].startswith(got), told
+
+
+@pytest.mark.parametrize("body", [b"", b"[]", b"null", b'"text"'])
+def test_what_is_no_object_is_the_body(client: TestClient, body: bytes) -> None:
+    told = assert_problem(client.post("/query", content=body, headers=JSON))
+    assert (told["argument"], told["expected"]) == ("body", "a JSON object")
+
+
+@pytest.mark.parametrize("value", ["1.01", "-2", "nan", "inf", "high", ""])
+def test_threshold_is_a_word_or_a_number(client: TestClient, value: str) -> None:
+    told = assert_problem(client.get("/query", params={"text": "apple", "threshold": value}))
+    assert (told["argument"], told["expected"], told["got"]) == ("threshold", THRESHOLD, repr(value))
+
+
+@pytest.mark.parametrize(
+    ("body", "argument", "expected"),
+    [
+        ('{"like": [[NaN]]}', "like.0", EXAMPLE),
+        ('{"like": [[]]}', "like.0", EXAMPLE),
+        ('{"like": ["splat:1", [1, "x"]]}', "like.1", EXAMPLE),
+        ('{"unlike": [[true]]}', "unlike.0", EXAMPLE),
+        ('{"like": [[' + "0," * 65_536 + "0]]}", "like.0", EXAMPLE),
+        ('{"like": "splat:1"}', "like", "a valid list"),
+        ('{"threshold": true}', "threshold", THRESHOLD),
+        ('{"threshold": NaN}', "threshold", THRESHOLD),
+        ('{"top": true}', "top", "a number"),
+        ('{"instances": false}', "instances", "a number"),
+        ('{"keep": "some"}', "keep", "'all' or 'largest'"),
+    ],
+)
+def test_field_of_a_query_says_what_it_takes(client: TestClient, body: str, argument: str, expected: str) -> None:
+    told = assert_problem(client.post("/query", content=body, headers=JSON))
+    assert (told["status"], told["argument"], told["expected"]) == (422, argument, expected)
+    assert len(told["got"]) < 200
+
+
+@pytest.mark.parametrize(
+    ("path", "body", "argument", "known"),
+    [
+        ("/query", {"negative": ["x"]}, "negative", "negatives"),
+        ("/query", {"x" * 500: 1}, "x" * 80, "text"),
+        ("/lift", {"knobs": {}}, "knobs", "settings"),
+        ("/tradeoff", {"labels": {"mask": 1}}, "labels.mask", "masks, table, classes"),
+    ],
+)
+def test_unknown_field_is_refused_with_the_known_ones(
+    client: TestClient, path: str, body: dict[str, Any], argument: str, known: str
+) -> None:
+    order = {} if path == "/query" else {"splats": NO_ASSET, "cameras": NO_ASSET, "features": [NO_ASSET]}
+    told = assert_problem(client.post(path, json=order | body))
+    assert (told["status"], told["argument"]) == (422, argument)
+    assert told["expected"].startswith("one of ") and known in told["expected"]
+    assert told["got"] == repr(argument.rpartition(".")[2])
+
+
+def test_booleans_are_no_budget_and_nothing_is_no_setting(client: TestClient) -> None:
+    order = {"splats": NO_ASSET, "cameras": NO_ASSET, "features": [NO_ASSET]}
+    told = assert_problem(client.post("/tradeoff", json=order | {"budget_s": True}))
+    assert (told["argument"], told["expected"], told["got"]) == ("budget_s", "a number", "True")
+    told = assert_problem(client.post("/lift", json=order | {"settings": {"power": None}}))
+    assert (told["argument"], told["expected"]) == ("settings.power", "a boolean, a number or a text")
+
+
+def test_missing_parameter_is_a_value_that_nobody_gave(client: TestClient) -> None:
+    told = assert_problem(client.get("/render"))
+    assert (told["argument"], told["expected"], told["got"]) == ("view", "a value", "nothing")
+
+
+@pytest.mark.parametrize("name", ["text", "negatives"])
+def test_texts_have_a_length_together(client: TestClient, name: str) -> None:
+    for texts in (["a" * 1000] * 4 + ["b"], ["a" * 126] * 32):
+        told = assert_problem(client.post("/query", json={"text": ["apple"], name: texts}))
+        assert (told["status"], told["argument"]) == (422, name)
+        assert told["expected"] == f"texts of at most 4000 characters together, which are {len(''.join(texts))}"
+    assert "4000" not in client.post("/query", json={"text": ["apple"], name: ["a" * 125] * 32}).text
+
+
+def test_settings_have_the_types_that_the_document_shows(client: TestClient) -> None:
+    order = {"splats": NO_ASSET, "cameras": NO_ASSET, "features": [NO_ASSET]}
+    shown = client.get("/openapi.json").json()["components"]["schemas"]
+    for path, schema, left_out in (("/lift", "LiftRequest", set()), ("/tradeoff", "TradeoffRequest", {COMPARED})):
+        fields = shown[schema]["properties"]["settings"]
+        assert set(fields["properties"]) == set(LiftSettings.model_fields) - left_out
+        assert fields["additionalProperties"] is False
+        assert fields["properties"]["stride"]["type"] == "integer"
+        told = assert_problem(client.post(path, json=order | {"settings": {"stride": "2"}}))
+        assert (told["status"], told["argument"], told["expected"]) == (422, "stride", "a valid integer")
+        for example in fields["examples"]:  # right, so it is the assets that are missed
+            assert client.post(path, json=order | {"settings": example}).status_code == 404
+
+
+def test_unknown_setting_is_refused_with_the_known_ones(client: TestClient) -> None:
+    order = {"splats": NO_ASSET, "cameras": NO_ASSET, "features": [NO_ASSET]}
+    told = assert_problem(client.post("/lift", json=order | {"settings": {"x" * 500: 1}}))
+    assert (told["status"], told["argument"], told["got"]) == (422, "x" * 80, "an unknown setting")
+    assert told["expected"].startswith("one of preset, speed, ")
+
+
+FREE = {"/healthz", "/readyz", "/version", "/metrics"}
+
+
+def test_every_route_refuses_what_it_does_not_declare(client: TestClient) -> None:
+    paths = client.get("/openapi.json").json()["paths"]
+    for method, path in every_route(client):
+        if path in FREE:
+            continue
+        declared = [
+            parameter["name"]
+            for parameter in paths[path][method.lower()].get("parameters", ())
+            if parameter["in"] == "query"
+        ]
+        address = re.sub(r"\{\w+\}", NOBODY, path.replace("{asset}", NO_ASSET if method != "PUT" else "splats"))
+        body: dict[str, Any] = {"json": {"text": ["x"]}} if method == "POST" and path.startswith("/query") else {}
+        reply = client.request(method, address, params={"colour": "red"}, **body)
+        told = assert_problem(reply)
+        assert (told["status"], told["type"]) == (422, "/problems/invalid-request"), (method, path, told)
+        if method != "POST":  # where the body is told of first
+            assert (told["argument"], told["got"]) == ("colour", "'colour'"), (method, path, told)
+            expected = f"one of {', '.join(declared)}" if declared else "no parameters"
+            assert set(told["expected"].split(", ")) == set(expected.split(", ")), (method, path, told)
+
+
+@pytest.mark.parametrize(
+    ("path", "wrong"),
+    [
+        ("/query?text=mug&negative=lamp", "negative"),
+        ("/query/scores?text=mug&view=left", "view"),
+        ("/query/mask?text=mug&view=left&top=3", "top"),
+        ("/render?view=left&text=mug", "text"),
+        ("/jobs?state=running", "state"),
+        ("/lifts?" + "a" * 5000, "a" * 80),
+    ],
+)
+def test_misspelt_parameter_is_named(client: TestClient, path: str, wrong: str) -> None:
+    told = assert_problem(client.get(path))
+    assert (told["status"], told["argument"]) == (422, wrong)
+    assert path.startswith(("/jobs", "/lifts")) or "lift" in told["expected"]
+
+
+@pytest.mark.parametrize(
+    "path", ["/healthz?probe=1", "/readyz?probe=1", "/version?x", "/metrics?x", "/?lift=x&view=y"]
+)
+def test_probes_and_links_to_the_page_may_carry_what_they_like(client: TestClient, path: str) -> None:
+    assert client.get(path).status_code == 200

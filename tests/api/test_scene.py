@@ -104,21 +104,6 @@ def test_wrong_questions_for_objects_are_problems(
     assert assert_problem(client.get(f"/lifts/{lift['id']}/{path}", params=how))["status"] == status
 
 
-def test_an_answer_says_what_is_known_of_presence(client: TestClient, lift: dict[str, Any]) -> None:
-    for route in ("/query", "/query/objects"):
-        told = client.get(route, params={"lift": lift["id"], "text": "lamp"}).json()
-        assert told["clear"] is True and told["present"] is None and "200 words" in told["why"]
-    kept = client.get("/query", params={"lift": lift["id"], "text": "lamp", "absent": "keep"}).json()
-    assert "absent=keep" in kept["links"]["objects"] and kept["count"] > 0
-    assert client.get("/query", params={"text": "lamp", "absent": "hide"}).status_code == 422
-    refused = client.get("/query", params={"lift": lift["id"], "text": "lamp", "weigh": "confidence"})
-    assert assert_problem(refused)["argument"] == "weigh"  # this lift was not reweighted
-    nothing = client.get(
-        "/query", params={"lift": lift["id"], "text": "lamp", "negatives": "book", "threshold": 1}
-    ).json()
-    assert (nothing["clear"], nothing["count"]) == (False, 0)
-
-
 def test_other_kernels_are_shown_as_near_gaussians() -> None:
     from liftcore.query.export import viewer_splats
     from liftcore.scene.splats import Splats

@@ -1,4 +1,4 @@
-"""Many words at once, the words of an uploaded table, and cameras that no file has, over HTTP."""
+"""Many words at once, and the words of an uploaded table, over HTTP."""
 
 from __future__ import annotations
 
@@ -12,10 +12,9 @@ from fastapi.testclient import TestClient
 from PIL import Image
 
 from .test_problems import assert_problem
-from .tiny_scene import CHANNELS, FOCAL, HEIGHT, SPLATS_A_CLUSTER, VIEWS, WIDTH, WORDS, text_table
+from .tiny_scene import CHANNELS, HEIGHT, SPLATS_A_CLUSTER, WIDTH, WORDS, text_table
 
 PLACES: dict[str, int] = dict(zip(WORDS, (6, 16, 26), strict=True))  # columns of view "middle" that show them
-POSE = [[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]]  # as "middle" stands, in OpenCV's axes
 
 
 @pytest.fixture(scope="module")
@@ -68,35 +67,9 @@ def test_an_uploaded_table_answers_questions(client: TestClient, lift: dict[str,
     assert assert_problem(client.get("/query", params=asked | {"encoder": "default"}))["argument"] == "table"
 
 
-def test_a_camera_of_no_file_sees_what_a_view_sees(client: TestClient, lift: dict[str, Any]) -> None:
-    """The same pose gives the same picture; an entry of the list of views is a camera; another pose sees no less."""
-    own = {"width": WIDTH, "height": HEIGHT, "fx": FOCAL, "viewmat": POSE}
-    named = {view["name"]: view for view in client.get(f"/lifts/{lift['id']}/views").json()["views"]}
-    for path, question in (
-        ("/query/mask", {"text": ["lamp"]}),
-        ("/query/attention", {"text": ["lamp"]}),
-        ("/render", {}),
-    ):
-        asked = {"lift": lift["id"], **question}
-        by_name = picture_of(client, path, asked | {"view": "middle"}).tobytes()
-        assert picture_of(client, path, asked | {"camera": own}).tobytes() == by_name
-        assert picture_of(client, path, asked | {"camera": named["middle"]}).tobytes() == by_name
-    larger = own | {"width": 2 * WIDTH, "height": 2 * HEIGHT, "fx": 2 * FOCAL}
-    mask = np.asarray(picture_of(client, "/query/mask", {"lift": lift["id"], "text": ["lamp"], "camera": larger}))
-    assert mask.shape == (2 * HEIGHT, 2 * WIDTH) and np.nonzero(mask)[1].min() > WIDTH
-    assert list(named) == list(VIEWS)
-
-
 @pytest.mark.parametrize(
     ("path", "body", "argument"),
     [
-        ("/query/mask", {"text": ["lamp"]}, "view"),
-        ("/query/mask", {"text": ["lamp"], "camera": {}}, "camera.width"),
-        ("/query/mask", {"text": ["lamp"], "camera": {"fx": 0}}, "camera 'camera' intrinsics"),
-        ("/query/mask", {"text": ["lamp"], "camera": {"viewmat": np.zeros((4, 4)).tolist()}}, "camera 'camera' pose"),
-        ("/query/mask", {"text": ["lamp"], "camera": {"viewmat": [[1, 0, 0, 0]] * 3}}, "camera.viewmat"),
-        ("/render", {"view": "middle", "camera": {"fx": FOCAL}}, "view"),
-        ("/render", {"view": "middle", "what": "confidence"}, "what"),
         ("/query/segment", {"words": []}, "words"),
         ("/query/segment", {"words": ["lamp", "lamp"]}, "words"),
         ("/query/segment", {"words": ["zeppelin"]}, "text"),
@@ -104,10 +77,8 @@ def test_a_camera_of_no_file_sees_what_a_view_sees(client: TestClient, lift: dic
         ("/query/what", {"example": "middle:99,0"}, "middle:99,0"),
     ],
 )
-def test_bodies_that_make_no_picture_are_problems(
+def test_words_that_name_nothing_are_problems(
     client: TestClient, lift: dict[str, Any], path: str, body: dict[str, Any], argument: str
 ) -> None:
-    if body.get("camera"):
-        body = body | {"camera": {"width": WIDTH, "height": HEIGHT, "fx": FOCAL, "viewmat": POSE} | body["camera"]}
     told = assert_problem(client.post(path, json={"lift": lift["id"]} | body))
     assert (told["status"], told.get("argument")) == (422, argument), told

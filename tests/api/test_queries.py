@@ -1,0 +1,412 @@
+"""Questions over HTTP: words, examples and vectors, and by an answer's links its objects, pictures and splats."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from pathlib import Path
+from typing import Any
+
+import anyio
+import numpy as np
+import pytest
+from fastapi.testclient import TestClient
+from PIL import Image
+from plyfile import PlyData
+from starlette.requests import ClientDisconnect
+
+from liftcore.features.pack import write_pack
+from liftcore.features.views import Regions
+from liftcore.query.text.table import TableEncoder
+from service.content import BINARY, BLOCK_BYTES, Draft
+from service.errors import NoSpace
+from service.models import AssetKind
+from service.queries import answers
+from service.queries.client import Frame
+from service.store.files import DataDirectory
+
+from .conftest import Uploaded, parts_of, put
+from .following import ended
+from .test_problems import assert_problem
+from .tiny_scene import (
+    CHANNELS,
+    DISTANCE,
+    FOCAL,
+    HEIGHT,
+    POSE,
+    SPLATS_A_CLUSTER,
+    VIEWS,
+    WIDTH,
+    WORDS,
+    TinyScene,
+    codebook,
+    labels,
+    ply,
+    splat_rows,
+)
+
+LAMP = {"like": f"middle:26,{HEIGHT // 2}", "threshold": 0.5}
+PICTURES = ("/render", "/query/mask", "/query/attention")
+
+
+def picture(content: bytes) -> np.ndarray:
+    return np.asarray(Image.open(io.BytesIO(content)))
+
+
+def array(content: bytes) -> np.ndarray:
+    return np.load(io.BytesIO(content), allow_pickle=False)
+
+
+def rows_of(content: bytes) -> np.ndarray:
+    return PlyData.read(io.BytesIO(content))["vertex"].data
+
+
+def of_lamp(answer: dict[str, Any]) -> bool:
+    rows = {splat["splat"] for splat in answer["top"]}
+    return rows <= set(range(2 * SPLATS_A_CLUSTER, 3 * SPLATS_A_CLUSTER)) and answer["count"] > 10
+
+
+@pytest.mark.parametrize("cluster", range(3))
+def test_word_finds_its_cluster_in_numbers_objects_scores_and_a_mask(
+    client: TestClient, lift: dict[str, Any], cluster: int
+) -> None:
+    asked = {"text": WORDS[cluster], "view": "middle", "threshold": 0.5}
+    answer = client.get("/query", params=asked).json()
+    assert answer["lift"] == lift["id"]  # left out of the request: there is only one
+    rows = range(cluster * SPLATS_A_CLUSTER, (cluster + 1) * SPLATS_A_CLUSTER)
+    assert {splat["splat"] for splat in answer["top"]} <= set(rows)
+    best = [splat["score"] for splat in answer["top"]]
+    assert best == sorted(best, reverse=True)
+    assert 0.8 * SPLATS_A_CLUSTER <= answer["count"] <= 1.2 * SPLATS_A_CLUSTER
+    assert answer["threshold"]["value"] == 0.5 and answer["threshold"]["method"] == "fixed"
+    found = client.get(answer["links"]["objects"]).json()
+    assert (found["lift"], found["count"], found["threshold"]) == (lift["id"], answer["count"], answer["threshold"])
+    (thing,) = found["objects"]
+    middle = (cluster - 1) * 1.2
+    assert answer["box"]["low"][0] <= thing["box"]["low"][0] < middle < thing["box"]["high"][0]
+    assert thing["centre"][0] == pytest.approx(middle, abs=0.2)
+    assert thing["splats"] + found["strays"] == found["count"] and thing["score"] >= 0.5
+    scores = array(client.get(answer["links"]["scores"]).content)
+    assert (scores.shape, scores.dtype) == ((3 * SPLATS_A_CLUSTER,), np.float32)
+    assert scores[answer["top"][0]["splat"]] == pytest.approx(best[0]) == scores.max()
+    assert int((scores >= 0.5).sum()) == answer["count"]
+    mask = picture(client.get(answer["links"]["mask"]).content)
+    assert mask.shape == (HEIGHT, WIDTH) and set(np.unique(mask)) == {0, 255}
+    assert abs(np.nonzero(mask)[1].mean() - (6, 16, 26)[cluster]) < 3
+
+
+@pytest.mark.parametrize("like", ["middle:26,12", "region:left:0:2", f"splat:{2 * SPLATS_A_CLUSTER}"])
+def test_example_finds_more_of_it_and_every_link_leads_somewhere(
+    client: TestClient, lift: dict[str, Any], like: str
+) -> None:
+    answer = client.get("/query", params={"like": like, "view": "middle", "lift": lift["id"]}).json()
+    assert of_lamp(answer), answer
+    assert (answer["like"], answer["text"], answer["encoder"]) == ([like], [], None)
+    for name, link in answer["links"].items():
+        assert client.get(link).status_code == 200, name
+    assert np.nonzero(picture(client.get(answer["links"]["mask"]).content))[1].min() >= WIDTH // 2
+
+
+def test_vector_is_asked_by_post_and_so_is_all_that_belongs_to_it(client: TestClient, lift: dict[str, Any]) -> None:
+    body = {"like": [codebook()[2].tolist()], "unlike": ["middle:6,12"], "view": "middle", "lift": lift["id"]}
+    answer = client.post("/query", json=body).json()
+    assert of_lamp(answer) and answer["like"] == [f"a vector of {CHANNELS} channels"]
+    assert (answer["links"]["mask"], answer["links"]["object"]) == ("/query/mask", "/query/splats?what=object")
+    asked = {"like": "region:left:0:2", "unlike": "middle:6,12", "lift": lift["id"]}
+    by_get = array(client.get("/query/scores", params=asked).content)
+    np.testing.assert_allclose(array(client.post(answer["links"]["scores"], json=body).content), by_get, atol=1e-5)
+    for name in ("mask", "attention"):
+        assert picture(client.post(answer["links"][name], json=body).content).shape[:2] == (HEIGHT, WIDTH)
+    found, coloured = (client.post(answer["links"][name], json=body) for name in ("object", "coloured"))
+    assert (len(rows_of(found.content)), len(rows_of(coloured.content))) == (answer["count"], 3 * SPLATS_A_CLUSTER)
+    assert assert_problem(client.post("/query/splats?what=mesh", json=body))["argument"] == "what"
+    for size in (1e-300, 1e300):  # it has a direction too
+        body = {"like": [(size * codebook()[2].astype(float)).tolist()], "lift": lift["id"]}
+        assert of_lamp(client.post("/query", json=body).json())
+
+
+def test_words_and_examples_make_one_query(client: TestClient, lift: dict[str, Any]) -> None:
+    both = {"text": ["apple"], "like": ["middle:26,12"], "negatives": ["book"], "threshold": 0.5, "lift": lift["id"]}
+    by_post, by_get = client.post("/query", json=both).json(), client.get("/query", params=both).json()
+    assert by_post == by_get
+    assert client.get(by_post["links"]["mask"]).status_code == 200
+    assert by_post["count"] > 1.5 * SPLATS_A_CLUSTER
+
+
+def test_answer_says_what_is_known_of_presence(client: TestClient, lift: dict[str, Any]) -> None:
+    asked = {"lift": lift["id"], "text": "lamp"}
+    for route in ("/query", "/query/objects"):
+        told = client.get(route, params=asked).json()
+        assert told["clear"] is True and told["present"] is None and "200 words" in told["why"]
+    kept = client.get("/query", params=asked | {"absent": "keep"}).json()
+    assert "absent=keep" in kept["links"]["objects"] and kept["count"] > 0
+    nothing = client.get("/query", params=asked | {"negatives": "book", "threshold": 1}).json()
+    assert (nothing["clear"], nothing["count"]) == (False, 0)
+
+
+def test_words_of_a_pack_need_no_encoder_of_the_operator(
+    client: TestClient, uploaded: Uploaded, tmp_path: Path
+) -> None:
+    words = TableEncoder("phrases", ["left thing", "right thing"], codebook()[[0, 2]])
+    views = {name: Regions(found, codebook()) for name, found in labels().items()}
+    write_pack(tmp_path / "pack", views, {"text_space": "prompts"}, table=words)
+    pack = put(client, AssetKind.FEATURES, (tmp_path / "pack").read_bytes())
+    job = ended(client, client.post("/lift", json=uploaded.order() | {"features": [pack]}).headers["location"])
+    lift = client.get(job["links"]["lift"]).json()
+    assert (lift["text_space"], lift["words"]) == ("prompts", ["left thing", "right thing"])
+    for text in ("Left_thing", "right thing"):
+        answer = client.get("/query", params={"lift": lift["id"], "text": text, "top": 1}).json()
+        assert (answer["count"], answer["clear"], answer["encoder"]) == (20, True, "prompts")
+        assert (answer["top"][0]["splat"] < 20) == (text == "Left_thing")
+    problem = assert_problem(client.get("/query", params={"lift": lift["id"], "text": "apple"}))
+    assert problem["status"] == 422 and "the lift's own words" in problem["detail"]
+    assert client.delete(job["links"]["self"], params={"with_lift": True}).status_code == 204
+    assert client.delete(f"/assets/{pack}").status_code == 204
+
+
+# Pictures and their tags
+
+
+@pytest.mark.parametrize("path", PICTURES)
+def test_picture_has_the_size_of_its_view_and_a_tag(client: TestClient, lift: dict[str, Any], path: str) -> None:
+    params = {"lift": lift["id"], "view": "left"} | ({} if path == "/render" else {"text": "apple"})
+    reply = client.get(path, params=params)
+    assert reply.headers["content-type"] == "image/png" and picture(reply.content).shape[:2] == (HEIGHT, WIDTH)
+    for known in (reply.headers["etag"], "*"):  # any picture at all is one that exists
+        again = client.get(path, params=params, headers={"If-None-Match": known})
+        assert (again.status_code, again.content, again.headers["etag"]) == (304, b"", reply.headers["etag"])
+    other = client.get(path, params=params | {"view": "right"}, headers={"If-None-Match": reply.headers["etag"]})
+    assert other.status_code == 200
+    nothing = client.get(path, params=params | {"view": "behind"}, headers={"If-None-Match": "*"})
+    assert assert_problem(nothing)["status"] == 404
+
+
+def test_every_question_has_a_tag_of_its_own(client: TestClient, lift: dict[str, Any]) -> None:
+    def tag(path: str = "/query/mask", **more: Any) -> str:
+        params = {"like": "middle:26,12", "lift": lift["id"]} | ({"view": "middle"} if "mask" in path else {}) | more
+        reply = client.get(path, params=params)
+        again = client.get(path, params=params, headers={"If-None-Match": reply.headers["etag"]})
+        assert (reply.status_code, again.status_code, again.content) == (200, 304, b"")
+        return reply.headers["etag"]
+
+    changes: list[dict[str, Any]] = [
+        {}, {"like": "middle:25,12"}, {"unlike": "middle:6,12"}, {"keep": "largest"}, {"instances": 2},
+        {"text": "lamp"}, {"path": "/query/splats", "what": "object"}, {"path": "/query/splats", "what": "scores"},
+        {"path": "/query/scores"},
+    ]  # fmt: skip
+    assert len({tag(**change) for change in changes}) == len(changes)
+
+
+def test_render_shows_colours_features_or_depth(client: TestClient, lift: dict[str, Any]) -> None:
+    asked = {"lift": lift["id"], "view": "middle"}
+    plain, features, depth = (
+        client.get("/render", params=asked | {"what": what}) for what in ("rgb", "pca", "depth")
+    )
+    assert len({reply.headers["etag"] for reply in (plain, features, depth)}) == 3
+    assert picture(features.content).shape == picture(plain.content).shape == (HEIGHT, WIDTH, 3)
+    assert (picture(features.content) != picture(plain.content)).any()
+    with Image.open(io.BytesIO(depth.content)) as shown:
+        assert (shown.size, shown.mode) == ((WIDTH, HEIGHT), "L")
+        near, far = (float(shown.info[name]) for name in ("depth-near", "depth-far"))
+    assert DISTANCE - 0.5 < near < far < DISTANCE + 0.5
+    lacking = assert_problem(client.get("/render", params=asked | {"what": "cluster"}))
+    assert lacking["type"] == "/problems/invalid-query" and "aggregation" in lacking["detail"]
+
+
+def test_camera_of_no_file_sees_what_a_view_sees(client: TestClient, lift: dict[str, Any]) -> None:
+    """The same pose gives the same picture; an entry of the list of views is a camera; another pose sees no less."""
+    own = {"width": WIDTH, "height": HEIGHT, "fx": FOCAL, "viewmat": POSE}
+    named = {view["name"]: view for view in client.get(f"/lifts/{lift['id']}/views").json()["views"]}
+    for path in PICTURES:
+        asked = {"lift": lift["id"]} | ({} if path == "/render" else {"text": ["lamp"]})
+        by_name = picture(client.post(path, json=asked | {"view": "middle"}).content).tobytes()
+        for camera in (own, named["middle"]):
+            assert picture(client.post(path, json=asked | {"camera": camera}).content).tobytes() == by_name
+    larger = own | {"width": 2 * WIDTH, "height": 2 * HEIGHT, "fx": 2 * FOCAL}
+    mask = picture(client.post("/query/mask", json={"lift": lift["id"], "text": ["lamp"], "camera": larger}).content)
+    assert mask.shape == (2 * HEIGHT, 2 * WIDTH) and np.nonzero(mask)[1].min() > WIDTH
+    assert list(named) == list(VIEWS)
+
+
+# Splats, and what is too large for the pipe
+
+
+def drafts(client: TestClient) -> list[Path]:
+    return list((parts_of(client).store.files.root / "tmp").iterdir())
+
+
+def test_object_is_the_rows_that_were_found_to_the_byte(client: TestClient, lift: dict[str, Any]) -> None:
+    answer = client.get("/query", params={**LAMP, "lift": lift["id"]}).json()
+    scores = array(client.get(answer["links"]["scores"]).content)
+    reply = client.get(answer["links"]["object"])
+    assert reply.content == ply(splat_rows()[scores >= 0.5])
+    assert reply.headers["content-type"] == "application/octet-stream"
+    assert reply.headers["content-disposition"] == f'attachment; filename="object-{lift["id"]}.ply"'
+    assert int(reply.headers["content-length"]) == len(reply.content)
+    assert not drafts(client)
+
+
+def test_scene_in_the_colours_of_its_scores_is_the_same_but_for_colours(
+    client: TestClient, lift: dict[str, Any], scene: TinyScene
+) -> None:
+    answer = client.get("/query", params={**LAMP, "lift": lift["id"]}).json()
+    reply = client.get(answer["links"]["coloured"])
+    before, after = rows_of(scene.splats), rows_of(reply.content)
+    changed = {name for name in before.dtype.names or () if before[name].tobytes() != after[name].tobytes()}
+    assert changed == {"f_dc_0", "f_dc_1", "f_dc_2"}
+    assert after["f_dc_1"][-SPLATS_A_CLUSTER:].min() > after["f_dc_1"][:-SPLATS_A_CLUSTER].max()
+    assert f'filename="scores-{lift["id"]}.ply"' in reply.headers["content-disposition"]
+
+
+def test_nothing_found_is_a_problem_that_says_what_to_try(client: TestClient, lift: dict[str, Any]) -> None:
+    params = {**LAMP, "negatives": "book", "threshold": 1, "lift": lift["id"]}
+    assert "object" not in client.get("/query", params=params).json()["links"]
+    problem = assert_problem(client.get("/query/splats", params=params))
+    assert (problem["status"], problem["type"]) == (422, "/problems/invalid-query")
+    assert "nothing stands out" in problem["got"] and "threshold" in problem["hint"]
+    assert len(rows_of(client.get("/query/splats", params=params | {"what": "scores"}).content)) == 60
+    assert not drafts(client)
+
+
+def test_too_little_disk_is_said_before_anything_is_made(
+    client: TestClient, lift: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(DataDirectory, "free_bytes", lambda files: 0)
+    asked = {**LAMP, "lift": lift["id"]}
+    assert assert_problem(client.get("/query/splats", params=asked))["type"] == "/problems/no-space"
+    assert client.get("/query", params=asked).status_code == 200
+
+
+def test_large_array_is_sent_from_a_file(
+    client: TestClient, lift: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    content = bytes(3 * BLOCK_BYTES + 7)
+
+    def call(wanted: dict[str, Any], asker: object) -> Frame:
+        Path(wanted["draft"]).write_bytes(content)
+        return Frame({})
+
+    monkeypatch.setattr(parts_of(client).queries, "call", call)
+    for reply in (
+        client.get("/query/scores", params=LAMP | {"lift": lift["id"]}),
+        client.post("/query/scores", json={"text": ["lamp"], "lift": lift["id"]}),
+        client.get(f"/lifts/{lift['id']}/colours"),
+    ):
+        assert reply.content == content and reply.headers["content-type"] == "application/x-npy"
+        assert "content-disposition" not in reply.headers
+    assert not drafts(client)
+
+
+def test_disk_that_fills_up_meanwhile_is_no_fault_of_ours() -> None:
+    with pytest.raises(NoSpace):
+        answers.write_draft([b"x"], Path("/dev/full"))
+    with pytest.raises(IsADirectoryError):
+        answers.write_draft([b"x"], Path("/dev"))
+
+
+@pytest.mark.parametrize("leaves", [False, True], ids=["reads", "leaves"])
+def test_draft_is_sent_without_its_name_and_closed_however_that_ends(tmp_path: Path, leaves: bool) -> None:
+    content = np.random.default_rng(0).bytes(3 * BLOCK_BYTES + 17)
+    (tmp_path / "draft").write_bytes(content)
+    reply = Draft(tmp_path / "draft", BINARY, filename="object.ply", headers={})
+    (tmp_path / "draft").unlink()
+    sent: list[bytes] = []
+
+    async def send(message: Any) -> None:
+        sent.append(message.get("body", b""))
+        if leaves and len(sent) == 3:
+            raise OSError("gone")
+
+    async def receive() -> Any:
+        await anyio.sleep_forever()
+
+    with pytest.raises(ClientDisconnect) if leaves else contextlib.nullcontext():
+        anyio.run(reply, {"type": "http", "asgi": {"spec_version": "2.4"}}, receive, send)
+    assert reply.file.closed
+    assert max(map(len, sent)) == BLOCK_BYTES
+    assert leaves or b"".join(sent) == content
+
+
+# What is refused
+
+
+@pytest.mark.parametrize(
+    ("path", "asked", "status", "argument"),
+    [
+        ("/query", {}, 422, "query"),
+        ("/query", {"text": ""}, 422, "text.0"),
+        ("/query", {"text": "apple", "negatives": " "}, 422, "negatives.0"),
+        ("/query", {"text": ["apple", "zeppelin"], "negatives": "lamp"}, 422, "text.1"),
+        ("/query", {"text": "apple", "negatives": ["lamp", "zeppelin"], "like": "splat:1"}, 422, "negatives.1"),
+        ("/query", {"unlike": ["splat:2", "behind:1,1"], "like": "splat:1"}, 404, "unlike.1"),
+        ("/query", {"like": ["splat:1", "splat:60"], "text": "apple"}, 422, "like.1"),
+        ("/query", {"like": "middle:0,0"}, 422, "like.0"),
+        ("/query", {"like": "a\ufffd:1,1"}, 404, "like.0"),
+        ("/query", {"like": "region:left:7:0"}, 404, "like.0"),
+        ("/query", {"like": ["splat:1"] * 33}, 422, "like"),
+        ("/query", {"like": "splat:1", "instances": 0}, 422, "instances"),
+        ("/query", {"text": "apple", "lift": "0" * 32}, 404, "lift"),
+        ("/query", {"text": "apple", "view": "behind"}, 404, "view"),
+        ("/query", {"text": "apple", "top": -1}, 422, "top"),
+        ("/query", {"text": "apple", "absent": "hide"}, 422, "absent"),
+        ("/query", {"text": "apple", "weigh": "confidence"}, 422, "weigh"),  # this lift was not reweighted
+        ("/query", {"text": "apple", "encoder": "table:/etc/passwd"}, 422, "encoder"),
+        ("/query", {"text": "apple", "encoder": "spare"}, 422, "encoder"),  # 5 channels and not 8
+        ("/query/mask", {"text": "apple"}, 422, "view"),
+        ("/query/scores", {"text": "apple", "lift": "../../etc/passwd"}, 422, "lift"),
+        ("/query/splats", {"text": "apple", "what": "mesh"}, 422, "what"),
+        ("/render", {"view": "left", "what": "x-rays"}, 422, "what"),
+    ],
+)
+def test_question_that_leads_nowhere_names_what_is_wrong(
+    client: TestClient, lift: dict[str, Any], path: str, asked: dict[str, Any], status: int, argument: str
+) -> None:
+    told = assert_problem(client.get(path, params={"lift": lift["id"]} | asked))
+    assert (told["status"], told.get("argument")) == (status, argument), told
+
+
+def test_what_an_example_lacks_is_told_beside_it(client: TestClient, lift: dict[str, Any]) -> None:
+    def told(**asked: Any) -> str:
+        return client.get("/query", params={"lift": lift["id"]} | asked).json()["detail"]
+
+    assert told(like="splat:60") == "like.0: expected a splat in 0..59, got 60 in splat:60"
+    assert told(unlike="splat:1") == (
+        "query: expected a text or an example of what to look for, got only what it is not; say what to look for, too"
+    )
+    assert told(like="behind:1,1").startswith("like.0: expected the name of a camera, got 'behind' in behind:1,1")
+
+
+@pytest.mark.parametrize(
+    ("path", "body", "argument"),
+    [
+        ("/query/mask", {"text": ["lamp"]}, "view"),
+        ("/query/mask", {"text": ["lamp"], "camera": {}}, "camera.width"),
+        ("/query/mask", {"text": ["lamp"], "camera": {"fx": 0}}, "camera 'camera' intrinsics"),
+        ("/query/mask", {"text": ["lamp"], "camera": {"viewmat": np.zeros((4, 4)).tolist()}}, "camera 'camera' pose"),
+        ("/query/mask", {"text": ["lamp"], "camera": {"viewmat": [[1, 0, 0, 0]] * 3}}, "camera.viewmat"),
+        ("/render", {"view": "middle", "camera": {"fx": FOCAL}}, "view"),
+        ("/render", {"view": "middle", "what": "confidence"}, "what"),
+    ],
+)
+def test_body_that_makes_no_picture_names_what_is_wrong(
+    client: TestClient, lift: dict[str, Any], path: str, body: dict[str, Any], argument: str
+) -> None:
+    if body.get("camera"):
+        body = body | {"camera": {"width": WIDTH, "height": HEIGHT, "fx": FOCAL, "viewmat": POSE} | body["camera"]}
+    told = assert_problem(client.post(path, json={"lift": lift["id"]} | body))
+    assert (told["status"], told.get("argument")) == (422, argument), told
+
+
+def test_document_says_what_is_answered_beside_200(client: TestClient) -> None:
+    paths = client.get("/openapi.json").json()["paths"]
+    files = ("/assets/{asset}/content", "/lifts/{lift}/features")
+    tagged = ("/query/scores", "/lifts/{lift}/splats", "/lifts/{lift}/colours", "/tradeoffs/{tradeoff}/chart")
+    for path in (*files, *PICTURES, *tagged):
+        told = paths[path]["get"]["responses"]
+        assert "304" in told and "content" not in told["304"] and list(told["200"]["content"]), path
+        assert ("206" in told, "416" in told) == (path in files, path in files), path
+    for path in files:
+        told = paths[path]["get"]["responses"]
+        assert list(told["206"]["content"]) == list(told["200"]["content"]) == ["application/octet-stream"]
+        assert list(told["416"]["content"]) == ["application/problem+json"]
+    assert "304" not in paths["/query/mask"]["post"]["responses"]
