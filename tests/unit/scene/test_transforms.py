@@ -6,7 +6,6 @@ import errno
 import json
 import math
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -63,7 +62,6 @@ def posed(matrix: Any) -> dict[str, Any]:
 # What is other than in SIZED; None takes the key away.
 BAD_TRANSFORMS = [
     ({"w": None}, "image size"),
-    ({"fl_x": None}, "fl_x or camera_angle_x"),
     ({"fl_x": None, "fx": 5}, "neither, but 'fx'; add the focal length in pixels as fl_x"),
     ({"k1": -1}, r"document.json camera 'a' distortion.*a pinhole sees \d\.\d% of the photo"),
     ({"camera_model": "FISHEYE624"}, "FISHEYE624.*undistorter"),
@@ -76,7 +74,6 @@ BAD_TRANSFORMS = [
     ({"frames": [{"file_path": "a"}]}, "matrix"),
     ({"fl_x": math.nan}, "a finite number, got nan"),
     ({"fl_x": 10**400}, "a finite number"),
-    ({"fl_x": "50"}, "a finite number"),
     ({"w": 9.5}, "whole number of pixels"),
     ({"fl_x": None, "camera_angle_x": 4}, "an angle"),
     ({"fl_x": 0, "fl_y": 5}, "positive focal"),
@@ -114,7 +111,6 @@ BROWN = Brown(k1=0.1, k2=-0.02, p1=0.001, p2=-0.002)
         (PARAMETERS, {}, BROWN),
         ({}, PARAMETERS, BROWN),
         (PARAMETERS, PARAMETERS, BROWN),
-        ({"distortion_params": LISTED}, {}, BROWN),
         ({}, {"distortion_params": LISTED, **PARAMETERS}, BROWN),
         ({"k3": 0.1, "camera_model": "OPENCV"}, {}, Brown(k3=0.1)),
         ({"camera_model": "OPENCV_FISHEYE", "k1": 0.1, "k4": 0.01}, {}, Fisheye(k1=0.1, k4=0.01)),
@@ -140,6 +136,10 @@ def test_bad_transforms_are_refused(changes: dict[str, Any], message: str, tmp_p
 
 APPLIED = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])  # of nerfstudio's converter
 SCALE, APPLIED_SCALE = 0.37, 4.0
+
+
+def zipped(folder: Path) -> Path:
+    return Path(shutil.make_archive(str(folder), "zip", folder))
 
 
 def oriented() -> np.ndarray:
@@ -216,7 +216,7 @@ def test_models_are_moved_to_the_same_frame(
     shutil.copy(run / FRAME_FILE, scene)
     for path in (scene, scene / place, scene / place / "images.bin"):
         assert_same(read_cameras(path), expected)
-    assert_same(read_cameras(Path(shutil.make_archive(str(scene), "zip", scene))), expected)
+    assert_same(read_cameras(zipped(scene)), expected)
 
 
 def test_transforms_json_comes_before_a_model_where_the_frame_is_told(
@@ -227,7 +227,7 @@ def test_transforms_json_comes_before_a_model_where_the_frame_is_told(
     (run / "transforms.json").write_text(json.dumps(document))
     (run / FRAME_FILE).write_text(json.dumps({"transform": oriented()[:3].tolist(), "scale": SCALE}))
     shutil.copytree(model, run / "colmap/sparse/0")
-    for path in (run, Path(shutil.make_archive(str(run), "zip", run))):
+    for path in (run, zipped(run)):
         assert_same(read_cameras(path), expected)
 
 
@@ -236,9 +236,11 @@ def test_zip_of_the_two_files_is_read(flat: bool, run: Path, expected: Cameras, 
     scene = tmp_path / "scene"
     inner = scene if flat else scene / "outputs/splatfacto/2026-01-01"
     inner.mkdir(parents=True)
-    shutil.copy(run / "transforms.json", scene)
+    (scene / ".ipynb_checkpoints").mkdir()
+    for place in (scene, scene / ".ipynb_checkpoints"):  # what is hidden does not count
+        shutil.copy(run / "transforms.json", place)
     shutil.copy(run / FRAME_FILE, inner)
-    path = Path(shutil.make_archive(str(scene), "zip", scene))
+    path = zipped(scene)
     assert_same(read_cameras(path), expected)
     assert inspect_file(path)["warnings"] == []
 
@@ -257,17 +259,14 @@ def test_lenses_stay_as_they_are(run: Path, tmp_path: Path) -> None:
     ("told", "message"),
     [
         ([1], "an object with 'transform', got list"),
-        ({"scale": 1}, "an object with 'transform'"),
         ({"transform": np.eye(4)[:3].tolist()}, "an object with 'scale'"),
         ({"transform": np.eye(3).tolist(), "scale": 1}, "a 3x4 or 4x4 matrix"),
         ({"transform": np.diag([1.0, 1, -1, 1]).tolist(), "scale": 1}, "a proper rotation .* a determinant of -1"),
-        ({"transform": np.zeros((3, 4)).tolist(), "scale": 1}, "a determinant of 0"),
         (
             {"transform": np.diag([1.0, 1, 2, 1]).tolist(), "scale": 1},
             "a rotation, a shift and a scale, got a matrix off",
         ),
         ({"transform": np.eye(4).tolist(), "scale": 0}, r"scale: expected a scale in 1e-09\.\.1e\+09, got 0"),
-        ({"transform": np.eye(4).tolist(), "scale": 1e300}, "scale: expected a scale in"),
         ({"transform": np.diag([1e12, 1e12, 1e12, 1]).tolist(), "scale": 1}, "numbers within 1e"),
         ({"transform": [[float("nan")] * 4] * 3, "scale": 1}, "a finite number"),
     ],
@@ -308,38 +307,42 @@ def test_inria_cameras_are_in_the_frame_of_their_splats(run: Path, tmp_path: Pat
 def test_zip_of_several_runs_is_refused(name: str, run: Path) -> None:
     (run / "other").mkdir()
     shutil.copy(run / name, run / "other")
-    path = Path(shutil.make_archive(str(run), "zip", run))
+    path = zipped(run)
     with pytest.raises(InvalidCameras, match=rf"expected one {name}, got {name} and other/{name}; zip those of one"):
         read_cameras(path)
 
 
-def test_the_frame_is_told_and_counts(run: Path, model: Path, tmp_path: Path) -> None:
+def test_the_frame_is_told_or_where_to_take_it_from(run: Path, model: Path) -> None:
     found = inspect_file(run)
     assert (found["frame"], found["warnings"]) == (FRAME_FILE, [])
     assert found["bytes"] == sum(path.stat().st_size for path in run.iterdir())
-    shutil.copytree(model, run / "sparse/0")
     (run / FRAME_FILE).unlink()
-    found = inspect_file(run)
-    assert found["frame"] is None
-    assert any("the COLMAP model was read, and beside it lies nerfstudio's" in text for text in found["warnings"])
-    assert any(
-        f"Put its run's {FRAME_FILE} beside" in text for text in inspect_file(run / "transforms.json")["warnings"]
-    )
-    (run / "transforms.json").write_text("{")
-    assert inspect_file(run)["warnings"] == []
+    document = json.loads((run / "transforms.json").read_text())
+    del document["applied_transform"]
+    for key in ("applied_transform", "ply_file_path"):  # nerfstudio's own converter writes them, and others do not
+        (run / "transforms.json").write_text(json.dumps({**document, key: APPLIED[:3].tolist()}))
+        for path in (run, run / "transforms.json"):
+            [told] = inspect_file(path)["warnings"]
+            assert "--orientation-method none" in told and f"Put its run's {FRAME_FILE} beside" in told
+    shutil.copytree(model, run / "colmap/sparse/0")
+    for path in (run, run / "colmap/sparse/0", run / "colmap/sparse/0/cameras.bin", zipped(run)):
+        assert any("the COLMAP model was read, and beside it" in text for text in inspect_file(path)["warnings"])
+    for other in (json.dumps(document), json.dumps(list(document)), "{"):
+        (run / "transforms.json").write_text(other)
+        assert inspect_file(run)["warnings"] == inspect_file(run / "colmap/sparse/0")["warnings"] == []
 
 
-@pytest.mark.parametrize("given", [lambda run: run, lambda run: run / "transforms.json"], ids=["folder", "file"])
-def test_another_frame_is_another_input(given: Callable[[Path], Path], run: Path) -> None:
-    before = camera_input(given(run))
+@pytest.mark.parametrize("name", ["", "transforms.json"])
+def test_another_frame_is_another_input(name: str, run: Path) -> None:
+    before = camera_input(run / name)
     told = json.loads((run / FRAME_FILE).read_text())
     (run / FRAME_FILE).write_text(json.dumps({**told, "scale": 2 * SCALE}))
-    assert camera_input(given(run)).sha256 != before.sha256
+    assert camera_input(run / name).sha256 != before.sha256
     (run / FRAME_FILE).unlink()
-    assert camera_input(given(run)).sha256 not in (before.sha256, "")
+    assert camera_input(run / name).sha256 not in (before.sha256, "")
     (run / "photo.jpg").write_bytes(b"not read")
     (run / FRAME_FILE).write_text(json.dumps(told))
-    assert camera_input(given(run)) == before
+    assert camera_input(run / name) == before
 
 
 def test_link_counts_where_it_lies_in_the_lift_and_after(run: Path, expected: Cameras, tmp_path: Path) -> None:
@@ -391,36 +394,15 @@ def test_frame_of_another_model_of_a_zip_is_refused(
         shutil.copytree(model, scenes / name / "sparse/0")
     shutil.copy(run / FRAME_FILE, scenes / "b")
     with pytest.raises(InvalidCameras, match=r"got one of b and the model a/sparse/0; zip those of one run alone"):
-        read_cameras(Path(shutil.make_archive(str(scenes), "zip", scenes)))
+        read_cameras(zipped(scenes))
     shutil.copy(run / FRAME_FILE, scenes / "a")
-    assert_same(read_cameras(Path(shutil.make_archive(str(scenes), "zip", scenes))), expected)
-
-
-def test_hidden_files_of_a_zip_do_not_count(run: Path, expected: Cameras) -> None:
-    (run / ".ipynb_checkpoints").mkdir()
-    shutil.copy(run / "transforms.json", run / ".ipynb_checkpoints")
-    assert_same(read_cameras(Path(shutil.make_archive(str(run), "zip", run))), expected)
+    assert_same(read_cameras(zipped(scenes)), expected)
 
 
 def test_transforms_of_another_name_are_zipped_with_their_frame(run: Path, expected: Cameras) -> None:
     (run / "transforms.json").rename(run / "transforms_train.json")
     assert_same(read_cameras(run / "transforms_train.json"), expected)
-    assert_same(read_cameras(Path(shutil.make_archive(str(run), "zip", run))), expected)
-
-
-def test_transforms_of_another_frame_are_told_beside_a_model(run: Path, model: Path) -> None:
-    (run / FRAME_FILE).unlink()
-    shutil.copytree(model, run / "colmap/sparse/0")
-    zipped = Path(shutil.make_archive(str(run), "zip", run))
-    for path in (run, run / "colmap/sparse/0", run / "colmap/sparse/0/cameras.bin", zipped):
-        assert any("beside it lies nerfstudio's" in text for text in inspect_file(path)["warnings"])
-    shutil.rmtree(run / "colmap")
-    document = json.loads((run / "transforms.json").read_text())
-    del document["applied_transform"]  # as others than nerfstudio's converter write it
-    for other in (json.dumps(document), json.dumps(list(document)), "{"):
-        shutil.copytree(model, run / "colmap/sparse/0", dirs_exist_ok=True)
-        (run / "transforms.json").write_text(other)
-        assert not any("nerfstudio" in text for text in inspect_file(run / "colmap/sparse/0")["warnings"])
+    assert_same(read_cameras(zipped(run)), expected)
 
 
 def test_frame_that_lies_elsewhere_in_a_zip_is_of_its_only_model(
@@ -430,14 +412,14 @@ def test_frame_that_lies_elsewhere_in_a_zip_is_of_its_only_model(
     shutil.copytree(model, scene / "sparse/0")
     (scene / "outputs").mkdir()
     shutil.copy(run / FRAME_FILE, scene / "outputs")
-    assert_same(read_cameras(Path(shutil.make_archive(str(scene), "zip", scene))), expected)
+    assert_same(read_cameras(zipped(scene)), expected)
 
 
 def test_full_disk_is_no_broken_zip(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: Any) -> int:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    path = Path(shutil.make_archive(str(run), "zip", run))
+    path = zipped(run)
     monkeypatch.setattr(cameras, "_unzip_one", full)
     with pytest.raises(Unavailable, match=r"expected room in .* for what is in the zip, got a full disk; make room"):
         read_cameras(path)
