@@ -27,8 +27,7 @@ def langsplat(folder: Path, ids: np.ndarray = IDS, codebook: np.ndarray = CODEBO
     return folder
 
 
-@pytest.mark.parametrize("ids", ["float32", "float16", "int32", "int64", "int16"])
-@pytest.mark.parametrize("features", ["float32", "float16", "float64"])
+@pytest.mark.parametrize(("ids", "features"), [("float32", "float32"), ("int64", "float64"), ("int16", "float16")])
 def test_langsplat_folder_becomes_a_pack(ids: str, features: str, tmp_path: Path) -> None:
     folder = tmp_path / "language_features"
     folder.mkdir()
@@ -58,16 +57,12 @@ def test_wrong_ids_are_refused(ids: np.ndarray, message: str, tmp_path: Path) ->
         langsplat_views(langsplat(tmp_path, ids))["frame_1"]
 
 
-def test_map_without_embeddings_is_refused(tmp_path: Path) -> None:
-    langsplat(tmp_path)
+def test_embeddings_that_are_none_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InvalidFeatures, match=r"floats \[M, F\]"):
+        langsplat_views(langsplat(tmp_path, codebook=IDS))["frame_1"]
     (tmp_path / "frame_1_f.npy").unlink()
     with pytest.raises(InvalidFeatures, match=r"frame_1_f\.npy, got frame_1_s\.npy alone"):
         langsplat_views(tmp_path)
-
-
-def test_embeddings_of_another_shape_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InvalidFeatures, match=r"floats \[M, F\]"):
-        langsplat_views(langsplat(tmp_path, codebook=IDS))["frame_1"]
 
 
 @pytest.mark.parametrize("layout", ["hwc", "chw"])
@@ -84,15 +79,12 @@ def test_array_folder_becomes_a_pack(layout, tmp_path: Path) -> None:
         assert np.array_equal(packs[view].codebook.numpy(), grid.reshape(6, 4))
 
 
-def test_arrays_of_another_shape_are_refused(tmp_path: Path) -> None:
+def test_arrays_that_are_no_maps_are_refused(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", np.zeros((1, 2, 3, 4), np.float32))
     np.save(tmp_path / "b.npy", np.zeros((2, 3, 4), np.int32))
     for view in ("a", "b"):
         with pytest.raises(InvalidFeatures, match=r"floats \[h, w, F\]"):
             array_views(tmp_path)[view]
-
-
-def test_numbers_beyond_what_a_pack_holds_are_refused_with_their_view(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", np.array([[[1.0, 1e300]]]))
     with pytest.raises(InvalidFeatures, match=r"'a' grid: expected finite values .*got 1 of 2"):
         write_pack(tmp_path / "pack", array_views(tmp_path), {})
@@ -114,7 +106,7 @@ def test_array_of_objects_is_never_unpickled(tmp_path: Path) -> None:
         open_npy(tmp_path / "a.npy")
 
 
-@pytest.mark.parametrize("shape", [(1 << 40,), (1 << 20, 1 << 20, 1 << 20), (0, 4), (-4,), (9,)])
+@pytest.mark.parametrize("shape", [(1 << 40,), (1 << 20, 1 << 20, 1 << 20), (0, 4), (-4,)])
 def test_array_header_is_believed_only_as_far_as_the_file_goes(shape: tuple[int, ...], tmp_path: Path) -> None:
     path = tmp_path / "bomb.npy"
     with path.open("wb") as handle:

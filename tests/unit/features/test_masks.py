@@ -91,15 +91,19 @@ def test_masks_that_overlap_are_laid_on_levels(kind: str, tmp_path: Path) -> Non
     assert mask_views(tmp_path)["a"].labels.tolist() == [first.tolist(), second.tolist()]
 
 
-def test_views_are_named_as_their_cameras_are(tmp_path: Path) -> None:
-    for name in ("a.jpg", "frame.0001", "c"):
+def test_views_are_named_as_their_cameras_are_and_with_their_folders(tmp_path: Path) -> None:
+    for name in ("a.jpg", "frame.0001", "c", "camA/0"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
         np.save(tmp_path / f"{name}.npy", VECTORS)
-    np.save(tmp_path / "a.jpg_masks.npy", MASKS)
+    for name in ("a.jpg", "camA/0"):
+        np.save(tmp_path / f"{name}_masks.npy", MASKS)
     save_text(tmp_path / "frame.0001.json", sam_records(MASKS))
     save_picture(tmp_path / "c.PNG", (LABELS + 1).astype(np.uint8))
     (tmp_path / "notes.txt").write_text("passed over", encoding="utf-8")
+    (tmp_path / ".thumbnails").mkdir()
+    (tmp_path / ".thumbnails" / "0.png").write_bytes(b"no mask")
     views = mask_views(tmp_path)
-    assert [*views] == ["a", "c", "frame.0001"]
+    assert [*views] == ["a", "c", "camA/0", "frame.0001"]
     assert {views[view].labels.tolist() == [LABELS.tolist()] for view in views} == {True}
 
 
@@ -162,7 +166,6 @@ def test_vectors_that_are_not_finite_in_a_pack_are_refused_with_their_view(bad: 
         (MASKS[0], r"booleans \[M, H, W\], got bool \[3, 4\]"),
         (MASKS.astype(np.uint8), r"zeros and ones; .*astype\(bool\)"),
         (np.full((3, 4), 3), r"ids in -1\.\.2"),
-        (np.full((3, 4), -2), r"ids in -1\.\.2"),
         (np.full((3, 4), 255, np.uint8), r"got ids from 255 to 255"),
         (np.full((3, 4), 0.5), "whole numbers"),
         (np.zeros((1, 1, 3, 4), np.int32), r"mask ids \[L, H, W\]"),
@@ -183,13 +186,11 @@ def test_arrays_that_are_no_masks_are_refused(masks: np.ndarray, message: str, t
     [
         ("", "no JSON"),
         ('[{"segmentation": {"size": [3', "no JSON"),
-        ("\ufeffx", "no JSON"),
         ("[" * 100_000, "no JSON"),
         ("3", r"a list of masks, or \{'annotations': \[\.\.\.\]\}, got none"),
         ('{"frames": [], "w": 3}', "an object of 'frames', 'w'; files of no views belong elsewhere"),
         ("[]", "3 masks, one a vector, got 0; leave out views without masks"),
         (json.dumps(sam_records(MASKS[:2])), "3 masks, one a vector, got 2; row k of the vectors is of mask k"),
-        (json.dumps([*sam_records(MASKS), *sam_records(MASKS)]), "got 6"),
         (json.dumps([*sam_records(MASKS[:2]), 3]), r"a\.json mask 2: expected run lengths"),
         (
             json.dumps([*sam_records(MASKS[:2]), *sam_records(MASKS[2:, :2])]),
@@ -248,7 +249,7 @@ def test_pictures_of_other_kinds_are_refused(mode: str, message: str, tmp_path: 
         mask_views(tmp_path)["a"]
 
 
-@pytest.mark.parametrize("kept", [0, 8, 20, 30, 60, 2000])
+@pytest.mark.parametrize("kept", [0, 20, 60, 2000])
 def test_pictures_that_are_cut_off_are_refused(kept: int, tmp_path: Path) -> None:
     save_picture(tmp_path / "a.png", np.random.default_rng(0).integers(0, 4, (128, 128), np.uint8))
     content = (tmp_path / "a.png").read_bytes()
@@ -275,18 +276,6 @@ def test_one_mask_over_the_whole_photo_is_one(tmp_path: Path) -> None:
     assert not mask_views(tmp_path)["a"].labels.any()
 
 
-def test_masks_of_sub_folders_are_views_with_their_folders(tmp_path: Path) -> None:
-    for camera, ids in (("camA", LABELS), ("camB", LABELS[::-1])):
-        (tmp_path / camera).mkdir()
-        np.save(tmp_path / camera / "0.jpg.npy", VECTORS)
-        np.save(tmp_path / camera / "0_masks.npy", ids)
-    (tmp_path / ".thumbnails").mkdir()
-    (tmp_path / ".thumbnails" / "0.png").write_bytes(b"no mask")
-    views = mask_views(tmp_path)
-    assert list(views) == ["camA/0", "camB/0"]
-    assert np.array_equal(views["camB/0"].labels.numpy()[0], LABELS[::-1])
-
-
 def mask_of(segmentation: Any) -> np.ndarray:
     return mask_of_runs(*read_runs(segmentation, "a.json mask 0"))
 
@@ -308,10 +297,6 @@ def test_long_runs_come_back(lengths: list[int]) -> None:
     lengths = [*lengths, 5461 * 32768 - sum(lengths)]
     size, found = read_runs({"size": [5461, 32768], "counts": compressed(lengths)}, "a.json mask 0")
     assert (size, found.tolist()) == ((5461, 32768), lengths)
-
-
-def test_pixels_go_down_the_columns() -> None:
-    assert mask_of({"size": [2, 3], "counts": [1, 2, 3]}).tolist() == [[False, True, False], [True, False, False]]
 
 
 @pytest.mark.parametrize(
@@ -337,21 +322,16 @@ def test_strings_that_coco_published_fill_the_boxes_that_it_published(
     [
         ([[1.0, 2.0, 3.0, 4.0]], r"run lengths \{size, counts\}, got a polygon; .*output_mode"),
         ({"counts": [6]}, "got another thing"),
-        (None, "got another thing"),
         ({"size": [2, 3, 1], "counts": [6]}, r"size \[h, w\], got \[2, 3, 1\]"),
         ({"size": [2.0, 3], "counts": [6]}, r"size \[h, w\]"),
-        ({"size": [True, 6], "counts": [6]}, r"size \[h, w\]"),
         ({"size": [0, 3], "counts": [0]}, r"sides in 1\.\.32768"),
-        ({"size": [-2, -3], "counts": [6]}, r"sides in 1\.\.32768"),
         ({"size": [32769, 1], "counts": [32769]}, r"sides in 1\.\.32768"),
         ({"size": [32768, 32768], "counts": [1 << 30]}, "at most 178956970 pixels"),
         ({"size": [2, 3], "counts": [1, 2]}, r"sum up to 2 x 3 = 6, got a sum of 3; the file is cut off"),
         ({"size": [2, 3], "counts": [1, 2, 10**30]}, "sum up to 2 x 3"),
         ({"size": [2, 3], "counts": []}, "got a sum of 0"),
-        ({"size": [2, 3], "counts": ""}, "got a sum of 0"),
         ({"size": [2, 3], "counts": [8, -2]}, "counts from 0 on, got a run of -2"),
         ({"size": [2, 3], "counts": [1.0, 5]}, "a list of whole numbers or a string"),
-        ({"size": [2, 3], "counts": {"0": 6}}, "a list of whole numbers or a string"),
         ({"size": [2, 3], "counts": "12"}, "got a sum of 3"),
         ({"size": [2, 3], "counts": "6O"}, "got a run of -1"),
         ({"size": [2, 3], "counts": "6P"}, "cut off within a number"),

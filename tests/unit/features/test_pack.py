@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +29,7 @@ def values() -> dict[str, ViewFeatures]:
     return {"b": FeatureGrid(MAP.transpose(1, 2, 0)), "a": Regions(LABELS, np.eye(2, 3, dtype=np.float16))}
 
 
-@pytest.mark.parametrize("kind", ["int64", "int16", "int32", "int8", ">i4"])
-@pytest.mark.parametrize("floats", ["float16", "float32", "float64", ">f4"])
+@pytest.mark.parametrize(("kind", "floats"), [("int64", "float64"), ("int8", "float16"), (">i4", ">f4")])
 def test_arrays_of_numpy_become_tensors(kind: str, floats: str) -> None:
     found = Regions(LABELS.astype(kind), np.eye(2, 3).astype(floats))
     assert found.labels.dtype == torch.int32 and found.labels.tolist() == [LABELS.tolist()]
@@ -68,12 +67,6 @@ def test_arrays_that_fit_are_not_copied() -> None:
 def test_values_that_cannot_be_right_are_refused(make, message: str) -> None:
     with pytest.raises(InvalidFeatures, match=message):
         make()
-
-
-def test_transposed_arrays_read_back_as_they_are(tmp_path) -> None:
-    write_pack(tmp_path / "p", {"v": FeatureGrid.unchecked(torch.from_numpy(MAP.transpose(1, 2, 0)))}, {})
-    found = read_features(tmp_path / "p")["v"]
-    assert isinstance(found, FeatureGrid) and np.array_equal(found.grid.numpy(), MAP.transpose(1, 2, 0))
 
 
 def test_tensors_of_any_order_are_stored_in_row_order(tmp_path) -> None:
@@ -171,19 +164,15 @@ def test_regions_and_grids_are_read_as_they_are(tmp_path: Path) -> None:
     assert torch.equal(other.grid, grid)
 
 
-def test_all_label_types_mean_the_same(tmp_path: Path) -> None:
+def test_all_types_of_labels_and_floats_mean_the_same(tmp_path: Path) -> None:
     kinds = {"u8": torch.uint8, "i16": torch.int16, "i32": torch.int32}
     for name, dtype in kinds.items():
         none = 255 if name == "u8" else -1
-        tensors = {"a/labels": labels(none, 2, dtype=dtype)[0], "a/codebook": CODEBOOK}  # [h, w] is one level
+        tensors = {"a/labels": labels(none, 2, dtype=dtype)[0], "a/codebook": CODEBOOK.bfloat16()}
         view = read_features(saved(tmp_path / name, tensors))["a"]
         assert isinstance(view, Regions)
-        assert view.labels.tolist() == [[[-1, 2]]]
-
-
-def test_bfloat16_is_read_as_float32(tmp_path: Path) -> None:
-    view = read_features(saved(tmp_path / "p", {"a/grid": torch.ones(1, 1, 2, dtype=torch.bfloat16)}))
-    assert view["a"].codebook.dtype == torch.float32
+        assert view.labels.tolist() == [[[-1, 2]]]  # [h, w] is one level
+        assert view.codebook.dtype == torch.float32 and torch.equal(view.codebook, CODEBOOK)
 
 
 def test_several_packs_make_one_set_of_views(tmp_path: Path) -> None:
@@ -191,6 +180,8 @@ def test_several_packs_make_one_set_of_views(tmp_path: Path) -> None:
     other = saved(tmp_path / "other", {"B/grid": torch.ones(1, 1, 3)})
     packs = read_features(one, other)
     assert packs.views == ("B", "a")
+    with pytest.raises(InvalidFeatures, match="'ghost'"):
+        packs["ghost"]
     assert packs.encoder == "clip"
     assert packs.normalised is None
 
@@ -264,14 +255,14 @@ def test_missing_and_truncated_packs_are_refused(tmp_path: Path) -> None:
         read_features(path)
 
 
-@pytest.mark.parametrize("value", [4, -2, 32_767])
+@pytest.mark.parametrize("value", [4, -2])
 def test_label_out_of_the_codebook_is_named_with_its_view(value: int, tmp_path: Path) -> None:
     packs = read_features(saved(tmp_path / "pack", regions(0, value, -1)))
     with pytest.raises(InvalidFeatures, match=rf"'a' labels: .*0\.\.3.*the label {value}$"):
         packs["a"]
 
 
-@pytest.mark.parametrize("bad", [float("nan"), float("inf"), float("-inf")])
+@pytest.mark.parametrize("bad", [float("nan"), float("-inf")])
 def test_feature_that_is_not_finite_is_named_with_its_view(bad: float, tmp_path: Path) -> None:
     codebook = CODEBOOK.clone()
     codebook[2, 1] = bad
@@ -280,12 +271,6 @@ def test_feature_that_is_not_finite_is_named_with_its_view(bad: float, tmp_path:
     for view, part in (("a", "codebook"), ("b", "grid")):
         with pytest.raises(InvalidFeatures, match=rf"'{view}' {part}: expected finite values within .*, got 1 of 12"):
             packs[view]
-
-
-def test_unknown_view_is_refused(tmp_path: Path) -> None:
-    packs = read_features(saved(tmp_path / "pack", regions(0)))
-    with pytest.raises(InvalidFeatures, match="'ghost'"):
-        packs["ghost"]
 
 
 def test_views_without_a_camera_are_reported_and_no_pair_at_all_is_refused(tmp_path: Path) -> None:
@@ -331,27 +316,6 @@ def test_written_pack_is_read_back(dtype: torch.dtype, tmp_path: Path) -> None:
             assert isinstance(found, Regions)
             assert torch.equal(found.labels, expected.labels)
     assert [path.name for path in tmp_path.iterdir()] == ["pack"]
-
-
-def test_views_are_written_one_at_a_time(tmp_path: Path) -> None:
-    class Counting(Mapping[str, Any]):
-        reads = 0
-
-        def __getitem__(self, view: str) -> FeatureGrid:
-            self.reads += 1
-            return FeatureGrid(torch.full((1, 1, 2), float(view)))
-
-        def __iter__(self):
-            return iter(["1", "2", "3"])
-
-        def __len__(self) -> int:
-            return 3
-
-    views = Counting()
-    write_pack(tmp_path / "pack", views, {})
-    assert views.reads == 6
-    packs = read_features(tmp_path / "pack")
-    assert [packs[view].codebook[0, 0].item() for view in packs.views] == [1, 2, 3]
 
 
 def test_pack_that_cannot_be_right_is_not_written(tmp_path: Path) -> None:

@@ -194,6 +194,16 @@ def test_packs_of_other_words_make_no_lift(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("names", "message"), [("{}", "JSON of values"), ('{"7": 3}', "JSON of values"), ('["a"]', "the value 7")]
+)
+def test_names_that_do_not_fit_their_pictures_are_told(names: str, message: str, tmp_path: Path) -> None:
+    write_labels(tmp_path)
+    (tmp_path / "names.json").write_text(names, encoding="utf-8")
+    with pytest.raises(InvalidFeatures, match=message):
+        prompt_views(tmp_path, tmp_path / "names.json")
+
+
+@pytest.mark.parametrize(
     ("files", "message"),
     [
         ({}, "no such folder"),
@@ -209,6 +219,10 @@ def test_packs_of_other_words_make_no_lift(tmp_path: Path) -> None:
         ({"a.json": '{"images": [{"id": 1}], "annotations": []}'}, "a file_name of each"),
         ({"a.json": '{"images": [{"id": 1, "file_name": "a"}], "annotations": [{}]}'}, "an image_id of the file"),
         ({"a.json": "[3]"}, "a mask with a phrase, got int"),
+        (
+            {"lamp/a.png": np.ones((2, 2), np.uint8), "mug/a.png": np.ones((2, 3), np.uint8)},
+            "masks of one size, got 2 x 2 and 2 x 3",
+        ),
     ],
 )
 def test_what_is_no_such_folder_is_told(files: dict[str, Any], message: str, tmp_path: Path) -> None:
@@ -220,21 +234,4 @@ def test_what_is_no_such_folder_is_told(files: dict[str, Any], message: str, tmp
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(content, encoding="utf-8")
     with pytest.raises(InvalidFeatures, match=message):
-        prompt_views(tmp_path / "masks")
-
-
-@pytest.mark.parametrize(
-    ("names", "message"), [("{}", "JSON of values"), ('{"7": 3}', "JSON of values"), ('["a"]', "the value 7")]
-)
-def test_names_that_do_not_fit_their_pictures_are_told(names: str, message: str, tmp_path: Path) -> None:
-    write_labels(tmp_path)
-    (tmp_path / "names.json").write_text(names, encoding="utf-8")
-    with pytest.raises(InvalidFeatures, match=message):
-        prompt_views(tmp_path, tmp_path / "names.json")
-
-
-def test_masks_of_several_sizes_in_a_view_are_refused(tmp_path: Path) -> None:
-    save_png(tmp_path / "lamp" / "a.png", np.ones((2, 2), np.uint8))
-    save_png(tmp_path / "mug" / "a.png", np.ones((2, 3), np.uint8))
-    with pytest.raises(InvalidFeatures, match="masks of one size, got 2 x 2 and 2 x 3"):
-        prompt_views(tmp_path).views["a"]
+        prompt_views(tmp_path / "masks").views["a"]

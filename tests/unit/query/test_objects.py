@@ -51,6 +51,8 @@ def test_clusters_that_are_apart_are_objects_with_their_boxes(scene: QueryScene)
         assert thing.centre == pytest.approx(np.mean(thing.box, axis=0))
     assert found.found[0].share >= found.found[1].share
     assert (found.numbers[SPLATS_A_CLUSTER : 2 * SPLATS_A_CLUSTER] == -1).all()
+    nothing = objects(scene, of(scene))
+    assert (nothing.found, nothing.strays) == ((), 0) and (nothing.numbers == -1).all()
 
 
 def test_single_splats_elsewhere_are_strays_and_stretch_no_box(scene: QueryScene) -> None:
@@ -89,19 +91,6 @@ def test_so_many_instances_are_kept_by_their_scores(scene: QueryScene) -> None:
             of(scene, 0, instances=count)
 
 
-def test_nothing_found_is_no_object(scene: QueryScene) -> None:
-    found = objects(scene, of(scene))
-    assert (found.found, found.strays) == ((), 0)
-    assert (found.numbers == -1).all()
-
-
-def test_without_evidence_splats_count_alike(scene: QueryScene) -> None:
-    bare = QueryScene(replace(scene.lift, evidence=torch.zeros_like(scene.lift.evidence)))
-    found = objects(bare, of(scene, 0, rows=(2 * SPLATS_A_CLUSTER, 2 * SPLATS_A_CLUSTER + 1)))
-    assert found.found[0].splats == SPLATS_A_CLUSTER
-    assert sum(thing.share for thing in found.found) <= 1.0
-
-
 def test_scores_of_objects_may_be_weighted_by_confidence(scene: QueryScene) -> None:
     confidence = torch.rand(len(scene.features), generator=torch.Generator().manual_seed(0))
     sure = QueryScene(replace(scene.lift, confidence=confidence), scene.splats)
@@ -136,8 +125,13 @@ def test_more_splats_than_are_grouped_are_refused(scene: QueryScene, monkeypatch
 
 
 def test_a_twentieth_of_the_evidence_of_the_largest_makes_an_object(scene: QueryScene) -> None:
-    for share, count in ((0.049, 1), (0.051, 2)):
-        evidence = torch.full_like(scene.lift.evidence, 1.0)
+    rows = len(scene.features)
+    for share, count in ((0.049, 1), (0.051, 2), (1.0, 2)):
+        evidence = torch.ones(rows)
         evidence[2 * SPLATS_A_CLUSTER :] = share
         weighed = QueryScene(replace(scene.lift, evidence=evidence))
         assert len(objects(weighed, of(scene, 0, 2)).found) == count
+    bare = QueryScene(replace(scene.lift, evidence=torch.zeros(rows)))  # without any, splats count alike
+    found = objects(bare, of(scene, 0, rows=(2 * SPLATS_A_CLUSTER, 2 * SPLATS_A_CLUSTER + 1)))
+    assert found.found[0].splats == SPLATS_A_CLUSTER
+    assert sum(thing.share for thing in found.found) <= 1.0

@@ -52,12 +52,12 @@ def clip(scene: QueryScene, table: TableEncoder) -> QueryScene:
 
 def test_absent_words_select_nothing_and_present_ones_do(clip: QueryScene, table: TableEncoder) -> None:
     others = [word for word in table.words if word not in THINGS]
-    absent = np.random.default_rng(1).choice(others, 200, replace=False).tolist()
+    absent = np.random.default_rng(1).choice(others, 60, replace=False).tolist()
     for word in THINGS:
         found = ask(clip, word, table)
         assert found.presence.present and found.count > 0 and "is there" in found.presence.why
     answers = [ask(clip, word, table) for word in absent]
-    assert sum(one.count == 0 for one in answers) >= 190
+    assert sum(one.count == 0 for one in answers) >= 57
     assert all((one.presence.present is False) == (one.count == 0) for one in answers)
 
 

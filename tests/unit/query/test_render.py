@@ -108,6 +108,8 @@ def test_a_view_that_sees_nothing_of_it_has_an_empty_mask(scene: QueryScene) -> 
     seen = view_mask(scene, of(scene, 0), "middle")
     assert not seen.mask.any() and (seen.row_sums >= 0.5).any()
     assert view_mask(scene, of(scene, 2), "middle").mask.any()
+    nothing = view_mask(scene, of(scene), "middle")
+    assert not nothing.mask.any() and "the 0 objects that were found" in nothing.explanation
 
 
 def test_what_hides_it_is_not_in_its_mask(scene: QueryScene) -> None:
@@ -132,11 +134,6 @@ def test_the_largest_object_alone_is_seen_when_asked(scene: QueryScene) -> None:
     assert 0 < int(kept.mask.sum()) < int(view_mask(scene, answer, "middle").mask.sum())
 
 
-def test_nothing_found_is_an_empty_mask(scene: QueryScene) -> None:
-    seen = view_mask(scene, of(scene), "middle")
-    assert not seen.mask.any() and "the 0 objects that were found" in seen.explanation
-
-
 def test_of_very_many_splats_strays_stay(scene: QueryScene, monkeypatch: pytest.MonkeyPatch) -> None:
     answer = of(scene, 0, rows=(STRAY,))
     monkeypatch.setattr(module, "MOST_GROUPED", answer.count)
@@ -153,20 +150,20 @@ def test_of_very_many_splats_strays_stay(scene: QueryScene, monkeypatch: pytest.
         view_mask(scene, largest, "middle")
 
 
-def test_objects_that_are_known_are_not_made_again(scene: QueryScene) -> None:
+def test_objects_that_are_known_are_not_made_again_and_none_for_no_view(scene: QueryScene) -> None:
     answer, asked = of(scene, 0, 1), []
     known = objects(scene, of(scene, 1))
-    seen = view_mask(scene, answer, "middle", group=lambda *both: asked.append(both) or known)
-    assert np.array_equal(seen.mask, mostly(scene, of(scene, 1).selected))
-    assert asked == [(scene, answer)]
 
-
-def test_a_view_that_is_not_there_is_told_before_anything_is_grouped(scene: QueryScene) -> None:
-    def never(*_: object) -> grouping.Objects:
-        raise AssertionError
+    def group(*both: object) -> grouping.Objects:
+        asked.append(both)
+        return known
 
     with pytest.raises(NotFound, match="middle"):
-        view_mask(scene, of(scene, 0), "midle", group=never)
+        view_mask(scene, answer, "midle", group=group)
+    assert asked == []
+    seen = view_mask(scene, answer, "middle", group=group)
+    assert np.array_equal(seen.mask, mostly(scene, of(scene, 1).selected))
+    assert asked == [(scene, answer)]
 
 
 def test_clusters_have_their_colours_and_the_rest_is_grey(scene: QueryScene) -> None:
@@ -246,14 +243,7 @@ def test_spherical_beta_lobes_add_to_the_base_colour() -> None:
         assert seen_colours(replace(bare, sb_params=wild * sign), camera).isfinite().all()
 
 
-def test_many_clusters_have_colours_that_can_be_told_apart() -> None:
-    colours = cluster_colours(24).astype(int)
-    assert colours.shape == (25, 3) and tuple(colours[-1]) == NO_CLUSTER_COLOUR
-    apart = np.abs(colours[:, None] - colours[None]).max(axis=2)[~np.eye(25, dtype=bool)]
-    assert apart.min() >= 16
-
-
-def test_groups_of_features_get_their_own_colours_at_every_run() -> None:
+def test_groups_get_colours_that_can_be_told_apart_at_every_run() -> None:
     generator = torch.Generator().manual_seed(1)
     group = torch.arange(3000) % 3
     features = (torch.eye(16)[group] + 0.02 * torch.randn(3000, 16, generator=generator)).half()
@@ -263,11 +253,11 @@ def test_groups_of_features_get_their_own_colours_at_every_run() -> None:
     assert first.min() >= 0 and first.max() <= 1 and not first[-1].any()
     means = torch.stack([first[:-1][group[:-1] == k].mean(dim=0) for k in range(3)])
     assert torch.pdist(means).min() > 0.4
-
-
-def test_fewer_than_three_channels_and_no_evidence_are_fine() -> None:
-    assert principal_colours(np.random.rand(10, 2), np.ones(10)).shape == (10, 3)
-    assert not principal_colours(np.random.rand(10, 4), np.zeros(10)).any()
+    assert principal_colours(np.random.rand(10, 2), np.ones(10)).shape == (10, 3)  # of fewer than three channels
+    assert not principal_colours(np.random.rand(10, 4), np.zeros(10)).any()  # and without evidence
+    colours = cluster_colours(24).astype(int)
+    apart = np.abs(colours[:, None] - colours[None]).max(axis=2)[~np.eye(25, dtype=bool)]
+    assert apart.min() >= 16 and tuple(colours[-1]) == NO_CLUSTER_COLOUR
 
 
 NEAR, FAR = 2.0, 5.0
@@ -361,37 +351,21 @@ def places(of: Camera) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("distortion", [BARREL, PINCUSHION])
-def test_numbers_are_interpolated_where_the_photo_shows_them(distortion: Distortion) -> None:
+def test_numbers_are_interpolated_and_labels_read_where_the_photo_shows_them(distortion: Distortion) -> None:
     camera = behind_lens(PLAIN, distortion)
-    picture = in_photo(camera, places)  # linear, so interpolation is exact off the very border
-    assert picture.shape == (44, 60, 2)
-    wanted = torch.stack([torch.from_numpy(axis) for axis in photo_places(camera.lens)], dim=2) if camera.lens else 0
-    assert float((picture - wanted)[2:-2, 2:-2].abs().max()) < 1e-4
-    assert float((picture - wanted).abs().max()) <= 0.5
-
-
-def test_labels_are_those_of_the_nearest_pixel() -> None:
-    camera = behind_lens(PLAIN, BARREL)
-
-    def columns(of: Camera) -> torch.Tensor:
-        return torch.arange(of.width, dtype=torch.int32).expand(of.height, -1)
-
-    picture = in_photo(camera, columns)
-    assert picture.dtype == torch.int32
     assert camera.lens is not None
-    assert torch.equal(picture, torch.from_numpy(np.floor(photo_places(camera.lens)[0])).to(torch.int32))
+    picture = in_photo(camera, places)  # linear, so interpolation is exact off the very border
+    wanted = torch.stack([torch.from_numpy(axis) for axis in photo_places(camera.lens)], dim=2)
+    assert picture.shape == (44, 60, 2) and float((picture - wanted)[2:-2, 2:-2].abs().max()) < 1e-4
+    assert float((picture - wanted).abs().max()) <= 0.5
+    labels = in_photo(camera, lambda of: torch.arange(of.width, dtype=torch.int32).expand(of.height, -1))
+    assert labels.dtype == torch.int32 and torch.equal(labels, wanted[..., 0].floor().to(torch.int32))
 
 
-def test_a_photo_without_a_lens_is_as_drawn() -> None:
-    drawn = torch.rand(44, 60)
-    assert in_photo(PLAIN, lambda _: drawn) is drawn
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.int32])
-def test_the_rim_that_no_pinhole_sees_is_empty(dtype: torch.dtype) -> None:
-    whole = Camera.pinhole("v", 160, 160, 50.0, 50.0, 80.0, 80.0, np.eye(4))
-    camera = behind_lens(whole, Fisheye())
-    picture = in_photo(camera, lambda of: torch.ones(of.height, of.width, dtype=dtype))
-    assert float(picture[80, 80]) == 1
-    assert float(picture[0, 0]) == float(picture[80, 0]) == 0
+def test_the_rim_that_no_pinhole_sees_is_empty() -> None:
+    camera = behind_lens(Camera.pinhole("v", 160, 160, 50.0, 50.0, 80.0, 80.0, np.eye(4)), Fisheye())
+    for dtype in (torch.float32, torch.int32):
+        picture = in_photo(camera, lambda of, dtype=dtype: torch.ones(of.height, of.width, dtype=dtype))
+        assert float(picture[80, 80]) == 1
+        assert float(picture[0, 0]) == float(picture[80, 0]) == 0
     assert drawn_by(camera).width < 180

@@ -13,8 +13,8 @@ from liftcore.query.scores import combine, cosines, cosines_about, mean_directio
 
 
 @given(
-    count=st.integers(1, 5000),
-    channels=st.sampled_from([1, 3, 64, 512]),
+    count=st.integers(1, 900),
+    channels=st.sampled_from([1, 64, 512]),
     dtype=st.sampled_from([torch.float16, torch.float32]),
     seed=st.integers(0, 99),
 )
@@ -31,17 +31,17 @@ def test_cosine_equals_its_definition(count: int, channels: int, dtype: torch.dt
     )
 
 
-def test_a_splat_without_a_feature_scores_the_minimum() -> None:
-    features = np.array([[0.0, 0.0], [1.0, 0.0]], np.float32)
-    assert cosines(features, norms_of(features), np.array([[1.0, 0.0]], np.float32))[:, 0].tolist() == [-1.0, 1.0]
-
-
-def test_several_texts_in_one_pass_equal_one_by_one() -> None:
+def test_texts_in_one_pass_equal_one_by_one_and_no_feature_scores_the_minimum() -> None:
     features = torch.randn(3000, 96).half().numpy()
+    features[7] = 0
     norms, texts = norms_of(features), torch.randn(4, 96).numpy()
     together = cosines(features, norms, texts)
     for column, text in enumerate(texts):
         assert np.array_equal(together[:, column], cosines(features, norms, text[None])[:, 0])
+    assert together[7].tolist() == [-1.0] * 4
+    for wrong in (torch.zeros(96), torch.full((96,), torch.nan), torch.ones(95)):
+        with pytest.raises(InvalidQuery):
+            cosines(features, norms, wrong[None].numpy())
 
 
 def test_relevancy_is_the_least_softmax_over_negatives() -> None:
@@ -98,10 +98,3 @@ def test_several_positives_are_as_good_as_the_nearest_one() -> None:
         10 * torch.stack([similarities[:, :3].amax(1), similarities[:, 3:].amax(1)], dim=1), dim=1
     )
     np.testing.assert_allclose(relevancy(scores, 3), against[:, 0].numpy(), rtol=1e-5)
-
-
-@pytest.mark.parametrize("text", [torch.zeros(8), torch.full((8,), torch.nan), torch.ones(7)])
-def test_a_text_without_direction_or_of_another_length_is_refused(text: torch.Tensor) -> None:
-    features = np.ones((5, 8), np.float32)
-    with pytest.raises(InvalidQuery):
-        cosines(features, norms_of(features), text[None].numpy())

@@ -27,22 +27,14 @@ def table(tmp_path: Path) -> Path:
     return path
 
 
-@pytest.mark.parametrize("text", ["alarm clock", "Alarm_Clock", "an alarm  clock", "THE ALARM CLOCK"])
-def test_spelling_variants_find_the_same_word(table: Path, text: str) -> None:
+def test_spelling_variants_find_the_same_word_and_others_name_the_nearest(table: Path) -> None:
     encoder = open_encoder(f"table:{table}")
-    assert encoder.encode([text]).tolist() == [[1.0, 0, 0, 0, 0, 0]]
-    assert encoder.channels == 6
-
-
-def test_a_word_that_begins_with_an_article_is_found(table: Path) -> None:
-    encoder = open_encoder(str(table))
-    assert encoder.encode(["the end", "a", "teapot"]).argmax(axis=1).tolist() == [2, 3, 1]
-
-
-def test_an_unknown_word_names_the_nearest_ones(table: Path) -> None:
+    rows = encoder.encode(["alarm clock", "Alarm_Clock", "an alarm  clock", "THE ALARM CLOCK"])
+    assert rows.tolist() == [[1.0, 0, 0, 0, 0, 0]] * 4 and encoder.channels == 6
+    assert open_encoder(str(table)).encode(["the end", "a", "teapot"]).argmax(axis=1).tolist() == [2, 3, 1]
     for text, nearest in (("teapott", "teapot"), ("a car", r"car \(automobile\), ")):
         with pytest.raises(InvalidQuery, match=f"nearest: {nearest}"):
-            open_encoder(str(table)).encode([text])
+            encoder.encode([text])
 
 
 def test_shipped_words_need_no_file_and_are_those_of_clip() -> None:
@@ -56,11 +48,9 @@ def test_shipped_words_need_no_file_and_are_those_of_clip() -> None:
     ("rows", "words"),
     [
         (torch.eye(3, 6), WORDS),
-        (torch.ones(6), WORDS),
         (torch.zeros(6, 6), WORDS),
         (torch.full((6, 6), torch.inf), WORDS),
         (torch.eye(6, 6).double(), WORDS),
-        (torch.eye(4, 6), {"a": 1}),
         (torch.eye(4, 6), [1, 2, 3, 4]),
         (torch.empty(0, 6), []),
     ],
@@ -84,7 +74,7 @@ def test_a_file_that_is_no_table_is_refused(tmp_path: Path) -> None:
         open_encoder(str(path))
 
 
-@pytest.mark.parametrize("spec", ["", "clip", "table:", "open_clip:", "open_clip:ViT-B-32/openai#5", "minilm:large"])
+@pytest.mark.parametrize("spec", ["", "clip", "table:", "open_clip:ViT-B-32/openai#5", "minilm:large"])
 def test_an_unknown_encoder_is_refused_with_those_that_exist(spec: str) -> None:
     with pytest.raises(InvalidQuery, match="minilm"):
         open_encoder(spec)
@@ -111,27 +101,24 @@ def test_package_that_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch)
         tokenizer_of("ViT-B-16-SigLIP")
 
 
-def test_an_empty_text_is_refused(clip: OpenClipEncoder) -> None:
-    with pytest.raises(InvalidQuery, match="empty"):
-        clip.encode(["mug", "  "])
-
-
 @pytest.fixture(scope="module")
 def clip() -> OpenClipEncoder:
-    return OpenClipEncoder._with_random_weights("ViT-B-32")
+    return OpenClipEncoder._with_random_weights("ViT-S-32-alt")
 
 
-def test_open_clip_gives_unit_rows_of_its_width(clip: OpenClipEncoder) -> None:
+def test_open_clip_gives_unit_rows_of_its_width_and_none_for_no_text(clip: OpenClipEncoder) -> None:
     rows = clip.encode(["a cat", "a dog on a mat"])
-    assert rows.shape == (2, 512) and clip.channels == 512
+    assert rows.shape == (2, 256) and clip.channels == 256
     np.testing.assert_allclose(np.linalg.norm(rows, axis=1), 1.0, rtol=1e-6)
+    with pytest.raises(InvalidQuery, match="empty"):
+        clip.encode(["mug", "  "])
 
 
 def test_templates_give_the_mean_over_their_sentences(clip: OpenClipEncoder, monkeypatch: pytest.MonkeyPatch) -> None:
     assert without_templates("open_clip:ViT-B-32@a#1.pt") == ("open_clip:ViT-B-32@a#1.pt", 1)
     monkeypatch.setattr(OpenClipEncoder, "open", lambda spec, count: (spec, count))
     assert open_encoder("open_clip:ViT-B-32/openai#80") == ("ViT-B-32/openai", 80)
-    seven = OpenClipEncoder("small", clip._model, tokenizer_of("ViT-B-32"), 7)
+    seven = OpenClipEncoder("small", clip._model, tokenizer_of("ViT-S-32-alt"), 7)
     said = ["itap of a mug.", "a bad photo of the mug.", "a origami mug.", "a photo of the large mug."]
     said += ["a mug in a video game.", "art of the mug.", "a photo of the small mug."]
     mean = clip.encode(said).mean(axis=0)
@@ -139,25 +126,22 @@ def test_templates_give_the_mean_over_their_sentences(clip: OpenClipEncoder, mon
     np.testing.assert_allclose(seven.encode(["mug"])[0], mean / np.linalg.norm(mean), atol=1e-6)
 
 
-def test_open_clip_without_weights_is_unavailable_and_never_random() -> None:
-    with pytest.raises(Unavailable, match="tag or a file"):
-        open_encoder("open_clip:ViT-B-32")
-    with pytest.raises(Unavailable, match="nothing at"):
-        open_encoder("open_clip:ViT-B-32@/no/such/file.pt")
-
-
-def test_open_clip_names_the_nearest_model_and_the_tags() -> None:
-    with pytest.raises(InvalidQuery, match="ViT-B-32"):
-        open_encoder("open_clip:ViT-B-33/openai")
-    with pytest.raises(InvalidQuery, match="openai"):
-        open_encoder("open_clip:ViT-B-32/none")
+def test_open_clip_is_never_random_and_names_the_nearest_model_and_tags() -> None:
+    for model, error, message in (
+        ("ViT-B-32", Unavailable, "tag or a file"),
+        ("ViT-B-32@/no/such/file.pt", Unavailable, "nothing at"),
+        ("ViT-B-33/openai", InvalidQuery, "ViT-B-32"),
+        ("ViT-B-32/none", InvalidQuery, "openai"),
+    ):
+        with pytest.raises(error, match=message):
+            open_encoder(f"open_clip:{model}")
 
 
 def test_open_clip_refuses_a_pickle_that_holds_code(tmp_path: Path) -> None:
     path = tmp_path / "weights.pt"
     torch.save({"state_dict": Path("code")}, path)
     with pytest.raises(InvalidQuery, match="nothing else"):
-        open_encoder(f"open_clip:ViT-B-32@{path}")
+        open_encoder(f"open_clip:ViT-S-32-alt@{path}")
     with pytest.raises(InvalidQuery, match="ending in"):
         open_encoder(f"open_clip:ViT-B-32@{Path(__file__)}")
 
