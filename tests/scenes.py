@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -9,8 +10,11 @@ from hypothesis import strategies as st
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+from liftcore.features.pack import write_pack
 from liftcore.features.views import FeatureGrid, Regions, ViewFeatures
-from liftcore.scene.cameras import Camera
+from liftcore.io.inria import write_inria_cameras
+from liftcore.io.ply import write_splats
+from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.splats import Kernel, Splats
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
@@ -136,3 +140,16 @@ def centred(camera: Camera) -> Camera:
         camera.name, camera.width, camera.height, camera.fx, camera.fy,
         camera.width / 2, camera.height / 2, camera.viewmat,
     )  # fmt: skip
+
+
+def write_scene(
+    folder: Path, seed: int, grids: bool = False, kernel: Kernel = Kernel.GAUSSIAN_3D
+) -> tuple[Path, Path, Path]:
+    """A random scene of three views on disk: splats, cameras, and features as ``observed`` gives them."""
+    views = tuple(centred(random_camera(seed + k, 32 + 5 * k, 24 + 3 * k, name=f"v{k}")) for k in range(3))
+    observations = {camera.name: observed(seed, k, grids) for k, camera in enumerate(views)}
+    paths = folder / "splats.ply", folder / "cameras.json", folder / "features.safetensors"
+    write_splats(random_splats(seed, 50, kernel=kernel), paths[0])
+    write_inria_cameras(Cameras(views), paths[1])
+    write_pack(paths[2], observations, {"encoder": "random"})
+    return paths

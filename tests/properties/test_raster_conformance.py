@@ -10,6 +10,7 @@ import pytest
 import torch
 from hypothesis import strategies as st
 
+from liftcore.errors import InvalidInput, InvalidSettings
 from liftcore.features.views import Regions, ViewFeatures
 from liftcore.raster.base import CompositingParams, RayRows, Selection, ViewRequest, Weighting
 from liftcore.raster.cpu.raster import CpuRaster
@@ -24,30 +25,46 @@ if TYPE_CHECKING:
 
 INSIDE = 1e-5  # absolute, on weights
 FLIPS = 1e-2  # of rays: on tiny random images one ray in a hundred; the pooled test below holds 1e-4
+UNDECIDED = 0.03  # of rays too close to call in a weighting, which no comparison sees
+GAIN = CompositingParams(opacity_logit_scale=1.2)
 WALKS = (
     CompositingParams(),
-    CompositingParams(opacity_logit_scale=1.2),
+    GAIN,
     CompositingParams(opacity_logit_scale=0.5),
     CompositingParams(alpha_cap=0.999, transmittance_stop=0.05),
 )
 SELECTIONS = (
-    Weighting(1, Selection.TOP_K, count=2),
+    Weighting(0, floor=0.05),
+    Weighting(1, Selection.TOP_K, count=1),
+    Weighting(2, Selection.TOP_K, count=3),
+    Weighting(0, Selection.TOP_K, count=2, floor=0.02),
+    Weighting(1, Selection.TOP_K, count=64),
+    Weighting(1, Selection.FRONT_MASS, mass=0.75),
     Weighting(2, Selection.FRONT_MASS, mass=0.6, floor=0.02),
+    Weighting(1, Selection.FRONT_MASS, mass=1.0),
     Weighting(1, Selection.CENTRE),
+    Weighting(0, Selection.CENTRE, floor=0.02),
 )
+POWERS = (Weighting(0), Weighting(1), Weighting(2))
 FOOTPRINTS = {str(kernel): (kernel, False) for kernel in Kernel} | {"3dgs antialiased": (Kernel.GAUSSIAN_3D, True)}
+CHANNELS = st.sampled_from([1, 3, 32, 33, 70])  # within a pass of the adjoint, at its edge, over several
 
 pytestmark = pytest.mark.usefixtures("every_kernel")
 every_footprint = pytest.mark.parametrize("footprint", FOOTPRINTS)
 
 
 def drawn(
-    data: st.DataObject, footprint: str, backend: Backend
+    data: st.DataObject, footprint: str, backend: Backend, *, strided: bool = False
 ) -> tuple[Splats, Camera, ViewFeatures, CompositingParams]:
-    """A scene of the kernel, a view, what it observes, and a walk."""
+    """A scene of the kernel, a view, what it observes, and a walk, over some of its pixels if asked."""
     kernel, antialiased = FOOTPRINTS[footprint]
     splats, camera, observation = data.draw(scenes(kernel, backend.splats, backend.size))
-    return splats, camera, observation, replace(data.draw(st.sampled_from(WALKS)), antialiased=antialiased)
+    walk = replace(data.draw(st.sampled_from(WALKS)), antialiased=antialiased)
+    if strided:
+        stride = data.draw(st.integers(1, 5))
+        left, top = (data.draw(st.integers(0, min(stride, side) - 1)) for side in (camera.width, camera.height))
+        walk = replace(walk, stride=stride, offset=(left, top))
+    return splats, camera, observation, walk
 
 
 def seeded(footprint: str, seed: int, count: int) -> tuple[Splats, CompositingParams]:
@@ -62,6 +79,24 @@ def dense(weights: RegionWeights, splats: int, rows: int) -> np.ndarray:
     lengths = np.diff(weights.indptr.numpy())
     W[np.repeat(weights.splats.numpy(), lengths), weights.region.numpy()] = weights.weight.numpy()
     return W
+
+
+def one_a_ray(camera: Camera) -> Regions:
+    """A region a pixel, so that W^T is A' itself."""
+    rays = camera.width * camera.height
+    labels = torch.arange(rays, dtype=torch.int32).reshape(1, camera.height, camera.width)
+    return Regions(labels, torch.ones(rays, 1))
+
+
+def random_image(camera: Camera, channels: int) -> torch.Tensor:
+    values = np.random.default_rng(1).normal(0, 1, (camera.height, camera.width, channels))
+    return torch.tensor(values, dtype=torch.float32)
+
+
+def every_pixel_of(camera: Camera) -> torch.Tensor:
+    """[H * W, 2] i32 (x, y)."""
+    y, x = np.mgrid[: camera.height, : camera.width]
+    return torch.tensor(np.stack([x.ravel(), y.ravel()], axis=1), dtype=torch.int32)
 
 
 @every_footprint
@@ -81,18 +116,75 @@ def test_renders_equal_the_oracle(footprint, backend):
 
 @every_footprint
 @every_backend
-def test_region_weights_equal_the_oracle(footprint, backend):
-    @backend.holds(st.data(), st.sampled_from([0, 1, 2]))
-    def check(data, power) -> None:
-        splats, camera, observation, walk = drawn(data, footprint, backend)
-        view = dense_view(splats, camera, walk)
-        S, ray = reading_matrix(observation, camera.width, camera.height)
-        if dense_view(splats, camera, replace(walk, opacity_logit_scale=1.0)).cut.any() or view.cut.any():
+def test_region_weights_and_evidence_equal_the_oracle(footprint, backend):
+    @backend.holds(st.data(), st.sampled_from(POWERS))
+    def check(data, weighting) -> None:
+        splats, camera, observation, walk = drawn(data, footprint, backend, strided=True)
+        walked = strided_rays(camera, walk)
+        weights = backend.open(splats).region_weights(camera, observation, walk, weighting)
+        plain = dense_view(splats, camera, replace(walk, opacity_logit_scale=1.0))
+        if plain.cut.any():
             return  # the pooled test counts the flips
-        expected = np.where(view.A > 0, view.A**power, 0.0)[ray].T @ S
-        weights = backend.open(splats).region_weights(camera, observation, walk, Weighting(power))
+        evidence = np.zeros(splats.count)
+        evidence[weights.evidence_splats.numpy()] = weights.evidence.numpy()
+        expected = plain.A[walked].sum(axis=0)  # whatever the gain and the power
+        assert np.abs(evidence - expected).max() < INSIDE * max(1.0, expected.max())
+        view = dense_view(splats, camera, walk)
+        if view.cut.any():
+            return
+        S, ray = reading_matrix(observation, camera.width, camera.height)
+        chosen = counted_weights(view.A, splats, camera, walk, weighting)[0]
+        expected = chosen[ray[walked[ray]]].T @ S[walked[ray]]
         W = dense(weights, splats.count, observation.codebook.shape[0])
         assert np.abs(W - expected).max(initial=0) < INSIDE * max(1.0, expected.max(initial=0))
+
+
+@every_footprint
+@every_backend
+def test_weights_that_count_equal_the_oracle_ray_by_ray(footprint, backend):
+    @backend.holds(st.data(), st.sampled_from(SELECTIONS))
+    def check(data, weighting) -> None:
+        splats, camera, _, walk = drawn(data, footprint, backend, strided=True)
+        view = dense_view(splats, camera, walk)
+        chosen, close = counted_weights(view.A, splats, camera, walk, weighting)
+        found = backend.open(splats).region_weights(camera, one_a_ray(camera), walk, weighting)
+        W = dense(found, splats.count, camera.width * camera.height)
+        walked = strided_rays(camera, walk)
+        assert W[:, ~walked].max(initial=0) == 0
+        assert np.abs(W.T - chosen)[walked & ~view.cut & ~close].max(initial=0) < INSIDE
+
+
+def test_few_rays_are_too_close_to_call():
+    seen = [(random_splats(seed, 60), random_camera(seed)) for seed in range(4)]
+    views = [dense_view(*scene, CompositingParams()) for scene in seen]
+    for weighting in SELECTIONS:
+        close = [
+            counted_weights(view.A, *scene, CompositingParams(), weighting)[1] & ~view.cut
+            for view, scene in zip(views, seen, strict=True)
+        ]
+        assert np.concatenate(close).mean() < UNDECIDED, weighting
+
+
+def test_of_equal_weights_the_nearest_counts():
+    """Behind an alpha of 1/4, an alpha of 1/3 weighs 1/4 too; some float near log 1/2 makes it so to the bit."""
+    camera = random_camera(0, 9, 9).replace(cx=4.5, cy=4.5, fx=9.0, fy=9.0, viewmat=np.eye(4))
+    means, scales = torch.tensor([[0.0, 0.0, 3.0], [0.0, 0.0, 2.0]]), torch.ones(2, 3)  # the second is the nearer
+
+    def on_the_axis(splats: Splats, weighting: Weighting) -> list[float]:
+        found = CpuRaster(splats).region_weights(camera, one_a_ray(camera), CompositingParams(), weighting)
+        return dense(found, 2, 81)[:, 4 * 9 + 4].tolist()
+
+    ties = 0
+    for step in range(-8, 9):
+        behind = np.float32(np.log(0.5)) + step * np.spacing(np.float32(0.5))
+        logits = torch.tensor([behind, np.log(1 / 3)], dtype=torch.float32)
+        splats = replace(random_splats(0, 2), means=means, opacity_logits=logits, log_scales=scales)
+        far, near = on_the_axis(splats, Weighting())
+        if far == near:
+            ties += 1
+            assert on_the_axis(splats, Weighting(1, Selection.TOP_K, count=1)) == [0.0, near]
+            assert np.count_nonzero(on_the_axis(splats, Weighting(1, Selection.TOP_K, count=2))) == 2
+    assert ties > 0
 
 
 @pytest.mark.parametrize("reading", ["regions", "grid"])
@@ -100,10 +192,10 @@ def test_region_weights_equal_the_oracle(footprint, backend):
 def test_a_region_or_a_cell_for_every_pixel_is_weighed_as_the_oracle_weighs_it(reading, backend):
     camera, splats = random_camera(3, *backend.size), random_splats(3, 60)
     pixels = camera.width * camera.height
-    labels = torch.arange(pixels, dtype=torch.int32).reshape(1, camera.height, camera.width)
     if reading == "grid":
         observation = random_grid(3, (camera.height + 4, camera.width - 4))
     else:
+        labels = one_a_ray(camera).labels
         observation = Regions(torch.cat([labels, labels // 200]), torch.ones(pixels, 1))
     view = dense_view(splats, camera, CompositingParams())
     S, ray = reading_matrix(observation, camera.width, camera.height)
@@ -130,40 +222,6 @@ def test_grids_finer_than_pixels_and_of_one_cell_equal_the_oracle(cells, backend
 
 @every_footprint
 @every_backend
-def test_evidence_is_the_sum_of_plain_weights_whatever_the_gain(footprint, backend):
-    @backend.holds(st.data())
-    def check(data) -> None:
-        splats, camera, observation, walk = drawn(data, footprint, backend)
-        view = dense_view(splats, camera, replace(walk, opacity_logit_scale=1.0))
-        weights = backend.open(splats).region_weights(camera, observation, walk, Weighting(2))
-        evidence = np.zeros(splats.count)
-        evidence[weights.evidence_splats.numpy()] = weights.evidence.numpy()
-        if not view.cut.any():
-            expected = view.A.sum(axis=0)
-            assert np.abs(evidence - expected).max() < INSIDE * max(1.0, expected.max())
-
-
-@every_footprint
-@every_backend
-def test_selections_and_strides_equal_the_oracle(footprint, backend):
-    @backend.holds(st.data(), st.sampled_from(SELECTIONS), st.sampled_from([1, 3]))
-    def check(data, weighting, stride) -> None:
-        splats, camera, _, walk = drawn(data, footprint, backend)
-        walk = replace(walk, stride=stride)
-        view = dense_view(splats, camera, walk)
-        chosen, hard = counted_weights(view.A, splats, camera, walk, weighting)
-        rays = camera.width * camera.height
-        labels = torch.arange(rays, dtype=torch.int32).reshape(1, camera.height, camera.width)
-        one_a_ray = Regions(labels, torch.ones(rays, 1))
-        W = dense(backend.open(splats).region_weights(camera, one_a_ray, walk, weighting), splats.count, rays)
-        walked = strided_rays(camera, walk)
-        assert W[:, ~walked].max(initial=0) == 0
-        clear = walked & ~view.cut & ~hard
-        assert np.abs(W.T - chosen)[clear].max(initial=0) < INSIDE
-
-
-@every_footprint
-@every_backend
 def test_flips_at_the_cut_offs_are_rare_and_unbiased(footprint, backend):
     rays = flips = 0
     drift = 0.0
@@ -185,13 +243,71 @@ def test_ray_rows_are_rows_of_a(footprint, backend):
     def check(data) -> None:
         splats, camera, _, walk = drawn(data, footprint, backend)
         view = dense_view(splats, camera, walk)
-        y, x = np.mgrid[: camera.height, : camera.width]
         some = np.arange(view.A.shape[0])[:: -(-view.A.shape[0] // backend.rays)]
-        pixels = torch.tensor(np.stack([x.ravel(), y.ravel()], axis=1)[some], dtype=torch.int32)
-        rows = backend.open(splats).ray_rows(camera, pixels, walk)
+        rows = backend.open(splats).ray_rows(camera, every_pixel_of(camera)[some], walk)
         A = np.zeros((len(some), splats.count))
         A[np.repeat(np.arange(len(some)), np.diff(rows.indptr.numpy())), rows.splats.numpy()] = rows.weights.numpy()
         assert np.abs(A - view.A[some])[~view.cut[some]].max(initial=0) < INSIDE
+
+
+@every_backend
+def test_adjoints_equal_the_oracle(backend):
+    @backend.holds(scenes(most=backend.splats, largest=backend.size), st.sampled_from(WALKS), CHANNELS)
+    def check(scene, walk, channels) -> None:
+        splats, camera, _ = scene
+        view = dense_view(splats, camera, walk)
+        Y = random_image(camera, channels)
+        Y[torch.from_numpy(view.cut.reshape(camera.height, camera.width))] = 0  # the render's test counts the flips
+        expected = view.A.T @ Y.double().numpy().reshape(-1, channels)
+        got = backend.open(splats).adjoint(camera, Y, walk).numpy()
+        assert got.shape == (splats.count, channels)
+        assert np.abs(got - expected).max(initial=0) < INSIDE * max(1.0, view.A.sum(axis=0).max(initial=0))
+
+
+@every_backend
+def test_a_render_and_its_adjoint_agree_on_every_inner_product(backend):
+    @backend.holds(scenes(most=backend.splats, largest=backend.size), st.sampled_from(WALKS))
+    def check(scene, walk) -> None:
+        splats, camera, _ = scene
+        raster = backend.open(splats)
+        X = torch.tensor(np.random.default_rng(2).normal(0, 1, (splats.count, 4)), dtype=torch.float32)
+        Y = random_image(camera, 4)
+        image, sums = raster.render(camera, X, walk), raster.adjoint(camera, Y, walk)
+        left, right = float((image.double() * Y).sum()), float((X * sums.double()).sum())
+        scale = float((raster.render(camera, X.abs(), walk).double() * Y.abs()).sum())  # no cancellation in it
+        assert abs(left - right) <= 1e-6 * scale + 1e-12
+
+
+@every_backend
+def test_strongest_labels_are_those_of_the_one_hot_render(backend):
+    for seed in range(min(6, backend.seeds)):
+        splats, camera = random_splats(seed, 80), random_camera(seed, *backend.size)
+        labels = torch.tensor(np.random.default_rng(seed).integers(-1, 60, 80), dtype=torch.int32)
+        view = dense_view(splats, camera, GAIN)
+        sums = view.A @ np.eye(61)[labels.numpy() + 1]
+        ranked = np.sort(sums, axis=1)
+        clear = (ranked[:, -1] - ranked[:, -2] > 1e-4) & ~view.cut
+        for raster in (backend.open(splats), ReferenceRaster(splats)):
+            shown = raster.strongest_labels(camera, labels, GAIN).numpy().ravel()
+            assert np.array_equal(shown[clear], (sums.argmax(axis=1) - 1)[clear])
+            assert (shown[view.A.sum(axis=1) == 0] == -1).all()
+        assert clear.mean() > 0.3
+
+
+@pytest.mark.parametrize(("cap", "stop"), [(0.9, 0.1), (0.95, 0.0025), (0.999, 1e-6), (0.99, 1e-6), (0.99, 1e-4)])
+def test_rays_end_at_the_same_splat_in_every_product(cap, stop):
+    splats = replace(
+        random_splats(0, 6),
+        means=torch.tensor([[0.0, 0.0, 2.0 + 0.1 * k] for k in range(6)]),
+        opacity_logits=torch.full((6,), 30.0),
+        log_scales=torch.full((6, 3), 2.0),
+    )
+    camera = random_camera(0, 5, 5).replace(cx=2.5, cy=2.5, fx=5.0, fy=5.0, viewmat=np.eye(4))
+    raster, walk = CpuRaster(splats), CompositingParams(alpha_cap=cap, transmittance_stop=stop)
+    image = raster.render(camera, torch.ones(6, 1), walk)[..., 0]
+    rows = raster.ray_rows(camera, every_pixel_of(camera), walk)
+    sums = [float(part.sum()) for part in rows.weights.split(rows.indptr.diff().tolist())]
+    assert image.ravel().tolist() == pytest.approx(sums, rel=1e-6, abs=1e-7)
 
 
 def same_bits(one: RegionWeights | RayRows, other: RegionWeights | RayRows) -> bool:
@@ -227,32 +343,89 @@ def test_views_walked_in_a_row_are_those_walked_alone_to_the_bit(footprint, back
 
 
 @every_footprint
-@pytest.mark.parametrize("gain", [1.0, 1.2])
-def test_the_number_of_threads_changes_no_bit(footprint, gain):
+def test_the_number_of_threads_changes_no_bit(footprint):
     (splats, walk), camera = seeded(footprint, 7, 3_000), random_camera(7, 200, 150)
-    walk = replace(walk, opacity_logit_scale=gain)
-    for observation in (random_regions(7, 4, 30, (75, 100)), random_grid(7, (10, 13))):
-        runs = [
-            CpuRaster(splats, threads=n).region_weights(camera, observation, walk, Weighting(2)) for n in (1, 2, 5)
-        ]
-        for other in runs[1:]:
-            for name, own in runs[0].tensors().items():
-                assert torch.equal(own, getattr(other, name)), name
-    images = [CpuRaster(splats, threads=n).row_sums(camera, walk) for n in (1, 2, 5)]
-    assert all(torch.equal(images[0], image) for image in images[1:])
+    gain, strided = replace(walk, opacity_logit_scale=1.2), replace(walk, stride=3, offset=(1, 2))
+    one, many = CpuRaster(splats, threads=1), CpuRaster(splats, threads=5)
+    for own, weighting in (
+        (walk, Weighting()),
+        (gain, Weighting(2)),
+        (gain, Weighting(2, Selection.TOP_K, count=3)),
+        (strided, Weighting(1, Selection.FRONT_MASS, mass=0.75)),
+        (strided, Weighting(0, Selection.CENTRE, floor=0.02)),
+    ):
+        for observation in (random_regions(7, 4, 30, (75, 100)), random_grid(7, (10, 13))):
+            first, second = (raster.region_weights(camera, observation, own, weighting) for raster in (one, many))
+            assert same_bits(first, second)
+    image, labels = random_image(camera, 5), torch.arange(3_000, dtype=torch.int32) % 60 - 1
+    for own in (walk, gain):
+        for product in (
+            lambda raster, own=own: raster.row_sums(camera, own),
+            lambda raster, own=own: raster.adjoint(camera, image, own),
+            lambda raster, own=own: raster.strongest_labels(camera, labels, own),
+        ):
+            first, second = product(one), product(many)
+            assert first.any() and torch.equal(first, second)
 
 
-@every_footprint
-@every_backend
-@pytest.mark.parametrize("seed", range(2))
-def test_the_oracle_is_a_backend_that_gives_the_same_products(footprint, backend, seed):
-    (splats, walk), camera = seeded(footprint, seed, 30), random_camera(seed)
-    if dense_view(splats, camera, walk).cut.any():
-        camera = random_camera(seed + 100)
-    fast, plain = backend.open(splats), ReferenceRaster(splats)
-    observation = random_regions(seed)
-    rows = observation.codebook.shape[0]
+def test_images_and_traced_rays_are_whole_whatever_the_stride():
+    splats, camera = random_splats(5, 300), random_camera(5, 61, 47)
+    raster, walk = CpuRaster(splats), CompositingParams(stride=4, offset=(3, 1))
+    assert torch.equal(raster.row_sums(camera, walk), raster.row_sums(camera, CompositingParams()))
+    pixels = torch.tensor([[3, 1], [7, 5], [59, 45]], dtype=torch.int32)
+    for asked in (pixels, torch.cat([pixels, torch.tensor([[0, 0]], dtype=torch.int32)])):
+        got, full = (raster.ray_rows(camera, asked, own) for own in (walk, CompositingParams()))
+        assert torch.equal(got.splats, full.splats)
+        assert torch.allclose(got.weights, full.weights, atol=1e-6)
+
+
+def test_the_oracle_is_a_backend_that_gives_the_same_products():
+    splats, camera = random_splats(1, 30), random_camera(1)
+    assert not dense_view(splats, camera, GAIN).cut.any()
+    fast, plain = CpuRaster(splats), ReferenceRaster(splats)
+    observation, walk = random_regions(1), replace(GAIN, stride=2, offset=(1, 0))
     ours, theirs = (raster.region_weights(camera, observation, walk, Weighting(2)) for raster in (fast, plain))
-    assert np.abs(dense(ours, 30, rows) - dense(theirs, 30, rows)).max() < INSIDE
+    assert np.abs(dense(ours, 30, 5) - dense(theirs, 30, 5)).max() < INSIDE
     assert torch.equal(ours.evidence_splats, theirs.evidence_splats)
-    assert torch.allclose(fast.row_sums(camera, walk), plain.row_sums(camera, walk), atol=INSIDE)
+    assert torch.allclose(ours.evidence, theirs.evidence, atol=INSIDE)
+    assert torch.allclose(fast.row_sums(camera, GAIN), plain.row_sums(camera, GAIN), atol=INSIDE)
+    image = random_image(camera, 2)
+    assert torch.allclose(fast.adjoint(camera, image, GAIN), plain.adjoint(camera, image, GAIN), atol=1e-4)
+    some = every_pixel_of(camera)[::50]
+    assert torch.equal(fast.ray_rows(camera, some, GAIN).indptr, plain.ray_rows(camera, some, GAIN).indptr)
+
+
+@every_backend
+@pytest.mark.parametrize(
+    ("name", "weighting", "walk"),
+    [
+        ("power", Weighting(3), {}),
+        ("count", Weighting(1, Selection.TOP_K, count=65), {}),
+        ("mass", Weighting(1, Selection.FRONT_MASS, mass=0.0), {}),
+        ("floor", Weighting(floor=float("nan")), {}),
+        ("stride", Weighting(), {"stride": 0}),
+        ("offset", Weighting(), {"stride": 2, "offset": (2, 0)}),
+        ("offset", Weighting(), {"stride": 100, "offset": (0, 40)}),
+    ],
+    ids=str,
+)
+def test_knobs_out_of_range_are_refused_by_name(backend, name, weighting, walk):
+    with pytest.raises(InvalidInput, match=f"^{name}: "):
+        backend.open(random_splats(0)).region_weights(
+            random_camera(0), random_grid(0), CompositingParams(**walk), weighting
+        )
+
+
+@every_backend
+def test_values_of_another_shape_and_walks_without_meaning_are_refused(backend):
+    splats, camera = random_splats(0, 4, kernel=Kernel.GAUSSIAN_2D), random_camera(0)
+    raster, walk = backend.open(splats), CompositingParams()
+    with pytest.raises(InvalidInput, match="values"):
+        raster.render(camera, torch.zeros(3, 1), walk)
+    with pytest.raises(InvalidInput, match="values"):
+        raster.adjoint(camera, torch.zeros(3, 4, 1), walk)
+    with pytest.raises(InvalidInput, match="labels"):
+        raster.strongest_labels(camera, torch.zeros(3, dtype=torch.int32), walk)
+    for made in (raster, ReferenceRaster(splats)):
+        with pytest.raises(InvalidSettings, match="3D Gaussians"):
+            made.row_sums(camera, CompositingParams(antialiased=True))

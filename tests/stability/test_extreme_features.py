@@ -7,9 +7,8 @@ import pytest
 import torch
 
 from liftcore.features.views import FeatureGrid, Regions
-from tests.benchmarks.extreme_measures import AWAY, Task, cloud, run
+from tests.benchmarks.extreme_measures import Task, cloud, run
 from tests.benchmarks.extremes import checkerboard
-from tests.scenes import splats_at
 
 
 def lifted(views, splats=None, **settings):
@@ -63,19 +62,3 @@ def test_the_nearest_reading_of_a_grid_takes_the_cell_under_the_pixel(size):
     assert torch.equal(got.features, as_regions.features)
     # The plan's memory is an upper bound of each reading, and cells of a grid make no objects.
     assert without_plan(got.metadata.certificate) == without_plan(as_regions.metadata.certificate)
-
-
-def test_a_view_that_sees_nothing_changes_nothing():
-    alone, both = lifted({"v0": checkerboard()}), lifted({AWAY: checkerboard(), "v0": checkerboard()})
-    assert torch.equal(alone.features, both.features)
-    assert torch.equal(alone.evidence, both.evidence)
-
-
-@pytest.mark.parametrize("preset", ["row-sum", "tikhonov"])
-def test_splats_behind_forty_opaque_ones_stay_finite_without_a_stop(preset):
-    splats = splats_at([(0.0, 0.0, 0.1 * k) for k in range(40)], log_scales=0.5, logits=1e4)
-    got = lifted({"v0": checkerboard()}, splats, preset=preset, transmittance_stop=0)
-    for tensor in (got.features, got.evidence, got.agreement):
-        assert bool(torch.isfinite(tensor).all())
-    assert float(got.features.abs().max()) <= 1.001
-    assert int(got.seen.sum()) > 5

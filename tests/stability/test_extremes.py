@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from liftcore.errors import InvalidSettings
-from liftcore.raster.base import ALPHA_FLOOR, CompositingParams
+from liftcore.features.views import Regions
+from liftcore.raster.base import ALPHA_FLOOR, CompositingParams, Weighting
 from liftcore.raster.cpu.raster import CpuRaster
-from liftcore.raster.reference import dense_view, projected_gaussian
+from liftcore.raster.reference import alphas, projected_gaussian
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Kernel, Splats
-from tests.benchmarks.extreme_measures import WEIGHTS, compare, exact_view, traced, weights_of
-from tests.scenes import ROW, TURNED, camera_at_origin, random_camera, random_splats, splats_at
+from tests.benchmarks.extreme_measures import WEIGHTS, compare, traced, weights_of
+from tests.scenes import ROW, TURNED, camera_at_origin, splats_at
 
 pytestmark = pytest.mark.usefixtures("every_kernel")
 DISC, BETA = Kernel.GAUSSIAN_2D, Kernel.BETA
@@ -31,28 +30,28 @@ def assert_equals_the_oracle(splats: Splats, camera: Camera, walk: CompositingPa
 
 
 @pytest.mark.parametrize("kernel", Kernel)
-@pytest.mark.parametrize("log_scale", [-80.0, -60.0, 60.0, 80.0])
-def test_scales_beyond_all_bounds_stay_finite(kernel, log_scale):
-    splats = splats_at(ROW, log_scales=log_scale, kernel=kernel)
-    A, evidence = weights_of(splats, camera_at_origin(), CompositingParams())
-    assert np.isfinite(A).all()
-    assert evidence.max() > 0
+def test_scales_beyond_all_bounds_stay_finite(kernel):
+    for log_scale in (-80.0, 80.0):
+        splats = splats_at(ROW, log_scales=log_scale, kernel=kernel)
+        A, evidence = weights_of(splats, camera_at_origin(), CompositingParams())
+        assert np.isfinite(A).all()
+        assert evidence.max() > 0
 
 
-@pytest.mark.parametrize("cap", [0.01, 0.5, 0.99, 0.999, 0.9999999])
-@pytest.mark.parametrize("stop", [0.0, 1e-30, 1e-4, 0.5])
-def test_any_cap_and_any_stop_equal_the_oracle(cap, stop):
-    splats = splats_at([(0.0, 0.0, 1.0 + k) for k in range(30)], log_scales=1.0, logits=[1e4, 3.0, -2.0] * 10)
-    assert_equals_the_oracle(splats, camera_at_origin(), CompositingParams(1.0, cap, stop))
-
-
-@pytest.mark.parametrize("gain", [0.1, 0.5, 1.2, 4.0, 16.0])
-def test_any_gain_equals_the_oracle_and_leaves_the_evidence_plain(gain):
-    splats, camera = random_splats(3, 60), camera_at_origin(24, 18)
-    assert_equals_the_oracle(splats, camera, CompositingParams(gain))
-    plain = exact_view(splats, camera, CompositingParams())
-    if not plain.cut.any():
-        assert np.abs(weights_of(splats, camera, CompositingParams(gain))[1] - plain.A.sum(axis=0)).max() < 1e-4
+def test_sums_over_a_million_rays_are_those_of_float64():
+    side = 1_000
+    splats = splats_at([(0.0, 0.0, 2.0)], log_scales=[0.3, 0.1, 0.0], logits=-2.0)  # faint, on all of the image
+    camera = Camera.pinhole("v0", side, side, 0.7 * side, 0.7 * side, side / 2, side / 2, np.eye(4))
+    x, total, squares = np.arange(side) + 0.5, 0.0, 0.0
+    for y in x:
+        alpha = alphas(splats, 0, camera, CompositingParams(), np.stack([x, np.full_like(x, y)], axis=1))[0]
+        total += float(alpha.sum())
+        squares += float((alpha * alpha).sum())
+    raster, region = CpuRaster(splats), Regions(torch.zeros(1, 1, 1, dtype=torch.int32), torch.ones(1, 1))
+    plain, squared = (raster.region_weights(camera, region, CompositingParams(), Weighting(n)) for n in (1, 2))
+    adjoint = raster.adjoint(camera, torch.ones(side, side, 1), CompositingParams())
+    assert [float(plain.weight[0]), float(plain.evidence[0]), float(adjoint[0, 0])] == pytest.approx(3 * [total])
+    assert float(squared.weight[0]) == pytest.approx(squares)
 
 
 def test_a_huge_image_equals_the_oracle_ray_by_ray():
@@ -146,33 +145,3 @@ def test_a_beta_of_zero_is_a_cylinder_and_of_four_a_bell():
     radius = 0.4 * 60 / 2
     row = alpha * np.maximum(1 - (np.arange(41) - 20) ** 2 / (radius**2 + 0.3), 0) ** 4
     assert np.abs(bell[20] - row).max() < 1e-6
-
-
-@pytest.mark.parametrize("kernel", [DISC, BETA])
-def test_the_opacity_compensation_is_refused_where_it_means_nothing(kernel):
-    splats, camera, walk = random_splats(0, 5, kernel=kernel), random_camera(0), CompositingParams(antialiased=True)
-    for make in (lambda: CpuRaster(splats).row_sums(camera, walk), lambda: dense_view(splats, camera, walk)):
-        with pytest.raises(InvalidSettings, match="3D Gaussians"):
-            make()
-
-
-def test_the_opacity_compensation_fades_small_splats_and_leaves_large_ones():
-    small, large = math.log(1e-4), math.log(0.5)
-    for log_scale, share in ((small, 0.0), (large, 1.0)):
-        splats = splats_at([(0.0, 0.0, 2.0)], log_scale)
-        plain, faded = (
-            float(CpuRaster(splats).row_sums(camera_at_origin(focal=160.0), CompositingParams(antialiased=on))[6, 8])
-            for on in (False, True)
-        )
-        assert plain == pytest.approx(1 / (1 + math.exp(-1.0)), abs=1e-4)
-        assert faded == pytest.approx(share * plain, abs=1e-3)
-
-
-def test_flat_gaussians_and_discs_agree_where_the_low_pass_is_small():
-    # Seen from the front, a disc and a Gaussian without thickness differ in their low-pass alone.
-    flat = splats_at([(0.0, 0.0, 2.0)], log_scales=[-0.7, -1.2, -12.0])
-    disc = replace(flat, kernel=DISC, log_scales=flat.log_scales[:, :2].contiguous())
-    camera = camera_at_origin(64, 48, focal=120.0)
-    images = [CpuRaster(splats).row_sums(camera, CompositingParams()) for splats in (flat, disc)]
-    assert float((images[0] - images[1]).abs().max()) < 5e-3
-    assert torch.isfinite(images[1]).all()

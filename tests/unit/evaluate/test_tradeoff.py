@@ -28,8 +28,7 @@ from liftcore.progress import silent
 from liftcore.raster.base import CompositingParams
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.raster.reference import dense_view, reading_matrix
-from tests.scenes import centred, observed, random_camera, random_splats
-from tests.unit.solve.test_lift_equals_dense import write_scene
+from tests.scenes import centred, observed, random_camera, random_splats, write_scene
 
 pytestmark = pytest.mark.slow
 

@@ -16,8 +16,7 @@ from liftcore.planning.views import WELL_COVERED
 from liftcore.raster.base import CompositingParams
 from liftcore.raster.reference import dense_view
 from liftcore.scene.cameras import Cameras
-from tests.scenes import random_camera, random_splats
-from tests.unit.solve.test_lift_equals_dense import write_scene
+from tests.scenes import random_camera, random_splats, write_scene
 
 
 def cameras_of(count: int) -> Cameras:

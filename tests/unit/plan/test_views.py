@@ -22,8 +22,7 @@ from liftcore.raster.base import CompositingParams, Weighting
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.splats import Kernel
 from liftcore.settings import LiftSettings
-from tests.scenes import look_at, random_camera, random_regions, random_splats
-from tests.unit.solve.test_lift_equals_dense import write_scene
+from tests.scenes import look_at, random_camera, random_regions, random_splats, write_scene
 
 
 def ring(count: int) -> list:

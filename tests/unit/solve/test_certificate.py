@@ -10,8 +10,7 @@ from liftcore.io.scene_files import lift_files
 from liftcore.raster.base import CompositingParams
 from liftcore.raster.reference import dense_view, reading_matrix
 from liftcore.settings import LiftSettings
-from tests.scenes import observed, random_splats
-from tests.unit.solve.test_lift_equals_dense import write_scene
+from tests.scenes import observed, random_splats, write_scene
 
 pytestmark = pytest.mark.slow
 

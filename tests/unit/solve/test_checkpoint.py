@@ -23,8 +23,7 @@ from liftcore.result import LiftResult
 from liftcore.scene.cameras import Camera
 from liftcore.settings import LiftSettings
 from liftcore.solve.checkpoint import Checkpoint, question
-
-from .test_lift_equals_dense import observed, write_scene
+from tests.scenes import observed, write_scene
 
 pytestmark = pytest.mark.slow
 

@@ -13,8 +13,8 @@ from liftcore.io.scene_files import lift_files
 from liftcore.progress import silent
 from liftcore.settings import LiftSettings
 from liftcore.solve.least_squares import BLOCK, Refinement, blocks, codebook_axes, random_axes, refine
+from tests.scenes import write_scene
 from tests.unit.solve.dense_rays import SmallScene
-from tests.unit.solve.test_lift_equals_dense import write_scene
 
 pytestmark = pytest.mark.slow
 

@@ -1,86 +1,117 @@
-"""The whole pipeline, from files to the lift file, against the dense definition of the paper."""
+"""The whole pipeline, from files to the lift file, against the dense definition of the paper; and its knobs."""
 
 from __future__ import annotations
 
-from pathlib import Path
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
+from liftcore.errors import InvalidFeatures, InvalidSettings, InvalidSplats
 from liftcore.features.pack import write_pack
 from liftcore.features.views import Regions
 from liftcore.io.cameras import read_cameras
-from liftcore.io.inria import write_inria_cameras
-from liftcore.io.lift_file import load_lift, save_lift
+from liftcore.io.lift_file import CLUSTER_TENSORS, TENSORS, load_lift, save_lift
 from liftcore.io.ply import write_splats
 from liftcore.io.scene_files import lift_files
+from liftcore.io.splats import read_splats
+from liftcore.query.scene import QueryScene
 from liftcore.raster.base import CompositingParams, Selection, Weighting
-from liftcore.raster.reference import counted_weights, dense_view, reading_matrix
+from liftcore.raster.reference import counted_weights, dense_view, reading_matrix, strided_rays
+from liftcore.result import LiftResult
 from liftcore.scene.cameras import Cameras
+from liftcore.scene.splats import Kernel, Splats
 from liftcore.settings import LiftSettings
-from tests.scenes import centred, observed, random_camera, random_splats
+from liftcore.solve.geometry import strided
+from tests.scenes import observed, random_camera, write_scene
+from tests.unit.features.test_observations import dense_sums
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("every_kernel")]
+ROW_SUM = {"preset": "row-sum", "dtype": "float32"}
 
-PRESETS = {  # lambda, and what counts as a weight
-    "row-sum": (1.0, Weighting(1)),
-    "tikhonov": (1.2, Weighting(2)),
-    "argmax": (1.0, Weighting(1, Selection.TOP_K, count=1)),
-    "top-k": (1.0, Weighting(1, Selection.TOP_K, count=40)),
-    "front-mass": (1.0, Weighting(1, Selection.FRONT_MASS, mass=0.75)),
-    "centre": (1.0, Weighting(1, Selection.CENTRE)),
-    "mean": (1.0, Weighting(0, Selection.CENTRE, floor=0.05)),
+
+@dataclass(frozen=True)
+class Case:
+    """A lift, and what counts as a weight in it by the words of the documentation."""
+
+    settings: dict[str, Any]
+    walk: CompositingParams
+    weighting: Weighting
+    kernel: Kernel = field(default=Kernel.GAUSSIAN_3D, kw_only=True)
+
+
+PLAIN, GAIN = CompositingParams(), CompositingParams(1.2)
+CASES = {
+    preset: Case({"preset": preset}, walk, weighting)
+    for preset, walk, weighting in (
+        ("row-sum", PLAIN, Weighting(1)),
+        ("tikhonov", GAIN, Weighting(2)),
+        ("argmax", PLAIN, Weighting(1, Selection.TOP_K, count=1)),
+        ("top-k", PLAIN, Weighting(1, Selection.TOP_K, count=40)),
+        ("front-mass", PLAIN, Weighting(1, Selection.FRONT_MASS, mass=0.75)),
+        ("centre", PLAIN, Weighting(1, Selection.CENTRE)),
+        ("mean", PLAIN, Weighting(0, Selection.CENTRE, floor=0.05)),
+    )
+} | {
+    "antialiased": Case({"preset": "tikhonov", "antialiased": True}, replace(GAIN, antialiased=True), Weighting(2)),
+    # The gain of 1.2 acts on the logits of every kernel; the released code leaves DBS out.
+    "2dgs": Case({"preset": "tikhonov"}, GAIN, Weighting(2), kernel=Kernel.GAUSSIAN_2D),
+    "dbs": Case({"preset": "tikhonov"}, GAIN, Weighting(2), kernel=Kernel.BETA),
+    "every second pixel": Case({"preset": "row-sum", "stride": 2}, PLAIN, Weighting(1)),
+    "every third pixel": Case({"preset": "row-sum", "stride": 3}, PLAIN, Weighting(1)),
 }
 
 
-def write_scene(folder: Path, seed: int, grids: bool = False) -> tuple[Path, Path, Path]:
-    """A random scene of three views on disk: splats, cameras, features."""
-    views = tuple(centred(random_camera(seed + k, 32 + 5 * k, 24 + 3 * k, name=f"v{k}")) for k in range(3))
-    observations = {camera.name: observed(seed, k, grids) for k, camera in enumerate(views)}
-    paths = folder / "splats.ply", folder / "cameras.json", folder / "features.safetensors"
-    write_splats(random_splats(seed, 50), paths[0])
-    write_inria_cameras(Cameras(views), paths[1])
-    write_pack(paths[2], observations, {"encoder": "random"})
-    return paths
+@dataclass
+class Dense:
+    """A lift by its definition, in float64; strided evidence speaks for all pixels."""
+
+    X: np.ndarray  # [P, F]
+    D: np.ndarray  # [P]
+    evidence: np.ndarray  # [P]
+    undecided: np.ndarray  # [P] bool: some ray of the splat float32 may decide otherwise
+    rays: int
 
 
-def dense_lift(
-    seed: int, cameras: Cameras, preset: str, grids: bool
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """X, evidence, seen, and whose rays float32 may decide otherwise, by the definitions, in float64."""
-    gain, weighting = PRESETS[preset]
-    splats, walk = random_splats(seed, 50), CompositingParams(gain)
-    numerator, denominator, evidence, undecided = np.zeros((50, 6)), np.zeros(50), np.zeros(50), np.zeros(50, bool)
+def dense_lift(seed: int, grids: bool, case: Case, splats: Splats, cameras: Cameras) -> Dense:
+    settings = LiftSettings.of(**case.settings)
+    numerator, made = np.zeros((50, 6)), Dense(np.zeros((50, 6)), np.zeros(50), np.zeros(50), np.zeros(50, bool), 0)
     for k, camera in enumerate(cameras.values()):
-        observation = observed(seed, k, grids)
+        observation, walk = observed(seed, k, grids), strided(case.walk, settings, camera, k)
+        view, walked = dense_view(splats, camera, walk), strided_rays(camera, walk)
         S, ray = reading_matrix(observation, camera.width, camera.height)
-        B = S @ observation.codebook.double().numpy()
-        A = dense_view(splats, camera, walk).A
-        chosen, close = counted_weights(A, splats, camera, walk, weighting)
-        undecided |= (A[close] > 0).any(axis=0)
-        weights = chosen[ray]
-        numerator += weights.T @ B
-        denominator += weights.sum(axis=0)
-        evidence += dense_view(splats, camera, CompositingParams()).A.sum(axis=0)
-    seen = denominator > 0
-    X = np.divide(numerator, denominator[:, None], out=np.zeros_like(numerator), where=seen[:, None])
-    return X, evidence, seen, undecided
+        chosen, close = counted_weights(view.A, splats, camera, walk, case.weighting)
+        own = walked[ray]
+        weights = chosen[ray[own]]
+        numerator += weights.T @ (S[own] @ observation.codebook.double().numpy())
+        made.D += weights.sum(axis=0)
+        plain = dense_view(splats, camera, replace(walk, opacity_logit_scale=1.0))
+        made.evidence += settings.stride**2 * plain.A[walked].sum(axis=0)
+        made.undecided |= (view.A[close | view.cut | plain.cut] > 0).any(axis=0)
+        made.rays += int(walked.sum())
+    made.X = np.divide(numerator, made.D[:, None], out=np.zeros((50, 6)), where=made.D[:, None] > 0)
+    return made
 
 
-@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 @pytest.mark.parametrize("grids", [False, True])
-@pytest.mark.parametrize("seed", range(4))
-def test_a_lift_equals_the_dense_definition(tmp_path, preset, grids, seed):
-    splats, cameras, features = write_scene(tmp_path, seed, grids)
-    save_lift(lift_files(splats, cameras, [features], LiftSettings.of(preset=preset)), tmp_path / "lift.safetensors")
+@pytest.mark.parametrize("seed", [0, 3])
+def test_a_lift_equals_the_dense_definition(tmp_path, case, grids, seed):
+    splats, cameras, features = write_scene(tmp_path, seed, grids, case.kernel)
+    made = lift_files(splats, cameras, [features], LiftSettings.of(**case.settings))
+    save_lift(made, tmp_path / "lift.safetensors")
     got = load_lift(tmp_path / "lift.safetensors")
-    X, evidence, seen, undecided = dense_lift(seed, read_cameras(cameras), preset, grids)
-    assert np.array_equal(got.seen.numpy()[~undecided], seen[~undecided])
-    error = np.linalg.norm(got.features.double().numpy() - X, axis=1)
-    assert (error <= 1e-3 * np.linalg.norm(X, axis=1) + 1e-7)[~undecided].all()
-    assert (~undecided & seen).sum() > 10
-    assert np.abs(got.evidence.numpy() - evidence).max() < 1e-4
+    assert read_splats(splats).kernel is case.kernel
+    exact = dense_lift(seed, grids, case, read_splats(splats), read_cameras(cameras))
+    decided, seen = ~exact.undecided, exact.D > 0
+    assert np.array_equal(got.seen.numpy()[decided], seen[decided])
+    error = np.linalg.norm(got.features.double().numpy() - exact.X, axis=1)
+    assert (error <= 1e-3 * np.linalg.norm(exact.X, axis=1) + 1e-7)[decided & (exact.D > 1e-6)].all()
+    assert (decided & seen).sum() > 10
+    assert np.abs(got.evidence.numpy() - exact.evidence)[decided].max() < 1e-3
+    assert got.metadata.certificate["rays"] == exact.rays
 
 
 @pytest.mark.parametrize("preset", ["row-sum", "tikhonov"])
@@ -92,25 +123,29 @@ def test_agreement_is_the_norm_of_the_mean_of_unit_inputs(tmp_path, preset):
     assert float(got.agreement.max()) <= 1.0
 
 
-def test_agreement_does_not_depend_on_the_length_of_inputs(tmp_path):
-    splats, cameras, features = write_scene(tmp_path, 6)
-    plain = lift_files(splats, cameras, [features], LiftSettings.of(preset="row-sum"))
-    maps = [observed(6, k) for k in range(3)]
-    regions = [own for own in maps if isinstance(own, Regions)]
-    longer = {f"v{k}": Regions(own.labels, own.codebook * 7.0) for k, own in enumerate(regions)}
-    write_pack(tmp_path / "longer.safetensors", longer, {})
-    scaled = lift_files(splats, cameras, [tmp_path / "longer.safetensors"], LiftSettings.of(preset="row-sum"))
-    assert torch.allclose(plain.agreement, scaled.agreement, atol=1e-4)
+def same_bits(one: LiftResult, other: LiftResult) -> bool:
+    """Whether all that two lifts found is equal to the bit."""
+    names = [name for name in (*TENSORS, *CLUSTER_TENSORS) if getattr(one, name) is not None]
+    same = all(torch.equal(getattr(one, name), getattr(other, name)) for name in names)
+    return same and one.metadata.certificate == other.metadata.certificate
 
 
-def test_the_number_of_threads_changes_no_bit_of_a_lift(tmp_path):
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {},
+        {"preset": "top-k", "k": 3},
+        {"preset": "centre", "stride": 2},
+        {"levels": "composite"},
+        {"cg_steps": 5, "damping": 0.1, "cg_basis": 3, "reference_channels": 4},
+        {"aggregation": True, "aggregation_cluster_size": 5},
+    ],
+    ids=str,
+)
+def test_the_number_of_threads_changes_no_bit_of_a_lift(tmp_path, settings):
     paths = write_scene(tmp_path, 7)
-    runs = [lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of(), threads=n) for n in (1, 2, 5)]
-    for other in runs[1:]:
-        assert torch.equal(runs[0].features, other.features)
-        assert torch.equal(runs[0].agreement, other.agreement)
-        assert torch.equal(runs[0].evidence, other.evidence)
-        assert runs[0].metadata.certificate == other.metadata.certificate
+    one, many = (lift_files(*paths[:2], paths[2:], LiftSettings.of(**settings), threads=n) for n in (1, 5))
+    assert same_bits(one, many)
 
 
 def test_weights_in_files_give_the_same_lift_as_weights_in_memory(tmp_path, monkeypatch):
@@ -120,3 +155,79 @@ def test_weights_in_files_give_the_same_lift_as_weights_in_memory(tmp_path, monk
     monkeypatch.setattr("liftcore.solve.weights.MEMORY_LIMIT", 0)
     files = lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of())
     assert torch.equal(memory.features, files.features)
+
+
+def lifted(paths, **knobs):
+    return lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of(**{**ROW_SUM, **knobs}))
+
+
+def test_discs_written_with_three_scales_are_discs_where_the_settings_say_so(tmp_path):
+    discs, cameras, features = write_scene(tmp_path, 3, kernel=Kernel.GAUSSIAN_2D)
+    flat, solid = read_splats(discs), tmp_path / "three.ply"
+    scales = torch.cat([flat.log_scales, torch.full((flat.count, 1), -1.0)], dim=1)  # of no account
+    write_splats(Splats(flat.means, flat.quats, scales, flat.opacity_logits, sh=flat.sh), solid)
+    wanted, got = lifted((discs, cameras, features)), lifted((solid, cameras, features), kernel="2dgs")
+    assert got.metadata.certificate["plan"]["kernel"] == "2dgs"
+    assert torch.equal(got.features, wanted.features)
+    assert not torch.equal(lifted((solid, cameras, features)).features, wanted.features)
+    save_lift(got, tmp_path / "made.safetensors")
+    assert QueryScene.open(tmp_path / "made.safetensors").splats.kernel is Kernel.GAUSSIAN_2D  # in pictures too
+    with pytest.raises(InvalidSplats, match="'beta' of a dbs splat"):
+        lifted((solid, cameras, features), kernel="dbs")
+
+
+def test_compensation_for_other_kernels_is_refused_before_features_are_read(tmp_path):
+    splats, cameras, _ = write_scene(tmp_path, 3, kernel=Kernel.BETA)
+    with pytest.raises(InvalidSettings, match="3D Gaussians"):
+        lifted((splats, cameras, tmp_path / "missing.safetensors"), antialiased=True)
+
+
+def test_first_pixels_differ_between_views_and_repeat_with_the_seed():
+    camera = random_camera(0)
+
+    def offsets(seed: int) -> list[tuple[int, int]]:
+        settings = LiftSettings.of(stride=4, seed=seed)
+        return [strided(settings.lift_params, settings, camera, k).offset for k in range(40)]
+
+    assert len(set(offsets(0))) > 8
+    assert offsets(0) == offsets(0) != offsets(1)
+
+
+def test_every_nth_view_is_lifted_from_the_first_on(tmp_path):
+    paths = write_scene(tmp_path, 4)
+    got = lifted(paths, view_stride=2)
+    assert got.metadata.views == ("v0", "v2")
+    write_pack(tmp_path / "two.safetensors", {name: observed(4, int(name[1])) for name in ("v0", "v2")}, {})
+    two = lifted((*paths[:2], tmp_path / "two.safetensors"))
+    assert torch.equal(got.features, two.features)
+
+
+def per_pixel(regions: Regions) -> Regions:
+    """A row a pixel: the normalised sum of its levels, as released code builds its dense maps."""
+    _, rows, columns = regions.labels.shape
+    own = torch.arange(rows * columns, dtype=torch.int32).reshape(1, rows, columns)
+    unlabelled = (regions.labels < 0).all(dim=0, keepdim=True)
+    return Regions(own.masked_fill(unlabelled, -1), torch.tensor(dense_sums(regions), dtype=torch.float32))
+
+
+def one_level(regions: Regions) -> Regions:
+    return Regions(regions.labels[1:2], regions.codebook)
+
+
+@pytest.mark.parametrize(("levels", "reference"), [("composite", per_pixel), (1, one_level)])
+def test_levels_lift_and_certify_as_the_maps_that_they_stand_for(tmp_path, levels, reference):
+    paths = write_scene(tmp_path, 6)
+    write_pack(tmp_path / "other.safetensors", {f"v{k}": reference(observed(6, k)) for k in range(3)}, {})
+    other = lifted((*paths[:2], tmp_path / "other.safetensors"))
+    got = lifted(paths, levels=levels)
+    assert torch.equal(got.seen, other.seen)
+    assert torch.allclose(got.features, other.features, atol=1e-5)
+    assert torch.allclose(got.agreement, other.agreement, atol=1e-5)
+    ours, theirs = got.metadata.certificate, other.metadata.certificate
+    for name in ("rays", "rows", "row_sum_mean", "residual", "surrogate", "bound"):
+        assert ours[name] == pytest.approx(theirs[name], rel=1e-4), name
+
+
+def test_a_level_that_a_view_lacks_is_an_error_that_names_the_view(tmp_path):
+    with pytest.raises(InvalidFeatures, match="v0"):
+        lifted(write_scene(tmp_path, 0), levels=2)

@@ -15,8 +15,7 @@ from liftcore.query.directions import directions
 from liftcore.query.scene import QueryScene
 from liftcore.query.terms import Query, Region
 from liftcore.settings import LiftSettings
-
-from .test_lift_equals_dense import write_scene
+from tests.scenes import write_scene
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -12,9 +12,8 @@ from liftcore.io.cameras import read_cameras
 from liftcore.io.splats import read_splats
 from liftcore.solve.loss import STEPS, huber_factors
 from liftcore.solve.weights import stacked
-from tests.scenes import observed
+from tests.scenes import observed, write_scene
 from tests.unit.solve.sparse_views import codebook_of, dense, random_view
-from tests.unit.solve.test_lift_equals_dense import write_scene
 
 
 def reweighted_steps(W: np.ndarray, E: np.ndarray, steps: int) -> tuple[np.ndarray, np.ndarray, float]:

@@ -18,8 +18,7 @@ from liftcore.scene.cameras import Camera
 from liftcore.settings import LiftSettings
 from liftcore.solve.diagnostics import shape_warnings
 from tests.benchmarks.base import cameras_of
-
-from .test_lift_equals_dense import write_scene
+from tests.scenes import write_scene
 
 
 def told(tmp_path: Path, observation: ViewFeatures, size: tuple[int, int]) -> list[str]:

@@ -16,9 +16,8 @@ from liftcore.settings import LARGEST_ALPHA, LiftSettings
 from liftcore.solve.diagnostics import ViewMeasures, measure_rows, quantiles
 from liftcore.solve.geometry import SampledRays, read_pixels, sample_pixels
 from liftcore.solve.least_squares import reference, row_betas
-from tests.scenes import look_at, random_splats
+from tests.scenes import look_at, random_splats, write_scene
 from tests.unit.solve.dense_rays import SmallScene
-from tests.unit.solve.test_lift_equals_dense import write_scene
 
 SEEDS = st.integers(0, 2**16)
 OPAQUE = CompositingParams(alpha_cap=LARGEST_ALPHA, transmittance_stop=0.0)

@@ -17,8 +17,8 @@ from liftcore.solve.closed_form import LONG
 from liftcore.solve.directions import RegionDirections
 from liftcore.solve.reweight import NO_CONSENSUS, agreement_factors, reweighted
 from liftcore.solve.weights import RegionWeights, stacked
+from tests.scenes import write_scene
 from tests.unit.solve.sparse_views import codebook_of, dense, of_dense
-from tests.unit.solve.test_lift_equals_dense import write_scene
 
 
 @dataclass
@@ -160,10 +160,9 @@ def test_what_a_cluster_explains_is_its_mean_cosine_in_float64(monkeypatch, tabl
     np.testing.assert_allclose(found.numpy(), expected, atol=1e-6)
 
 
-@pytest.mark.parametrize("steps", [1, 2, 3])
-@pytest.mark.parametrize("seed", range(6))
-def test_steps_that_change_much_equal_their_definition_to_the_last_digits(seed, steps):
-    scene = random_scene(seed, count=20, views=2 + seed, channels=33)
+@pytest.mark.parametrize(("views", "steps"), [(2, 1), (4, 2), (7, 3)])
+def test_steps_that_change_much_equal_their_definition_to_the_last_digits(views, steps):
+    scene = random_scene(views, count=20, views=views, channels=33)
     scene.books[0][0] = 0
     scene.books[1] = scene.books[1].half()
     scene.weights[1][3] = 0
@@ -195,13 +194,24 @@ def test_splats_of_many_views_and_of_many_regions_equal_the_definition():
         np.testing.assert_allclose(mine / D, real / D, atol=1e-6)
 
 
-def things(noise: float, views: int = 8, seed: int = 0) -> tuple[Scene, np.random.Generator]:
+@pytest.mark.parametrize(("rows", "channels"), [(20_000, 8), (8, 10_000)])
+def test_a_step_over_very_many_terms_keeps_its_digits(rows, channels):
+    rng = np.random.default_rng(2)
+    direction = rng.normal(0, 1, channels)
+    books = rng.uniform(-1, 2, (2, rows, 1)) * direction + rng.normal(0, 1, (2, rows, channels))
+    weights = rng.uniform(0.001, 1, (2, 1, rows)).astype(np.float32)
+    scene = Scene([*weights], [torch.tensor(book, dtype=torch.float32) for book in books])
+    got, exact = np.concatenate(scene.after(1)), np.concatenate(defined(scene, 1))
+    assert np.abs(got - exact).max() < 1e-6 * exact.max()
+
+
+def things(views: int = 8) -> Scene:
     """Forty splats, half of each of two things, seen right by every view; all vectors in a narrow cone."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     cone, own = rng.normal(0, 1, 64), rng.normal(0, 0.3, (2, 64))
     weights = [np.kron(np.eye(2), np.ones((20, 1))) * rng.uniform(0.5, 1, (40, 1)) for _ in range(views)]
-    books = [torch.tensor(cone + own + rng.normal(0, noise, (2, 64)), dtype=torch.float32) for _ in range(views)]
-    return Scene([view.astype(np.float32) for view in weights], books), rng
+    books = [torch.tensor(cone + own + rng.normal(0, 0.1, (2, 64)), dtype=torch.float32) for _ in range(views)]
+    return Scene([view.astype(np.float32) for view in weights], books)
 
 
 def shares(weights: list[np.ndarray], splat: int) -> np.ndarray:
@@ -211,7 +221,7 @@ def shares(weights: list[np.ndarray], splat: int) -> np.ndarray:
 
 
 def test_one_wrong_view_loses_its_weight_to_the_others():
-    scene, _ = things(noise=0.1)
+    scene = things()
     scene.weights[3][:5] = scene.weights[3][:5, ::-1].copy()
     before, after = shares(scene.weights, 0), shares(scene.after(1), 0)
     assert after[3] < 0.2 * before[3]
@@ -219,42 +229,12 @@ def test_one_wrong_view_loses_its_weight_to_the_others():
     assert np.allclose(after[others] / after[others].sum(), before[others] / before[others].sum(), atol=0.01)
 
 
-def test_a_scene_without_outliers_changes_little():
-    scene, _ = things(noise=0.05)
-    for splat in (0, 20):
-        assert np.abs(shares(scene.after(2), splat) - shares(scene.weights, splat)).max() < 0.01
-
-
 def test_a_view_that_holds_most_of_the_weight_is_not_outvoted():
-    scene, _ = things(noise=0.1, views=4)
+    scene = things(views=4)
     scene.weights[0][0] *= 20
     for view in scene.weights[1:]:
         view[0] = view[0, ::-1].copy()
     assert shares(scene.after(1), 0)[0] > shares(scene.weights, 0)[0] > 0.8
-
-
-def test_a_heavy_region_is_not_rewarded_for_its_own_noise():
-    rng = np.random.default_rng(1)
-    books = [torch.tensor(rng.normal(0, 1, (40, 300)), dtype=torch.float32) for _ in range(6)]
-    weights = [np.eye(40, dtype=np.float32)[rng.permutation(40)] for _ in range(6)]
-    weights[0] *= 3
-    scene = Scene(weights, books)
-    heavy = [shares(scene.after(1), splat)[0] for splat in range(40)]
-    by_the_mean = []
-    for splat in range(40):
-        seen = torch.cat([book[view[splat] > 0] for book, view in zip(books, weights, strict=True)])
-        own = torch.tensor([view[splat].sum() for view in weights])
-        cosines = torch.nn.functional.cosine_similarity(seen, own @ seen, dim=1)
-        by_the_mean.append(float(own[0] * cosines[0] / (own @ cosines)))
-    assert np.mean(by_the_mean) > 0.6
-    assert np.mean(heavy) < 0.5
-
-
-def test_a_splat_of_one_view_does_not_change():
-    scene, _ = things(noise=0.1)
-    for view in scene.weights[1:]:
-        view[7] = 0
-    assert np.allclose(scene.after(2)[0][7], scene.weights[0][7], rtol=1e-6)
 
 
 @pytest.mark.parametrize("value", [0.0, 1.0])
