@@ -109,23 +109,30 @@ def features() -> dict[str, bytes]:
 
 def masks() -> dict[str, bytes]:
     """Bombs for the reader of masks: those of packs, which hold none, and some of its own."""
+    fractions = {"v/mask": {**tensor([2, 3], 0, 24), "dtype": "F32"}}
+    below = {"v/mask": {**tensor([1, 1], 0, 2), "dtype": "I16"}}
     return features() | {
+        "fractions": pack(fractions, 24),
+        "a number below that of no class": safetensors(json.dumps(below).encode()) + struct.pack("<h", -2),
+        "no masks": pack({"v": {**tensor([2, 3], 0, 12), "dtype": "I16"}}, 12),
         "no sides": pack({"v/mask": tensor([], 0, 4)}, 4),
         "an empty side": pack({"v/mask": tensor([10**9, 0], 0, 0)}, 0),
         "100,000 sides": pack({"v/mask": tensor([1] * 100_000, 0, 4)}, 4),
-        "floats": pack({"v/mask": tensor([1, 1], 0, 4)}, 4),
     }
 
 
 def table() -> dict[str, bytes]:
     """Bombs for the reader of text tables, likewise."""
     row = {"embeddings": tensor([1, 1], 0, 4)}
+    both = {"embeddings": tensor([1, 1], 0, 4), "v/mask": tensor([1, 1], 4, 8), "__metadata__": {"words": '["a"]'}}
     worded = {name: {**row, "__metadata__": {"words": words}} for name, words in WORDS.items()}
     return (
         features()
         | {name: safetensors(json.dumps(header).encode()) + struct.pack("<f", 1) for name, header in worded.items()}
         | {
             "no words": pack(row, 4),
+            "zeros": pack({**row, "__metadata__": {"words": '["apple"]'}}, 4),
+            "masks too": safetensors(json.dumps(both).encode()) + struct.pack("<ff", 1, 1),
             "a long word without a direction": pack({**row, "__metadata__": {"words": json.dumps(["x" * 10**6])}}, 4),
             "100,000 sides": pack(
                 {"embeddings": tensor([1] * 100_000, 0, 4), "__metadata__": {"words": '["apple"]'}}, 4

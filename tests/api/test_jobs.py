@@ -4,33 +4,30 @@ from __future__ import annotations
 
 import json
 import shutil
-import sqlite3
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
 from service.app import create_app
-from service.errors import Misconfigured
+from service.jobs import supervisor as pace
 from service.jobs.process import JobLimits
 from service.jobs.supervisor import Supervisor
-from service.models import JobState
 from service.queries.client import QueryClient, QueryLimits
 from service.settings import ServiceSettings
-from service.store.assets import ALL
+from service.store.jobs import LINE_CHARACTERS, LOG_LINES, EventKind, log_line, note
 from service.store.owners import SERVICE
-from service.store.schema import MIGRATIONS
 from service.store.store import Store
 from tests.crash.conftest import order, stand_in, until
 
-from .conftest import ADDRESS
+from .conftest import ADDRESS, parts_of
 from .following import ended
+from .guarded import finish
 from .test_problems import assert_problem
-from .tiny_scene import TinyScene
+from .tiny_scene import SPLATS_A_CLUSTER, TinyScene
 
 Quick = Callable[..., AbstractContextManager[tuple[TestClient, dict[str, Any]]]]
 
@@ -53,12 +50,6 @@ def quick(store: Store) -> Quick:
     return serve
 
 
-def application(client: TestClient) -> FastAPI:
-    """The application behind a client."""
-    assert isinstance(client.app, FastAPI)
-    return client.app
-
-
 def events(text: str) -> list[tuple[int, str, dict[str, Any]]]:
     """The events of a stream: id, name, data."""
     found = []
@@ -69,7 +60,7 @@ def events(text: str) -> list[tuple[int, str, dict[str, Any]]]:
     return found
 
 
-def test_same_key_and_order_are_the_same_job(quick: Quick) -> None:
+def test_same_key_is_the_same_job_or_refused_with_another_order(quick: Quick) -> None:
     with quick("answer") as (client, body):
         first = client.post("/lift", json=body, headers={"Idempotency-Key": "one"})
         again = client.post("/lift", json=body, headers={"Idempotency-Key": "one"})
@@ -81,11 +72,6 @@ def test_same_key_and_order_are_the_same_job(quick: Quick) -> None:
         assert len(client.get("/jobs").json()["jobs"]) == 1
         other = client.post("/lift", json=body, headers={"Idempotency-Key": "two"})
         assert other.status_code == 202 and other.json()["id"] != first.json()["id"]
-
-
-def test_same_key_with_another_order_is_refused(quick: Quick) -> None:
-    with quick("answer") as (client, body):
-        client.post("/lift", json=body, headers={"Idempotency-Key": "one"})
         changed = body | {"settings": {"preset": "row-sum"}}
         reply = client.post("/lift", json=changed, headers={"Idempotency-Key": "one"})
         assert (assert_problem(reply)["type"], reply.status_code) == ("/problems/key-reused", 422)
@@ -105,10 +91,12 @@ def test_full_line_is_503_with_retry_after_and_a_known_key_still_finds_its_job(q
         assert client.post("/lift", json=body, headers={"Idempotency-Key": "k"}).status_code == 200
 
 
-def test_cancel_over_http(quick: Quick) -> None:
+def test_canceled_job_keeps_its_plan(quick: Quick) -> None:
     with quick("hang") as (client, body):
         running = client.post("/lift", json=body).headers["location"]
-        until(lambda: client.get(running).json()["state"] == "running")
+        until(lambda: client.get(running).json()["plan"])
+        found = client.get(running).json()
+        assert found["state"] == "running" and found["plan"]["summary"] == ["a long time"]
         waiting = client.post("/lift", json=body).headers["location"]
         assert client.get(waiting).json()["links"]["cancel"] == f"{waiting}/cancel"
         reply = client.post(f"{waiting}/cancel")
@@ -119,6 +107,8 @@ def test_cancel_over_http(quick: Quick) -> None:
         for job in (running, waiting):
             reply = client.post(f"{job}/cancel")
             assert (reply.status_code, reply.json()["state"]) == (200, "canceled")
+        told = [data for _, name, data in events(client.get(f"{running}/events").text) if name == "plan"]
+        assert told == [found["plan"]] == [client.get(running).json()["plan"]]
 
 
 def test_ended_job_cannot_be_canceled_and_only_an_ended_one_can_be_deleted(quick: Quick, store: Store) -> None:
@@ -167,24 +157,12 @@ def test_failed_job_tells_its_problem_in_its_events(quick: Quick) -> None:
         assert last["problem"]["type"] == "/problems/crashed"
 
 
-def test_streams_are_bounded(quick: Quick) -> None:
-    with quick("answer", max_streams=1) as (client, body):
-        job = client.post("/lift", json=body).headers["location"]
-        ended(client, job)
-        streams = application(client).state.deps.streams
-        streams._open["another"] = 1  # as if another client followed
-        reply = client.get(f"{job}/events")
-        assert (assert_problem(reply)["type"], reply.status_code) == ("/problems/busy", 503)
-        del streams._open["another"]
-        assert client.get(f"{job}/events").status_code == 200 and streams.open == 0
-
-
 def test_no_work_is_taken_below_the_disk_floor_and_the_service_lives(
     quick: Quick, scene: TinyScene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     usage = shutil.disk_usage("/")
     with quick("answer", disk_floor_bytes=1000) as (client, body):
-        application(client).state.deps.store.files._floor = 1000
+        parts_of(client).store.files._floor = 1000
         monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=999))
         for reply in (
             client.put("/assets/splats", content=scene.splats),
@@ -196,90 +174,72 @@ def test_no_work_is_taken_below_the_disk_floor_and_the_service_lives(
         assert ended(client, client.post("/lift", json=body).headers["location"])["state"] == "succeeded"
 
 
-def test_query_worker_that_died_is_replaced(client: TestClient, lift: dict[str, Any]) -> None:
-    assert isinstance(client.app, FastAPI)
-    worker = client.app.state.deps.queries
-    assert client.get("/query", params={"text": "apple", "lift": lift["id"]}).status_code == 200
-    worker._process.kill()
-    assert client.get("/query", params={"text": "book", "lift": lift["id"]}).status_code == 200
+def test_job_tells_of_every_stage_and_its_plan_comes_before_the_walk(
+    client: TestClient, lift: dict[str, Any]
+) -> None:
+    story = events(client.get(f"{lift['links']['job']}/events").text)
+    lines = [(number, data["line"]) for number, name, data in story if name == "log"]
+    _, *stages = (line for _, line in lines)
+    assert stages == ["read", "digest", "compile", "plan", "geometry: 3 views", "solve", "certify", "save"]
+    (planned_at,) = (number for number, name, _ in story if name == "plan")
+    at = {line: number for number, line in lines}
+    assert at["plan"] < planned_at < at["geometry: 3 views"]
+    job = client.get(lift["links"]["job"]).json()
+    first, *_ = job["plan"].pop("summary")
+    assert first.startswith(f"{3 * SPLATS_A_CLUSTER} splats (3dgs), ") and first.endswith("3 of 3 views")
+    assert isinstance(job["plan"].pop("warnings"), list)  # what there is to say is of the machine
+    assert job["plan"] == lift["certificate"]["plan"]
+    assert job["progress"] == {"stage": "save", "done": 1, "total": 1, "unit": "steps", "eta_s": 0.0}
 
 
-def test_one_server_a_data_directory(store: Store) -> None:
-    with pytest.raises(Misconfigured, match="no other server"):
-        Store.open(store.files.root)
+TIMES = (20.0, 10.0, 30.0)
+NEWEST_FIRST = (2, 0, 1)
 
 
-def test_database_of_a_later_release_is_refused(tmp_path: Path) -> None:
-    store = Store.open(tmp_path)
-    with store.database.read() as connection:
-        connection.execute("PRAGMA user_version = 99")
-    store.close()
-    with pytest.raises(Misconfigured, match="99"):
-        Store.open(tmp_path)
+def test_lists_begin_with_the_newest(store: Store) -> None:
+    jobs = [store.jobs.submit(SERVICE, order(store))[0] for _ in TIMES]
+    for job in jobs:
+        finish(store, job.encode())
+    assets = [asset.id for asset in store.assets.all(SERVICE)]
+    with store.database.write() as connection:
+        for created, job, asset in zip(TIMES, jobs, assets, strict=True):
+            connection.execute("UPDATE jobs SET created = ? WHERE id = ?", (created, job))
+            connection.execute("UPDATE lifts SET created = ? WHERE id = ?", (created, job))
+            connection.execute("UPDATE asset_owners SET created = ? WHERE asset = ?", (created, asset))
+    assert [job.id for job in store.jobs.all(SERVICE)] == [jobs[place] for place in NEWEST_FIRST]
+    assert [lift.id for lift in store.lifts.all(SERVICE)] == [jobs[place] for place in NEWEST_FIRST]
+    assert [asset.id for asset in store.assets.all(SERVICE)] == [assets[place] for place in NEWEST_FIRST]
 
 
-def test_store_remembers_after_reopening(tmp_path: Path) -> None:
-    store = Store.open(tmp_path)
-    job = store.jobs.submit(SERVICE, order(store))[0]
-    (tmp_path / "tmp" / "left-over").write_bytes(b"half a file")
-    store.close()
-    store = Store.open(tmp_path)
-    assert store.jobs.get(SERVICE, job).state is JobState.QUEUED and len(store.assets.all(SERVICE)) == 3
-    assert list((tmp_path / "tmp").iterdir()) == []
-    store.close()
+def test_job_keeps_its_states_the_last_of_its_log_and_its_latest_progress(store: Store) -> None:
+    job, _ = store.jobs.submit(SERVICE, order(store))
+    with store.database.write() as connection:
+        for number in range(LOG_LINES + 5):
+            note(connection, job, EventKind.LOG, log_line(f"{number:03} {'x' * LINE_CHARACTERS}"))
+            note(connection, job, EventKind.PROGRESS, {"done": number})
+    events = store.jobs.events(SERVICE, job, 0)
+    assert [event.data["state"] for event in events if event.kind is EventKind.STATE] == ["queued"]
+    lines = [event.data["line"] for event in events if event.kind is EventKind.LOG]
+    assert [int(line[:3]) for line in lines] == list(range(5, LOG_LINES + 5))
+    assert {len(line) for line in lines} == {LINE_CHARACTERS}
+    assert [event.data for event in events if event.kind is EventKind.PROGRESS] == [{"done": LOG_LINES + 4}]
+    numbers = [event.number for event in events]
+    assert numbers == sorted(set(numbers)) and store.jobs.events(SERVICE, job, numbers[-2]) == events[-1:]
 
 
-def test_database_of_the_first_schema_is_taken_over(tmp_path: Path) -> None:
-    (tmp_path / "data").mkdir()
-    old = sqlite3.connect(tmp_path / "data" / "service.sqlite")
-    old.executescript(f"BEGIN; {MIGRATIONS[0]} PRAGMA user_version = 1; COMMIT;")
-    old.executemany(
-        "INSERT INTO assets VALUES (?, ?, 1, 'blobs/x', '{}', '[]', 0)",
-        [("s", "splats"), ("c", "cameras"), ("f", "features"), ("t", "table")],
-    )
-    for asset, counts in (("c", {"views": 2, "names": ["w", "v"]}), ("t", {"words": ["apple"], "channels": 1})):
-        old.execute("UPDATE assets SET counts = ? WHERE id = ?", (json.dumps(counts), asset))
-    old.execute("INSERT INTO lifts VALUES ('c', 1, 'd', 'lifts/c', 1, 1, ?, 0)", (json.dumps({"views": ["v"]}),))
-    problem = json.dumps({"kind": "crashed", "argument": "job", "expected": "a", "got": "b", "hint": ""})
-    for job, state, told in (("a", "running", None), ("b", "queued", None), ("c", "failed", problem)):
-        old.execute(
-            "INSERT INTO jobs (id, state, attempt, splats, cameras, settings, problem, created)"
-            " VALUES (?, ?, 1, 's', 'c', '{}', ?, 0)",
-            (job, state, told),
-        )
-        old.execute("INSERT INTO job_features VALUES (?, 0, 'f')", (job,))
-    old.commit()
-    old.close()
-    store = Store.open(tmp_path / "data")
-    assert store.jobs.get(SERVICE, "a").features == ("f",) and store.jobs.get(SERVICE, "a").plan is None
-    assert store.assets.get(SERVICE, "c").counts == {"views": 2}
-    assert store.assets.get(SERVICE, "c", most=ALL).counts == {"views": 2, "names": ["w", "v"]}
-    assert store.assets.get(SERVICE, "t", most=ALL).counts == {"channels": 1, "words": ["apple"]}
-    assert store.assets.names(SERVICE, "c", 1, 9) == ["v"]
-    assert store.lifts.lifted(SERVICE, "c", ["w", "v"]) == {"v"}
-    assert store.lifts.get(SERVICE, "c").metadata == {"views": ["v"]}
-    store.jobs.release_all("the server died")
-    assert [store.jobs.get(SERVICE, job).state for job in "abc"] == [
-        JobState.QUEUED,
-        JobState.QUEUED,
-        JobState.FAILED,
-    ]
-    (last,) = store.jobs.events(SERVICE, "c", 0)
-    assert last.data == {"state": "failed", "attempt": 1, "problem": json.loads(problem)}
-    with store.database.read() as connection:
-        assert connection.execute("PRAGMA user_version").fetchone()[0] == len(MIGRATIONS)
-    store.close()
-    Store.open(tmp_path / "data").close()  # and once is enough
+def test_what_a_stage_will_still_take_follows_from_its_own_pace(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = 100.0
+    monkeypatch.setattr(pace, "time", SimpleNamespace(monotonic=lambda: now))
+    stages = pace.StagePace()
 
+    def left(stage: str, done: int) -> float | None:
+        return stages.progress({"stage": stage, "done": done, "total": 10, "unit": "views"})["eta_s"]
 
-def test_migration_that_breaks_off_changes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        "service.store.database.MIGRATIONS", (*MIGRATIONS, "CREATE TABLE x (a);\nCREATE TABLE x (a);")
-    )
-    with pytest.raises(Misconfigured, match="already exists"):
-        Store.open(tmp_path / "data")
-    monkeypatch.undo()
-    left = sqlite3.connect(tmp_path / "data" / "service.sqlite")
-    assert left.execute("SELECT count(*) FROM sqlite_master").fetchone()[0] == 0
-    left.close()
-    Store.open(tmp_path / "data").close()
+    assert left("walk", 4) is None  # what an earlier attempt has done says nothing of the pace
+    now += 10
+    assert left("walk", 4) is None
+    assert left("walk", 6) == 20
+    assert left("solve", 0) is None
+    now += 3
+    assert left("solve", 3) == 7
+    assert left("solve", 10) == 0

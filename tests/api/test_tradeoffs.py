@@ -1,34 +1,35 @@
-"""Trade-offs over HTTP: ordered as jobs, looked at, deleted; and one that is real."""
+"""Trade-offs over HTTP: ordered as jobs, looked at, deleted, judged by masks; and one that is real."""
 
 from __future__ import annotations
 
-import io
+import hashlib
 import json
+import math
 import shutil
-import sqlite3
-from pathlib import Path
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
 
-from service.jobs import child, comparing
-from service.models import JobKind, JobState
+from service.models import AssetKind
 from service.store.jobs import fingerprint
 from service.store.owners import SERVICE, stored_bytes
-from service.store.schema import MIGRATIONS
 from service.store.store import Store
+from tests.crash.conftest import labels as stored_labels
 from tests.crash.conftest import until
 from tests.crash.service_process import processes_of
 
-from .conftest import Uploaded, parts_of
+from .conftest import Uploaded, parts_of, put
 from .following import ended
 from .test_jobs import Quick, quick
-from .test_problems import assert_problem
+from .test_problems import NO_ASSET, assert_problem
+from .tiny_scene import TinyScene, labels, masks, text_table
 
 __all__ = ["quick"]  # a fixture
 
-BEFORE_KINDS = 4  # the schema of the release before there were kinds of jobs
+CLASSES = ["the Lamp", "book", "apple"]  # in another order than the table has them
+MASKS = {view: 2 - found[0] for view, found in labels().items()}  # numbers of these classes
 
 
 def compare(client: TestClient, body: dict[str, Any], **more: Any) -> Any:
@@ -95,35 +96,22 @@ def test_tradeoff_goes_with_its_job_when_that_is_said(quick: Quick) -> None:
     ("wrong", "told"),
     [
         ({"budget_s": 9}, "budget_s"),
-        ({"budget_s": 86_401}, "budget_s"),
         ({"budget_s": 3601}, "at most 3600 s"),
-        ({"budget_s": "long"}, "budget_s"),
+        ({"budget_s": math.nan}, "budget_s"),
+        ({"budget_s": math.inf}, "budget_s"),
         ({"settings": {"speed": "fast"}}, "the same in all runs"),
         ({"settings": {"stride": 0}}, "stride"),
-        ({"settings": {"colour": 1}}, "colour"),
-        ({"features": []}, "features"),
         ({"labels": "x"}, "labels"),
+        ({"splats": "sha256:" + hashlib.sha256(b"cameras").hexdigest()}, "splats"),
     ],
 )
 def test_bad_order_is_a_problem_that_names_what_is_wrong(quick: Quick, wrong: dict[str, Any], told: str) -> None:
     with quick("answer") as (client, body):
-        problem = assert_problem(client.post("/tradeoff", json=body | wrong))
-        assert problem["status"] == 422 and told in problem["detail"]
+        content = json.dumps(body | wrong)
+        reply = client.post("/tradeoff", content=content, headers={"Content-Type": "application/json"})
+        problem = assert_problem(reply)
+        assert problem["status"] == (404 if told == "splats" else 422) and told in problem["detail"]
         assert client.get("/jobs").json() == {"jobs": []}
-
-
-def test_numbers_that_json_does_not_have_are_refused(quick: Quick) -> None:
-    with quick("answer") as (client, body):
-        for budget in ("NaN", "Infinity", "1e999"):
-            content = json.dumps(body | {"budget_s": 0}).replace('"budget_s": 0', f'"budget_s": {budget}')
-            headers = {"Content-Type": "application/json"}
-            assert assert_problem(client.post("/tradeoff", content=content, headers=headers))["status"] == 422
-
-
-def test_asset_of_another_kind_is_not_found(quick: Quick) -> None:
-    with quick("answer") as (client, body):
-        for wrong in ({"splats": body["cameras"]}, {"cameras": body["splats"]}, {"features": [body["splats"]]}):
-            assert assert_problem(compare(client, body | wrong))["status"] == 404
 
 
 def test_room_for_the_exact_features_is_asked_for_beforehand(
@@ -135,22 +123,27 @@ def test_room_for_the_exact_features_is_asked_for_beforehand(
     assert (assert_problem(reply)["type"], reply.status_code) == ("/problems/no-space", 507)
 
 
-def test_real_tradeoff_of_a_tiny_scene(client: TestClient, uploaded: Uploaded) -> None:
-    body = uploaded.order(certificate_rays=0, preset="tikhonov") | {"budget_s": 10}
-    job = ended(client, client.post("/tradeoff", json=body).headers["location"])
+def test_real_tradeoff_is_judged_by_the_masks_of_its_order(
+    client: TestClient, uploaded: Uploaded, judged: dict[str, Any]
+) -> None:
+    order = uploaded.order(certificate_rays=0, preset="tikhonov") | {"budget_s": 10, "labels": judged}
+    job = ended(client, client.post("/tradeoff", json=order).headers["location"])
     assert job["state"] == "succeeded", job
+    assert job["parameters"] == {"budget_s": 10, "labels": judged}
     assert job["progress"]["stage"] == "tradeoff" and job["progress"]["done"] == job["progress"]["total"]
     found = client.get(job["links"]["tradeoff"]).json()
-    assert found["runs"][0]["name"] == "exact" and found["runs"][0]["cosine"] == pytest.approx(1.0)
-    assert found["choice"]["name"] in {run["name"] for run in found["runs"]}
-    assert found["views"]["held_out"] == 1 and found["views"]["lifted"] in (1, 2)
+    exact = found["runs"][0]
+    assert exact["name"] == "exact" and exact["cosine"] == pytest.approx(1.0) and exact["mask_iou"] > 0.5
+    assert exact["settings"]["preset"] == "tikhonov"  # where the dial starts
     assert all(run["settings"]["certificate_rays"] == 0 for run in found["runs"])
-    assert found["runs"][0]["settings"]["preset"] == "tikhonov"  # where the dial starts
-    data = str(parts_of(client).store.files.root)
-    assert data not in json.dumps(found)  # no path of this machine
-    assert client.get(job["links"]["chart"]).content.startswith(b"\x89PNG")
+    assert (found["labelled_views"], found["labels"], found["choice"]["accuracy"]) == (1, judged, "mask_iou")
+    assert found["choice"]["name"] in {run["name"] for run in found["runs"]}
     assert not found["choice"]["recommended"]  # by the one view that is held out
-    assert "Nothing can be recommended" in client.get(found["links"]["table"]).text
+    assert str(parts_of(client).store.files.root) not in json.dumps(found)  # no path of this machine
+    table = client.get(found["links"]["table"]).text
+    assert "Nothing can be recommended" in table
+    assert f"{exact['mask_iou']:.4f}" in table and judged["masks"] in table
+    assert client.get(job["links"]["chart"]).content.startswith(b"\x89PNG")
     assert client.delete(job["links"]["self"], params={"with_tradeoff": True}).status_code == 204
 
 
@@ -164,47 +157,87 @@ def test_canceled_tradeoff_leaves_no_process_of_its_runs(client: TestClient, upl
     assert client.delete(f"/jobs/{job}").status_code == 204
 
 
-def test_what_a_comparison_refuses_is_the_users_problem_and_names_no_path(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.fixture(scope="module")
+def judged(client: TestClient, uploaded: Uploaded, scene: TinyScene) -> Iterator[dict[str, Any]]:
+    """The labels of an order: masks of one view, and the table."""
+    files = {"masks": masks({"right": MASKS["right"], "nowhere": MASKS["left"]}), "table": scene.table}
+    ids = {kind: put(client, AssetKind(kind), content) for kind, content in files.items()}
+    counts = {kind: client.get(f"/assets/{asset}").json()["counts"] for kind, asset in ids.items()}
+    assert (counts["masks"]["names"], counts["masks"]["classes"]) == (["nowhere", "right"], 3)
+    assert (counts["table"]["channels"], counts["table"]["words"]) == (8, ["apple", "book", "lamp"])
+    yield {**ids, "classes": CLASSES}
+    for asset in ids.values():
+        assert client.delete(f"/assets/{asset}").status_code == 204
+
+
+@pytest.mark.parametrize(
+    ("wrong", "argument", "told"),
+    [
+        ({"classes": ["lamp", "bok", "apple"]}, "labels.classes.1", "nearest: book"),
+        ({"classes": ["lamp", "book", "The_Book"]}, "labels.classes", "each class once"),
+        ({"classes": ["lamp", "book"]}, "labels.classes", "classes 0..2"),
+        ({"classes": []}, "labels.classes", "at least 1 item"),
+        ({"classes": ["\ud800", "book", "apple"]}, "labels.classes.0", ""),
+        ({"classes": None}, "labels.classes", "valid list"),
+        ({"table": "words.safetensors"}, "labels.table", "sha256"),
+        ({"words": ["lamp"]}, "labels.words", "one of masks, table, classes"),
+    ],
+)
+def test_labels_that_do_not_fit_are_refused_at_once(
+    client: TestClient, uploaded: Uploaded, judged: dict[str, Any], wrong: dict[str, Any], argument: str, told: str
 ) -> None:
-    monkeypatch.setattr(comparing, "warm_up_lift", lambda *lift: None)
-    paths = {kind: str(tmp_path / kind) for kind in ("splats", "cameras", "features")}
-    Path(paths["cameras"]).write_bytes(b"of no format")
-    order = {
-        "kind": "tradeoff", "kernel": "3dgs", "threads": 1, "settings": {}, "parameters": {"budget_s": 10},
-        "splats": paths["splats"], "cameras": paths["cameras"], "features": [paths["features"]], "labels": {},
-        "names": {path: f"{kind} sha256:x" for kind, path in paths.items()},
-    }  # fmt: skip
-    fault = child.run(order, child.Reporter(io.BytesIO()))["fault"]
-    assert fault["kind"] == "invalid-cameras" and str(tmp_path) not in json.dumps(fault)
-    assert "sha256:x" in fault["argument"]
+    problem = refused(client, uploaded, judged | wrong)
+    assert (problem["status"], problem["type"]) == (422, "/problems/invalid-request")
+    assert problem["argument"] == argument and told in problem["detail"]
 
 
-def test_directory_of_the_release_before_keeps_its_jobs_lifts_and_keys(tmp_path: Path) -> None:
-    (tmp_path / "data").mkdir()
-    old = sqlite3.connect(tmp_path / "data" / "service.sqlite")
-    old.executescript("".join(MIGRATIONS[:BEFORE_KINDS]) + f"PRAGMA user_version = {BEFORE_KINDS};")
-    for asset in ("splats", "cameras", "features"):
-        old.execute("INSERT INTO assets VALUES (?, ?, 1, 'blobs/x', '{}', '[]')", (asset[0], asset))
-        old.execute("INSERT INTO asset_owners VALUES (?, '', 0)", (asset[0],))
-    body = {"splats": "s", "cameras": "c", "features": ["f"], "settings": {}}
-    for job, state in (("a", "succeeded"), ("b", "queued")):
-        old.execute(
-            "INSERT INTO jobs (id, state, splats, cameras, settings, created, idempotency_key, fingerprint)"
-            " VALUES (?, ?, 's', 'c', '{}', 0, ?, ?)",
-            (job, state, job, fingerprint(body)),
-        )
-        old.execute("INSERT INTO job_features VALUES (?, 0, 'f')", (job,))
-    old.execute("INSERT INTO lifts VALUES ('a', 7, 'x', 'lifts/a.safetensors', 1, 1, '{}', 0)")
-    old.commit()
-    old.close()
-    store = Store.open(tmp_path / "data")
-    assert {job.id: job.state for job in store.jobs.all(SERVICE)} == {
-        "a": JobState.SUCCEEDED,
-        "b": JobState.QUEUED,
-    }
-    assert {job.kind for job in store.jobs.all(SERVICE)} == {JobKind.LIFT}
-    assert store.lifts.get(SERVICE, "a").bytes == 7
-    claimed = store.jobs.claim()
-    assert claimed is not None and (claimed.id, claimed.kind, claimed.parameters) == ("b", JobKind.LIFT, {})
-    store.close()
+def test_files_that_do_not_fit_are_refused_at_once(
+    client: TestClient, uploaded: Uploaded, judged: dict[str, Any]
+) -> None:
+    files = [
+        ("masks", masks({"nowhere": MASKS["left"]}), "none in common"),
+        ("masks", masks(MASKS), "masks of all of them"),
+        ("table", text_table(5), "8 channels"),
+    ]
+    for kind, content, told in files:
+        asset = put(client, AssetKind(kind), content)
+        problem = refused(client, uploaded, judged | {kind: asset})
+        assert (problem["status"], problem["argument"]) == (422, f"labels.{kind}") and told in problem["detail"]
+        assert client.delete(f"/assets/{asset}").status_code == 204
+    # Of every second view, "left" and "right", masks leave one to lift; of every third, "left", they may leave none.
+    asset = put(client, AssetKind.MASKS, masks({"left": MASKS["left"]}))
+    body = {"labels": judged | {"masks": asset}, "settings": {"view_stride": 3}}
+    problem = assert_problem(client.post("/tradeoff", json=uploaded.order() | body))
+    assert (problem["status"], problem["argument"]) == (422, "labels.masks")
+    assert client.delete(f"/assets/{asset}").status_code == 204
+
+
+def test_labels_that_are_not_here_or_of_another_kind_are_not_found(
+    client: TestClient, uploaded: Uploaded, judged: dict[str, Any]
+) -> None:
+    for kind in ("masks", "table"):
+        for asset in (NO_ASSET, uploaded.features):
+            problem = refused(client, uploaded, judged | {kind: asset})
+            assert (problem["status"], problem["argument"]) == (404, kind)
+
+
+def refused(client: TestClient, uploaded: Uploaded, given: dict[str, Any]) -> dict[str, Any]:
+    before = client.get("/jobs").json()
+    body = json.dumps(uploaded.order() | {"labels": given})  # httpx would not send half a surrogate pair
+    reply = client.post("/tradeoff", content=body, headers={"Content-Type": "application/json"})
+    problem = assert_problem(reply)
+    assert client.get("/jobs").json() == before
+    return problem
+
+
+def test_order_with_other_labels_is_another_order_and_one_without_is_what_it_was(quick: Quick, store: Store) -> None:
+    with quick("answer") as (client, body):
+        given, key = stored_labels(store), {"Idempotency-Key": "one"}
+        first, again = (client.post("/tradeoff", json=body | {"labels": given}, headers=key) for _ in range(2))
+        assert (first.status_code, again.status_code) == (202, 200) and first.json()["id"] == again.json()["id"]
+        for other in (body, body | {"labels": given | {"classes": ["Apple"]}}):
+            assert assert_problem(client.post("/tradeoff", json=other, headers=key))["type"] == "/problems/key-reused"
+        plain = client.post("/tradeoff", json=body, headers={"Idempotency-Key": "two"}).json()["id"]
+        with store.database.read() as connection:
+            row = connection.execute("SELECT fingerprint FROM jobs WHERE id = ?", (plain,)).fetchone()
+    assert row["fingerprint"] == fingerprint(body | {"settings": {}, "budget_s": 600.0})  # of the release before

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import sqlite3
 import stat
 from collections.abc import Callable
 from pathlib import Path
@@ -17,10 +16,9 @@ from service.scopes import Scope
 from service.store import backup
 from service.store.__main__ import main as store_command
 from service.store.backup import back_up, restore, verify
-from service.store.database import DATABASE, KEYS_REQUIRED
+from service.store.database import KEYS_REQUIRED
 from service.store.keys import Quota
 from service.store.owners import SERVICE
-from service.store.schema import MIGRATIONS
 from service.store.store import Store
 
 from .conftest import Supervising, asset_of, ended, order, supervised, until
@@ -130,19 +128,6 @@ def test_backup_replaces_nothing_and_leaves_no_half_of_one(filled: Store, tmp_pa
     with pytest.raises(Misconfigured, match="1 lost"):
         back_up(filled.files.root, tmp_path / "half")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["data", "full"]
-
-
-def test_copy_of_the_database_is_made_before_a_migration(tmp_path: Path) -> None:
-    old = sqlite3.connect(tmp_path / DATABASE)
-    old.executescript(f"BEGIN; {MIGRATIONS[0]} PRAGMA user_version = 1; COMMIT;")
-    old.execute("INSERT INTO assets VALUES ('s', 'splats', 1, 'blobs/x', '{}', '[]', 0)")
-    old.commit()
-    old.close()
-    Store.open(tmp_path).close()
-    kept = sqlite3.connect(tmp_path / f"{DATABASE}.schema-1")
-    assert kept.execute("PRAGMA user_version").fetchone()[0] == 1
-    assert kept.execute("SELECT id, created FROM assets").fetchall() == [("s", 0)]
-    kept.close()
 
 
 def test_data_directory_is_its_owners_alone(tmp_path: Path) -> None:

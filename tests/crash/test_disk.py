@@ -224,8 +224,11 @@ def test_file_that_is_no_database_is_a_misconfiguration(tmp_path: Path, capsys: 
         assert said.startswith("splatlift: data: expected a database") and said.count("\n") <= 2
 
 
-def test_a_look_at_the_lock_does_not_keep_a_server_from_starting(tmp_path: Path) -> None:
-    Store.open(tmp_path).close()
+def test_directory_has_one_server_and_a_look_at_its_lock_keeps_none_from_starting(tmp_path: Path) -> None:
+    store = Store.open(tmp_path)
+    with pytest.raises(Misconfigured, match="no other server"):
+        Store.open(tmp_path)
+    store.close()
     with (tmp_path / "lock").open("a") as looking:
         fcntl.flock(looking, fcntl.LOCK_SH)
         timer = threading.Timer(0.1, fcntl.flock, (looking, fcntl.LOCK_UN))

@@ -1,7 +1,8 @@
-"""A database that is gone, empty or older than the files beside it: the start is refused, and nothing is lost."""
+"""A database that is gone, empty, older than the files beside it or of another release: nothing is lost of it."""
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import sqlite3
@@ -12,11 +13,12 @@ from pathlib import Path
 import pytest
 
 from service import __main__ as server
-from service.errors import StaleDatabase
+from service.errors import Misconfigured, StaleDatabase
 from service.keys import main as keys
-from service.models import AssetKind
+from service.models import AssetKind, JobKind, JobState
 from service.scopes import Scope
 from service.store import database as markers
+from service.store.assets import ALL
 from service.store.collect import Collector, collect, empty_quarantine
 from service.store.database import DATABASE
 from service.store.files import DataDirectory
@@ -25,7 +27,7 @@ from service.store.owners import SERVICE
 from service.store.schema import MIGRATIONS
 from service.store.store import Store
 
-from .conftest import asset_of, often, until
+from .conftest import asset_of, often, order, until
 
 DAY = 86_400.0
 
@@ -239,3 +241,87 @@ def test_marker_that_holds_no_number_is_one_line(data: Path, capsys: pytest.Capt
     assert server.main(["--data", str(data), "--port", "0"]) == 2
     said = capsys.readouterr().err
     assert "expected a whole number in the file 'generation'" in said and said.count("\n") == 1
+
+
+# Of another release
+
+
+def test_database_of_a_later_release_is_refused(tmp_path: Path) -> None:
+    store = Store.open(tmp_path)
+    with store.database.read() as connection:
+        connection.execute("PRAGMA user_version = 99")
+    store.close()
+    with pytest.raises(Misconfigured, match="99"):
+        Store.open(tmp_path)
+
+
+def test_store_remembers_after_reopening(tmp_path: Path) -> None:
+    store = Store.open(tmp_path)
+    job = store.jobs.submit(SERVICE, order(store))[0]
+    (tmp_path / "tmp" / "left-over").write_bytes(b"half a file")
+    store.close()
+    store = Store.open(tmp_path)
+    assert store.jobs.get(SERVICE, job).state is JobState.QUEUED and len(store.assets.all(SERVICE)) == 3
+    assert list((tmp_path / "tmp").iterdir()) == []
+    store.close()
+
+
+def test_database_of_the_first_schema_is_taken_over(tmp_path: Path) -> None:
+    (tmp_path / "data").mkdir()
+    old = sqlite3.connect(tmp_path / "data" / "service.sqlite")
+    old.executescript(f"BEGIN; {MIGRATIONS[0]} PRAGMA user_version = 1; COMMIT;")
+    old.executemany(
+        "INSERT INTO assets VALUES (?, ?, 1, 'blobs/x', '{}', '[]', 0)",
+        [("s", "splats"), ("c", "cameras"), ("f", "features"), ("t", "table")],
+    )
+    for asset, counts in (("c", {"views": 2, "names": ["w", "v"]}), ("t", {"words": ["apple"], "channels": 1})):
+        old.execute("UPDATE assets SET counts = ? WHERE id = ?", (json.dumps(counts), asset))
+    old.execute("INSERT INTO lifts VALUES ('c', 1, 'd', 'lifts/c', 1, 1, ?, 0)", (json.dumps({"views": ["v"]}),))
+    problem = json.dumps({"kind": "crashed", "argument": "job", "expected": "a", "got": "b", "hint": ""})
+    for job, state, told in (("a", "running", None), ("b", "queued", None), ("c", "failed", problem)):
+        old.execute(
+            "INSERT INTO jobs (id, state, attempt, splats, cameras, settings, problem, created)"
+            " VALUES (?, ?, 1, 's', 'c', '{}', ?, 0)",
+            (job, state, told),
+        )
+        old.execute("INSERT INTO job_features VALUES (?, 0, 'f')", (job,))
+    old.commit()
+    old.close()
+    store = Store.open(tmp_path / "data")
+    kept = sqlite3.connect(tmp_path / "data" / f"{DATABASE}.schema-1")  # a copy, made before the migration
+    assert kept.execute("PRAGMA user_version").fetchone()[0] == 1
+    assert kept.execute("SELECT count(*) FROM assets").fetchone()[0] == 4
+    kept.close()
+    assert {job.kind for job in store.jobs.all(SERVICE)} == {JobKind.LIFT}
+    assert store.jobs.get(SERVICE, "a").features == ("f",) and store.jobs.get(SERVICE, "a").plan is None
+    assert store.assets.get(SERVICE, "c").counts == {"views": 2}
+    assert store.assets.get(SERVICE, "c", most=ALL).counts == {"views": 2, "names": ["w", "v"]}
+    assert store.assets.get(SERVICE, "t", most=ALL).counts == {"channels": 1, "words": ["apple"]}
+    assert store.assets.names(SERVICE, "c", 1, 9) == ["v"]
+    assert store.lifts.lifted(SERVICE, "c", ["w", "v"]) == {"v"}
+    assert store.lifts.get(SERVICE, "c").metadata == {"views": ["v"]}
+    store.jobs.release_all("the server died")
+    assert [store.jobs.get(SERVICE, job).state for job in "abc"] == [
+        JobState.QUEUED,
+        JobState.QUEUED,
+        JobState.FAILED,
+    ]
+    (last,) = store.jobs.events(SERVICE, "c", 0)
+    assert last.data == {"state": "failed", "attempt": 1, "problem": json.loads(problem)}
+    with store.database.read() as connection:
+        assert connection.execute("PRAGMA user_version").fetchone()[0] == len(MIGRATIONS)
+    store.close()
+    Store.open(tmp_path / "data").close()  # and once is enough
+
+
+def test_migration_that_breaks_off_changes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        "service.store.database.MIGRATIONS", (*MIGRATIONS, "CREATE TABLE x (a);\nCREATE TABLE x (a);")
+    )
+    with pytest.raises(Misconfigured, match="already exists"):
+        Store.open(tmp_path / "data")
+    monkeypatch.undo()
+    left = sqlite3.connect(tmp_path / "data" / "service.sqlite")
+    assert left.execute("SELECT count(*) FROM sqlite_master").fetchone()[0] == 0
+    left.close()
+    Store.open(tmp_path / "data").close()
