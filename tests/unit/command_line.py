@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 from typing import TYPE_CHECKING
 
@@ -23,11 +24,14 @@ if TYPE_CHECKING:
     import pytest
 
 
+PROGRESS = re.compile(r"^\w+: \d+ of \d+ \w+\n", re.MULTILINE)  # what a slow machine tells every ten seconds
+
+
 def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
-    """The exit status, and what went to stdout and stderr."""
+    """The exit status, and what went to stdout and stderr but for lines of progress."""
     status = cli.main([str(argument) for argument in arguments])
     captured = capsys.readouterr()
-    return status, captured.out, captured.err
+    return status, captured.out, PROGRESS.sub("", captured.err)
 
 
 def programs_become(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:

@@ -23,6 +23,7 @@ from liftcore.features.views import FeatureGrid
 from liftcore.io.lift_file import load_lift
 from liftcore.io.scene_files import lift_files
 from liftcore.query.threshold import METHODS
+from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.settings import LiftSettings, Preset
 
 from .command_line import assert_one_line, lift_arguments, programs_become, run, write_toy_scene
@@ -131,15 +132,6 @@ def test_bad_input_exits_2_and_leaves_nothing(
     assert sorted(scene.iterdir()) == before
 
 
-def test_a_folder_in_place_of_a_pack_is_told_how_one_is_made(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (scene / "maps").mkdir()
-    arguments = lift_arguments(scene)
-    status, out, err = run(capsys, *arguments[:3], scene / "maps", *arguments[4:])
-    assert (status, out) == (2, "")
-    assert "got a folder; make packs with 'splatlift pack'" in err
-    assert_one_line(err)
-
-
 @pytest.mark.parametrize(
     ("order", "told"),
     [
@@ -157,6 +149,10 @@ def test_files_in_each_others_place_are_told_as_that(
     assert_one_line(err)
     status, out, err = run(capsys, "query", files[2], "word")
     assert (status, out) == (2, "") and "pack.safetensors: expected lift as LIFT, got features" in err
+    (scene / "maps").mkdir()
+    status, out, err = run(capsys, "plan", *files[:2], scene / "maps")
+    assert (status, out) == (2, "") and "got a folder; make packs with 'splatlift pack'" in err
+    assert_one_line(err)
 
 
 def test_output_is_never_an_input_or_a_folder(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -181,82 +177,35 @@ def test_settings_are_json_or_words() -> None:
     settings = LiftSettings.of(preset="row-sum", **pairs)
     assert pairs_of(["power=2", "power=2"]) == {"power": 2}
     assert (settings.power, settings.lift_gain, settings.dtype) == (2, 0.8, "float32")
-    with pytest.raises(InvalidSettings):
-        pairs_of(["=1"])
-
-
-def test_older_lifts_may_have_had_more_rays_than_new_ones_may() -> None:
-    assert LiftSettings.model_validate({"certificate_rays": 5_000_000}).certificate_rays == 5_000_000
+    assert str(pairs_of(["damping=NaN"])["damping"]) == "nan"  # which is no contradiction to itself
+    for wrong, message in ((["=1"], "key=value"), (["damping=1", "damping=2"], "damping: expected one value")):
+        with pytest.raises(InvalidSettings, match=message):
+            pairs_of(wrong)
+    assert LiftSettings.model_validate({"certificate_rays": 5_000_000}).certificate_rays == 5_000_000  # older lifts'
     with pytest.raises(InvalidSettings, match="certificate_rays: expected at most 1000000 rays, got 5000000"):
         LiftSettings.of(certificate_rays=5_000_000)
 
 
-def test_not_a_number_is_no_contradiction() -> None:
-    assert str(pairs_of(["damping=NaN"])["damping"]) == "nan"
-    with pytest.raises(InvalidSettings, match="damping: expected one value"):
-        pairs_of(["damping=1", "damping=2"])
-
-
-def test_plan_is_printed_alone_and_before_a_lift_and_kept_with_it(
-    scene: Path, capsys: pytest.CaptureFixture[str]
+def test_inspect_speaks_to_people_and_programs(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    arguments = lift_arguments(scene)
-    status, out, err = run(capsys, "plan", *arguments[1:4], "--json")
-    assert (status, err) == (0, "")
-    plan = json.loads(out)
-    assert plan["views"] == {"lifted": ["front"], "left_out": []}
-    assert (plan["splats"], plan["channels"], plan["dtype"]) == (2, 3, "float16")
-    assert plan["memory_bytes"] == sum(plan["memory"].values())
-    status, out, _ = run(capsys, *arguments, "--explain", "--speed", "draft", "--set", "stride=1")
-    assert status == 0
-    assert out.startswith("plan: 2 splats (3dgs), 100.0% in some view's field; 1 of 1 views\n")
-    made = load_lift(scene / "lift.safetensors").metadata
-    assert (made.settings.speed, made.settings.stride, made.settings.view_cosine) == ("draft", 1, 0.98)
-    assert made.certificate["plan"]["memory_bytes"] == plan["memory_bytes"]
-
-
-def test_what_the_plan_warned_of_is_said_once(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    square = FeatureGrid(torch.ones(16, 16, 3))
-    write_pack(scene / "pack.safetensors", {"front": square}, {"encoder": "toy", "text_space": "none"})
-    for more in (["--explain"], []):
-        assert run(capsys, *lift_arguments(scene), *more)[1].count("maps of another aspect") == 1
-    document = json.loads(run(capsys, *lift_arguments(scene), "--explain", "--json")[1])
-    assert sum("maps of another aspect" in warning for warning in document["warnings"]) == 1
-
-
-def test_inspect_speaks_to_people_and_programs(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
     status, out, _ = run(capsys, "inspect", scene / "splats.ply")
-    assert status == 0
-    assert "3dgs" in out
-    status, out, _ = run(capsys, "inspect", scene / "splats.ply", "--json")
-    assert json.loads(out)["splats"] == 2
-    assert out.count("\n") == 1
-
-
-def test_inspect_counts_all_words_of_a_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert status == 0 and "3dgs" in out
+    out = run(capsys, "inspect", scene / "splats.ply", "--json")[1]
+    assert json.loads(out)["splats"] == 2 and out.count("\n") == 1
     words = [f"word {row}" for row in range(50)]
     save_file({"embeddings": torch.eye(50)}, str(tmp_path / "t"), metadata={"words": json.dumps(words)})
     assert "word 5, ... (50)\n" in run(capsys, "inspect", tmp_path / "t")[1]
     assert json.loads(run(capsys, "inspect", tmp_path / "t", "--json")[1])["words"] == words
 
 
-@pytest.mark.parametrize("command", ["query", "evaluate"])
-def test_help_names_every_threshold(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    out = " ".join(run(capsys, command, "--help")[1].split())
-    assert f"{', '.join(METHODS)} or a number" in out
-
-
-def test_help_names_every_preset(capsys: pytest.CaptureFixture[str]) -> None:
-    for command in ("lift", "plan"):
-        out = " ".join(run(capsys, command, "--help")[1].split())
-        assert all(preset in out for preset in Preset)
-
-
 @pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_has_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_command_has_help_and_names_its_choices(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     status, out, err = run(capsys, command, "--help")
-    assert (status, err) == (0, "")
-    assert f"splatlift {command}" in out
+    said = " ".join(out.split())
+    assert (status, err) == (0, "") and f"splatlift {command}" in said
+    assert command not in ("query", "evaluate") or f"{', '.join(METHODS)} or a number" in said
+    assert command not in ("lift", "plan") or all(preset in said for preset in Preset)
 
 
 @pytest.mark.parametrize(
@@ -284,34 +233,6 @@ def test_our_own_fault_exits_1_with_one_line(
         cli.main(["inspect", str(scene), "--debug"])
 
 
-def test_serve_becomes_the_service(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    calls = programs_become(monkeypatch)
-    assert run(capsys, "serve", "--port", "0", "--data", "d", "--encoder", "minilm")[0] == cli.INTERRUPTED
-    run(capsys, "serve", "--json")
-    assert calls == [
-        ["-m", "service", "--port", "0", "--data", "d", "--encoder", "minilm"], ["-m", "service", "--json"]
-    ]  # fmt: skip
-
-
-def test_json_replies_are_strict(capsys: pytest.CaptureFixture[str]) -> None:
-    reply.reply({"a": float("nan"), "b": [float("inf"), (1, 2)], "c": {"d": -float("inf")}}, as_json=True)
-    assert json.loads(capsys.readouterr().out) == {"a": None, "b": [None, [1, 2]], "c": {"d": None}}
-
-
-def test_progress_is_drawn_only_on_a_terminal(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for watched in (False, True):
-        monkeypatch.setattr(sys.stderr, "isatty", lambda watched=watched: watched)
-        with reply.progress_bars() as progress:
-            for done in range(4):
-                progress("geometry", done, 3, "views")
-            progress("solve", 1, 1, "slices")
-        captured = capsys.readouterr()
-        assert captured.out == ""
-        assert ("geometry" in captured.err and "solve" in captured.err) is watched
-
-
 def test_help_loads_nothing_heavy() -> None:
     code = (
         "import sys; from liftcore.cli import main; status = main(['--help']); "
@@ -329,6 +250,125 @@ def test_closed_pipe_is_no_complaint(scene: Path) -> None:
     assert done.stderr == b""
 
 
-def test_every_error_of_ours_is_one_line() -> None:
+def test_replies_are_strict_json_and_errors_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    reply.reply({"a": float("nan"), "b": [float("inf"), (1, 2)], "c": {"d": -float("inf")}}, as_json=True)
+    assert json.loads(capsys.readouterr().out) == {"a": None, "b": [None, [1, 2]], "c": {"d": None}}
     error = SplatliftError("a\nb", expected="c\nd", got="e\tf", hint="g\n")
     assert str(error) == "a b: expected c d, got e f; g"
+
+
+def test_progress_is_drawn_only_on_a_terminal(
+    scene: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for watched in (False, True):
+        monkeypatch.setattr(sys.stderr, "isatty", lambda watched=watched: watched)
+        with reply.progress_bars() as progress:
+            progress("compile", 0, 1, "steps")
+            assert ("compile:   0%" in capsys.readouterr().err) is watched
+            progress("compile", 1, 1, "steps")
+            assert capsys.readouterr().err.endswith("\r") is watched  # an empty line, before anything else is said
+            for done in range(4):
+                progress("geometry", done, 3, "views")
+        captured = capsys.readouterr()
+        assert captured.out == "" and ("geometry" in captured.err) is captured.err.endswith("\n") is watched
+    assert "save:   0%" in run(capsys, *lift_arguments(scene, "--json"))[2]
+
+
+@pytest.fixture
+def little_memory(monkeypatch: pytest.MonkeyPatch) -> str:
+    """What a machine has to say whose memory is short."""
+    told = "the rest of the lift may take 9.0 GiB and 1.0 GiB are free"
+    monkeypatch.setattr("liftcore.planning.plan.check_memory", lambda parts, free: [told])
+    return told
+
+
+def test_plan_is_printed_alone_and_before_a_lift_and_kept_with_it(
+    scene: Path, little_memory: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = lift_arguments(scene)
+    status, out, err = run(capsys, "plan", *arguments[1:4], "--json")
+    assert (status, err) == (0, "")
+    plan = json.loads(out)
+    assert plan["views"] == {"lifted": ["front"], "left_out": []}
+    assert (plan["splats"], plan["channels"], plan["dtype"]) == (2, 3, "float16")
+    assert plan["memory_bytes"] == sum(plan["memory"].values())
+    status, out, _ = run(capsys, *arguments, "--explain", "--speed", "draft", "--set", "stride=1")
+    summary = "plan: 2 splats (3dgs), 100.0% in some view's field; 1 of 1 views"
+    assert status == 0 and out.startswith(f"{summary}\n")
+    made = load_lift(scene / "lift.safetensors").metadata
+    assert (made.settings.speed, made.settings.stride, made.settings.view_cosine) == ("draft", 1, 0.98)
+    assert made.certificate["plan"]["memory_bytes"] == plan["memory_bytes"]
+    status, out, err = run(capsys, *arguments)
+    told, _, rest = out.partition(f"{scene / 'lift.safetensors'}: ")
+    first, channels, memory, warning = told.splitlines()
+    assert (status, err, first, channels) == (0, "", summary, "  3 channels, stored as float16")
+    assert memory.startswith("  about ") and " MiB at the peak, on " in memory
+    assert warning == f"warning: {little_memory}" and little_memory not in rest
+    status, out, err = run(capsys, *arguments, "--json", "--explain")
+    assert (status, err, out.count("\n")) == (0, "", 1)
+    document = json.loads(out)
+    assert document["warnings"][0] == little_memory and document["certificate"]["plan"]["channels"] == 3
+    assert little_memory not in document["certificate"]["warnings"]  # equal inputs give equal certificates
+
+
+def test_what_the_plan_warned_of_is_said_once(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    square = FeatureGrid(torch.ones(16, 16, 3))
+    write_pack(scene / "pack.safetensors", {"front": square}, {"encoder": "toy", "text_space": "none"})
+    for more in (["--explain"], []):
+        assert run(capsys, *lift_arguments(scene), *more)[1].count("maps of another aspect") == 1
+    document = json.loads(run(capsys, *lift_arguments(scene), "--explain", "--json")[1])
+    assert sum("maps of another aspect" in warning for warning in document["warnings"]) == 1
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["serve", "--port", "0", "--data", "d", "--encoder", "minilm"],
+        ["serve", "--json"],
+        ["keys", "create", "--name=-a b", "--scopes", "read,write", "--max-bytes", "0", "--max-uploads", "3"],
+        ["keys", "create", "--name", "a", "--scopes", "admin", "--max-queued", "2", "--data", "a b", "--json"],
+        ["keys", "list", "--data=-d"],
+        ["keys", "revoke", "--json", "--", "-0123"],
+    ],
+)
+def test_commands_of_the_service_become_its_programs(
+    arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    calls = programs_become(monkeypatch)
+    assert run(capsys, *arguments)[0] == cli.INTERRUPTED
+    [(dash_m, program, *given)] = calls
+    assert (dash_m, program) == ("-m", "service" if arguments[0] == "serve" else "service.keys")
+    if program == "service":
+        assert given == arguments[1:]
+    else:  # every option as it was given
+        parse = cli.build_parser().parse_args
+        assert vars(parse(["keys", *given])) == vars(parse(arguments))
+
+
+def test_a_second_lift_of_a_checkpoint_walks_no_view_and_gives_the_same_bits(
+    scene: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept = scene / "kept" / "here"
+    arguments = lift_arguments(scene, "--checkpoint", kept, "--device", "cpu")
+    assert run(capsys, *arguments)[0] == 0
+    features = load_lift(scene / "lift.safetensors").features.clone()
+    assert list(kept.glob("*.safetensors"))
+
+    def never(self: CpuRaster, camera: Any, *rest: Any) -> Any:
+        raise AssertionError(f"{camera.name} was walked again")
+
+    monkeypatch.setattr(CpuRaster, "region_weights", never)
+    monkeypatch.setattr("liftcore.lifting.warm_up_lift", lambda *_: None)  # which walks a scene of its own
+    monkeypatch.setattr("liftcore.planning.plan.contradictions", lambda *_: [])  # which looks at some views, coarsely
+    assert run(capsys, *arguments)[0] == 0
+    assert torch.equal(load_lift(scene / "lift.safetensors").features, features)
+
+
+def test_a_checkpoint_that_cannot_be_written_is_told_before_the_work(
+    scene: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    status, out, err = run(capsys, *lift_arguments(scene, "--checkpoint", scene / "splats.ply", "--json"))
+    assert (status, out) == (2, "")
+    assert "checkpoint: expected a folder that can be written" in err
+    assert_one_line(err)
+    assert not (scene / "lift.safetensors").exists()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,6 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from liftcore.io.lift_file import load_lift, save_lift
 from tests.labelled_scene import (
     FRAMES,
     LIFTED,
@@ -115,17 +113,20 @@ def test_only_held_out_frames_are_judged_and_lifted_ones_are_named(
         assert (status, out) == (2, "") and message in err and err.count("\n") == 1
 
 
-def test_categories_that_a_table_lacks_are_left_out_with_a_note(
+def test_categories_that_a_table_lacks_are_left_out_and_none_at_all_are_named(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     table = load_file(folder / "words.safetensors")["embeddings"]
-    few = tmp_path / "few.safetensors"
+    few, lift = tmp_path / "few.safetensors", folder / "kitchen.lift.safetensors"
     save_file({"embeddings": table[1:2].clone()}, str(few), metadata={"words": json.dumps(WORDS[1:2])})
-    arguments = ["lerf-ovs", folder / "kitchen.lift.safetensors", "--data", folder / "lerf_ovs", "--table", few]
-    document = evaluate(capsys, *arguments, "--protocol", "P3")
+    options = ["--data", folder / "lerf_ovs", "--table", few, "--protocol", "P3"]
+    document = evaluate(capsys, "lerf-ovs", lift, *options)
     (row,) = document["measured"]
     assert len(row["classes"]) == 1 and any("lacks" in told and "left out" in told for told in document["warnings"])
     assert not any(row["scenes"] for row in document["published"])  # kitchen is none of the papers' scenes
+    (tmp_path / "frame_00001.json").write_text(json.dumps(isat([("griffin", rectangle(0, 0, 9, 9))])))
+    status, _, err = run(capsys, "evaluate", "lerf-ovs", lift, "--data", tmp_path)
+    assert status == 2 and "griffin" in err
 
 
 def test_published_rows_stand_beside_and_never_in_a_mean(
@@ -189,24 +190,3 @@ def test_what_cannot_be_judged_exits_2_with_one_line(
     status, out, err = run(capsys, "evaluate", "lerf-ovs", *given, "--data", folder / "lerf_ovs")
     assert (status, out) == (2, "")
     assert message in err and err.count("\n") == 1
-
-
-@pytest.mark.parametrize(("space", "told"), [("none", "text space is 'none'"), ("", "text space is not named")])
-def test_a_lift_without_a_text_encoder_is_refused_with_its_text_space(
-    space: str, told: str, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    lift = load_lift(folder / "kitchen.lift.safetensors")
-    lift = replace(lift, metadata=lift.metadata.model_copy(update={"text_space": space}))
-    save_lift(lift, tmp_path / "kitchen.lift.safetensors")
-    status, out, err = run(capsys, "evaluate", "lerf-ovs", tmp_path, "--data", folder / "lerf_ovs")
-    assert (status, out) == (2, "")
-    assert told in err and "--table FILE or --encoder NAME" in err and err.count("\n") == 1
-
-
-def test_a_category_that_the_table_lacks_is_named(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "frame_00001.json").write_text(json.dumps(isat([("griffin", rectangle(0, 0, 9, 9))])))
-    lift = folder / "kitchen.lift.safetensors"
-    status, _, err = run(capsys, "evaluate", "lerf-ovs", lift, "--data", tmp_path)
-    assert status == 2 and "griffin" in err

@@ -20,105 +20,74 @@ if TYPE_CHECKING:
     import pytest
 
 
-def test_langsplat_folder_is_packed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder = tmp_path / "language_features"
-    folder.mkdir()
-    np.save(folder / "a_s.npy", np.zeros((4, 2, 2), np.float32))
-    np.save(folder / "a_f.npy", np.ones((1, 5), np.float32))
+def save(path: Path, values: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.save(path, values)
+
+
+def test_langsplat_folders_are_packed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder, pack = tmp_path / "language_features", tmp_path / "p.safetensors"
+    for camera in ("camA", "camB"):
+        save(folder / camera / "000_s.npy", np.zeros((4, 2, 2), np.float32))
+        save(folder / camera / "000_f.npy", np.ones((1, 5), np.float32))
     options = ["--encoder-name", "clip", "--text-space", "open_clip:ViT-B-16", "--normalised", "--json"]
-    status, out, err = run(capsys, "pack", "langsplat", folder, "-o", tmp_path / "p.safetensors", *options)
+    status, out, err = run(capsys, "pack", "langsplat", folder, "-o", pack, *options)
     assert (status, err) == (0, "")
     document = json.loads(out)
-    assert (document["views"], document["channels"], document["normalised"]) == (1, 5, True)
+    assert (document["views"], document["channels"], document["normalised"]) == (2, 5, True)
     assert document["text_space"] == "open_clip:ViT-B-16"
-    (folder / "a_f.npy").unlink()
+    assert read_features(pack).views == ("camA/000", "camB/000")
+    (folder / "camA" / "000_f.npy").unlink()
     status, out, err = run(capsys, "pack", "langsplat", folder, "-o", tmp_path / "q.safetensors")
-    assert (status, out) == (2, "")
+    assert (status, out) == (2, "") and not (tmp_path / "q.safetensors").exists()
     assert_one_line(err)
-    assert not (tmp_path / "q.safetensors").exists()
 
 
-def test_arrays_are_packed_in_either_layout(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "maps").mkdir()
-    np.save(tmp_path / "maps" / "a.npy", np.ones((3, 4, 5), np.float16))
-    for layout, channels in (("hwc", 5), ("chw", 3)):
-        out = tmp_path / f"{layout}.safetensors"
-        status, text, _ = run(capsys, "pack", "npy", tmp_path / "maps", "-o", out, "--layout", layout)
-        assert status == 0
-        assert f"1 views, {channels} channels" in text
-        assert read_features(out).channels == channels
-
-
-def test_maps_named_after_whole_images_are_packed_under_their_cameras_names(
+def test_maps_are_packed_under_their_cameras_names_in_either_layout(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (tmp_path / "maps").mkdir()
-    for name in ("a.jpg.npy", "b.PNG.npy", "frame.0001.npy"):
-        np.save(tmp_path / "maps" / name, np.full((3, 4, 5), 2.0, np.float16))
-    arguments = ["pack", "npy", tmp_path / "maps", "-o", tmp_path / "p.safetensors", "--encoder-name", "toy"]
-    status, out, _ = run(capsys, *arguments)
-    assert status == 0
-    assert "a.jpg.npy is 'a'" in out
-    assert "warning: unnormalised vectors" in out
-    status, out, _ = run(capsys, *arguments, "--json")
-    document = json.loads(out)
-    assert document["renamed"] == {"a.jpg.npy": "a", "b.PNG.npy": "b"}
-    assert [text.split(":")[0] for text in document["warnings"]] == ["unnormalised vectors"]
-    assert read_features(tmp_path / "p.safetensors").views == ("a", "b", "frame.0001")
+    maps, pack = tmp_path / "maps", tmp_path / "p.safetensors"
+    for name in ("a.jpg", "b.PNG", "frame.0001", "camA/000", "camB/000.jpg", ".trash/000"):
+        save(maps / f"{name}.npy", np.full((3, 4, 5), 2.0, np.float16))
+    status, out, _ = run(capsys, "pack", "npy", maps, "-o", pack, "--layout", "chw", "--encoder-name", "toy")
+    assert status == 0 and "5 views, 3 channels" in out
+    assert "a.jpg.npy is 'a'" in out and "warning: unnormalised vectors" in out
+    arguments = ["pack", "npy", maps, "-o", pack, "--encoder-name", "toy"]
+    document = json.loads(run(capsys, *arguments, "--json")[1])
+    assert document["renamed"] == {"a.jpg.npy": "a", "b.PNG.npy": "b", "camB/000.jpg.npy": "camB/000"}
+    assert document["warnings"][0].startswith("unnormalised vectors:")
+    packs = read_features(pack)
+    assert (packs.views, packs.channels) == (("a", "b", "camA/000", "camB/000", "frame.0001"), 5)
+    save(maps / "a.npy", np.ones((3, 4, 5), np.float16))
+    for folder, message in ((maps, "a.jpg.npy and a.npy, both of the view 'a'"), (maps / "a.npy", "folder")):
+        status, out, err = run(capsys, "pack", "npy", folder, "-o", pack)
+        assert (status, out) == (2, "") and message in err
+        assert_one_line(err)
 
 
-def test_maps_of_a_rig_keep_their_folders(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for name in ("camA/000.npy", "camB/000.jpg.npy", ".trash/000.npy"):
-        (tmp_path / "maps" / name).parent.mkdir(parents=True)
-        np.save(tmp_path / "maps" / name, np.ones((3, 4, 5), np.float16))
-    arguments = ["pack", "npy", tmp_path / "maps", "-o", tmp_path / "p.safetensors", "--json"]
-    status, out, _ = run(capsys, *arguments)
-    assert (status, json.loads(out)["renamed"]) == (0, {"camB/000.jpg.npy": "camB/000"})
-    assert read_features(tmp_path / "p.safetensors").views == ("camA/000", "camB/000")
-    arguments[4] = tmp_path / "maps" / "camA" / "000.npy"
-    status, out, err = run(capsys, *arguments)
-    assert (status, out) == (2, "")
-    assert_one_line(err)
-
-
-def test_masks_of_a_rig_keep_their_folders(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for folder in ("camA", "camB"):
-        (tmp_path / "rig" / folder).mkdir(parents=True)
-        np.save(tmp_path / "rig" / folder / "000_s.npy", np.zeros((1, 2, 2), np.int32))
-        np.save(tmp_path / "rig" / folder / "000_f.npy", np.ones((1, 5), np.float32))
-    status, _, _ = run(capsys, "pack", "langsplat", tmp_path / "rig", "-o", tmp_path / "p.safetensors")
-    assert status == 0
-    assert read_features(tmp_path / "p.safetensors").views == ("camA/000", "camB/000")
-
-
-def test_two_maps_of_one_view_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "maps").mkdir()
-    for name in ("a.npy", "a.jpg.npy"):
-        np.save(tmp_path / "maps" / name, np.ones((3, 4, 5), np.float16))
-    status, out, err = run(capsys, "pack", "npy", tmp_path / "maps", "-o", tmp_path / "p.safetensors")
-    assert (status, out) == (2, "")
-    assert_one_line(err)
-    assert "a.jpg.npy and a.npy, both of the view 'a'" in err
-
-
-def test_masks_and_their_vectors_are_packed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder = tmp_path / "masks"
-    folder.mkdir()
-    labels = np.array([[255, 0], [1, 1]], np.uint8)
-    Image.fromarray(labels).save(folder / "a.png")
-    np.save(folder / "a.jpg.npy", np.eye(2, 5, dtype=np.float16))
-    pack = tmp_path / "p.safetensors"
-    options = ["--encoder-name", "clip", "--text-space", "open_clip:ViT-B-16", "--normalised"]
-    status, out, err = run(capsys, "pack", "masks", folder, "-o", pack, "--unlabelled", 255, *options)
+def test_masks_and_their_vectors_are_packed_and_no_input_is_written_over(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, pack = tmp_path / "masks", tmp_path / "p.safetensors"
+    for camera in ("camA", "camB"):
+        save(folder / camera / "a.jpg.npy", np.eye(2, 5, dtype=np.float16))
+        Image.fromarray(np.array([[255, 0], [1, 1]], np.uint8)).save(folder / camera / "a.PNG", format="PNG")
+    arguments = ["pack", "masks", folder, "--unlabelled", 255, "--encoder-name", "clip", "--normalised"]
+    status, out, err = run(capsys, *arguments, "-o", pack)
     assert (status, err) == (0, "")
-    assert "1 views, 5 channels" in out and "1 levels of 2x2" in out and "a.jpg.npy is 'a'" in out
-    regions = read_features(pack)["a"]
+    assert "2 views, 5 channels" in out and "1 levels of 2x2" in out and "camA/a.jpg.npy is 'camA/a'" in out
+    assert "of sub-folders, whose names are part of their views': camA, camB" in out
+    regions = read_features(pack)["camA/a"]
     assert isinstance(regions, Regions)
     assert regions.labels.tolist() == [[[-1, 0], [1, 1]]]
-    status, out, _ = run(capsys, "pack", "masks", folder, "-o", pack, "--unlabelled", 255, *options, "--json")
-    document = json.loads(out)
-    assert (document["views"], document["text_space"], document["normalised"]) == (1, "open_clip:ViT-B-16", True)
+    document = json.loads(run(capsys, *arguments, "-o", pack, "--json")[1])
+    assert (document["views"], document["folders"], document["normalised"]) == (2, ["camA", "camB"], True)
     assert (document["sizes"], document["warnings"]) == (["1 levels of 2x2"], [])
+    for name in ("a.PNG", "a.jpg.npy"):
+        before = (folder / "camA" / name).read_bytes()
+        status, _, err = run(capsys, *arguments, "-o", folder / "camA" / name)
+        assert status == 2 and "another file than the inputs" in err
+        assert (folder / "camA" / name).read_bytes() == before
 
 
 def test_masks_that_do_not_fit_write_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -134,24 +103,6 @@ def test_masks_that_do_not_fit_write_nothing(tmp_path: Path, capsys: pytest.Capt
         status, out, err = run(capsys, "pack", "masks", tmp_path, "-o", "p.safetensors", f"--unlabelled={value}")
         assert (status, out) == (2, "")
         assert "a whole number from 0 to 65535" in err
-
-
-def test_sub_folders_are_told_and_no_input_is_written_over(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    folder = tmp_path / "masks"
-    for camera in ("camA", "camB"):
-        (folder / camera).mkdir(parents=True)
-        np.save(folder / camera / "0.npy", np.ones((1, 3), np.float32))
-        Image.fromarray(np.ones((2, 2), np.uint8)).save(folder / camera / "0.PNG", format="PNG")
-    status, out, _ = run(capsys, "pack", "masks", folder, "-o", tmp_path / "p.safetensors")
-    assert status == 0
-    assert "of sub-folders, whose names are part of their views': camA, camB" in out
-    for name in ("0.PNG", "0.npy"):
-        before = (folder / "camA" / name).read_bytes()
-        status, _, err = run(capsys, "pack", "masks", folder, "-o", folder / "camA" / name)
-        assert status == 2 and "another file than the inputs" in err
-        assert (folder / "camA" / name).read_bytes() == before
 
 
 def test_a_pack_is_named_anew_and_else_kept_to_the_byte(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -24,8 +24,10 @@ if TYPE_CHECKING:
 
 
 @pytest.fixture
-def scene(tmp_path: Path) -> Path:
-    return write_toy_scene(tmp_path)
+def scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Path:
+    """The folder of the toy scene and its lift."""
+    assert run(capsys, *lift_arguments(write_toy_scene(tmp_path)))[0] == 0
+    return tmp_path
 
 
 @pytest.mark.parametrize(
@@ -51,9 +53,11 @@ def test_the_text_of_a_query_stands_before_between_or_after_options(arguments: l
         (["L", "--view", "v", "red", "mug"], "arguments: mug; a text of several words is one, in quotes"),
         (["L", "--vieuw", "v", "mug"], "arguments: --vieuw v"),
         (["L", "--negative", "cat", "mug"], "expected what to look for, before --negative, got --negative cat mug"),
+        (["L", "cat", "--mask", "m.png"], "no --view"),
+        (["L", "cat", "--view", "v", "--mask", "m.png", "--attention", "m.png"], "got the same file twice"),
     ],
 )
-def test_words_that_a_query_has_no_place_for_are_told(
+def test_what_a_query_has_no_place_for_is_told(
     arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     status, out, err = run(capsys, "query", *arguments)
@@ -66,7 +70,6 @@ def test_words_that_a_query_has_no_place_for_are_told(
 def test_words_to_a_lift_without_a_text_encoder_are_refused_with_its_text_space(
     space: str, told: str, scene: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run(capsys, *lift_arguments(scene))[0] == 0
     lift = load_lift(scene / "lift.safetensors")
     lift = replace(lift, metadata=lift.metadata.model_copy(update={"text_space": space}))
     save_lift(lift, scene / "other.safetensors")
@@ -77,7 +80,6 @@ def test_words_to_a_lift_without_a_text_encoder_are_refused_with_its_text_space(
 
 
 def test_overlays_show_what_was_found_and_say_its_share(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(capsys, *lift_arguments(scene))[0] == 0
     photo = np.full((48, 96, 3), 100, np.uint8)  # thrice the camera's size
     Image.fromarray(photo).save(scene / "photo.png")
     shares, pictures = [], []
@@ -99,16 +101,9 @@ def test_overlays_show_what_was_found_and_say_its_share(scene: Path, capsys: pyt
         assert np.mean(tinted) >= share and np.mean(dimmed) <= 1 - share  # the outline is beside the mask
 
 
-def test_picture_without_a_view_is_refused(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    status, _, err = run(capsys, "query", scene / "l", "cat", "--mask", scene / "m.png")
-    assert status == 2
-    assert "no --view" in err
-
-
 def test_every_term_and_option_is_part_of_the_query(
     scene: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run(capsys, *lift_arguments(scene))[0] == 0
     asked: list[Query] = []
 
     def ask(scene: object, query: Query, encoder: object) -> None:
@@ -127,46 +122,25 @@ def test_every_term_and_option_is_part_of_the_query(
     assert {(*map(str, query.positives), *map(str, query.negatives)) for query in asked} == {("splat:1", "splat:0")}
 
 
-def test_one_file_for_two_pictures_is_refused(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    picture = scene / "m.png"
-    arguments = ["cat", "--view", "v", "--mask", picture, "--attention", picture]
-    status, out, err = run(capsys, "query", scene / "l", *arguments)
-    assert (status, out) == (2, "") and not picture.exists()
-    assert "got the same file twice" in err
+def test_what_was_found_is_written_as_splats_and_over_no_input(
+    scene: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = {path: path.read_bytes() for path in scene.iterdir()}
+    question = ["query", scene / "lift.safetensors", "--like", "splat:1"]
+    for name in ("splats.ply", "cameras.json", "pack.safetensors", "lift.safetensors"):
+        status, _, err = run(capsys, *question, "--object", scene / name)
+        assert status == 2 and "another file than the inputs" in err
+    nothing = ["--unlike", "splat:1", "--threshold", "1", "--scores", scene / "s.npy", "--object", scene / "o.ply"]
+    status, out, err = run(capsys, *question, *nothing)
+    assert (status, out) == (2, "")
+    assert "nothing stands out" in err and "lower threshold" in err
     assert_one_line(err)
-
-
-def test_what_a_query_found_is_written_as_splats(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(capsys, *lift_arguments(scene))[0] == 0
-    question = ["query", scene / "lift.safetensors", "--like", "splat:1", "--json"]
+    assert {path: path.read_bytes() for path in scene.iterdir()} == before
     files = {kind: scene / f"{kind}.ply" for kind in ("object", "coloured")}
     written = [part for kind, path in files.items() for part in (f"--{kind}", path)]
-    status, out, err = run(capsys, *question, "--threshold", "0.5", *written)
+    status, out, err = run(capsys, *question, "--json", *written)
     assert (status, err) == (0, "")
     assert json.loads(out)["files"] == {kind: str(path) for kind, path in files.items()}
     whole = read_splats(scene / "splats.ply")
     assert torch.equal(read_splats(files["object"]).means, whole.means[1:])
     assert torch.equal(read_splats(files["coloured"]).means, whole.means)
-
-
-def test_nothing_found_is_no_file_and_a_word_on_what_to_try(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(capsys, *lift_arguments(scene))[0] == 0
-    before = sorted(scene.iterdir())
-    question = ["query", scene / "lift.safetensors", "--like", "splat:1", "--unlike", "splat:1", "--threshold", "1"]
-    status, out, err = run(capsys, *question, "--scores", scene / "s.npy", "--object", scene / "o.ply")
-    assert (status, out) == (2, "")
-    assert "nothing stands out" in err
-    assert "lower threshold" in err
-    assert_one_line(err)
-    assert sorted(scene.iterdir()) == before
-
-
-def test_an_answer_is_never_written_over_what_was_lifted(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(capsys, *lift_arguments(scene))[0] == 0
-    before = {path: path.read_bytes() for path in scene.iterdir()}
-    for name in ("splats.ply", "cameras.json", "pack.safetensors", "lift.safetensors"):
-        question = ["query", scene / "lift.safetensors", "--like", "splat:1"]
-        status, _, err = run(capsys, *question, "--object", scene / name)
-        assert status == 2
-        assert "another file than the inputs" in err
-    assert {path: path.read_bytes() for path in scene.iterdir()} == before

@@ -36,11 +36,6 @@ def card(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
     return monkeypatch
 
 
-def test_auto_takes_a_card_that_can_be_used_and_cpu_takes_none(card: pytest.MonkeyPatch) -> None:
-    assert choose_device("auto") == choose_device("cuda") == CARD
-    assert choose_device("cpu") == CPU
-
-
 LACKS = {
     "a build without CUDA": (torch.version, "cuda", None),
     "no C compiler": (shutil, "which", lambda *_: None),
@@ -50,29 +45,21 @@ LACKS = {
 }
 
 
-@pytest.mark.parametrize("lack", LACKS)
-def test_what_a_card_lacks_is_said_with_a_hint_of_its_own(card: pytest.MonkeyPatch, lack: str) -> None:
-    card.setattr(*LACKS[lack])
-    assert choose_device("auto") == CPU
-    with pytest.raises(Unavailable) as caught:
-        choose_device("cuda")
-    error = caught.value
-    assert (error.argument, lack in error.got, "device=cpu" in error.hint) == ("device", True, True)
-    assert device_process.look("cuda")["event"] == "fault"
-
-
-def test_each_lack_has_a_hint_of_its_own(card: pytest.MonkeyPatch) -> None:
+def test_what_a_card_lacks_is_said_with_a_hint_of_its_own(card: pytest.MonkeyPatch) -> None:
+    assert choose_device("auto") == choose_device("cuda") == CARD
+    assert choose_device("cpu") == CPU
     hints = set()
-    for lack in LACKS.values():
+    for lack, change in LACKS.items():
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(*lack)
+            patch.setattr(*change)
+            assert choose_device("auto") == CPU
             with pytest.raises(Unavailable) as caught:
                 choose_device("cuda")
-            hints.add(caught.value.hint)
+            error = caught.value
+            assert (error.argument, lack in error.got, "device=cpu" in error.hint) == ("device", True, True)
+            assert device_process.look("cuda")["event"] == "fault"
+            hints.add(error.hint)
     assert len(hints) == len(LACKS)
-
-
-def test_unknown_device_is_an_invalid_setting() -> None:
     with pytest.raises(InvalidSettings, match="device"):
         LiftSettings.of(device="gpu")
 

@@ -54,8 +54,7 @@ def share_of_own_quarter(made: LiftResult) -> torch.Tensor:
     return (own / made.features.float().sum(dim=1)).nan_to_num(nan=1.0)[torch.from_numpy(clear)]
 
 
-@pytest.mark.parametrize("grids", [False, True])
-@pytest.mark.parametrize("lens", LENSES)
+@pytest.mark.parametrize(("lens", "grids"), [("barrel", True), *((lens, False) for lens in LENSES)])
 def test_features_reach_the_splats_that_the_photo_shows(lens: str, grids: bool, tmp_path: Path) -> None:
     made = lifted(tmp_path, lens, grids=grids)
     shares = share_of_own_quarter(made)
@@ -81,7 +80,7 @@ def is_lifted(camera: Camera) -> np.ndarray:
     return (x >= 0) & (x <= camera.width) & (y >= 0) & (y <= camera.height)
 
 
-@pytest.mark.parametrize("lens", LENSES)
+@pytest.mark.parametrize("lens", ["barrel", "fisheye"])
 def test_masks_lie_over_the_photo(lens: str, tmp_path: Path) -> None:
     save_lift(lifted(tmp_path, lens), tmp_path / "made.safetensors")
     scene = QueryScene.open(tmp_path / "made.safetensors")
@@ -137,9 +136,5 @@ def test_a_model_that_comes_later_changes_no_lift(tmp_path: Path) -> None:
         read_cameras(scene)
     opened = QueryScene.open(tmp_path / "made.safetensors")
     assert opened.cameras.distorted == tuple(VIEWS)
-
-
-def test_what_cannot_say_a_lens_is_not_written(tmp_path: Path) -> None:
-    cameras = read_cameras(write_distorted_scene(tmp_path / "scene", "barrel")[1])
     with pytest.raises(InvalidCameras, match="cameras without distortion, got 'left'; keep these"):
-        write_inria_cameras(cameras, tmp_path / "cameras.json")
+        write_inria_cameras(opened.cameras, tmp_path / "cameras.json")

@@ -1,6 +1,7 @@
-"""``import liftcore as lc``: its list, what it loads, and lifts of values in memory."""
+"""``import liftcore as lc``: its list, what it loads, lifts of values in memory, and what a lift tells meanwhile."""
 
 import json
+import logging
 import subprocess
 import sys
 
@@ -127,3 +128,46 @@ def test_region_weights_times_codebooks_are_the_lift(scene):
     np.testing.assert_allclose(made.features.numpy(), X, atol=1e-5)
     again = lc.region_weights(splats, cameras, iter(views.items()), preset="row-sum", threads=2)
     assert torch.equal(again.weight, found.weight) and torch.equal(again.region, found.region)
+
+
+def test_every_stage_is_told_in_order_and_the_plan_before_the_first_view(tmp_path):
+    splats, cameras, pack = write_scene(tmp_path, 3)
+    said = []
+    plans = []
+
+    def hear(stage, done, total, unit):
+        said.append((stage, done, total, unit))
+
+    def on_plan(plan):
+        plans.append((plan, {stage for stage, *_ in said}))
+
+    made = lift_files(splats, cameras, [pack], lc.LiftSettings.of(), progress=hear, on_plan=on_plan)
+    [(plan, before)] = plans
+    assert before == {"read", "digest", "compile", "plan"}
+    assert plan.facts() == made.metadata.certificate["plan"]
+    for stage in ("read", "digest", "compile", "plan", "certify"):
+        assert [word for word in said if word[0] == stage] == [(stage, 0, 1, "steps"), (stage, 1, 1, "steps")]
+    order = list(dict.fromkeys(stage for stage, *_ in said))
+    assert order == ["read", "digest", "compile", "plan", "geometry", "robust", "solve", "certify"]
+    assert set(order) <= made.metadata.timings.keys()
+    for stage in order:
+        done = [word[1] for word in said if word[0] == stage]
+        assert done == sorted(done)
+
+
+def test_what_a_machine_lacks_goes_to_whoever_listens_else_to_the_log(tmp_path, monkeypatch, caplog):
+    little_memory = "the rest of the lift may take 9.0 GiB and 1.0 GiB are free"
+    monkeypatch.setattr("liftcore.planning.plan.check_memory", lambda parts, free: [little_memory])
+    splats, cameras, pack = write_scene(tmp_path, 3)
+    heard = []
+
+    def refuse(plan):
+        raise InterruptedError(plan.kernel)
+
+    with pytest.raises(InterruptedError, match="3dgs"):  # a hearer that refuses stops the lift
+        lift_files(splats, cameras, [pack], lc.LiftSettings.of(), on_plan=refuse)
+    with caplog.at_level(logging.WARNING):
+        lift_files(splats, cameras, [pack], lc.LiftSettings.of(), on_plan=heard.append)
+        assert heard[0].warnings == (little_memory,) and little_memory not in caplog.text
+        lift_files(splats, cameras, [pack], lc.LiftSettings.of())
+        assert caplog.text.count(little_memory) == 1
