@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import json
-import sqlite3
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +23,6 @@ from service.store.assets import SHOWN_CHARACTERS
 from service.store.database import Database
 from service.store.files import DataDirectory
 from service.store.owners import SERVICE
-from service.store.store import DATABASE, Store
-from tests.crash.conftest import order, until
 from tests.crash.server import NoQueries
 
 from .conftest import Uploaded, app_of, parts_of, put
@@ -219,46 +216,6 @@ def test_lift_of_very_many_views_tells_their_names_apart_in_pages(
         assert (told["views"], told["view_count"]) == (["v"], 1)
 
 
-# Readiness: a database and a disk that are not what they were
-
-
-def test_readyz_names_a_database_that_was_replaced_or_deleted(start: Start) -> None:
-    with start() as client:
-        until(lambda: client.get("/readyz").status_code == 200)
-        path = parts_of(client).store.files.root / DATABASE
-        aside = path.rename(path.with_name("aside"))
-        until(lambda: client.get("/readyz").json().get("argument") == "database")
-        path.write_bytes(aside.read_bytes())  # as a restored backup is: what is written goes elsewhere
-        assert assert_problem(client.get("/readyz"))["argument"] == "database"
-        aside.rename(path)
-        until(lambda: client.get("/readyz").status_code == 200)
-
-
-def test_readyz_names_a_disk_that_takes_no_file(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
-    with start() as client:
-        until(lambda: client.get("/readyz").status_code == 200)
-
-        def refused(files: DataDirectory, suffix: str) -> None:
-            raise OSError(30, "Read-only file system")
-
-        monkeypatch.setattr(DataDirectory, "draft", refused)
-        until(lambda: client.get("/readyz").json().get("argument") == "disk")
-
-
-def test_database_that_another_holds_for_long_is_503_with_retry_after(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with guarded(tmp_path / "data") as house:
-        house.store.database._writer.execute("PRAGMA busy_timeout = 10")
-        with closing(sqlite3.connect(tmp_path / "data" / DATABASE, isolation_level=None)) as other:
-            other.execute("BEGIN IMMEDIATE")
-            reply = house.ask("alice", "POST", "/lift", json=house.body())
-            other.execute("ROLLBACK")
-        assert (assert_problem(reply)["type"], reply.status_code) == ("/problems/busy", 503)
-        assert int(reply.headers["retry-after"]) > 0
-        assert house.ask("alice", "POST", "/lift", json=house.body()).status_code == 202
-
-
 # What browsers are told, and what the log leaves out
 
 
@@ -273,11 +230,6 @@ def test_every_answer_tells_browsers_to_guess_and_frame_nothing(client: TestClie
     assert "http" not in policy and "unsafe-inline" not in policy and "'unsafe-eval'" not in policy
 
 
-@pytest.mark.parametrize("host", ["localhost:", "127.0.0.1:", "[::1]:"])
-def test_port_of_a_host_may_be_empty(client: TestClient, host: str) -> None:
-    assert client.get("/healthz", headers={"Host": host}).status_code == 200
-
-
 def test_log_of_one_thing_again_and_again_is_thinned_out() -> None:
     import logging
 
@@ -289,8 +241,3 @@ def test_log_of_one_thing_again_and_again_is_thinned_out() -> None:
     now[0] = 61
     late = logging.LogRecord("service.jobs", 40, "x", 1, "m", (), None)
     assert sparing.filter(late) and vars(late)["fields"] == {"left_out": 10_000 - SAME_A_MINUTE}
-
-
-def test_lists_of_a_directory_of_the_release_before_are_paged(store: Store) -> None:
-    order(store)
-    assert [len(store.assets.page(SERVICE, 2).records), store.assets.page(SERVICE, 3).cursor] == [2, None]

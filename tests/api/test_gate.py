@@ -43,7 +43,16 @@ def check(hosts: Hosts, method: str = "GET", **headers: str) -> None:
 
 @pytest.mark.parametrize(
     "host",
-    ["localhost", "LOCALHOST:8787", "127.0.0.1:1", "[::1]:8787", "[::1]", "lift.example.org:443", "localhost."],
+    [
+        "localhost",
+        "LOCALHOST:8787",
+        "127.0.0.1:1",
+        "[::1]:8787",
+        "[::1]",
+        "lift.example.org:443",
+        "localhost.",
+        "localhost:",
+    ],
 )
 def test_own_names_are_taken(host: str) -> None:
     check(HERE, host=host)

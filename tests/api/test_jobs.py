@@ -85,6 +85,9 @@ def test_full_line_is_503_with_retry_after_and_a_known_key_still_finds_its_job(q
         location = client.post("/lift", json=body).headers["location"]
         until(lambda: client.get(location).json()["state"] != "queued")
         assert client.post("/lift", json=body, headers={"Idempotency-Key": "k"}).status_code == 202
+        counts = client.get("/metrics").text
+        for line in ("queue_length 1.0", "running_lifts 1.0", 'jobs{state="queued"} 1.0'):
+            assert f"splatlift_{line}" in counts
         reply = client.post("/lift", json=body)
         assert (assert_problem(reply)["type"], reply.status_code) == ("/problems/busy", 503)
         assert int(reply.headers["retry-after"]) > 0

@@ -11,16 +11,15 @@ import signal
 import sqlite3
 import sys
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import replace
+from collections.abc import Callable
+from contextlib import closing
 from importlib.metadata import version
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
+from unittest.mock import Mock
 
 import anyio
-import httpx
 import pytest
 import uvicorn
 from fastapi.testclient import TestClient
@@ -30,19 +29,19 @@ from prometheus_client.parser import text_string_to_metric_families
 from service.__main__ import AnnouncingServer
 from service.errand import ErrandLimits
 from service.errors import Busy
-from service.jobs.process import JobLimits
 from service.jobs.supervisor import Supervisor
 from service.models import AssetKind
-from service.observe import JsonLines, TextLines, current_id, working_for
+from service.observe import JsonLines, TextLines, working_for
 from service.state import Stopping
+from service.store.files import DataDirectory
 from service.store.owners import SERVICE
 from service.store.store import Store
 from service.streams import EventStreams
 from service.uploads.intake import check
-from tests.crash.conftest import order, stand_in, until
+from tests.crash.conftest import order, until
 from tests.crash.service_process import ServiceProcess, processes_of
 
-from .conftest import LIFT_REQUEST, Uploaded, app_of, parts_of
+from .conftest import Uploaded, app_of, parts_of
 from .test_problems import assert_problem
 from .tiny_scene import TinyScene
 
@@ -50,13 +49,17 @@ Start = Callable[..., Any]
 MADE = re.compile(r"[0-9a-f]{32}")
 
 
-def failing(client: TestClient) -> str:
-    """The checks that /readyz says have failed."""
-    reply = client.get("/readyz")
-    body = assert_problem(reply)
-    assert (reply.status_code, body["type"]) == (503, "/problems/not-ready")
-    assert int(reply.headers["retry-after"]) > 0
-    return body["argument"]
+def fails(client: TestClient, check: str) -> None:
+    """Wait until /readyz has looked again, and says that a check has failed."""
+    replies: list[Any] = []
+
+    def says_so() -> bool:
+        replies.append(client.get("/readyz"))
+        return replies[-1].json().get("argument") == check
+
+    until(says_so)
+    assert (replies[-1].status_code, assert_problem(replies[-1])["type"]) == (503, "/problems/not-ready")
+    assert int(replies[-1].headers["retry-after"]) > 0
 
 
 def samples(client: TestClient) -> dict[tuple[str, tuple[tuple[str, str], ...]], float]:
@@ -75,43 +78,32 @@ def counted(found: dict[Any, float], name: str, **labels: str) -> float:
     return found.get((name, tuple(sorted(labels.items()))), 0.0)
 
 
-def test_readyz_says_what_was_looked_at(client: TestClient) -> None:
-    reply = client.get("/readyz")
-    assert reply.status_code == 200
-    assert reply.json() == {"status": "ready", "checks": ["database", "disk", "supervisor", "queries"]}
-
-
-def test_readyz_names_a_disk_below_the_floor(start: Start) -> None:
-    with start(disk_floor_bytes=1 << 60) as client:
-        assert failing(client) == "disk"
-
-
-def test_readyz_names_a_database_that_another_process_holds(start: Start, tmp_path: Path) -> None:
+def test_readyz_names_what_fails_until_it_works_again(start: Start, tmp_path: Path, monkeypatch: Any) -> None:
     with start() as client:
-        other = sqlite3.connect(tmp_path / "data" / "service.sqlite", isolation_level=None)
-        other.execute("BEGIN IMMEDIATE")
-        assert failing(client) == "database"
-        assert failing(client) == "database"  # and the look that still waits holds up nobody but the next one
-        other.execute("ROLLBACK")
-        other.close()
         until(lambda: client.get("/readyz").status_code == 200)
-
-
-def test_readyz_names_a_supervisor_whose_thread_died(start: Start) -> None:
-    with start() as client:
-        parts_of(client).runner.stop()
-        assert failing(client) == "supervisor"
-
-
-def test_readyz_names_a_dead_query_worker_and_a_new_one_starts(start: Start) -> None:
-    with start() as client:
+        found = client.get("/readyz").json()
+        assert found == {"status": "ready", "checks": ["database", "disk", "supervisor", "queries"]}
+        with monkeypatch.context() as full:
+            full.setattr(DataDirectory, "free_bytes", lambda files: 0)
+            fails(client, "disk")
+        until(lambda: client.get("/readyz").status_code == 200)
+        with monkeypatch.context() as read_only:
+            read_only.setattr(DataDirectory, "draft", Mock(side_effect=OSError(30, "Read-only file system")))
+            fails(client, "disk")
+        until(lambda: client.get("/readyz").status_code == 200)
+        with closing(sqlite3.connect(tmp_path / "data" / "service.sqlite", isolation_level=None)) as other:
+            other.execute("BEGIN IMMEDIATE")
+            fails(client, "database")  # and the look that still waits holds up nobody but the next one
+            other.execute("ROLLBACK")
+        until(lambda: client.get("/readyz").status_code == 200)
         process = parts_of(client).queries._process
         assert process is not None
         process.kill()
-        process.wait()
-        assert failing(client) == "queries"
+        fails(client, "queries")
         until(lambda: client.get("/readyz").status_code == 200)
         assert counted(samples(client), "splatlift_query_worker_restarts_total") == 1
+        parts_of(client).runner.stop()
+        fails(client, "supervisor")
 
 
 def test_operations_and_errors_answer_while_every_thread_of_the_pool_is_busy(start: Start) -> None:
@@ -121,8 +113,12 @@ def test_operations_and_errors_answer_while_every_thread_of_the_pool_is_busy(sta
         held.set()
         answered.append(not release.wait(60))
 
-    with start() as client:
+    def broken() -> None:
+        raise RuntimeError("the secret")
+
+    with start(commit="abc1234") as client:
         app_of(client).get("/slow")(slow)
+        app_of(client).get("/broken")(broken)
         assert client.portal is not None
         client.portal.call(lambda: setattr(anyio.to_thread.current_default_thread_limiter(), "total_tokens", 1))
         thread = threading.Thread(target=client.get, args=("/slow",))
@@ -138,45 +134,36 @@ def test_operations_and_errors_answer_while_every_thread_of_the_pool_is_busy(sta
             release.set()
             thread.join()
         assert answered == [False]
-
-
-def test_version_tells_what_runs_without_loading_it(client: TestClient) -> None:
-    found = client.get("/version").json()
-    assert found["version"] == version("splatlift")
-    assert found["python"] == ".".join(map(str, sys.version_info[:3]))
-    assert found["packages"]["torch"] == version("torch")
-    assert found["commit"] is None
-
-
-def test_commit_is_told_when_the_operator_knows_it(start: Start) -> None:
-    with start(commit="abc1234") as client:
-        assert client.get("/version").json()["commit"] == "abc1234"
+        found = client.get("/version").json()
+        assert (found["version"], found["commit"]) == (version("splatlift"), "abc1234")
+        assert found["python"] == ".".join(map(str, sys.version_info[:3]))
+        assert found["packages"]["torch"] == version("torch")
         assert any(dict(labels).get("commit") == "abc1234" for name, labels in samples(client) if "build" in name)
+        for path, status in (("/nowhere", 404), ("/jobs/x", 404), ("/lifts?x", 422), ("/broken", 500)):
+            problem = assert_problem(client.get(path, headers={"X-Request-ID": "mine"}))
+            assert (problem["status"], problem["request_id"]) == (status, "mine")
 
 
-def test_metrics_count_requests_by_route_template(client: TestClient, uploaded: Uploaded) -> None:
-    labels = {"method": "GET", "route": "/assets/{asset}", "status": "200"}
-    before = counted(samples(client), "splatlift_http_requests_total", **labels)
+def test_metrics_count_requests_by_route_template_and_labels_stay_few(client: TestClient, uploaded: Uploaded) -> None:
+    name, labels = "splatlift_http_requests_total", {"route": "/assets/{asset}", "status": "200"}
+    for path in ("/x", "/jobs/x"):
+        client.get(path)
+    client.request("BREW", "/x")
+    before = samples(client)
     for asset in (uploaded.splats, uploaded.cameras):
         client.get(f"/assets/{asset}")
+        client.head(f"/assets/{asset}")
     found = samples(client)
-    assert counted(found, "splatlift_http_requests_total", **labels) == before + 2
-    seconds = {"method": "GET", "route": "/assets/{asset}"}
-    assert counted(found, "splatlift_http_request_seconds_count", **seconds) >= 2
-
-
-def test_labels_stay_few_whatever_clients_ask_for(client: TestClient) -> None:
-    client.get("/x")
-    client.request("BREW", "/x")
-    client.get("/jobs/x")
-    samples(client)
-    before = samples(client).keys()
-    for number in range(40):
+    for method in ("GET", "HEAD"):
+        assert counted(found, name, method=method, **labels) == counted(before, name, method=method, **labels) + 2
+    assert counted(found, "splatlift_http_request_seconds_count", method="GET", route="/assets/{asset}") >= 2
+    for number in range(20):
         client.get(f"/nowhere/{number}?{number}", headers={"X-Request-ID": f"id{number}"})
         client.get(f"/jobs/{number}")
-        client.request(f"BREW{number}", "/x")
         client.request(f"BREW{number}", f"/y{number}")
-    assert samples(client).keys() == before
+    assert samples(client).keys() == found.keys()
+    # Each application counts for itself.
+    assert not [family.name for family in REGISTRY.collect() if family.name.startswith("splatlift")]
 
 
 def test_metrics_tell_of_uploads_jobs_queries_and_the_disk(client: TestClient, scene: TinyScene, lift: Any) -> None:
@@ -201,83 +188,13 @@ def test_metrics_tell_of_uploads_jobs_queries_and_the_disk(client: TestClient, s
     assert counted(found, "splatlift_query_worker_up") == 1
 
 
-def test_queue_and_running_lifts_are_counted(tmp_path: Path) -> None:
-    with hanging_server(tmp_path, jobs=3) as (service, jobs):
-        until(lambda: service.job(jobs[0])["state"] == "running")
-        text = service.client.get("/metrics").text
-        assert "splatlift_queue_length 2.0" in text and "splatlift_running_lifts 1.0" in text
-        assert 'splatlift_jobs{state="queued"} 2.0' in text
-
-
-def test_each_application_counts_for_itself(start: Start) -> None:
-    with start("one") as one, start("two") as two:
-        one.get("/healthz")
-        name, labels = "splatlift_http_requests_total", {"method": "GET", "route": "/healthz", "status": "200"}
-        assert (counted(samples(one), name, **labels), counted(samples(two), name, **labels)) == (1, 0)
-    assert not [family.name for family in REGISTRY.collect() if family.name.startswith("splatlift")]
-
-
-@pytest.mark.parametrize("sane", ["a", "7f3c-22.ab_~", "Root=1-67891233-abcdef012345678912345678", "x" * 128])
-def test_sane_request_id_is_kept(client: TestClient, sane: str) -> None:
-    assert client.get("/healthz", headers={"X-Request-ID": sane}).headers.get_list("x-request-id") == [sane]
-
-
-@pytest.mark.parametrize("odd", ["", " ", "a b", 'a"b', "x" * 129, "a\tb", "<script>", "{}", "ä"])
-def test_other_request_ids_are_replaced(client: TestClient, odd: str) -> None:
-    reply = client.get("/healthz", headers={b"X-Request-ID": odd.encode()})
-    (found,) = reply.headers.get_list("x-request-id")
-    assert MADE.fullmatch(found)
-
-
-def test_two_request_ids_are_none(client: TestClient) -> None:
-    reply = client.get("/healthz", headers=[("X-Request-ID", "a"), ("X-Request-ID", "b")])
-    assert MADE.fullmatch(reply.headers["x-request-id"])
-
-
-def test_every_problem_names_its_request(start: Start) -> None:
-    with start() as client:
-
-        def broken() -> None:
-            raise RuntimeError("the secret")
-
-        app_of(client).get("/broken")(broken)
-        requests = [("GET", "/nowhere"), ("PUT", "/query"), ("POST", "/lift"), ("GET", "/jobs/x"), ("GET", "/broken")]
-        statuses = []
-        for number, (method, path) in enumerate(requests):
-            reply = client.request(method, path, headers={"X-Request-ID": f"id-{number}"})
-            assert assert_problem(reply)["request_id"] == reply.headers["x-request-id"] == f"id-{number}"
-            statuses.append(reply.status_code)
-        assert statuses == [404, 405, 422, 404, 500]
-
-
-def test_job_knows_the_request_that_made_it(client: TestClient, lift: dict[str, Any]) -> None:
-    job = client.get(lift["links"]["job"]).json()
-    assert job["request_id"] == LIFT_REQUEST
-    assert LIFT_REQUEST in client.get(job["links"]["events"]).text
-
-
-def test_log_of_a_job_names_the_request_that_made_it(tmp_path: Path) -> None:
-    seen: dict[str, str | None] = {}
-
-    class Watch(logging.Handler):
-        def emit(self, record: logging.LogRecord) -> None:
-            seen[record.getMessage()] = current_id()
-
-    watch, logger = Watch(), logging.getLogger("service.jobs")
-    store = Store.open(tmp_path)
-    job = store.jobs.submit(SERVICE, replace(order(store), request_id="the-order"))[0]
-    runner = Supervisor(store, JobLimits(), command=stand_in("answer"))
-    logger.addHandler(watch)
-    logger.setLevel(logging.INFO)
-    try:
-        runner.start()
-        until(lambda: any("succeeded" in message for message in seen))
-    finally:
-        logger.setLevel(logging.NOTSET)
-        logger.removeHandler(watch)
-        runner.stop()
-        store.close()
-    assert {request for message, request in seen.items() if job in message} == {"the-order"}
+def test_sane_request_id_is_kept_and_any_other_replaced(client: TestClient) -> None:
+    for sane in ("a", "7f3c-22.ab_~", "Root=1-67891233-abcdef012345678912345678", "x" * 128):
+        assert client.get("/healthz", headers={"X-Request-ID": sane}).headers.get_list("x-request-id") == [sane]
+    odd = ["", " ", "a b", 'a"b', "x" * 129, "a\tb", "<script>", "{}", "\u00e4"]
+    for headers in [[(b"X-Request-ID", one.encode())] for one in odd] + [[(b"X-Request-ID", b"a")] * 2]:
+        (found,) = client.get("/healthz", headers=headers).headers.get_list("x-request-id")
+        assert MADE.fullmatch(found), headers
 
 
 def record(message: str, **fields: Any) -> logging.LogRecord:
@@ -306,21 +223,14 @@ def test_text_log_is_one_line_that_no_client_can_break() -> None:
     assert line == r'1970-01-01T00:00:00.250Z INFO place: a\nINFO forged path="/b\nINFO forged"'
 
 
-@contextmanager
-def hanging_server(data: Path, jobs: int) -> Iterator[tuple[ServiceProcess, list[str]]]:
-    """A server process whose lifts never end, with jobs in line."""
-    store = Store.open(data)
-    ids = [store.jobs.submit(SERVICE, order(store))[0] for _ in range(jobs)]
-    store.close()
-    with ServiceProcess(data, "--behaviour", "hang") as service:
-        yield service, ids
-
-
 def test_stop_refuses_work_ends_streams_puts_jobs_back_and_exits_0(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("SPLATLIFT_NOTICE_SECONDS", "10")  # for three requests, on a machine that may be busy
-    with hanging_server(tmp_path, jobs=1) as (service, (job,)):
+    monkeypatch.setenv("SPLATLIFT_NOTICE_SECONDS", "5")  # for three requests, on a machine that may be busy
+    store = Store.open(tmp_path)
+    job = store.jobs.submit(SERVICE, order(store))[0]
+    store.close()
+    with ServiceProcess(tmp_path, "--behaviour", "hang") as service:
         until(lambda: processes_of(job))
         with service.client.stream("GET", f"/jobs/{job}/events") as stream:
             lines = stream.iter_lines()
@@ -357,28 +267,6 @@ def test_stop_ends_a_check_that_would_take_long(tmp_path: Path) -> None:
     ending.set()
     thread.join(30)
     assert ended == [True]
-
-
-def test_log_of_a_server_is_json_lines_and_holds_no_secret(tmp_path: Path, table: Path) -> None:
-    from .test_server import server
-
-    log = tmp_path / "log"
-    with log.open("w") as stderr, server(tmp_path / "data", table, stderr=stderr) as address:
-        secret = {"Authorization": "Bearer the-secret", "X-Request-ID": "mine", "Cookie": "the-secret"}
-        with httpx.Client(base_url=address, headers=secret, timeout=120) as client:
-            for path in ("/healthz?token=the-secret", "/nowhere?the-secret", "/query?text=the-secret"):
-                client.get(path)
-            client.post("/lift", json={"splats": "the-secret"})
-            client.put("/assets/splats", content=b"the-secret")
-    text = log.read_text()
-    told = [json.loads(line) for line in text.splitlines()]
-    assert "the-secret" not in text
-    access = [line for line in told if line["logger"] == "service.access"]
-    assert [line["status"] for line in access] == [200, 404, 404, 422, 422]
-    assert {line["request_id"] for line in access} == {"mine"}
-    wanted = {"method", "route", "path", "status", "seconds", "received", "sent"}
-    assert all(wanted <= line.keys() for line in access)
-    assert access[-1]["received"] == len(b"the-secret") and access[-1]["sent"] > 0
 
 
 def test_routes_are_described_without_another_host(client: TestClient) -> None:

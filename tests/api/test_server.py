@@ -9,7 +9,6 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,6 +22,7 @@ from safetensors.numpy import save
 from service.__main__ import main, parse
 from service.encoders import encoder_label, encoder_spec
 from service.errors import InvalidRequest
+from service.keys import main as keys
 from service.routes.operations import WEB
 from service.settings import ServiceSettings
 
@@ -36,19 +36,8 @@ ROOT = Path(__file__).parents[2]
 @contextmanager
 def server(data: Path, table: Path, stderr: IO[str] | None = None) -> Iterator[str]:
     """A server process; its address. It ends with status 0 when it is told to."""
-    command = [
-        sys.executable,
-        "-m",
-        "service",
-        "--port",
-        "0",
-        "--data",
-        str(data),
-        "--encoder",
-        f"table:{table}",
-        "--text-space",
-        f"tiny=table:{table}",
-    ]
+    encoders = ["--encoder", f"table:{table}", "--text-space", f"tiny=table:{table}"]
+    command = [sys.executable, "-m", "service", "--port", "0", "--data", str(data), *encoders]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=stderr, text=True, cwd=ROOT)
     with process:
         try:
@@ -61,17 +50,34 @@ def server(data: Path, table: Path, stderr: IO[str] | None = None) -> Iterator[s
             assert process.wait(60) == 0
 
 
-def test_server_process_does_the_main_job(tmp_path: Path, scene: TinyScene, table: Path) -> None:
-    with server(tmp_path, table) as address, httpx.Client(base_url=address, timeout=120) as client:
-        assert client.get("/healthz").json() == {"status": "ok"}
-        contents = {"splats": scene.splats, "cameras": scene.cameras, "features": scene.features}
-        ids = [client.put(f"/assets/{kind}", content=body).json()["id"] for kind, body in contents.items()]
-        job = ended(client, client.post("/lift", json=Uploaded(*ids).order()).headers["location"])
-        assert job["state"] == "succeeded", job
-        answer = client.get("/query", params={"text": "lamp", "view": "right"}).json()
-        assert answer["top"][0]["splat"] >= 40
-        assert client.get(answer["links"]["mask"]).content.startswith(b"\x89PNG")
-        assert "<title>splatlift</title>" in client.get("/").text
+def test_server_process_does_the_main_job_and_its_log_holds_no_secret(
+    tmp_path: Path, scene: TinyScene, table: Path
+) -> None:
+    with (tmp_path / "log").open("w") as stderr, server(tmp_path / "data", table, stderr=stderr) as address:
+        with httpx.Client(base_url=address, timeout=120) as client:
+            assert client.get("/healthz").json() == {"status": "ok"}
+            contents = {"splats": scene.splats, "cameras": scene.cameras, "features": scene.features}
+            ids = [client.put(f"/assets/{kind}", content=body).json()["id"] for kind, body in contents.items()]
+            job = ended(client, client.post("/lift", json=Uploaded(*ids).order()).headers["location"])
+            assert job["state"] == "succeeded", job
+            answer = client.get("/query", params={"text": "lamp", "view": "right"}).json()
+            assert answer["top"][0]["splat"] >= 40
+            assert client.get(answer["links"]["mask"]).content.startswith(b"\x89PNG")
+            assert "<title>splatlift</title>" in client.get("/").text
+        secret = {"Authorization": "Bearer the-secret", "X-Request-ID": "mine", "Cookie": "the-secret"}
+        with httpx.Client(base_url=address, headers=secret, timeout=120) as client:
+            for path in ("/healthz?token=the-secret", "/nowhere?the-secret", "/query?text=the-secret"):
+                client.get(path)
+            client.post("/lift", json={"splats": "the-secret"})
+            client.put("/assets/splats", content=b"the-secret")
+    text = (tmp_path / "log").read_text()
+    assert "the-secret" not in text
+    told = [json.loads(line) for line in text.splitlines()]
+    access = [line for line in told if line["logger"] == "service.access" and line["request_id"] == "mine"]
+    assert [line["status"] for line in access] == [200, 404, 422, 422, 422]
+    wanted = {"method", "route", "path", "status", "seconds", "received", "sent"}
+    assert all(wanted <= line.keys() for line in access)
+    assert access[-1]["received"] == len(b"the-secret") and access[-1]["sent"] > 0
 
 
 def test_server_that_speaks_json_says_one_object_when_it_is_ready_and_nothing_after(tmp_path: Path) -> None:
@@ -97,30 +103,24 @@ def test_http_process_loads_neither_torch_nor_numba_nor_hdbscan() -> None:
     assert result.stdout.strip() == "[]"
 
 
-@pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.0.2.1", "example.org"])
-def test_binding_beyond_loopback_is_refused(host: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--host", host, "--data", str(tmp_path / "data"), "--port", "0"]) == 2
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["--host", "0.0.0.0"], "a loopback address such as 127.0.0.1, as there are no keys"),
+        (["--host", "example.org"], "a loopback address"),
+        (["--port", "70000"], "port: expected"),
+        (["--text-space", "name"], "expected NAME=SPEC"),
+        (["--text-space", "clip=nonsense"], "text_spaces, 'clip': expected one of table:FILE"),
+        (["--encoder", "open_clip:RN50@/nowhere/w.pt"], "w.pt (No such file"),
+    ],
+)
+def test_setting_that_cannot_be_is_one_line_at_the_start(
+    arguments: list[str], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*arguments, "--data", str(tmp_path / "data")]) == 2
     said = capsys.readouterr().err
-    assert said.count("\n") == 1 and "loopback" in said and "keys" in said
+    assert said.startswith("splatlift: ") and told in said and said.count("\n") == 1
     assert not (tmp_path / "data").exists()
-
-
-@pytest.mark.parametrize("arguments", [["--port", "70000"], ["--text-space", "name"], ["--text-space", "=minilm"]])
-def test_bad_settings_are_one_line(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(arguments) == 2
-    assert capsys.readouterr().err.count("\n") == 1
-
-
-@pytest.mark.parametrize("command", ["service", "service.keys"])
-def test_a_variable_that_is_no_json_is_one_line(command: str, tmp_path: Path) -> None:
-    arguments = ["list", "--data", str(tmp_path)] if command == "service.keys" else ["--data", str(tmp_path)]
-    result = subprocess.run(
-        [sys.executable, "-m", command, *arguments], cwd=ROOT, capture_output=True, text=True, check=False,
-        timeout=120, env=os.environ | {"SPLATLIFT_TEXT_SPACES": "{bad"},
-    )  # fmt: skip
-    assert (result.returncode, result.stdout) == (2, "")
-    assert "SPLATLIFT_TEXT_SPACES: expected JSON, got '{bad'" in result.stderr
-    assert result.stderr.count("\n") == 1
 
 
 @pytest.mark.parametrize(
@@ -135,26 +135,36 @@ def test_a_variable_that_is_no_json_is_one_line(command: str, tmp_path: Path) ->
         (save({"embeddings": np.eye(2)}, {"words": '["cat"]'}), "1 words and embeddings [2, 2]"),
     ],
 )
-@pytest.mark.parametrize("setting", ["--encoder", "--text-space"])
-def test_a_text_table_that_is_none_is_told_at_the_start(
-    setting: str, content: bytes | None, told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_text_table_that_is_none_is_told_at_the_start(
+    content: bytes | None, told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     table = tmp_path / "words.safetensors"
     if content is not None:
         table.write_bytes(content)
-    spec = {"--encoder": f"table:{table}", "--text-space": f"clip=table:{table}"}[setting]
-    assert main([setting, spec, "--data", str(tmp_path / "data"), "--port", "0"]) == 2
+    assert main(["--encoder", f"table:{table}", "--data", str(tmp_path / "data")]) == 2
     said = capsys.readouterr().err
-    name = "encoder" if setting == "--encoder" else "text_spaces, 'clip'"
-    assert said.startswith(f"splatlift: {name}: expected ") and told in said and str(table) in said
-    assert said.count("\n") == 1
-    assert not (tmp_path / "data").exists()
+    assert said.startswith("splatlift: encoder: expected ") and told in said and str(table) in said
+    assert said.count("\n") == 1 and not (tmp_path / "data").exists()
 
 
-def test_weights_that_are_not_there_are_told_at_the_start(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["--encoder", f"open_clip:RN50@{tmp_path / 'w.pt'}", "--data", str(tmp_path / "data")]
-    assert main(arguments) == 2
-    assert "w.pt (No such file" in capsys.readouterr().err
+def test_taken_port_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        assert main(["--port", str(port), "--data", str(tmp_path / "data")]) == 2
+    assert "free port" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("program", [main, keys])
+def test_variable_that_is_no_json_is_one_line(
+    program: Callable[[list[str]], int],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setenv("SPLATLIFT_TEXT_SPACES", "{bad")
+    assert program([*(["list"] if program is keys else []), "--data", str(tmp_path)]) == 2
+    said = capsys.readouterr().err
+    assert "SPLATLIFT_TEXT_SPACES: expected JSON, got '{bad'" in said and said.count("\n") == 1
 
 
 def test_settings_come_from_the_environment_and_the_command_line_wins(
@@ -166,21 +176,9 @@ def test_settings_come_from_the_environment_and_the_command_line_wins(
     assert (parse([]).port, parse([]).query_seconds) == (1234, 7)
     assert parse([]).text_spaces == {"a": "minilm"}
     assert parse(["--port", "1", "--text-space", "a=table:x=y"]).text_spaces == {"a": "table:x=y"}
-    assert parse(["--port", "1"]).port == 1
-
-
-def test_every_setting_is_described() -> None:
-    for name, field in ServiceSettings.model_fields.items():
-        assert field.description, name
-
-
-def test_encoder_that_does_not_exist_is_told_before_the_start(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["--text-space", "clip=nonsense", "--data", str(tmp_path / "data")]) == 2
-    told = capsys.readouterr().err
-    assert "text_spaces, 'clip'" in told and "minilm" in told and "'nonsense'" in told
-    assert not (tmp_path / "data").exists()
+    for name in ("COMMIT", "PORT", "ALLOWED_HOSTS", "TEXT_SPACES"):  # empty, it is as if it were not set
+        monkeypatch.setenv(f"SPLATLIFT_{name}", "")
+    assert (parse([]).commit, parse([]).port, parse([]).allowed_hosts) == (None, 8787, ())
 
 
 def test_encoder_is_chosen_by_text_space_and_never_by_the_client(tmp_path: Path) -> None:
@@ -217,42 +215,6 @@ def test_default_encoder_stands_in_for_other_spaces_only_where_the_operator_chos
 )  # fmt: skip
 def test_encoder_is_told_without_its_file(spec: str, told: str) -> None:
     assert encoder_label(spec) == told
-
-
-def test_taken_port_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        port = taken.getsockname()[1]
-        assert main(["--port", str(port), "--data", str(tmp_path / "data")]) == 2
-    assert "free port" in capsys.readouterr().err
-
-
-def test_upload_that_breaks_off_leaves_nothing(tmp_path: Path, table: Path) -> None:
-    with server(tmp_path, table) as address:
-        url = httpx.URL(address)
-        with socket.create_connection((url.host, url.port or 80)) as client:
-            client.sendall(
-                b"PUT /assets/splats HTTP/1.1\r\nHost: localhost\r\nContent-Length: 9000000\r\n\r\n"
-                + b"p" * 2_000_000
-            )
-            wait_until(lambda: any((tmp_path / "tmp").iterdir()))
-        wait_until(lambda: not any((tmp_path / "tmp").iterdir()))
-        assert httpx.get(f"{address}/assets").json() == {"assets": []}
-
-
-def wait_until(condition: Callable[[], bool]) -> None:
-    """Wait a little for something that is about to happen."""
-    deadline = time.monotonic() + 60
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
-
-
-def test_empty_variable_is_one_that_is_not_set(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("COMMIT", "PORT", "ALLOWED_HOSTS", "TEXT_SPACES"):
-        monkeypatch.setenv(f"SPLATLIFT_{name}", "")
-    assert (parse([]).commit, parse([]).port, parse([]).allowed_hosts) == (None, 8787, ())
 
 
 def test_built_page_is_of_these_sources() -> None:

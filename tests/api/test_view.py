@@ -2,45 +2,48 @@
 
 from __future__ import annotations
 
+import io
 import os
 import re
 import signal
 import socket
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import httpx
+import pytest
 
 from liftcore.io.lift_file import save_lift
 from liftcore.io.scene_files import lift_files
 from liftcore.settings import LiftSettings
+from service.view import main
 from tests.crash.conftest import until
 
 from .tiny_scene import colmap_zip, make_scene
 
-if TYPE_CHECKING:
-    import pytest
-
 ROOT = Path(__file__).parents[2]
 
 
-def test_a_lift_is_shown_by_links_until_it_is_interrupted(tmp_path: Path) -> None:
-    import zipfile
-
-    tiny, temporary = make_scene(), tmp_path / "temporary"
-    temporary.mkdir()
-    (tmp_path / "cameras.zip").write_bytes(colmap_zip())
-    zipfile.ZipFile(tmp_path / "cameras.zip").extractall(tmp_path / "scene")
-    for name, content in (("scene.ply", tiny.splats), ("f.safetensors", tiny.features)):
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """The tiny scene with cameras of either kind, and its lift with a folder of them."""
+    tiny = make_scene()
+    with zipfile.ZipFile(io.BytesIO(colmap_zip())) as model:
+        model.extractall(tmp_path / "scene")
+    for name, content in (("s.ply", tiny.splats), ("c.json", tiny.cameras), ("f.safetensors", tiny.features)):
         (tmp_path / name).write_bytes(content)
-    made = lift_files(
-        tmp_path / "scene.ply", tmp_path / "scene", [tmp_path / "f.safetensors"], LiftSettings.of(preset="row-sum")
-    )
-    save_lift(made, tmp_path / "l.safetensors")
-    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
-    command = [sys.executable, "-m", "liftcore.cli", "view", str(tmp_path / "l.safetensors"), "--no-browser"]
+    files = tmp_path / "s.ply", tmp_path / "scene", [tmp_path / "f.safetensors"]
+    save_lift(lift_files(*files, LiftSettings.of(preset="row-sum")), tmp_path / "l.safetensors")
+    return tmp_path
+
+
+def test_lift_is_shown_by_links_until_it_is_interrupted(folder: Path) -> None:
+    temporary = folder / "temporary"
+    temporary.mkdir()
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    command = [sys.executable, "-m", "liftcore.cli", "view", str(folder / "l.safetensors"), "--no-browser"]
     environment = os.environ | {"PYTHONPATH": str(ROOT), "TMPDIR": str(temporary)}
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as server:
         assert server.stdout is not None
@@ -58,13 +61,10 @@ def test_a_lift_is_shown_by_links_until_it_is_interrupted(tmp_path: Path) -> Non
         server.send_signal(signal.SIGINT)
         assert server.wait(timeout=600) == 0
     assert not list(temporary.iterdir())
-    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
 
 
-def test_lift_in_memory_is_shown_until_it_is_interrupted_or_killed(tmp_path: Path) -> None:
-    tiny = make_scene()
-    for name, content in (("s.ply", tiny.splats), ("c.json", tiny.cameras), ("f.safetensors", tiny.features)):
-        (tmp_path / name).write_bytes(content)
+def test_lift_in_memory_is_shown_until_it_is_interrupted_or_killed(folder: Path) -> None:
     script = """if True:
         import signal, socket
         import liftcore as lc
@@ -87,9 +87,9 @@ def test_lift_in_memory_is_shown_until_it_is_interrupted_or_killed(tmp_path: Pat
         input()
         result.show(splats, cameras, browser=False)
     """
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "TMPDIR": str(tmp_path)}
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "TMPDIR": str(folder)}
     command, pipe = [sys.executable, "-c", script], subprocess.PIPE
-    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, env=environment, cwd=tmp_path) as process:
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, env=environment, cwd=folder) as process:
         assert process.stdout is not None
         told = [process.stdout.readline().strip() for _ in range(4)]
         assert told == ["splats", "cameras", "splats", "the page"]
@@ -101,7 +101,7 @@ def test_lift_in_memory_is_shown_until_it_is_interrupted_or_killed(tmp_path: Pat
             assert client.get("/render", params={"view": "middle"}).status_code == 200
         process.send_signal(signal.SIGINT)
         assert process.stdout.readline() == "ended\n"
-        assert not list(tmp_path.glob("splatlift*"))
+        assert not list(folder.glob("splatlift*"))
         assert process.stdin is not None
         print(file=process.stdin, flush=True)
         found = re.match(r"http://(127\.0\.0\.1):(\d+)/", process.stdout.readline())
@@ -110,17 +110,10 @@ def test_lift_in_memory_is_shown_until_it_is_interrupted_or_killed(tmp_path: Pat
     until(lambda: not _answers(found[1], int(found[2])))
 
 
-def test_a_lift_whose_files_moved_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from service.view import main
-
-    tiny = make_scene()
-    for name, content in (("s.ply", tiny.splats), ("c.json", tiny.cameras), ("f.safetensors", tiny.features)):
-        (tmp_path / name).write_bytes(content)
-    files = tmp_path / "s.ply", tmp_path / "c.json", [tmp_path / "f.safetensors"]
-    save_lift(lift_files(*files, LiftSettings.of(preset="row-sum")), tmp_path / "l.safetensors")
-    (tmp_path / "s.ply").unlink()
+def test_lift_whose_files_moved_is_told(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / "s.ply").unlink()
     for lift, told in (("l.safetensors", "its splats at"), ("f.safetensors", "a lift file")):
-        assert main([str(tmp_path / lift), "--no-browser"]) == 2
+        assert main([str(folder / lift), "--no-browser"]) == 2
         assert told in capsys.readouterr().err
 
 
