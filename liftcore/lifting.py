@@ -20,8 +20,8 @@ from liftcore.errors import InvalidSettings
 from liftcore.io.lift_file import poses_of
 from liftcore.planning.plan import Plan, plan_lift
 from liftcore.progress import Progress, Timings
-from liftcore.raster import open_raster
-from liftcore.raster.base import Raster, check_antialiased
+from liftcore.raster import check_given, open_raster
+from liftcore.raster.base import Raster
 from liftcore.result import LiftMetadata, LiftResult
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.splats import Splats
@@ -52,7 +52,7 @@ def lift(
     progress: Progress | None = None,
     on_plan: Callable[[Plan], None] | None = None,
     threads: int | None = None,
-    checkpoint: Checkpoint | Path | None = None,
+    checkpoint: Checkpoint | Path | str | None = None,
     engine: Engine | None = None,
     **settings: Any,
 ) -> LiftResult:
@@ -65,7 +65,8 @@ def lift(
             on the disk, so that no more than a few maps are in memory.
         preset: a published choice of weights (`Preset`), or `LiftSettings` in place of preset and settings.
         progress: called ``progress(stage, done, total, unit)``; an exception from it stops the work.
-        on_plan: called with the plan before the first view; None logs its warnings of this machine.
+        on_plan: called with the plan before the first view, and shows its warnings. None: they are logged, and at
+            the end those of the diagnostics.
         threads: None takes the cores that this process may use. The number changes no bit of the result.
         checkpoint: a folder that keeps the weights of finished views. The same lift goes on from there, identical to
             the bit, and so does one that differs in features alone (another encoder's of the same regions).
@@ -79,6 +80,7 @@ def lift(
         the CPU where that has no room for them.
 
     Raises:
+        InvalidSplats, InvalidCameras: splats or cameras are something else, such as a path.
         InvalidFeatures: views are malformed, or none has a camera.
         InvalidSettings: a setting is unknown or out of range, or does not suit the splats' kernel or the views.
         Unavailable: neither memory nor disk can hold what the lift needs, or there is no such device as asked for.
@@ -89,16 +91,15 @@ def lift(
     if settings:
         own = chosen.model_dump(exclude_unset=True) if isinstance(preset, LiftSettings) else {"preset": preset}
         chosen = LiftSettings.of(**own | settings)
-    check_antialiased(splats.kernel, chosen.antialiased)
+    check_given(splats, chosen.antialiased, threads)
+    kept = Checkpoint(Path(checkpoint)) if isinstance(checkpoint, Path | str) else checkpoint
     if engine is not None:
         known = cameras if isinstance(cameras, Cameras) else Cameras(cameras)
-        folder = checkpoint.folder if isinstance(checkpoint, Checkpoint) else checkpoint
-        given = {"progress": progress, "on_plan": on_plan or log_warnings, "folder": folder}
+        given = {"progress": progress, "on_plan": on_plan or log_all, "folder": kept.folder if kept else None}
         return lift_in_blocks(engine, splats, known, views, chosen, **given)
     work = _Lift(splats, chosen, threads, Timings(progress), choose_device(chosen.device))
     found = LiftViews.of(views, cameras, chosen)
-    plan = work.planned(found, on_plan or log_warnings)
-    kept = Checkpoint(checkpoint) if isinstance(checkpoint, Path) else checkpoint
+    plan = work.planned(found, on_plan or log_all)
     with within_memory(work.device):
         geometry = work.weigh(found, plan, kept)
         things = work.find_objects(geometry)
@@ -111,6 +112,9 @@ def lift(
         things = things if chosen.objects else None
         notes |= _objects(things) if things else {}
         diagnostics = work.diagnose(found, geometry, X, sums, plan, notes)
+    for warning in diagnostics["warnings"] if on_plan is None else ():
+        if warning not in plan.told:  # which the log has
+            log.warning(warning)
     table = found.features.table
     made = LiftResult(
         features=X,
@@ -156,7 +160,7 @@ def plan(
         InvalidFeatures, InvalidSettings, Unavailable: as `lift` has it.
     """
     chosen = preset if isinstance(preset, LiftSettings) else LiftSettings.of(preset=preset, **settings)
-    check_antialiased(splats.kernel, chosen.antialiased)
+    check_given(splats, chosen.antialiased, threads)
     found = LiftViews.of(views, cameras, chosen)
     return plan_lift(splats, found, chosen, choose_device(chosen.device), threads, look=True)
 
@@ -181,6 +185,13 @@ def _objects(found: RegionObjects) -> dict[str, Any]:
 def log_warnings(plan: Plan) -> None:
     """Log what the plan has to say of this machine, which no certificate keeps: equal inputs give equal lifts."""
     for warning in plan.warnings:
+        log.warning(warning)
+
+
+def log_all(plan: Plan) -> None:
+    """Log what a plan warns of, where nobody shows it: a program that has waited for an hour would like to know."""
+    log_warnings(plan)
+    for warning in plan.told:
         log.warning(warning)
 
 

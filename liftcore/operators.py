@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from liftcore.device import choose_device
-from liftcore.errors import InvalidSettings
+from liftcore.errors import InvalidCameras, InvalidSettings
 from liftcore.progress import Progress, silent
-from liftcore.raster import open_raster
-from liftcore.raster.base import CompositingParams, check_antialiased
+from liftcore.raster import check_given, open_raster
+from liftcore.raster.base import CompositingParams
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.splats import Splats
 from liftcore.settings import LiftSettings, Preset
@@ -45,14 +45,18 @@ def render(
         [H, W] or [H, W, F] f32, on the CPU.
 
     Raises:
-        InvalidSettings: values have another number of rows than there are splats.
+        InvalidSplats, InvalidCameras: splats or camera are something else, such as a path or a name.
+        InvalidSettings: values have another number of rows than there are splats, or threads are no number.
         Unavailable: there is no such device.
     """
+    check_given(splats, params.antialiased, threads)
+    if not isinstance(camera, Camera):
+        got, hint = repr(camera)[:80], "cameras[name] is the camera of a view"
+        raise InvalidCameras("camera", expected="a Camera", got=got, hint=hint)
     given = torch.as_tensor(values).detach().cpu()
     if given.ndim not in (1, 2) or given.shape[0] != splats.count:
         expected = f"[{splats.count}] or [{splats.count}, F], a row a splat"
         raise InvalidSettings("values", expected=expected, got=str(list(given.shape)))
-    check_antialiased(splats.kernel, params.antialiased)
     raster = open_raster(splats, choose_device(device), threads)
     rows = given.float()[:, None] if given.ndim == 1 else given.float()
     image = raster.render(camera, rows, params)
@@ -86,7 +90,7 @@ def region_weights(
         InvalidFeatures, InvalidSettings, Unavailable: as `lift` has it.
     """
     chosen = preset if isinstance(preset, LiftSettings) else LiftSettings.of(preset=preset, **settings)
-    check_antialiased(splats.kernel, chosen.antialiased)
+    check_given(splats, chosen.antialiased, threads)
     found = LiftViews.of(views, cameras, chosen)
     own = chosen.model_copy(update={"certificate_rays": 0})
     raster = open_raster(splats, choose_device(chosen.device), threads)

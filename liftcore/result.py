@@ -74,6 +74,11 @@ class LiftResult:
     object: Tensor | None = None  # [P] i32, -1 = of no object; None: objects were not looked for
     object_views: Tensor | None = None  # [N, 5] i32, places in ``views`` that show most of each, -1 after the last
 
+    def __repr__(self) -> str:
+        splats, channels = self.features.shape
+        what = f"{splats} splats, {channels} channels from {len(self.views)} views"
+        return f"LiftResult({what}, preset={str(self.settings.preset)!r}, on {self.features.device})"
+
     @property
     def settings(self) -> LiftSettings:
         """What the lift was made with."""

@@ -143,10 +143,14 @@ def as_views(
         scratch: the folder for an iterator's views; None: the system's for temporary files.
 
     Raises:
-        InvalidFeatures: there are none, one is neither regions nor a grid, a name comes twice, channels differ.
+        InvalidFeatures: there are none, one is neither regions nor a grid, a name comes twice, channels differ, or it
+            is something else, such as a path.
     """
     if isinstance(views, Views):
         return views
+    if isinstance(views, str | Path) or not isinstance(views, Iterable):
+        got, hint = f"{type(views).__name__} {views!r}"[:80], "read_features(path) opens a feature pack"
+        raise InvalidFeatures("features", expected="views by name, or pairs of a name and a view", got=got, hint=hint)
     if not isinstance(views, Mapping):
         return _spooled(views, scratch)
     given = cast("Mapping[str, ViewFeatures]", views)
@@ -292,7 +296,11 @@ def _check_channels(views: Iterable[tuple[str, ViewFeatures]]) -> None:
 def _spooled(pairs: Iterable[tuple[str, ViewFeatures]], scratch: Path | None) -> Views:
     with tempfile.TemporaryDirectory(dir=scratch, prefix="splatlift-views-") as folder:
         files: dict[str, Path] = {}
-        for name, features in pairs:
+        for pair in pairs:
+            if not (isinstance(pair, tuple | list) and len(pair) == 2):
+                got = type(pair).__name__
+                raise InvalidFeatures("features", expected="pairs of a name and a view", got=got)
+            name, features = pair
             if name in files:
                 raise InvalidFeatures("features", expected="each view once", got=f"{name!r} twice")
             files[name] = Path(folder, f"{len(files)}.safetensors")

@@ -29,7 +29,8 @@ from liftcore.one_thread import one_thread
 from liftcore.planning.contradictions import LEAST_IN_VIEW, LEAST_ROW_SUM, empty, unseen
 from liftcore.planning.views import SAMPLE, WELL_COVERED, greedy, spread
 from liftcore.progress import Progress, silent
-from liftcore.raster.base import CompositingParams, ViewRequest, check_antialiased
+from liftcore.raster import check_given
+from liftcore.raster.base import CompositingParams, ViewRequest
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.cameras import Camera, Cameras, distortion_warning
 from liftcore.scene.splats import Splats
@@ -111,7 +112,7 @@ def plan_photos(
         InvalidSettings: ``antialiased`` does not suit the splats' kernel.
     """
     settings = settings or LiftSettings.of()
-    check_antialiased(splats.kernel, settings.antialiased)
+    check_given(splats, settings.antialiased, threads)
     known = cameras if isinstance(cameras, Cameras) else Cameras(cameras)
     views = list(known.values())[:: settings.view_stride]
     rows = spread(splats.count, min(SAMPLE, splats.count))

@@ -74,11 +74,11 @@ class Camera:
         face: Face | None = None,
         name: str = "",
     ) -> None:
-        fields = {"viewmat": _matrix(viewmat), "K": _matrix(K), "width": width, "height": height}
+        fields = {"viewmat": _matrix(viewmat), "K": _matrix(K), "width": _pixels(width), "height": _pixels(height)}
         for field, value in {**fields, "lens": lens, "face": face, "name": name}.items():
             object.__setattr__(self, field, value)
-        if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
-            self._refuse("size", f"width and height in 1..{MAX_SIDE}", f"{width}x{height}")
+        if not (0 < self.width <= MAX_SIDE and 0 < self.height <= MAX_SIDE):
+            self._refuse("size", f"width and height, whole numbers in 1..{MAX_SIDE}", f"{width!r} x {height!r}")
         self._check_intrinsics()
         self._check_pose(self.viewmat)
 
@@ -177,6 +177,14 @@ def _matrix(values: Any) -> np.ndarray:
     return found
 
 
+def _pixels(side: Any) -> int:
+    """A whole number of any kind, as readers of JSON and arrays have it; 0, which is refused, of anything else."""
+    try:
+        return int(side) if int(side) == side else 0
+    except (TypeError, ValueError, OverflowError):
+        return 0
+
+
 def _what_it_is(matrix: np.ndarray, error: float) -> str:
     scale = float(np.cbrt(np.linalg.det(matrix))) if np.abs(matrix).max() < MAX_REACH else 0.0
     if scale > 0 and np.abs(matrix @ matrix.T / scale**2 - np.eye(3)).max() < 1e-3:
@@ -193,7 +201,7 @@ class Cameras(Mapping[str, Camera]):
         of_nerfstudio: as nerfstudio's own converter writes them, and not moved.
 
     Raises:
-        InvalidCameras: there are none, more than MAX_VIEWS, or two of one name.
+        InvalidCameras: there are none, more than MAX_VIEWS, two of one name, or something else than cameras.
     """
 
     def __init__(
@@ -205,10 +213,11 @@ class Cameras(Mapping[str, Camera]):
     ) -> None:
         self.frame = frame
         self.of_nerfstudio = of_nerfstudio
+        alone = _cameras_in(views)
         if isinstance(views, Mapping):
             named = [view if view.name == name else view.replace(name=name) for name, view in views.items()]
         else:
-            named = list(views)
+            named = alone
         if not named:
             raise InvalidCameras("cameras", expected="at least one view", got="none")
         check_count(len(named), "cameras")
@@ -216,7 +225,8 @@ class Cameras(Mapping[str, Camera]):
         for camera in named:
             if camera.name in self._by_name:
                 got = f"{camera.name!r} twice"
-                raise InvalidCameras("cameras", expected="one view a name", got=got, hint=SAME_NAMES)
+                hint = SAME_NAMES if camera.name else "give a dict of names to cameras, or Camera(..., name=...)"
+                raise InvalidCameras("cameras", expected="one view a name", got=got, hint=hint)
             self._by_name[camera.name] = camera
 
     def __getitem__(self, name: str) -> Camera:
@@ -247,6 +257,17 @@ class Cameras(Mapping[str, Camera]):
     def distorted(self) -> tuple[str, ...]:
         """The names of the views whose photos are distorted."""
         return tuple(name for name, camera in self._by_name.items() if camera.lens is not None)
+
+
+def _cameras_in(given: Any) -> list[Camera]:
+    """The cameras of a mapping or of a sequence, or a refusal of what is none of these, such as a path."""
+    values = given.values() if isinstance(given, Mapping) else given
+    found: list[Any] = list(values) if isinstance(values, Iterable) and not isinstance(values, str) else [values]
+    strange = [one for one in found if not isinstance(one, Camera)]
+    if strange:
+        got, hint = f"{type(strange[0]).__name__} {strange[0]!r}"[:80], "read_cameras(path) makes them of a file"
+        raise InvalidCameras("cameras", expected="a Camera for each name", got=got, hint=hint)
+    return found
 
 
 def viewmat_of(camera_to_world: np.ndarray, centre: np.ndarray) -> np.ndarray:

@@ -47,6 +47,10 @@ class RegionWeights:
     offsets: Tensor  # [V + 1] i64, on the CPU: the first region of each view, and how many there are in all
     views: tuple[str, ...] = ()  # their names, in the order of the offsets; () where nobody named them
 
+    def __repr__(self) -> str:
+        sizes = {"splats": self.splats.shape[0], "regions": int(self.offsets[-1]), "entries": self.region.shape[0]}
+        return f"RegionWeights({', '.join(f'{name}={size}' for name, size in sizes.items())}, on {self.device})"
+
     @property
     def nbytes(self) -> int:
         """Bytes of all tensors."""

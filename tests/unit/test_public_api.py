@@ -4,6 +4,7 @@ import json
 import logging
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -171,3 +172,60 @@ def test_what_a_machine_lacks_goes_to_whoever_listens_else_to_the_log(tmp_path, 
         assert heard[0].warnings == (little_memory,) and little_memory not in caplog.text
         lift_files(splats, cameras, [pack], lc.LiftSettings.of())
         assert caplog.text.count(little_memory) == 1
+
+
+@pytest.mark.parametrize(
+    ("changed", "error", "told"),
+    [
+        ({"splats": "scene.ply"}, lc.InvalidSplats, r"splats: .*got str 'scene.ply'; read_splats"),
+        ({"cameras": "sparse/0"}, lc.InvalidCameras, r"cameras: .*got str 'sparse/0'; read_cameras"),
+        ({"cameras": None}, lc.InvalidCameras, r"cameras: expected a Camera for each name, got NoneType"),
+        ({"views": "pack.safetensors"}, lc.InvalidFeatures, r"features: .*got str 'pack.safetensors'; read_features"),
+        ({"views": None}, lc.InvalidFeatures, r"features: expected views by name"),
+        ({"views": [torch.ones(2, 2, 4)]}, lc.InvalidFeatures, r"features: expected pairs of a name and a view"),
+        ({"threads": 0}, lc.InvalidSettings, r"threads: expected a whole number of one or more, .*got 0"),
+        ({"threads": 1.5}, lc.InvalidSettings, r"threads: .*got 1.5"),
+    ],
+)
+@pytest.mark.parametrize("call", [lc.lift, lc.plan, lc.region_weights])
+def test_what_is_no_such_value_is_refused_by_its_name(scene, call, changed, error, told):
+    _, splats, cameras, views = scene
+    given = {"splats": splats, "cameras": cameras, "views": views} | changed
+    with pytest.raises(error, match=told):
+        call(**given)
+
+
+def test_render_refuses_the_name_of_a_camera(scene):
+    _, splats, _, _ = scene
+    with pytest.raises(lc.InvalidCameras, match=r"camera: expected a Camera, got 'v0'; cameras\[name\]"):
+        lc.render(splats, "v0", torch.ones(splats.count))  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize("engine", [None, lc.LocalEngine(1)])
+def test_checkpoint_is_a_folder_by_its_path_or_its_text(scene, engine, tmp_path):
+    _, splats, cameras, views = scene
+    made = [
+        lc.lift(splats, cameras, views, preset="row-sum", engine=engine, checkpoint=kind(tmp_path / "kept"))
+        for kind in (str, Path)
+    ]
+    assert torch.equal(made[0].features, made[1].features) and any((tmp_path / "kept").iterdir())
+
+
+def test_warnings_of_a_lift_are_logged_once_where_nobody_shows_the_plan(scene, caplog):
+    _, splats, cameras, views = scene
+    turned = {name: lc.FeatureGrid(torch.ones(64, 4, 3)) for name in views}
+    made = lc.lift(splats, cameras, turned, preset="row-sum")
+    assert any("see that they are [rows, columns]" in warning for warning in made.diagnostics["warnings"])
+    assert [record.getMessage() for record in caplog.records].count(made.diagnostics["warnings"][-1]) == 1
+    assert {record.getMessage() for record in caplog.records} >= set(made.diagnostics["warnings"])
+    caplog.clear()
+    lc.lift(splats, cameras, turned, preset="row-sum", on_plan=lambda plan: None)
+    assert not caplog.records
+
+
+def test_lift_and_region_weights_are_shown_in_a_line(scene):
+    _, splats, cameras, views = scene
+    assert repr(lc.lift(splats, cameras, views)).startswith(f"LiftResult({splats.count} splats, ")
+    assert repr(lc.region_weights(splats, cameras, views)).startswith(
+        f"RegionWeights(splats={splats.count}, regions="
+    )
