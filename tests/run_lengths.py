@@ -1,11 +1,10 @@
-"""Masks as COCO writes them, made pixel by pixel: the twin of what `liftcore.features.mask_files` reads."""
+"""Masks as COCO writes them, the twin of what `liftcore.features.mask_files` reads."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    import numpy as np
+import numpy as np
 
 
 def sam_records(masks: np.ndarray, *, as_string: bool = False) -> list[dict[str, Any]]:
@@ -19,14 +18,10 @@ def sam_records(masks: np.ndarray, *, as_string: bool = False) -> list[dict[str,
 
 
 def lengths_of(mask: np.ndarray) -> list[int]:
-    """The run lengths of a mask, pixel by pixel."""
-    lengths, inside = [0], False
-    for pixel in mask.T.flatten().tolist():
-        if pixel != inside:
-            lengths.append(0)
-            inside = pixel
-        lengths[-1] += 1
-    return lengths
+    """The run lengths of a mask down its columns, zeros first."""
+    flat = mask.T.ravel().astype(bool)
+    changes = np.flatnonzero(np.diff(flat, prepend=False))
+    return np.diff([0, *changes, flat.size]).tolist()
 
 
 def compressed(lengths: list[int]) -> str:

@@ -26,14 +26,14 @@ from tests.run_lengths import sam_records
 if TYPE_CHECKING:
     from pathlib import Path
 
-EVERY = 26  # of 52 views: two are enough
-
 
 @pytest.fixture(scope="module")
 def views(shared_data: Path) -> dict[str, Regions]:
+    """One of 52, which is enough."""
     packs = read_features(shared_data / "tabletop" / "features_hard.safetensors")
-    found = {view: packs[view] for view in packs.views[::EVERY]}
-    return {view: regions for view, regions in found.items() if isinstance(regions, Regions)}
+    found = packs[packs.views[0]]
+    assert isinstance(found, Regions)
+    return {packs.views[0]: found}
 
 
 def test_a_level_as_pictures_is_the_same_pack(views: dict[str, Regions], tmp_path: Path) -> None:
@@ -83,7 +83,7 @@ def test_objects_are_found_in_the_words_of_their_masks(shared_data: Path, tmp_pa
         [thing["class"] for thing in told["objects"]]
     )
     packs = read_features(scene / "features_clean.safetensors")
-    for view in packs.views[::2]:
+    for view in packs.views[::4]:
         regions = packs[view]
         assert isinstance(regions, Regions)
         nearest = np.append((regions.codebook.float().numpy() @ vectors.T).argmax(axis=1), -1)

@@ -50,7 +50,6 @@ def told(scene: Path, pack: Path, own: dict[str, Any]) -> tuple[float, float]:
     ("name", "own", "most"),
     [
         ("features", {"view_stride": 6}, 9),
-        ("features", {"view_stride": 6, "robust_steps": 1}, 7),
         ("features", {"view_stride": 6, "levels": 0}, 7),
         ("grids", {"view_stride": 6}, 4),
         ("grids", {"view_stride": 6, "grid_reading": "nearest"}, 9),

@@ -1,4 +1,4 @@
-"""A real room: its two camera files agree, its rays are full, and rendered features resemble the encoder's."""
+"""A real room: its files agree, and disagree where one is broken; rays are full, features like the encoder's."""
 
 from __future__ import annotations
 
@@ -8,7 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 import torch
+from safetensors.numpy import load_file, save_file
 
+from liftcore.evaluate.check import check_scene
+from liftcore.features.encoders.encode import find_images
 from liftcore.features.pack import read_features
 from liftcore.features.views import FeatureGrid
 from liftcore.io.cameras import read_cameras
@@ -16,6 +19,7 @@ from liftcore.io.scene_files import lift_files
 from liftcore.io.splats import read_splats
 from liftcore.raster.base import CompositingParams
 from liftcore.raster.cpu.raster import CpuRaster
+from liftcore.scene.cameras import Cameras
 from liftcore.settings import LiftSettings
 
 if TYPE_CHECKING:
@@ -23,7 +27,7 @@ if TYPE_CHECKING:
 
     from torch import Tensor
 
-    from liftcore.scene.cameras import Camera, Cameras
+    from liftcore.scene.cameras import Camera
 
 SAMPLE = 8  # views
 CHANNELS = 5  # every fifth of 320
@@ -53,6 +57,22 @@ def test_colmap_and_inria_files_describe_the_same_cameras(plush, cameras):
         assert (camera.width, camera.height) == (other.width, other.height) == (990, 742)
         assert np.allclose([camera.fx, camera.fy], [other.fx, other.fy], rtol=1e-6)
         assert np.allclose(camera.viewmat, other.viewmat, atol=1e-5)
+
+
+@pytest.mark.parametrize("broken", [None, "cameras", "features"])
+def test_check_tells_broken_inputs_alone(plush, cameras, raster, tmp_path: Path, broken: str | None) -> None:
+    pack = plush / "grids.safetensors"
+    if broken == "cameras":
+        factors = np.ones((4, 4))
+        factors[:3, 3] = 0.3
+        cameras = Cameras([camera.replace(viewmat=camera.viewmat * factors) for camera in cameras.values()])
+    if broken == "features":  # bytes [F, h, w] under a shape of [h, w, F]
+        grids = {name: grid.transpose(2, 0, 1).copy().reshape(grid.shape) for name, grid in load_file(pack).items()}
+        pack = tmp_path / "grids.safetensors"
+        save_file(grids, pack)
+    found = check_scene(raster.splats, cameras, find_images([plush / "images"]), read_features(pack))
+    expected = {None: [], "cameras": ["photos"], "features": ["features"]}[broken]
+    assert [told.partition(":")[0] for told in found.wrong] == expected
 
 
 def test_rays_are_as_full_as_the_training_measured(plush, cameras, raster):
