@@ -21,7 +21,7 @@ def lengths_of(mask: np.ndarray) -> list[int]:
     """The run lengths of a mask down its columns, zeros first."""
     flat = mask.T.ravel().astype(bool)
     changes = np.flatnonzero(np.diff(flat, prepend=False))
-    return np.diff([0, *changes, flat.size]).tolist()
+    return np.diff(changes, prepend=0, append=flat.size).tolist()
 
 
 def compressed(lengths: list[int]) -> str:

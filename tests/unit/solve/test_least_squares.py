@@ -1,4 +1,4 @@
-"""Damped least squares against dense solvers, on scenes small enough for both."""
+"""Conjugate gradients and damped least squares against dense solvers, on scenes small enough for both."""
 
 from __future__ import annotations
 
@@ -12,7 +12,15 @@ from liftcore.features.views import Regions, ViewFeatures
 from liftcore.io.scene_files import lift_files
 from liftcore.progress import silent
 from liftcore.settings import LiftSettings
-from liftcore.solve.least_squares import BLOCK, Refinement, blocks, codebook_axes, random_axes, refine
+from liftcore.solve.least_squares import (
+    Refinement,
+    Stopping,
+    blocks,
+    codebook_axes,
+    column_dots,
+    conjugate_gradients,
+    refine,
+)
 from tests.scenes import write_scene
 from tests.unit.solve.dense_rays import SmallScene
 
@@ -20,6 +28,56 @@ pytestmark = pytest.mark.slow
 
 SEEDS = st.integers(0, 2**16)
 few = settings(max_examples=6, deadline=None)
+
+
+def system(kind: str, size: int = 12, channels: int = 5) -> tuple[np.ndarray, np.ndarray]:
+    """A symmetric matrix that is at least zero, and right sides in its range."""
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(size, size))
+    if kind == "scaled":  # what a Jacobi preconditioner is for
+        root *= np.logspace(-2, 2, size)
+    if kind == "deficient":
+        root[size // 2 :] = root[: size - size // 2]
+    K = root.T @ root
+    return K.astype(np.float32), (K @ rng.normal(size=(size, channels))).astype(np.float32)
+
+
+def jacobi(K: np.ndarray) -> np.ndarray:
+    return (1 / np.diag(K)).astype(np.float32)
+
+
+@pytest.mark.parametrize("kind", ["plain", "scaled", "deficient"])
+def test_the_system_is_solved(kind):
+    K, right = system(kind)
+    outcome = conjugate_gradients(lambda X: K @ X, right, jacobi(K), Stopping(200, 1e-5))
+    assert outcome.converged.all()
+    assert not outcome.broken.any()
+    assert np.abs(K @ outcome.solution - right).max() < 1e-3 * np.abs(right).max()
+    assert np.abs(outcome.rest - (right - K @ outcome.solution)).max() < 1e-3 * np.abs(right).max()
+
+
+def test_every_channel_is_solved_as_if_it_were_alone():
+    K, right = system("plain")
+    together = conjugate_gradients(lambda X: K @ X, right, jacobi(K), Stopping(6)).solution
+    for channel in range(right.shape[1]):
+        alone = conjugate_gradients(lambda X: K @ X, right[:, [channel]], jacobi(K), Stopping(6)).solution
+        assert np.allclose(alone[:, 0], together[:, channel], rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("bad", [-1.0, np.nan])
+def test_a_matrix_without_curvature_stops_and_says_so(bad):
+    K, right = system("plain")
+    with np.errstate(invalid="ignore", over="ignore"):
+        outcome = conjugate_gradients(lambda X: X * np.float32(bad), right, jacobi(K), Stopping(20))
+    assert outcome.broken.all()
+    assert outcome.steps == 1
+    assert np.isfinite(outcome.solution).all()
+
+
+def test_inner_products_are_summed_in_float64():
+    left = np.full((100_000, 2), 1e-3, np.float32)
+    left[0] = 1e4
+    assert np.allclose(column_dots(left, np.ones_like(left)), left.astype(np.float64).sum(axis=0), rtol=1e-12)
 
 
 def refined(scene: SmallScene, dtype: torch.dtype = torch.float32, **chosen: float) -> Refinement:
@@ -69,11 +127,6 @@ def test_undamped_steps_reach_the_least_squares_loss(seed):
     made = refined(scene, damping=0.0, cg_steps=200)
     first = scene.loss(scene.closed_form)
     assert least - 1e-6 <= scene.loss(made.features) <= least + 2e-3 * first
-
-
-def test_a_large_damping_is_the_closed_form():
-    scene = SmallScene(1)
-    assert torch.allclose(refined(scene, damping=1e6).features, scene.closed_form, atol=1e-5)
 
 
 @pytest.mark.parametrize("damping", [0.0, 0.3])
@@ -127,18 +180,6 @@ def test_axes_hold_most_of_the_squares_and_repeat_to_the_bit():
     assert torch.equal(axes, again)
 
 
-def test_random_projections_keep_lengths_in_the_mean():
-    rows = torch.randn(200, 64, generator=torch.Generator().manual_seed(1))
-    kept = (rows @ random_axes(64, 500, seed=0)).square().sum() / rows.square().sum()
-    assert float(kept) == pytest.approx(1.0, abs=0.05)
-
-
-def test_blocks_cover_all_channels_once():
-    for channels in (1, BLOCK, BLOCK + 1, 3 * BLOCK):
-        covered = [c for part in blocks(channels) for c in range(part.begin, part.end)]
-        assert covered == list(range(channels))
-
-
 def test_unseen_splats_stay_zero():
     scene = SmallScene(5)
     hidden = np.flatnonzero(scene.seen)[0]
@@ -158,15 +199,6 @@ def test_float16_features_that_grow_too_large_become_float32():
         added = part.add(largest.clone(), np.full((3, 2), step, np.float32))
         assert added.dtype == dtype
         assert torch.allclose(added.float(), largest.float() + step, rtol=5e-4)
-
-
-def test_the_number_of_threads_changes_no_bit_of_a_refined_lift(tmp_path):
-    paths = write_scene(tmp_path, 7)
-    knobs = LiftSettings.of(cg_steps=5, damping=0.1, cg_basis=3, reference_channels=4)
-    runs = [lift_files(paths[0], paths[1], [paths[2]], knobs, threads=n) for n in (1, 2, 5)]
-    for other in runs[1:]:
-        assert torch.equal(runs[0].features, other.features)
-        assert runs[0].metadata.certificate == other.metadata.certificate
 
 
 def test_all_that_was_seen_is_refined_however_faintly(tmp_path, monkeypatch):
