@@ -72,9 +72,14 @@ def running(data: Path, queries: QueryClient | None = None, **settings: Any) -> 
 
 
 @pytest.fixture(scope="module")
-def patient(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, int]]:
+def data_of_patient(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("patient") / "data"
+
+
+@pytest.fixture(scope="module")
+def patient(data_of_patient: Path) -> Iterator[tuple[str, int]]:
     """A server in no hurry."""
-    with served(tmp_path_factory.mktemp("patient") / "data") as address:
+    with served(data_of_patient) as address:
         yield address
 
 
@@ -156,75 +161,56 @@ def assert_problem(said: tuple[bytes, bytes], status: int, kind: str) -> None:
 
 
 @pytest.mark.parametrize("head", [HEAD, JSON_HEAD], ids=["upload", "json"])
-def test_body_that_trickles_is_408_and_closed_and_leaves_no_draft(
+def test_body_that_trickles_or_does_not_come_is_408_and_leaves_no_draft(
     brisk: tuple[str, int], data_of_brisk: Path, head: bytes
 ) -> None:
     with client_of(brisk) as client:
         assert_problem(trickle(client, head, b" "), 408, "too-slow")
-    until(lambda: not list((data_of_brisk / "tmp").iterdir()))
-
-
-@pytest.mark.parametrize("head", [HEAD, JSON_HEAD], ids=["upload", "json"])
-def test_body_that_does_not_come_is_408(brisk: tuple[str, int], head: bytes) -> None:
     with client_of(brisk) as client:
         client.sendall(head)
         assert_problem(answer(client), 408, "too-slow")
+    until(lambda: not list((data_of_brisk / "tmp").iterdir()))
 
 
-def test_body_that_comes_fast_and_then_trickles_is_408(brisk: tuple[str, int]) -> None:
-    with client_of(brisk) as client:
-        head = HEAD.replace(b"5000", b"500000")
-        assert_problem(trickle(client, head + b" " * 200_000, b" "), 408, "too-slow")
-
-
-def test_body_in_pieces_is_taken(patient: tuple[str, int]) -> None:
+def test_upload_that_breaks_off_leaves_nothing(patient: tuple[str, int], data_of_patient: Path) -> None:
     with client_of(patient) as client:
-        client.sendall(JSON_HEAD.replace(b"Host: localhost\r\n", b"Host: localhost\r\nConnection: close\r\n"))
-        for _ in range(20):
-            client.sendall(b" " * 250)
-            time.sleep(0.01)
-        head, _ = answer(client)
-    assert head.startswith(b"HTTP/1.1 422 ")  # read to its end, and found to be no order
+        client.sendall(HEAD.replace(b"5000", b"9000000") + b"p" * 2_000_000)
+        until(lambda: any((data_of_patient / "tmp").iterdir()))
+    until(lambda: not any((data_of_patient / "tmp").iterdir()))
+    assert httpx.get(f"http://127.0.0.1:{patient[1]}/assets").json() == {"assets": []}
 
 
-def judged(wait: Wait, steps: list[tuple[float, int]], turn: int = 0) -> list[bool]:
-    """What is said of a client that waits, by seconds and bytes since the beginning."""
+MOST = 10 + UNREAD_BYTES / 1000  # seconds of a reader
+
+
+@pytest.mark.parametrize(
+    ("wait", "steps", "over_at"),
+    [
+        (Wait.BODY, [(seconds, seconds * 5000) for seconds in range(0, 600, 2)], None),
+        (Wait.BODY, [(seconds, seconds * 1100) for seconds in range(0, 600, 2)], None),
+        (Wait.BODY, [(seconds, seconds * 900) for seconds in range(0, 22, 2)], 10),
+        (Wait.BODY, [(0, 0), (10, 10**6), (19, 10**6), (20, 10**6)], 20),  # fast, and then it stalls
+        (Wait.HEAD, [(0, 0), (19, 19), (20, 20)], 20),  # whatever trickles
+        (Wait.READER, [(0, 0), (MOST - 1, 1), (2 * MOST - 2, 1), (2 * MOST, 1)], 2 * MOST),
+        (Wait.NOTHING, [(0, 0), (10**6, 0)], None),  # work of the server is nobody's fault
+    ],
+)
+def test_patience_ends_with_who_keeps_the_server_waiting(
+    wait: Wait, steps: list[tuple[float, int]], over_at: float | None
+) -> None:
     patience = Patience(Pace(bytes_per_second=1000, grace_seconds=10, head_seconds=20))
-    return [patience.is_over(wait, turn, moved, 1000 + seconds) for seconds, moved in steps]
+    ends = [seconds for seconds, moved in steps if patience.is_over(wait, 0, moved, 1000 + seconds)]
+    assert (ends[0] if ends else None) == over_at
 
 
-@pytest.mark.parametrize(("speed", "over"), [(5000, False), (1100, False), (900, True)])
-def test_body_may_take_long_if_it_keeps_the_least_speed(speed: int, over: bool) -> None:
-    assert any(judged(Wait.BODY, [(seconds, seconds * speed) for seconds in range(0, 600, 2)])) is over
-
-
-def test_body_that_is_fast_and_then_stalls_is_too_slow() -> None:
-    assert judged(Wait.BODY, [(0, 0), (10, 10**6), (19, 10**6), (20, 10**6)]) == [False, False, False, True]
-
-
-def test_head_has_its_time_whatever_trickles() -> None:
-    assert judged(Wait.HEAD, [(0, 0), (19, 19), (20, 20)]) == [False, False, True]
-
-
-def test_reader_must_take_something_in_its_time() -> None:
-    most = 10 + UNREAD_BYTES / 1000
-    assert judged(Wait.READER, [(0, 0), (most - 1, 1), (2 * most - 2, 1), (2 * most, 1)]) == [
-        False,
-        False,
-        False,
-        True,
-    ]
-
-
-def test_work_of_the_server_is_nobodys_fault() -> None:
-    assert not any(judged(Wait.NOTHING, [(0, 0), (10**6, 0)]))
+def test_each_request_has_its_own_time() -> None:
     patience = Patience(Pace(head_seconds=1))
-    assert not any(patience.is_over(Wait.HEAD, turn, 0, turn) for turn in range(9))  # each request has its own time
+    assert not any(patience.is_over(Wait.HEAD, turn, 0, turn) for turn in range(9))
 
 
-@pytest.mark.parametrize("begin", [b"G", b"GET / HTTP/1.1\r\nHost: localhost\r\n"], ids=["line", "headers"])
-def test_headers_that_trickle_are_408_and_closed(curt: tuple[str, int], begin: bytes) -> None:
-    assert_problem(trickle_anew(curt, begin, b"a"), 408, "too-slow")
+def test_headers_that_trickle_are_408_and_closed(curt: tuple[str, int]) -> None:
+    for begin in (b"G", b"GET / HTTP/1.1\r\nHost: localhost\r\n"):  # within a line, and within headers
+        assert_problem(trickle_anew(curt, begin, b"a"), 408, "too-slow")
 
 
 def test_headers_that_trickle_after_an_answer_are_408_and_closed(curt: tuple[str, int]) -> None:
@@ -257,33 +243,33 @@ def test_more_connections_than_allowed_are_503_until_one_ends(tmp_path: Path) ->
         until(lambda: httpx.get(f"http://127.0.0.1:{address[1]}/healthz").status_code == 200)
 
 
-def stored(data: Path, content: bytes) -> str:
-    """The path of content that a server over a data directory will have."""
+def stored(store: Store, content: bytes) -> str:
+    """The path of content that a server over a store will have."""
     digest = hashlib.sha256(content).hexdigest()
-    store = Store.open(data)
     with store.files.draft(".ply") as draft:
         draft.write_bytes(content)
         store.assets.add(SERVICE, CheckedUpload(draft, AssetKind.SPLATS, digest, ".ply", {}, []))
-    store.close()
     return f"/assets/sha256:{digest}/content"
 
 
-@pytest.mark.parametrize("size", [33_000_000, 3_000_000], ids=["held up", "sent, and not read to its end"])
-def test_client_that_does_not_read_is_cut_off(tmp_path: Path, size: int) -> None:
-    content = bytes(size)  # more than the buffers between us hold
-    path = stored(tmp_path / "data", content)
+def test_client_that_does_not_read_is_cut_off(tmp_path: Path) -> None:
+    """Both while we are held up, and once all is sent and lies in buffers."""
+    contents = [bytes(size) for size in (33_000_000, 3_000_000)]
+    store = Store.open(tmp_path / "data")
+    paths = [stored(store, content) for content in contents]
+    store.close()
     with running(tmp_path / "data", min_bytes_per_second=1 << 20, slow_grace_seconds=0.5) as server:
-        with socket.socket() as client:
-            client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-            client.settimeout(PATIENCE_SECONDS)
-            client.connect(server.servers[0].sockets[0].getsockname())
-            client.sendall(f"GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
-            until(lambda: server.server_state.connections)
-            until(lambda: not server.server_state.connections)
-            head, body = answer(client)
-        assert head.startswith(b"HTTP/1.1 200 ") and len(body) < len(content)
-    with served(tmp_path / "data") as address:
-        assert httpx.get(f"http://127.0.0.1:{address[1]}{path}", timeout=PATIENCE_SECONDS).content == content
+        address = server.servers[0].sockets[0].getsockname()
+        for path, content in zip(paths, contents, strict=True):
+            with socket.socket() as client:
+                client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+                client.settimeout(PATIENCE_SECONDS)
+                client.connect(address)
+                client.sendall(f"GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
+                until(lambda: server.server_state.connections)
+                until(lambda: not server.server_state.connections)
+                head, body = answer(client)
+            assert head.startswith(b"HTTP/1.1 200 ") and len(body) < len(content)
 
 
 def test_two_lengths_of_a_body_are_refused_and_the_connection_is_closed(patient: tuple[str, int]) -> None:

@@ -28,10 +28,10 @@ from .guarded import Guarded, address, bearer, every_route, guarded, make_key
 from .tiny_scene import TinyScene, colmap_zip, labels, masks
 
 
-@pytest.fixture
-def filled(tmp_path: Path, scene: TinyScene, table: Path) -> tuple[Path, dict[str, Any]]:
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory: pytest.TempPathFactory, scene: TinyScene, table: Path) -> tuple[Path, dict[str, Any]]:
     """A data directory with an asset of each kind and a lift, and what the service told of them."""
-    data = tmp_path / "data"
+    data = tmp_path_factory.mktemp("kept") / "data"
     with serving(data, table) as client:
         contents = {"splats": scene.splats, "cameras": scene.cameras, "features": scene.features}
         ids = [client.put(f"/assets/{kind}", content=body).json()["id"] for kind, body in contents.items()]
@@ -42,6 +42,13 @@ def filled(tmp_path: Path, scene: TinyScene, table: Path) -> tuple[Path, dict[st
         assert job["state"] == "succeeded", job
         told = all_told(client)
     return data, told
+
+
+@pytest.fixture
+def filled(kept: tuple[Path, dict[str, Any]], tmp_path: Path) -> tuple[Path, dict[str, Any]]:
+    """A copy of it."""
+    shutil.copytree(kept[0], tmp_path / "data")
+    return tmp_path / "data", kept[1]
 
 
 def all_told(client: TestClient) -> dict[str, Any]:

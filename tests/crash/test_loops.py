@@ -10,9 +10,7 @@ from tests.benchmarks.soak import POOLED, fault_points, kill_loop, leak_loop, sc
 
 IN_SHORT = (
     "after the job is in line, before the 202",
-    "after some progress",
     "after the lift is published, before it has a row",
-    "after the lift has its row",
     "before the trade-off has its row",
 )
 

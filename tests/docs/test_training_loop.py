@@ -1,14 +1,12 @@
 """The five lines for a training loop, on tensors as gsplat trains them, give what the same scene gives from files."""
 
 import inspect
-import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 import liftcore as lc
 from liftcore.features.pack import write_pack
@@ -83,9 +81,3 @@ def test_tensors_of_a_training_loop_lift_as_their_files_do(loop: dict[str, Any],
     columns = np.nonzero(np.asarray(loop["mask"]))[1]
     assert len(columns) > 20 and columns.max() < WIDTH / 2  # the cloud on the left was asked for
     assert loop["means"].grad is None
-    if folder := os.environ.get("PICTURES"):
-        photo = loop["photos"][2][1].clip(0, 1).numpy()
-        side = np.concatenate([photo, np.where(np.asarray(loop["mask"])[..., None], photo, 0.3)], axis=1)
-        Image.fromarray((255 * side).astype(np.uint8)).resize((8 * WIDTH, 4 * HEIGHT), 0).save(
-            Path(folder) / "training_loop.png"
-        )
