@@ -16,7 +16,7 @@ from liftcore.errors import InvalidSplats
 from liftcore.io.ply import BLOCK_ROWS, write_splats
 from liftcore.io.splats import read_splats, recoloured, some_rows
 from liftcore.query.splat_colours import seen_colours
-from liftcore.scene.splats import Kernel, Splats
+from liftcore.scene.splats import Kernel
 from tests.scenes import look_at, random_splats
 
 ROTATION = [f"rot_{i}" for i in range(4)]
@@ -128,23 +128,6 @@ def test_forced_kernel_overrules_the_properties(tmp_path: Path) -> None:
     assert flat.log_scales.shape == (5, 2)
     with pytest.raises(InvalidSplats, match=r"'scale_2' of a 3dgs splat.*nearest dialect is 2DGS"):
         read_splats(with_ply(tmp_path, ply_bytes(DIALECTS["2dgs"])), Kernel.GAUSSIAN_3D)
-
-
-def test_splats_made_in_code_are_written_in_the_usual_layout(tmp_path: Path) -> None:
-    splats = Splats(
-        means=torch.zeros(3, 3),
-        quats=torch.ones(3, 4),
-        log_scales=torch.zeros(3, 3),
-        opacity_logits=torch.zeros(3),
-        sh=torch.ones(3, 4, 3),
-        extras={"object": torch.arange(3, dtype=torch.int16)},
-    )
-    write_splats(splats, tmp_path / "made.ply")
-    again = read_splats(tmp_path / "made.ply")
-    assert again.layout[:6] == ("x", "y", "z", "nx", "ny", "nz")
-    assert again.sh is not None
-    assert torch.equal(again.sh, torch.ones(3, 4, 3))
-    assert torch.equal(again.extras["object"], splats.extras["object"])
 
 
 def test_failed_write_leaves_nothing_behind(tmp_path: Path) -> None:
@@ -323,7 +306,7 @@ def test_filter_of_mip_splatting_must_be_a_width(tmp_path: Path) -> None:
 
 
 def test_rows_are_kept_to_the_byte_over_blocks_and_in_their_own_types(tmp_path: Path) -> None:
-    names, count = [*DIALECTS["inria degree 3"], "mask", "time"], 2 * BLOCK_ROWS + 5
+    names, count = [*INRIA, "mask", "time"], 2 * BLOCK_ROWS + 5
     types = {"f_dc_1": "double", "mask": "uchar", "time": "double"}
     path = with_ply(tmp_path, ply_bytes(names, count, types, head="comment of somebody\n"))
     kept = np.random.default_rng(1).random(count) < 0.3
