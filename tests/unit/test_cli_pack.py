@@ -25,24 +25,6 @@ def save(path: Path, values: np.ndarray) -> None:
     np.save(path, values)
 
 
-def test_langsplat_folders_are_packed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder, pack = tmp_path / "language_features", tmp_path / "p.safetensors"
-    for camera in ("camA", "camB"):
-        save(folder / camera / "000_s.npy", np.zeros((4, 2, 2), np.float32))
-        save(folder / camera / "000_f.npy", np.ones((1, 5), np.float32))
-    options = ["--encoder-name", "clip", "--text-space", "open_clip:ViT-B-16", "--normalised", "--json"]
-    status, out, err = run(capsys, "pack", "langsplat", folder, "-o", pack, *options)
-    assert (status, err) == (0, "")
-    document = json.loads(out)
-    assert (document["views"], document["channels"], document["normalised"]) == (2, 5, True)
-    assert document["text_space"] == "open_clip:ViT-B-16"
-    assert read_features(pack).views == ("camA/000", "camB/000")
-    (folder / "camA" / "000_f.npy").unlink()
-    status, out, err = run(capsys, "pack", "langsplat", folder, "-o", tmp_path / "q.safetensors")
-    assert (status, out) == (2, "") and not (tmp_path / "q.safetensors").exists()
-    assert_one_line(err)
-
-
 def test_maps_are_packed_under_their_cameras_names_in_either_layout(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -54,7 +54,6 @@ def test_the_text_of_a_query_stands_before_between_or_after_options(arguments: l
         (["L", "--vieuw", "v", "mug"], "arguments: --vieuw v"),
         (["L", "--negative", "cat", "mug"], "expected what to look for, before --negative, got --negative cat mug"),
         (["L", "cat", "--mask", "m.png"], "no --view"),
-        (["L", "cat", "--view", "v", "--mask", "m.png", "--attention", "m.png"], "got the same file twice"),
     ],
 )
 def test_what_a_query_has_no_place_for_is_told(

@@ -62,6 +62,8 @@ def test_views_come_in_their_order_whichever_ends_first() -> None:
     names = [f"v{k}" for k in range(9)]
     raster = Staged({"v0": "v2 ended", "v1": "v2 ended"})  # all three are in work at the same time, or none ends
     assert [walked.weights for walked in side_by_side(beside(raster, 3), looks(*names))] == names
+    assert raster.forgotten  # no view is kept
+    assert [views_at_a_time(threads) for threads in (1, 2, 64)] == [1, 2, 4]
 
 
 def test_an_error_comes_in_the_place_of_its_view() -> None:
@@ -80,14 +82,3 @@ def test_closing_awaits_the_views_in_work_and_begins_no_other() -> None:
     after = list(raster.happened)
     assert "v1 ended" in after
     assert sum(what.endswith("begun") for what in after) == sum(what.endswith("ended") for what in after) <= 3
-
-
-def test_no_view_is_kept_when_the_walks_end() -> None:
-    rasters = [Staged() for _ in range(3)]
-    assert len(list(side_by_side([cast("Raster", raster) for raster in rasters], looks("v0", "v1")))) == 2
-    assert all(raster.forgotten for raster in rasters)
-
-
-@pytest.mark.parametrize(("threads", "views"), [(1, 1), (2, 2), (64, 4)])
-def test_many_threads_share_a_few_views(threads: int, views: int) -> None:
-    assert views_at_a_time(threads) == views

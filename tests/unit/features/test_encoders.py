@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from liftcore.errors import InvalidFeatures, InvalidInput, Unavailable
@@ -156,21 +157,20 @@ def test_cells_are_unit_vectors_unless_asked_otherwise(photos: Path, encode: Enc
     torch.testing.assert_close(lengths[:, -1], torch.ones(2), atol=1e-3, rtol=0)
 
 
-def test_what_float16_cannot_hold_is_float32(photos: Path, encode: Encode) -> None:
+def test_what_float16_cannot_hold_is_float32_and_what_is_no_number_refused(
+    photos: Path, encode: Encode, tmp_path: Path
+) -> None:
     Image.new("RGB", (8, 8), (255, 255, 255)).save(photos / "bright.png")
     Image.new("RGB", (8, 8), (9, 9, 9)).save(photos / "dark.png")
     done, grids = encode(photos, MeanColour(scale=1e5))
     assert done.wide == ("bright",)
     assert grids["bright"].dtype == torch.float32 and grids["bright"].max() == 1e5
     assert grids["dark"].dtype == torch.float16
-
-
-@pytest.mark.parametrize("scale", [float("nan"), 1e30])
-def test_features_that_are_no_numbers_are_refused(scale: float, photos: Path, encode: Encode, tmp_path: Path) -> None:
-    Image.new("RGB", (8, 8), (255, 255, 255)).save(photos / "a.png")
-    with pytest.raises(InvalidFeatures, match="image 'a'"):
-        encode(photos, MeanColour(scale))
-    assert list((tmp_path / "out").iterdir()) == []
+    before = (tmp_path / "out" / "pack.safetensors").read_bytes()
+    for scale in (float("nan"), 1e30):
+        with pytest.raises(InvalidFeatures, match="image 'bright'"):
+            encode(photos, MeanColour(scale))
+    assert [path.read_bytes() for path in (tmp_path / "out").iterdir()] == [before]
 
 
 def test_views_are_named_after_their_images(photos: Path) -> None:
@@ -203,26 +203,21 @@ def test_images_of_sub_folders_keep_these_in_their_names(photos: Path) -> None:
         find_images([photos / "none"])
 
 
-def test_what_is_no_image_is_refused_by_name(photos: Path) -> None:
+def test_what_is_no_image_is_refused_by_name(photos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = photos / "whole.png"
     blob(64, 64, (3, 3, 40, 50)).save(whole)
+    Image.fromarray(np.ones((4, 4), np.float32)).save(photos / "float.tif")
     bad = {"text.png": b"hello", "empty.png": b"", "cut.png": whole.read_bytes()[:-40]}
     for name, content in bad.items():
         (photos / name).write_bytes(content)
+    for name in (*bad, "float.tif"):
         with pytest.raises(InvalidInput, match=name):
             read_image(photos / name)
-    Image.fromarray(np.ones((4, 4), np.float32)).save(photos / "float.tif")
-    with pytest.raises(InvalidInput, match=r"float\.tif"):
-        read_image(photos / "float.tif")
-
-
-def test_decompression_bombs_are_refused(photos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    Image.new("RGB", (64, 64)).save(photos / "a.png")
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 3_000)
-    assert read_image(photos / "a.png")[0].size == (64, 64)
-    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 1_000)
+    assert read_image(whole)[0].size == (64, 64)
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 1_000)  # a decompression bomb is twice as large
     with pytest.raises(InvalidInput, match="at most 2000 pixels"):
-        read_image(photos / "a.png")
+        read_image(whole)
 
 
 PATCH, SIDE, WIDTH, F = 8, 32, 24, 10
@@ -267,16 +262,6 @@ def backbone(name: str) -> TimmEncoder:
     return TimmEncoder._with_random_weights(name)
 
 
-@pytest.fixture
-def resnet() -> TimmEncoder:
-    return backbone("resnet18")
-
-
-@pytest.fixture
-def vit() -> TimmEncoder:
-    return backbone("vit_tiny_patch16_224")
-
-
 def test_maskclip_is_the_last_attention_when_each_token_sees_itself_alone() -> None:
     tower = small_vit()
     images = torch.randn(2, 3, SIDE, SIDE)
@@ -300,19 +285,6 @@ def test_clip_patches_are_the_tokens_that_open_clip_gives_projected() -> None:
         torch.testing.assert_close(vit_patches(tower, images), (tokens @ tower.proj).reshape(2, 4, 4, F))
 
 
-def test_resnet_values_are_what_the_pool_gives_for_equal_cells() -> None:
-    tower = small_resnet()
-    nn.init.zeros_(tower.attnpool.positional_embedding)
-    cells = torch.randn(2, 128, 1, 1)
-    pool = tower.attnpool
-    with torch.no_grad():
-        pooled = pool(cells.expand(-1, -1, 2, 2))
-        dense = pool.c_proj(pool.v_proj(cells[:, :, 0, 0]))
-        torch.testing.assert_close(pooled, dense)
-        grid = resnet_values(tower, torch.randn(1, 3, 64, 96))
-    assert grid.shape == (1, 2, 3, F)
-
-
 ENCODERS = {
     "maskclip ViT": lambda: small_encoder("maskclip", small_vit()),
     "clip ViT": lambda: small_encoder("clip", small_vit()),
@@ -320,6 +292,19 @@ ENCODERS = {
     "timm ViT": lambda: backbone("vit_tiny_patch16_224"),
     "timm ResNet": lambda: backbone("resnet18"),
 }
+
+
+def test_resnet_values_are_what_the_pool_gives_for_equal_cells() -> None:
+    tower = small_resnet()
+    nn.init.zeros_(tower.attnpool.positional_embedding)
+    images = torch.randn(1, 3, 64, 96)
+    with torch.no_grad():
+        grid = resnet_values(tower, images)
+        cells = tower.layer4(tower.layer3(tower.layer2(tower.layer1(tower.stem(images)))))
+        assert grid.shape == (1, 2, 3, F)
+        for row, column in np.ndindex(2, 3):
+            alike = cells[:, :, row, column, None, None].expand(-1, -1, 2, 2)
+            torch.testing.assert_close(grid[:, row, column], tower.attnpool(alike))
 
 
 @pytest.mark.parametrize("kind", ENCODERS)
@@ -340,9 +325,9 @@ def test_a_change_in_a_patch_moves_its_own_cell_most(kind: str) -> None:
         assert divmod(int(moved.argmax()), columns) == (row, column)
 
 
-def test_cells_of_a_resnet_are_brought_back_to_their_patches(resnet: TimmEncoder) -> None:
+def test_cells_of_a_resnet_are_brought_back_to_their_patches() -> None:
     """Without it they look 15.5 pixels up and left, so a patch moves the cell below and right of it as well."""
-    images = torch.randn(4, 3, 5 * 32, 5 * 32)
+    resnet, images = backbone("resnet18"), torch.randn(4, 3, 5 * 32, 5 * 32)
     spotted = images.clone()
     spotted[..., 64:96, 64:96] += torch.randn(4, 3, 32, 32)
     moved = (resnet.encode(spotted) - resnet.encode(images)).square().sum(dim=(0, 3))
@@ -368,9 +353,8 @@ def test_shift_of_cells_is_counted_from_strides_and_paddings(layers: list[nn.Mod
     assert cell_shift(Net(*layers), torch.zeros(1, 3, 32, 32)) == shift
 
 
-def test_weights_from_a_file_give_the_same_features(tmp_path: Path, vit: TimmEncoder) -> None:
-    from safetensors.torch import save_file
-
+def test_weights_from_a_file_give_the_same_features(tmp_path: Path) -> None:
+    vit = backbone("vit_tiny_patch16_224")
     state = {key: value.contiguous() for key, value in vit._model.state_dict().items()}
     head = {"head.weight": torch.zeros(1000, 192), "head.bias": torch.zeros(1000)}
     save_file(state | head, str(tmp_path / "vit.safetensors"))
@@ -388,9 +372,8 @@ def test_weights_from_a_file_give_the_same_features(tmp_path: Path, vit: TimmEnc
             open_image_encoder(f"timm:vit_tiny_patch16_224@{tmp_path / name}.safetensors")
 
 
-def test_weights_under_other_names_are_taken_in_their_order(tmp_path: Path, resnet: TimmEncoder) -> None:
-    from safetensors.torch import save_file
-
+def test_weights_under_other_names_are_taken_in_their_order(tmp_path: Path) -> None:
+    resnet = backbone("resnet18")
     own = [*resnet._model.state_dict().items()]
     other = {f"_part{k}.{name.rpartition('.')[2]}": tensor for k, (name, tensor) in enumerate(own)}
     head = {"_fc.weight": torch.zeros(10, 512), "_fc.bias": torch.zeros(10)}
@@ -422,23 +405,23 @@ def test_weights_under_other_names_are_taken_in_their_order(tmp_path: Path, resn
         ("clip:ViT-B-32/nothing", "one of the tags"),
         ("timm:resnet19", "resnet18"),
         (f"timm:resnet18@{__file__}", "ending in"),
+        ("maskclip:ViT-S-32-alt@{code}", "nothing else"),
+        ("timm:resnet18@{code}", "nothing else"),
     ],
 )
-def test_a_specification_that_is_none_is_refused(spec: str, message: str) -> None:
+def test_what_is_no_encoder_is_refused_and_no_code_is_run(spec: str, message: str, tmp_path: Path) -> None:
+    torch.save({"state_dict": Path("code")}, tmp_path / "code.pt")
     with pytest.raises(InvalidInput, match=message):
-        open_image_encoder(spec)
+        open_image_encoder(spec.format(code=tmp_path / "code.pt"))
 
 
-@pytest.mark.parametrize(
-    ("spec", "message"),
-    [
-        ("maskclip:ViT-B-32", "tag or a file"),
-        ("timm:resnet18@/no/such.pth", "nothing at"),
-    ],
-)
-def test_missing_weights_are_unavailable_and_never_random(spec: str, message: str) -> None:
-    with pytest.raises(Unavailable, match=message):
-        open_image_encoder(spec)
+def test_missing_weights_and_devices_are_unavailable_and_never_random() -> None:
+    for spec, message in (("maskclip:ViT-B-32", "tag or a file"), ("timm:resnet18@/no/such.pth", "nothing at")):
+        with pytest.raises(Unavailable, match=message):
+            open_image_encoder(spec)
+    for device in ("cuda:99", "nonsense"):
+        with pytest.raises(Unavailable, match="--device"):
+            open_image_encoder("timm:resnet18", device)
 
 
 @pytest.mark.parametrize("spec", ["maskclip:ViT-B-32/openai", "timm:resnet18.a1_in1k"])
@@ -459,13 +442,6 @@ def test_weights_are_asked_of_the_cache_and_once_of_the_network(
         with pytest.raises(BlockingIOError):
             silent.accept()
     assert weights.fetched("x", lambda: 7, "") == 7  # what is in the cache asks nobody
-
-
-@pytest.mark.parametrize("spec", ["maskclip:ViT-S-32-alt", "timm:resnet18"])
-def test_a_pickle_that_holds_code_is_refused(spec: str, tmp_path: Path) -> None:
-    torch.save({"state_dict": Path("code")}, tmp_path / "weights.pt")
-    with pytest.raises(InvalidInput, match="nothing else"):
-        open_image_encoder(f"{spec}@{tmp_path / 'weights.pt'}")
 
 
 def small_trunk(name: str, pool: str, proj: Any) -> Any:
@@ -512,9 +488,3 @@ def test_towers_without_dense_features_are_refused() -> None:
             small_encoder(kind, tower)
     with pytest.raises(InvalidInput, match="any size"):
         TimmEncoder._with_random_weights("mixer_s32_224")
-
-
-def test_a_device_that_is_not_there_is_unavailable() -> None:
-    for device in ("cuda:99", "nonsense"):
-        with pytest.raises(Unavailable, match="--device"):
-            open_image_encoder("timm:resnet18", device)

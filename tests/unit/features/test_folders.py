@@ -30,12 +30,13 @@ def langsplat(folder: Path, ids: np.ndarray = IDS, codebook: np.ndarray = CODEBO
 @pytest.mark.parametrize(("ids", "features"), [("float32", "float32"), ("int64", "float64"), ("int16", "float16")])
 def test_langsplat_folder_becomes_a_pack(ids: str, features: str, tmp_path: Path) -> None:
     folder = tmp_path / "language_features"
-    folder.mkdir()
-    langsplat(folder, IDS.astype(ids), CODEBOOK.astype(features))
+    for camera in ("camA", "camB"):
+        (folder / camera).mkdir(parents=True)
+        langsplat(folder / camera, IDS.astype(ids), CODEBOOK.astype(features))
     write_pack(tmp_path / "pack", langsplat_views(folder), {})
     packs = read_features(tmp_path / "pack")
-    assert packs.views == ("frame_1",)
-    view = packs["frame_1"]
+    assert packs.views == ("camA/frame_1", "camB/frame_1")
+    view = packs["camB/frame_1"]
     assert isinstance(view, Regions)
     assert view.labels.tolist() == IDS.tolist()
     assert torch.equal(view.codebook.float(), torch.from_numpy(CODEBOOK))

@@ -160,13 +160,6 @@ def test_thresholds_scale_with_any_scores(scores: np.ndarray, method: str, power
     assert scaled == find_threshold(torch.from_numpy(scores), method).value * 2.0**power
 
 
-@given(scores=SCORES, method=st.sampled_from(SEARCHED), seed=st.integers(0, 99))
-@settings(max_examples=100, deadline=None)
-def test_the_order_of_the_scores_does_not_matter(scores: np.ndarray, method: str, seed: int) -> None:
-    mixed = np.random.default_rng(seed).permutation(scores)
-    assert find_threshold(torch.from_numpy(mixed), method) == find_threshold(torch.from_numpy(scores), method)
-
-
 @given(
     seed=st.integers(0, 1000),
     method=st.sampled_from(SEARCHED),
