@@ -43,10 +43,15 @@ from tests.scenes import look_at, random_camera, random_splats
 STRAY = 2 * SPLATS_A_CLUSTER + 5  # a splat of the third cluster
 
 
-@pytest.fixture
-def scene(lift_tiny: Callable[..., Path], tmp_path: Path) -> QueryScene:
+@pytest.fixture(scope="module")
+def lifted(lift_tiny: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The tiny scene lifted with a scale of the opacity logits."""
-    return QueryScene.open(lift_tiny(tmp_path, "tikhonov"))
+    return lift_tiny(tmp_path_factory.mktemp("tikhonov"), "tikhonov")
+
+
+@pytest.fixture
+def scene(lifted: Path) -> QueryScene:
+    return QueryScene.open(lifted)
 
 
 def of(scene: QueryScene, *clusters: int, keep: str = "all", rows: tuple[int, ...] = ()) -> Answer:
@@ -263,10 +268,10 @@ def test_groups_get_colours_that_can_be_told_apart_at_every_run() -> None:
 NEAR, FAR = 2.0, 5.0
 
 
-def scene_of(lifted: QueryScene, splats: Splats, camera: Camera) -> QueryScene:
+def scene_of(given: QueryScene, splats: Splats, camera: Camera) -> QueryScene:
     """A lift of nothing, over those splats and that camera."""
     ones = torch.ones(splats.count)
-    made = replace(lifted.lift, features=torch.ones(splats.count, 1), evidence=ones, seen=ones > 0)
+    made = replace(given.lift, features=torch.ones(splats.count, 1), evidence=ones, seen=ones > 0)
     return QueryScene(made, splats, Cameras((camera,)))
 
 

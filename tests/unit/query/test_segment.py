@@ -28,7 +28,6 @@ from tests.api.tiny_scene import CHANNELS, HEIGHT, SPLATS_A_CLUSTER, WIDTH, text
 EYE = np.eye(CHANNELS, dtype=np.float32)
 COUNT = 3 * SPLATS_A_CLUSTER
 CLUSTER = np.arange(COUNT) // SPLATS_A_CLUSTER
-FIRST = slice(0, SPLATS_A_CLUSTER)
 
 
 @pytest.fixture

@@ -150,12 +150,6 @@ def oriented() -> np.ndarray:
     return pose
 
 
-def trained(poses: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Camera-to-world poses of a transforms.json as nerfstudio trains on them: moved, then scaled."""
-    moved = {name: oriented() @ pose for name, pose in poses.items()}
-    return {name: np.vstack([np.hstack([p[:3, :3], SCALE * p[:3, 3:]]), p[3:]]) for name, p in moved.items()}
-
-
 @pytest.fixture
 def model(tmp_path: Path) -> Path:
     return write_files(tmp_path / "model", binary_files())
@@ -164,28 +158,25 @@ def model(tmp_path: Path) -> Path:
 @pytest.fixture
 def run(tmp_path: Path, model: Path) -> Path:
     """A folder with the transforms.json of the model's poses, and the file of a run."""
-    document, poses = transforms_of(read_cameras(model)), {}
+    document = transforms_of(read_cameras(model))
     for record in document["frames"]:
-        poses[record["file_path"]] = APPLIED @ np.array(record["transform_matrix"])
-        record["transform_matrix"] = poses[record["file_path"]].tolist()
+        record["transform_matrix"] = (APPLIED @ np.array(record["transform_matrix"])).tolist()
     folder = tmp_path / "run"
     folder.mkdir()
     (folder / "transforms.json").write_text(json.dumps({**document, "applied_transform": APPLIED[:3].tolist()}))
     (folder / FRAME_FILE).write_text(json.dumps({"transform": (oriented() @ APPLIED)[:3].tolist(), "scale": SCALE}))
-    (folder.parent / "trained.json").write_text(json.dumps({k: v.tolist() for k, v in trained(poses).items()}))
     return folder
 
 
 @pytest.fixture
-def expected(run: Path, model: Path) -> Cameras:
-    """The model's cameras with the poses that nerfstudio trains on."""
-    poses = json.loads((run.parent / "trained.json").read_text())
-    views = []
-    for camera, pose in zip(read_cameras(model).values(), poses.values(), strict=True):
-        sizes = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-        opencv = np.array(pose) * [1.0, -1.0, -1.0, 1.0]  # axes are columns
-        views.append(Camera.pinhole(camera.name, *sizes, viewmat=np.linalg.inv(opencv)))
-    return Cameras(tuple(views))
+def expected(model: Path) -> Cameras:
+    """The model's cameras with the poses that nerfstudio trains on: moved, then scaled."""
+    cameras, views = read_cameras(model), []
+    for camera, record in zip(cameras.values(), transforms_of(cameras)["frames"], strict=True):
+        pose = oriented() @ APPLIED @ np.array(record["transform_matrix"])
+        pose[:3, 3] *= SCALE
+        views.append(camera.replace(viewmat=np.linalg.inv(pose * [1.0, -1.0, -1.0, 1.0])))  # axes are columns
+    return Cameras(views)
 
 
 def test_poses_of_a_transforms_json_are_moved_as_nerfstudio_moves_them(run: Path, expected: Cameras) -> None:
