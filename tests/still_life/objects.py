@@ -1,4 +1,4 @@
-"""What stands on the table: surfaces, paints and how many splats each takes."""
+"""What stands on the table: surfaces, colours and how many splats each takes."""
 
 from __future__ import annotations
 
@@ -7,25 +7,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tests.still_life import paints, surfaces
+from tests.still_life import surfaces
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from tests.still_life.paints import Paint
-
 
 @dataclass(frozen=True)
 class Piece:
-    """One painted surface of a part of an object."""
+    """One surface of a part of an object."""
 
     thing: str  # the object's name
     part: str  # the part's name
     surface: Callable[[np.ndarray, np.ndarray], np.ndarray]
-    paint: Paint
+    colour: tuple[float, float, float]  # sRGB
     splats: int
-    two_sided: bool = False  # lit from whichever side the light is on
-    glow: float = 0.0  # light of its own, 0..1
 
 
 def still_life_pieces() -> list[Piece]:
@@ -49,29 +45,25 @@ def small_things() -> list[Piece]:
     ring = surfaces.tube(round_, lambda t: np.full_like(t, 0.06), (0.0, 0.0, 1.0))
     nut = surfaces.lathe((0.6, 0.2, 0.0), (0.2, 0.24, 0.24, 0.2), (0.0, 0.08, 0.26, 0.34))
     pear = surfaces.ellipsoid((2.2, 0.9, 0.8), (0.75, 0.75, 0.8))
-    steel = paints.plain(0.66, 0.66, 0.7)
+    steel = (0.66, 0.66, 0.7)
     return [
-        Piece("cloth", "cloth", cloth, paints.plain(0.7, 0.2, 0.2), 3000),
+        Piece("cloth", "cloth", cloth, (0.7, 0.2, 0.2), 3000),
         Piece("kettle", "kettle", kettle, steel, 1300),
-        Piece("pear", "pear", pear, paints.plain(0.7, 0.75, 0.2), 900),
+        Piece("pear", "pear", pear, (0.7, 0.75, 0.2), 900),
         Piece("sword", "sword", sword, steel, 360),
         Piece("ring", "ring", ring, steel, 90),
         Piece("nut", "nut", nut, steel, 70),
     ]
 
 
-# Bases on the table, for contact shadows: centre x, y and radius.
-FOOTPRINTS = ((-2.5, -1.5, 0.62), (0.1, -0.1, 1.0), (2.5, -1.55, 1.15), (3.2, 1.3, 0.75), (-3.3, 1.2, 0.75))
-
-
 def _room() -> list[Piece]:
     top = surfaces.rectangle((-7.0, -4.2, 0.0), (14.0, 0.0, 0.0), (0.0, 7.2, 0.0))
     front = surfaces.rectangle((-7.0, -4.2, -0.35), (14.0, 0.0, 0.0), (0.0, 0.0, 0.35))
     return [
-        Piece("wall", "wall", _curved_wall, paints.plaster, 6000),
-        Piece("floor", "floor", surfaces.disc((0.0, 0.0, -4.0), 15.0), paints.tiles, 4500),
-        Piece("table", "table top", top, paints.wood, 13000),
-        Piece("table", "table edge", front, paints.wood, 900),
+        Piece("wall", "wall", _curved_wall, (0.68, 0.76, 0.75), 6000),
+        Piece("floor", "floor", surfaces.disc((0.0, 0.0, -4.0), 15.0), (0.45, 0.42, 0.4), 4500),
+        Piece("table", "table top", top, (0.7, 0.5, 0.29), 13000),
+        Piece("table", "table edge", front, (0.7, 0.5, 0.29), 900),
     ]
 
 
@@ -95,10 +87,10 @@ def _mug() -> list[Piece]:
     handle = surfaces.tube(bow, lambda t: np.full_like(t, 0.095), (0.0, 1.0, 0.0))
     coffee = surfaces.disc((x, y, 1.05), 0.48)
     return [
-        Piece("mug", "mug body", outside, paints.glaze, 2200),
-        Piece("mug", "mug body", inside, paints.plain(0.93, 0.92, 0.88), 900),
-        Piece("mug", "mug body", coffee, paints.plain(0.24, 0.13, 0.07), 350),
-        Piece("mug", "mug handle", handle, paints.plain(0.16, 0.34, 0.62), 700),
+        Piece("mug", "mug body", outside, (0.16, 0.34, 0.62), 2200),
+        Piece("mug", "mug body", inside, (0.93, 0.92, 0.88), 900),
+        Piece("mug", "mug body", coffee, (0.24, 0.13, 0.07), 350),
+        Piece("mug", "mug handle", handle, (0.16, 0.34, 0.62), 700),
     ]
 
 
@@ -107,8 +99,8 @@ def _bowl() -> list[Piece]:
     outside = surfaces.lathe(centre, (0.1, 0.6, 1.05, 1.35, 1.5), (0.0, 0.02, 0.2, 0.5, 0.85))
     inside = surfaces.lathe(centre, (1.5, 1.43, 1.28, 0.95, 0.05), (0.85, 0.82, 0.5, 0.22, 0.1))
     return [
-        Piece("bowl", "bowl", outside, paints.ceramic, 2600),
-        Piece("bowl", "bowl", inside, paints.plain(0.88, 0.87, 0.83), 1500),
+        Piece("bowl", "bowl", outside, (0.9, 0.88, 0.83), 2600),
+        Piece("bowl", "bowl", inside, (0.88, 0.87, 0.83), 1500),
     ]
 
 
@@ -131,22 +123,22 @@ def _fruit() -> list[Piece]:
 
     banana = surfaces.tube(arc, lambda t: 0.04 + 0.2 * np.sin(np.pi * np.clip(t, 0, 1)) ** 0.55, (0.0, 1.0, 0.0))
     return [
-        Piece("red apple", "red apple", apple, paints.apple_skin, 1900),
+        Piece("red apple", "red apple", apple, (0.75, 0.15, 0.11), 1900),
         Piece(
             "red apple",
             "red apple",
             surfaces.tube(stem, lambda t: np.full_like(t, 0.03), (0, 1, 0)),
-            paints.plain(0.3, 0.2, 0.1),
+            (0.3, 0.2, 0.1),
             80,
         ),
         Piece(
             "orange",
             "orange",
             surfaces.ellipsoid((0.62, -0.42, 0.95), (0.56, 0.56, 0.54)),
-            paints.orange_peel,
+            (0.94, 0.52, 0.08),
             1900,
         ),
-        Piece("yellow banana", "yellow banana", banana, paints.banana_peel, 1900),
+        Piece("yellow banana", "yellow banana", banana, (0.95, 0.82, 0.22), 1900),
     ]
 
 
@@ -162,10 +154,10 @@ def _book() -> list[Piece]:
 
     w, h, t = 1.5, 2.1, 0.42
     return [
-        Piece("book", "book cover", side((-w / 2, -h / 2, t), w * a, h * b), paints.book_cover, 2300),
-        Piece("book", "book cover", side((-w / 2, h / 2, 0), -h * b, t * up), paints.plain(0.45, 0.09, 0.1), 500),
-        Piece("book", "book pages", side((-w / 2, -h / 2, 0), w * a, t * up), paints.pages, 700),
-        Piece("book", "book pages", side((w / 2, -h / 2, 0), h * b, t * up), paints.pages, 700),
+        Piece("book", "book cover", side((-w / 2, -h / 2, t), w * a, h * b), (0.52, 0.1, 0.12), 2300),
+        Piece("book", "book cover", side((-w / 2, h / 2, 0), -h * b, t * up), (0.45, 0.09, 0.1), 500),
+        Piece("book", "book pages", side((-w / 2, -h / 2, 0), w * a, t * up), (0.86, 0.82, 0.72), 700),
+        Piece("book", "book pages", side((w / 2, -h / 2, 0), h * b, t * up), (0.86, 0.82, 0.72), 700),
     ]
 
 
@@ -175,9 +167,9 @@ def _lamp() -> list[Piece]:
     pole = surfaces.lathe(centre, (0.07, 0.07), (0.4, 3.3))
     shade = surfaces.lathe(centre, (1.25, 0.62), (2.5, 4.0))
     return [
-        Piece("lamp", "lamp post", foot, paints.plain(0.62, 0.5, 0.26), 900),
-        Piece("lamp", "lamp post", pole, paints.plain(0.66, 0.54, 0.3), 500),
-        Piece("lamp", "lamp shade", shade, paints.shade_cloth, 2600, two_sided=True, glow=0.48),
+        Piece("lamp", "lamp post", foot, (0.62, 0.5, 0.26), 900),
+        Piece("lamp", "lamp post", pole, (0.66, 0.54, 0.3), 500),
+        Piece("lamp", "lamp shade", shade, (0.96, 0.83, 0.54), 2600),
     ]
 
 
@@ -185,8 +177,8 @@ def _plant() -> list[Piece]:
     x, y = -3.3, 1.2
     pot = surfaces.lathe((x, y, 0), (0.55, 0.62, 0.78, 0.86, 0.86), (0.0, 0.3, 0.95, 1.0, 1.2))
     pieces = [
-        Piece("potted plant", "plant pot", pot, paints.terracotta, 1700),
-        Piece("potted plant", "plant pot", surfaces.disc((x, y, 1.1), 0.84), paints.plain(0.2, 0.14, 0.09), 500),
+        Piece("potted plant", "plant pot", pot, (0.66, 0.32, 0.21), 1700),
+        Piece("potted plant", "plant pot", surfaces.disc((x, y, 1.1), 0.84), (0.2, 0.14, 0.09), 500),
     ]
     for k in range(15):
         angle = 2.4 * k  # the golden angle, nearly: leaves spread without repeating
@@ -198,5 +190,5 @@ def _plant() -> list[Piece]:
             0.26,
             0.5 * out,
         )
-        pieces.append(Piece("potted plant", "plant leaves", blade, paints.leaf_green, 320, two_sided=True))
+        pieces.append(Piece("potted plant", "plant leaves", blade, (0.22, 0.46, 0.2), 320))
     return pieces

@@ -11,7 +11,7 @@ import torch
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.harmonics import SH_C0
 from liftcore.scene.splats import Splats
-from tests.still_life.objects import FOOTPRINTS, Piece, still_life_pieces
+from tests.still_life.objects import Piece, still_life_pieces
 from tests.still_life.surfaces import Samples, sample
 
 if TYPE_CHECKING:
@@ -25,8 +25,7 @@ COVERAGE = 0.85  # standard deviation of a splat over the mean distance of its n
 STRETCH = 1.25  # a splat is longer along its surface's first direction by this, and narrower across
 FLATNESS = 0.08  # thickness over width
 LIGHT = np.array([-5.0, -7.0, 9.0])  # decimetres, a window in front on the left
-BULB = np.array([3.2, 1.3, 2.9])  # decimetres, inside the lamp's shade
-AMBIENT, WINDOW, LAMP = 0.42, 0.62, 1.1
+AMBIENT, WINDOW = 0.5, 0.6
 
 
 @dataclass(frozen=True)
@@ -137,33 +136,11 @@ def _spacing(piece: Piece) -> float:
 
 
 def _lit(piece: Piece, points: Samples) -> np.ndarray:
-    """[n, 3] colours: paint under an ambient light, a window and the lamp (Lambert), with contact shadows."""
-    paint = piece.paint(points.points, points.parameters)
-    window = _lambert(points, LIGHT, piece.two_sided)
-    away = np.linalg.norm(points.points - BULB, axis=1)
-    lamp = _lambert(points, BULB, piece.two_sided) / (1 + 0.18 * away**2)
-    warm = np.array([1.0, 0.86, 0.62])
-    light = AMBIENT + WINDOW * window[:, None] + LAMP * lamp[:, None] * warm
-    if piece.thing == "table":
-        light = light * _contact(points.points)[:, None]
-    return paint * np.maximum(light, 1.15 * piece.glow + 0.4 * (piece.glow > 0))
-
-
-def _lambert(points: Samples, light: np.ndarray, two_sided: bool) -> np.ndarray:
-    towards = light - points.points
+    """[n, 3] colours: the piece's under an ambient light and a window (Lambert)."""
+    towards = LIGHT - points.points
     towards = towards / np.linalg.norm(towards, axis=1, keepdims=True)
-    cosine = (points.normals * towards).sum(axis=1)
-    return np.abs(cosine) if two_sided else np.maximum(cosine, 0.0)
-
-
-def _contact(points: np.ndarray) -> np.ndarray:
-    """[n] in 0..1, darker under and right behind what stands on the table, away from the window."""
-    shade = np.ones(len(points))
-    for x, y, radius in FOOTPRINTS:
-        near = np.hypot(points[:, 0] - x, points[:, 1] - y) / radius
-        far = np.hypot(points[:, 0] - x - 0.5 * radius, points[:, 1] - y - 0.7 * radius) / radius
-        shade *= 1 - 0.45 * np.exp(-((near / 1.05) ** 6)) - 0.3 * np.exp(-((far / 1.15) ** 4))
-    return shade.clip(0.25, 1.0)
+    cosine = np.abs((points.normals * towards).sum(axis=1))
+    return np.array(piece.colour) * (AMBIENT + WINDOW * cosine[:, None])
 
 
 def _quaternions(frames: np.ndarray) -> np.ndarray:

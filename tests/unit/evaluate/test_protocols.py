@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ from liftcore.evaluate.protocols import (
     SelectedSplats,
     segment,
 )
+from liftcore.evaluate.published import published
 from liftcore.query.ask import Answer, ask
 from liftcore.query.objects import objects
 from liftcore.query.render import view_mask
@@ -30,6 +32,7 @@ from liftcore.query.scene import QueryScene
 from liftcore.query.terms import Query
 from liftcore.query.text import open_encoder
 from liftcore.query.threshold import find_threshold
+from liftcore.raster.cpu.raster import CpuRaster
 from tests.labelled_scene import HEIGHT, WIDTH, isat, rectangle, write_lift
 
 P1, P2, P3, _ = EvaluationProtocol
@@ -143,10 +146,6 @@ def test_p1_compares_rendered_features(scene: QueryScene) -> None:
 
 
 def test_p2_sees_the_selected_splats_alone(scene: QueryScene) -> None:
-    from dataclasses import replace
-
-    from liftcore.raster.cpu.raster import CpuRaster
-
     texts, encoder = ["red apple", "unicorn"], words(scene)
     protocol = SelectedSplats(scene, texts, encoder, threshold=0.5)
     chosen = ask(scene, Query(("red apple",), threshold=0.5), encoder).selected
@@ -225,17 +224,13 @@ GOOD = isat([("cup", rectangle(0, 0, 4, 4))])
 @pytest.mark.parametrize(
     "document",
     [
-        "{",
         "[]",
         "[" * 100_000,
-        {},
         {**GOOD, "info": {"width": 0, "height": 3}},
-        {**GOOD, "info": {"width": "9", "height": 3}},
         {**GOOD, "objects": {"a": 1}},
         {**GOOD, "objects": [1]},
         {**GOOD, "objects": [{"category": " ", "segmentation": []}]},
         {**GOOD, "objects": [{"category": "cup"}]},
-        {**GOOD, "objects": [{"category": "cup", "segmentation": [[1]]}]},
         {**GOOD, "objects": [{"category": "cup", "segmentation": [[1, "2"]]}]},
         {**GOOD, "objects": [{"category": "cup", "segmentation": [[1, float("nan")]]}]},
         {**GOOD, "objects": [{"category": "cup", "segmentation": [[1, 1e300]]}]},
@@ -282,3 +277,9 @@ def test_labels_that_are_not_there_are_refused(tmp_path: Path) -> None:
     (view / "cat.png").write_bytes(b"no picture")
     with pytest.raises(InvalidInput, match=r"cat\.png"):
         scene.objects("03", 4, 4)
+
+
+def test_published_means_are_those_of_their_scenes_but_where_the_paper_slips() -> None:
+    rows = [row for dataset in ("lerf-ovs", "3d-ovs") for row in published(dataset) if row.scenes]
+    off = {row.method for row in rows if abs(sum(row.scenes.values()) / len(row.scenes) - row.mean) > 0.11}
+    assert off == {"N2F2"}

@@ -257,25 +257,20 @@ BAD_MASKS = {
 }
 
 
-@pytest.mark.parametrize("masks", BAD_MASKS.values(), ids=BAD_MASKS)
-def test_bad_masks_are_refused_in_one_line(tmp_path, capsys, masks):
+def test_bad_masks_and_a_table_of_other_channels_are_refused_in_one_line(tmp_path, capsys):
     paths = write_scene(tmp_path, 2)
-    save_file({"embeddings": torch.eye(2, 6)}, tmp_path / "t", metadata={"words": '["cat", "dog"]'})
-    if masks is not None:
-        (tmp_path / "m").write_bytes(masks)
     words = ["--labels", str(tmp_path / "m"), "--table", str(tmp_path / "t"), "--classes", "cat", "dog"]
-    assert cli.main(["tradeoff", *map(str, paths), "-o", str(tmp_path / "out"), *words]) == 2
-    told = capsys.readouterr().err
-    assert told.count("\n") == 1
-    assert "labels" in told
-
-
-def test_a_table_of_other_channels_is_refused_in_one_line(tmp_path, capsys):
-    paths = write_scene(tmp_path, 2)
+    command = ["tradeoff", *map(str, paths), "-o", str(tmp_path / "out"), *words]
+    save_file({"embeddings": torch.eye(2, 6)}, tmp_path / "t", metadata={"words": '["cat", "dog"]'})
+    for name, masks in BAD_MASKS.items():
+        if masks is not None:
+            (tmp_path / "m").write_bytes(masks)
+        assert cli.main(command) == 2, name
+        told = capsys.readouterr().err
+        assert told.count("\n") == 1 and "labels" in told, name
     save_file({"embeddings": torch.eye(2, 5)}, tmp_path / "t", metadata={"words": '["cat", "dog"]'})
     save_file({"v2/mask": torch.zeros(7, 9, dtype=torch.int16)}, tmp_path / "m")
-    words = ["--labels", str(tmp_path / "m"), "--table", str(tmp_path / "t"), "--classes", "cat", "dog"]
-    assert cli.main(["tradeoff", *map(str, paths), "-o", str(tmp_path / "out"), *words]) == 2
+    assert cli.main(command) == 2
     assert capsys.readouterr().err == "splatlift: table: expected 6 channels, as the features, got 5\n"
 
 

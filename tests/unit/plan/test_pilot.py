@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
 import torch
 
 from liftcore.evaluate.accuracy import cosine_figures
-from liftcore.features.pack import read_features, write_pack
+from liftcore.features.pack import write_pack
 from liftcore.features.views import Regions
-from liftcore.io.cameras import read_cameras
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.ply import write_splats
 from liftcore.io.scene_files import lift_files, open_files
@@ -160,26 +158,6 @@ def test_few_views_are_all_taken(tmp_path):
     splats, cameras, pack = disagreeing(tmp_path / "scene", 0.0)
     lifted = lift_files(splats, cameras, [pack], LiftSettings.of(view_cosine=0.5, view_stride=2))
     assert len(lifted.metadata.views) == VIEWS // 2 <= FEW_VIEWS
-
-
-def test_a_room_is_written_the_same_twice_and_its_views_disagree_as_told(tmp_path):
-    for name in ("one", "two"):
-        write_room(tmp_path / name, Room(splats=2_000, views=3, size=(64, 48), channels=16))
-    files = [(tmp_path / name / "features.safetensors").read_bytes() for name in ("one", "two")]
-    assert files[0] == files[1]
-    packs = read_features(tmp_path / "one" / "features.safetensors")
-    cameras = read_cameras(tmp_path / "one" / "cameras.json")
-    assert set(packs.views) == set(cameras)
-    for view in packs.views:
-        observed = packs[view]
-        assert isinstance(observed, Regions)
-        labels = observed.labels
-        sizes = [len(level.unique()) for level in labels]
-        assert labels.shape == (4, 24, 32)
-        assert sizes == sorted(sizes)  # from coarse to fine
-        for coarse, fine in pairwise(labels):
-            pairs = torch.stack([coarse.flatten(), fine.flatten()]).unique(dim=1)
-            assert pairs.shape[1] == len(fine.unique())  # a part lies in one whole
 
 
 def flown(splats, cameras, pack, threads=1) -> Pilot:

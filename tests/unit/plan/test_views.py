@@ -54,11 +54,6 @@ def test_whatever_a_view_blends_is_in_its_field(kernel):
     assert seen.seen_share == seen.in_view.any(axis=0).mean()
 
 
-def test_every_direction_has_one_of_the_sides():
-    directions = np.random.default_rng(0).normal(size=(2_000, 3))
-    assert np.unique(side_of(directions)).tolist() == list(range(SIDES))
-
-
 def test_chosen_views_look_from_all_sides():
     seen = visibility(random_splats(0, 80, 0.3), ring(24), CompositingParams())
     order = list(view_order(seen))
