@@ -79,23 +79,6 @@ def test_photos_are_shown_as_they_were_uploaded(client: TestClient, lift: dict[s
     assert client.delete(f"/assets/{asset['id']}").status_code == 204
 
 
-@pytest.mark.parametrize(
-    "content",
-    [b"no zip", photos(), photos(left=b"no photo"), photos(left=png() + bytes(1 << 22))[:-900]],
-    ids=["no zip", "none", "no photo", "cut"],
-)
-def test_what_is_no_photos_is_refused(client: TestClient, content: bytes) -> None:
-    assert assert_problem(client.put("/assets/photos", content=content))["type"] == "/problems/invalid-photos"
-
-
-def test_photos_that_unpack_to_much_more_are_refused(client: TestClient) -> None:
-    content = io.BytesIO()
-    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("left.png", png() + bytes(1 << 25))
-    told = assert_problem(client.put("/assets/photos", content=content.getvalue()))
-    assert "twice the zip" in told["expected"]
-
-
 def test_lift_file_from_elsewhere_becomes_a_lift(
     client: TestClient, lift: dict[str, Any], scene: TinyScene, start: Callable[..., Any], tmp_path: Any
 ) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import sys
 import threading
 from collections.abc import Callable, Iterator
@@ -231,8 +232,6 @@ def test_every_answer_tells_browsers_to_guess_and_frame_nothing(client: TestClie
 
 
 def test_log_of_one_thing_again_and_again_is_thinned_out() -> None:
-    import logging
-
     now = [0.0]
     sparing, access = Sparing(lambda: now[0]), logging.LogRecord("service.access", 20, "x", 1, "m", (), None)
     repeated = [logging.LogRecord("service.jobs", 40, "x", 1, "m", (), None) for _ in range(10_000)]
