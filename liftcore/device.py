@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 
-from liftcore.errors import Unavailable
+from liftcore.errors import InvalidSettings, Unavailable
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -114,8 +114,11 @@ def choose_device(asked: str) -> Device:
     """The device that ``auto``, ``cpu`` or ``cuda`` stands for here; ``auto`` takes a card where one can be used.
 
     Raises:
+        InvalidSettings: another name.
         Unavailable: ``cuda`` was asked for and cannot be had.
     """
+    if asked not in ("auto", "cpu", "cuda"):
+        raise InvalidSettings("device", expected="'auto', 'cpu' or 'cuda'", got=repr(asked)[:80])
     if asked == "cpu":
         return CPU
     missing = _missing()

@@ -87,10 +87,7 @@ def lift(
 
     Source: Splat Feature Solver, Eq. 3 and 6.
     """
-    chosen = preset if isinstance(preset, LiftSettings) else LiftSettings.of(preset=preset)
-    if settings:
-        own = chosen.model_dump(exclude_unset=True) if isinstance(preset, LiftSettings) else {"preset": preset}
-        chosen = LiftSettings.of(**own | settings)
+    chosen = LiftSettings.chosen(preset, settings)
     check_given(splats, chosen.antialiased, threads)
     kept = Checkpoint(Path(checkpoint)) if isinstance(checkpoint, Path | str) else checkpoint
     if engine is not None:
@@ -159,7 +156,7 @@ def plan(
     Raises:
         InvalidFeatures, InvalidSettings, Unavailable: as `lift` has it.
     """
-    chosen = preset if isinstance(preset, LiftSettings) else LiftSettings.of(preset=preset, **settings)
+    chosen = LiftSettings.chosen(preset, settings)
     check_given(splats, chosen.antialiased, threads)
     found = LiftViews.of(views, cameras, chosen)
     return plan_lift(splats, found, chosen, choose_device(chosen.device), threads, look=True)

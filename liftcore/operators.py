@@ -89,7 +89,7 @@ def region_weights(
     Raises:
         InvalidFeatures, InvalidSettings, Unavailable: as `lift` has it.
     """
-    chosen = preset if isinstance(preset, LiftSettings) else LiftSettings.of(preset=preset, **settings)
+    chosen = LiftSettings.chosen(preset, settings)
     check_given(splats, chosen.antialiased, threads)
     found = LiftViews.of(views, cameras, chosen)
     own = chosen.model_copy(update={"certificate_rays": 0})

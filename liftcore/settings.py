@@ -14,12 +14,14 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from pydantic_core import PydanticCustomError
 
 from liftcore.errors import InvalidSettings
+from liftcore.nearest import nearest
 from liftcore.raster.base import MOST_OF_A_RAY, CompositingParams, Selection, Weighting
 
 TIKHONOV_GAIN = 1.2  # lambda of the paper's Tikhonov Guidance (App. Tikhonov, lambda sweep)
 LARGEST_ALPHA = 0.9999999  # nearer to one, float32 says one, and the ray has no light left to go on with
 VISIBLE_WEIGHT = 0.05  # a splat that weighs less at its centre is hidden there, or hardly there at all
 _SHOWN = 80  # characters of a wrong value in an error
+NEAREST = 3  # settings that are named where one is unknown
 
 
 class Preset(StrEnum):
@@ -232,6 +234,17 @@ class LiftSettings(BaseModel):
         return cls._checked(lambda: cls(**values))
 
     @classmethod
+    def chosen(cls, preset: Preset | str | Self, others: Mapping[str, Any]) -> Self:
+        """A preset by its name, or settings as they are, with others in place of some.
+
+        Raises:
+            InvalidSettings: an unknown name or a value out of range.
+        """
+        if not isinstance(preset, cls):
+            return cls.of(preset=preset, **others)
+        return cls.of(**preset.model_dump(exclude_unset=True) | dict(others)) if others else preset
+
+    @classmethod
     def of_json(cls, values: Mapping[str, Any]) -> Self:
         """Settings from JSON, where a number is a number and a boolean no number.
 
@@ -263,7 +276,9 @@ def _told(error: ValidationError, known: Iterable[str]) -> InvalidSettings:
         name = str(first["loc"][0])[:_SHOWN]
         branches += [other for other in others if other["loc"][:1] == first["loc"][:1]]
     if first["type"] == "extra_forbidden":
-        return InvalidSettings(name, expected=f"one of {', '.join(known)}", got="an unknown setting")
+        names = list(known)
+        expected, hint = f"one of {', '.join(names)}", nearest(name, names, NEAREST)
+        return InvalidSettings(name, expected=expected, got="an unknown setting", hint=hint)
     expected = " or ".join(branch["msg"].removeprefix("Input should be ") for branch in branches)
     return InvalidSettings(name, expected=expected, got=repr(first["input"])[:_SHOWN])
 

@@ -45,12 +45,15 @@ def needs_all(settings: LiftSettings) -> list[str]:
     return [f"{name}={value}" for name in names if (value := getattr(settings, name)) not in (0, "auto", "l2")]
 
 
-def check_settings(settings: LiftSettings) -> None:
+def check_engine(engine: Engine, settings: LiftSettings) -> None:
     """Refuse, before the work, what needs W or X in one place.
 
     Raises:
-        InvalidSettings: reweighting, Huber's loss, objects, aggregation, or least squares.
+        InvalidSettings: it is no engine; reweighting, Huber's loss, objects, aggregation, or least squares.
     """
+    if not hasattr(engine, "run"):
+        hint = "LocalEngine() or RayEngine(address) makes one"
+        raise InvalidSettings("engine", expected="an engine, or None", got=repr(engine)[:80], hint=hint)
     asked = needs_all(settings)
     if asked:
         raise InvalidSettings(
@@ -85,7 +88,7 @@ def lift_in_blocks(
     Raises:
         InvalidSettings: the settings need W or X in one place.
     """
-    check_settings(settings)
+    check_engine(engine, settings)
     timings = Timings(progress)
     given = as_views(views)
     found = LiftViews.of(given, cameras, settings)

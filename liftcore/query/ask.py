@@ -107,6 +107,10 @@ class VectorAnswer:
     why: str  # one sentence on how that is known
     objects: Objects | None  # the things that they make up, with boxes; None where no splats were given
 
+    def __repr__(self) -> str:
+        found = f"{int(self.splats.sum())} of {len(self.splats)} splats at or above {self.threshold:.4g}"
+        return f"VectorAnswer({found}, present={self.present}, clear={self.clear})"
+
 
 def ask(scene: QueryScene, query: Query | str, encoder: TextEncoder | None = None) -> Answer:
     """Score every splat for a query and choose those that answer it.

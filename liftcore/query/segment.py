@@ -39,6 +39,7 @@ LEAST_OWN = 0.25  # of a word's answer, by evidence, that no other word is neare
 MOST_WORDS = 4_096
 AT_ONCE = 16  # words whose cosines are held at a time: [P, AT_ONCE] f32
 SHOWN = 20  # words of a drawn legend
+SHOWN_WORDS = 6  # of what Python shows
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,11 @@ class Segmentation:
     score: np.ndarray  # [P] f32, the cosine to its word; 0 where it has none
     margin: np.ndarray  # [P] f32, the cosine to its word less that to the nearest other; 0 where it has none
     found: tuple[NamedSplats, ...]  # those that are there, with the most evidence first
+
+    def __repr__(self) -> str:
+        found = ", ".join(f"{one.word!r}: {one.splats}" for one in self.found[:SHOWN_WORDS])
+        more = ", ..." if len(self.found) > SHOWN_WORDS else ""
+        return f"Segmentation({len(self.labels)} splats, {len(self.found)} of {len(self.words)} words: {found}{more})"
 
     @property
     def values(self) -> np.ndarray:

@@ -263,6 +263,9 @@ def _cameras_in(given: Any) -> list[Camera]:
     """The cameras of a mapping or of a sequence, or a refusal of what is none of these, such as a path."""
     values = given.values() if isinstance(given, Mapping) else given
     found: list[Any] = list(values) if isinstance(values, Iterable) and not isinstance(values, str) else [values]
+    names = [name for name in given if not isinstance(name, str)] if isinstance(given, Mapping) else []
+    if names:
+        raise InvalidCameras("cameras", expected="names that are texts, as of photos", got=repr(names[0])[:80])
     strange = [one for one in found if not isinstance(one, Camera)]
     if strange:
         got, hint = f"{type(strange[0]).__name__} {strange[0]!r}"[:80], "read_cameras(path) makes them of a file"

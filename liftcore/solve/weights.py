@@ -145,7 +145,13 @@ class RegionWeights:
         return torch.cat([firsts, starts[-1:]]), torch.searchsorted(starts, firsts, right=True) - 1
 
     def matrix(self, splats: int) -> csr_array:
-        """W [splats, M] for scipy, a row for each of so many splats."""
+        """W [splats, M] for scipy, a row for each of so many splats.
+
+        Raises:
+            InvalidInput: a splat of W is beyond them.
+        """
+        if self.splats.numel() and int(self.splats[-1]) >= splats:
+            raise InvalidInput("splats", expected=f"{int(self.splats[-1]) + 1} or more", got=str(splats))
         lengths = np.zeros(splats, np.int64)
         lengths[self.splats.numpy()] = np.diff(self.indptr.numpy())
         indptr = np.concatenate([[0], np.cumsum(lengths)])

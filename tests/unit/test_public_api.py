@@ -5,6 +5,7 @@ import logging
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -179,12 +180,15 @@ def test_what_a_machine_lacks_goes_to_whoever_listens_else_to_the_log(tmp_path, 
     [
         ({"splats": "scene.ply"}, lc.InvalidSplats, r"splats: .*got str 'scene.ply'; read_splats"),
         ({"cameras": "sparse/0"}, lc.InvalidCameras, r"cameras: .*got str 'sparse/0'; read_cameras"),
+        ({"cameras": {0: None}}, lc.InvalidCameras, r"cameras: expected names that are texts, as of photos, got 0"),
         ({"cameras": None}, lc.InvalidCameras, r"cameras: expected a Camera for each name, got NoneType"),
         ({"views": "pack.safetensors"}, lc.InvalidFeatures, r"features: .*got str 'pack.safetensors'; read_features"),
         ({"views": None}, lc.InvalidFeatures, r"features: expected views by name"),
         ({"views": [torch.ones(2, 2, 4)]}, lc.InvalidFeatures, r"features: expected pairs of a name and a view"),
         ({"threads": 0}, lc.InvalidSettings, r"threads: expected a whole number of one or more, .*got 0"),
         ({"threads": 1.5}, lc.InvalidSettings, r"threads: .*got 1.5"),
+        ({"device": "tpu"}, lc.InvalidSettings, r"device: expected 'auto', 'cpu' or 'cuda', got 'tpu'"),
+        ({"robust_step": 1}, lc.InvalidSettings, r"robust_step: .*nearest: robust_steps"),
     ],
 )
 @pytest.mark.parametrize("call", [lc.lift, lc.plan, lc.region_weights])
@@ -195,8 +199,45 @@ def test_what_is_no_such_value_is_refused_by_its_name(scene, call, changed, erro
         call(**given)
 
 
-def test_render_refuses_the_name_of_a_camera(scene):
-    _, splats, _, _ = scene
+def test_settings_and_keywords_beside_them_are_one(scene):
+    _, splats, cameras, views = scene
+    settings = lc.LiftSettings.of(preset="row-sum", stride=2)
+    whole = lc.region_weights(splats, cameras, views, preset="row-sum")
+    strided = lc.region_weights(splats, cameras, views, settings, view_stride=2)
+    assert lc.lift(splats, cameras, views, settings, view_stride=2).settings.stride == 2
+    assert lc.plan(splats, cameras, views, settings, view_stride=2).views == strided.views == ("v0", "v2")
+    assert float(whole.weight.sum()) > 2 * float(strided.weight.sum())
+
+
+def test_answers_refuse_splats_of_another_scene(scene):
+    _, splats, cameras, views = scene
+    made = lc.lift(splats, cameras, views, preset="row-sum")
+    vectors = torch.eye(2, made.features.shape[1])
+    names = ("means", "quats", "log_scales", "opacity_logits")
+    fewer = lc.Splats(**{name: getattr(splats, name)[1:] for name in names})
+    others: list[Any] = [fewer, "scene.ply"]
+    for other in others:
+        for ask in (
+            lambda other=other: made.query(vectors, splats=other),
+            lambda other=other: made.segment(["a", "b"], vectors, other),
+            lambda other=other: made.objects(other),
+        ):
+            with pytest.raises(lc.InvalidSplats, match=f"the {splats.count} Splats that were lifted"):
+                ask()
+
+
+def test_what_is_no_engine_and_too_few_rows_are_refused(scene):
+    _, splats, cameras, views = scene
+    with pytest.raises(lc.InvalidSettings, match=r"engine: expected an engine, or None, got 'local'; LocalEngine"):
+        lc.lift(splats, cameras, views, engine="local")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(lc.InvalidInput, match="splats: expected"):
+        lc.region_weights(splats, cameras, views).matrix(1)
+
+
+def test_render_refuses_the_name_of_a_camera_and_an_unknown_device(scene):
+    _, splats, cameras, _ = scene
+    with pytest.raises(lc.InvalidSettings, match="device: expected 'auto', 'cpu' or 'cuda', got 'tpu'"):
+        lc.render(splats, cameras["v0"], torch.ones(splats.count), device="tpu")
     with pytest.raises(lc.InvalidCameras, match=r"camera: expected a Camera, got 'v0'; cameras\[name\]"):
         lc.render(splats, "v0", torch.ones(splats.count))  # pyright: ignore[reportArgumentType]
 
@@ -223,9 +264,12 @@ def test_warnings_of_a_lift_are_logged_once_where_nobody_shows_the_plan(scene, c
     assert not caplog.records
 
 
-def test_lift_and_region_weights_are_shown_in_a_line(scene):
+def test_results_are_shown_in_a_line(scene):
     _, splats, cameras, views = scene
-    assert repr(lc.lift(splats, cameras, views)).startswith(f"LiftResult({splats.count} splats, ")
-    assert repr(lc.region_weights(splats, cameras, views)).startswith(
-        f"RegionWeights(splats={splats.count}, regions="
-    )
+    made = lc.lift(splats, cameras, views)
+    vectors = torch.eye(2, made.features.shape[1])
+    shown = [made, lc.region_weights(splats, cameras, views), made.query(vectors)]
+    shown.append(made.segment(["a", "b"], vectors, splats))
+    for result in shown:
+        assert repr(result).startswith(type(result).__name__) and len(repr(result)) < 120
+        assert str(splats.count) in repr(result)
