@@ -64,24 +64,6 @@ def test_a_right_lift_scores_near_one_in_every_protocol_of_lerf_ovs(
     assert document["settings"]["threshold"] == "auto"
 
 
-def test_a_wrong_label_has_the_iou_that_its_pixels_give(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """The book's label is a half of the book, and an apple's lies where the wall is."""
-    labels = tmp_path / "kitchen"
-    labels.mkdir()
-    half = isat([("book", rectangle(90, 20, 140, 60)), ("red apple", rectangle(0, 0, 10, 10))])
-    (labels / "frame_00001.json").write_text(json.dumps(half))
-    lift = f"kitchen={folder / 'kitchen.lift.safetensors'}"
-    options = ["--data", tmp_path, "--protocol", "P2", "P3", "own", "--threshold", 0.5]
-    document = evaluate(capsys, "lerf-ovs", lift, *options)
-    for row in document["measured"]:
-        ious = {thing["category"]: thing["iou"] for thing in row["objects"]}
-        assert ious["red apple"] == 0
-        assert ious["book"] == pytest.approx(0.5, abs=0.03)
-        assert row["means"]["all labelled"]["accuracy_25"] == 0.5
-
-
 def test_3d_ovs_pools_the_pixels_of_a_class(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     document = evaluate(capsys, "3d-ovs", folder, "--data", folder / "3d_ovs", "--protocol", "P3", "--threshold", 0.5)
     (row,) = document["measured"]

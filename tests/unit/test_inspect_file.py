@@ -19,12 +19,11 @@ from liftcore.features.views import FeatureGrid, Regions
 from liftcore.io.class_masks import read_masks
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.inspect import inspect_file
-from liftcore.io.lift_file import save_lift
+from liftcore.io.lift_file import load_lift, save_lift
 from liftcore.io.ply import write_splats
-from liftcore.result import InputFile, LiftMetadata, LiftResult
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.splats import Splats
-from liftcore.settings import LiftSettings
+from tests.labelled_scene import WORDS, write_lift
 
 SPLATS = Path(__file__).parents[1] / "data" / "splats"
 
@@ -130,28 +129,15 @@ def test_maps_in_another_order_and_masks_of_one_region_are_told(tmp_path: Path) 
 
 
 def test_lift_is_described(tmp_path: Path) -> None:
-    gone = InputFile(path="/nowhere/s.ply", sha256="0")
-    metadata = LiftMetadata(
-        version="1",
-        settings=LiftSettings.of(),
-        splats=gone,
-        cameras=gone,
-        features=(gone,),
-        encoder="clip",
-        text_space="",
-        views=("a",),
-        certificate={"beta": 0.1},
-        timings={},
-    )
-    seen = torch.tensor([True, False])
-    save_lift(
-        LiftResult(torch.ones(2, 3), torch.tensor([2.0, 0]), torch.tensor([0.5, 0]), seen, metadata), tmp_path / "l"
-    )
+    lift = load_lift(write_lift(tmp_path))
+    count, unseen = len(lift.features), len(lift.features) // 2
+    save_lift(replace(lift, seen=torch.arange(count) >= unseen), tmp_path / "l")
+    (tmp_path / "splats.ply").unlink()
     found = inspected(tmp_path / "l")
-    assert (found["kind"], found["splats"], found["channels"], found["seen_share"]) == ("lift", 2, 3, 0.5)
-    assert found["settings"]["preset"] == "default"
-    assert found["warnings"][0] == "1 of 2 splats were reached by no labelled ray; their features are zero"
-    assert "no longer at" in found["warnings"][1]
+    assert (found["kind"], found["splats"], found["channels"]) == ("lift", count, len(WORDS))
+    assert found["seen_share"] == pytest.approx(1 - unseen / count) and found["settings"]["preset"] == "row-sum"
+    told = f"{unseen} of {count} splats were reached by no labelled ray; their features are zero"
+    assert found["warnings"][0] == told and "no longer at" in found["warnings"][1]
 
 
 def test_text_table_is_described(tmp_path: Path) -> None:

@@ -173,34 +173,23 @@ def test_what_float16_cannot_hold_is_float32_and_what_is_no_number_refused(
     assert [path.read_bytes() for path in (tmp_path / "out").iterdir()] == [before]
 
 
-def test_views_are_named_after_their_images(photos: Path) -> None:
-    for name in ("b.0001.JPG", "a.png", "._a.png", "notes.txt"):
-        (photos / name).write_bytes(b"")
-    assert find_images([photos]) == {"a": photos / "a.png", "b.0001": photos / "b.0001.JPG"}
-    assert list(find_images([photos / "b.0001.JPG", photos / "a.png"])) == ["a", "b.0001"]
-    (photos / "a.jpg").write_bytes(b"")
-    with pytest.raises(InvalidInput, match="one image a view"):
-        find_images([photos])
-
-
-def test_images_of_sub_folders_keep_these_in_their_names(photos: Path) -> None:
-    for name in ("camA/000.jpg", "camB/000.jpg", "camB/001.png", ".thumbnails/000.jpg"):
+def test_views_are_named_after_their_images_and_sub_folders(photos: Path) -> None:
+    kept = ("a.png", "b.0001.JPG", "camA/000.jpg", "camB/000.jpg", "camB/001.png")
+    for name in (*kept, "._a.png", "notes.txt", ".thumbnails/000.jpg", "notes/notes.txt"):
         (photos / name).parent.mkdir(exist_ok=True)
         (photos / name).write_bytes(b"")
-    assert find_images([photos]) == {
-        "camA/000": photos / "camA/000.jpg",
-        "camB/000": photos / "camB/000.jpg",
-        "camB/001": photos / "camB/001.png",
-    }
+    assert find_images([photos]) == {name.rpartition(".")[0]: photos / name for name in kept}
+    assert list(find_images([photos / "b.0001.JPG", photos / "a.png"])) == ["a", "b.0001"]
     assert list(find_images([photos / "camB"])) == ["000", "001"]
-    with pytest.raises(InvalidInput, match="one image a view"):
-        find_images([photos / "camA", photos / "camB"])
-    (photos / "notes").mkdir()
-    (photos / "notes" / "notes.txt").write_bytes(b"")
-    with pytest.raises(InvalidInput, match="1 other files"):
-        find_images([photos / "notes"])
-    with pytest.raises(InvalidInput, match="nothing at"):
-        find_images([photos / "none"])
+    (photos / "a.jpg").write_bytes(b"")
+    for given, message in (
+        ([photos], "one image a view"),
+        ([photos / "camA", photos / "camB"], "one image a view"),
+        ([photos / "notes"], "1 other files"),
+        ([photos / "none"], "nothing at"),
+    ):
+        with pytest.raises(InvalidInput, match=message):
+            find_images(given)
 
 
 def test_what_is_no_image_is_refused_by_name(photos: Path, monkeypatch: pytest.MonkeyPatch) -> None:

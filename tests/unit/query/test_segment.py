@@ -61,18 +61,13 @@ def test_words_that_are_not_there_name_nothing(clear: QueryScene) -> None:
     assert np.array_equal(found.labels, np.array([0, 2, 3])[CLUSTER])
 
 
-def test_splats_of_no_word_are_named_none(clear: QueryScene) -> None:
-    found = segment(clear, ["apple", "book"], EYE[:2])
-    assert (found.labels[2 * SPLATS_A_CLUSTER :] == -1).all() and not found.margin[2 * SPLATS_A_CLUSTER :].any()
-    assert (found.labels[: 2 * SPLATS_A_CLUSTER] >= 0).all() and (found.values[2 * SPLATS_A_CLUSTER :] == 0).all()
-
-
-def test_unseen_splats_and_equal_scores_have_no_word(clear: QueryScene) -> None:
-    seen = torch.ones(COUNT, dtype=torch.bool)
-    seen[3] = False
-    hidden = QueryScene(replace(clear.lift, seen=seen), clear.splats)
+def test_splats_of_no_word_and_unseen_ones_are_named_none(clear: QueryScene) -> None:
+    found, rest = segment(clear, ["apple", "book"], EYE[:2]), slice(2 * SPLATS_A_CLUSTER, None)
+    assert np.array_equal(found.labels == -1, CLUSTER == 2) and np.array_equal(found.values == 0, CLUSTER == 2)
+    assert not found.margin[rest].any()
+    hidden = QueryScene(replace(clear.lift, seen=torch.arange(COUNT) != 3), clear.splats)
     assert segment(hidden, ["apple", "book", "lamp"], EYE[:3]).labels[3] == -1
-    flat = QueryScene(replace(clear.lift, features=torch.ones(COUNT, CHANNELS)), clear.splats)
+    flat = QueryScene(replace(clear.lift, features=torch.ones(COUNT, CHANNELS)), clear.splats)  # of equal scores
     assert segment(flat, ["apple", "book"], EYE[:2]).found == ()
 
 

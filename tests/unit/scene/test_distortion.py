@@ -207,22 +207,18 @@ def test_a_photo_whose_corners_show_no_ray_is_lifted_as_far_as_it_shows_some(
     assert drawn.width >= view.width and drawn.height >= view.height
 
 
-def test_share_of_a_photo_that_is_lifted_is_what_its_pinhole_sees() -> None:
-    view = camera(BARREL)
-    assert view.lens is not None
-    v, u = np.meshgrid(np.arange(view.lens.height) + 0.5, np.arange(view.lens.width) + 0.5, indexing="ij")
-    x, y = view.lens.on_plane(u, v)
-    x, y = x * view.fx + view.cx, y * view.fy + view.cy
-    seen = (x >= 0) & (x <= view.width) & (y >= 0) & (y <= view.height)
-    assert view.lens.share == pytest.approx(seen.mean(), abs=0.01)
-
-
 def test_warning_tells_the_least_share_and_knows_no_hundred_percent_or_more() -> None:
     barrel, slight, plain = (
         camera(Brown(k1=-0.25)),
         camera(Brown(k1=1e-12)),
         replace(camera(Brown(k1=0.0)), lens=None),
     )
+    lens = lens_of(barrel)
+    v, u = np.meshgrid(np.arange(lens.height) + 0.5, np.arange(lens.width) + 0.5, indexing="ij")
+    x, y = lens.on_plane(u, v)
+    x, y = x * barrel.fx + barrel.cx, y * barrel.fy + barrel.cy
+    seen = (x >= 0) & (x <= barrel.width) & (y >= 0) & (y <= barrel.height)  # of the photo by its pinhole
+    assert lens.share == pytest.approx(seen.mean(), abs=0.01)
     (told,) = distortion_warning([slight, barrel, plain])
     assert (
         f"2 of 3 views are of distorted photos, of each of which {lens_of(barrel).share:.0%} or more is lifted"

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import io
 import math
-import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from camera_files import assert_same, with_json, write_files
+from camera_files import assert_same, binary_files, text_files, with_json, write_files
 from PIL import Image
 
 import liftcore as lc
@@ -99,22 +98,23 @@ def test_each_point_is_seen_by_one_face_where_the_photo_shows_it() -> None:
 
 
 def test_colmaps_and_nerfstudios_files_mean_the_same(tmp_path: Path) -> None:
-    w, x, y, z = np.array(QUATERNION) / np.linalg.norm(QUATERNION)
-    line = f"1 {w} {x} {y} {z} {' '.join(map(str, SHIFT))} 1 pano.jpg\n\n"
-    camera = f"1 EQUIRECTANGULAR {WIDTH} {HEIGHT} {WIDTH} {HEIGHT}\n"
-    text = write_files(tmp_path / "text", {"cameras.txt": camera.encode(), "images.txt": line.encode()})
-    sensor = struct.pack("<QIiQQ2d", 1, 1, 17, WIDTH, HEIGHT, WIDTH, HEIGHT)
-    image = struct.pack("<QI7dI", 1, 1, w, x, y, z, *SHIFT, 1) + b"pano.jpg\0" + struct.pack("<Q", 0)
-    binary = write_files(tmp_path / "binary", {"cameras.bin": sensor, "images.bin": image})
+    sensor, image = {1: (17, "EQUIRECTANGULAR", (640.0, 480.0))}, (1, QUATERNION, SHIFT, "pano.jpg")
     to_world = np.linalg.inv(pose()) @ np.diag([1.0, -1.0, -1.0, 1.0])
     frame = {"file_path": "images/pano.jpg", "transform_matrix": to_world.tolist()}
-    document = {"camera_model": "EQUIRECTANGULAR", "w": WIDTH, "h": HEIGHT, "fl_x": 1.0, "frames": [frame]}
-    for found in (text, binary, with_json(tmp_path, document)):
-        cameras = read_cameras(found)
-        assert_same(cameras, panorama())
-        assert [view.face for view in cameras.values()] == [view.face for view in panorama().values()]
+    document = {"camera_model": "EQUIRECTANGULAR", "w": 640, "h": 480, "fl_x": 1.0, "frames": [frame]}
+    expected = Cameras(faces_of("pano", 640, 480, pose()))
+    for path in (
+        write_files(tmp_path / "text", text_files(sensor, [image])),
+        write_files(tmp_path / "binary", binary_files(sensor, [image])),
+        with_json(tmp_path, document),
+    ):
+        cameras = read_cameras(path)
+        assert_same(cameras, expected)
+        assert [view.face for view in cameras.values()] == [view.face for view in expected.values()]
     with pytest.raises(InvalidCameras, match="'pano' size"):
         read_cameras(with_json(tmp_path, document | {"w": 99_999}))
+    names = ["pano@front", "pano@up", "rig@a/1", "@left", "x@y"]
+    assert with_panoramas(names) == {*names, "pano"}
 
 
 def test_labels_of_a_face_are_those_of_the_photo() -> None:
@@ -190,8 +190,3 @@ def test_photos_of_panoramas_are_checked_face_by_face(tmp_path: Path) -> None:
     assert not [note for note in report.notes if "no camera" in note or "have none" in note]
     own = lc.Regions(np.arange(64 * 80, dtype=np.int32).reshape(1, 64, 80) // 1280, np.eye(4, dtype=np.float32))
     check_scene(splats, cameras, {"pano": tmp_path / "pano.png"}, as_views(dict.fromkeys(cameras, own)))
-
-
-def test_names_of_faces_stand_for_their_panorama() -> None:
-    names = ["pano@front", "pano@up", "rig@a/1", "@left", "x@y"]
-    assert with_panoramas(names) == {*names, "pano"}

@@ -229,7 +229,6 @@ def test_compressed_ply_that_lacks_something_is_refused(
         ("a.ksplat", bytes(64), r"GaussianSplats3D's \.ksplat format; .*splat-transform"),
         ("a", b"NGSP\x09\0\0\0" + bytes(40), r"an \.spz of version 1 to 4, got version 9"),
         ("a.spz", b"\x1f\x8b\x08", "a gzip file"),
-        ("a.sog", b"PK\x03\x04", "a zip"),
         ("a.ckpt", b"version https://git-lfs.github.com/spec/v1\n", "git lfs pull"),
         ("a.pt", b"\x80\x02}q\0.", "a Python pickle, which may run code"),
     ],
