@@ -10,18 +10,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from liftcore.errors import InvalidCameras, InvalidFeatures, InvalidInput, InvalidSplats
 from liftcore.features.pack import read_features, write_pack
-from liftcore.features.views import FeatureGrid, Regions
+from liftcore.features.views import FeatureGrid, Regions, ViewFeatures
 from liftcore.io.cameras import read_cameras
 from liftcore.io.npy import open_npy
 from liftcore.io.ply import usual_layout, write_splats
 from liftcore.io.splats import read_splats
+from liftcore.scene.cameras import Cameras
 from liftcore.scene.splats import Kernel
 
 LINES = [
@@ -99,57 +99,6 @@ def test_every_layout_is_written_back_to_the_byte(kernel, sh_rows, lobes, count,
         assert path.with_name("again.ply").read_bytes() == path.read_bytes()
 
 
-@given(st.integers(0, 400))
-@settings(max_examples=40, deadline=None)
-def test_file_cut_anywhere_is_refused(cut: int) -> None:
-    names = usual_layout(Kernel.GAUSSIAN_3D, 1, 0)
-    lines = "".join(f"property float {name}\n" for name in names)
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex 3\n{lines}end_header\n".encode()
-    content = header + bytes(3 * 4 * len(names))
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "cut.ply"
-        path.write_bytes(content[: min(cut, len(content) - 1)])
-        with pytest.raises(InvalidSplats):
-            read_splats(path)
-
-
-def camera_documents() -> list[bytes]:
-    """One valid file of each camera format, each a few hundred bytes."""
-    pose = np.eye(4).tolist()
-    frame = {"file_path": "a.png", "transform_matrix": pose}
-    transforms = {"fl_x": 50.0, "w": 64, "h": 48, "frames": [frame, {**frame, "file_path": "b.png"}]}
-    record = {"id": 0, "img_name": "a", "width": 64, "height": 48, "fx": 50.0, "fy": 50.0}
-    inria = [{**record, "position": [0.0, 0.0, 0.0], "rotation": np.eye(3).tolist()}]
-    return [json.dumps(document).encode() for document in (transforms, inria)]
-
-
-COLMAP = {
-    "cameras.bin": struct.pack("<QIiQQ4d", 1, 1, 1, 64, 48, 50.0, 50.0, 32.0, 24.0),
-    "images.bin": struct.pack("<QI7dI", 1, 1, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1) + b"a.png\0" + bytes(8),
-    "cameras.txt": b"# list\n1 PINHOLE 64 48 50 50 32 24\n",
-    "images.txt": b"1 1 0 0 0 0 0 1 1 a.png\n\n2 1 0 0 0 0 0 1 1 b.png\n1 2 -1\n",
-}
-edits = st.lists(st.tuples(st.integers(0, 400), st.integers(0, 255)), max_size=6)
-
-
-def edited(content: bytes, changes: list[tuple[int, int]], keep: int) -> bytes:
-    """The content with some bytes changed, cut after ``keep``."""
-    changed = bytearray(content)
-    for place, value in changes:
-        changed[place % len(changed)] = value
-    return bytes(changed[:keep])
-
-
-@given(st.sampled_from(camera_documents()), edits, st.integers(0, 1000))
-@settings(max_examples=200, deadline=None)
-def test_any_damage_to_camera_json_is_cameras_or_an_error_of_ours(content, changes, keep) -> None:
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "cameras.json"
-        path.write_bytes(edited(content, changes, keep))
-        found = read_or_refused(read_cameras, path, InvalidCameras)
-        assert found is None or len(found) > 0
-
-
 @given(st.floats(), st.floats(), st.integers(0, 15))
 @settings(max_examples=100, deadline=None)
 def test_any_number_in_a_pose_is_a_camera_or_an_error_of_ours(focal, value, place) -> None:
@@ -163,45 +112,59 @@ def test_any_number_in_a_pose_is_a_camera_or_an_error_of_ours(focal, value, plac
         assert found is None or np.isfinite(found["a"].centre).all()
 
 
-@given(st.sampled_from(["bin", "txt"]), st.booleans(), edits, st.integers(0, 1000))
-@settings(max_examples=300, deadline=None)
-def test_any_damage_to_a_sparse_model_is_cameras_or_an_error_of_ours(kind, images, changes, keep) -> None:
+def as_bytes(write: Callable[[Path], object]) -> bytes:
+    """What is written into a file."""
     with tempfile.TemporaryDirectory() as folder:
-        names = [f"cameras.{kind}", f"images.{kind}"]
-        for name in names:
-            damage = name == names[images]
-            (Path(folder) / name).write_bytes(edited(COLMAP[name], changes, keep) if damage else COLMAP[name])
-        found = read_or_refused(read_cameras, Path(folder), InvalidCameras)
-        assert found is None or len(found) > 0
+        write(Path(folder) / "a.npy")
+        return (Path(folder) / "a.npy").read_bytes()
 
 
-def whole_pack(path: Path) -> None:
-    """Read every view of a pack."""
+def whole_pack(path: Path) -> list[ViewFeatures]:
+    """Every view of a pack."""
     packs = read_features(path)
-    for view in packs.views:
-        assert packs[view].codebook.shape[-1] == packs.channels
+    return [packs[view] for view in packs.views]
 
 
-@given(edits, st.integers(0, 2000), st.binary(max_size=60))
-@settings(max_examples=200, deadline=None)
-def test_any_damage_to_a_pack_is_a_pack_or_an_error_of_ours(changes, keep, noise) -> None:
-    labels = torch.tensor([[[0, -1], [1, 0]]], dtype=torch.int32)
-    views = {"a": Regions(labels, torch.eye(2, 3)), "b": FeatureGrid(torch.ones(1, 2, 3))}
+def whole_model(path: Path) -> Cameras:
+    """The cameras of the folder that a file lies in."""
+    return read_cameras(path.parent)
+
+
+POSE = np.eye(4).tolist()
+FRAMES = [{"file_path": name, "transform_matrix": POSE} for name in ("a.png", "b.png")]
+RECORD = {"id": 0, "img_name": "a", "width": 64, "height": 48, "fx": 50.0, "fy": 50.0, "position": [0.0, 0.0, 0.0]}
+PACK = {
+    "a": Regions(torch.tensor([[[0, -1], [1, 0]]], dtype=torch.int32), torch.eye(2, 3)),
+    "b": FeatureGrid(torch.ones(1, 2, 3)),
+}
+CAMERAS_BIN = struct.pack("<QIiQQ4d", 1, 1, 1, 64, 48, 50.0, 50.0, 32.0, 24.0)
+IMAGES_BIN = struct.pack("<QI7dI", 1, 1, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1) + b"a.png\0" + bytes(8)
+CAMERAS_TXT = b"# list\n1 PINHOLE 64 48 50 50 32 24\n"
+IMAGES_TXT = b"1 1 0 0 0 0 0 1 1 a.png\n\n2 1 0 0 0 0 0 1 1 b.png\n1 2 -1\n"
+# A name, a good file of it, the files beside it, and what reads it or says why not.
+FILES = [
+    ("transforms.json", json.dumps({"fl_x": 50.0, "w": 64, "h": 48, "frames": FRAMES}).encode(), {}, read_cameras),
+    ("cameras.json", json.dumps([{**RECORD, "rotation": np.eye(3).tolist()}]).encode(), {}, read_cameras),
+    ("cameras.bin", CAMERAS_BIN, {"images.bin": IMAGES_BIN}, whole_model),
+    ("images.bin", IMAGES_BIN, {"cameras.bin": CAMERAS_BIN}, whole_model),
+    ("cameras.txt", CAMERAS_TXT, {"images.txt": IMAGES_TXT}, whole_model),
+    ("images.txt", IMAGES_TXT, {"cameras.txt": CAMERAS_TXT}, whole_model),
+    ("pack.safetensors", as_bytes(lambda path: write_pack(path, PACK, {"encoder": "e"})), {}, whole_pack),
+    ("a.npy", as_bytes(lambda path: np.save(path, np.ones((3, 4), np.float32))), {}, open_npy),
+]
+EDITS = st.lists(st.tuples(st.integers(0, 400), st.integers(0, 255)), max_size=6)
+
+
+@given(st.sampled_from(FILES), EDITS, st.integers(0, 2_000), st.one_of(st.none(), st.binary(max_size=60)))
+@settings(max_examples=1_000, deadline=None)
+def test_any_damage_to_a_file_is_read_or_an_error_of_ours(file, changes, keep, noise) -> None:
+    name, content, others, read = file
+    changed = bytearray(content)
+    for place, value in changes:
+        changed[place % len(changed)] = value
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "pack"
-        write_pack(path, views, {"encoder": "e"})
-        content = edited(path.read_bytes(), changes, keep)
-        for damaged_content in (content, noise, content[:8] + noise):
-            path.write_bytes(damaged_content)
-            read_or_refused(whole_pack, path, InvalidFeatures)
-
-
-@given(edits, st.integers(0, 300))
-@settings(max_examples=150, deadline=None)
-def test_any_damage_to_an_array_is_an_array_or_an_error_of_ours(changes, keep) -> None:
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "a.npy"
-        np.save(path, np.ones((3, 4), np.float32))
-        path.write_bytes(edited(path.read_bytes(), changes, keep))
-        found = read_or_refused(open_npy, path, InvalidFeatures)
-        assert found is None or found.size > 0
+        for other, own in {**others, name: bytes(changed[:keep]) if noise is None else content[:8] + noise}.items():
+            (Path(folder) / other).write_bytes(own)
+        error = InvalidCameras if read in (read_cameras, whole_model) else InvalidFeatures
+        found = read_or_refused(read, Path(folder) / name, error)
+        assert found is None or len(found) > 0

@@ -12,7 +12,6 @@ from liftcore.raster.base import CompositingParams
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.raster.reference import reading_matrix
 from liftcore.scene.cameras import Camera
-from liftcore.scene.splats import Splats
 from liftcore.solve.least_squares import AllRays
 from tests.scenes import random_camera, random_grid, random_regions, random_splats
 
@@ -30,19 +29,9 @@ def dense_view(raster: CpuRaster, camera: Camera, walk: CompositingParams) -> np
 class SmallScene:
     """Three views of a random scene: the operator, and A [rows, P] and B [rows, F] of the same rays."""
 
-    def __init__(
-        self,
-        seed: int,
-        grids: bool = False,
-        splats: Splats | None = None,
-        walk: CompositingParams | None = None,
-        views: Sequence[Camera] | None = None,
-        observations: Sequence[ViewFeatures] | None = None,
-    ) -> None:
-        self.walk = walk or CompositingParams()
-        self.splats = splats or random_splats(seed, 25)
-        around = [random_camera(seed + k, 22 + 3 * k, 17 + 2 * k, name=f"v{k}") for k in range(3)]
-        self.views = list(views or around)
+    def __init__(self, seed: int, grids: bool = False, observations: Sequence[ViewFeatures] | None = None) -> None:
+        self.walk, self.splats = CompositingParams(), random_splats(seed, 25)
+        self.views = [random_camera(seed + k, 22 + 3 * k, 17 + 2 * k, name=f"v{k}") for k in range(3)]
         made = [random_grid(seed + k) if grids else random_regions(seed + k) for k in range(3)]
         self.observations = list(observations or made)
         self.raster = CpuRaster(self.splats, threads=2)

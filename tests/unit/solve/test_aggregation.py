@@ -26,12 +26,8 @@ from liftcore.raster.reference import ReferenceRaster, dense_view
 from liftcore.scene.cameras import Cameras
 from liftcore.settings import LiftSettings
 from liftcore.solve.aggregate import (
-    KeptRegions,
     evidence_means,
     filter_regions,
-    kept_means,
-    spread,
-    with_feature,
 )
 from liftcore.solve.clusters import Clustering
 from liftcore.solve.geometry import LiftViews
@@ -80,35 +76,6 @@ def test_kept_regions_are_those_of_the_paper_pixel_by_pixel(tmp_path_factory, se
     assert kept.regions == present
     assert kept.counts.tolist() == counts.tolist()
     assert np.abs(kept.sums - sums).max() < 1e-6
-
-
-@given(st.integers(0, 2**20), st.integers(1, 60), st.integers(1, 5))
-@settings(max_examples=40, deadline=None)
-def test_splats_take_the_mean_of_their_clusters_kept_regions_and_the_others_keep_their_own(seed, count, channels):
-    rng = np.random.default_rng(seed)
-    labels = rng.integers(-1, K, count)
-    features = torch.tensor(rng.normal(size=(count, channels)), dtype=torch.float32)
-    before = features.clone()
-    kept = KeptRegions(np.zeros((K, channels)), np.zeros(K, np.int64))
-    own: list[list[np.ndarray]] = [[] for _ in range(K)]
-    for _ in range(2):
-        codebook = torch.tensor(rng.normal(size=(7, channels)), dtype=torch.float32)
-        clusters, chosen = rng.integers(0, K - 1, 7), rng.random(7) < 0.5  # the last cluster gets none
-        kept.add(codebook, clusters, chosen)
-        for row in np.flatnonzero(chosen):
-            own[clusters[row]].append(codebook[row].double().numpy())
-    merged = kept_means(kept, torch.float32)
-    taken = with_feature(torch.tensor(labels, dtype=torch.int32), merged)
-    spread(features, torch.tensor(labels, dtype=torch.int32), merged, taken)
-    took = 0
-    for j, label in enumerate(labels):
-        if label >= 0 and own[label]:
-            took += 1
-            assert np.abs(features[j].numpy() - np.mean(own[label], axis=0)).max() < 1e-6
-        else:
-            assert torch.equal(features[j], before[j])
-    assert int(taken.sum()) == took
-    assert not merged[K - 1].any()
 
 
 def test_clusters_of_grids_take_the_mean_of_their_splats_weighted_by_evidence():

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from liftcore.device import CPU, Device
 from liftcore.solve import closed_form
-from liftcore.solve.closed_form import Solution, morton_codes, solve, solve_rows
+from liftcore.solve.closed_form import Solution, solve
 from liftcore.solve.weights import RegionWeights, stacked
 from tests.unit.solve.sparse_views import codebook_of, defined, of_dense, random_view
 
@@ -147,27 +147,3 @@ def test_float16_codebooks_give_the_bits_of_their_float32_twins(seed, channels, 
     mixed = [book.float() if k else book for k, book in enumerate(books)]
     assert torch.equal(found, solve(W, codebook_of(mixed), torch.float32).features)
     assert all(map(torch.equal, books, before))
-
-
-def test_some_splats_alone_are_solved_into_their_rows():
-    views, books = scene()
-    whole, rows = solved(views, books), torch.tensor([3, 500, 4])
-    X = torch.full((SPLATS, 33), 9.0)
-    solve_rows(X, rows, stacked(views, SPLATS), codebook_of(books))
-    assert torch.equal(X[rows], whole.features[rows])
-    X[rows] = 9.0
-    assert (X == 9.0).all()
-
-
-def test_places_along_the_curve_are_woven_from_the_bits_of_the_cells():
-    most = 2**21 - 1
-    cells = [[0, 0, 0], [most] * 3, [5, 1, most - 1], [1_234_567, 7, 99]]
-    woven = [
-        sum((c >> bit & 1) << (3 * bit + axis) for axis, c in enumerate(cell) for bit in range(21)) for cell in cells
-    ]
-    points = torch.tensor(cells, dtype=torch.float32)
-    assert morton_codes(points).tolist() == woven
-    assert torch.equal(morton_codes(points * 2.0**-40), morton_codes(points))
-    assert morton_codes(points[:1]).tolist() == [0] and morton_codes(points[:0]).tolist() == []
-    flat = torch.tensor([[0.0, 5.0, 1.0], [1.0, 5.0, 0.0], [1.0, 5.0, 1.0]])
-    assert len(set(morton_codes(flat).tolist())) == 3

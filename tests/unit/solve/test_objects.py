@@ -7,7 +7,7 @@ import pytest
 
 from liftcore.solve import objects
 from liftcore.solve.consensus import BELONGS, FAINT
-from liftcore.solve.objects import CONTAINS, LEAST_VIEWS, OBSERVES, TOGETHER, clustered, region_objects
+from liftcore.solve.objects import CONTAINS, LEAST_VIEWS, OBSERVES, TOGETHER, region_objects
 from liftcore.solve.weights import RegionWeights, stacked
 from tests.unit.solve.sparse_views import dense, of_dense
 from tests.unit.solve.test_consensus import SPLATS, of_things, random_scene
@@ -126,11 +126,3 @@ def test_the_number_of_threads_changes_no_label() -> None:
     W, levels = mistaken_scene(3, views=9)
     one, many = (region_objects(W, levels, np.ones(SPLATS), threads) for threads in (1, 5))
     np.testing.assert_array_equal(one.labels, many.labels)
-
-
-def test_pairs_that_no_view_sees_neither_join_nor_part() -> None:
-    supports = np.array(
-        [[1, 1, 0], [1, 2, 1], [0, 1, 1]], np.float32
-    )  # the first and the last are never seen together
-    observes = np.array([[1, 1, 0], [1, 2, 1], [0, 1, 1]], np.float32)
-    assert clustered(supports, observes).tolist() == [0, 0, 0]

@@ -67,22 +67,6 @@ def test_a_saved_file_is_mapped_as_it_was(tmp_path):
             RegionWeights.load(path)
 
 
-def test_taken_rows_and_their_runs_are_those_of_the_matrix():
-    W = stacked(views(), SPLATS)
-    rows = torch.tensor([7, 3, 299, 0, 3])
-    starts, entries = W.take(rows)
-    region = W.region[entries]
-    runs, row = W.runs(starts, region)
-    view = np.searchsorted(W.offsets.numpy(), region.numpy(), side="right") - 1
-    matrix = dense(W, SPLATS)
-    for place, splat in enumerate(rows.tolist()):
-        own = slice(int(starts[place]), int(starts[place + 1]))
-        assert np.array_equal(region[own].numpy(), np.flatnonzero(matrix[splat]))
-        expected = [np.flatnonzero(view[own] == v)[0] + own.start for v in np.unique(view[own])]
-        assert runs[:-1][row == place].tolist() == expected
-    assert runs[-1] == entries.shape[0]
-
-
 def test_more_regions_than_four_bytes_number_are_refused():
     many = weights.replace(random_view(0, 3, 5), offsets=torch.tensor([0, 2**30]))
     with pytest.raises(Unavailable, match="regions"):
