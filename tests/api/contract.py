@@ -10,11 +10,9 @@ over a store that may hold a real lift.
 from __future__ import annotations
 
 import argparse
-import socket
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -24,7 +22,6 @@ from unittest import mock
 
 import httpx
 
-from service.__main__ import server_of
 from service.app import create_app, job_limits, query_limits
 from service.errand import Heard
 from service.jobs.supervisor import Supervisor
@@ -34,7 +31,7 @@ from service.settings import ServiceSettings
 from service.store.keys import Quota
 from service.store.store import Store
 from service.uploads.intake import Report
-from tests.crash.conftest import stand_in, until
+from tests.crash.conftest import address_of, listening, stand_in, until
 
 CHECKS = (
     "not_a_server_error", "status_code_conformance", "content_type_conformance", "response_schema_conformance",
@@ -57,9 +54,7 @@ def served(data: Path, *, keys: bool, **settings: Any) -> Iterator[tuple[str, st
     store = Store.open(chosen.data)
     secret = store.keys.create("contract", frozenset({Scope.ADMIN}), Quota())[1] if keys else None
     runner = Supervisor(store, job_limits(chosen), command=stand_in("answer"))
-    listener = socket.create_server(("127.0.0.1", 0))
-    server = server_of(create_app(chosen, store, runner, QueryClient(query_limits(chosen))), chosen)
-    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+    app = create_app(chosen, store, runner, QueryClient(query_limits(chosen)))
     nowhere = {"sha256": "0" * 64}
     metadata = {"splats": nowhere, "cameras": nowhere, "features": [], "settings": {}, "views": ["v"]}
     lift = {"metadata": metadata, "count": 1}
@@ -69,15 +64,12 @@ def served(data: Path, *, keys: bool, **settings: Any) -> Iterator[tuple[str, st
         mock.patch("service.uploads.intake.check", lambda *given: report),
         mock.patch("service.routes.jobs.run_errand", lambda *given: planned),
     ):
-        thread.start()
         try:
-            until(lambda: server.started)
-            address = f"http://127.0.0.1:{listener.getsockname()[1]}"
-            _warm_up(address, secret)
-            yield address, secret
+            with listening(app, chosen) as server:
+                address = "http://{}:{}".format(*address_of(server))
+                _warm_up(address, secret)
+                yield address, secret
         finally:
-            server.should_exit = True
-            thread.join()
             store.close()
 
 

@@ -10,7 +10,7 @@ from fastapi.testclient import TestClient
 
 from service.store.jobs import JobOrder
 from service.store.owners import SERVICE
-from tests.crash.conftest import until
+from tests.crash.conftest import address_of, until
 
 from .conftest import Uploaded, parts_of
 from .test_problems import NOBODY
@@ -71,7 +71,7 @@ def test_head_of_events_ends_at_once_and_leaves_no_stream(client: TestClient, up
 
 def test_connection_goes_on_after_a_head(tmp_path: Any) -> None:
     with running(tmp_path / "data") as server:
-        host, port = server.servers[0].sockets[0].getsockname()
+        host, port = address_of(server)
         for address in ("/healthz", "/", "/lifts/nothing"):
             with httpx.Client(base_url=f"http://{host}:{port}", timeout=PATIENCE_SECONDS) as client:
                 head, whole = client.head(address), client.get(address)

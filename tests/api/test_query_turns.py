@@ -17,7 +17,7 @@ from liftcore.errors import SplatliftError
 from service.errors import Busy, ClientLeft, TimedOut, TooMany
 from service.queries import client
 from service.queries.client import Asker, Frame, QueryClient, QueryLimits
-from tests.crash.conftest import until
+from tests.crash.conftest import address_of, until
 from tests.crash.server import NoQueries
 
 from .guarded import guarded
@@ -193,7 +193,7 @@ def test_closed_connection_is_a_client_that_left(tmp_path: Path, method: str) ->
     queries = Patient()
     chosen = {"text_spaces": {"t": "lvis"}}
     with running(tmp_path / "data", queries=cast("QueryClient", queries), **chosen) as server:
-        with socket.create_connection(server.servers[0].sockets[0].getsockname(), timeout=60) as connection:
+        with socket.create_connection(address_of(server), timeout=60) as connection:
             connection.sendall((head + sent[method]).encode())
             until(lambda: queries.askers)
             assert not queries.askers[0].left and queries.askers[0].key == house.ids["alice"]

@@ -17,9 +17,8 @@ import httpx
 import pytest
 import uvicorn
 
-from service.__main__ import pace_of
 from service.app import create_app, job_limits
-from service.connection import UNREAD_BYTES, Pace, Patience, Wait, watched
+from service.connection import UNREAD_BYTES, Pace, Patience, Wait
 from service.jobs.supervisor import Supervisor
 from service.models import AssetKind
 from service.queries.client import QueryClient
@@ -27,7 +26,7 @@ from service.settings import ServiceSettings
 from service.store.assets import CheckedUpload
 from service.store.owners import SERVICE
 from service.store.store import Store
-from tests.crash.conftest import until
+from tests.crash.conftest import address_of, listening, until
 from tests.crash.server import NoQueries
 
 TRIES = 10
@@ -44,31 +43,21 @@ Served = Callable[..., AbstractContextManager[tuple[str, int]]]
 def served(data: Path, **settings: Any) -> Iterator[tuple[str, int]]:
     """A server in a thread: host and port. It is in no hurry, unless told to be."""
     with running(data, **settings) as server:
-        yield server.servers[0].sockets[0].getsockname()
+        yield address_of(server)
 
 
 @contextmanager
 def running(data: Path, queries: QueryClient | None = None, **settings: Any) -> Iterator[uvicorn.Server]:
     """That server, to look into it; without a query process, unless one is given."""
-    patient = {"min_bytes_per_second": 1000, "slow_grace_seconds": 30, "header_seconds": 30}
+    patient = {"min_bytes_per_second": 1000, "slow_grace_seconds": 30, "header_seconds": 30, "notice_seconds": 0}
     chosen = ServiceSettings.model_validate({"data": data, "disk_floor_bytes": 0, **patient, **settings})
     store = Store.open(chosen.data)
     worker = queries or cast("QueryClient", NoQueries())
-    app = create_app(chosen, store, Supervisor(store, job_limits(chosen)), worker)
-    listener = socket.create_server(("127.0.0.1", 0))
-    connection = watched(pace_of(chosen))
-    config = uvicorn.Config(app, http=connection, log_level="critical", timeout_graceful_shutdown=10)
-    server = uvicorn.Server(config)
-    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
-    thread.start()
     try:
-        until(lambda: server.started)
-        yield server
+        with listening(create_app(chosen, store, Supervisor(store, job_limits(chosen)), worker), chosen) as server:
+            yield server
     finally:
-        server.should_exit = True
-        thread.join()
         store.close()
-        listener.close()
 
 
 @pytest.fixture(scope="module")
@@ -259,7 +248,7 @@ def test_client_that_does_not_read_is_cut_off(tmp_path: Path) -> None:
     paths = [stored(store, content) for content in contents]
     store.close()
     with running(tmp_path / "data", min_bytes_per_second=1 << 20, slow_grace_seconds=0.5) as server:
-        address = server.servers[0].sockets[0].getsockname()
+        address = address_of(server)
         for path, content in zip(paths, contents, strict=True):
             with socket.socket() as client:
                 client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)

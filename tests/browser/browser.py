@@ -87,9 +87,9 @@ class Browser:
             raise AssertionError(f"{script}: {result['exceptionDetails']}")
         return result["result"].get("value")
 
-    def until(self, script: str) -> None:
+    def until(self, script: str, seconds: float = PATIENCE_SECONDS) -> None:
         """Wait until an expression is true."""
-        deadline = time.monotonic() + PATIENCE_SECONDS
+        deadline = time.monotonic() + seconds
         while time.monotonic() < deadline:
             with contextlib.suppress(AssertionError):  # while one document makes room for the next
                 if self.value(f"Promise.resolve({script}).then(Boolean)"):

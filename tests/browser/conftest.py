@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import socket
-import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,13 +11,12 @@ from typing import Any
 import httpx
 import pytest
 
-from service.__main__ import server_of
 from service.app import assemble
 from service.settings import ServiceSettings
 from service.store.store import Store
 from tests.api.following import ended
 from tests.api.tiny_scene import make_scene
-from tests.crash.conftest import until
+from tests.crash.conftest import address_of, listening
 
 from .browser import Browser, chromium
 
@@ -40,16 +37,10 @@ def serving(data: Path, **settings: Any) -> Iterator[tuple[str, Store]]:
     """A server on a free port: its address and its store."""
     chosen = ServiceSettings.model_validate({"data": data, "disk_floor_bytes": 0, **settings})
     store = Store.open(chosen.data)
-    listener = socket.create_server(("127.0.0.1", 0))
-    server = server_of(assemble(chosen, store), chosen)
-    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
-    thread.start()
     try:
-        until(lambda: server.started)
-        yield f"http://127.0.0.1:{listener.getsockname()[1]}", store
+        with listening(assemble(chosen, store), chosen) as server:
+            yield "http://{}:{}".format(*address_of(server)), store
     finally:
-        server.should_exit = True
-        thread.join()
         store.close()
 
 

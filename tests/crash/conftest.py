@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import socket
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -12,7 +14,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import uvicorn
+from fastapi import FastAPI
 
+from service.__main__ import server_of
 from service.jobs.process import JobLimits
 from service.jobs.supervisor import Clock, Supervisor
 from service.models import ENDED, AssetKind
@@ -63,6 +68,27 @@ def until(condition: Callable[[], Any], seconds: float = 600.0) -> None:
     while not condition():
         assert time.monotonic() < deadline, "it did not happen"
         time.sleep(0.01)
+
+
+@contextmanager
+def listening(app: FastAPI, settings: ServiceSettings) -> Iterator[uvicorn.Server]:
+    """The service's server of an application, in a thread and on a free port: see `address_of`."""
+    listener = socket.create_server(("127.0.0.1", 0))
+    server = server_of(app, settings)
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+    thread.start()
+    try:
+        until(lambda: server.started)
+        yield server
+    finally:
+        server.should_exit = True
+        thread.join()
+        listener.close()
+
+
+def address_of(server: uvicorn.Server) -> tuple[str, int]:
+    """Host and port at which it listens."""
+    return server.servers[0].sockets[0].getsockname()
 
 
 def ended(store: Store, job: str) -> JobRecord:
