@@ -187,33 +187,20 @@ def test_of_equal_weights_the_nearest_counts():
     assert ties > 0
 
 
-@pytest.mark.parametrize("reading", ["regions", "grid"])
+@pytest.mark.parametrize("cells", [None, (1.1, 0.9), (4.0, 4.0), (0, 4.0), (4.0, 0), (0, 0), (2.05, 2.05)], ids=str)
 @every_backend
-def test_a_region_or_a_cell_for_every_pixel_is_weighed_as_the_oracle_weighs_it(reading, backend):
-    camera, splats = random_camera(3, *backend.size), random_splats(3, 60)
-    pixels = camera.width * camera.height
-    if reading == "grid":
-        observation = random_grid(3, (camera.height + 4, camera.width - 4))
-    else:
+def test_a_region_a_pixel_and_grids_of_any_fineness_are_weighed_as_the_oracle_weighs_them(cells, backend):
+    # Cells a pixel, down and across. Four by four: each pixel reads four cells of its own.
+    width, height = (18, 4) if backend.name == "gpu" and cells else (20, 18)
+    camera, splats = random_camera(3, width, height), random_splats(3, 60)
+    if cells is None:
         labels = one_a_ray(camera).labels
-        observation = Regions(torch.cat([labels, labels // 200]), torch.ones(pixels, 1))
+        observation = Regions(torch.cat([labels, labels // 200]), torch.ones(width * height, 1))
+    else:
+        down, across = (max(1, int(n * side)) for n, side in zip(cells, (height, width), strict=True))
+        observation = random_grid(3, (down, across))
     view = dense_view(splats, camera, CompositingParams())
-    S, ray = reading_matrix(observation, camera.width, camera.height)
-    weights = backend.open(splats).region_weights(camera, observation, CompositingParams(), Weighting())
-    W = dense(weights, splats.count, observation.codebook.shape[0])
-    assert not view.cut.any() and (W > 0).sum() > 2 * pixels
-    assert np.abs(W - view.A[ray].T @ S).max() < INSIDE
-
-
-@pytest.mark.parametrize("cells", [(4.0, 4.0), (0, 4.0), (4.0, 0), (0, 0), (2.05, 2.05)])  # a pixel, down and across
-@every_backend
-def test_grids_finer_than_pixels_and_of_one_cell_equal_the_oracle(cells, backend):
-    # Four by four: each pixel reads four cells of its own.
-    camera, splats = random_camera(3, *((18, 4) if backend.name == "gpu" else (20, 18))), random_splats(3, 60)
-    down, across = (max(1, int(n * side)) for n, side in zip(cells, (camera.height, camera.width), strict=True))
-    observation = random_grid(3, (down, across))
-    view = dense_view(splats, camera, CompositingParams())
-    S, ray = reading_matrix(observation, camera.width, camera.height)
+    S, ray = reading_matrix(observation, width, height)
     weights = backend.open(splats).region_weights(camera, observation, CompositingParams(), Weighting(2))
     W = dense(weights, splats.count, observation.codebook.shape[0])
     assert not view.cut.any() and W.max() > 0

@@ -74,23 +74,16 @@ def pilot_of(areas: list[list[float]], errors: list[float], weights: list[float]
     return Pilot(np.array(areas, np.float32), np.array(errors), np.array(weights))
 
 
-def test_views_that_weigh_alike_have_the_cosine_of_their_variance():
+def test_cosines_are_those_of_the_variance_and_of_the_splats_that_views_show():
     views, variance = 20, 2.0
     pilot = pilot_of([[1.0]] * views, [variance / (variance + views)], [1.0])
     among = variance / (1 + variance / views)
     for count, cosine in enumerate(pilot.cosines(range(views)), start=1):
         assert 1 / cosine**2 - 1 == pytest.approx(among * (1 / count - 1 / views), abs=1e-9)
-
-
-def test_a_splat_that_no_chosen_view_shows_counts_nothing_and_evidence_weighs_splats():
-    pilot = pilot_of([[1.0, 0.0], [0.0, 1.0]], [0.0, 0.0], [3.0, 1.0])
-    assert list(pilot.cosines([0, 1])) == pytest.approx([0.75, 1.0])
-    assert list(pilot.cosines([1, 0])) == pytest.approx([0.25, 1.0])
-
-
-def test_features_that_are_all_error_need_the_square_of_the_cosine_of_their_weight():
-    pilot = pilot_of([[1.0]] * 100, [1.0], [1.0])
-    assert pilot.views_for(0.9, range(100)) == (81, pytest.approx(0.9))
+    shown = pilot_of([[1.0, 0.0], [0.0, 1.0]], [0.0, 0.0], [3.0, 1.0])  # evidence weighs splats
+    assert list(shown.cosines([0, 1])) == pytest.approx([0.75, 1.0])
+    assert list(shown.cosines([1, 0])) == pytest.approx([0.25, 1.0])
+    assert pilot_of([[1.0]] * 100, [1.0], [1.0]).views_for(0.9, range(100)) == (81, pytest.approx(0.9))  # all error
 
 
 def test_the_fewest_views_that_come_to_the_cosine_are_taken_but_never_fewer_than_told():

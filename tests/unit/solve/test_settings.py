@@ -47,7 +47,9 @@ def test_texts_may_stand_for_numbers_on_a_command_line() -> None:
 
 @pytest.mark.parametrize("made", [LiftSettings.of_json, lambda values: LiftSettings.of(**values)])
 def test_what_is_wrong_is_told_in_our_words(made: Any) -> None:
-    with pytest.raises(InvalidSettings, match=r"^lambda: expected one of preset, speed, .*, got an unknown setting; nearest: "):
+    with pytest.raises(
+        InvalidSettings, match=r"^lambda: expected one of preset, speed, .*, got an unknown setting; nearest: "
+    ):
         made({"lambda": 1.2})
     with pytest.raises(InvalidSettings, match=r"^settings: expected other levels than composite"):
         made({"aggregation_resolve": True, "levels": "composite"})
