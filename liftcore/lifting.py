@@ -37,12 +37,14 @@ from liftcore.solve.loss import huber_factors
 from liftcore.solve.objects import RegionObjects, region_objects
 from liftcore.solve.reweight import Agreement, agreement_factors, reweighted
 from liftcore.solve.weights import RegionWeights
+from liftcore.torch_modes import usual_modes
 from liftcore.warm_up import warm_up_lift
 
 LEAST_KEPT = 0.5  # of a splat's weight, in regions that the aggregation kept, for it to be solved for again
 log = logging.getLogger(__name__)
 
 
+@usual_modes()
 def lift(
     splats: Splats,
     cameras: Cameras | Mapping[str, Camera],
@@ -139,6 +141,7 @@ def lift(
     return made.to(work.device.place)
 
 
+@usual_modes()
 def plan(
     splats: Splats,
     cameras: Cameras | Mapping[str, Camera],

@@ -19,10 +19,12 @@ from liftcore.scene.splats import Splats
 from liftcore.settings import LiftSettings, Preset
 from liftcore.solve.geometry import Given, LiftViews, weigh_views
 from liftcore.solve.weights import RegionWeights
+from liftcore.torch_modes import usual_modes
 
 DEFAULT = CompositingParams()
 
 
+@usual_modes()
 def render(
     splats: Splats,
     camera: Camera,
@@ -66,6 +68,7 @@ def render(
     return (image[:, :, 0] if given.ndim == 1 else image).cpu()
 
 
+@usual_modes()
 def region_weights(
     splats: Splats,
     cameras: Cameras | Mapping[str, Camera],

@@ -28,6 +28,7 @@ from liftcore.progress import Progress, silent
 from liftcore.query.text.table import TableEncoder
 from liftcore.scene.cameras import Camera
 from liftcore.scene.views import require_pairs
+from liftcore.torch_modes import callers_modes
 
 U8_NO_LABEL = 255
 LARGEST_I16 = 32_767
@@ -296,7 +297,7 @@ def _check_channels(views: Iterable[tuple[str, ViewFeatures]]) -> None:
 def _spooled(pairs: Iterable[tuple[str, ViewFeatures]], scratch: Path | None) -> Views:
     with tempfile.TemporaryDirectory(dir=scratch, prefix="splatlift-views-") as folder:
         files: dict[str, Path] = {}
-        for pair in pairs:
+        for pair in _in_callers_modes(pairs):
             if not (isinstance(pair, tuple | list) and len(pair) == 2):
                 got = type(pair).__name__
                 raise InvalidFeatures("features", expected="pairs of a name and a view", got=got)
@@ -311,6 +312,19 @@ def _spooled(pairs: Iterable[tuple[str, ViewFeatures]], scratch: Path | None) ->
         return replace(read_features(*files.values()), paths=())  # mapped: the files may lose their names
 
 
+def _in_callers_modes(values: Iterable[Any]) -> Iterator[Any]:
+    """The values, each made as if there were no library around the iterator."""
+    with callers_modes():
+        rest = iter(values)
+    end = object()
+    while True:
+        with callers_modes():
+            value = next(rest, end)
+        if value is end:
+            return
+        yield value
+
+
 @dataclass(frozen=True)
 class _Given:
     """A view of a mapping of values."""
@@ -323,7 +337,8 @@ class _Given:
         return {part: TensorSpec(TYPES[str(one.dtype)], tuple(one.shape)) for part, one in _parts(self.read())}
 
     def read(self) -> ViewFeatures:
-        found = self.views[self.name]
+        with callers_modes():
+            found = self.views[self.name]
         if isinstance(found, Regions | FeatureGrid):
             return found
         hint = "make FeatureGrid(map [h, w, F]) or Regions(labels [L, h, w], codebook [M, F]) of arrays"

@@ -36,6 +36,7 @@ from liftcore.scene.cameras import Camera, Cameras, distortion_warning
 from liftcore.scene.splats import Splats
 from liftcore.settings import LiftSettings
 from liftcore.solve.geometry import strided
+from liftcore.torch_modes import usual_modes
 
 SIDE = 240  # pixels of an image's longer side, about: shares of weight are within .01 of those of all pixels
 SEEN = 0.1  # of the evidence of the view that sees a splat best
@@ -92,6 +93,7 @@ class PhotoPlan:
         yield from (f"warning: {warning}" for warning in self.warnings)
 
 
+@usual_modes()
 def plan_photos(
     splats: Splats,
     cameras: Cameras | Mapping[str, Camera],

@@ -4,6 +4,7 @@ import json
 import logging
 import subprocess
 import sys
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -262,6 +263,52 @@ def test_warnings_of_a_lift_are_logged_once_where_nobody_shows_the_plan(scene, c
     caplog.clear()
     lc.lift(splats, cameras, turned, preset="row-sum", on_plan=lambda plan: None)
     assert not caplog.records
+
+
+@contextmanager
+def default_dtype(dtype):
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(dtype)
+    try:
+        yield
+    finally:
+        torch.set_default_dtype(before)
+
+
+MODES = {
+    "inference": torch.inference_mode,
+    "float64": lambda: default_dtype(torch.float64),
+    "bfloat16": lambda: default_dtype(torch.bfloat16),
+    "another device": lambda: torch.device("meta"),  # where there is one, a card
+}
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_torch_modes_of_the_caller_change_no_bit_and_are_back_where_his_code_runs(scene, mode):
+    _, splats, cameras, views = scene
+    vectors, values = np.eye(2, views["v0"].codebook.shape[1]), np.linspace(0, 1, splats.count)
+
+    def modes():
+        return torch.is_inference_mode_enabled(), torch.get_default_dtype(), torch.get_default_device()
+
+    def found(given):
+        made = lc.lift(splats, cameras, given)
+        assert lc.plan(splats, cameras, views).views == made.views
+        answer = made.query(vectors, splats=splats)
+        W, image = lc.region_weights(splats, cameras, views), lc.render(splats, cameras["v0"], values)
+        return made.features, made.evidence, answer.scores, W.weight, image
+
+    def iterator(seen):
+        for name, view in views.items():
+            seen.append(modes())
+            yield name, view
+
+    usual, seen = found(views), []
+    with MODES[mode]():
+        around = modes()
+        within = found(iterator(seen))
+        assert modes() == around and set(seen) == {around}
+    assert all(torch.equal(one, other) for one, other in zip(usual, within, strict=True))
 
 
 def test_results_are_shown_in_a_line(scene):
