@@ -126,14 +126,14 @@ def test_backbones_without_words_say_so(photos: Path, tmp_path: Path, capsys: py
 
     torch.manual_seed(6)
     weights, pack = tmp_path / "resnet.pt", tmp_path / "pack.safetensors"
-    torch.save(TimmEncoder._with_random_weights("resnet18")._model.state_dict(), weights)
+    torch.save(TimmEncoder._with_random_weights("test_resnet")._model.state_dict(), weights)
     status, out, err = run(
-        capsys, "encode", photos / "left.png", "-o", pack, "--encoder", f"timm:resnet18@{weights}", "--no-normalised"
+        capsys, "encode", photos / "left.png", "-o", pack, "--encoder", f"timm:test_resnet@{weights}", "--no-normalised"
     )
     assert (status, err) == (0, "")
-    assert "1 views, 512 channels" in out and "no words" in out
+    assert "1 views, 96 channels" in out and "no words" in out
     packs = read_features(pack)
-    assert (packs.text_space, packs.normalised, packs.encoder) == ("none", False, "timm:resnet18")
+    assert (packs.text_space, packs.normalised, packs.encoder) == ("none", False, "timm:test_resnet")
 
 
 @pytest.mark.parametrize(

@@ -96,6 +96,8 @@ def test_plan_chooses_what_the_lift_takes(scene):
     plan = lc.plan(splats, cameras, views, coverage=1)
     made = lc.lift(splats, cameras, views, coverage=1)
     assert made.views == plan.views and len(plan.views) + len(plan.left_out) == 3
+    strided = lc.plan(splats, cameras, views, view_stride=2)
+    assert any("; 2 of 3 views" in line for line in strided.lines())
 
 
 def test_view_of_another_kind_is_refused_by_name(scene):

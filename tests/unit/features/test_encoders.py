@@ -278,7 +278,7 @@ ENCODERS = {
     "maskclip ViT": lambda: small_encoder("maskclip", small_vit()),
     "clip ViT": lambda: small_encoder("clip", small_vit()),
     "maskclip ResNet": lambda: small_encoder("maskclip", small_resnet()),
-    "timm ViT": lambda: backbone("vit_tiny_patch16_224"),
+    "timm ViT": lambda: backbone("test_vit"),
     "timm ResNet": lambda: backbone("resnet18"),
 }
 
@@ -343,32 +343,32 @@ def test_shift_of_cells_is_counted_from_strides_and_paddings(layers: list[nn.Mod
 
 
 def test_weights_from_a_file_give_the_same_features(tmp_path: Path) -> None:
-    vit = backbone("vit_tiny_patch16_224")
+    vit = backbone("test_vit")
     state = {key: value.contiguous() for key, value in vit._model.state_dict().items()}
-    head = {"head.weight": torch.zeros(1000, 192), "head.bias": torch.zeros(1000)}
+    head = {"head.weight": torch.zeros(1000, 64), "head.bias": torch.zeros(1000)}
     save_file(state | head, str(tmp_path / "vit.safetensors"))
     torch.save({"model": state}, tmp_path / "vit.pth")
     images = torch.randn(1, 3, 32, 48)
     for name in ("vit.safetensors", "vit.pth"):
-        opened = open_image_encoder(f"timm:vit_tiny_patch16_224@{tmp_path / name}")
+        opened = open_image_encoder(f"timm:test_vit@{tmp_path / name}")
         assert torch.equal(opened.encode(images), vit.encode(images))
-        assert (opened.name, opened.text_space) == ("timm:vit_tiny_patch16_224", "none")
+        assert (opened.name, opened.text_space) == ("timm:test_vit", "none")
     save_file({**state, "blocks.99.weight": torch.zeros(1)}, str(tmp_path / "more.safetensors"))
     del state["cls_token"]
     save_file(state, str(tmp_path / "less.safetensors"))
     for name, what in (("more", "a strange blocks.99"), ("less", "cls_token")):
         with pytest.raises(InvalidInput, match=what):
-            open_image_encoder(f"timm:vit_tiny_patch16_224@{tmp_path / name}.safetensors")
+            open_image_encoder(f"timm:test_vit@{tmp_path / name}.safetensors")
 
 
 def test_weights_under_other_names_are_taken_in_their_order(tmp_path: Path) -> None:
-    resnet = backbone("resnet18")
+    resnet = backbone("test_resnet")
     own = [*resnet._model.state_dict().items()]
     other = {f"_part{k}.{name.rpartition('.')[2]}": tensor for k, (name, tensor) in enumerate(own)}
-    head = {"_fc.weight": torch.zeros(10, 512), "_fc.bias": torch.zeros(10)}
+    head = {"_fc.weight": torch.zeros(10, 96), "_fc.bias": torch.zeros(10)}
     torch.save(other | head, tmp_path / "renamed.pth")
     images = torch.randn(1, 3, 64, 96)
-    opened = open_image_encoder(f"timm:resnet18@{tmp_path / 'renamed.pth'}")
+    opened = open_image_encoder(f"timm:test_resnet@{tmp_path / 'renamed.pth'}")
     assert torch.equal(opened.encode(images), resnet.encode(images))
     swapped = [*other.items()]
     swapped[1], swapped[2] = swapped[2], swapped[1]  # a weight and a bias of one shape
@@ -376,12 +376,12 @@ def test_weights_under_other_names_are_taken_in_their_order(tmp_path: Path) -> N
     torch.save(other | {"_more.weight": torch.zeros(2)}, tmp_path / "long.pth")
     save_file({name: tensor.clone() for name, tensor in other.items()}, tmp_path / "sorted.safetensors")
     for name, what in (
-        ("swapped.pth", r"tensor 1 is _part2.bias \[64\] where the model has bn1.weight \[64\]"),
+        ("swapped.pth", r"tensor 1 is _part2.bias \[16\] where the model has conv1.1.weight \[16\]"),
         ("long.pth", r"_more.weight \[2\] where the model has nothing"),
         ("sorted.safetensors", "sorts by name"),
     ):
         with pytest.raises(InvalidInput, match=what):
-            open_image_encoder(f"timm:resnet18@{tmp_path / name}")
+            open_image_encoder(f"timm:test_resnet@{tmp_path / name}")
 
 
 @pytest.mark.parametrize(
@@ -451,7 +451,7 @@ def test_a_trunk_that_takes_a_mean_gives_cells_whose_mean_is_the_image() -> None
 
 
 def test_a_trunk_that_attends_gives_the_value_path_of_its_pooling() -> None:
-    tower = small_trunk("vit_tiny_patch16_224", "map", "none")  # as SigLIP has it
+    tower = small_trunk("test_vit", "map", "none")  # as SigLIP has it
     encoder, images = small_encoder("maskclip", tower), torch.randn(1, 3, 32, 48)
     pool = tower.trunk.attn_pool
     with torch.no_grad():
@@ -462,7 +462,7 @@ def test_a_trunk_that_attends_gives_the_value_path_of_its_pooling() -> None:
 
 
 def test_a_trunk_with_a_class_token_has_no_values_to_take() -> None:
-    tower = small_trunk("vit_tiny_patch16_224", "token", "linear")
+    tower = small_trunk("test_vit", "token", "linear")
     assert small_encoder("clip", tower).encode(torch.randn(1, 3, 32, 16)).shape == (1, 2, 1, F)
     with pytest.raises(InvalidInput, match="reads its class token; clip:small"):
         small_encoder("maskclip", tower)

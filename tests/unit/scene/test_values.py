@@ -188,6 +188,13 @@ def test_more_views_than_a_scene_may_have_are_refused_before_they_are_read(
         read_cameras(path)
 
 
+def test_bombs_of_empty_images_are_refused(tmp_path: Path) -> None:
+    images = struct.pack("<Q", 300_000) + bytes(300_000 * 73)
+    path = write_files(tmp_path, {**binary_files(), "images.bin": images})
+    with pytest.raises(InvalidCameras, match=r"images\.bin: expected at most 100000 views, got 300000 or more"):
+        read_cameras(path)
+
+
 @pytest.mark.parametrize(
     ("views", "cameras", "pairs"),
     [
