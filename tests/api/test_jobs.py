@@ -1,4 +1,4 @@
-"""What jobs promise over HTTP: keys, cancel, events, limits; and that they outlive their server."""
+"""What jobs and lifts tell of themselves over HTTP, and what jobs promise: keys, cancel, events, limits."""
 
 from __future__ import annotations
 
@@ -6,12 +6,14 @@ import json
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
 
+from liftcore.query.scene import QueryScene
 from service.app import create_app
 from service.jobs import supervisor as pace
 from service.jobs.process import JobLimits
@@ -23,11 +25,11 @@ from service.store.owners import SERVICE
 from service.store.store import Store
 from tests.crash.conftest import order, stand_in, until
 
-from .conftest import ADDRESS, parts_of
+from .conftest import ADDRESS, LIFT_REQUEST, Uploaded, parts_of
 from .following import ended
 from .guarded import finish
 from .test_problems import assert_problem
-from .tiny_scene import SPLATS_A_CLUSTER, TinyScene
+from .tiny_scene import CHANNELS, SPLATS_A_CLUSTER, VIEWS, TinyScene
 
 Quick = Callable[..., AbstractContextManager[tuple[TestClient, dict[str, Any]]]]
 
@@ -246,3 +248,55 @@ def test_what_a_stage_will_still_take_follows_from_its_own_pace(monkeypatch: pyt
     now += 3
     assert left("solve", 3) == 7
     assert left("solve", 10) == 0
+
+
+COUNT = 3 * SPLATS_A_CLUSTER
+
+
+def test_assets_say_what_is_in_them_and_their_names_alone(client: TestClient, uploaded: Uploaded) -> None:
+    listed = {asset["id"]: asset["counts"] for asset in client.get("/assets").json()["assets"]}
+    splats, cameras, features = (
+        client.get(f"/assets/{asset}").json()["counts"]
+        for asset in (uploaded.splats, uploaded.cameras, uploaded.features)
+    )
+    assert (splats["splats"], splats["kernel"]) == (COUNT, "3dgs")
+    assert (cameras["views"], features["channels"], features["text_space"]) == (len(VIEWS), CHANNELS, "tiny")
+    for asset, counts in ((uploaded.cameras, cameras), (uploaded.features, features)):
+        assert "middle" in counts.pop("names") and listed[asset] == counts  # lists leave out the names
+
+
+def test_job_tells_its_story(client: TestClient, lift: dict[str, Any], uploaded: Uploaded) -> None:
+    job = client.get(lift["links"]["job"]).json()
+    assert (job["state"], job["attempt"], job["problem"]) == ("succeeded", 1, None)
+    assert job["splats"] == uploaded.splats and job["features"] == [uploaded.features]
+    assert job["settings"]["preset"] == "row-sum" and job["settings"]["power"] == 1
+    assert job["created"] <= job["started"] <= job["ended"]
+    assert job["id"] in {found["id"] for found in client.get("/jobs").json()["jobs"]}
+    assert job["request_id"] == LIFT_REQUEST
+    assert LIFT_REQUEST in client.get(job["links"]["events"]).text
+
+
+def test_lift_tells_how_far_to_trust_it(client: TestClient, lift: dict[str, Any], uploaded: Uploaded) -> None:
+    assert (lift["count"], lift["channels"], lift["text_space"]) == (COUNT, CHANNELS, "tiny")
+    assert sorted(lift["views"]) == sorted(VIEWS) and lift["certificate"] and lift["timings"]
+    assert (lift["splats"], lift["cameras"], lift["features"]) == (
+        uploaded.splats, uploaded.cameras, [uploaded.features]
+    )  # fmt: skip
+    assert lift in client.get("/lifts").json()["lifts"]
+
+
+def test_lift_and_its_files_are_found_where_they_were_downloaded(
+    client: TestClient, data: Path, lift: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = client.get(lift["links"]["features"])
+    assert len(whole.content) == lift["bytes"] and whole.headers["etag"] == f'"{lift["sha256"]}"'
+    files = [f"/assets/{asset}/content" for asset in (lift["splats"], lift["cameras"], *lift["features"])]
+    for reply in (whole, *map(client.get, files)):
+        name = reply.headers["content-disposition"].partition('filename="')[2].rstrip('"')
+        (tmp_path / name).write_bytes(reply.content)
+    [made] = tmp_path.glob("lift-*.safetensors")
+    assert str(data).encode() not in made.read_bytes()  # paths of the server are nobody's business
+    monkeypatch.chdir(tmp_path)
+    scene = QueryScene.open(made)
+    assert scene.splats.count == COUNT and {camera.name for camera in scene.cameras.values()} == set(VIEWS)
+    assert set(scene.packs.views) == set(VIEWS)

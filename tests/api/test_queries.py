@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import json
 from pathlib import Path
 from typing import Any
 
@@ -43,9 +44,11 @@ from .tiny_scene import (
     labels,
     ply,
     splat_rows,
+    text_table,
 )
 
 LAMP = {"like": f"middle:26,{HEIGHT // 2}", "threshold": 0.5}
+PLACES: dict[str, int] = dict(zip(WORDS, (6, 16, 26), strict=True))  # columns of view "middle" that show them
 PICTURES = ("/render", "/query/mask", "/query/attention")
 
 
@@ -92,7 +95,7 @@ def test_word_finds_its_cluster_in_numbers_objects_scores_and_a_mask(
     assert int((scores >= 0.5).sum()) == answer["count"]
     mask = picture(client.get(answer["links"]["mask"]).content)
     assert mask.shape == (HEIGHT, WIDTH) and set(np.unique(mask)) == {0, 255}
-    assert abs(np.nonzero(mask)[1].mean() - (6, 16, 26)[cluster]) < 3
+    assert abs(np.nonzero(mask)[1].mean() - PLACES[WORDS[cluster]]) < 3
 
 
 @pytest.mark.parametrize("like", ["middle:26,12", "region:left:0:2", f"splat:{2 * SPLATS_A_CLUSTER}"])
@@ -386,9 +389,14 @@ def test_what_an_example_lacks_is_told_beside_it(client: TestClient, lift: dict[
         ("/query/mask", {"text": ["lamp"], "camera": {"viewmat": [[1, 0, 0, 0]] * 3}}, "camera.viewmat"),
         ("/render", {"view": "middle", "camera": {"fx": FOCAL}}, "view"),
         ("/render", {"view": "middle", "what": "confidence"}, "what"),
+        ("/query/segment", {"words": []}, "words"),
+        ("/query/segment", {"words": ["lamp", "lamp"]}, "words"),
+        ("/query/segment", {"words": ["zeppelin"]}, "text"),
+        ("/query/segment/map", {}, "view"),
+        ("/query/what", {"example": "middle:99,0"}, "middle:99,0"),
     ],
 )
-def test_body_that_makes_no_picture_names_what_is_wrong(
+def test_body_that_cannot_be_answered_names_what_is_wrong(
     client: TestClient, lift: dict[str, Any], path: str, body: dict[str, Any], argument: str
 ) -> None:
     if body.get("camera"):
@@ -410,3 +418,50 @@ def test_document_says_what_is_answered_beside_200(client: TestClient) -> None:
         assert list(told["206"]["content"]) == list(told["200"]["content"]) == ["application/octet-stream"]
         assert list(told["416"]["content"]) == ["application/problem+json"]
     assert "304" not in paths["/query/mask"]["post"]["responses"]
+
+
+# Many words at once, and those of an uploaded table
+
+
+@pytest.fixture(scope="module")
+def own_table(client: TestClient) -> str:
+    """A table of other names for the three things, and of one that is not there."""
+    names = ("fruit", "novel", "light", "boat")
+    content = text_table(words=names, rows=np.eye(4, CHANNELS, dtype=np.float32))
+    return client.put("/assets/table", content=content).json()["id"]
+
+
+def test_every_splat_gets_its_word_of_the_table(client: TestClient, lift: dict[str, Any], own_table: str) -> None:
+    body = {"lift": lift["id"], "table": own_table, "view": "middle"}
+    told = client.post("/query/segment", json=body).json()
+    found = {word["word"]: word for word in told["found"]}
+    assert (set(found), told["words"], told["encoder"]) == ({"fruit", "novel", "light"}, 4, "table")
+    assert found["fruit"]["box"]["high"][0] < found["novel"]["box"]["low"][0]
+    labels = array(client.post("/query/segment/labels", json=body).content)
+    assert (labels == 0).sum() == told["none"]
+    own = labels[2 * SPLATS_A_CLUSTER :]
+    assert set(own.tolist()) - {0} == {found["light"]["value"]}
+    seen = Image.open(io.BytesIO(client.post("/query/segment/map", json=body).content))
+    legend = json.loads(seen.text["legend"])  # pyright: ignore[reportAttributeAccessIssue]: of a PNG
+    values = np.asarray(seen)[HEIGHT // 2]
+    assert [legend[str(values[column])] for column in PLACES.values()] == ["fruit", "novel", "light"]
+    assert picture(client.post("/query/segment/picture", json=body).content).shape[1] > WIDTH
+
+
+@pytest.mark.parametrize("word", WORDS)
+def test_what_this_is_names_the_nearest_words(client: TestClient, lift: dict[str, Any], word: str) -> None:
+    for example in (f"middle:{PLACES[word]},12", f"splat:{SPLATS_A_CLUSTER * WORDS.index(word)}"):
+        body = {"lift": lift["id"], "example": example, "top": 2}
+        best = client.post("/query/what", json=body).json()["words"]
+        assert best[0]["word"] == word and best[0]["score"] > best[1]["score"]
+
+
+def test_an_uploaded_table_answers_questions(client: TestClient, lift: dict[str, Any], own_table: str) -> None:
+    asked = {"lift": lift["id"], "text": "light", "table": own_table, "view": "middle"}
+    answer = client.get("/query", params=asked).json()
+    assert {splat["splat"] // SPLATS_A_CLUSTER for splat in answer["top"]} == {2}
+    for link in answer["links"].values():
+        assert client.get(link).status_code == 200
+    for wrong, status in ((lift["splats"], 422), ("sha256:" + "0" * 64, 404)):
+        assert assert_problem(client.get("/query", params=asked | {"table": wrong}))["status"] == status
+    assert assert_problem(client.get("/query", params=asked | {"encoder": "default"}))["argument"] == "table"

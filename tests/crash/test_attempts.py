@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import io
+import json
+import logging
 import os
 import signal
 import subprocess
@@ -10,6 +13,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -17,9 +21,10 @@ import pytest
 
 from service import errand
 from service.jobs import process as processes
-from service.jobs.process import mark
+from service.jobs.process import LONGEST, mark
 from service.jobs.supervisor import Lease
 from service.models import AssetKind, JobState
+from service.observe import JsonLines
 from service.scopes import Scope
 from service.store.jobs import MAX_ATTEMPTS, EventKind
 from service.store.keys import Quota
@@ -373,3 +378,40 @@ def test_queued_jobs_of_a_key_that_ended_are_canceled_with_a_reason(expired: boo
     found = store.jobs.get(SERVICE, waiting)
     assert found.state is JobState.CANCELED and found.problem is not None and found.problem["argument"] == "key"
     assert store.jobs.get(SERVICE, running).state is JobState.RUNNING  # what has begun goes on
+
+
+class Slow(logging.StreamHandler[io.StringIO]):
+    """A log that takes its time, as on a busy disk."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        time.sleep(0.02)
+        super().emit(record)
+
+
+@pytest.fixture
+def logged() -> Iterator[io.StringIO]:
+    """The server's log of what jobs print."""
+    written, logger = io.StringIO(), logging.getLogger("service.jobs.process")
+    handler = Slow(written)
+    handler.setFormatter(JsonLines())
+    logger.addHandler(handler)
+    yield written
+    logger.removeHandler(handler)
+
+
+def test_every_line_that_a_job_prints_is_a_record_with_its_job_and_request(
+    store: Store, supervising: Supervising, logged: io.StringIO, capfd: pytest.CaptureFixture[str]
+) -> None:
+    job = store.jobs.submit(SERVICE, replace(order(store), request_id="the-order"))[0]
+    with supervising("print_much"):
+        ended(store, job)
+    records = [json.loads(line) for line in logged.getvalue().splitlines()]
+    assert {(record["job"], record["request_id"], record["level"]) for record in records} == {
+        (job, "the-order", "warning")
+    }
+    messages = [record["message"] for record in records]
+    assert messages.count('a warning with "quotes" and \ufffd') == 3  # once an attempt: none is lost, however it ends
+    assert messages.count("RuntimeError: unforeseen") == 3
+    long = [message for message in messages if message.strip("x") == ""]
+    assert max(map(len, long)) == LONGEST and sum(map(len, long)) == 3 * 100_000
+    assert "unforeseen" not in capfd.readouterr().err  # and nothing of it goes past the log

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import io
 import json
 import re
@@ -13,27 +14,34 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
+import matplotlib
 import numpy as np
 import pytest
 import torch
 from fastapi.routing import APIRoute
+from matplotlib import pyplot
 from PIL import Image
 from pydantic import BaseModel
+from scipy.spatial.transform import Rotation
 
 import liftcore as lc
 from liftcore.cli import main
+from liftcore.demo.scene_folder import find_scene
 from liftcore.features.encoders import Pixels
 from liftcore.features.encoders.crops import CropEncoder
-from liftcore.features.pack import read_features
+from liftcore.features.pack import read_features, write_pack
+from liftcore.io.cameras import read_cameras
+from liftcore.io.inria import write_inria_cameras
+from liftcore.io.ply import write_splats
 from liftcore.io.splats import read_splats
 from liftcore.query.text.table import TableEncoder
 from service import models
 from service.routes import assets, jobs, operations, queries, results, scene, words
 from service.scopes import OPEN
-from tests.api.tiny_scene import WIDTH, WORDS, codebook, colmap_zip, labels, make_scene
+from tests.api.tiny_scene import HEIGHT, WIDTH, WORDS, cameras_document, codebook, colmap_zip, labels, make_scene
 from tests.run_lengths import sam_records
 
-from .readme import FOR_USERS, GUIDE, PYTHON, SERVICE, SETTINGS, blocks, text
+from .readme import FOR_USERS, GUIDE, PYTHON, ROOT, SERVICE, SETTINGS, blocks, text
 
 ROUTES: tuple[ModuleType, ...] = (operations, assets, jobs, results, scene, queries, words)
 SHAPES: dict[str, type[BaseModel]] = {  # a field that no other answer has -> the answer
@@ -246,3 +254,183 @@ def test_every_route_is_told_and_no_other() -> None:
             real |= {f"{method} {route.path}" for method in route.methods or ()}
     in_a_sentence = {f"GET {path}" for path in OPEN if path.startswith(("/openapi", "/docs", "/web"))}
     assert named == real - in_a_sentence
+
+
+# Scenes of nerfstudio and gsplat
+
+
+SCALE = 0.2
+
+
+def similarity() -> np.ndarray:
+    """[4, 4], from the frame of the camera files to that of the splats."""
+    moved = np.eye(4)
+    moved[:3, :3] = SCALE * Rotation.from_euler("xyz", [10, 130, -40], degrees=True).as_matrix()
+    moved[:3, 3] = (0.5, -2.0, 1.0)
+    return moved
+
+
+def commands() -> list[list[str]]:
+    section = text(GUIDE).partition("## Scenes of nerfstudio and gsplat")[2].partition("\n## ")[0]
+    lines = section.partition("```sh\n")[2].partition("```")[0].splitlines()
+    return [shlex.split(line) for line in lines]
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The tiny scene as nerfstudio would have trained it, and its run's file; the working directory."""
+    scene, back = make_scene(), np.linalg.inv(similarity())
+    (tmp_path / "splat.ply").write_bytes(scene.splats)
+    (tmp_path / "features.safetensors").write_bytes(scene.features)
+    (tmp_path / "words.safetensors").write_bytes(scene.table)
+    document = cameras_document()
+    for frame in document["frames"]:
+        pose = back @ np.array(frame["transform_matrix"])
+        pose[:3, :3] *= SCALE  # of cameras only the places are scaled
+        frame["transform_matrix"] = pose.tolist()
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "transforms.json").write_text(json.dumps({**document, "ply_file_path": "sparse_pc.ply"}))
+    run = tmp_path / commands()[0][1]
+    run.parent.mkdir(parents=True)
+    told = similarity()[:3] / np.array([[SCALE]])
+    run.write_text(json.dumps({"transform": told.tolist(), "scale": SCALE}))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_lift_of_nerfstudios_scene_finds_the_apple(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    copy, *splatlift, packed = commands()
+    assert (copy[0], packed[1:4]) == ("cp", ["-m", "zipfile", "-c"])
+    assert main(["inspect", "data"]) == 0
+    assert "--orientation-method none" in capsys.readouterr().out
+    unmoved = ["lift", "splat.ply", "data", "features.safetensors", "-o", "unmoved.lift.safetensors"]
+    assert main(unmoved) == 0
+    assert "Put its run's dataparser_transforms.json beside them" in capsys.readouterr().out
+    shutil.copy(*copy[1:])
+    assert [main(command[1:]) for command in splatlift] == [0, 0]
+    said = capsys.readouterr().out
+    assert "dataparser_transforms.json" in said and "Put its run's" not in said
+    question = ["query", "plants.lift.safetensors", "apple", "--table", "words.safetensors", "--view", "middle"]
+    assert main([*question, "--mask", "apple.png"]) == 0
+    with Image.open("apple.png") as mask:
+        columns = np.asarray(mask).nonzero()[1]
+    assert len(columns) > 0 and columns.max() < WIDTH // 2
+    with zipfile.ZipFile(packed[4], "w") as archive:
+        for name in packed[5:]:
+            archive.write(name, Path(name).name)
+    one, other = (read_cameras(Path(path)).values() for path in ("data", packed[4]))
+    assert [view.viewmat.tolist() for view in one] == [view.viewmat.tolist() for view in other]
+
+
+def test_transform_of_gsplat_is_written_and_read(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with zipfile.ZipFile(io.BytesIO(colmap_zip())) as archive:
+        archive.extractall(folder / "data/garden")
+    before = read_cameras(folder / "data/garden")
+    module = ModuleType("datasets.colmap")
+    vars(module)["Parser"] = lambda path, factor, normalize: SimpleNamespace(transform=similarity())
+    monkeypatch.setitem(sys.modules, "datasets", ModuleType("datasets"))
+    monkeypatch.setitem(sys.modules, "datasets.colmap", module)
+    (example,) = (block for block in blocks(GUIDE, "python") if "datasets.colmap" in block)
+    exec(compile(example, GUIDE, "exec"), {})
+    after = read_cameras(folder / "data/garden")
+    for old, new in zip(before.values(), after.values(), strict=True):
+        assert np.allclose(new.centre, (similarity() @ [*old.centre, 1])[:3])
+
+
+# The notebook: what is saved in it is what its cells say
+
+
+NOTEBOOK = ROOT / "docs" / "quickstart.ipynb"
+CELLS = [cell for cell in json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"] if cell["cell_type"] == "code"]
+
+
+def test_cells_run_in_order_and_print_what_is_saved(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    matplotlib.use("Agg")
+    monkeypatch.setattr(pyplot, "show", lambda: None)
+    names: dict[str, Any] = {}
+    for cell in CELLS:
+        exec(compile("".join(cell["source"]), str(NOTEBOOK), "exec"), names)
+        saved = "".join("".join(output.get("text", [])) for output in cell["outputs"])
+        assert capsys.readouterr().out.splitlines()[:1] == saved.splitlines()[:1]
+        pictures = [output for output in cell["outputs"] if "image/png" in output.get("data", {})]
+        assert len(pictures) == len(pyplot.get_fignums())
+        pyplot.close("all")
+    scene = find_scene(names["folder"], (), names["folder"])
+    assert scene.truth is not None
+    mask, truth = names["mask"], scene.truth.mask_of(names["phrase"], "view_030")
+    assert (mask & truth).sum() / (mask | truth).sum() > 0.8
+
+
+def test_notebook_is_small_and_its_cells_ran_in_order() -> None:
+    assert NOTEBOOK.stat().st_size < 400_000
+    assert [cell["execution_count"] for cell in CELLS] == list(range(1, len(CELLS) + 1))
+
+
+# The five lines for a training loop, on tensors as gsplat trains them
+
+
+@pytest.fixture
+def loop() -> dict[str, Any]:
+    """What a training loop holds: parameters, poses and photos of two clouds of splats, and an image encoder."""
+    random = torch.Generator().manual_seed(5)
+    means = 0.25 * torch.randn(400, 3, generator=random)
+    means[:200, 0] -= 0.8
+    means[200:, 0] += 0.8
+    params: dict[str, Any] = {
+        "means": means,
+        "quats": 3 * torch.randn(400, 4, generator=random),  # unnormalised, as they are trained
+        "log_scales": torch.full((400, 3), -2.6) + 0.2 * torch.randn(400, 3, generator=random),
+        "opacity_logits": torch.full((400,), 1.5),
+    }
+    names = dict(torch.nn.ParameterDict(params).items())
+    viewmats, Ks = torch.eye(4).repeat(5, 1, 1), torch.eye(3).repeat(5, 1, 1)
+    viewmats[:, 0, 3], viewmats[:, 2, 3] = torch.linspace(-0.5, 0.5, 5), 4.0
+    Ks[:, 0, 0] = Ks[:, 1, 1] = 30.0
+    Ks[:, 0, 2], Ks[:, 1, 2] = WIDTH / 2, HEIGHT / 2
+    splats = lc.Splats(**params)
+    colours = torch.where(means[:, :1] < 0, torch.tensor([1.0, 0.2, 0.1]), torch.tensor([0.1, 0.3, 1.0]))
+    views = [f"{view:04d}" for view in range(5)]
+    poses: Any = list(zip(views, viewmats, Ks, strict=True))
+    torch.manual_seed(2)
+    net = torch.nn.Sequential(
+        torch.nn.Conv2d(3, 16, 3, stride=2, padding=1), torch.nn.Tanh(), torch.nn.Conv2d(16, 12, 1)
+    )
+
+    def encode(photo: torch.Tensor) -> torch.Tensor:
+        """[h, w, F] of a photo [H, W, 3], with gradients as a network gives them."""
+        return net(photo.permute(2, 0, 1)[None])[0].permute(1, 2, 0)
+
+    photos = [(name, lc.render(splats, lc.Camera(viewmat, K, WIDTH, HEIGHT), colours)) for name, viewmat, K in poses]
+    return names | {
+        "poses": poses, "photos": photos, "encode": encode, "width": WIDTH, "height": HEIGHT, "name": views[2],
+    }  # fmt: skip
+
+
+def test_tensors_of_a_training_loop_lift_as_their_files_do(loop: dict[str, Any], tmp_path: Path) -> None:
+    assert all(loop[name].requires_grad for name in ("means", "quats", "log_scales", "opacity_logits"))
+    (example,) = (block for block in blocks(PYTHON, "python") if "lc.Splats(" in block)
+    five = example.splitlines()[2:]
+    assert len(five) == 5
+    exec("\n".join([example.splitlines()[0], *five[:4]]), loop)
+    assert inspect.isgenerator(loop["views"])
+    features = loop["result"].features.float()
+    loop["text_vectors"] = features[loop["means"][:, 0].detach() < 0].mean(dim=0)
+    exec(five[4], loop)
+
+    write_splats(loop["splats"], tmp_path / "scene.ply")
+    named = [lc.Camera(viewmat, K, WIDTH, HEIGHT, name=name) for name, viewmat, K in loop["poses"]]
+    write_inria_cameras(lc.Cameras(tuple(named)), tmp_path / "cameras.json")
+    grids = {name: lc.FeatureGrid(loop["encode"](photo)) for name, photo in loop["photos"]}
+    write_pack(tmp_path / "features.safetensors", grids, {})
+    filed = lc.lift(
+        lc.read_splats(tmp_path / "scene.ply"), lc.read_cameras(tmp_path / "cameras.json"),
+        lc.read_features(tmp_path / "features.safetensors"),
+    )  # fmt: skip
+    assert torch.allclose(filed.features.float(), features, atol=2e-3)  # packs and poses are rounded, values are not
+    assert torch.equal(filed.seen, loop["result"].seen)
+
+    columns = np.nonzero(np.asarray(loop["mask"]))[1]
+    assert len(columns) > 10 and columns.max() < WIDTH / 2  # the cloud on the left was asked for
+    assert loop["means"].grad is None
