@@ -127,9 +127,8 @@ def test_backbones_without_words_say_so(photos: Path, tmp_path: Path, capsys: py
     torch.manual_seed(6)
     weights, pack = tmp_path / "resnet.pt", tmp_path / "pack.safetensors"
     torch.save(TimmEncoder._with_random_weights("test_resnet")._model.state_dict(), weights)
-    status, out, err = run(
-        capsys, "encode", photos / "left.png", "-o", pack, "--encoder", f"timm:test_resnet@{weights}", "--no-normalised"
-    )
+    options = ["--encoder", f"timm:test_resnet@{weights}", "--no-normalised"]
+    status, out, err = run(capsys, "encode", photos / "left.png", "-o", pack, *options)
     assert (status, err) == (0, "")
     assert "1 views, 96 channels" in out and "no words" in out
     packs = read_features(pack)
