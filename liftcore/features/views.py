@@ -18,6 +18,7 @@ NO_LABEL = -1  # a pixel that a level leaves unlabelled
 LARGEST = 1e15  # of a feature; float32 sums of squares over all channels stay finite far beyond
 MAX_CHANNELS = 1 << 16
 INTEGERS = (torch.int32, torch.int16, torch.int64, torch.int8, torch.uint8)
+WIDENED = (torch.uint16, torch.uint32)  # of pictures of 16 bits; torch does hardly anything with these
 Array = Tensor | np.ndarray
 FLOATS = (torch.float16, torch.float32, torch.float64, torch.bfloat16)
 Numbers = TypeVar("Numbers", np.ndarray, Tensor)
@@ -147,6 +148,7 @@ def _labels(values: object, rows: int, where: str) -> Tensor:
         found = _tensor(values)
     except (TypeError, ValueError):
         raise InvalidFeatures(where, expected="integers [L, h, w]", got=type(values).__name__) from None
+    found = found.to(torch.int64) if found.dtype in WIDENED else found
     if found.ndim not in (2, 3) or not found.numel() or found.dtype not in INTEGERS:
         raise InvalidFeatures(where, expected="integers [L, h, w], no side empty", got=_kind(found))
     low, high = (int(value) for value in torch.aminmax(found))

@@ -37,6 +37,14 @@ def test_arrays_of_numpy_become_tensors(kind: str, floats: str) -> None:
     assert found.codebook.tolist() == np.eye(2, 3).tolist()
 
 
+@pytest.mark.parametrize("kind", [np.uint16, np.uint32])
+def test_labels_may_be_without_a_sign_as_pictures_have_them(kind: type[np.unsignedinteger]) -> None:
+    labels = np.array([[0, 1], [1, 0]], kind)
+    assert ANY_REGIONS(labels, np.eye(2)).labels.tolist() == [labels.tolist()]
+    with pytest.raises(InvalidFeatures, match="the label 65535"):
+        ANY_REGIONS(labels + kind(65_534), np.eye(2))
+
+
 def test_arrays_that_fit_are_not_copied() -> None:
     codebook, labels = torch.eye(2, 3, requires_grad=True), torch.zeros(1, 2, 2, dtype=torch.int32)
     found = Regions(labels, codebook)
@@ -53,6 +61,7 @@ def test_arrays_that_fit_are_not_copied() -> None:
         (lambda: ANY_REGIONS([[0, 2]], np.eye(2)), r"labels: expected rows of its codebook \(0\.\.1\).*the label 2"),
         (lambda: ANY_REGIONS([[0, -2]], np.eye(2)), "the label -2"),
         (lambda: ANY_REGIONS([[0.5]], np.eye(2)), r"integers \[L, h, w\]"),
+        (lambda: ANY_REGIONS(np.ones((1, 1), np.uint64), np.eye(2)), r"integers \[L, h, w\].*uint64"),
         (lambda: ANY_REGIONS([0], np.eye(2)), r"labels: .*int64 \[1\]"),
         (lambda: ANY_REGIONS([[0]], np.ones(2)), r"codebook: expected floats \[M, F\]"),
         (lambda: ANY_REGIONS([[0]], np.full((1, 2), np.nan), where="view 'a'"), "view 'a' codebook: .*got 2 of 2"),
