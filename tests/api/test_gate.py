@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from starlette.datastructures import Headers
 
 from liftcore.errors import SplatliftError
-from service.auth import CALLER, Caller, Gate, Hosts, host_name, is_loopback
+from service.auth import CALLER, Gate, Hosts, host_name, is_loopback
 from service.errors import Busy, ForeignOrigin, Misdirected, TooMany
 from service.scopes import OPEN, needed
 from service.settings import ServiceSettings
@@ -41,40 +41,18 @@ def check(hosts: Hosts, method: str = "GET", **headers: str) -> None:
     hosts.check(method, Headers(headers))
 
 
-@pytest.mark.parametrize(
-    "host",
-    [
-        "localhost",
-        "LOCALHOST:8787",
-        "127.0.0.1:1",
-        "[::1]:8787",
-        "[::1]",
-        "lift.example.org:443",
-        "localhost.",
-        "localhost:",
-    ],
-)
-def test_own_names_are_taken(host: str) -> None:
-    check(HERE, host=host)
-
-
-@pytest.mark.parametrize(
-    "host",
-    [
-        "evil.example", "evil.example:8787", "localhost.evil.example", "127.0.0.1.evil.example", "", ":80", "[::1",
-        "192.0.2.1", "localhost:port", "localhost@evil.example", "evil.example@localhost", "[localhost]", "[]",
-    ],
-)  # fmt: skip
-def test_other_names_are_misdirected(host: str) -> None:
-    with pytest.raises(Misdirected):
+def test_own_names_are_taken_and_no_other() -> None:
+    for host in ("localhost", "LOCALHOST:8787", "127.0.0.1:1", "[::1]:8787", "[::1]", "lift.example.org:443",
+                 "localhost.", "localhost:"):  # fmt: skip
         check(HERE, host=host)
-
-
-def test_without_a_host_or_with_two_nothing_is_said() -> None:
-    with pytest.raises(Misdirected):
-        check(HERE)
-    with pytest.raises(Misdirected):
-        HERE.check("GET", Headers(raw=[(b"host", b"localhost"), (b"host", b"localhost")]))
+    for host in ("evil.example", "evil.example:8787", "localhost.evil.example", "127.0.0.1.evil.example", "", ":80",
+                 "[::1", "192.0.2.1", "localhost:port", "localhost@evil.example", "evil.example@localhost",
+                 "[localhost]", "[]"):  # fmt: skip
+        with pytest.raises(Misdirected):
+            check(HERE, host=host)
+    for hosts in ([], [(b"host", b"localhost"), (b"host", b"localhost")]):  # none, and two
+        with pytest.raises(Misdirected):
+            HERE.check("GET", Headers(raw=hosts))
 
 
 def test_service_on_all_addresses_takes_digits_and_no_names() -> None:
@@ -82,6 +60,8 @@ def test_service_on_all_addresses_takes_digits_and_no_names() -> None:
     check(EVERYWHERE, host="[2001:db8::1]:8787")
     with pytest.raises(Misdirected):
         check(EVERYWHERE, host="evil.example")
+    loopback = [is_loopback(host) for host in ("localhost", "127.8.8.8", "::1", "0.0.0.0", "::", "example.org")]
+    assert loopback == [True, True, True, False, False, False]
 
 
 @given(st.text(st.characters(codec="latin-1"), max_size=40))
@@ -99,20 +79,15 @@ def test_what_is_not_listed_as_open_wants_a_scope(method: str, rest: str) -> Non
         assert (needed(method, path) is None) == (method in ("GET", "HEAD") and path in OPEN)
 
 
-@pytest.mark.parametrize("origin", ["http://localhost:8787", "https://lift.example.org", "http://LOCALHOST:8787"])
-def test_own_page_may_change_things(origin: str) -> None:
-    check(HERE, "POST", host="localhost:8787", origin=origin)
-
-
-@pytest.mark.parametrize(
-    "origin",
-    ["https://evil.example", "null", "", "http://localhost:3000", "http://localhost", "file://", "localhost:8787", "http://["],
-)  # fmt: skip
-def test_foreign_pages_may_only_look(origin: str) -> None:
-    check(HERE, "GET", host="localhost:8787", origin=origin)  # without CORS headers no page can read the answer
-    for method in ("POST", "PUT", "DELETE", "PATCH"):
-        with pytest.raises(ForeignOrigin):
-            check(HERE, method, host="localhost:8787", origin=origin)
+def test_own_page_may_change_things_and_foreign_ones_only_look() -> None:
+    for origin in ("http://localhost:8787", "https://lift.example.org", "http://LOCALHOST:8787"):
+        check(HERE, "POST", host="localhost:8787", origin=origin)
+    for origin in ("https://evil.example", "null", "", "http://localhost:3000", "http://localhost", "file://",
+                   "localhost:8787", "http://["):  # fmt: skip
+        check(HERE, "GET", host="localhost:8787", origin=origin)  # without CORS headers no page can read the answer
+        for method in ("POST", "PUT", "DELETE", "PATCH"):
+            with pytest.raises(ForeignOrigin):
+                check(HERE, method, host="localhost:8787", origin=origin)
 
 
 def test_gate_answers_with_problems(house: Guarded) -> None:
@@ -127,31 +102,20 @@ def test_gate_answers_with_problems(house: Guarded) -> None:
     assert own.status_code == 200
 
 
-@pytest.mark.parametrize(
-    ("host", "loopback"),
-    [
-        ("localhost", True),
-        ("127.8.8.8", True),
-        ("::1", True),
-        ("0.0.0.0", False),
-        ("::", False),
-        ("example.org", False),
-    ],
-)
-def test_loopback_is_known(host: str, loopback: bool) -> None:
-    assert is_loopback(host) is loopback
+def gate_of(store: Store, app: Any, **settings: int) -> Gate:
+    chosen = ServiceSettings.model_validate({"data": store.files.root, **settings})
+    return Gate(app, store.keys, chosen, lambda: False)
 
 
-def test_uploads_at_a_time_have_a_quota_a_key(tmp_path: Path) -> None:
-    store = Store.open(tmp_path)
-    keys = {name: make_key(store, "write", max_uploads=2)[1] for name in ("alice", "bob")}
+async def through(gate: Gate, secret: str, path: str = "/assets/splats") -> None:
+    """A PUT with a key, of which nobody reads or answers anything."""
+    headers = [(b"host", b"localhost"), (b"authorization", f"Bearer {secret}".encode())]
+    nothing: Any = None
+    await gate({"type": "http", "method": "PUT", "path": path, "headers": headers}, nothing, nothing)
 
-    async def nothing(message: Any = None) -> Any:
-        raise AssertionError("nobody reads or answers here")
 
-    async def upload(gate: Gate, name: str, path: str = "/assets/splats") -> None:
-        headers = [(b"host", b"localhost"), (b"authorization", bearer(keys[name])["Authorization"].encode())]
-        await gate({"type": "http", "method": "PUT", "path": path, "headers": headers}, nothing, nothing)
+def test_uploads_at_a_time_have_a_quota_a_key(store: Store) -> None:
+    alice, bob = (make_key(store, "write", max_uploads=2)[1] for _ in range(2))
 
     async def run() -> None:
         release, inside = anyio.Event(), list[str]()
@@ -161,29 +125,37 @@ def test_uploads_at_a_time_have_a_quota_a_key(tmp_path: Path) -> None:
             await release.wait()
             raise OSError("it broke off")
 
-        gate = Gate(slow, store.keys, ServiceSettings.model_validate({"data": tmp_path}), lambda: False)
-
-        async def broken(name: str, path: str = "/assets/splats") -> None:
+        async def broken(*asked: str) -> None:
             with pytest.raises(OSError, match="broke"):
-                await upload(gate, name, path)
+                await through(gate, *asked)
 
+        gate = gate_of(store, slow)
         async with anyio.create_task_group() as group:
-            for name in ("alice", "alice", "bob"):
-                group.start_soon(broken, name)
-            group.start_soon(broken, "alice", "/lift")  # no upload
+            for asked in ((alice,), (alice,), (bob,), (alice, "/lift")):  # which is no upload
+                group.start_soon(broken, *asked)
             with anyio.fail_after(60):
                 while len(inside) < 4:
                     await anyio.sleep(0.01)
             with pytest.raises(TooMany):
-                await upload(gate, "alice")
+                await through(gate, alice)
             release.set()
-        await broken("alice")  # what broke off counts no more
+        await broken(alice)  # what broke off counts no more
         assert len(inside) == 5
 
-    try:
-        anyio.run(run)
-    finally:
-        store.close()
+    anyio.run(run)
+
+
+def test_key_has_its_own_quota_and_else_that_of_every_key(store: Store) -> None:
+    quotas: list[tuple[int | None, int | None, int]] = []
+
+    async def seen(scope: Any, receive: Any, send: Any) -> None:
+        caller = scope["state"][CALLER]
+        quotas.append((caller.owner.max_bytes, caller.owner.max_queued, caller.max_uploads))
+
+    gate = gate_of(store, seen, key_bytes=70, key_queued=80, key_uploads=90)
+    for own in ({}, {"max_bytes": 1}, {"max_queued": 2}, {"max_uploads": 3}, {"max_bytes": 0, "max_queued": 0}):
+        anyio.run(through, gate, make_key(store, "write", **own)[1])
+    assert quotas == [(70, 80, 90), (1, 80, 90), (70, 2, 90), (70, 80, 3), (0, 0, 90)]
 
 
 def test_streams_at_a_time_have_a_share_a_key() -> None:
@@ -212,33 +184,6 @@ def test_database_that_is_held_at_the_gate_is_503_with_retry_after(house: Guarde
     reply = house.ask("alice", "GET", "/jobs")
     assert (assert_problem(reply)["type"], reply.status_code) == ("/problems/busy", 503)
     assert int(reply.headers["retry-after"]) > 0
-
-
-def test_key_has_its_own_quota_and_else_that_of_every_key(tmp_path: Path) -> None:
-    store = Store.open(tmp_path)
-    callers: list[Caller] = []
-
-    async def seen(scope: Any, receive: Any, send: Any) -> None:
-        callers.append(scope["state"][CALLER])
-
-    async def nothing(message: Any = None) -> Any:
-        raise AssertionError("nobody reads or answers here")
-
-    shared = {"key_bytes": 70, "key_queued": 80, "key_uploads": 90}
-    gate = Gate(seen, store.keys, ServiceSettings.model_validate({"data": tmp_path, **shared}), lambda: False)
-
-    async def run() -> None:
-        for own in ({}, {"max_bytes": 1}, {"max_queued": 2}, {"max_uploads": 3}, {"max_bytes": 0, "max_queued": 0}):
-            secret = make_key(store, "read", **own)[1]
-            headers = [(b"host", b"localhost"), (b"authorization", f"Bearer {secret}".encode())]
-            await gate({"type": "http", "method": "GET", "path": "/jobs", "headers": headers}, nothing, nothing)
-
-    try:
-        anyio.run(run)
-    finally:
-        store.close()
-    quotas = [(caller.owner.max_bytes, caller.owner.max_queued, caller.max_uploads) for caller in callers]
-    assert quotas == [(70, 80, 90), (1, 80, 90), (70, 2, 90), (70, 80, 3), (0, 0, 90)]
 
 
 def test_stored_bytes_have_a_quota(tmp_path: Path) -> None:
