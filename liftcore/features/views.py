@@ -4,7 +4,6 @@ S is never built. A region map says for every pixel which codebook row each leve
 read by bilinear interpolation, four rows a pixel.
 """
 
-import warnings
 from dataclasses import dataclass
 from typing import Self, TypeVar
 
@@ -13,6 +12,7 @@ import torch
 from torch import Tensor
 
 from liftcore.errors import InvalidFeatures
+from liftcore.scene.splats import shared_tensor
 
 NO_LABEL = -1  # a pixel that a level leaves unlabelled
 LARGEST = 1e15  # of a feature; float32 sums of squares over all channels stay finite far beyond
@@ -115,22 +115,10 @@ def check_finite(values: Tensor, where: str) -> None:
         raise InvalidFeatures(where, expected=f"finite values within +-{LARGEST:g}", got=got)
 
 
-def _tensor(values: object) -> Tensor:
-    """A tensor over the same memory where torch can have it; a mapped file or a reversed array is copied."""
-    if isinstance(values, Tensor):
-        return values.detach()
-    array = np.asarray(values)
-    if not array.dtype.isnative:
-        array = array.astype(array.dtype.newbyteorder("="))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # of arrays that must not be written to: nobody does
-        return torch.from_numpy(np.ascontiguousarray(array))
-
-
 def _features(values: object, axes: str, where: str) -> Tensor:
     """[.., F] f16 or f32, contiguous and finite."""
     try:
-        found = _tensor(values)
+        found = shared_tensor(values)
     except (TypeError, ValueError):
         raise InvalidFeatures(where, expected=f"floats [{axes}]", got=type(values).__name__) from None
     fits = found.ndim == len(axes.split()) and found.numel() and found.dtype in FLOATS
@@ -145,7 +133,7 @@ def _features(values: object, axes: str, where: str) -> Tensor:
 def _labels(values: object, rows: int, where: str) -> Tensor:
     """[L, h, w] i32, contiguous, each -1 or below ``rows``."""
     try:
-        found = _tensor(values)
+        found = shared_tensor(values)
     except (TypeError, ValueError):
         raise InvalidFeatures(where, expected="integers [L, h, w]", got=type(values).__name__) from None
     found = found.to(torch.int64) if found.dtype in WIDENED else found

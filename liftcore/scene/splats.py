@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 
 from liftcore.errors import InvalidSplats
@@ -13,7 +15,6 @@ from liftcore.scene.kernel import Kernel, kernel_named, scale_count
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    import numpy as np
     from torch import Tensor
 
     Array = Tensor | np.ndarray
@@ -41,7 +42,7 @@ class Splats:
     means: Tensor  # [P, 3] f32, world frame, scene units
     quats: Tensor  # [P, 4] f32, w x y z, may be unnormalised; zero counts as identity
     log_scales: Tensor  # [P, 3] f32 ([P, 2] for 2DGS), log of scene units
-    opacity_logits: Tensor  # [P] f32, theta in alpha = sigmoid(theta)
+    opacity_logits: Tensor  # [P] f32 (of [P] or [P, 1]), theta in alpha = sigmoid(theta)
     kernel: Kernel
     beta: Tensor | None  # [P] f32, DBS only: b in beta = 4 exp(b)
     sh: Tensor | None  # [P, K, 3] f32, K = (degree + 1)^2, spherical harmonics
@@ -102,10 +103,22 @@ class Splats:
         return None if self.sh is None else int(self.sh.shape[1] ** 0.5) - 1
 
 
+def shared_tensor(values: object) -> Tensor:
+    """A tensor over the same memory where torch can have it; a mapped file or a reversed array is copied."""
+    if isinstance(values, torch.Tensor):
+        return values.detach()
+    array = np.asarray(values)
+    if not array.dtype.isnative:
+        array = array.astype(array.dtype.newbyteorder("="))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of arrays that must not be written to: nobody does
+        return torch.from_numpy(np.ascontiguousarray(array))
+
+
 def _floats(name: str, values: Array) -> Tensor:
     """Values as f32 where they lie, without a copy where they are that already."""
     try:
-        found = torch.as_tensor(values).detach()
+        found = shared_tensor(values)
     except (TypeError, ValueError, RuntimeError) as error:
         expected, got = "an array of torch or numpy", f"{type(values).__name__} ({str(error)[:80]})"
         raise InvalidSplats(name, expected=expected, got=got) from None
@@ -117,6 +130,8 @@ def _floats(name: str, values: Array) -> Tensor:
 def _column(name: str, values: Array, shape: tuple[Any, ...], device: torch.device) -> Tensor:
     """Values as f32 of a shape, whose ``...`` is any number, with no NaN nor an infinity that has no meaning."""
     found = _floats(name, values)
+    if len(shape) == 1 and found.ndim == 2 and found.shape[1] == 1:  # as Inria's code keeps opacities
+        found = found[:, 0]
     if found.ndim != len(shape) or any(
         want not in (..., side) for want, side in zip(shape, found.shape, strict=True)
     ):

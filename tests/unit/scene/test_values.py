@@ -69,7 +69,7 @@ def test_kernel_is_a_string_or_one_of_the_kernels() -> None:
         ("means", "a string", "means: expected an array of torch or numpy, got str"),
         ("quats", torch.zeros(3, 3), r"quats: expected floats of shape \[3, 4\], got shape \[3, 3\]"),
         ("log_scales", torch.zeros(3, 2), r"log_scales: expected floats of shape \[3, 3\]"),
-        ("opacity_logits", torch.zeros(3, 1), r"opacity_logits: .* got shape \[3, 1\]"),
+        ("opacity_logits", torch.zeros(3, 2), r"opacity_logits: .* got shape \[3, 2\]"),
         ("sh", torch.zeros(3, 5, 3), "sh: expected .* rows"),
         ("sb_params", torch.zeros(3, 2, 5), r"sb_params: expected floats of shape \[3, any, 6\]"),
         ("beta", torch.zeros(3), "beta: expected one value a splat for DBS and none"),
@@ -81,6 +81,20 @@ def test_kernel_is_a_string_or_one_of_the_kernels() -> None:
 def test_wrong_arrays_are_refused_by_their_name(name: str, values: Any, message: str) -> None:
     with pytest.raises(InvalidSplats, match=message):
         Splats(**{**arrays(), name: values})
+
+
+def test_arrays_of_any_order_and_opacities_in_a_column_are_splats() -> None:
+    given = {name: values.numpy() for name, values in arrays().items()}
+    turned = {
+        "means": given["means"][::-1].copy()[::-1],
+        "quats": np.asfortranarray(given["quats"]),
+        "log_scales": given["log_scales"].astype(">f8"),
+        "opacity_logits": given["opacity_logits"][:, None],
+    }
+    turned["means"].setflags(write=False)
+    plain, found = Splats(**given), Splats(**turned)
+    for name in given:
+        assert torch.equal(getattr(found, name), getattr(plain, name)), name
 
 
 @pytest.mark.parametrize("make", [np.asarray, torch.tensor, np.ndarray.tolist])
