@@ -154,15 +154,22 @@ def test_weights_that_count_equal_the_oracle_ray_by_ray(footprint, backend):
         assert np.abs(W.T - chosen)[walked & ~view.cut & ~close].max(initial=0) < INSIDE
 
 
-def test_few_rays_are_too_close_to_call():
-    seen = [(random_splats(seed, 60), random_camera(seed)) for seed in range(4)]
-    views = [dense_view(*scene, CompositingParams()) for scene in seen]
+@every_backend
+def test_every_weighting_equals_the_oracle_and_few_rays_are_too_close_to_call(backend):
+    width, height = backend.size if backend.name == "gpu" else (37, 29)
+    views = []
+    for seed in range(min(4, backend.seeds)):
+        splats, camera = random_splats(seed, 60), random_camera(seed, width, height)
+        views.append((splats, camera, backend.open(splats), dense_view(splats, camera, CompositingParams())))
     for weighting in SELECTIONS:
-        close = [
-            counted_weights(view.A, *scene, CompositingParams(), weighting)[1] & ~view.cut
-            for view, scene in zip(views, seen, strict=True)
-        ]
-        assert np.concatenate(close).mean() < UNDECIDED, weighting
+        undecided = []
+        for splats, camera, raster, view in views:
+            chosen, close = counted_weights(view.A, splats, camera, CompositingParams(), weighting)
+            found = raster.region_weights(camera, one_a_ray(camera), CompositingParams(), weighting)
+            W = dense(found, splats.count, width * height)
+            assert np.abs(W.T - chosen)[~view.cut & ~close].max() < INSIDE, weighting
+            undecided.append(close & ~view.cut)
+        assert np.concatenate(undecided).mean() < UNDECIDED, weighting
 
 
 def test_of_equal_weights_the_nearest_counts():
