@@ -52,6 +52,7 @@ if TYPE_CHECKING:
     from liftcore.query.objects import Objects as Objects
     from liftcore.query.segment import NamedSplats as NamedSplats
     from liftcore.query.segment import Segmentation as Segmentation
+    from liftcore.raster.base import CompositingParams as CompositingParams
     from liftcore.result import LiftResult as LiftResult
     from liftcore.scene.cameras import Camera as Camera
     from liftcore.scene.cameras import Cameras as Cameras
@@ -90,6 +91,7 @@ _PUBLIC = {  # name -> the module that defines it
     "region_weights": "liftcore.operators",
     "RegionWeights": "liftcore.solve.weights",
     "render": "liftcore.operators",
+    "CompositingParams": "liftcore.raster.base",
     "SplatliftError": "liftcore.errors",
     "InvalidInput": "liftcore.errors",
     "InvalidSplats": "liftcore.errors",
@@ -106,6 +108,7 @@ __all__ = [
     "Camera",
     "Cameras",
     "Catalogue",
+    "CompositingParams",
     "FeatureGrid",
     "FoundObject",
     "InvalidCameras",
