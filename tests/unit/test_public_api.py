@@ -18,9 +18,10 @@ from tests.unit.solve.test_lift_equals_dense import observed, write_scene
 
 PUBLIC = """
     Camera Cameras Catalogue CompositingParams FeatureGrid FoundObject InvalidCameras InvalidFeatures InvalidInput
-    InvalidLift InvalidQuery InvalidSettings InvalidSplats LiftResult LiftSettings LocalEngine NamedSplats NotFound Objects
-    PhotoPlan Plan RayEngine RegionWeights Regions SceneObject Segmentation Splats SplatliftError Unavailable
-    VectorAnswer lift load_lift plan plan_photos read_cameras read_features read_splats region_weights render
+    InvalidLift InvalidQuery InvalidSettings InvalidSplats LiftResult LiftSettings LocalEngine NamedSplats NotFound
+    Objects PhotoPlan Plan RayEngine RegionWeights Regions SceneObject Segmentation Splats SplatliftError
+    Unavailable VectorAnswer lift load_lift plan plan_photos read_cameras read_features read_splats region_weights
+    render
 """
 
 
