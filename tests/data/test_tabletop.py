@@ -8,15 +8,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import liftcore as lc
-from liftcore.features.pack import read_features
+from liftcore.features.pack import read_features, write_pack
+from liftcore.features.prompts import prompt_views
 from liftcore.query.ask import ask
+from liftcore.query.render import view_mask
 from liftcore.query.scene import QueryScene
 from liftcore.query.segment import segment
 from liftcore.query.terms import OneSplat, Query
 from liftcore.query.text.table import TableEncoder
-from tests.benchmarks.base import lift_files, scene_files
+from tests.benchmarks.base import lift_files, opened, scene_files
 from tests.benchmarks.consensus import Truth, tabletop_truth
 from tests.benchmarks.objects import measure_lift
 from tests.benchmarks.tabletop import CASES, Case, Tabletop
@@ -161,3 +164,28 @@ def test_a_thing_stays_found_when_something_else_is_not_wanted(truth: Truth, usu
     for unlike in cases:
         against = np.array([iou(thing, *(unlike or ((thing + 1) % len(THINGS),))) for thing in THINGS])
         assert (against > plain - 0.01).all(), unlike
+
+
+def test_things_are_found_in_the_words_of_their_masks(
+    truth: Truth, tabletop: Tabletop, words: list[str], encoder: TableEncoder, tmp_path: Path
+) -> None:
+    """Regions of real photos become a picture a word and view: the cloth and the curtain have none."""
+    packs, vectors = read_features(tabletop.folder / "features_clean.safetensors"), encoder.encode(words)
+    for view in packs.views[::4]:
+        regions = packs[view]
+        assert isinstance(regions, lc.Regions)
+        nearest = np.append((regions.codebook.float().numpy() @ vectors.T).argmax(axis=1), -1)
+        things = nearest[regions.labels[0].numpy()]
+        for thing in set(np.unique(things).tolist()) & {*THINGS}:
+            (tmp_path / words[thing]).mkdir(exist_ok=True)
+            Image.fromarray(things == thing).save(tmp_path / words[thing] / f"{view}.png")
+    found = prompt_views(tmp_path)
+    write_pack(tmp_path / "pack", found.views, {}, table=found.table)
+    files = *scene_files(tabletop.folder)[:2], tmp_path / "pack"
+    scene = opened(lift_files(files, preset="row-sum", certificate_rays=0), truth.raster)
+    for thing in THINGS:
+        answer, ious = ask(scene, words[thing]), []
+        for view, mask in truth.masks.items():
+            shown, right = view_mask(scene, answer, view).mask, (mask == thing).numpy()
+            ious.append((shown & right).sum() / (shown | right).sum() if right.any() else 1.0)
+        assert np.mean(ious) >= 0.95, (words[thing], ious)

@@ -77,17 +77,11 @@ def test_phrases_of_the_user_come_first_and_a_table_is_the_encoder(folder: Path,
     assert (other.features.name, other.other_packs) == ("grids.safetensors", ("features.safetensors",))
 
 
-@pytest.mark.parametrize(
-    ("missing", "message"),
-    [("point_cloud.ply", "splats"), ("grids.safetensors", "features")],
-)
-def test_what_is_missing_is_named(folder: Path, tmp_path: Path, missing: str, message: str) -> None:
-    (folder / missing).unlink()
-    with pytest.raises(InvalidInput, match=message):
-        find_scene(folder, (), tmp_path)
-
-
-def test_a_folder_that_is_not_there_is_named(tmp_path: Path) -> None:
+def test_what_is_missing_is_named(folder: Path, tmp_path: Path) -> None:
+    for missing, message in (("point_cloud.ply", "splats"), ("grids.safetensors", "features")):
+        (folder / missing).unlink()
+        with pytest.raises(InvalidInput, match=message):
+            find_scene(folder, (), tmp_path)
     with pytest.raises(InvalidInput, match="folder"):
         find_scene(tmp_path / "none", (), tmp_path)
 
@@ -97,12 +91,6 @@ def test_a_scene_that_says_nothing_of_itself_is_asked_nothing(folder: Path, tmp_
     (folder / "cameras.json").write_text(json.dumps([INRIA_CAMERA]))
     scene = find_scene(folder, (), tmp_path)
     assert (scene.phrases, scene.text_space, scene.views) == ((), "minilm", ("v",))
-
-
-def test_features_without_words_are_asked_nothing(folder: Path, tmp_path: Path) -> None:
-    save_file({"v/grid": torch.ones(1, 1, 2)}, str(folder / "grids.safetensors"))
-    scene = find_scene(folder, (), tmp_path)
-    assert (scene.phrases, scene.text_space) == ((), "")  # not named
 
 
 @pytest.mark.parametrize("space", ["none", "animals"])
@@ -116,6 +104,7 @@ def test_phrases_without_an_encoder_for_them_are_refused(folder: Path, tmp_path:
 
 def test_a_pack_that_names_no_text_space_has_the_words_of_the_table_beside_it(folder: Path, tmp_path: Path) -> None:
     save_file({"v/grid": torch.ones(1, 1, 2)}, str(folder / "grids.safetensors"))
-    assert find_scene(folder, (), tmp_path / "bare").phrases == ()
+    bare = find_scene(folder, (), tmp_path / "bare")
+    assert (bare.phrases, bare.text_space) == ((), "")  # not named, so nothing is asked
     (folder / "text_table.safetensors").touch()
     assert find_scene(folder, (), tmp_path / "worded").phrases == ("the cat", "the fish")

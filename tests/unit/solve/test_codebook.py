@@ -8,7 +8,6 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from liftcore.features.levels import label_tuples
 from liftcore.features.views import NO_LABEL, FeatureGrid, Regions
 from liftcore.raster.base import CompositingParams, Weighting
 from liftcore.raster.cpu.raster import CpuRaster
@@ -67,17 +66,6 @@ def test_means_of_float16_rows_are_rounded_as_the_features_are():
         assert tuples.features.dtype == dtype
         np.testing.assert_allclose(tuples.features, rows.features, atol=error)
         np.testing.assert_allclose(tuples.agreement, rows.agreement, atol=error)
-
-
-@given(st.integers(0, 2**31), st.integers(1, 4), st.integers(-1, 3))
-def test_tuples_are_the_distinct_ones_in_the_order_of_the_pixels(seed, levels, highest):
-    labels = np.random.default_rng(seed).integers(-1, highest + 1, (levels, 7, 9)).astype(np.int32)
-    numbers, tuples = label_tuples(labels)
-    assert len(np.unique(tuples, axis=0)) == len(tuples)
-    first = [number for k, number in enumerate(numbers.reshape(-1)) if number not in numbers.reshape(-1)[:k]]
-    assert [number for number in first if number != NO_LABEL] == list(range(len(tuples)))
-    read = np.append(tuples, np.full((1, levels), NO_LABEL, np.int32), axis=0)[numbers]
-    assert np.array_equal(read.transpose(2, 0, 1), labels)
 
 
 def test_a_map_is_left_as_it_is_where_tuples_save_nothing():
