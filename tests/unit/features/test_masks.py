@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from pathlib import Path
 from typing import Any
@@ -25,42 +26,51 @@ VECTORS = np.arange(15, dtype=np.float32).reshape(3, 5)
 OVERLAPPING = np.stack([MASKS[0] | MASKS[1], MASKS[1], MASKS[2]])
 
 
-def save_picture(path: Path, values: np.ndarray, mode: str = "") -> None:
-    image = Image.fromarray(values)
-    if mode == "P":
-        image.putpalette([255, 0, 0, 0, 255, 0, 0, 0, 255])
-    image.save(path)
+GREY, VALUES_255 = (LABELS + 1).astype(np.uint8), np.where(LABELS < 0, 255, LABELS).astype(np.uint8)
+PALETTE = Image.fromarray(GREY)
+PALETTE.putpalette([255, 0, 0, 0, 255, 0, 0, 0, 255])
+LARGE = np.random.default_rng(0).integers(0, 4, (128, 128), np.uint8)
 
 
-def save_text(path: Path, content: object) -> None:
-    path.write_text(json.dumps(content), encoding="utf-8")
+def save(folder: Path, files: dict[str, Any]) -> None:
+    """Each file as its suffix and its content have it; texts and bytes as they are."""
+    for name, content in files.items():
+        path = folder / name
+        path.parent.mkdir(exist_ok=True)
+        if isinstance(content, bytes):
+            path.write_bytes(content)
+        elif path.suffix == ".npy":
+            np.save(path, content)
+        elif path.suffix.lower() == ".png":
+            (content if isinstance(content, Image.Image) else Image.fromarray(content)).save(path)
+        else:
+            path.write_text(content if isinstance(content, str) else json.dumps(content), encoding="utf-8")
 
 
-def palette(folder: Path) -> None:
-    save_picture(folder / "a.png", (LABELS + 1).astype(np.uint8), "P")
+def png(values: np.ndarray) -> bytes:
+    content = io.BytesIO()
+    Image.fromarray(values).save(content, format="PNG")
+    return content.getvalue()
 
 
-WRITERS = {
-    "grey of 8 bits": lambda folder: save_picture(folder / "a.png", (LABELS + 1).astype(np.uint8)),
-    "grey of 16 bits": lambda folder: save_picture(folder / "a.png", (LABELS + 1).astype(np.uint16)),
-    "palette": palette,
-    "ids": lambda folder: np.save(folder / "a_masks.npy", LABELS),
-    "ids on a level": lambda folder: np.save(folder / "a_masks.npy", LABELS[None].astype(np.int16)),
-    "ids as floats": lambda folder: np.save(folder / "a_masks.npy", LABELS.astype(np.float32)),
-    "booleans": lambda folder: np.save(folder / "a_masks.npy", MASKS),
-    "booleans down the columns": lambda folder: np.save(folder / "a_masks.npy", np.asfortranarray(MASKS)),
-    "uncompressed_rle": lambda folder: save_text(folder / "a.json", sam_records(MASKS)),
-    "coco_rle": lambda folder: save_text(folder / "a.json", sam_records(MASKS, as_string=True)),
-    "SA-1B": lambda folder: save_text(
-        folder / "a.json", {"image": {"image_id": 1}, "annotations": sam_records(MASKS, as_string=True)}
-    ),
+KINDS: dict[str, dict[str, Any]] = {
+    "grey of 8 bits": {"a.png": GREY},
+    "grey of 16 bits": {"a.png": GREY.astype(np.uint16)},
+    "palette": {"a.png": PALETTE},
+    "ids": {"a_masks.npy": LABELS},
+    "ids on a level": {"a_masks.npy": LABELS[None].astype(np.int16)},
+    "ids as floats": {"a_masks.npy": LABELS.astype(np.float32)},
+    "booleans": {"a_masks.npy": MASKS},
+    "booleans down the columns": {"a_masks.npy": np.asfortranarray(MASKS)},
+    "uncompressed_rle": {"a.json": sam_records(MASKS)},
+    "coco_rle": {"a.json": sam_records(MASKS, as_string=True)},
+    "SA-1B": {"a.json": {"image": {"image_id": 1}, "annotations": sam_records(MASKS, as_string=True)}},
 }
 
 
-@pytest.mark.parametrize("kind", WRITERS)
+@pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_of_masks_makes_the_same_regions(kind: str, tmp_path: Path) -> None:
-    WRITERS[kind](tmp_path)
-    np.save(tmp_path / "a.npy", VECTORS)
+    save(tmp_path, {"a.npy": VECTORS, **KINDS[kind]})
     write_pack(tmp_path / "pack.safetensors", mask_views(tmp_path), {})
     packs = read_features(tmp_path / "pack.safetensors")
     assert packs.views == ("a",)
@@ -74,181 +84,115 @@ def test_every_kind_of_masks_makes_the_same_regions(kind: str, tmp_path: Path) -
     ("unlabelled", "dtype"), [(255, np.uint8), (65_535, np.uint16), (255, np.uint16), (3, np.uint8)]
 )
 def test_pictures_with_another_value_for_none_number_masks_from_zero(unlabelled, dtype, tmp_path: Path) -> None:
-    save_picture(tmp_path / "a.png", np.where(LABELS < 0, unlabelled, LABELS).astype(dtype))
-    np.save(tmp_path / "a.npy", VECTORS)
+    save(tmp_path, {"a.npy": VECTORS, "a.png": np.where(LABELS < 0, unlabelled, LABELS).astype(dtype)})
     assert mask_views(tmp_path, unlabelled)["a"].labels.tolist() == [LABELS.tolist()]
 
 
-@pytest.mark.parametrize("kind", ["booleans", "rle"])
-def test_masks_that_overlap_are_laid_on_levels(kind: str, tmp_path: Path) -> None:
-    if kind == "booleans":
-        np.save(tmp_path / "a_masks.npy", OVERLAPPING)
-    else:
-        save_text(tmp_path / "a.json", sam_records(OVERLAPPING))
-    np.save(tmp_path / "a.npy", VECTORS.astype(np.float16))
+@pytest.mark.parametrize("masks", [{"a_masks.npy": OVERLAPPING}, {"a.json": sam_records(OVERLAPPING)}])
+def test_masks_that_overlap_are_laid_on_levels(masks: dict[str, Any], tmp_path: Path) -> None:
+    save(tmp_path, {"a.npy": VECTORS.astype(np.float16), **masks})
     first = np.where(OVERLAPPING[0], 0, np.where(OVERLAPPING[2], 2, -1))
     second = np.where(OVERLAPPING[1], 1, -1)
     assert mask_views(tmp_path)["a"].labels.tolist() == [first.tolist(), second.tolist()]
 
 
 def test_views_are_named_as_their_cameras_are_and_with_their_folders(tmp_path: Path) -> None:
-    for name in ("a.jpg", "frame.0001", "c", "camA/0"):
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        np.save(tmp_path / f"{name}.npy", VECTORS)
-    for name in ("a.jpg", "camA/0"):
-        np.save(tmp_path / f"{name}_masks.npy", MASKS)
-    save_text(tmp_path / "frame.0001.json", sam_records(MASKS))
-    save_picture(tmp_path / "c.PNG", (LABELS + 1).astype(np.uint8))
-    (tmp_path / "notes.txt").write_text("passed over", encoding="utf-8")
-    (tmp_path / ".thumbnails").mkdir()
-    (tmp_path / ".thumbnails" / "0.png").write_bytes(b"no mask")
+    save(tmp_path, {f"{name}.npy": VECTORS for name in ("a.jpg", "frame.0001", "c", "camA/0")})
+    save(tmp_path, {"a.jpg_masks.npy": MASKS, "camA/0_masks.npy": MASKS, "c.PNG": GREY})
+    save(tmp_path, {"frame.0001.json": sam_records(MASKS)})
+    save(tmp_path, {"notes.txt": "passed over", ".thumbnails/0.png": b"no mask"})
     views = mask_views(tmp_path)
     assert [*views] == ["a", "c", "camA/0", "frame.0001"]
     assert {views[view].labels.tolist() == [LABELS.tolist()] for view in views} == {True}
 
 
+def test_one_mask_over_the_whole_photo_is_one(tmp_path: Path) -> None:
+    save(tmp_path, {"a.npy": VECTORS[:1], "a_masks.npy": np.zeros((1, 3, 4), np.int32)})
+    assert not mask_views(tmp_path)["a"].labels.any()
+
+
 @pytest.mark.parametrize(
     ("files", "message"),
     [
-        (("a.npy",), r"masks in a\.json, a_masks\.npy or a\.png, got a\.npy alone"),
-        (
-            ("a_f.npy", "a_s.npy"),
-            r"got a_f\.npy alone; folders of LangSplat are packed by 'splatlift pack langsplat'",
-        ),
-        (("a.npy", "a.json", "b.json"), r"vectors in b\.npy, got b\.json alone; .*belong in another folder"),
-        (("a_masks.npy",), r"vectors in a\.npy, got a_masks\.npy alone"),
-        (("a.npy", "a.json", "a.png"), r"one file of masks a view, got a\.json and a\.png.*photos belong"),
-        (("a.npy", "a.jpg.npy", "a.json"), r"one file of vectors a view, got a\.jpg\.npy and a\.npy, both of"),
-        (("a.json",), r"\*\.npy files"),
-        (("a.pt",), "pickles"),
+        ("a.npy", r"masks in a\.json, a_masks\.npy or a\.png, got a\.npy alone"),
+        ("a_f.npy a_s.npy", r"a_f\.npy alone; folders of LangSplat are packed by 'splatlift pack langsplat'"),
+        ("a.npy a.json b.json", r"vectors in b\.npy, got b\.json alone; .*belong in another folder"),
+        ("a_masks.npy", r"vectors in a\.npy, got a_masks\.npy alone"),
+        ("a.npy a.json a.png", r"one file of masks a view, got a\.json and a\.png.*photos belong"),
+        ("a.npy a.jpg.npy a.json", r"one file of vectors a view, got a\.jpg\.npy and a\.npy, both of"),
+        ("a.json", r"\*\.npy files"),
+        ("a.pt", "pickles"),
     ],
 )
-def test_files_without_their_partners_are_told(files: tuple[str, ...], message: str, tmp_path: Path) -> None:
-    for name in files:
-        (tmp_path / name).write_bytes(b"not opened yet")
+def test_files_without_their_partners_are_told(files: str, message: str, tmp_path: Path) -> None:
+    save(tmp_path, dict.fromkeys(files.split(), b"not opened yet"))
     with pytest.raises(InvalidFeatures, match=message):
         mask_views(tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("vectors", "message"),
-    [
-        (np.zeros(3, np.float32), r"floats \[M, F\]"),
-        (np.zeros((3, 5), np.int32), r"floats \[M, F\], got int32"),
-        (np.array([[None]], dtype=object), "Python objects, which may run code"),
-        (VECTORS[:2], r"ids in -1\.\.1, got ids from -1 to 2"),
-        (np.where(VECTORS == 7, np.nan, VECTORS), r"view 'a' codebook.*1 of 15"),
-        (np.where(VECTORS == 7, 1e300, VECTORS.astype(np.float64)), r"view 'a' codebook.*1 of 15"),
-    ],
-)
-def test_vectors_that_do_not_fit_are_refused(vectors: np.ndarray, message: str, tmp_path: Path) -> None:
-    np.save(tmp_path / "a_masks.npy", LABELS)
-    np.save(tmp_path / "a.npy", vectors)
-    with pytest.raises(InvalidFeatures, match=message):
-        write_pack(tmp_path / "pack", mask_views(tmp_path), {})
-    assert not (tmp_path / "pack").exists()
+def of_vectors(vectors: np.ndarray) -> dict[str, Any]:
+    return {"a.npy": vectors, "a_masks.npy": LABELS}
 
 
-@pytest.mark.parametrize(
-    ("masks", "message"),
-    [
-        (MASKS[:2], r"3 masks, one a vector, got bool \[2, 3, 4\]; row k of the vectors is of mask k"),
-        (
-            OVERLAPPING.transpose(2, 0, 1),
-            r"got bool \[4, 3, 3\]; row k .*, and masks come first: \[M, H, W\]",
-        ),
-        (MASKS[0], r"booleans \[M, H, W\], got bool \[3, 4\]"),
-        (MASKS.astype(np.uint8), r"zeros and ones; .*astype\(bool\)"),
-        (np.full((3, 4), 3), r"ids in -1\.\.2"),
-        (np.full((3, 4), 255, np.uint8), r"got ids from 255 to 255"),
-        (np.full((3, 4), 0.5), "whole numbers"),
-        (np.zeros((1, 1, 3, 4), np.int32), r"mask ids \[L, H, W\]"),
-        (np.array([{}], dtype=object), "Python objects, which may run code"),
-        (np.array(["a"]), "an array of numbers"),
-    ],
-)
-def test_arrays_that_are_no_masks_are_refused(masks: np.ndarray, message: str, tmp_path: Path) -> None:
-    np.save(tmp_path / "a_masks.npy", masks)
-    np.save(tmp_path / "a.npy", VECTORS)
-    with pytest.raises(InvalidFeatures, match=message) as caught:
-        mask_views(tmp_path)["a"]
-    assert "a_masks.npy" in str(caught.value)
+OBJECTS = np.array([[None]], dtype=object)
+OTHER_SIZE = sam_records(MASKS[2:, :2])
+REFUSED: list[tuple[dict[str, Any], str]] = [
+    (of_vectors(np.zeros(3, np.float32)), r"floats \[M, F\]"),
+    (of_vectors(np.zeros((3, 5), np.int32)), r"floats \[M, F\], got int32"),
+    (of_vectors(OBJECTS), "Python objects, which may run code"),
+    (of_vectors(VECTORS[:2]), r"ids in -1\.\.1, got ids from -1 to 2"),
+    (of_vectors(np.where(VECTORS == 7, np.nan, VECTORS)), r"view 'a' codebook.*1 of 15"),
+    (of_vectors(np.where(VECTORS == 7, 1e300, VECTORS.astype(np.float64))), r"view 'a' codebook.*1 of 15"),
+    ({"a_masks.npy": MASKS[:2]}, r"a_masks.npy.* 3 masks, one a vector, got bool \[2, 3, 4\]; row k of the vectors"),
+    ({"a_masks.npy": OVERLAPPING.T}, r"got bool \[4, 3, 3\]; row k .*, and masks come first: \[M, H, W\]"),
+    ({"a_masks.npy": MASKS[0]}, r"booleans \[M, H, W\], got bool \[3, 4\]"),
+    ({"a_masks.npy": MASKS.astype(np.uint8)}, r"zeros and ones; .*astype\(bool\)"),
+    ({"a_masks.npy": np.full((3, 4), 3)}, r"ids in -1\.\.2"),
+    ({"a_masks.npy": np.full((3, 4), 255, np.uint8)}, r"got ids from 255 to 255"),
+    ({"a_masks.npy": np.full((3, 4), 0.5)}, "whole numbers"),
+    ({"a_masks.npy": np.zeros((1, 1, 3, 4), np.int32)}, r"mask ids \[L, H, W\]"),
+    ({"a_masks.npy": OBJECTS}, "Python objects, which may run code"),
+    ({"a_masks.npy": np.array(["a"])}, "an array of numbers"),
+    ({"a.json": ""}, r"a\.json.*no JSON"),
+    ({"a.json": '[{"segmentation": {"size": [3'}, "no JSON"),
+    ({"a.json": "[" * 100_000}, "no JSON"),
+    ({"a.json": 3}, r"a list of masks, or \{'annotations': \[\.\.\.\]\}, got none"),
+    ({"a.json": {"frames": [], "w": 3}}, "an object of 'frames', 'w'; files of no views belong elsewhere"),
+    ({"a.json": []}, "3 masks, one a vector, got 0; leave out views without masks"),
+    ({"a.json": sam_records(MASKS[:2])}, "3 masks, one a vector, got 2; row k of the vectors is of mask k"),
+    ({"a.json": [*sam_records(MASKS[:2]), 3]}, r"a\.json mask 2: expected run lengths"),
+    ({"a.json": [*sam_records(MASKS[:2]), *OTHER_SIZE]}, "one size, got 3 x 4 of mask 0 and 2 x 4 of mask 2"),
+    ({"a.png": GREY + 1}, r"values 1\.\.3 for 3 vectors, and 0 for none, got values up to 4; name the value"),
+    ({"a.png": VALUES_255}, r"got values up to 255; .*--unlabelled \(255, 65535\)"),
+    ({"a.png": LABELS.clip(0).astype(np.uint8)}, r"got values up to 2; is there a vector for 0 too"),
+    ({"a.png": np.zeros((3, 4), np.uint8)}, "got values up to 0"),
+    ({"a.png": Image.new("RGB", (4, 3))}, "red, green and blue of 8 bits; a photo belongs in another folder"),
+    ({"a.png": Image.new("RGBA", (4, 3))}, "colours with transparency of 8 bits"),
+    ({"a.png": Image.new("LA", (4, 3))}, "grey with transparency of 8 bits"),
+    ({"a.png": Image.new("1", (4, 3))}, "grey of 1 bits"),  # Pillow spreads fewer bits of grey over 0 to 255
+    *(({"a.png": png(LARGE)[:kept]}, r"a\.png: expected a PNG of one channel") for kept in (0, 30, 60, 2000)),
+]
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        ("", "no JSON"),
-        ('[{"segmentation": {"size": [3', "no JSON"),
-        ("[" * 100_000, "no JSON"),
-        ("3", r"a list of masks, or \{'annotations': \[\.\.\.\]\}, got none"),
-        ('{"frames": [], "w": 3}', "an object of 'frames', 'w'; files of no views belong elsewhere"),
-        ("[]", "3 masks, one a vector, got 0; leave out views without masks"),
-        (json.dumps(sam_records(MASKS[:2])), "3 masks, one a vector, got 2; row k of the vectors is of mask k"),
-        (json.dumps([*sam_records(MASKS[:2]), 3]), r"a\.json mask 2: expected run lengths"),
-        (
-            json.dumps([*sam_records(MASKS[:2]), *sam_records(MASKS[2:, :2])]),
-            "one size, got 3 x 4 of mask 0 and 2 x 4 of mask 2",
-        ),
-    ],
-)
-def test_json_that_holds_no_such_masks_is_refused(content: str, message: str, tmp_path: Path) -> None:
-    (tmp_path / "a.json").write_text(content, encoding="utf-8")
-    np.save(tmp_path / "a.npy", VECTORS)
-    with pytest.raises(InvalidFeatures, match=message) as caught:
-        mask_views(tmp_path)["a"]
-    assert "a.json" in str(caught.value) and "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("values", "unlabelled", "message"),
-    [
-        (LABELS + 2, 0, r"values 1\.\.3 for 3 vectors, and 0 for none, got values up to 4; name the value"),
-        (np.where(LABELS < 0, 255, LABELS), 0, r"got values up to 255; .*--unlabelled \(255, 65535\)"),
-        (LABELS.clip(0), 0, r"got values up to 2; is there a vector for 0 too"),
-        (np.zeros((3, 4)), 0, "got values up to 0"),
-        (LABELS + 1, 255, r"values 0\.\.2 for 3 vectors, and 255 for none, got the value 3; .*--unlabelled 0"),
-    ],
-)
-def test_values_that_do_not_end_with_the_vectors_are_refused(
-    values: np.ndarray, unlabelled: int, message: str, tmp_path: Path
+@pytest.mark.parametrize(("files", "message"), REFUSED)
+def test_files_that_hold_no_masks_of_their_vectors_are_refused(
+    files: dict[str, Any], message: str, tmp_path: Path
 ) -> None:
-    save_picture(tmp_path / "a.png", values.astype(np.uint8))
-    np.save(tmp_path / "a.npy", VECTORS)
-    with pytest.raises(InvalidFeatures, match=message):
-        mask_views(tmp_path, unlabelled)["a"]
+    save(tmp_path, {"a.npy": VECTORS, **files})
+    with pytest.raises(InvalidFeatures, match=message) as caught:
+        write_pack(tmp_path / "pack", mask_views(tmp_path), {})
+    assert "\n" not in str(caught.value) and not (tmp_path / "pack").exists()
 
 
-@pytest.mark.parametrize(
-    ("mode", "message"),
-    [
-        ("RGB", "red, green and blue of 8 bits; a photo belongs in another folder"),
-        ("RGBA", "colours with transparency of 8 bits"),
-        ("LA", "grey with transparency of 8 bits"),
-        ("1", "grey of 1 bits"),  # Pillow spreads fewer bits of grey over 0 to 255
-    ],
-)
-def test_pictures_of_other_kinds_are_refused(mode: str, message: str, tmp_path: Path) -> None:
-    Image.new(mode, (4, 3)).save(tmp_path / "a.png")
-    np.save(tmp_path / "a.npy", VECTORS)
-    with pytest.raises(InvalidFeatures, match=message):
-        mask_views(tmp_path)["a"]
-
-
-@pytest.mark.parametrize("kept", [0, 30, 60, 2000])
-def test_pictures_that_are_cut_off_are_refused(kept: int, tmp_path: Path) -> None:
-    save_picture(tmp_path / "a.png", np.random.default_rng(0).integers(0, 4, (128, 128), np.uint8))
-    content = (tmp_path / "a.png").read_bytes()
-    assert len(content) > 4000
-    (tmp_path / "a.png").write_bytes(content[:kept])
-    np.save(tmp_path / "a.npy", VECTORS)
-    with pytest.raises(InvalidFeatures, match=r"a\.png: expected a PNG of one channel"):
-        mask_views(tmp_path)["a"]
+def test_values_that_begin_at_one_are_told_where_zero_was_expected(tmp_path: Path) -> None:
+    save(tmp_path, {"a.npy": VECTORS, "a.png": GREY})
+    told = r"values 0\.\.2 for 3 vectors, and 255 for none, got the value 3; .*--unlabelled 0"
+    with pytest.raises(InvalidFeatures, match=told):
+        mask_views(tmp_path, 255)["a"]
 
 
 def test_files_beyond_the_limits_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    palette(tmp_path)
-    np.save(tmp_path / "a.npy", VECTORS)
+    save(tmp_path, {"a.npy": VECTORS, "a.png": GREY})
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 11)
     assert mask_views(tmp_path)["a"].labels.tolist() == [LABELS.tolist()]
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 5)
@@ -256,15 +200,9 @@ def test_files_beyond_the_limits_are_refused(tmp_path: Path, monkeypatch: pytest
         mask_views(tmp_path)["a"]
     (tmp_path / "a.png").unlink()
     monkeypatch.setattr("liftcore.features.mask_files.MAX_JSON_BYTES", 10)
-    save_text(tmp_path / "a.json", sam_records(MASKS))
+    save(tmp_path, {"a.json": sam_records(MASKS)})
     with pytest.raises(InvalidFeatures, match=r"at most 10 bytes, got \d+ bytes; .*coco_rle"):
         mask_views(tmp_path)["a"]
-
-
-def test_one_mask_over_the_whole_photo_is_one(tmp_path: Path) -> None:
-    np.save(tmp_path / "a.npy", VECTORS[:1])
-    np.save(tmp_path / "a_masks.npy", np.zeros((1, 3, 4), np.int32))
-    assert not mask_views(tmp_path)["a"].labels.any()
 
 
 def mask_of(segmentation: Any) -> np.ndarray:
