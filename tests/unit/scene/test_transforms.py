@@ -135,7 +135,7 @@ def test_bad_transforms_are_refused(changes: dict[str, Any], message: str, tmp_p
 
 
 APPLIED = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])  # of nerfstudio's converter
-SCALE, APPLIED_SCALE = 0.37, 4.0
+SCALE = 0.37
 
 
 def zipped(folder: Path) -> Path:
@@ -179,61 +179,56 @@ def expected(model: Path) -> Cameras:
     return Cameras(views)
 
 
-def test_poses_of_a_transforms_json_are_moved_as_nerfstudio_moves_them(run: Path, expected: Cameras) -> None:
-    for path in (run, run / "transforms.json"):
-        cameras = read_cameras(path)
+def change(path: Path, **changes: Any) -> None:
+    """Other values in a JSON file; None takes a key away."""
+    document = {**json.loads(path.read_text()), **changes}
+    path.write_text(json.dumps({key: value for key, value in document.items() if value is not None}))
+
+
+@pytest.mark.parametrize(
+    ("given", "frame", "paths"),  # a model's folder or a transforms.json; where the run's file lies; what is read
+    [
+        ("transforms.json", ".", ["", "transforms.json", "zip"]),
+        ("transforms_train.json", ".", ["transforms_train.json", "zip"]),
+        ("transforms.json", "outputs/splatfacto/2026-01-01", ["zip"]),
+        (".", ".", ["", "images.bin", "zip"]),
+        ("sparse/0", ".", ["", "sparse/0", "sparse/0/images.bin", "zip"]),
+        ("colmap/sparse/0", ".", ["", "colmap/sparse/0", "colmap/sparse/0/images.bin", "zip"]),
+        ("sparse/0", "outputs", ["zip"]),  # of the zip's only model
+    ],
+)
+def test_cameras_are_moved_as_nerfstudio_moves_them(
+    given: str, frame: str, paths: list[str], run: Path, model: Path, expected: Cameras, tmp_path: Path
+) -> None:
+    scene = tmp_path / "scene"
+    for folder in (scene / frame, scene / ".ipynb_checkpoints"):
+        folder.mkdir(parents=True)
+    shutil.copy(run / "transforms.json", scene / ".ipynb_checkpoints")  # which does not count
+    shutil.copy(run / FRAME_FILE, scene / frame)
+    if given.endswith(".json"):
+        shutil.copy(run / "transforms.json", scene / given)
+    else:
+        shutil.copytree(model, scene / given, dirs_exist_ok=True)
+    for path in paths:
+        cameras = read_cameras(zipped(scene) if path == "zip" else scene / path)
         assert cameras.frame == FRAME_FILE
         assert_same(cameras, expected)
+    assert inspect_file(zipped(scene))["warnings"] == []
     (run / FRAME_FILE).unlink()
     assert read_cameras(run).frame is None
     with pytest.raises(AssertionError):
         assert_same(read_cameras(run), expected)
 
 
-def test_scale_that_was_applied_before_is_not_applied_twice(run: Path, expected: Cameras) -> None:
-    document = json.loads((run / "transforms.json").read_text())
-    (run / "transforms.json").write_text(json.dumps({**document, "applied_scale": APPLIED_SCALE}))
-    told = json.loads((run / FRAME_FILE).read_text())
-    (run / FRAME_FILE).write_text(json.dumps({**told, "scale": SCALE * APPLIED_SCALE}))  # what nerfstudio then writes
+def test_what_was_applied_before_is_not_applied_twice(run: Path, model: Path, expected: Cameras) -> None:
+    change(run / "transforms.json", applied_scale=4.0)
+    change(run / FRAME_FILE, scale=4.0 * SCALE)  # what nerfstudio then writes
     assert_same(read_cameras(run), expected)
-
-
-@pytest.mark.parametrize("place", [".", "sparse/0", "colmap/sparse/0"])
-def test_models_are_moved_to_the_same_frame(
-    place: str, run: Path, model: Path, expected: Cameras, tmp_path: Path
-) -> None:
-    scene = tmp_path / "scene"
-    shutil.copytree(model, scene / place)
-    shutil.copy(run / FRAME_FILE, scene)
-    for path in (scene, scene / place, scene / place / "images.bin"):
-        assert_same(read_cameras(path), expected)
-    assert_same(read_cameras(zipped(scene)), expected)
-
-
-def test_transforms_json_comes_before_a_model_where_the_frame_is_told(
-    run: Path, model: Path, expected: Cameras
-) -> None:
-    document = json.loads((run / "transforms.json").read_text())
-    del document["applied_transform"]  # of a capture whose poses are no COLMAP model's
-    (run / "transforms.json").write_text(json.dumps(document))
-    (run / FRAME_FILE).write_text(json.dumps({"transform": oriented()[:3].tolist(), "scale": SCALE}))
-    shutil.copytree(model, run / "colmap/sparse/0")
+    change(run / "transforms.json", applied_scale=None, applied_transform=None)  # of poses that are no model's
+    change(run / FRAME_FILE, scale=SCALE, transform=oriented()[:3].tolist())
+    shutil.copytree(model, run / "colmap/sparse/0")  # the transforms.json comes before it, as the frame is told
     for path in (run, zipped(run)):
         assert_same(read_cameras(path), expected)
-
-
-@pytest.mark.parametrize("flat", [False, True])
-def test_zip_of_the_two_files_is_read(flat: bool, run: Path, expected: Cameras, tmp_path: Path) -> None:
-    scene = tmp_path / "scene"
-    inner = scene if flat else scene / "outputs/splatfacto/2026-01-01"
-    inner.mkdir(parents=True)
-    (scene / ".ipynb_checkpoints").mkdir()
-    for place in (scene, scene / ".ipynb_checkpoints"):  # what is hidden does not count
-        shutil.copy(run / "transforms.json", place)
-    shutil.copy(run / FRAME_FILE, inner)
-    path = zipped(scene)
-    assert_same(read_cameras(path), expected)
-    assert inspect_file(path)["warnings"] == []
 
 
 def test_lenses_stay_as_they_are(run: Path, tmp_path: Path) -> None:
@@ -247,49 +242,37 @@ def test_lenses_stay_as_they_are(run: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("told", "message"),
+    ("file", "key", "value", "message"),
     [
-        ([1], "an object with 'transform', got list"),
-        ({"transform": np.eye(4)[:3].tolist()}, "an object with 'scale'"),
-        ({"transform": np.eye(3).tolist(), "scale": 1}, "a 3x4 or 4x4 matrix"),
-        ({"transform": np.diag([1.0, 1, -1, 1]).tolist(), "scale": 1}, "a proper rotation .* a determinant of -1"),
+        (FRAME_FILE, "transform", None, "an object with 'transform'"),
+        (FRAME_FILE, "scale", None, "an object with 'scale'"),
+        (FRAME_FILE, "transform", np.eye(3).tolist(), "a 3x4 or 4x4 matrix"),
+        (FRAME_FILE, "transform", np.diag([1.0, 1, -1, 1]).tolist(), "a proper rotation .* a determinant of -0.05"),
+        (FRAME_FILE, "transform", np.diag([1.0, 1, 2, 1]).tolist(), "a rotation, a shift and a scale, got a matrix"),
+        (FRAME_FILE, "transform", np.diag([1e12, 1e12, 1e12, 1]).tolist(), "numbers within 1e"),
+        (FRAME_FILE, "transform", [[float("nan")] * 4] * 3, "a finite number"),
+        (FRAME_FILE, "scale", 0, r"scale: expected a scale in 1e-09\.\.1e\+09, got 0"),
         (
-            {"transform": np.diag([1.0, 1, 2, 1]).tolist(), "scale": 1},
-            "a rotation, a shift and a scale, got a matrix off",
+            "transforms.json",
+            "applied_transform",
+            np.zeros((3, 4)).tolist(),
+            "applied_transform: expected a proper rotation",
         ),
-        ({"transform": np.eye(4).tolist(), "scale": 0}, r"scale: expected a scale in 1e-09\.\.1e\+09, got 0"),
-        ({"transform": np.diag([1e12, 1e12, 1e12, 1]).tolist(), "scale": 1}, "numbers within 1e"),
-        ({"transform": [[float("nan")] * 4] * 3, "scale": 1}, "a finite number"),
+        ("transforms.json", "applied_transform", "up", "applied_transform: expected a 3x4 or 4x4 matrix"),
+        ("transforms.json", "applied_scale", 0, "applied_scale: expected a scale in"),
     ],
 )
-def test_frame_that_is_none_is_refused(told: Any, message: str, run: Path) -> None:
-    (run / FRAME_FILE).write_text(json.dumps(told))
-    with pytest.raises(InvalidCameras, match=rf"dataparser_transforms\.json.*{message}"):
-        read_cameras(run)
-
-
-@pytest.mark.parametrize(
-    ("key", "value", "message"),
-    [
-        ("applied_transform", np.zeros((3, 4)).tolist(), "applied_transform: expected a proper rotation"),
-        ("applied_transform", "up", "applied_transform: expected a 3x4 or 4x4 matrix"),
-        ("applied_scale", 0, "applied_scale: expected a scale in"),
-    ],
-)
-def test_what_was_applied_before_is_checked(key: str, value: Any, message: str, run: Path) -> None:
-    document = json.loads((run / "transforms.json").read_text())
-    (run / "transforms.json").write_text(json.dumps({**document, key: value}))
-    with pytest.raises(InvalidCameras, match=rf"transforms\.json {message}"):
+def test_frame_that_is_none_is_refused(file: str, key: str, value: Any, message: str, run: Path) -> None:
+    change(run / file, **{key: value})
+    with pytest.raises(InvalidCameras, match=rf"{file}.*{message}"):
         read_cameras(run)
 
 
 def test_inria_cameras_are_in_the_frame_of_their_splats(run: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "inria"
-    folder.mkdir()
     camera = Camera.pinhole("a", 9, 9, 5, 5, 4.5, 4.5, np.eye(4))
-    write_inria_cameras(Cameras((camera,)), folder / "cameras.json")
-    shutil.copy(run / FRAME_FILE, folder)
-    for path in (folder, folder / "cameras.json"):
+    (run / "transforms.json").unlink()
+    write_inria_cameras(Cameras((camera,)), run / "cameras.json")
+    for path in (run, run / "cameras.json"):
         with pytest.raises(InvalidCameras, match=r"cameras that are still to be moved, got Inria's.*; take .* away"):
             read_cameras(path)
 
@@ -298,9 +281,19 @@ def test_inria_cameras_are_in_the_frame_of_their_splats(run: Path, tmp_path: Pat
 def test_zip_of_several_runs_is_refused(name: str, run: Path) -> None:
     (run / "other").mkdir()
     shutil.copy(run / name, run / "other")
-    path = zipped(run)
     with pytest.raises(InvalidCameras, match=rf"expected one {name}, got {name} and other/{name}; zip those of one"):
-        read_cameras(path)
+        read_cameras(zipped(run))
+
+
+def test_frame_of_another_model_of_a_zip_is_refused(run: Path, model: Path, expected: Cameras) -> None:
+    for name in ("a", "b"):
+        shutil.copytree(model, run / name / "sparse/0")
+    (run / "transforms.json").unlink()
+    (run / FRAME_FILE).rename(run / "b" / FRAME_FILE)
+    with pytest.raises(InvalidCameras, match=r"got one of b and the model a/sparse/0; zip those of one run alone"):
+        read_cameras(zipped(run))
+    shutil.copy(run / "b" / FRAME_FILE, run / "a")
+    assert_same(read_cameras(zipped(run)), expected)
 
 
 def test_the_frame_is_told_or_where_to_take_it_from(run: Path, model: Path) -> None:
@@ -308,17 +301,16 @@ def test_the_frame_is_told_or_where_to_take_it_from(run: Path, model: Path) -> N
     assert (found["frame"], found["warnings"]) == (FRAME_FILE, [])
     assert found["bytes"] == sum(path.stat().st_size for path in run.iterdir())
     (run / FRAME_FILE).unlink()
-    document = json.loads((run / "transforms.json").read_text())
-    del document["applied_transform"]
-    for key in ("applied_transform", "ply_file_path"):  # nerfstudio's own converter writes them, and others do not
-        (run / "transforms.json").write_text(json.dumps({**document, key: APPLIED[:3].tolist()}))
+    for absent in ("ply_file_path", "applied_transform"):  # nerfstudio's own converter writes them, others do not
+        change(run / "transforms.json", **{"ply_file_path": "sparse_pc.ply", absent: None})
         for path in (run, run / "transforms.json"):
             [told] = inspect_file(path)["warnings"]
             assert "--orientation-method none" in told and f"Put its run's {FRAME_FILE} beside" in told
     shutil.copytree(model, run / "colmap/sparse/0")
     for path in (run, run / "colmap/sparse/0", run / "colmap/sparse/0/cameras.bin", zipped(run)):
         assert any("the COLMAP model was read, and beside it" in text for text in inspect_file(path)["warnings"])
-    for other in (json.dumps(document), json.dumps(list(document)), "{"):
+    change(run / "transforms.json", ply_file_path=None)
+    for other in ((run / "transforms.json").read_text(), "[]", "{"):
         (run / "transforms.json").write_text(other)
         assert inspect_file(run)["warnings"] == inspect_file(run / "colmap/sparse/0")["warnings"] == []
 
@@ -326,91 +318,55 @@ def test_the_frame_is_told_or_where_to_take_it_from(run: Path, model: Path) -> N
 @pytest.mark.parametrize("name", ["", "transforms.json"])
 def test_another_frame_is_another_input(name: str, run: Path) -> None:
     before = camera_input(run / name)
-    told = json.loads((run / FRAME_FILE).read_text())
-    (run / FRAME_FILE).write_text(json.dumps({**told, "scale": 2 * SCALE}))
+    change(run / FRAME_FILE, scale=2 * SCALE)
     assert camera_input(run / name).sha256 != before.sha256
+    change(run / FRAME_FILE, scale=SCALE)
+    (run / "photo.jpg").write_bytes(b"not read")
+    assert camera_input(run / name) == before
     (run / FRAME_FILE).unlink()
     assert camera_input(run / name).sha256 not in (before.sha256, "")
-    (run / "photo.jpg").write_bytes(b"not read")
-    (run / FRAME_FILE).write_text(json.dumps(told))
-    assert camera_input(run / name) == before
 
 
 def test_link_counts_where_it_lies_in_the_lift_and_after(run: Path, expected: Cameras, tmp_path: Path) -> None:
     scene = tmp_path / "linked"
     scene.mkdir()
     (scene / "transforms.json").symlink_to(run / "transforms.json")
-    told = json.loads((run / FRAME_FILE).read_text())
-    (run / FRAME_FILE).unlink()
-    (scene / FRAME_FILE).write_text(json.dumps(told))
+    (run / FRAME_FILE).rename(scene / FRAME_FILE)
     remembered = camera_input(scene / "transforms.json")
     assert_same(read_cameras(Path(remembered.path)), expected)
-    (scene / FRAME_FILE).write_text(json.dumps({**told, "scale": 2 * SCALE}))
+    change(scene / FRAME_FILE, scale=2 * SCALE)
     assert camera_input(Path(remembered.path)).sha256 != remembered.sha256
 
 
-@pytest.mark.parametrize("kind", ["link", "folder"])
-def test_frame_that_is_no_file_is_told(kind: str, run: Path, model: Path) -> None:
+@pytest.mark.parametrize(("kind", "said"), [("link", "a link that leads to none"), ("folder", "none")])
+def test_frame_that_is_no_file_is_told(kind: str, said: str, run: Path, model: Path) -> None:
     (run / FRAME_FILE).unlink()
     if kind == "link":
         (run / FRAME_FILE).symlink_to("outputs/nowhere")
     else:
         (run / FRAME_FILE).mkdir()
     shutil.copytree(model, run / "sparse/0")
-    said = "a link that leads to none" if kind == "link" else "none"
     for path in (run, run / "transforms.json", run / "sparse/0"):
         with pytest.raises(InvalidCameras, match=rf"{FRAME_FILE}: expected a file, got {said}; copy the file itself"):
             read_cameras(path)
 
 
-def test_frame_beside_a_zip_counts_where_the_zip_has_none(run: Path, expected: Cameras, tmp_path: Path) -> None:
-    told = json.loads((run / FRAME_FILE).read_text())
-    path = Path(shutil.make_archive(str(tmp_path / "scene"), "zip", run))
-    (tmp_path / FRAME_FILE).write_text(json.dumps({**told, "scale": 5 * SCALE}))
-    assert_same(read_cameras(path), expected)
-    (run / FRAME_FILE).unlink()
-    path = Path(shutil.make_archive(str(tmp_path / "scene"), "zip", run))
-    (tmp_path / FRAME_FILE).write_text(json.dumps(told))
-    before = camera_input(path)
-    assert_same(read_cameras(path), expected)
-    (tmp_path / FRAME_FILE).unlink()
-    assert camera_input(path).sha256 != before.sha256
-
-
-def test_frame_of_another_model_of_a_zip_is_refused(
-    run: Path, model: Path, expected: Cameras, tmp_path: Path
-) -> None:
-    scenes = tmp_path / "scenes"
-    for name in ("a", "b"):
-        shutil.copytree(model, scenes / name / "sparse/0")
-    shutil.copy(run / FRAME_FILE, scenes / "b")
-    with pytest.raises(InvalidCameras, match=r"got one of b and the model a/sparse/0; zip those of one run alone"):
-        read_cameras(zipped(scenes))
-    shutil.copy(run / FRAME_FILE, scenes / "a")
-    assert_same(read_cameras(zipped(scenes)), expected)
-
-
-def test_transforms_of_another_name_are_zipped_with_their_frame(run: Path, expected: Cameras) -> None:
-    (run / "transforms.json").rename(run / "transforms_train.json")
-    assert_same(read_cameras(run / "transforms_train.json"), expected)
+def test_frame_beside_a_zip_counts_where_the_zip_has_none(run: Path, expected: Cameras) -> None:
+    beside = run.parent / FRAME_FILE
+    shutil.copy(run / FRAME_FILE, beside)
+    change(beside, scale=5 * SCALE)
     assert_same(read_cameras(zipped(run)), expected)
-
-
-def test_frame_that_lies_elsewhere_in_a_zip_is_of_its_only_model(
-    run: Path, model: Path, expected: Cameras, tmp_path: Path
-) -> None:
-    scene = tmp_path / "scene"
-    shutil.copytree(model, scene / "sparse/0")
-    (scene / "outputs").mkdir()
-    shutil.copy(run / FRAME_FILE, scene / "outputs")
-    assert_same(read_cameras(zipped(scene)), expected)
+    (run / FRAME_FILE).rename(beside)
+    before = camera_input(zipped(run))
+    assert_same(read_cameras(zipped(run)), expected)
+    beside.unlink()
+    assert camera_input(zipped(run)).sha256 != before.sha256
 
 
 def test_full_disk_is_no_broken_zip(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: Any) -> int:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    path = zipped(run)
     monkeypatch.setattr(cameras, "_unzip_one", full)
     with pytest.raises(Unavailable, match=r"expected room in .* for what is in the zip, got a full disk; make room"):
-        read_cameras(path)
+        read_cameras(zipped(run))
