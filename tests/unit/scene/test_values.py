@@ -34,35 +34,26 @@ def arrays(count: int = 3, scales: int = 3) -> dict[str, Any]:
     }
 
 
-@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
-def test_splats_come_of_numpy_of_any_float_type(dtype: Any) -> None:
-    given: dict[str, Any] = {name: values.numpy().astype(dtype) for name, values in arrays().items()}
-    splats = Splats(**given)
-    assert splats.kernel is Kernel.GAUSSIAN_3D
-    for name, values in given.items():
-        found = getattr(splats, name)
-        assert found.dtype == torch.float32 and np.array_equal(found.numpy(), values.astype(np.float32))
-
-
-def test_float32_arrays_are_taken_without_a_copy_or_gradient() -> None:
-    given = arrays()
-    means = given["means"].requires_grad_()
-    splats = Splats(**given)
+def test_splats_come_of_arrays_of_any_float_type_without_a_copy_of_float32() -> None:
+    for dtype in (np.float16, np.float32, np.float64):
+        given: dict[str, Any] = {name: values.numpy().astype(dtype) for name, values in arrays().items()}
+        splats = Splats(**given)
+        assert splats.kernel is Kernel.GAUSSIAN_3D
+        for name, values in given.items():
+            found = getattr(splats, name)
+            assert found.dtype == torch.float32 and np.array_equal(found.numpy(), values.astype(np.float32))
+            assert np.shares_memory(found.numpy(), values) is (dtype == np.float32)
+    means = torch.rand(3, 3, requires_grad=True)
+    splats = Splats(**{**arrays(scales=2), "means": means}, kernel="2dgs")
     assert splats.means.data_ptr() == means.data_ptr() and not splats.means.requires_grad
-    own = np.zeros((3, 3), np.float32)
-    assert np.shares_memory(Splats(**{**given, "means": own}).means.numpy(), own)
-
-
-def test_kernel_is_a_string_or_one_of_the_kernels() -> None:
-    assert Splats(**arrays(scales=2), kernel="2dgs").kernel is Kernel.GAUSSIAN_2D
+    assert splats.kernel is Kernel.GAUSSIAN_2D
     assert Splats(**arrays(), kernel=Kernel.BETA, beta=torch.zeros(3)).kernel is Kernel.BETA
-    with pytest.raises(InvalidSplats, match="kernel: expected 3dgs or 2dgs or dbs, got '4dgs'"):
-        Splats(**arrays(), kernel="4dgs")
 
 
 @pytest.mark.parametrize(
     ("name", "values", "message"),
     [
+        ("kernel", "4dgs", "kernel: expected 3dgs or 2dgs or dbs, got '4dgs'"),
         ("means", torch.zeros(3, 3, dtype=torch.int32), "means: expected floats, got int32"),
         ("means", torch.zeros(0, 3), "at least one splat"),
         ("means", torch.tensor(1.0), "at least one splat"),
@@ -104,23 +95,18 @@ def test_cameras_come_of_numpy_torch_or_lists(make: Any) -> None:
     assert camera.viewmat.dtype == camera.K.dtype == np.float64 and camera.lens is None
     moved = replace(camera.replace(cx=31.0), name="moved")
     assert (moved.name, moved.cx, moved.fx, moved.width) == ("moved", 31.0, 50.0, 64)
-
-
-@pytest.mark.parametrize(
-    ("viewmat", "intrinsics", "message"),
-    [
+    wrong: list[tuple[Any, Any, str]] = [
         (np.eye(3), K, "pose: expected a finite 4x4 matrix"),
         (np.eye(4) * 2, K, "pose: expected 0 0 0 1 as the last row"),
         ("no matrix", K, "pose: expected a finite 4x4 matrix"),
         (np.eye(4), K[:2], "K: expected a 3x3 matrix"),
         (np.eye(4), K.T, "K: expected a 3x3 matrix"),
-        (np.eye(4), K + np.array([[0, 1, 0], [0, 0, 0], [0, 0, 0]]), "without skew"),
+        (np.eye(4), K + np.eye(3, k=1), "without skew"),
         (np.eye(4), K * np.nan, "K: expected"),
-    ],
-)
-def test_wrong_matrices_of_a_camera_are_refused(viewmat: Any, intrinsics: Any, message: str) -> None:
-    with pytest.raises(InvalidCameras, match=message):
-        Camera(viewmat, intrinsics, 64, 48, name="v")
+    ]
+    for viewmat, intrinsics, message in wrong:
+        with pytest.raises(InvalidCameras, match=message):
+            Camera(viewmat, intrinsics, 64, 48, name="v")
 
 
 def test_cameras_are_a_mapping_whose_names_win() -> None:
