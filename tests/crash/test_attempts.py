@@ -17,10 +17,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NoReturn
 
+import numpy as np
 import pytest
+import torch
 
+import liftcore as lc
+from liftcore.features.pack import write_pack
+from liftcore.io.ply import write_splats
+from liftcore.io.transforms import transforms_of
 from service import errand
 from service.jobs import process as processes
+from service.jobs.child import Reporter
+from service.jobs.lifting import lift_as_ordered
 from service.jobs.process import LONGEST, mark
 from service.jobs.supervisor import Lease
 from service.models import AssetKind, JobState
@@ -31,6 +39,7 @@ from service.store.keys import Quota
 from service.store.owners import SERVICE, Owner
 from service.store.store import Store
 from service.uploads import intake
+from tests.scenes import look_at, random_splats
 
 from .conftest import Supervising, alive, ended, order, state_of, supervised, until
 
@@ -380,6 +389,9 @@ def test_queued_jobs_of_a_key_that_ended_are_canceled_with_a_reason(expired: boo
     assert store.jobs.get(SERVICE, running).state is JobState.RUNNING  # what has begun goes on
 
 
+# What a job prints is part of the server's log, however it is printed
+
+
 class Slow(logging.StreamHandler[io.StringIO]):
     """A log that takes its time, as on a busy disk."""
 
@@ -415,3 +427,65 @@ def test_every_line_that_a_job_prints_is_a_record_with_its_job_and_request(
     long = [message for message in messages if message.strip("x") == ""]
     assert max(map(len, long)) == LONGEST and sum(map(len, long)) == 3 * 100_000
     assert "unforeseen" not in capfd.readouterr().err  # and nothing of it goes past the log
+
+
+ROOT = Path(__file__).parents[2]
+# A job in blocks goes on from finished ones
+
+
+VIEWS = 20  # three blocks
+KILLED = """if True:
+    import io, json, os, signal, sys
+    from service.jobs.child import Reporter
+    from service.jobs.lifting import lift_as_ordered
+
+    class Deadly(Reporter):
+        def __call__(self, stage, done, total, unit):
+            if (stage, done) == ("geometry", 16):
+                os.kill(os.getpid(), signal.SIGKILL)
+
+    lift_as_ordered(json.loads(sys.argv[1]), Deadly(io.BytesIO()))
+"""
+
+
+def order_of(folder: Path, **settings: Any) -> dict[str, Any]:
+    """A scene of twenty views as files, and the order of its lift on the local engine."""
+    rng = np.random.default_rng(2)
+    names = [f"v{number:02}" for number in range(VIEWS)]
+    cameras = {name: look_at(name, rng.normal((0, 0, -4), 1), 32, 24, 30.0) for name in names}
+    write_splats(random_splats(3, 2000, spread=2.0), folder / "s.ply")
+    (folder / "c.json").write_text(json.dumps(transforms_of(cameras)))
+    maps = {name: lc.Regions(rng.integers(-1, 6, (1, 12, 16)), np.eye(6, dtype=np.float32)) for name in names}
+    write_pack(folder / "f.safetensors", maps, {})
+    files = {str(folder / name): name for name in ("s.ply", "c.json", "f.safetensors")}
+    splats, cameras_file, pack = files
+    return {
+        "splats": splats, "cameras": cameras_file, "features": [pack], "settings": settings, "threads": 1,
+        "work": str(folder / "work"), "checkpoint_seconds": 0, "engine": "local", "ray_address": None,
+        "output": str(folder / "lift.safetensors"), "file_names": files, "names": files,
+    }  # fmt: skip
+
+
+def test_job_in_blocks_that_is_killed_goes_on_from_them(tmp_path: Path) -> None:
+    order = order_of(tmp_path, preset="row-sum")
+    (tmp_path / "work").mkdir()
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    died = subprocess.run([sys.executable, "-c", KILLED, json.dumps(order)], env=environment, check=False)
+    assert died.returncode == -signal.SIGKILL and not Path(order["output"]).exists()
+    kept = {path: path.stat().st_mtime_ns for path in (tmp_path / "work").rglob("view-*.safetensors")}
+    assert len(kept) >= 16
+    told = io.BytesIO()
+    ended = lift_as_ordered(order, Reporter(told))
+    assert {path: path.stat().st_mtime_ns for path in kept} == kept
+    stages = {json.loads(line).get("stage") for line in told.getvalue().splitlines()}
+    assert {"geometry", "solve", "save"} <= stages and ended["count"] == 2000
+    whole = lc.lift(lc.read_splats(order["splats"]), lc.read_cameras(order["cameras"]),
+                    lc.read_features(*order["features"]), preset="row-sum")  # fmt: skip
+    assert torch.equal(lc.load_lift(order["output"]).features, whole.features)
+
+
+def test_job_that_needs_all_regions_is_lifted_whole_whatever_the_engine(tmp_path: Path) -> None:
+    order = order_of(tmp_path, preset="default")
+    (tmp_path / "work").mkdir()
+    lift_as_ordered(order, Reporter(io.BytesIO()))
+    assert lc.load_lift(order["output"]).confidence is not None
