@@ -18,7 +18,7 @@ from typing import IO, Any, Protocol, cast
 import torch
 from torch import Tensor
 
-from liftcore.errors import InvalidFeatures, InvalidTable
+from liftcore.errors import InvalidFeatures, InvalidTable, Unavailable
 from liftcore.features.lens import as_pinhole_sees, grid_sides
 from liftcore.features.views import MAX_CHANNELS, NO_LABEL, FeatureGrid, Regions, ViewFeatures
 from liftcore.io.files import whole_file
@@ -146,6 +146,7 @@ def as_views(
     Raises:
         InvalidFeatures: there are none, one is neither regions nor a grid, a name comes twice, channels differ, or it
             is something else, such as a path.
+        Unavailable: the disk has no room for an iterator's views.
     """
     if isinstance(views, Views):
         return views
@@ -305,8 +306,14 @@ def _spooled(pairs: Iterable[tuple[str, ViewFeatures]], scratch: Path | None) ->
             if name in files:
                 raise InvalidFeatures("features", expected="each view once", got=f"{name!r} twice")
             files[name] = Path(folder, f"{len(files)}.safetensors")
-            with files[name].open("wb") as handle:
-                _write(handle, {name: _Given({name: features}, name).read()}, {}, silent)
+            view = _Given({name: features}, name).read()
+            try:
+                with files[name].open("wb") as handle:
+                    _write(handle, {name: view}, {}, silent)
+            except OSError as error:
+                hint = "set TMPDIR to a folder with more room, or give a mapping of views, which is read as it is"
+                expected, got = f"room for an iterator's views in {folder}", error.strerror or str(error)
+                raise Unavailable("features", expected=expected, got=got, hint=hint) from None
         if not files:
             raise InvalidFeatures("features", expected="at least one view", got="none")
         return replace(read_features(*files.values()), paths=())  # mapped: the files may lose their names

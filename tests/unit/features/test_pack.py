@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,7 +13,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save, save_file
 
-from liftcore.errors import InvalidFeatures
+from liftcore.errors import InvalidFeatures, Unavailable
 from liftcore.features.pack import Views, as_views, pair, read_features, write_pack
 from liftcore.features.views import FeatureGrid, Regions, ViewFeatures
 from liftcore.io.cameras import read_cameras
@@ -43,6 +44,16 @@ def test_labels_may_be_without_a_sign_as_pictures_have_them(kind: type[np.unsign
     assert ANY_REGIONS(labels, np.eye(2)).labels.tolist() == [labels.tolist()]
     with pytest.raises(InvalidFeatures, match="the label 65535"):
         ANY_REGIONS(labels + kind(65_534), np.eye(2))
+
+
+def test_iterator_that_the_disk_has_no_room_for_is_told() -> None:
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
+    try:
+        with pytest.raises(Unavailable, match=r"room for an iterator's views in .*set TMPDIR"):
+            as_views(iter([("a", FeatureGrid(np.ones((20, 20, 8))))]))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 def test_arrays_that_fit_are_not_copied() -> None:
