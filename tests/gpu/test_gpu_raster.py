@@ -12,15 +12,12 @@ import pytest
 import torch
 
 from liftcore.errors import Unavailable
-from liftcore.features.views import Regions
 from liftcore.raster.base import CompositingParams, Selection, Weighting
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.raster.gpu.tiles import Frame
-from liftcore.raster.reference import ReferenceRaster
 from liftcore.scene.splats import Kernel
 from liftcore.solve.weights import RegionWeights
 from tests.backends import gpu_raster, needs_triton
-from tests.properties.test_raster_conformance import INSIDE
 from tests.scenes import random_camera, random_grid, random_regions, random_splats
 
 if TYPE_CHECKING:
@@ -113,18 +110,6 @@ def test_a_view_that_sees_nothing_gives_empty_products():
     assert (raster.strongest_labels(away, torch.zeros(5, dtype=torch.int32), CompositingParams()) == -1).all()
     rows = raster.ray_rows(away, torch.zeros(2, 2, dtype=torch.int32), CompositingParams())
     assert rows.indptr.tolist() == [0, 0, 0]
-
-
-def test_an_image_of_one_pixel_and_labels_of_none():
-    splats, camera = random_splats(4, 30), random_camera(4, 1, 1)
-    raster, plain = gpu_raster(splats), ReferenceRaster(splats)
-    assert torch.allclose(
-        raster.row_sums(camera, CompositingParams()), plain.row_sums(camera, CompositingParams()), atol=INSIDE
-    )
-    nothing = Regions(torch.full((2, 1, 1), -1, dtype=torch.int32), torch.ones(3, 1))
-    weights = raster.region_weights(camera, nothing, CompositingParams(), Weighting())
-    assert weights.weight.numel() == 0
-    assert weights.evidence.numel() > 0
 
 
 def test_more_levels_than_one_key_holds_are_told_apart():

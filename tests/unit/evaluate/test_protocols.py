@@ -12,12 +12,10 @@ import torch
 from PIL import Image
 
 from liftcore.errors import InvalidInput
-from liftcore.evaluate import protocols
 from liftcore.evaluate.judging import judge, mean_of_scenes, means, pooled_ious
 from liftcore.evaluate.labels import LabelledObject, lerf_scenes, three_d_ovs_scenes
 from liftcore.evaluate.protocols import (
     EvaluationProtocol,
-    OwnMasks,
     Prediction,
     RenderedFeatures,
     RenderedScores,
@@ -25,8 +23,7 @@ from liftcore.evaluate.protocols import (
     segment,
 )
 from liftcore.evaluate.published import published
-from liftcore.query.ask import Answer, ask
-from liftcore.query.objects import objects
+from liftcore.query.ask import ask
 from liftcore.query.render import view_mask
 from liftcore.query.scene import QueryScene
 from liftcore.query.terms import Query
@@ -172,20 +169,6 @@ def test_p3_cuts_the_rendered_scores_of_a_query(scene: QueryScene, threshold: st
         assert (found[text].mask == (met & (seen.attention >= cut))).all() and found[text].mask.any()
         x, y = found[text].peak or (0, 0)
         assert seen.attention[y, x] == seen.attention.max()
-
-
-def test_our_own_protocol_makes_the_masks_of_a_query(scene: QueryScene, monkeypatch: pytest.MonkeyPatch) -> None:
-    made: list[Answer] = []
-    monkeypatch.setattr(protocols, "objects", lambda *asked: made.append(asked[1]) or objects(*asked))
-    texts, encoder = ["book", "red apple"], words(scene)
-    judged = OwnMasks(scene, texts, encoder, negatives=("wall",))
-    for view in ("frame_00001", "frame_00002"):
-        found = judged.look(view)
-        for text in texts:
-            seen = view_mask(scene, ask(scene, Query((text,), ("wall",)), encoder), view)
-            assert (found[text].mask == seen.mask).all() and found[text].mask.any()
-            assert found[text].peak is None
-    assert [answer.query.positives for answer in made] == [("book",), ("red apple",)]  # once for all views
 
 
 def labels_of(folder: Path, document: object) -> Path:

@@ -8,7 +8,6 @@ import torch
 
 from liftcore.io.scene_files import lift_files
 from liftcore.planning.views import (
-    ORDER_SPLATS,
     SIDES,
     WELL_COVERED,
     Visibility,
@@ -88,19 +87,6 @@ def test_looking_at_gains_lazily_finds_the_order_of_looking_at_all():
         held[every, sides[best]] += shares[best]
         order.append(best)
     assert list(view_order(seen)) == order
-
-
-def test_of_many_splats_a_part_makes_the_order():
-    rng = np.random.default_rng(0)
-    areas = np.ones((12, 2 * ORDER_SPLATS), np.float32)
-    centres, means = rng.normal(size=(12, 3)), rng.normal(size=(2 * ORDER_SPLATS, 3)).astype(np.float32)
-    means[: len(means) // 2] *= 0.1  # near the middle, where all views are on the same side of many
-    seen, some = (
-        Visibility(areas, centres, means, 2 * ORDER_SPLATS),
-        Visibility(areas[:, ::2], centres, means[::2], 9),
-    )
-    first = Visibility(areas[:, ::2], centres, means[: len(means) // 2], 9)
-    assert list(view_order(seen)) == list(view_order(some)) != list(view_order(first))
 
 
 def test_some_views_alone_are_what_they_were_among_all():

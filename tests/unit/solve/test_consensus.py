@@ -49,8 +49,8 @@ def of_things(views: list[list[int]]) -> tuple[RegionWeights, np.ndarray]:
     return stacked(parts, SPLATS), np.zeros(sum(max(view) + 1 for view in views), np.int8)
 
 
-def defined(W: RegionWeights, levels: np.ndarray) -> np.ndarray:
-    """The module's equation, line by line: c [P, M], zero where W is."""
+def belonging(W: RegionWeights, levels: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[np.ndarray], np.ndarray]:
+    """W dense, the view of each region, the regions of each view and level, and B [P, M]: who belongs to what."""
     whole, offsets = dense(W, SPLATS), W.offsets.numpy()
     view = np.searchsorted(offsets, np.arange(levels.size), side="right") - 1
     groups = [np.flatnonzero((view == v) & (levels == level)) for v in range(offsets.size - 1) for level in (0, 1)]
@@ -59,12 +59,18 @@ def defined(W: RegionWeights, levels: np.ndarray) -> np.ndarray:
     for group in groups:
         sums = whole[:, group].sum(axis=1, keepdims=True)
         B[:, group] = (sums > FAINT) & (whole[:, group] >= BELONGS * sums) & (whole[:, group] > 0)
+    return whole, view, groups, B
+
+
+def defined(W: RegionWeights, levels: np.ndarray) -> np.ndarray:
+    """The module's equation, line by line: c [P, M], zero where W is."""
+    whole, view, groups, B = belonging(W, levels)
     R = B.T @ (whole.sum(axis=1)[:, None] * B)
     asked, views = np.zeros_like(whole), np.zeros_like(whole)
     for j, m in zip(*np.nonzero(whole), strict=True):
         if levels[m] < 0:
             continue
-        for v in range(offsets.size - 1):
+        for v in range(W.offsets.numel() - 1):
             seen = [(group, R[m, group].sum()) for group in groups if v == view[group[0]] != view[m]]
             seen = [(group, sum_) for group, sum_ in seen if sum_ >= OBSERVES * R[m, m] and sum_ > 0]
             shares = [R[m, n] / sum_ for group, sum_ in seen for n in group[B[j, group]]]

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from liftcore.solve import objects
-from liftcore.solve.consensus import BELONGS, FAINT
 from liftcore.solve.objects import CONTAINS, LEAST_VIEWS, OBSERVES, TOGETHER, region_objects
 from liftcore.solve.weights import RegionWeights, stacked
 from tests.unit.solve.sparse_views import dense, of_dense
-from tests.unit.solve.test_consensus import SPLATS, of_things, random_scene
+from tests.unit.solve.test_consensus import SPLATS, belonging, of_things, random_scene
 
 
 def mistaken_scene(seed: int, views: int = 7) -> tuple[RegionWeights, np.ndarray]:
@@ -33,22 +32,14 @@ def mistaken_scene(seed: int, views: int = 7) -> tuple[RegionWeights, np.ndarray
 
 def defined(W: RegionWeights, levels: np.ndarray) -> np.ndarray:
     """The cluster of each region that any splat belongs to, by the module's words, line by line; -1 for none."""
-    whole, offsets = dense(W, SPLATS), W.offsets.numpy()
-    view = np.searchsorted(offsets, np.arange(levels.size), side="right") - 1
-    B, groups = np.zeros(whole.shape, bool), {}
-    for v in range(offsets.size - 1):
-        for level in np.unique(levels[view == v]):
-            own = groups[v, level] = np.flatnonzero((view == v) & (levels == level))
-            sums = whole[:, own].sum(axis=1, keepdims=True)
-            B[:, own] = (sums > FAINT) & (whole[:, own] >= BELONGS * sums) & (whole[:, own] > 0)
+    whole, view, groups, B = belonging(W, levels)
     R = B.T @ (np.sqrt(whole.sum(axis=1))[:, None] * B)
     size = levels.size
     supports, observes = np.zeros((size, size)), np.zeros((size, size))
-    for v in range(offsets.size - 1):
+    views = W.offsets.numel() - 1
+    for v in range(views):
         sees, both = np.zeros(size, bool), np.zeros((size, size), bool)
-        for (of, _), own in groups.items():
-            if of != v:
-                continue
+        for own in (group for group in groups if view[group[0]] == v):
             held = R[:, own].sum(axis=1)
             seen = (held > 0) & (held >= OBSERVES * np.diag(R))
             best = own[R[:, own].argmax(axis=1)]
@@ -69,7 +60,7 @@ def defined(W: RegionWeights, levels: np.ndarray) -> np.ndarray:
             break
         clusters[j] += clusters.pop(i)
     found = np.full(size, -1)
-    kept = [own for own in clusters if np.unique(view[own]).size >= min(LEAST_VIEWS, offsets.size - 1)]
+    kept = [own for own in clusters if np.unique(view[own]).size >= min(LEAST_VIEWS, views)]
     for number, own in enumerate(kept):
         found[own] = number
     return found
