@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,14 +12,16 @@ import pytest
 import torch
 
 from liftcore.errors import InvalidFeatures, InvalidSettings, InvalidSplats
-from liftcore.features.pack import write_pack
+from liftcore.features.pack import read_features, write_pack
 from liftcore.features.views import Regions
 from liftcore.io.cameras import read_cameras
 from liftcore.io.lift_file import CLUSTER_TENSORS, TENSORS, load_lift, save_lift
 from liftcore.io.ply import write_splats
 from liftcore.io.scene_files import lift_files
 from liftcore.io.splats import read_splats
+from liftcore.query.directions import directions
 from liftcore.query.scene import QueryScene
+from liftcore.query.terms import Query, Region
 from liftcore.raster.base import CompositingParams, Selection, Weighting
 from liftcore.raster.reference import counted_weights, dense_view, reading_matrix, strided_rays
 from liftcore.result import LiftResult
@@ -231,3 +235,38 @@ def test_levels_lift_and_certify_as_the_maps_that_they_stand_for(tmp_path, level
 def test_a_level_that_a_view_lacks_is_an_error_that_names_the_view(tmp_path):
     with pytest.raises(InvalidFeatures, match="v0"):
         lifted(write_scene(tmp_path, 0), levels=2)
+
+
+def repacked(features: Path, names: dict[str, str]) -> Path:
+    """The pack's views under other names."""
+    packs, out = read_features(features), features.with_name("rig.safetensors")
+    write_pack(out, {name: packs[view] for view, name in names.items()}, {"encoder": "random"})
+    return out
+
+
+def test_folders_before_the_names_of_views_change_no_bit(tmp_path):
+    paths = write_scene(tmp_path, 3)
+    rig = repacked(paths[2], {"v0": "camA/v0", "v1": "camA/v1", "v2": "camB/v2"})
+    plain, made = lifted(paths), lifted((*paths[:2], rig))
+    assert torch.equal(plain.features, made.features)
+    assert made.metadata.views == plain.metadata.views == ("v0", "v1", "v2")
+    assert made.metadata.certificate["warnings"] == plain.metadata.certificate["warnings"]
+    save_lift(made, tmp_path / "rig.lift")
+    regions = observed(3, 1)
+    assert isinstance(regions, Regions)
+    label = int(regions.labels[0].max())  # the region is asked for by the lift's name of the view
+    (direction,) = directions(QueryScene.open(tmp_path / "rig.lift"), Query((Region("v1", 0, label),)), None)
+    expected = torch.nn.functional.normalize(regions.codebook[label], dim=0)
+    assert torch.allclose(torch.as_tensor(direction), expected, atol=1e-3)
+
+
+def test_the_warning_of_skipped_views_tells_how_a_rig_is_named(tmp_path):
+    splats, cameras, features = write_scene(tmp_path, 3)
+    records = json.loads(cameras.read_text())
+    for record, name in zip(records, ("camA/0", "camA/1", "camB/0"), strict=True):
+        record["img_name"] = name
+    cameras.write_text(json.dumps(records))
+    made = lifted((splats, cameras, repacked(features, {"v0": "0", "v1": "1"})))
+    assert (made.metadata.views, made.metadata.certificate["views_without_camera"]) == (("camA/1",), ["0"])
+    [warning] = [text for text in made.metadata.certificate["warnings"] if "skipped" in text]
+    assert warning.endswith("cameras are named with their folders here, such as camA/1: name views like them")
