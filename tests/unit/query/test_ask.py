@@ -57,11 +57,18 @@ def exact(scene: QueryScene) -> QueryScene:
     return of(scene, rows, seen=torch.arange(COUNT) < COUNT - 1)
 
 
-def test_splats_that_mean_the_text_are_selected(exact: QueryScene) -> None:
-    answer = ask(exact, "y", Axes())
-    assert np.flatnonzero(answer.selected).tolist() == list(range(1, COUNT - 1, 3))
-    assert answer.count == len(range(1, COUNT - 1, 3))
+def test_splats_that_mean_the_text_are_selected_the_best_with_places_and_a_box(exact: QueryScene) -> None:
+    answer = ask(exact, "x", Axes())
+    assert np.flatnonzero(answer.selected).tolist() == list(range(0, COUNT - 1, 3))
+    assert answer.count == len(range(0, COUNT - 1, 3))
     assert answer.statistics["min"] <= answer.statistics["q50"] <= answer.statistics["max"]
+    found, means = top(answer, exact, 4), exact.splats.means.numpy()
+    assert [best.splat for best in found.best] == [0, 3, 6, 9]  # of equal scores the first in the file
+    assert found.best[0].position == pytest.approx(means[0].tolist())
+    selected = means[answer.selected]
+    assert found.box == tuple(tuple(end.tolist()) for end in (selected.min(axis=0), selected.max(axis=0)))
+    assert len(top(answer, exact, 1000).best) == COUNT - 1  # none that was not seen
+    assert top(ask(exact, Query(("x",), ("y",), threshold=1.0), Axes()), exact, 1).box is None
 
 
 def test_negatives_take_away_and_unseen_splats_are_never_selected(exact: QueryScene) -> None:
@@ -97,27 +104,29 @@ def test_questions_together_have_the_bits_of_each_alone(scene: QueryScene) -> No
         assert np.array_equal(together.scores, alone.scores) and together.threshold == alone.threshold
 
 
-def test_encoder_of_another_space_is_refused_with_both_named(scene: QueryScene) -> None:
-    with pytest.raises(InvalidQuery, match=r"8 channels.*axes with 5"):
-        ask(scene, "x", Axes(5))
+def test_what_cannot_be_asked_is_refused(scene: QueryScene) -> None:
+    def of_space(space: str) -> QueryScene:
+        return QueryScene(replace(scene.lift, metadata=scene.metadata.model_copy(update={"text_space": space})))
 
-
-def test_words_without_an_encoder_are_refused(scene: QueryScene) -> None:
-    for space, told in (("", "not named"), ("axes", "axes")):
-        lift = replace(scene.lift, metadata=scene.metadata.model_copy(update={"text_space": space}))
-        with pytest.raises(InvalidQuery, match=rf"text space: {told}\), got no encoder"):
-            ask(QueryScene(lift), "x")
-
-
-def test_best_splats_come_with_places_and_a_box(exact: QueryScene) -> None:
-    answer = ask(exact, "x", Axes())
-    found, means = top(answer, exact, 4), exact.splats.means.numpy()
-    assert [best.splat for best in found.best] == [0, 3, 6, 9]  # of equal scores the first in the file
-    assert found.best[0].position == pytest.approx(means[0].tolist())
-    assert found.box == tuple(tuple(corner.tolist()) for corner in (
-        means[answer.selected].min(axis=0), means[answer.selected].max(axis=0)))  # fmt: skip
-    assert len(top(answer, exact, 1000).best) == COUNT - 1  # none that was not seen
-    assert top(ask(exact, Query(("x",), ("y",), threshold=1.0), Axes()), exact, 1).box is None
+    for refused, message in (
+        (lambda: ask(scene, "x", Axes(5)), r"8 channels.*axes with 5"),
+        (lambda: ask(of_space(""), "x"), r"text space: not named\), got no encoder"),
+        (lambda: ask(of_space("axes"), "x"), r"text space: axes\), got no encoder"),
+        (
+            lambda: question(scene, Query(("x",), weigh="confidence"), Axes()),
+            "a lift with confidence.*preset default",
+        ),
+        (lambda: Query(("x",), weigh="light"), "weigh: expected one of evidence, confidence"),
+        (lambda: Query(()), "query: expected a text or an example"),
+        (lambda: Query(("a",) * 65), "at most 64"),
+        (lambda: Query(("a",), keep="some"), "keep: expected"),
+        (lambda: Query(("a",), threshold="best"), "threshold: expected"),
+    ):
+        with pytest.raises(InvalidQuery, match=message):
+            refused()
+    sure = replace(scene.lift, confidence=torch.ones(len(scene.features)))
+    told, plain = (sure.query(np.eye(CHANNELS)[0], weigh=weigh) for weigh in ("confidence", "evidence"))
+    assert torch.equal(told.splats, plain.splats) and told.threshold == plain.threshold
 
 
 def test_vectors_are_asked_as_their_words_are(scene: QueryScene) -> None:
@@ -143,16 +152,6 @@ def test_scene_made_of_values_needs_no_files(scene: QueryScene) -> None:
     assert np.array_equal(ask(bare, query).selected, ask(scene, query).selected)
     with pytest.raises(InvalidLift, match="give the splats"):
         _ = QueryScene(lift).splats
-
-
-def test_who_weighs_by_confidence_needs_a_reweighted_lift(scene: QueryScene) -> None:
-    with pytest.raises(InvalidQuery, match=r"weigh: expected a lift with confidence.*preset default"):
-        question(scene, Query(("x",), weigh="confidence"), Axes())
-    with pytest.raises(InvalidQuery, match="weigh: expected one of evidence, confidence"):
-        Query(("x",), weigh="light")
-    sure = replace(scene.lift, confidence=torch.ones(len(scene.features)))
-    told, plain = (sure.query(np.eye(CHANNELS)[0], weigh=weigh) for weigh in ("confidence", "evidence"))
-    assert torch.equal(told.splats, plain.splats) and told.threshold == plain.threshold
 
 
 def test_words_of_a_table_are_asked_without_torch(tiny_lift: Path) -> None:
@@ -285,17 +284,6 @@ def test_any_other_notation_is_refused(notation: str) -> None:
 def test_what_points_nowhere_is_refused(notation: str) -> None:
     with pytest.raises(InvalidQuery, match="like"):
         parse_example(notation)
-
-
-def test_queries_that_ask_nothing_or_too_much_are_refused() -> None:
-    for refused in (
-        lambda: Query(()),
-        lambda: Query(("a",) * 65),
-        lambda: Query(("a",), keep="some"),
-        lambda: Query(("a",), threshold="best"),
-    ):
-        with pytest.raises(InvalidQuery):
-            refused()
 
 
 def test_vectors_come_from_numpy_files(tmp_path: Path) -> None:
