@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +21,6 @@ from tests.run_lengths import sam_records
 from tests.unit.command_line import assert_one_line, run
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
     from pathlib import Path
 
 PHRASES = {0: "red_apple", 2: "Lamp"}  # the cluster between them has no phrase
@@ -34,101 +34,88 @@ def records(view: str, key: str = "class_name", *, as_string: bool = False) -> l
     return [{**record, key: phrase} for record, phrase in zip(found, MASKS[view], strict=True)]
 
 
-def save_png(path: Path, values: np.ndarray, **options: Any) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(values).save(path, **options)
+def save(folder: Path, files: dict[str, Any]) -> Path:
+    """Pictures of arrays, bytes and texts as they are, and all else as JSON."""
+    for name, content in files.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if isinstance(content, np.ndarray):
+            Image.fromarray(content).save(path)
+        elif isinstance(content, bytes):
+            path.write_bytes(content)
+        else:
+            path.write_text(content if isinstance(content, str) else json.dumps(content), encoding="utf-8")
+    return folder
 
 
-def save_json(path: Path, content: Any) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(content), encoding="utf-8")
+def binary(name: str) -> dict[str, np.ndarray]:
+    return {
+        f"{name.format(view=view, phrase=phrase)}.png": 255 * mask.astype(np.uint8)
+        for view, masks in MASKS.items()
+        for phrase, mask in masks.items()
+    }
 
 
-def write_binary(folder: Path) -> None:
-    for view, masks in MASKS.items():
-        for phrase, mask in masks.items():
-            save_png(folder / phrase / f"{view}.png", 255 * mask.astype(np.uint8))
+def run_lengths(*, as_string: bool = False) -> dict[str, Any]:
+    return {f"{view}.jpg.json": {"annotations": records(view, as_string=as_string)} for view in MASKS}
 
 
-def write_colours_by_view(folder: Path) -> None:
-    for view, masks in MASKS.items():
-        for phrase, mask in masks.items():
-            save_png(folder / view / f"{phrase}.png", np.repeat(mask[..., None], 3, axis=2).astype(np.uint8))
-
-
-def write_run_lengths(folder: Path, *, as_string: bool = False) -> None:
-    for view in MASKS:
-        save_json(folder / f"{view}.jpg.json", {"annotations": records(view, as_string=as_string)})
-
-
-def write_data_set(folder: Path) -> None:
+def data_set() -> dict[str, Any]:
     numbers = {phrase: number for number, phrase in PHRASES.items()}
     masks = [
         {**record, "image_id": number, "category_id": numbers[record.pop("phrase")]}
         for number, view in enumerate(MASKS)
         for record in records(view, "phrase")
     ]
-    save_json(
-        folder / "instances.json",
-        {
-            "images": [{"id": number, "file_name": f"{view}.jpg"} for number, view in enumerate(MASKS)],
-            "categories": [{"id": number, "name": phrase} for number, phrase in PHRASES.items()],
-            "annotations": masks,
-        },
-    )
+    images = [{"id": number, "file_name": f"{view}.jpg"} for number, view in enumerate(MASKS)]
+    categories = [{"id": number, "name": phrase} for number, phrase in PHRASES.items()]
+    return {"instances.json": {"images": images, "categories": categories, "annotations": masks}}
 
 
-def write_pairs(folder: Path) -> None:
+def pairs() -> dict[str, Any]:
     """As SA-Co does it: an image for each photo and phrase."""
-    pairs = [(view, phrase) for view in MASKS for phrase in PHRASES.values()]
-    masks = [record for view in MASKS for record in records(view, "phrase")]
-    content = {
-        "images": [
-            {"id": number, "file_name": f"{view}.jpg", "text_input": phrase}
-            for number, (view, phrase) in enumerate(pairs)
-        ],
-        "categories": [{"id": 1, "name": "object"}],
-        "annotations": [
-            {"image_id": number, "category_id": 1, "segmentation": record["segmentation"]}
-            for number, record in enumerate(masks)
-        ],
-    }
-    save_json(folder / "pairs.json", content)
+    asked = [(view, phrase) for view in MASKS for phrase in PHRASES.values()]
+    images = [
+        {"id": number, "file_name": f"{view}.jpg", "text_input": phrase}
+        for number, (view, phrase) in enumerate(asked)
+    ]
+    masks = [
+        {"image_id": number, "category_id": 1, "segmentation": record["segmentation"]}
+        for number, record in enumerate(record for view in MASKS for record in records(view, "phrase"))
+    ]
+    categories = [{"id": 1, "name": "object"}]
+    return {"pairs.json": {"images": images, "categories": categories, "annotations": masks}}
 
 
 def numbered(view: str) -> np.ndarray:
     return sum((7 * number * mask for number, mask in enumerate(MASKS[view].values(), 1)), np.zeros(())).astype("u1")
 
 
-def write_labels(folder: Path) -> None:
-    for view in MASKS:
-        save_png(folder / f"{view}.png", numbered(view))
-    save_json(folder / "names.json", {7: "red_apple", 14: "Lamp"})
+def with_legend(view: str) -> bytes:
+    content, text = io.BytesIO(), PngInfo()
+    text.add_text("legend", json.dumps({7: "red apple", 14: "Lamp", 21: "elsewhere"}))
+    Image.fromarray(numbered(view)).save(content, format="PNG", pnginfo=text)
+    return content.getvalue()
 
 
-def write_legends(folder: Path) -> None:
-    for view in MASKS:
-        text = PngInfo()
-        text.add_text("legend", json.dumps({7: "red apple", 14: "Lamp", 21: "elsewhere"}))
-        save_png(folder / f"{view}.png", numbered(view), pnginfo=text)
-
-
-KINDS: dict[str, tuple[Callable[[Path], None], dict[str, str]]] = {
-    "binary PNGs": (write_binary, {}),
-    "binary PNGs a view": (write_colours_by_view, {"folders": "views"}),
-    "run lengths": (write_run_lengths, {}),
-    "run lengths as strings": (lambda folder: write_run_lengths(folder, as_string=True), {}),
-    "COCO's data set": (write_data_set, {}),
-    "SA-Co's pairs": (write_pairs, {}),
-    "label PNGs": (write_labels, {"names": "names.json"}),
-    "label PNGs with a legend": (write_legends, {}),
+LABELS = {**{f"{view}.png": numbered(view) for view in MASKS}, "names.json": {7: "red_apple", 14: "Lamp"}}
+COLOURS = {name: np.repeat(mask[..., None] // 255, 3, axis=2) for name, mask in binary("{view}/{phrase}").items()}
+KINDS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
+    "binary PNGs": (binary("{phrase}/{view}"), {}),
+    "binary PNGs a view": (COLOURS, {"folders": "views"}),
+    "run lengths": (run_lengths(), {}),
+    "run lengths as strings": (run_lengths(as_string=True), {}),
+    "COCO's data set": (data_set(), {}),
+    "SA-Co's pairs": (pairs(), {}),
+    "label PNGs": (LABELS, {"names": "names.json"}),
+    "label PNGs with a legend": ({f"{view}.png": with_legend(view) for view in MASKS}, {}),
 }
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_makes_the_same_pack(kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write, options = KINDS[kind]
-    write(tmp_path / "masks")
+    files, options = KINDS[kind]
+    save(tmp_path / "masks", files)
     options = {name: str(tmp_path / "masks" / told) if name == "names" else told for name, told in options.items()}
     flags = [part for name, told in options.items() for part in (f"--{name}", told)]
     pack = tmp_path / "pack.safetensors"
@@ -148,7 +135,7 @@ def test_every_kind_makes_the_same_pack(kind: str, tmp_path: Path, capsys: pytes
 
 
 def test_a_lift_of_prompts_is_asked_in_its_words_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_binary(tmp_path / "masks")
+    save(tmp_path / "masks", binary("{phrase}/{view}"))
     tiny, pack, lifted = make_scene(), tmp_path / "pack.safetensors", tmp_path / "lift.safetensors"
     (tmp_path / "scene.ply").write_bytes(tiny.splats)
     (tmp_path / "cameras.json").write_bytes(tiny.cameras)
@@ -171,11 +158,9 @@ def test_a_lift_of_prompts_is_asked_in_its_words_alone(tmp_path: Path, capsys: p
 
 def test_masks_that_overlap_count_for_both_phrases(tmp_path: Path) -> None:
     mask = MASKS["middle"]["Lamp"]
-    save_png(tmp_path / "lamp" / "a.png", mask)
-    save_png(tmp_path / "lamp" / "b.png", np.zeros_like(mask))
-    save_png(tmp_path / "thing" / "a.png", np.ones_like(mask))
-    save_png(tmp_path / "ghost" / "a.png", np.zeros_like(mask))
-    found = prompt_views(tmp_path)
+    nothing, everything = np.zeros_like(mask), np.ones_like(mask)
+    files = {"lamp/a.png": mask, "lamp/b.png": nothing, "thing/a.png": everything, "ghost/a.png": nothing}
+    found = prompt_views(save(tmp_path, files))
     assert found.table.words == ("lamp", "thing")
     assert found.counts == {"ghost": 0, "lamp": 1, "thing": 1}
     view = found.views["a"]
@@ -186,8 +171,7 @@ def test_masks_that_overlap_count_for_both_phrases(tmp_path: Path) -> None:
 
 def test_packs_of_other_words_make_no_lift(tmp_path: Path) -> None:
     for name, phrase in (("one", "lamp"), ("other", "mug")):
-        save_png(tmp_path / name / phrase / f"{name}.png", MASKS["middle"]["Lamp"])
-        found = prompt_views(tmp_path / name)
+        found = prompt_views(save(tmp_path / name, {f"{phrase}/{name}.png": MASKS["middle"]["Lamp"]}))
         write_pack(tmp_path / f"{name}.pack", found.views, {}, table=found.table)
     with pytest.raises(InvalidFeatures, match="one table in all packs"):
         read_features(tmp_path / "one.pack", tmp_path / "other.pack")
@@ -197,10 +181,8 @@ def test_packs_of_other_words_make_no_lift(tmp_path: Path) -> None:
     ("names", "message"), [("{}", "JSON of values"), ('{"7": 3}', "JSON of values"), ('["a"]', "the value 7")]
 )
 def test_names_that_do_not_fit_their_pictures_are_told(names: str, message: str, tmp_path: Path) -> None:
-    write_labels(tmp_path)
-    (tmp_path / "names.json").write_text(names, encoding="utf-8")
     with pytest.raises(InvalidFeatures, match=message):
-        prompt_views(tmp_path, tmp_path / "names.json")
+        prompt_views(save(tmp_path, {**LABELS, "names.json": names}), tmp_path / "names.json")
 
 
 @pytest.mark.parametrize(
@@ -226,12 +208,6 @@ def test_names_that_do_not_fit_their_pictures_are_told(names: str, message: str,
     ],
 )
 def test_what_is_no_such_folder_is_told(files: dict[str, Any], message: str, tmp_path: Path) -> None:
-    for name, content in files.items():
-        path = tmp_path / "masks" / name
-        if isinstance(content, np.ndarray):
-            save_png(path, content)
-        else:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(content, encoding="utf-8")
+    save(tmp_path / "masks", files)
     with pytest.raises(InvalidFeatures, match=message):
         prompt_views(tmp_path / "masks").views["a"]
