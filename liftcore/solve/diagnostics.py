@@ -178,10 +178,11 @@ def quantiles(values: np.ndarray) -> dict[str, float | None]:
     return {name: float(value) if np.isfinite(value) else None for name, value in found.items()}
 
 
-MOSTLY = 0.5  # of the splats; below it, what was not seen is most of the answer
+MOSTLY = 0.5  # of the splats, or of the views; below it, what was not seen is most of the answer
 FAINT = 1e-30  # of a sum of weights: its terms come near the smallest numbers of float32
 UNSEEN = "splats were reached by no labelled ray; their features are zero"
 NAMES = 3  # that a sentence shows
+POSES = "poses are world to camera, with x right, y down and z forward"
 SAMPLE = 10_000  # splats whose depths are looked at, evenly over the file
 
 
@@ -206,7 +207,8 @@ def lift_warnings(
         told = f"{len(skipped)} views have features but no camera and were skipped: {_some(skipped)}"
         warnings.append(told + _folders_of(views))
     if empty:
-        warnings.append(f"{len(empty)} of {len(views)} views meet no splat: {_some(empty)}")
+        told = f"{len(empty)} of {len(views)} views meet no splat: {_some(empty)}"
+        warnings.append(told + (f"; {POSES}" if len(empty) > MOSTLY * len(views) else ""))
     unseen, faint = int((sums == 0).sum()), int(((sums > 0) & (sums < FAINT)).sum())
     if unseen == len(sums):
         warnings.append("no labelled ray reached any splat: check that splats and cameras share their frame")

@@ -692,7 +692,7 @@ MAPS: tuple[Extreme, ...] = (
         Task({AWAY: checkerboard()}),
         lambda made: not bool(made.seen.any()),
         bound=0.0,
-        told="share their frame",
+        told="poses are world to camera",
     ),
     lifted(
         "a splat that one ray alone meets",
