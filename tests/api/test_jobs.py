@@ -8,8 +8,9 @@ import json
 import shutil
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -24,23 +25,19 @@ from liftcore.lifting import plan as plan_of
 from liftcore.progress import Progress
 from liftcore.query.scene import QueryScene
 from liftcore.settings import LiftSettings
-from service.app import create_app
 from service.child import fault_of
 from service.jobs import child, comparing, device
 from service.jobs import supervisor as pace
 from service.jobs.child import Reporter
 from service.jobs.device import Devices
 from service.jobs.lifting import plan_document
-from service.jobs.process import JobLimits
-from service.jobs.supervisor import Supervisor
-from service.queries.client import QueryClient, QueryLimits
-from service.settings import ServiceSettings
 from service.store.jobs import LINE_CHARACTERS, LOG_LINES, EventKind, log_line, note
 from service.store.owners import SERVICE
 from service.store.store import Store
-from tests.crash.conftest import order, stand_in, until
+from tests.crash.conftest import order, until
+from tests.crash.server import standing_in
 
-from .conftest import ADDRESS, LIFT_REQUEST, Uploaded, parts_of
+from .conftest import LIFT_REQUEST, Uploaded, parts_of
 from .following import ended
 from .guarded import finish
 from .test_problems import assert_problem
@@ -52,19 +49,7 @@ Quick = Callable[..., AbstractContextManager[tuple[TestClient, dict[str, Any]]]]
 @pytest.fixture
 def quick(store: Store) -> Quick:
     """The application with stand-ins for lifts, and the body of an order that it takes."""
-
-    @contextmanager
-    def serve(behaviour: str, **settings: Any) -> Iterator[tuple[TestClient, dict[str, Any]]]:
-        chosen = ServiceSettings.model_validate({"data": store.files.root, **settings})
-        worker = QueryClient(QueryLimits(waiting=1, seconds=1, scenes=1, cache_bytes=0, encoder="lvis"))
-        supervisor = Supervisor(store, JobLimits(), command=stand_in(behaviour))
-        known = order(store)
-        body = {"splats": known.splats, "cameras": known.cameras, "features": list(known.features)}
-        app = create_app(chosen, store, supervisor, worker)
-        with TestClient(app, ADDRESS, raise_server_exceptions=False) as client:
-            yield client, body
-
-    return serve
+    return partial(standing_in, store)
 
 
 def events(text: str) -> list[tuple[int, str, dict[str, Any]]]:

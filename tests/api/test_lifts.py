@@ -23,7 +23,7 @@ from liftcore.settings import LiftSettings
 from service.store.__main__ import main
 from service.store.database import DATABASE
 
-from .conftest import Uploaded, serving
+from .conftest import serving
 from .test_problems import assert_problem
 from .tiny_scene import (
     FOCAL,
@@ -165,14 +165,6 @@ def test_broken_lift_files_are_refused(client: TestClient, lift: dict[str, Any],
     assert "timings" in assert_problem(client.post("/lifts", content=save(tensors, endless_time)))["expected"]
     assert client.get("/lifts").status_code == 200
     assert assert_problem(client.post("/lifts", content=b"\x80\x04pickle"))["type"] == "/problems/invalid-lift"
-
-
-def test_plan_is_told_before_the_order(client: TestClient, uploaded: Uploaded) -> None:
-    jobs = len(client.get("/jobs").json()["jobs"])
-    plan = client.post("/lift/plan", json=uploaded.order(preset="row-sum"))
-    assert plan.status_code == 200 and "60 splats" in plan.json()["summary"][0]
-    assert len(client.get("/jobs").json()["jobs"]) == jobs
-    assert client.post("/lift/plan", json=uploaded.order(preset="none")).status_code == 422
 
 
 # What a viewer draws of a lift

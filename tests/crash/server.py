@@ -11,9 +11,10 @@ import argparse
 import os
 import signal
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from service.__main__ import keep_pauses_short, server_of
 from service.app import create_app, job_limits
@@ -26,7 +27,10 @@ from service.store.jobs import JobStore
 from service.store.lifts import LiftStore, TradeoffStore
 from service.store.store import Store
 
-from .conftest import stand_in
+from .conftest import order, stand_in
+
+if TYPE_CHECKING:
+    from fastapi.testclient import TestClient
 
 # Name -> class, method, and whether the process dies before or after it.
 POINTS: dict[str, tuple[type, str, str]] = {
@@ -69,6 +73,20 @@ class NoQueries:
         return Frame({})
 
     restarts = 0
+
+
+@contextmanager
+def standing_in(store: Store, behaviour: str, **settings: Any) -> Iterator[tuple[TestClient, dict[str, Any]]]:
+    """The application in this process with stand-ins for jobs and queries, and the body of an order that it takes."""
+    from fastapi.testclient import TestClient  # which the server of the other tests has no use for
+
+    chosen = ServiceSettings.model_validate({"data": store.files.root, "disk_floor_bytes": 0, **settings})
+    runner = Supervisor(store, job_limits(chosen), command=stand_in(behaviour))
+    known = order(store)
+    body = {"splats": known.splats, "cameras": known.cameras, "features": list(known.features)}
+    app = create_app(chosen, store, runner, cast("QueryClient", NoQueries()))
+    with TestClient(app, "http://127.0.0.1", raise_server_exceptions=False) as client:
+        yield client, body
 
 
 def arm(point: str) -> None:

@@ -9,20 +9,15 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
 
 from service import __main__ as server
-from service.app import create_app
 from service.errors import Misconfigured
-from service.jobs.process import JobLimits
-from service.jobs.supervisor import Supervisor
-from service.queries.client import QueryClient
-from service.settings import ServiceSettings
 from service.store import database as databases
 from service.store.collect import collect
 from service.store.database import DATABASE, RESERVE, Database
@@ -30,8 +25,8 @@ from service.store.keys import any_key
 from service.store.owners import SERVICE
 from service.store.store import Store
 
-from .conftest import ended, order, stand_in
-from .server import NoQueries
+from .conftest import ended, order
+from .server import standing_in
 
 
 @pytest.fixture
@@ -58,21 +53,8 @@ def fill(disk: Path) -> Path:
 
 @contextmanager
 def serving(data: Path) -> Iterator[tuple[Store, TestClient, dict[str, Any]]]:
-    """The service with stand-ins for lifts, and the body of an order that it takes."""
-    store = Store.open(data)
-    try:
-        yield from _serving(store)
-    finally:
-        store.close()
-
-
-def _serving(store: Store) -> Iterator[tuple[Store, TestClient, dict[str, Any]]]:
-    known = order(store)
-    body = {"splats": known.splats, "cameras": known.cameras, "features": list(known.features)}
-    settings = ServiceSettings.model_validate({"data": store.files.root, "disk_floor_bytes": 0})
-    runner = Supervisor(store, JobLimits(), command=stand_in("answer"))
-    app = create_app(settings, store, runner, cast("QueryClient", NoQueries()))
-    with TestClient(app, "http://127.0.0.1", raise_server_exceptions=False) as client:
+    """The service over a directory, with stand-ins for lifts, and the body of an order that it takes."""
+    with closing(Store.open(data)) as store, standing_in(store, "answer") as (client, body):
         yield store, client, body
 
 
