@@ -256,17 +256,6 @@ def test_database_of_a_later_release_is_refused(tmp_path: Path) -> None:
         Store.open(tmp_path)
 
 
-def test_store_remembers_after_reopening(tmp_path: Path) -> None:
-    store = Store.open(tmp_path)
-    job = store.jobs.submit(SERVICE, order(store))[0]
-    (tmp_path / "tmp" / "left-over").write_bytes(b"half a file")
-    store.close()
-    store = Store.open(tmp_path)
-    assert store.jobs.get(SERVICE, job).state is JobState.QUEUED and len(store.assets.all(SERVICE)) == 3
-    assert list((tmp_path / "tmp").iterdir()) == []
-    store.close()
-
-
 def test_database_of_the_first_schema_is_taken_over(tmp_path: Path) -> None:
     (tmp_path / "data").mkdir()
     old = sqlite3.connect(tmp_path / "data" / "service.sqlite")

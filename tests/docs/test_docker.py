@@ -104,17 +104,6 @@ def test_one_version_is_told_everywhere() -> None:
     assert set(re.findall(r"splatlift:([\d.]+)", text("docker/Dockerfile"))) == {__version__}
 
 
-def test_no_image_is_named_without_its_version() -> None:
-    arguments = dict(re.findall(r"(\w+)=(\S*)", " ".join(given("ARG"))))
-    stages = {words.split()[-1] for words in given("FROM")}
-    named = {words.split()[0] for words in given("FROM")} - stages
-    for image in (re.sub(r"\$\{(\w+)\}", lambda name: arguments[name[1]], one) for one in named):
-        assert image in stages or re.search(r":\d+\.\d+\.\d+", image), image
-    for service in services().values():
-        assert service["image"].split(":")[1].split("-")[0] == __version__
-    assert "latest" not in text("docker/Dockerfile") + text("docker/compose.yaml")
-
-
 def test_the_service_is_no_root_and_gets_its_signals() -> None:
     names = [name for name, _ in instructions()]
     assert names.index("USER") < names.index("CMD") and given("USER") != ["root"]
