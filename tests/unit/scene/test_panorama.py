@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 from pathlib import Path
 
@@ -172,19 +171,8 @@ def test_things_all_around_are_found_and_asked_by_their_masks() -> None:
 
 def test_photos_of_panoramas_are_checked_face_by_face(tmp_path: Path) -> None:
     splats, cameras = things(), panorama()
-    assert splats.sh is not None
-    photo = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
-    renders = {name: lc.render(splats, camera, splats.sh[:, 0] + 0.5) for name, camera in cameras.items()}
-    for y, x in np.ndindex(HEIGHT, WIDTH):
-        for name, camera in cameras.items():
-            assert camera.face is not None
-            ray = camera.face.rotation @ ray_of(x + 0.5, y + 0.5)
-            u, v = camera.K[:2] @ (ray / ray[2])
-            if ray[2] > 0 and 0 <= u < camera.width and 0 <= v < camera.height:
-                photo[y, x] = (255 * renders[name][int(v), int(u)].clamp(0, 1)).byte().numpy()
-    content = io.BytesIO()
-    Image.fromarray(photo).save(content, format="PNG")
-    (tmp_path / "pano.png").write_bytes(content.getvalue())
+    colours = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255], [0, 0, 0]], np.uint8)  # of the heaps
+    Image.fromarray(colours[labels()[0]]).save(tmp_path / "pano.png")
     report = check_scene(splats, cameras, {"pano": tmp_path / "pano.png"})
     assert len(report.views) == 6 and all(view.psnr is not None for view in report.views)
     assert not [note for note in report.notes if "no camera" in note or "have none" in note]
