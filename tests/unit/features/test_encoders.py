@@ -451,7 +451,7 @@ def test_a_trunk_that_takes_a_mean_gives_cells_whose_mean_is_the_image() -> None
 
 
 def test_a_trunk_that_attends_gives_the_value_path_of_its_pooling() -> None:
-    tower = small_trunk("test_vit", "map", "none")  # as SigLIP has it
+    tower = small_trunk("vit_tiny_patch16_224", "map", "none")  # as SigLIP has it
     encoder, images = small_encoder("maskclip", tower), torch.randn(1, 3, 32, 48)
     pool = tower.trunk.attn_pool
     with torch.no_grad():
