@@ -13,6 +13,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NoReturn
@@ -62,24 +63,35 @@ def pids(store: Store, job: str) -> list[int]:
     return [int(pid) for pid in path.read_text().split()] if path.exists() else []
 
 
-def test_child_that_dies_without_a_word_is_tried_three_times_then_failed(
-    store: Store, supervising: Supervising
+@pytest.mark.parametrize(
+    ("behaviour", "limit", "state", "attempt", "told"),
+    [
+        ("die", {}, JobState.FAILED, MAX_ATTEMPTS, "signal 9"),
+        ("die_once", {}, JobState.SUCCEEDED, 2, None),
+        ("hang", {"seconds": 0.5}, JobState.FAILED, 1, "0.5 s"),
+        ("eat", {"memory_bytes": 200 << 20}, JobState.FAILED, 1, "memory"),
+        ("feed", {"memory_bytes": 200 << 20}, JobState.FAILED, 1, "memory"),
+    ],
+)
+def test_job_has_three_attempts_and_one_within_its_limits(
+    store: Store,
+    supervising: Supervising,
+    behaviour: str,
+    limit: dict[str, Any],
+    state: JobState,
+    attempt: int,
+    told: str | None,
 ) -> None:
     job = submit(store)
-    with supervising("die"):
+    with supervising(behaviour, **limit):
         found = ended(store, job)
-    assert (found.state, found.attempt) == (JobState.FAILED, MAX_ATTEMPTS)
-    assert found.problem is not None and "signal 9" in found.problem["got"] and "3 attempts" in found.problem["got"]
-    assert states(store, job) == ["queued", *["running", "queued"] * 2, "running", "failed"]
-
-
-def test_job_whose_child_died_succeeds_in_its_next_attempt(store: Store, supervising: Supervising) -> None:
-    job = submit(store)
-    with supervising("die_once"):
-        found = ended(store, job)
-    assert (found.state, found.attempt) == (JobState.SUCCEEDED, 2)
-    assert states(store, job) == ["queued", "running", "queued", "running", "succeeded"]
-    until(lambda: not store.files.work(job).exists())  # what it went on from is removed
+    assert (found.state, found.attempt) == (state, attempt)
+    assert states(store, job) == ["queued", *["running", "queued"] * (attempt - 1), "running", state]
+    if told is None:
+        until(lambda: not store.files.work(job).exists())  # what it went on from is removed
+    else:
+        assert found.problem is not None and found.problem["kind"] == ("over-limit" if limit else "crashed")
+        assert told in found.problem["expected"] + found.problem["got"]
 
 
 class StoppedTime:
@@ -170,51 +182,25 @@ def test_canceled_job_has_no_live_process(store: Store, supervising: Supervising
     assert states(store, job) == ["queued", "running", "canceling", "canceled"]
 
 
-@pytest.mark.parametrize(
-    ("behaviour", "limit", "word"),
-    [
-        ("hang", {"seconds": 0.5}, "0.5 s"),
-        ("eat", {"memory_bytes": 200 << 20}, "memory"),
-        ("feed", {"memory_bytes": 200 << 20}, "memory"),
-    ],
-)
-def test_job_beyond_a_limit_is_ended_once_and_told(
-    store: Store, supervising: Supervising, behaviour: str, limit: dict[str, Any], word: str
-) -> None:
-    job = submit(store)
-    with supervising(behaviour, **limit):
-        found = ended(store, job)
-    assert (found.state, found.attempt) == (JobState.FAILED, 1)
-    assert found.problem is not None and found.problem["kind"] == "over-limit" and word in found.problem["expected"]
-
-
 def test_lifts_run_side_by_side_when_the_operator_says_so(store: Store, supervising: Supervising) -> None:
     jobs = [submit(store), submit(store)]
     with supervising("meet", parallel=2):
         assert [ended(store, job).state for job in jobs] == [JobState.SUCCEEDED] * 2
 
 
-def test_orderly_stop_leaves_no_process_and_puts_its_job_back(store: Store, supervising: Supervising) -> None:
-    job = submit(store)
-    with supervising("hang"):
-        until(lambda: store.jobs.get(SERVICE, job).state is JobState.RUNNING and pids(store, job))
-    assert store.jobs.get(SERVICE, job).state is JobState.QUEUED
-    assert not any(alive(pid) for pid in pids(store, job))
-
-
 def test_job_interrupted_by_a_stop_goes_on_where_the_data_directory_is_next(tmp_path: Path) -> None:
-    store = Store.open(tmp_path / "data")
-    job = submit(store)
-    with supervised(store, "hang"):
-        until(lambda: pids(store, job))
-    store.close()
-    store = Store.open((tmp_path / "data").rename(tmp_path / "moved"))
-    with supervised(store, "answer"):
-        found = ended(store, job)
-    assert (found.state, found.attempt) == (JobState.SUCCEEDED, 2)
-    assert store.lifts.get(SERVICE, job).path.is_relative_to(tmp_path / "moved")
-    assert store.lifts.get(SERVICE, job).path.exists()
-    store.close()
+    with closing(Store.open(tmp_path / "data")) as store:
+        job = submit(store)
+        with supervised(store, "hang"):
+            until(lambda: pids(store, job))
+        assert store.jobs.get(SERVICE, job).state is JobState.QUEUED
+        assert not any(alive(pid) for pid in pids(store, job))
+    with closing(Store.open((tmp_path / "data").rename(tmp_path / "moved"))) as store:
+        with supervised(store, "answer"):
+            found = ended(store, job)
+        assert (found.state, found.attempt) == (JobState.SUCCEEDED, 2)
+        path = store.lifts.get(SERVICE, job).path
+        assert path.is_relative_to(tmp_path / "moved") and path.exists()
 
 
 def test_what_a_dead_server_left_running_is_ended_before_its_job_runs_again(
