@@ -403,9 +403,7 @@ def loop() -> dict[str, Any]:
         return net(photo.permute(2, 0, 1)[None])[0].permute(1, 2, 0)
 
     photos = [(name, lc.render(splats, lc.Camera(viewmat, K, WIDTH, HEIGHT), colours)) for name, viewmat, K in poses]
-    return names | {
-        "poses": poses, "photos": photos, "encode": encode, "width": WIDTH, "height": HEIGHT, "name": views[2],
-    }  # fmt: skip
+    return names | {"poses": poses, "photos": photos, "encode": encode, "width": WIDTH, "height": HEIGHT}
 
 
 def test_tensors_of_a_training_loop_lift_as_their_files_do(loop: dict[str, Any], tmp_path: Path) -> None:
