@@ -234,7 +234,9 @@ def test_progress_is_drawn_only_on_a_terminal(
             for done in range(4):
                 progress("geometry", done, 3, "views")
         captured = capsys.readouterr()
-        assert captured.out == "" and ("geometry" in captured.err) is captured.err.endswith("\n") is watched
+        assert captured.out == ""
+        assert ("geometry" in captured.err) is watched
+        assert captured.err.endswith("\n") is watched
     assert "save:   0%" in run(capsys, *lift_arguments(scene, "--json"))[2]
 
 

@@ -32,11 +32,14 @@ def means(scene: QueryScene, cluster: int) -> np.ndarray:
     return scene.splats.means.numpy()[cluster * SPLATS_A_CLUSTER : (cluster + 1) * SPLATS_A_CLUSTER]
 
 
-def test_clusters_that_are_apart_are_objects_with_their_boxes(scene: QueryScene) -> None:
+@pytest.mark.parametrize("weigh", ["evidence", "confidence"])
+def test_clusters_that_are_apart_are_objects_with_their_boxes(weigh: str, scene: QueryScene) -> None:
+    confidence = torch.rand(len(scene.features), generator=torch.Generator().manual_seed(0))
     answer = of(scene, 0, 2)
-    found = objects(scene, answer)
+    answer = replace(answer, query=replace(answer.query, weigh=weigh))
+    found = objects(QueryScene(replace(scene.lift, confidence=confidence), scene.splats), answer)
     assert len(found.found) == 2 and found.strays == 0
-    evidence = scene.evidence
+    evidence = scene.evidence * (confidence.numpy() if weigh == "confidence" else 1)
     for number, thing in enumerate(found.found):
         rows = np.flatnonzero(found.numbers == number)
         cluster = rows[0] // SPLATS_A_CLUSTER
@@ -89,21 +92,6 @@ def test_so_many_instances_are_kept_by_their_scores(scene: QueryScene) -> None:
     for count in (0, 101):
         with pytest.raises(InvalidQuery, match="instances: expected 1 to 100"):
             of(scene, 0, instances=count)
-
-
-def test_scores_of_objects_may_be_weighted_by_confidence(scene: QueryScene) -> None:
-    confidence = torch.rand(len(scene.features), generator=torch.Generator().manual_seed(0))
-    sure = QueryScene(replace(scene.lift, confidence=confidence), scene.splats)
-    answer = of(scene, 1, 2)
-    answer = replace(answer, query=replace(answer.query, weigh="confidence"))
-    found = objects(sure, answer)
-    for number, thing in enumerate(found.found):
-        own = found.numbers == number
-        weights = (scene.evidence * confidence.numpy())[own]
-        assert thing.score == pytest.approx(np.average(answer.scores[own], weights=weights))
-        assert thing.share == pytest.approx(
-            weights.sum() / (scene.evidence * confidence.numpy())[answer.selected].sum()
-        )
 
 
 def test_tails_of_a_thousandth_are_not_in_the_box() -> None:
