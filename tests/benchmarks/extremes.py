@@ -597,8 +597,8 @@ def _task(observation: ViewFeatures, **settings: object) -> Task:
 
 LENGTHS: tuple[Extreme, ...] = (
     *(
-        lifted(f"F = {channels}", _task(checkerboard(channels=channels)), bound=SUM)
-        for channels in (1, 2, 31, 33, 8_192)
+        lifted(f"F = {channels}", _task(checkerboard(channels=channels)), bound=SUM, kernels=kernels)
+        for channels, kernels in ((1, KERNELS), (2, KERNELS), (31, KERNELS), (33, KERNELS), (8_192, GAUSSIAN))
     ),
     *(
         lifted(

@@ -15,7 +15,7 @@ from liftcore.io.scene_files import lift_files
 from liftcore.planning.plan import check_card
 from liftcore.settings import LiftSettings
 from service.jobs import device as device_process
-from tests.unit.solve.test_lift_equals_dense import write_scene
+from tests.scenes import write_scene
 
 CARD = Device("cuda", torch.device("cuda", 0))
 GIB = 1 << 30

@@ -11,7 +11,7 @@ from liftcore.io.scene_files import lift_files
 from liftcore.one_thread import one_thread
 from liftcore.settings import LiftSettings
 from liftcore.solve import closed_form, geometry, reweight
-from tests.unit.solve.test_lift_equals_dense import write_scene
+from tests.scenes import write_scene
 
 
 @pytest.fixture(autouse=True)

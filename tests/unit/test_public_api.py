@@ -14,7 +14,7 @@ import torch
 
 import liftcore as lc
 from liftcore.io.scene_files import lift_files
-from tests.unit.solve.test_lift_equals_dense import observed, write_scene
+from tests.scenes import observed, write_scene
 
 PUBLIC = """
     Camera Cameras Catalogue CompositingParams FeatureGrid FoundObject InvalidCameras InvalidFeatures InvalidInput
