@@ -29,11 +29,10 @@ METHODS = ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS", "TRACE", 
 ODD_PARTS = ("%00", "%FF%FE", "%ED%A0%80", "..%2F..%2Fetc%2Fpasswd", "a" * 6000, "%0d%0aX:y", "-1")
 ODD_VALUES = ("", "%00", "%ED%A0%80", "nan", "-1", "1e999", "9" * 5000, "%0d%0aX:y")
 ODD_HEADERS = (
-    {"Idempotency-Key": b"\xe4"}, {"Idempotency-Key": b"k" * 300}, {"Last-Event-ID": b"x"}, {"Last-Event-ID": b"-1"},
-    {"Last-Event-ID": b"9" * 5000}, {"Content-Type": b"\xff"}, {"Content-Type": b"application/json; charset=utf-7"},
-    {"Content-Encoding": b"br"}, {"Content-Encoding": b"\xff"}, {"Range": b"bytes=" + b"9" * 5000 + b"-"},
-    {"If-None-Match": b"\xff"}, {"If-Range": b'"'}, {"Accept": b"image/x-nothing"}, {"Authorization": b"\xff"},
-    {"Cookie": b"=;\xff"}, {"Expect": b"magic"}, {"Transfer-Encoding": b"gzip"}, {"X-Request-ID": b"\xff"},
+    {"Idempotency-Key": b"\xe4"}, {"Last-Event-ID": b"x"}, {"Last-Event-ID": b"9" * 5000}, {"Content-Type": b"\xff"},
+    {"Content-Encoding": b"\xff"}, {"Range": b"bytes=" + b"9" * 5000 + b"-"}, {"If-None-Match": b"\xff"},
+    {"If-Range": b'"'}, {"Authorization": b"\xff"}, {"Cookie": b"=;\xff"}, {"Expect": b"magic"},
+    {"Transfer-Encoding": b"gzip"},
 )  # fmt: skip
 ODD_BODIES = (
     b"", b"{", b"[]", b"null", b"\xff\xfe", b'"\xed\xa0\x80"', b"[" * 60_000, b'{"text": NaN}', b'{"\\ud800": 1}',
@@ -42,7 +41,7 @@ ODD_BODIES = (
     b'{"like": [[1' + b"0" * 400 + b"]]}", b'{"settings": {"power": 1' + b"0" * 5000 + b"}}",
 )  # fmt: skip
 
-ODD_MEDIA = ("application/json", "multipart/form-data; boundary=x", "nonsense")
+ODD_MEDIA = ("multipart/form-data; boundary=x", "nonsense", "application/json; charset=utf-7")
 
 
 @pytest.fixture(scope="module")
@@ -106,7 +105,10 @@ def odd_requests(client: TestClient, path: str, taken: set[str]) -> Iterator[tup
         yield method, f"{address(path)}?{name}={value}{needed}", {}
     for odd in ODD_HEADERS:  # one method is enough, as what reads headers knows none
         yield min(taken), address(path), {"headers": {name.encode(): value for name, value in odd.items()}}
-    for body, media in itertools.product(ODD_BODIES if "POST" in taken else (), ODD_MEDIA):
+    bodies = itertools.chain(
+        itertools.product(ODD_BODIES, ["application/json"]), itertools.product(ODD_BODIES[:4], ODD_MEDIA)
+    )
+    for body, media in bodies if "POST" in taken else ():
         yield "POST", address(path), {"content": body, "headers": {"Content-Type": media}}
 
 

@@ -190,10 +190,16 @@ def test_job_tells_of_every_stage_and_its_plan_comes_before_the_walk(
     at = {line: number for number, line in lines}
     assert at["plan"] < planned_at < at["geometry: 3 views"]
     job = client.get(lift["links"]["job"]).json()
+    assert job in client.get("/jobs").json()["jobs"]
     first, *_ = job["plan"].pop("summary")
     assert first.startswith(f"{3 * SPLATS_A_CLUSTER} splats (3dgs), ") and first.endswith("3 of 3 views")
     assert isinstance(job["plan"].pop("warnings"), list)  # what there is to say is of the machine
     assert job["plan"] == lift["certificate"]["plan"]
+    assert (job["state"], job["attempt"], job["problem"]) == ("succeeded", 1, None)
+    assert job["settings"]["preset"] == "row-sum" and job["settings"]["power"] == 1
+    assert job["created"] <= job["started"] <= job["ended"]
+    assert job["request_id"] == LIFT_REQUEST
+    assert LIFT_REQUEST in client.get(job["links"]["events"]).text
     assert job["progress"] == {"stage": "save", "done": 1, "total": 1, "unit": "steps", "eta_s": 0.0}
 
 
@@ -263,17 +269,6 @@ def test_assets_say_what_is_in_them_and_their_names_alone(client: TestClient, up
     assert (cameras["views"], features["channels"], features["text_space"]) == (len(VIEWS), CHANNELS, "tiny")
     for asset, counts in ((uploaded.cameras, cameras), (uploaded.features, features)):
         assert "middle" in counts.pop("names") and listed[asset] == counts  # lists leave out the names
-
-
-def test_job_tells_its_story(client: TestClient, lift: dict[str, Any], uploaded: Uploaded) -> None:
-    job = client.get(lift["links"]["job"]).json()
-    assert (job["state"], job["attempt"], job["problem"]) == ("succeeded", 1, None)
-    assert job["splats"] == uploaded.splats and job["features"] == [uploaded.features]
-    assert job["settings"]["preset"] == "row-sum" and job["settings"]["power"] == 1
-    assert job["created"] <= job["started"] <= job["ended"]
-    assert job["id"] in {found["id"] for found in client.get("/jobs").json()["jobs"]}
-    assert job["request_id"] == LIFT_REQUEST
-    assert LIFT_REQUEST in client.get(job["links"]["events"]).text
 
 
 def test_lift_tells_how_far_to_trust_it(client: TestClient, lift: dict[str, Any], uploaded: Uploaded) -> None:

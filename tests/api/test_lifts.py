@@ -24,7 +24,7 @@ from service.store.__main__ import main
 from service.store.database import DATABASE
 
 from .conftest import serving
-from .test_problems import assert_problem
+from .test_problems import NO_ASSET, assert_problem
 from .tiny_scene import (
     FOCAL,
     HEIGHT,
@@ -52,13 +52,6 @@ def png() -> bytes:
     content = io.BytesIO()
     Image.new("RGB", (32, 24), (9, 99, 199)).save(content, "PNG")
     return content.getvalue()
-
-
-def lift_file(client: TestClient, lift: dict[str, Any], tmp_path: Any) -> tuple[bytes, dict[str, str]]:
-    content = client.get(f"/lifts/{lift['id']}/features").content
-    (tmp_path / "lift.safetensors").write_bytes(content)
-    with safe_open(tmp_path / "lift.safetensors", framework="np") as opened:
-        return content, opened.metadata()
 
 
 def test_lift_has_the_name_that_somebody_gave_it(client: TestClient, lift: dict[str, Any]) -> None:
@@ -93,9 +86,9 @@ def test_photos_are_shown_as_they_were_uploaded(client: TestClient, lift: dict[s
 
 
 def test_lift_file_from_elsewhere_becomes_a_lift(
-    client: TestClient, lift: dict[str, Any], scene: TinyScene, start: Callable[..., Any], tmp_path: Any
+    client: TestClient, lift: dict[str, Any], scene: TinyScene, start: Callable[..., Any]
 ) -> None:
-    content, _ = lift_file(client, lift, tmp_path)
+    content = client.get(lift["links"]["features"]).content
     with start("elsewhere") as other:
         told = assert_problem(other.post("/lifts", content=content))  # nothing that it was made of is there
         assert told["status"] == 404 and told["got"] == lift["splats"]
@@ -146,8 +139,11 @@ def test_lift_of_a_folder_of_cameras_takes_a_zip_of_them(
 
 
 def test_broken_lift_files_are_refused(client: TestClient, lift: dict[str, Any], tmp_path: Any) -> None:
-    content, metadata = lift_file(client, lift, tmp_path)
+    content = client.get(lift["links"]["features"]).content
     tensors = load(content)
+    (tmp_path / "lift").write_bytes(content)
+    with safe_open(tmp_path / "lift", framework="np") as opened:
+        metadata = opened.metadata()
 
     def refused(**changed: np.ndarray) -> str:
         reply = client.post("/lifts", content=save({**tensors, **changed}, metadata))
@@ -186,19 +182,15 @@ def test_splats_come_in_the_rows_of_the_lift(client: TestClient, lift: dict[str,
     assert (again.status_code, again.content) == (304, b"")
 
 
-@pytest.mark.parametrize("what", ["pca", "evidence", "agreement"])
-def test_each_splat_has_a_colour_in_each_layer(client: TestClient, lift: dict[str, Any], what: str) -> None:
-    reply = client.get(f"/lifts/{lift['id']}/colours", params={"what": what})
-    colours = np.load(io.BytesIO(reply.content), allow_pickle=False)
-    assert (colours.shape, colours.dtype) == ((lift["count"], 3), np.uint8)
-    if what == "pca":  # three words, so three colours that lie apart
-        means = colours.reshape(3, SPLATS_A_CLUSTER, 3).mean(axis=1)
-        assert min(np.abs(means[one] - means[other]).max() for one, other in ((0, 1), (0, 2), (1, 2))) > 60
-    assert client.get(f"/lifts/{lift['id']}/colours", params={"what": "pca"}).headers["etag"] is not None
-
-
-def test_clusters_are_asked_of_a_lift_that_has_them(client: TestClient, lift: dict[str, Any]) -> None:
-    problem = assert_problem(client.get(f"/lifts/{lift['id']}/colours", params={"what": "cluster"}))
+def test_each_splat_has_a_colour_in_each_layer(client: TestClient, lift: dict[str, Any]) -> None:
+    path, shown = f"/lifts/{lift['id']}/colours", {}
+    for what in ("pca", "evidence", "agreement"):
+        reply = client.get(path, params={"what": what})
+        shown[what] = np.load(io.BytesIO(reply.content), allow_pickle=False)
+        assert (shown[what].shape, shown[what].dtype) == ((lift["count"], 3), np.uint8) and reply.headers["etag"]
+    means = shown["pca"].reshape(3, SPLATS_A_CLUSTER, 3).mean(axis=1)  # of three words, that lie apart
+    assert min(np.abs(means[one] - means[other]).max() for one, other in ((0, 1), (0, 2), (1, 2))) > 60
+    problem = assert_problem(client.get(path, params={"what": "cluster"}))  # which this lift has none of
     assert (problem["status"], problem["argument"]) == (422, "what") and "aggregation" in problem["hint"]
 
 
@@ -238,23 +230,15 @@ def test_objects_are_there_without_words_and_a_table_names_them(
     rows = np.frombuffer(ply.content[ply.content.index(b"end_header\n") + 11 :], "<f4").reshape(-1, 14)
     assert len(rows) == whole["objects"][1]["splats"]
     assert np.abs(rows[:, 0] - whole["objects"][1]["centre"][0]).max() < 0.5
-
-
-@pytest.mark.parametrize(
-    ("path", "how", "status"),
-    [
-        ("objects", {"table": "sha256:" + "0" * 64}, 404),
-        ("objects", {"table": "sha256:" + "0" * 64, "encoder": "default"}, 422),
-        ("objects", {"encoder": "nowhere"}, 422),
-        ("objects", {"limit": 0}, 422),
-        ("objects/3/splats", {}, 404),
-        ("objects/-1/splats", {}, 422),
-    ],
-)
-def test_wrong_questions_for_objects_are_problems(
-    client: TestClient, lift: dict[str, Any], path: str, how: dict[str, Any], status: int
-) -> None:
-    assert assert_problem(client.get(f"/lifts/{lift['id']}/{path}", params=how))["status"] == status
+    for path, how, status in (
+        (route, {"table": NO_ASSET}, 404),
+        (route, {"table": NO_ASSET, "encoder": "default"}, 422),
+        (route, {"encoder": "nowhere"}, 422),
+        (route, {"limit": 0}, 422),
+        (f"{route}/3/splats", {}, 404),
+        (f"{route}/-1/splats", {}, 422),
+    ):
+        assert assert_problem(client.get(path, params=how))["status"] == status
 
 
 def test_other_kernels_are_shown_as_near_gaussians() -> None:
