@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import contextlib
 import json
 import os
@@ -140,10 +139,6 @@ class Browser:
         data = {"items": [], "files": [str(file) for file in files], "dragOperationsMask": 1}
         for kind in ("dragEnter", "dragOver", "drop"):
             self._call("Input.dispatchDragEvent", type=kind, data=data, **size)
-
-    def screenshot(self) -> bytes:
-        """The window as a PNG."""
-        return base64.b64decode(self._call("Page.captureScreenshot", format="png")["data"])
 
     def write(self, selector: str, text: str) -> None:
         """Put text into a field, in place of what is there."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -76,14 +76,3 @@ def browsing(profile: Path, *options: str) -> Iterator[Browser]:
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     with browsing(tmp_path_factory.mktemp("profile")) as browser:
         yield browser
-
-
-@pytest.fixture
-def keep(request: pytest.FixtureRequest) -> Callable[[Browser, str], None]:
-    """Keeps a picture of the window: in .pytest_cache/d/page, for who wants to see what the tests saw."""
-    folder = request.config.cache.mkdir("page")
-
-    def shot(browser: Browser, name: str) -> None:
-        (folder / f"{name}.png").write_bytes(browser.screenshot())
-
-    return shot

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import httpx
@@ -49,14 +49,11 @@ def empty(browser: Browser, files: dict[str, Path], tmp_path: Path) -> Iterator[
         browser.open("about:blank#")
 
 
-def test_dropped_files_are_planned_compared_and_cancelled(
-    empty: Browser, files: dict[str, Path], keep: Callable[[Browser, str], None]
-) -> None:
+def test_dropped_files_are_planned_compared_and_cancelled(empty: Browser, files: dict[str, Path]) -> None:
     empty.drop([files[kind] for kind in ("splats", "cameras", "features")])
     empty.until("!document.querySelector('#plan-it').disabled")
     empty.press("#plan-it")
     empty.until("document.querySelector('#plan').textContent.includes('60 splats')")
-    keep(empty, "plan")
     assert empty.value("fetch('jobs').then(reply => reply.json()).then(({jobs}) => jobs.length)") == 0
     empty.value(SHORTEST)  # which the page does not offer
     empty.press("#compare")
@@ -69,7 +66,6 @@ def test_dropped_files_are_planned_compared_and_cancelled(
     empty.until("splatlift.bring.followed.size === 0")  # the list is as it stays
     empty.press("#jobs .job:last-child .actions button")
     empty.until(CHART)
-    keep(empty, "chart")
 
 
 def test_lift_file_asks_for_what_it_was_made_of_and_opens(
@@ -141,17 +137,14 @@ def test_lift_takes_a_name_and_photos(browser: Browser, served: Served, tmp_path
     browser.until("document.querySelector('#layer-words').textContent === 'There is no photo of this view.'")
 
 
-def test_strangers_files_become_an_object_that_lights_up(
-    browser: Browser, tmp_path: Path, keep: Callable[[Browser, str], None]
-) -> None:
+def test_strangers_files_become_an_object_that_lights_up(browser: Browser, tmp_path: Path) -> None:
     """The whole way: files are dropped, a lift runs, a phrase lights up the object in 3D, and all is deleted."""
     scene, page = tmp_path / "still-life", browser
-    write_still_life(scene, still_life(views=7, density=0.3))
+    write_still_life(scene, still_life(views=5, density=0.2))
     with serving(tmp_path / "data", encoder=f"table:{scene}/text_table.safetensors") as (address, _):
         page.window(1280, 800)
         page.open(address)
         page.until("globalThis.splatlift && !document.querySelector('#empty').hidden")
-        keep(page, "empty")
         (tmp_path / "broken.ply").write_bytes((scene / "point_cloud.ply").read_bytes()[:-40])
         page.give("#files", [tmp_path / "broken.ply", scene / "cameras.json"])
         page.until("document.querySelector('.file.bad')")
@@ -162,14 +155,12 @@ def test_strangers_files_become_an_object_that_lights_up(
         page.drop([scene / "point_cloud.ply", scene / "features.safetensors"])
         page.until("!document.querySelector('#lift-it').disabled")
         assert "views" in text_of(page, "#sent")
-        keep(page, "bring")
         page.press("#lift-it")
         page.until("globalThis.splatlift.lift || document.querySelector('#jobs .failed')", LONG)
         assert page.value("document.querySelector('#jobs .failed')") is None
         page.until(READY)
         ask(page, "mug")
         lit = columns(page, AMBER)
-        keep(page, "found")
         assert len(lit) > 2000 and page.value("splatlift.ask.now.things.length") >= 1
         low, high = page.value("(({low, high}) => [low, high])(splatlift.ask.now.things[0].box)")
         assert low[0] < -2.7 < high[0] and low[1] < -1.5 < high[1]  # where the mug stands

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +33,6 @@ CLEAR = """(() => {
   return clear;
 })()"""
 MODE_VIEW = "input[name=mode][value=view] + span"
-Keep = Callable[[Browser, str], None]
 
 
 @pytest.fixture
@@ -55,10 +53,9 @@ def test_first_view_is_shown_in_3d_with_its_lists(page: Browser, served: Served)
     assert "60 splats" in text_of(page, "#about")
 
 
-def test_word_lights_its_thing(page: Browser, keep: Keep) -> None:
+def test_word_lights_its_thing(page: Browser) -> None:
     before = columns(page)
     ask(page, "lamp")
-    keep(page, "lamp")
     lit = columns(page, AMBER)
     assert lit and min(lit) > 50  # the lamp is the right one of three
     assert "splats of 60" in text_of(page, "#answer") and "by itself" in text_of(page, "#why")
@@ -140,11 +137,10 @@ def test_what_is_not_there_is_said_plainly(page: Browser) -> None:
     assert "absent=keep" in asked and "threshold=auto" not in asked and "&threshold=" in page.value("location.search")
 
 
-def test_everything_is_named_and_one_word_is_seen_alone(page: Browser, keep: Keep) -> None:
+def test_everything_is_named_and_one_word_is_seen_alone(page: Browser) -> None:
     page.press("#tab-name")
     page.press("#naming button.main")
     page.until("document.querySelectorAll('#legend button').length === 3 && splatlift.viewer.settled")
-    keep(page, "named")
     assert text_of(page, "#named").startswith("3 words of 3 are here")
     names = page.value("[...document.querySelectorAll('#labels .label')].map(label => label.textContent)")
     assert sorted(names) == ["apple", "book", "lamp"]
@@ -180,7 +176,7 @@ def test_link_to_the_words_of_a_table_says_so_in_the_form(page: Browser, served:
     assert httpx.delete(f"{served.address}/assets/{table}").status_code == 204
 
 
-def test_mask_under_a_click_is_an_example(page: Browser, keep: Keep) -> None:
+def test_mask_under_a_click_is_an_example(page: Browser) -> None:
     page.press(MODE_VIEW)
     page.until("document.querySelector('#render').naturalWidth > 0")
     page.press("#pick-mask")
@@ -188,19 +184,17 @@ def test_mask_under_a_click_is_an_example(page: Browser, keep: Keep) -> None:
     page.until(f"{EXAMPLES}.length === 1")
     page.until(FOUND)
     page.until("!document.querySelector('#outline').hidden")
-    keep(page, "mask")
     (example,) = page.value(EXAMPLES)
     assert example.startswith("region:") and page.value("splatlift.ask.now.count") > 0
     assert text_of(page, "#chips .chip").startswith("like a mask of")
 
 
-def test_things_are_listed_without_a_question_and_shown(page: Browser, keep: Keep) -> None:
+def test_things_are_listed_without_a_question_and_shown(page: Browser) -> None:
     page.until("splatlift.things.found.length === 3")
     assert sorted(page.value("splatlift.things.found.map(thing => thing.name)")) == ["apple", "book", "lamp"]
     before = page.value("splatlift.viewer.place3d")
     page.press("#catalogue-list button")
     page.until("splatlift.viewer.settled && document.querySelector('#labels .label')")
-    keep(page, "things")
     assert text_of(page, "#labels .label") == page.value("splatlift.things.found[0].name")
     assert page.value("splatlift.viewer.place3d") != before
     ask(page, "lamp")
@@ -270,13 +264,12 @@ def test_link_opens_question_layer_and_camera_again(page: Browser, served: Serve
     assert page.value("[splatlift.look.view.name, splatlift.ask.now.cut]") == ["right", 0.5]
 
 
-def test_photo_view_shows_the_mask_and_takes_examples(page: Browser, keep: Keep) -> None:
+def test_photo_view_shows_the_mask_and_takes_examples(page: Browser) -> None:
     page.press("#tools input[value=view] + span")
     page.until("document.querySelector('#render').naturalWidth === 32")
     ask(page, "lamp")
     page.until("!document.querySelector('#mask').hidden")
     assert min(page.value(CLEAR)) > 16
-    keep(page, "photo-view")
     page.press("#render", 7.5 / 32, 12.5 / 24)
     page.until(f"{EXAMPLES}.length === 1")
     assert page.value(EXAMPLES) == ["left:7,12"]
@@ -294,7 +287,7 @@ def test_page_without_webgl_shows_the_views(served: Served, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("scheme", ["dark", "light"])
-def test_accessibility_check_finds_nothing_serious(page: Browser, scheme: str, keep: Keep) -> None:
+def test_accessibility_check_finds_nothing_serious(page: Browser, scheme: str) -> None:
     page.window(1280, 800, scheme)
     ask(page, "lamp")
     page.value(f"(() => {{ {AXE}; }})()")
@@ -306,17 +299,15 @@ def test_accessibility_check_finds_nothing_serious(page: Browser, scheme: str, k
         found = page.value("axe.run(document).then(all => all.violations)")
         told = {rule["id"]: [node["html"] for node in rule["nodes"]] for rule in found if rule["impact"] != "minor"}
         assert told == {}, tab
-        keep(page, f"{scheme}-{tab}")
 
 
-def test_nothing_is_wider_than_the_window(page: Browser, keep: Keep) -> None:
+def test_nothing_is_wider_than_the_window(page: Browser) -> None:
     ask(page, "lamp")
     for width, height, zoom in ((1280, 800, 1), (768, 1024, 1), (390, 844, 1), (640, 400, 2)):
         page.window(width, height, zoom=zoom)
         for tab in ("bring", "take", "look", "ask"):
             page.press(f"#tab-{tab}")
             assert page.value("document.documentElement.scrollWidth") <= width, (width, tab)
-        keep(page, f"{width}")
 
 
 def test_lines_to_take_away_ask_the_same(page: Browser) -> None:
