@@ -1,4 +1,4 @@
-"""Bad uploads are the client's problem, told in one line, and leave nothing behind."""
+"""Bad uploads, bombs too, are the client's problem: told in one line, they leave nothing and take little."""
 
 from __future__ import annotations
 

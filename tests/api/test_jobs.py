@@ -203,23 +203,18 @@ def test_job_tells_of_every_stage_and_its_plan_comes_before_the_walk(
     assert job["progress"] == {"stage": "save", "done": 1, "total": 1, "unit": "steps", "eta_s": 0.0}
 
 
-TIMES = (20.0, 10.0, 30.0)
-NEWEST_FIRST = (2, 0, 1)
-
-
 def test_lists_begin_with_the_newest(store: Store) -> None:
-    jobs = [store.jobs.submit(SERVICE, order(store))[0] for _ in TIMES]
+    jobs = [store.jobs.submit(SERVICE, order(store))[0] for _ in range(3)]
     for job in jobs:
         finish(store, job.encode())
     assets = [asset.id for asset in store.assets.all(SERVICE)]
     with store.database.write() as connection:
-        for created, job, asset in zip(TIMES, jobs, assets, strict=True):
+        for created, job, asset in zip((20.0, 10.0, 30.0), jobs, assets, strict=True):
             connection.execute("UPDATE jobs SET created = ? WHERE id = ?", (created, job))
             connection.execute("UPDATE lifts SET created = ? WHERE id = ?", (created, job))
             connection.execute("UPDATE asset_owners SET created = ? WHERE asset = ?", (created, asset))
-    assert [job.id for job in store.jobs.all(SERVICE)] == [jobs[place] for place in NEWEST_FIRST]
-    assert [lift.id for lift in store.lifts.all(SERVICE)] == [jobs[place] for place in NEWEST_FIRST]
-    assert [asset.id for asset in store.assets.all(SERVICE)] == [assets[place] for place in NEWEST_FIRST]
+    for listed, ids in ((store.jobs, jobs), (store.lifts, jobs), (store.assets, assets)):
+        assert [one.id for one in listed.all(SERVICE)] == [ids[2], ids[0], ids[1]]
 
 
 def test_job_keeps_its_states_the_last_of_its_log_and_its_latest_progress(store: Store) -> None:

@@ -37,11 +37,9 @@ from tests.crash.conftest import order
 
 from .conftest import app_of, parts_of
 from .guarded import Guarded, address, bearer, every_route, finish, guarded, make_key
-from .test_problems import assert_problem
+from .test_problems import NO_ASSET, NOBODY, assert_problem
 
 PATIENCE_SECONDS = 60.0  # for what takes a quarter of a second
-NOBODY = "e" * 32
-NO_ASSET = "sha256:" + "f" * 64
 DOCS = {"/openapi.json", "/docs", "/docs/swagger-ui-bundle.js", "/docs/swagger-ui.css"}
 PAGE = {"/", "/web/page.js", "/web/page.css", "/web/LICENSES.txt"}
 OPEN_ROUTES = {*PAGE, "/healthz", "/readyz", "/version", *DOCS}

@@ -415,10 +415,10 @@ def test_every_line_that_a_job_prints_is_a_record_with_its_job_and_request(
     assert "unforeseen" not in capfd.readouterr().err  # and nothing of it goes past the log
 
 
-ROOT = Path(__file__).parents[2]
 # A job in blocks goes on from finished ones
 
 
+ROOT = Path(__file__).parents[2]
 VIEWS = 20  # three blocks
 KILLED = """if True:
     import io, json, os, signal, sys

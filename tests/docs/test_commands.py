@@ -34,47 +34,34 @@ from .readme import (
 
 
 @pytest.mark.parametrize("document", PAGES)
-def test_relative_links_lead_somewhere(document: str) -> None:
-    links = re.findall(r"\]\(([^)#]+)", text(document))
-    missing = [link for link in links if "://" not in link and not (ROOT / document).parent.joinpath(link).exists()]
-    assert not missing
+def test_links_lead_to_files_and_headings(document: str) -> None:
+    for page, place in re.findall(r"\]\(([^)#]*)(?:#([^)]+))?\)", text(document)):
+        target = (ROOT / document).parent / page if page else ROOT / document
+        if "://" in page:
+            continue
+        assert target.exists(), page
+        if place:
+            headings = re.findall(r"^#+ (.*)$", target.read_text(encoding="utf-8"), flags=re.MULTILINE)
+            assert place in {re.sub(r"[^a-z0-9 -]", "", head.lower()).replace(" ", "-") for head in headings}, place
 
 
 @pytest.mark.parametrize("document", PAGES)
-def test_links_to_headings_lead_there(document: str) -> None:
-    for page, place in re.findall(r"\]\(([\w./-]*)#([^)]+)\)", text(document)):
-        target = (ROOT / document).parent / page if page else ROOT / document
-        headings = re.findall(r"^#+ (.*)$", target.read_text(encoding="utf-8"), flags=re.MULTILINE)
-        assert place in {re.sub(r"[^a-z0-9 -]", "", head.lower()).replace(" ", "-") for head in headings}, place
+def test_sources_modules_and_make_targets_that_are_named_exist(document: str) -> None:
+    sources = {code for code in inline_code(document) if re.fullmatch(r"[\w/*]+\.py", code)}
+    rooms = [ROOT / room for room in ("", "liftcore", "service")]
+    assert not [name for name in sources if not any([*room.glob(name)] for room in rooms)]
+    assert sources or document != "ARCHITECTURE.md"
+    modules = set(re.findall(r"python -m ([a-z_]+(?:\.[a-z_]+)*)", text(document)))
+    assert not [name for name in modules if find_spec(name) is None]
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    targets = set(re.findall(r"(?:`|^)make ([a-z]+)", text(document), flags=re.MULTILINE))
+    assert targets <= set(re.findall(r"^([a-z]+):", makefile, flags=re.MULTILINE))
+    assert targets or document not in ("README.md", "CONTRIBUTING.md")
 
 
 def test_every_page_of_the_guide_is_in_the_readme() -> None:
     linked = set(re.findall(r"\]\((docs/[\w-]+\.md)", text("README.md")))
     assert linked == set(PAGES) - set(DOCUMENTS)
-
-
-@pytest.mark.parametrize("document", PAGES)
-def test_named_sources_exist(document: str) -> None:
-    named = {code for code in inline_code(document) if re.fullmatch(r"[\w/*]+\.py", code)}
-    rooms = [ROOT / room for room in ("", "liftcore", "service")]
-    missing = [name for name in named if not any([*room.glob(name)] for room in rooms)]
-    assert named or document != "ARCHITECTURE.md"
-    assert not missing
-
-
-@pytest.mark.parametrize("document", PAGES)
-def test_named_modules_exist(document: str) -> None:
-    named = set(re.findall(r"python -m ([a-z_]+(?:\.[a-z_]+)*)", text(document)))
-    assert not [name for name in named if find_spec(name) is None]
-
-
-@pytest.mark.parametrize("document", PAGES)
-def test_make_targets_exist(document: str) -> None:
-    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
-    targets = set(re.findall(r"^([a-z]+):", makefile, flags=re.MULTILINE))
-    named = set(re.findall(r"(?:`|^)make ([a-z]+)", text(document), flags=re.MULTILINE))
-    assert named or document not in ("README.md", "CONTRIBUTING.md")
-    assert named <= targets
 
 
 def test_readme_opens_with_the_two_commands() -> None:
