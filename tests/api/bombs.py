@@ -34,6 +34,7 @@ def splats() -> dict[str, bytes]:
         "count of 5,000 digits": vertices(b"9" * 5000),
         "count that is no integer": vertices(b"1e9"),
         "property without a width": vertices(b"1", b"property void x\n"),
+        "zip of pictures with a deep description": zipped([("meta.json", b"[" * 100_000)]),
     }
 
 
