@@ -14,7 +14,6 @@ from fastapi.testclient import TestClient
 
 from service.models import AssetKind
 from service.store.jobs import fingerprint
-from service.store.owners import SERVICE, stored_bytes
 from service.store.store import Store
 from tests.crash.conftest import labels as stored_labels
 from tests.crash.conftest import until
@@ -53,7 +52,7 @@ def test_tradeoff_is_a_job_as_a_lift_is(quick: Quick) -> None:
         assert {found["kind"] for found in client.get("/jobs").json()["jobs"]} == {"lift", "tradeoff"}
 
 
-def test_what_was_found_is_looked_at_in_three_ways_and_is_no_lift(quick: Quick, store: Store) -> None:
+def test_what_was_found_is_no_lift_and_goes_when_that_is_said(quick: Quick) -> None:
     with quick("answer") as (client, body):
         links = ended(client, compare(client, body, budget_s=60).headers["location"])["links"]
         found = client.get(links["tradeoff"])
@@ -72,16 +71,6 @@ def test_what_was_found_is_looked_at_in_three_ways_and_is_no_lift(quick: Quick, 
         lift = ended(client, client.post("/lift", json=body).headers["location"])["id"]
         for path in (f"/lifts/{job}", f"/lifts/{job}/features", f"/tradeoffs/{lift}", f"/tradeoffs/{lift}/chart"):
             assert assert_problem(client.get(path))["type"] == "/problems/not-found"
-        with store.database.read() as connection:
-            stored = stored_bytes(connection, SERVICE)
-        assert client.delete(f"/jobs/{job}", params={"with_tradeoff": True}).status_code == 204
-        with store.database.read() as connection:
-            assert 0 < stored - stored_bytes(connection, SERVICE) < 1000
-
-
-def test_tradeoff_goes_with_its_job_when_that_is_said(quick: Quick) -> None:
-    with quick("answer") as (client, body):
-        links = ended(client, compare(client, body, budget_s=60).headers["location"])["links"]
         for params in ({}, {"with_lift": True}):
             reply = client.delete(links["self"], params=params)
             assert assert_problem(reply)["status"] == 409 and "with_tradeoff=true" in reply.json()["hint"]
@@ -89,7 +78,6 @@ def test_tradeoff_goes_with_its_job_when_that_is_said(quick: Quick) -> None:
         assert client.delete(links["self"], params={"with_tradeoff": True}).status_code == 204
         for link in links.values():
             assert assert_problem(client.get(link))["status"] == 404
-        assert client.delete(f"/assets/{body['splats']}").status_code == 204
 
 
 @pytest.mark.parametrize(
