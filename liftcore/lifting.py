@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -91,14 +91,16 @@ def lift(
     """
     chosen = LiftSettings.chosen(preset, settings)
     check_given(splats, chosen.antialiased, threads)
-    kept = Checkpoint(Path(checkpoint)) if isinstance(checkpoint, Path | str) else checkpoint
+    kept, own = _checkpoint(checkpoint), _Log()
     if engine is not None:
         known = cameras if isinstance(cameras, Cameras) else Cameras(cameras)
-        given = {"progress": progress, "on_plan": on_plan or log_all, "folder": kept.folder if kept else None}
-        return lift_in_blocks(engine, splats, known, views, chosen, **given)
+        given = {"progress": progress, "on_plan": on_plan or own.plan, "folder": kept.folder if kept else None}
+        result = lift_in_blocks(engine, splats, known, views, chosen, **given)
+        own.tell(result.diagnostics["warnings"] if on_plan is None else ())
+        return result
     work = _Lift(splats, chosen, threads, Timings(progress), choose_device(chosen.device))
     found = LiftViews.of(views, cameras, chosen)
-    plan = work.planned(found, on_plan or log_all)
+    plan = work.planned(found, on_plan or own.plan)
     with within_memory(work.device):
         geometry = work.weigh(found, plan, kept)
         things = work.find_objects(geometry)
@@ -111,9 +113,7 @@ def lift(
         things = things if chosen.objects else None
         notes |= _objects(things) if things else {}
         diagnostics = work.diagnose(found, geometry, X, sums, plan, notes)
-    for warning in diagnostics["warnings"] if on_plan is None else ():
-        if warning not in plan.told:  # which the log has
-            log.warning(warning)
+    own.tell(diagnostics["warnings"] if on_plan is None else ())
     table = found.features.table
     made = LiftResult(
         features=X,
@@ -188,11 +188,35 @@ def log_warnings(plan: Plan) -> None:
         log.warning(warning)
 
 
-def log_all(plan: Plan) -> None:
-    """Log what a plan warns of, where nobody shows it: a program that has waited for an hour would like to know."""
-    log_warnings(plan)
-    for warning in plan.told:
-        log.warning(warning)
+class _Log:
+    """Logs what a lift warns of, once, where nobody shows its plan: a program would not look into diagnostics."""
+
+    def __init__(self) -> None:
+        self._said = set[str]()
+
+    def plan(self, plan: Plan) -> None:
+        """Before the first view."""
+        self.tell((*plan.warnings, *plan.told))
+
+    def tell(self, warnings: Iterable[str]) -> None:
+        """Those that were not told yet."""
+        for warning in dict.fromkeys(warnings):
+            if warning not in self._said:
+                log.warning(warning)
+        self._said |= set(warnings)
+
+
+def _checkpoint(given: object) -> Checkpoint | None:
+    """The checkpoint, or that of a folder.
+
+    Raises:
+        InvalidSettings: it is something else.
+    """
+    if given is None or isinstance(given, Checkpoint):
+        return given
+    if isinstance(given, Path | str) and str(given):
+        return Checkpoint(Path(given))
+    raise InvalidSettings("checkpoint", expected="the path of a folder, or None", got=repr(given)[:80])
 
 
 @dataclass

@@ -15,7 +15,7 @@ from liftcore.progress import Progress, silent
 from liftcore.raster import check_given, open_raster
 from liftcore.raster.base import CompositingParams
 from liftcore.scene.cameras import Camera, Cameras
-from liftcore.scene.splats import Splats
+from liftcore.scene.splats import Splats, shared_tensor
 from liftcore.settings import LiftSettings, Preset
 from liftcore.solve.geometry import Given, LiftViews, weigh_views
 from liftcore.solve.weights import RegionWeights
@@ -51,11 +51,17 @@ def render(
         InvalidSettings: values have another number of rows than there are splats, or threads are no number.
         Unavailable: there is no such device.
     """
+    if not isinstance(params, CompositingParams):
+        raise InvalidSettings("params", expected="CompositingParams", got=repr(params)[:80])
     check_given(splats, params.antialiased, threads)
     if not isinstance(camera, Camera):
         got, hint = repr(camera)[:80], "cameras[name] is the camera of a view"
         raise InvalidCameras("camera", expected="a Camera", got=got, hint=hint)
-    given = torch.as_tensor(values).detach().cpu()
+    try:
+        given = shared_tensor(values).cpu()
+    except (TypeError, ValueError) as error:
+        got = f"{type(values).__name__} ({error})"[:120]
+        raise InvalidSettings("values", expected="numbers or booleans of splats", got=got) from None
     if given.ndim not in (1, 2) or given.shape[0] != splats.count:
         expected = f"[{splats.count}] or [{splats.count}, F], a row a splat"
         raise InvalidSettings("values", expected=expected, got=str(list(given.shape)))

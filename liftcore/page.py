@@ -40,7 +40,7 @@ def show(
 ) -> None:
     """Serve a lift until Ctrl-C: `LiftResult.show`."""
     require_service()
-    with tempfile.TemporaryDirectory(prefix="splatlift-show-") as folder:
+    with tempfile.TemporaryDirectory(prefix="splatlift-show-", ignore_cleanup_errors=True) as folder:
         inputs = {
             "splats": _splats_file(lift, splats, Path(folder)),
             "cameras": _cameras_file(lift.metadata, cameras, Path(folder)),
@@ -48,7 +48,7 @@ def show(
         path = Path(folder, "lift.safetensors")
         save_lift(replace(lift.cpu(), metadata=lift.metadata.model_copy(update=inputs)), path)
         command = [sys.executable, "-m", "service.view", str(path), "--port", str(port)]
-        command += ["--until-stdin-closes", *["--no-browser"] * (not browser)]  # a notebook's kernel may be killed
+        command += ["--lent", folder, *["--no-browser"] * (not browser)]  # a notebook's kernel may be killed
         with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as server:
             assert server.stdout is not None
             try:
@@ -68,11 +68,10 @@ def show(
 def _splats_file(lift: LiftResult, splats: Splats | None, folder: Path) -> InputFile:
     if splats is None:
         return _remembered("splats", lift.metadata)
-    if splats.count != len(lift.features):
-        got = f"{splats.count} for {len(lift.features)} rows"
-        raise InvalidInput("splats", expected="the splats that were lifted, one a row", got=got)
     from liftcore.io.ply import write_splats
+    from liftcore.query.scene import require_lifted
 
+    require_lifted(splats, len(lift.features))
     write_splats(splats, folder / "splats.ply")
     return input_file(folder / "splats.ply")
 

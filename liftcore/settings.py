@@ -242,7 +242,12 @@ class LiftSettings(BaseModel):
         """
         if not isinstance(preset, cls):
             return cls.of(preset=preset, **others)
-        return cls.of(**preset.model_dump(exclude_unset=True) | dict(others)) if others else preset
+        if not others:
+            return preset
+        chosen = {"preset": preset.preset, "speed": preset.speed}
+        filled = set(cls.of(**chosen).model_dump().items())
+        own = dict(set(preset.model_dump().items()) - filled)
+        return cls.of(**chosen | own | dict(others))
 
     @classmethod
     def of_json(cls, values: Mapping[str, Any]) -> Self:

@@ -11,6 +11,7 @@ import hashlib
 import json
 import os
 import secrets
+import shutil
 import signal
 import sys
 import tempfile
@@ -20,7 +21,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from liftcore.errors import InvalidLift, SplatliftError
 from liftcore.query.text import BUILT_IN, NO_WORDS, OWN_WORDS
@@ -117,20 +118,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("lift", type=Path)
     parser.add_argument("--port", type=int, default=0)
     parser.add_argument("--no-browser", action="store_true")
-    parser.add_argument(
-        "--until-stdin-closes", action="store_true", help="end with the process that started this one"
-    )
+    lent = "end when stdin closes, as the end of whoever started this closes it, and take the folder away then"
+    parser.add_argument("--lent", type=Path, metavar="FOLDER", help=lent)
     given = parser.parse_args(arguments)
-    if given.until_stdin_closes:
-        threading.Thread(target=stop_when_closed, args=(sys.stdin.buffer,), daemon=True).start()
+    if given.lent is None:
+        return serve(given.lift, given.port, browser=not given.no_browser)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))  # in order, until the server takes signals itself
+    threading.Thread(target=stop_when_stdin_closes, daemon=True).start()
+    try:
+        return serve(given.lift, given.port, browser=not given.no_browser)
+    finally:
+        shutil.rmtree(given.lent, ignore_errors=True)
+
+
+def serve(path: Path, port: int, *, browser: bool) -> int:
+    """Show the lift at a port, over a data directory that goes with the server; the exit status."""
     with tempfile.TemporaryDirectory(prefix="splatlift-view-") as folder:
         try:
-            settings = settings_of(Path(folder), given.port, metadata_of(given.lift)[0].get("text_space", ""))
+            settings = settings_of(Path(folder), port, metadata_of(path)[0].get("text_space", ""))
             listener = bind(settings.host, settings.port)
             store = Store.open(settings.data, floor_bytes=0)
             try:
-                lift = adopt(store, settings, given.lift)
-                show = partial(announce, lift=lift, browser=not given.no_browser)
+                show = partial(announce, lift=adopt(store, settings, path), browser=browser)
                 with logging_to_stderr(settings.log_format):
                     server_of(assemble(settings, store), settings, show).run(sockets=[listener])
             finally:
@@ -142,9 +151,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def stop_when_closed(pipe: BinaryIO) -> None:
-    """Stop this process in order once nobody holds the other end of a pipe, however that one ended."""
-    pipe.read()
+def stop_when_stdin_closes() -> None:
+    """Stop this process in order once nobody holds the other end of the pipe, however that one ended."""
+    while os.read(0, 1 << 16):  # not by sys.stdin, whose lock a thread that waits would keep beyond the end
+        pass
     os.kill(os.getpid(), signal.SIGTERM)
 
 

@@ -6,6 +6,7 @@ grid, ``V/grid`` [h, w, F]. A pack may bring its words: ``embeddings`` [n, F] an
 of text embeddings has them; a lift of it is asked in these without an encoder.
 """
 
+import errno
 import json
 import math
 import tempfile
@@ -35,6 +36,7 @@ LARGEST_I16 = 32_767
 LABEL_TYPES = ("U8", "I16", "I32")
 FEATURE_TYPES = ("F16", "F32", "BF16")
 PARTS = ("labels", "codebook", "grid")
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 TABLE = "embeddings"
 
 
@@ -156,6 +158,7 @@ def as_views(
     if not isinstance(views, Mapping):
         return _spooled(views, scratch)
     given = cast("Mapping[str, ViewFeatures]", views)
+    _check_names(given)
     sources = {name: _Given(given, name) for name in given}
     if not sources:
         raise InvalidFeatures("features", expected="at least one view", got="none")
@@ -303,6 +306,7 @@ def _spooled(pairs: Iterable[tuple[str, ViewFeatures]], scratch: Path | None) ->
                 got = type(pair).__name__
                 raise InvalidFeatures("features", expected="pairs of a name and a view", got=got)
             name, features = pair
+            _check_names([name])
             if name in files:
                 raise InvalidFeatures("features", expected="each view once", got=f"{name!r} twice")
             files[name] = Path(folder, f"{len(files)}.safetensors")
@@ -311,12 +315,21 @@ def _spooled(pairs: Iterable[tuple[str, ViewFeatures]], scratch: Path | None) ->
                 with files[name].open("wb") as handle:
                     _write(handle, {name: view}, {}, silent)
             except OSError as error:
+                if error.errno not in NO_ROOM:
+                    raise
                 hint = "set TMPDIR to a folder with more room, or give a mapping of views, which is read as it is"
                 expected, got = f"room for an iterator's views in {folder}", error.strerror or str(error)
-                raise Unavailable("features", expected=expected, got=got, hint=hint) from None
+                raise Unavailable("features", expected=expected, got=got, hint=hint) from error
         if not files:
             raise InvalidFeatures("features", expected="at least one view", got="none")
         return replace(read_features(*files.values()), paths=())  # mapped: the files may lose their names
+
+
+def _check_names(names: Iterable[Any]) -> None:
+    strange = next((name for name in names if not isinstance(name, str)), None)
+    if strange is not None:
+        expected, got = "names that are texts, as of cameras", f"{type(strange).__name__} {strange!r}"[:80]
+        raise InvalidFeatures("features", expected=expected, got=got)
 
 
 def _in_callers_modes(values: Iterable[Any]) -> Iterator[Any]:

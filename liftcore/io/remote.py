@@ -53,8 +53,8 @@ def local_path(path: Path | str) -> Path:
         if not found:
             raise FileNotFoundError("nothing is there")
         # Of HTTP ukey is the address alone: what is told of a file (ETag, size, time) tells its versions apart. Of a
-        # file that is asked for itself, and of no folder, `find` tells nothing.
-        told = {name: known or storage.info(name) for name, known in found.items()}
+        # file that is asked for itself `find` tells nothing, and of one in a folder over HTTP no size and no tag.
+        told = {name: known if known.get("size") is not None else storage.info(name) for name, known in found.items()}
         versions = sorted((name, storage.ukey(name), sorted(map(str, told[name].items()))) for name in found)
         base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "splatlift" / "remote"
         name = PurePosixPath(place.rstrip("/")).name

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from liftcore.errors import InvalidSettings
 from liftcore.features.views import Regions
 from liftcore.io.transforms import frame_warning
 from liftcore.one_thread import one_thread
@@ -113,7 +114,9 @@ def plan_photos(
         InvalidCameras: there is no camera.
         InvalidSettings: ``antialiased`` does not suit the splats' kernel.
     """
-    settings = settings or LiftSettings.of()
+    settings = LiftSettings.of() if settings is None else settings
+    if not isinstance(settings, LiftSettings):
+        raise InvalidSettings("settings", expected="LiftSettings, or None", got=repr(settings)[:80])
     check_given(splats, settings.antialiased, threads)
     known = cameras if isinstance(cameras, Cameras) else Cameras(cameras)
     views = list(known.values())[:: settings.view_stride]

@@ -43,6 +43,6 @@ def check_given(splats: Splats, antialiased: bool, threads: int | None) -> None:
         got, hint = f"{type(splats).__name__} {splats!r}"[:80], "read_splats(path) makes them of a file"
         raise InvalidSplats("splats", expected="Splats", got=got, hint=hint)
     check_antialiased(splats.kernel, antialiased)
-    if threads is not None and not (isinstance(threads, Integral) and threads >= 1):
+    if threads is not None and (isinstance(threads, bool) or not isinstance(threads, Integral) or threads < 1):
         got = repr(threads)[:80]
         raise InvalidSettings("threads", expected="a whole number of one or more, or None for all cores", got=got)

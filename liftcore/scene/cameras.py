@@ -180,7 +180,7 @@ def _matrix(values: Any) -> np.ndarray:
 def _pixels(side: Any) -> int:
     """A whole number of any kind, as readers of JSON and arrays have it; 0, which is refused, of anything else."""
     try:
-        return int(side) if int(side) == side else 0
+        return int(side) if int(side) == side and not isinstance(side, bool) else 0
     except (TypeError, ValueError, OverflowError):
         return 0
 
@@ -262,7 +262,8 @@ class Cameras(Mapping[str, Camera]):
 def _cameras_in(given: Any) -> list[Camera]:
     """The cameras of a mapping or of a sequence, or a refusal of what is none of these, such as a path."""
     values = given.values() if isinstance(given, Mapping) else given
-    found: list[Any] = list(values) if isinstance(values, Iterable) and not isinstance(values, str) else [values]
+    many = isinstance(values, Iterable) and not isinstance(values, str | np.ndarray)
+    found: list[Any] = list(values) if many else [values]
     names = [name for name in given if not isinstance(name, str)] if isinstance(given, Mapping) else []
     if names:
         raise InvalidCameras("cameras", expected="names that are texts, as of photos", got=repr(names[0])[:80])

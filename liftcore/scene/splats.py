@@ -104,9 +104,9 @@ class Splats:
 
 
 def shared_tensor(values: object) -> Tensor:
-    """A tensor over the same memory where torch can have it; a mapped file or a reversed array is copied."""
-    if isinstance(values, torch.Tensor):
-        return values.detach()
+    """A tensor over the same memory where torch can have it; a reversed array, or one of other bytes, is copied."""
+    if isinstance(values, torch.Tensor) or hasattr(values, "__cuda_array_interface__"):  # the latter as CuPy's are
+        return torch.as_tensor(values).detach()
     array = np.asarray(values)
     if not array.dtype.isnative:
         array = array.astype(array.dtype.newbyteorder("="))

@@ -305,7 +305,7 @@ def test_lift_in_memory_is_shown_until_it_is_interrupted_or_killed(folder: Path)
             with socket.create_server(("127.0.0.1", 0)) as taken:
                 result.show(splats, cameras, port=taken.getsockname()[1], browser=False)
         except lc.Unavailable as error:
-            print(error.argument, flush=True)
+            print(error.argument, error.got.partition(";")[0], flush=True)
         result.show(splats, cameras, browser=False)
         print("ended", flush=True)
         input()
@@ -313,10 +313,15 @@ def test_lift_in_memory_is_shown_until_it_is_interrupted_or_killed(folder: Path)
     """
     environment = os.environ | {"PYTHONPATH": str(ROOT), "TMPDIR": str(folder)}
     command, pipe = [sys.executable, "-c", script], subprocess.PIPE
-    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, env=environment, cwd=folder) as process:
+    with (
+        (folder / "stderr").open("w") as errors,
+        subprocess.Popen(
+            command, stdin=pipe, stdout=pipe, stderr=errors, text=True, env=environment, cwd=folder
+        ) as process,
+    ):
         assert process.stdout is not None
         told = [process.stdout.readline().strip() for _ in range(4)]
-        assert told == ["splats", "cameras", "splats", "the page"]
+        assert told == ["splats", "cameras", "splats", "the page one that ended with status 2"]
         line = process.stdout.readline()
         found = re.match(r"(http://127\.0\.0\.1:\d+)/\?lift=(\w+) ", line)
         assert found, line
@@ -331,7 +336,8 @@ def test_lift_in_memory_is_shown_until_it_is_interrupted_or_killed(folder: Path)
         found = re.match(r"http://(127\.0\.0\.1):(\d+)/", process.stdout.readline())
         assert found
         process.kill()  # as a notebook's kernel may be
-    until(lambda: not _answers(found[1], int(found[2])))
+    until(lambda: not _answers(found[1], int(found[2])) and not list(folder.glob("splatlift*")))
+    assert "Fatal" not in (folder / "stderr").read_text()
 
 
 def test_lift_whose_files_moved_is_told(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

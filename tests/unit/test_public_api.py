@@ -4,6 +4,7 @@ import json
 import logging
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -191,6 +192,13 @@ def test_what_a_machine_lacks_goes_to_whoever_listens_else_to_the_log(tmp_path, 
         ({"views": [torch.ones(2, 2, 4)]}, lc.InvalidFeatures, r"features: expected pairs of a name and a view"),
         ({"threads": 0}, lc.InvalidSettings, r"threads: expected a whole number of one or more, .*got 0"),
         ({"threads": 1.5}, lc.InvalidSettings, r"threads: .*got 1.5"),
+        ({"threads": True}, lc.InvalidSettings, r"threads: .*got True"),
+        (
+            {"views": {0: None}},
+            lc.InvalidFeatures,
+            r"features: expected names that are texts, as of cameras, got int 0",
+        ),
+        ({"views": [(0, None)]}, lc.InvalidFeatures, r"features: expected names that are texts"),
         ({"device": "tpu"}, lc.InvalidSettings, r"device: expected 'auto', 'cpu' or 'cuda', got 'tpu'"),
         ({"robust_step": 1}, lc.InvalidSettings, r"robust_step: .*nearest: robust_steps"),
     ],
@@ -211,6 +219,9 @@ def test_settings_and_keywords_beside_them_are_one(scene):
     assert lc.lift(splats, cameras, views, settings, view_stride=2).settings.stride == 2
     assert lc.plan(splats, cameras, views, settings, view_stride=2).views == strided.views == ("v0", "v2")
     assert float(whole.weight.sum()) > 2 * float(strided.weight.sum())
+    chosen = lc.lift(splats, cameras, views, lc.LiftSettings.of(speed="fast", seed=3), speed="exact").settings
+    assert chosen == lc.LiftSettings.of(speed="exact", seed=3)
+    assert lc.lift(splats, cameras, views, lc.LiftSettings.of(), robust_steps=0).confidence is None
 
 
 def test_answers_refuse_splats_of_another_scene(scene):
@@ -234,6 +245,10 @@ def test_what_is_no_engine_and_too_few_rows_are_refused(scene):
     _, splats, cameras, views = scene
     with pytest.raises(lc.InvalidSettings, match=r"engine: expected an engine, or None, got 'local'; LocalEngine"):
         lc.lift(splats, cameras, views, engine="local")  # pyright: ignore[reportArgumentType]
+    strange: list[Any] = [5, ""]
+    for checkpoint in strange:
+        with pytest.raises(lc.InvalidSettings, match="checkpoint: expected the path of a folder"):
+            lc.lift(splats, cameras, views, checkpoint=checkpoint)
     with pytest.raises(lc.InvalidInput, match="splats: expected"):
         lc.region_weights(splats, cameras, views).matrix(1)
 
@@ -242,6 +257,13 @@ def test_render_refuses_the_name_of_a_camera_and_an_unknown_device(scene):
     _, splats, cameras, _ = scene
     with pytest.raises(lc.InvalidSettings, match="device: expected 'auto', 'cpu' or 'cuda', got 'tpu'"):
         lc.render(splats, cameras["v0"], torch.ones(splats.count), device="tpu")
+    for values in (None, "colours", [["x"]]):
+        with pytest.raises(lc.InvalidSettings, match="values: expected"):
+            lc.render(splats, cameras["v0"], values)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(lc.InvalidSettings, match="params: expected CompositingParams"):
+        lc.render(splats, cameras["v0"], np.ones(splats.count), {})  # pyright: ignore[reportArgumentType]
+    swapped = np.arange(splats.count)[::-1].astype(">i4")
+    assert lc.render(splats, cameras["v0"], swapped).shape == (cameras["v0"].height, cameras["v0"].width)
     with pytest.raises(lc.InvalidCameras, match=r"camera: expected a Camera, got 'v0'; cameras\[name\]"):
         lc.render(splats, "v0", torch.ones(splats.count))  # pyright: ignore[reportArgumentType]
 
@@ -282,6 +304,7 @@ MODES = {
     "inference": torch.inference_mode,
     "float64": lambda: default_dtype(torch.float64),
     "bfloat16": lambda: default_dtype(torch.bfloat16),
+    "autocast": lambda: torch.autocast("cpu", torch.bfloat16),
     "another device": lambda: torch.device("meta"),  # where there is one, a card
 }
 
@@ -292,10 +315,11 @@ def test_torch_modes_of_the_caller_change_no_bit_and_are_back_where_his_code_run
     vectors, values = np.eye(2, views["v0"].codebook.shape[1]), np.linspace(0, 1, splats.count)
 
     def modes():
-        return torch.is_inference_mode_enabled(), torch.get_default_dtype(), torch.get_default_device()
+        modes = torch.is_inference_mode_enabled(), torch.is_autocast_enabled("cpu")
+        return *modes, torch.get_default_dtype(), torch.get_default_device()
 
     def found(given):
-        made = lc.lift(splats, cameras, given)
+        made = lc.lift(splats, cameras, given, cg_steps=1, reference_channels=2)
         assert lc.plan(splats, cameras, views).views == made.views
         answer = made.query(vectors, splats=splats)
         W, image = lc.region_weights(splats, cameras, views), lc.render(splats, cameras["v0"], values)
@@ -303,6 +327,7 @@ def test_torch_modes_of_the_caller_change_no_bit_and_are_back_where_his_code_run
 
     def iterator(seen):
         for name, view in views.items():
+            lc.render(splats, cameras["v0"], values)  # a call within a call
             seen.append(modes())
             yield name, view
 
@@ -312,6 +337,15 @@ def test_torch_modes_of_the_caller_change_no_bit_and_are_back_where_his_code_run
         within = found(iterator(seen))
         assert modes() == around and set(seen) == {around}
     assert all(torch.equal(one, other) for one, other in zip(usual, within, strict=True))
+
+
+def test_lifts_in_two_threads_beside_another_default_dtype_are_as_one_alone(scene):
+    _, splats, cameras, views = scene
+    usual = lc.lift(splats, cameras, views).features
+    with default_dtype(torch.float64), ThreadPoolExecutor(2) as pool:
+        found = [pool.submit(lc.lift, splats, cameras, views) for _ in range(4)]
+        assert all(torch.equal(one.result().features, usual) for one in found)
+        assert torch.get_default_dtype() == torch.float64
 
 
 def test_results_are_shown_in_a_line(scene):

@@ -9,6 +9,7 @@ interpreter: that is how it is tested where there is no card.
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
+from contextvars import copy_context
 from functools import wraps
 from typing import Concatenate, ParamSpec, TypeVar
 
@@ -228,8 +229,9 @@ def made_ahead(items: Iterable[Item], make: Callable[[Item], Made]) -> Generator
             return item, make(item)
         return None
 
+    context = copy_context()  # of the caller, whose code may be among the items
     with ThreadPoolExecutor(1, "view-ahead") as pool:
-        waiting = pool.submit(following)
+        waiting = pool.submit(context.run, following)
         while (found := waiting.result()) is not None:
-            waiting = pool.submit(following)
+            waiting = pool.submit(context.run, following)
             yield found

@@ -181,6 +181,7 @@ def test_small_files_that_say_they_are_large_are_refused(kind: str, message: str
         ("sh0", "files", ["meta.json"], "a WebP picture as 'meta.json'"),
         ("shN", "count", 1, "labels below 1"),
         ("shN", "bands", 2, "a palette 512 pixels wide, got 960"),
+        ("", "", None, "meta.json as JSON"),
     ],
 )
 def test_sog_that_says_something_else_is_refused(
@@ -192,7 +193,7 @@ def test_sog_that_says_something_else_is_refused(
             if name == "meta.json":
                 meta = json.loads(content)
                 (meta[part] if part else meta)[key] = value
-                content = json.dumps(meta).encode()
+                content = json.dumps(meta).encode() if key else b"{"
             made.writestr(name, content)
     with pytest.raises(InvalidSplats, match=message):
         read_splats(tmp_path / "a")

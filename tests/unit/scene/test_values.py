@@ -103,6 +103,8 @@ def test_cameras_come_of_numpy_torch_or_lists(make: Any) -> None:
         (np.eye(4), K.T, "K: expected a 3x3 matrix"),
         (np.eye(4), K + np.eye(3, k=1), "without skew"),
         (np.eye(4), K * np.nan, "K: expected"),
+        (np.eye(4) + 1e13 * np.eye(4, k=3), K, "pose: expected a translation within 1e[+]12, got 1e[+]13"),
+        (np.eye(4), K + 1e10 * np.eye(3, k=2), "intrinsics: expected a principal point within 1e[+]09 pixels"),
     ]
     for viewmat, intrinsics, message in wrong:
         with pytest.raises(InvalidCameras, match=message):
