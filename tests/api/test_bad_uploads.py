@@ -67,6 +67,8 @@ def camera_of(image: str) -> bytes:
         (AssetKind.CAMERAS, camera_of("a" * 501)),
         (AssetKind.FEATURES, with_label_out_of_the_codebook()),
         (AssetKind.MASKS, masks({"left": np.full((2, 3), -2)})),
+        (AssetKind.MASKS, save({"left": codebook()})),
+        (AssetKind.TABLE, save({"embeddings": np.eye(2, 3), "more": np.eye(2)}, metadata={"words": '["a", "b"]'})),
         (AssetKind.TABLE, save({"embeddings": codebook()[:1]}, metadata={"words": '["\\ud800"]'})),
         (AssetKind.PHOTOS, b"no zip"),
     ],
