@@ -14,6 +14,7 @@ from liftcore.errors import InvalidInput
 from liftcore.evaluate.hardware import hardware, peak_memory
 from liftcore.evaluate.synthetic import room_cameras, room_regions, room_splats
 from liftcore.features.views import Regions, ViewFeatures
+from liftcore.one_thread import one_thread
 from liftcore.raster import open_raster
 from liftcore.raster.base import CompositingParams, Raster, ViewRequest, Weighting
 from liftcore.scene.cameras import Camera
@@ -98,6 +99,7 @@ def time_lift(work: Workload, preset: Preset, device: Device, threads: int | Non
     }
 
 
+@one_thread()
 def weigh_regions(
     raster: Raster,
     views: Sequence[tuple[Camera, ViewFeatures]],
@@ -105,7 +107,7 @@ def weigh_regions(
     count: int,
     threads: int | None = None,
 ) -> tuple[RegionWeights, Codebook]:
-    """W of all views and what its regions stand for, as the closed form takes them.
+    """W of all views and what its regions stand for, as a lift makes them for the closed form.
 
     Args:
         count: P.
