@@ -25,9 +25,11 @@ def hills(*parts: tuple[float, float, int], seed: int = 0) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("method", SEARCHED)
-def test_two_hills_are_parted_between_them(method: str) -> None:
+def test_two_hills_are_parted_between_them_in_any_order_of_the_scores(method: str) -> None:
     scores = hills((0.2, 0.01, 9000), (0.3, 0.01, 3000))
-    assert 0.22 < find_threshold(scores, method).value < 0.285
+    found = find_threshold(scores, method)
+    assert 0.22 < found.value < 0.285
+    assert find_threshold(scores.flip(0), method) == found
 
 
 @pytest.mark.parametrize(
