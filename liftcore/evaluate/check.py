@@ -121,11 +121,11 @@ def check_scene(
         figures, told = _check_features(features, cameras, files, whole)
         settings = LiftSettings.of()
         lifted = LiftViews.of(features, cameras, settings)
-        agreement = agreement_of_views(splats, lifted, settings)[1]
+        agreement = agreement_of_views(raster, lifted, settings)[1]
         if agreement is not None:
             figures["agreement_of_views"] = agreement
             if not (told or wrong):  # other cameras are told already, and broken maps agree nowhere
-                told += disagreement(splats, lifted, settings, agreement)
+                told += disagreement(raster, lifted, settings, agreement)
         wrong += told
     compared = [view for view in views if view.psnr is not None]
     worst = min(compared, key=lambda view: view.psnr or 0.0).view if compared else None

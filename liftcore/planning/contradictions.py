@@ -61,11 +61,12 @@ def contradictions(
     told = unlike_maps(some_grids(views.features, views.names))
     if seen.seen_share < LEAST_IN_VIEW:
         return [*told, unseen(seen.seen_share)]
-    row_sum, agreement = agreement_of_views(splats, views, settings, threads)
+    raster = CpuRaster(splats, threads)
+    row_sum, agreement = agreement_of_views(raster, views, settings)
     if row_sum < LEAST_ROW_SUM:
         return [*told, empty(row_sum)]
     if not told and agreement is not None:  # broken maps agree nowhere
-        told += disagreement(splats, views, settings, agreement, threads)
+        told += disagreement(raster, views, settings, agreement)
     return told
 
 
@@ -79,9 +80,7 @@ def empty(row_sum: float) -> str:
     return f"cameras: splats fill {row_sum:.1%} of the rays of a view; {FRAME}"
 
 
-def disagreement(
-    splats: Splats, views: LiftViews, settings: LiftSettings, agreement: float, threads: int | None = None
-) -> list[str]:
+def disagreement(raster: CpuRaster, views: LiftViews, settings: LiftSettings, agreement: float) -> list[str]:
     """That views contradict each other, if they do; and the scale at which they would not."""
     if agreement >= LOW_AGREEMENT:
         return []
@@ -90,7 +89,7 @@ def disagreement(
         if len(known) == len(NEAR_SCALES) and agreement >= max(LEAST_AGREEMENT, *known.values()):
             return []
         for factor in factors:
-            found = agreement_of_views(splats, _scaled(views, factor), settings, threads, rays=0)[1]
+            found = agreement_of_views(raster, _scaled(views, factor), settings, rays=0)[1]
             if found is not None:
                 known[factor] = found
     best = max(known, key=lambda factor: known[factor], default=None)
@@ -112,7 +111,7 @@ def _scaled(views: LiftViews, factor: float) -> LiftViews:
 
 
 def agreement_of_views(
-    splats: Splats, views: LiftViews, settings: LiftSettings, threads: int | None = None, *, rays: int = RAYS
+    raster: CpuRaster, views: LiftViews, settings: LiftSettings, *, rays: int = RAYS
 ) -> tuple[float, float | None]:
     """The mean sum of weights of so many rays, and how far views agree, of what their features allow.
 
@@ -123,8 +122,8 @@ def agreement_of_views(
     coarse = {"stride": max(1, longest // SIDE), "certificate_rays": rays, "robust_steps": 0, "consensus": False}
     own = settings.model_copy(update=coarse)
     with one_thread():
-        raster = CpuRaster(splats, threads)
-        geometry = weigh_views(raster, splats.count, few, own, silent, by_rows=False, threads=threads)
+        how = {"by_rows": False, "threads": raster.threads}
+        geometry = weigh_views(raster, raster.splats.count, few, own, silent, **how)
     sums = sum(float(sample.rows.weights.sum()) for sample in geometry.samples)
     taken = sum(len(sample.rows.indptr) - 1 for sample in geometry.samples)
     return sums / max(taken, 1), None if len(few) < FEWEST else _agreement_of(geometry)
