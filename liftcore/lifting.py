@@ -91,16 +91,16 @@ def lift(
     """
     chosen = LiftSettings.chosen(preset, settings)
     check_given(splats, chosen.antialiased, threads)
-    kept, own = _checkpoint(checkpoint), _Log()
+    kept, warn = _checkpoint(checkpoint), _WarnOnce()
     if engine is not None:
         known = cameras if isinstance(cameras, Cameras) else Cameras(cameras)
-        given = {"progress": progress, "on_plan": on_plan or own.plan, "folder": kept.folder if kept else None}
+        given = {"progress": progress, "on_plan": on_plan or warn.of_plan, "folder": kept.folder if kept else None}
         result = lift_in_blocks(engine, splats, known, views, chosen, **given)
-        own.tell(result.diagnostics["warnings"] if on_plan is None else ())
+        warn.of(result.diagnostics["warnings"] if on_plan is None else ())
         return result
     work = _Lift(splats, chosen, threads, Timings(progress), choose_device(chosen.device))
     found = LiftViews.of(views, cameras, chosen)
-    plan = work.planned(found, on_plan or own.plan)
+    plan = work.planned(found, on_plan or warn.of_plan)
     with within_memory(work.device):
         geometry = work.weigh(found, plan, kept)
         things = work.find_objects(geometry)
@@ -113,7 +113,7 @@ def lift(
         things = things if chosen.objects else None
         notes |= _objects(things) if things else {}
         diagnostics = work.diagnose(found, geometry, X, sums, plan, notes)
-    own.tell(diagnostics["warnings"] if on_plan is None else ())
+    warn.of(diagnostics["warnings"] if on_plan is None else ())
     table = found.features.table
     made = LiftResult(
         features=X,
@@ -188,18 +188,18 @@ def log_warnings(plan: Plan) -> None:
         log.warning(warning)
 
 
-class _Log:
+class _WarnOnce:
     """Logs what a lift warns of, once, where nobody shows its plan: a program would not look into diagnostics."""
 
     def __init__(self) -> None:
         self._said = set[str]()
 
-    def plan(self, plan: Plan) -> None:
-        """Before the first view."""
-        self.tell((*plan.warnings, *plan.told))
+    def of_plan(self, plan: Plan) -> None:
+        """What the plan warns of, before the first view."""
+        self.of((*plan.warnings, *plan.told))
 
-    def tell(self, warnings: Iterable[str]) -> None:
-        """Those that were not told yet."""
+    def of(self, warnings: Iterable[str]) -> None:
+        """Those that were not logged yet."""
         for warning in dict.fromkeys(warnings):
             if warning not in self._said:
                 log.warning(warning)

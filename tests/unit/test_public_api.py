@@ -310,7 +310,7 @@ MODES = {
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_torch_modes_of_the_caller_change_no_bit_and_are_back_where_his_code_runs(scene, mode):
+def test_torch_modes_change_no_bit_and_hold_in_the_callers_iterator(scene, mode):
     _, splats, cameras, views = scene
     vectors, values = np.eye(2, views["v0"].codebook.shape[1]), np.linspace(0, 1, splats.count)
 
@@ -339,7 +339,7 @@ def test_torch_modes_of_the_caller_change_no_bit_and_are_back_where_his_code_run
     assert all(torch.equal(one, other) for one, other in zip(usual, within, strict=True))
 
 
-def test_lifts_in_two_threads_beside_another_default_dtype_are_as_one_alone(scene):
+def test_two_threads_lift_alike_beside_another_default_dtype(scene):
     _, splats, cameras, views = scene
     usual = lc.lift(splats, cameras, views).features
     with default_dtype(torch.float64), ThreadPoolExecutor(2) as pool:
