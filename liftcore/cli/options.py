@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from liftcore.errors import InvalidInput, InvalidQuery
+from liftcore.errors import InvalidInput, InvalidQuery, Unavailable
 from liftcore.io.remote import place
 
 if TYPE_CHECKING:
@@ -179,13 +180,16 @@ def whole(text: str) -> int:
 def text_encoder(options: argparse.Namespace, scene: QueryScene, hint: str = "") -> TextEncoder:
     """The encoder that ``--table`` or ``--encoder`` names, else the lift's own words, else that of its text space.
 
+    Where the weights of that space cannot be had, the table of it that ships answers, as it does over HTTP.
+
     Args:
         hint: what else the command can do.
 
     Raises:
         InvalidQuery: neither is given, and the lift has no words and names no encoder.
+        Unavailable: the encoder's weights are not on this machine.
     """
-    from liftcore.query.text import NO_WORDS, open_encoder
+    from liftcore.query.text import BUILT_IN, NO_WORDS, open_encoder
 
     if options.table:
         return open_encoder(f"table:{options.table}")
@@ -199,4 +203,11 @@ def text_encoder(options: argparse.Namespace, scene: QueryScene, hint: str = "")
             "encoder", expected="--table FILE or --encoder NAME", got=f"neither, and the lift's text space {space}",
             hint=hint,
         )  # fmt: skip
-    return open_encoder(spec)
+    ships = next((name for name, space in BUILT_IN.items() if space == spec), None)
+    try:
+        return open_encoder(spec)
+    except Unavailable as error:
+        if options.encoder or ships in (None, spec):
+            raise
+        print(f"splatlift: {error}, and answers now", file=sys.stderr)
+        return open_encoder(ships)

@@ -14,6 +14,7 @@ from PIL import Image
 from liftcore import cli
 from liftcore.io.lift_file import load_lift, save_lift
 from liftcore.io.splats import read_splats
+from liftcore.query.text import BUILT_IN, open_encoder
 
 from .command_line import assert_one_line, lift_arguments, run, write_toy_scene
 
@@ -76,6 +77,24 @@ def test_words_to_a_lift_without_a_text_encoder_are_refused_with_its_text_space(
     assert (status, out) == (2, "")
     assert told in err and "--like" in err
     assert_one_line(err)
+
+
+def test_the_table_that_ships_answers_where_weights_of_its_space_cannot_be_had(
+    scene: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from huggingface_hub import constants
+
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(scene))
+    lift = load_lift(scene / "lift.safetensors")
+    metadata = lift.metadata.model_copy(update={"text_space": BUILT_IN["lvis"]})
+    words = torch.from_numpy(open_encoder("lvis").encode(["mug", "cat"]))
+    save_lift(replace(lift, features=words.half(), metadata=metadata), scene / "clip.safetensors")
+    status, out, err = run(capsys, "query", scene / "clip.safetensors", "cat", "--json")
+    document, name = json.loads(out), open_encoder("lvis").name
+    assert (status, document["encoder"], document["statistics"]["max"]) == (0, name, pytest.approx(1.0, abs=1e-3))
+    assert "HF_HUB_OFFLINE is set" in err and "lvis has 1,203 words of it, and answers now" in err
+    assert run(capsys, "query", scene / "clip.safetensors", "cat", "--encoder", BUILT_IN["lvis"])[0] == 2
 
 
 def test_overlays_show_what_was_found_and_say_its_share(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
