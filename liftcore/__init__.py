@@ -52,6 +52,8 @@ if TYPE_CHECKING:
     from liftcore.query.objects import Objects as Objects
     from liftcore.query.segment import NamedSplats as NamedSplats
     from liftcore.query.segment import Segmentation as Segmentation
+    from liftcore.query.text import TextEncoder as TextEncoder
+    from liftcore.query.text import open_encoder as open_encoder
     from liftcore.raster.base import CompositingParams as CompositingParams
     from liftcore.result import LiftResult as LiftResult
     from liftcore.scene.cameras import Camera as Camera
@@ -81,6 +83,8 @@ _PUBLIC = {  # name -> the module that defines it
     "RayEngine": "liftcore.engine.ray",
     "LiftResult": "liftcore.result",
     "load_lift": "liftcore.io.lift_file",
+    "open_encoder": "liftcore.query.text",
+    "TextEncoder": "liftcore.query.text",
     "VectorAnswer": "liftcore.query.ask",
     "Segmentation": "liftcore.query.segment",
     "NamedSplats": "liftcore.query.segment",
@@ -133,10 +137,12 @@ __all__ = [
     "Segmentation",
     "SplatliftError",
     "Splats",
+    "TextEncoder",
     "Unavailable",
     "VectorAnswer",
     "lift",
     "load_lift",
+    "open_encoder",
     "plan",
     "plan_photos",
     "read_cameras",

@@ -86,8 +86,8 @@ def test_sams_masks_make_a_lift_that_knows_the_words(scene_folder: Path, monkeyp
     run_example(GUIDE, "from segment_anything import")
     table = TableEncoder.open(scene_folder / "words.safetensors")
     (scene_folder / "words.safetensors").unlink()
-    monkeypatch.setattr("liftcore.query.text.open_encoder", lambda spec: table)  # whose weights are not here
-    run_example(GUIDE, "import open_encoder")
+    monkeypatch.setattr("liftcore.open_encoder", lambda spec: table)  # whose weights are not here
+    run_example(GUIDE, "lc.open_encoder")
     monkeypatch.undo()
     monkeypatch.chdir(scene_folder)
     monkeypatch.setattr(CropEncoder, "open", GreyEncoder)  # nor are these

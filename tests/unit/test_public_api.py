@@ -21,8 +21,8 @@ PUBLIC = """
     Camera Cameras Catalogue CompositingParams FeatureGrid FoundObject InvalidCameras InvalidFeatures InvalidInput
     InvalidLift InvalidQuery InvalidSettings InvalidSplats LiftResult LiftSettings LocalEngine NamedSplats NotFound
     Objects PhotoPlan Plan RayEngine RegionWeights Regions SceneObject Segmentation Splats SplatliftError
-    Unavailable VectorAnswer lift load_lift plan plan_photos read_cameras read_features read_splats region_weights
-    render
+    TextEncoder Unavailable VectorAnswer lift load_lift open_encoder plan plan_photos read_cameras read_features
+    read_splats region_weights render
 """
 
 

@@ -43,7 +43,8 @@ class TextEncoder(Protocol):
         """n texts -> [n, F] f32 with unit rows.
 
         Raises:
-            InvalidQuery: a text that the encoder cannot read (a word that a table lacks, an empty text).
+            InvalidQuery: a text that the encoder cannot read (a word that a table lacks, an empty text), or no list
+                of texts.
         """
         ...
 
@@ -55,8 +56,8 @@ def without_templates(spec: str) -> tuple[str, int]:
     return (bare, int(count)) if known else (spec, 1)
 
 
-def open_encoder(spec: str) -> TextEncoder:
-    """Open a text encoder by its specification.
+def open_encoder(spec: str | Path) -> TextEncoder:
+    """Open a text encoder by its specification: ``open_encoder("lvis").encode(["mug"])`` is what lifts are asked by.
 
     Args:
         spec: ``table:FILE`` or a path ending in ``.safetensors`` (precomputed embeddings); ``lvis`` (a table of the
@@ -68,7 +69,7 @@ def open_encoder(spec: str) -> TextEncoder:
         InvalidQuery: the specification is none of these, or a table is malformed.
         Unavailable: the encoder's weights are not on this machine.
     """
-    spec, templates = without_templates(spec)
+    spec, templates = without_templates(str(spec))
     kind, _, rest = spec.partition(":")
     # A bare path may hold a colon itself, so the suffix is asked first.
     if kind != "table" and spec.endswith(".safetensors") and not spec.startswith("open_clip:"):
@@ -88,12 +89,14 @@ def open_encoder(spec: str) -> TextEncoder:
     raise InvalidQuery("encoder", expected=f"one of {', '.join(ENCODER_SPECS)}", got=repr(spec))
 
 
-def refuse_empty(texts: Sequence[str]) -> None:
-    """Refuse texts that say nothing.
+def check_texts(texts: Sequence[str]) -> None:
+    """Refuse what is no list of texts, and texts that say nothing.
 
     Raises:
-        InvalidQuery: one is empty.
+        InvalidQuery: a text alone, something else than texts, or an empty one.
     """
+    if isinstance(texts, str) or not all(isinstance(text, str) for text in texts):
+        raise InvalidQuery("texts", expected="a list of texts", got=repr(texts)[:80], hint='such as ["a mug"]')
     if not all(text.strip() for text in texts):
         raise InvalidQuery("text", expected="a word or a sentence", got="an empty text")
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from liftcore.errors import Unavailable
-from liftcore.query.text import refuse_empty
+from liftcore.query.text import check_texts
 from liftcore.query.text.torchvision_ops import import_torchvision
 
 _OFFLINE = ("HF_HUB_OFFLINE", "TRANSFORMERS_OFFLINE")
@@ -34,7 +34,7 @@ class MiniLmEncoder:
         Raises:
             InvalidQuery: an empty text.
         """
-        refuse_empty(texts)
+        check_texts(texts)
         if not texts:
             return np.empty((0, self.channels), np.float32)
         return np.asarray(

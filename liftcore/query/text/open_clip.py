@@ -16,7 +16,7 @@ import torch
 
 from liftcore.errors import InvalidQuery, Unavailable
 from liftcore.nearest import nearest
-from liftcore.query.text import BUILT_IN, refuse_empty
+from liftcore.query.text import BUILT_IN, check_texts
 from liftcore.query.text.torchvision_ops import import_torchvision
 from liftcore.query.text.weights import fetched
 
@@ -192,7 +192,7 @@ class OpenClipEncoder:
         Raises:
             InvalidQuery: an empty text.
         """
-        refuse_empty(texts)
+        check_texts(texts)
         if not texts:
             return np.empty((0, self.channels), np.float32)
         if not self._templates:

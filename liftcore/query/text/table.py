@@ -11,6 +11,7 @@ import numpy as np
 from liftcore import nearest
 from liftcore.errors import InvalidQuery, InvalidTable
 from liftcore.io.safetensors_file import check_header, map_tensors
+from liftcore.query.text import check_texts
 
 _HALF = re.compile("[\ud800-\udfff]")  # half a surrogate pair, which UTF-8 cannot carry
 _ARTICLES = frozenset({"a", "an", "the"})
@@ -109,6 +110,7 @@ class TableEncoder:
         Raises:
             InvalidQuery: a word that the table lacks; the error names the nearest ones.
         """
+        check_texts(texts)
         return self._unit[[self._row(text) for text in texts]]
 
     def _row(self, text: str) -> int:

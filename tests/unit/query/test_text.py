@@ -4,6 +4,7 @@ import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -31,10 +32,16 @@ def test_spelling_variants_find_the_same_word_and_others_name_the_nearest(table:
     encoder = open_encoder(f"table:{table}")
     rows = encoder.encode(["alarm clock", "Alarm_Clock", "an alarm  clock", "THE ALARM CLOCK"])
     assert rows.tolist() == [[1.0, 0, 0, 0, 0, 0]] * 4 and encoder.channels == 6
-    assert open_encoder(str(table)).encode(["the end", "a", "teapot"]).argmax(axis=1).tolist() == [2, 3, 1]
+    assert open_encoder(table).encode(["the end", "a", "teapot"]).argmax(axis=1).tolist() == [2, 3, 1]
     for text, nearest in (("teapott", "teapot"), ("a car", r"car \(automobile\), ")):
         with pytest.raises(InvalidQuery, match=f"nearest: {nearest}"):
             encoder.encode([text])
+
+
+@pytest.mark.parametrize("texts", ["mug", ["mug", 7]])
+def test_what_is_no_list_of_texts_is_refused(texts: Any) -> None:
+    with pytest.raises(InvalidQuery, match="texts: expected a list of texts"):
+        open_encoder("lvis").encode(texts)
 
 
 def test_shipped_words_need_no_file_and_are_those_of_clip() -> None:
