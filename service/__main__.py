@@ -16,6 +16,7 @@ import sys
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
+from textwrap import fill
 from types import FrameType
 from typing import Any
 
@@ -31,7 +32,7 @@ from service.connection import Pace, watched
 from service.encoders import require_encoder_files
 from service.errors import Misconfigured
 from service.observe import logging_to_stderr
-from service.settings import ServiceSettings
+from service.settings import ServiceSettings, variables
 from service.state import Stopping
 from service.store.database import DATABASE, keys_were_made, require_database
 from service.store.keys import any_key
@@ -39,6 +40,7 @@ from service.store.store import Store
 
 FILES_A_CONNECTION = 2  # itself, and what it is sent
 SWITCH_SECONDS = 0.0005  # that a thread may compute on while the event loop waits; Python's own is ten times that
+MARGIN = " " * 6  # of what --help says of a variable
 FILES_BESIDE = 128  # of the database, checks, jobs and the query worker
 
 log = logging.getLogger(__name__)
@@ -107,8 +109,9 @@ def parse(arguments: Sequence[str]) -> ServiceSettings:
 def options(arguments: Sequence[str]) -> dict[str, Any]:
     """What the command line gives, by name; what it leaves out is not there."""
     parser = argparse.ArgumentParser(
-        prog="python -m service", description=__doc__, argument_default=argparse.SUPPRESS
-    )
+        prog="python -m service", description=__doc__, argument_default=argparse.SUPPRESS, epilog=told_variables(),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
     parser.add_argument("--host", help="the address to bind; beyond loopback only with keys")
     parser.add_argument("--port", type=int, help="the port to bind; 0 picks a free one")
     parser.add_argument("--data", help="the directory for the database and all files")
@@ -123,6 +126,15 @@ def options(arguments: Sequence[str]) -> dict[str, Any]:
     )  # fmt: skip
     parser.add_argument("--json", action="store_true", help="say in one JSON object where it listens")
     return vars(parser.parse_args(arguments))
+
+
+def told_variables() -> str:
+    """All settings, as ``--help`` tells them."""
+    rows = (
+        f"  {name}, default {default}\n{fill(said, 78, initial_indent=MARGIN, subsequent_indent=MARGIN)}"
+        for name, default, said in variables()
+    )
+    return "\n".join(("environment variables; options win, and an empty variable is not set:", *rows))
 
 
 def _no_json(error: SettingsError) -> Misconfigured:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -26,9 +27,13 @@ class ServiceSettings(BaseSettings):
     )
 
     keys: Literal["required", "none"] | None = Field(
-        None, description="whether requests need a key: required, none; not set = required once one was made"
+        None,
+        description="required: requests need a key even before one was made, and the service may bind to any "
+        "address; none: all on this machine are admins, on loopback only; not set = required once a key was made",
     )
-    key_bytes: int = Field(100 * GiB, ge=0, description="bytes of assets and results that a key may store")
+    key_bytes: int = Field(
+        100 * GiB, ge=0, description="bytes of assets and results that a key may store; more get 403"
+    )
     key_queued: int = Field(20, ge=0, description="jobs of a key that may wait in line; more are answered 429")
     key_uploads: int = Field(4, ge=0, description="uploads of a key at the same time; more are answered 429")
     key_queries: int = Field(8, ge=1, description="queries of a key that may wait or run; more are answered 429")
@@ -42,7 +47,9 @@ class ServiceSettings(BaseSettings):
     stop_seconds: float = Field(10, gt=0, le=600, description="time that open requests have to end in a stop")
 
     max_splats_bytes: int = Field(4 * GiB, gt=0, description="the largest splat file, compressed or not")
-    max_cameras_bytes: int = Field(256 * MiB, gt=0, description="the largest camera file, compressed or not")
+    max_cameras_bytes: int = Field(
+        256 * MiB, gt=0, description="the largest camera file, compressed or not; at most 100,000 views"
+    )
     max_features_bytes: int = Field(16 * GiB, gt=0, description="the largest feature pack, compressed or not")
     max_masks_bytes: int = Field(256 * MiB, gt=0, description="the largest file of masks, compressed or not")
     max_table_bytes: int = Field(64 * MiB, gt=0, description="the largest text table, compressed or not")
@@ -84,14 +91,15 @@ class ServiceSettings(BaseSettings):
     )
     engine: Literal["local", "ray"] | None = Field(
         None,
-        description="who lifts in blocks, of bounded memory: local or ray (a cluster); not set = in memory",
+        description="who lifts in blocks, of bounded memory: local or ray (a cluster); not set = in memory, as are "
+        "jobs that need all regions at once",
     )
     ray_address: str = Field("auto", description="of that cluster, host:port; auto takes RAY_ADDRESS")
     parallel_lifts: int = Field(1, ge=1, le=64, description="jobs that run at the same time")
     max_queued: int = Field(100, ge=1, description="jobs that may wait in line; more are answered 503")
     lift_seconds: float = Field(86_400, gt=0, description="wall time that one attempt at a job may take")
     lift_memory_bytes: int | None = Field(
-        None, ge=1, description="private memory of a job's processes (Linux); not set = no limit"
+        None, ge=1, description="private memory of a job's processes together (Linux); not set = no limit"
     )
     tradeoff_seconds: float = Field(
         3600, ge=10, description="the largest budget of a trade-off; larger ones are answered 422"
@@ -101,13 +109,15 @@ class ServiceSettings(BaseSettings):
         ge=3,
         description="silence after which a job's process is given up, unless it computes, and its job waits anew",
     )
-    checkpoint_seconds: float = Field(2, ge=0, description="work that a killed lift may have to do again")
+    checkpoint_seconds: float = Field(
+        2, ge=0, description="work that a killed lift may have to do again, beside at most five views"
+    )
     max_streams: int = Field(32, ge=1, description="clients that may follow events at the same time; more get 503")
 
     encoder: str = Field(
         "lvis",
-        description="text encoder of its own space and, if you set it, of lifts whose text space has none: "
-        "lvis, minilm, table:FILE, open_clip:MODEL...",
+        description="text encoder for lifts of its own text space and, if you set it, for those whose text space has "
+        "no entry in the next one (never for none): lvis, minilm, table:FILE, open_clip:MODEL...",
     )
     text_spaces: dict[str, str] = Field(
         default_factory=dict, description="text space -> text encoder, in the same notation (JSON object)"
@@ -127,3 +137,14 @@ class ServiceSettings(BaseSettings):
     def max_upload_bytes(self, kind: str) -> int:
         """The size limit of an asset kind, or of a ``lift``."""
         return getattr(self, f"max_{kind}_bytes")
+
+
+def variables() -> Iterator[tuple[str, str, str]]:
+    """Name of the environment variable, default and meaning of each setting, in order."""
+    for name, field in ServiceSettings.model_fields.items():
+        default = field.get_default(call_default_factory=True)
+        unit, size = ("GiB", GiB) if name.endswith("bytes") and default and default % GiB == 0 else ("MiB", MiB)
+        shown = "not set" if default in (None, ()) else str(default)
+        if name.endswith("bytes") and default and default % size == 0:
+            shown = f"{default} ({default // size} {unit})"
+        yield f"SPLATLIFT_{name.upper()}", shown, field.description or ""

@@ -16,6 +16,9 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument("--port", type=int, help="the port to bind; 0 picks a free one")
     parser.add_argument("--data", type=Path, metavar="DIR", help="for the database and all files")
     parser.add_argument("--encoder", metavar="NAME", help="the default text encoder")
+    parser.epilog = (
+        "All settings can be environment variables: python -m service --help lists them, with their defaults."
+    )
     anew = "where the database is gone or older than the files, begin an empty one; the files go to quarantine"
     parser.add_argument("--new", action="store_true", help=anew)
 

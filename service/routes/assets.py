@@ -50,7 +50,9 @@ RAW_BODY = {
     openapi_extra=RAW_BODY,
 )
 async def upload(kind: AssetKind, request: Request, deps: Deps, sha256: Sha256 = None) -> Response:
-    """Upload splats, cameras (JSON or a zip of a COLMAP model), a feature pack, masks, a text table or photos."""
+    """Upload splats (any format but checkpoints), cameras (JSON, or a zip of a COLMAP model or of several files), a
+    feature pack, masks, a text table, or photos (a zip of JPEG and PNG files that are named like the views).
+    """
     asset, new = await taken(AssetIntake, kind, request, deps, sha256)
     return _reply(asset, 201 if new else 200)
 
@@ -155,7 +157,7 @@ def _retagged(asset: str, change: models.PackChange, deps: AppState) -> tuple[As
 
 @router.delete("/{asset}", status_code=204)
 def delete_asset(asset: AssetId, deps: Deps) -> None:
-    """Forget an asset that no job and no lift refers to."""
+    """Forget an asset. It is refused (409) while a job or a lift refers to it."""
     deps.store.assets.delete(deps.owner, asset)
 
 

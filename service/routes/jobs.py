@@ -198,7 +198,9 @@ async def follow_job(job: str, deps: Deps, last_event: LastEvent = 0) -> Respons
     tags=["jobs"],
 )
 def cancel_job(job: str, deps: Deps) -> Response:
-    """End a job. It is ``canceling`` until its processes are gone, then ``canceled``; asking twice does no harm."""
+    """End a job. It is ``canceling`` until its processes are gone (within 5 s), then ``canceled``; asking twice does
+    no harm. A job that has succeeded or failed is refused (409).
+    """
     deps.store.jobs.cancel(deps.owner, job)
     found = deps.store.jobs.get(deps.owner, job)
     return _reply(found, 200 if found.state is models.JobState.CANCELED else 202)
@@ -211,7 +213,7 @@ def delete_job(
     with_lift: Annotated[bool, Query(description="its lift goes too; without this a job with a lift stays")] = False,
     with_tradeoff: Annotated[bool, Query(description="its trade-off goes too, likewise")] = False,
 ) -> None:
-    """Forget a job that has ended."""
+    """Forget a job. It is refused (409) before it has ended."""
     said = {models.JobKind.LIFT: with_lift, models.JobKind.TRADEOFF: with_tradeoff}
     deps.store.jobs.delete(deps.owner, job, given_up=[kind for kind, gone in said.items() if gone])
 

@@ -158,8 +158,10 @@ def render(
 ) -> Response:
     """The splats from a view, in their colours or in those of their features or clusters, or their depth: a PNG.
 
-    Depths are grey, near bright. The PNG's texts `depth-near` and `depth-far` tell the depths of its levels 255 and
-    1, in scene units, with even steps between; what lies beyond has these levels too. 0 is where no splat is.
+    Depths are those of the splats' centres along the camera's axis, weighted as the colours are. They are grey, near
+    bright. The PNG's texts `depth-near` and `depth-far` tell the depths of its levels 255 and 1 (1st and 99th
+    percentile), in scene units, with even steps between; what lies beyond has these levels too. 0 is where no splat
+    is.
     """
     found = find_lift(lift, deps)
     wanted = scene_request("render", found, deps) | {"view": view, "what": what}

@@ -47,7 +47,11 @@ def list_lifts(deps: Deps, limit: Limit = None, cursor: Cursor = None) -> Respon
     tags=["lifts"],
 )
 async def upload_lift(request: Request, deps: Deps, sha256: Sha256 = None, cameras: LiftCameras = None) -> Response:
-    """Bring a lift file of the command line. The splats and cameras that it was made of must be here."""
+    """Bring a lift file of the command line, which is checked whole.
+
+    Its splats and its file of cameras must be assets (404 names the missing one), its feature packs only for examples
+    by region. ``cameras`` names other cameras with the same poses, such as a zip of the folder that was lifted with.
+    """
     lift, new = await taken(partial(LiftIntake, cameras=cameras), LIFT, request, deps, sha256)
     location = {"Location": f"/lifts/{lift.id}"}
     return JSONResponse(shape_lift(lift).model_dump(mode="json"), 201 if new else 200, headers=location)

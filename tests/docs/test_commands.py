@@ -15,6 +15,7 @@ import pytest
 
 from liftcore.cli import build_parser
 from liftcore.settings import LiftSettings, Preset
+from service.__main__ import options
 from service.settings import ServiceSettings
 
 from .readme import (
@@ -142,13 +143,29 @@ def test_every_preset_is_told() -> None:
     assert all(f"`{preset}`" in heads for preset in Preset)
 
 
-def test_every_setting_of_the_service_is_told_with_its_default() -> None:
-    rows = dict(re.findall(r"^\| `SPLATLIFT_([A-Z_]+)` \| (.*?) \|", text(SERVICE), flags=re.MULTILINE))
-    assert rows.keys() == {field.upper() for field in ServiceSettings.model_fields}
+def test_the_services_help_tells_every_setting_with_its_default_and_meaning(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    with pytest.raises(SystemExit, match="0"):
+        options(["--help"])
+    lines = capsys.readouterr().out.partition("environment variables")[2]
+    told = dict(re.findall(r"^  SPLATLIFT_([A-Z_]+), default (.*)$", lines, flags=re.MULTILINE))
+    assert told.keys() == {field.upper() for field in ServiceSettings.model_fields}
     for name, field in ServiceSettings.model_fields.items():
         default = field.get_default(call_default_factory=True)
-        shown = rows[name.upper()].split(" (")[0].strip("`")
-        assert shown == ("-" if default in (None, ()) else str(default)), name
+        assert told[name.upper()].split(" (")[0] == ("not set" if default in (None, ()) else str(default)), name
+        assert field.description and " ".join(field.description.split()) in " ".join(lines.split()), name
+
+
+def test_settings_of_the_service_that_are_told_exist_and_have_that_default() -> None:
+    told = dict(re.findall(r"^\| `SPLATLIFT_([A-Z_]+)` \| (.*?) \|", text(SERVICE), flags=re.MULTILINE))
+    assert {"DATA", "HOST", "KEYS", "TEXT_SPACES"} <= told.keys()
+    for name, shown in told.items():
+        default = ServiceSettings.model_fields[name.lower()].get_default(call_default_factory=True)
+        assert shown.split(" (")[0].strip("`") == ("-" if default in (None, ()) else str(default)), name
+    named = {name.lower() for page in PAGES for name in re.findall(r"SPLATLIFT_([A-Z_]+)", text(page))}
+    assert named - {"key"} <= ServiceSettings.model_fields.keys()
 
 
 def _commands() -> dict[str, argparse.ArgumentParser]:
