@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from liftcore.cli import build_parser
+from liftcore.cli import COMMANDS, build_parser
 from liftcore.settings import LiftSettings, Preset
 from service.__main__ import options
 from service.settings import ServiceSettings
@@ -122,16 +122,16 @@ def _named_in_sentences(room: Path) -> Iterator[tuple[str, ...]]:
 
 
 def test_every_command_is_told_and_every_option_has_help() -> None:
-    parsers, rows = _commands(), _command_rows()
-    assert {head.strip("`") for head in rows} == {f"splatlift {name}" for name in parsers}
+    parsers = _commands()
+    sentences = (code.removeprefix("splatlift ") for code in inline_code(GUIDE) if code.startswith("splatlift "))
+    told = {command.split()[0] for command in (*shell_commands(GUIDE), *sentences)}
+    assert parsers.keys() <= told and COMMANDS.keys() == parsers.keys() and all(COMMANDS.values())
     for name, parser in parsers.items():
-        told = set(re.findall(r"(?<![\w-])--?[a-z][a-z-]*", rows[f"`splatlift {name}`"]))
-        assert told <= {option for action in _actions(parser) for option in action.option_strings}, name
         assert not [action.dest for action in _actions(parser) if action.option_strings and not action.help], name
 
 
 def test_every_setting_of_a_lift_is_told_with_its_default() -> None:
-    section = text(SETTINGS).partition("## All settings")[2].partition("###")[0]
+    section = text(SETTINGS).partition("## All settings")[2].partition("\n## ")[0]
     rows = dict(re.findall(r"^\| `([a-z_]+)` \| (.*?) \|", section, flags=re.MULTILINE))
     for name, default in LiftSettings.of().model_dump(mode="json").items():
         shown = rows[name].split(" (")[0].strip("`")
@@ -171,10 +171,6 @@ def test_settings_of_the_service_that_are_told_exist_and_have_that_default() -> 
 def _commands() -> dict[str, argparse.ArgumentParser]:
     actions = build_parser()._actions
     return next(dict(action.choices) for action in actions if isinstance(action, argparse._SubParsersAction))
-
-
-def _command_rows() -> dict[str, str]:
-    return dict(re.findall(r"^\| (`splatlift [a-z]+`) \| (.*) \|$", text(GUIDE), flags=re.MULTILINE))
 
 
 def _actions(parser: argparse.ArgumentParser) -> list[argparse.Action]:
