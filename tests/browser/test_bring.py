@@ -112,6 +112,32 @@ def test_lift_file_waits_for_other_cameras_after_wrong_ones(
     assert min(columns(empty, AMBER)) > 50
 
 
+def test_scenes_that_others_make_and_delete_are_followed(empty: Browser, files: dict[str, Path]) -> None:
+    with httpx.Client(base_url=empty.value("location.origin")) as other:
+        put = {kind: other.put(f"/assets/{kind}", content=file.read_bytes()) for kind, file in files.items()}
+        ids = {kind: reply.json()["id"] for kind, reply in put.items() if kind != "table"}
+        order = ids | {"features": [ids["features"]], "settings": {"preset": "row-sum"}}
+        job = other.post("/lift", json=order).json()["id"]
+        empty.press("#tab-bring")
+        empty.until(READY, LONG)  # nothing was open, so it is
+        assert empty.value("splatlift.lift.id") == job
+        assert other.delete(f"/jobs/{job}?with_lift=true").status_code == 204
+        empty.press("#tab-bring")
+        empty.until("!document.querySelector('#empty').hidden && !splatlift.lift")
+
+
+def test_table_of_words_is_dropped_and_named_by(browser: Browser, served: Served, files: dict[str, Path]) -> None:
+    browser.window(1200, 800)
+    browser.open(served.address)
+    browser.until(READY)
+    browser.drop([files["table"]])
+    browser.until("document.querySelector('.file.done')")
+    browser.press("#tab-name")
+    browser.until("document.querySelectorAll('#vocabulary option').length === 3")
+    table = browser.value("document.querySelectorAll('#vocabulary option')[1].value")
+    assert httpx.delete(f"{served.address}/assets/{table}").status_code == 204
+
+
 def test_lift_takes_a_name_and_photos(browser: Browser, served: Served, tmp_path: Path) -> None:
     browser.window(1200, 800)
     browser.open(served.address)

@@ -33,6 +33,10 @@ CLEAR = """(() => {
   return clear;
 })()"""
 MODE_VIEW = "input[name=mode][value=view] + span"
+BOXES = """['#render', '#mask'].map(name => {
+  const { left, top, width, height } = document.querySelector(name).getBoundingClientRect();
+  return [left, top, width, height];
+})"""
 
 
 @pytest.fixture
@@ -75,6 +79,8 @@ def test_slider_repaints_without_a_request(page: Browser) -> None:
     page.value("document.querySelector('#cut').value = 9")  # the most there is
     page.value("document.querySelector('#cut').dispatchEvent(new Event('input'))")
     assert len(page.asked) == asked and "You set this cut" in text_of(page, "#why")
+    assert page.value("document.querySelectorAll('#things button').length") == 0  # those of the cut before
+    assert text_of(page, ".chip small") == str(page.value("splatlift.ask.now.count"))
     assert len(columns(page, AMBER)) < lit
     page.until(FOUND)  # the things follow
     page.press("#auto")
@@ -264,6 +270,16 @@ def test_link_opens_question_layer_and_camera_again(page: Browser, served: Serve
     assert page.value("[splatlift.look.view.name, splatlift.ask.now.cut]") == ["right", 0.5]
 
 
+def test_link_to_a_scene_that_is_gone_leaves_the_others_to_choose(page: Browser, served: Served) -> None:
+    page.open(f"{served.address}/?lift={'0' * 32}")
+    page.until("!document.querySelector('#trouble').hidden")
+    assert text_of(page, "#lift option:checked") == "Choose a scene"
+    choose = "(scenes => { scenes.selectedIndex = 1; scenes.dispatchEvent(new Event('change')); })"
+    page.value(f"{choose}(document.querySelector('#lift'))")
+    page.until(READY)
+    assert page.value("document.querySelector('#lift').options.length") == 1
+
+
 def test_photo_view_shows_the_mask_and_takes_examples(page: Browser) -> None:
     page.press("#tools input[value=view] + span")
     page.until("document.querySelector('#render').naturalWidth === 32")
@@ -274,6 +290,11 @@ def test_photo_view_shows_the_mask_and_takes_examples(page: Browser) -> None:
     page.until(f"{EXAMPLES}.length === 1")
     assert page.value(EXAMPLES) == ["left:7,12"]
     page.until("document.querySelectorAll('#picture .mark').length === 1")
+    page.value("document.querySelector('#mask').width = 3200")  # as many pixels as a window does not have
+    for width, height in ((1200, 700), (1000, 500), (390, 844)):
+        page.window(width, height)
+        picture, mask = page.value(BOXES)
+        assert mask == pytest.approx(picture, abs=0.1), (width, height)
 
 
 def test_page_without_webgl_shows_the_views(served: Served, tmp_path: Path) -> None:
@@ -313,6 +334,7 @@ def test_nothing_is_wider_than_the_window(page: Browser) -> None:
 def test_lines_to_take_away_ask_the_same(page: Browser) -> None:
     page.write("#but", "book")
     ask(page, "apple")
+    page.write("#but", "lamp")  # which was not asked
     page.press("#tab-take")
     assert "text=apple" in text_of(page, "#curl") and "negatives=book" in text_of(page, "#curl")
     found: dict[str, Any] = {}

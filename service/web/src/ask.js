@@ -10,7 +10,7 @@ const SOON = 350; // ms after the slider's last move, until the things are looke
 export class Ask {
   // changed: called when colours, boxes or the link must follow; fly: with a box to look at.
   constructor({ changed, fly }) {
-    Object.assign(this, { changed, fly, questions: [], active: 0, thing: -1, heat: false, turn: 0, lift: null });
+    Object.assign(this, { changed, fly, questions: [], active: 0, thing: -1, negatives: [], heat: false, turn: 0, lift: null });
     at("query").addEventListener("submit", event => { event.preventDefault(); this.fromForm(); });
     at("by-example").addEventListener("submit", event => { event.preventDefault(); this.typed(false); });
     at("less").addEventListener("click", () => this.typed(true));
@@ -28,10 +28,6 @@ export class Ask {
     return this.questions[this.active];
   }
 
-  get negatives() {
-    return split(at("but").value);
-  }
-
   // Another lift: nothing of the old one's answers stays.
   of(lift) {
     this.lift = lift;
@@ -46,6 +42,7 @@ export class Ask {
     this.questions = [];
     this.active = 0;
     this.thing = -1;
+    this.negatives = [];
     at("words").value = at("but").value = "";
     this.show();
     if (changed) this.changed();
@@ -131,6 +128,7 @@ export class Ask {
     if (!this.lift) return;
     const mine = ++this.turn;
     const asked = only ? [only] : this.questions;
+    if (asked.length === this.questions.length) this.negatives = split(at("but").value); // else the others' answers are without
     for (const question of asked) Object.assign(question, { answer: null, things: [], problem: null, anyway: false });
     this.thing = -1;
     at("stage").classList.add("asking");
@@ -202,9 +200,8 @@ export class Ask {
     question.count = countFrom(question.scores, value);
     question.things = [];
     this.thing = -1;
+    this.show();
     this.changed();
-    this.told();
-    this.bars();
     clearTimeout(this.soon);
     this.soon = setTimeout(() => this.things(question), SOON);
   }

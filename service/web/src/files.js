@@ -26,8 +26,9 @@ async function zipKind(file) {
 async function safetensors(file) {
   try {
     const length = Number(new DataView(await file.slice(0, 8).arrayBuffer()).getBigUint64(0, true));
-    const told = JSON.parse(await file.slice(8, 8 + Math.min(length, HEADER)).text()).__metadata__?.splatlift;
-    if (!told) return { kind: "features" };
+    const { __metadata__: more, ...tensors } = JSON.parse(await file.slice(8, 8 + Math.min(length, HEADER)).text());
+    const told = more?.splatlift;
+    if (!told) return { kind: Object.keys(tensors).join() === "embeddings" ? "table" : "features" };
     const { splats, cameras } = JSON.parse(told);
     const need = (kind, { sha256, path }) => ({ kind, id: `sha256:${sha256}`, name: path.split(/[\\/]/).at(-1) });
     return { kind: "lift", needs: [need("splats", splats), need("cameras", cameras)] };

@@ -24,7 +24,7 @@ const dark = matchMedia("(prefers-color-scheme: dark)");
 let lift = null;
 let viewer = null;
 let turn = 0; // of opening lifts: what an older one loads is late and is dropped
-let busy = false;
+let busy = true; // until it is known what to open
 
 const ask = new Ask({ changed, fly: box => viewer?.toBox(box) });
 const look = new Look({ changed: () => { repaint(); link(); }, fly: view => viewer?.to(view), pick: (term, less) => pointed(term, less), fallback: !webgl() });
@@ -114,7 +114,8 @@ function tab(name) {
     button.tabIndex = chosen ? 0 : -1;
     at(`panel-${button.id.slice(4)}`).hidden = !chosen;
   }
-  if (name === "bring") bring.refresh();
+  if (name === "bring") { bring.refresh(); refreshLifts().catch(problem => problem.status !== 401 && tell(words(problem), true)); }
+  if (name === "name") names.tables().catch(problem => tell(words(problem), true));
   if (name === "take") take.show();
   repaint();
 }
@@ -136,14 +137,16 @@ async function refreshLifts() {
   const { lifts: known, next } = await json(`/lifts?limit=${PAGE}`);
   const gone = lift && !known.some(({ id }) => id === lift.id);
   at("lift-label").hidden = !known.length;
-  fill(at("lift"), [...known, ...(gone && next ? [lift] : [])].map(one => [one.id, title(one)]), lift?.id);
+  const choices = [...known, ...(gone && next ? [lift] : [])].map(one => [one.id, title(one)]);
+  fill(at("lift"), lift ? choices : [["", "Choose a scene"], ...choices], lift?.id ?? "");
   lifts.show(known, lift?.id);
   if (gone && !next) { // it was deleted
     lift = null;
     viewer?.clear();
     of(null);
-    if (known.length) open(known[0].id);
+    tell("The scene that was open was deleted.");
   }
+  if (!lift && !busy && known.length) open(known[0].id); // also the first one, when its job was followed here
   at("empty").hidden = Boolean(known.length);
   document.body.classList.toggle("no-lifts", !known.length);
   return known;
@@ -368,7 +371,7 @@ for (const button of document.querySelectorAll("[role=tab]")) {
     next.focus();
   });
 }
-at("lift").addEventListener("change", () => open(at("lift").value, true));
+at("lift").addEventListener("change", () => at("lift").value && open(at("lift").value, true));
 for (const id of ["hide", "show-boxes"]) at(id).addEventListener("change", () => { repaint(); link(); });
 at("again").addEventListener("click", () => location.reload());
 at("reset-view").addEventListener("click", () => look.view && viewer?.to(look.view));
@@ -393,6 +396,7 @@ async function begin() {
     const known = await refreshLifts();
     const wanted = started.get("lift") || known[0]?.id;
     if (wanted) return await open(wanted);
+    busy = false;
     tab("bring");
   } catch (problem) {
     if (problem.status !== 401) trouble(words(problem));

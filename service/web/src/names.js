@@ -29,16 +29,22 @@ export class Names {
     this.turn += 1;
     at("own-words").value = "";
     this.show();
-    const wordless = !lift || lift.text_space === "none";
-    const vocabularies = wordless ? [] : [["", lift.words.length ? `The lift's own ${count(lift.words.length)} words` : "All words that the service knows"]];
-    this.choose([...vocabularies, [OWN, "Words that you type"]]);
-    if (!lift) return;
-    const { assets } = await json(`/assets?limit=${PAGE}`);
-    const tables = assets.filter(({ kind }) => kind === "table");
-    if (lift === this.lift) this.choose([...vocabularies, ...tables.map(({ id }, place) => [id, `The words of table ${place + 1}`]), [OWN, "Words that you type"]]);
+    this.choose([]);
+    await this.tables();
   }
 
-  choose(vocabularies) {
+  // Also those that were brought after the lift was opened.
+  async tables() {
+    const { lift } = this;
+    if (!lift) return;
+    const { assets } = await json(`/assets?limit=${PAGE}`);
+    if (lift === this.lift) this.choose(assets.filter(({ kind }) => kind === "table"));
+  }
+
+  choose(tables) {
+    const { lift } = this;
+    const own = !lift || lift.text_space === "none" ? [] : [["", lift.words.length ? `The lift's own ${count(lift.words.length)} words` : "All words that the service knows"]];
+    const vocabularies = [...own, ...tables.map(({ id }, place) => [id, `The words of table ${place + 1}`]), [OWN, "Words that you type"]];
     fill(at("vocabulary"), vocabularies, this.chosen ?? at("vocabulary").value); // a link may name a table before they are listed
     at("own-words-label").hidden = at("vocabulary").value !== OWN;
   }
