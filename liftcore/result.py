@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from liftcore.query.ask import VectorAnswer
     from liftcore.query.catalogue import Catalogue
     from liftcore.query.segment import Segmentation
+    from liftcore.query.text import TextEncoder
     from liftcore.query.text.table import TableEncoder
     from liftcore.scene.cameras import Camera
     from liftcore.scene.splats import Splats
@@ -133,13 +134,14 @@ class LiftResult:
         absent: str = "drop",
         weigh: str = "evidence",
         references: Any = None,
+        encoder: TextEncoder | str | None = None,
     ) -> VectorAnswer:
-        """Which splats answer vectors of the lift's text space, as a text encoder gives them, or words of its own.
+        """Which splats answer words, or vectors of the lift's text space.
 
         Args:
-            positives: [n, F] or [F], torch or numpy, what is looked for; rows of any length above zero. Of a lift
-                that has words (`table`) also a word or some of them.
-            negatives: [m, F], or words, what takes away from the scores.
+            positives: a text or several, or [n, F] or [F], torch or numpy: what is looked for; rows of any length
+                above zero.
+            negatives: the same, what takes away from the scores.
             splats: that were lifted; with them the answer has objects with boxes.
             threshold: auto, valley, paper, otsu, stability or a number on the scores.
             instances: how many things there are, where the caller knows. keep: of the objects, all or the largest.
@@ -148,16 +150,19 @@ class LiftResult:
                 `confidence`.
             references: [n, F], the vectors of 200 words or more, by which presence is known; None = those of the
                 lift's text space, where it has some.
+            encoder: of texts, or the specification of one (`liftcore.open_encoder`). None: the lift's own words
+                (`table`), else the encoder of its text space, opened for this question: give one for many questions.
 
         Raises:
-            InvalidQuery: a vector of another length, of zeros or not finite, a word that the lift lacks, or an
-                unknown threshold.
+            InvalidQuery: a vector of another length, of zeros or not finite; a text that the encoder cannot read, or
+                no encoder of the lift's text space; or an unknown threshold.
+            Unavailable: the encoder's weights are not on this machine.
         """
         from liftcore.query.ask import query_vectors
 
         return query_vectors(
             self.cpu(), positives, negatives, splats=splats, threshold=threshold, instances=instances, keep=keep,
-            absent=absent, weigh=weigh, references=references,
+            absent=absent, weigh=weigh, references=references, encoder=encoder,
         )  # fmt: skip
 
     def segment(self, words: Sequence[str], vectors: Any, splats: Splats) -> Segmentation:

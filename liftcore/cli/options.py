@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from liftcore.errors import InvalidInput, InvalidQuery, Unavailable
+from liftcore.errors import InvalidInput, InvalidQuery
 from liftcore.io.remote import place
 
 if TYPE_CHECKING:
@@ -180,34 +179,18 @@ def whole(text: str) -> int:
 def text_encoder(options: argparse.Namespace, scene: QueryScene, hint: str = "") -> TextEncoder:
     """The encoder that ``--table`` or ``--encoder`` names, else the lift's own words, else that of its text space.
 
-    Where the weights of that space cannot be had, the table of it that ships answers, as it does over HTTP.
-
     Args:
         hint: what else the command can do.
 
     Raises:
-        InvalidQuery: neither is given, and the lift has no words and names no encoder.
-        Unavailable: the encoder's weights are not on this machine.
+        InvalidQuery, Unavailable: as `encoder_of_space` has it.
     """
-    from liftcore.query.text import BUILT_IN, NO_WORDS, open_encoder
+    from liftcore.query.text import encoder_of_space, open_encoder
 
     if options.table:
         return open_encoder(f"table:{options.table}")
-    if options.encoder is None and scene.table is not None:
+    if options.encoder:
+        return open_encoder(options.encoder)
+    if scene.table is not None:
         return scene.table
-    text_space = scene.metadata.text_space
-    spec = options.encoder or text_space
-    if spec in ("", NO_WORDS):
-        space = f"is {NO_WORDS!r}: its features share no space with words" if spec else "is not named"
-        raise InvalidQuery(
-            "encoder", expected="--table FILE or --encoder NAME", got=f"neither, and the lift's text space {space}",
-            hint=hint,
-        )  # fmt: skip
-    ships = next((name for name, space in BUILT_IN.items() if space == spec), None)
-    try:
-        return open_encoder(spec)
-    except Unavailable as error:
-        if options.encoder or ships in (None, spec):
-            raise
-        print(f"splatlift: {error}, and answers now", file=sys.stderr)
-        return open_encoder(ships)
+    return encoder_of_space(scene.metadata.text_space, f"--table FILE or --encoder NAME; {hint}".rstrip("; "))

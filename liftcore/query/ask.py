@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from liftcore.errors import InvalidQuery
 from liftcore.query.directions import directions
 from liftcore.query.objects import Objects, objects
 from liftcore.query.presence import (
@@ -25,7 +26,7 @@ from liftcore.query.presence import (
 from liftcore.query.scene import QueryScene, as_numpy
 from liftcore.query.scores import LEAST_LIKENESS, LOWEST_COSINE, combine, cosines, cosines_about
 from liftcore.query.terms import Query, Vector
-from liftcore.query.text import TextEncoder
+from liftcore.query.text import TextEncoder, encoder_of_space, open_encoder
 from liftcore.query.threshold import find_threshold
 
 if TYPE_CHECKING:
@@ -148,33 +149,46 @@ def query_vectors(
     absent: str = "drop",
     weigh: str = "evidence",
     references: Any = None,
+    encoder: TextEncoder | str | None = None,
 ) -> VectorAnswer:
-    """Ask a lift for vectors of its text space, as a text encoder gives them, or for words of its own.
+    """Ask a lift for words, or for vectors of its text space.
 
     Args:
         result: the lift.
-        positives: [n, F] or [F], torch or numpy, what is looked for; rows of any length above zero; or words.
-        negatives: [m, F], or words, what takes away from the scores (`scores.combine`).
+        positives: a text or several, or [n, F] or [F], torch or numpy: what is looked for; rows of any length above
+            zero.
+        negatives: the same, what takes away from the scores (`scores.combine`).
         splats: that were lifted; with them the answer has objects.
         threshold: as in `find_threshold`. instances: keep so many objects, the best. keep: all or the largest.
         absent: drop what is not there, so that nothing is selected, or keep what is most like it.
         weigh: what splats count by in the threshold's histogram and in objects: evidence, or that times confidence.
         references: [n, F], the vectors of 200 words or more, by which presence is known; None = those of the lift's
             text space, where it has some (`liftcore.query.presence`).
+        encoder: of texts, or its specification; None: the lift's own words, else that of its text space, opened for
+            this question.
 
     Raises:
-        InvalidQuery: a vector of another length, of zeros or not finite; or what `Query` refuses.
+        InvalidQuery: a vector of another length, of zeros or not finite; a text that the encoder cannot read, or none
+            of the lift's space; or what `Query` refuses.
+        Unavailable: the encoder's weights are not on this machine.
     """
     import torch
 
     scene = QueryScene(result, splats)
     groups = [_terms(values) for values in (positives, negatives)]
     query = Query(*groups, threshold=threshold, instances=instances, keep=keep, absent=absent, weigh=weigh)
-    rows = directions(scene, query, None)
+    if isinstance(encoder, str):
+        encoder = open_encoder(encoder)
+    elif query.texts and encoder is None:
+        encoder = scene.table or encoder_of_space(scene.metadata.text_space, "give encoder=, or vectors")
+    elif encoder is not None and not hasattr(encoder, "encode"):
+        expected = "a text encoder (open_encoder) or its specification"
+        raise InvalidQuery("encoder", expected=expected, got=type(encoder).__name__)
+    rows = directions(scene, query, encoder)
     if references is not None:
         others = References.of(references, scene.channels)
-    elif query.texts and scene.table is not None:
-        others = references_of(scene.table, scene.metadata.text_space)
+    elif query.texts and encoder is not None:
+        others = references_of(encoder, scene.metadata.text_space)
     else:
         others = references_beside(rows, scene.metadata.text_space)
     answer = answers(scene, [Question(query, rows, np.ones(len(rows), np.bool_), others)])[0]

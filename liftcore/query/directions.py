@@ -57,7 +57,7 @@ def _encode(scene: QueryScene, query: Query, encoder: TextEncoder | None) -> dic
     if encoder is None:
         space = scene.metadata.text_space or "not named"
         expected = f"a text encoder (the lift's text space: {space})"
-        hint = "open_encoder(SPACE).encode([TEXT]) makes vectors of texts; or ask by example"
+        hint = "name a text encoder of the lift's space, or ask by example"
         raise InvalidQuery("encoder", expected=expected, got="no encoder", hint=hint)
     if encoder.channels != scene.channels:
         space = scene.metadata.text_space or "not named"

@@ -80,7 +80,10 @@ def test_words_to_a_lift_without_a_text_encoder_are_refused_with_its_text_space(
 
 
 def test_the_table_that_ships_answers_where_weights_of_its_space_cannot_be_had(
-    scene: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    scene: Path,
+    capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     from huggingface_hub import constants
 
@@ -90,10 +93,10 @@ def test_the_table_that_ships_answers_where_weights_of_its_space_cannot_be_had(
     metadata = lift.metadata.model_copy(update={"text_space": BUILT_IN["lvis"]})
     words = torch.from_numpy(open_encoder("lvis").encode(["mug", "cat"]))
     save_lift(replace(lift, features=words.half(), metadata=metadata), scene / "clip.safetensors")
-    status, out, err = run(capsys, "query", scene / "clip.safetensors", "cat", "--json")
+    status, out, _ = run(capsys, "query", scene / "clip.safetensors", "cat", "--json")
     document, name = json.loads(out), open_encoder("lvis").name
     assert (status, document["encoder"], document["statistics"]["max"]) == (0, name, pytest.approx(1.0, abs=1e-3))
-    assert "HF_HUB_OFFLINE is set" in err and "lvis has 1,203 words of it, and answers now" in err
+    assert "HF_HUB_OFFLINE is set" in caplog.text and "lvis has 1,203 words of it, and answers now" in caplog.text
     assert run(capsys, "query", scene / "clip.safetensors", "cat", "--encoder", BUILT_IN["lvis"])[0] == 2
 
 

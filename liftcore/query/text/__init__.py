@@ -1,5 +1,6 @@
 """Text encoders behind one protocol: words in, unit vectors out. Importing this loads no torch."""
 
+import logging
 from collections import OrderedDict
 from collections.abc import Sequence
 from pathlib import Path
@@ -7,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from liftcore.errors import InvalidQuery
+from liftcore.errors import InvalidQuery, Unavailable
 
 ENCODER_SPECS = (
     "table:FILE.safetensors",
@@ -24,6 +25,7 @@ TEMPLATES = (1, 7, 80)  # sentences that open_clip's encoders put a word into: t
 NO_WORDS = "none"  # the text space of features that no text encoder shares
 OWN_WORDS = "prompts"  # of features whose packs bring their words
 REMEMBERED = 1_024  # texts; two megabytes at 512 channels
+log = logging.getLogger(__name__)
 
 
 class TextEncoder(Protocol):
@@ -87,6 +89,30 @@ def open_encoder(spec: str | Path) -> TextEncoder:
 
         return OpenClipEncoder.open(rest, templates)
     raise InvalidQuery("encoder", expected=f"one of {', '.join(ENCODER_SPECS)}", got=repr(spec))
+
+
+def encoder_of_space(text_space: str, hint: str = "") -> TextEncoder:
+    """The encoder of a lift's text space; where its weights cannot be had, the table of it that ships, as over HTTP.
+
+    Args:
+        hint: what else can be done.
+
+    Raises:
+        InvalidQuery: the space has no name, or no words.
+        Unavailable: the encoder's weights are not on this machine, and no table of it ships.
+    """
+    if text_space in ("", NO_WORDS):
+        space = f"is {NO_WORDS!r}: its features share no space with words" if text_space else "is not named"
+        got = f"none, and the lift's text space {space}"
+        raise InvalidQuery("encoder", expected="a text encoder, or a table of words", got=got, hint=hint)
+    try:
+        return open_encoder(text_space)
+    except Unavailable as error:
+        ships = next((name for name, space in BUILT_IN.items() if space == text_space != name), None)
+        if ships is None:
+            raise
+        log.warning("%s, and answers now", error)
+        return open_encoder(ships)
 
 
 def check_texts(texts: Sequence[str]) -> None:

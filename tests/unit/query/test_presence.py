@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -160,6 +161,28 @@ def test_vectors_of_words_are_present_or_absent_too(clip: QueryScene, table: Tab
     for wrong in (table.embeddings[:9], table.embeddings[:, :9], np.zeros((300, 512))):
         with pytest.raises(InvalidQuery, match="references"):
             clip.lift.query(sofa, references=wrong)
+
+
+def test_texts_are_asked_as_their_vectors_are(
+    clip: QueryScene, table: TableEncoder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lift, cat = clip.lift, clip.lift.query(table.encode(["cat"]), table.encode(["pizza"]))
+    opened: list[str] = []
+
+    def encoder_of_space(space: str, hint: str) -> TableEncoder:
+        opened.append(space)
+        return table
+
+    monkeypatch.setattr("liftcore.query.ask.encoder_of_space", encoder_of_space)
+    for encoder in (table, "lvis", None):
+        told = lift.query("cat", ["pizza"], encoder=encoder)
+        assert torch.equal(told.scores, cat.scores) and torch.equal(told.splats, cat.splats)
+        assert (told.present, told.presence) == (cat.present, cat.presence) and told.why.startswith("'cat' is there")
+    assert opened == [lift.metadata.text_space]
+    wrong: Any
+    for wrong in (7, "no such encoder"):
+        with pytest.raises(InvalidQuery, match="encoder: expected"):
+            lift.query("cat", encoder=wrong)
 
 
 def test_many_words_follow_the_same_rule(clip: QueryScene, table: TableEncoder) -> None:
