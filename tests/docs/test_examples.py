@@ -73,8 +73,10 @@ def test_python_example_of_files_finds_the_apple(page: str, scene_folder: Path) 
     names = run_example(page, 'read_splats("scene.ply")')
     result, means = lc.load_lift("scene.lift.safetensors"), names["splats"].means
     assert torch.equal(result.features, names["result"].features)
-    found = result.query(codebook()[WORDS.index("apple")]).splats
+    found = names["apple"].splats
+    assert torch.equal(found, result.query(codebook()[WORDS.index("apple")]).splats)
     assert found.any() and float(means[found, 0].max()) < 0  # the apple is the cluster on the left
+    assert len(names["apple"].objects.found) == 1
 
 
 def test_sams_masks_make_a_lift_that_knows_the_words(scene_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
