@@ -1,9 +1,11 @@
-"""What the benchmarks share: lifts from files, tables, and the machine that took the figures."""
+"""What the benchmarks share: scene folders, tables, and the machine that took the figures."""
 
 import argparse
 import json
-import tempfile
+import os
+import platform
 from collections.abc import Iterable, Mapping, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +13,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+import liftcore as lc
 from liftcore.evaluate.hardware import hardware, machine_line
-from liftcore.io.lift_file import save_lift
-from liftcore.io.scene_files import lift_files as lift_paths
-from liftcore.query.scene import QueryScene
-from liftcore.raster.base import Raster
-from liftcore.result import LiftResult
-from liftcore.settings import LiftSettings
+from liftcore.features.views import ViewFeatures
 
 PACKS = ("features", "features_hard", "features_clean", "grids")  # of tabletop
 PRESETS = ("row-sum", "tikhonov")
@@ -34,35 +32,16 @@ def scene_files(folder: Path, pack: str = "features") -> tuple[Path, Path, Path]
     return folder / "point_cloud.ply", cameras_of(folder), folder / f"{pack}.safetensors"
 
 
-def lift_files(files: Sequence[Path], **settings: Any) -> LiftResult:
-    """A lift of splats, cameras and packs, without the certificate unless the settings ask for it."""
-    return lift_paths(files[0], files[1], list(files[2:]), LiftSettings.of(**{"certificate_rays": 0, **settings}))
+def read_scene(folder: Path) -> tuple[lc.Splats, lc.Cameras]:
+    """Splats and cameras of a scene folder."""
+    splats, cameras, _ = scene_files(folder)
+    return lc.read_splats(splats), lc.read_cameras(cameras)
 
 
-def opened(made: LiftResult, raster: Raster | None = None) -> QueryScene:
-    """A lift to ask questions of, with a raster of its splats that is there already."""
-    with tempfile.TemporaryDirectory() as place:
-        save_lift(made, Path(place) / "lift.safetensors")
-        scene = QueryScene(made)
-        if raster is not None:
-            scene.raster = raster
-        _ = scene.cameras
-    return scene
-
-
-def class_scores(features: Tensor, classes: Tensor) -> Tensor:
-    """Cosine of every splat with every class vector: features [P, F], classes [K, F] unit -> [P, K] f32."""
-    parts = []
-    for block in features.split(65_536):
-        rows = block.to(torch.float32)
-        norms = torch.linalg.vector_norm(rows, dim=1, keepdim=True).clamp_min(1e-12)
-        parts.append(rows / norms @ classes.to(torch.float32).T)
-    return torch.cat(parts)
-
-
-def splat_accuracy(scores: Tensor, truth: Tensor, counted: Tensor) -> float:
-    """Share of the counted splats [P] bool whose best class equals the truth [P]."""
-    return float((scores.argmax(dim=1) == truth.long())[counted].float().mean())
+def read_pack(folder: Path, name: str, every: int = 1) -> Mapping[str, ViewFeatures]:
+    """Every n-th view of a feature pack of a scene folder; the pack itself where that is all of them."""
+    views = lc.read_features(folder / f"{name}.safetensors")
+    return views if every == 1 else {view: views[view] for view in views.views[::every]}
 
 
 def mask_iou(mask: Tensor | np.ndarray, truth: Tensor | np.ndarray) -> float:
@@ -70,6 +49,14 @@ def mask_iou(mask: Tensor | np.ndarray, truth: Tensor | np.ndarray) -> float:
     mask, truth = torch.as_tensor(mask), torch.as_tensor(truth)
     union = int((mask | truth).sum())
     return int((mask & truth).sum()) / union if union else 1.0
+
+
+def box_iou(one: np.ndarray, other: np.ndarray) -> float:
+    """Volume of the intersection over that of the union of two boxes [2, d], corners; 0 where both are flat."""
+    sides = np.minimum(one[1], other[1]) - np.maximum(one[0], other[0])
+    common = float(np.prod(np.maximum(sides, 0)))
+    union = float(np.prod(one[1] - one[0]) + np.prod(other[1] - other[0])) - common
+    return common / union if union > 0 else 0.0
 
 
 def command_line(module: str, doc: str | None, *arguments: Sequence[Any]) -> argparse.ArgumentParser:
@@ -100,6 +87,12 @@ def tell(rows: Iterable[Mapping[str, Any]], *, as_json: bool, note: str = "", co
         return
     print(table_of(rows, columns))
     print("\n".join(["", *([note] if note else []), machine_line(hardware())]))
+
+
+def machine() -> dict[str, str]:
+    """The minute and the machine, for figures that are printed as JSON."""
+    minute = datetime.now(UTC).isoformat(timespec="minutes")
+    return {"date": minute, "machine": f"{os.cpu_count()} cores, Python {platform.python_version()}"}
 
 
 def _cell(value: Any) -> str:

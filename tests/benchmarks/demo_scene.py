@@ -47,18 +47,15 @@ def make(data: Path, out: Path) -> None:
     _splats(source / "point_cloud.ply", out / "point_cloud.spz")
     shutil.copyfile(source / "cameras.json", out / "cameras.json")
     truth = json.loads((source / "truth.json").read_text())
-    _words(data / "text_tables" / "lvis_clip_vit_b_32.safetensors")
+    shutil.copyfile(data / "text_tables" / "lvis_clip_vit_b_32.safetensors", LVIS_TABLE)
+    open_encoder("lvis").encode(ASKED)
     _features(source / f"{PACK}.safetensors", truth["feature_views"][::EVERY], out)
     arrays = load_file(source / "truth.safetensors")
     views = sorted(truth["held_out_views"], key=lambda view: view != PICTURED)
     _compressed(save({f"{view}/mask": arrays[f"{view}/mask"] for view in views}), out / "truth.safetensors.zst")
-    keys = ("class", "source", "splats", "license")
-    told = {
-        "objects": [{key: thing[key] for key in keys} for thing in truth["objects"]],
-        "held_out_views": views,
-        "ask": ASKED,
-        "phrases": {phrase: [] for phrase in ASKED if phrase not in {thing["class"] for thing in truth["objects"]}},
-    }
+    things = [{key: thing[key] for key in ("class", "source", "splats", "license")} for thing in truth["objects"]]
+    absent = {phrase: [] for phrase in ASKED if phrase not in {thing["class"] for thing in things}}
+    told = {"objects": things, "held_out_views": views, "ask": ASKED, "phrases": absent}
     (out / "truth.json").write_text(json.dumps(told, indent=1) + "\n")
 
 
@@ -76,20 +73,11 @@ def _splats(ply: Path, spz: Path) -> None:
 
 def _features(pack: Path, views: list[str], out: Path) -> None:
     features = lc.read_features(pack)
-    told = {
-        "encoder": "words of CLIP ViT-B/32 with noise",
-        "text_space": BUILT_IN["lvis"],
-        "normalised": "true",
-    }
+    told = {"encoder": "words of CLIP ViT-B/32 with noise", "text_space": BUILT_IN["lvis"], "normalised": "true"}
     with tempfile.TemporaryDirectory() as folder:
         plain = Path(folder) / "features.safetensors"
         write_pack(plain, {view: features[view] for view in views}, told)
         _compressed(plain.read_bytes(), out / f"{plain.name}.zst")
-
-
-def _words(table: Path) -> None:
-    shutil.copyfile(table, LVIS_TABLE)
-    open_encoder("lvis").encode(ASKED)
 
 
 def _compressed(content: bytes, path: Path) -> None:

@@ -15,23 +15,25 @@ prints, of fifty million splats, ten thousand views and 512 channels on more wor
 from __future__ import annotations
 
 import argparse
-import multiprocessing
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from importlib import import_module
+from multiprocessing import get_context
 from pathlib import Path
 from threading import Event, Thread
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 
 import liftcore as lc
 from liftcore.engine.blocks import SUMMED, WEIGHED
+from liftcore.features.views import ViewFeatures
 from liftcore.io.shards import ROWS
-from liftcore.scene.cameras import Camera
+from tests.benchmarks.base import read_pack, read_scene
 
 GIB = 1 << 30
 SIZE, FOCAL = (960, 720), 900.0
@@ -80,7 +82,7 @@ def flight(views: int) -> lc.Cameras:
         x, y = (CITY * (place + 0.5) / side for place in (column, row))
         pose = np.array([[1, 0, 0, -x], [0, -1, 0, y], [0, 0, -1, HEIGHT], [0, 0, 0, 1]], float)
         name = f"v{number:05}"
-        made[name] = Camera.pinhole(name, *SIZE, FOCAL, FOCAL, SIZE[0] / 2, SIZE[1] / 2, pose)
+        made[name] = lc.Camera.pinhole(name, *SIZE, FOCAL, FOCAL, SIZE[0] / 2, SIZE[1] / 2, pose)
     return lc.Cameras(made)
 
 
@@ -90,65 +92,81 @@ def maps(views: lc.Cameras, channels: int) -> Iterator[tuple[str, lc.FeatureGrid
         yield name, lc.FeatureGrid(np.random.default_rng(number).normal(0, 1, (45, 60, channels)).astype(np.float16))
 
 
-def large(splats: int, channels: int, views: int, told: Any) -> None:
-    """Lift the city in blocks, in a process of its own, and send what it took."""
+class Cost(NamedTuple):
+    """What a lift of the city took."""
+
+    seconds: float
+    timings: dict[str, float]  # seconds by stage
+    held: int  # bytes at the most
+    scene: int  # of them those of the scene
+    entries: int  # of W
+    blocks: int  # bytes of W in files
+    shown: float  # splats in a view
+    seen: float  # share of the splats
+
+
+def large(splats: int, channels: int, views: int) -> Cost:
+    """Lift the city in blocks."""
     cameras = flight(views)
     with tempfile.TemporaryDirectory() as folder, most_held() as held:
         scene = city(splats)
         begun, before = time.perf_counter(), held[0]
-        work, out = Path(folder, "blocks"), Path(folder, "lift")
-        result = lc.lift(
-            scene, cameras, maps(cameras, channels), preset="row-sum", engine=lc.LocalEngine(), checkpoint=work
-        )
+        work = Path(folder, "blocks")
+        given = {"preset": "row-sum", "engine": lc.LocalEngine(), "checkpoint": work}
+        result = lc.lift(scene, cameras, maps(cameras, channels), **given)
         seconds = time.perf_counter() - begun
-        result.save(out)
-        entries = result.diagnostics["weights_entries"]
+        result.save(Path(folder, "lift"))
+        entries, shown = result.diagnostics["weights_entries"], result.diagnostics["plan"]["splats_a_view"]
         blocks = sum(path.stat().st_size for path in work.glob("view-*"))
-        shown = result.diagnostics["plan"]["splats_a_view"]
-    told.put(
-        (seconds, result.metadata.timings, held[0], before, entries, blocks, shown, float(result.seen.float().mean()))
-    )
+    seen = float(result.seen.float().mean())
+    return Cost(seconds, result.metadata.timings, held[0], before, entries, blocks, shown, seen)
 
 
 def tell_large(splats: int, channels: int, views: int) -> None:
-    """Print what the city took, and what follows from it."""
-    context = multiprocessing.get_context("spawn")
-    told = context.Queue()
-    process = context.Process(target=large, args=(splats, channels, views, told))
-    process.start()
-    seconds, timings, held, before, entries, blocks, shown, seen = told.get()
-    process.join()
-    view, entry = timings["geometry"] / views, timings["solve"] / (entries * channels)
+    """Print what the city took, in a process of its own, and what follows from it."""
+    with ProcessPoolExecutor(1, get_context("spawn")) as own:
+        cost = own.submit(large, splats, channels, views).result()
+    view, entry = cost.timings["geometry"] / views, cost.timings["solve"] / (cost.entries * channels)
     size = "x".join(map(str, SIZE))
-    print(f"{splats} splats, {views} views of {size}, {channels} channels: {seconds:.0f} s, {seen:.1%} seen")
-    print("  " + ", ".join(f"{name} {took:.1f}" for name, took in timings.items()))
     print(
-        f"  at most {held / GIB:.2f} GiB held, {before / GIB:.2f} of it the scene; W {blocks / GIB:.2f} GiB in files"
+        f"{splats} splats, {views} views of {size}, {channels} channels: {cost.seconds:.0f} s, {cost.seen:.1%} seen"
     )
-    print(f"  {view:.2f} s and {blocks / views / 2**20:.0f} MiB a view, {shown:.0f} splats in it")
+    print("  " + ", ".join(f"{name} {took:.1f}" for name, took in cost.timings.items()))
+    print(f"  at most {cost.held / GIB:.2f} GiB held, {cost.scene / GIB:.2f} of it the scene; "
+          f"W {cost.blocks / GIB:.2f} GiB in files")  # fmt: skip
+    print(f"  {view:.2f} s and {cost.blocks / views / 2**20:.0f} MiB a view, {cost.shown:.0f} splats in it")
     print(f"  {entry * 1e9:.2f} ns an entry and channel")
     goal_views, goal_channels, goal_splats = 10_000, 512, 50_000_000
-    walk, solve = view * goal_views, entry * entries / views * goal_views * goal_channels
-    traffic = blocks / views * goal_views
-    pieces = -(-goal_views // WEIGHED), -(-goal_splats // ROWS)
-    print(
-        f"model: {goal_splats} splats, {goal_views} such views, {goal_channels} channels (this machine as one worker)"
-    )
+    walk, solve = view * goal_views, entry * cost.entries / views * goal_views * goal_channels
+    traffic = 2 * cost.blocks / views * goal_views + 2 * goal_splats * goal_channels
+    parts, blocks = -(-goal_views // WEIGHED), -(-goal_splats // ROWS)
+    print(f"model: {goal_splats} splats, {goal_views} such views, {goal_channels} channels "
+          "(this machine as one worker)")  # fmt: skip
     for workers in (1, 4, 16, 64, 256):
-        rounds = -(-pieces[0] // workers) * WEIGHED * view + -(-pieces[1] // workers) * solve / pieces[1]
-        sent = (2 * traffic + 2 * goal_splats * goal_channels) / workers
-        print(f"  {workers:>3} workers: {rounds / 3600:.2f} h, {sent / GIB:.1f} GiB read and written by each")
-    names = goal_views * pieces[1]
-    print(
-        f"  first to break: {names} openings of files ({goal_views} views x {pieces[1]} blocks, {SUMMED} at a time)"
-    )
+        rounds = -(-parts // workers) * WEIGHED * view + -(-blocks // workers) * solve / blocks
+        sent = traffic / workers / GIB
+        print(f"  {workers:>3} workers: {rounds / 3600:.2f} h, {sent:.1f} GiB read and written by each")
+    print(f"  first to break: {goal_views * blocks} openings of files ({goal_views} views x {blocks} blocks, "
+          f"{SUMMED} at a time)")  # fmt: skip
     print(f"  sums without waiting: {walk / 3600:.2f} h geometry, {solve / 3600:.2f} h solution")
 
 
-def overhead(scene: Path, turns: int) -> None:
+def read(folder: Path) -> tuple[lc.Splats, lc.Cameras, Mapping[str, ViewFeatures]]:
+    """A scene folder with the pack ``regions`` or else ``features``."""
+    pack = next(name for name in ("regions", "features") if (folder / f"{name}.safetensors").exists())
+    return *read_scene(folder), read_pack(folder, pack)
+
+
+def timed(scene: tuple[Any, ...], **given: Any) -> tuple[float, lc.LiftResult]:
+    """Seconds of a lift, and what it gave."""
+    begun = time.perf_counter()
+    result = lc.lift(*scene, preset="row-sum", **given)
+    return time.perf_counter() - begun, result
+
+
+def overhead(folder: Path, turns: int) -> None:
     """Print the seconds of the same lift in memory and in blocks, by turns."""
-    pack = next(path for name in ("regions", "features") if (path := scene / f"{name}.safetensors").exists())
-    splats, cameras = lc.read_splats(scene / "point_cloud.ply"), lc.read_cameras(scene)
+    scene = read(folder)
     engines: dict[str, Any] = {"in memory": None, "LocalEngine": lc.LocalEngine()}
     try:
         engines |= {
@@ -161,33 +179,25 @@ def overhead(scene: Path, turns: int) -> None:
     first = None
     for _ in range(turns + 1):  # the first warms up
         for name, engine in engines.items():
-            begun = time.perf_counter()
-            found = lc.lift(splats, cameras, lc.read_features(pack), preset="row-sum", engine=engine)
-            took[name].append(time.perf_counter() - begun)
+            seconds, found = timed(scene, engine=engine)
+            took[name].append(seconds)
             first = first or found
             assert torch.equal(found.features, first.features)
-    base = np.median(took["in memory"][1:])
-    for name, seconds in took.items():
-        middle = np.median(seconds[1:])
-        print(f"{name}: {middle:.2f} s, {middle / base:.2f} of a lift in memory, the same bits")
+    middles = {name: np.median(seconds[1:]) for name, seconds in took.items()}
+    for name, middle in middles.items():
+        print(f"{name}: {middle:.2f} s, {middle / middles['in memory']:.2f} of a lift in memory, the same bits")
 
 
-def weak(scene: Path, turns: int) -> None:
+def weak(folder: Path, turns: int) -> None:
     """Print the seconds of half of the views by one worker of a core, and of all views by two."""
-    ray = import_module("ray")
-    pack = next(path for name in ("regions", "features") if (path := scene / f"{name}.safetensors").exists())
-    splats, cameras, views = lc.read_splats(scene / "point_cloud.ply"), lc.read_cameras(scene), lc.read_features(pack)
-    middles = []
+    ray, scene, middles = import_module("ray"), read(folder), []
     for workers in (1, 2):
         ray.init(num_cpus=workers, include_dashboard=False, log_to_driver=False, _node_ip_address="127.0.0.1")
-        given = {"preset": "row-sum", "engine": lc.RayEngine("auto", cpus=1), "view_stride": 3 - workers}
-        found, took = lc.lift(splats, cameras, views, **given), []  # the first warms up
-        for _ in range(turns):
-            begun = time.perf_counter()
-            found = lc.lift(splats, cameras, views, **given)
-            took.append(time.perf_counter() - begun)
+        given = {"engine": lc.RayEngine("auto", cpus=1), "view_stride": 3 - workers}
+        took = [timed(scene, **given) for _ in range(turns + 1)][1:]  # the first warms up
         ray.shutdown()
-        middles.append(float(np.median(took)))
+        middles.append(float(np.median([seconds for seconds, _ in took])))
+        found = took[-1][1]
         stages = ", ".join(f"{name} {seconds:.1f}" for name, seconds in found.metadata.timings.items())
         print(f"{workers} workers, {len(found.views)} views: {middles[-1]:.2f} s ({stages})")
     print(f"twice the views by twice the workers: {middles[1] / middles[0]:.2f} of the time")
@@ -196,22 +206,18 @@ def weak(scene: Path, turns: int) -> None:
 def main() -> None:
     """Run what was asked for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    commands = parser.add_subparsers(dest="command", required=True)
-    for name in ("overhead", "weak"):
-        one = commands.add_parser(name)
-        one.add_argument("scene", type=Path)
+    commands = parser.add_subparsers(required=True)
+    for run in (overhead, weak):
+        one = commands.add_parser(run.__name__)
+        one.add_argument("folder", type=Path, metavar="SCENE")
         one.add_argument("--turns", type=int, default=3)
+        one.set_defaults(run=run)
     two = commands.add_parser("large")
-    two.add_argument("--splats", type=int, default=20_000_000)
-    two.add_argument("--channels", type=int, default=64)
-    two.add_argument("--views", type=int, default=64)
-    options = parser.parse_args()
-    if options.command == "overhead":
-        overhead(options.scene, options.turns)
-    elif options.command == "weak":
-        weak(options.scene, options.turns)
-    else:
-        tell_large(options.splats, options.channels, options.views)
+    for name, usual in (("splats", 20_000_000), ("channels", 64), ("views", 64)):
+        two.add_argument(f"--{name}", type=int, default=usual)
+    two.set_defaults(run=tell_large)
+    options = vars(parser.parse_args())
+    options.pop("run")(**options)
 
 
 if __name__ == "__main__":

@@ -22,20 +22,14 @@ import torch
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
-from liftcore.errors import InvalidQuery
-from liftcore.features.views import Regions
-from liftcore.io.splats import read_splats
+import liftcore as lc
 from liftcore.query.ask import ask
-from liftcore.query.directions import MINIMUM_ROW_SUM
-from liftcore.query.objects import objects
-from liftcore.query.render import view_mask
 from liftcore.query.scene import QueryScene
 from liftcore.query.terms import Pixel, Query
 from liftcore.query.threshold import METHODS, find_threshold
-from liftcore.raster.cpu.raster import CpuRaster
-from tests.benchmarks.base import PACKS, PRESETS, command_line, lift_files, mask_iou, opened, scene_files, tell
-from tests.benchmarks.tabletop import Tabletop
-from tests.benchmarks.thresholds import best_iou
+from tests.benchmarks.base import PACKS, PRESETS, command_line, read_pack, read_scene, tell
+from tests.benchmarks.tabletop import Truth, tabletop
+from tests.benchmarks.thresholds import judged
 
 Case = tuple[Pixel, list[tuple[str, Tensor]]]  # an example, and what it shows: views, and [H, W] bool in each
 
@@ -55,27 +49,18 @@ def measure(scene: QueryScene, cases: Iterable[Case]) -> dict[str, float]:
         asked += 1
         try:
             answers = {name: ask(scene, Query((example,), threshold=name)) for name in METHODS}
-        except InvalidQuery:
+        except lc.InvalidQuery:
             refused += 1
             continue
         auto = answers["auto"]
         cut = find_threshold(auto.scores[auto.seen], "auto", scene.weights).value
         answers["anywhere"] = replace(auto, threshold=cut, selected=auto.seen & (auto.scores >= cut))
-        found = {name: (answer, objects(scene, answer)) for name, answer in answers.items()}  # once for all views
-        for view, truth in truths:
-            looks = {
-                name: view_mask(scene, answer, view, group=lambda *_, known=known: known)
-                for name, (answer, known) in found.items()
-            }
-            for name, seen in looks.items():
-                rows[name].append(mask_iou(seen.mask, truth))
-            attention, met = looks["auto"].attention, looks["auto"].row_sums >= MINIMUM_ROW_SUM
-            rows["rendered"].append(mask_iou(met & (attention >= find_threshold(attention[met]).value), truth))
-            rows["best"].append(best_iou(attention, met, truth))
+        for name, values in judged(scene, answers, truths).items():
+            rows[name] += values
     return {"asked": asked, "refused": refused} | {name: float(np.mean(values)) for name, values in rows.items()}
 
 
-def objects_of(truth: Tabletop) -> Iterator[Case]:
+def objects_of(truth: Truth) -> Iterator[Case]:
     """The objects that the first held-out view shows, and where the others show them."""
     first, *others = truth.held_out
     for number in range(len(truth.classes)):
@@ -87,9 +72,9 @@ def objects_of(truth: Tabletop) -> Iterator[Case]:
 
 def regions_of(scene: QueryScene, level: int) -> Iterator[Case]:
     """The regions of a level of every third view, and where their own views show them."""
-    for view in scene.lift.metadata.views[::3]:
+    for view in scene.lift.views[::3]:
         camera, observed = scene.cameras[view], scene.packs[view]
-        assert isinstance(observed, Regions)
+        assert isinstance(observed, lc.Regions)
         labels = torch.as_tensor(observed.labels[level]).float()[None, None]
         size = (camera.height, camera.width)
         of_pixels = torch.nn.functional.interpolate(labels, size=size, mode="nearest")[0, 0]
@@ -112,17 +97,20 @@ def main() -> None:
     )
     options = parser.parse_args()
     folder, rows = options.folder, []
-    truth = Tabletop(folder) if (folder / "truth.json").exists() else None
-    raster = truth.raster if truth else CpuRaster(read_splats(folder / "point_cloud.ply"))
-    for pack, preset in product(options.features if truth else ("regions",), options.presets):
-        scene = opened(lift_files(scene_files(folder, pack), preset=preset), raster)
-        head = {"scene": folder.name, "features": pack, "preset": preset}
-        if truth:
+    if (folder / "truth.json").exists():
+        truth = tabletop(folder)
+        for pack, preset in product(options.features, options.presets):
+            scene = truth.opened(truth.lift(read_pack(folder, pack), preset=preset))
+            head = {"scene": folder.name, "features": pack, "preset": preset}
             rows.append(head | measure(scene, objects_of(truth)))
-            continue
-        rows += [
-            head | {"features": f"{pack} {level}"} | measure(scene, regions_of(scene, level)) for level in range(3)
-        ]
+    else:
+        (splats, cameras), views = read_scene(folder), lc.read_features(folder / "regions.safetensors")
+        for preset in options.presets:
+            lifted = lc.lift(splats, cameras, views, preset=preset, certificate_rays=0)
+            scene = QueryScene(lifted, splats, cameras, views)
+            for level in range(3):
+                head = {"scene": folder.name, "features": f"regions {level}", "preset": preset}
+                rows.append(head | measure(scene, regions_of(scene, level)))
     tell(rows, as_json=options.json)
 
 

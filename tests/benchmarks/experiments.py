@@ -2,16 +2,13 @@
 
     python -m tests.benchmarks.experiments NAME SCENE [--every N] [--json]
 
-SCENE is a folder with ``point_cloud.ply``, cameras and feature packs. ``--every`` takes every n-th view only. Where
-accuracy is measured the scene needs truth in the layout of ``tabletop`` (`tests.benchmarks.tabletop`).
+SCENE is a folder with ``point_cloud.ply``, cameras and feature packs. ``--every`` takes every n-th view only. All but
+``conditioning`` and ``row_sums`` need truth in the layout of ``tabletop`` (`tests.benchmarks.tabletop`).
 """
 
-import json
 import math
-import sys
-import tempfile
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -23,89 +20,59 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.nn.functional import cosine_similarity, normalize
 
-from liftcore.errors import SplatliftError
-from liftcore.features.pack import Views, pair, read_features, write_pack
-from liftcore.features.views import NO_LABEL, Regions, ViewFeatures
-from liftcore.io.cameras import read_cameras
-from liftcore.io.ply import write_splats
-from liftcore.io.splats import read_splats
-from liftcore.io.transforms import transforms_of
+import liftcore as lc
+from liftcore.features.views import NO_LABEL, ViewFeatures
 from liftcore.query.directions import MINIMUM_ROW_SUM
 from liftcore.query.threshold import find_threshold
-from liftcore.raster.base import CompositingParams
 from liftcore.raster.cpu.raster import CpuRaster
-from liftcore.result import LiftResult
-from liftcore.scene.cameras import Camera, Cameras
-from liftcore.scene.splats import Kernel, Splats
+from liftcore.scene.splats import Kernel
 from liftcore.settings import TIKHONOV_GAIN
 from liftcore.solve.geometry import sample_pixels
 from liftcore.solve.least_squares import AllRays, Channels, solve_block
-from tests.benchmarks.base import PRESETS, command_line, lift_files, mask_iou, scene_files, splat_accuracy, tell
-from tests.benchmarks.tabletop import Tabletop
+from tests.benchmarks.base import PRESETS, command_line, mask_iou, read_pack, read_scene, tell
+from tests.benchmarks.tabletop import Truth, tabletop
 
 Rows = Iterator[dict[str, Any]]
 
 
-@dataclass(frozen=True)
-class Subject:
-    """The scene of an experiment, of which every n-th view counts."""
-
-    folder: Path
-    every: int = 1
-
-    def packs(self, *names: str) -> list[str]:
-        """Those of the packs that the scene has."""
-        return [name for name in names if (self.folder / f"{name}.safetensors").is_file()]
-
-    def open(self, name: str, cameras: Cameras) -> Views:
-        """A pack, its views paired with the cameras."""
-        return pair(read_features(self.folder / f"{name}.safetensors"), cameras)[0]
-
-    def lift(
-        self,
-        pack: str,
-        splats: Splats | None = None,
-        views: Mapping[str, ViewFeatures] | None = None,
-        cameras: Mapping[str, Camera] | None = None,
-        **settings: Any,
-    ) -> LiftResult:
-        """A lift of a pack; onto other splats, of other views or by other cameras where they are given."""
-        with tempfile.TemporaryDirectory(prefix="splatlift-experiment-") as place:
-            files, own = list(scene_files(self.folder, pack)), Path(place)
-            if splats is not None:
-                files[0] = own / "splats.ply"
-                write_splats(splats, files[0])
-            if cameras is not None:
-                files[1] = own / "cameras.json"
-                files[1].write_text(json.dumps(transforms_of(cameras)), encoding="utf-8")
-            if views is not None:
-                files[2] = own / "features.safetensors"
-                write_pack(files[2], views, {"normalised": "true"})
-            return lift_files(files, **{"view_stride": self.every, **settings})
+def packs_of(folder: Path, *names: str) -> list[str]:
+    """Those of the packs that the scene has."""
+    return [name for name in names if (folder / f"{name}.safetensors").is_file()]
 
 
-def judged(truth: Tabletop, made: LiftResult, raster: CpuRaster | None = None) -> dict[str, float]:
+def judged(truth: Truth, lifted: lc.LiftResult, raster: CpuRaster | None = None) -> dict[str, float]:
     """Accuracy and held-out mIoU of a lift."""
-    found = truth.judge(made.features, made.metadata.settings, raster=raster)
+    found = truth.judge(lifted, raster)
     return {"accuracy": found.accuracy, "miou": found.miou}
 
 
 # --- the paper's tables ---
 
 
-def ablation(subject: Subject) -> Rows:
+def ablation(folder: Path, every: int) -> Rows:
     """Table 1c: guidance (T), robust step (R) and aggregation (P) on and off.
 
     mIoU by argmax knows all classes; phrase IoU asks for each class of a view alone and cuts its map by an automatic
     threshold.
     """
-    truth = Tabletop(subject.folder)
-    parts = product((False, True), repeat=3)
-    for pack, (guided, robust, aggregated) in product(subject.packs("features", "features_hard"), parts):
-        preset = "tikhonov" if guided else "row-sum"
-        made = subject.lift(pack, preset=preset, robust_steps=int(robust), aggregation=aggregated)
+    truth, parts = tabletop(folder), product((False, True), repeat=3)
+    for pack, (guided, robust, aggregated) in product(packs_of(folder, "features", "features_hard"), parts):
+        settings = {"preset": "tikhonov" if guided else "row-sum", "robust_steps": int(robust)}
+        made = truth.lift(read_pack(folder, pack, every), **settings, aggregation=aggregated)
         marks = {name: "on" if on else "-" for name, on in (("T", guided), ("R", robust), ("P", aggregated))}
         yield {"pack": pack, **marks, **judged(truth, made), "phrase_iou": phrase_iou(truth, made)}
+
+
+def phrase_iou(truth: Truth, lifted: lc.LiftResult) -> float:
+    """Mean IoU over the classes of each held-out view, each asked for alone."""
+    ious, params = [], lifted.settings.render_params
+    maps = truth.rendered(truth.scores(lifted), params)
+    for (view, mask), scores in zip(truth.held_out.items(), maps, strict=True):
+        met = truth.raster.row_sums(truth.cameras[view], params) >= MINIMUM_ROW_SUM
+        for k in mask.unique().tolist():
+            cut = find_threshold(scores[:, :, k][met], "auto").value
+            ious.append(mask_iou(met & (scores[:, :, k] >= cut), mask == k))
+    return float(np.mean(ious))
 
 
 POSED = {
@@ -116,37 +83,25 @@ POSED = {
 }
 
 
-def pose_noise(subject: Subject) -> Rows:
+def pose_noise(folder: Path, every: int) -> Rows:
     """Table on noisy poses: N of 100 feature views turned by a degree and moved by a hundredth of the scene.
 
     Splats and held-out cameras stay right.
     """
-    truth = Tabletop(subject.folder)
-    for pack, share in product(subject.packs("features"), (0, 1, 2, 3, 10, 20, 50, 100)):
-        names = subject.open(pack, truth.cameras).views[:: subject.every]
-        order = np.random.default_rng(1).permutation(len(names))
-        wrong = [names[k] for k in order[: math.ceil(len(names) * share / 100)]]
-        moved = noisy_poses(truth.cameras, wrong, seed=0)
+    truth, views = tabletop(folder), read_pack(folder, "features", every)
+    order = np.random.default_rng(1).permutation(len(views))
+    for share in (0, 1, 2, 3, 10, 20, 50, 100):
+        wrong = [list(views)[k] for k in order[: math.ceil(len(views) * share / 100)]]
+        moved = replace(truth, cameras=noisy_poses(truth.cameras, wrong, seed=0))
         for name, settings in POSED.items():
-            found = judged(truth, subject.lift(pack, cameras=moved, **settings))
-            yield {"pack": pack, "noisy_of_100": share, "method": name, **found}
+            found = judged(truth, moved.lift(views, **settings))
+            yield {"pack": "features", "noisy_of_100": share, "method": name, **found}
 
 
-def phrase_iou(truth: Tabletop, made: LiftResult) -> float:
-    """Mean IoU over the classes of each held-out view, each asked for alone."""
-    ious, settings = [], made.metadata.settings
-    maps = truth.maps(made.features, settings, truth.raster)
-    for (view, mask), scores in zip(truth.held_out.items(), maps, strict=True):
-        met = truth.raster.row_sums(truth.cameras[view], settings.render_params) >= MINIMUM_ROW_SUM
-        for k in mask[mask >= 0].unique().tolist():
-            cut = find_threshold(scores[:, :, k][met], "auto").value
-            ious.append(mask_iou(met & (scores[:, :, k] >= cut), mask == k))
-    return float(np.mean(ious))
-
-
-def kernels(subject: Subject) -> Rows:
+def kernels(folder: Path, every: int) -> Rows:
     """Table 2a: one trained 3DGS scene, and the same read as discs and as beta kernels (conversions, not trained)."""
-    truth, trained = Tabletop(subject.folder), read_splats(subject.folder / "point_cloud.ply")
+    truth = tabletop(folder)
+    trained = truth.raster.splats
     forms = {
         "3dgs": (trained, {}),
         "3dgs antialiased": (trained, {"antialiased": True}),
@@ -155,57 +110,55 @@ def kernels(subject: Subject) -> Rows:
     }
     for kernel, (splats, more) in forms.items():
         raster = CpuRaster(splats)
-        for pack, preset in product(subject.packs("features", "features_hard"), PRESETS):
-            made = subject.lift(pack, splats=splats, preset=preset, **more)
-            walk = made.metadata.settings.render_params
-            sums = [raster.row_sums(truth.cameras[view], walk).mean() for view in truth.held_out]
+        for pack, preset in product(packs_of(folder, "features", "features_hard"), PRESETS):
+            made = replace(truth, raster=raster).lift(read_pack(folder, pack, every), preset=preset, **more)
+            params = made.settings.render_params
+            sums = [raster.row_sums(truth.cameras[view], params).mean() for view in truth.held_out]
             head = {"pack": pack, "kernel": kernel, "preset": preset, "row_sum_mean": float(np.mean(sums))}
             yield head | judged(truth, made, raster)
 
 
-def lambda_sweep(subject: Subject) -> Rows:
+def lambda_sweep(folder: Path, every: int) -> Rows:
     """Table on Tikhonov Guidance: the scale lambda of the opacity logits, lifting and rendering apart."""
-    truth = Tabletop(subject.folder)
+    truth, pack = tabletop(folder), "features_hard"
     same = (1.0, 1.1, 1.2, 1.35, 1.5, 2.0, 4.0, 8.0)
     pairs = [(0.5, 1.0), (0.8, 1.0), (1.2, 1.0), *((gain, gain) for gain in same)]
-    for pack, power, (lift_gain, render_gain) in product(subject.packs("features_hard"), (1, 2), pairs):
+    for power, (lift_gain, render_gain) in product((1, 2), pairs):
         values = {"power": power, "lift_gain": lift_gain, "render_gain": render_gain}
-        yield {"pack": pack, **values, **judged(truth, subject.lift(pack, preset="tikhonov", **values))}
+        made = truth.lift(read_pack(folder, pack, every), preset="tikhonov", **values)
+        yield {"pack": pack, **values, **judged(truth, made)}
 
 
-def mask_noise(subject: Subject) -> Rows:
+NOISE_METHODS: dict[str, dict[str, Any]] = {
+    "row-sum": {"preset": "row-sum"},
+    "tikhonov": {"preset": "tikhonov"},
+    "tikhonov + aggregation": {"preset": "tikhonov", "aggregation": True},
+    "default": {},
+    "default + aggregation": {"aggregation": True},
+}
+
+
+def mask_noise(folder: Path, every: int) -> Rows:
     """Wrong masks: a growing share of exact regions merged, mislabelled or dropped; the same for all methods."""
-    truth = Tabletop(subject.folder)
-    packs = subject.open("features_clean", truth.cameras)
-    seen = {name: packs[name] for name in packs.views}
-    maps = {name: observed for name, observed in seen.items() if isinstance(observed, Regions)}
-    methods: dict[str, dict[str, Any]] = {
-        "row-sum": {"preset": "row-sum"},
-        "tikhonov": {"preset": "tikhonov"},
-        "tikhonov + robust step": {"preset": "tikhonov", "robust_steps": 1},
-        "tikhonov + aggregation": {"preset": "tikhonov", "aggregation": True},
-        "default": {},
-        "default + aggregation": {"aggregation": True},
-    }
+    truth, exact = tabletop(folder), read_pack(folder, "features_clean")
+    maps = {name: view for name, view in exact.items() if isinstance(view, lc.Regions)}
     for rate in (0.0, 0.1, 0.2, 0.4, 0.6):
         wrong = noisy_masks(maps, rate, seed=0)
-        for method, settings in methods.items():
-            yield {
-                "method": method, "rate": rate,
-                **judged(truth, subject.lift("features_clean", views=wrong, **settings)),
-            }  # fmt: skip
+        for method, settings in NOISE_METHODS.items():
+            found = judged(truth, truth.lift(wrong, view_stride=every, **settings))
+            yield {"method": method, "rate": rate, **found}
 
 
-def row_sums(subject: Subject) -> Rows:
+def row_sums(folder: Path, every: int) -> Rows:
     """Property 2: how close the rows of A come to one, over all pixels, without and with the opacity scale."""
-    splats, cameras, _ = scene_files(subject.folder)
-    raster, views = CpuRaster(read_splats(splats)), list(read_cameras(cameras).values())[:: subject.every]
+    splats, cameras = read_scene(folder)
+    raster, views = CpuRaster(splats), list(cameras.values())[::every]
     for gain in (1.0, TIKHONOV_GAIN):
-        sums = [raster.row_sums(camera, CompositingParams(gain)).numpy().ravel() for camera in views]
-        every = np.concatenate(sums).astype(np.float64)
+        sums = [raster.row_sums(camera, lc.CompositingParams(gain)).numpy().ravel() for camera in views]
+        rays = np.concatenate(sums).astype(np.float64)
         lowest = min(float(part.mean(dtype=np.float64)) for part in sums)
-        head = {"gain": gain, "views": len(views), "mean": float(every.mean()), "std": float(every.std())}
-        yield head | {"lowest_view_mean": lowest, "below_0.9": float((every < 0.9).mean()), "min": float(every.min())}
+        head = {"gain": gain, "views": len(views), "mean": float(rays.mean()), "std": float(rays.std())}
+        yield head | {"lowest_view_mean": lowest, "below_0.9": float((rays < 0.9).mean()), "min": float(rays.min())}
 
 
 # --- conditioning ---
@@ -214,22 +167,19 @@ RAYS = 150_000  # of the scene
 NEIGHBOURS = 1_200  # splats whose dense spectrum is taken
 
 
-def conditioning(subject: Subject) -> Rows:
+def conditioning(folder: Path, every: int) -> Rows:
     """What lambda does to G = A^T A, on rays of the scene.
 
     own_share: how much of what the closed form gives a splat is the splat's own, ``(C^T A)_jj / (C^T A 1)_j`` with
     C = A^p; dominant: the share of splats where it is over a half. cond: of the unit-diagonal form of C^T C over
-    splats that lie together, by interlacing a lower bound of the whole. noise: a splat's deviation under white noise
-    in B. beta: the paper's.
+    splats that lie together, by interlacing a lower bound of the whole.
     """
-    splats, cameras, _ = scene_files(subject.folder)
-    raster, views = CpuRaster(read_splats(splats)), list(read_cameras(cameras).values())[:: subject.every]
+    splats, cameras = read_scene(folder)
+    raster, views = CpuRaster(splats), list(cameras.values())[::every]
     evidence = np.asarray(rays_of(raster, views, 1.0).sum(axis=0)).ravel()
-    chosen, packs = neighbourhood(raster.splats.means, evidence), subject.packs("features", "regions")
+    chosen = neighbourhood(splats.means, evidence)
     for gain in (0.5, 0.8, 1.0, 1.2, 1.5, 2.0, 4.0, 8.0):
-        sampled = {"preset": "row-sum", "lift_gain": gain, "stride": 2, "certificate_rays": 5_000}
-        beta = subject.lift(packs[0], **sampled).metadata.certificate["beta"]["median"] if packs else None
-        yield {"gain": gain, **conditions(rays_of(raster, views, gain), evidence, chosen), "beta_median": beta}
+        yield {"gain": gain, **conditions(rays_of(raster, views, gain), evidence, chosen)}
 
 
 def conditions(A: csr_array, evidence: np.ndarray, chosen: np.ndarray) -> dict[str, float]:
@@ -239,26 +189,23 @@ def conditions(A: csr_array, evidence: np.ndarray, chosen: np.ndarray) -> dict[s
         C = A if power == 1 else A.multiply(A).tocsr()
         own, total = np.asarray(A.multiply(C).sum(axis=0)).ravel(), C.T @ (A @ np.ones(len(evidence)))
         shares = np.divide(own, total, out=np.zeros_like(own), where=total > 0)
-        sums, squares = np.asarray(C.sum(axis=0)).ravel(), np.asarray(C.multiply(C).sum(axis=0)).ravel()
-        some = chosen[sums[chosen] > 0]
         G = (C[:, chosen].T @ C[:, chosen]).toarray()
         visible = np.diag(G) > 1e-24
         scale = 1 / np.sqrt(np.diag(G)[visible])
         values = np.linalg.eigvalsh(G[np.ix_(visible, visible)] * scale[:, None] * scale)
         found[f"own_share_{key}"] = float(np.average(shares, weights=evidence))
         found[f"cond_{key}"] = float(values[-1] / max(values[0], 1e-16 * values[-1]))
-        found[f"noise_{key}"] = float(np.median(np.sqrt(squares[some]) / sums[some]))
         if power == 1:
             found["dominant"] = float((shares[met] > 0.5).mean())
     return found
 
 
-def rays_of(raster: CpuRaster, views: Sequence[Camera], gain: float) -> csr_array:
+def rays_of(raster: CpuRaster, views: Sequence[lc.Camera], gain: float) -> csr_array:
     """A [R, P] f64 of about RAYS rays, evenly over the views and their pixels."""
     parts = []
     for number, camera in enumerate(views):
         stride = max(round((camera.width * camera.height * len(views) / RAYS) ** 0.5), 1)
-        walk = CompositingParams(gain, stride=stride)
+        walk = lc.CompositingParams(gain, stride=stride)
         pixels = sample_pixels(camera, camera.width * camera.height, (0, number), walk)
         rows = raster.ray_rows(camera, pixels, walk)
         entries = rows.weights.double().numpy(), rows.splats.numpy(), rows.indptr.numpy()
@@ -276,87 +223,52 @@ def neighbourhood(means: Tensor, evidence: np.ndarray) -> np.ndarray:
 # --- least squares under wrong masks ---
 
 
-def overfitting(subject: Subject) -> Rows:
+def overfitting(folder: Path, every: int) -> Rows:
     """Section 3.2: conjugate gradients towards the smallest ``|A X - B|^2`` under wrong masks, with several dampings.
 
     All runs in the channels ``X C^T``, C the class vectors: closed form and least squares are linear in B, so these
     are exactly the class scores of the full solutions, at the cost of 14 channels.
     """
-    scene = Tabletop(subject.folder)
-    packs = read_features(subject.folder / "features_hard.safetensors")
-    names = packs.views[:: subject.every]
-    rays = AllRays(
-        scene.raster,
-        scene.raster.splats.count,
-        [scene.cameras[name] for name in names],
-        lambda view: scored(packs[names[view]], scene.classes),
-        CompositingParams(),
-    )
-    truth = Truth(scene.classes, scene.objects, scene.counted & torch.from_numpy(rays.row_sums > 0))
-    first = closed_form(rays, len(scene.classes))
+    scene, views = tabletop(folder), read_pack(folder, "features_hard", every)
+    observed = [scored(view, scene.classes) for view in views.values()]
+    cameras, plain = [scene.cameras[name] for name in views], lc.CompositingParams()
+    rays = AllRays(scene.raster, scene.raster.splats.count, cameras, observed.__getitem__, plain)
+    met = rays.row_sums > 0
+    part = Channels(0, len(scene.classes), None)
+    sums, _ = rays.gradient(np.zeros((rays.count, part.end), np.float32), part.project)
+    scale = np.divide(1.0, rays.row_sums, out=np.zeros(rays.count), where=met)
+    first = torch.from_numpy(sums * scale.astype(np.float32)[:, None])  # D^-1 A^T B
+    truth = replace(scene, counted=scene.counted & torch.from_numpy(met))
 
-    def row(damping: float | None, path: Mapping[str, Any], step: int, scores: Tensor) -> dict[str, Any]:
-        maps = (scene.raster.render(scene.cameras[view], scores, CompositingParams()) for view in scene.held_out)
-        ends = {name: path[name][step] for name in ("residual", "accuracy", "cosine")}
-        steps = len(path["residual"]) - 1 if step else 0
-        return {"damping": damping, "steps": steps, **ends, "miou": scene.miou(maps)}
+    def row(damping: float | None, steps: int, loss: float, scores: Tensor) -> dict[str, Any]:
+        found, cosine = truth.judge_scores(scores, plain), centred_cosine(truth, scores)
+        head = {"damping": damping, "steps": steps, "residual": loss / max(rays.rows, 1)}
+        return head | {"accuracy": found.accuracy, "cosine": cosine, "miou": found.miou}
 
-    for number, damping in enumerate((0.0, 0.1, 0.3, 1.0)):
-        path, last = follow(rays, first, truth, damping, 20)
-        if number == 0:
-            yield row(None, path, 0, first)
-        yield row(damping, path, -1, last)
+    for damping in (0.0, 0.1, 0.3, 1.0):
+        block = solve_block(rays, part, first, met, damping, 20)
+        if damping == 0:
+            yield row(None, 0, block.losses[0], first)
+        yield row(damping, len(block.losses) - 1, block.losses[-1], first + torch.from_numpy(block.step))
 
 
-@dataclass(frozen=True)
-class Truth:
-    """What the splats really are."""
-
-    classes: Tensor  # [K, F] f32, unit vectors
-    objects: Tensor  # [P] int, the class of every splat
-    counted: Tensor  # [P] bool, the splats that count
-
-    def judge(self, scores: Tensor) -> dict[str, float]:
-        """Accuracy of the scores [P, K], and their mean cosine to the true ones, centred on the classes' mean."""
-        true = (self.classes @ self.classes.T)[self.objects.long()]
-        left, right = (part - part.mean(dim=1, keepdim=True) for part in (scores, true))
-        cosines = cosine_similarity(left, right, dim=1, eps=1e-12)
-        accuracy = splat_accuracy(scores, self.objects, self.counted)
-        return {"accuracy": accuracy, "cosine": float(cosines[self.counted].mean())}
-
-
-def scored(observation: ViewFeatures, classes: Tensor) -> Regions:
+def scored(observation: ViewFeatures, classes: Tensor) -> lc.Regions:
     """A region map whose codebook [M, K] holds the scores of the classes [K, F]."""
-    assert isinstance(observation, Regions)
-    return Regions(observation.labels, observation.codebook.float() @ classes.T)
+    assert isinstance(observation, lc.Regions)
+    return lc.Regions(observation.labels, observation.codebook.float() @ classes.T)
 
 
-def closed_form(rays: AllRays, channels: int) -> Tensor:
-    """``D^-1 A^T B`` [P, C] f32 in all channels of the observations."""
-    part = Channels(0, channels, None)
-    sums, _ = rays.gradient(np.zeros((rays.count, channels), np.float32), part.project)
-    scale = np.divide(1.0, rays.row_sums, out=np.zeros(rays.count), where=rays.row_sums > 0)
-    return torch.from_numpy(sums * scale.astype(np.float32)[:, None])
-
-
-def follow(rays: AllRays, first: Tensor, truth: Truth, damping: float, steps: int) -> tuple[dict[str, Any], Tensor]:
-    """Residual, accuracy and cosine after every step from ``first`` [P, K] on, and the last scores [P, K]."""
-    found = [truth.judge(first)]
-
-    def watch(step: int, solution: np.ndarray, rest: np.ndarray) -> None:
-        found.append(truth.judge(first + torch.from_numpy(solution)))
-
-    part = Channels(0, first.shape[1], None)
-    block = solve_block(rays, part, first, rays.row_sums > 0, damping, steps, watch)
-    path: dict[str, Any] = {"residual": [loss / max(rays.rows, 1) for loss in block.losses]}
-    path |= {key: [point[key] for point in found] for key in ("accuracy", "cosine")}
-    return path, first + torch.from_numpy(block.step)
+def centred_cosine(truth: Truth, scores: Tensor) -> float:
+    """Mean cosine of the splats' scores [P, K] to the true ones, both centred on their means over the classes."""
+    true = (truth.classes @ truth.classes.T)[truth.objects.long()]
+    left, right = (part - part.mean(dim=1, keepdim=True) for part in (scores, true))
+    return float(cosine_similarity(left, right, dim=1, eps=1e-12)[truth.counted].mean())
 
 
 # --- ways to be wrong, by an explicit seed ---
 
 
-def noisy_poses(cameras: Cameras, wrong: Collection[str], seed: int) -> Cameras:
+def noisy_poses(cameras: lc.Cameras, wrong: Collection[str], seed: int) -> lc.Cameras:
     """The cameras, those named in ``wrong`` with the paper's noise.
 
     Deviations are a degree of roll, pitch and yaw each, and a hundredth of the scene's scale (the farthest camera
@@ -374,10 +286,10 @@ def noisy_poses(cameras: Cameras, wrong: Collection[str], seed: int) -> Cameras:
         pose[:3, :3] = Rotation.from_euler("ZXY", turn, degrees=True).as_matrix() @ camera.viewmat[:3, :3]
         pose[:3, 3] = -pose[:3, :3] @ (camera.centre + shift)
         moved.append(camera.replace(viewmat=pose))
-    return Cameras(moved)
+    return lc.Cameras(moved)
 
 
-def noisy_masks(maps: Mapping[str, Regions], rate: float, seed: int) -> dict[str, Regions]:
+def noisy_masks(maps: Mapping[str, lc.Regions], rate: float, seed: int) -> dict[str, lc.Regions]:
     """Region maps in which each region of each level goes wrong with probability ``rate``.
 
     Equally often it is merged with the neighbour that it touches most (both get the mean of the two vectors), takes
@@ -388,7 +300,7 @@ def noisy_masks(maps: Mapping[str, Regions], rate: float, seed: int) -> dict[str
     return {view: _spoilt(regions, rate, vectors, random) for view, regions in maps.items()}
 
 
-def _spoilt(regions: Regions, rate: float, vectors: Tensor, random: np.random.Generator) -> Regions:
+def _spoilt(regions: lc.Regions, rate: float, vectors: Tensor, random: np.random.Generator) -> lc.Regions:
     labels, codebook = regions.labels.numpy().copy(), [regions.codebook]
     rows = regions.codebook.shape[0]
     for level in labels:
@@ -412,7 +324,7 @@ def _spoilt(regions: Regions, rate: float, vectors: Tensor, random: np.random.Ge
             level[area] = rows
             rows += 1
             codebook.append(vector[None].to(regions.codebook.dtype))
-    return Regions(torch.from_numpy(labels), torch.cat(codebook))
+    return lc.Regions(torch.from_numpy(labels), torch.cat(codebook))
 
 
 def _neighbour(level: np.ndarray, region: int) -> int:
@@ -427,28 +339,21 @@ def _neighbour(level: np.ndarray, region: int) -> int:
 
 # --- a trained 3DGS scene read as other kernels ---
 
-# Turns by a third about (1, 1, 1), w x y z: R q has the columns (1, 2, 0) of R, or (2, 0, 1).
-_TURNS = ((0.5, 0.5, 0.5, 0.5), (0.5, -0.5, -0.5, -0.5), (1.0, 0.0, 0.0, 0.0))
 _ORDERS = ((1, 2, 0), (2, 0, 1), (0, 1, 2))  # the axes that stay, then the one that goes: 0, 1 or 2
 _BARE: dict[str, Any] = {"layout": (), "header": (), "extras": {}}
 
 
-def to_discs(splats: Splats) -> Splats:
+def to_discs(splats: lc.Splats) -> lc.Splats:
     """2DGS: every splat loses its shortest axis, which becomes the disc's normal; opacities and colours stay."""
-    shortest = splats.log_scales.argmin(dim=1)
-    log_scales = splats.log_scales.gather(1, torch.tensor(_ORDERS)[shortest][:, :2]).contiguous()
-    pw, px, py, pz = normalize(splats.quats, dim=1).unbind(dim=1)
-    qw, qx, qy, qz = torch.tensor(_TURNS)[shortest].unbind(dim=1)
-    turned = [  # Hamilton's product: the rotation of q, then that of p
-        pw * qw - px * qx - py * qy - pz * qz,
-        pw * qx + px * qw + py * qz - pz * qy,
-        pw * qy - px * qz + py * qw + pz * qx,
-        pw * qz + px * qy - py * qx + pz * qw,
-    ]
-    return replace(splats, kernel=Kernel.GAUSSIAN_2D, quats=torch.stack(turned, 1), log_scales=log_scales, **_BARE)
+    order = torch.tensor(_ORDERS)[splats.log_scales.argmin(dim=1)]
+    log_scales = splats.log_scales.gather(1, order[:, :2]).contiguous()
+    axes = Rotation.from_quat(splats.quats.numpy(), scalar_first=True).as_matrix()
+    turned = Rotation.from_matrix(np.take_along_axis(axes, order.numpy()[:, None], axis=2))
+    quats = torch.from_numpy(turned.as_quat(scalar_first=True)).float()
+    return replace(splats, kernel=Kernel.GAUSSIAN_2D, quats=quats, log_scales=log_scales, **_BARE)
 
 
-def to_betas(splats: Splats) -> Splats:
+def to_betas(splats: lc.Splats) -> lc.Splats:
     """DBS: beta = 4 (b = 0) and axes that give every footprint the area of its Gaussian; opacities and colours stay.
 
     In the image plane ``(1 - r^2 / R^2)^beta`` sums to ``pi R^2 / (beta + 1)`` and ``exp(-r^2 / 2)`` to ``2 pi``: the
@@ -458,7 +363,7 @@ def to_betas(splats: Splats) -> Splats:
     return replace(splats, kernel=Kernel.BETA, log_scales=log_scales, beta=beta, **_BARE)
 
 
-EXPERIMENTS: dict[str, Callable[[Subject], Rows]] = {
+EXPERIMENTS: dict[str, Callable[[Path, int], Rows]] = {
     made.__name__: made
     for made in (
         ablation, conditioning, kernels, lambda_sweep, mask_noise, overfitting, pose_noise, row_sums,
@@ -466,7 +371,7 @@ EXPERIMENTS: dict[str, Callable[[Subject], Rows]] = {
 }  # fmt: skip
 
 
-def main() -> int:
+def main() -> None:
     """Print the table of one experiment."""
     parser = command_line(
         "tests.benchmarks.experiments",
@@ -477,14 +382,9 @@ def main() -> int:
     )
     options = parser.parse_args()
     experiment = EXPERIMENTS[options.name]
-    try:
-        rows = list(experiment(Subject(options.scene, options.every)))
-    except SplatliftError as error:
-        print(error, file=sys.stderr)
-        return 2
-    tell(rows, as_json=options.json, note=f"{options.name} on {options.scene.resolve().name}: {experiment.__doc__}")
-    return 0
+    note = f"{options.name} on {options.scene.resolve().name}: {experiment.__doc__}"
+    tell(experiment(options.scene, options.every), as_json=options.json, note=note)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

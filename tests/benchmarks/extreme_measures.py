@@ -5,37 +5,33 @@ The float64 reference is `liftcore.raster.reference`; of features, the dense def
 
 import json
 import math
-import re
 import tempfile
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
-from functools import partial
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 
-from liftcore.errors import SplatliftError
+import liftcore as lc
 from liftcore.features.pack import read_features, write_pack
-from liftcore.features.views import Regions, ViewFeatures
+from liftcore.features.views import ViewFeatures
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.inspect import describe_cameras, describe_packs, describe_splats
 from liftcore.io.ply import write_splats
 from liftcore.io.scene_files import lift_files
 from liftcore.query.threshold import METHODS
-from liftcore.raster.base import NEAR_PLANE, CompositingParams, Weighting
+from liftcore.raster.base import NEAR_PLANE, Weighting
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.raster.reference import DenseView, dense_view, projected_gaussian, reading_matrix
-from liftcore.result import LiftResult
-from liftcore.scene.cameras import Camera, Cameras
-from liftcore.scene.splats import Kernel, Splats
-from liftcore.settings import LiftSettings
+from liftcore.scene.splats import Kernel
 from liftcore.solve.diagnostics import FAINT, order_warnings
-from tests.scenes import IDENTITY, of_kernel, splats_at
+from tests.scenes import IDENTITY, camera_at_origin, splats_at
 
 KERNELS = (Kernel.GAUSSIAN_3D, Kernel.GAUSSIAN_2D, Kernel.BETA)
-GAUSSIAN = (Kernel.GAUSSIAN_3D,)
+GAUSSIAN, DISC, BETA = (Kernel.GAUSSIAN_3D,), (Kernel.GAUSSIAN_2D,), (Kernel.BETA,)
 FLOORED = (Kernel.GAUSSIAN_3D, Kernel.GAUSSIAN_2D)  # the kernels with a smallest alpha
 WEIGHTS = 1e-5  # absolute, of weights against the float64 oracle
 
@@ -68,6 +64,8 @@ class Extreme:
     told: str = ""  # what some message must contain; "" where nothing is lost and nothing need be told
 
 
+# --- weights of a view ---
+
 FLIP = 1e-5  # a weight that differs by more, on a ray near a cut-off, was decided otherwise
 
 
@@ -84,19 +82,19 @@ class Comparison:
     finite: bool
 
 
-def exact_view(splats: Splats, camera: Camera, walk: CompositingParams) -> DenseView:
+def exact_view(splats: lc.Splats, camera: lc.Camera, walk: lc.CompositingParams) -> DenseView:
     """The oracle; logits far below zero overflow its exponential on the way to an exact zero."""
     with np.errstate(over="ignore"):
         return dense_view(splats, camera, walk)
 
 
 def weights_of(
-    splats: Splats, camera: Camera, walk: CompositingParams, power: int = 1
+    splats: lc.Splats, camera: lc.Camera, walk: lc.CompositingParams, power: int = 1
 ) -> tuple[np.ndarray, np.ndarray]:
     """A^p [H * W, P] and the evidence [P], through region weights with one region a pixel."""
     rays = camera.width * camera.height
     labels = torch.arange(rays, dtype=torch.int32).reshape(1, camera.height, camera.width)
-    every_ray = Regions(labels, torch.ones(rays, 1))
+    every_ray = lc.Regions(labels, torch.ones(rays, 1))
     got = CpuRaster(splats, threads=2).region_weights(camera, every_ray, walk, Weighting(power))
     A = np.zeros((rays, splats.count))
     rows = np.repeat(got.splats.numpy(), np.diff(got.indptr.numpy()))
@@ -106,7 +104,7 @@ def weights_of(
     return A, evidence
 
 
-def traced(splats: Splats, camera: Camera, walk: CompositingParams) -> np.ndarray:
+def traced(splats: lc.Splats, camera: lc.Camera, walk: lc.CompositingParams) -> np.ndarray:
     """A [H * W, P] by single rays, as the certificate takes it."""
     y, x = np.mgrid[: camera.height, : camera.width]
     pixels = torch.tensor(np.stack([x.ravel(), y.ravel()], axis=1), dtype=torch.int32)
@@ -116,9 +114,9 @@ def traced(splats: Splats, camera: Camera, walk: CompositingParams) -> np.ndarra
     return A
 
 
-def compare(splats: Splats, camera: Camera, walk: CompositingParams | None = None) -> Comparison:
+def compare(splats: lc.Splats, camera: lc.Camera, walk: lc.CompositingParams | None = None) -> Comparison:
     """A by region weights, by single rays and squared, the row sums and the evidence, against the oracle."""
-    walk = walk or CompositingParams()
+    walk = walk or lc.CompositingParams()
     exact = exact_view(splats, camera, walk)
     weights, evidence = weights_of(splats, camera, walk)
     single, squares = traced(splats, camera, walk), weights_of(splats, camera, walk, power=2)[0]
@@ -141,16 +139,33 @@ def compare(splats: Splats, camera: Camera, walk: CompositingParams | None = Non
 class View:
     """What a view looks at, and how."""
 
-    splats: Splats
-    camera: Camera
-    walk: CompositingParams = field(default_factory=CompositingParams)
+    splats: lc.Splats
+    camera: lc.Camera
+    walk: lc.CompositingParams
+
+
+Scene = Callable[[Kernel], View]
+CAMERA, PLAIN = camera_at_origin(), lc.CompositingParams()
+
+
+def at(
+    means: Sequence[Sequence[float]] | np.ndarray,
+    log_scales: ArrayLike = -2.0,
+    *,
+    camera: lc.Camera = CAMERA,
+    walk: lc.CompositingParams = PLAIN,
+    **more: Any,
+) -> Scene:
+    """Splats at the means, as ``splats_at`` takes them, of whatever kernel."""
+    return lambda kernel: View(splats_at(means, log_scales, **more, kernel=kernel), camera, walk)
 
 
 def walked(
     name: str,
-    scene: Callable[[Kernel], View],
+    scene: Scene,
     claim: Callable[[np.ndarray], bool] = always,
-    like: Callable[[Kernel], np.ndarray] | None = None,
+    like: Scene | None = None,
+    of: Callable[[np.ndarray], np.ndarray] = np.asarray,
     **more: Any,
 ) -> Extreme:
     """An extreme whose weights are held to the oracle.
@@ -158,15 +173,27 @@ def walked(
     Args:
         name: of the row. scene: the view, for a kernel.
         claim: what exact arithmetic says of A [H * W, P], of the oracle's and of the float32 raster's.
-        like: what A equals, from another scene or camera, for a kernel; NaN where that says nothing.
+        like: another view that has the same A, or the same as ``of`` gives of it.
         more: kernels, bound and told of the Extreme.
     """
-    return Extreme(name, partial(_measure_view, scene, claim, like), **more)
+
+    def measure(kernel: Kernel) -> Found:
+        view = scene(kernel)
+        got = compare(view.splats, view.camera, view.walk)
+        both = got.A, got.got
+        exact = exact_weights(like(kernel)) if like else None
+        alike = exact is None or all(float(np.abs(of(A) - exact).max()) < WEIGHTS for A in both)
+        gives = f"{int((got.got > 0).any(axis=0).sum())} of {view.splats.count} met"
+        gives += f", weights to {got.got.max(initial=0):.3g}"
+        holds = got.finite and alike and all(claim(A) for A in both)
+        return Found(gives, got.error, told_of(view.splats, view.camera), holds, got.flips, got.rays)
+
+    return Extreme(name, measure, **more)
 
 
-def told_of(splats: Splats, camera: Camera) -> tuple[str, ...]:
+def told_of(splats: lc.Splats, camera: lc.Camera) -> tuple[str, ...]:
     """The warnings of ``inspect`` and of a lift on such splats and such a camera."""
-    warnings = describe_splats(splats)["warnings"] + describe_cameras(Cameras((camera,)))["warnings"]
+    warnings = describe_splats(splats)["warnings"] + describe_cameras(lc.Cameras((camera,)))["warnings"]
     return tuple(warnings + order_warnings(splats, [camera]))
 
 
@@ -175,93 +202,103 @@ def exact_weights(view: View) -> np.ndarray:
     return exact_view(view.splats, view.camera, view.walk).A
 
 
-def _measure_view(
-    scene: Callable[[Kernel], View],
-    claim: Callable[[np.ndarray], bool],
-    like: Callable[[Kernel], np.ndarray] | None,
-    kernel: Kernel,
-) -> Found:
-    view = scene(kernel)
-    got = compare(view.splats, view.camera, view.walk)
-    alike = like is None or all(float(np.nanmax(np.abs(A - like(kernel)))) < WEIGHTS for A in (got.A, got.got))
-    met = int((got.got > 0).any(axis=0).sum())
-    return Found(
-        f"{met} of {view.splats.count} met, weights to {got.got.max(initial=0):.3g}",
-        got.error,
-        told_of(view.splats, view.camera),
-        got.finite and alike and claim(got.A) and claim(got.got),
-        got.flips,
-        got.rays,
-    )
+# --- whole lifts ---
 
-
-FOLDER = "splatlift-extreme-"
 WIDTH, HEIGHT = 16, 12
 AWAY = "away"  # the view that looks where nothing is
 CLOUD = 30  # splats
+SUM = 2e-6  # of the longest value, for what is stored in float32
+EVERYTHING = {"preset": "default", "aggregation": True, "aggregation_cluster_size": 3}
+EVERYTHING |= {"cg_steps": 3, "damping": 0.0, "reference_channels": 2}
 
 
-@dataclass(frozen=True)
-class Task:
-    """What is lifted, and how. A view named AWAY looks where nothing is."""
-
-    views: Mapping[str, ViewFeatures]
-    splats: Splats | None = None  # None is a random cloud
-    settings: Mapping[str, Any] = field(default_factory=lambda: {"dtype": "float32"})
-
-
-def lifted(name: str, task: Task, claim: Callable[[Any], bool] = always, **more: Any) -> Extreme:
+def lifted(
+    name: str,
+    views: ViewFeatures | Mapping[str, ViewFeatures],
+    claim: Callable[[lc.LiftResult], bool] = always,
+    *,
+    splats: lc.Splats | None = None,
+    settings: Mapping[str, Any] | None = None,
+    bound: float = SUM,
+    **more: Any,
+) -> Extreme:
     """An extreme whose features are held to the dense definition, relative to the longest value that came in.
 
     All else that a lift may do after it (EVERYTHING), and questions by each threshold, must give finite numbers.
 
     Args:
-        name: of the row. task: what is lifted. claim: what exact arithmetic says of the lift.
-        more: kernels, bound and told of the Extreme.
+        name: of the row. views: one, or several by name; AWAY looks where nothing is.
+        claim: what exact arithmetic says of the lift. splats: None takes a random cloud.
+        settings: of the lift. more: kernels and told of the Extreme.
     """
-    return Extreme(name, partial(_measure_lift, task, claim), **more)
+    named = views if isinstance(views, Mapping) else {"v0": views}
+
+    def measure(kernel: Kernel) -> Found:
+        own = splats or cloud(kernel)
+        made, warnings = run(named, own, **(settings or {}))
+        X, totals = dense_features(named, own, made.settings)
+        longest = max(float(view.codebook.double().abs().max()) for view in named.values())
+        faint = (totals > 0) & (totals < FAINT)
+        errors = np.abs(made.features.double().numpy() - X) / (longest or 1.0)
+        seen = made.seen.numpy()
+        sound = all(bool(part.isfinite().all()) for part in (made.features, made.evidence, made.agreement))
+        sound &= np.array_equal(seen[~faint], totals[~faint] > 0) and not made.features[~made.seen].any()
+        sound &= survives(run(named, own, **{**(settings or {}), **EVERYTHING})[0], next(iter(named.values())))
+        gives = f"{int(seen.sum())} of {own.count} seen, {str(made.features.dtype).removeprefix('torch.')}"
+        if faint.any():
+            gives += f"; {int(faint.sum())} too faint, off by {errors[faint].max():.2g}"
+        told = tuple(warnings + made.diagnostics["warnings"])
+        return Found(gives, float(errors[~faint].max(initial=0)), told, bool(sound) and claim(made))
+
+    return Extreme(name, measure, bound=bound, **more)
 
 
-def refused(name: str, work: Callable[[], object], told: str, **more: Any) -> Extreme:
+def refused(name: str, work: Callable[[], object], told: str) -> Extreme:
     """An extreme that no answer could be right for: the input is refused, with ``told`` in the error."""
-    return Extreme(name, partial(_refusal, work), told=told, **more)
+
+    def measure(_: Kernel) -> Found:
+        try:
+            work()
+        except lc.SplatliftError as error:
+            return Found("refused", None, (str(error),))
+        return Found("accepted", None, (), holds=False)
+
+    return Extreme(name, measure, GAUSSIAN, told=told)
 
 
-def cloud(kernel: Kernel | None = None) -> Splats:
+def cloud(kernel: Kernel = Kernel.GAUSSIAN_3D) -> lc.Splats:
     """Splats around the origin: needles, discs and balls, faint and opaque."""
     rng = np.random.default_rng(11)
-    splats = splats_at(
-        rng.normal(0, 1, (CLOUD, 3)),
-        rng.uniform(-4.5, -0.5, (CLOUD, 3)),
-        rng.normal(0, 3, CLOUD),
-        rng.normal(0, 1, (CLOUD, 4)),
-    )
-    return splats if kernel is None else of_kernel(splats, kernel, splats.opacity_logits)
+    means, log_scales = rng.normal(0, 1, (CLOUD, 3)), rng.uniform(-4.5, -0.5, (CLOUD, 3))
+    logits, quats = rng.normal(0, 3, CLOUD), rng.normal(0, 1, (CLOUD, 4))
+    return splats_at(means, log_scales, logits, quats, kernel, logits)
 
 
-def camera(name: str = "v0") -> Camera:
+def camera(name: str = "v0") -> lc.Camera:
     """Four units before the origin; AWAY a million behind it."""
     pose = np.eye(4)
     pose[2, 3] = -1e6 if name == AWAY else 4.0
-    return Camera.pinhole(name, WIDTH, HEIGHT, 16.0, 16.0, WIDTH / 2, HEIGHT / 2, pose)
+    return lc.Camera.pinhole(name, WIDTH, HEIGHT, 16.0, 16.0, WIDTH / 2, HEIGHT / 2, pose)
 
 
-def run(task: Task, splats: Splats) -> tuple[LiftResult, list[str]]:
-    """The lift, made through files, and the warnings of its pack."""
-    with tempfile.TemporaryDirectory(prefix=FOLDER) as name:
-        folder = Path(name)
-        paths = folder / "splats.ply", folder / "cameras.json", folder / "pack.safetensors"
+def run(views: Mapping[str, ViewFeatures], splats: lc.Splats, **settings: Any) -> tuple[lc.LiftResult, list[str]]:
+    """The lift, made through files, and the warnings of its pack; plain row-sum weights unless settings say else."""
+    with tempfile.TemporaryDirectory() as name:
+        paths = [Path(name) / part for part in ("splats.ply", "cameras.json", "pack.safetensors")]
         write_splats(splats, paths[0])
-        write_inria_cameras(Cameras(tuple(camera(view) for view in task.views)), paths[1])
-        write_pack(paths[2], task.views, {"encoder": "by hand", "normalised": "false"})
-        made = lift_files(paths[0], paths[1], paths[2:], LiftSettings.of(**{"preset": "row-sum", **task.settings}))
-        return made, describe_packs(read_features(*paths[2:]))["warnings"]
+        write_inria_cameras(lc.Cameras(tuple(camera(view) for view in views)), paths[1])
+        write_pack(paths[2], views, {"encoder": "by hand", "normalised": "false"})
+        chosen = lc.LiftSettings.of(**{"preset": "row-sum", "dtype": "float32", **settings})
+        made = lift_files(paths[0], paths[1], paths[2:], chosen)
+        return made, describe_packs(read_features(paths[2]))["warnings"]
 
 
-def dense_features(task: Task, splats: Splats, settings: LiftSettings) -> tuple[np.ndarray, np.ndarray]:
+def dense_features(
+    views: Mapping[str, ViewFeatures], splats: lc.Splats, settings: lc.LiftSettings
+) -> tuple[np.ndarray, np.ndarray]:
     """``x_j = sum w^p b / sum w^p`` [P, F] f64 over the oracle's A, and the sums [P]."""
     sums, totals = 0.0, np.zeros(splats.count)
-    for name, observation in task.views.items():
+    for name, observation in views.items():
         S, ray = reading_matrix(observation, WIDTH, HEIGHT)
         weights = exact_view(splats, camera(name), settings.lift_params).A[ray] ** settings.power
         sums = sums + weights.T @ (S @ observation.codebook.double().numpy())
@@ -270,35 +307,10 @@ def dense_features(task: Task, splats: Splats, settings: LiftSettings) -> tuple[
     return np.divide(X, totals[:, None], out=np.zeros_like(X), where=totals[:, None] > 0), totals
 
 
-def _measure_lift(task: Task, claim: Callable[[LiftResult], bool], kernel: Kernel) -> Found:
-    splats = task.splats or cloud(kernel)
-    made, warnings = run(task, splats)
-    X, totals = dense_features(task, splats, made.metadata.settings)
-    longest = max(float(view.codebook.double().abs().max()) for view in task.views.values())
-    faint = (totals > 0) & (totals < FAINT)
-    errors = np.abs(made.features.double().numpy() - X) / (longest or 1.0)
-    sound = bool(made.features.isfinite().all() & made.evidence.isfinite().all() & made.agreement.isfinite().all())
-    sound &= _survives(task, splats)
-    sound &= np.array_equal(made.seen.numpy()[~faint], totals[~faint] > 0) and not bool(
-        made.features[~made.seen].any()
-    )
-    dtype = str(made.features.dtype).removeprefix("torch.")
-    gives = f"{int(made.seen.sum())} of {splats.count} seen, {dtype}"
-    if faint.any():
-        gives += f"; {int(faint.sum())} too faint, off by {errors[faint].max():.2g}"
-    told = tuple(warnings + made.metadata.certificate["warnings"])
-    return Found(gives, float(errors[~faint].max(initial=0)), told, sound and claim(made))
-
-
-EVERYTHING = {"preset": "default", "aggregation": True, "aggregation_cluster_size": 3}
-EVERYTHING |= {"cg_steps": 3, "damping": 0.0, "reference_channels": 2}
-
-
-def _survives(task: Task, splats: Splats) -> bool:
-    """Whether least squares, reference, reweighting and aggregation give finite numbers, and questions a score."""
-    made = run(replace(task, settings={**task.settings, **EVERYTHING}), splats)[0]
+def survives(made: lc.LiftResult, view: ViewFeatures) -> bool:
+    """Whether all numbers of a lift are finite, and those of questions to it."""
     json.dumps(made.diagnostics, allow_nan=False)
-    asked = next(iter(task.views.values())).codebook[:1].float()
+    asked = view.codebook[:1].float()
     if not asked.any():
         return bool(made.features.isfinite().all())
     answers = [made.query(asked, threshold=method) for method in METHODS]
@@ -307,33 +319,13 @@ def _survives(task: Task, splats: Splats) -> bool:
     return found and all(bool(part.isfinite().all()) for part in parts)
 
 
-def _refusal(work: Callable[[], object], _: Kernel) -> Found:
-    try:
-        work()
-    except SplatliftError as error:
-        return Found("refused", None, (re.sub(rf"\S*{FOLDER}[^/]*/", "", str(error)),))
-    return Found("accepted", None, (), holds=False)
-
+# --- many wide scenes ---
 
 SCENES = 300
-BOUND = WEIGHTS
 CONDITION = 1e8
 GAINS = (0.01, 0.5, 1.0, 1.2, 16.0)
 CAPS = (0.5, 0.85, 0.98, 0.9998)  # no power of 1 - cap is a stop, as (1 - 0.99)^2 is: that tie has its own row
 STOPS = (0.0, 1e-4, 0.05)
-
-
-@dataclass(frozen=True)
-class Survey:
-    """What many wide scenes of one kernel gave."""
-
-    scenes: int
-    judged: int
-    rays: int  # of the judged scenes
-    near: int  # of those, within 1e-4 of a cut-off
-    flips: int  # of those, decided otherwise
-    error: float  # the largest of any weight elsewhere
-    finite: bool  # in all scenes
 
 
 def wide_view(seed: int, kernel: Kernel) -> View:
@@ -347,7 +339,9 @@ def wide_view(seed: int, kernel: Kernel) -> View:
     focal = width * 10.0 ** rng.uniform(-1, 3)
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = _rotation(rng), rng.uniform(-100, 100, 3)
-    camera = Camera.pinhole("v0", width, height, focal, focal * rng.uniform(0.5, 2), width * 0.4, height * 0.6, pose)
+    camera = lc.Camera.pinhole(
+        "v0", width, height, focal, focal * rng.uniform(0.5, 2), width * 0.4, height * 0.6, pose
+    )
     z = 10.0 ** rng.uniform(-2.5, 6, count)
     sides = rng.uniform(-1.5, 1.5, (count, 2)) * (width, height) / focal * z[:, None]
     means = (np.column_stack([sides, z]) - pose[:3, 3]) @ pose[:3, :3]
@@ -355,25 +349,26 @@ def wide_view(seed: int, kernel: Kernel) -> View:
     logits = np.where(rng.random(count) < 0.2, rng.choice([-1e4, 1e4, 0.0], count), rng.uniform(-12, 12, count))
     quats = np.where(rng.random((count, 1)) < 0.1, IDENTITY, rng.normal(0, 1, (count, 4)))
     splats = splats_at(means, log_scales, logits, quats, kernel, rng.uniform(-6, 4, count))
-    walk = CompositingParams(float(rng.choice(GAINS)), float(rng.choice(CAPS)), float(rng.choice(STOPS)))
+    walk = lc.CompositingParams(float(rng.choice(GAINS)), float(rng.choice(CAPS)), float(rng.choice(STOPS)))
     return View(splats, camera, walk)
 
 
-def survey(kernel: Kernel, scenes: int = SCENES) -> Survey:
-    """Compare so many wide scenes with the oracle."""
-    judged = rays = near = flips = 0
-    error, finite = 0.0, True
+def survey(kernel: Kernel, scenes: int = SCENES) -> dict[str, Any]:
+    """What many wide scenes gave beside the oracle.
+
+    Of the scenes that can be ``judged``: rays, those of them within 1e-4 of a cut-off (``near``) and those of these
+    that float32 decided otherwise (``flips``), and the largest ``error`` of any weight elsewhere.
+    """
+    judged, error, finite = [], 0.0, True
     for seed in range(scenes):
         view = wide_view(seed, kernel)
         got = compare(view.splats, view.camera, view.walk)
         finite &= got.finite and bool(got.got.min(initial=0) >= 0 and got.got.sum(axis=1).max() <= 1 + 1e-5)
         if judgeable(view):
-            judged += 1
-            rays += got.rays
-            near += got.near
-            flips += got.flips
+            judged.append((got.rays, got.near, got.flips))
             error = max(error, got.error)
-    return Survey(scenes, judged, rays, near, flips, error, finite)
+    sums = dict(zip(("rays", "near", "flips"), np.sum(judged, axis=0).tolist(), strict=True))
+    return {"scenes": scenes, "judged": len(judged), **sums, "error": error, "finite": finite}
 
 
 def judgeable(view: View) -> bool:

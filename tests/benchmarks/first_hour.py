@@ -25,14 +25,12 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+import liftcore as lc
 from liftcore.evaluate.check import check_scene
 from liftcore.features.encoders.encode import find_images
 from liftcore.features.pack import Views, as_views, read_features
-from liftcore.features.views import FeatureGrid
 from liftcore.io.cameras import read_cameras
 from liftcore.io.splats import read_splats
-from liftcore.scene.cameras import Cameras
-from liftcore.scene.splats import Splats
 from tests.benchmarks.base import command_line
 from tests.still_life.files import write_still_life
 from tests.still_life.scene import still_life
@@ -57,8 +55,8 @@ class Case(NamedTuple):
 class Scene(NamedTuple):
     """A scene as `check` takes it."""
 
-    splats: Splats
-    cameras: Cameras
+    splats: lc.Splats
+    cameras: lc.Cameras
     photos: Mapping[str, Path] | None
     packs: Mapping[str, Views]
 
@@ -115,7 +113,7 @@ def _healthy(name: str, scene: Scene, views: Views) -> Iterator[Case]:
         yield Case(f"{name}, healthy, {len(some)} views", not found.wrong, said)
 
 
-def _broken(name: str, scene: Scene, views: Views, foreign: Cameras) -> Iterator[Case]:
+def _broken(name: str, scene: Scene, views: Views, foreign: lc.Cameras) -> Iterator[Case]:
     renamed = [
         camera.replace(name=own)
         for own, camera in zip(scene.cameras, list(foreign.values()) * len(scene.cameras), strict=False)
@@ -123,7 +121,7 @@ def _broken(name: str, scene: Scene, views: Views, foreign: Cameras) -> Iterator
     broken = {
         "positions x 0.3": (_scaled(scene.cameras, 0.3), views),
         "positions x 0.5": (_scaled(scene.cameras, 0.5), views),
-        "foreign cameras": (Cameras(renamed), views),
+        "foreign cameras": (lc.Cameras(renamed), views),
     }
     if not views.is_regions(views.views[0]):
         broken["[F, h, w] under [h, w, F]"] = (scene.cameras, _turned(views))
@@ -135,17 +133,17 @@ def _broken(name: str, scene: Scene, views: Views, foreign: Cameras) -> Iterator
             yield Case(f"{name}, {what}, {beside}", bool(found.wrong), said)
 
 
-def _scaled(cameras: Cameras, factor: float) -> Cameras:
+def _scaled(cameras: lc.Cameras, factor: float) -> lc.Cameras:
     scale = np.ones((4, 4))
     scale[:3, 3] = factor
-    return Cameras([camera.replace(viewmat=camera.viewmat * scale) for camera in cameras.values()])
+    return lc.Cameras([camera.replace(viewmat=camera.viewmat * scale) for camera in cameras.values()])
 
 
 def _turned(views: Views) -> Views:
     made = {}
     for name, view in views.items():
-        assert isinstance(view, FeatureGrid)
-        made[name] = FeatureGrid(torch.clone(view.grid.permute(2, 0, 1).contiguous()).reshape(view.grid.shape))
+        assert isinstance(view, lc.FeatureGrid)
+        made[name] = lc.FeatureGrid(torch.clone(view.grid.permute(2, 0, 1).contiguous()).reshape(view.grid.shape))
     return as_views(made)
 
 

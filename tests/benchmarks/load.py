@@ -13,7 +13,6 @@ import asyncio
 import contextlib
 import json
 import os
-import platform
 import socket
 import subprocess
 import sys
@@ -21,11 +20,12 @@ import tempfile
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
-from datetime import UTC, datetime
-from itertools import islice
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -35,8 +35,10 @@ from safetensors.torch import save_file
 from liftcore.cli.demo import serving
 from liftcore.demo.run import Client
 from liftcore.raster.cpu.warm_up import warm_up
+from tests.benchmarks.base import machine
 from tests.benchmarks.scenes import Room, write_bench_room
 
+T = TypeVar("T")
 HEALTH_MS, QUERY_SECONDS = 50.0, 2.0  # the most that is promised of an otherwise idle machine
 OTHER = Room(200_000, 60, (640, 480), 32)  # what is lifted meanwhile; it takes a minute or more
 QUESTIONS = 16  # at the same moment
@@ -68,7 +70,8 @@ def measure(seconds: float, rounds: int, splats: int) -> dict[str, Any]:
             stop = threading.Event()
             lifts = threading.Thread(target=_keep_lifting, args=(url, other, stop))
             lifts.start()
-            _wait_for_lift(client)
+            while not any(job["state"] == "running" and job["plan"] for job in client.get("/jobs")["jobs"]):
+                time.sleep(0.05)
             with _slow_clients(url, f"/assets/{large['splats']}/content") as told:
                 slow = probe(url, _after(seconds))
             beside = _questions(url, job["id"], words, rounds)
@@ -85,9 +88,9 @@ def measure(seconds: float, rounds: int, splats: int) -> dict[str, Any]:
         }
 
 
-def _write_words(path: Path, count: int) -> list[str]:
-    rows = torch.nn.functional.normalize(torch.randn(count, 512, generator=torch.Generator().manual_seed(1)), dim=1)
-    words = [f"word{number}" for number in range(count)]
+def _write_words(path: Path, number: int) -> list[str]:
+    rows = torch.nn.functional.normalize(torch.randn(number, 512, generator=torch.Generator().manual_seed(1)), dim=1)
+    words = [f"word{k}" for k in range(number)]
     save_file({"embeddings": rows}, str(path), metadata={"words": json.dumps(words)})
     return words
 
@@ -95,52 +98,48 @@ def _write_words(path: Path, count: int) -> list[str]:
 def _upload(client: Client, folder: Path, size: Room) -> dict[str, Any]:
     """Write a room and upload it; the body of an order of its lift."""
     folder.mkdir()
-    kinds = ("splats", "cameras", "features")
-    ids = {
-        kind: client.upload(kind, path)["id"]
-        for kind, path in zip(kinds, write_bench_room(folder, size), strict=True)
-    }
-    return {**ids, "features": [ids["features"]]}
+    splats, cameras, features = (
+        client.upload(kind, path)["id"]
+        for kind, path in zip(("splats", "cameras", "features"), write_bench_room(folder, size), strict=True)
+    )
+    return {"splats": splats, "cameras": cameras, "features": [features]}
 
 
 def _keep_lifting(url: str, body: dict[str, Any], stop: threading.Event) -> None:
     """Lift one after the other, each of another seed."""
-    client, seed = Client(url), 0
-    while not stop.is_set():
-        seed += 1
+    client = Client(url)
+    for seed in count(1):
+        if stop.is_set():
+            break
         client.lift(body | {"settings": {"seed": seed}}, lambda _: None)
     client.close()
-
-
-def _wait_for_lift(client: Client) -> None:
-    while not any(job["state"] == "running" and job["plan"] for job in client.get("/jobs")["jobs"]):
-        time.sleep(0.05)
 
 
 def _questions(url: str, lift: str, words: Iterator[str], rounds: int) -> dict[str, Any]:
     """Ask rounds of different questions, those of a round at the same moment; how long they took."""
     slowest, every, load = [], [], []
+    clients = [Client(url) for _ in range(QUESTIONS)]
+
+    def ask(client: Client, word: str) -> float:
+        begin = time.perf_counter()
+        client.get("/query", lift=lift, text=word)
+        return time.perf_counter() - begin
+
     for _ in range(rounds):
-        chosen, clients = list(islice(words, QUESTIONS)), [Client(url) for _ in range(QUESTIONS)]
         load.append(round(os.getloadavg()[0], 1))
-        gate, times = threading.Barrier(QUESTIONS), [0.0] * QUESTIONS
-
-        def ask(k: int, own: tuple[Any, ...] = (gate, times, clients, chosen)) -> None:
-            own[0].wait()
-            begin = time.perf_counter()
-            own[2][k].ask(lift, own[3][k])
-            own[1][k] = time.perf_counter() - begin
-
-        threads = [threading.Thread(target=ask, args=(k,)) for k in range(QUESTIONS)]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
-        for client in clients:
-            client.close()
+        times = at_once([partial(ask, client, next(words)) for client in clients])
         slowest.append(round(max(times), 2))
         every += times
+    for client in clients:
+        client.close()
     return {"median": round(float(np.median(every)), 2), "slowest_of_each_round": slowest, "load": load}
+
+
+def at_once(work: Sequence[Callable[[], T]]) -> list[T]:
+    """What each gives, all begun at the same moment in threads of their own."""
+    gate = threading.Barrier(len(work))
+    with ThreadPoolExecutor(len(work)) as pool:
+        return list(pool.map(lambda one: (gate.wait(), one())[1], work))
 
 
 def probe(url: str, over: Callable[[], bool]) -> dict[str, Any]:
@@ -182,8 +181,7 @@ def _slow_clients(url: str, path: str, sockets: int = 200, readers: int = 20) ->
 async def _be_slow(port: int, path: str, sockets: int, readers: int) -> None:
     """Trickle until stdin ends; then say how many connections are open, and how often each kind was cut off."""
     kinds = [name for name in SLOW for _ in range(sockets // len(SLOW))] + ["download"] * readers
-    cut: Counter[str] = Counter()
-    live: Counter[str] = Counter()
+    cut, live = Counter[str](), Counter[str]()
     came = [asyncio.Event() for _ in kinds]
 
     async def keep_coming(kind: str, first: asyncio.Event) -> None:
@@ -208,14 +206,12 @@ async def _be_slow(port: int, path: str, sockets: int, readers: int) -> None:
             await asyncio.sleep(0.05)
 
     tasks = [asyncio.create_task(keep_coming(kind, first)) for kind, first in zip(kinds, came, strict=True)]
-    for first in came:
-        await first.wait()
+    await asyncio.gather(*(first.wait() for first in came))
     print("all have come", flush=True)
     await asyncio.to_thread(sys.stdin.read)
-    told = {"open": dict(live), "cut_off": dict(cut)}
+    print(json.dumps({"open": live, "cut_off": cut}), flush=True)
     for task in tasks:
         task.cancel()
-    print(json.dumps(told), flush=True)
 
 
 def main() -> int:
@@ -231,13 +227,9 @@ def main() -> int:
         asyncio.run(_be_slow(int(port), path, int(sockets), int(readers)))
         return 0
     warm_up()
-    begun = {
-        "date": datetime.now(UTC).isoformat(timespec="minutes"),
-        "machine": f"{os.cpu_count()} cores, Python {platform.python_version()}",
-        "load_before": [round(load, 1) for load in os.getloadavg()],
-    }
+    head = machine() | {"load_before": [round(load, 1) for load in os.getloadavg()]}
     found = measure(given.seconds, given.rounds, given.splats)
-    print(json.dumps({**begun, **found}, indent=2))
+    print(json.dumps(head | found, indent=2))
     health, asked = found["healthz_ms"]["beside_slow_clients_and_a_lift"], found["questions_s"]["beside_a_lift"]
     quick = health["p99"] < HEALTH_MS and max(asked["slowest_of_each_round"]) < QUERY_SECONDS
     return 0 if quick and health["wrong"] == found["drafts_left"] == 0 and found["lifts_ran"] else 1

@@ -18,11 +18,11 @@ import platform
 import socket
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -34,7 +34,7 @@ from service.store.jobs import JobOrder
 from service.store.lifts import FinishedLift
 from service.store.owners import SERVICE
 from service.store.store import Store
-from tests.benchmarks.load import probe
+from tests.benchmarks.load import at_once, probe
 from tests.crash.service_process import ServiceProcess
 
 LIMIT_MB, HEALTH_MS = 400.0, 50.0
@@ -75,23 +75,18 @@ def add(store: Store, kind: AssetKind, names: list[str]) -> str:
         return store.assets.add(SERVICE, upload)[0].id
 
 
-def at_once(count: int, ask: Callable[[httpx.Client, int], object]) -> Load:
+def many(count: int, ask: Callable[[httpx.Client, int], object]) -> Load:
     """So many clients that ask and read at the same moment, each twice."""
 
     def run(url: str) -> None:
-        gate = threading.Barrier(count)
+        with ExitStack() as opened:
+            clients = [opened.enter_context(httpx.Client(base_url=url, timeout=600)) for _ in range(count)]
 
-        def one(number: int) -> None:
-            with httpx.Client(base_url=url, timeout=600) as client:
-                gate.wait()
+            def twice(number: int) -> None:
                 for _ in range(2):
-                    ask(client, number)
+                    ask(clients[number], number)
 
-        threads = [threading.Thread(target=one, args=(number,)) for number in range(count)]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
+            at_once([partial(twice, number) for number in range(count)])
 
     return run
 
@@ -124,13 +119,13 @@ def loads(asset: str, lift: str) -> dict[str, Load]:
     scores = f"/query/scores?like=splat:0&lift={lift.removeprefix('/lifts/')}"
     return {
         "nothing": lambda url: time.sleep(5),
-        "40 at once: GET /assets/ID": at_once(40, lambda client, _: client.get(asset)),
-        "40 at once: pages of its names": at_once(40, lambda client, n: client.get(f"{asset}/names?cursor={n}000")),
-        "40 at once: GET /lifts/ID and /lifts": at_once(40, lambda ask, _: (ask.get(lift), ask.get("/lifts"))),
+        "40 at once: GET /assets/ID": many(40, lambda client, _: client.get(asset)),
+        "40 at once: pages of its names": many(40, lambda client, n: client.get(f"{asset}/names?cursor={n}000")),
+        "40 at once: GET /lifts/ID and /lifts": many(40, lambda ask, _: (ask.get(lift), ask.get("/lifts"))),
         "80 clients that do not read": never_read(("/jobs", asset, f"{asset}/names", lift, "/lifts")),
         "80 that do not read 32 MB of scores": never_read((scores,), pipelined=1),
-        "32 orders with settings of 1 MB": at_once(32, of_a_megabyte),
-        "8 at once: GET /jobs whole": at_once(8, lambda client, _: client.get("/jobs")),
+        "32 orders with settings of 1 MB": many(32, of_a_megabyte),
+        "8 at once: GET /jobs whole": many(8, lambda client, _: client.get("/jobs")),
     }
 
 

@@ -14,7 +14,6 @@ splats with evidence over 0.5; the ``mean`` and ``worst`` of their best IoUs; ``
 there should be with table and curtain; and what they cost, ``seconds`` of the lift's ``of``.
 """
 
-import json
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
@@ -24,26 +23,16 @@ from typing import Any
 
 import numpy as np
 
-import liftcore as lc
-from liftcore.features.pack import read_features
 from liftcore.query.ask import Answer, ask
 from liftcore.query.objects import objects
 from liftcore.query.scene import QueryScene
 from liftcore.query.text import open_encoder
 from liftcore.solve.clusters import cluster_splats
-from tests.benchmarks.base import PACKS, PRESETS, command_line, lift_files, opened, scene_files, tell
-from tests.benchmarks.tabletop import Tabletop
+from tests.benchmarks.base import PACKS, PRESETS, box_iou, command_line, read_pack, tell
+from tests.benchmarks.tabletop import Truth, tabletop
 
 FOUND = 0.75  # IoU of splats
-PROCEDURAL = "(procedural)"  # the source of what the things stand on and before
-
-
-def box_iou(one: np.ndarray, other: np.ndarray) -> float:
-    """Volume of the intersection over that of the union of two boxes [2, 3], corners; 0 where both are flat."""
-    sides = np.minimum(one[1], other[1]) - np.maximum(one[0], other[0])
-    common = float(np.prod(np.maximum(sides, 0)))
-    union = float(np.prod(one[1] - one[0]) + np.prod(other[1] - other[0])) - common
-    return common / union if union > 0 else 0.0
+CLOTHS = ("tablecloth", "curtain")  # what the things stand on and before
 
 
 def measure_lift(scene: QueryScene, answers: dict[int, Answer], owners: np.ndarray) -> dict[str, Any]:
@@ -87,14 +76,10 @@ def best_ious(labels: np.ndarray, owners: np.ndarray, things: Iterable[int]) -> 
 
 def rows_without_words(folder: Path, packs: Iterable[str], strides: Iterable[int]) -> Iterator[dict[str, Any]]:
     """Two rows a lift of the preset default: the objects that it holds, and HDBSCAN's clusters of its features."""
-    truth = Tabletop(folder)
-    known = json.loads((folder / "truth.json").read_text())["objects"]
-    things = [number for number, thing in enumerate(known) if thing["source"] != PROCEDURAL]
-    owners = truth.objects.numpy()[truth.counted.numpy()].astype(np.int64)
+    truth = tabletop(folder)
+    things, owners = things_of(truth), truth.objects.numpy()[truth.counted.numpy()].astype(np.int64)
     for pack, stride in product(packs, strides):
-        whole = read_features(folder / f"{pack}.safetensors")
-        views = {view: whole[view] for view in whole.views[::stride]}
-        made = lc.lift(truth.raster.splats, truth.cameras, views, preset="default", certificate_rays=0)
+        made = truth.lift(read_pack(folder, pack, stride), preset="default")
         assert made.object is not None
         start = time.perf_counter()
         clusters = cluster_splats(made.features, made.evidence.numpy(), made.settings).labels
@@ -103,40 +88,44 @@ def rows_without_words(folder: Path, packs: Iterable[str], strides: Iterable[int
             own = labels.numpy()[truth.counted.numpy()]
             ious = best_ious(own, owners, things)
             yield {
-                "features": pack, "views": len(views), "by": by, "found": int((ious > FOUND).sum()),
+                "features": pack, "views": len(made.views), "by": by, "found": int((ious > FOUND).sum()),
                 "mean": float(ious.mean()), "worst": float(ious.min()), "all": int(labels.max()) + 1,
                 "seconds": spent[by], "of": sum(made.metadata.timings.values()),
             }  # fmt: skip
 
 
-def rows_of(folder: Path, packs: Iterable[str] = PACKS, presets: Iterable[str] = PRESETS) -> Iterator[dict[str, Any]]:
+def rows_of(folder: Path, packs: Iterable[str], presets: Iterable[str]) -> Iterator[dict[str, Any]]:
     """One row a lift of the tabletop scene."""
-    truth = Tabletop(folder)
-    known = json.loads((folder / "truth.json").read_text())["objects"]
-    words = {number: thing["class"] for number, thing in enumerate(known) if thing["source"] != PROCEDURAL}
-    encoder = open_encoder(f"table:{folder / 'text_table.safetensors'}")
+    truth, encoder = tabletop(folder), open_encoder(f"table:{folder / 'text_table.safetensors'}")
     for pack, preset in product(packs, presets):
-        scene = opened(lift_files(scene_files(folder, pack), preset=preset), truth.raster)
-        answers = {thing: ask(scene, word, encoder) for thing, word in words.items()}
+        scene = truth.opened(truth.lift(read_pack(folder, pack), preset=preset))
+        answers = {thing: ask(scene, truth.words[thing], encoder) for thing in things_of(truth)}
         yield {"features": pack, "preset": preset, **measure_lift(scene, answers, truth.objects.numpy())}
+
+
+def things_of(truth: Truth) -> list[int]:
+    """The classes that are things, by their numbers."""
+    return [number for number, word in enumerate(truth.words) if word not in CLOTHS]
 
 
 def main() -> None:
     """Print the table, or one JSON object."""
-    packs, presets = {"nargs": "+", "default": PACKS, "choices": PACKS}, {"nargs": "+", "default": PRESETS}
     parser = command_line(
-        "tests.benchmarks.objects", __doc__, ("folder", {"type": Path}), ("--features", packs), ("--presets", presets)
+        "tests.benchmarks.objects",
+        __doc__,
+        ("folder", {"type": Path}),
+        ("--features", {"nargs": "+", "default": PACKS, "choices": PACKS}),
+        ("--presets", {"nargs": "+", "default": PRESETS}),
+        ("--without-words", {"action": "store_true", "help": "the objects that lifts hold, not those of words"}),
+        ("--strides", {"nargs": "*", "type": int, "default": (1, 2, 4), "help": "every n-th view, without words"}),
     )
-    parser.add_argument(
-        "--without-words", action="store_true", help="the objects that lifts hold, not those of words"
-    )
-    parser.add_argument("--strides", nargs="*", type=int, default=(1, 2, 4), help="every n-th view, without words")
     options = parser.parse_args()
     if options.without_words:
         packs = [pack for pack in options.features if pack != "grids"]  # which have no masks
-        tell(rows_without_words(options.folder, packs, options.strides), as_json=options.json)
-        return
-    tell(rows_of(options.folder, options.features, options.presets), as_json=options.json)
+        rows = rows_without_words(options.folder, packs, options.strides)
+    else:
+        rows = rows_of(options.folder, options.features, options.presets)
+    tell(rows, as_json=options.json)
 
 
 if __name__ == "__main__":

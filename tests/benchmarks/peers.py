@@ -17,7 +17,7 @@ import math
 import os
 import statistics
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -29,37 +29,28 @@ from numba import njit
 from torch import Tensor
 from torch.nn.functional import cosine_similarity, embedding, embedding_bag, pad, threshold
 
+import liftcore as lc
+from liftcore.device import CPU, Device
 from liftcore.evaluate.bench import weigh_regions
 from liftcore.evaluate.synthetic import room_cameras, room_regions, room_splats
-from liftcore.features.views import Regions, cells_under
-from liftcore.raster.base import ALPHA_FLOOR, TILE, CompositingParams, Weighting
+from liftcore.features.views import cells_under
+from liftcore.raster import open_raster
+from liftcore.raster.base import ALPHA_FLOOR, TILE, Weighting
 from liftcore.raster.cpu.composite import Frame
 from liftcore.raster.cpu.project import CUTOFF, KY, MX, MY, OPACITY, ROOT_X, SLOPE
 from liftcore.raster.cpu.raster import CpuRaster
-from liftcore.scene.cameras import Camera
-from liftcore.scene.splats import Splats
 from liftcore.solve.closed_form import solve
 from tests.benchmarks.base import command_line, tell
+from tests.benchmarks.scenes import Room
 
 LONG = 60.0  # seconds
 THREADS = len(os.sched_getaffinity(0))
 
 
-@dataclass(frozen=True)
-class Size:
-    """How much there is to lift."""
-
-    splats: int
-    width: int  # pixels
-    height: int  # pixels
-    views: int
-    channels: int
-
-
-TINY = Size(500, 64, 48, 1, 4)  # to load kernels and start threads
+TINY = Room(500, 1, (64, 48), 4)  # to load kernels and start threads
 SIZES = {
-    "large": [Size(200_000, 640, 480, 2, 512)],
-    "channels": [Size(20_000, 200, 150, 4, n) for n in (4, 16, 64, 256, 1024)],
+    "large": [Room(200_000, 2, (640, 480), 512)],
+    "channels": [Room(20_000, 4, (200, 150), channels) for channels in (4, 16, 64, 256, 1024)],
 }
 
 
@@ -67,9 +58,9 @@ SIZES = {
 class Work:
     """One scene, its views with label maps and codebooks, and how rays are composited."""
 
-    splats: Splats
-    views: tuple[tuple[Camera, Regions], ...]
-    walk: CompositingParams = field(default_factory=CompositingParams)
+    splats: lc.Splats
+    views: tuple[tuple[lc.Camera, lc.Regions], ...]
+    params: lc.CompositingParams = field(default_factory=lc.CompositingParams)
 
     @property
     def channels(self) -> int:
@@ -80,25 +71,30 @@ class Work:
 Answer = tuple[Tensor, Tensor]  # X [P, F] f32, zero where no ray met the splat; A^T n [P] f64 over all views
 
 
-def room(size: Size) -> Work:
+def room(size: Room) -> Work:
     """The synthetic room of ``splatlift bench`` at a size, always the same."""
-    cameras = room_cameras(size.views, size.width, size.height)
+    cameras = room_cameras(size.views, *size.size)
     views = tuple((camera, room_regions(camera, k, 4, size.channels)) for k, camera in enumerate(cameras))
     return Work(room_splats(size.splats), views)
 
 
-def dense_target(camera: Camera, regions: Regions) -> Tensor:
-    """B and n of a view as an image [H, W, F + 1] f32, n last; levels are added up, a quarter of a peer's work."""
+def at_pixels(regions: lc.Regions, camera: lc.Camera) -> lc.Regions:
+    """The regions with a label a pixel."""
     rows, columns = regions.labels.shape[1:]
     y = cells_under(torch.arange(camera.height), camera.height, rows)
     x = cells_under(torch.arange(camera.width), camera.width, columns)
-    labels = regions.labels[:, y][:, :, x].reshape(len(regions.labels), -1).T
+    return lc.Regions(regions.labels[:, y][:, :, x].contiguous(), regions.codebook)
+
+
+def dense_target(regions: lc.Regions, place: torch.device = CPU.place) -> Tensor:
+    """B and n of every pixel, [H, W, F + 1] f32, n last: levels are added up, a quarter of a peer's work."""
     count, channels = regions.codebook.shape
-    book = torch.zeros(count + 1, channels + 1)  # its last row is what an unlabelled level reads
-    book[:count, :channels] = regions.codebook
+    book = torch.zeros(count + 1, channels + 1, device=place)  # its last row is what an unlabelled level reads
+    book[:count, :channels] = regions.codebook.to(place)
     book[:count, channels] = 1.0
+    labels = regions.labels.to(place).flatten(1).T
     target = embedding_bag(torch.where(labels >= 0, labels, count), book, mode="sum")
-    return target.reshape(camera.height, camera.width, channels + 1)
+    return target.reshape(*regions.labels.shape[1:], channels + 1)
 
 
 def answer_of(sums: Tensor) -> Answer:
@@ -107,12 +103,12 @@ def answer_of(sums: Tensor) -> Answer:
     return torch.where(totals > 0, sums[:, :-1] / totals, 0.0), totals[:, 0].double()
 
 
-def ours(work: Work) -> Answer:
+def ours(work: Work, device: Device = CPU) -> Answer:
     """As ``splatlift lift --preset row-sum --set dtype=float32`` has it."""
-    raster, looking = CpuRaster(work.splats, THREADS), (work.walk, Weighting())
-    W, codebook = weigh_regions(raster, work.views, looking, work.splats.count, THREADS)
-    solution = solve(W, codebook, torch.float32, means=work.splats.means, threads=THREADS)
-    return solution.features, W.row_sums()
+    raster, looking = open_raster(work.splats, device), (work.params, Weighting())
+    W, codebook = weigh_regions(raster, work.views, looking, work.splats.count)
+    solution = solve(W, codebook, torch.float32, means=work.splats.means, device=device)
+    return solution.features, W.row_sums().cpu()
 
 
 # --- dense numba ---
@@ -126,8 +122,8 @@ def dense_numba(work: Work) -> Answer:
     own = np.zeros((THREADS, work.splats.count, work.channels + 1), np.float32)
     with ThreadPoolExecutor(THREADS) as pool:
         for camera, regions in work.views:
-            (frame,) = raster._bands(camera, work.walk)
-            target = dense_target(camera, regions).numpy()
+            (frame,) = raster._bands(camera, work.params)
+            target = dense_target(at_pixels(regions, camera)).numpy()
             marks = np.linspace(0, frame.starts[-1], SHARES + 1)  # about as many list items a share
             edges = np.searchsorted(frame.starts, marks).clip(0, frame.columns * frame.rows)
             parts = [pool.submit(_add_shares, k, THREADS, edges, frame, target, own[k]) for k in range(THREADS)]
@@ -215,8 +211,8 @@ def torch_autograd(work: Work) -> Answer:
     one_each = {"initializer": torch.set_num_threads, "initargs": (1,)}
     with torch_threads(1), ThreadPoolExecutor(THREADS, **one_each) as pool:
         for camera, regions in work.views:
-            (frame,) = raster._bands(camera, work.walk)
-            target = by_tile(dense_target(camera, regions))
+            (frame,) = raster._bands(camera, work.params)
+            target = by_tile(dense_target(at_pixels(regions, camera)))
             tiles = torch.arange(len(target))
             parts = [pool.submit(_add_view, frame, target, tiles[k::THREADS], sums) for k, sums in enumerate(own)]
             for part in parts:
@@ -301,12 +297,14 @@ PEERS: dict[str, Callable[[Work], Answer]] = {
 }  # fmt: skip
 
 
-def side_by_side(size: Size, rounds: int) -> Iterator[dict[str, Any]]:
-    """A row a peer: all lift the work in turns, a round of all, then the next; each is held to our X."""
-    work, seconds = room(size), {name: [] for name in PEERS}
+def side_by_side(
+    size: Room, work: Work, peers: Mapping[str, Callable[[Work], Answer]], rounds: int
+) -> Iterator[dict[str, Any]]:
+    """A row a peer: all lift the work in turns, a round of all, then the next; each is held to the first's X."""
+    seconds: dict[str, list[float]] = {name: [] for name in peers}
     answers: dict[str, Answer] = {}
     for _ in range(rounds):
-        for name, lift in PEERS.items():
+        for name, lift in peers.items():
             if max(seconds[name], default=0.0) < LONG:
                 start = time.perf_counter()
                 answers[name] = lift(work)
@@ -317,7 +315,7 @@ def side_by_side(size: Size, rounds: int) -> Iterator[dict[str, Any]]:
         median = statistics.median(seconds[name])
         cosines = cosine_similarity(features, theirs, dim=1).double()
         yield {
-            "splats": size.splats, "image": f"{size.width}x{size.height}", "views": size.views,
+            "splats": size.splats, "image": "x".join(map(str, size.size)), "views": size.views,
             "channels": size.channels, "peer": name, "seconds": median, "fastest": min(seconds[name]),
             "times ours": median / usual, "cosine": float((cosines * evidence).sum() / evidence.sum()),
         }  # fmt: skip
@@ -334,7 +332,8 @@ def main() -> None:
     options = parser.parse_args()
     for lift in PEERS.values():
         lift(room(TINY))
-    rows = [row for name in options.sizes for size in SIZES[name] for row in side_by_side(size, options.rounds)]
+    sizes = [size for name in options.sizes for size in SIZES[name]]
+    rows = [row for size in sizes for row in side_by_side(size, room(size), PEERS, options.rounds)]
     tell(rows, as_json=options.json)
 
 

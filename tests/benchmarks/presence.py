@@ -10,25 +10,20 @@ the encoder makes itself.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from liftcore.features.pack import read_features
-from liftcore.io.cameras import read_cameras
-from liftcore.lifting import lift
 from liftcore.query.presence import References, judge, references_of
 from liftcore.query.scene import QueryScene
 from liftcore.query.scores import cosines
 from liftcore.query.text import open_encoder
 from liftcore.query.text.table import TableEncoder
-from liftcore.raster.cpu.raster import CpuRaster
-from tests.benchmarks.base import PACKS, command_line, tell
-from tests.benchmarks.consensus import HARD
-from tests.benchmarks.tabletop import Tabletop
-from tests.still_life.masks import Mistakes, observe
-from tests.still_life.scene import still_life
+from tests.benchmarks.base import PACKS, command_line, read_pack, tell
+from tests.benchmarks.consensus import still_life_scene
+from tests.benchmarks.tabletop import tabletop
 
 PRESETS = ("default", "row-sum", "tikhonov")
 ABSENT = 200
@@ -48,11 +43,8 @@ def told(scene: QueryScene, vectors: np.ndarray, references: References) -> np.n
 
 def figures(present: np.ndarray, absent: np.ndarray) -> dict[str, Any]:
     """Of the presence of things that are there, and of others."""
-    return {
-        "missed": int((present < 0.5).sum()),
-        "lowest": float(present.min()),
-        "nothing": float((absent < 0.5).mean()),
-    }
+    missed, nothing = int((present < 0.5).sum()), float((absent < 0.5).mean())
+    return {"missed": missed, "lowest": float(present.min()), "nothing": nothing}
 
 
 def measured(scene: QueryScene, table: TableEncoder, present: Sequence[int]) -> dict[str, Any]:
@@ -70,20 +62,16 @@ def measured(scene: QueryScene, table: TableEncoder, present: Sequence[int]) -> 
 
 
 def tabletop_rows(
-    folder: Path, packs: Iterable[str], presets: Iterable[str], strides: Iterable[int]
+    folder: Path, packs: Iterable[str], presets: Sequence[str], strides: Sequence[int]
 ) -> Iterator[dict[str, Any]]:
     """One row a lift of the tabletop scene."""
-    scene, table = Tabletop(folder), TableEncoder.open(folder / "text_table.safetensors")
-    present = [int(np.argmax(table.embeddings @ row)) for row in scene.classes.numpy()]
-    cameras, presets, strides = read_cameras(folder / "cameras.json"), list(presets), list(strides)
+    truth, table = tabletop(folder), TableEncoder.open(folder / "text_table.safetensors")
+    present = [int(np.argmax(table.embeddings @ row)) for row in truth.classes.numpy()]
     for pack in packs:
-        whole = read_features(folder / f"{pack}.safetensors")
-        for stride in strides if pack != "grids" else (1,):
-            views = {view: whole[view] for view in whole.views[::stride]}
-            for preset in presets:
-                lifted = lift(scene.raster.splats, cameras, views, preset=preset, certificate_rays=0)
-                head = {"scene": f"{pack}, {len(views)} views", "preset": preset}
-                yield head | measured(QueryScene(lifted), table, present)
+        for stride, preset in product(strides if pack != "grids" else (1,), presets):
+            lifted = truth.lift(read_pack(folder, pack, stride), preset=preset)
+            head = {"scene": f"{pack}, {len(lifted.views)} views", "preset": preset}
+            yield head | measured(truth.opened(lifted), table, present)
 
 
 def still_life_rows(presets: Iterable[str]) -> Iterator[dict[str, Any]]:
@@ -91,21 +79,15 @@ def still_life_rows(presets: Iterable[str]) -> Iterator[dict[str, Any]]:
     encoder = open_encoder("minilm")
     references = references_of(encoder, "minilm")
     assert isinstance(references, References)
-    presets = list(presets)
-    for seed, (name, mistakes) in enumerate((("usual", Mistakes()), ("hard", HARD)), start=7):
-        made = still_life(seed)
-        views = observe(made, CpuRaster(made.splats), encoder, mistakes, seed)
+    for seed, kind in enumerate(("usual", "hard"), start=7):
+        truth, views = still_life_scene(kind, seed)
         for preset in presets:
-            scene = QueryScene(lift(made.splats, made.cameras, views, preset=preset, certificate_rays=0))
+            scene = truth.opened(truth.lift(views, preset=preset))
             present, absent = (told(scene, encoder.encode(words), references) for words in (THERE, NOT_THERE))
             wrong = [word for word, one in zip(THERE, present, strict=True) if one < 0.5]
             wrong += [word for word, one in zip(NOT_THERE, absent, strict=True) if one >= 0.5]
-            yield {
-                "scene": f"still life, {name}",
-                "preset": preset,
-                **figures(present, absent),
-                "wrong": ", ".join(wrong),
-            }
+            head = {"scene": f"still life, {kind}", "preset": preset}
+            yield head | figures(present, absent) | {"wrong": ", ".join(wrong)}
 
 
 def main() -> None:

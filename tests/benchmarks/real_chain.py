@@ -40,26 +40,21 @@ from scipy import ndimage
 from torch import Tensor
 from torch.nn import functional
 
+import liftcore as lc
 from liftcore.features.encoders.encode import find_images
 from liftcore.features.pack import read_features
-from liftcore.features.views import FeatureGrid
 from liftcore.query.ask import ask
 from liftcore.query.directions import MINIMUM_ROW_SUM
 from liftcore.query.render import overlay, view_mask
 from liftcore.query.scene import QueryScene
 from liftcore.query.terms import Pixel, Query
 from liftcore.query.text.table import TableEncoder
-from tests.benchmarks.base import cameras_of, command_line, tell
+from tests.benchmarks.base import box_iou, command_line, scene_files, tell
 
 Box = tuple[int, int, int, int]
-
-
-class Question(NamedTuple):
-    """What is asked of a lift, and the word of the boxes that it is judged by."""
-
-    told: str
-    word: str
-    terms: tuple[str | Pixel, ...]
+Question = tuple[
+    str, str, tuple[str | Pixel, ...]
+]  # what is asked, the word of the boxes that judge it, and its terms
 
 
 PIP = ("h5py==3.15.1",)
@@ -97,11 +92,11 @@ BOXES: Mapping[str, Mapping[str, Sequence[Box]]] = {
 }
 _PLACES = {"face": (500, 350), "hair": (450, 220), "fleece": (690, 520), "dress": (520, 460), "quilt": (250, 690)}
 _SHOWN = {place: Pixel("20240212_003921", *pixel) for place, pixel in _PLACES.items()}
-BY_WORD = tuple(Question(word, word, (word,)) for word in WORDS)
-BY_EXAMPLE = (
-    Question("a pixel of its face", "teddy bear", (_SHOWN["face"],)),
-    Question("pixels of face, hair, fleece, dress", "teddy bear", (*_SHOWN.values(),)[:4]),
-    Question("a pixel of the quilt", "bed", (_SHOWN["quilt"],)),
+BY_WORD: tuple[Question, ...] = tuple((word, word, (word,)) for word in WORDS)
+BY_EXAMPLE: tuple[Question, ...] = (
+    ("a pixel of its face", "teddy bear", (_SHOWN["face"],)),
+    ("pixels of face, hair, fleece, dress", "teddy bear", (*_SHOWN.values(),)[:4]),
+    ("a pixel of the quilt", "bed", (_SHOWN["quilt"],)),
 )
 
 
@@ -148,29 +143,27 @@ def _splatlift(*arguments: object) -> None:
     _run(sys.executable, "-m", "liftcore.cli", *arguments)
 
 
-class Hed:
-    """Holistically-nested edge detection (Xie and Tu, ICCV 2015): VGG16 with an edge map of each scale, fused."""
+def hed(weights: Path, image: Image.Image) -> Tensor:
+    """How likely each pixel is an edge, [h, w] f32.
 
-    def __init__(self, weights: Path) -> None:
-        with np.load(weights) as stored:
-            self._weights = {name: torch.from_numpy(stored[name]) for name in stored.files}
+    Holistically-nested edge detection (Xie and Tu, ICCV 2015): VGG16 with an edge map of each scale, fused.
+    """
+    stored = np.load(weights)
 
-    def edges(self, image: Image.Image) -> Tensor:
-        """[h, w] f32, how likely each pixel is an edge."""
-        bgr = np.asarray(image, np.float32)[..., ::-1] - np.asarray(BGR_MEAN, np.float32)
-        x = torch.from_numpy(bgr).permute(2, 0, 1)[None]
-        size, sides = x.shape[2:], []
-        for block, layers in enumerate((2, 2, 3, 3, 3), 1):
-            if block > 1:
-                x = functional.max_pool2d(x, 2, ceil_mode=True)
-            for layer in range(layers):
-                x = self._convolve(x, f"block{block}/layers/conv2d{f'_{layer}' if layer else ''}").relu()
-            sides.append(functional.interpolate(self._convolve(x, f"dsn{block}"), size, mode="bilinear"))
-        return self._convolve(torch.cat(sides, dim=1), "fuse").sigmoid()[0, 0]
-
-    def _convolve(self, x: Tensor, name: str) -> Tensor:
-        kernel, bias = (self._weights[f"{name}/vars/{k}"] for k in (0, 1))
+    def convolve(x: Tensor, name: str) -> Tensor:
+        kernel, bias = (torch.from_numpy(stored[f"{name}/vars/{k}"]) for k in (0, 1))
         return functional.conv2d(x, kernel.permute(3, 2, 0, 1), bias, padding=kernel.shape[0] // 2)
+
+    bgr = np.asarray(image, np.float32)[..., ::-1] - np.asarray(BGR_MEAN, np.float32)
+    x = torch.from_numpy(bgr).permute(2, 0, 1)[None]
+    size, sides = x.shape[2:], []
+    for block, layers in enumerate((2, 2, 3, 3, 3), 1):
+        if block > 1:
+            x = functional.max_pool2d(x, 2, ceil_mode=True)
+        for layer in range(layers):
+            x = convolve(x, f"block{block}/layers/conv2d{f'_{layer}' if layer else ''}").relu()
+        sides.append(functional.interpolate(convolve(x, f"dsn{block}"), size, mode="bilinear"))
+    return convolve(torch.cat(sides, dim=1), "fuse").sigmoid()[0, 0]
 
 
 def basins(edges: Tensor) -> np.ndarray:
@@ -235,15 +228,15 @@ def make_packs(networks: Path, photos: Mapping[str, Path], seen: Mapping[str, Se
     """Write ``words``, ``look`` and ``dense``: regions with scores of words, regions with a look, and its grids."""
     _splatlift("encode", *photos.values(), "-o", _pack(out, "dense"), *LITE2, _weights(networks))
     grids = read_features(_pack(out, "dense"))
-    hed = Hed(networks / "models" / "hed.npz")
     for view, path in photos.items():
         photo = _photo(path)
+        half = photo.resize((photo.width // 2, photo.height // 2), Image.Resampling.LANCZOS)
         with torch.inference_mode():
-            labels = basins(hed.edges(photo.resize((photo.width // 2, photo.height // 2), Image.Resampling.LANCZOS)))
+            labels = basins(hed(networks / "models" / "hed.npz", half))
         starts = np.cumsum([0, *(int(level.max()) + 1 for level in labels[:-1])])
         labels += starts[:, None, None].astype(np.int32)
         observed = grids[view]
-        assert isinstance(observed, FeatureGrid)
+        assert isinstance(observed, lc.FeatureGrid)
         for name, dense in (("words", seen[view].maps), ("look", torch.as_tensor(observed.grid))):
             folder = out / "regions" / name
             folder.mkdir(parents=True, exist_ok=True)
@@ -268,10 +261,10 @@ def _photo(path: Path) -> Image.Image:
         return photo.convert("RGB")
 
 
-def judged(mask: np.ndarray, peak: tuple[int, int] | None, boxes: Sequence[Box]) -> tuple[float, float, bool]:
+def judged(mask: np.ndarray, peak: tuple[int, int], boxes: Sequence[Box]) -> tuple[float, float, bool]:
     """``box``, ``inside`` and ``points`` of a mask [H, W] bool and the x and y of the highest score."""
     rows, columns = np.nonzero(mask)
-    points = peak is not None and any(_within(*peak, box) for box in boxes)
+    points = any(_within(*peak, box) for box in boxes)
     if not len(rows):
         return 0.0, 0.0, points
     (x0, x1), (y0, y1) = (np.quantile(axis, (0.01, 0.99)) for axis in (columns, rows))
@@ -281,9 +274,7 @@ def judged(mask: np.ndarray, peak: tuple[int, int] | None, boxes: Sequence[Box])
 
 def overlap(one: Sequence[float], other: Sequence[float]) -> float:
     """Intersection over union of two boxes x0 y0 x1 y1."""
-    width, height = (max(0.0, min(one[k + 2], other[k + 2]) - max(one[k], other[k])) for k in (0, 1))
-    areas = [(box[2] - box[0]) * (box[3] - box[1]) for box in (one, other)]
-    return width * height / (sum(areas) - width * height)
+    return box_iou(np.reshape(one, (2, 2)), np.reshape(other, (2, 2)))
 
 
 def _within(x: Any, y: Any, box: Box) -> Any:
@@ -304,13 +295,9 @@ def of_photos(seen: Mapping[str, Seen], photos: Mapping[str, Path]) -> Iterator[
             x0, y0, x1, y1 = best[:4] * scale
             middle = (x0 + x1) / 2, (y0 + y1) / 2
             found.append((overlap((x0, y0, x1, y1), boxes[word][0]), any(_within(*middle, b) for b in boxes[word])))
-        values = np.mean(found, axis=0)
-        yield {
-            "features": "the photo alone",
-            "asked": word,
-            "box": values[0],
-            "points": f"{values[1] * len(BOXES):.0f}",
-        }
+        box, points = np.mean(found, axis=0)
+        row = {"features": "the photo alone", "asked": word, "box": box}
+        yield row | {"points": f"{points * len(BOXES):.0f}"}
 
 
 def of_lift(
@@ -319,21 +306,20 @@ def of_lift(
     """A row a question to a lift; its masks and a picture of them are written."""
     scene = QueryScene.open(out / f"{name}.lift.safetensors")
     sheet: list[np.ndarray] = []
-    for question in questions:
-        answer = ask(scene, Query(question.terms), words)
+    for number, (asked, word, terms) in enumerate(questions):
+        answer = ask(scene, Query(terms), words)
         found, shown = [], []
         for view, boxes in BOXES.items():
             seen = view_mask(scene, answer, view)
-            mask = seen.mask
             scores = np.where(seen.row_sums >= MINIMUM_ROW_SUM, seen.attention, -np.inf)
             y, x = (int(part) for part in np.unravel_index(scores.argmax(), scores.shape))
-            found.append(judged(mask, (x, y), boxes[question.word]))
-            Image.fromarray(mask).save(out / "masks" / f"{name}_{questions.index(question)}_{view}.png")
-            shown.append(_picture(photos[view], mask, (x, y), boxes[question.word]))
+            found.append(judged(seen.mask, (x, y), boxes[word]))
+            Image.fromarray(seen.mask).save(out / "masks" / f"{name}_{number}_{view}.png")
+            shown.append(_picture(photos[view], seen.mask, (x, y), boxes[word]))
         sheet.append(np.concatenate(shown, axis=1))
         box, inside, points = np.mean(found, axis=0)
         least = min(one[0] for one in found)
-        row = {"features": name, "asked": question.told, "box": box, "least": least, "inside": inside}
+        row = {"features": name, "asked": asked, "box": box, "least": least, "inside": inside}
         yield row | {"points": f"{points * len(BOXES):.0f}"}
     Image.fromarray(np.concatenate(sheet)).save(out / f"{name}.png")
 
@@ -366,8 +352,7 @@ def main() -> None:
     words = TableEncoder.open(out / "coco_words.safetensors")
     rows = [*of_photos(seen, photos)]
     for name in PACKS:
-        files = (folder / "point_cloud.ply", cameras_of(folder), _pack(out, name))
-        _splatlift("lift", *files, "-o", out / f"{name}.lift.safetensors")
+        _splatlift("lift", *scene_files(folder)[:2], _pack(out, name), "-o", out / f"{name}.lift.safetensors")
         rows += of_lift(name, BY_WORD if name == "words" else BY_EXAMPLE, words, photos, out)
     note = f"A closed vocabulary: the 80 words of COCO. {len(lifted)} photos lifted, {len(BOXES)} others judged."
     tell(rows, as_json=options.json, note=note, columns=("features", "asked", "box", "least", "inside", "points"))

@@ -17,14 +17,13 @@ from pathlib import Path
 import numpy as np
 import torch
 
+import liftcore as lc
 from liftcore.evaluate.synthetic import PART_LEVELS, room_cameras, room_parts, room_regions, room_splats
 from liftcore.features.pack import write_pack
-from liftcore.features.views import NO_LABEL, Regions, ViewFeatures
+from liftcore.features.views import NO_LABEL, ViewFeatures
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.ply import write_splats
-from liftcore.raster.base import CompositingParams
 from liftcore.raster.cpu.raster import CpuRaster
-from liftcore.scene.cameras import Camera, Cameras
 
 NOISE = 0.45
 WRONG, MIXED = 0.1, 0.3  # shares of a view's regions
@@ -35,7 +34,7 @@ SHRUNK = 2  # label maps have every other pixel
 class RoomViews(Mapping[str, ViewFeatures]):
     """What each view observes, made when it is asked for: the same each time."""
 
-    cameras: dict[str, Camera]
+    cameras: dict[str, lc.Camera]
     raster: CpuRaster
     parts: np.ndarray  # [P, PART_LEVELS] i64
     vectors: np.ndarray  # [parts of all levels, F] f32, level by level
@@ -47,13 +46,13 @@ class RoomViews(Mapping[str, ViewFeatures]):
         rng = np.random.default_rng((self.seed, number))
         camera = _shrunk(self.cameras[name])
         fine = torch.from_numpy(self.parts[:, -1].astype(np.int32))
-        seen = self.raster.strongest_labels(camera, fine, CompositingParams()).numpy()
+        seen = self.raster.strongest_labels(camera, fine, lc.CompositingParams()).numpy()
         levels = [np.append(table, NO_LABEL)[seen] for table in self._rows()]  # none is -1, the last
         rows, labels = np.unique(np.stack(levels), return_inverse=True)
         first = int(rows[0] == NO_LABEL)
         book = self.vectors[rows[first:]]
         said = _noisy(book if self.clean else _mistaken(book, self.vectors, rng), rng)
-        return Regions(torch.from_numpy((labels - first).astype(np.int32)), torch.from_numpy(said).half())
+        return lc.Regions(torch.from_numpy((labels - first).astype(np.int32)), torch.from_numpy(said).half())
 
     def _rows(self) -> Iterator[np.ndarray]:
         """For each level, the row of ``vectors`` that a finest part has there."""
@@ -94,7 +93,7 @@ def write_room(folder: Path, room: Room) -> None:
     named = {camera.name: camera for camera in cameras}
     observed = RoomViews(named, CpuRaster(scene), parts, vectors, room.seed, room.clean)
     write_splats(scene, folder / "point_cloud.ply")
-    write_inria_cameras(Cameras(tuple(cameras)), folder / "cameras.json")
+    write_inria_cameras(lc.Cameras(tuple(cameras)), folder / "cameras.json")
     write_pack(folder / "features.safetensors", observed, {"encoder": "random parts", "normalised": "true"})
 
 
@@ -118,7 +117,7 @@ def _unit(rows: np.ndarray) -> np.ndarray:
     return (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
 
 
-def _shrunk(camera: Camera) -> Camera:
+def _shrunk(camera: lc.Camera) -> lc.Camera:
     sizes = {"width": camera.width // SHRUNK, "height": camera.height // SHRUNK}
     lengths = {name: getattr(camera, name) / SHRUNK for name in ("fx", "fy", "cx", "cy")}
     return camera.replace(**sizes, **lengths)
@@ -133,13 +132,13 @@ def write_bench_room(folder: Path, size: Room, different: int = 12) -> tuple[Pat
     paths = folder / "point_cloud.ply", folder / "cameras.json", folder / "features.safetensors"
     cameras = room_cameras(size.views, *size.size)
     write_splats(room_splats(size.splats), paths[0])
-    write_inria_cameras(Cameras(tuple(cameras)), paths[1])
+    write_inria_cameras(lc.Cameras(tuple(cameras)), paths[1])
     maps = [room_regions(camera, k, 4, 1).labels for k, camera in enumerate(cameras[:different])]
     views: dict[str, ViewFeatures] = {}
     for k, camera in enumerate(cameras):
         labels, generator = maps[k % len(maps)], torch.Generator().manual_seed(k)
         rows = torch.randn(int(labels.max()) + 1, size.channels, generator=generator)
-        views[camera.name] = Regions(labels, torch.nn.functional.normalize(rows, dim=1).half())
+        views[camera.name] = lc.Regions(labels, torch.nn.functional.normalize(rows, dim=1).half())
     write_pack(paths[2], views, {"encoder": "random", "normalised": "true"})
     return paths
 

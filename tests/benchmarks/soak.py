@@ -8,28 +8,27 @@ Each proof is a loop that gives figures; ``tests/crash/test_loops.py`` runs them
 import argparse
 import hashlib
 import json
-import os
-import platform
 import random
 import sys
 import tempfile
 import time
 from collections import Counter
-from datetime import UTC, datetime
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+import liftcore as lc
 from liftcore.features.pack import write_pack
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.ply import write_splats
 from liftcore.raster.cpu.warm_up import warm_up
-from liftcore.scene.cameras import Cameras
 from service.models import AssetKind
 from service.store.assets import CheckedUpload
 from service.store.owners import SERVICE
 from service.store.store import Store
+from tests.benchmarks.base import machine
 from tests.crash.server import POINTS
 from tests.crash.service_process import ServiceProcess, kill_processes_of, usage
 from tests.scenes import centred, random_camera, random_regions, random_splats
@@ -46,13 +45,9 @@ def scene_files(folder: Path, *, views: int, splats: int, width: int) -> dict[st
     """A random scene: kind -> bytes."""
     cameras = tuple(centred(random_camera(k, width, width * 3 // 4, name=f"v{k:03d}")) for k in range(views))
     observations = {camera.name: random_regions(k, F=32) for k, camera in enumerate(cameras)}
-    paths = {
-        "splats": folder / "splats.ply",
-        "cameras": folder / "cameras.json",
-        "features": folder / "features.safetensors",
-    }
+    paths = {kind: folder / f"{kind}{suffix}" for kind, suffix in SUFFIXES.items()}
     write_splats(random_splats(0, splats), paths["splats"])
-    write_inria_cameras(Cameras(cameras), paths["cameras"])
+    write_inria_cameras(lc.Cameras(cameras), paths["cameras"])
     write_pack(paths["features"], dict(observations), {"encoder": "random"})
     return {kind: path.read_bytes() for kind, path in paths.items()}
 
@@ -65,10 +60,9 @@ def stored(data: Path, files: dict[str, bytes]) -> dict[str, Any]:
     for kind, content in files.items():
         with store.files.draft(".part") as draft:
             draft.write_bytes(content)
-            digest, suffix = hashlib.sha256(content).hexdigest(), SUFFIXES[kind]
-            ids[kind] = store.assets.add(SERVICE, CheckedUpload(draft, AssetKind(kind), digest, suffix, names, []))[
-                0
-            ].id
+            digest = hashlib.sha256(content).hexdigest()
+            upload = CheckedUpload(draft, AssetKind(kind), digest, SUFFIXES[kind], names, [])
+            ids[kind] = store.assets.add(SERVICE, upload)[0].id
     store.close()
     return {**ids, "features": [ids["features"]]}
 
@@ -89,8 +83,7 @@ def kill_loop(files: dict[str, bytes], *, kills: int, seconds: float, seed: int 
 
     Args:
         files: the scene to lift.
-        kills: how many, unless ``seconds`` end first.
-        seconds: no job begins after these.
+        kills: how many, unless ``seconds`` end first: no job begins after these.
         seed: of the moments and the victims.
     """
     with tempfile.TemporaryDirectory() as folder:
@@ -102,9 +95,8 @@ def kill_loop(files: dict[str, bytes], *, kills: int, seconds: float, seed: int 
 def _kill_jobs(
     service: ServiceProcess, body: dict[str, Any], kills: int, seconds: float, chance: random.Random
 ) -> dict[str, Any]:
-    victims: Counter[str] = Counter()
-    stages: Counter[str] = Counter()
-    figures: Counter[str] = Counter(jobs=0, lost=0, doubled=0, digests_equal=0, resumed=0)
+    victims, stages = Counter[str](), Counter[str]()
+    figures = Counter[str](jobs=0, lost=0, doubled=0, digests_equal=0, resumed=0)
     begun = time.monotonic()
     reference = insist(service, body, "undisturbed")
     service.ended(reference)
@@ -123,23 +115,15 @@ def _kill_jobs(
                 victims["server"] += 1
                 service.kill()
                 service.start()
-        found = service.ended(job)
+        succeeded = service.ended(job)["state"] == "succeeded"
         figures["jobs"] += 1
-        figures["lost"] += found["state"] != "succeeded" or insist(service, body, key) != job
+        figures["lost"] += not succeeded or insist(service, body, key) != job
         figures["doubled"] += service.times_succeeded(job) > 1
         figures["resumed"] += "blocks of walked views are kept" in service.client.get(f"/jobs/{job}/events").text
-        if found["state"] == "succeeded":
-            figures["digests_equal"] += service.digest(job) == wanted
-    jobs = service.client.get("/jobs").json()["jobs"]
-    figures["doubled"] += len(jobs) - figures["jobs"] - 1
-    return {
-        "kills": victims.total(),
-        "victims": dict(victims),
-        "killed_while": dict(stages),
-        **figures,
-        "undisturbed_seconds": round(whole, 2),
-        "seconds": round(time.monotonic() - begun),
-    }
+        figures["digests_equal"] += succeeded and service.digest(job) == wanted
+    figures["doubled"] += len(service.client.get("/jobs").json()["jobs"]) - figures["jobs"] - 1
+    head = {"kills": victims.total(), "victims": victims, "killed_while": stages, **figures}
+    return head | {"undisturbed_seconds": round(whole, 2), "seconds": round(time.monotonic() - begun)}
 
 
 def _stage(job: dict[str, Any]) -> str:
@@ -148,7 +132,7 @@ def _stage(job: dict[str, Any]) -> str:
     return "starting" if job["progress"] is None else job["progress"]["stage"]
 
 
-def fault_points(points: list[str]) -> dict[str, str]:
+def fault_points(points: Iterable[str]) -> dict[str, str]:
     """Kill the server at each named point of a job's life, start it again, and say what came of the job."""
     return {point: _at_point(point) for point in points}
 
@@ -200,10 +184,9 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         files = scene_files(Path(folder), views=30, splats=20_000, width=320)
     figures = {
-        "date": datetime.now(UTC).date().isoformat(),
-        "machine": f"{os.cpu_count()} cores, Python {platform.python_version()}",
+        **machine(),
         "leaks": leak_loop(given.jobs),
-        "points": fault_points(list(POINTS)),
+        "points": fault_points(POINTS),
         "kills": kill_loop(files, kills=given.kills, seconds=given.seconds),
     }
     print(json.dumps(figures, indent=2))

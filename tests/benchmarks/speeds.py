@@ -9,10 +9,10 @@ compiling. ``splatlift tradeoff`` measures more, with views held out. FOLDER as 
 import time
 from pathlib import Path
 
+import liftcore as lc
 from liftcore.evaluate.accuracy import cosine_figures
 from liftcore.io.scene_files import lift_files
-from liftcore.result import LiftResult
-from liftcore.settings import LiftSettings, Speed
+from liftcore.settings import Speed
 from tests.benchmarks.base import command_line, scene_files, tell
 
 
@@ -30,11 +30,11 @@ def main() -> None:
     options = parser.parse_args()
     splats, cameras, pack = scene_files(options.folder, options.features)
     seconds: dict[str, float] = {}
-    made: dict[str, LiftResult] = {}
+    made: dict[str, lc.LiftResult] = {}
     for number in range(1 + max(1, options.rounds)):  # the first round compiles
         for speed in dict.fromkeys(["exact", *options.speeds]):
             start = time.process_time()
-            settings = LiftSettings.of(preset=options.preset, speed=speed, device="cpu")
+            settings = lc.LiftSettings.of(preset=options.preset, speed=speed, device="cpu")
             made[speed] = lift_files(splats, cameras, [pack], settings, threads=1)
             if number:
                 seconds[speed] = min(seconds.get(speed, float("inf")), time.process_time() - start)

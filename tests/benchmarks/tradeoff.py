@@ -9,42 +9,40 @@ views that no run saw, the best run by truth, and how far the taken one is below
 """
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import liftcore as lc
 from liftcore.device import CPU
 from liftcore.evaluate.accuracy import centred_cosines
 from liftcore.evaluate.ranking import accuracy_of, choose
 from liftcore.evaluate.tradeoff import candidates_of, hold_out
-from liftcore.features.pack import read_features
 from liftcore.features.views import ViewFeatures
-from liftcore.lifting import lift
-from liftcore.settings import LiftSettings
 from liftcore.warm_up import warm_up_lift
-from tests.benchmarks.base import command_line, tell
-from tests.benchmarks.consensus import Truth, still_life_scene, tabletop_truth
-from tests.benchmarks.tabletop import Tabletop
+from tests.benchmarks.base import command_line, read_pack, tell
+from tests.benchmarks.consensus import still_life_scene
+from tests.benchmarks.tabletop import Truth, tabletop
 
 CASES = (
     "features_hard", "features_hard/2", "features_hard/4", "features", "features/4", "usual 7", "hard 7", "grids",
 )  # fmt: skip
 
 
-def measured(case: str, truth: Truth, views: dict[str, ViewFeatures]) -> dict[str, Any]:
+def measured(case: str, truth: Truth, views: Mapping[str, ViewFeatures]) -> dict[str, Any]:
     """The row of a case, and under ``runs`` what it comes from."""
     lifted, judges = hold_out(list(views))
     seen, runs, judged = [(truth.cameras[view], views[view]) for view in judges], [], []
     for candidate in candidates_of({}):
-        settings = LiftSettings.of(**{"certificate_rays": 0, **candidate.settings})
+        settings = lc.LiftSettings.of(**{"certificate_rays": 0, **candidate.settings})
         warm_up_lift(truth.raster.splats.kernel, CPU, settings)
         busy = time.process_time()
-        made = lift(truth.raster.splats, truth.cameras, {view: views[view] for view in lifted}, settings)
+        made = lc.lift(truth.raster.splats, truth.cameras, {view: views[view] for view in lifted}, settings)
         seconds = time.process_time() - busy
         cosines = centred_cosines(truth.raster, seen, made.features, settings.render_params)
         judged.append({"centred_cosine": cosines, "intersections": [], "unions": [], "phrase_iou": []})
         own = {"name": candidate.name, "options": candidate.settings, "cpu_s": seconds, "cosine": 1.0}
-        runs.append({**own, **accuracy_of(judged[-1]), "miou": truth.judge(made)[1], "views": cosines})
+        runs.append({**own, **accuracy_of(judged[-1]), "miou": truth.judge(made).miou, "views": cosines})
     choice, miou = choose(runs, judged), {run["name"]: run["miou"] for run in runs}
     best = max(miou, key=lambda name: miou[name])
     row = {"case": f"{case}, {len(lifted)} and {len(judges)} views", "taken": choice["name"]}
@@ -54,16 +52,14 @@ def measured(case: str, truth: Truth, views: dict[str, ViewFeatures]) -> dict[st
 
 def rows_of(folder: Path, cases: Iterable[str]) -> Iterator[dict[str, Any]]:
     """A row a case."""
-    tabletop = tabletop_truth(Tabletop(folder))
+    truth = tabletop(folder)
     for case in cases:
         if " " in case:
             kind, seed = case.split()
-            own, views = still_life_scene(kind, int(seed))
-            yield measured(f"still life, {case}", own, dict(views))
+            yield measured(f"still life, {case}", *still_life_scene(kind, int(seed)))
         else:
             pack, _, every = case.partition("/")
-            read = read_features(folder / f"{pack}.safetensors")
-            yield measured(case, tabletop, {view: read[view] for view in read.views[:: int(every or 1)]})
+            yield measured(case, truth, read_pack(folder, pack, int(every or 1)))
 
 
 def main() -> None:

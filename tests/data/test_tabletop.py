@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
@@ -15,14 +14,13 @@ from liftcore.features.pack import read_features, write_pack
 from liftcore.features.prompts import prompt_views
 from liftcore.query.ask import ask
 from liftcore.query.render import view_mask
-from liftcore.query.scene import QueryScene
 from liftcore.query.segment import segment
 from liftcore.query.terms import OneSplat, Query
 from liftcore.query.text.table import TableEncoder
-from tests.benchmarks.base import lift_files, opened, scene_files
-from tests.benchmarks.consensus import Truth, tabletop_truth
+from tests.benchmarks.base import read_pack
+from tests.benchmarks.consensus import ranked
 from tests.benchmarks.objects import measure_lift
-from tests.benchmarks.tabletop import CASES, Case, Tabletop
+from tests.benchmarks.tabletop import CASES, Case, Truth, tabletop
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -36,108 +34,90 @@ THINGS, CLOTH, CURTAIN = range(12), 12, 13
 
 
 @pytest.fixture(scope="module")
-def tabletop(shared_data: Path) -> Tabletop:
-    return Tabletop(shared_data / "tabletop")
+def folder(shared_data: Path) -> Path:
+    return shared_data / "tabletop"
 
 
 @pytest.fixture(scope="module")
-def truth(tabletop: Tabletop) -> Truth:
-    return tabletop_truth(tabletop)
+def truth(folder: Path) -> Truth:
+    return tabletop(folder)
 
 
 @pytest.fixture(scope="module")
-def words(tabletop: Tabletop) -> list[str]:
-    """Of the classes: twelve things, the cloth and the curtain."""
-    return [thing["class"] for thing in json.loads((tabletop.folder / "truth.json").read_text())["objects"]]
+def encoder(folder: Path) -> TableEncoder:
+    return TableEncoder.open(folder / "text_table.safetensors")
 
 
 @pytest.fixture(scope="module")
-def encoder(tabletop: Tabletop) -> TableEncoder:
-    return TableEncoder.open(tabletop.folder / "text_table.safetensors")
-
-
-def lifted(truth: Truth, folder: Path, pack: str, preset: str) -> lc.LiftResult:
-    """A lift of every fourth view."""
-    packs = read_features(folder / f"{pack}.safetensors")
-    views = {view: packs[view] for view in packs.views[::4]}
-    return lc.lift(truth.raster.splats, truth.cameras, views, preset=preset, certificate_rays=0)
+def usual(truth: Truth, folder: Path) -> lc.LiftResult:
+    """The lift of masks that are mostly right, by default; every fourth view."""
+    return truth.lift(read_pack(folder, "features", every=4))
 
 
 @pytest.fixture(scope="module")
-def usual(truth: Truth, tabletop: Tabletop) -> lc.LiftResult:
-    """The lift of masks that are mostly right, by default."""
-    return lifted(truth, tabletop.folder, "features", "default")
+def hard(truth: Truth, folder: Path) -> lc.LiftResult:
+    """The lift of masks of which many are wrong, by default; every fourth view."""
+    return truth.lift(read_pack(folder, "features_hard", every=4))
 
 
-@pytest.fixture(scope="module")
-def hard(truth: Truth, tabletop: Tabletop) -> lc.LiftResult:
-    """The lift of masks of which many are wrong, by default."""
-    return lifted(truth, tabletop.folder, "features_hard", "default")
-
-
-def asked(made: lc.LiftResult, truth: Truth) -> QueryScene:
-    return QueryScene(made, truth.raster.splats, truth.cameras)
-
-
-def test_the_splats_that_count_are_those_of_the_data_readme(tabletop: Tabletop) -> None:
-    share = float(tabletop.counted.float().mean())
+def test_the_splats_that_count_are_those_of_the_data_readme(truth: Truth) -> None:
+    share = float(truth.counted.float().mean())
     assert share == pytest.approx(0.9056, abs=5e-4)
 
 
 @pytest.fixture(scope="module")
-def lift_of(tabletop: Tabletop) -> Callable[[Case], lc.LiftResult]:
+def lift_of(truth: Truth, folder: Path) -> Callable[[Case], lc.LiftResult]:
     """The lift of a row of the data README, with all views; each once."""
-    return cache(lambda case: lift_files(scene_files(tabletop.folder, case.pack), **case.values))
+    return cache(lambda case: truth.lift(read_pack(folder, case.pack), **case.values))
 
 
 @pytest.mark.parametrize("case", BARS, ids=lambda case: case.name)
 def test_a_row_sum_lift_reaches_the_baseline(
-    tabletop: Tabletop, lift_of: Callable[[Case], lc.LiftResult], case: Case
+    truth: Truth, lift_of: Callable[[Case], lc.LiftResult], case: Case
 ) -> None:
     """At least those of the data README, to the digits that it prints."""
     assert case.accuracy is not None
     assert case.miou is not None
-    got = tabletop.judge(lift_of(case).features, case.settings)
+    got = truth.judge(lift_of(case))
     assert got.accuracy >= case.accuracy - ROUNDING
     assert got.miou >= case.miou - ROUNDING
 
 
 def test_hard_masks_gain_and_confidence_tells_right_from_wrong(truth: Truth, hard: lc.LiftResult) -> None:
-    accuracy, miou, _ = truth.judge(hard)
-    assert accuracy > 0.893  # .818 with row-sum, .862 with a robust step
-    assert miou > 0.894  # .834 and .878
+    found = truth.judge(hard)
+    assert found.accuracy > 0.893  # .818 with row-sum, .862 with a robust step
+    assert found.miou > 0.894  # .834 and .878
     assert hard.confidence is not None
-    assert truth.ranked(hard, hard.confidence) > 0.8
-    assert truth.ranked(hard, hard.agreement) < 0.5  # which is not what it is for
+    assert ranked(truth, hard, hard.confidence) > 0.8
+    assert ranked(truth, hard, hard.agreement) < 0.5  # which is not what it is for
 
 
 def test_masks_that_are_mostly_right_lose_nothing_by_the_default(
-    truth: Truth, tabletop: Tabletop, usual: lc.LiftResult
+    truth: Truth, folder: Path, usual: lc.LiftResult
 ) -> None:
-    plain = lifted(truth, tabletop.folder, "features", preset="row-sum")
-    (accuracy, miou, _), (before, shown, _) = truth.judge(usual), truth.judge(plain)
-    assert accuracy >= before - NOTHING
-    assert miou >= shown - NOTHING
+    plain = truth.judge(truth.lift(read_pack(folder, "features", every=4), preset="row-sum"))
+    found = truth.judge(usual)
+    assert found.accuracy >= plain.accuracy - NOTHING
+    assert found.miou >= plain.miou - NOTHING
     assert usual.confidence is not None
-    assert truth.ranked(usual, usual.confidence) > 0.8
+    assert ranked(truth, usual, usual.confidence) > 0.8
 
 
 def test_the_objects_of_hard_masks_are_the_things_of_the_scene(
-    truth: Truth, lift_of: Callable[[Case], lc.LiftResult], words: list[str], encoder: TableEncoder
+    truth: Truth, lift_of: Callable[[Case], lc.LiftResult], encoder: TableEncoder
 ) -> None:
-    scene = asked(lift_of(BARS[0]), truth)
-    answers = {thing: ask(scene, words[thing], encoder) for thing in THINGS}
-    found = measure_lift(scene, answers, truth.splats.numpy())
+    scene = truth.opened(lift_of(BARS[0]))
+    answers = {thing: ask(scene, truth.words[thing], encoder) for thing in THINGS}
+    found = measure_lift(scene, answers, truth.objects.numpy())
     assert found["one"] == found["things"] == 12
     assert found["box"] > 0.93 and found["worst"] > 0.85  # .059 around all selected splats
     assert found["middle"] < 0.01
     assert found["apart"] == found["pairs"] == 66
 
 
-def test_fourteen_words_are_found_among_many(
-    truth: Truth, usual: lc.LiftResult, words: list[str], encoder: TableEncoder
-) -> None:
-    scene, real = asked(usual, truth), truth.splats.numpy()
+def test_fourteen_words_are_found_among_many(truth: Truth, usual: lc.LiftResult, encoder: TableEncoder) -> None:
+    scene, real = truth.opened(usual), truth.objects.numpy()
+    words = list(truth.words)
     others = [word for word in encoder.words if word not in words]
     absent = np.random.default_rng(0).choice(others, 100, replace=False).tolist()
     found = segment(scene, words + absent, encoder.encode(words + absent))
@@ -149,7 +129,7 @@ def test_fourteen_words_are_found_among_many(
 
 
 def test_a_thing_stays_found_when_something_else_is_not_wanted(truth: Truth, usual: lc.LiftResult) -> None:
-    scene, real = asked(usual, truth), truth.splats.numpy()
+    scene, real = truth.opened(usual), truth.objects.numpy()
     best = [int(np.argmax(np.where(real == thing, scene.evidence, -1.0))) for thing in range(CURTAIN + 1)]
 
     def iou(thing: int, *unlike: int) -> float:
@@ -167,25 +147,24 @@ def test_a_thing_stays_found_when_something_else_is_not_wanted(truth: Truth, usu
 
 
 def test_things_are_found_in_the_words_of_their_masks(
-    truth: Truth, tabletop: Tabletop, words: list[str], encoder: TableEncoder, tmp_path: Path
+    truth: Truth, folder: Path, encoder: TableEncoder, tmp_path: Path
 ) -> None:
     """Regions of real photos become a picture a word and view: the cloth and the curtain have none."""
-    packs, vectors = read_features(tabletop.folder / "features_clean.safetensors"), encoder.encode(words)
+    packs, vectors = read_features(folder / "features_clean.safetensors"), encoder.encode(truth.words)
     for view in packs.views[::4]:
         regions = packs[view]
         assert isinstance(regions, lc.Regions)
         nearest = np.append((regions.codebook.float().numpy() @ vectors.T).argmax(axis=1), -1)
         things = nearest[regions.labels[0].numpy()]
         for thing in set(np.unique(things).tolist()) & {*THINGS}:
-            (tmp_path / words[thing]).mkdir(exist_ok=True)
-            Image.fromarray(things == thing).save(tmp_path / words[thing] / f"{view}.png")
+            (tmp_path / truth.words[thing]).mkdir(exist_ok=True)
+            Image.fromarray(things == thing).save(tmp_path / truth.words[thing] / f"{view}.png")
     found = prompt_views(tmp_path)
     write_pack(tmp_path / "pack", found.views, {}, table=found.table)
-    files = *scene_files(tabletop.folder)[:2], tmp_path / "pack"
-    scene = opened(lift_files(files, preset="row-sum", certificate_rays=0), truth.raster)
+    scene = truth.opened(truth.lift(read_features(tmp_path / "pack"), preset="row-sum"))
     for thing in THINGS:
-        answer, ious = ask(scene, words[thing]), []
-        for view, mask in truth.masks.items():
+        answer, ious = ask(scene, truth.words[thing]), []
+        for view, mask in truth.held_out.items():
             shown, right = view_mask(scene, answer, view).mask, (mask == thing).numpy()
             ious.append((shown & right).sum() / (shown | right).sum() if right.any() else 1.0)
-        assert np.mean(ious) >= 0.95, (words[thing], ious)
+        assert np.mean(ious) >= 0.95, (truth.words[thing], ious)

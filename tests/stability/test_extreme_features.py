@@ -7,13 +7,13 @@ import pytest
 import torch
 
 from liftcore.features.views import FeatureGrid, Regions
-from tests.benchmarks.extreme_measures import Task, cloud, run
+from tests.benchmarks.extreme_measures import cloud, run
 from tests.benchmarks.extremes import checkerboard
 
 
 def lifted(views, splats=None, **settings):
     """The lift of the views onto a cloud, in float32."""
-    return run(Task(views, settings={"dtype": "float32", "preset": "tikhonov", **settings}), splats or cloud())[0]
+    return run(views, splats or cloud(), **{"preset": "tikhonov", **settings})[0]
 
 
 def test_agreement_is_the_same_at_any_length_of_the_vectors():
