@@ -1,16 +1,15 @@
 """A scene to measure on: a synthetic room of many views, with known mistakes.
 
-    python -m tests.benchmarks.scenes room FOLDER --splats 500000 --views 160 [--alike C] [--clean]
+    python -m tests.benchmarks.scenes room FOLDER --splats 500000 --views 160 [--alike C]
 
 Every view of the room has regions on four levels, from walls and balls to their parts, seen with occlusion. A part
 has a random unit vector; what a view says of it has noise of norm NOISE. Of all regions a tenth say another part's
-vector, and of three tenths the vector is mixed with another's, unless ``--clean`` leaves the noise alone. With
-``--alike C`` the vectors of parts have the cosine C to one another in the mean, as those of an encoder lie in a
-narrow cone.
+vector, and of three tenths the vector is mixed with another's. With ``--alike C`` the vectors of parts have the
+cosine C to one another in the mean, as those of an encoder lie in a narrow cone.
 """
 
 import argparse
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,7 +18,7 @@ import torch
 
 import liftcore as lc
 from liftcore.evaluate.synthetic import PART_LEVELS, room_cameras, room_parts, room_regions, room_splats
-from liftcore.features.pack import write_pack
+from liftcore.features.pack import as_views, write_pack
 from liftcore.features.views import NO_LABEL, ViewFeatures
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.ply import write_splats
@@ -31,46 +30,6 @@ SHRUNK = 2  # label maps have every other pixel
 
 
 @dataclass(frozen=True)
-class RoomViews(Mapping[str, ViewFeatures]):
-    """What each view observes, made when it is asked for: the same each time."""
-
-    cameras: dict[str, lc.Camera]
-    raster: CpuRaster
-    parts: np.ndarray  # [P, PART_LEVELS] i64
-    vectors: np.ndarray  # [parts of all levels, F] f32, level by level
-    seed: int
-    clean: bool  # no region is wrong or mixed
-
-    def __getitem__(self, name: str) -> ViewFeatures:
-        number = list(self.cameras).index(name)
-        rng = np.random.default_rng((self.seed, number))
-        camera = _shrunk(self.cameras[name])
-        fine = torch.from_numpy(self.parts[:, -1].astype(np.int32))
-        seen = self.raster.strongest_labels(camera, fine, lc.CompositingParams()).numpy()
-        levels = [np.append(table, NO_LABEL)[seen] for table in self._rows()]  # none is -1, the last
-        rows, labels = np.unique(np.stack(levels), return_inverse=True)
-        first = int(rows[0] == NO_LABEL)
-        book = self.vectors[rows[first:]]
-        said = _noisy(book if self.clean else _mistaken(book, self.vectors, rng), rng)
-        return lc.Regions(torch.from_numpy((labels - first).astype(np.int32)), torch.from_numpy(said).half())
-
-    def _rows(self) -> Iterator[np.ndarray]:
-        """For each level, the row of ``vectors`` that a finest part has there."""
-        fine, begin = self.parts[:, -1], 0
-        for level in range(PART_LEVELS):
-            table = np.zeros(fine.max() + 1, np.int64)
-            table[fine] = begin + self.parts[:, level]
-            begin += int(self.parts[:, level].max()) + 1
-            yield table
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.cameras)
-
-    def __len__(self) -> int:
-        return len(self.cameras)
-
-
-@dataclass(frozen=True)
 class Room:
     """What to make."""
 
@@ -78,7 +37,6 @@ class Room:
     views: int
     size: tuple[int, int]  # width and height of the views, pixels
     channels: int
-    clean: bool = False
     alike: float = 0.0  # cosine of two parts' vectors, in the mean
     seed: int = 0
 
@@ -86,15 +44,31 @@ class Room:
 def write_room(folder: Path, room: Room) -> None:
     """Write ``point_cloud.ply``, ``cameras.json`` and ``features.safetensors``."""
     folder.mkdir(parents=True, exist_ok=True)
-    scene, cameras = room_splats(room.splats, room.seed), room_cameras(room.views, *room.size)
-    parts = room_parts(room.splats, room.seed)
-    total = int((parts.max(axis=0) + 1).sum())
-    vectors = _vectors(total, room)
-    named = {camera.name: camera for camera in cameras}
-    observed = RoomViews(named, CpuRaster(scene), parts, vectors, room.seed, room.clean)
-    write_splats(scene, folder / "point_cloud.ply")
+    splats, cameras = room_splats(room.splats, room.seed), room_cameras(room.views, *room.size)
+    write_splats(splats, folder / "point_cloud.ply")
     write_inria_cameras(lc.Cameras(tuple(cameras)), folder / "cameras.json")
-    write_pack(folder / "features.safetensors", observed, {"encoder": "random parts", "normalised": "true"})
+    views = as_views(_observed(CpuRaster(splats), cameras, room))
+    write_pack(folder / "features.safetensors", views, {"encoder": "random parts", "normalised": "true"})
+
+
+def _observed(raster: CpuRaster, cameras: Sequence[lc.Camera], room: Room) -> Iterator[tuple[str, ViewFeatures]]:
+    """What each view observes, by its name."""
+    parts = room_parts(room.splats, room.seed)  # [P, PART_LEVELS], numbers of parts on each level
+    fine, counts = parts[:, -1], parts.max(axis=0) + 1
+    vectors = _vectors(int(counts.sum()), room)  # level by level
+    rows = np.full((PART_LEVELS, fine.max() + 2), NO_LABEL)  # of a finest part its vector on each level; none is last
+    rows[:, fine] = (np.cumsum(counts) - counts + parts).T
+    for number, camera in enumerate(cameras):
+        rng = np.random.default_rng((room.seed, number))
+        labels = torch.from_numpy(fine.astype(np.int32))
+        seen = raster.strongest_labels(_shrunk(camera), labels, lc.CompositingParams()).numpy()
+        shown, labels = np.unique(rows[:, seen], return_inverse=True)
+        first = int(shown[0] == NO_LABEL)
+        said = _noisy(_mistaken(vectors[shown[first:]], vectors, rng), rng)
+        yield (
+            camera.name,
+            lc.Regions(torch.from_numpy((labels - first).astype(np.int32)), torch.from_numpy(said).half()),
+        )
 
 
 def _vectors(count: int, room: Room) -> np.ndarray:
@@ -150,11 +124,10 @@ def main() -> None:
     room.add_argument("folder", type=Path)
     for name, default in (("splats", 500_000), ("views", 160), ("width", 986), ("height", 728), ("channels", 512)):
         room.add_argument(f"--{name}", type=int, default=default)
-    room.add_argument("--clean", action="store_true")
     room.add_argument("--alike", type=float, default=0.0, metavar="C")
     given = parser.parse_args()
     size = given.width, given.height
-    write_room(given.folder, Room(given.splats, given.views, size, given.channels, given.clean, given.alike))
+    write_room(given.folder, Room(given.splats, given.views, size, given.channels, given.alike))
 
 
 if __name__ == "__main__":
