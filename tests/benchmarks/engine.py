@@ -128,9 +128,8 @@ def tell_large(splats: int, channels: int, views: int) -> None:
         cost = own.submit(large, splats, channels, views).result()
     view, entry = cost.timings["geometry"] / views, cost.timings["solve"] / (cost.entries * channels)
     size = "x".join(map(str, SIZE))
-    print(
-        f"{splats} splats, {views} views of {size}, {channels} channels: {cost.seconds:.0f} s, {cost.seen:.1%} seen"
-    )
+    print(f"{splats} splats, {views} views of {size}, {channels} channels: {cost.seconds:.0f} s, "
+          f"{cost.seen:.1%} seen")  # fmt: skip
     print("  " + ", ".join(f"{name} {took:.1f}" for name, took in cost.timings.items()))
     print(f"  at most {cost.held / GIB:.2f} GiB held, {cost.scene / GIB:.2f} of it the scene; "
           f"W {cost.blocks / GIB:.2f} GiB in files")  # fmt: skip

@@ -19,7 +19,6 @@ import statistics
 import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -34,6 +33,7 @@ from liftcore.device import CPU, Device
 from liftcore.evaluate.bench import weigh_regions
 from liftcore.evaluate.synthetic import room_cameras, room_regions, room_splats
 from liftcore.features.views import cells_under
+from liftcore.one_thread import one_thread
 from liftcore.raster import open_raster
 from liftcore.raster.base import ALPHA_FLOOR, TILE, Weighting
 from liftcore.raster.cpu.composite import Frame
@@ -193,23 +193,12 @@ WEIGHTS = 1 << 20  # of a batch of slabs: 4 MiB an intermediate
 CHANNELS = 128  # a chunk
 
 
-@contextmanager
-def torch_threads(count: int) -> Iterator[None]:
-    """Torch's operations on so many threads, inside the block."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-
-
 def torch_autograd(work: Work) -> Answer:
     """View by view, slab by slab, chunk by chunk of channels; each thread has tiles and sums of its own."""
     raster = CpuRaster(work.splats, THREADS)
     own = torch.zeros(THREADS, work.splats.count, work.channels + 1)
     one_each = {"initializer": torch.set_num_threads, "initargs": (1,)}
-    with torch_threads(1), ThreadPoolExecutor(THREADS, **one_each) as pool:
+    with one_thread(), ThreadPoolExecutor(THREADS, **one_each) as pool:
         for camera, regions in work.views:
             (frame,) = raster._bands(camera, work.params)
             target = by_tile(dense_target(at_pixels(regions, camera)))
