@@ -1,6 +1,6 @@
-"""A stranger's first hour: inputs that contradict each other are told, healthy ones are not, the demo takes a scene.
+"""A stranger's first hour: inputs that contradict each other are told, healthy ones are not.
 
-    python -m tests.benchmarks.first_hour SHARED [--demo] [--json]
+    python -m tests.benchmarks.first_hour SHARED [--json]
 
 SHARED holds the folders ``plush`` and ``tabletop``; the still life is generated. Each case is a row: ``done`` or
 ``NOT DONE``, and what was seen. A healthy scene is done where `check` finds nothing wrong with all of its views, 20,
@@ -9,12 +9,9 @@ SHARED holds the folders ``plush`` and ``tabletop``; the still life is generated
 - ``positions x 0.3``, ``x 0.5``: the cameras' positions in another scale than the splats;
 - ``foreign cameras``: the other scene's, under the names of its own;
 - ``[F, h, w] under [h, w, F]``: a grid whose bytes lie in another order than its shape says.
-
-``--demo`` also runs ``splatlift demo --scene`` on both folders, which takes some minutes.
 """
 
 import json
-import subprocess
 import sys
 import tempfile
 import time
@@ -56,11 +53,10 @@ Scene = tuple[lc.Splats, lc.Cameras, Mapping[str, Path] | None]  # as `check` ta
 
 def main() -> int:
     """Run the cases and print them; 1 where one is not done."""
-    arguments = ("shared", {"type": Path}), ("--demo", {"action": "store_true"})
-    options = command_line("tests.benchmarks.first_hour", __doc__, *arguments).parse_args()
+    options = command_line("tests.benchmarks.first_hour", __doc__, ("shared", {"type": Path})).parse_args()
     cases = []
     with tempfile.TemporaryDirectory() as scratch:
-        for case in _cases(options.shared, Path(scratch), demo=options.demo):
+        for case in _cases(options.shared, Path(scratch)):
             cases.append(case)
             if not options.json:
                 print(f"{'done' if case.done else 'NOT DONE':<9} {case.what}: {case.seen}", flush=True)
@@ -69,7 +65,7 @@ def main() -> int:
     return 0 if done == len(cases) else 1
 
 
-def _cases(shared: Path, scratch: Path, *, demo: bool) -> Iterator[Case]:
+def _cases(shared: Path, scratch: Path) -> Iterator[Case]:
     write_still_life(scratch, still_life())
     folders = {"plush": shared / "plush", "tabletop": shared / "tabletop", "still life": scratch}
     scenes = {name: _opened(folder) for name, folder in folders.items()}
@@ -83,8 +79,6 @@ def _cases(shared: Path, scratch: Path, *, demo: bool) -> Iterator[Case]:
     check_scene(*scenes["plush"], lc.read_features(shared / "plush" / "grids.safetensors"))
     took = time.perf_counter() - begin
     yield Case(f"check of plush within {MOST_SECONDS:g} s", took <= MOST_SECONDS, f"{took:.1f} s")
-    if demo:
-        yield from (_demo(folder, scratch / f"out-{name}") for name, folder in list(folders.items())[:2])
 
 
 def _opened(folder: Path) -> Scene:
@@ -131,16 +125,6 @@ def _turned(views: Views) -> Views:
         assert isinstance(view, lc.FeatureGrid)
         made[name] = lc.FeatureGrid(torch.clone(view.grid.permute(2, 0, 1).contiguous()).reshape(view.grid.shape))
     return as_views(made)
-
-
-def _demo(folder: Path, out: Path) -> Case:
-    """The demo on a folder: it names the pack that it took, and asks about something that is in view."""
-    command = [sys.executable, "-m", "liftcore.cli", "demo", "--scene", str(folder), "--out", str(out)]
-    ran = subprocess.run(command, capture_output=True, text=True, check=False)
-    told = "--pack takes others" in ran.stdout
-    found = [line.strip() for line in ran.stdout.splitlines() if " splats, best score " in line]
-    seen = found[0] if found else (ran.stderr.strip().splitlines() or ["nothing was found"])[-1]
-    return Case(f"demo on {folder.name}", ran.returncode == 0 and told and bool(found), seen)
 
 
 if __name__ == "__main__":

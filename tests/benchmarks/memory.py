@@ -14,14 +14,12 @@ import argparse
 import json
 import multiprocessing
 import os
-import platform
 import socket
 import sys
 import tempfile
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
-from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -34,6 +32,7 @@ from service.store.jobs import JobOrder
 from service.store.lifts import FinishedLift
 from service.store.owners import SERVICE
 from service.store.store import Store
+from tests.benchmarks.base import machine
 from tests.benchmarks.load import at_once, probe
 from tests.crash.service_process import ServiceProcess
 
@@ -152,8 +151,7 @@ def main() -> int:
     parser.add_argument("--names", type=int, default=99_999, help="long names of views")
     parser.add_argument("--jobs", type=int, default=50_000, help="that have ended")
     given = parser.parse_args()
-    print(f"{datetime.now(UTC):%Y-%m-%d}, {os.cpu_count()} cores, Python {platform.python_version()}, "
-          f"load {os.getloadavg()[0]:.1f}\n")  # fmt: skip
+    print(f"{', '.join(machine().values())}, load {os.getloadavg()[0]:.1f}\n")
     print("| load | MB at most | /healthz p50 ms | p99 ms | probes |\n|---|---|---|---|---|")
     kept = True
     with tempfile.TemporaryDirectory() as folder:

@@ -1,6 +1,6 @@
 """The setting ``speed`` on one scene: processor seconds of whole lifts by turns, and how near to exact they come.
 
-    python -m tests.benchmarks.speeds FOLDER [--features NAME] [--speeds NAME...] [--rounds N] [--json]
+    python -m tests.benchmarks.speeds FOLDER [--speeds NAME...] [--rounds N] [--json]
 
 All views are lifted, on one thread, in one process; seconds are the fewest of the rounds, with reading, without
 compiling. ``splatlift tradeoff`` measures more, with views held out. FOLDER as `tests.benchmarks.scenes` makes it.
@@ -22,19 +22,17 @@ def main() -> None:
         "tests.benchmarks.speeds",
         __doc__,
         ("folder", {"type": Path}),
-        ("--features", {"default": "features", "metavar": "NAME", "help": "the pack in FOLDER"}),
         ("--speeds", {"nargs": "+", "default": list(map(str, Speed)), "choices": list(map(str, Speed))}),
         ("--rounds", {"type": int, "default": 2}),
-        ("--preset", {"default": "tikhonov", "metavar": "NAME"}),
     )
     options = parser.parse_args()
-    splats, cameras, pack = scene_files(options.folder, options.features)
+    splats, cameras, pack = scene_files(options.folder)
     seconds: dict[str, float] = {}
     made: dict[str, lc.LiftResult] = {}
     for number in range(1 + max(1, options.rounds)):  # the first round compiles
         for speed in dict.fromkeys(["exact", *options.speeds]):
             start = time.process_time()
-            settings = lc.LiftSettings.of(preset=options.preset, speed=speed, device="cpu")
+            settings = lc.LiftSettings.of(preset="tikhonov", speed=speed, device="cpu")
             made[speed] = lift_files(splats, cameras, [pack], settings, threads=1)
             if number:
                 seconds[speed] = min(seconds.get(speed, float("inf")), time.process_time() - start)
