@@ -3,7 +3,8 @@
 SplatliftError
 └── ServiceError
     ├── Unauthorized, MissingScope, ForeignOrigin, Misdirected      who may ask
-    ├── InvalidRequest, DigestMismatch, InvalidEncoding, UnsupportedEncoding, TooLarge, RangeNotSatisfiable, KeyReused
+    ├── InvalidRequest, UnreadableBody, DigestMismatch, InvalidEncoding, UnsupportedEncoding, TooLarge,
+    │   RangeNotSatisfiable, KeyReused
     ├── InUse, Conflict                                             what the state of things does not allow
     ├── OverQuota, OverLimit, NoSpace                               what there is no room for
     ├── RetryLater: TooMany, Busy (NotReady)                        what may go well in a while
@@ -66,6 +67,12 @@ class InvalidRequest(ServiceError):
     """A parameter or a body that the route does not understand."""
 
     kind = "invalid-request"
+
+
+class UnreadableBody(ServiceError):
+    """A body that no reader of JSON gets to the end of."""
+
+    kind = "malformed-request"
 
 
 class DigestMismatch(ServiceError):

@@ -15,6 +15,7 @@ from pydantic import (
     ConfigDict,
     Field,
     GetJsonSchemaHandler,
+    StringConstraints,
     ValidationError,
     ValidatorFunctionWrapHandler,
     WrapValidator,
@@ -346,9 +347,10 @@ class PackChange(Body):
 class LiftChange(Body):
     """What to change of a lift; what is left out stays."""
 
-    name: Annotated[str, Field(max_length=LIFT_NAME_CHARACTERS, pattern=PRINTABLE)] | None = Field(
-        None, description="for people; null or an empty one takes the name away"
-    )
+    name: (
+        Annotated[str, StringConstraints(strip_whitespace=True, max_length=LIFT_NAME_CHARACTERS, pattern=PRINTABLE)]
+        | None
+    ) = Field(None, description="for people; null or an empty one takes the name away")
     photos: AssetId | None = Field(None, description="an asset of kind photos; null takes them away")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import logging
+import re
 import sqlite3
 from collections.abc import Mapping
 from http import HTTPStatus
@@ -27,6 +28,9 @@ METHODS = ("GET", "POST", "PUT", "PATCH", "DELETE", "OPTIONS")  # and HEAD, wher
 PATH_CHARACTERS = 200  # of what a client asked for, told back
 SHOWN = 120  # characters of a value that came
 SHOWN_OF_JSON = 20  # from where it is none
+PYDANTIC = re.compile(
+    r"^\w+ should (be|have) |, unable to parse .*| after validation, not \d+$"
+)  # around what it expects
 CLOSE = {"Connection": "close"}  # what is still to come of the body would be taken for the next request
 # Of the database's file, or of the disk below it: nobody's request is at fault, and nothing was kept of it.
 UNUSABLE = (
@@ -35,6 +39,7 @@ UNUSABLE = (
 )  # fmt: skip
 NO_SPACE = "There is no room left"
 BUSY = "The server is busy"
+MALFORMED = "The request is malformed"
 
 # Exception -> status and title. The nearest class in the exception's ancestry counts; `type` is its `kind`.
 TABLE: dict[type[SplatliftError], tuple[int, str]] = {
@@ -57,7 +62,8 @@ TABLE: dict[type[SplatliftError], tuple[int, str]] = {
     errors.Misdirected: (421, "This is another host"),
     errors.OverQuota: (403, "The key's quota is used up"),
     errors.TooMany: (429, "The key asks for too much at a time"),
-    errors.InvalidRequest: (422, "The request is malformed"),
+    errors.InvalidRequest: (422, MALFORMED),
+    errors.UnreadableBody: (400, MALFORMED),
     errors.DigestMismatch: (422, "The body is not what its digest promised"),
     errors.InvalidEncoding: (422, "The body does not decompress"),
     errors.UnsupportedEncoding: (415, "The content encoding is not supported"),
@@ -77,7 +83,7 @@ TABLE: dict[type[SplatliftError], tuple[int, str]] = {
 
 # Errors that the framework raises by status, not by class.
 FRAMEWORK: dict[int, tuple[str, str]] = {
-    400: ("malformed-request", "The request is malformed"),
+    400: ("malformed-request", MALFORMED),
     404: ("no-such-route", "There is no such route"),
     405: ("method-not-allowed", "The route does not take this method"),
     408: ("too-slow", "The request came too slowly"),
@@ -171,6 +177,10 @@ def _of_framework(request: Request, error: HTTPException) -> JSONResponse:
         headers["Allow"] = ", ".join(_methods_of(request))
         told = {"argument": "method", "expected": f"one of {headers['Allow']}", "got": method}
         detail = f"expected {told['expected']}, got {method}"
+    if error.status_code == HTTPStatus.NOT_FOUND:
+        told = {"argument": "path", "expected": "a route of this service", "got": request.url.path[:PATH_CHARACTERS]}
+        told["hint"] = "GET /docs shows them all"
+        detail = f"expected {told['expected']}; {told['hint']}"
     asked = f"{method} {request.url.path[:PATH_CHARACTERS]}"
     return answer(by_status(error.status_code, f"{asked}: {detail}", **told), headers)
 
@@ -210,7 +220,7 @@ def refusal(request: Request, error: RequestValidationError) -> errors.InvalidRe
 def _expected(told: dict[str, Any]) -> str:
     if told["type"] == "missing":
         return "a value"
-    words = told["msg"].removeprefix("Input should be ")
+    words = PYDANTIC.sub("", told["msg"]).replace("String should match pattern", "text that matches pattern")
     return told.get("ctx", {}).get("expected") or words[:1].lower() + words[1:]
 
 

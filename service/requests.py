@@ -16,12 +16,13 @@ from pydantic import BaseModel, ValidationError
 from pydantic.json_schema import models_json_schema
 from starlette.exceptions import HTTPException
 
-from service.errors import InvalidRequest
+from service.errors import InvalidRequest, UnreadableBody
 from service.models import NAME_CHARACTERS, one_of
 from service.problems import CLOSE
 
 M = TypeVar("M", bound=BaseModel)
 SCHEMAS = "#/components/schemas/"
+BODY = "in the body of the request"
 LET_GO = 16  # times the limit of a body: an upload sent to the wrong route ends there
 
 
@@ -102,8 +103,11 @@ def _parsed(model: type[M], content: bytes, media: str | None) -> M:
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         raise RequestValidationError([{**first, "loc": ("body", *first["loc"])}]) from None
-    except (ValueError, RecursionError):  # no UTF-8, numbers of thousands of digits, too deep
-        raise HTTPException(400, "the body is no JSON that can be read") from None
+    except UnicodeDecodeError:
+        raise UnreadableBody("body", expected="JSON in UTF-8", got="bytes that are none", hint=BODY) from None
+    except (ValueError, RecursionError):
+        got = "a number of thousands of digits, or brackets within brackets without end"
+        raise UnreadableBody("body", expected="JSON that can be read", got=got, hint=BODY) from None
 
 
 def _refused(kind: str, message: str, given: object) -> RequestValidationError:

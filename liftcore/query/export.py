@@ -30,7 +30,9 @@ def object_splats(scene: QueryScene, answer: Answer, suffix: str = ".ply") -> It
 
     if answer.dropped:
         hint = "absent=keep takes what is most like it; or ask in other words or by example"
-        raise InvalidQuery("object", expected="something that is there", got=answer.presence.why, hint=hint)
+        raise InvalidQuery(
+            "object", expected="something that is there", got=answer.presence.why.rstrip("."), hint=hint
+        )
     if answer.count == 0:
         raise InvalidQuery(
             "object",

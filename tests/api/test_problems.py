@@ -71,6 +71,26 @@ def test_assets_in_a_wrong_place_and_one_pack_twice_are_refused(client: TestClie
     assert assert_problem(client.post("/lift", json=twice))["type"] == "/problems/invalid-features"
 
 
+@pytest.mark.parametrize(
+    ("method", "path", "more", "argument", "expected", "got"),
+    [
+        ("POST", "/query", {"content": b'{"text": ["\xc4pfel"]}', "headers": {"Content-Type": "application/json"}},
+         "body", "JSON in UTF-8", "bytes that are none"),
+        ("GET", "/query?text=", {}, "text.0", "at least 1 character", "''"),
+        ("GET", "/query?text=apple&top=many", {}, "top", "a valid integer", "'many'"),
+        ("GET", "/query?text=apple&lift=x", {}, "lift", "text that matches pattern '^[0-9a-f]{32}$'", "'x'"),
+        ("POST", "/lift", {"json": {"splats": NO_ASSET, "cameras": NO_ASSET, "features": []}},
+         "features", "at least 1 item", "[]"),
+        ("GET", "/querry", {}, "path", "a route of this service", "/querry"),
+    ],
+)  # fmt: skip
+def test_refusal_names_the_argument_and_what_was_expected(
+    client: TestClient, method: str, path: str, more: dict[str, Any], argument: str, expected: str, got: str
+) -> None:
+    body = assert_problem(client.request(method, path, **more))
+    assert (body["argument"], body["expected"], body["got"]) == (argument, expected, got) and body["hint"]
+
+
 FULL = sqlite3.OperationalError("disk is full")
 FULL.sqlite_errorcode = sqlite3.SQLITE_FULL
 

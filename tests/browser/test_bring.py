@@ -161,6 +161,8 @@ def test_lift_takes_a_name_and_photos(browser: Browser, served: Served, tmp_path
     browser.until("document.querySelector('#over').naturalWidth === 32")
     browser.press("#view-after")
     browser.until("document.querySelector('#layer-words').textContent === 'There is no photo of this view.'")
+    browser.press("#panel-look input[value=evidence]")
+    browser.until("document.querySelector('#layer-words').textContent.endsWith('It is seen in 3D alone.')")
 
 
 def test_strangers_files_become_an_object_that_lights_up(browser: Browser, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 // is here already.
 import { ago, at, count, el, plural, size, tell, twice } from "./dom.js";
 import { dropped, gathered, kindOf } from "./files.js";
+import { space } from "./lifts.js";
 import { events, json, patch, picture, post, remove, upload, words } from "./service.js";
 
 const PAGE = 20; // of each list
@@ -130,7 +131,7 @@ export class Bring {
       el("b", {}, KINDS[kind]), ` ${has(kind) ? "ready" : WANTED[kind]}`)));
     at("lift-it").disabled = at("compare").disabled = at("plan-it").disabled = Boolean(missing.length) || busy;
     at("settings").hidden = missing.length === 3;
-    at("plan").hidden = true;
+    at("plan").hidden = at("order-problem").hidden = true; // of other files
   }
 
   line(one) {
@@ -344,7 +345,7 @@ function field(told) {
 function said({ kind, counts = {} }) {
   const told = { splats: ["splats", "kernel"], cameras: ["views"], features: ["views", "channels", "text_space"], photos: ["photos"] }[kind] || Object.keys(counts);
   const parts = told.filter(name => ["number", "string"].includes(typeof counts[name])).map(name => {
-    if (typeof counts[name] === "string") return name === "text_space" ? `words of ${counts[name]}` : counts[name];
+    if (typeof counts[name] === "string") return name === "text_space" ? space(counts) : counts[name];
     return plural(counts[name], name.replace(/s$/, "").replaceAll("_", " "));
   });
   return parts.join(", ");

@@ -5,7 +5,7 @@ import { patch, remove, words } from "./service.js";
 export const title = lift => lift.name || `${count(lift.count)} splats, ${ago(lift.created)}, ${space(lift)}`;
 
 const SPACES = { none: "no words", prompts: "own words", "": "words of no known encoder" };
-const space = ({ text_space: name }) => SPACES[name] || `words of ${name}`;
+export const space = ({ text_space: name }) => SPACES[name] || `words of ${name}`;
 
 export class Lifts {
   // opened: with the lift to show; changed: after one was named or deleted.

@@ -142,7 +142,8 @@ export class Look {
     const place = new URLSearchParams({ lift: this.lift.id, view: this.view.name });
     const over = this.what === "photo" ? this.view.photo && `/lifts/${this.lift.id}/photo?view=${encodeURIComponent(this.view.name)}`
       : IN_VIEWS.includes(this.what) && this.what !== "rgb" ? `/render?${place}&what=${this.what}` : null;
-    at("layer-words").textContent = this.what === "photo" && !this.view.photo ? "There is no photo of this view." : LAYERS[this.what];
+    at("layer-words").textContent = this.what === "photo" && !this.view.photo ? "There is no photo of this view."
+      : this.mode === "view" && ![...IN_VIEWS, "photo"].includes(this.what) ? `${LAYERS[this.what]} It is seen in 3D alone.` : LAYERS[this.what];
     at("picture-box").classList.add("busy");
     try {
       const examples = this.examples?.() || [];
