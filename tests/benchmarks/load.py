@@ -138,8 +138,13 @@ def _questions(url: str, lift: str, words: Iterator[str], rounds: int) -> dict[s
 def at_once(work: Sequence[Callable[[], T]]) -> list[T]:
     """What each gives, all begun at the same moment in threads of their own."""
     gate = threading.Barrier(len(work))
+
+    def begin(one: Callable[[], T]) -> T:
+        gate.wait()
+        return one()
+
     with ThreadPoolExecutor(len(work)) as pool:
-        return list(pool.map(lambda one: (gate.wait(), one())[1], work))
+        return list(pool.map(begin, work))
 
 
 def probe(url: str, over: Callable[[], bool]) -> dict[str, Any]:
