@@ -97,6 +97,17 @@ def test_several_words_have_a_colour_each(page: Browser) -> None:
     assert page.value(WORDS) == []
 
 
+def test_question_is_taken_back_or_narrowed_while_it_is_asked(page: Browser) -> None:
+    page.value("document.querySelector('#words').value = 'lamp, apple'")
+    submit = "document.querySelector('#query').requestSubmit()"
+    page.value(f"(() => {{ {submit}; document.querySelector('#clear').click(); }})()")
+    assert not page.value("document.querySelector('#stage').classList.contains('asking')")
+    page.value("document.querySelector('#words').value = 'lamp, apple'")
+    page.value(f"(() => {{ {submit}; splatlift.ask.example('splat:{APPLE}', true); }})()")
+    page.until(FOUND)  # both, the one that was not narrowed too
+    assert page.value(WORDS) == ["lamp", "apple"]
+
+
 def test_click_asks_for_more_and_shift_for_less(page: Browser) -> None:
     page.press("#scene", *splat_at(page, APPLE))
     page.until(f"{EXAMPLES}.length === 1")

@@ -44,6 +44,7 @@ export class Ask {
     this.thing = -1;
     this.negatives = [];
     at("words").value = at("but").value = "";
+    at("stage").classList.remove("asking"); // what is on its way is late
     this.show();
     if (changed) this.changed();
   }
@@ -127,7 +128,8 @@ export class Ask {
   async ask(only = null) {
     if (!this.lift) return;
     const mine = ++this.turn;
-    const asked = only ? [only] : this.questions;
+    const waits = question => !question.answer && !question.problem; // what it was asked last is late from here on
+    const asked = only ? this.questions.filter(question => question === only || waits(question)) : this.questions;
     if (asked.length === this.questions.length) this.negatives = split(at("but").value); // else the others' answers are without
     for (const question of asked) Object.assign(question, { answer: null, things: [], problem: null, anyway: false });
     this.thing = -1;
