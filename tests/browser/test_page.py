@@ -275,10 +275,11 @@ def test_link_opens_question_layer_and_camera_again(page: Browser, served: Serve
     page.until(FOUND)
     assert page.value(WORDS) == ["apple", "lamp"] and page.value("splatlift.look.what") == "pca"
     assert page.value("splatlift.viewer.place3d") == pytest.approx(place, rel=1e-3, abs=1e-3)
-    page.open(f"{served.address}/?lift={served.lift}&view=right&text=apple&threshold=0.5")  # a link of before
+    page.open(f"{served.address}/?lift={served.lift}&view=right&text=apple&threshold=0.5&what=odd&show=odd")
     page.until(READY)
     page.until(FOUND)
     assert page.value("[splatlift.look.view.name, splatlift.ask.now.cut]") == ["right", 0.5]
+    assert page.value("[splatlift.look.what, splatlift.look.mode]") == ["rgb", "scene"]
 
 
 def test_link_to_a_scene_that_is_gone_leaves_the_others_to_choose(page: Browser, served: Served) -> None:

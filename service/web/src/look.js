@@ -15,6 +15,7 @@ const LAYERS = {
   photo: "The photo of the view, where one was brought.",
   depth: "The depth of the splats: near is bright.",
 };
+const MODES = ["scene", "both", "view"];
 const IN_VIEWS = ["rgb", "pca", "cluster", "confidence", "depth"]; // that the service draws of a view
 
 export class Look {
@@ -89,7 +90,7 @@ export class Look {
   }
 
   switch(mode) {
-    this.mode = this.fallback ? "view" : mode;
+    this.mode = this.fallback ? "view" : MODES.includes(mode) ? mode : "scene"; // a link may name anything
     if (this.mode === "scene" && ["depth", "photo"].includes(this.what)) this.choose("rgb"); // of views alone
     at("stage").dataset.mode = this.mode;
     document.querySelector(`input[name=mode][value=${this.mode}]`).checked = true;
@@ -104,6 +105,7 @@ export class Look {
   }
 
   async choose(what) {
+    if (!Object.hasOwn(LAYERS, what)) return undefined;
     this.showLayer(what);
     this.draw();
     if (["rgb", "depth", "photo"].includes(what) || this.fallback) {
