@@ -7,6 +7,7 @@ import { events, json, patch, picture, post, remove, upload, words } from "./ser
 
 const PAGE = 20; // of each list
 const LOOK = 15_000; // ms between looks for jobs of others, while the panel is open
+const AGAIN = 2000; // ms, within which the same order is a second click
 const ENDED = ["succeeded", "failed", "canceled"];
 const KINDS = { splats: "Splats", cameras: "Cameras", features: "Features" };
 const OTHERS = { photos: "Photos", lift: "Lift", masks: "Masks", table: "Words" };
@@ -204,8 +205,12 @@ export class Bring {
       delete settings.speed;
       body.budget_s = Number(at("budget").value);
     }
+    // A double click orders once: the service takes the same order with the same key for the same job.
+    const order = path + JSON.stringify(body);
+    if (this.last?.order !== order || this.last.until < Date.now()) this.last = { order, key: `${Date.now()}-${Math.random()}` };
+    this.last.until = Date.now() + AGAIN;
     try {
-      const job = await post(path, body);
+      const job = await post(path, body, { "Idempotency-Key": this.last.key });
       at("order-problem").hidden = true;
       this.jobs = [job, ...this.jobs.filter(known => known.id !== job.id)];
       this.showJobs();

@@ -33,7 +33,7 @@ export async function call(path, { method = "GET", body, signal, more = {} } = {
 }
 
 export const json = async (path, how) => (await call(path, how)).json();
-export const post = (path, body) => json(path, { method: "POST", body });
+export const post = (path, body, more) => json(path, { method: "POST", body, more });
 export const patch = (path, body) => json(path, { method: "PATCH", body });
 export const remove = path => call(path, { method: "DELETE" });
 
