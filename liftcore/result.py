@@ -134,7 +134,7 @@ class LiftResult:
         absent: str = "drop",
         weigh: str = "evidence",
         references: Any = None,
-        encoder: TextEncoder | str | None = None,
+        encoder: TextEncoder | str | Path | None = None,
     ) -> VectorAnswer:
         """Which splats answer words, or vectors of the lift's text space.
 
@@ -150,8 +150,9 @@ class LiftResult:
                 `confidence`.
             references: [n, F], the vectors of 200 words or more, by which presence is known; None = those of the
                 lift's text space, where it has some.
-            encoder: of texts, or the specification of one (`liftcore.open_encoder`). None: the lift's own words
-                (`table`), else the encoder of its text space, opened for this question: give one for many questions.
+            encoder: of texts and of reference words, or the specification of one (`liftcore.open_encoder`). None: the
+                lift's own words (`table`), else the encoder of its text space, opened for this question (give one for
+                many), or the table of it that ships, where its weights cannot be had.
 
         Raises:
             InvalidQuery: a vector of another length, of zeros or not finite; a text that the encoder cannot read, or

@@ -15,7 +15,6 @@ from pydantic import (
     ConfigDict,
     Field,
     GetJsonSchemaHandler,
-    StringConstraints,
     ValidationError,
     ValidatorFunctionWrapHandler,
     WrapValidator,
@@ -348,8 +347,7 @@ class LiftChange(Body):
     """What to change of a lift; what is left out stays."""
 
     name: (
-        Annotated[str, StringConstraints(strip_whitespace=True, max_length=LIFT_NAME_CHARACTERS, pattern=PRINTABLE)]
-        | None
+        Annotated[str, Field(max_length=LIFT_NAME_CHARACTERS, pattern=PRINTABLE), AfterValidator(str.strip)] | None
     ) = Field(None, description="for people; null or an empty one takes the name away")
     photos: AssetId | None = Field(None, description="an asset of kind photos; null takes them away")
 

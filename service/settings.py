@@ -117,7 +117,8 @@ class ServiceSettings(BaseSettings):
     encoder: str = Field(
         "lvis",
         description="text encoder for lifts of its own text space and, if you set it, for those whose text space has "
-        "no entry in the next one (never for none): lvis, minilm, table:FILE, open_clip:MODEL...",
+        "no entry in SPLATLIFT_TEXT_SPACES (never for the text space 'none'): lvis, minilm, table:FILE, "
+        "open_clip:MODEL...",
     )
     text_spaces: dict[str, str] = Field(
         default_factory=dict, description="text space -> text encoder, in the same notation (JSON object)"

@@ -176,11 +176,13 @@ def whole(text: str) -> int:
     return int(text)
 
 
-def text_encoder(options: argparse.Namespace, scene: QueryScene, hint: str = "") -> TextEncoder:
+def text_encoder(
+    options: argparse.Namespace, scene: QueryScene, hint: str = "", *, stand_in: bool = False
+) -> TextEncoder:
     """The encoder that ``--table`` or ``--encoder`` names, else the lift's own words, else that of its text space.
 
     Args:
-        hint: what else the command can do.
+        hint: what else the command can do. stand_in: as `encoder_of_space` has it.
 
     Raises:
         InvalidQuery, Unavailable: as `encoder_of_space` has it.
@@ -193,4 +195,5 @@ def text_encoder(options: argparse.Namespace, scene: QueryScene, hint: str = "")
         return open_encoder(options.encoder)
     if scene.table is not None:
         return scene.table
-    return encoder_of_space(scene.metadata.text_space, f"--table FILE or --encoder NAME; {hint}".rstrip("; "))
+    told = f"--table FILE or --encoder NAME; {hint}".rstrip("; ")
+    return encoder_of_space(scene.metadata.text_space, told, stand_in=stand_in)

@@ -84,7 +84,8 @@ def run(options: argparse.Namespace) -> int:
     scene = opened_lift(options)
     if files:
         free_outputs(files, made_from(scene))
-    encoder = text_encoder(options, scene, "or ask by example, with --like") if query.texts else None
+    hint = "or ask by example, with --like"
+    encoder = text_encoder(options, scene, hint, stand_in=True) if query.texts else None
     answer = ask(scene, query, encoder)
     seen = None
     if view is not None:

@@ -7,6 +7,7 @@ import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -149,7 +150,7 @@ def query_vectors(
     absent: str = "drop",
     weigh: str = "evidence",
     references: Any = None,
-    encoder: TextEncoder | str | None = None,
+    encoder: TextEncoder | str | Path | None = None,
 ) -> VectorAnswer:
     """Ask a lift for words, or for vectors of its text space.
 
@@ -164,8 +165,8 @@ def query_vectors(
         weigh: what splats count by in the threshold's histogram and in objects: evidence, or that times confidence.
         references: [n, F], the vectors of 200 words or more, by which presence is known; None = those of the lift's
             text space, where it has some (`liftcore.query.presence`).
-        encoder: of texts, or its specification; None: the lift's own words, else that of its text space, opened for
-            this question.
+        encoder: of texts and of reference words, or its specification; None: the lift's own words, else that of its
+            text space, opened for this question, or the table of it that ships.
 
     Raises:
         InvalidQuery: a vector of another length, of zeros or not finite; a text that the encoder cannot read, or none
@@ -177,17 +178,18 @@ def query_vectors(
     scene = QueryScene(result, splats)
     groups = [_terms(values) for values in (positives, negatives)]
     query = Query(*groups, threshold=threshold, instances=instances, keep=keep, absent=absent, weigh=weigh)
-    if isinstance(encoder, str):
+    if isinstance(encoder, str | Path):
         encoder = open_encoder(encoder)
-    elif query.texts and encoder is None:
-        encoder = scene.table or encoder_of_space(scene.metadata.text_space, "give encoder=, or vectors")
-    elif encoder is not None and not hasattr(encoder, "encode"):
+    elif encoder is None and query.texts:
+        space = scene.metadata.text_space
+        encoder = scene.table or encoder_of_space(space, "give encoder=, or vectors", stand_in=True)
+    elif encoder is not None and not all(hasattr(encoder, name) for name in ("encode", "channels", "name")):
         expected = "a text encoder (open_encoder) or its specification"
         raise InvalidQuery("encoder", expected=expected, got=type(encoder).__name__)
     rows = directions(scene, query, encoder)
     if references is not None:
         others = References.of(references, scene.channels)
-    elif query.texts and encoder is not None:
+    elif encoder is not None:
         others = references_of(encoder, scene.metadata.text_space)
     else:
         others = references_beside(rows, scene.metadata.text_space)
@@ -207,7 +209,11 @@ def _terms(values: Any) -> tuple[str | Vector, ...]:
     words = (values,) if isinstance(values, str) else tuple(values) if isinstance(values, list | tuple) else ()
     if words and all(isinstance(word, str) for word in words):
         return words
-    rows = np.asarray(as_numpy(values), np.float64)
+    try:
+        rows = np.asarray(as_numpy(values), np.float64)
+    except (TypeError, ValueError):
+        what = type(values).__name__
+        raise InvalidQuery("query", expected="a text, a list of texts, or vectors [n, F]", got=what) from None
     return tuple(Vector(tuple(row.tolist())) for row in np.atleast_2d(rows)) if rows.size else ()
 
 

@@ -125,7 +125,7 @@ def test_every_command_is_told_and_every_option_has_help() -> None:
     parsers = _commands()
     sentences = (code.removeprefix("splatlift ") for code in inline_code(GUIDE) if code.startswith("splatlift "))
     told = {command.split()[0] for command in (*shell_commands(GUIDE), *sentences)}
-    assert parsers.keys() <= told and COMMANDS.keys() == parsers.keys() and all(COMMANDS.values())
+    assert parsers.keys() <= told and all(COMMANDS.values())
     for name, parser in parsers.items():
         assert not [action.dest for action in _actions(parser) if action.option_strings and not action.help], name
 

@@ -66,7 +66,14 @@ def test_what_a_query_has_no_place_for_is_told(
     assert_one_line(err)
 
 
-@pytest.mark.parametrize(("space", "told"), [("none", "text space is 'none': its"), ("", "text space is not named")])
+@pytest.mark.parametrize(
+    ("space", "told"),
+    [
+        ("none", "text space is 'none': its"),
+        ("", "text space is not named"),
+        ("mine", "text space 'mine' is not one"),
+    ],
+)
 def test_words_to_a_lift_without_a_text_encoder_are_refused_with_its_text_space(
     space: str, told: str, scene: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -96,7 +103,10 @@ def test_the_table_that_ships_answers_where_weights_of_its_space_cannot_be_had(
     status, out, _ = run(capsys, "query", scene / "clip.safetensors", "cat", "--json")
     document, name = json.loads(out), open_encoder("lvis").name
     assert (status, document["encoder"], document["statistics"]["max"]) == (0, name, pytest.approx(1.0, abs=1e-3))
-    assert "HF_HUB_OFFLINE is set" in caplog.text and "lvis has 1,203 words of it, and answers now" in caplog.text
+    assert "its weights are not here; the table lvis answers" in caplog.text
+    assert (
+        run(capsys, "segment", scene / "clip.safetensors")[0] == 2
+    )  # by all words that happen to be here: not asked
     assert run(capsys, "query", scene / "clip.safetensors", "cat", "--encoder", BUILT_IN["lvis"])[0] == 2
 
 

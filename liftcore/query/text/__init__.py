@@ -2,7 +2,7 @@
 
 import logging
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Protocol
 
@@ -91,15 +91,16 @@ def open_encoder(spec: str | Path) -> TextEncoder:
     raise InvalidQuery("encoder", expected=f"one of {', '.join(ENCODER_SPECS)}", got=repr(spec))
 
 
-def encoder_of_space(text_space: str, hint: str = "") -> TextEncoder:
-    """The encoder of a lift's text space; where its weights cannot be had, the table of it that ships, as over HTTP.
+def encoder_of_space(text_space: str, hint: str = "", *, stand_in: bool = False) -> TextEncoder:
+    """The encoder of a lift's text space.
 
     Args:
         hint: what else can be done.
+        stand_in: where its weights cannot be had, take the table of it that ships, which knows its own words alone.
 
     Raises:
-        InvalidQuery: the space has no name, or no words.
-        Unavailable: the encoder's weights are not on this machine, and no table of it ships.
+        InvalidQuery: the space has no name, or no words, or is no encoder's.
+        Unavailable: the encoder's weights are not on this machine, and no table stands in.
     """
     if text_space in ("", NO_WORDS):
         space = f"is {NO_WORDS!r}: its features share no space with words" if text_space else "is not named"
@@ -107,11 +108,14 @@ def encoder_of_space(text_space: str, hint: str = "") -> TextEncoder:
         raise InvalidQuery("encoder", expected="a text encoder, or a table of words", got=got, hint=hint)
     try:
         return open_encoder(text_space)
-    except Unavailable as error:
+    except InvalidQuery as error:
+        got = f"none, and the lift's text space {text_space!r} is not one that opens by its name ({error})"
+        raise InvalidQuery("encoder", expected="a text encoder, or a table of words", got=got, hint=hint) from None
+    except Unavailable:
         ships = next((name for name, space in BUILT_IN.items() if space == text_space != name), None)
-        if ships is None:
+        if ships is None or not stand_in:
             raise
-        log.warning("%s, and answers now", error)
+        log.warning("%s: its weights are not here; the table %s answers, of 1,203 words", text_space, ships)
         return open_encoder(ships)
 
 
@@ -121,7 +125,8 @@ def check_texts(texts: Sequence[str]) -> None:
     Raises:
         InvalidQuery: a text alone, something else than texts, or an empty one.
     """
-    if isinstance(texts, str) or not all(isinstance(text, str) for text in texts):
+    listed = isinstance(texts, Collection) and not isinstance(texts, str)
+    if not listed or not all(isinstance(text, str) for text in texts):
         raise InvalidQuery("texts", expected="a list of texts", got=repr(texts)[:80], hint='such as ["a mug"]')
     if not all(text.strip() for text in texts):
         raise InvalidQuery("text", expected="a word or a sentence", got="an empty text")

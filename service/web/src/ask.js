@@ -159,6 +159,7 @@ export class Ask {
       if (question.threshold === "auto") question.auto = answer.threshold.value;
       else if (question.auto === undefined) question.auto = await this.automaticCut(question);
     } catch (problem) {
+      if (mine !== this.turn) return;
       question.problem = problem;
       if (!String(problem.argument).includes("like")) return;
       const [kind, place] = String(problem.argument).split("."); // like.1 is the second that was sent as like

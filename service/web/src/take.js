@@ -70,12 +70,9 @@ const TERMS = ["text", "like", "unlike", "negatives"];
 
 // The question in Python, of the lift file.
 function ofFile(asked, encoder) {
-  const vectors = name => (encoder === "prompts" ? list(asked.getAll(name)) : `words.encode(${list(asked.getAll(name))})`);
-  const given = [vectors("text"), asked.has("negatives") && vectors("negatives"), asked.get("threshold") !== "auto" && `threshold=${asked.get("threshold")}`,
+  const given = [list(asked.getAll("text")), asked.has("negatives") && list(asked.getAll("negatives")), encoder !== "prompts" && `encoder="${encoder}"`, asked.get("threshold") !== "auto" && `threshold=${asked.get("threshold")}`,
     asked.has("absent") && 'absent="keep"'].filter(Boolean).join(", ");
-  const open = encoder === "prompts" ? [] : ["from liftcore.query.text import open_encoder"];
-  const words = encoder === "prompts" ? [] : [`words = open_encoder("${encoder}")`];
-  return ["import liftcore as lc", ...open, "", `lift = lc.load_lift("lift-${asked.get("lift")}.safetensors")`, ...words,
+  return ["import liftcore as lc", "", `lift = lc.load_lift("lift-${asked.get("lift")}.safetensors")`,
     `found = lift.query(${given})`, "print(int(found.splats.sum()), found.why, found.explanation)"].join("\n");
 }
 

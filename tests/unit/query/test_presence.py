@@ -169,20 +169,23 @@ def test_texts_are_asked_as_their_vectors_are(
     lift, cat = clip.lift, clip.lift.query(table.encode(["cat"]), table.encode(["pizza"]))
     opened: list[str] = []
 
-    def encoder_of_space(space: str, hint: str) -> TableEncoder:
+    def encoder_of_space(space: str, hint: str, *, stand_in: bool) -> TableEncoder:
         opened.append(space)
         return table
 
     monkeypatch.setattr("liftcore.query.ask.encoder_of_space", encoder_of_space)
-    for encoder in (table, "lvis", None):
+    for encoder in (table, "lvis", LVIS_TABLE, None):
         told = lift.query("cat", ["pizza"], encoder=encoder)
         assert torch.equal(told.scores, cat.scores) and torch.equal(told.splats, cat.splats)
         assert (told.present, told.presence) == (cat.present, cat.presence) and told.why.startswith("'cat' is there")
     assert opened == [lift.metadata.text_space]
     wrong: Any
-    for wrong in (7, "no such encoder"):
+    for wrong in (7, "no such encoder", TableEncoder):
         with pytest.raises(InvalidQuery, match="encoder: expected"):
             lift.query("cat", encoder=wrong)
+    for wrong in (["cat", 3], np.array(["cat", "dog"]), {"cat"}, None):
+        with pytest.raises(InvalidQuery, match=r"query: expected a text|vector"):
+            lift.query(wrong)
 
 
 def test_many_words_follow_the_same_rule(clip: QueryScene, table: TableEncoder) -> None:

@@ -38,7 +38,7 @@ def test_spelling_variants_find_the_same_word_and_others_name_the_nearest(table:
             encoder.encode([text])
 
 
-@pytest.mark.parametrize("texts", ["mug", ["mug", 7]])
+@pytest.mark.parametrize("texts", ["mug", ["mug", 7], iter(["mug"]), 7, None])
 def test_what_is_no_list_of_texts_is_refused(texts: Any) -> None:
     with pytest.raises(InvalidQuery, match="texts: expected a list of texts"):
         open_encoder("lvis").encode(texts)
