@@ -1,6 +1,7 @@
 """Reweighting and aggregation under wrong masks: what each part gains, over scenes and seeds of mistakes.
 
-    python -m tests.benchmarks.consensus DIR [--packs NAME ...] [--mistakes NAME ...] [--seeds N ...] [--json]
+    python -m tests.benchmarks.consensus DIR [--packs NAME ...] [--strides N ...] [--mistakes NAME ...]
+        [--seeds N ...] [--settings NAME ...] [--json]
 
 ``DIR`` is `tabletop`, with its packs of 52, 26 and 13 views. ``--mistakes`` are made on its exact masks (13 views),
 and on the tests' still life and small things (their words need the extra ``minilm``), with each seed. A row is a

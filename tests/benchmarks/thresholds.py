@@ -1,6 +1,6 @@
 """Masks on the tabletop scene: mean IoU in the views that were not lifted, a phrase at a time.
 
-    python -m tests.benchmarks.thresholds DIR [--lifts NAME ...] [--every N] [--json]
+    python -m tests.benchmarks.thresholds DIR [--lifts NAME ...] [--every N] [--still-life] [--json]
 
 Each phrase is asked alone, no other phrase and no truth is known to the threshold. A column a method: masks of the
 objects that it finds; ``worst`` is the phrase that ``auto`` shows least well. ``rendered`` cuts the rendered scores
@@ -8,7 +8,8 @@ of each view by an ``auto`` of its own instead (protocol P3), and ``best`` by th
 mask, which needs the truth. ``absent`` and ``absent rendered`` are the mean shares of the image that masks cover
 where nothing of the phrase is to be seen.
 
-The scene is where the constants of ``valley`` were tuned; those of ``auto`` were not tuned. Examples in place of
+The scene is where the constants of ``valley`` were tuned; those of ``auto`` were not tuned. ``--still-life`` judges
+the tests' still life too, with three kinds of mistakes; its words need the extra ``minilm``. Examples in place of
 words: ``tests.benchmarks.examples``.
 """
 
@@ -31,6 +32,7 @@ from liftcore.query.terms import Query
 from liftcore.query.text import TextEncoder, open_encoder
 from liftcore.query.threshold import METHODS, find_threshold
 from tests.benchmarks.base import PACKS, command_line, mask_iou, read_pack, tell
+from tests.benchmarks.consensus import still_life_scene
 from tests.benchmarks.tabletop import Truth, tabletop
 
 COLUMNS = (*METHODS, "rendered", "best", "absent", "absent rendered")
@@ -108,18 +110,30 @@ def rows_of(folder: Path, packs: Iterable[str], lifts: Iterable[str], every: int
         yield head | measure_phrases(truth.opened(lifted), truth, encoder)
 
 
+def still_life_rows(lifts: Iterable[str]) -> Iterator[dict[str, Any]]:
+    """One row a kind of mistakes and a lift."""
+    encoder = open_encoder("minilm")
+    for seed, kind in enumerate(("usual", "hard", "cone"), start=7):
+        truth, views = still_life_scene(kind, seed)
+        for name in lifts:
+            scene = truth.opened(truth.lift(views, **LIFTS[name]))
+            yield {"scene": "still life", "features": kind, "lift": name} | measure_phrases(scene, truth, encoder)
+
+
 def main() -> None:
     """Print the table, or one JSON object."""
     parser = command_line(
         "tests.benchmarks.thresholds",
         __doc__,
         ("folder", {"type": Path}),
-        ("--features", {"nargs": "+", "default": PACKS, "choices": PACKS}),
+        ("--features", {"nargs": "*", "default": PACKS, "choices": PACKS}),
         ("--lifts", {"nargs": "+", "default": tuple(LIFTS), "choices": tuple(LIFTS)}),
+        ("--still-life", {"action": "store_true", "help": "the still life too, which nothing was tuned on"}),
         ("--every", {"type": int, "default": 1, "metavar": "N", "help": "tabletop's every N-th view alone"}),
     )
     options = parser.parse_args()
-    rows = rows_of(options.folder, options.features, options.lifts, options.every)
+    rows = list(rows_of(options.folder, options.features, options.lifts, options.every))
+    rows += still_life_rows(options.lifts) if options.still_life else []
     tell(rows, as_json=options.json, columns=("scene", "features", "lift", "worst", *COLUMNS))
 
 
