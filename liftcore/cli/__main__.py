@@ -9,8 +9,8 @@ from liftcore.cli import main
 
 def run() -> NoReturn:
     """Run a command as the whole of a process, and end it."""
-    # torch makes a million objects, and a command lives for seconds: to look through them for cycles at each 700 new
-    # ones takes .2 s, and .3 s more at the end.
+    # A command lives for seconds, and torch makes many objects: to look through them for cycles at each 700 new ones
+    # takes .2 s, and once more at the end .3 s.
     gc.set_threshold(50_000)
     status = main()
     gc.freeze()

@@ -115,7 +115,7 @@ def encoder_of_space(text_space: str, hint: str = "", *, stand_in: bool = False)
         ships = next((name for name, space in BUILT_IN.items() if space == text_space != name), None)
         if ships is None or not stand_in:
             raise
-        log.warning("%s: its weights are not here; the table %s answers, of 1,203 words", text_space, ships)
+        log.warning("%s: its weights are not here; the table %s answers, with its own words alone", text_space, ships)
         return open_encoder(ships)
 
 
