@@ -42,7 +42,7 @@ class ErrandLimits:
     """What one task may take."""
 
     seconds: float
-    memory_bytes: int  # of private memory; mapped files, however large, cost none
+    memory_bytes: int  # of private memory beside what the imports hold; mapped files, however large, cost none
     ending: threading.Event  # set when the server must end, and every task with it
 
 
@@ -82,9 +82,11 @@ class _Template:
         with theirs:
             command = [sys.executable, "-m", "service.errand", str(theirs.fileno()), *IMPORTED]
             null, passed = subprocess.DEVNULL, [theirs.fileno()]
+            # A limit on memory counts the stacks and buffers of torch's and BLAS's threads, one of each a core.
+            alone = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
             try:
                 self._process = subprocess.Popen(
-                    command, stdin=null, stdout=null, pass_fds=passed, start_new_session=True
+                    command, stdin=null, stdout=null, pass_fds=passed, start_new_session=True, env=alone
                 )
             except OSError:
                 ours.close()
@@ -296,7 +298,8 @@ def _work(request: dict[str, Any], said: int, lifeline: int) -> NoReturn:
             os.dup2(printed, stream)
         os.environ["TMPDIR"] = tempfile.tempdir = request["scratch"]
         run = importlib.import_module(request["module"]).run
-        resource.setrlimit(resource.RLIMIT_DATA, (request["memory"], request["memory"]))
+        most = data_bytes() + request["memory"]  # torch's CUDA builds hold half a gigabyte once they are imported
+        resource.setrlimit(resource.RLIMIT_DATA, (most, most))
         _say(said, {"event": "ready"})
         _say(said, run(*request["arguments"]))
         status = 0
@@ -305,6 +308,15 @@ def _work(request: dict[str, Any], said: int, lifeline: int) -> NoReturn:
     finally:
         sys.stderr.flush()
         os._exit(status)
+
+
+def data_bytes() -> int:
+    """Private memory that may be written to, as RLIMIT_DATA counts it. 0 where Linux does not tell."""
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/self/status").read_text().splitlines():
+            if line.startswith("VmData:"):
+                return int(line.split()[1]) << 10
+    return 0
 
 
 def _say(said: int, message: dict[str, Any]) -> None:

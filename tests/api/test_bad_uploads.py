@@ -189,8 +189,9 @@ def test_check_that_takes_too_long_is_ended(start: Callable[..., TestClient], sc
 
 
 def test_check_that_needs_too_much_memory_is_ended(start: Callable[..., TestClient], scene: TinyScene) -> None:
+    """It is the file's alone: what torch holds once it is imported, the more in CUDA builds, does not count."""
     rows = np.tile(splat_rows(), (20_000, 1))  # 67 MB, of which a reader holds several copies
-    with start(check_memory_bytes=300 << 20) as client:
+    with start(check_memory_bytes=48 << 20) as client:
         small = client.put("/assets/splats", content=scene.splats)
         reply = client.put("/assets/splats", content=ply(rows))
     assert small.status_code == 201, small.text
@@ -198,15 +199,16 @@ def test_check_that_needs_too_much_memory_is_ended(start: Callable[..., TestClie
 
 
 ROOT = Path(__file__).parents[2]
-MEMORY_BYTES = 1 << 30  # private memory for the whole corpus, made and read in one process
+MEMORY_BYTES = 700 << 20  # private memory for the whole corpus, made and read in one process, beside its imports
 SECONDS = 600  # for the same; it takes some, and the machine may be busy
 ALL_IN_ONE_PROCESS = """
 import json, resource, sys
 from pathlib import Path
+from service.errand import data_bytes
 from service.uploads import check
 from tests.api.bombs import CORPUS
 folder = Path(sys.argv[1])
-resource.setrlimit(resource.RLIMIT_DATA, (int(sys.argv[2]),) * 2)
+resource.setrlimit(resource.RLIMIT_DATA, (data_bytes() + int(sys.argv[2]),) * 2)
 for kind, corpus in CORPUS.items():
     for name, content in corpus().items():
         path = folder / f"draft.{kind}"
