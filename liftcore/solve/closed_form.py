@@ -9,8 +9,10 @@ faint splats keep their digits. float32 adds LONG terms one by one; longer bags,
 are sums of the sums of such parts: added one by one, ten million equal terms would be wrong in their first digit.
 """
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -26,6 +28,7 @@ from liftcore.solve.weights import BLOCK_ENTRIES, BLOCK_ROWS, RegionWeights, fro
 LONG = 256  # terms of a sum that float32 adds up one by one
 DEVICE_ROWS, DEVICE_ENTRIES = 1 << 16, 1 << 24  # of a block on a device; halved where its memory runs out
 LEAST_ROWS = 256  # of a block that is halved no more
+BESIDE = 4  # blocks of a device in work together: to write one into X takes longer than to sum it up
 
 
 @dataclass(frozen=True)
@@ -127,8 +130,8 @@ def solve_rows(
         if device.kind == "cpu":
             run_each(solve_block, blocks, threads)
         else:
-            for block in blocks:
-                _halved_to_fit(solve_block, *block)
+            cores = threads or len(os.sched_getaffinity(0))
+            run_each(partial(_halved_to_fit, solve_block), blocks, min(cores, BESIDE))
         progress("solve", number + 1, len(slices), "slices")
     return squares
 

@@ -251,8 +251,10 @@ def stacked(parts: Sequence[RegionWeights], splats: int, threads: int | None = N
             weight.scatter_(0, to, part.weight[own].to(place))
             cursors[rows] = at + lengths
 
-    ranges = row_blocks(lengths.cpu().numpy(), max(splats, 1), 1 << 22)
-    run_each(fill, ranges, threads if place.type == "cpu" else 1)
+    ranges = [(0, splats)]  # on a card, which takes longer to be asked for a piece than to move it
+    if place.type == "cpu":
+        ranges = row_blocks(lengths.numpy(), max(splats, 1), 1 << 22)
+    run_each(fill, ranges, threads)
     met = torch.nonzero(evidence)[:, 0]
     own = [part.offsets[1:] + base for part, base in zip(parts, bases, strict=False)]
     offsets = torch.cat([torch.zeros(1, dtype=torch.int64), *own])

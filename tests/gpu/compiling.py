@@ -14,6 +14,7 @@ import subprocess
 import tempfile
 from dataclasses import dataclass
 from functools import partial
+from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,7 +27,8 @@ from triton.compiler import ASTSource, make_backend
 from liftcore.device import Device
 from liftcore.raster.base import CompositingParams, Selection, Weighting
 from liftcore.raster.cpu.warm_up import warm_up
-from liftcore.raster.gpu import launching, raster, render, weights
+from liftcore.raster.gpu import launching, raster, render, tiles, weights
+from liftcore.raster.gpu.tiles import _cut as cut
 from liftcore.scene.splats import Kernel
 from tests.scenes import random_camera, random_grid, random_regions, random_splats
 
@@ -114,8 +116,12 @@ def launches_of(work: Callable[[], None]) -> dict[Launch, None]:
         for argument in arguments:  # what nothing wrote would be nought, and nothing be summed up
             if isinstance(argument, torch.Tensor) and argument.dtype == torch.float32:
                 argument.fill_(1.0)
+        if kernel is cut:  # a span for each splat, in the first tile
+            named = dict(zip(signature(kernel.fn).parameters, arguments, strict=False))
+            for name, value in (("rows", 0), ("firsts", 0), ("counts", 1)):
+                named[name].fill_(value)
 
-    modules: list[Any] = [render, weights]
+    modules: list[Any] = [render, tiles, weights]
     for module in modules:
         module.launch = note
     work()

@@ -15,7 +15,9 @@ from tests.backends import needs_triton
 
 pytestmark = needs_triton
 ROOT = Path(__file__).parents[2]
-STACK = 512  # bytes a thread: what a disc has more than the 255 registers of a thread; others have none
+STACK = (
+    512  # bytes a thread: what a disc has more than the 255 registers of a thread, and the widest top-k in Triton 3.6
+)
 SHARED_MEMORY = 64 * 1024  # bytes a block: what cards of 2018 have, later ones more
 
 
@@ -45,7 +47,7 @@ def lifts(reports) -> list[dict]:
 
 def test_every_kernel_compiles_for_an_h100(compiled):
     names = {report["kernel"] for report in compiled}
-    assert names == {"_weigh", "_gather", "_render", "_strongest", "rank_tile", "_trace", "_add_runs"}
+    assert names == {"_weigh", "_gather", "_render", "_strongest", "rank_tile", "_trace", "_add_runs", "_cut"}
     assert {report["constants"]["KIND"] for report in compiled if report["kernel"] == "_weigh"} == {0, 1, 2}
     assert all(report["machine_code"] > 0 and report["hints"] > 4 for report in compiled)
 
@@ -66,7 +68,7 @@ def test_no_kernel_adds_by_atomics_or_loses_the_digits_of_logarithms_near_one(co
 
 
 def test_kernels_keep_their_values_in_registers_and_in_the_shared_memory_of_consumer_cards(compiled):
-    assert {report["stack"] for report in compiled if report["kernel"] in ("_add_runs", "_trace", "rank_tile")} == {0}
+    assert {report["stack"] for report in compiled if report["kernel"] in ("_add_runs", "_trace", "_cut")} == {0}
     assert 64 in {report["constants"]["COUNT"] for report in compiled if report["kernel"] == "rank_tile"}
-    assert max(report["stack"] for report in compiled if report["kernel"] == "_weigh") <= STACK
+    assert max(report["stack"] for report in compiled if report["kernel"] in ("_weigh", "rank_tile")) <= STACK
     assert max(report["shared"] for report in compiled) <= SHARED_MEMORY

@@ -8,13 +8,18 @@ whose lists would outgrow a block is walked in bands of tile rows, with the list
 from typing import NamedTuple
 
 import torch
+import triton.language as tl
 from torch import Tensor
 
 from liftcore.raster.base import TILE, CompositingParams
 from liftcore.raster.cpu.project import View
 from liftcore.raster.gpu.composite import FLOORS, KINDS, PART, PARTS
+from liftcore.raster.gpu.launching import jit, lang, launch
 from liftcore.raster.gpu.project import DeviceScene, Outlines, ProjectedSplats, project
 from liftcore.scene.splats import Kernel
+
+SPANS = 256  # a program
+_TILE = tl.constexpr(TILE)
 
 
 class Spans(NamedTuple):
@@ -117,13 +122,15 @@ def expanded(counts: Tensor) -> tuple[Tensor, Tensor]:
 
 def _spans(own: Outlines, rows: tuple[int, int], columns: int, base: int) -> Spans:
     top, bottom = tile_rows_of(own, rows)
-    place, step = expanded((bottom - top + 1.0).clamp(min=0.0).long())
-    tile_row = top[place] + step
-    first, last = _tile_columns(own.at(place), tile_row)
-    first, last = first.clamp(min=0.0), last.clamp(max=columns - 1.0)
-    kept = (first <= last).nonzero()[:, 0]
-    whole = (place[kept] + base, tile_row[kept], first[kept], last[kept] - first[kept] + 1.0)
-    return Spans(*(column.to(torch.int32) for column in whole))
+    splat, step = expanded((bottom - top + 1.0).clamp(min=0.0).long())
+    count = splat.shape[0]
+    found = [torch.empty(count, dtype=torch.int32, device=splat.device) for _ in range(3)]
+    launch(
+        _cut, -(-count // SPANS), *own, top, splat, step, *found, columns, count,
+        CIRCLES=own.circle.numel() > 0, SPANS=SPANS,
+    )  # fmt: skip
+    kept = found[2].nonzero()[:, 0]
+    return Spans((splat[kept] + base).to(torch.int32), *(column[kept] for column in found))
 
 
 def _tiles_between(low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
@@ -131,40 +138,66 @@ def _tiles_between(low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
     return torch.floor(torch.ceil(low - 0.5) / TILE), torch.floor(torch.floor(high - 0.5) / TILE)
 
 
-def _tile_columns(own: Outlines, tile_row: Tensor) -> tuple[Tensor, Tensor]:
-    """First and last tile column that a projected splat touches in a tile row, clamped nowhere."""
-    first, last = _outline_columns(own, tile_row)
-    if not own.circle.numel():
-        return first, last
-    meets = (tile_row * TILE + 0.5 * TILE - own.circle_y).abs() <= own.circle + 0.5 * TILE
-    near_first, near_last = _tiles_between(own.circle_x - own.circle, own.circle_x + own.circle)
-    alone = first > last
-    low = torch.where(alone, near_first, torch.minimum(first, near_first))
-    high = torch.where(alone, near_last, torch.maximum(last, near_last))
-    return torch.where(meets, low, first), torch.where(meets, high, last)
+@jit
+def _cut(
+    mx, my, slope, root_x, ky, cutoff, extent_x, extent_y, lean, circle_x, circle_y, circle, top, splats, steps,
+    rows, firsts, counts, columns, count, CIRCLES: tl.constexpr, SPANS: tl.constexpr,
+):  # fmt: skip
+    """The tile columns that splats touch in their tile rows, a span a lane; a count of 0 where there are none."""
+    span = tl.program_id(0) * SPANS + tl.arange(0, SPANS)
+    given = span < count
+    splat = tl.load(splats + span, mask=given, other=0)
+    row = tl.load(top + splat, mask=given, other=0.0) + tl.load(steps + span, mask=given, other=0).to(tl.float64)
+    x, y = tl.load(mx + splat, mask=given, other=0.0), tl.load(my + splat, mask=given, other=0.0)
+    wide, high = tl.load(extent_x + splat, mask=given, other=0.0), tl.load(extent_y + splat, mask=given, other=0.0)
+    leans = tl.load(lean + splat, mask=given, other=0.0)
+    slopes, roots = tl.load(slope + splat, mask=given, other=0.0), tl.load(root_x + splat, mask=given, other=1.0)
+    curves, reach = tl.load(ky + splat, mask=given, other=0.0), tl.load(cutoff + splat, mask=given, other=0.0)
+    begin = tl.maximum(row * _TILE + 0.5 - y, -high)  # of the outline within the row, by its pixel centres
+    end = tl.minimum(row * _TILE + _TILE - 0.5 - y, high)
+    right = _edge(tl.where(leans > end, end, begin), 1.0, slopes, roots, curves, reach)
+    right = tl.where((begin <= leans) & (leans <= end), wide, right)
+    left = _edge(tl.where(-leans > end, end, begin), -1.0, slopes, roots, curves, reach)
+    left = tl.where((begin <= -leans) & (-leans <= end), -wide, left)
+    narrow, broad = _first_tile(x - wide), _last_tile(x + wide)
+    single = narrow == broad  # one column at most: no need to look closer
+    first = tl.where(single, narrow, tl.where(begin > end, 0.0, _first_tile(x + left)))
+    last = tl.where(single, broad, tl.where(begin > end, -1.0, _last_tile(x + right)))
+    if CIRCLES:
+        radius = tl.load(circle + splat, mask=given, other=0.0)
+        near_x = tl.load(circle_x + splat, mask=given, other=0.0)
+        near_y = tl.load(circle_y + splat, mask=given, other=0.0)
+        meets = tl.abs(row * _TILE + 0.5 * _TILE - near_y) <= radius + 0.5 * _TILE
+        near_first, near_last = _first_tile(near_x - radius), _last_tile(near_x + radius)
+        alone = first > last
+        low = tl.where(alone, near_first, tl.minimum(first, near_first))
+        up = tl.where(alone, near_last, tl.maximum(last, near_last))
+        first = tl.where(meets, low, first)
+        last = tl.where(meets, up, last)
+    first = tl.maximum(first, 0.0)
+    last = tl.minimum(last, columns - 1.0)
+    touched = first <= last
+    tl.store(rows + span, row.to(tl.int32), mask=given)
+    tl.store(firsts + span, tl.where(touched, first, 0.0).to(tl.int32), mask=given)
+    tl.store(counts + span, tl.where(touched, last - first + 1.0, 0.0).to(tl.int32), mask=given)
 
 
-def _outline_columns(own: Outlines, tile_row: Tensor) -> tuple[Tensor, Tensor]:
-    """First and last tile column that the outline touches between a tile row's first and last pixel centres."""
-    narrow, wide = _tiles_between(own.mx - own.extent_x, own.mx + own.extent_x)
-    low = torch.maximum(tile_row * TILE + 0.5 - own.my, -own.extent_y)
-    high = torch.minimum(tile_row * TILE + TILE - 0.5 - own.my, own.extent_y)
-    lean = own.lean
-    within = (low <= lean) & (lean <= high)
-    right = torch.where(within, own.extent_x, _edge(own, torch.where(lean > low, high, low), 1.0))
-    within = (low <= -lean) & (-lean <= high)
-    left = torch.where(within, -own.extent_x, _edge(own, torch.where(-lean > low, high, low), -1.0))
-    first, last = _tiles_between(own.mx + left, own.mx + right)
-    outside = low > high
-    first, last = torch.where(outside, 0.0, first), torch.where(outside, -1.0, last)
-    single = narrow == wide  # one column at most: no need to look closer
-    return torch.where(single, narrow, first), torch.where(single, wide, last)
+@jit
+def _first_tile(low):
+    """The tile column of the first pixel centre from ``low`` on."""
+    return lang.floor(lang.ceil(low - 0.5) / _TILE)
 
 
-def _edge(own: Outlines, dy: Tensor, side: float) -> Tensor:
+@jit
+def _last_tile(high):
+    """The tile column of the last pixel centre up to ``high``."""
+    return lang.floor(lang.floor(high - 0.5) / _TILE)
+
+
+@jit
+def _edge(dy, side, slope, root_x, ky, cutoff):
     """x of the outline's left (-1) or right (+1) edge at dy, relative to its centre."""
-    room = (own.cutoff - own.ky * dy * dy).clamp(min=0.0)
-    return own.slope * dy + side * torch.sqrt(room) / own.root_x
+    return slope * dy + side * tl.sqrt(tl.maximum(cutoff - ky * dy * dy, 0.0)) / root_x
 
 
 BLOCK = 1 << 24  # items of tile lists at a time: some 1.5 GB while they are made
@@ -195,7 +228,7 @@ class Frame:
         self.sums_at_once = max(1, block >> 2)  # that become rows of splats
         self._lists: Lists | None = None
         self._projected = project(scene, view, kernel, params.antialiased, max(1, block >> 4))
-        self._spans = spans_of(self._projected.outlines, (0, self.rows), self.columns, max(1, block >> 6))
+        self._spans = spans_of(self._projected.outlines, (0, self.rows), self.columns, max(1, block >> 5))
         self.bands = bands_of(items_by_row(self._spans, self.rows).tolist(), block)
 
     def lists_of(self, band: tuple[int, int]) -> Lists:
