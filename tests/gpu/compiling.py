@@ -109,7 +109,7 @@ def launches_of(work: Callable[[], None]) -> dict[Launch, None]:
     found: dict[Launch, None] = {}
 
     def note(
-        kernel: Any, programs: int, *arguments: object, warps: int = launching.WARPS, **constants: object
+        kernel: Any, programs: int, *arguments: Any, warps: int = launching.WARPS, **constants: object
     ) -> None:
         if programs:
             found[as_launched(kernel, arguments, warps, constants)] = None
