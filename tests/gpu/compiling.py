@@ -108,9 +108,7 @@ def launches_of(work: Callable[[], None]) -> dict[Launch, None]:
     """What the work launches, each once."""
     found: dict[Launch, None] = {}
 
-    def note(
-        kernel: Any, programs: int, *arguments: Any, warps: int = launching.WARPS, **constants: object
-    ) -> None:
+    def note(kernel: Any, programs: int, *arguments: Any, warps: int = launching.WARPS, **constants: object) -> None:
         if programs:
             found[as_launched(kernel, arguments, warps, constants)] = None
         for argument in arguments:  # what nothing wrote would be nought, and nothing be summed up

@@ -5,6 +5,7 @@ operations a splat, so plain tensor operations serve; they run on the CPU as wel
 """
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -108,12 +109,15 @@ def project(scene: DeviceScene, view: View, kernel: Kernel, antialiased: bool, a
             part, z = _project_ellipses(block, view, seen, unit, antialiased)
         parts.append(part)
         depths.append(z.to(torch.float32))
-    order = torch.sort(torch.cat(depths), stable=True).indices
-    outlines = Outlines(*(torch.cat(column) for column in zip(*(part.outlines for part in parts), strict=True)))
-    ids, places, inks = (
-        torch.cat([getattr(part, name) for part in parts])[order] for name in ("ids", "places", "inks")
-    )
+    order = torch.sort(_joined(depths), stable=True).indices
+    outlines = Outlines(*map(_joined, zip(*(part.outlines for part in parts), strict=True)))
+    names = "ids", "places", "inks"
+    ids, places, inks = (_joined([getattr(part, name) for part in parts])[order] for name in names)
     return ProjectedSplats(ids, outlines.at(order), places, inks)
+
+
+def _joined(parts: Sequence[Tensor]) -> Tensor:
+    return parts[0] if len(parts) == 1 else torch.cat(list(parts))
 
 
 def _before_the_camera(scene: DeviceScene, view: View, first: int) -> Seen:
