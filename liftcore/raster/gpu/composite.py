@@ -34,6 +34,7 @@ _CHUNK, _TILE, _PIXELS = tl.constexpr(CHUNK), tl.constexpr(TILE), tl.constexpr(T
 _SCRATCH, _EVIDENCE = tl.constexpr(PARTS * PART), tl.constexpr(PARTS * PART)
 _WEIGHTS, _PLAIN_ALPHAS = tl.constexpr(PART), tl.constexpr(2 * PART)
 _LARGEST, _FRONT, _CENTRAL = tl.constexpr(LARGEST), tl.constexpr(FRONT), tl.constexpr(CENTRAL)
+_LATER = tl.constexpr(1 << 30)  # above every number of an item: a place that is still free
 _BETAS = tl.constexpr(BETAS)
 _DISCS = tl.constexpr(DISCS)
 _LARGEST_EXPONENT = tl.constexpr(LARGEST_EXPONENT)
@@ -232,11 +233,13 @@ def rank_tile(
     mine = scratch + tl.program_id(0) * _SCRATCH
     pixel = tl.arange(0, _PIXELS)
     rank = tl.arange(0, COUNT)
-    at = tl.load(starts + own)
+    first = tl.load(starts + own)
+    at = first
     last = tl.load(starts + own + 1)
     light = start_rays(tile, columns, width, height)
     # The rest of a power of two is filled with what nothing displaces.
     held = tl.where((rank < count)[None, :] & (pixel >= 0)[:, None], 0.0, float("inf"))
+    order = _LATER + rank[None, :] + tl.zeros([_PIXELS, COUNT], tl.int32)
     lit = lang.max(light, 0)
     while (at < last) & (lit > 0.0):
         known = (last - at).to(tl.int32)
@@ -244,9 +247,12 @@ def rank_tile(
         light = blend_chunk(mine, light, stop, known)
         for number in range(tl.minimum(known, _CHUNK)):
             weight = tl.load(mine + _WEIGHTS + number * _PIXELS + pixel)
-            least, place = lang.min(held, 1, return_indices=True)
-            displaced = (rank[None, :] == place[:, None]) & (weight > least)[:, None]
+            least = lang.min(held, 1)
+            # Of equal ones the last that came makes room.
+            latest = lang.max(tl.where(held == least[:, None], order, -1), 1)
+            displaced = (order == latest[:, None]) & (weight > least)[:, None]
             held = tl.where(displaced, weight[:, None], held)
+            order = tl.where(displaced, (at - first).to(tl.int32) + number, order)
         lit = lang.max(light, 0)
         at += _CHUNK
     to = (tl.program_id(0) * _PIXELS + pixel)[:, None] * count + rank[None, :]

@@ -484,7 +484,7 @@ def _largest_weights(frame: Frame, lists: Lists, run: tuple[int, int], count: in
     launch(
         rank_tile, tiles, *lists.splats, lists.starts, lists.items, frame.scratch(tiles), weights,
         lists.first_tile, run[0], *frame.size, count, *frame.cuts, KIND=frame.kind,
-        COUNT=wide, warps=16 if wide >= _WIDE else WARPS,
+        COUNT=wide, warps=8 if wide >= _WIDE else WARPS,
     )  # fmt: skip
     return weights
 
