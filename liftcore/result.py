@@ -162,7 +162,7 @@ class LiftResult:
         from liftcore.query.ask import query_vectors
 
         return query_vectors(
-            self.cpu(), positives, negatives, splats=splats, threshold=threshold, instances=instances, keep=keep,
+            self, positives, negatives, splats=splats, threshold=threshold, instances=instances, keep=keep,
             absent=absent, weigh=weigh, references=references, encoder=encoder,
         )  # fmt: skip
 

@@ -274,6 +274,7 @@ def measured(spec: RunSpec) -> dict[str, Any]:
     cpu, wall = time.process_time(), time.perf_counter()
     made = lift(splats, cameras, lifted, settings, threads=spec.threads)
     seconds = {"cpu": time.process_time() - cpu, "wall": time.perf_counter() - wall}
+    made = made.cpu()
     figures = {
         "cpu_s": seconds["cpu"],
         "wall_s": seconds["wall"],

@@ -175,7 +175,7 @@ def query_vectors(
     """
     import torch
 
-    scene = QueryScene(result, splats)
+    scene = QueryScene(result.cpu(), splats)
     groups = [_terms(values) for values in (positives, negatives)]
     query = Query(*groups, threshold=threshold, instances=instances, keep=keep, absent=absent, weigh=weigh)
     if isinstance(encoder, str | Path):

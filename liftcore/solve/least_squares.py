@@ -186,7 +186,7 @@ class AllRays:
         self.rows += rays.size
         labelled = _labelled(observation)
         for power, sums in ((1, self.row_sums), (2, self.diagonal)):
-            weights = self._raster.region_weights(camera, labelled, self._params, Weighting(power))
+            weights = self._raster.region_weights(camera, labelled, self._params, Weighting(power)).cpu()
             sums[weights.splats.numpy()] += weights.weight.numpy()
 
     def normal(self, X: np.ndarray) -> np.ndarray:

@@ -152,10 +152,10 @@ class RegionWeights:
         """
         if self.splats.numel() and int(self.splats[-1]) >= splats:
             raise InvalidInput("splats", expected=f"{int(self.splats[-1]) + 1} or more", got=str(splats))
-        lengths = np.zeros(splats, np.int64)
-        lengths[self.splats.numpy()] = np.diff(self.indptr.numpy())
+        own, lengths = self.cpu(), np.zeros(splats, np.int64)
+        lengths[own.splats.numpy()] = np.diff(own.indptr.numpy())
         indptr = np.concatenate([[0], np.cumsum(lengths)])
-        return csr_array((self.weight.numpy(), self.region.numpy(), indptr), shape=(splats, int(self.offsets[-1])))
+        return csr_array((own.weight.numpy(), own.region.numpy(), indptr), shape=(splats, int(own.offsets[-1])))
 
     def save(self, path: Path | str, others: Mapping[str, Tensor] | None = None) -> None:
         """Write one safetensors file, whole or not at all: its tensors by name, and ``views`` in the metadata.

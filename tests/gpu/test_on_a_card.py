@@ -1,0 +1,90 @@
+"""Lifts whose tensors are a card's, and what people do with them: on a card of paper where there is no other."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+import liftcore as lc
+from liftcore.evaluate.tradeoff import RunSpec, Scene, measured
+from liftcore.settings import Preset
+from tests import paper_card
+from tests.api.tiny_scene import WORDS, make_scene
+from tests.backends import needs_triton
+
+pytestmark = needs_triton
+FEW = {"certificate_rays": 6}  # as the interpreter traces one in a thirtieth of a second
+GRIDS: list[dict[str, Any]] = [{}, {"preset": "top-k"}, {"cg_steps": 1}, {"aggregation": True}]
+MAPS: list[dict[str, Any]] = [{"preset": preset.value} for preset in Preset]
+MAPS += [{"loss": "huber"}, {"robust_steps": 2}, {"cg_steps": 1}, {"dtype": "float32"}]
+MAPS += [{"aggregation": True}, {"aggregation": True, "aggregation_resolve": True}, {"objects": True}]
+MAPS += [{"aggregation": True, "aggregation_clusters": "graph"}, {"engine": lc.LocalEngine(1)}]
+CASES = [*((False, how) for how in MAPS), *((True, how) for how in GRIDS)]
+
+
+@pytest.fixture(autouse=True)
+def card(monkeypatch: pytest.MonkeyPatch) -> None:
+    if not torch.cuda.is_available():
+        paper_card.lay(monkeypatch)
+
+
+@pytest.fixture
+def paths(tmp_path: Path) -> list[Path]:
+    """Splats, cameras, features and a text table of the tiny scene."""
+    scene, names = make_scene(), ("splats.ply", "cameras.json", "features.safetensors", "table.safetensors")
+    paths = [tmp_path / name for name in names]
+    for path, content in zip(paths, (scene.splats, scene.cameras, scene.features, scene.table), strict=True):
+        path.write_bytes(content)
+    return paths
+
+
+def lifted(paths: list[Path], views: Any = None, **how: Any) -> lc.LiftResult:
+    views = lc.read_features(paths[2]) if views is None else views
+    chosen: dict[str, Any] = ({"preset": "row-sum"} if "engine" in how else {}) | FEW | how
+    return lc.lift(lc.read_splats(paths[0]), lc.read_cameras(paths[1]), views, **chosen)
+
+
+@pytest.mark.parametrize(
+    ("grids", "how"), [*((False, how) for how in MAPS), *((True, how) for how in GRIDS)], ids=str
+)
+def test_a_lift_on_a_card_is_the_processors(paths: list[Path], grids: bool, how: dict[str, Any]) -> None:
+    views = None
+    if grids:
+        draw = torch.Generator().manual_seed(0)
+        views = {name: lc.FeatureGrid(torch.randn(6, 8, 8, generator=draw)) for name in lc.read_cameras(paths[1])}
+    ours, theirs = (lifted(paths, views, device=device, **how) for device in ("cpu", "cuda"))
+    assert theirs.features.is_cuda or "engine" in how, "results stay where the work was; an engine's lie in files"
+    theirs = theirs.cpu()
+    for name in ("features", "evidence", "agreement"):
+        one, other = getattr(ours, name).float(), getattr(theirs, name).float()
+        assert torch.allclose(one, other, rtol=2e-3, atol=2e-3), name
+    assert torch.equal(ours.seen, theirs.seen)
+
+
+def test_what_follows_a_lift_takes_it_from_the_card(paths: list[Path], tmp_path: Path) -> None:
+    made = lifted(paths, objects=True, device="cuda")
+    splats, cameras = lc.read_splats(paths[0]), lc.read_cameras(paths[1])
+    vectors = torch.from_numpy(lc.open_encoder(f"table:{paths[3]}").encode(list(WORDS)))
+    answer = made.query("apple", encoder=f"table:{paths[3]}", splats=splats)
+    assert answer.scores.is_cuda and answer.splats.nonzero()[:, 0].tolist() == list(range(20))
+    for given in (vectors[0], vectors[0].to("cuda")):
+        assert torch.equal(made.query(given).splats, answer.splats)
+    assert made.segment(WORDS, vectors, splats).labels.tolist() == [number // 20 for number in range(60)]
+    assert len(made.objects(splats, WORDS, vectors.to("cuda")).objects) == 3
+    image = lc.render(splats, cameras["middle"], made.features, device="cuda")
+    assert image.shape == (24, 32, 8)
+    lc.region_weights(splats, cameras, lc.read_features(paths[2]), device="cuda").matrix(splats.count)
+    made.save(tmp_path / "made.safetensors")
+    assert torch.equal(lc.load_lift(tmp_path / "made.safetensors").features, made.cpu().features)
+
+
+def test_a_run_of_a_tradeoff_is_judged_off_the_card(paths: list[Path], tmp_path: Path) -> None:
+    scene, judged = Scene(paths[0], paths[1], (paths[2],)), []
+    for device in ("cpu", "cuda"):
+        settings = FEW | {"preset": "row-sum", "device": device}
+        run = RunSpec(scene, settings, ("left", "right"), ("middle",), (), 1, tmp_path, exact=True)
+        judged.append(measured(run)["judged"]["centred_cosine"])
+    assert judged[0] == pytest.approx(judged[1], abs=1e-3) and len(judged[0]) == 1

@@ -1,0 +1,107 @@
+"""A card of paper: tensors that lie in this machine's memory, and are as hard to reach from it as a card's.
+
+Who has no card finds here what a card would refuse: numpy that reads its tensors, and one call with tensors of both
+places. Triton's interpreter runs the kernels. What a card computes, and how fast, only ``make gpu`` tells.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import nullcontext
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from torch.utils._pytree import tree_leaves, tree_map
+
+from liftcore.raster.gpu import launching
+
+PLACE = torch.device("cuda", 0)
+MAKERS = ("arange", "as_tensor", "empty", "eye", "full", "linspace", "ones", "rand", "randn", "tensor", "zeros")
+MAY_MIX = ("copy_", "to", "__setitem__", "__getitem__", "index_put_")
+MAY_MIX_INTO_OURS = ("copy_", "to", "__setitem__")  # where the first of them is a tensor of the processor
+_move = Tensor.to
+
+
+class OnCard(Tensor):
+    """A tensor of the card."""
+
+    @classmethod
+    def __torch_function__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        """Call torch with what lies behind the tensors of the card, and leave its answer there.
+
+        Raises:
+            TypeError, RuntimeError: where torch raises one for tensors of a card.
+        """
+        name, kwargs = getattr(func, "__name__", ""), kwargs or {}
+        if name == "__get__" and func.__self__.__name__ in ("device", "is_cuda"):
+            return PLACE if func.__self__.__name__ == "device" else True
+        if name in ("numpy", "__array__"):
+            raise TypeError("can't convert cuda:0 device type tensor to numpy")
+        tensors = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, Tensor)]
+        ours = [own for own in tensors if not isinstance(own, OnCard) and own.dim()]
+        into_ours = not isinstance(tensors[0], OnCard)
+        if ours and name not in (MAY_MIX_INTO_OURS if into_ours else MAY_MIX):
+            raise RuntimeError(f"Expected all tensors to be on the same device: {name}")
+        asked = [leaf for leaf in tree_leaves((args, kwargs)) if _is_place(leaf)]
+        leaves = name == "cpu" or (asked and torch.device(asked[0]).type == "cpu") or (name == "copy_" and into_ours)
+        args, kwargs = tree_map(_behind, (args, kwargs))
+        with torch._C.DisableTorchFunctionSubclass():
+            made = func(*args, **kwargs)
+        return made if leaves else tree_map(_on_card, made)
+
+
+def lay(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have this machine find a card of paper."""
+    for name in MAKERS:
+        monkeypatch.setattr(torch, name, _made_there(getattr(torch, name)))
+    monkeypatch.setattr(Tensor, "to", _to)
+    monkeypatch.setattr(Tensor, "pin_memory", lambda own: own)
+    answers = {
+        "current_device": 0, "current_stream": SimpleNamespace(synchronize=lambda: None), "device": nullcontext(),
+        "empty_cache": None, "get_device_capability": (9, 0), "get_device_name": "paper", "is_available": True,
+        "mem_get_info": (8 << 30, 8 << 30), "memory_allocated": 0, "memory_reserved": 0,
+    }  # fmt: skip
+    for name, answer in answers.items():
+        monkeypatch.setattr(torch.cuda, name, lambda *_, answer=answer: answer)
+    monkeypatch.setattr("liftcore.device._missing", lambda: None)
+    for module in ("render", "tiles", "weights"):
+        monkeypatch.setattr(f"liftcore.raster.gpu.{module}.launch", _launch)
+
+
+def _launch(kernel: Any, programs: int, *arguments: object, **constants: Any) -> None:
+    assert all(isinstance(own, OnCard) for own in arguments if isinstance(own, Tensor)), "a kernel reads the card's"
+    launching.launch(kernel, programs, *map(_behind, arguments), **constants)
+
+
+def _made_there(make: Callable[..., Any]) -> Callable[..., Any]:
+    def made(*args: Any, device: Any = None, pin_memory: bool = False, **named: Any) -> Any:
+        if device is None or torch.device(device).type == "cpu":
+            return make(*args, device=device, **named)
+        return _on_card(make(*args, device="cpu", **named))
+
+    return made
+
+
+def _to(own: Tensor, *args: Any, non_blocking: bool = False, **named: Any) -> Tensor:
+    asked = [leaf for leaf in (*args, *named.values()) if _is_place(leaf) and torch.device(leaf).type == "cuda"]
+    if isinstance(own, OnCard) or not asked:
+        return _move(own, *args, **named)
+    args, named = tree_map(_behind, (args, named))
+    return _on_card(_move(own, *args, **named, copy=True))
+
+
+def _is_place(value: Any) -> bool:
+    return isinstance(value, torch.device) or (isinstance(value, str) and value.split(":")[0] in ("cpu", "cuda"))
+
+
+def _behind(value: Any) -> Any:
+    if isinstance(value, OnCard):
+        return value.as_subclass(Tensor)
+    return torch.device("cpu") if _is_place(value) else value
+
+
+def _on_card(value: Any) -> Any:
+    return value.as_subclass(OnCard) if type(value) is Tensor else value
