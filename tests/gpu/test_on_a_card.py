@@ -48,7 +48,7 @@ def lifted(paths: list[Path], views: Any = None, **how: Any) -> lc.LiftResult:
 
 
 @pytest.mark.parametrize(
-    ("grids", "how"), [*((False, how) for how in MAPS), *((True, how) for how in GRIDS)], ids=str
+    ("grids", "how"), CASES, ids=[f"{number} {' '.join(how)}" for number, (_, how) in enumerate(CASES)]
 )
 def test_a_lift_on_a_card_is_the_processors(paths: list[Path], grids: bool, how: dict[str, Any]) -> None:
     views = None
