@@ -90,7 +90,7 @@ def lift(
     Source: Splat Feature Solver, Eq. 3 and 6.
     """
     chosen = LiftSettings.chosen(preset, settings)
-    check_given(splats, chosen.antialiased, threads)
+    splats = check_given(splats, chosen.antialiased, threads)
     kept, warn = _checkpoint(checkpoint), _WarnOnce()
     if engine is not None:
         known = cameras if isinstance(cameras, Cameras) else Cameras(cameras)
@@ -138,7 +138,8 @@ def lift(
         object=torch.from_numpy(things.labels) if things else None,
         object_views=torch.from_numpy(things.views) if things else None,
     )
-    return made.to(work.device.place)
+    room = plan.features_room
+    return made if room is not None and X.nbytes > room else made.to(work.device.place)  # X in a mapped file stays
 
 
 @usual_modes()
@@ -160,7 +161,7 @@ def plan(
         InvalidFeatures, InvalidSettings, Unavailable: as `lift` has it.
     """
     chosen = LiftSettings.chosen(preset, settings)
-    check_given(splats, chosen.antialiased, threads)
+    splats = check_given(splats, chosen.antialiased, threads)
     found = LiftViews.of(views, cameras, chosen)
     return plan_lift(splats, found, chosen, choose_device(chosen.device), threads, look=True)
 

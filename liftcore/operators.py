@@ -53,7 +53,7 @@ def render(
     """
     if not isinstance(params, CompositingParams):
         raise InvalidSettings("params", expected="CompositingParams", got=repr(params)[:80])
-    check_given(splats, params.antialiased, threads)
+    splats = check_given(splats, params.antialiased, threads)
     if not isinstance(camera, Camera):
         got, hint = repr(camera)[:80], "cameras[name] is the camera of a view"
         raise InvalidCameras("camera", expected="a Camera", got=got, hint=hint)
@@ -99,7 +99,7 @@ def region_weights(
         InvalidFeatures, InvalidSettings, Unavailable: as `lift` has it.
     """
     chosen = LiftSettings.chosen(preset, settings)
-    check_given(splats, chosen.antialiased, threads)
+    splats = check_given(splats, chosen.antialiased, threads)
     found = LiftViews.of(views, cameras, chosen)
     own = chosen.model_copy(update={"certificate_rays": 0})
     raster = open_raster(splats, choose_device(chosen.device), threads)

@@ -20,8 +20,6 @@ from liftcore.raster.gpu import launching
 
 PLACE = torch.device("cuda", 0)
 MAKERS = ("arange", "as_tensor", "empty", "eye", "full", "linspace", "ones", "rand", "randn", "tensor", "zeros")
-MAY_MIX = ("copy_", "to", "__setitem__", "__getitem__", "index_put_")
-MAY_MIX_INTO_OURS = ("copy_", "to", "__setitem__")  # where the first of them is a tensor of the processor
 _move = Tensor.to
 
 
@@ -40,13 +38,12 @@ class OnCard(Tensor):
             return PLACE if func.__self__.__name__ == "device" else True
         if name in ("numpy", "__array__"):
             raise TypeError("can't convert cuda:0 device type tensor to numpy")
-        tensors = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, Tensor)]
-        ours = [own for own in tensors if not isinstance(own, OnCard) and own.dim()]
-        into_ours = not isinstance(tensors[0], OnCard)
-        if ours and name not in (MAY_MIX_INTO_OURS if into_ours else MAY_MIX):
+        tensors = _tensors((args, kwargs))
+        if _mixes(name, args, tensors):
             raise RuntimeError(f"Expected all tensors to be on the same device: {name}")
         asked = [leaf for leaf in tree_leaves((args, kwargs)) if _is_place(leaf)]
-        leaves = name == "cpu" or (asked and torch.device(asked[0]).type == "cpu") or (name == "copy_" and into_ours)
+        ours = name == "copy_" and not isinstance(tensors[0], OnCard)
+        leaves = ours or name == "cpu" or (asked and torch.device(asked[0]).type == "cpu")
         args, kwargs = tree_map(_behind, (args, kwargs))
         with torch._C.DisableTorchFunctionSubclass():
             made = func(*args, **kwargs)
@@ -91,6 +88,23 @@ def _to(own: Tensor, *args: Any, non_blocking: bool = False, **named: Any) -> Te
         return _move(own, *args, **named)
     args, named = tree_map(_behind, (args, named))
     return _on_card(_move(own, *args, **named, copy=True))
+
+
+def _mixes(name: str, args: Any, tensors: list[Tensor]) -> bool:
+    """Whether a card would refuse these tensors of both places together."""
+    if name in ("copy_", "to"):
+        return False
+    first, indices = tensors[0], _tensors(args[1]) if name in ("__getitem__", "__setitem__") else []
+    if name == "__setitem__" and not indices:
+        return False  # a slice is copied
+    # The processor's numbers, and its indices of a card's tensor, are brought there.
+    brought = [own for own in tensors if not isinstance(own, OnCard) and not own.dim()]
+    brought += indices if isinstance(first, OnCard) else []
+    return len({isinstance(own, OnCard) for own in tensors if all(own is not other for other in brought)}) > 1
+
+
+def _tensors(values: Any) -> list[Tensor]:
+    return [leaf for leaf in tree_leaves(values) if isinstance(leaf, Tensor)]
 
 
 def _is_place(value: Any) -> bool:

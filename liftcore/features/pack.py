@@ -360,7 +360,7 @@ class _Given:
         with callers_modes():
             found = self.views[self.name]
         if isinstance(found, Regions | FeatureGrid):
-            return found
+            return found.cpu()
         hint = "make FeatureGrid(map [h, w, F]) or Regions(labels [L, h, w], codebook [M, F]) of arrays"
         raise InvalidFeatures(
             f"view {self.name!r}", expected="Regions or FeatureGrid", got=type(found).__name__, hint=hint

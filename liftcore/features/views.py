@@ -55,6 +55,10 @@ class Regions:
         object.__setattr__(self, "codebook", rows)
         object.__setattr__(self, "labels", _labels(labels, len(rows), f"{where} labels".strip()))
 
+    def cpu(self) -> Self:
+        """The same with its tensors on the CPU."""
+        return self.unchecked(self.labels.cpu(), self.codebook.cpu())
+
     @classmethod
     def unchecked(cls, labels: Tensor, codebook: Tensor) -> Self:
         """Regions of tensors that are right by how they were made."""
@@ -84,6 +88,10 @@ class FeatureGrid:
 
     def __init__(self, grid: Array, *, where: str = "") -> None:
         object.__setattr__(self, "grid", _features(grid, "h, w, F", f"{where} grid".strip()))
+
+    def cpu(self) -> Self:
+        """The same with its tensor on the CPU."""
+        return self.unchecked(self.grid.cpu())
 
     @classmethod
     def unchecked(cls, grid: Tensor) -> Self:

@@ -117,7 +117,7 @@ def plan_photos(
     settings = LiftSettings.of() if settings is None else settings
     if not isinstance(settings, LiftSettings):
         raise InvalidSettings("settings", expected="LiftSettings, or None", got=repr(settings)[:80])
-    check_given(splats, settings.antialiased, threads)
+    splats = check_given(splats, settings.antialiased, threads)
     known = cameras if isinstance(cameras, Cameras) else Cameras(cameras)
     views = list(known.values())[:: settings.view_stride]
     rows = spread(splats.count, min(SAMPLE, splats.count))

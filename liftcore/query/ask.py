@@ -97,7 +97,7 @@ class Found:
 
 @dataclass(frozen=True)
 class VectorAnswer:
-    """How a lift answers vectors (`query_vectors`); tensors lie where the lift's features do."""
+    """How a lift answers vectors (`query_vectors`); tensors lie on the CPU, where questions are answered."""
 
     scores: Tensor  # [P] f32 in -1..1; -1 where not seen
     splats: Tensor  # [P] bool, seen and at or above the threshold
@@ -194,9 +194,7 @@ def query_vectors(
     else:
         others = references_beside(rows, scene.metadata.text_space)
     answer = answers(scene, [Question(query, rows, np.ones(len(rows), np.bool_), others)])[0]
-    scores, selected = (
-        torch.from_numpy(array).to(result.features.device) for array in (answer.scores, answer.selected)
-    )
+    scores, selected = map(torch.from_numpy, (answer.scores, answer.selected))
     found = None if splats is None else objects(scene, answer)
     clear = answer.clear and answer.count > 0
     told = answer.presence

@@ -60,6 +60,7 @@ class QueryScene:
         names += ("object", "object_views")
         if splats is not None:
             require_lifted(splats, len(result.features))
+            splats = splats.cpu()
         self._hold({name: as_numpy(getattr(result, name)) for name in names})
         self.path = Path("lift")
         given = {"lift": result, "metadata": result.metadata, "splats": splats, "cameras": cameras, "packs": packs}

@@ -30,8 +30,8 @@ def open_raster(splats: Splats, device: Device, threads: int | None = None, kept
     return GpuRaster(splats, device.place, stays=kept > 0)
 
 
-def check_given(splats: Splats, antialiased: bool, threads: int | None) -> None:
-    """What callers of the library give to every call that rasterizes.
+def check_given(splats: Splats, antialiased: bool, threads: int | None) -> Splats:
+    """What callers of the library give to every call that rasterizes; the splats come back on the CPU.
 
     Raises:
         InvalidSplats: the splats are something else, such as a path.
@@ -46,3 +46,4 @@ def check_given(splats: Splats, antialiased: bool, threads: int | None) -> None:
     if threads is not None and (isinstance(threads, bool) or not isinstance(threads, Integral) or threads < 1):
         got = repr(threads)[:80]
         raise InvalidSettings("threads", expected="a whole number of one or more, or None for all cores", got=got)
+    return splats.cpu()

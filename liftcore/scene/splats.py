@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -91,6 +91,13 @@ class Splats:
         if (kernel is Kernel.BETA) != (beta is not None):
             got = f"{'none' if beta is None else 'values'} with kernel {kernel}"
             raise InvalidSplats("beta", expected="one value a splat for DBS and none for other kernels", got=got)
+
+    def cpu(self) -> Splats:
+        """The same with its tensors on the CPU."""
+        if self.means.device.type == "cpu":
+            return self
+        columns = {name: value.cpu() for name, value in vars(self).items() if isinstance(value, torch.Tensor)}
+        return replace(self, **columns, extras={name: column.cpu() for name, column in self.extras.items()})
 
     @property
     def count(self) -> int:

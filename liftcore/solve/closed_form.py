@@ -130,8 +130,10 @@ def solve_rows(
         if device.kind == "cpu":
             run_each(solve_block, blocks, threads)
         else:
-            cores = threads or len(os.sched_getaffinity(0))
-            run_each(partial(_halved_to_fit, solve_block), blocks, min(cores, BESIDE))
+            cores, late = threads or len(os.sched_getaffinity(0)), list[tuple[int, int]]()
+            run_each(partial(_unless_full, solve_block, late), blocks, min(cores, BESIDE))
+            for block in late:
+                _halved_to_fit(solve_block, *block)
         progress("solve", number + 1, len(slices), "slices")
     return squares
 
@@ -158,6 +160,16 @@ def _bags(index: Tensor, table: Tensor, starts: Tensor, shares: Tensor | None) -
     return embedding_bag(
         index, table, starts.to(index.dtype), mode="sum", per_sample_weights=shares, include_last_offset=True
     )
+
+
+def _unless_full(work: Callable[[int, int], None], late: list[tuple[int, int]], first: int, last: int) -> None:
+    """Do a block of work, or note it for later where the device has no room for it beside the others."""
+    try:
+        work(first, last)
+    except RuntimeError as error:
+        if not out_of_memory(error):
+            raise
+        late.append((first, last))
 
 
 def _halved_to_fit(work: Callable[[int, int], None], first: int, last: int) -> None:

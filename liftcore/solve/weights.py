@@ -16,6 +16,7 @@ from safetensors import SafetensorError
 from scipy.sparse import csr_array
 from torch import Tensor
 
+from liftcore.device import out_of_memory
 from liftcore.errors import InvalidInput, Unavailable
 from liftcore.io.safetensors_file import map_tensors, write_tensors
 from liftcore.one_thread import one_thread
@@ -204,7 +205,8 @@ def one_view(
 def stacked(parts: Sequence[RegionWeights], splats: int, threads: int | None = None) -> RegionWeights:
     """W of all views of the parts, in their order, with a row for every splat; evidence is added up.
 
-    The result lies where all parts lie, else on the CPU: in memory, or in mapped files beyond MEMORY_LIMIT.
+    The result lies where all parts lie if there is room, else on the CPU: in memory, or in mapped files beyond
+    MEMORY_LIMIT.
 
     Args:
         splats: P. threads: None takes the cores that this process may use. The number changes no bit.
@@ -212,6 +214,15 @@ def stacked(parts: Sequence[RegionWeights], splats: int, threads: int | None = N
     Raises:
         Unavailable: there are more regions than four bytes can number, or no room for W.
     """
+    try:
+        return _stacked(parts, splats, threads)
+    except RuntimeError as error:
+        if not out_of_memory(error) or all(not part.region.is_cuda for part in parts):
+            raise
+    return _stacked([part.cpu() for part in parts], splats, threads)  # out here the error holds nothing any more
+
+
+def _stacked(parts: Sequence[RegionWeights], splats: int, threads: int | None) -> RegionWeights:
     counts = [int(part.offsets[-1]) for part in parts]
     bases = np.concatenate([[0], np.cumsum(counts)]).tolist()
     if bases[-1] > MOST_REGIONS:

@@ -104,7 +104,7 @@ def tabletop_rows(folder: Path, device: Device) -> Iterator[dict[str, Any]]:
     """Accuracy of all of the scene's features, lifted on the device and judged on the processor."""
     scene = tabletop(folder)
     for case in CASES:
-        found = scene.judge(scene.lift(read_pack(folder, case.pack), **case.values, device=device.kind).to(CPU.place))
+        found = scene.judge(scene.lift(read_pack(folder, case.pack), **case.values, device=device.kind))
         base = {"README accuracy": case.accuracy, "README mIoU": case.miou}
         yield {"features, weights": case.name, "accuracy": found.accuracy, "mIoU": found.miou, **base}
 

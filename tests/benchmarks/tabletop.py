@@ -52,7 +52,7 @@ class Truth:
 
     def lift(self, views: Mapping[str, ViewFeatures], **settings: Any) -> lc.LiftResult:
         """A lift of views onto the scene, without the certificate unless the settings ask for it."""
-        return lc.lift(self.raster.splats, self.cameras, views, **{"certificate_rays": 0, **settings})
+        return lc.lift(self.raster.splats, self.cameras, views, **{"certificate_rays": 0, **settings}).cpu()
 
     def opened(self, lifted: lc.LiftResult) -> QueryScene:
         """A lift to ask questions of."""

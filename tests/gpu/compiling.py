@@ -165,7 +165,7 @@ def main() -> None:
         print(json.dumps({"kernel": str(kernel), "launches": len(lift), "compiled_in_the_lift": later}), flush=True)
         every |= lift
     every |= launches_of(_every_product)
-    names = ("_weigh", "_add_runs", "_trace")
+    names = ("_weigh", "_add_runs", "_trace", "_cut")
     everywhere = [next(launch for launch in every if launch.name == name) for name in names]
     for launch in every:
         for card in (H100, *OTHERS) if launch in everywhere else (H100,):

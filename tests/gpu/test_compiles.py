@@ -53,7 +53,7 @@ def test_every_kernel_compiles_for_an_h100(compiled):
 
 
 def test_a_lifts_kernels_compile_for_cards_from_turing_on(compiled):
-    for kernel in ("_weigh", "_add_runs", "_trace"):
+    for kernel in ("_weigh", "_add_runs", "_trace", "_cut"):
         assert {report["card"] for report in compiled if report["kernel"] == kernel} == {75, 80, 89, 90}
 
 

@@ -11,12 +11,13 @@ import torch
 import liftcore as lc
 from liftcore.evaluate.tradeoff import RunSpec, Scene, measured
 from liftcore.settings import Preset
+from liftcore.solve import weights
 from tests import paper_card
 from tests.api.tiny_scene import WORDS, make_scene
 from tests.backends import needs_triton
 
 pytestmark = needs_triton
-FEW = {"certificate_rays": 6}  # as the interpreter traces one in a thirtieth of a second
+FEW: dict[str, Any] = {"certificate_rays": 6}  # as the interpreter traces one in a thirtieth of a second
 GRIDS: list[dict[str, Any]] = [{}, {"preset": "top-k"}, {"cg_steps": 1}, {"aggregation": True}]
 MAPS: list[dict[str, Any]] = [{"preset": preset.value} for preset in Preset]
 MAPS += [{"loss": "huber"}, {"robust_steps": 2}, {"cg_steps": 1}, {"dtype": "float32"}]
@@ -69,7 +70,7 @@ def test_what_follows_a_lift_takes_it_from_the_card(paths: list[Path], tmp_path:
     splats, cameras = lc.read_splats(paths[0]), lc.read_cameras(paths[1])
     vectors = torch.from_numpy(lc.open_encoder(f"table:{paths[3]}").encode(list(WORDS)))
     answer = made.query("apple", encoder=f"table:{paths[3]}", splats=splats)
-    assert answer.scores.is_cuda and answer.splats.nonzero()[:, 0].tolist() == list(range(20))
+    assert answer.splats.nonzero()[:, 0].tolist() == list(range(20))
     for given in (vectors[0], vectors[0].to("cuda")):
         assert torch.equal(made.query(given).splats, answer.splats)
     assert made.segment(WORDS, vectors, splats).labels.tolist() == [number // 20 for number in range(60)]
@@ -79,6 +80,47 @@ def test_what_follows_a_lift_takes_it_from_the_card(paths: list[Path], tmp_path:
     lc.region_weights(splats, cameras, lc.read_features(paths[2]), device="cuda").matrix(splats.count)
     made.save(tmp_path / "made.safetensors")
     assert torch.equal(lc.load_lift(tmp_path / "made.safetensors").features, made.cpu().features)
+
+
+def test_tensors_of_a_card_come_in(paths: list[Path]) -> None:
+    """As a training loop has them: splats, cameras, maps and values."""
+    kept, views, camera = lc.read_splats(paths[0]), lc.read_features(paths[2]), lc.read_cameras(paths[1])["middle"]
+    means, quats, scales, logits = (
+        part.to("cuda") for part in (kept.means, kept.quats, kept.log_scales, kept.opacity_logits)
+    )
+    splats = lc.Splats(means, quats, scales, logits)
+    pose, K = (torch.tensor(matrix).to("cuda") for matrix in (camera.viewmat, camera.K))
+    cameras = {"middle": lc.Camera(pose, K, camera.width, camera.height)}
+    map_ = views["middle"]
+    assert isinstance(map_, lc.Regions)
+    regions = lc.Regions(map_.labels.to("cuda"), map_.codebook.to("cuda"))
+    grid = lc.FeatureGrid(torch.ones(6, 8, 8).to("cuda"))
+    for device in ("cpu", "cuda"):
+        whole = lc.lift(kept, cameras, {"middle": views["middle"]}, device=device, **FEW).cpu()
+        made = lc.lift(splats, cameras, {"middle": regions}, device=device, **FEW)
+        assert torch.equal(made.cpu().features, whole.features)
+        assert lc.lift(splats, cameras, iter([("middle", grid)]), device=device, **FEW).seen.any()
+        assert lc.lift(splats, cameras, {"middle": grid}, "default", device=device, **FEW).seen.any()
+        ones = lc.render(splats, cameras["middle"], torch.ones(60).to("cuda"), device=device)
+        assert torch.equal(ones, lc.render(kept, camera, torch.ones(60), device=device))
+        lc.region_weights(splats, cameras, {"middle": regions}, device=device)
+        assert lc.plan(splats, cameras, {"middle": regions}, device=device).views == ("middle",)
+    assert lc.plan_photos(splats, cameras).order
+    assert len(made.objects(splats, WORDS, torch.eye(3, 8).to("cuda")).objects) >= 0
+    found = made.query(torch.eye(8)[0].to("cuda"), splats=splats)
+    assert splats.means[found.splats].shape[1] == 3
+
+
+def test_weights_that_no_card_can_stack_are_stacked_here(paths: list[Path], monkeypatch) -> None:
+    whole, stack = lifted(paths, device="cuda").cpu(), weights._stacked
+
+    def crowded(parts: Any, *rest: Any) -> Any:
+        if parts[0].region.is_cuda:
+            raise torch.OutOfMemoryError
+        return stack(parts, *rest)
+
+    monkeypatch.setattr(weights, "_stacked", crowded)
+    assert torch.allclose(lifted(paths, device="cuda").cpu().features.float(), whole.features.float(), atol=1e-3)
 
 
 def test_a_run_of_a_tradeoff_is_judged_off_the_card(paths: list[Path], tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import replace
 
 import numpy as np
@@ -87,6 +88,30 @@ def test_slices_of_channels_are_put_together(monkeypatch, device):
     assert torch.equal(cut.features, whole.features)
     torch.testing.assert_close(cut.agreement, whole.agreement, rtol=0, atol=1e-6)
     assert told[-1] == ("solve", 5, 5, "slices")
+
+
+def test_blocks_that_have_no_room_beside_others_are_solved_after_them(monkeypatch):
+    """One block holds the device until another has been refused."""
+    views, books = scene()
+    whole, sums = solved(views, books, device=DEVICES[1]), closed_form.bag_sums
+    held, refused = threading.Lock(), threading.Event()
+
+    def crowded(*given):
+        if not held.acquire(blocking=False):
+            refused.set()
+            raise torch.OutOfMemoryError
+        try:
+            refused.wait(60)
+            return sums(*given)
+        finally:
+            held.release()
+
+    monkeypatch.setattr(closed_form, "bag_sums", crowded)
+    monkeypatch.setattr(closed_form, "DEVICE_ROWS", SPLATS // 5)
+    monkeypatch.setattr(closed_form, "LEAST_ROWS", SPLATS)  # no block may be halved
+    made = solved(views, books, device=DEVICES[1], threads=4)
+    assert refused.is_set()
+    assert torch.equal(made.features, whole.features)
 
 
 def test_a_device_without_room_is_given_less_at_a_time(monkeypatch):
