@@ -53,7 +53,7 @@ gpu:  ## all that a card is for: CUDA's torch, conformance, speed, accuracy, gsp
 	| $(BIN)/python -m pip install --quiet --require-hashes -r /dev/stdin; }
 	@$(BIN)/python -m tests.benchmarks.gpu --look
 	@$(BIN)/python -m pip install --quiet gsplat==1.5.3 ninja || echo "gsplat does not install here"
-	@held=0; env -u TRITON_INTERPRET SPLATLIFT_TESTS_ON=cuda $(BIN)/python -m pytest -rs tests/gpu tests/properties \
+	@held=0; env -u TRITON_INTERPRET TESTS_ON=cuda $(BIN)/python -m pytest -rs tests/gpu tests/properties \
 	tests/unit/solve/test_closed_form.py || held=$$?; \
 	env -u TRITON_INTERPRET $(BIN)/python -m tests.benchmarks.gpu --shared $(SHARED) && exit $$held
 

@@ -82,7 +82,7 @@ class _Template:
         with theirs:
             command = [sys.executable, "-m", "service.errand", str(theirs.fileno()), *IMPORTED]
             null, passed = subprocess.DEVNULL, [theirs.fileno()]
-            # A limit on memory counts the stacks and buffers of torch's and BLAS's threads, one of each a core.
+            # One thread: the limit on memory counts the stack and the buffers of each, and cores may be many.
             alone = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
             try:
                 self._process = subprocess.Popen(

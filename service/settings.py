@@ -67,7 +67,7 @@ class ServiceSettings(BaseSettings):
     parallel_checks: int = Field(2, ge=1, le=64, description="uploads that are validated at the same time")
     check_seconds: float = Field(300, gt=0, description="wall time that the validation of one upload may take")
     check_memory_bytes: int = Field(
-        8 * GiB, gt=0, description="private memory that the validation of one upload may take (Linux)"
+        8 * GiB, gt=0, description="private memory of the check of an upload or a plan, beside its imports (Linux)"
     )
 
     disk_floor_bytes: int = Field(

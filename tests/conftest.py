@@ -11,7 +11,7 @@ from hypothesis import settings
 
 # Tests compute on the processor, whatever machine this is: `make gpu` alone lets them see a card. Where they see
 # none, the GPU's kernels run in Triton's interpreter. Triton asks once, when it is imported.
-if os.environ.get("SPLATLIFT_TESTS_ON") != "cuda":
+if os.environ.get("TESTS_ON") != "cuda":
     os.environ["CUDA_VISIBLE_DEVICES"] = ""
 if not torch.cuda.is_available():
     os.environ.setdefault("TRITON_INTERPRET", "1")

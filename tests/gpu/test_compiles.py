@@ -15,9 +15,8 @@ from tests.backends import needs_triton
 
 pytestmark = needs_triton
 ROOT = Path(__file__).parents[2]
-STACK = (
-    512  # bytes a thread: what a disc has more than the 255 registers of a thread, and the widest top-k in Triton 3.6
-)
+# Bytes a thread: what a disc has more than the 255 registers of a thread, and the widest top-k in Triton 3.6.
+STACK = 512
 SHARED_MEMORY = 64 * 1024  # bytes a block: what cards of 2018 have, later ones more
 
 
