@@ -166,36 +166,67 @@ class LiftResult:
             absent=absent, weigh=weigh, references=references, encoder=encoder,
         )  # fmt: skip
 
-    def segment(self, words: Sequence[str], vectors: Any, splats: Splats) -> Segmentation:
+    def segment(
+        self,
+        words: Sequence[str],
+        vectors: Any = None,
+        splats: Splats | None = None,
+        *,
+        encoder: TextEncoder | str | Path | None = None,
+    ) -> Segmentation:
         """Name every splat by the word that it is most like, or by none (`liftcore.query.segment`).
 
         Args:
             words: n different ones. vectors: [n, F], torch or numpy, their text vectors, of any length above zero.
-            splats: that were lifted.
+                None: the encoder makes them.
+            splats: that were lifted; may be left out where the lift was made of files that are where they were.
+            encoder: as in `query`.
 
         Raises:
-            InvalidQuery: no words, one word twice, or vectors that are no directions of the lift's space.
+            InvalidQuery: no words, one word twice, vectors that are no directions of the lift's space, a word that
+                the encoder cannot read, or no encoder of the space.
+            Unavailable: the encoder's weights are not on this machine.
         """
+        from liftcore.query.ask import encoder_for
+        from liftcore.query.presence import references_of
         from liftcore.query.scene import QueryScene
         from liftcore.query.segment import segment
 
-        return segment(QueryScene(self.cpu(), splats), words, vectors)
+        scene, references = QueryScene(self.cpu(), splats), None
+        if vectors is None:
+            encoder = encoder_for(scene, encoder)
+            vectors, references = encoder.encode(list(words)), references_of(encoder, scene.metadata.text_space)
+        return segment(scene, words, vectors, references=references)
 
-    def objects(self, splats: Splats, words: Sequence[str] = (), vectors: Any = None) -> Catalogue:
+    def objects(
+        self,
+        splats: Splats | None = None,
+        words: Sequence[str] = (),
+        vectors: Any = None,
+        *,
+        encoder: TextEncoder | str | Path | None = None,
+    ) -> Catalogue:
         """The objects that masks of many views agree on, found at lift time without a word; the largest first.
 
         Args:
-            splats: that were lifted.
+            splats: that were lifted; may be left out where the lift was made of files that are where they were.
             words: n, that objects are named by. vectors: [n, F], torch or numpy, their text vectors, of any length
-                above zero.
+                above zero. None: the encoder makes them.
+            encoder: as in `query`.
 
         Raises:
-            InvalidQuery: words without vectors, or vectors that are no directions of the lift's space.
+            InvalidQuery: vectors that are no directions of the lift's space, a word that the encoder cannot read, or
+                no encoder of the space.
+            Unavailable: the encoder's weights are not on this machine.
         """
+        from liftcore.query.ask import encoder_for
         from liftcore.query.catalogue import catalogue
         from liftcore.query.scene import QueryScene
 
-        return catalogue(QueryScene(self.cpu(), splats), words, vectors)
+        scene = QueryScene(self.cpu(), splats)
+        if words and vectors is None:
+            vectors = encoder_for(scene, encoder).encode(list(words))
+        return catalogue(scene, words, vectors)
 
     def save(self, path: Path | str) -> None:
         """Write a lift file (`liftcore.io.lift_file`), whole or not at all."""

@@ -138,6 +138,23 @@ def ask(scene: QueryScene, query: Query | str, encoder: TextEncoder | None = Non
     return answers(scene, [question(scene, query, encoder)])[0]
 
 
+def encoder_for(scene: QueryScene, encoder: TextEncoder | str | Path | None) -> TextEncoder:
+    """The encoder, or that of its specification; None: the lift's own words, else that of its text space.
+
+    Raises:
+        InvalidQuery: it is something else, or the lift's text space names none.
+        Unavailable: its weights are not on this machine.
+    """
+    if encoder is None:
+        return scene.table or encoder_of_space(scene.metadata.text_space, "give encoder=, or vectors", stand_in=True)
+    if isinstance(encoder, str | Path):
+        return open_encoder(encoder)
+    if not all(hasattr(encoder, name) for name in ("encode", "channels", "name")):
+        expected = "a text encoder (open_encoder) or its specification"
+        raise InvalidQuery("encoder", expected=expected, got=type(encoder).__name__)
+    return encoder
+
+
 def query_vectors(
     result: LiftResult,
     positives: Any,
@@ -178,14 +195,7 @@ def query_vectors(
     scene = QueryScene(result.cpu(), splats)
     groups = [_terms(values) for values in (positives, negatives)]
     query = Query(*groups, threshold=threshold, instances=instances, keep=keep, absent=absent, weigh=weigh)
-    if isinstance(encoder, str | Path):
-        encoder = open_encoder(encoder)
-    elif encoder is None and query.texts:
-        space = scene.metadata.text_space
-        encoder = scene.table or encoder_of_space(space, "give encoder=, or vectors", stand_in=True)
-    elif encoder is not None and not all(hasattr(encoder, name) for name in ("encode", "channels", "name")):
-        expected = "a text encoder (open_encoder) or its specification"
-        raise InvalidQuery("encoder", expected=expected, got=type(encoder).__name__)
+    encoder = encoder_for(scene, encoder) if query.texts or encoder is not None else None
     rows = directions(scene, query, encoder)
     if references is not None:
         others = References.of(references, scene.channels)

@@ -152,7 +152,7 @@ def tell_large(splats: int, channels: int, views: int) -> None:
 
 def read(folder: Path) -> tuple[lc.Splats, lc.Cameras, Mapping[str, ViewFeatures]]:
     """A scene folder with the pack ``regions`` or else ``features``."""
-    pack = next(name for name in ("regions", "features") if (folder / f"{name}.safetensors").exists())
+    pack = "regions" if (folder / "regions.safetensors").exists() else "features"
     return *read_scene(folder), read_pack(folder, pack)
 
 

@@ -120,7 +120,7 @@ export class Viewer {
     const mesh = new SplatMesh({ fileBytes: content.slice(), fileName: "scene.splat", lod: false });
     let timer;
     await Promise.race([mesh.initialized, new Promise((_, reject) => {
-      timer = setTimeout(() => reject(new Error("unpacking it takes too long")), LOADING);
+      timer = setTimeout(() => reject({ title: "The splats are not shown in 3D", detail: "this browser takes too long to unpack them; the photo view needs none" }), LOADING);
     })]).finally(() => clearTimeout(timer));
     this.painter = new Painter(this.count, this.rows);
     mesh.objectModifiers = [this.painter.modifier];

@@ -11,6 +11,7 @@ import torch
 from PIL import Image
 from plyfile import PlyData
 
+import liftcore as lc
 from liftcore import cli
 from liftcore.errors import InvalidQuery
 from liftcore.io.cameras import read_cameras
@@ -94,6 +95,22 @@ def test_words_without_directions_of_their_own_are_refused(clear: QueryScene, wo
 def test_a_lift_in_memory_is_segmented_by_one_call(clear: QueryScene) -> None:
     found = clear.lift.segment(["apple", "book", "lamp"], torch.eye(CHANNELS)[:3], clear.splats)
     assert np.array_equal(found.labels, CLUSTER)
+
+
+def test_words_need_no_vectors_where_there_is_an_encoder(clear: QueryScene, tmp_path: Path) -> None:
+    """A specification, an opened encoder, and at last none of the lift's space."""
+    words, table = ["apple", "book", "lamp"], tmp_path / "table.safetensors"
+    table.write_bytes(text_table())
+    for encoder in (f"table:{table}", lc.open_encoder(f"table:{table}")):
+        found = clear.lift.segment(words, splats=clear.splats, encoder=encoder)
+        assert np.array_equal(found.labels, CLUSTER)
+    with pytest.raises(InvalidQuery, match="give encoder="):
+        clear.lift.segment(words, splats=clear.splats)
+    with pytest.raises(InvalidQuery, match="give encoder="):
+        clear.lift.objects(clear.splats, words)
+    for nothing in ([], ["no such word"]):
+        with pytest.raises(InvalidQuery):
+            clear.lift.segment(nothing, splats=clear.splats, encoder=f"table:{table}")
 
 
 def test_pictures_show_the_words_of_the_pixels(clear: QueryScene) -> None:
