@@ -233,8 +233,8 @@ def _stacked(parts: Sequence[RegionWeights], splats: int, threads: int | None) -
     lengths = torch.zeros(splats, dtype=torch.int64, device=place)
     evidence = torch.zeros(splats, dtype=torch.float64, device=place)
     for part in parts:  # whose splats are different ones, so that no two threads of a device add to one
-        lengths[part.splats.to(place).long()] += part.indptr.diff().to(place)
-        evidence[part.evidence_splats.to(place).long()] += part.evidence.to(place).double()
+        lengths.index_add_(0, part.splats.to(place), part.indptr.diff().to(place))
+        evidence.index_add_(0, part.evidence_splats.to(place), part.evidence.to(place).double())
     indptr = from_zero(lengths)
     total = int(indptr[-1])
     made = []
@@ -252,19 +252,19 @@ def _stacked(parts: Sequence[RegionWeights], splats: int, threads: int | None) -
             begin, end = torch.searchsorted(part.splats, bounds).tolist()
             if begin == end:
                 continue
-            rows, starts = part.splats[begin:end].to(place).long() - first, part.indptr[begin : end + 1]
+            rows, starts = part.splats[begin:end].to(place) - first, part.indptr[begin : end + 1]
             own = slice(int(starts[0]), int(starts[-1]))
             starts = starts.to(place) - own.start
-            at, lengths = cursors[rows], starts.diff()
+            at, lengths = cursors.index_select(0, rows), starts.diff()
             to = torch.repeat_interleave(at - starts[:-1], lengths, output_size=own.stop - own.start)
             to += torch.arange(to.shape[0], device=place)
             region.scatter_(0, to, part.region[own].to(place) + base)
             weight.scatter_(0, to, part.weight[own].to(place))
-            cursors[rows] = at + lengths
+            cursors.index_add_(0, rows, lengths)
 
     ranges = [(0, splats)]  # on a card, which takes longer to be asked for a piece than to move it
     if place.type == "cpu":
-        ranges = row_blocks(lengths.numpy(), max(splats, 1), 1 << 22)
+        ranges = row_blocks(lengths.numpy(), max(splats, 1), max(1 << 20, total >> 5))  # each asks every view
     run_each(fill, ranges, threads)
     met = torch.nonzero(evidence)[:, 0]
     own = [part.offsets[1:] + base for part, base in zip(parts, bases, strict=False)]
