@@ -116,8 +116,10 @@ def malformed(path: Path) -> None:
 
 
 def replaced(path: Path) -> None:
+    other = path.with_name("other.sqlite")  # made aside: beside the WAL of the one in use, locks would meet
+    Database(other, rebuilding=True).close()
     path.rename(path.with_name("elsewhere"))
-    Database(path, rebuilding=True).close()
+    other.rename(path)
 
 
 @pytest.mark.parametrize("broken", [malformed, Path.unlink, replaced])
