@@ -195,7 +195,7 @@ class LiftResult:
         scene, references = QueryScene(self.cpu(), splats), None
         if vectors is None:
             encoder = encoder_for(scene, encoder)
-            vectors, references = encoder.encode(list(words)), references_of(encoder, scene.metadata.text_space)
+            vectors, references = encoder.encode(words), references_of(encoder, scene.metadata.text_space)
         return segment(scene, words, vectors, references=references)
 
     def objects(
@@ -225,7 +225,7 @@ class LiftResult:
 
         scene = QueryScene(self.cpu(), splats)
         if words and vectors is None:
-            vectors = encoder_for(scene, encoder).encode(list(words))
+            vectors = encoder_for(scene, encoder).encode(words)
         return catalogue(scene, words, vectors)
 
     def save(self, path: Path | str) -> None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import os
 import signal
 import sys
 import threading
 from collections.abc import Mapping
+from pathlib import Path
 from typing import BinaryIO
 
 from liftcore.errors import SplatliftError
@@ -47,6 +49,19 @@ def die_with_parent() -> None:
     """
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+
+
+def memory_of(process: int | str, field: str) -> int:
+    """Bytes that Linux tells of a process, by its number or ``self``; 0 where it does not.
+
+    Args:
+        field: ``RssAnon``, what is in memory but for mapped files; ``VmData``, what RLIMIT_DATA limits.
+    """
+    with contextlib.suppress(OSError):
+        for line in Path(f"/proc/{process}/status").read_text().splitlines():
+            if line.startswith(f"{field}:"):
+                return int(line.split()[1]) << 10
+    return 0
 
 
 def fault_of(error: SplatliftError, names: Mapping[str, str] | None = None) -> dict[str, str]:

@@ -27,7 +27,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NoReturn
 
-from service.child import die_with_parent, end_with_parent
+from service.child import die_with_parent, end_with_parent, memory_of
 from service.errors import Busy, Crashed
 
 IMPORTED = ("service.uploads.check", "service.jobs.planning")  # by the template
@@ -298,7 +298,9 @@ def _work(request: dict[str, Any], said: int, lifeline: int) -> NoReturn:
             os.dup2(printed, stream)
         os.environ["TMPDIR"] = tempfile.tempdir = request["scratch"]
         run = importlib.import_module(request["module"]).run
-        most = data_bytes() + request["memory"]  # torch's CUDA builds hold half a gigabyte once they are imported
+        most = (
+            memory_of("self", "VmData") + request["memory"]
+        )  # torch's CUDA builds hold half a gigabyte once they are imported
         resource.setrlimit(resource.RLIMIT_DATA, (most, most))
         _say(said, {"event": "ready"})
         _say(said, run(*request["arguments"]))
@@ -308,15 +310,6 @@ def _work(request: dict[str, Any], said: int, lifeline: int) -> NoReturn:
     finally:
         sys.stderr.flush()
         os._exit(status)
-
-
-def data_bytes() -> int:
-    """Private memory that may be written to, as RLIMIT_DATA counts it. 0 where Linux does not tell."""
-    with contextlib.suppress(OSError):
-        for line in Path("/proc/self/status").read_text().splitlines():
-            if line.startswith("VmData:"):
-                return int(line.split()[1]) << 10
-    return 0
 
 
 def _say(said: int, message: dict[str, Any]) -> None:

@@ -27,7 +27,7 @@ def main() -> None:
         paths = [Path(name) / file for file in files]
         for path, content in zip(paths, files.values(), strict=True):
             path.write_bytes(content)
-        lift_files(paths[0], paths[1], paths[2:], LiftSettings.of())
+        lift_files(paths[0], paths[1], paths[2:], LiftSettings.of(device="cpu"))
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, Self
 
+from service.child import memory_of
 from service.observe import current_id, working_for
 
 PIECE = 1 << 16
@@ -98,7 +99,7 @@ class JobProcess:
 
     def private_bytes(self) -> int:
         """Memory of the child and of all that it started, but for mapped files. 0 where Linux does not tell."""
-        return sum(_private_bytes(pid) for pid in _family(self.pid))
+        return sum(memory_of(pid, "RssAnon") for pid in _family(self.pid))
 
     def processor_seconds(self) -> float:
         """Of the child and of all that it started and that runs still. 0 where Linux does not tell."""
@@ -188,14 +189,6 @@ def _killed(pid: int, marks: set[bytes]) -> int | None:
             if handle >= 0:
                 os.close(handle)
     return None
-
-
-def _private_bytes(pid: int) -> int:
-    with contextlib.suppress(OSError):
-        for line in Path(f"/proc/{pid}/status").read_text().splitlines():
-            if line.startswith("RssAnon:"):
-                return int(line.split()[1]) << 10
-    return 0
 
 
 def _processor_seconds(pid: int) -> float:

@@ -205,11 +205,11 @@ SECONDS = 600  # for the same; it takes some, and the machine may be busy
 ALL_IN_ONE_PROCESS = """
 import json, resource, sys
 from pathlib import Path
-from service.errand import data_bytes
+from service.child import memory_of
 from service.uploads import check
 from tests.api.bombs import CORPUS
 folder = Path(sys.argv[1])
-resource.setrlimit(resource.RLIMIT_DATA, (data_bytes() + int(sys.argv[2]),) * 2)
+resource.setrlimit(resource.RLIMIT_DATA, (memory_of("self", "VmData") + int(sys.argv[2]),) * 2)
 for kind, corpus in CORPUS.items():
     for name, content in corpus().items():
         path = folder / f"draft.{kind}"

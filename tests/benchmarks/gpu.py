@@ -35,7 +35,7 @@ from tests.benchmarks.peers import Answer, Work, answer_of, at_pixels, dense_tar
 from tests.benchmarks.scenes import Room, write_bench_room
 from tests.benchmarks.tabletop import CASES, tabletop
 
-LARGE = Room(1_000_000, 300, (986, 728), 512)  # an H100 is to lift it in 5 s and to walk a view in 10 ms
+LARGE = Room(1_000_000, 300, (986, 728), 512)  # docs/results.md has it on an H100
 SMALL = Room(200_000, 8, (640, 480), 512)  # to compare both devices on: the processor lifts it in seconds
 
 

@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -15,8 +16,7 @@ from tests.backends import needs_triton
 
 pytestmark = needs_triton
 ROOT = Path(__file__).parents[2]
-# Bytes a thread: what a disc has more than the 255 registers of a thread, and the widest top-k in Triton 3.6.
-STACK = 512
+STACK = 512  # bytes a thread: what a disc has more than the 255 registers of a thread; others have none
 SHARED_MEMORY = 64 * 1024  # bytes a block: what cards of 2018 have, later ones more
 
 
@@ -69,5 +69,7 @@ def test_no_kernel_adds_by_atomics_or_loses_the_digits_of_logarithms_near_one(co
 def test_kernels_keep_their_values_in_registers_and_in_the_shared_memory_of_consumer_cards(compiled):
     assert {report["stack"] for report in compiled if report["kernel"] in ("_add_runs", "_trace", "_cut")} == {0}
     assert 64 in {report["constants"]["COUNT"] for report in compiled if report["kernel"] == "rank_tile"}
-    assert max(report["stack"] for report in compiled if report["kernel"] in ("_weigh", "rank_tile")) <= STACK
+    assert max(report["stack"] for report in compiled if report["kernel"] == "_weigh") <= STACK
+    ranks = max(report["stack"] for report in compiled if report["kernel"] == "rank_tile")
+    assert ranks == 0 or (version("triton") < "3.7" and ranks <= STACK), "Triton 3.6 has fewer registers for top-k"
     assert max(report["shared"] for report in compiled) <= SHARED_MEMORY

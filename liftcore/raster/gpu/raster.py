@@ -1,9 +1,9 @@
 """The GPU backend: A by Triton kernels, the same to the bit in every run.
 
-Projection and tile lists are tensor operations in float64 (``project``, ``tiles``); one program a tile composites its
-rays (``composite``), and a product takes the weights as a matrix (``weights``, ``render``). Sums over tiles are
-float64 in a fixed order. No kernel adds to memory that another adds to. On tensors of the CPU it runs in Triton's
-interpreter: that is how it is tested where there is no card.
+Projection and tile lists are tensor operations in float64 (``project``, ``tiles``), but for the tile columns of a
+splat, which a kernel finds. One program a tile composites its rays (``composite``), and a product takes the weights
+as a matrix (``weights``, ``render``). Sums over tiles are float64 in a fixed order. No kernel adds to memory that
+another adds to. On tensors of the CPU it runs in Triton's interpreter: so it is tested where there is no card.
 """
 
 from collections.abc import Callable, Generator, Iterable
