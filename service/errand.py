@@ -298,9 +298,7 @@ def _work(request: dict[str, Any], said: int, lifeline: int) -> NoReturn:
             os.dup2(printed, stream)
         os.environ["TMPDIR"] = tempfile.tempdir = request["scratch"]
         run = importlib.import_module(request["module"]).run
-        most = (
-            memory_of("self", "VmData") + request["memory"]
-        )  # torch's CUDA builds hold half a gigabyte once they are imported
+        most = memory_of("self", "VmData") + request["memory"]  # imports hold half a gigabyte with CUDA's torch
         resource.setrlimit(resource.RLIMIT_DATA, (most, most))
         _say(said, {"event": "ready"})
         _say(said, run(*request["arguments"]))

@@ -71,5 +71,6 @@ def test_kernels_keep_their_values_in_registers_and_in_the_shared_memory_of_cons
     assert 64 in {report["constants"]["COUNT"] for report in compiled if report["kernel"] == "rank_tile"}
     assert max(report["stack"] for report in compiled if report["kernel"] == "_weigh") <= STACK
     ranks = max(report["stack"] for report in compiled if report["kernel"] == "rank_tile")
-    assert ranks == 0 or (version("triton") < "3.7" and ranks <= STACK), "Triton 3.6 has fewer registers for top-k"
+    old = tuple(map(int, version("triton").split(".")[:2])) < (3, 7)  # which spills the widest top-k
+    assert ranks <= (STACK if old else 0)
     assert max(report["shared"] for report in compiled) <= SHARED_MEMORY
