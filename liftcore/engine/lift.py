@@ -21,7 +21,7 @@ from liftcore.engine.base import Engine
 from liftcore.engine.blocks import SCENE, SELECTED, SUMMED, WEIGHED, Job, read_view, solve, weigh, write_scene
 from liftcore.errors import InvalidSettings
 from liftcore.features.pack import Views, as_views, write_pack
-from liftcore.io.lift_file import load_lift
+from liftcore.io.lift_file import load_lift, poses_of
 from liftcore.io.safetensors_file import map_tensors
 from liftcore.io.shards import ROWS, map_rows, shard_at, write_index
 from liftcore.one_thread import one_thread
@@ -130,6 +130,7 @@ def lift_in_blocks(
             text_space=found.features.text_space,
             words=table.words if table else (),
             views=job.names,
+            poses=poses_of([found.camera(number) for number in range(len(found))]),
             certificate=certificate,
             timings=timings.seconds,
         )

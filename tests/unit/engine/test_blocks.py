@@ -79,6 +79,20 @@ def test_blocks_give_the_bits_of_a_lift_in_memory(scene: dict[str, Any], monkeyp
     assert_same(in_blocks(Shuffled(1), scene, settings), in_blocks(LocalEngine(2), scene, settings))
 
 
+@pytest.mark.parametrize("preset", ["row-sum", "tikhonov"])
+def test_lift_by_an_engine_has_the_metadata_of_a_lift_in_memory(scene: dict[str, Any], preset: str) -> None:
+    views = {**scene["views"], "camera-less": scene["views"]["v0"]}
+    settings = LiftSettings.of(preset=preset, certificate_rays=200, view_stride=2)
+    whole = lc.lift(scene["splats"], scene["cameras"], views, settings).metadata
+    by_engine = lc.lift(scene["splats"], scene["cameras"], views, settings, engine=LocalEngine(1)).metadata
+    assert whole.poses != ""
+    for name in type(whole).model_fields:
+        if name == "timings":
+            assert set(by_engine.timings) >= {"geometry", "solve"}
+        else:
+            assert getattr(by_engine, name) == getattr(whole, name), name
+
+
 def test_worker_holds_the_splats_that_its_views_see(scene: dict[str, Any], tmp_path: Path) -> None:
     told: list[tuple[int, int]] = []
 
