@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,8 @@ from liftcore.engine.base import Engine
 from liftcore.engine.lift import lift_in_blocks
 from liftcore.errors import InvalidSettings
 from liftcore.io.lift_file import poses_of
-from liftcore.planning.plan import Plan, plan_lift
+from liftcore.planning.contradictions import contradictions, probe_views
+from liftcore.planning.plan import TIMED_VIEWS, Plan, plan_lift
 from liftcore.progress import Progress, Timings
 from liftcore.raster import check_given, open_raster
 from liftcore.raster.base import Raster
@@ -100,9 +102,9 @@ def lift(
         return result
     work = _Lift(splats, chosen, threads, Timings(progress), choose_device(chosen.device))
     found = LiftViews.of(views, cameras, chosen)
-    plan = work.planned(found, on_plan or warn.of_plan)
+    plan = work.plan(found)
     with within_memory(work.device):
-        geometry = work.weigh(found, plan, kept)
+        geometry, plan = work.weigh(found, plan, kept, on_plan or warn.of_plan)
         things = work.find_objects(geometry)
         W, agreement = work.reweight(geometry)
         solution = work.solve(W, geometry, plan)
@@ -241,23 +243,37 @@ class _Lift:
         with self.timings.step("compile"):
             warm_up_lift(self.splats.kernel, self.device, self.settings)
 
-    def planned(self, views: LiftViews, on_plan: Callable[[Plan], None]) -> Plan:
+    def plan(self, views: LiftViews) -> Plan:
         """The plan, which may leave views out and take another device."""
         self.compile()
         with self.timings.step("plan"):
             plan = plan_lift(self.splats, views, self.settings, self.device, self.threads)
             views.names = list(plan.views)
-        on_plan(plan)
         if plan.device != self.device:
             self.device = plan.device
             self.compile()
         return plan
 
-    def weigh(self, views: LiftViews, plan: Plan, checkpoint: Checkpoint | None) -> Geometry:
-        """W of all views, and sampled rows of A."""
+    def weigh(
+        self, views: LiftViews, plan: Plan, checkpoint: Checkpoint | None, on_plan: Callable[[Plan], None]
+    ) -> tuple[Geometry, Plan]:
+        """W of all views, and sampled rows of A; and the plan with what the first views tell of the others."""
         self.raster = open_raster(self.splats, self.device, self.threads, plan.kept_on_card)
+        first, begin = probe_views(len(views)), time.perf_counter()
+        plans = [plan]
+
+        def look(geometry: Geometry) -> None:
+            took = time.perf_counter() - begin
+            assert self.raster is not None
+            if views.features.paths:
+                wrong = contradictions(self.raster, views, self.settings, plan.seen_share, geometry)
+                plans.append(replace(plan, told=(*plan.told, *wrong)))
+            if len(views) >= TIMED_VIEWS:
+                plans.append(replace(plans[-1], seconds=took * len(views) / len(first)))
+            on_plan(plans[-1])
+
         with self.timings.stage("geometry"):
-            return weigh_views(
+            geometry = weigh_views(
                 self.raster,
                 self.splats.count,
                 views,
@@ -273,7 +289,10 @@ class _Lift:
                 checkpoint=checkpoint.of(self.splats, self.device.facts()) if checkpoint else None,
                 device_bytes=plan.kept_on_card,
                 threads=self.threads,
+                first=first,
+                on_first=look,
             )
+        return geometry, plans[-1]
 
     @property
     def _by_masks(self) -> bool:

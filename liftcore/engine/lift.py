@@ -93,7 +93,7 @@ def lift_in_blocks(
     given = as_views(views)
     found = LiftViews.of(given, cameras, settings)
     with timings.step("plan"):
-        plan = plan_lift(splats, found, settings, choose_device(settings.device), apart=True)
+        plan = plan_lift(splats, found, settings, choose_device(settings.device), apart=True, look=bool(given.paths))
         found.names = list(plan.views)
     on_plan(replace(plan, memory=_memory_of_a_worker(plan), weight_bytes=0))
     with _folder(folder or engine.scratch, kept=folder is not None) as place:

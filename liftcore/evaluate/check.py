@@ -121,7 +121,7 @@ def check_scene(
         figures, told = _check_features(features, cameras, files, whole)
         settings = LiftSettings.of()
         lifted = LiftViews.of(features, cameras, settings)
-        agreement = agreement_of_views(raster, lifted, settings)[1]
+        agreement = agreement_of_views(raster, lifted, settings).agreement
         if agreement is not None:
             figures["agreement_of_views"] = agreement
             if not (told or wrong):  # other cameras are told already, and broken maps agree nowhere

@@ -1,16 +1,16 @@
-"""Inputs that contradict each other, told before the work: cameras, splats and features that do not belong together.
+"""Inputs that contradict each other: cameras, splats and features that do not belong together.
 
-**Do views say the same of what they see?** A few views are weighed at coarse pixels. Let ``c_r`` be the unit vector
-of region or cell r less the mean of all, by the weight that it gives. Over the splats, m is the squared length of
-what all views share of what one of them says, as a share (`liftcore.planning.views` has the sums): one where views
-agree, and none where they say anything of it. How alike it could be, the features tell without any geometry: each
-region's cosine to the most similar one of another view. The ratio of the two is .39 to .91 on the scenes that this
-was made with, noisy, merged and wrong masks among them (.26 with 6 views). With positions times 0.3 it is .05 to .31,
-and with another scene's cameras .15 at most. Where it is low, positions times other factors are the control: of
-healthy scenes these reach .42 of it at most, and of scenes whose positions are off by .3 or .5 at least 1.4 of it
-(``python -m tests.benchmarks.first_hour``). Half and double come first: where the given scale has LEAST_AGREEMENT or
-more and neither of these has as much, the others are not tried, which is half of the work. All cases of that command
-are told as before.
+**Do views say the same of what they see?** A few views are weighed: those that a lift begins with, so that the check
+costs a lift next to nothing; without a lift, views at coarse pixels, whose ratio (below) is the same within .03. Let
+``c_r`` be the unit vector of region or cell r less the mean of all, by the weight that it gives. Over the splats, m
+is the squared length of what all views share of what one of them says, as a share (`liftcore.planning.views` has the
+sums): one where views agree, and none where they say anything of it. How alike it could be, the features tell without
+any geometry: each region's cosine to the most similar one of another view. The ratio of the two is .39 to .91 on the
+scenes that this was made with, noisy, merged and wrong masks among them (.26 with 6 views). With positions times 0.3
+it is .05 to .31, and with another scene's cameras .15 at most. Where it is low, positions times other factors are
+the control: of healthy scenes these reach .42 of it at most, and of scenes whose positions are off by .3 or .5 at
+least 1.4 of it (``python -m tests.benchmarks.first_hour``). Half and double come first: where the given scale has
+LEAST_AGREEMENT or more and neither of these has as much, the others are not tried, which is half of the work.
 
 Maps are also looked at alone (`liftcore.features.smoothness`).
 """
@@ -19,17 +19,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
 
 from liftcore.features.smoothness import some_grids, unlike_maps
 from liftcore.one_thread import one_thread
-from liftcore.planning.views import PILOT_CHANNELS, SAMPLE, Said, Visibility, spread
+from liftcore.planning.views import PILOT_CHANNELS, SAMPLE, Said, spread
 from liftcore.progress import silent
-from liftcore.raster.cpu.raster import CpuRaster
+from liftcore.raster.base import Raster
 from liftcore.scene.cameras import Cameras
-from liftcore.scene.splats import Splats
 from liftcore.settings import LiftSettings
 from liftcore.solve.geometry import Geometry, LiftViews, weigh_views
 from liftcore.solve.least_squares import random_axes
@@ -51,23 +51,35 @@ HINT = "splatlift check with the photos tells more"
 
 
 def contradictions(
-    splats: Splats, views: LiftViews, settings: LiftSettings, seen: Visibility, threads: int | None = None
+    raster: Raster, views: LiftViews, settings: LiftSettings, seen_share: float, weighed: Geometry | None = None
 ) -> list[str]:
-    """What of these inputs cannot be true together, a sentence each.
+    """List what of these inputs cannot be true together, a sentence each.
 
     Args:
-        seen: how large the splats are in all views. threads: None takes the cores that this process may use.
+        seen_share: of the splats, that some view can see.
+        weighed: W of the views `probe_views`, where a lift has it. None: these views are weighed at coarse pixels.
     """
-    told = unlike_maps(some_grids(views.features, views.names))
-    if seen.seen_share < LEAST_IN_VIEW:
-        return [*told, unseen(seen.seen_share)]
-    raster = CpuRaster(splats, threads)
-    row_sum, agreement = agreement_of_views(raster, views, settings)
-    if row_sum < LEAST_ROW_SUM:
-        return [*told, empty(row_sum)]
-    if not told and agreement is not None:  # broken maps agree nowhere
-        told += disagreement(raster, views, settings, agreement)
-    return told
+    warnings = unlike_maps(some_grids(views.features, views.names))
+    if seen_share < LEAST_IN_VIEW:
+        return [*warnings, unseen(seen_share)]
+    found = agreement_of(weighed) if weighed else agreement_of_views(raster, views, settings)
+    if found.row_sum is not None and found.row_sum < LEAST_ROW_SUM:
+        return [*warnings, empty(found.row_sum)]
+    if not warnings and found.agreement is not None:  # broken maps agree nowhere
+        warnings += disagreement(raster, views, settings, found.agreement)
+    return warnings
+
+
+def probe_views(count: int) -> list[int]:
+    """Number the views, evenly spread among ``count``, that tell whether inputs contradict each other."""
+    return spread(count, min(FLOWN, count)).tolist()
+
+
+class ViewAgreement(NamedTuple):
+    """What a few views say of each other."""
+
+    row_sum: float | None  # mean sum of weights of their sampled rays; None: no ray was sampled
+    agreement: float | None  # of what their features allow; None: too few views, or too little that is seen twice
 
 
 def unseen(seen_share: float) -> str:
@@ -80,7 +92,7 @@ def empty(row_sum: float) -> str:
     return f"cameras: splats fill {row_sum:.1%} of the rays of a view; {FRAME}"
 
 
-def disagreement(raster: CpuRaster, views: LiftViews, settings: LiftSettings, agreement: float) -> list[str]:
+def disagreement(raster: Raster, views: LiftViews, settings: LiftSettings, agreement: float) -> list[str]:
     """That views contradict each other, if they do; and the scale at which they would not."""
     if agreement >= LOW_AGREEMENT:
         return []
@@ -89,7 +101,7 @@ def disagreement(raster: CpuRaster, views: LiftViews, settings: LiftSettings, ag
         if len(known) == len(NEAR_SCALES) and agreement >= max(LEAST_AGREEMENT, *known.values()):
             return []
         for factor in factors:
-            found = agreement_of_views(raster, _scaled(views, factor), settings, rays=0)[1]
+            found = agreement_of_views(raster, _scaled(views, factor), settings, rays=0).agreement
             if found is not None:
                 known[factor] = found
     best = max(known, key=lambda factor: known[factor], default=None)
@@ -111,22 +123,27 @@ def _scaled(views: LiftViews, factor: float) -> LiftViews:
 
 
 def agreement_of_views(
-    raster: CpuRaster, views: LiftViews, settings: LiftSettings, *, rays: int = RAYS
-) -> tuple[float, float | None]:
-    """The mean sum of weights of so many rays, and how far views agree, of what their features allow.
+    raster: Raster, views: LiftViews, settings: LiftSettings, *, rays: int = RAYS
+) -> ViewAgreement:
+    """Weigh a few views at coarse pixels, and tell how far they agree.
 
-    None for the latter where they are too few, see too little in common, or have nothing to tell apart.
+    Args:
+        rays: of all of them, whose sums of weights are taken.
     """
     few = replace(views, names=_some(views.names, FLOWN))
     longest = max(max(few.camera(k).width, few.camera(k).height) for k in range(len(few)))
     coarse = {"stride": max(1, longest // SIDE), "certificate_rays": rays, "robust_steps": 0, "consensus": False}
     own = settings.model_copy(update=coarse)
     with one_thread():
-        how = {"by_rows": False, "threads": raster.threads}
-        geometry = weigh_views(raster, raster.splats.count, few, own, silent, **how)
+        return agreement_of(weigh_views(raster, raster.splats.count, few, own, silent, by_rows=False))
+
+
+def agreement_of(geometry: Geometry) -> ViewAgreement:
+    """Tell how far the views of W agree."""
     sums = sum(float(sample.rows.weights.sum()) for sample in geometry.samples)
-    taken = sum(len(sample.rows.indptr) - 1 for sample in geometry.samples)
-    return sums / max(taken, 1), None if len(few) < FEWEST else _agreement_of(geometry)
+    rays = sum(len(sample.rows.indptr) - 1 for sample in geometry.samples)
+    agreement = None if len(geometry.samples) < FEWEST else _agreement_of(geometry)
+    return ViewAgreement(sums / rays if rays else None, agreement)
 
 
 def _agreement_of(geometry: Geometry) -> float | None:

@@ -30,8 +30,8 @@ from liftcore.planning.views import (
     visibility,
 )
 from liftcore.progress import silent
-from liftcore.raster.base import TILE
-from liftcore.raster.cpu.raster import CpuRaster
+from liftcore.raster import open_raster
+from liftcore.raster.base import TILE, Raster
 from liftcore.scene.cameras import Camera, distortion_warning
 from liftcore.scene.splats import Splats
 from liftcore.settings import LiftSettings
@@ -167,9 +167,8 @@ def plan_lift(
         device: where it should run. A card with too little room leaves an ``auto`` lift to the processor.
         threads: that walk on the processor; None takes the cores that this process may use.
         apart: whether others hold W and X, so that this machine needs no room for them.
-        look: whether a few views are weighed, coarsely, to tell inputs that contradict each other. Views of files
-            are in any case. Others come from a program, perhaps a training loop: to look at them may take longer
-            than to lift them.
+        look: whether a few views are weighed, to tell inputs that contradict each other and how long the views take.
+            A lift in one place tells both by the views that it begins with.
 
     Raises:
         Unavailable: this machine has no room for the codebooks, or for the features in no place; or the card that
@@ -179,10 +178,17 @@ def plan_lift(
     names = views.names
     cameras = [views.cameras[name] for name in names]
     seen = visibility(splats, cameras, settings.lift_params)
-    wrong = contradictions(splats, views, settings, seen, threads) if look or features.paths else ()
-    chosen, expected = _choose_views(splats, views, settings, seen, threads)
-    names, seen, cameras = [names[k] for k in chosen], seen.of(chosen), [cameras[k] for k in chosen]
     short = [] if apart else check_card(device, splats.count, settings.device)
+    device = CPU if short else device
+    raster, seconds, wrong = None, None, list[str]()
+    if look or _has_pilot(settings, len(names)):
+        raster = open_raster(splats, device, threads)
+    if look and raster is not None:
+        wrong = contradictions(raster, views, settings, seen.seen_share)
+    chosen, expected = _choose_views(raster, views, settings, seen)
+    names, seen, cameras = [names[k] for k in chosen], seen.of(chosen), [cameras[k] for k in chosen]
+    if look and raster is not None and device.kind == "cpu":
+        seconds = _seconds(raster, views, names, settings)
     weights = weight_bytes(seen, features, names, settings)
     parts = memory_parts(splats, seen, cameras, features, names, settings)
     free, on_card = (None, None) if apart else (free_memory(), None if short else device.free_bytes())
@@ -203,10 +209,10 @@ def plan_lift(
         dtype=settings.dtype,
         memory=parts,
         weight_bytes=weights,
-        device=CPU if short else device,
+        device=device,
         kept_on_card=kept,
         features_room=features_room(parts, free),
-        seconds=_seconds(splats, views, names, settings, threads) if device.kind == "cpu" or short else None,
+        seconds=seconds,
         warnings=(*short, *check_memory(parts, free), *check_weights(in_files)),
         told=(
             *frame_warning(views.cameras),
@@ -217,8 +223,13 @@ def plan_lift(
     )
 
 
+def _has_pilot(settings: LiftSettings, views: int) -> bool:
+    """Whether the settings choose among so many views by what a pilot tells of them."""
+    return bool(settings.view_cosine) and views > FEW_VIEWS
+
+
 def _choose_views(
-    splats: Splats, views: LiftViews, settings: LiftSettings, seen: Visibility, threads: int | None
+    raster: Raster | None, views: LiftViews, settings: LiftSettings, seen: Visibility
 ) -> tuple[list[int], float | None]:
     """The views to lift, ascending, and the cosine that a pilot expects of them, where one was flown.
 
@@ -226,29 +237,27 @@ def _choose_views(
     a pilot could spare no more views than it looks at, none is flown and all are taken.
     """
     every = list(range(seen.areas.shape[0]))
-    if not settings.coverage and not (settings.view_cosine and len(every) > FEW_VIEWS):
+    if not settings.coverage and not _has_pilot(settings, len(every)):
         return every, None
     order = list(view_order(seen))
     least = views_to_show(seen, order, settings.coverage)
     if not settings.view_cosine:
         return sorted(order[:least]), None
-    if len(every) <= max(FEW_VIEWS, least + PILOT_VIEWS):
+    if raster is None or len(every) <= max(FEW_VIEWS, least + PILOT_VIEWS):
         return every, None
-    pilot = fly_pilot(splats, views, settings, seen, threads)
+    pilot = fly_pilot(raster, views, settings, seen)
     count, expected = pilot.views_for(settings.view_cosine, order, least)
     return sorted(order[:count]), expected
 
 
-def _seconds(
-    splats: Splats, views: LiftViews, names: Sequence[str], settings: LiftSettings, threads: int | None
-) -> float | None:
+def _seconds(raster: Raster, views: LiftViews, names: Sequence[str], settings: LiftSettings) -> float | None:
     """About how long the views take, by the one in the middle."""
     if len(names) < TIMED_VIEWS:
         return None
     begin = time.perf_counter()
     one = replace(views, names=[names[len(names) // 2]])
     own = settings.model_copy(update={"certificate_rays": 0})
-    weigh_views(CpuRaster(splats, threads), splats.count, one, own, silent, by_rows=False, threads=threads)
+    weigh_views(raster, raster.splats.count, one, own, silent, by_rows=False)
     return len(names) * (time.perf_counter() - begin)
 
 

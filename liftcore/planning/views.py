@@ -45,9 +45,8 @@ from torch import Tensor
 
 from liftcore.one_thread import one_thread
 from liftcore.progress import silent
-from liftcore.raster.base import CompositingParams
+from liftcore.raster.base import CompositingParams, Raster
 from liftcore.raster.cpu.project import COLUMNS, EXTENT_X, EXTENT_Y, Targets, activated, project, view_of
-from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Splats
 from liftcore.settings import LiftSettings
@@ -245,9 +244,7 @@ class Pilot:
         return len(order), expected
 
 
-def fly_pilot(
-    splats: Splats, views: LiftViews, settings: LiftSettings, seen: Visibility, threads: int | None = None
-) -> Pilot:
+def fly_pilot(raster: Raster, views: LiftViews, settings: LiftSettings, seen: Visibility) -> Pilot:
     """Weigh evenly spaced views of those of which ``seen`` tells, two at least."""
     total, count = len(views.names), min(PILOT_VIEWS, len(views.names))
     flown: list[int] = spread(total, count).tolist()
@@ -257,10 +254,9 @@ def fly_pilot(
     own = settings.model_copy(update=coarse)
     channels = views.features.channels
     axes = random_axes(channels, min(PILOT_CHANNELS, channels), settings.seed)
-    raster = CpuRaster(splats, threads)
-    rows = spread(splats.count, seen.areas.shape[1])
+    rows = spread(raster.splats.count, seen.areas.shape[1])
     with one_thread():
-        geometry = weigh_views(raster, splats.count, chosen, own, silent, by_rows=False, threads=threads)
+        geometry = weigh_views(raster, raster.splats.count, chosen, own, silent, by_rows=False)
         read = [view.means(view.rows.float() @ axes) for view in geometry.codebook.views]
         said = Said(geometry.weights, torch.cat(read), torch.from_numpy(rows))
     evidence = _evidence(geometry.evidence().numpy()[rows], seen.areas, seen.areas[flown])

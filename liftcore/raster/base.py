@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
     from liftcore.features.views import ViewFeatures
     from liftcore.scene.cameras import Camera
+    from liftcore.scene.splats import Splats
     from liftcore.solve.weights import RegionWeights
 
 # The constants of the field, named once. They move results at the 1e-3 level: state them with every number.
@@ -101,6 +102,8 @@ class ViewWeights:
 
 class Raster(Protocol):
     """A for one scene. Every product is deterministic to the bit, whatever the number of threads."""
+
+    splats: Splats
 
     def region_weights(
         self, camera: Camera, observation: ViewFeatures, params: CompositingParams, weighting: Weighting

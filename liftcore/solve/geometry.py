@@ -1,9 +1,10 @@
 """The geometry phase: each view meets the raster once, which finds its W, and no feature channel is touched."""
 
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -157,6 +158,8 @@ def weigh_views(
     checkpoint: Checkpoint | None = None,
     device_bytes: int = 0,
     threads: int | None = None,
+    first: Sequence[int] = (),
+    on_first: Callable[[Geometry], None] | None = None,
 ) -> Geometry:
     """W of all views, and sampled rows of A.
 
@@ -165,40 +168,59 @@ def weigh_views(
         by_rows: whether a region is a row of a codebook in any case, or may be a tuple of labels (`as_regions`).
         checkpoint: what the raster found of views before, and is to keep.
         device_bytes: of W that may stay on the device that found it.
+        first: numbers of views that are weighed before the others. The result is the same for any.
+        on_first: called with what these alone say, as soon as it is known. An exception from it stops the work.
     """
-    parts: list[RegionWeights] = []
-    samples, codebooks, blind, levels = list[SampledRays](), list[ViewCodebook](), [], []
+    order = [*first, *sorted({*range(len(views))} - {*first})]
+    weighed = dict[int, _WeighedView]()
     waiting = deque[Question]()
 
     def requests() -> Iterator[ViewRequest]:
-        for number in range(len(views)):
+        for number in order:
             waiting.append(question_of(views, number, settings, by_rows))
             yield waiting[-1].request
 
-    found = raster.iterate_views(requests()) if checkpoint is None else checkpoint.answers(raster, requests())
+    answers = raster.iterate_views(requests()) if checkpoint is None else checkpoint.answers(raster, requests())
     on_device = in_memory = 0
-    with closing(found):
-        for view in found:
-            asked = waiting.popleft()
-            part = asked.weights(view)
+    with closing(answers):
+        for number, answer in zip(order, answers, strict=True):
+            question = waiting.popleft()
+            part = question.weights(answer)
             if part.region.is_cuda and on_device + part.nbytes <= device_bytes:
                 on_device += part.nbytes
             else:
                 part = part.cpu()
                 in_memory += part.nbytes
                 part = part if in_memory <= MEMORY_LIMIT else part.in_files()
-            if not part.evidence.numel():
-                blind.append(asked.request.camera.name)
-            parts.append(part)
-            samples.append(SampledRays(view.rows, asked.readout))
-            codebooks.append(asked.codebook)
-            levels.append(asked.levels)
-            del view, part, asked  # before the next one is made beside it
-            progress("geometry", len(samples), len(views), "views")
+            sample = SampledRays(answer.rows, question.readout)
+            weighed[number] = _WeighedView(part, sample, question.codebook, question.levels)
+            del answer, part, question  # before the next one is made beside it
+            progress("geometry", len(weighed), len(views), "views")
+            if on_first and len(weighed) == len(first):
+                on_first(_stacked_views([weighed[one] for one in first], splats, threads))
+    return _stacked_views([weighed.pop(number) for number in range(len(views))], splats, threads)
+
+
+class _WeighedView(NamedTuple):
+    """What the raster found of a view, without what the view observes."""
+
+    weights: RegionWeights
+    sample: SampledRays
+    codebook: ViewCodebook
+    levels: np.ndarray  # [M] i8
+
+
+def _stacked_views(views: list[_WeighedView], splats: int, threads: int | None) -> Geometry:
+    """W of some views, which are dropped from the list."""
+    samples, codebook = tuple(view.sample for view in views), Codebook(tuple(view.codebook for view in views))
+    blind = tuple(view.weights.views[0] for view in views if not view.weights.evidence.numel())
+    levels = np.concatenate([view.levels for view in views])
+    parts = [view.weights for view in views]
+    views.clear()
     W = stacked(parts, splats, threads)
     parts.clear()
     give_back_memory()
-    return Geometry(W, Codebook(tuple(codebooks)), tuple(samples), tuple(blind), np.concatenate(levels))
+    return Geometry(W, codebook, samples, blind, levels)
 
 
 def strided(params: CompositingParams, settings: LiftSettings, camera: Camera, number: int) -> CompositingParams:

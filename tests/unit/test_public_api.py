@@ -137,7 +137,7 @@ def test_region_weights_times_codebooks_are_the_lift(scene):
     assert torch.equal(again.weight, found.weight) and torch.equal(again.region, found.region)
 
 
-def test_every_stage_is_told_in_order_and_the_plan_before_the_first_view(tmp_path):
+def test_every_stage_is_told_in_order_and_the_plan_after_the_first_views(tmp_path):
     splats, cameras, pack = write_scene(tmp_path, 3)
     said = []
     plans = []
@@ -146,11 +146,11 @@ def test_every_stage_is_told_in_order_and_the_plan_before_the_first_view(tmp_pat
         said.append((stage, done, total, unit))
 
     def on_plan(plan):
-        plans.append((plan, {stage for stage, *_ in said}))
+        plans.append((plan, {stage: done for stage, done, *_ in said}))
 
     made = lift_files(splats, cameras, [pack], lc.LiftSettings.of(), progress=hear, on_plan=on_plan)
     [(plan, before)] = plans
-    assert before == {"read", "digest", "compile", "plan"}
+    assert before == {"read": 1, "digest": 1, "compile": 1, "plan": 1, "geometry": 3}
     assert plan.facts() == made.metadata.certificate["plan"]
     for stage in ("read", "digest", "compile", "plan", "certify"):
         assert [word for word in said if word[0] == stage] == [(stage, 0, 1, "steps"), (stage, 1, 1, "steps")]

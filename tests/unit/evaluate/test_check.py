@@ -18,6 +18,7 @@ from liftcore.features.views import FeatureGrid, Regions
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.ply import write_splats
 from liftcore.planning import contradictions
+from liftcore.planning.contradictions import ViewAgreement
 from liftcore.query.splat_colours import seen_colours
 from liftcore.query.text.table import TableEncoder
 from liftcore.raster.base import CompositingParams
@@ -154,7 +155,7 @@ def test_far_scales_are_left_out_where_both_near_ones_agree_less(
 ) -> None:
     found = [*near, 0.1, 0.9, 0.1]  # three times the scale is the right one
     asked = iter(found)
-    monkeypatch.setattr(contradictions, "agreement_of_views", lambda *_, **__: (1.0, next(asked)))
+    monkeypatch.setattr(contradictions, "agreement_of_views", lambda *_, **__: ViewAgreement(1.0, next(asked)))
     monkeypatch.setattr(contradictions, "_scaled", lambda views, factor: views)
     nothing: Any = None
     told = contradictions.disagreement(nothing, nothing, nothing, 0.4)

@@ -16,6 +16,7 @@ from liftcore.io.ply import write_splats
 from liftcore.io.scene_files import lift_files, open_files
 from liftcore.planning.plan import FEW_VIEWS
 from liftcore.planning.views import PILOT_VIEWS, Pilot, fly_pilot, visibility
+from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.cameras import Cameras
 from liftcore.settings import LiftSettings
 from liftcore.solve.geometry import LiftViews
@@ -158,7 +159,7 @@ def flown(splats, cameras, pack, threads=1) -> Pilot:
     scene, views, packs = open_files(splats, cameras, [pack], settings)
     found = LiftViews.of(packs, views, settings)
     seen = visibility(scene, [found.camera(k) for k in range(len(found.names))], settings.lift_params)
-    return fly_pilot(scene, found, settings, seen, threads)
+    return fly_pilot(CpuRaster(scene, threads), found, settings, seen)
 
 
 def test_a_pilot_repeats_on_any_number_of_threads(tmp_path):

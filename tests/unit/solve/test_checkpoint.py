@@ -44,7 +44,7 @@ def walks(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         return walk(self, camera, *rest, **named)
 
     monkeypatch.setattr(CpuRaster, "region_weights", counted)
-    monkeypatch.setattr("liftcore.planning.plan.contradictions", lambda *_: [])  # which looks at some views, coarsely
+    monkeypatch.setattr("liftcore.lifting.contradictions", lambda *_: [])  # which may look at some views, coarsely
     monkeypatch.setattr("liftcore.lifting.choose_device", lambda _: CPU)  # on machines with a card too
     return walked
 
