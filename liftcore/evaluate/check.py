@@ -87,7 +87,7 @@ def check_scene(
         InvalidInput: an image that cannot be read. InvalidFeatures: features that cannot be read.
     """
     wrong: list[str] = []
-    notes: list[str] = []
+    notes = [f"splats: {warning}" for warning in splats.warnings]
     photos = photos or {}
     paired = cameras_of_views(photos, with_panoramas(cameras))
     taken = {name: photos[view] for view, name in paired.items()}

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from liftcore.errors import InvalidSplats
-from liftcore.io.ply import EXPORT, parse_elements, read_head
+from liftcore.io.ply import EXPORT, padding_bytes, parse_elements, read_head, tail_warnings
 from liftcore.io.quantised import Fields, decoded, field_shapes, logits, smallest_three
 from liftcore.scene.harmonics import constant_terms
 
@@ -32,11 +32,12 @@ def read_compressed_ply(path: Path, *, colour: bool = True) -> Fields:
     _, elements, offset = parse_elements(head, str(path))
     tables: dict[str, np.ndarray] = {}
     total = offset + sum(element.count * element.dtype.itemsize for element in elements)
-    if total != size or any(element.list_column for element in elements):
+    if total > size or any(element.list_column for element in elements):
         raise InvalidSplats(
             str(path), expected=f"{total} bytes, as its header says", got=f"{size}",
             hint="the file is truncated, or none of this format: export it again",
         )  # fmt: skip
+    tail = size - total - padding_bytes(path, size, size - total)
     for element in elements:
         table = np.memmap(path, np.uint8, "r", 0)[offset : offset + element.count * element.dtype.itemsize]
         tables[element.name] = table.view(element.dtype)
@@ -67,7 +68,8 @@ def read_compressed_ply(path: Path, *, colour: bool = True) -> Fields:
             fields["sh"][:, 1:] = ((unit - 0.5) * SH_RANGE).reshape(-1, 3, higher).transpose(0, 2, 1)
         return fields
 
-    return decoded(len(vertices), field_shapes(1 + higher if colour else 0), decode)
+    fields = decoded(len(vertices), field_shapes(1 + higher if colour else 0), decode)
+    return fields | {"warnings": tail_warnings(tail)}
 
 
 def _checked(tables: dict[str, np.ndarray], path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
@@ -87,8 +89,6 @@ def _checked(tables: dict[str, np.ndarray], path: Path) -> tuple[np.ndarray, np.
     if len(chunks) != -(-len(vertices) // CHUNK_ROWS):
         expected, got = f"a chunk for {CHUNK_ROWS} splats", f"{len(chunks)} for {len(vertices)}"
         raise InvalidSplats(str(path), expected=expected, got=got)
-    if not all(np.isfinite(chunks[name]).all() for name in wanted["chunk"]):
-        raise InvalidSplats(f"{path} chunks", expected="finite ranges", got="some that are NaN or infinite")
     if harmonics is not None:
         columns = harmonics.dtype.names or ()
         known = {f"f_rest_{i}" for i in range(len(columns))} == set(columns) and len(columns) in SH_COLUMNS

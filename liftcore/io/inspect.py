@@ -161,7 +161,8 @@ def _splat_warnings(splats: Splats, scales: Tensor, opacities: Tensor) -> list[s
         f"lie further than {FAR:g} scene units from the origin, where float32 is coarse": far,
         "have an opacity below 1/255 and are never seen": faint,
     }
-    warnings = [f"{count} of {splats.count} splats {what}" for what, count in counted.items() if count]
+    warnings = [*splats.warnings]
+    warnings += [f"{count} of {splats.count} splats {what}" for what, count in counted.items() if count]
     warnings += _reading_warnings(splats)
     if splats.sh is None:
         warnings.append("no colour: renders in RGB are not possible")

@@ -14,7 +14,7 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,7 +22,7 @@ import numpy as np
 
 from liftcore.errors import InvalidSplats
 from liftcore.io.files import whole_file
-from liftcore.scene.kernel import Kernel, kernel_named, scale_count
+from liftcore.scene.kernel import DARK_LOBE, LOBE_COLOURS, Kernel, kernel_named, scale_count
 
 if TYPE_CHECKING:
     from liftcore.scene.splats import Splats
@@ -32,8 +32,6 @@ MAX_HEADER_LINES = 4096
 BLOCK_ROWS = 16_384  # rows converted at a time: a few MB, so that memory stays near the file's size
 MAX_SH_DEGREE = 4
 LOBE_CHANNELS = 6  # of a spherical beta lobe: r g b theta phi beta
-LOBE_COLOURS = 3  # r g b, the first of them
-DARK_LOBE = -10.0  # r g b of a lobe that adds nothing: its softplus of sharpness 10 ln 2 is 1e-31, and of zero 0.1
 COLOUR = ("sh", "sb_params")  # fields that a lift has no use for, and most of a file
 FILTER = "filter_3D"  # of Mip-Splatting, the column of its smoothing filter
 NORMALS = ("nx", "ny", "nz")
@@ -46,7 +44,11 @@ REWRITE = (
     "rewrite it with Python: from plyfile import PlyData; p = PlyData.read('IN.ply'); p.text = False; "
     "p.byte_order = '<'; p.write('OUT.ply')"
 )
-_END = re.compile(rb"(?:^|\n)end_header(\r?\n)")
+_END = re.compile(rb"(?:^|\n)end_header[ \t]*(\r?\n)")
+_REMARKS = ("comment", "obj_info")  # lines that are kept, and not understood
+PADDING = b"\0 \t\r\n"  # bytes that some programs end a file with
+MAX_PADDING_BYTES = 4096  # that are looked at
+FLOAT_BYTES = 4  # of a column that a header may have forgotten
 _ELEMENT = re.compile(r"\s*element\s+(\S+)\s+([0-9]{1,18})\s*")
 _GSPLAT = {"x", "y", "z", "f_dc_0", "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_3"}
 _SIGNATURES = {
@@ -70,7 +72,7 @@ def read_ply(path: Path, kernel: Kernel | str = "auto", *, colour: bool = True) 
     opacities, which are then written as plain splats; elements behind the vertices are neither read nor written.
 
     Raises:
-        InvalidSplats: the file is malformed, lacks a property of the kernel, or holds NaN or no splats.
+        InvalidSplats: the file is malformed, lacks a property of the kernel, or holds no splat of finite numbers.
     """
     import torch
 
@@ -97,7 +99,8 @@ def read_ply(path: Path, kernel: Kernel | str = "auto", *, colour: bool = True) 
         lines, layout = (), tuple(name for name in layout if name != FILTER)
         fields |= _filtered(fields["log_scales"], fields["opacity_logits"], extras.pop(FILTER))
     tensors = {name: torch.from_numpy(values) for name, values in extras.items()}
-    return Splats(**fields, kernel=kernel, extras=tensors, layout=layout, header=lines)
+    warnings = tail_warnings(header.tail)
+    return Splats(**fields, kernel=kernel, extras=tensors, layout=layout, header=lines, warnings=warnings)
 
 
 def read_places(path: Path) -> np.ndarray:
@@ -266,12 +269,12 @@ def _filtered(log_scales: np.ndarray, opacity_logits: np.ndarray, deviations: np
 
         s' = sqrt(s^2 + f^2),   o' = o sqrt(prod s^2 / prod s'^2)
     """
-    bad = ~(np.isfinite(deviations) & (deviations >= 0))
-    if bad.any():
-        got = f"{float(deviations[bad][0]):g} in splat {int(bad.argmax())}"
-        raise InvalidSplats(FILTER, expected="finite values of zero or more", got=got, hint="export the splats again")
+    if (negative := deviations < 0).any():
+        got = f"{float(deviations[negative][0]):g} in splat {int(negative.argmax())}"
+        raise InvalidSplats(FILTER, expected="values of zero or more", got=got, hint="export the splats again")
+    deviations = np.where(np.isposinf(deviations), np.nan, deviations)  # a size that is no number
     scales, theta = log_scales.astype(np.float64), opacity_logits.astype(np.float64)
-    with np.errstate(divide="ignore"):  # a deviation of zero changes nothing; so do logs of it
+    with np.errstate(divide="ignore", invalid="ignore"):  # a deviation of zero changes nothing; so do logs of it
         widened = np.logaddexp(2 * scales, 2 * np.log(deviations.astype(np.float64))[:, None]) / 2
         # log of sigmoid(theta) and of what it loses, then the logit of their product
         lost = np.where(np.isinf(scales), -np.inf, scales - widened).sum(axis=1)
@@ -412,6 +415,7 @@ class PlyHeader:
     dtype: np.dtype  # of a row, a field a column
     data_offset: int  # bytes before the first row
     after: int | None = 0  # bytes behind the last row, of other elements; None when their lists make it unknown
+    tail: int = 0  # bytes behind all of that, which the header does not describe
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -429,22 +433,41 @@ class PlyHeader:
 def read_header(path: Path) -> PlyHeader:
     """Read and check the header of a splat PLY, at most 256 KiB of the file.
 
+    Bytes behind all elements count in ``tail``, but for zeros and blanks: viewers open such files, too.
+
     Raises:
         InvalidSplats: the file cannot be opened, is not a binary little-endian PLY that begins with a vertex element
-            of scalar properties, or has another size than the header says.
+            of scalar properties, is shorter than the header says, or has longer rows.
     """
     head, size = read_head(path)
     header = parse_header(head, str(path))
-    found, stride = size - header.data_offset, header.dtype.itemsize
-    least = header.count * stride + (header.after or 0)
-    if found < least or (header.after is not None and found > least):
-        hint = "the file has bytes that its header does not describe: export it again"
-        if found < least:
-            hint = "the file is truncated: copy or export it again"
+    length, stride = size - header.data_offset, header.dtype.itemsize
+    described = header.count * stride + (header.after or 0)
+    tail = 0 if header.after is None else max(0, length - described)
+    padding = padding_bytes(path, size, tail)
+    forgotten = tail > padding and header.count > 1 and tail % (FLOAT_BYTES * header.count) == 0
+    if length < described or forgotten:
+        hint = "the file is truncated: copy or export it again"
+        if forgotten:
+            hint = "the rows are longer than their properties in the header: export the file again"
         others = f" and {header.after} bytes of other elements" if header.after else ""
-        expected = f"{header.count} rows of {stride} bytes{others} = {least} bytes after the header"
-        raise InvalidSplats(str(path), expected=expected, got=f"{found} bytes", hint=hint)
-    return header
+        expected = f"{header.count} rows of {stride} bytes{others} = {described} bytes after the header"
+        raise InvalidSplats(str(path), expected=expected, got=f"{length} bytes", hint=hint)
+    return replace(header, tail=tail - padding)
+
+
+def tail_warnings(tail: int) -> tuple[str, ...]:
+    """A warning of bytes behind all that a header describes, if there are any."""
+    return (f"{tail} bytes at the file's end are of nothing that its header describes: not read",) if tail else ()
+
+
+def padding_bytes(path: Path, size: int, tail: int) -> int:
+    """How many of the last ``tail`` bytes of a file of ``size`` bytes say nothing: all, if all are zeros or blank."""
+    if not 0 < tail <= MAX_PADDING_BYTES:
+        return 0
+    with path.open("rb") as handle:
+        handle.seek(size - tail)
+        return 0 if handle.read(tail).strip(PADDING) else tail
 
 
 def read_head(path: Path) -> tuple[bytes, int]:
@@ -506,7 +529,8 @@ def parse_elements(head: bytes, source: str) -> tuple[tuple[str, ...], list[Elem
             expected = "the name of an element and a count of zero or more"
             raise _refused(source, expected, repr(" ".join(words)[:60]))
         counts += [int(element[2])] if element else []
-        empty.append(f"element {element[1]} 0" if element else line.removesuffix("\r"))
+        if words and not line.startswith(_REMARKS):
+            empty.append(f"element {element[1]} 0" if element else " ".join(words))
     try:
         ply = PlyData.read(io.BytesIO(header_bytes(empty)))
     except (PlyParseError, ValueError) as error:
@@ -529,8 +553,8 @@ def _refused(source: str, expected: str, got: str, hint: str = EXPORT) -> Invali
 
 
 def header_bytes(lines: Sequence[str]) -> bytes:
-    """The lines of a header as they stand in a file."""
-    return "".join(f"{line}\n" for line in lines).encode("ascii")
+    """The lines of a header as they stand in a file; comments may hold any bytes, a character each."""
+    return "".join(f"{line}\n" for line in lines).encode("latin-1")
 
 
 def _header_lines(head: bytes, source: str) -> tuple[tuple[str, ...], int]:
@@ -541,11 +565,10 @@ def _header_lines(head: bytes, source: str) -> tuple[tuple[str, ...], int]:
     if end is None:
         limit = f"'end_header' within the first {MAX_HEADER_BYTES} bytes"
         raise InvalidSplats(source, expected=limit, got=f"none in {len(head)} bytes", hint=EXPORT)
-    text = head[: end.end() - 1]
-    if not text.isascii():
-        hint = "take the comments with other characters out of it"
-        raise InvalidSplats(source, expected="an ASCII header", got="other characters in it", hint=hint)
-    lines = tuple(text.decode("ascii").split("\n"))
+    lines = tuple(head[: end.end() - 1].decode("latin-1").split("\n"))
+    if not all(line.isascii() or line.startswith(_REMARKS) for line in lines):
+        expected, got = "ASCII characters in all lines but comments", "other characters in it"
+        raise _refused(source, expected, got)
     if len(lines) > MAX_HEADER_LINES:
         limit, hint = f"at most {MAX_HEADER_LINES} header lines", "leave out properties that are no splat's"
         raise InvalidSplats(source, expected=limit, got=str(len(lines)), hint=hint)

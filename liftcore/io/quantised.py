@@ -26,7 +26,7 @@ THIN = 0.01  # of a disc's smaller scale: the thickness that it is shown with
 OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # places of a quaternion but each
 LARGEST_SCALE = 80.0  # log: its exponential is a float32
 
-Fields = dict[str, np.ndarray]
+Fields = dict[str, Any]  # arguments of `Splats` by their names: arrays, and what the file says of them
 
 
 def decoded(count: int, shapes: Mapping[str, tuple[int, ...]], decode: Callable[[slice], Fields]) -> Fields:

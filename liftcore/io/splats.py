@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -85,8 +85,8 @@ def read_splats(path: Path | str, kernel: Kernel | str = "auto", *, colour: bool
 
     Raises:
         InvalidInput: it lies elsewhere (`io.remote`), and does not come.
-        InvalidSplats: the file is malformed or of no such format, lacks a property of the kernel, or holds NaN or no
-            splats.
+        InvalidSplats: the file is malformed or of no such format, lacks a property of the kernel, or holds no splat
+            of finite numbers.
     """
     path = local_path(path)
     found = format_of(path)
@@ -97,7 +97,7 @@ def read_splats(path: Path | str, kernel: Kernel | str = "auto", *, colour: bool
         require_kernel(path, chosen, str(path))
         from liftcore.scene.splats import Splats
 
-        fields: dict[str, Any] = _READERS[found](path, colour=colour)
+        fields = _READERS[found](path, colour=colour)
         if chosen is Kernel.GAUSSIAN_2D:
             fields["log_scales"] = np.ascontiguousarray(fields["log_scales"][:, :2])
         return Splats(**fields, kernel=chosen)
@@ -105,13 +105,17 @@ def read_splats(path: Path | str, kernel: Kernel | str = "auto", *, colour: bool
 
 def read_places(path: Path) -> np.ndarray:
     """[P, 3] f32, the means alone of a file that `read_splats` takes, in its frame and unit. Only checkpoints need
-    torch for that, which takes a second to import.
+    torch for that, which takes a second to import. Places that are no number become the first that is.
 
     Raises:
         InvalidSplats: the file is of no format of splats.
     """
     found = format_of(path)
-    return ply.read_places(path) if found is SplatFormat.PLY else _READERS[found](path, colour=False)["means"]
+    places = ply.read_places(path) if found is SplatFormat.PLY else _READERS[found](path, colour=False)["means"]
+    finite = np.isfinite(places).all(axis=1)
+    if not finite.all():
+        places[~finite] = places[finite.argmax()]
+    return places
 
 
 def format_of(path: Path) -> SplatFormat:

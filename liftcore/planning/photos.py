@@ -139,7 +139,7 @@ def plan_photos(
         shown=tuple(shown_by(seen, weight, order, seconds)),
         seen_share=seen_share,
         row_sum=row_sum,
-        warnings=(*frame_warning(known), *distortion_warning(views), *told),
+        warnings=(*splats.warnings, *frame_warning(known), *distortion_warning(views), *told),
     )
 
 

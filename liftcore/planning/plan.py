@@ -215,6 +215,7 @@ def plan_lift(
         seconds=seconds,
         warnings=(*short, *check_memory(parts, free), *check_weights(in_files)),
         told=(
+            *splats.warnings,
             *frame_warning(views.cameras),
             *distortion_warning(cameras),
             *shape_warnings(features, cameras),

@@ -1,10 +1,13 @@
-"""What a splat may be: the names of the kernels, for those who load no torch, too."""
+"""What a splat may be: the names of the kernels and the numbers of a lobe, for those who load no torch, too."""
 
 from __future__ import annotations
 
 from enum import StrEnum
 
 from liftcore.errors import InvalidSplats
+
+LOBE_COLOURS = 3  # r g b, the first of the six numbers of a spherical beta lobe
+DARK_LOBE = -10.0  # r g b of a lobe that adds nothing: its softplus of sharpness 10 ln 2 is 1e-31, and of zero 0.1
 
 
 class Kernel(StrEnum):

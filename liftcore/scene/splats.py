@@ -1,4 +1,9 @@
-"""Trained splats, as their files store them: logs and logits, validated once."""
+"""Trained splats, as their files store them: logs and logits, validated once.
+
+Trained files hold a few numbers that are none (NaN or infinite), and their rows must stay, since scores and exports
+follow the rows. A splat whose place, size, turn or opacity is no number becomes one that no ray meets; a colour that
+is no number becomes grey. Both are counted in ``warnings``.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +15,7 @@ import numpy as np
 import torch
 
 from liftcore.errors import InvalidSplats
-from liftcore.scene.kernel import Kernel, kernel_named, scale_count
+from liftcore.scene.kernel import DARK_LOBE, LOBE_COLOURS, Kernel, kernel_named, scale_count
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -22,6 +27,7 @@ if TYPE_CHECKING:
 
 SH_ROWS = (1, 4, 9, 16, 25)  # (degree + 1)^2
 _BEYOND = {"opacity_logits": (True, True), "log_scales": (True, False)}  # whether -inf and +inf have a meaning
+_GEOMETRY = ("means", "quats", "log_scales", "opacity_logits", "beta")  # what rays meet; all else is colour
 
 
 @dataclass(frozen=True, init=False)
@@ -30,13 +36,15 @@ class Splats:
 
     Arrays come of torch, on any device, or of numpy. They become float32 of torch where they lie, without a copy
     where they are that already, and without their gradients. A logit may be infinite (an opacity of 1 or 0, as
-    converters of quantised splats write it), and a log scale minus infinity (flat); all else is finite.
+    converters of quantised splats write it), and a log scale minus infinity (flat). Splats with other numbers that
+    are not finite are unseen: their opacity becomes 0 (a logit of minus infinity), and a place, size or turn that is
+    no number becomes the first one that is. Colours that are not finite become grey.
 
     ``layout``, ``extras`` and ``header`` keep what the file had beyond the model (normals, SAGA's ``mask``,
     comments), so that writing gives back what was read.
 
     Raises:
-        InvalidSplats: an array has another shape, holds no floats, or is not finite; the error names it.
+        InvalidSplats: an array has another shape or holds no floats, or no splat is finite; the error names it.
     """
 
     means: Tensor  # [P, 3] f32, world frame, scene units
@@ -50,6 +58,7 @@ class Splats:
     extras: Mapping[str, Tensor]  # name -> [P], columns we do not model
     layout: tuple[str, ...]  # the file's property names in order; () = the kernel's usual layout
     header: tuple[str, ...]  # the file's header lines verbatim; () = made from the layout
+    warnings: tuple[str, ...]  # of what in these splats, or in their file, is not as it should be
 
     def __init__(
         self,
@@ -65,6 +74,7 @@ class Splats:
         extras: Mapping[str, Tensor] | None = None,
         layout: tuple[str, ...] = (),
         header: tuple[str, ...] = (),
+        warnings: tuple[str, ...] = (),
     ) -> None:
         kernel = kernel_named(kernel)
         first = _floats("means", means)
@@ -80,10 +90,16 @@ class Splats:
             "sh": (sh, (count, ..., 3)),
             "sb_params": (sb_params, (count, ..., 6)),
         }
-        for name, (given, shape) in shapes.items():
-            found = None if given is None else _column(name, given, shape, first.device)
-            object.__setattr__(self, name, found)
+        columns = {
+            name: _column(name, values, shape, first.device)
+            for name, (values, shape) in shapes.items()
+            if values is not None
+        }
+        columns, repairs = _repaired(columns)
+        for name in shapes:
+            object.__setattr__(self, name, columns.get(name))
         fixed = {"kernel": kernel, "extras": dict(extras or {}), "layout": tuple(layout), "header": tuple(header)}
+        fixed["warnings"] = tuple(dict.fromkeys((*warnings, *repairs)))
         for name, value in fixed.items():
             object.__setattr__(self, name, value)
         if self.sh is not None and self.sh.shape[1] not in SH_ROWS:
@@ -135,29 +151,63 @@ def _floats(name: str, values: Array) -> Tensor:
 
 
 def _column(name: str, values: Array, shape: tuple[Any, ...], device: torch.device) -> Tensor:
-    """Values as f32 of a shape, whose ``...`` is any number, with no NaN nor an infinity that has no meaning."""
-    found = _floats(name, values)
-    if len(shape) == 1 and found.ndim == 2 and found.shape[1] == 1:  # as Inria's code keeps opacities
-        found = found[:, 0]
-    if found.ndim != len(shape) or any(
-        want not in (..., side) for want, side in zip(shape, found.shape, strict=True)
+    """Values as f32 of a shape, whose ``...`` is any number."""
+    column = _floats(name, values)
+    if len(shape) == 1 and column.ndim == 2 and column.shape[1] == 1:  # as Inria's code keeps opacities
+        column = column[:, 0]
+    if column.ndim != len(shape) or any(
+        want not in (..., side) for want, side in zip(shape, column.shape, strict=True)
     ):
         wanted = ", ".join("any" if side is ... else str(side) for side in shape)
-        raise InvalidSplats(name, expected=f"floats of shape [{wanted}]", got=f"shape {list(found.shape)}")
-    if found.device != device:
-        raise InvalidSplats(name, expected=f"an array on {device}, where the means are", got=str(found.device))
-    if not found.numel():
-        return found
-    # The extremes carry NaN and infinity along, and need no memory of the tensor's size.
-    if not all(bool(_allowed(name, end)) for end in torch.aminmax(found)):
-        bad = ~_allowed(name, found)
-        row = int(bad.reshape(shape[0], -1).any(dim=1).nonzero()[0, 0])
-        got = f"{int(bad.sum())} that are NaN or infinite, the first in splat {row}"
-        hint = "prune the broken splats before the upload"
-        raise InvalidSplats(name, expected="finite values", got=got, hint=hint)
-    return found
+        raise InvalidSplats(name, expected=f"floats of shape [{wanted}]", got=f"shape {list(column.shape)}")
+    if column.device != device:
+        raise InvalidSplats(name, expected=f"an array on {device}, where the means are", got=str(column.device))
+    return column
 
 
-def _allowed(name: str, values: Tensor) -> Tensor:
+def _repaired(columns: dict[str, Tensor]) -> tuple[dict[str, Tensor], list[str]]:
+    """The columns with what is no number replaced (`Splats`), and a warning of each kind.
+
+    Raises:
+        InvalidSplats: no splat has a place, a size, a turn and an opacity.
+    """
+    bad = {name: ~_meaningful(name, values) for name, values in columns.items() if not _all_meaningful(name, values)}
+    if not bad:
+        return columns, []
+    columns, warnings, count = dict(columns), [], len(columns["means"])
+    rows = {name: mask.reshape(count, -1).any(dim=1) for name, mask in bad.items()}
+    unseen = [rows[name] for name in _GEOMETRY if name in rows]
+    if unseen:
+        broken = torch.stack(unseen).any(dim=0)
+        if bool(broken.all()):
+            got = f"{count} whose {' and '.join(name for name in _GEOMETRY if name in rows)} are NaN or infinite"
+            raise InvalidSplats("splats", expected="at least one splat of finite numbers", got=got)
+        for name in set(bad).intersection(_GEOMETRY):
+            values, row = columns[name], rows[name].reshape(-1, *[1] * (columns[name].ndim - 1))
+            columns[name] = torch.where(row, values[(~rows[name]).nonzero()[0, 0]], values)
+        columns["opacity_logits"] = columns["opacity_logits"].masked_fill(broken, -torch.inf)
+        first = int(broken.nonzero()[0, 0])
+        what = "have a place, size, turn or opacity that is no number (NaN or infinite), and are never seen"
+        warnings.append(f"{int(broken.sum())} of {count} splats {what}; the first is splat {first}")
+    grey = [rows[name] for name in rows if name not in _GEOMETRY]
+    if grey:
+        grey = torch.stack(grey).any(dim=0)
+        if "sh" in columns:
+            columns["sh"] = columns["sh"].masked_fill(grey[:, None, None], 0.0)
+        if "sb_params" in columns:
+            lobes = columns["sb_params"].masked_fill(grey[:, None, None], 0.0)
+            lobes[..., :LOBE_COLOURS].masked_fill_(grey[:, None, None], DARK_LOBE)
+            columns["sb_params"] = lobes
+        what = "have a colour that is no number (NaN or infinite), and are grey"
+        warnings.append(f"{int(grey.sum())} of {count} splats {what}; the first is splat {int(grey.nonzero()[0, 0])}")
+    return columns, warnings
+
+
+def _all_meaningful(name: str, values: Tensor) -> bool:
+    """Whether all values have a meaning; the extremes carry NaN along, and need no memory of the tensor's size."""
+    return not values.numel() or all(bool(_meaningful(name, end)) for end in torch.aminmax(values))
+
+
+def _meaningful(name: str, values: Tensor) -> Tensor:
     minus, plus = _BEYOND.get(name, (False, False))
     return torch.isfinite(values) | (torch.isneginf(values) & minus) | (torch.isposinf(values) & plus)

@@ -174,7 +174,7 @@ def test_small_files_that_say_they_are_large_are_refused(kind: str, message: str
         ("", "version", 1, "version 2, got 1"),
         ("", "count", 10_000, "10000 pixels in 'means_l.webp'"),
         ("", "means", None, "'means' in meta.json, got none"),
-        ("means", "maxs", [1e4] * 3, "means: expected finite values"),
+        ("means", "maxs", [1e6] * 3, "at least one splat of finite numbers"),
         ("means", "mins", [float("nan")] * 3, "3 finite numbers as 'mins' of 'means'"),
         ("means", "files", ["../x", "y"], r"'\.\./x' beside meta.json, got none"),
         ("scales", "codebook", [0.0] * 255, "256 finite numbers as 'codebook' of 'scales'"),
@@ -206,19 +206,12 @@ def test_sog_that_says_something_else_is_refused(
         (b"uint packed_color", b"uint packed_colur", "the uint 'packed_color' of the element 'vertex'"),
         (b"uchar f_rest_44", b"uchar f_rest_45", "9 or 24 or 45 uchar f_rest"),
         (b"element chunk 1", b"element chunk 2", "bytes, as its header says, got"),
-        (b"", None, "finite ranges"),
     ],
 )
-def test_compressed_ply_that_lacks_something_is_refused(
-    old: bytes, new: bytes | None, message: str, tmp_path: Path
-) -> None:
+def test_compressed_ply_that_lacks_something_is_refused(old: bytes, new: bytes, message: str, tmp_path: Path) -> None:
     head, end, body = (FILES / "degree3.compressed.ply").read_bytes().partition(b"end_header\n")
-    if new is None:
-        body = struct.pack("<f", float("nan")) + body[4:]
-    else:
-        assert old in head
-        head = head.replace(old, new)
-    (tmp_path / "a").write_bytes(head + end + body)
+    assert old in head
+    (tmp_path / "a").write_bytes(head.replace(old, new) + end + body)
     with pytest.raises(InvalidSplats, match=message):
         read_splats(tmp_path / "a")
 

@@ -1,0 +1,175 @@
+"""NaN and infinity in trained splats: rows stay, no ray meets them, colours are grey, and all of it is counted."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import liftcore as lc
+from liftcore.io.inspect import inspect_file
+from liftcore.io.ply import write_splats
+from liftcore.io.splats import read_places, read_splats, some_rows
+from liftcore.planning.photos import plan_photos
+from liftcore.query.splat_colours import seen_colours
+from liftcore.raster.base import CompositingParams
+from liftcore.raster.reference import dense_view
+from liftcore.scene.kernel import Kernel
+from liftcore.scene.splats import Splats
+from tests.scenes import look_at, observed, random_camera, random_splats
+from tests.unit.command_line import lift_arguments, run, write_toy_scene
+
+FILES = Path(__file__).parents[2] / "data" / "splats"
+COUNT, BROKEN = 40, {"means": 5, "log_scales": 9, "quats": 17, "opacity_logits": 20}
+KEPT = torch.tensor([row not in BROKEN.values() for row in range(COUNT)])
+ODD = {"means": np.nan, "log_scales": np.inf, "quats": -np.inf, "opacity_logits": np.nan}
+
+
+def geometry_of(splats: Splats) -> dict[str, Any]:
+    names = ("means", "quats", "log_scales", "opacity_logits", "beta")
+    return {name: value.clone() for name in names if (value := getattr(splats, name)) is not None}
+
+
+def broken(splats: Splats) -> dict[str, Any]:
+    """The arrays of splats with a number that is none in four of them."""
+    values = geometry_of(splats)
+    for name, row in BROKEN.items():
+        values[name].reshape(COUNT, -1)[row, 0] = ODD[name]
+    return values
+
+
+@pytest.mark.parametrize("kernel", list(Kernel))
+def test_no_ray_meets_a_splat_that_is_no_number(kernel: Kernel) -> None:
+    whole = random_splats(3, COUNT, kernel=kernel)
+    splats = Splats(**broken(whole), kernel=kernel)
+    fewer = Splats(**{name: value[KEPT] for name, value in geometry_of(whole).items()}, kernel=kernel)
+    assert splats.count == COUNT and "4 of 40 splats" in splats.warnings[0] and "splat 5" in splats.warnings[0]
+    camera = random_camera(0)
+    for own, other in zip(
+        (dense_view(one, camera, CompositingParams()).A for one in (splats, fewer)),
+        (torch.stack([lc.render(one, camera, row) for row in torch.eye(one.count)]) for one in (splats, fewer)),
+        strict=True,
+    ):
+        np.testing.assert_allclose(other.numpy().reshape(len(other), -1).T, own, atol=1e-5)
+    cameras = {f"v{number}": random_camera(number, name=f"v{number}") for number in range(3)}
+    views = {name: observed(number, 0) for number, name in enumerate(cameras)}
+    for preset in ("default", "mean"):
+        result, expected = (lc.lift(one, cameras, views, preset, device="cpu") for one in (splats, fewer))
+        assert not result.seen[~KEPT].any() and not result.features[~KEPT].any()
+        assert torch.equal(result.features[KEPT], expected.features)
+        assert any("4 of 40 splats" in text for text in result.diagnostics["warnings"])
+    assert any("4 of 40 splats" in text for text in plan_photos(splats, cameras).warnings)
+
+
+@pytest.mark.parametrize("kernel", [Kernel.GAUSSIAN_3D, Kernel.BETA])
+def test_a_colour_that_is_no_number_is_grey_from_everywhere(kernel: Kernel) -> None:
+    splats = random_splats(3, COUNT, kernel=kernel)
+    sh = torch.rand(COUNT, 4, 3)
+    sh[7, 2, 1], sh[8, 0, 0] = np.nan, np.inf
+    lobes = torch.rand(COUNT, 2, 6) if kernel is Kernel.BETA else None
+    if lobes is not None:
+        lobes[9, 1, 3] = np.nan
+    shown = replace(splats, sh=sh, sb_params=lobes)
+    grey = [7, 8] + [9] * (lobes is not None)
+    assert f"{len(grey)} of 40 splats have a colour that is no number" in shown.warnings[0]
+    for centre in ([3.0, 1.0, -4.0], [0.0, -5.0, 0.3]):
+        colours = seen_colours(shown, look_at("v", np.array(centre), 8, 8, 8.0))
+        torch.testing.assert_close(colours[grey], torch.full((len(grey), 3), 0.5), atol=1e-6, rtol=0)
+        assert bool(torch.isfinite(colours).all())
+    assert torch.equal(shown.opacity_logits, splats.opacity_logits)
+
+
+def files(folder: Path) -> Iterator[tuple[Path, int, int]]:
+    """A file of each format that can hold such numbers, with how many splats of it are unseen and how many grey."""
+    splats = random_splats(3, COUNT)
+    own = replace(splats, sh=torch.rand(COUNT, 4, 3))
+    write_splats(own, folder / "s.ply")
+    content = (folder / "s.ply").read_bytes()
+    start, stride = content.index(b"end_header\n") + 11, 4 * len(own.layout or read_splats(folder / "s.ply").layout)
+    names = read_splats(folder / "s.ply").layout
+    rows = np.frombuffer(content[start:], np.dtype([(name, "<f4") for name in names])).copy()
+    assert rows.itemsize == stride
+    rows["x"][5], rows["rot_1"][17], rows["f_rest_3"][7] = np.nan, np.inf, np.nan
+    (folder / "s.ply").write_bytes(content[:start] + rows.tobytes())
+    yield folder / "s.ply", 2, 1
+    torch.save({"splats": {
+        "means": torch.from_numpy(broken(splats)["means"].numpy()).double(), "quats": splats.quats,
+        "scales": splats.log_scales, "opacities": splats.opacity_logits,
+        "sh0": torch.full((COUNT, 1, 3), np.nan), "shN": torch.zeros(COUNT, 0, 3),
+    }}, folder / "s.pt")  # fmt: skip
+    yield folder / "s.pt", 1, COUNT
+    content = bytearray(b"".join(some_rows(folder / "s.ply", np.ones(COUNT, bool), ".splat")))
+    content[32 * 3 : 32 * 3 + 4] = struct.pack("<f", np.nan)
+    content[32 * 4 + 12 : 32 * 4 + 16] = struct.pack("<f", -1.0)  # a scale, of which there is no logarithm
+    (folder / "s.splat").write_bytes(bytes(content))
+    yield folder / "s.splat", 2, 0
+    head, end, body = (FILES / "degree1.compressed.ply").read_bytes().partition(b"end_header\n")
+    (folder / "s.compressed.ply").write_bytes(head + end + struct.pack("<f", np.nan) + body[4:])
+    yield folder / "s.compressed.ply", 256, 0  # a whole chunk of 300 splats
+
+
+def test_files_of_every_format_keep_their_rows_and_count_what_is_none(tmp_path: Path) -> None:
+    for path, unseen, grey in files(tmp_path):
+        splats = read_splats(path)
+        text = " | ".join(splats.warnings)
+        assert (f"{unseen} of {splats.count} splats have a place" in text) == (unseen > 0), path
+        assert (f"{grey} of {splats.count} splats have a colour" in text) == (grey > 0), path
+        assert int(torch.isneginf(splats.opacity_logits).sum()) == unseen
+        found = json.loads(json.dumps(inspect_file(path), allow_nan=False))
+        assert set(splats.warnings) <= set(found["warnings"])
+        assert np.isfinite(read_places(path)).all()
+        np.testing.assert_array_equal(read_places(path), splats.means.numpy())
+        for suffix in (".ply", ".splat", ".spz"):
+            copy = tmp_path / f"copy{suffix}"
+            copy.write_bytes(b"".join(some_rows(path, np.ones(splats.count, bool), suffix)))
+            assert read_splats(copy).count == splats.count
+
+
+def test_questions_take_what_the_lift_took(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = write_toy_scene(tmp_path)
+    splats = read_splats(scene / "splats.ply")
+    places, sh = torch.cat([splats.means, torch.full((1, 3), np.nan)]), torch.zeros(3, 1, 3)
+    sh[1, 0, 2] = np.nan
+    own = {name: getattr(splats, name)[[0, 1, 1]] for name in ("quats", "log_scales", "opacity_logits")}
+    write_splats(Splats(places.nan_to_num(7.5), **own, sh=sh.nan_to_num(7.5)), scene / "splats.ply")
+    content = (scene / "splats.ply").read_bytes()
+    content = content.replace(struct.pack("<f", 7.5), struct.pack("<f", np.nan))
+    (scene / "splats.ply").write_bytes(content)
+    assert content.count(struct.pack("<f", np.nan)) == 4
+    for command in (lift_arguments(scene), ["plan", *lift_arguments(scene)[1:4]]):
+        status, out, err = run(capsys, *command)
+        assert status == 0 and "1 of 3 splats have a place" in out + err
+    status, out, _ = run(capsys, "inspect", scene / "splats.ply")
+    assert status == 0 and "1 of 3 splats have a place" in out and "1 of 3 splats have a colour" in out
+    assert "1 of 3 splats have a colour" in run(capsys, "check", scene / "splats.ply", scene / "cameras.json")[1]
+    np.save(scene / "like.npy", np.array([1.0, 0.0, 0.0], np.float32))
+    ask = ["query", scene / "lift.safetensors", "--like", scene / "like.npy"]
+    status, out, err = run(capsys, *ask, "--objects", "--json")
+    assert status == 0, err
+    found = json.loads(out)
+    assert all(np.isfinite(box).all() for box in (one["box"] for one in found["objects"]))
+    for more in (["--mask", scene / "m.png"], ["--overlay", scene / "r.png"], ["--attention", scene / "a.png"]):
+        assert run(capsys, *ask, "--view", "front", *more)[0] == 0
+    assert run(capsys, *ask, "--coloured", scene / "c.ply")[0] == 0
+    assert read_splats(scene / "c.ply").count == 3
+    for name in ("o.ply", "o.splat", "o.spz"):
+        status, _, err = run(capsys, *ask, "--object", scene / name)
+        assert (status, read_splats(scene / name).count if status == 0 else err) == (0, 1)
+
+
+def test_whole_and_empty_opacities_and_flat_splats_are_numbers() -> None:
+    values = geometry_of(random_splats(3, COUNT))
+    values["opacity_logits"][:2] = torch.tensor([np.inf, -np.inf])
+    values["log_scales"][2, 1], values["quats"][3] = -np.inf, 0.0
+    splats = Splats(**values)
+    assert splats.warnings == () and all(
+        torch.equal(getattr(splats, name), values[name]) for name in ("opacity_logits", "log_scales", "quats")
+    )
+    assert bool(torch.isfinite(lc.render(splats, random_camera(0), torch.ones(COUNT))).all())
