@@ -38,4 +38,4 @@ def warm_up_lift(kernel: Kernel, device: Device, settings: LiftSettings) -> None
     if settings.loss == "huber":
         huber_factors(W, book, threads=1)
     if settings.aggregation:
-        explained_by(W, RegionDirections(W, book), one, torch.ones(1, 1), 1)
+        explained_by(W, RegionDirections.of_weights(W, book), one, torch.ones(1, 1), 1)

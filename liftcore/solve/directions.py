@@ -6,19 +6,24 @@ alike. A zero vector and the mean itself have none, and are zero.
 
 Where the channels are many and a region has many entries, directions are written in DIRECTIONS principal ones. Of
 noise these keep what regions share with one another, so cosines between noisy vectors grow alike.
+
+Of W only the weight of each region is needed, a sum over all splats (`region_totals`); all else is a function of the
+codebook, of the size of M.
 """
 
 from collections.abc import Iterator
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from liftcore.jit import kernel
 from liftcore.solve.codebook import LEAST_CHANNELS, TABLE_BYTES, Codebook
+from liftcore.solve.sums import PieceSums, added, piece_sums
 from liftcore.solve.weights import RegionWeights
 
 CPU = torch.device("cpu")
 ROWS = 1 << 14  # of a table in float64 at a time
-ENTRIES = 1 << 20  # of W likewise
 DIRECTIONS = 256  # principal ones, in which cosines are taken where regions are few beside entries
 SAMPLE = 1 << 14  # regions that say which directions are principal
 NO_DIRECTION = 1e-6  # a unit vector nearer to the mean than that is the mean
@@ -28,20 +33,23 @@ class RegionDirections:
     """e of the regions of W, [M, D] f32 in slices of its columns; work of one thread, whose bits are fixed.
 
     Args:
-        W: of all views by rows of codebooks, on the CPU, before any reweighting.
+        codebook: E, whose regions are rows.
+        totals: [M] f64, the weight of each region before any reweighting. entries: how many W has.
     """
 
     mean: Tensor  # [F] f64, mu
     totals: Tensor  # [M] f64, the weight of each region
 
-    def __init__(self, W: RegionWeights, codebook: Codebook) -> None:
-        self._codebook = codebook
-        self.totals = torch.zeros(codebook.regions, dtype=torch.float64)
-        for first in range(0, W.region.shape[0], ENTRIES):
-            own = slice(first, first + ENTRIES)
-            self.totals.index_add_(0, W.region[own], W.weight[own].double())
+    def __init__(self, codebook: Codebook, totals: Tensor, entries: int) -> None:
+        self._codebook, self.totals = codebook, totals
         self.mean, self._distances = self._measured()
-        self._axes = self._principal(W.region.shape[0])
+        self._axes = self._principal(entries)
+
+    @classmethod
+    def of_weights(cls, W: RegionWeights, codebook: Codebook, threads: int | None = None) -> "RegionDirections":
+        """Those of a scene whose W, of all views by rows of codebooks, lies in one place, on the CPU."""
+        totals = added(region_totals(W, threads), (1, codebook.regions))[0]
+        return cls(codebook, torch.from_numpy(totals), W.region.shape[0])
 
     @property
     def width(self) -> int:
@@ -112,3 +120,20 @@ class RegionDirections:
         for part, own in zip(unit.split(ROWS), inverse.split(ROWS), strict=True):
             part.copy_((part.double() - self.mean[channels]) * own[:, None])
         return unit
+
+
+def region_totals(W: RegionWeights, threads: int | None = None) -> Iterator[PieceSums]:
+    """The weight of each region at every piece of splats, [1, M]."""
+    indptr, region, weight = (part.numpy() for part in (W.indptr, W.region, W.weight))
+
+    def add(first: int, last: int, table: np.ndarray) -> None:
+        add_weights(first, last, indptr, region, weight, table[0])
+
+    return piece_sums(add, indptr.size - 1, (1, int(W.offsets[-1])), threads)
+
+
+@kernel
+def add_weights(first, last, indptr, region, weight, totals):
+    """Add the weights of rows ``first..last`` to those of their regions [M] f64."""
+    for k in range(indptr[first], indptr[last]):
+        totals[region[k]] += weight[k]

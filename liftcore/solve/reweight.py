@@ -38,8 +38,12 @@ themselves, and geometry has the more to say the less they do. That exponent is 
 **Confidence** of a splat is the mean of c_jm over its entries, each by its final weight: how far views that do not
 know of each other say the same of it. **What its own feature explains** of a splat is the same mean of
 ``(1 - p) c_jm + p c``: what a splat of one view says is worth what is usual, not nothing.
+
+**How a step splits.** Cosines, factors and scores are functions of a splat's own row of W (`ViewConsistency`, on any
+block of splats). Of the scene they take c, r and the r_m: sums over all splats, taken by pieces (`SceneAgreement`).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -53,6 +57,7 @@ from liftcore.solve.closed_form import morton_codes
 from liftcore.solve.codebook import Codebook
 from liftcore.solve.directions import RegionDirections
 from liftcore.solve.memory import zeros
+from liftcore.solve.sums import PieceSums, piece_sums
 from liftcore.solve.weights import MEMORY_LIMIT, RegionWeights, row_blocks, run_each
 
 BLOCK_ROWS, BLOCK_ENTRIES = 1 << 11, 1 << 15  # a splat has a sum for each view of it
@@ -89,7 +94,7 @@ def agreement_factors(
     reliability: Tensor | None = None,
     consensus: Tensor | None = None,
 ) -> Agreement:
-    """What each entry of W is multiplied with after so many steps.
+    """What each entry of W is multiplied with after so many steps, for a scene whose W lies in one place.
 
     Args:
         W: of all views by rows of codebooks, on the CPU. means: [P, 3] of the splats; neighbours are judged together.
@@ -97,32 +102,64 @@ def agreement_factors(
         reliability: [M] bool, the regions that have factors as a whole; None: none has.
         consensus: [nnz] f32 of each entry (`mask_consensus`).
     """
-    judge = _Judge(W, codebook, means, threads, reliability, consensus)
-    factors = judge.array()
-    factors += 1.0
+    directions = RegionDirections.of_weights(W, codebook, threads)
+    block = ViewConsistency(W, means, threads)
+    factors, scores, scene = None, torch.zeros(2, 0), None
     for step in range(steps):
-        factors = judge.step(factors)
+        table = np.zeros((2, codebook.regions + 1))
+
+        def add(part: PieceSums, table: np.ndarray = table) -> None:
+            table[:, part.places] += part.values
+
+        cosines = block.cosines(directions, factors, reliability is not None, add)
+        scene = SceneAgreement.of(table, reliability)
+        scores = block.weigh(cosines, factors, scene, consensus)
+        factors = cosines
         progress("robust", step + 1, steps, "steps")
-    confidence, explained = judge.told if steps else (None, None)
-    return Agreement(factors, judge.directions, confidence, explained, judge.median)
+    if factors is None or scene is None:
+        return Agreement(torch.ones_like(W.weight), directions, None, None)
+    return Agreement(factors, directions, scores[0], scores[1], scene.reliability)
 
 
-class _Judge:
-    """What all steps share: the sums of rows and the directions of regions."""
+@dataclass(frozen=True)
+class SceneAgreement:
+    """What a step takes from the whole scene."""
 
-    def __init__(
-        self,
-        W: RegionWeights,
-        codebook: Codebook,
-        means: Tensor | None,
-        threads: int | None,
-        reliability: Tensor | None,
-        consensus: Tensor | None,
-    ) -> None:
+    usual: float  # c, the mean cosine
+    regions: Tensor  # [M] f32, r_m / r of each region; one where it has no factor as a whole
+    power: float  # of the consensus, SHARPNESS (1 - r)
+    reliability: float | None  # r, the median over regions; None where it was not asked for
+
+    @classmethod
+    def of(cls, sums: np.ndarray, whole: Tensor | None) -> "SceneAgreement":
+        """From the sums of `ViewConsistency.cosines` over all splats.
+
+        Args:
+            sums: [2, M + 1] f64. whole: [M] bool, the regions that have factors as a whole; None: none has.
+        """
+        told, everything = torch.from_numpy(sums)
+        usual, regions = float(told[-1]) / (float(everything[-1]) or 1.0), torch.ones(sums.shape[1] - 1)
+        if whole is None:
+            return cls(usual, regions, 1.0, None)
+        known = (everything[:-1] > 0) & whole
+        reliable = torch.where(known, told[:-1] / everything[:-1], 0.0)
+        median = float(reliable[known].median()) if known.any() else 0.0
+        if median > 0:
+            regions = torch.where(known, reliable / median, 1.0).float()
+        return cls(usual, regions, SHARPNESS * (1.0 - median), median)
+
+
+class ViewConsistency:
+    """A step's work on a block of splats, which begins at a piece (`liftcore.solve.sums`): no other splat is needed.
+
+    Args:
+        W: of all views by rows of codebooks, on the CPU; a row for each splat of the block.
+        means: [n, 3] of these splats; neighbours, which read the same directions, are judged together.
+        threads: None takes the cores that this process may use. The result is bitwise identical for any value.
+    """
+
+    def __init__(self, W: RegionWeights, means: Tensor | None, threads: int | None) -> None:
         self.W, self.threads = W, threads
-        self.reliability, self.consensus = reliability, consensus
-        self.regions, self.power, self.median = torch.ones(codebook.regions), 1.0, None
-        self.told = torch.zeros(2, W.splats.shape[0])
         sums = W.row_sums()
         self.inverse = torch.where(sums > 0, 1.0 / sums, 0.0)
         self.view = torch.repeat_interleave(W.offsets.diff())
@@ -130,70 +167,76 @@ class _Judge:
         if means is not None:
             self.rows = self.rows[torch.argsort(morton_codes(means[self.rows]))]
         self.blocks = row_blocks(W.indptr.diff()[self.rows].numpy(), BLOCK_ROWS, BLOCK_ENTRIES)
-        self.directions = RegionDirections(W, codebook)
 
-    def array(self) -> Tensor:
+    def cosines(
+        self,
+        directions: RegionDirections,
+        factors: Tensor | None,
+        by_region: bool,
+        add: Callable[[PieceSums], None],
+    ) -> Tensor:
+        """``c_jm`` of each entry, [nnz] f32.
+
+        Args:
+            factors: [nnz] f32, of the step before; None before the first one.
+            by_region: whether reliability is asked for.
+            add: called with the sums of each piece, in their order: ``W (1 - p) c`` and ``W (1 - p)`` of each region
+                and, at place M, ``W c`` and ``W`` of all.
+        """
+        found, squares, factors = self._entries(), self._entries(), _or_ones(factors)
+        for columns in directions.slices():
+            table = directions.table(columns)
+            arrays = [*self._arrays(factors), *(part.numpy() for part in (table, found, squares))]
+            blocks = [(self.rows[first:last].numpy(), *arrays) for first, last in self.blocks]
+            run_each(compare_rows, blocks, self.threads)
+        arrays = [*self._arrays(factors), found.numpy(), squares.numpy()]
+
+        def summed(first: int, last: int, table: np.ndarray) -> None:
+            tally(*[first, last, *arrays, by_region, table])
+
+        shape = 2, int(self.W.offsets[-1]) + 1
+        for part in piece_sums(summed, self.W.indptr.shape[0] - 1, shape, self.threads):
+            add(part)
+        return found
+
+    def weigh(
+        self, cosines: Tensor, factors: Tensor | None, scene: SceneAgreement, consensus: Tensor | None
+    ) -> Tensor:
+        """Cosines become factors ``s ((1 - p) c_jm + p c) (r_m / r) q^power``, in place.
+
+        Args:
+            cosines: [nnz] f32, as `cosines` gives them. factors: of the step before, as there.
+            consensus: [nnz] f32 of each entry (`mask_consensus`); None: there is none.
+
+        Returns:
+            [2, n] f32: the confidence of each splat, and how well its own feature explains what views say of it.
+        """
+        scores = torch.zeros(2, self.W.indptr.shape[0] - 1)
+        parts = cosines, scene.regions, torch.zeros(0) if consensus is None else consensus, scores
+        arrays = [*self._arrays(_or_ones(factors)), *(part.numpy() for part in parts), scene.usual, scene.power]
+        blocks = [(self.rows[first:last].numpy(), *arrays) for first, last in self.blocks]
+        run_each(weigh_rows, blocks, self.threads)
+        return scores
+
+    def _entries(self) -> Tensor:
         """Zeros for the entries of W, [nnz] f32."""
         size = self.W.weight.nbytes
         return zeros(tuple(self.W.weight.shape), torch.float32, name="weights", in_file=2 * size > MEMORY_LIMIT)
 
-    def step(self, factors: Tensor) -> Tensor:
-        """The factors after a step from those before it."""
-        W, found, squares = self.W, self.array(), self.array()
-        for columns in self.directions.slices():
-            table = self.directions.table(columns)
-            blocks = [(first, last, factors, table, found, squares) for first, last in self.blocks]
-            run_each(self._compare, blocks, self.threads)
-        everything = agreeing = 0.0
-        for first in range(0, found.shape[0], BLOCK_ENTRIES << 5):
-            own = slice(first, first + (BLOCK_ENTRIES << 5))
-            lengths = squares[own].sqrt_()
-            cosines = torch.where(lengths > NO_CONSENSUS, found[own] / lengths, 0.0).clamp_(0.0, 1.0)
-            found[own] = cosines
-            agreeing += float((W.weight[own].double() * cosines).sum())
-            everything += float(W.weight[own].sum(dtype=torch.float64))
-        del squares
-        usual = agreeing / (everything or 1.0)
-        if self.reliability is not None:
-            self._rely(factors, found, self.reliability)
-        run_each(self._weigh, [(first, last, factors, usual, found) for first, last in self.blocks], self.threads)
-        return found
-
-    def _compare(
-        self, first: int, last: int, factors: Tensor, table: Tensor, products: Tensor, squares: Tensor
-    ) -> None:
-        """Add ``e_m . r_jv`` and ``|r_jv|^2`` of the entries of some rows, over the channels of the table."""
-        arrays = (self.inverse, self.view, table, products, squares)
-        compare_rows(*self._entries(first, last, factors), *(part.numpy() for part in arrays))
-
-    def _weigh(self, first: int, last: int, factors: Tensor, usual: float, found: Tensor) -> None:
-        """Cosines of some rows become their factors ``s ((1 - p) c_m + p c) (r_m / r) q^power``."""
-        consensus = torch.zeros(0) if self.consensus is None else self.consensus
-        arrays = (self.inverse, self.view, found, self.regions, consensus, self.told)
-        numbers = usual, self.power
-        weigh_rows(*[*self._entries(first, last, factors), *(part.numpy() for part in arrays), *numbers])
-
-    def _entries(self, first: int, last: int, factors: Tensor) -> list[np.ndarray]:
-        """Some rows, and W with its factors."""
+    def _arrays(self, factors: Tensor) -> list[np.ndarray]:
+        """W with its factors, the inverse sums of its rows, and the view of each region."""
         W = self.W
-        return [part.numpy() for part in (self.rows[first:last], W.indptr, W.region, W.weight, factors)]
+        return [part.numpy() for part in (W.indptr, W.region, W.weight, factors, self.inverse, self.view)]
 
-    def _rely(self, factors: Tensor, cosines: Tensor, whole: Tensor) -> None:
-        """The factors of regions as a whole [M] bool, and how sharp the consensus is to be."""
-        W, sums = self.W, torch.zeros(2, self.regions.shape[0], dtype=torch.float64)
-        arrays = (W.indptr, W.region, W.weight, factors, cosines, self.inverse, self.view, sums)
-        tally(*(part.numpy() for part in arrays))
-        known = (sums[1] > 0) & whole
-        reliable = torch.where(known, sums[0] / sums[1], 0.0)
-        self.median = float(reliable[known].median()) if known.any() else 0.0
-        if self.median > 0:
-            self.regions = torch.where(known, reliable / self.median, 1.0).float()
-        self.power = SHARPNESS * (1.0 - self.median)
+
+def _or_ones(factors: Tensor | None) -> Tensor:
+    """Factors [nnz] f32 for a kernel, which takes none [0] for ones."""
+    return torch.zeros(0) if factors is None else factors
 
 
 @vectorised
 def compare_rows(rows, indptr, region, weight, factors, inverse, view, table, products, squares):
-    """`_Judge._compare` of some rows.
+    """Add ``e_m . r_jv`` and ``|r_jv|^2`` of the entries of some rows, over the channels of the table.
 
     The sum of the others is that of the views before and that of the views behind: a difference of two float32 sums
     would be mostly rounding where a view has most of the weight. Of a view float32 adds up LONG entries one by one.
@@ -217,7 +260,8 @@ def compare_rows(rows, indptr, region, weight, factors, inverse, view, table, pr
                     m = region[n]
                     if view[m] != v:
                         break
-                    share = np.float32(weight[n] * factors[n] * inverse[row])
+                    factor = factors[n] if factors.size > 0 else np.float32(1.0)
+                    share = np.float32(weight[n] * factor * inverse[row])
                     for c in range(width):
                         said[target, c] += share * table[m, c]
                     k += 1
@@ -246,9 +290,9 @@ def compare_rows(rows, indptr, region, weight, factors, inverse, view, table, pr
 
 @kernel
 def weigh_rows(
-    rows, indptr, region, weight, factors, inverse, view, cosines, reliable, consensus, told, usual, power
+    rows, indptr, region, weight, factors, inverse, view, cosines, reliable, consensus, scores, usual, power
 ):
-    """`_Judge._weigh` of some rows, and what views say of them: confidence, and what their own feature explains."""
+    """`ViewConsistency.weigh` of some rows."""
     sharp = np.float32(power)
     for row in rows:
         first, last = indptr[row], indptr[row + 1]
@@ -257,7 +301,8 @@ def weigh_rows(
         while k < last:
             begin, v, own = k, view[region[k]], 0.0
             while k < last and view[region[k]] == v:
-                own += weight[k] * factors[k] * inverse[row]
+                factor = factors[k] if factors.size > 0 else np.float32(1.0)
+                own += weight[k] * factor * inverse[row]
                 k += 1
             own = min(own, 1.0)
             for n in range(begin, k):
@@ -273,21 +318,28 @@ def weigh_rows(
         gain = before / after if after > 0.0 else 0.0
         for n in range(first, last):
             cosines[n] = cosines[n] * gain if gain > 0.0 else 1.0
-        told[0, row] = confirmed / after if after > 0.0 else 0.0
-        told[1, row] = explained / after if after > 0.0 else usual
+        scores[0, row] = confirmed / after if after > 0.0 else 0.0
+        scores[1, row] = explained / after if after > 0.0 else usual
 
 
 @kernel
-def tally(indptr, region, weight, factors, cosines, inverse, view, sums):
-    """Of each region, what the splats' other views say of it, ``W (1 - p) c``, and ``W (1 - p)``: sums [2, M] f64."""
-    for row in range(indptr.shape[0] - 1):
+def tally(first, last, indptr, region, weight, factors, inverse, view, cosines, squares, by_region, sums):
+    """Products and squares of the entries of some rows become cosines, and their sums [2, M + 1] f64 are taken."""
+    every = sums.shape[1] - 1
+    for row in range(first, last):
         k = indptr[row]
         while k < indptr[row + 1]:
             begin, v, own = k, view[region[k]], 0.0
             while k < indptr[row + 1] and view[region[k]] == v:
-                own += weight[k] * factors[k] * inverse[row]
+                length, factor = np.sqrt(squares[k]), factors[k] if factors.size > 0 else np.float32(1.0)
+                cosine = cosines[k] / length if length > NO_CONSENSUS else np.float32(0.0)
+                cosines[k] = min(max(cosine, np.float32(0.0)), np.float32(1.0))
+                sums[0, every] += weight[k] * np.float64(cosines[k])
+                sums[1, every] += weight[k]
+                own += weight[k] * factor * inverse[row]
                 k += 1
             others = max(1.0 - own, 0.0)
-            for n in range(begin, k):
-                sums[0, region[n]] += weight[n] * factors[n] * others * cosines[n]
-                sums[1, region[n]] += weight[n] * factors[n] * others
+            for n in range(begin, k if by_region else begin):
+                factor = factors[n] if factors.size > 0 else np.float32(1.0)
+                sums[0, region[n]] += weight[n] * factor * others * cosines[n]
+                sums[1, region[n]] += weight[n] * factor * others

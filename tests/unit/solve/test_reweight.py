@@ -145,7 +145,7 @@ def test_what_a_cluster_explains_is_its_mean_cosine_in_float64(monkeypatch, tabl
     merged, labels = scene.books[0][:5].double().numpy(), rng.integers(-1, 5, 700)
     merged[3] = 0  # a cluster without a feature explains nothing
     W, given = scene.stacked(), (torch.from_numpy(labels).int(), torch.from_numpy(merged).float())
-    directions = RegionDirections(W, codebook_of(scene.books))
+    directions = RegionDirections.of_weights(W, codebook_of(scene.books))
     found = explained_by(W, directions, *given, threads=1)
     assert torch.equal(found, explained_by(W, directions, *given, threads=3))
     mean, e = defined_directions(scene)
